@@ -8,11 +8,14 @@ import torch
 from torch import Tensor
 
 import forcegp
+from forcegp.constraints import ConstrainedSystem
 from forcegp.data.fields import DataHeader
+from forcegp.forces.posterior import ForceSamples
 from forcegp.forces.priors.base import ForcePrior
-from forcegp.forces.priors.contact import ContactForcePrior, SlidingFrictionPrior
+from forcegp.forces.priors.contact import ContactForcePrior, SlidingFrictionPrior, with_coulomb
 from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.forces.priors.sets import REMAINING
+from forcegp.forces.quantities import States
 from forcegp.gp.kernels import Linear, SquaredExponential
 from forcegp.models.structured_fit import StructuredFit
 
@@ -96,3 +99,18 @@ def conditioned(
         step = 0.4 * torch.randn(value.shape, generator=generator, dtype=torch.float64)
         values[key] = value.clamp(min=-3.0) + step if "noise" not in key else value
     return fit.condition(observations, values)
+
+
+def sampled_forces(samples: ForceSamples, system: ConstrainedSystem, at: States) -> tuple[Tensor, Tensor]:
+    """Joint force Q and dissipative contact force Q_z of all samples at all states, `(samples, n, nq)`."""
+    # Q = m + Σ E f over joint forces, Q_z = Σ E f over contact forces (eq. 18)
+    process = samples.posterior.process
+    Q = process.mean(system, at).expand(samples.count, *at.q.shape)
+    Q_z = torch.zeros_like(Q)
+    for p, prior in enumerate(process.priors):
+        features = process.features(p, system, at)
+        latent = samples.functions.latent(p, features) + samples.posterior.shift(p, features)
+        force = (prior.operator(system, at) @ latent[..., None])[..., 0]
+        Q, Q_z = (Q, Q_z + force) if prior.target == "contact" else (Q + force, Q_z)
+    # Q_z ← Q̄ − Q, with Coulomb friction in Q̄
+    return Q, with_coulomb(system, at, Q + Q_z, process.coulomb) - Q

@@ -27,7 +27,7 @@ from forcegp.forces.priors.joint import JointFrictionPrior
 from forcegp.forces.problem import force_posterior, kernel_parameters
 from forcegp.forces.quantities import States, affine_map, states
 from forcegp.gp.kernels import Linear
-from forces.cases import CONTACTS, draw, logged, mixed_contacts, two_contacts
+from forces.cases import CONTACTS, draw, logged, mixed_contacts, sampled_forces, two_contacts
 from random_data import table_system
 
 N, MU, EPS = 8, (0.15, 0.1), 0.004
@@ -157,7 +157,7 @@ def test_updates_and_samples_carry_the_error_of_learned_friction() -> None:
     samples = whole.force_samples(4000, torch.Generator().manual_seed(0))
     assert isinstance(samples, ForceSamples)
     at = states(whole.system, test.q, test.qd, test.tau, torch.ones(10, 1, dtype=torch.bool))
-    multiplier = at.eom.multiplier(sum(samples.forces(whole.system, at)))
+    multiplier = at.eom.multiplier(sum(sampled_forces(samples, whole.system, at)))
     spread = multiplier[..., 0].var(0) / other[:, 0]
     assert float((spread - 1.0).abs().max()) < 5.0 * math.sqrt(2.0 / 4000)
 

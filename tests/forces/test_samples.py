@@ -8,7 +8,7 @@ import torch
 from forcegp.forces.posterior import CHUNK_STATES, draw_samples
 from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.forces.quantities import states
-from forces.cases import conditioned, draw, logged, mixed_contacts, two_contacts
+from forces.cases import conditioned, draw, logged, mixed_contacts, sampled_forces, two_contacts
 
 COUNT = 1500
 STANDARD_ERRORS = 5.0
@@ -22,7 +22,7 @@ def test_moments_are_those_of_the_posterior() -> None:
     (q, qd, tau), active = draw(4, seed=7), mixed_contacts(4)
     q = q * 0.1 + model.training.measurements[0].q[:4]  # near data, where the correction matters
     samples = draw_samples(model.posterior, COUNT, torch.Generator().manual_seed(1))
-    Q, Q_z = samples.forces(model.system, states(model.system, q, qd, tau, active))
+    Q, Q_z = sampled_forces(samples, model.system, states(model.system, q, qd, tau, active))
     expected = model.predict(q, qd, tau, "joint_force", active=active)
     assert Q.shape == (COUNT, 4, 7) and bool((Q_z == 0.0).all())
     error = (Q.mean(0) - expected.mean).abs() / (expected.std / COUNT**0.5)
@@ -35,7 +35,7 @@ def test_every_sample_obeys_newton_and_the_constraint() -> None:
     model = conditioned(logged(system, 8))
     (q, qd, tau), active = draw(6, seed=7), mixed_contacts(6)
     samples = draw_samples(model.posterior, 5, torch.Generator().manual_seed(2))
-    Q, Q_z = samples.forces(system, states(system, q, qd, tau, active))
+    Q, Q_z = sampled_forces(samples, system, states(system, q, qd, tau, active))
     assert bool((Q_z[:, ~active.any(-1)] == 0.0).all()), "no friction without contact"
     eom = system.equations(q, qd, active)
     for force in Q + Q_z:
@@ -55,13 +55,16 @@ def test_a_sample_is_one_function() -> None:
     one, two = (
         draw_samples(model.posterior, 3, torch.Generator().manual_seed(4), features=64) for _ in range(2)
     )
-    Q, _ = one.forces(system, at)
-    assert torch.equal(Q, two.forces(system, at)[0])
-    own = torch.tensor([2, 0, 1, 1, 0])
-    chosen, _ = one.forces(system, at, own)
-    assert torch.allclose(chosen, Q[own, torch.arange(5)], rtol=1e-12, atol=1e-12)
+    Q, Q_z = sampled_forces(one, system, at)
+    assert torch.equal(Q, sampled_forces(two, system, at)[0])
+    own = torch.tensor([2, 0, 1])
+    few = states(system, *(x[:3] for x in draw(5, seed=7)), mixed_contacts(5)[:3])
+    chosen = sampled_forces(one, system, few)
+    assert torch.allclose(
+        sum(chosen)[own, torch.arange(3)], (Q + Q_z)[own, torch.arange(3)], rtol=1e-12, atol=1e-12
+    )
     other = draw_samples(model.posterior, 3, torch.Generator().manual_seed(5), features=64)
-    assert not torch.allclose(Q, other.forces(system, at)[0])
+    assert not torch.allclose(Q, sampled_forces(other, system, at)[0])
 
 
 @pytest.mark.parametrize(
@@ -74,5 +77,6 @@ def test_each_sample_at_its_own_states(count: int, runs: int) -> None:
     samples = draw_samples(model.posterior, count, torch.Generator().manual_seed(4), features=64)
     q, qd, tau = draw(count * runs, seed=7)
     at = states(system, q, qd, tau, mixed_contacts(count * runs))
-    Q, Q_z = samples.forces(system, at, torch.arange(count).repeat_interleave(runs))
-    assert torch.allclose(samples(system, at), Q + Q_z, rtol=1e-10, atol=1e-10)
+    own = torch.arange(count).repeat_interleave(runs), torch.arange(count * runs)
+    force = sum(sampled_forces(samples, system, at))[own]
+    assert torch.allclose(samples(system, at), force, rtol=1e-10, atol=1e-10)

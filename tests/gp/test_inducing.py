@@ -8,7 +8,7 @@ from torch import Tensor
 
 from forcegp.gp.basis import latent_basis
 from forcegp.gp.features import Block
-from forcegp.gp.inducing import candidates, select_inducing
+from forcegp.gp.inducing import select_inducing
 from forcegp.gp.kernels import Linear, Matern32, SquaredExponential, sub
 from forcegp.gp.sums import accumulate
 from gp.sparse_cases import COMPONENTS, PROCESSES, Named, parameters, rows
@@ -79,18 +79,3 @@ def test_repeated_samples_are_chosen_once() -> None:
         x = torch.cat([selection.points["q"], selection.points["qd"]], dim=-1)
         assert len(x.unique(dim=0)) == 6
         assert float(selection.missed[-1]) < 1e-9 * float(selection.missed[0])
-
-
-def test_candidates_are_evenly_spaced_over_a_stream() -> None:
-    block = rows(50)
-    parts = (
-        Block(
-            tuple({k: x[i:j] for k, x in f.items()} for f in block.features),
-            tuple(W[i:j] for W in block.operators),
-            block.target[i:j],
-        )
-        for i, j in ((0, 13), (13, 14), (14, 50))
-    )
-    kept = torch.cat([b.target for b in candidates(parts, 50, 10)])
-    assert torch.equal(kept, block.target[::5])
-    assert len(torch.cat([b.target for b in candidates([block], 50, 500)])) == 50

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
@@ -12,7 +13,7 @@ from torch import Tensor
 from torch.linalg import vecdot
 
 from forcegp import dynamics, kinematics
-from forcegp.constraints.contact import Constraint, ConstraintTerms
+from forcegp.constraints.contact import Constraint, ConstraintTerms, SurfaceContact
 from forcegp.constraints.gauss import Equations, Linearization, linearize
 from forcegp.errors import ParameterError, ShapeError, UnknownNameError
 from forcegp.kinematics import LinkMotion, LinkPoses
@@ -134,6 +135,16 @@ class ConstrainedSystem:
         if name not in self.contact_names:
             raise UnknownNameError("contact", name, self.contact_names)
         return self.contacts[self.contact_names.index(name)]
+
+    @cached_property
+    def may_stick(self) -> list[tuple[int, SurfaceContact, slice]]:
+        """The contacts that may stick: index, contact and its two tangential rows."""
+        ends = itertools.accumulate(contact.rows for contact in self.contacts)
+        return [
+            (k, contact, slice(end - 2, end))
+            for k, (contact, end) in enumerate(zip(self.contacts, ends, strict=True))
+            if isinstance(contact, SurfaceContact) and contact.stick_speed is not None
+        ]
 
     @property
     def state_bytes(self) -> int:

@@ -61,7 +61,6 @@ def autocorrelation_time(x: Tensor, segment: Tensor, white: Tensor | float = 0.0
 
     Args:
         x: `(n, d)` in the order of time, with mean zero.
-        segment: `(n,)`.
         white: variance of white noise in x, which is not counted.
     """
     longest = int(segment.unique(return_counts=True)[1].max())
@@ -86,7 +85,6 @@ def correlation_times(x: Tensor, segment: Tensor, length: int, white: Tensor | f
 
     Args:
         x: `(n, d)` in the order of time, with mean zero.
-        segment: `(n,)`.
         length: L, several times the autocorrelation time.
         white: variance of white noise in x, which is not counted.
     """
@@ -121,30 +119,13 @@ def _of_force(at: States, quantity: str) -> Tensor:
     return M if quantity == "qdd" else torch.eye(M.shape[-1], dtype=M.dtype, device=M.device).expand_as(M)
 
 
-def likelihood_power(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> float:
-    """κ = 1/τ̄, τ̄ the geometric mean over the joints of the autocorrelation time of their torque noise.
-
-    The n samples of a log hold as much evidence as n/τ̄ independent ones.
-
-    Args:
-        problem: what is conditioned on, at its own rate.
-        hyperparameters: learned tensors.
-
-    Returns:
-        κ, at most 1.
-    """
-    return residual_times(problem, hyperparameters, problem.training)[0]
-
-
 def residual_times(
     problem: Problem, hyperparameters: Mapping[str, Tensor], training: Training
 ) -> tuple[float, Tensor | None]:
-    """κ as in `likelihood_power`, and `correlation_times` of joints `(nq,)` [s], `None` for too few samples.
+    """κ ≤ 1, and `correlation_times` of joints `(nq,)` [s], `None` for too few samples.
 
-    Args:
-        problem: what is conditioned on, with learned torque noise.
-        hyperparameters: learned tensors.
-        training: samples whose residuals are looked at, at their own rate.
+    κ = 1/τ̄, τ̄ the geometric mean over the joints of the autocorrelation time of their torque noise in the
+    residuals of `training`, at its rate: n samples hold as much evidence as n/τ̄ independent ones.
     """
     posterior = force_posterior(problem, hyperparameters)
     logs, times = [], []
@@ -223,8 +204,6 @@ def held_out_torque_std(problem: Problem, hyperparameters: Mapping[str, Tensor],
     mean(r_i² / (Σ_k P_ik² s_k² + Var r_i)) = 1 over all samples at which P_ii is more than a half.
 
     Args:
-        problem: what was learned.
-        hyperparameters: learned tensors.
         least: the learned standard deviation, which is kept where the errors ask for less.
     """
     parts = []

@@ -28,7 +28,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from forcegp import dynamics, kinematics
-from forcegp.errors import ParameterError, UnknownNameError
+from forcegp.errors import ParameterError, check_name
 from forcegp.robot.model import RobotModel
 
 Array = NDArray[np.float64]
@@ -76,11 +76,9 @@ class WrenchFrame:
     change: tuple[float, float] = (FORCE_CHANGE, MOMENT_CHANGE)
 
     def __post_init__(self) -> None:
-        if self.reference not in ("world", "local"):
-            raise UnknownNameError("reference of a wrench", self.reference, ("world", "local"))
+        check_name("reference of a wrench", self.reference, ("world", "local"))
         for axis in self.axes:
-            if axis not in AXES:
-                raise UnknownNameError("component of a wrench", axis, AXES)
+            check_name("component of a wrench", axis, AXES)
         if not self.axes or len(set(self.axes)) < len(self.axes):
             raise ParameterError("invalid components of a wrench", expected="some of AXES", got=self.axes)
         for name, pair in (("prior_std", self.prior_std), ("change", self.change)):

@@ -93,8 +93,6 @@ def memory_of(
     time, or too far apart.
 
     Args:
-        problem: what was learned.
-        hyperparameters: learned tensors.
         training: samples whose residuals are looked at.
     """
     if not training.period:
@@ -135,8 +133,6 @@ def learn_memory(
     """Learn the correction from training samples in free motion.
 
     Args:
-        robot: the robot.
-        motion: of the samples.
         residual: joint force that the fit leaves, M q̈ − E Q̄ `(n, nq)`.
         white: its variance that noise of the accelerations explains, `(n, nq)`.
         forces: its variance that the learned forces explain, `(n, nq)`.

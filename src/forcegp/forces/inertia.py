@@ -108,7 +108,7 @@ def rigid_robot(robot: RobotModel, rows: Rows) -> RobotModel | None:
 
 
 def _power(rows: Rows, left: Tensor) -> float:
-    """κ = 1/τ̄ of what nothing explains, as in `likelihood_power`."""
+    """κ = 1/τ̄ of what nothing explains, as in `residual_times`."""
     times = autocorrelation_time(left[: rows.leading], rows.segment[: rows.leading])
     return min(1.0, math.exp(-float(times.log().mean())))
 
@@ -241,7 +241,6 @@ def _damped(rows: Rows, M: Tensor, found: Tensor) -> Tensor:
     friction explains is no noise.
 
     Args:
-        rows: the samples.
         M: mass matrix of the file at the samples.
         found: inertia of drives that torques ask for.
     """

@@ -322,14 +322,7 @@ def held_out(
 def acceleration_errors(
     rows: Rows, by_stretch: NormalEquations, columns: Tensor, delta: Tensor, M: Tensor
 ) -> Tensor:
-    """Mean squares of acceleration errors at δ on stretches that friction has not seen, `(groups, nq)`.
-
-    Args:
-        rows, by_stretch: the samples.
-        columns: C.
-        delta: unknowns.
-        M: mass matrix with them.
-    """
+    """Mean squares of acceleration errors at δ on stretches that friction has not seen, `(groups, nq)`."""
     residual, errors = rows.residual - columns @ delta, []
     for g in range(len(by_stretch.gram)):
         inside = rows.group == g

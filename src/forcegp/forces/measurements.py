@@ -168,29 +168,22 @@ class Training:
             part_of=0,
             measurements=tuple(m[index] for m, index in zip(self.measurements, rows, strict=True)),
             noise_std=tuple(
-                std[index] if std.ndim == 2 else std for std, index in zip(self.noise_std, rows, strict=True)
+                std[i] if std.ndim == 2 else std for std, i in zip(self.noise_std, rows, strict=True)
             ),
-            weights=None
-            if self.weights is None
-            else tuple(w[index] for w, index in zip(self.weights, rows, strict=True)),
-            slopes=None
-            if self.slopes is None
-            else tuple(None if G is None else G[index] for G, index in zip(self.slopes, rows, strict=True)),
+            weights=self.weights and tuple(w[i] for w, i in zip(self.weights, rows, strict=True)),
+            slopes=self.slopes
+            and tuple(None if G is None else G[i] for G, i in zip(self.slopes, rows, strict=True)),
         )
 
     def joined(self, more: Training, noise_std: Sequence[Tensor]) -> Training:
         """These and further measurements, with the noise of the latter; slopes are of both."""
-        weights, slopes = self.weights, self.slopes
-        if weights is not None:
-            weights = (*weights, *(torch.ones_like(m.t) for m in more.measurements))
-        if slopes is not None and more.slopes is not None:
-            slopes = (*slopes, *more.slopes)
+        weights, slopes = tuple(torch.ones_like(m.t) for m in more.measurements), more.slopes or ()
         return dataclasses.replace(
             self,
             measurements=(*self.measurements, *more.measurements),
             noise_std=(*self.noise_std, *noise_std),
-            weights=weights,
-            slopes=slopes,
+            weights=self.weights and (*self.weights, *weights),
+            slopes=self.slopes and (*self.slopes, *slopes),
         )
 
     def moving(self, speed: float) -> Training:
@@ -214,7 +207,6 @@ def without_impacts(training: Training, system: ConstrainedSystem) -> tuple[Trai
 
     Args:
         training: measured accelerations among others.
-        system: robot and contacts.
     """
     if not system.m:
         return training, 0
@@ -421,9 +413,6 @@ def training_of(
     """Measurements with their noise and input scales.
 
     Args:
-        data: measured accelerations, or any mixture of measurements.
-        system: robot and contacts.
-        priors: the force priors.
         noise_std: of accelerations whose noise is not stated.
         kept: scales of priors, by name, that keep earlier ones.
         standardize: whether inputs of kernels are standardized, or enter in their units.

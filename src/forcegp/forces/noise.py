@@ -186,7 +186,6 @@ def warnings_beyond(distance: Tensor, joints: Sequence[str]) -> tuple[str, ...]:
 
     Args:
         distance: D `(*batch, nq)`.
-        joints: their names.
     """
     rows = distance.reshape(-1, distance.shape[-1])
     far = int((rows > FAR).any(-1).sum())
@@ -260,8 +259,6 @@ def state_jacobian(
     """G = dz/d(q, q̇) `(n, d, 2 nq)` of measured accelerations or multipliers; `None` for other quantities.
 
     Args:
-        system: robot and contacts.
-        m: the measurement.
         force: all impressed forces; by default those of the robot file and the measured torque.
     """
     if m.quantity not in ("qdd", "multiplier"):

@@ -63,9 +63,6 @@ def with_learned_slopes(
 
     Args:
         problem: exact, with noise of the state and the slopes of the robot file.
-        search: what is learned and what is held.
-        learned: what was learned of the problem.
-        progress: called after each evaluation.
 
     Returns:
         The problem, what is learned, and warnings.
@@ -96,11 +93,7 @@ def with_learned_weights(
     """The problem with the weights of its samples, and what is learned with them.
 
     Args:
-        problem: samples, robot and noise.
-        search: what is learned and what is held.
-        learned: what was learned of the problem.
         degrees: ν.
-        progress: called after each evaluation.
     """
     for _ in range(ROUNDS):
         problem = weighted(problem, search.values(learned), degrees)
@@ -113,8 +106,6 @@ def weighted(problem: Problem, values: Mapping[str, Tensor], degrees: float) -> 
     """The problem with the weights of its samples after `STEPS` steps, from those that it has.
 
     Args:
-        problem: samples, robot and noise.
-        values: hyperparameters.
         degrees: ν.
     """
     for _ in range(STEPS):

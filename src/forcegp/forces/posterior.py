@@ -62,8 +62,6 @@ class ForceProcess:
         """A quantity as rows of the latent forces.
 
         Args:
-            system: robot and contacts.
-            at: n states.
             z: the quantity, with Coulomb friction of contacts.
 
         Returns:
@@ -137,8 +135,6 @@ class ForcePosterior:
         """A quantity at n states as rows of the processes, with its prior mean as target.
 
         Args:
-            system: robot and contacts.
-            at: n states.
             z: the quantity, without Coulomb friction of contacts.
         """
         # W = B E, target o + B m (eqs. 12 and 15)
@@ -177,36 +173,10 @@ class ForceSamples:
         """Number of samples."""
         return self.functions.count
 
-    def forces(
-        self, system: ConstrainedSystem, at: States, sample: Tensor | None = None
-    ) -> tuple[Tensor, Tensor]:
-        """Sampled joint force Q and dissipative contact force Q_z.
-
-        Args:
-            system: robot and contacts.
-            at: n states.
-            sample: `(n,)` which sample each state belongs to; all samples at all states by default.
-
-        Returns:
-            Q and Q_z `(samples, n, nq)`, or `(n, nq)` where `sample` is given [N m, N].
-        """
-        # Q = m + Σ E f over joint forces, Q_z = Σ E f over contact forces (eq. 18)
-        Q = self.posterior.process.mean(system, at)
-        Q = Q if sample is not None else Q.expand(self.count, *Q.shape)
-        Q_z = torch.zeros_like(Q)
-        for p, prior in enumerate(self.posterior.priors):
-            features = self.posterior.process.features(p, system, at)
-            latent = self.functions.latent(p, features, sample) + self.posterior.shift(p, features)
-            force = (prior.operator(system, at) @ latent[..., None])[..., 0]
-            Q, Q_z = (Q, Q_z + force) if prior.target == CONTACT else (Q + force, Q_z)
-        # Q_z ← Q̄ − Q, with Coulomb friction in Q̄
-        return Q, with_coulomb(system, at, Q + Q_z, self.posterior.process.coulomb) - Q
-
     def __call__(self, system: ConstrainedSystem, at: States) -> Tensor:
         """Q̄ = Q + Q_z of one sample per trajectory, the force field of a rollout.
 
         Args:
-            system: robot and contacts.
             at: samples × k states, of which the s-th run of k belongs to sample s.
 
         Returns:
@@ -247,8 +217,6 @@ def draw_samples(
     """Draw force functions from the posterior.
 
     Args:
-        posterior: what to draw from.
-        count: number of functions.
         generator: source of randomness, on the CPU.
         features: random features per component; by default as many as the kind of posterior needs.
     """
@@ -273,11 +241,6 @@ def force_correlation(posterior: ForcePosterior, system: ConstrainedSystem, at: 
 
     corr_i = Cov(Q_i, Q_z,i) / √(Var Q_i Var Q_z,i). The part of Q along the constraint, which accelerations
     never show, is left out.
-
-    Args:
-        posterior: over latent forces.
-        system: robot and contacts.
-        at: n states.
     """
     z = affine_map(system, at, ("joint_force", "contact_friction"))
     rows = posterior.rows(system, at, z)
@@ -292,29 +255,14 @@ def force_correlation(posterior: ForcePosterior, system: ConstrainedSystem, at: 
     return torch.where(scale > 0.0, cross / scale.where(scale > 0.0, 1.0), 0.0).clamp(-1.0, 1.0)
 
 
-@dataclass(frozen=True)
-class Doubts:
-    """What a fit is doubtful about.
-
-    Attributes:
-        correlation: mean correlation of Q and Q_z over some of the training states, where both have priors.
-        warnings: each with a remedy.
-    """
-
-    correlation: float | None
-    warnings: tuple[str, ...]
-
-
 def doubts_of(
-    posterior: ForcePosterior, system: ConstrainedSystem, training: Training, power: float = 1.0
-) -> Doubts:
-    """What a posterior is doubtful about, at some of its training states in contact and on the whole.
+    posterior: ForcePosterior, system: ConstrainedSystem, training: Training, power: float
+) -> tuple[float | None, tuple[str, ...]]:
+    """Doubts about a posterior of rows to a power, at training states in contact and on the whole.
 
-    Args:
-        posterior: over latent forces.
-        system: robot and contacts.
-        training: what the posterior is conditioned on.
-        power: κ, by which the rows of the posterior are tempered.
+    Returns:
+        Mean correlation of Q and Q_z over some of these states, where both have priors; and warnings, each
+        with a remedy.
     """
     few = training.evenly(min(CORRELATION_STATES, training.samples)).measurements if training.samples else ()
     # Elsewhere Q_z is zero, and there is no multiplier.
@@ -357,7 +305,7 @@ def doubts_of(
             f"the covariance was factorised with a jitter of {jitter:.2g} times the noise variance: "
             "drop duplicated rows, or state a larger noise",
         )
-    return Doubts(correlation, warnings)
+    return correlation, warnings
 
 
 def _on_multiplier(mean: Tensor, variance: Tensor) -> tuple[str, ...]:

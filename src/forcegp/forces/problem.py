@@ -18,13 +18,7 @@ from torch import Tensor, nn
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError
 from forcegp.forces.measurements import Training
-from forcegp.forces.noise import (
-    TORQUE_NOISE,
-    ForceNoise,
-    SampleNoise,
-    hidden_variance,
-    state_jacobian,
-)
+from forcegp.forces.noise import TORQUE_NOISE, ForceNoise, SampleNoise, hidden_variance, state_jacobian
 from forcegp.forces.posterior import ForcePosterior, ForceProcess
 from forcegp.forces.priors.base import ANALYTICAL, MIXING, NOISE, RESERVED, ForceMean, ForcePrior
 from forcegp.forces.priors.contact import CoulombErrorPrior, CoulombFriction, coulomb_of
@@ -34,7 +28,7 @@ from forcegp.gp.exact import ExactPosterior, require_exact_fits
 from forcegp.gp.features import Features, Standardization
 from forcegp.gp.inducing import CANDIDATES, LIMIT, select_inducing
 from forcegp.gp.kernels import sub
-from forcegp.gp.likelihood import bound_of, negative_bound, negative_log_likelihood
+from forcegp.gp.likelihood import negative_log_likelihood, negative_log_likelihood_of_weights
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.gp.sums import Sums, accumulate, add_over_processes, reduce_sums
 
@@ -252,10 +246,10 @@ class Problem:
         return torch.cat(squares).mean(0).sqrt()
 
     def negative_log_likelihood(self, params: Tensors, rows: WhitenedRows) -> Tensor:
-        """Of the rows, exact or as the collapsed bound, with their constant."""
-        if self.inducing is not None:
-            return negative_bound(self.priors, params, rows.blocks, self.inducing) + rows.constant
-        return negative_log_likelihood(self.priors, params, rows.blocks) + rows.constant
+        """Of the rows, with their constant; of the weights of features where inference is sparse."""
+        exact = self.inducing is None
+        of = negative_log_likelihood if exact else negative_log_likelihood_of_weights
+        return of(self.priors, params, rows.blocks) + rows.constant
 
     def rows_for(self, tensors: Tensors, held: Tensors) -> WhitenedRows:
         """The rows at learned and held tensors; computed once where they are those as given."""
@@ -326,8 +320,6 @@ def total_over(
 
     Args:
         problem: robot, priors and noise; its own training data are not read.
-        hyperparameters: learned and held.
-        basis: basis functions.
         pieces: the samples; may be a generator.
         begin: totals of the pieces before.
         after: called after each piece.
@@ -408,7 +400,6 @@ def with_inducing(problem: Problem, hyperparameters: Mapping[str, Tensor], limit
 
     Args:
         problem: with the samples that are conditioned on.
-        hyperparameters: of the priors.
         limit: maximum number of inducing points of one prior.
     """
     training = problem.training
@@ -459,15 +450,6 @@ def forces_and_constant(
     # f | y ~ N(k Wᵀ Σ⁻¹ y, k − k Wᵀ Σ⁻¹ W k), Σ = W k Wᵀ + I (eqs. 22 to 24)
     latent = ExactPosterior.of(problem.priors, params, rows.blocks)
     return ForcePosterior(problem.process_at(hyperparameters), latent), rows.constant
-
-
-def log_likelihood(posterior: ForcePosterior) -> float:
-    """log p(y) of the rows without their constant, or its lower bound."""
-    latent = posterior.latent
-    if isinstance(latent, ExactPosterior):
-        return float(latent.log_likelihood())
-    assert isinstance(latent, SparsePosterior)
-    return -float(bound_of(latent.sums, latent))
 
 
 def lost_by_inducing(posterior: ForcePosterior) -> tuple[dict[str, Any], tuple[str, ...]]:

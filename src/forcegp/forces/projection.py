@@ -170,14 +170,7 @@ class _Rows:
 def whiten(
     system: ConstrainedSystem, process: ForceProcess, measurement: Measurement, noise: SampleNoise
 ) -> WhitenedRows:
-    """Rows of one measurement with unit white noise, without noise-free directions.
-
-    Args:
-        system: robot and contacts.
-        process: the forces a priori.
-        measurement: what was measured.
-        noise: of its samples.
-    """
+    """Rows of one measurement with unit white noise, without noise-free directions."""
     # z = B_Q Q + B_z Q_z + o (eqs. 19 and 20)
     at, std = measurement.at(system), noise.std.expand_as(measurement.values)
     z = process.coupled(system, at, affine_map(system, at, measurement.quantity))

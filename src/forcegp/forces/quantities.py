@@ -297,8 +297,6 @@ def hidden_forces(
     """What is hidden of some quantities; `None` where all of them are determined.
 
     Args:
-        system: robot and contacts.
-        at: n states.
         parts: the rows of each quantity, as `affine_maps` gives them.
         never: contacts that were closed in no training sample.
 
@@ -377,7 +375,6 @@ def linearize_field(
 
     Args:
         force: the impressed force Q̄ at states, `(n, nq)`.
-        system: robot and contacts.
         q, qd, tau: `(*batch, nq)` states.
         active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
 

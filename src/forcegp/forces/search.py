@@ -126,8 +126,6 @@ def initial_hyperparameters(
     """Initial log-hyperparameters, by `<prior>.<name>`.
 
     Args:
-        priors: force priors.
-        blocks: whitened rows.
         beyond_noise: whether the noise of the rows explains its share, as where unknown forces are stated.
     """
     params: dict[str, Tensor] = {}
@@ -190,7 +188,6 @@ def box_around(
     noise leaves nothing of it.
 
     Args:
-        start: default initial values.
         begin: where learning begins, if not there; the box contains it.
     """
     box: dict[str, tuple[float | Tensor, float | Tensor]] = {}
@@ -304,7 +301,6 @@ class Search:
         """Learn; on a part of the data first where there is much, and from several starts on request.
 
         Args:
-            problem: whose objective is minimised.
             progress: called after each evaluation on all data.
             begin: where to begin on all data, instead of warm starts and restarts.
 

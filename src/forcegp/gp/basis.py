@@ -17,7 +17,7 @@ import torch
 from torch import Tensor
 
 from forcegp.gp.factor import Spectrum
-from forcegp.gp.features import FeatureMap, Features, points
+from forcegp.gp.features import Block, FeatureMap, Features, points
 from forcegp.gp.kernels import Constant, Kernel, Linear, Parameters, Process, Product, Sum, sides, sub
 
 EXACT: tuple[type[Kernel], ...] = (Linear, Constant)
@@ -32,11 +32,7 @@ class KernelPart:
     params: Parameters
 
     def features(self, x: Features) -> FeatureMap:
-        """φ of a finite part: features whose products are the kernel exactly.
-
-        Args:
-            x: any inputs, whose widths count.
-        """
+        """φ of a finite part: features whose products are the kernel exactly."""
         # Such a draw takes no random number, so any generator does.
         return self.kernel.draw(self.params, x, 1, torch.Generator())
 
@@ -145,11 +141,6 @@ class ProcessBasis:
         device = next(iter(self.inducing.values())).device
         return self.used.reshape(-1).nonzero()[:, 0].to(device)
 
-    @cached_property
-    def owner(self) -> Tensor:
-        """The component of each basis function `(Σ sizes,)`."""
-        return self.used.nonzero()[:, 0].to(self.columns.device)
-
     def values(self, features: Features) -> tuple[Tensor, Tensor]:
         """V(x) filled up with zeros `(components, n, width)`; |V|² of inducing points `(components, n)`."""
         if self.to_inducing is None:
@@ -200,7 +191,6 @@ class ProcessBasis:
         """k(x, x) of the whole kernel `(components, n)`.
 
         Args:
-            features: kernel inputs.
             values: V(x), as `values` gives it.
         """
         # k(x, x) = k_rest(x, x) + |φ(x)|²
@@ -263,12 +253,6 @@ class LatentBasis:
         """Number of basis functions in all."""
         return self.columns[-1].stop
 
-    @cached_property
-    def owner(self) -> Tensor:
-        """The component of each basis function `(size,)`, of the components of all processes in order."""
-        pairs = zip(self.parts, self.components, strict=True)
-        return torch.cat([part.owner + among.start for part, among in pairs])
-
     def tensors(self) -> dict[str, Tensor]:
         """Inducing points and eigenvectors, by name.
 
@@ -309,6 +293,11 @@ class LatentBasis:
         slices = self.columns[self.components[p]]
         return slice(slices[0].start, slices[-1].stop)
 
+    def rows(self, block: Block) -> Tensor:
+        """The rows of samples in terms of the basis functions, Φ `(n r, size)`."""
+        each = zip(self.parts, block.operators, block.features, strict=True)
+        return torch.cat([part.rows(W, part.values(x)[0]) for part, W, x in each], dim=-1)
+
     def evaluate(self, features: Sequence[Features]) -> tuple[Tensor, Tensor, Tensor]:
         """Basis functions at n samples.
 
@@ -333,8 +322,6 @@ def latent_basis(
     """Basis functions of processes with given inducing points.
 
     Args:
-        processes: the processes.
-        params: log-hyperparameters, `<process>.<name>`.
         inducing: kernel inputs of the inducing points of each process, of any number, none included.
         components: number of components of each process.
     """

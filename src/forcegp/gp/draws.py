@@ -51,23 +51,11 @@ class FunctionSamples:
         """Number of samples."""
         return self.weights[0][0].shape[-1]
 
-    def latent(self, p: int, features: Features, sample: Tensor | None = None) -> Tensor:
-        """Values of process p.
-
-        Args:
-            p: index of the process.
-            features: its standardized inputs at n states.
-            sample: `(n,)` which sample each state belongs to; all samples at all states by default.
-
-        Returns:
-            `(samples, n, components)`, or `(n, components)` where `sample` is given.
-        """
+    def latent(self, p: int, features: Features) -> Tensor:
+        """Values of process p at its standardized inputs at n states, `(samples, n, components)`."""
         # f_s(x) = Σ_t φ_t(x) w_ts
-        terms = [(basis(features), w) for basis, w in zip(self.bases[p], self.weights[p], strict=True)]
-        if sample is None:
-            return sum((k @ w for k, w in terms[1:]), start=terms[0][0] @ terms[0][1]).permute(2, 1, 0)
-        rows = torch.stack([torch.einsum("knj,kjn->nk", k, w[..., sample]) for k, w in terms])
-        return rows.sum(0)
+        terms = zip(self.bases[p], self.weights[p], strict=True)
+        return torch.stack([basis(features) @ w for basis, w in terms]).sum(0).permute(2, 1, 0)
 
     @cached_property
     def _weights_by_sample(self) -> list[list[Tensor]]:
@@ -101,7 +89,6 @@ def draw_priors(
     Args:
         processes, params, blocks: as given to `gram`.
         measured: whether any row depends on each process.
-        count: number of functions.
         generator: source of randomness, on the CPU.
         features: random features per component.
 
@@ -134,8 +121,6 @@ def kernel_terms(kernel: Kernel, params: Parameters, X: Features, w: Tensor) -> 
     length-scales all components share is evaluated once for all of them, and so is a product of such terms.
 
     Args:
-        kernel: the kernel, of k components.
-        params: its log-hyperparameters.
         X: n points.
         w: `(k, n, samples)`.
 
@@ -199,7 +184,6 @@ def draw_functions(
     """Functions with given weights of the basis functions, and what these miss drawn from the prior.
 
     Args:
-        basis: basis functions.
         weights: drawn from their posterior `(size, samples)`.
         generator: source of randomness, on the CPU.
         features: random features of each component's prior.

@@ -207,15 +207,15 @@ class ExactPosterior:
                     add_rows(cross[:, starts[g] : starts[g + 1]], W, k, self.blocks[g].operators[p])
         return cross
 
-    def log_likelihood(self) -> Tensor:
+    @property
+    def log_likelihood(self) -> float:
         """log p(y) of the rows without their constant, −½ yᵀ(K + I)⁻¹y − ½ log|K + I| − ½ n log 2π."""
-        return -self.conditioned.negative_log_likelihood(target_of(self.blocks))
+        return -float(self.conditioned.negative_log_likelihood(target_of(self.blocks)))
 
     def draw(self, count: int, generator: torch.Generator, features: int = FEATURES) -> FunctionSamples:
         """Functions from the posterior by Matheron's rule: f(x) + k(x, X) WᵀΣ⁻¹(y − W f(X) − ε), Σ = K + I.
 
         Args:
-            count: number of functions.
             generator: source of randomness, on the CPU.
             features: random features per component.
         """
@@ -238,7 +238,6 @@ def exact_bytes(blocks: Sequence[Block], learning: bool = True) -> int:
     """Bytes of memory that exact inference on whitened rows takes at its peak.
 
     Args:
-        blocks: whitened rows.
         learning: whether hyperparameters are learned, or the rows conditioned on only.
     """
     rows = sum(block.target.numel() for block in blocks)
@@ -253,8 +252,6 @@ def require_exact_fits(blocks: Sequence[Block], learning: bool = True, available
     """Refuse exact inference that would not fit into memory, and announce what takes most of it.
 
     Args:
-        blocks: whitened rows.
-        learning: whether hyperparameters are learned.
         available: bytes that may be taken; by default `SHARE` of what is free.
 
     Raises:

@@ -156,24 +156,3 @@ class Spectrum:
     def root(self) -> Tensor:
         """R = U Λ^{−1/2} of the kept eigenvalues `(m, kept)`; R Rᵀ is the pseudo-inverse of K_zz."""
         return self.vectors[:, self.dropped :] * self.values[self.dropped :].rsqrt()
-
-    def pull_back(self, dR: Tensor) -> Tensor:
-        """Derivative for K_zz from that for R, of any function of the truncated pseudo-inverse R Rᵀ.
-
-        Exact where no eigenvalue crosses the truncation: with E = UᵀdK U, dR = U X with
-        X_jk = −½ E_jk λ_j⁻¹ λ_k^{−½} among kept ones and X_dk = E_dk λ_k^{−½} / (λ_k − λ_d) for dropped d.
-
-        Args:
-            dR: `(m, kept)`, or wider, filled up with columns that are not read.
-        """
-        # B = Uᵀ ∂F/∂R
-        values, first = self.values, self.dropped
-        kept = values[first:]
-        B = self.vectors.mT @ dR[:, : len(kept)]
-        # G_jk = −½ B_jk λ_j⁻¹ λ_k^{−½} among kept ones, G_dk = B_dk λ_k^{−½} / (λ_k − λ_d) for dropped d
-        G = torch.zeros_like(self.vectors)
-        G[first:, first:] = -0.5 * B[first:] * kept.rsqrt() / kept[:, None]
-        G[:first, first:] = B[:first] * kept.rsqrt() / (kept - values[:first, None])
-        # ∂F/∂K_zz = U G Uᵀ, made symmetric
-        dK = self.vectors @ G @ self.vectors.mT
-        return 0.5 * (dK + dK.mT)

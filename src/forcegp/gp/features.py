@@ -168,32 +168,10 @@ class FeatureTerm:
     Attributes:
         values: φ.
         scale: a `(k, f)`.
-        inputs: names of the inputs, of the features of a linear kernel alone; else empty.
-        factors: two terms of which these features are all pairs.
     """
 
     values: Basis
     scale: Tensor
-    inputs: tuple[str, ...] = ()
-    factors: tuple[FeatureTerm, FeatureTerm] | None = None
-
-    def weighted(self, weights: Tensor) -> tuple[Basis, Tensor]:
-        """Σ_f a_f φ_f w_f as functions with weights `(k, f, samples)`; equal functions only once."""
-        w = self.scale[..., None] * weights
-        pairs, rest = self.factors or (self, self)
-        if pairs.factors is None or not pairs.factors[0].inputs == pairs.factors[1].inputs != ():
-            return self.values, w
-        # The products ab and ba of two features of one linear kernel are the same function: weights add.
-        line, count = pairs.factors[0].values, pairs.factors[0].scale.shape[-1]
-        i, j = torch.triu_indices(count, count, device=w.device)
-        w = w.unflatten(1, (count, count, -1))
-        folded = (w + w.transpose(1, 2))[:, i, j] * torch.where(i == j, 0.5, 1.0)[:, None, None].to(w)
-
-        def squares(x: Features) -> Tensor:
-            phi = line(x)
-            return _all_pairs(phi[..., i] * phi[..., j], rest.values(x))
-
-        return squares, folded.flatten(1, 2)
 
 
 @dataclass(frozen=True, eq=False)
@@ -214,7 +192,8 @@ class FeatureMap:
     def weighted(self, weights: Tensor) -> list[tuple[Basis, Tensor]]:
         """φ(x)ᵀw as functions with weights, for `w` of shape `(k, features, samples)`."""
         parts = weights.split([term.scale.shape[-1] for term in self.terms], dim=1)
-        return [term.weighted(w) for term, w in zip(self.terms, parts, strict=True)]
+        pairs = zip(self.terms, parts, strict=True)
+        return [(term.values, term.scale[..., None] * w) for term, w in pairs]
 
     def joined(self) -> FeatureTerm:
         """All features as one term."""
@@ -236,8 +215,7 @@ class FeatureMap:
         """All pairs of features, for the product of two kernels."""
         a, b = self.joined(), other.joined()
         scale = (a.scale[:, :, None] * b.scale[:, None, :]).flatten(-2)
-        pairs = FeatureTerm(lambda x: _all_pairs(a.values(x), b.values(x)), scale, factors=(a, b))
-        return FeatureMap((pairs,))
+        return FeatureMap((FeatureTerm(lambda x: _all_pairs(a.values(x), b.values(x)), scale),))
 
     def paired(self, other: FeatureMap, count: int, generator: torch.Generator) -> FeatureMap:
         """`count` random pairs of features, for the product of two kernels with many features each."""
@@ -323,7 +301,7 @@ def linear_features(x: Features, inputs: tuple[str, ...] | None, slope: Tensor, 
 
     width = stacked(x, inputs).shape[-1]
     scale = torch.cat([slope.expand(-1, width), bias[:, None]], dim=-1)
-    return FeatureMap((FeatureTerm(values, scale, tuple(x) if inputs is None else inputs),))
+    return FeatureMap((FeatureTerm(values, scale),))
 
 
 def constant_features(std: Tensor) -> FeatureMap:

@@ -7,7 +7,7 @@ term of the collapsed bound counts (pivoted partial Cholesky factorisation; Burt
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -15,7 +15,7 @@ from torch import Tensor
 
 from forcegp.gp.basis import KernelPart, split
 from forcegp.gp.factor import TRUNCATION
-from forcegp.gp.features import Block, Features, points, rows_of
+from forcegp.gp.features import Block, Features, points
 from forcegp.gp.kernels import Parameters, Process, sub
 
 CANDIDATES = 4000
@@ -46,23 +46,6 @@ class Selection:
     missed: Tensor
 
 
-def candidates(blocks: Iterable[Block], samples: int, count: int = CANDIDATES) -> list[Block]:
-    """About `count` of all samples, evenly spaced; streams over the blocks.
-
-    Args:
-        blocks: whitened rows; may be a generator.
-        samples: number of samples in all blocks.
-        count: how many to keep.
-    """
-    step, kept, first = max(1, -(-samples // count)), [], 0
-    for block in blocks:
-        index = torch.arange(len(block.target), device=block.target.device)[-first % step :: step]
-        first += len(block.target)
-        if len(index):
-            kept.append(rows_of(block, index))
-    return kept
-
-
 @torch.no_grad()
 def select_inducing(
     processes: Sequence[Process],
@@ -77,9 +60,6 @@ def select_inducing(
     A process that no row shows, or whose kernel has a finite number of features, gets none.
 
     Args:
-        processes: the processes.
-        params: log-hyperparameters.
-        blocks: candidates, as given by `candidates`.
         rows: number of rows that will be conditioned on, of which these are a part; all by default.
         limit: most points of one process.
         share: missed variance of all rows, as a fraction of what the noise leaves of them, at which to stop.

@@ -13,7 +13,7 @@ import scipy
 import torch
 from torch import Tensor
 
-from forcegp.errors import ModelError, NumericalError, UnknownNameError
+from forcegp.errors import ModelError, NumericalError, check_name
 
 Objective = Callable[[dict[str, Tensor]], Tensor]
 Progress = Callable[[int, float, dict[str, Tensor]], None]
@@ -64,8 +64,7 @@ class LearningOptions:
     hyperpriors: bool = True
 
     def __post_init__(self) -> None:
-        if self.optimizer not in OPTIMIZERS:
-            raise UnknownNameError("optimizer", self.optimizer, OPTIMIZERS)
+        check_name("optimizer", self.optimizer, OPTIMIZERS)
         if self.max_evaluations < 1:
             raise ModelError(
                 "learning takes an evaluation", expected="max_evaluations ≥ 1", got=self.max_evaluations
@@ -155,11 +154,8 @@ def minimise(
 
     Args:
         objective: maps the tensors to a scalar, differentiably.
-        start: initial tensors by name.
-        options: how to learn.
         analytical: names of the analytical parameters θ_A, which have an ADAM of their own.
         bounds: box of each tensor, for L-BFGS.
-        progress: called after each evaluation.
         first_step: largest change of an entry in the first step of L-BFGS in a box.
 
     Raises:

@@ -15,6 +15,7 @@ information form, with A = I + G, v, the drifting weights p and the others o,
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from functools import cached_property
@@ -149,11 +150,6 @@ class SparsePosterior:
     ) -> SparsePosterior:
         """The posterior that `tensors` belong to.
 
-        Args:
-            processes: the processes.
-            params: log-hyperparameters.
-            tensors: as given by `tensors`.
-
         Raises:
             ModelError: a tensor is missing, or does not fit the processes.
         """
@@ -185,6 +181,16 @@ class SparsePosterior:
     def weights(self) -> Tensor:
         """A⁻¹v, the posterior mean of the basis functions' weights `(size,)`."""
         return torch.cholesky_solve(self.moments.v[:, None], self.L)[:, 0]
+
+    @property
+    def log_likelihood(self) -> float:
+        """The collapsed bound of log p(y), no larger than that of exact inference (Titsias 2009)."""
+        # F = −½ [Σ y² − vᵀA⁻¹v + log|A| + rows log 2π + Σ tr W(k − VᵀV)Wᵀ], log|A| = 2 Σ log L_ii
+        moments = self.moments
+        fit = moments.yy - moments.v @ self.weights
+        log_determinant = 2.0 * self.L.diagonal().abs().log().sum()
+        constant = moments.rows * math.log(2.0 * math.pi)
+        return -float(0.5 * (fit + log_determinant + constant + moments.missed.sum()))
 
     @property
     def residual(self) -> float:
@@ -311,7 +317,6 @@ class SparsePosterior:
         """Functions from the posterior.
 
         Args:
-            count: number of functions.
             generator: source of randomness, on the CPU.
             features: random features per component.
         """

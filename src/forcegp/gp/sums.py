@@ -120,7 +120,6 @@ def accumulate(basis: LatentBasis, blocks: Iterable[Block], chunk: int = CHUNK_S
     """Sum over the samples of blocks, in memory that does not depend on their number.
 
     Args:
-        basis: basis functions.
         blocks: whitened rows; may be a generator.
         chunk: samples whose basis functions are held at a time.
     """
@@ -136,17 +135,12 @@ def accumulate(basis: LatentBasis, blocks: Iterable[Block], chunk: int = CHUNK_S
     return total
 
 
-def normal_terms(block: Block) -> tuple[Tensor, Tensor, Tensor]:
-    """W of all components `(n, r, k)`, S = WᵀW `(k, k, n)` and c = Wᵀy `(n, k)` of each sample."""
-    W = torch.cat(block.operators, dim=-1)
-    S = (W.mT @ W).permute(1, 2, 0).contiguous()
-    return W, S, (W.mT @ block.target[..., None])[..., 0]
-
-
 def _add(basis: LatentBasis, block: Block, into: Sums) -> None:
     """Add a block in place; only the upper triangle of G."""
     V, prior, missed = basis.evaluate(block.features)
-    _, S, c = normal_terms(block)
+    # S = WᵀW `(k, k, n)` and c = Wᵀy `(n, k)` of each sample
+    W = torch.cat(block.operators, dim=-1)
+    S, c = (W.mT @ W).permute(1, 2, 0).contiguous(), (W.mT @ block.target[..., None])[..., 0]
     weighted = torch.empty_like(V)
     active = [
         k for k in range(len(S)) if basis.columns[k].stop > basis.columns[k].start and bool(S[k, k].any())

@@ -89,8 +89,7 @@ class AnalyticalModel(Model["AnalyticalFit"]):
             options: ADAM on batches with early stopping by default; `LearningOptions` minimise over all
                 samples at once, by L-BFGS or ADAM.
             progress: called after each epoch, or evaluation.
-            checkpoint: file that records a long fit; a fit that finds it resumes there, to the same bits.
-                Remove it once the fitted model is saved.
+            checkpoint: see `Model.fit`.
 
         Raises:
             ModelError, DataError: the data do not fit the model.

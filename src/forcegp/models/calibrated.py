@@ -15,7 +15,7 @@ Samples are the same for functions drawn from the posterior, with inertial param
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -58,6 +58,8 @@ HALVINGS = 40
 """Steps that find the least inertia across an axis."""
 MOMENTS = ("mass", "mass·x", "mass·y", "mass·z", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
 """The inertial parameters of a link, about its origin [kg, kg m, kg m²]."""
+FIGURES = ("damping", "friction", *MOMENTS, "armature")
+"""Names of the figures of a joint."""
 
 
 @dataclass(frozen=True)
@@ -308,10 +310,10 @@ class _Reader:
         yield self._over_poses(known + fit.posterior.unknown_force(fit.system, at, priors))
         for k in range(drawn.count):
             force = torch.zeros_like(at.q)
-            which = torch.full((len(at.q),), k, device=at.q.device)
             for p in priors:
                 features = fit.posterior.process.features(p, fit.system, at)
-                latent = drawn.functions.latent(p, features, which) + fit.posterior.shift(p, features)
+                latent = drawn.functions.by_runs(p, features, range(k, k + 1), len(at.q))
+                latent = latent + fit.posterior.shift(p, features)
                 force = force + (fit.force_priors[p].operator(fit.system, at) @ latent[..., None])[..., 0]
             yield self._over_poses(known + force)
 
@@ -383,14 +385,13 @@ def _moved(robot: RobotModel, change: Tensor) -> RobotModel:
     J = J₀^½ V max(w, ε) Vᵀ J₀^½ with the eigenvalues w of J₀^-½ (J₀ + ΔJ) J₀^-½; a link that no body could be
     stays as it is.
     """
-    pi = inertial_parameters(robot.mass, robot.com, robot.inertia)
     J = pseudo_inertia(robot.mass, robot.com, robot.inertia)
     values, vectors = torch.linalg.eigh(J)
     sound = values[:, 0] > 0.0
     values = torch.where(sound[:, None], values, 1.0)
     root = vectors @ torch.diag_embed(values.sqrt()) @ vectors.mT
     inverse = vectors @ torch.diag_embed(values.rsqrt()) @ vectors.mT
-    w, V = torch.linalg.eigh(inverse @ (J + _pseudo(pi + change) - _pseudo(pi)) @ inverse)
+    w, V = torch.linalg.eigh(inverse @ (J + _pseudo(change)) @ inverse)
     moved = root @ V @ torch.diag_embed(w.clamp(min=SMALLEST)) @ V.mT @ root
     mass, com, inertia = from_pseudo_inertia(torch.where(sound[:, None, None], moved, J))
     kept = sound[:, None]
@@ -453,29 +454,22 @@ def _physical(inertia: Tensor) -> bool:
     return float(moments[0]) > 0.0 and float(moments[2]) <= (1.0 - MARGIN) * float(moments[0] + moments[1])
 
 
+def _figures(robot: RobotModel) -> Tensor:
+    """The figures of each joint that a fit may change `(nq, 13)`, in the order of `FIGURES`."""
+    friction = torch.stack([robot.damping, robot.friction], dim=-1)
+    links = inertial_parameters(robot.mass, robot.com, robot.inertia)
+    return torch.cat([friction, links, robot.armature[:, None]], dim=-1)
+
+
 def _parameters(
     file: RobotModel, robot: RobotModel, samples: list[RobotModel], scale: Tensor | None
 ) -> tuple[Parameter, ...]:
     """All figures that the fit may change, with standard deviations over samples."""
-
-    def links(each: RobotModel) -> Tensor:
-        return inertial_parameters(each.mass, each.com, each.inertia)
-
-    of: dict[str, Callable[[RobotModel], Tensor]] = {
-        "damping": lambda each: each.damping,
-        "friction": lambda each: each.friction,
-        "armature": lambda each: each.armature,
-    }
-    of |= {name: lambda each, k=k: links(each)[:, k] for k, name in enumerate(MOMENTS)}
-    found = []
-    for name, value in of.items():
-        before, after = value(file), value(robot)
-        std = torch.stack([value(each) for each in samples]).std(0)
-        prior = after.abs()
-        if scale is not None and name in (*MOMENTS, "armature"):
-            prior = scale[:, (*MOMENTS, "armature").index(name)]
-        determined = (std > 0.0) & (std <= DETERMINED * prior)
-        columns = (x.tolist() for x in (before, after, std, determined))
-        rows = zip(robot.joint_names, *columns, strict=True)
-        found += [Parameter(joint, name, *row) for joint, *row in rows]
-    return tuple(found)
+    before, after = _figures(file), _figures(robot)
+    std, prior = torch.stack([_figures(each) for each in samples]).std(0), after.abs()
+    if scale is not None:
+        prior[:, 2:] = scale
+    determined = (std > 0.0) & (std <= DETERMINED * prior)
+    columns = [x.T.flatten().tolist() for x in (before, after, std, determined)]
+    named = ((joint, name) for name in FIGURES for joint in robot.joint_names)
+    return tuple(Parameter(*names, *row) for names, *row in zip(named, *columns, strict=True))

@@ -15,7 +15,7 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem, Equations
 from forcegp.data import Dataset
-from forcegp.errors import DataError, ModelError, ParameterError, UnknownNameError
+from forcegp.errors import DataError, ModelError, ParameterError, check_name
 from forcegp.forces.external_wrench import (
     MULTIPLIER_STD,
     MomentumLog,
@@ -125,8 +125,7 @@ def external_wrench(
     external: Mapping[str, float] | None = None,
 ) -> ExternalWrench:
     """The external wrench at the samples of a log; see `StructuredFit.external_wrench`."""
-    if method not in METHODS:
-        raise UnknownNameError("method of estimating a wrench", method, METHODS)
+    check_name("method of estimating a wrench", method, METHODS)
     reading = Reading.of(fit, data, frame, external)
     if method == "acceleration":
         mean, covariance = reading.from_accelerations()
@@ -255,13 +254,7 @@ class Reading:
 
 
 def velocity_noise(data: Dataset) -> Tensor:
-    """Standard deviation of the white noise of each joint's velocity in a log, `(nq,)`.
-
-    From the departure of each sample from the cubic through its four neighbours, whose variance is 35/18 σ²;
-    its median absolute value does not see jumps.
-
-    Args:
-        data: a log in order of time, evenly sampled.
+    """`white_noise_std` of each joint's velocity in a log in order of time, evenly sampled, `(nq,)`.
 
     Raises:
         DataError: no five samples follow each other.
@@ -269,6 +262,16 @@ def velocity_noise(data: Dataset) -> Tensor:
     whole = data.segment[4:] == data.segment[:-4]
     if not bool(whole.any()):
         raise DataError("velocity noise cannot be estimated", expected="five samples of one trajectory")
-    a, b, middle, c, d = (data.qd[k : len(data) - 4 + k][whole] for k in range(5))
+    return white_noise_std(data.qd, whole).clamp(min=LEAST_NOISE)
+
+
+def white_noise_std(x: Tensor, whole: Tensor) -> Tensor:
+    """Standard deviation σ of the white noise of each column of a smooth signal `(n, d)`, `(d,)`.
+
+    x_i − (−x_{i−2} + 4 x_{i−1} + 4 x_{i+1} − x_{i+2})/6, the departure from the cubic through the neighbours,
+    has the variance 35/18 σ²; its median absolute value does not see jumps. `whole` `(n − 4,)` bool are the
+    first of five samples that follow each other.
+    """
+    a, b, middle, c, d = (x[k : len(x) - 4 + k][whole] for k in range(5))
     departure = middle - (4.0 * (b + c) - a - d) / 6.0
-    return (MAD_TO_STD * departure.abs().median(0).values / (35.0 / 18.0) ** 0.5).clamp(min=LEAST_NOISE)
+    return MAD_TO_STD * departure.abs().median(0).values / (35.0 / 18.0) ** 0.5

@@ -23,8 +23,6 @@ import torch
 from forcegp.data import Dataset
 from forcegp.errors import ModelError
 from forcegp.forces.priors.inertial import PayloadPrior
-from forcegp.gp.likelihood import bound_of
-from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.structured_fit import StructuredFit
 
 CHANGE = 1e-3
@@ -69,7 +67,9 @@ def follow(
     continued = aged.update(data)
     forgotten = aged.forget(0.0, priors=priors)
     restarted = forgotten.update(data)
-    gain = _evidence(restarted) - _evidence(forgotten) - (_evidence(continued) - _evidence(aged))
+    # log p of the rows, up to what both hypotheses share
+    evidence = [fit.posterior.latent.log_likelihood for fit in (restarted, forgotten, continued, aged)]
+    gain = evidence[0] - evidence[1] - (evidence[2] - evidence[3])
     log_odds = gain + math.log(change) - math.log1p(-change)
     changed = log_odds > 0.0
     if changed:
@@ -104,10 +104,3 @@ def _knowing(
         problem=dataclasses.replace(fit.problem, priors=updated_priors),
         posterior=dataclasses.replace(fit.posterior, process=process),
     )
-
-
-def _evidence(fit: StructuredFit) -> float:
-    """log p of the rows, up to what both hypotheses share."""
-    latent = fit.posterior.latent
-    assert isinstance(latent, SparsePosterior)
-    return -float(bound_of(latent.moments, latent))

@@ -133,8 +133,7 @@ class IndependentGP(Model["IndependentFit"]):
             data: states and measured accelerations.
             options: optimiser and its limits, for each joint.
             progress: called after each evaluation, with those of all joints.
-            checkpoint: file that records a long fit; a fit that finds it resumes there, to the same bits.
-                Remove it once the fitted model is saved.
+            checkpoint: see `Model.fit`.
 
         Raises:
             ModelError, DataError: the data do not fit the model.
@@ -194,7 +193,7 @@ def fitted(
     processes = training.processes()
     posteriors = tuple(ExactPosterior.of([prior], hyperparameters, [block]) for prior, block, _ in processes)
     pairs = zip(posteriors, processes, strict=True)
-    value = sum(float(p.log_likelihood() - constant) for p, (_, _, constant) in pairs)
+    value = sum(p.log_likelihood - float(constant) for p, (_, _, constant) in pairs)
     ended = zip(model.system.robot.joint_names, parts, strict=False)
     result = FitResult(
         converged=all(part.converged for part in parts),

@@ -10,7 +10,7 @@ from typing import Any
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.errors import ForceGPError, ModelError, UnknownNameError
+from forcegp.errors import ForceGPError, ModelError, check_name
 from forcegp.models.analytical import AnalyticalFit
 from forcegp.models.base import FittedModel
 from forcegp.models.independent_gp import IndependentFit
@@ -75,8 +75,7 @@ def _restored(
     header: ModelHeader, tensors: Mapping[str, Tensor], source: str, system: ConstrainedSystem | None = None
 ) -> FittedModel:
     """The model of a header and tensors."""
-    if header.kind not in KINDS:
-        raise UnknownNameError(f"kind of models in {source}", header.kind, KINDS)
+    check_name(f"kind of models in {source}", header.kind, KINDS)
     try:
         model_system = unpack_system(header.system, tensors, source, system)
         return KINDS[header.kind].restored(header, model_tensors(tensors), model_system, source)

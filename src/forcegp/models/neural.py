@@ -75,8 +75,7 @@ class NeuralNetwork(Model["NetworkFit"]):
             data: states and measured accelerations.
             options: how to train; `SHALLOW` or `DEEP` by default.
             progress: called after each epoch.
-            checkpoint: file that records a long fit; a fit that finds it resumes there, to the same bits.
-                Remove it once the fitted model is saved.
+            checkpoint: see `Model.fit`.
 
         Returns:
             The epochs as `evaluations`, and the held-out error of standardized accelerations.

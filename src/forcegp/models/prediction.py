@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from abc import ABC, abstractmethod
+from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -14,12 +14,12 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.data import Dataset
 from forcegp.data.fields import AXES
-from forcegp.errors import DataError, ForceGPError, ModelError, NumericalError, ShapeError, UnknownNameError
+from forcegp.errors import DataError, ForceGPError, ModelError, NumericalError, ShapeError, check_name
 from forcegp.forces.measurements import COLUMNS
 from forcegp.forces.noise import warnings_beyond
-from forcegp.forces.quantities import FlatStates, ForceField, ForceLinearization, linearize_field
+from forcegp.forces.quantities import FlatStates, ForceLinearization, linearize_field
 from forcegp.rollout.forward import rollout_model
-from forcegp.rollout.inputs import Disturbance, Torque
+from forcegp.rollout.inputs import ForwardModel, Torque
 from forcegp.rollout.trajectory import Rollout
 
 if TYPE_CHECKING:
@@ -194,8 +194,7 @@ def measured(system: ConstrainedSystem, data: Dataset, quantity: str) -> Tensor:
         UnknownNameError: the quantity cannot be measured, or a contact of the system is not logged.
         NotLoggedError: it is not logged.
     """
-    if quantity not in COLUMNS:
-        raise UnknownNameError("measured quantity", quantity, COLUMNS)
+    check_name("measured quantity", quantity, COLUMNS)
     return COLUMNS[quantity](data, system)
 
 
@@ -214,16 +213,8 @@ def component_names(system: ConstrainedSystem, quantity: str) -> list[str]:
     ]
 
 
-class Predictor(ABC):
+class Predictor(ForwardModel):
     """A forward dynamics (q, q̇, τ) ↦ q̈ that predicts."""
-
-    kind: str
-    """Name of the class of models in saved files."""
-    has_function_samples: bool = False
-    """Whether `force_samples` draws functions from a posterior over forces."""
-
-    system: ConstrainedSystem
-    """Robot and contacts that predictions refer to."""
 
     @abstractmethod
     def predict(
@@ -247,36 +238,10 @@ class Predictor(ABC):
             system: another system to predict on, for models of forces.
         """
 
-    def force_field(self) -> ForceField | None:
-        """The mean impressed force Q̄ `(n, nq)` at states, or `None` for a model of accelerations alone."""
-        return None
-
     @property
     def specified(self) -> ConstrainedSystem:
         """The system before the fit, with the robot of the file if the fit keeps it."""
         return self.system
-
-    @property
-    def disturbance(self) -> Disturbance | None:
-        """Forces beside the learned ones that disturb rollouts of function samples, `None` for none."""
-        return None
-
-    def force_samples(self, samples: int, generator: torch.Generator) -> ForceField:
-        """Force functions drawn from the posterior, all evaluated at once.
-
-        Args:
-            samples: number S of functions.
-            generator: source of the draws.
-
-        Returns:
-            A force field on `(S * k, nq)` states, of which the s-th run of k belongs to function s.
-
-        Raises:
-            ModelError: the model has no posterior over force functions.
-        """
-        raise ModelError(
-            f"a {self.kind!r} model has no function samples", hint="use StructuredGP, or samples=0"
-        )
 
     def linearize(
         self,

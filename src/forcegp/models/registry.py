@@ -8,7 +8,7 @@ from inspect import signature
 from typing import Any
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.errors import UnknownNameError
+from forcegp.errors import check_name
 from forcegp.forces.measurements import NoiseStd
 from forcegp.forces.noise import Noise
 from forcegp.forces.priors.base import ForcePrior
@@ -102,8 +102,7 @@ def create(
     Raises:
         UnknownNameError: no such model.
     """
-    if name not in MODELS:
-        raise UnknownNameError("model", name, MODELS)
+    check_name("model", name, MODELS)
     entry = MODELS[name]
     taken = signature(entry.made).parameters
     arguments: dict[str, Any] = {key: x for key, x in (("noise", noise), ("seed", seed)) if key in taken}

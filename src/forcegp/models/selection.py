@@ -242,8 +242,6 @@ def trained(
     Args:
         spec: with the priors of the candidate.
         inertia: of the robot to learn with.
-        train: the half.
-        begin: hyperparameters to begin with.
     """
     spec, pinned = identified(spec, train) if inertia.identified else (spec, {})
     rows = scaled(train.evenly(ROWS), spec.system, spec.priors, {}, spec.options.standardize)

@@ -16,8 +16,8 @@ from forcegp.data import Dataset
 from forcegp.errors import ModelError
 from forcegp.forces.measurements import Observation
 from forcegp.forces.quantities import states_at
+from forcegp.models.external_wrench import white_noise_std
 from forcegp.models.structured_fit import StructuredFit
-from forcegp.robust import MAD_TO_STD
 
 SENSOR = "F_sensor"
 """Force on the robot at a contact, as `forcegp import` writes it [N]."""
@@ -123,9 +123,6 @@ def sensed_force(data: Dataset, system: ConstrainedSystem) -> Tensor:
 def sensor_noise_std(data: Dataset, system: ConstrainedSystem) -> float:
     """Standard deviation of the white noise of the sensor's normal force, from the log itself [N].
 
-    x_i − (−x_{i−2} + 4 x_{i−1} + 4 x_{i+1} − x_{i+2})/6, the departure from the cubic through the neighbours,
-    has the variance 35/18 σ² where the force is smooth; its median absolute value does not see jumps.
-
     Args:
         data: a log in order of time, with `F_sensor`.
         system: robot with a single contact with a surface.
@@ -138,11 +135,9 @@ def sensor_noise_std(data: Dataset, system: ConstrainedSystem) -> float:
     follows = (steps < 1.5 * steps.median()) & (data.segment[1:] == data.segment[:-1])
     inner = torch.stack([follows[k : len(closed) - 4 + k] for k in range(4)]).all(0)
     inner &= torch.stack([closed[k : len(closed) - 4 + k] for k in range(5)]).all(0)
-    a, b, middle, c, d = (force[k : len(force) - 4 + k][inner] for k in range(5))
-    if not len(middle):
+    if not bool(inner.any()):
         raise ModelError("the sensor's noise cannot be estimated", expected="five rows in contact in a row")
-    departure = middle - (4.0 * (b + c) - a - d) / 6.0
-    return float(MAD_TO_STD * departure.abs().median() / (35.0 / 18.0) ** 0.5)
+    return float(white_noise_std(force[:, None], inner))
 
 
 @torch.no_grad()

@@ -124,11 +124,7 @@ def pack(
     """A fit as settings and tensors; an exact posterior keeps its data, a sparse one its sums over them.
 
     Args:
-        spec: what was fitted.
         problem: what it is conditioned on.
-        hyperparameters: all learned tensors.
-        posterior: over the forces.
-        result: how the fit went.
 
     Raises:
         ModelError: a prior or kernel is Python code.

@@ -14,28 +14,15 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.constraints.compiled_system import compiled_system
 from forcegp.data import Dataset
-from forcegp.errors import ModelError, UnknownNameError
+from forcegp.errors import ModelError, check_name
 from forcegp.files import Record
 from forcegp.forces.external_wrench import WrenchFrame
 from forcegp.forces.measurements import Observation, Training
-from forcegp.forces.noise import (
-    LOW,
-    TORQUE_NOISE,
-    distance_beyond,
-    learned_slopes,
-    unknown_variance,
-)
+from forcegp.forces.noise import LOW, TORQUE_NOISE, distance_beyond, learned_slopes, unknown_variance
 from forcegp.forces.posterior import ForcePosterior, doubts_of, draw_samples
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior
-from forcegp.forces.problem import (
-    Problem,
-    forces_and_constant,
-    is_sparse,
-    log_likelihood,
-    lost_by_inducing,
-    typical,
-)
+from forcegp.forces.problem import Problem, forces_and_constant, is_sparse, lost_by_inducing, typical
 from forcegp.forces.quantities import (
     AffineMap,
     FlatStates,
@@ -390,8 +377,7 @@ class StructuredFit(FittedModel):
         if priors is not None:
             names = [prior.name for prior in self.posterior.priors]
             for name in priors:
-                if name not in names:
-                    raise UnknownNameError("force prior to forget", name, names)
+                check_name("force prior to forget", name, names)
             return self._with(latent.drifting(factor, [names.index(name) for name in priors]))
         if not 0.0 < factor <= 1.0:
             raise ModelError("invalid forgetting factor", expected="above 0, at most 1", got=factor)
@@ -525,11 +511,6 @@ def conditioned(
     """Condition forces on the data of a problem at given hyperparameters.
 
     Args:
-        specification: what is conditioned.
-        problem: data, robot and inference.
-        hyperparameters: of priors, noise and robot.
-        learned: how they were learned.
-        warnings: doubts that have come up.
         learned_on: number of samples that they were learned on.
         forces: result of conditioning, where the data of the problem are only a part of the log.
 
@@ -540,17 +521,17 @@ def conditioned(
     noise = {m.quantity: typical(problem.noise_at(hyperparameters, i)) for i, m in measured}
     posterior, constant = forces or forces_and_constant(*problem.with_coulomb_errors(hyperparameters))
     lost, more_points = lost_by_inducing(posterior)
-    likelihood, jitter = log_likelihood(posterior) - float(constant), posterior.latent.jitter
+    likelihood, jitter = posterior.latent.log_likelihood - float(constant), posterior.latent.jitter
     learned = learned or Learned({}, -likelihood, True, 0, 0.0, "conditioned, nothing learned")
     training, system = problem.training, problem.system_at(hyperparameters)
-    doubts = doubts_of(posterior, system, training, problem.power)
+    correlation, doubts = doubts_of(posterior, system, training, problem.power)
     result = FitResult(
         **learned.outcome,
         log_marginal_likelihood=likelihood,
         jitter=jitter,
         constant_inputs=constant_inputs(problem),
-        force_correlation=doubts.correlation,
-        warnings=(*warnings, *learned.doubts, *doubts.warnings, *more_points),
+        force_correlation=correlation,
+        warnings=(*warnings, *learned.doubts, *doubts, *more_points),
         samples=training.all_samples,
         learned_on=learned_on,
         never_closed=training.never_closed(system),

@@ -27,13 +27,7 @@ from forcegp.gp.optimise import LearningOptions
 from forcegp.models.base import FitProgress, Model
 from forcegp.models.selection import with_priors
 from forcegp.models.structured_fit import KIND, StructuredFit, conditioned
-from forcegp.models.structured_learning import (
-    Specification,
-    check_learned,
-    learned,
-    search_of,
-    task_of,
-)
+from forcegp.models.structured_learning import Specification, check_learned, learned, search_of, task_of
 from forcegp.models.structured_stream import Pass, Sample, sample_of
 from forcegp.storage.options import StructuredOptions
 

@@ -26,8 +26,8 @@ from torch import Tensor, nn
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.dynamics import mass_matrix
-from forcegp.errors import UnknownNameError
-from forcegp.forces.calibration import calibrated_noise, likelihood_power, residual_times
+from forcegp.errors import check_name
+from forcegp.forces.calibration import calibrated_noise, residual_times
 from forcegp.forces.friction_memory import MEMORY, memory_of
 from forcegp.forces.inertia import VOLUME_STATES, Inertia, inertia_of, with_updated_robot
 from forcegp.forces.inverse_dynamics import LEAST
@@ -44,18 +44,9 @@ from forcegp.forces.noise import REGION, TORQUE_NOISE, Noise, external_std, stat
 from forcegp.forces.noise_learning import left_out, weighted, with_learned_slopes, with_learned_weights
 from forcegp.forces.priors.base import ANALYTICAL, COULOMB, NOISE, ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior
-from forcegp.forces.priors.joint import (
-    AnalyticalMean,
-    JointFrictionPrior,
-)
+from forcegp.forces.priors.joint import AnalyticalMean, JointFrictionPrior
 from forcegp.forces.priors.sets import PriorSet
-from forcegp.forces.problem import (
-    Problem,
-    is_finite,
-    is_sparse,
-    with_inducing,
-    without_inducing,
-)
+from forcegp.forces.problem import Problem, is_finite, is_sparse, with_inducing, without_inducing
 from forcegp.forces.search import Search, initial
 from forcegp.gp.exact import require_exact_fits
 from forcegp.gp.optimise import FitProgress, Learned, LearningOptions, Progress, reported
@@ -288,8 +279,7 @@ def check_learned(spec: Specification, learn: Iterable[str]) -> None:
     """
     names = (*(prior.name for prior in spec.priors), NOISE, ANALYTICAL, COULOMB)
     for name in learn:
-        if name not in names:
-            raise UnknownNameError("force prior to learn", name, names)
+        check_name("force prior to learn", name, names)
 
 
 def search_of(
@@ -361,13 +351,7 @@ def learned(
     """Learn what is free in a search, and record it; where nothing is free, prepare the problem alone.
 
     Args:
-        spec: the model.
-        problem: all samples.
-        search: what is learned and what is held.
         file: records the evaluations; learning that finds it goes on from there, to the same bits.
-        progress: called after each evaluation.
-        begin: where to begin.
-        neighbours: see `solve`.
 
     Raises:
         ModelError: the file belongs to other learning.
@@ -430,11 +414,6 @@ def solve(
     """Learn what is free in a search, then prepare the problem that is conditioned on.
 
     Args:
-        spec: the model.
-        problem: all samples.
-        search: what is learned and what is held.
-        progress: called after each evaluation.
-        begin: where to begin.
         neighbours: samples as close in time as those of the log, where those of the problem are a part of it.
     """
     part = subset(spec, problem)
@@ -454,7 +433,8 @@ def solve(
     if spec.noise.degrees_of_freedom is not None:
         part, learned = with_learned_weights(part, search, learned, spec.noise.degrees_of_freedom, progress)
     if correlated:
-        part = dataclasses.replace(part, power=likelihood_power(part, search.values(learned)))
+        power, _ = residual_times(part, search.values(learned), part.training)
+        part = dataclasses.replace(part, power=power)
         learned = search.solve(part, progress, learned.tensors)
     values = search.values(learned)
     if calibrated and any(isinstance(prior, InertialPrior) for prior in part.priors):

@@ -57,7 +57,6 @@ class Sample:
         """Contiguous stretches of the log as training data.
 
         Args:
-            spec: the model.
             training: the sample, whose input scales are kept.
 
         Returns:
@@ -236,9 +235,4 @@ def _restored(basis: LatentBasis, tensors: Mapping[str, Tensor]) -> tuple[Latent
     """The basis and totals that `_tensors` was given; kernel inputs are in the order of the prior."""
     own = LatentBasis.of_tensors(basis.processes, basis.params, sub(tensors, "basis"))
     sums = Sums(*(tensors[f"sums.{i}"] for i in range(len(fields(Sums)))))
-    return own, Totals(
-        sums,
-        tensors["constant"],
-        tensors["samples"],
-        int(tensors["pieces"]),
-    )
+    return own, Totals(sums, tensors["constant"], tensors["samples"], int(tensors["pieces"]))

@@ -9,7 +9,6 @@ which the friction is smooth. Within a step, friction stops a contact that slide
 from __future__ import annotations
 
 import dataclasses
-import itertools
 from collections.abc import Container, Mapping
 
 import torch
@@ -17,26 +16,16 @@ from torch import Tensor
 from torch.linalg import vecdot
 from torch.nn.functional import normalize
 
-from forcegp.constraints import ConstrainedSystem, SurfaceContact
+from forcegp.constraints import ConstrainedSystem
 from forcegp.constraints.gauss import Equations, tangent_frame
 from forcegp.constraints.unilateral import project_velocity
 from forcegp.forces.quantities import States
 
 
-def may_stick(system: ConstrainedSystem) -> list[tuple[int, SurfaceContact, slice]]:
-    """The contacts that may stick: index, contact and its two tangential rows."""
-    ends = itertools.accumulate(contact.rows for contact in system.contacts)
-    return [
-        (k, contact, slice(end - 2, end))
-        for k, (contact, end) in enumerate(zip(system.contacts, ends, strict=True))
-        if isinstance(contact, SurfaceContact) and contact.stick_speed is not None
-    ]
-
-
 def sticking_contacts(system: ConstrainedSystem, at: States, among: Container[str]) -> Tensor:
     """Closed contacts that stick `(n, n_contacts)` bool, among those named."""
     sticks = torch.zeros_like(at.active)
-    for k, contact, _ in may_stick(system):
+    for k, contact, _ in system.may_stick:
         rests = at.eom.contact_points[contact.name].sticks
         if contact.name in among and rests is not None:
             sticks[:, k] = rests & at.active[:, k]
@@ -49,15 +38,13 @@ def sliding_away(
     """The states where contacts that stick start to slide against the force that would hold them.
 
     Args:
-        system: robot and contacts.
-        at: n states.
         multiplier: λ `(n, m)` of sticking.
         slides: `(n, n_contacts)` bool, which contacts slide.
         speeds: at which, by name [m/s].
     """
     eom, points = at.eom, dict(at.eom.contact_points)
     free = torch.zeros_like(eom.b, dtype=torch.bool)
-    for k, contact, rows in may_stick(system):
+    for k, contact, rows in system.may_stick:
         if contact.name not in speeds:
             continue
         point, gone = points[contact.name], slides[:, k, None]
@@ -76,7 +63,7 @@ def accelerating(system: ConstrainedSystem, at: States, multiplier: Tensor, qdd:
     away = torch.zeros_like(at.active)
     # −λ_tᵀ(A_t q̈ − b_t) > 0
     held = multiplier * ((at.eom.A @ qdd[..., None])[..., 0] - at.eom.b)
-    for k, _, rows in may_stick(system):
+    for k, _, rows in system.may_stick:
         away[:, k] = held[:, rows].sum(-1) < 0.0
     return away
 
@@ -94,14 +81,13 @@ def arrested(
     The impulse is that of an impact on the tangential rows, q̇ ← q̇ − L A q̇.
 
     Args:
-        system: robot and contacts.
         rough: contacts with friction.
         before, after: the equations of motion at both ends of the step.
         closed: `(n, n_contacts)` bool, contacts that are closed at both.
         qd: `(n, nq)` velocity after the step.
     """
     A, stops = after.A, torch.zeros_like(closed[:, :1])
-    for k, contact, rows in may_stick(system):
+    for k, contact, rows in system.may_stick:
         old, new = before.contact_points[contact.name], after.contact_points[contact.name]
         if contact.name not in rough or old.sticks is None:
             continue

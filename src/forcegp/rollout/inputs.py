@@ -5,7 +5,7 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -25,38 +25,44 @@ EVEN = 0.02
 """Largest deviation of a step from the sampling period, relative to the period, in a log that is replayed."""
 
 
-@runtime_checkable
-class ForwardModel(Protocol):
+class ForwardModel(ABC):
     """What a rollout asks of a model of the forward dynamics."""
 
-    @property
-    def kind(self) -> str:
-        """Name of the class of models."""
-        ...
+    kind: str
+    """Name of the class of models in saved files."""
+    has_function_samples: bool = False
+    """Whether `force_samples` draws functions from a posterior over forces."""
 
-    @property
-    def system(self) -> ConstrainedSystem:
-        """Robot and contacts that the model was made for."""
-        ...
-
-    @property
-    def has_function_samples(self) -> bool:
-        """Whether `force_samples` draws functions from a posterior over forces."""
-        ...
+    system: ConstrainedSystem
+    """Robot and contacts that predictions refer to."""
 
     def force_field(self) -> ForceField | None:
-        """The mean impressed force, or `None` for a model of accelerations alone."""
-        ...
+        """The mean impressed force Q̄ `(n, nq)` at states, or `None` for a model of accelerations alone."""
+        return None
 
     def force_samples(self, samples: int, generator: torch.Generator) -> ForceField:
-        """Force functions drawn from the posterior, on `(samples * k, nq)` states."""
-        ...
+        """Force functions drawn from the posterior, all evaluated at once.
+
+        Args:
+            samples: number S of functions.
+            generator: source of the draws.
+
+        Returns:
+            A force field on `(S * k, nq)` states, of which the s-th run of k belongs to function s.
+
+        Raises:
+            ModelError: the model has no posterior over force functions.
+        """
+        raise ModelError(
+            f"a {self.kind!r} model has no function samples", hint="use StructuredGP, or samples=0"
+        )
 
     @property
     def disturbance(self) -> Disturbance | None:
-        """What disturbs the torques of function samples, `None` for nothing."""
-        ...
+        """Forces beside the learned ones that disturb rollouts of function samples, `None` for none."""
+        return None
 
+    @abstractmethod
     def predict(
         self,
         q: Tensor,
@@ -68,7 +74,6 @@ class ForwardModel(Protocol):
         covariance: bool = True,
     ) -> Any:
         """`mean` and `std` `(*batch, d)` of a quantity at states `(*batch, nq)`; `std` may be `None`."""
-        ...
 
 
 class Disturbance(NamedTuple):

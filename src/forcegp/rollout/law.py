@@ -36,15 +36,10 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError, NumericalError
 from forcegp.forces.posterior import ForcePosterior, ForceSamples
 from forcegp.forces.priors.base import ForcePrior
-from forcegp.forces.priors.contact import (
-    CoulombFriction,
-    SurfaceForcePrior,
-    coulomb_response,
-    with_coulomb,
-)
+from forcegp.forces.priors.contact import CoulombFriction, SurfaceForcePrior, coulomb_response, with_coulomb
 from forcegp.forces.priors.joint import AnalyticalMean
 from forcegp.forces.quantities import ForceField, States, affine_map
-from forcegp.rollout.cone import accelerating, arrested, may_stick, sliding_away, sticking_contacts
+from forcegp.rollout.cone import accelerating, arrested, sliding_away, sticking_contacts
 from forcegp.rollout.inputs import ForwardModel, Inputs, Reached
 
 REGULARIZATION = 1e-10
@@ -87,12 +82,16 @@ class DryFriction:
     damping: Tensor
 
 
+def posterior_of(force: ForceField) -> ForcePosterior | None:
+    """The posterior that a force field is the mean or a sample of, if any."""
+    force = force.posterior if isinstance(force, ForceSamples) else force
+    return force if isinstance(force, ForcePosterior) else None
+
+
 def split(system: ConstrainedSystem, at: States, force: ForceField) -> DryFriction:
     """A force field at states with the dry friction of joints apart.
 
     Args:
-        system: robot and contacts.
-        at: n states.
         force: posterior mean, samples, or a prior mean alone, Q̄.
 
     Example:
@@ -258,9 +257,8 @@ class ForceLaw(Law):
         return at.eom.motion_under(self.force(system, at))
 
     def dry_friction(self, system: ConstrainedSystem) -> Callable[[States], DryFriction] | None:
-        force = self.force.posterior if isinstance(self.force, ForceSamples) else self.force
-        known = force.process if isinstance(force, ForcePosterior) else None
-        mean, priors = (force, ()) if known is None else (known.mean, known.priors)
+        known = posterior_of(self.force)
+        mean, priors = (self.force, ()) if known is None else (known.process.mean, known.priors)
         robot = system.robot
         in_mean = isinstance(mean, AnalyticalMean) and "friction" in mean.terms
         declared = in_mean and bool(((robot.friction != 0.0) | (robot.stribeck != 0.0)).any())
@@ -270,15 +268,15 @@ class ForceLaw(Law):
 
     @property
     def rough(self) -> Mapping[str, float]:
-        force = self.force.posterior if isinstance(self.force, ForceSamples) else self.force
-        if not isinstance(force, ForcePosterior):
+        known = posterior_of(self.force)
+        if known is None:
             return {}
-        speeds = {p.contact: 0.0 for p in force.process.priors if isinstance(p, SurfaceForcePrior)}
-        return speeds | {f.contact: SATURATED * float(f.smoothing) for f in force.process.coulomb}
+        speeds = {p.contact: 0.0 for p in known.priors if isinstance(p, SurfaceForcePrior)}
+        return speeds | {f.contact: SATURATED * float(f.smoothing) for f in known.process.coulomb}
 
     def knows_friction(self, system: ConstrainedSystem, at: States) -> bool:
-        posterior = self.force.posterior if isinstance(self.force, ForceSamples) else self.force
-        assert isinstance(posterior, ForcePosterior)
+        posterior = posterior_of(self.force)
+        assert posterior is not None
         with torch.no_grad():
             mean, covariance = posterior.read(system, at, affine_map(system, at, "contact_friction"))
         spread = covariance.diagonal(dim1=-2, dim2=-1).sum(-1)
@@ -377,7 +375,7 @@ class RolloutProblem:
     @cached_property
     def rough(self) -> Mapping[str, float]:
         """Contacts that may stick and have friction, with the speed from which it is that of sliding."""
-        speeds = {contact.name: contact.stick_speed or 0.0 for _, contact, _ in may_stick(self.system)}
+        speeds = {contact.name: contact.stick_speed or 0.0 for _, contact, _ in self.system.may_stick}
         known = self.law.rough if speeds else {}
         return {name: max(speeds[name], known[name]) for name in speeds if name in known}
 
@@ -392,8 +390,7 @@ class RolloutProblem:
         tau = self.inputs.torque(state.t, end, Reached(self.system, eom, state.q, state.qd))
         at, h = States(state.q, state.qd, tau, state.active, eom), end - state.t
         now, rough = self._instant(at, h), self.rough
-        sticks = sticking_contacts(self.system, at, rough)
-        if not bool(sticks.any()):
+        if not rough or not bool((sticks := sticking_contacts(self.system, at, rough)).any()):
             return now
         away = sliding_away(self.system, at, now.multiplier, sticks, rough)
         if not self._known:

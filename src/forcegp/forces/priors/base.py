@@ -12,7 +12,7 @@ from dataclasses import dataclass, field
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.errors import ModelError, UnknownNameError
+from forcegp.errors import ModelError, check_name
 from forcegp.forces.quantities import States
 from forcegp.gp.kernels import Kernel, SquaredExponential
 from forcegp.robot.model import RobotModel
@@ -98,8 +98,7 @@ def check_inputs(name: str, inputs: tuple[str, ...], valid: tuple[str, ...]) -> 
     if not inputs:
         raise ModelError(f"force prior {name!r} depends on nothing", expected="one input at least")
     for symbol in inputs:
-        if symbol not in valid:
-            raise UnknownNameError(f"input of force prior {name!r}", symbol, valid)
+        check_name(f"input of force prior {name!r}", symbol, valid)
 
 
 def check_priors(priors: tuple[ForcePrior, ...], system: ConstrainedSystem) -> None:

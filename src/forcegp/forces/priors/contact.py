@@ -413,7 +413,6 @@ def coupled(
 
     Args:
         system: robot and contacts; friction of contacts that it does not have is left out.
-        at: n states.
         z: the quantity without this friction.
         friction: of each contact that has one.
     """

@@ -19,7 +19,7 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.errors import ModelError, UnknownNameError
+from forcegp.errors import ModelError, check_name
 from forcegp.forces.priors.base import JOINT, ForcePrior
 from forcegp.forces.quantities import States
 from forcegp.gp.kernels import Constant, Kernel
@@ -274,6 +274,5 @@ class PayloadPrior(ForcePrior):
     def _link(self, robot: RobotModel) -> int:
         if self.joint is None:
             return robot.nq - 1
-        if self.joint not in robot.joint_names:
-            raise UnknownNameError("joint that carries a payload", self.joint, robot.joint_names)
+        check_name("joint that carries a payload", self.joint, robot.joint_names)
         return robot.joint_names.index(self.joint)

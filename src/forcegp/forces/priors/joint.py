@@ -23,7 +23,7 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.dynamics import damping_force
-from forcegp.errors import ModelError, UnknownNameError
+from forcegp.errors import ModelError, check_name
 from forcegp.forces.priors.base import JOINT, MIXING, ForcePrior, check_inputs
 from forcegp.forces.quantities import States
 from forcegp.gp.kernels import Kernel, Linear, SquaredExponential
@@ -54,8 +54,7 @@ class AnalyticalMean:
 
     def __post_init__(self) -> None:
         for term in self.terms:
-            if term not in TERMS:
-                raise UnknownNameError("term of the analytical mean", term, TERMS)
+            check_name("term of the analytical mean", term, TERMS)
             if self.terms.count(term) > 1:
                 raise ModelError(f"term {term!r} of the analytical mean is named twice", got=self.terms)
 
@@ -75,8 +74,7 @@ def mean_of(mean: str | AnalyticalMean) -> AnalyticalMean:
     if isinstance(mean, AnalyticalMean):
         return mean
     named = {"zero": AnalyticalMean(()), "analytical": AnalyticalMean()}
-    if mean not in named:
-        raise UnknownNameError("mean", mean, named)
+    check_name("mean", mean, named)
     return named[mean]
 
 

@@ -6,7 +6,7 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
-from forcegp.errors import UnknownNameError
+from forcegp.errors import check_name
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.contact import ContactForcePrior, NormalForcePrior, SlidingFrictionPrior
 from forcegp.forces.priors.joint import AnalyticalMean, JointForcePrior, JointFrictionPrior, mean_of
@@ -35,7 +35,6 @@ def default_priors(
     without one the joints are blamed for its friction, and what is read in free motion is overconfident.
 
     Args:
-        system: robot and contacts.
         mean: the model's prior mean, which decides what is left to the prior.
         kernel: covariance of each joint force, without a prior on the contact's friction; by default
             `REMAINING` where the mean includes the motor torque, `WHOLE` elsewhere.
@@ -73,11 +72,7 @@ def friction_priors(system: ConstrainedSystem) -> tuple[ForcePrior, ...]:
 
 
 def friction_and_residual_priors(system: ConstrainedSystem) -> tuple[ForcePrior, ...]:
-    """`friction_priors`, and any force of each joint that depends on (q, q̇).
-
-    Args:
-        system: robot and contacts.
-    """
+    """`friction_priors`, and any force of each joint that depends on (q, q̇)."""
     residual = JointForcePrior(STATE_RESIDUAL, inputs=("q", "qd"))
     normal = (NormalForcePrior(residual),) if system.m else ()
     return (*friction_priors(system), residual, *normal)
@@ -111,7 +106,6 @@ def contact_priors(system: ConstrainedSystem, kernel: Kernel | None = None) -> t
     """A prior on the friction of each contact with a surface; a joint force prior where there is none.
 
     Args:
-        system: robot and contacts.
         kernel: covariance of each Cartesian component of any tangential force; by default the force is
             friction that opposes sliding.
 
@@ -161,6 +155,5 @@ def priors_of(
         return tuple(force_priors)
     if force_priors == "auto":
         return FEW.priors(system) if "actuation" in mean.terms else default_priors(system, mean)
-    if force_priors not in SETS:
-        raise UnknownNameError("set of force priors", force_priors, ("auto", *SETS))
+    check_name("set of force priors", force_priors, ("auto", *SETS))
     return SETS[force_priors].priors(system)
