@@ -44,6 +44,7 @@ BOUNDS = {  # µs, at -O3
     "friction+inertia covariance": 30.0,
     "residual mean": 20.0,
     "residual covariance": 120.0,
+    "residual jacobian": 60.0,
     "forward dynamics": 1.0,
     "python mean": 50.0,
     "python covariance": 150.0,
@@ -62,15 +63,18 @@ static double now(void) {
 }
 
 int main(void) {
-  static double mean[64], covariance[64 * 64], beyond[64];
-  double best[3] = {1e30, 1e30, 1e30}, sink = 0.0;
+  static double mean[64], covariance[64 * 64], beyond[64], jacobian[64 * 21];
+  double best[4] = {1e30, 1e30, 1e30, 1e30}, sink = 0.0;
   for (int round = 0; round < ROUNDS; ++round)
-    for (int kind = 0; kind < 3; ++kind) {
+    for (int kind = 0; kind < 4; ++kind) {
       const double start = now();
       for (int i = 0; i < STATES; ++i) {
         if (kind == 2)
           controller_forward_dynamics(q[i], qd[i], tau[i], mean);
-        else if (controller_predict(q[i], qd[i], tau[i], NULL, CONTROLLER_QDD | CONTROLLER_MULTIPLIER, 0,
+        else if (kind == 3) {
+          if (controller_jacobian(q[i], qd[i], tau[i], NULL, CONTROLLER_QDD | CONTROLLER_MULTIPLIER, mean, jacobian))
+            return 1;
+        } else if (controller_predict(q[i], qd[i], tau[i], NULL, CONTROLLER_QDD | CONTROLLER_MULTIPLIER, 0,
                                     mean, kind ? covariance : NULL, beyond))
           return 1;
         sink += mean[0];
@@ -78,7 +82,7 @@ int main(void) {
       const double each = (now() - start) / STATES;
       best[kind] = each < best[kind] ? each : best[kind];
     }
-  printf("%g %g %g %g\\n", best[0], best[1], best[2], sink);
+  printf("%g %g %g %g %g\\n", best[0], best[1], best[2], best[3], sink);
   return 0;
 }
 """
@@ -113,7 +117,7 @@ def logged(fit: StructuredFit) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def in_c(fit: StructuredFit, flags: list[str]) -> list[float]:
-    """µs of the mean, of mean and covariance, and of forward dynamics alone."""
+    """µs of the mean, of mean and covariance, of forward dynamics alone, and of the mean with Jacobians."""
     with tempfile.TemporaryDirectory() as place:
         folder = fit.export(Path(place) / "c").folder
         tables = dict(zip(("q", "qd", "tau"), logged(fit), strict=True))
@@ -126,7 +130,7 @@ def in_c(fit: StructuredFit, flags: list[str]) -> list[float]:
         command = ["gcc", "-std=c99", *flags, "time.c", "controller.c", "-o", "run", "-lm"]
         subprocess.run(command, cwd=folder, check=True)
         done = subprocess.run([str(folder / "run")], capture_output=True, text=True, check=True)
-    return [float(x) for x in done.stdout.split()[:3]]
+    return [float(x) for x in done.stdout.split()[:4]]
 
 
 def in_python(call: Callable[[int], object], calls: int = 32) -> float:
@@ -170,12 +174,18 @@ def measure() -> dict[str, float]:
         result[f"{name} functions"] = latent.basis.size
         for level, flags in LEVELS.items():
             times = in_c(fit, flags)
-            for what, value in zip(("mean", "covariance", "forward dynamics"), times, strict=True):
+            for what, value in zip(
+                ("mean", "covariance", "forward dynamics", "jacobian"), times, strict=True
+            ):
                 result[f"{name} {what} {level}"] = value
         fast = fit.compiled()
         for kind, predictor in (("compiled", fast), ("predict", fit)):
             for what, covariance in (("mean", False), ("covariance", True)):
                 result[f"{name} {what} python {kind}"] = predicting(predictor, fit, covariance)
+            q, qd, tau = logged(fit)
+            result[f"{name} jacobian python {kind}"] = in_python(
+                lambda i: predictor.linearize(q[i], qd[i], tau[i])
+            )
         if name == "friction" and (peer := pinocchio(fit)) is not None:
             result["forward dynamics pinocchio from python"] = peer
     return result
