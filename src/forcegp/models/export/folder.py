@@ -1,4 +1,4 @@
-"""The folder of an exported model: C code, a test program with reference values, CMakeLists.txt, README."""
+"""The folder of an exported model: C code with its test program and CMakeLists.txt, or a CasADi function."""
 
 from __future__ import annotations
 
@@ -14,12 +14,13 @@ from forcegp.errors import ParameterError, check_name
 from forcegp.files import written_folder
 from forcegp.forces.measurements import Training
 from forcegp.forces.noise import HIGH, LOW
+from forcegp.models.export.casadi_function import casadi_function
 from forcegp.models.export.library import CompiledFit
 from forcegp.models.export.model import ExportedModel
 from forcegp.models.export.source import READ, c_source, template
 from forcegp.models.prediction import Predictor
 
-LANGUAGES = ("c",)
+LANGUAGES = ("c", "casadi")
 STATES, LOSS_STATES = 16, 200
 """States of the test program, and those at which the loss of a reduced posterior is measured."""
 TOLERANCE, ZERO = 1e-10, 1e-5
@@ -53,8 +54,18 @@ def write_export(
             f"{name!r} cannot be the prefix of C functions",
             expected="lower-case letters, digits and underscores, a letter first",
         )
-    own = (f"{name}.h", f"{name}.c", f"test_{name}.c", "CMakeLists.txt", "README.md", "build")
+    own = (
+        f"{name}.h",
+        f"{name}.c",
+        f"test_{name}.c",
+        "CMakeLists.txt",
+        "README.md",
+        "build",
+        f"{name}.casadi",
+    )
     check_destination(path, folder=True, own_files=own)
+    if language == "casadi":
+        return _write_casadi(model, Path(path), name)
     header, source = c_source(model, name)
     result = Export(Path(path), model.parts()[0].rank, *loss_of(model, fit, training))
     where = "training" if training.samples else "random"
@@ -78,6 +89,22 @@ def write_export(
 
     write_or_keep(write, path)
     return result
+
+
+def _write_casadi(model: ExportedModel, path: Path, name: str) -> Export:
+    """Write the mean as a CasADi function, with a README."""
+    function = casadi_function(model, name)
+    names = {"joints": model.system.robot.joint_names, "contacts": model.system.contact_names or ("none",)}
+    fields = {key: ", ".join(x) for key, x in names.items()} | {"robot": model.system.robot.name}
+
+    def write(folder: Path) -> None:
+        with written_folder(folder) as temporary:
+            function.save(str(temporary / f"{name}.casadi"))
+            text = template("casadi.md.in", fields | {"name": name})
+            (temporary / "README.md").write_text(text, encoding="utf-8")
+
+    write_or_keep(write, path)
+    return Export(path, model.parts()[0].rank)
 
 
 def loss_of(model: ExportedModel, fit: Predictor, training: Training) -> tuple[float, float]:
