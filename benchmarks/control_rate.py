@@ -7,13 +7,15 @@ robot (some 50 functions); the same with uncertain inertia (some 120); and `resi
 of a residual force of 21 inputs (some 460). Nothing is learned: time does not depend on hyperparameters.
 The C code is compiled by gcc with `-O3 -march=native -ffp-contract=fast` and with `-O2`, both `-std=c99`,
 and runs on one core over 256 logged states, contact closed; the time is the least mean of several rounds.
-Peers in the same run: `StructuredFit.predict`, and for the mechanics alone Pinocchio's `aba` from Python,
-if it is installed.
+The Jacobian is that of q̈ and λ by q, q̇ and τ, mean included; the CasADi function gives the same.
+Peers in the same run: `StructuredFit.predict` and `linearize`, and for the mechanics alone Pinocchio's `aba`
+from Python, if it is installed.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import subprocess
 import tempfile
@@ -31,6 +33,7 @@ from forcegp.forces.priors.joint import JointForcePrior, JointFrictionPrior
 from forcegp.forces.priors.sets import friction_priors
 from forcegp.gp.kernels import Matern32
 from forcegp.gp.sparse import SparsePosterior
+from forcegp.models.export.casadi_function import casadi_function
 from forcegp.models.prediction import Predictor
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.simulate import SimulationConfig, simulate
@@ -72,7 +75,8 @@ int main(void) {
         if (kind == 2)
           controller_forward_dynamics(q[i], qd[i], tau[i], mean);
         else if (kind == 3) {
-          if (controller_jacobian(q[i], qd[i], tau[i], NULL, CONTROLLER_QDD | CONTROLLER_MULTIPLIER, mean, jacobian))
+          if (controller_jacobian(q[i], qd[i], tau[i], NULL, CONTROLLER_QDD | CONTROLLER_MULTIPLIER, mean,
+                                  jacobian))
             return 1;
         } else if (controller_predict(q[i], qd[i], tau[i], NULL, CONTROLLER_QDD | CONTROLLER_MULTIPLIER, 0,
                                     mean, kind ? covariance : NULL, beyond))
@@ -152,6 +156,20 @@ def predicting(predictor: Predictor, fit: StructuredFit, covariance: bool) -> fl
     )
 
 
+def linearizing(predictor: Predictor, fit: StructuredFit) -> float:
+    """µs of `linearize`: q̈ and λ with their Jacobians by q, q̇ and τ."""
+    q, qd, tau = logged(fit)
+    return in_python(lambda i: predictor.linearize(q[i], qd[i], tau[i]))
+
+
+def in_casadi(fit: StructuredFit) -> float:
+    """µs of the same by the CasADi function, called from Python."""
+    f = casadi_function(fit._exported(None))
+    outputs = [f"jac:{z}:{x}" for z in ("qdd", "multiplier") for x in ("q", "qd", "tau")]
+    slopes, states = f.factory("slopes", f.name_in(), ["qdd", "multiplier", *outputs]), logged(fit)
+    return in_python(lambda i: slopes(*(x[i].numpy() for x in states), 1.0))
+
+
 def pinocchio(fit: StructuredFit) -> float | None:
     """µs of Pinocchio's articulated-body algorithm from Python."""
     try:
@@ -182,10 +200,9 @@ def measure() -> dict[str, float]:
         for kind, predictor in (("compiled", fast), ("predict", fit)):
             for what, covariance in (("mean", False), ("covariance", True)):
                 result[f"{name} {what} python {kind}"] = predicting(predictor, fit, covariance)
-            q, qd, tau = logged(fit)
-            result[f"{name} jacobian python {kind}"] = in_python(
-                lambda i: predictor.linearize(q[i], qd[i], tau[i])
-            )
+            result[f"{name} jacobian python {kind}"] = linearizing(predictor, fit)
+        if importlib.util.find_spec("casadi"):
+            result[f"{name} jacobian casadi"] = in_casadi(fit)
         if name == "friction" and (peer := pinocchio(fit)) is not None:
             result["forward dynamics pinocchio from python"] = peer
     return result

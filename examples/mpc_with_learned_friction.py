@@ -2,9 +2,10 @@
 
     python examples/mpc_with_learned_friction.py [figure.png]
 
-A KUKA iiwa carries a hidden payload, and its joints have dry and viscous friction. A controller that predicts by
-the robot file follows a fast motion badly. The same controller on the learned model follows it closely. Each step
-linearizes the model along the last plan, by its C code, and solves one quadratic program with a solver of CasADi.
+A KUKA iiwa carries a hidden payload, and its joints have dry and viscous friction. A controller that
+predicts by the robot file follows a fast motion badly; the same controller on the learned model follows it
+closely. Each step linearizes the model along the last plan (the learned one by its C code) and solves one
+quadratic program.
 """
 
 # %% The arm as it is, and the arm of the file
@@ -65,7 +66,7 @@ def step(tau: torch.Tensor) -> None:
     engine.step(tau + dynamics.damping_force(actual, engine.state()[1]))
 
 
-# %% Twelve seconds of slow motion under joint control are the log; a Gaussian process learns what the file lacks
+# %% Twelve seconds of slow motion are the log; a Gaussian process learns what the file lacks
 t = np.arange(0.0, 12.0, STEP)
 motion = torch.from_numpy(np.concatenate(sines(t, 0.35, 2.0, seed=1), axis=1))
 engine.reset(*motion[0].split(n))
@@ -78,7 +79,9 @@ for at, rate in (x.split(n) for x in motion):
 q, qd, tau = torch.stack(rows)[::20].split(n, dim=1)
 qdd = dynamics.forward_dynamics(actual, q, qd, tau + dynamics.damping_force(actual, qd))
 qdd = qdd + 0.1 * torch.randn(qdd.shape, dtype=torch.float64, generator=torch.Generator().manual_seed(0))
-log = forcegp.Dataset(t=torch.from_numpy(t[::20]), q=q, qd=qd, tau=tau, qdd=qdd, joint_names=robot.joint_names)
+log = forcegp.Dataset(
+    t=torch.from_numpy(t[::20]), q=q, qd=qd, tau=tau, qdd=qdd, joint_names=robot.joint_names
+)
 system = forcegp.ConstrainedSystem(robot)
 model = forcegp.StructuredGP(system, "analytical", [JointFrictionPrior(), InertialPrior()], noise=0.1)
 fit = model.fit(log[::3])

@@ -219,7 +219,7 @@ def _forward_dynamics(links: Links) -> np.ndarray:
 def _inverse_dynamics_derivatives(
     links: Links, qd: list | None, qdd: list, gravity: bool = True
 ) -> tuple[np.ndarray, np.ndarray]:
-    """∂ID/∂q and ∂ID/∂q̇, with the terms of `_joint_force`; the formulas are those of `forcegp.derivatives`."""
+    """∂ID/∂q and ∂ID/∂q̇ of the terms that are given; the formulas are those of `forcegp.derivatives`."""
     motion = _motion(links, qd, qdd, gravity)
     torques, forces = _link_forces(links, motion)
     spin, momenta = [], []

@@ -4,17 +4,16 @@ from __future__ import annotations
 
 import operator
 from collections.abc import Iterable, Mapping
+from pathlib import Path
 from typing import Any
 
-import torch
-
-from forcegp.compiled.expression import UNARY, Scalar
-from forcegp.errors import MissingDependencyError
-from forcegp.gp import kernels
-from forcegp.gp.basis import KernelPart
-from forcegp.gp.features import stacked
+from forcegp.compiled.expression import Graph, Scalar
+from forcegp.destination import write_or_keep
+from forcegp.errors import optional_module
+from forcegp.files import written_folder
 from forcegp.models.export.mean import ARGUMENTS, DIFFERENTIATED, LearnedMotion
-from forcegp.models.export.model import ExportedModel, Functions, row_of
+from forcegp.models.export.model import ExportedModel
+from forcegp.models.export.source import template
 
 OPERATORS = {
     "neg": operator.neg,
@@ -23,111 +22,56 @@ OPERATORS = {
     "*": operator.mul,
     "/": operator.truediv,
 }
-AT_REST = 1e-30
-"""Added to a squared distance whose root is taken, so that the root has a slope at a support point."""
-
-PROFILES = {
-    kernels.SquaredExponential: lambda ca, u: ca.exp(-0.5 * u),
-    kernels.Matern32: lambda ca, u: _matern(ca, 3.0 * u, 0.0),
-    kernels.Matern52: lambda ca, u: _matern(ca, 5.0 * u, 1.0 / 3.0),
-}
-"""Stationary kernels by the square of the distance."""
-
-
-def _matern(ca: Any, square: Any, more: float) -> Any:
-    """(1 + r + more r²) e^{−r}."""
-    r = ca.sqrt(square + AT_REST)
-    return (1.0 + r + more * square) * ca.exp(-r)
 
 
 def casadi_function(model: ExportedModel, name: str = "forcegp") -> Any:
     """A `casadi.Function` from (q, q̇, τ, closed) to the mean of each of `DIFFERENTIATED`.
 
-    `closed` has a 1 for each contact that is closed, and a 0 for one that is open. The closed contacts must be
-    independent of each other.
+    `closed` has a 1 for each contact that is closed, and a 0 for one that is open. The closed contacts must
+    be independent of each other.
 
     Raises:
         ModelError: a part of the model has no such form; names it.
         MissingDependencyError: CasADi is not installed.
     """
-    try:
-        import casadi
-    except ImportError as cause:
-        raise MissingDependencyError(
-            "a CasADi function needs the package casadi", hint="pip install 'forcegp[casadi]'"
-        ) from cause
-    ca: Any = casadi
+    ca: Any = optional_module("casadi", "a CasADi function")
     model.check()
-    parts, nq, contacts = model.parts(), model.system.robot.nq, len(model.system.contacts)
-    mean = LearnedMotion(model, parts, differentiate=False)
-    values, supported = mean.quantities(), [p for p, part in enumerate(parts) if part.size]
-    sizes = dict(
-        zip(
-            (*ARGUMENTS, "f"),
-            (nq, nq, nq, contacts, sum(parts[p].components for p in supported)),
-            strict=True,
-        )
-    )
+    mean, nq = LearnedMotion(model, model.parts(), differentiate=False), model.system.robot.nq
+    sizes = dict(zip(ARGUMENTS, (nq, nq, nq, len(model.system.contacts)), strict=True))
     given = {x: ca.SX.sym(x, n) for x, n in sizes.items()}
-    state = [given[x] for x in ARGUMENTS]
-    results = [_vector(ca, mean, given, values[x].flat) for x in DIFFERENTIATED]
+    given |= {"sin": ca.sin(given["q"]), "cos": ca.cos(given["q"])}
+    values = mean.quantities()
+    results = [_vector(ca, mean.graph, given, values[x].flat) for x in DIFFERENTIATED]
     names = list(ARGUMENTS), list(DIFFERENTIATED)
-    if not supported:
-        return ca.Function(name, state, results, *names)
-    motion = ca.Function("motion", [*state, given["f"]], results)
-    inputs = ca.Function(
-        "inputs", state, [_vector(ca, mean, given, row) for p in supported for row in mean.x[p]]
-    )
-    # The functions with support points are written as matrices; as scalars, their Jacobian is faster.
-    state = [ca.MX.sym(x, sizes[x]) for x in ARGUMENTS]
-    x, f = iter(inputs.call(state)), []
-    for p in supported:
-        part, rows, known = parts[p], [next(x) for _ in mean.x[p]], dict[tuple, Any]()
-        assert part.rest is not None
-        for k in range(part.components):
-            covariances = _covariances(ca, part, part.rest, k, rows[k if len(rows) > 1 else 0], known)
-            f.append(covariances @ ca.DM(part.weights[k, : part.size].numpy()))
-    whole = ca.Function(name, state, motion.call([*state, ca.vertcat(*f)]), *names)
-    return whole.expand()
+    return ca.Function(name, [given[x] for x in ARGUMENTS], results, *names)
 
 
-def _vector(ca: Any, mean: LearnedMotion, given: Mapping[str, Any], outputs: Iterable[Scalar]) -> Any:
+def _vector(ca: Any, graph: Graph, given: Mapping[str, Any], outputs: Iterable[Scalar]) -> Any:
     """Scalars as one CasADi vector."""
-    nodes, outputs = mean.graph.nodes, list(outputs)
-    values: dict[int, Any] = {}
-    for position in mean.graph.live(outputs):
-        op, left, right = nodes[position]
+    outputs, values = list(outputs), dict[int, Any]()
+    functions = {"step": lambda x: x > 0.0, "exp": ca.exp, "tanh": ca.tanh, "sqrt": ca.sqrt} | OPERATORS
+    for position in graph.live(outputs):
+        op, left, right = graph.nodes[position]
         if op == "const":
             values[position] = ca.SX(left)
         elif op == "input":
-            values[position] = (
-                getattr(ca, left)(given["q"][right]) if left in ("sin", "cos") else given[left][right]
-            )
-        elif op == "step":
-            values[position] = values[left] > 0.0
-        elif op in UNARY:
-            values[position] = getattr(ca, op)(values[left])
+            values[position] = given[left][right]  # pyright: ignore[reportArgumentType]
         else:
-            values[position] = OPERATORS[op](*(values[x] for x in (left, right) if x is not None))
+            values[position] = functions[op](*(values[x] for x in (left, right) if isinstance(x, int)))
     return ca.vertcat(*(values[x.position] for x in outputs)) if outputs else ca.SX(0, 1)
 
 
-def _covariances(ca: Any, part: Functions, rest: KernelPart, k: int, x: Any, known: dict) -> Any:
-    """k(x, z_j) of component k, `(1, m)`, or a number."""
-    kernel, params = rest.kernel, rest.params
-    if isinstance(kernel, kernels.Sum):
-        a, b = (_covariances(ca, part, KernelPart(*side), k, x, known) for side in kernel.parts(params))
-        return a * b if isinstance(kernel, kernels.Product) else a + b
-    if isinstance(kernel, kernels.Constant):
-        return float(row_of(kernel.std(params), k).square())
-    linear, z = isinstance(kernel, kernels.Linear), stacked(part.support, kernel.inputs)
-    scale = row_of(kernel.slope_std(params) if linear else torch.exp(-params["log_lengthscale"]), k)
-    Z, columns = (z if z.ndim == 2 else z[k]) * scale, part.columns(kernel.inputs)
-    scaled = x[columns].T * ca.DM(scale.expand(len(columns)).tolist()).T
-    if linear:
-        return scaled @ ca.DM(Z.T.numpy()) + float(row_of(kernel.bias_std(params), k).square())
-    key = (id(x), *Z.flatten().tolist())
-    if key not in known:
-        apart = ca.repmat(scaled, len(Z), 1) - ca.DM(Z.numpy())
-        known[key] = PROFILES[type(kernel)](ca, ca.sum2(apart * apart).T)
-    return known[key] * float(row_of((2.0 * params["log_std"]).exp(), k))
+def write_casadi(model: ExportedModel, path: Path, name: str) -> None:
+    """Write the function to a folder, with a README; errors as of `casadi_function`."""
+    function = casadi_function(model, name)
+    names = {"joints": model.system.robot.joint_names, "contacts": model.system.contact_names or ("none",)}
+    fields: dict[str, object] = {"name": name, "robot": model.system.robot.name}
+    fields |= {key: ", ".join(x) for key, x in names.items()}
+
+    def write(folder: Path) -> None:
+        with written_folder(folder) as temporary:
+            function.save(str(temporary / f"{name}.casadi"))
+            text = template("casadi.md.in", fields)
+            (temporary / "README.md").write_text(text, encoding="utf-8")
+
+    write_or_keep(write, path)

@@ -14,7 +14,7 @@ from forcegp.errors import ParameterError, check_name
 from forcegp.files import written_folder
 from forcegp.forces.measurements import Training
 from forcegp.forces.noise import HIGH, LOW
-from forcegp.models.export.casadi_function import casadi_function
+from forcegp.models.export.casadi_function import write_casadi
 from forcegp.models.export.library import CompiledFit
 from forcegp.models.export.model import ExportedModel
 from forcegp.models.export.source import READ, c_source, template
@@ -65,7 +65,8 @@ def write_export(
     )
     check_destination(path, folder=True, own_files=own)
     if language == "casadi":
-        return _write_casadi(model, Path(path), name)
+        write_casadi(model, Path(path), name)
+        return Export(Path(path), model.parts()[0].rank)
     header, source = c_source(model, name)
     result = Export(Path(path), model.parts()[0].rank, *loss_of(model, fit, training))
     where = "training" if training.samples else "random"
@@ -89,22 +90,6 @@ def write_export(
 
     write_or_keep(write, path)
     return result
-
-
-def _write_casadi(model: ExportedModel, path: Path, name: str) -> Export:
-    """Write the mean as a CasADi function, with a README."""
-    function = casadi_function(model, name)
-    names = {"joints": model.system.robot.joint_names, "contacts": model.system.contact_names or ("none",)}
-    fields = {key: ", ".join(x) for key, x in names.items()} | {"robot": model.system.robot.name}
-
-    def write(folder: Path) -> None:
-        with written_folder(folder) as temporary:
-            function.save(str(temporary / f"{name}.casadi"))
-            text = template("casadi.md.in", fields | {"name": name})
-            (temporary / "README.md").write_text(text, encoding="utf-8")
-
-    write_or_keep(write, path)
-    return Export(path, model.parts()[0].rank)
 
 
 def loss_of(model: ExportedModel, fit: Predictor, training: Training) -> tuple[float, float]:

@@ -131,7 +131,7 @@ class CompiledFit(Predictor):
             raise self._error(status, q, qd, tau, active)
         if read.order is not None:
             mean, slopes = mean[..., read.order], slopes[..., read.order, :, :]
-        return MeanJacobian(mean, *slopes.unbind(-2), read.parts)
+        return MeanJacobian(mean, slopes[..., 0, :], slopes[..., 1, :], slopes[..., 2, :], read.parts)
 
     def linearize(
         self,
@@ -145,9 +145,11 @@ class CompiledFit(Predictor):
         """Mean acceleration and multiplier with their Jacobians, as `StructuredFit.linearize` gives them."""
         if system is not None and system is not self.system:
             raise ModelError("a compiled fit predicts on its own system", hint="use that of the fit")
-        mean, *slopes, parts = self.jacobian(q, qd, tau, ["qdd", "multiplier"], active=active)
-        both = [(mean[..., at], *(x[..., at, :] for x in slopes)) for at in parts.values()]
-        return ForceLinearization(*both[0], *both[1])
+        found = self.jacobian(q, qd, tau, ["qdd", "multiplier"], active=active)
+        fields: list[Tensor] = []
+        for at in found.parts.values():
+            fields += [found.mean[..., at], *(x[..., at, :] for x in found[1:4])]
+        return ForceLinearization(*fields)
 
     def _states(
         self, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor | None

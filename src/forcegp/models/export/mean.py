@@ -1,4 +1,4 @@
-"""The posterior mean of a fit in scalars, from which its C code, its Jacobians and its CasADi function are made.
+"""The posterior mean of a fit in scalars, the source of its C code, its Jacobians and its CasADi function.
 
 What depends on the state alone is a straight-line program: mechanics, touching points, inputs and features of
 the priors. The functions of the priors that have support points are loops, and enter as inputs f with their
@@ -14,9 +14,10 @@ from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
 from functools import cached_property
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
+import torch
 
 from forcegp.compiled.expression import Scalar, Tangents
 from forcegp.compiled.mechanics import _forces, _point_blocks
@@ -38,28 +39,47 @@ from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import TERMS, JointForcePrior, JointFrictionPrior
 from forcegp.gp import kernels
 from forcegp.gp.basis import KernelPart
+from forcegp.gp.features import stacked
 from forcegp.models.export.model import ExportedModel, Functions, row_of
 
 DIFFERENTIATED = ("qdd", "multiplier", "contact_force", "joint_friction")
 """The quantities whose mean has Jacobians and a CasADi form."""
 ARGUMENTS = ("q", "qd", "tau", "closed")
 REST = 1e-30
-"""Square of a sliding speed below which its root has no slope."""
+"""Square of a sliding speed, or of a distance, below which its root has no slope."""
+
+
+def _matern(square: Scalar, more: float) -> Scalar:
+    """(1 + r + more r²) e^{−r}; the root has a slope at a support point too."""
+    r = (square + REST).sqrt()
+    return (r + 1.0 + square * more) * (-r).exp()
+
+
+PROFILES = {
+    kernels.SquaredExponential: lambda square: (square * -0.5).exp(),
+    kernels.Matern32: lambda square: _matern(square * 3.0, 0.0),
+    kernels.Matern52: lambda square: _matern(square * 5.0, 1.0 / 3.0),
+}
+"""Stationary kernels by the square of the distance."""
+
+
+Scalars = Any
+"""A numpy array of scalars."""
 
 
 class Touching(NamedTuple):
-    """A contact, in the order of `touching` of `controller.c`; A and b follow."""
+    """A contact, in the order of `touching` of `controller.c`."""
 
-    position: np.ndarray
-    velocity: np.ndarray
-    jacobian: np.ndarray
-    normal: np.ndarray
-    tangent: np.ndarray
-    sliding: np.ndarray
-    sliding_jacobian: np.ndarray
-    turning: np.ndarray
-    A: np.ndarray
-    b: np.ndarray
+    position: Scalars
+    velocity: Scalars
+    jacobian: Scalars
+    normal: Scalars
+    tangent: Scalars
+    sliding: Scalars
+    sliding_jacobian: Scalars
+    turning: Scalars
+    A: Scalars
+    b: Scalars
 
 
 class Mean:
@@ -98,11 +118,11 @@ class Mean:
         outputs = list(outputs)
         return Program(tuple(arguments), (len(outputs),), self.graph, outputs)
 
-    def zeros(self, *shape: int) -> np.ndarray:
+    def zeros(self, *shape: int) -> Scalars:
         """Zeros."""
         return self.graph.constants(np.zeros(shape))
 
-    def _damping(self) -> np.ndarray:
+    def _damping(self) -> Scalars:
         """Q_D of the robot file: viscous, Coulomb and Stribeck friction."""
         names = ("damping", "friction", "friction_velocity", "stribeck", "stribeck_velocity")
         force = []
@@ -115,7 +135,7 @@ class Mean:
         return np.array(force, dtype=object)
 
     def _contact(self, contact: SurfaceContact) -> Touching:
-        ((frame, point),), graph, n = contact.anchors, self.graph, self.robot.nq
+        ((frame, point),), n = contact.anchors, self.robot.nq
         at = np.asarray([float(x) for x in point])
         _, center, J, bias = _point_blocks(self.links, self.robot, self.robot.frame_index(frame), at)
         twist = J @ self.qd
@@ -139,7 +159,7 @@ class Mean:
             np.array([b], dtype=object),
         )
 
-    def _surface(self, surface: object, p: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, Scalar, Scalar]:
+    def _surface(self, surface: object, p: Scalars, v: Scalars) -> tuple[Scalars, Scalar, Scalar]:
         """Normal, signed distance c and vᵀ (∇²c) v of a point at velocity v."""
         constants = self.graph.constants
         if isinstance(surface, Plane):
@@ -155,14 +175,14 @@ class Mean:
         along = n @ v
         return n, length - float(surface.radius), (v @ v - along * along) / length
 
-    def _tangents(self, n: np.ndarray) -> np.ndarray:
+    def _tangents(self, n: Scalars) -> Scalars:
         """R e_x and R e_y of the smallest rotation with R e_z = n; a fixed frame where n is −e_z."""
         up = (n[2] + (1.0 - FACING_DOWN)).step()
         share = up / (n[2] * up + 1.0)
         x, y, both = 1.0 - n[0] * n[0] * share, up * 2.0 - 1.0 - n[1] * n[1] * share, -(n[0] * n[1] * share)
         return np.array([[x, both, -n[0]], [both, y, -n[1]]], dtype=object)
 
-    def _inputs(self, p: int, part: Functions) -> np.ndarray:
+    def _inputs(self, p: int, part: Functions) -> Scalars:
         """Standardized inputs x, one row for all components if they share them."""
         scales, shared = (
             self.model.posterior.process.scales[p],
@@ -222,12 +242,34 @@ class Mean:
         product = isinstance(kernel, kernels.Product)
         return [a * b for a in left for b in right] if product else left + right
 
+    def _covariances(self, p: int, part: KernelPart, k: int) -> list[Scalar]:
+        """k(x, z_j) of component k and the support points of a prior."""
+        kernel, params, support = part.kernel, part.params, self.parts[p].support
+        if isinstance(kernel, kernels.Sum):
+            left, right = (self._covariances(p, KernelPart(*side), k) for side in kernel.parts(params))
+            product = isinstance(kernel, kernels.Product)
+            return [a * b if product else a + b for a, b in zip(left, right, strict=True)]
+        if isinstance(kernel, kernels.Constant):
+            return [self.graph.constant(float(row_of(kernel.std(params), k).square()))] * self.parts[p].size
+        assert isinstance(kernel, kernels.Linear | kernels.Stationary)
+        z = stacked(support, kernel.inputs)
+        inverse = isinstance(kernel, kernels.Stationary)
+        scale = row_of(torch.exp(-params["log_lengthscale"]) if inverse else kernel.slope_std(params), k)
+        row, columns = self.x[p][k if len(self.x[p]) > 1 else 0], self.parts[p].columns(kernel.inputs)
+        x = row[columns] * np.array(scale.expand(len(columns)).tolist())
+        Z = ((z if z.ndim == 2 else z[k]) * scale).numpy()
+        if isinstance(kernel, kernels.Linear):
+            bias = float(row_of(kernel.bias_std(params), k).square())
+            return [(x * point).sum() + bias for point in Z]
+        profile, variance = PROFILES[type(kernel)], float(row_of((2.0 * params["log_std"]).exp(), k))
+        return [profile(((x - point) * (x - point)).sum()) * variance for point in Z]
+
 
 class Motion(NamedTuple):
     """q̈ and λ of impressed forces."""
 
-    qdd: np.ndarray
-    multiplier: np.ndarray
+    qdd: Scalars
+    multiplier: Scalars
 
 
 class LearnedMotion(Mean):
@@ -253,13 +295,13 @@ class LearnedMotion(Mean):
             c = self.names.index(law.contact)
             self.U[:, c] = self._against(c, float(law.smoothing)) * float(law.coefficient)
 
-    def tangents(self, outputs: Iterable[Scalar]) -> np.ndarray:
+    def tangents(self, outputs: Iterable[Scalar]) -> Scalars:
         """Derivatives of scalars, `(outputs, 3 nq)`."""
         found, zero = self.graph.tangents(list(outputs), self.seeds), self.graph.constant(0.0)
         directions = range(3 * self.robot.nq)
         return np.array([[t.get(d, zero) for d in directions] for t in found], dtype=object)
 
-    def quantities(self) -> dict[str, np.ndarray]:
+    def quantities(self) -> dict[str, Scalars]:
         """The posterior mean of each of `DIFFERENTIATED`."""
         Q, Q_z, Q_F = self._forces_of_priors()
         motion = self._motion(Q + Q_z, self._mean_terms, self.U)
@@ -277,7 +319,7 @@ class LearnedMotion(Mean):
         return self.model.posterior.process.mean.terms  # pyright: ignore[reportFunctionMemberAccess]
 
     @cached_property
-    def _inverses(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _inverses(self) -> tuple[Scalars, Scalars, Scalars]:
         """M⁻¹, S = (A M⁻¹ Aᵀ)⁻¹ with ones for open contacts, and L = M⁻¹ Aᵀ S."""
         M_inv, m = _solve(self.M, self.graph.constants(np.eye(self.robot.nq))), len(self.names)
         if not m:
@@ -290,9 +332,9 @@ class LearnedMotion(Mean):
 
     def _motion(
         self,
-        rest: np.ndarray,
+        rest: Scalars,
         terms: Sequence[str],
-        U: np.ndarray | None = None,
+        U: Scalars | None = None,
         pulled: bool = True,
     ) -> Motion:
         """The motion M q̈ = Q_C + Q_G + rest + (A + U)ᵀ λ, A q̈ = b with its derivatives.
@@ -310,7 +352,7 @@ class LearnedMotion(Mean):
         response = self.graph.constants(np.eye(m)) if U is None or not m else L.T @ U + np.eye(m)
         b = self.b if pulled else self.zeros(m)
 
-        def solved(force: np.ndarray, gap: np.ndarray) -> Motion:
+        def solved(force: Scalars, gap: Scalars) -> Motion:
             # (I + LᵀU) λ = S gap − Lᵀ force, q̈ = M⁻¹ (force + K λ)
             if not m:
                 return Motion(M_inv @ force, gap)
@@ -333,12 +375,7 @@ class LearnedMotion(Mean):
                 self.seeds[x.position] = {d: t for d, t in enumerate(by) if t.value != 0.0}
         return motion
 
-    @cached_property
-    def _analytical(self) -> Motion:
-        """The motion of the robot file without friction of contacts."""
-        return self._motion(self.Q_D + self.tau, TERMS)
-
-    def _forces_of_priors(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    def _forces_of_priors(self) -> tuple[Scalars, Scalars, Scalars]:
         """Q beside Q_C and Q_G, Q_z and the learned friction of the joints."""
         n, terms = self.robot.nq, self._mean_terms
         Q, Q_z, Q_F = self.zeros(n), self.zeros(n), self.zeros(n)
@@ -360,28 +397,32 @@ class LearnedMotion(Mean):
                 Q_F = Q_F + f if isinstance(prior, JointFrictionPrior) else Q_F
         return Q, Q_z, Q_F
 
-    def _latent(self, p: int, first: int, slope: int) -> np.ndarray:
-        """f of a prior: its features, and the input of what has support points with its slopes by x."""
+    def _latent(self, p: int, first: int, slope: int) -> Scalars:
+        """f of a prior: its features, and what has support points, as an input with its slopes by x if
+        derivatives are carried along."""
         part, forces = self.parts[p], []
         for k, phi in enumerate(self.phi[p]):
             weights = part.weights[k, part.size :].tolist()
             f = sum((x * w for x, w in zip(phi, weights, strict=True)), start=self.graph.constant(0.0))
-            if part.size:
+            if part.rest is not None and part.size and not self.differentiate:
+                covariances = self._covariances(p, part.rest, k)
+                weights = part.weights[k, : part.size].tolist()
+                f = sum((x * w for x, w in zip(covariances, weights, strict=True)), start=f)
+            elif part.size:
                 rest, x = self.graph.input("f", first + k), self.x[p][k if len(self.x[p]) > 1 else 0]
                 by_x = [self.graph.input("slope", slope + k * len(x) + c) for c in range(len(x))]
-                if self.differentiate:
-                    rates = np.array(by_x, dtype=object) @ self.tangents(x)
-                    self.seeds[rest.position] = {d: t for d, t in enumerate(rates) if t.value != 0.0}
+                rates = np.array(by_x, dtype=object) @ self.tangents(x)
+                self.seeds[rest.position] = {d: t for d, t in enumerate(rates) if t.value != 0.0}
                 f = rest + f
             forces.append(f)
         return np.array(forces, dtype=object)
 
-    def _against(self, c: int, smoothing: float) -> np.ndarray:
+    def _against(self, c: int, smoothing: float) -> Scalars:
         """u = −J_Eᵀ s(v), the generalized force of a unit friction force."""
         at = self.touching[c]
         return -(at.sliding_jacobian.T @ at.sliding) / (at.sliding @ at.sliding + smoothing**2).sqrt()
 
-    def _contact_operator(self, prior: ForcePrior) -> np.ndarray:
+    def _contact_operator(self, prior: ForcePrior) -> Scalars:
         """E of a force at a contact, `(nq, components)`; see `forces/priors/contact.py`."""
         assert isinstance(prior, contact.CoulombErrorPrior | contact.SurfaceForcePrior)
         c = self.names.index(prior.contact)
@@ -401,12 +442,8 @@ class LearnedMotion(Mean):
             # The multiplier of the analytical forces with the friction μ̂ λ u of this contact
             U = self.zeros(*self.U.shape)
             U[:, c] = u * prior.friction_coefficient
-            motion = (
-                self._motion(self.Q_D + self.tau, TERMS, U)
-                if prior.friction_coefficient
-                else self._analytical
-            )
-            load = motion.multiplier[c] * motion.multiplier[c].step()
+            free = self._motion(self.Q_D + self.tau, TERMS, U).multiplier[c]
+            load = free * free.step()
             rate = at.turning @ self.qd
             spin = (rate * rate + prior.torsion_smoothing**2).sqrt()
             columns["coulomb"] = u * load
@@ -414,11 +451,14 @@ class LearnedMotion(Mean):
             columns["torsion"] = at.turning * (-(load * rate) / spin)
         return np.stack([columns[term] * closed for term in prior.terms], axis=1)
 
-    def _inertial_force(self, prior: InertialPrior, f: np.ndarray) -> np.ndarray:
+    def _inertial_force(self, prior: InertialPrior, f: Scalars) -> Scalars:
         """Y(q, q̇, q̈) S f at the analytical q̈: inverse dynamics of the errors of the inertia alone."""
         scale, links = prior.scale(self.robot).tolist(), self.links
-        errors = (f * np.array(scale)).reshape(-1, PARAMETERS)
-        motion = _motion(links, list(self.qd), list(self._analytical.qdd), gravity=True)
+        errors, qdd = (
+            (f * np.array(scale)).reshape(-1, PARAMETERS),
+            self._motion(self.Q_D + self.tau, TERMS).qdd,
+        )
+        motion = _motion(links, list(self.qd), list(qdd), gravity=True)
         torques, forces = [], []
         for (omega, v, alpha, a), R, p, (m, *rest) in zip(motion, links.R, links.p, errors, strict=True):
             h = R @ np.array(rest[:3], dtype=object)
@@ -433,12 +473,12 @@ class LearnedMotion(Mean):
         return np.array([z @ torque + l @ force for z, l, torque, force in wrenches], dtype=object)
 
 
-def _times(K: np.ndarray, x: np.ndarray, zero: np.ndarray) -> np.ndarray:
+def _times(K: Scalars, x: Scalars, zero: Scalars) -> Scalars:
     """K x, zero where there is no x."""
     return K @ x if len(x) else zero
 
 
-def _eliminated(K: np.ndarray, rhs: np.ndarray) -> np.ndarray:
+def _eliminated(K: Scalars, rhs: Scalars) -> Scalars:
     """K⁻¹ rhs by elimination without pivots."""
     K, x, n = K.copy(), rhs.copy(), len(rhs)
     for k in range(n):

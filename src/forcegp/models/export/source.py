@@ -267,12 +267,12 @@ class Writer:
             calls += f"  slopes_{p}(e, f, slope);\n"
             first += part.components
         unread = "  (void)e, (void)f;\n  memset(slope, 0, sizeof(double) * SLOPES);\n"
-        return [*texts, f"static void all_slopes({SLOPES}) {{\n{unread}{calls}}}\n"]
+        return [*texts, f"static void all_slopes({SLOPES}) {{\n{unread + calls}}}\n"]
 
 
 class Leaf(NamedTuple):
-    """A kernel of support points in C: its array `u`, their table, its inputs with their factors, and what the
-    array is multiplied by and added to."""
+    """A kernel of support points in C: its array `u`, their table, its inputs with their factors, and what
+    the array is multiplied by and added to."""
 
     u: str
     table: str
@@ -292,12 +292,6 @@ class KernelCode:
         self.shared = rows == 1 and all(z.ndim == 2 for z in self.part.support.values())
         self._known: dict[tuple[int, int], Leaf] = {}
         lines.append(f"  const double *const x = {x};\n  (void)x;")
-
-    def _x(self, kernel: kernels.Linear | kernels.Stationary, k: int, scale: Tensor) -> list[str]:
-        """The inputs of a kernel, each with its factor."""
-        columns, first = self.part.columns(kernel.inputs), 0 if self.shared else k * self._width
-        factors = scale.expand(len(columns)).tolist()
-        return [f"{s!r} * x[{first + c}]" for c, s in zip(columns, factors, strict=True)]
 
     def covariance(self, part: KernelPart, k: int) -> tuple[str, str]:
         """k(x, z_j) and k(x, x) of component k."""
@@ -343,7 +337,7 @@ class KernelCode:
             yield self._leaf(part, k), isinstance(part.kernel, kernels.Stationary), factor
 
     def _leaf(self, part: KernelPart, k: int) -> Leaf:
-        """A local array over the support points: xᵀz_j, or a profile of |x − z_j|, with its slope by the square."""
+        """A local array over the support points: xᵀz_j, or a profile of |x − z_j|."""
         kernel, params = part.kernel, part.params
         if isinstance(kernel, kernels.Linear):
             # k = Σ_d (s σ_d)² x_d x′_d + σ_0²
