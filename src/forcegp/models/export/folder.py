@@ -127,7 +127,7 @@ def random_states(model: ExportedModel, count: int) -> tuple[Tensor, ...]:
 
 
 def _reference(model: ExportedModel, fit: Predictor, name: str) -> str:
-    """C tables of states, and of mean and covariance of all quantities of Python there."""
+    """C tables of states, and of mean and covariance of all quantities and of Jacobians of Python there."""
     q, qd, tau, active = random_states(model, STATES)
     read = fit.predict(q, qd, tau, list(READ[:-1]), active=active)  # pyright: ignore[reportArgumentType]
     assert read.covariance is not None
@@ -139,6 +139,10 @@ def _reference(model: ExportedModel, fit: Predictor, name: str) -> str:
     lines.append(f"static const double TOLERANCE = {TOLERANCE!r}, ZERO = {ZERO!r};")
     flags = torch.nn.functional.pad(active, (0, int(not active.shape[1]))).int()
     tables = {"q": q, "qd": qd, "tau": tau, "mean": read.mean, "covariance": read.covariance.flatten(1)}
+    along = fit.linearize(q, qd, tau, active=active)
+    both = [torch.stack(along[at : at + 3], dim=-2).flatten(1) for at in (1, 5)]
+    tables["slopes"] = torch.cat(both, dim=1)
+    lines.append(f"enum {{ SLOPES = {tables['slopes'].shape[1]} }};")
     for key, x in {**tables, "closed": flags}.items():
         kind = "unsigned char" if key == "closed" else "double"
         rows = ",\n  ".join("{" + ", ".join(map(repr, row)) + "}" for row in x.tolist())
