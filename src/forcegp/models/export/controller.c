@@ -66,8 +66,6 @@ static int inverse_factor(const double *restrict M, double *restrict K) {
 }
 
 #if CONTACTS > 0
-static double dot3(const double *a, const double *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
-
 /* P = W^+ `(NQ, ROWS)` by one-sided Jacobi rotations of the rows; small singular values count as zero */
 static void pseudo_inverse(double *restrict W, double *restrict P) {
   double V[ROWS * ROWS], square[ROWS], most = 0.0;
@@ -177,7 +175,7 @@ static int assemble(const double *restrict q, const double *restrict qd, const d
 #if COULOMB > 0
 /* u = -J_E^T s(v), the generalized force of a unit friction force */
 static void against_sliding(const touching *at, double smoothing, double *u) {
-  const double size = sqrt(dot3(at->sliding, at->sliding) + smoothing * smoothing);
+  const double size = sqrt(dot(at->sliding, at->sliding, 3) + smoothing * smoothing);
   for (int j = 0; j < NQ; ++j) {
     u[j] = 0.0;
     for (int x = 0; x < 3; ++x) u[j] -= at->sliding_jacobian[x][j] * at->sliding[x] / size;
@@ -355,7 +353,7 @@ static int against(const equations *restrict e, const double *restrict qd, int c
                    double smoothing, double mu, double stribeck_speed, double torsion_smoothing, double (*restrict E)[NQ]) {
   enum { VISCOUS, DRY, COULOMBS, STRIBECKS, TORSION };
   const touching *at = &e->contact[c];
-  const double square = dot3(at->sliding, at->sliding), size = sqrt(square + smoothing * smoothing);
+  const double square = dot(at->sliding, at->sliding, 3), size = sqrt(square + smoothing * smoothing);
   const double rate = dot(at->turning, qd, NQ), spin = sqrt(rate * rate + torsion_smoothing * torsion_smoothing);
   double push[NQ], relief = 1.0, load;
   int loaded = 0;
@@ -385,7 +383,7 @@ static int against(const equations *restrict e, const double *restrict qd, int c
 static void friction_error(const equations *restrict e, const double *restrict tau, const double *restrict gain, int c,
                            double mu, double smoothing, double (*restrict E)[NQ]) {
   const touching *at = &e->contact[c];
-  const double square = dot3(at->sliding, at->sliding), fading = smoothing * smoothing / (square + smoothing * smoothing);
+  const double square = dot(at->sliding, at->sliding, 3), fading = smoothing * smoothing / (square + smoothing * smoothing);
   double u[NQ], Q[NQ], qdd[NQ], multiplier[SOME(ROWS)];
   against_sliding(at, smoothing, u);
   for (int j = 0; j < NQ; ++j)
