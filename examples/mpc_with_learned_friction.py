@@ -144,7 +144,8 @@ for name, predictor in models.items():
         for _ in range(round(PERIOD / STEP)):
             step(torch.from_numpy(tau))
     rms = 1e3 * np.sqrt((errors[name] ** 2).mean())
-    print(f"{name}: tracking error {rms:.2f} mrad, solve {1e3 * np.median(seconds):.1f} ms of processor time (median)")
+    ms = 1e3 * np.median(seconds)
+    print(f"{name}: tracking error {rms:.2f} mrad, solve {ms:.1f} ms of processor time (median)")
 
 # %%
 fig, axes = plt.subplots(2, 1, figsize=(7, 4), layout="constrained", sharex=True, sharey=True)

@@ -386,13 +386,15 @@ class LearnedMotion(Mean):
             if part.size:
                 first, slope = first + part.components, slope + part.components * self.x[p].shape[1]
             if isinstance(prior, InertialPrior):
-                Q = Q - self._inertial_force(prior, f)
+                errors = f * np.array(prior.scale(self.robot).tolist())
+                Q = Q - self._inertial_force(errors.reshape(-1, PARAMETERS))
             elif isinstance(prior, contact.NormalForcePrior):
                 # Aᵀ Lᵀ f: −Lᵀ f is the multiplier of M q̈ = f + Aᵀ λ, A q̈ = 0
                 Q = Q - _times(self.A.T, self._motion(f, (), pulled=False).multiplier, self.zeros(n))
             elif isinstance(prior, contact.CoulombErrorPrior | contact.SurfaceForcePrior):
                 Q_z = Q_z + self._contact_operator(prior) @ f
             else:
+                assert isinstance(prior, JointForcePrior | JointFrictionPrior)
                 Q = Q + f
                 Q_F = Q_F + f if isinstance(prior, JointFrictionPrior) else Q_F
         return Q, Q_z, Q_F
@@ -451,13 +453,9 @@ class LearnedMotion(Mean):
             columns["torsion"] = at.turning * (-(load * rate) / spin)
         return np.stack([columns[term] * closed for term in prior.terms], axis=1)
 
-    def _inertial_force(self, prior: InertialPrior, f: Scalars) -> Scalars:
-        """Y(q, q̇, q̈) S f at the analytical q̈: inverse dynamics of the errors of the inertia alone."""
-        scale, links = prior.scale(self.robot).tolist(), self.links
-        errors, qdd = (
-            (f * np.array(scale)).reshape(-1, PARAMETERS),
-            self._motion(self.Q_D + self.tau, TERMS).qdd,
-        )
+    def _inertial_force(self, errors: Scalars) -> Scalars:
+        """Y(q, q̇, q̈) δ at the analytical q̈: inverse dynamics of errors `(nq, 10)` of the inertia alone."""
+        links, qdd = self.links, self._motion(self.Q_D + self.tau, TERMS).qdd
         motion = _motion(links, list(self.qd), list(qdd), gravity=True)
         torques, forces = [], []
         for (omega, v, alpha, a), R, p, (m, *rest) in zip(motion, links.R, links.p, errors, strict=True):
