@@ -387,7 +387,8 @@ class LearnedMotion(Mean):
                 first, slope = first + part.components, slope + part.components * self.x[p].shape[1]
             if isinstance(prior, InertialPrior):
                 errors = f * np.array(prior.scale(self.robot).tolist())
-                Q = Q - self._inertial_force(errors.reshape(-1, PARAMETERS))
+                links, drives = errors[: PARAMETERS * n].reshape(n, PARAMETERS), errors[PARAMETERS * n :]
+                Q = Q - self._inertial_force(links, drives)
             elif isinstance(prior, contact.NormalForcePrior):
                 # Aᵀ Lᵀ f: −Lᵀ f is the multiplier of M q̈ = f + Aᵀ λ, A q̈ = 0
                 Q = Q - _times(self.A.T, self._motion(f, (), pulled=False).multiplier, self.zeros(n))
@@ -453,8 +454,9 @@ class LearnedMotion(Mean):
             columns["torsion"] = at.turning * (-(load * rate) / spin)
         return np.stack([columns[term] * closed for term in prior.terms], axis=1)
 
-    def _inertial_force(self, errors: Scalars) -> Scalars:
-        """Y(q, q̇, q̈) δ at the analytical q̈: inverse dynamics of errors `(nq, 10)` of the inertia alone."""
+    def _inertial_force(self, errors: Scalars, drives: Scalars) -> Scalars:
+        """[Y(q, q̇, q̈), diag q̈] δ at the analytical q̈: inverse dynamics of errors `(nq, 10)` of the links
+        alone, and of those of the drives if there are any."""
         links, qdd = self.links, self._motion(self.Q_D + self.tau, TERMS).qdd
         motion = _motion(links, list(self.qd), list(qdd), gravity=True)
         torques, forces = [], []
@@ -468,7 +470,8 @@ class LearnedMotion(Mean):
             torques.append(torque + cross(p, force))
             forces.append(force)
         wrenches = zip(links.z, links.l, links.composite(torques), links.composite(forces), strict=True)
-        return np.array([z @ torque + l @ force for z, l, torque, force in wrenches], dtype=object)
+        force = np.array([z @ torque + l @ force for z, l, torque, force in wrenches], dtype=object)
+        return force + drives * qdd if len(drives) else force
 
 
 def _times(K: Scalars, x: Scalars, zero: Scalars) -> Scalars:
