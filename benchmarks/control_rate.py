@@ -7,13 +7,15 @@ robot (some 50 functions); the same with uncertain inertia (some 120); and `resi
 of a residual force of 21 inputs (some 460). Nothing is learned: time does not depend on hyperparameters.
 The C code is compiled by gcc with `-O3 -march=native -ffp-contract=fast` and with `-O2`, both `-std=c99`,
 and runs on one core over 256 logged states, contact closed; the time is the least mean of several rounds.
-Peers in the same run: `StructuredFit.predict`, and for the mechanics alone Pinocchio's `aba` from Python,
-if it is installed.
+The Jacobian is that of q̈ and λ by q, q̇ and τ, mean included; the CasADi function gives the same.
+Peers in the same run: `StructuredFit.predict` and `linearize`, and for the mechanics alone Pinocchio's `aba`
+from Python, if it is installed.
 """
 
 from __future__ import annotations
 
 import argparse
+import importlib.util
 import json
 import subprocess
 import tempfile
@@ -31,6 +33,7 @@ from forcegp.forces.priors.joint import JointForcePrior, JointFrictionPrior
 from forcegp.forces.priors.sets import friction_priors
 from forcegp.gp.kernels import Matern32
 from forcegp.gp.sparse import SparsePosterior
+from forcegp.models.export.casadi_function import casadi_function
 from forcegp.models.prediction import Predictor
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.simulate import SimulationConfig, simulate
@@ -44,6 +47,7 @@ BOUNDS = {  # µs, at -O3
     "friction+inertia covariance": 30.0,
     "residual mean": 20.0,
     "residual covariance": 120.0,
+    "residual jacobian": 60.0,
     "forward dynamics": 1.0,
     "python mean": 50.0,
     "python covariance": 150.0,
@@ -62,15 +66,19 @@ static double now(void) {
 }
 
 int main(void) {
-  static double mean[64], covariance[64 * 64], beyond[64];
-  double best[3] = {1e30, 1e30, 1e30}, sink = 0.0;
+  static double mean[64], covariance[64 * 64], beyond[64], jacobian[64 * 21];
+  double best[4] = {1e30, 1e30, 1e30, 1e30}, sink = 0.0;
   for (int round = 0; round < ROUNDS; ++round)
-    for (int kind = 0; kind < 3; ++kind) {
+    for (int kind = 0; kind < 4; ++kind) {
       const double start = now();
       for (int i = 0; i < STATES; ++i) {
         if (kind == 2)
           controller_forward_dynamics(q[i], qd[i], tau[i], mean);
-        else if (controller_predict(q[i], qd[i], tau[i], NULL, CONTROLLER_QDD | CONTROLLER_MULTIPLIER, 0,
+        else if (kind == 3) {
+          if (controller_jacobian(q[i], qd[i], tau[i], NULL, CONTROLLER_QDD | CONTROLLER_MULTIPLIER, mean,
+                                  jacobian))
+            return 1;
+        } else if (controller_predict(q[i], qd[i], tau[i], NULL, CONTROLLER_QDD | CONTROLLER_MULTIPLIER, 0,
                                     mean, kind ? covariance : NULL, beyond))
           return 1;
         sink += mean[0];
@@ -78,7 +86,7 @@ int main(void) {
       const double each = (now() - start) / STATES;
       best[kind] = each < best[kind] ? each : best[kind];
     }
-  printf("%g %g %g %g\\n", best[0], best[1], best[2], sink);
+  printf("%g %g %g %g %g\\n", best[0], best[1], best[2], best[3], sink);
   return 0;
 }
 """
@@ -113,7 +121,7 @@ def logged(fit: StructuredFit) -> tuple[Tensor, Tensor, Tensor]:
 
 
 def in_c(fit: StructuredFit, flags: list[str]) -> list[float]:
-    """µs of the mean, of mean and covariance, and of forward dynamics alone."""
+    """µs of the mean, of mean and covariance, of forward dynamics alone, and of the mean with Jacobians."""
     with tempfile.TemporaryDirectory() as place:
         folder = fit.export(Path(place) / "c").folder
         tables = dict(zip(("q", "qd", "tau"), logged(fit), strict=True))
@@ -126,7 +134,7 @@ def in_c(fit: StructuredFit, flags: list[str]) -> list[float]:
         command = ["gcc", "-std=c99", *flags, "time.c", "controller.c", "-o", "run", "-lm"]
         subprocess.run(command, cwd=folder, check=True)
         done = subprocess.run([str(folder / "run")], capture_output=True, text=True, check=True)
-    return [float(x) for x in done.stdout.split()[:3]]
+    return [float(x) for x in done.stdout.split()[:4]]
 
 
 def in_python(call: Callable[[int], object], calls: int = 32) -> float:
@@ -146,6 +154,20 @@ def predicting(predictor: Predictor, fit: StructuredFit, covariance: bool) -> fl
     return in_python(
         lambda i: predictor.predict(q[i], qd[i], tau[i], ["qdd", "multiplier"], covariance=covariance)
     )
+
+
+def linearizing(predictor: Predictor, fit: StructuredFit) -> float:
+    """µs of `linearize`: q̈ and λ with their Jacobians by q, q̇ and τ."""
+    q, qd, tau = logged(fit)
+    return in_python(lambda i: predictor.linearize(q[i], qd[i], tau[i]))
+
+
+def in_casadi(fit: StructuredFit) -> float:
+    """µs of the same by the CasADi function, called from Python."""
+    f = casadi_function(fit._exported(None))
+    outputs = [f"jac:{z}:{x}" for z in ("qdd", "multiplier") for x in ("q", "qd", "tau")]
+    slopes, states = f.factory("slopes", f.name_in(), ["qdd", "multiplier", *outputs]), logged(fit)
+    return in_python(lambda i: slopes(*(x[i].numpy() for x in states), 1.0))
 
 
 def pinocchio(fit: StructuredFit) -> float | None:
@@ -170,12 +192,17 @@ def measure() -> dict[str, float]:
         result[f"{name} functions"] = latent.basis.size
         for level, flags in LEVELS.items():
             times = in_c(fit, flags)
-            for what, value in zip(("mean", "covariance", "forward dynamics"), times, strict=True):
+            for what, value in zip(
+                ("mean", "covariance", "forward dynamics", "jacobian"), times, strict=True
+            ):
                 result[f"{name} {what} {level}"] = value
         fast = fit.compiled()
         for kind, predictor in (("compiled", fast), ("predict", fit)):
             for what, covariance in (("mean", False), ("covariance", True)):
                 result[f"{name} {what} python {kind}"] = predicting(predictor, fit, covariance)
+            result[f"{name} jacobian python {kind}"] = linearizing(predictor, fit)
+        if importlib.util.find_spec("casadi"):
+            result[f"{name} jacobian casadi"] = in_casadi(fit)
         if name == "friction" and (peer := pinocchio(fit)) is not None:
             result["forward dynamics pinocchio from python"] = peer
     return result

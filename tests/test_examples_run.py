@@ -102,6 +102,19 @@ def test_payload_followed_online(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
+def test_mpc_with_learned_friction(tmp_path: Path) -> None:
+    for package in ("mujoco", "casadi"):
+        pytest.importorskip(package)
+    text = example("mpc_with_learned_friction", tmp_path)
+    (file, _), (learned, solve) = (
+        numbers(rf"{name}: tracking error ([\d.]+) mrad, solve ([\d.]+) ms", text)
+        for name in ("robot file", "learned")
+    )
+    assert learned < 0.5 * file
+    assert solve < 20.0
+
+
+@pytest.mark.slow
 def test_two_contacts(tmp_path: Path) -> None:
     text = example("two_contacts", tmp_path)
     for contact in ("table", "rail"):

@@ -8,7 +8,7 @@ import numpy as np
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from forcegp.compiled.expression import Graph, Scalar
+from forcegp.compiled.expression import UNARY, Graph, Scalar
 
 
 def evaluate(x: Scalar, values: list[float]) -> float:
@@ -21,6 +21,9 @@ def evaluate(x: Scalar, values: list[float]) -> float:
             done.append(values[right])  # type: ignore[index]
         else:
             a, b = done[left], 0.0 if right is None else done[right]  # type: ignore[index]
+            if op in UNARY:
+                done.append(float(a > 0.0) if op == "step" else getattr(math, op)(a))
+                continue
             done.append({"+": a + b, "-": a - b, "*": a * b, "neg": -a, "/": a / b if b else math.inf}[op])
     return done[x.position]
 
@@ -86,3 +89,23 @@ def test_object_arrays_multiply() -> None:
     graph = Graph()
     A, x = graph.constants(np.eye(3)), np.array([graph.input("q", i) for i in range(3)], dtype=object)
     assert [(a).position for a in A @ x] == [b.position for b in x]
+
+
+def test_tangents_are_derivatives() -> None:
+    graph, at = Graph(), [0.7, -0.4, 1.3]
+    x, y, z = (graph.input("q", i) for i in range(3))
+    inner = (x * y - z).tanh()
+    whole = (inner * x + (-y).exp() / (z * z + 1.0).sqrt() - x.step() * y) / (2.0 - y) - -z
+    one = graph.constant(1.0)
+    seeds = {entry.position: {i: one} for i, entry in enumerate((x, y, z))}
+    (rates,) = graph.tangents([whole], seeds)
+    for i, rate in rates.items():
+        pair = [[v + sign * 1e-6 * (i == k) for k, v in enumerate(at)] for sign in (1.0, -1.0)]
+        slope = (evaluate(whole, pair[0]) - evaluate(whole, pair[1])) / 2e-6
+        assert abs(evaluate(rate, at) - slope) < 1e-8
+    assert sorted(rates) == [0, 1, 2]
+    # A seed behind which nothing is looked at, and a constant
+    assert graph.tangents([inner * inner], {inner.position: {}}) == [{}]
+    (given,) = graph.tangents([inner * x], {inner.position: {5: one}, x.position: {}})
+    assert {d: t.position for d, t in given.items()} == {5: x.position}
+    assert (graph.constant(4.0).sqrt().value, graph.constant(-1.0).step().value) == (2.0, 0.0)

@@ -65,9 +65,9 @@ def free_friction() -> StructuredFit:
 
 
 def free_inertial() -> StructuredFit:
-    """Uncertain inertia, marginalised."""
+    """Uncertain inertia of links and drives, marginalised."""
     robot = forcegp.load_robot("kuka_iiwa")
-    priors = [JointFrictionPrior(), InertialPrior()]
+    priors = [JointFrictionPrior(), InertialPrior().with_drives(torch.full((7,), 0.05))]
     model = forcegp.StructuredGP(forcegp.ConstrainedSystem(robot), "analytical", priors, noise=0.1)
     return model.fit(free_log(robot, 60), learn=[])
 
@@ -75,7 +75,7 @@ def free_inertial() -> StructuredFit:
 def contained_inertia() -> StructuredFit:
     """The same, where the robot contains the errors of its inertia."""
     fit = fitted("free_inertial")
-    value = 0.1 * torch.randn(70, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
+    value = 0.1 * torch.randn(77, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
     process = dataclasses.replace(fit.posterior.process, pinned={1: value})
     return dataclasses.replace(fit, posterior=dataclasses.replace(fit.posterior, process=process))
 

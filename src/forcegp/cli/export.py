@@ -1,4 +1,4 @@
-"""`forcegp export`: a fitted model as source code of a controller, or as figures in a robot file."""
+"""`forcegp export`: a fitted model as code of a controller, or as figures in a robot file."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ from forcegp.errors import ModelError, RobotFileError, check_name
 if TYPE_CHECKING:
     from forcegp.models.structured_fit import StructuredFit
 
-TARGETS = ("c", "urdf", "mjcf")
+TARGETS = ("c", "casadi", "urdf", "mjcf")
 
 
 def export(
@@ -23,7 +23,7 @@ def export(
     out: Annotated[
         Path, typer.Option("--out", "-o", help="Folder for the code and its test, or the robot file.")
     ],
-    to: Annotated[str, typer.Option("--to", help="c, urdf or mjcf.")] = "c",
+    to: Annotated[str, typer.Option("--to", help="c, casadi, urdf or mjcf.")] = "c",
     name: Annotated[
         str, typer.Option(help="Of C code: name of the files, and prefix of the functions.")
     ] = "controller",
@@ -40,10 +40,13 @@ def export(
     seed: Annotated[int, typer.Option(help="Of these samples.")] = 0,
     as_json: AsJson = False,
 ) -> None:
-    """Write a structured Gaussian process as C99 that needs libm alone, or into the file of its robot.
+    """Write a structured Gaussian process as C99 or for CasADi, or into the file of its robot.
 
     C: one .h and one .c file: state and closed contacts to accelerations, multipliers and forces, each with
-    mean and covariance. Beside them a test program with reference values, CMakeLists.txt and a README.
+    mean and covariance, and Jacobians of the mean. It needs libm alone. Beside them a test program with
+    reference values, CMakeLists.txt and a README.
+
+    CasADi: the mean as a function with exact derivatives, in a file for `casadi.Function.load`.
 
     URDF, MJCF: a copy of the robot's file with identified inertia, damping and friction, in which nothing
     else changes. Beside it a report with standard deviations and losses, and robots drawn from the posterior.
@@ -54,6 +57,8 @@ def export(
 
     forcegp export -m model --functions 100 --name arm -o controller/
 
+    forcegp export -m model --to casadi -o mpc/
+
     forcegp export -m model --to urdf --robot my.urdf --samples 100 -o calibrated.urdf
     """
     from forcegp.models.structured_fit import StructuredFit
@@ -62,7 +67,7 @@ def export(
     fit = forcegp.load_model(model)
     if not isinstance(fit, StructuredFit):
         raise ModelError("only a structured Gaussian process can be exported", expected="sgp", got=fit.kind)
-    if to != "c":
+    if to in ("urdf", "mjcf"):
         show(_written_back(fit, to, robot, out, samples, seed), as_json)
         return
     written = fit.export(out, language=to, name=name, functions=functions)

@@ -6,12 +6,18 @@ and records a straight-line program.
 
 from __future__ import annotations
 
+import math
+from collections.abc import Container
 from dataclasses import dataclass, field
 
 import numpy as np
 
 Node = tuple[str, object, object]
 """Operation and operands: ("const", value, None), ("input", name, index), (op, left, right) by position."""
+UNARY = ("exp", "tanh", "sqrt", "step")
+"""Functions of one operand; step is 1 above 0, and 0 elsewhere."""
+Tangents = dict[int, "Scalar"]
+"""Derivatives of a scalar by direction; those that are not there are zero."""
 
 
 @dataclass
@@ -42,17 +48,52 @@ class Graph:
         """Entry of an argument of the program."""
         return self.scalar(("input", name, index))
 
-    def live(self, outputs: list[Scalar]) -> list[int]:
-        """Positions of the nodes that the outputs depend on, in order of computation."""
+    def live(self, outputs: list[Scalar], known: Container[int] = ()) -> list[int]:
+        """Positions of the nodes that the outputs depend on, in order of computation, not looking behind
+        those that are known."""
         needed, open_ = set(), [x.position for x in outputs]
         while open_:
             position = open_.pop()
             if position not in needed:
                 needed.add(position)
                 op, left, right = self.nodes[position]
-                if op not in ("const", "input"):
+                if op not in ("const", "input") and position not in known:
                     open_ += [x for x in (left, right) if isinstance(x, int)]
         return sorted(needed)
+
+    def tangents(self, outputs: list[Scalar], seeds: dict[int, Tangents]) -> list[Tangents]:
+        """Derivatives of the outputs by forward mode, from those of `seeds` by position.
+
+        A seed need not be an input: what is the solution of an equation is given its derivative so, and a
+        scalar without directions counts as a constant.
+        """
+        found = dict(seeds)
+        for position in self.live(outputs, seeds):
+            if position not in seeds:
+                found[position] = self._tangents(position, found)
+        return [found[x.position] for x in outputs]
+
+    def _tangents(self, position: int, found: dict[int, Tangents]) -> Tangents:
+        """The derivatives of one node from those of its operands."""
+        op, i, j = self.nodes[position]
+        if op in ("const", "input", "step"):
+            return {}
+        value, a, by_a = Scalar(self, position), Scalar(self, i), found[i]  # pyright: ignore
+        if j is None:
+            factors = {"neg": lambda: self.constant(-1.0), "exp": lambda: value}
+            factors |= {"tanh": lambda: 1.0 - value * value, "sqrt": lambda: 0.5 / value}
+            factor = factors[op]()
+            return {d: t * factor for d, t in by_a.items()}
+        b, by_b = Scalar(self, j), found[j]  # pyright: ignore
+        one, by_left, by_right = self.constant(1.0), b, a
+        if op in "+-":
+            by_left, by_right = one, one if op == "+" else -one
+        elif op == "/":
+            by_left, by_right = one / b, -(value / b)
+        total = {d: t * by_left for d, t in by_a.items()}
+        for d, t in by_b.items():
+            total[d] = total[d] + t * by_right if d in total else t * by_right
+        return total
 
 
 @dataclass(frozen=True, slots=True, eq=False)
@@ -79,6 +120,28 @@ class Scalar:
 
     def _node(self, op: str, other: Scalar) -> Scalar:
         return self.graph.scalar((op, self.position, other.position))
+
+    def exp(self) -> Scalar:
+        """e^x."""
+        return self._function("exp")
+
+    def tanh(self) -> Scalar:
+        """Hyperbolic tangent."""
+        return self._function("tanh")
+
+    def sqrt(self) -> Scalar:
+        """Square root."""
+        return self._function("sqrt")
+
+    def step(self) -> Scalar:
+        """1 above 0, and 0 elsewhere."""
+        return self._function("step")
+
+    def _function(self, name: str) -> Scalar:
+        if self.value is not None:
+            step = float(self.value > 0.0)
+            return self.graph.constant(step if name == "step" else getattr(math, name)(self.value))
+        return self.graph.scalar((name, self.position, None))
 
     def __neg__(self) -> Scalar:
         if self.value is not None:

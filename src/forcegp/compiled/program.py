@@ -216,9 +216,11 @@ def _forward_dynamics(links: Links) -> np.ndarray:
     return _solve(_mass_matrix(links), np.array(links.vector("force"), dtype=object) - needed)
 
 
-def _inverse_dynamics_derivatives(links: Links, qd: list, qdd: list) -> tuple[np.ndarray, np.ndarray]:
-    """∂ID/∂q and ∂ID/∂q̇; the formulas are those of `forcegp.derivatives`."""
-    motion = _motion(links, qd, qdd, gravity=True)
+def _inverse_dynamics_derivatives(
+    links: Links, qd: list | None, qdd: list, gravity: bool = True
+) -> tuple[np.ndarray, np.ndarray]:
+    """∂ID/∂q and ∂ID/∂q̇ of the terms that are given; the formulas are those of `forcegp.derivatives`."""
+    motion = _motion(links, qd, qdd, gravity)
     torques, forces = _link_forces(links, motion)
     spin, momenta = [], []
     for (omega, v, _, _), m, h, I in zip(motion, links.mass, links.moment, links.inertia, strict=True):

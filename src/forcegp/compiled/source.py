@@ -12,6 +12,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
+from forcegp.compiled.expression import UNARY
 from forcegp.compiled.program import Program
 from forcegp.errors import MissingDependencyError
 from forcegp.native import load_library
@@ -76,28 +77,32 @@ class Source:
     arrays: tuple[str, ...]
 
 
-def statements(program: Program, load: dict[tuple[str, int], str], store: str, vector: bool = True) -> str:
-    """One statement a live node, then the stores, on vectors `V` of numbers `T` or, in C, on doubles."""
+def statements(program: Program, load: dict[tuple[str, int], str], store: str) -> str:
+    """One statement a live node, then the stores, on vectors `V` of numbers `T`."""
     nodes, lines = program.graph.nodes, []
-    kind, lifted = ("V", "V{{}} + {}") if vector else ("double", "{}")
     name: dict[int, str] = {}
     for position in program.graph.live(program.outputs):
         op, left, right = nodes[position]
         if op == "const":
             # A scalar operand is spread over the lanes by the compiler; repr keeps every bit.
-            name[position] = f"T({left!r})" if vector else repr(left)
+            name[position] = f"T({left!r})"
             continue
         name[position] = f"x{position}"
         if op == "input":
             value = load[left, right]  # pyright: ignore[reportArgumentType]
-        elif op == "neg":
-            value = f"-{name[left]}"  # pyright: ignore[reportArgumentType]
         else:
-            value = f"{name[left]} {op} {name[right]}"  # pyright: ignore[reportArgumentType]
-        lines.append(f"  const {kind} x{position} = {value};")
+            value = _operation(op, *(name[x] for x in (left, right) if isinstance(x, int)))
+        lines.append(f"  const V x{position} = {value};")
     for k, output in enumerate(program.outputs):
-        lines.append("  " + store.format(k=k, value=lifted.format(name[output.position])))
+        lines.append("  " + store.format(k=k, value=f"V{{}} + {name[output.position]}"))
     return "\n".join(lines)
+
+
+def _operation(op: str, left: str, right: str = "") -> str:
+    """The text of an operation; `step` and other functions exist in C alone."""
+    if op in UNARY:
+        return f"{left} > 0.0" if op == "step" else f"{op}({left})"
+    return f"{left} {op} {right}" if right else f"-{left}"
 
 
 def inputs_of(program: Program) -> tuple[tuple[str, ...], list[tuple[str, int]]]:
@@ -134,16 +139,66 @@ def cpu_source(program: Program, nq: int, dtype: torch.dtype) -> Source:
     return Source(text, arrays)
 
 
+STATEMENTS = 500
+"""Statements of a C function; the time that compilers take grows faster than their number."""
+
+
 def c_function(name: str, program: Program) -> str:
-    """A static C99 function of one state: the arguments, sin q and cos q, then where the result goes."""
+    """A static C99 function of one state: the arguments, sin q and cos q, then where the result goes.
+
+    A long program becomes several functions that pass on what later ones need in an array.
+    """
     names = (*program.arguments, "sin_q", "cos_q")
     entry = {"sin": "sin_q", "cos": "cos_q"}
-    load = {(x, i): f"{entry.get(x, x)}[{i}]" for x, i in inputs_of(program)[1]}
-    used = {entry.get(x, x) for x, _ in load}
-    unread = "".join(f"  (void){x};\n" for x in names if x not in used)
+    nodes, order = program.graph.nodes, program.graph.live(program.outputs)
+    steps = [order[i : i + STATEMENTS] for i in range(0, len(order), STATEMENTS)]
+    step_of = {position: i for i, step in enumerate(steps) for position in step}
+    slot: dict[int, int] = {}
+    for position in order:
+        op, *operands = nodes[position]
+        for x in operands if op not in ("const", "input") else ():
+            if isinstance(x, int) and step_of[x] < step_of[position] and nodes[x][0] != "const":
+                slot.setdefault(x, len(slot))
+    stored: dict[int, list[int]] = {}
+    for k, output in enumerate(program.outputs):
+        stored.setdefault(output.position, []).append(k)
     arguments = ", ".join(f"const double *restrict {x}" for x in names)
-    body = statements(program, load, "out[{k}] = {value};", vector=False)
-    return f"static void {name}({arguments}, double *restrict out) {{\n{unread}{body}\n}}\n"
+    arguments += ", double *restrict kept, double *restrict out"
+    texts = []
+    for i, step in enumerate(steps):
+        lines, named = list[str](), dict[int, str]()
+
+        def value_of(position: int, lines: list[str] = lines, named: dict[int, str] = named) -> str:
+            if position not in named:
+                op, value, _ = nodes[position]
+                named[position] = repr(value) if op == "const" else f"x{position}"
+                if op != "const":
+                    lines.append(f"  const double x{position} = kept[{slot[position]}];")
+            return named[position]
+
+        for position in step:
+            op, left, right = nodes[position]
+            if op != "const":
+                if op == "input":
+                    value = f"{entry.get(left, left)}[{right}]"  # pyright: ignore
+                else:
+                    value = _operation(op, *(value_of(x) for x in (left, right) if isinstance(x, int)))
+                named[position] = f"x{position}"
+                lines.append(f"  const double x{position} = {value};")
+            lines += [f"  out[{k}] = {value_of(position)};" for k in stored.get(position, ())]
+            lines += [f"  kept[{slot[position]}] = x{position};"] if position in slot else []
+        unread = "".join(f"(void){x}, " for x in (*names, "kept"))
+        texts.append(
+            f"static void {name}_{i}({arguments}) {{\n  {unread}(void)out;\n{chr(10).join(lines)}\n}}\n"
+        )
+    calls = ", ".join(f"{name}_{i}" for i in range(len(steps)))
+    passed = ", ".join((*names, "kept", "out"))
+    texts.append(
+        f"static void {name}({arguments.replace(', double *restrict kept', '')}) {{\n"
+        f"  static void (*const steps[])({arguments}) = {{{calls}}};\n  double kept[{len(slot) or 1}];\n"
+        f"  for (int i = 0; i < {len(steps)}; ++i) steps[i]({passed});\n}}\n"
+    )
+    return "\n".join(texts)
 
 
 def cuda_source(program: Program, nq: int, dtype: torch.dtype) -> Source:

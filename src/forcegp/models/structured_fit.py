@@ -224,13 +224,14 @@ class StructuredFit(FittedModel):
     def export(
         self, path: str | Path, *, language: str = "c", name: str = "controller", functions: int | None = None
     ) -> Export:
-        """Write the fit as C99 that needs libm alone, with a test program, `CMakeLists.txt` and a README.
+        """Write the fit as C99 that needs libm alone, with a test program, or its mean as a CasADi function.
 
-        The code maps (q, q̇, τ, closed contacts) to mean and covariance of every quantity.
+        The code maps (q, q̇, τ, closed contacts) to mean and covariance of every quantity, and to Jacobians of
+        the mean. The CasADi function gives the mean with exact derivatives of any order.
 
         Args:
             path: folder, which is made.
-            language: `"c"`.
+            language: `"c"` or `"casadi"`.
             name: of the files, and prefix of all names in them.
             functions: number r that the covariance is reduced to; `None` for all.
 
@@ -241,6 +242,7 @@ class StructuredFit(FittedModel):
             ModelError: a prior, kernel or contact has no C form, or the posterior is too large; names it.
             UnknownNameError, ParameterError: no such language, or a name that is no C identifier.
             DestinationError: the folder cannot be written, or holds other files.
+            MissingDependencyError: CasADi is not installed.
         """
         return write_export(self._exported(functions), self, self.training, path, language, name)
 

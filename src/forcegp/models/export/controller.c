@@ -31,6 +31,7 @@ typedef struct {
   double normal[3], tangent[2][3];                  /* of the surface there */
   double sliding[3], sliding_jacobian[3][NQ];       /* velocity and Jacobian along the surface */
   double turning[NQ];                               /* n^T J_omega */
+  double A[NQ], b;                                  /* A qdd = b while it is closed */
 } touching;
 
 typedef struct {
@@ -42,6 +43,7 @@ typedef struct {
   double qdd[NQ], load[SOME(ROWS)];            /* qdd and lambda of the analytical forces */
   int closed[SOME(CONTACTS)];
   touching contact[SOME(CONTACTS)];
+  double x[SOME(INPUTS)], phi[SOME(FEATURES)]; /* standardized inputs and features of the priors */
 } equations;
 
 /* K = G^-1 of the lower Cholesky factor, M = G G^T; 0 unless M is positive definite */
@@ -64,76 +66,6 @@ static int inverse_factor(const double *restrict M, double *restrict K) {
 }
 
 #if CONTACTS > 0
-static double dot3(const double *a, const double *b) { return a[0] * b[0] + a[1] * b[1] + a[2] * b[2]; }
-
-static void cross3(const double *a, const double *b, double *c) {
-  c[0] = a[1] * b[2] - a[2] * b[1];
-  c[1] = a[2] * b[0] - a[0] * b[2];
-  c[2] = a[0] * b[1] - a[1] * b[0];
-}
-
-/* signed distance c of a point from the surface that its tip moves on, normal n and v^T (nabla^2 c) v */
-static double surface(int i, const double *p, const double *v, double *n, double *curvature) {
-  double r[3], w[3], along, length;
-  *curvature = 0.0;
-  if (SURFACE[i] == PLANE) {
-    for (int x = 0; x < 3; ++x) n[x] = AXIS[i][x];
-    return dot3(n, p) - SIZE[i];
-  }
-  for (int x = 0; x < 3; ++x) r[x] = p[x] - CENTER[i][x], w[x] = v[x];
-  if (SURFACE[i] == CYLINDER) {
-    const double far = dot3(r, AXIS[i]), speed = dot3(w, AXIS[i]);
-    for (int x = 0; x < 3; ++x) r[x] -= far * AXIS[i][x], w[x] -= speed * AXIS[i][x];
-  }
-  length = sqrt(dot3(r, r));
-  for (int x = 0; x < 3; ++x) n[x] = r[x] / length;
-  along = dot3(n, w);
-  *curvature = (dot3(w, w) - along * along) / length;
-  return length - SIZE[i];
-}
-
-/* tangent frame that turns with the normal: R e_x and R e_y of the smallest rotation with R e_z = n */
-static void tangents(const double *n, double t[2][3]) {
-  const int down = 1.0 + n[2] < 1e-6;
-  const double share = down ? 0.0 : 1.0 / (1.0 + n[2]);
-  t[0][0] = 1.0 - n[0] * n[0] * share, t[0][1] = -n[0] * n[1] * share, t[0][2] = -n[0];
-  t[1][0] = -n[0] * n[1] * share, t[1][1] = (down ? -1.0 : 1.0) - n[1] * n[1] * share, t[1][2] = -n[1];
-}
-
-/* A, b and the touching point of a contact, from position, Jacobian [omega; v] and J_dot qd of its point */
-static void contact_rows(int i, const double *restrict point, const double *restrict qd, equations *restrict e) {
-  const double *J = point + 3, *bias = point + 3 + 6 * NQ;
-  touching *at = &e->contact[i];
-  double twist[6], arm[3], c, cd, curvature, n_v;
-  for (int x = 0; x < 6; ++x) twist[x] = dot(J + x * NQ, qd, NQ);
-  c = surface(i, point, twist + 3, at->normal, &curvature);
-  for (int j = 0; j < NQ; ++j) {
-    const double column[3] = {J[3 * NQ + j], J[4 * NQ + j], J[5 * NQ + j]}, spin[3] = {J[j], J[NQ + j], J[2 * NQ + j]};
-    double moved[3];
-    e->A[i][j] = dot3(at->normal, column);
-    at->turning[j] = dot3(at->normal, spin);
-    for (int x = 0; x < 3; ++x) arm[x] = -TIP[i] * at->normal[x];
-    cross3(spin, arm, moved);
-    for (int x = 0; x < 3; ++x) at->jacobian[x][j] = column[x] + moved[x];
-  }
-  cross3(twist, arm, at->velocity);
-  for (int x = 0; x < 3; ++x) at->velocity[x] += twist[3 + x], at->position[x] = point[x] + arm[x];
-  cd = dot(e->A[i], qd, NQ);
-  e->b[i] = -(dot3(at->normal, bias + 3) + curvature) - RATE_GAIN * cd - ERROR_GAIN * c;
-  tangents(at->normal, at->tangent);
-  n_v = dot3(at->normal, at->velocity);
-  for (int x = 0; x < 3; ++x) at->sliding[x] = at->velocity[x] - at->normal[x] * n_v;
-  for (int j = 0; j < NQ; ++j) {
-    double n_J = 0.0;
-    for (int x = 0; x < 3; ++x) n_J += at->normal[x] * at->jacobian[x][j];
-    for (int x = 0; x < 3; ++x) at->sliding_jacobian[x][j] = at->jacobian[x][j] - at->normal[x] * n_J;
-  }
-  if (!e->closed[i]) {
-    for (int j = 0; j < NQ; ++j) e->A[i][j] = 0.0;
-    e->b[i] = 0.0;
-  }
-}
-
 /* P = W^+ `(NQ, ROWS)` by one-sided Jacobi rotations of the rows; small singular values count as zero */
 static void pseudo_inverse(double *restrict W, double *restrict P) {
   double V[ROWS * ROWS], square[ROWS], most = 0.0;
@@ -184,16 +116,17 @@ static void motion_under(const equations *restrict e, const double *restrict Q, 
 static int assemble(const double *restrict q, const double *restrict qd, const double *restrict tau,
                     const unsigned char *restrict closed, equations *restrict e) {
   double sine[NQ], cosine[NQ], out[MECHANICS], K[NQ * NQ], Q[NQ];
+  const double *next = out + NQ * NQ + 3 * NQ;
   for (int i = 0; i < NQ; ++i) sine[i] = sin(q[i]), cosine[i] = cos(q[i]);
-  mechanics(q, qd, sine, cosine, out);
+  mechanics(q, qd, tau, sine, cosine, out);
   memcpy(e->M, out, sizeof e->M);
   memcpy(e->Q_C, out + NQ * NQ, sizeof e->Q_C);
   memcpy(e->Q_G, out + NQ * NQ + NQ, sizeof e->Q_G);
-  for (int i = 0; i < NQ; ++i) {
-    const double fast = qd[i] / STRIBECK_VELOCITY[i], dry = FRICTION[i] + STRIBECK[i] * exp(-fast * fast);
-    e->Q_D[i] = -DAMPING[i] * qd[i] - (dry != 0.0 ? dry * tanh(qd[i] / FRICTION_VELOCITY[i]) : 0.0);
-    Q[i] = e->Q_C[i] + e->Q_G[i] + e->Q_D[i] + tau[i];
-  }
+  memcpy(e->Q_D, out + NQ * NQ + 2 * NQ, sizeof e->Q_D);
+  memcpy(e->contact, next, sizeof(touching) * CONTACTS), next += sizeof(touching) / sizeof(double) * CONTACTS;
+  memcpy(e->x, next, sizeof(double) * INPUTS), next += INPUTS;
+  memcpy(e->phi, next, sizeof(double) * FEATURES);
+  for (int i = 0; i < NQ; ++i) Q[i] = e->Q_C[i] + e->Q_G[i] + e->Q_D[i] + tau[i];
   if (!inverse_factor(&e->M[0][0], K)) return 0;
   for (int i = 0; i < NQ; ++i)
     for (int j = 0; j <= i; ++j) {
@@ -207,7 +140,8 @@ static int assemble(const double *restrict q, const double *restrict qd, const d
     double W[ROWS * NQ], P[NQ * ROWS], along[ROWS][NQ];
     for (int i = 0; i < CONTACTS; ++i) {
       e->closed[i] = closed == NULL || closed[i] != 0;
-      contact_rows(i, out + NQ * NQ + 2 * NQ + i * (9 + 6 * NQ), qd, e);
+      for (int j = 0; j < NQ; ++j) e->A[i][j] = e->closed[i] ? e->contact[i].A[j] : 0.0;
+      e->b[i] = e->closed[i] ? e->contact[i].b : 0.0;
     }
     for (int r = 0; r < ROWS; ++r) combine(&e->M_inv[0][0], e->A[r], NQ, NQ, along[r]);
     for (int r = 0; r < ROWS; ++r)
@@ -241,7 +175,7 @@ static int assemble(const double *restrict q, const double *restrict qd, const d
 #if COULOMB > 0
 /* u = -J_E^T s(v), the generalized force of a unit friction force */
 static void against_sliding(const touching *at, double smoothing, double *u) {
-  const double size = sqrt(dot3(at->sliding, at->sliding) + smoothing * smoothing);
+  const double size = sqrt(dot(at->sliding, at->sliding, 3) + smoothing * smoothing);
   for (int j = 0; j < NQ; ++j) {
     u[j] = 0.0;
     for (int x = 0; x < 3; ++x) u[j] -= at->sliding_jacobian[x][j] * at->sliding[x] / size;
@@ -419,7 +353,7 @@ static int against(const equations *restrict e, const double *restrict qd, int c
                    double smoothing, double mu, double stribeck_speed, double torsion_smoothing, double (*restrict E)[NQ]) {
   enum { VISCOUS, DRY, COULOMBS, STRIBECKS, TORSION };
   const touching *at = &e->contact[c];
-  const double square = dot3(at->sliding, at->sliding), size = sqrt(square + smoothing * smoothing);
+  const double square = dot(at->sliding, at->sliding, 3), size = sqrt(square + smoothing * smoothing);
   const double rate = dot(at->turning, qd, NQ), spin = sqrt(rate * rate + torsion_smoothing * torsion_smoothing);
   double push[NQ], relief = 1.0, load;
   int loaded = 0;
@@ -449,7 +383,7 @@ static int against(const equations *restrict e, const double *restrict qd, int c
 static void friction_error(const equations *restrict e, const double *restrict tau, const double *restrict gain, int c,
                            double mu, double smoothing, double (*restrict E)[NQ]) {
   const touching *at = &e->contact[c];
-  const double square = dot3(at->sliding, at->sliding), fading = smoothing * smoothing / (square + smoothing * smoothing);
+  const double square = dot(at->sliding, at->sliding, 3), fading = smoothing * smoothing / (square + smoothing * smoothing);
   double u[NQ], Q[NQ], qdd[NQ], multiplier[SOME(ROWS)];
   against_sliding(at, smoothing, u);
   for (int j = 0; j < NQ; ++j)
@@ -474,6 +408,31 @@ static void squares(const double *restrict x, const double *restrict Z, int widt
 /* exp(-r^2/2) */
 static void squaredexponential(double *restrict u, int m) {
   for (int j = 0; j < m; ++j) u[j] = exp(-0.5 * fmin(u[j], 600.0));
+}
+
+/* the slope of a profile by r^2 */
+static void squaredexponential_slope(double *restrict u, int m) {
+  for (int j = 0; j < m; ++j) u[j] = -0.5 * exp(-0.5 * fmin(u[j], 600.0));
+}
+
+static void matern32_slope(double *restrict u, int m) {
+  for (int j = 0; j < m; ++j) u[j] = -1.5 * exp(-fmin(sqrt(3.0 * u[j]), 300.0));
+}
+
+static void matern52_slope(double *restrict u, int m) {
+  for (int j = 0; j < m; ++j) u[j] = sqrt(5.0 * u[j]), u[j] = -5.0 / 6.0 * (1.0 + u[j]) * exp(-fmin(u[j], 300.0));
+}
+
+/* df/dx of f = sum of h_j |x - z_j|^2 or, of a linear kernel, of h_j x^T z_j */
+static void pull(const double *restrict Z, const double *restrict x, const double *restrict scale,
+                 const int *restrict column, int width, int m, const double *restrict h, int stationary,
+                 double *restrict slope) {
+  double sum = 0.0;
+  for (int j = 0; j < m; ++j) sum += h[j];
+  for (int d = 0; d < width; ++d) {
+    const double along = dot(Z + (long)d * m, h, m);
+    slope[column[d]] += scale[d] * (stationary ? 2.0 * (x[d] * sum - along) : along);
+  }
 }
 
 /* (1 + r) exp(-r) at sqrt(3) r */
@@ -596,6 +555,53 @@ int forcegp_predict(const double *q, const double *qd, const double *tau, const 
       for (int i = 0; quantities >> bit & 1u && i < SIZES[bit]; ++i, ++row)
         covariance[row * size + row] += SENSOR_VARIANCE[bit] ? SENSOR_VARIANCE[bit][i] : 0.0;
   return status;
+}
+
+/* ---- Jacobians of the mean ---- */
+
+/* whether the closed contacts are independent: the trace of the projector A L is their number */
+static int independent(const equations *restrict e) {
+  double missing = 0.0;
+  for (int r = 0; r < ROWS; ++r) {
+    missing += e->closed[r];
+    for (int i = 0; i < NQ; ++i) missing -= e->A[r][i] * e->L[i][r];
+  }
+  return missing < 0.5;
+}
+
+int forcegp_jacobian(const double *q, const double *qd, const double *tau, const unsigned char *closed,
+                     unsigned quantities, double *mean, double *jacobian) {
+  double sine[NQ], cosine[NQ], shut[SOME(ROWS)], f[SOME(SUPPORTED)], slope[SOME(SLOPES)], out[SIZE_OF_ALL * 3 * NQ];
+  const double *row = out;
+  equations e;
+  const int status = forcegp_predict(q, qd, tau, closed, quantities, 0, mean, NULL, NULL);
+  if (status) return status;
+  if (quantities & ~DIFFERENTIATED) return FORCEGP_NO_JACOBIAN;
+  assemble(q, qd, tau, closed, &e);
+  if (!independent(&e)) return FORCEGP_NO_JACOBIAN;
+  for (int i = 0; i < NQ; ++i) sine[i] = sin(q[i]), cosine[i] = cos(q[i]);
+  for (int r = 0; r < ROWS; ++r) shut[r] = e.closed[r];
+  all_slopes(&e, f, slope);
+  slopes_of_mean(q, qd, tau, shut, f, slope, sine, cosine, out);
+  for (int bit = 0; bit < QUANTITIES; ++bit) {
+    const long size = 3 * NQ * SIZES[bit];
+    if (quantities >> bit & 1u) memcpy(jacobian, row, sizeof(double) * size), jacobian += size;
+    if (DIFFERENTIATED >> bit & 1u) row += size;
+  }
+  return 0;
+}
+
+int forcegp_jacobian_many(long count, const double *q, const double *qd, const double *tau, const unsigned char *closed,
+                          unsigned quantities, double *mean, double *jacobian) {
+  const int d = forcegp_size(quantities);
+  int worst = 0;
+  for (long i = 0; i < count; ++i) {
+    const int status =
+        forcegp_jacobian(q + i * NQ, qd + i * NQ, tau + i * NQ, closed ? closed + i * CONTACTS : NULL, quantities,
+                         mean + i * d, jacobian + i * d * 3 * NQ);
+    worst = worst ? worst : status;
+  }
+  return worst;
 }
 
 void forcegp_forward_dynamics(const double *q, const double *qd, const double *force, double *qdd) {

@@ -24,6 +24,7 @@ extern "C" {
 #define FORCEGP_JAMMED 2     /* friction of a contact would press harder than it opposes */
 #define FORCEGP_UNRESOLVED 3 /* a variance is rounding */
 #define FORCEGP_NO_INERTIA 4 /* the mass matrix is not positive definite */
+#define FORCEGP_NO_JACOBIAN 5 /* not of this quantity, or the closed contacts are not independent */
 
 /* Number d of components of quantities. */
 int forcegp_size(unsigned quantities);
@@ -45,6 +46,17 @@ int forcegp_predict(const double *q, const double *qd, const double *tau, const 
 /* The same at `count` states, one after the other; returns the first error. */
 int forcegp_predict_many(long count, const double *q, const double *qd, const double *tau, const unsigned char *closed,
                          unsigned quantities, int noise, double *mean, double *covariance, double *beyond);
+
+/* Posterior mean and its Jacobian: of qdd, multiplier, contact force and joint friction.
+ *
+ * jacobian     d x 3 FORCEGP_JOINTS numbers, row by row: derivatives by q, then by qd, then by tau
+ */
+int forcegp_jacobian(const double *q, const double *qd, const double *tau, const unsigned char *closed,
+                     unsigned quantities, double *mean, double *jacobian);
+
+/* The same at `count` states, one after the other; returns the first error. */
+int forcegp_jacobian_many(long count, const double *q, const double *qd, const double *tau, const unsigned char *closed,
+                          unsigned quantities, double *mean, double *jacobian);
 
 /* Free acceleration M^-1 (force + Q_C + Q_G) of the robot alone. */
 void forcegp_forward_dynamics(const double *q, const double *qd, const double *force, double *qdd);

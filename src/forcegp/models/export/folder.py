@@ -1,4 +1,4 @@
-"""The folder of an exported model: C code, a test program with reference values, CMakeLists.txt, README."""
+"""The folder of an exported model: C code with its test program and CMakeLists.txt, or a CasADi function."""
 
 from __future__ import annotations
 
@@ -14,12 +14,13 @@ from forcegp.errors import ParameterError, check_name
 from forcegp.files import written_folder
 from forcegp.forces.measurements import Training
 from forcegp.forces.noise import HIGH, LOW
+from forcegp.models.export.casadi_function import write_casadi
 from forcegp.models.export.library import CompiledFit
 from forcegp.models.export.model import ExportedModel
 from forcegp.models.export.source import READ, c_source, template
 from forcegp.models.prediction import Predictor
 
-LANGUAGES = ("c",)
+LANGUAGES = ("c", "casadi")
 STATES, LOSS_STATES = 16, 200
 """States of the test program, and those at which the loss of a reduced posterior is measured."""
 TOLERANCE, ZERO = 1e-10, 1e-5
@@ -53,8 +54,19 @@ def write_export(
             f"{name!r} cannot be the prefix of C functions",
             expected="lower-case letters, digits and underscores, a letter first",
         )
-    own = (f"{name}.h", f"{name}.c", f"test_{name}.c", "CMakeLists.txt", "README.md", "build")
+    own = (
+        f"{name}.h",
+        f"{name}.c",
+        f"test_{name}.c",
+        "CMakeLists.txt",
+        "README.md",
+        "build",
+        f"{name}.casadi",
+    )
     check_destination(path, folder=True, own_files=own)
+    if language == "casadi":
+        write_casadi(model, Path(path), name)
+        return Export(Path(path), model.parts()[0].rank)
     header, source = c_source(model, name)
     result = Export(Path(path), model.parts()[0].rank, *loss_of(model, fit, training))
     where = "training" if training.samples else "random"
@@ -115,7 +127,7 @@ def random_states(model: ExportedModel, count: int) -> tuple[Tensor, ...]:
 
 
 def _reference(model: ExportedModel, fit: Predictor, name: str) -> str:
-    """C tables of states, and of mean and covariance of all quantities of Python there."""
+    """C tables of states, and of mean and covariance of all quantities and of Jacobians of Python there."""
     q, qd, tau, active = random_states(model, STATES)
     read = fit.predict(q, qd, tau, list(READ[:-1]), active=active)  # pyright: ignore[reportArgumentType]
     assert read.covariance is not None
@@ -127,6 +139,10 @@ def _reference(model: ExportedModel, fit: Predictor, name: str) -> str:
     lines.append(f"static const double TOLERANCE = {TOLERANCE!r}, ZERO = {ZERO!r};")
     flags = torch.nn.functional.pad(active, (0, int(not active.shape[1]))).int()
     tables = {"q": q, "qd": qd, "tau": tau, "mean": read.mean, "covariance": read.covariance.flatten(1)}
+    along = fit.linearize(q, qd, tau, active=active)
+    both = [torch.stack(along[at : at + 3], dim=-2).flatten(1) for at in (1, 5)]
+    tables["slopes"] = torch.cat(both, dim=1)
+    lines.append(f"enum {{ SLOPES = {tables['slopes'].shape[1]} }};")
     for key, x in {**tables, "closed": flags}.items():
         kind = "unsigned char" if key == "closed" else "double"
         rows = ",\n  ".join("{" + ", ".join(map(repr, row)) + "}" for row in x.tolist())

@@ -11,21 +11,23 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.errors import ModelError, NumericalError, check_name
+from forcegp.errors import ForceGPError, ModelError, NumericalError, check_name
 from forcegp.forces.noise import LOW
-from forcegp.forces.quantities import ForceField, flat_states
+from forcegp.forces.quantities import ForceField, ForceLinearization, flat_states
+from forcegp.models.export.mean import DIFFERENTIATED
 from forcegp.models.export.model import ExportedModel
 from forcegp.models.export.source import READ, c_source
 from forcegp.models.prediction import Prediction, Predictor
 from forcegp.native import load_library
 
 NAME = "forcegp"
-JAMMED, UNRESOLVED, NO_INERTIA = 2, 3, 4
+JAMMED, UNRESOLVED, NO_INERTIA, NO_JACOBIAN = 2, 3, 4, 5
 """What the C code returns other than 0."""
 MESSAGES = {
     JAMMED: "friction of a contact would press harder than it opposes",
     UNRESOLVED: "double precision does not resolve a predicted variance",
     NO_INERTIA: "the mass matrix is not positive definite",
+    NO_JACOBIAN: "closed contacts hold the robot in the same direction, so that a Jacobian is not determined",
 }
 
 
@@ -43,6 +45,8 @@ class CompiledFit(Predictor):
         self._many = self.library.forcegp_predict_many
         self._many.argtypes = [ctypes.c_long, *[ctypes.c_void_p] * 4, ctypes.c_uint, ctypes.c_int]
         self._many.argtypes += [ctypes.c_void_p] * 3
+        self._slopes = self.library.forcegp_jacobian_many
+        self._slopes.argtypes = [ctypes.c_long, *[ctypes.c_void_p] * 4, ctypes.c_uint, *[ctypes.c_void_p] * 2]
         self._sizes = {name: self.library.forcegp_size(1 << bit) for bit, name in enumerate(READ)}
         self._known: dict[str | tuple[str, ...], _Rows] = {}
 
@@ -81,24 +85,85 @@ class CompiledFit(Predictor):
         if system is not None and system is not self.system:
             raise ModelError("a compiled fit predicts on its own system", hint="use the predict of the fit")
         read = self._read(quantity if isinstance(quantity, str) else tuple(quantity))
-        nq = self.system.robot.nq
-        if active is None and self._plain(q, qd, tau):
-            arrays, batch = (q, qd, tau, None), q.shape[:-1]
-        else:
-            *given, batch = flat_states(self.system, q, qd, tau, active)
-            arrays = tuple(x.contiguous() for x in given)
+        nq, (arrays, batch) = self.system.robot.nq, self._states(q, qd, tau, active)
         mean, beyond = q.new_empty((*batch, read.size)), q.new_empty((*batch, nq))
         spread = q.new_empty((*batch, read.size, read.size)) if covariance else None
         pointers = [None if x is None else x.data_ptr() for x in (*arrays, mean, spread, beyond)]
         status = self._many(batch.numel(), *pointers[:4], read.bits, noise, *pointers[4:])
         if status:
-            flat_states(self.system, q, qd, tau, active)  # says which state is not finite
-            raise (ModelError if status == JAMMED else NumericalError)(MESSAGES[status])
+            raise self._error(status, q, qd, tau, active)
         if read.order is not None:
             mean = mean[..., read.order]
             spread = None if spread is None else spread[..., read.order, :][..., read.order]
         joints = self.system.robot.joint_names
         return Prediction(mean, spread, read.parts, beyond if LOW in self.model.tensors else None, joints)
+
+    def jacobian(
+        self,
+        q: Tensor,
+        qd: Tensor,
+        tau: Tensor,
+        quantity: str | Sequence[str] = "qdd",
+        *,
+        active: Tensor | None = None,
+    ) -> MeanJacobian:
+        """Posterior mean of quantities and its Jacobian by q, q̇ and τ.
+
+        Args:
+            q, qd, tau: `(*batch, nq)` states.
+            quantity: `"qdd"`, `"multiplier"`, `"contact_force"` or `"joint_friction"`, or several of them.
+            active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
+
+        Raises:
+            UnknownNameError: no such quantity.
+            ModelError: friction with which a contact jams.
+            NumericalError: closed contacts are not independent.
+        """
+        names = [quantity] if isinstance(quantity, str) else list(quantity)
+        for name in names:
+            check_name("quantity with a Jacobian", name, DIFFERENTIATED)
+        read, nq = self._read(tuple(names)), self.system.robot.nq
+        arrays, batch = self._states(q, qd, tau, active)
+        mean, slopes = q.new_empty((*batch, read.size)), q.new_empty((*batch, read.size, 3, nq))
+        pointers = [None if x is None else x.data_ptr() for x in (*arrays, mean, slopes)]
+        status = self._slopes(batch.numel(), *pointers[:4], read.bits, *pointers[4:])
+        if status:
+            raise self._error(status, q, qd, tau, active)
+        if read.order is not None:
+            mean, slopes = mean[..., read.order], slopes[..., read.order, :, :]
+        return MeanJacobian(mean, slopes[..., 0, :], slopes[..., 1, :], slopes[..., 2, :], read.parts)
+
+    def linearize(
+        self,
+        q: Tensor,
+        qd: Tensor,
+        tau: Tensor,
+        *,
+        active: Tensor | None = None,
+        system: ConstrainedSystem | None = None,
+    ) -> ForceLinearization:
+        """Mean acceleration and multiplier with their Jacobians, as `StructuredFit.linearize` gives them."""
+        if system is not None and system is not self.system:
+            raise ModelError("a compiled fit predicts on its own system", hint="use that of the fit")
+        found = self.jacobian(q, qd, tau, ["qdd", "multiplier"], active=active)
+        fields: list[Tensor] = []
+        for at in found.parts.values():
+            fields += [found.mean[..., at], *(x[..., at, :] for x in found[1:4])]
+        return ForceLinearization(*fields)
+
+    def _states(
+        self, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor | None
+    ) -> tuple[tuple[Tensor | None, ...], torch.Size]:
+        """Arrays of states for the C code, and the batch."""
+        if active is None and self._plain(q, qd, tau):
+            return (q, qd, tau, None), q.shape[:-1]
+        *given, batch = flat_states(self.system, q, qd, tau, active)
+        return tuple(x.contiguous() for x in given), batch
+
+    def _error(self, status: int, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor | None) -> ForceGPError:
+        """What the C code reports; raises at once if a state is not finite, and says which."""
+        flat_states(self.system, q, qd, tau, active)
+        return (ModelError if status == JAMMED else NumericalError)(MESSAGES[status])
 
     def _plain(self, *states: Tensor) -> bool:
         """Whether states can be read where they are."""
@@ -128,6 +193,22 @@ class CompiledFit(Predictor):
         bits, as_is = sum(1 << READ.index(name) for name in names), order == list(range(len(order)))
         self._known[quantity] = _Rows(bits, len(order), parts, None if as_is else order)
         return self._known[quantity]
+
+
+class MeanJacobian(NamedTuple):
+    """The mean of quantities with its Jacobian; row = component.
+
+    Attributes:
+        mean: `(*batch, d)`.
+        dq, dqd, dtau: `(*batch, d, nq)` derivatives by q, q̇ and τ.
+        parts: the slice of each quantity.
+    """
+
+    mean: Tensor
+    dq: Tensor
+    dqd: Tensor
+    dtau: Tensor
+    parts: dict[str, slice]
 
 
 class _Rows(NamedTuple):

@@ -11,8 +11,9 @@ of the training states determine most. What is left out only widens the error ba
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from itertools import accumulate
 
 import torch
 from torch import Tensor
@@ -73,6 +74,14 @@ class Functions:
     def size(self) -> int:
         """Number m of support points."""
         return 0 if self.rest is None else points(self.support)
+
+    def columns(self, names: Sequence[str] | None) -> list[int]:
+        """Columns of named inputs, or of all."""
+        widths = {name: x.shape[-1] for name, x in self.support.items()}
+        starts = dict(zip(widths, accumulate(widths.values(), initial=0), strict=False))
+        return [
+            starts[name] + i for name in (widths if names is None else names) for i in range(widths[name])
+        ]
 
 
 @dataclass(frozen=True, eq=False)
@@ -194,6 +203,11 @@ class ExportedModel:
             C, first = tuple(whole[..., 1:]), (0,) * len(whole)
             parts.append(Functions(prior, cut.rest, cut.finite, support, whole[..., 0], None, C, first))
         return parts
+
+
+def row_of(x: Tensor, k: int) -> Tensor:
+    """The row of component k, or the one that all share."""
+    return x[k if len(x) > 1 else 0]
 
 
 def _none(features: Features) -> Features:

@@ -9,38 +9,34 @@ import re
 from collections.abc import Iterable
 from importlib.resources import files
 from itertools import accumulate
+from typing import NamedTuple
 
 import numpy as np
 import torch
 from torch import Tensor
 
-from forcegp.compiled.mechanics import _forces, _point_blocks
-from forcegp.compiled.program import Links, Program, regressor_program, trace
+from forcegp.compiled.program import Links, regressor_program, trace
 from forcegp.compiled.source import c_function
 from forcegp.constraints import SurfaceContact
 from forcegp.constraints.gauss import rank_tolerance
 from forcegp.forces.noise import GROWTH, HIGH, LOW, SPREAD, STICK_NOISE, STICK_SPEED
 from forcegp.forces.priors import contact
-from forcegp.forces.priors.base import CONSTRAINT, CONTACT, JOINT, ForcePrior
+from forcegp.forces.priors.base import CONSTRAINT, CONTACT, JOINT
 from forcegp.forces.priors.inertial import InertialPrior
-from forcegp.forces.priors.joint import TERMS, JointForcePrior, JointFrictionPrior
+from forcegp.forces.priors.joint import TERMS, JointFrictionPrior
 from forcegp.forces.quantities import QUANTITIES
 from forcegp.gp import kernels
 from forcegp.gp.basis import KernelPart
 from forcegp.gp.features import SMALLEST_FRACTION, stacked
-from forcegp.models.export.model import ExportedModel, Functions
+from forcegp.models.export.mean import ARGUMENTS, DIFFERENTIATED, LearnedMotion
+from forcegp.models.export.model import ExportedModel, Functions, row_of
 
 READ = (*QUANTITIES, "joint_friction")
 """The quantities of the C code, in the order of its bits; the last one is not in `QUANTITIES`."""
-TARGETS, SURFACES = (JOINT, CONTACT, CONSTRAINT), ("plane", "sphere", "cylinder")
-ALONG = {
-    "position": [f"dot3(at->tangent[{i}], at->position)" for i in range(2)],
-    "velocity": [f"dot3(at->tangent[{i}], at->velocity)" for i in range(2)],
-    "speed": ["sqrt(fmax(dot3(at->sliding, at->sliding), 1e-30))"],
-}
-"""Inputs along a surface, of `touching *at`."""
-ARGUMENTS = """const double *restrict q, const double *restrict qd, const double *restrict tau,
+TARGETS = (JOINT, CONTACT, CONSTRAINT)
+GIVEN = """const double *restrict q, const double *restrict qd, const double *restrict tau,
     const equations *restrict e, const double *restrict gain, int spread, latent *restrict f"""
+SLOPES = "const equations *restrict e, double *restrict f, double *restrict slope"
 
 
 def c_source(model: ExportedModel, name: str) -> tuple[str, str]:
@@ -59,7 +55,7 @@ def c_source(model: ExportedModel, name: str) -> tuple[str, str]:
     )
     head = '#include <math.h>\n#include <string.h>\n#include "forcegp.h"\n'
     head += "#ifdef __cplusplus\n#define restrict __restrict__\n#endif\n"
-    blocks = [head, "\n".join(writer.lines), *_mechanics(model), before, *used, *priors, after]
+    blocks = [head, "\n".join(writer.lines), *_programs(writer.mean), before, *used, *priors, after]
     robot, contacts = model.system.robot, model.system.contact_names
     fields = {
         "nq": robot.nq,
@@ -94,21 +90,20 @@ def _called(text: str) -> str:
     return text.partition("static ")[2].partition("(")[0].split()[-1]
 
 
-def _mechanics(model: ExportedModel) -> list[str]:
-    """M, Q_C, Q_G and, for each contact, position, Jacobian and bias acceleration; forward dynamics; Y."""
-    robot, links = model.system.robot, Links(model.system.robot)
-    blocks = _forces(links)
-    for touching in model.system.contacts:
-        ((frame, point),) = touching.anchors
-        at = np.asarray([float(x) for x in point])
-        blocks += _point_blocks(links, robot, robot.frame_index(frame), at)[1:]
+def _programs(mean: LearnedMotion) -> list[str]:
+    """Mechanics, touching points and what priors read of the state; forward dynamics; Y; Jacobians."""
+    robot, quantities = mean.robot, mean.quantities()
+    blocks = [mean.M, mean.Q_C, mean.Q_G, mean.Q_D, *(x for at in mean.touching for x in at), *mean.x]
     outputs = [x for block in blocks for x in block.flat]
+    outputs += [x for features in mean.phi for phi in features for x in phi]
     programs = {
-        "mechanics": Program(("q", "qd"), (len(outputs),), links.graph, outputs),
+        "mechanics": mean.program(outputs, ARGUMENTS[:3]),
         "forward_dynamics": trace(robot, "forward_dynamics"),
     }
-    if any(isinstance(prior, InertialPrior) for prior in model.posterior.priors):
+    if any(isinstance(part.prior, InertialPrior) for part in mean.parts):
         programs["regressor"] = regressor_program(Links(robot))
+    values = np.concatenate([quantities[x] for x in DIFFERENTIATED])
+    programs["slopes_of_mean"] = mean.program(mean.tangents(values).flat, (*ARGUMENTS, "f", "slope"))
     return [f"#define MECHANICS {len(outputs)}", *(c_function(*item) for item in programs.items())]
 
 
@@ -116,7 +111,8 @@ class Writer:
     """Writes the code of priors, and in `lines` the tables that it reads."""
 
     def __init__(self, model: ExportedModel) -> None:
-        self.model, self.parts, self.lines = model, model.parts(), []
+        self.model, self.parts, self.lines = model, model.parts(), list[str]()
+        self.mean, self._tables = LearnedMotion(model, self.parts, differentiate=True), dict[str, str]()
         self.starts = list(accumulate((part.components for part in self.parts), initial=0))
         self._constants()
         self._noise()
@@ -124,14 +120,16 @@ class Writer:
     def array(self, values: Tensor | Iterable[float], name: str = "", kind: str = "double") -> str:
         """A constant array, and its name."""
         x = values if isinstance(values, Tensor) else torch.tensor(list(values), dtype=torch.float64)
-        name = name or f"TABLE_{len(self.lines)}"
         rows = x.detach().double().reshape(-1, x.shape[-1] if x.ndim else 1).tolist() or [[0.0]]
         texts = [", ".join(repr(v) if kind == "double" else str(int(v)) for v in row) for row in rows]
         rows = [f"{{{text}}}" for text in texts] if x.ndim > 1 else texts[0].split(", ")
         body = ",\n  ".join(rows)
         shape = "".join(f"[{n}]" for n in x.shape) if x.numel() else "[1]"
-        self.lines.append(f"static const {kind} {name}{shape} = {{\n  {body}}};")
-        return name
+        text = f"{shape} = {{\n  {body}}};"
+        if name or text not in self._tables:
+            self._tables[text] = name or f"TABLE_{len(self.lines)}"
+            self.lines.append(f"static const {kind} {self._tables[text]}{text}")
+        return self._tables[text]
 
     def _constants(self) -> None:
         system, process = self.model.system, self.model.posterior.process
@@ -150,17 +148,24 @@ class Writer:
             "QUANTITIES": len(READ),
             "SIZE_OF_ALL": sum(sizes),
             "COULOMB": len(process.coulomb),
+            "INPUTS": sum(x.size for x in self.mean.x),
+            "FEATURES": sum(len(phi) for features in self.mean.phi for phi in features),
+            "SUPPORTED": sum(part.components for part in self.parts if part.size),
+            "SLOPES": sum(
+                part.components * x.shape[1]
+                for part, x in zip(self.parts, self.mean.x, strict=True)
+                if part.size
+            ),
+            "DIFFERENTIATED": f"({' | '.join(f'FORCEGP_{x.upper()}' for x in DIFFERENTIATED)})",
             "SMALLEST_FRACTION": repr(SMALLEST_FRACTION),
             "RANK_TOLERANCE": repr(rank_tolerance(robot.dtype)),
         }
         self.lines += [f"#define {name} {value}" for name, value in defined.items()]
-        self.lines.append("enum { JOINT, CONTACT, CONSTRAINT, JOINT_FRICTION, PLANE = 0, SPHERE, CYLINDER };")
+        self.lines.append("enum { JOINT, CONTACT, CONSTRAINT, JOINT_FRICTION };")
         self.array(sizes, "SIZES", "int")
         owners = [part.prior for part in self.parts for _ in range(part.components)]
         self.array([TARGETS.index(prior.target) for prior in owners], "TARGET", "int")
         self.array([float(isinstance(prior, JointFrictionPrior)) for prior in owners], "IS_FRICTION", "int")
-        for name in ("damping", "friction", "friction_velocity", "stribeck", "stribeck_velocity"):
-            self.array(getattr(robot, name), name.upper())
         terms = process.mean.terms  # pyright: ignore[reportFunctionMemberAccess]
         self.array([float(term in terms) for term in TERMS], "MEAN_TERMS")
         for part, start in zip(self.parts, self.starts, strict=False):
@@ -168,8 +173,6 @@ class Writer:
                 self.lines.append(f"#define INERTIAL {start}")
                 self.lines.append(f"#define INERTIAL_COLUMNS {part.components}")
                 self.array(part.prior.scale(robot), "INERTIAL_SCALE")
-        if contacts:
-            self._surfaces(contacts)
         if process.coulomb:
             where = [system.contact_names.index(x.contact) for x in process.coulomb]
             self.array(where, "COULOMB_CONTACT", "int")
@@ -191,31 +194,18 @@ class Writer:
         sensors = [self.array(self.model.noise[x] ** 2) if x in self.model.noise else "0" for x in READ]
         self.lines.append(f"static const double *const SENSOR_VARIANCE[] = {{{', '.join(sensors)}}};")
 
-    def _surfaces(self, contacts: list[SurfaceContact]) -> None:
-        """The surfaces that the tips move on, and the gains of the stabilization b − 2ωξ ċ − ω² c."""
-        on, zero = [contact.center_surface for contact in contacts], (0.0, 0.0, 0.0)
-        self.array([SURFACES.index(vars(x)["type"]) for x in on], "SURFACE", "int")
-        self.array(torch.tensor([vars(x).get("center", zero) for x in on], dtype=torch.float64), "CENTER")
-        axes = [vars(x).get("normal", vars(x).get("axis", zero)) for x in on]
-        self.array(torch.tensor(axes, dtype=torch.float64), "AXIS")
-        self.array([vars(x)["offset" if "offset" in vars(x) else "radius"] for x in on], "SIZE")
-        self.array([contact.radius for contact in contacts], "TIP")
-        rule = self.model.system.baumgarte
-        omega, xi = (0.0, 0.0) if rule is None else (rule.natural_frequency, rule.damping_ratio)
-        self.lines += [f"#define RATE_GAIN {2.0 * omega * xi!r}", f"#define ERROR_GAIN {omega**2!r}"]
-
     def priors(self) -> list[str]:
         """A function for each prior, and the one that calls them all."""
         texts, calls = [], []
         for p, part in enumerate(self.parts):
             body = [*self._operator(part, self.starts[p]), *self._functions(p, part)]
             title = f"/* {_comment(part.prior.name)}: {type(part.prior).__name__} */\n"
-            title += f"static int prior_{p}({ARGUMENTS}) {{\n"
+            title += f"static int prior_{p}({GIVEN}) {{\n"
             unread = "  (void)q, (void)qd, (void)tau, (void)e, (void)gain, (void)spread;\n"
             texts.append(title + unread + "\n".join(body) + "\n  return 0;\n}\n")
             calls.append(f"  if (prior_{p}(q, qd, tau, e, gain, spread, f) != 0) return FORCEGP_JAMMED;\n")
-        texts.append(f"static int latent_forces({ARGUMENTS}) {{\n{''.join(calls)}  return 0;\n}}\n")
-        return texts
+        texts.append(f"static int latent_forces({GIVEN}) {{\n{''.join(calls)}  return 0;\n}}\n")
+        return [*texts, *self._slopes()]
 
     def _operator(self, part: Functions, start: int) -> list[str]:
         """Code of E(x), which carries f to generalized forces; that of `INERTIAL` is in `controller.c`."""
@@ -233,26 +223,25 @@ class Writer:
             law = next(x for x in prior.friction if x.contact == prior.contact)
             numbers = f"{float(law.coefficient)!r}, {float(law.smoothing)!r}"
             return [f"  friction_error(e, tau, gain, {c}, {numbers}, {E});"]
-        at = f"  const touching *const at = &e->contact[{c}];"
         if not isinstance(prior, contact.SlidingFrictionPrior):
-            return [at, f"  tangential(e, {c}, {E});"]
+            return [f"  tangential(e, {c}, {E});"]
         terms = self.array([contact.TERMS.index(term) for term in prior.terms], kind="int")
         numbers = (prior.smoothing, prior.friction_coefficient, prior.stribeck_speed, prior.torsion_smoothing)
         called = f"against(e, qd, {c}, {terms}, {len(prior.terms)}, {', '.join(map(repr, numbers))}, {E})"
-        return [at, f"  if (! {called}) return 1;"]
+        return [f"  if (! {called}) return 1;"]
 
     def _functions(self, p: int, part: Functions) -> list[str]:
         """Code of the functions V of each component, and of their posterior."""
-        inputs, shared = self._inputs(p, part)
-        lines, m = [inputs], part.size
-        kernel = KernelCode(self, part, shared, lines)
-        for k in range(part.components):
+        before = self.mean.phi[:p]
+        lines, m, first = [], part.size, sum(len(phi) for features in before for phi in features)
+        kernel = KernelCode(self, p, lines, f"e->x + {sum(x.size for x in self.mean.x[:p])}")
+        for k, phi in enumerate(self.mean.phi[p]):
             value, variance = ("", "0.0") if part.rest is None else kernel.covariance(part.rest, k)
-            phi = [] if part.finite is None else kernel.features(part.finite, k)
             lines += [f"  {{\n    double V[{part.weights.shape[1] or 1}];"]
             if m:
                 lines.append(f"    for (int j = 0; j < {m}; ++j) V[j] = {value};")
-            lines += [f"    V[{m + i}] = {feature};" for i, feature in enumerate(phi)]
+            lines += [f"    V[{m + i}] = e->phi[{first + i}];" for i in range(len(phi))]
+            first += len(phi)
             white, kept = "0", 0
             if part.whitening is not None and m:
                 white, kept = self.array(part.whitening[k].flatten()), part.whitening[k].shape[1]
@@ -261,74 +250,49 @@ class Writer:
             lines.append(f"    component(V, {m}, {len(phi)}, {variance}, {tables}, {rest});\n  }}")
         return lines
 
-    def _inputs(self, p: int, part: Functions) -> tuple[str, bool]:
-        """Code of the standardized inputs x, and whether all components share them."""
-        raw, scales = self._raw_inputs(part.prior), self.model.posterior.process.scales[p]
-        shared, rows = all(x.ndim == 2 for x in part.support.values()), []
-        for k in range(1 if shared else part.components):
-            row = []
-            for name, columns in raw.items():
-                given = columns if shared else [columns[k]]
-                pair = ((x if shared else x[k]).tolist() for x in (scales.mean[name], scales.std[name]))
-                row += [f"({x} - {m!r}) / {s!r}" for x, m, s in zip(given, *pair, strict=True)]
-            rows.append(row)
-        body = ",\n".join(f"    {{{', '.join(row)}}}" for row in rows)
-        return f"  const double x[{len(rows)}][{len(rows[0])}] = {{\n{body}}};\n  (void)x;", shared
+    def _slopes(self) -> list[str]:
+        """For each prior with support points, its share of the mean of f and the derivatives by x."""
+        texts, calls, first, start = [], "", 0, 0
+        for p, part in enumerate(self.parts):
+            if not part.size or part.rest is None:
+                continue
+            lines, width = list[str](), self.mean.x[p].shape[1]
+            kernel = KernelCode(self, p, lines, f"e->x + {sum(x.size for x in self.mean.x[:p])}", True)
+            for k in range(part.components):
+                value = kernel.covariance(part.rest, k)[0]
+                lines += kernel.slopes(part.rest, k, value, f"f + {first + k}", f"slope + {start}")
+                start += width
+            title = f"/* {_comment(part.prior.name)}: f and df/dx */\n"
+            title += f"static void slopes_{p}({SLOPES}) {{\n"
+            texts.append(title + "\n".join(lines) + "\n}\n")
+            calls += f"  slopes_{p}(e, f, slope);\n"
+            first += part.components
+        unread = "  (void)e, (void)f;\n  memset(slope, 0, sizeof(double) * SLOPES);\n"
+        return [*texts, f"static void all_slopes({SLOPES}) {{\n{unread + calls}}}\n"]
 
-    def _raw_inputs(self, prior: ForcePrior) -> dict[str, list[str]]:
-        """C expressions of the inputs by name; of joint friction, one for each joint."""
-        joints, revolute = range(self.model.system.robot.nq), self.model.system.robot.revolute.bool().tolist()
-        if isinstance(prior, contact.NormalForcePrior):
-            return self._raw_inputs(prior.like)
-        if isinstance(prior, JointFrictionPrior):
-            raw = {"velocity": [f"qd[{i}]" for i in joints]}
-            for n, speed in enumerate(prior.speeds):
-                raw[f"coulomb_{n}"] = [f"tanh(qd[{i}] / {speed!r})" for i in joints]
-            if prior.load:
-                raw["load"] = [f"fabs(e->Q_G[{i}]) * {raw['coulomb_0'][i]}" for i in joints]
-            return raw
-        if isinstance(prior, contact.SurfaceForcePrior):
-            return {name: ALONG[name] for name in prior.inputs}
-        if not isinstance(prior, JointForcePrior):
-            return {"one": ["0.0"]}
-        raw = {name: [f"{name}[{i}]" for i in joints] for name in prior.inputs}
-        if prior.periodic and "q" in raw:
-            raw["q"] = [f"{turn}(q[{i}])" for turn in ("sin", "cos") for i in joints if revolute[i]]
-            raw["q"] += [f"q[{i}]" for i in joints if not revolute[i]]
-        return raw
+
+class Leaf(NamedTuple):
+    """A kernel of support points in C: its array `u`, their table, its inputs with their factors, and what
+    the array is multiplied by and added to."""
+
+    u: str
+    table: str
+    columns: list[int]
+    scale: list[float]
+    size: float
+    bias: float
 
 
 class KernelCode:
     """C code of the kernel of one prior; what a leaf needs is computed once in front of its use."""
 
-    def __init__(self, writer: Writer, part: Functions, shared: bool, lines: list[str]) -> None:
-        self.writer, self.part, self.shared, self.lines = writer, part, shared, lines
-        self._known: dict[tuple[int, int], str] = {}
-
-    def _x(self, kernel: kernels.Linear | kernels.Stationary, k: int, scale: Tensor) -> list[str]:
-        """The inputs of a kernel, each with its factor."""
-        widths = {name: x.shape[-1] for name, x in self.part.support.items()}
-        starts = dict(zip(widths, accumulate(widths.values(), initial=0), strict=False))
-        names = tuple(widths) if kernel.inputs is None else kernel.inputs
-        columns = [starts[name] + i for name in names for i in range(widths[name])]
-        row, factors = 0 if self.shared else k, scale.expand(len(columns)).tolist()
-        return [f"{s!r} * x[{row}][{c}]" for c, s in zip(columns, factors, strict=True)]
-
-    def features(self, part: KernelPart, k: int) -> list[str]:
-        """φ(x) of component k."""
-        kernel, params = part.kernel, part.params
-        if isinstance(kernel, kernels.Linear):
-            bias = float(_row(kernel.bias_std(params), k))
-            return [*self._x(kernel, k, _row(kernel.slope_std(params), k)), repr(bias)]
-        if isinstance(kernel, kernels.Constant):
-            return [repr(float(_row(kernel.std(params), k)))]
-        assert isinstance(kernel, kernels.Sum)
-        left, right = (self.features(KernelPart(*side), k) for side in kernel.parts(params))
-        return (
-            [f"{a} * {b}" for a in left for b in right]
-            if isinstance(kernel, kernels.Product)
-            else left + right
-        )
+    def __init__(self, writer: Writer, p: int, lines: list[str], x: str, differentiate: bool = False) -> None:
+        self.writer, self.part, self.lines = writer, writer.parts[p], lines
+        self.differentiate = differentiate
+        rows, self._width = writer.mean.x[p].shape
+        self.shared = rows == 1 and all(z.ndim == 2 for z in self.part.support.values())
+        self._known: dict[tuple[int, int], Leaf] = {}
+        lines.append(f"  const double *const x = {x};\n  (void)x;")
 
     def covariance(self, part: KernelPart, k: int) -> tuple[str, str]:
         """k(x, z_j) and k(x, x) of component k."""
@@ -338,48 +302,81 @@ class KernelCode:
             sign = "*" if isinstance(kernel, kernels.Product) else "+"
             return f"({a} {sign} {b})", f"({aa} {sign} {bb})"
         if isinstance(kernel, kernels.Constant):
-            value = repr(float(_row(kernel.std(params), k).square()))
+            value = repr(float(row_of(kernel.std(params), k).square()))
             return value, value
+        leaf = self._leaf(part, k)
+        if isinstance(kernel, kernels.Stationary):
+            return f"{leaf.size!r} * {leaf.u}[j]", repr(leaf.size)
+        square = " + ".join(f"({a}) * ({a})" for a in self._x(leaf, k))
+        return (
+            f"({leaf.size!r} * {leaf.u}[j] + {leaf.bias!r})",
+            f"({leaf.size!r} * ({square}) + {leaf.bias!r})",
+        )
+
+    def slopes(self, part: KernelPart, k: int, value: str, f: str, slope: str) -> list[str]:
+        """Code of f = Σ w_j k(x, z_j) of component k, and of ∂f/∂x."""
+        m, w = self.part.size, self.writer.array(self.part.weights[k])
+        lines = [f"  {{\n    double h[{m}];\n    for (int j = 0; j < {m}; ++j) h[j] = {value};"]
+        lines.append(f"    *({f}) = dot(h, {w}, {m});")
+        for leaf, stationary, factor in self._leaves(part, k, ""):
+            column, scale = self.writer.array(leaf.columns, kind="int"), self.writer.array(leaf.scale)
+            by = f" * d_{leaf.u}[j]" if stationary else ""
+            lines.append(f"    for (int j = 0; j < {m}; ++j) h[j] = {w}[j] * {leaf.size!r}{by}{factor};")
+            rest = f"{scale}, {column}, {len(leaf.columns)}, {m}, h, {int(stationary)}, {slope}"
+            lines.append(f"    pull({leaf.table}, x_{leaf.u}, {rest});")
+        return [*lines, "  }"]
+
+    def _leaves(self, part: KernelPart, k: int, factor: str) -> Iterable[tuple[Leaf, bool, str]]:
+        """The leaves of a kernel that depend on x, each with what it is multiplied by."""
+        if isinstance(part.kernel, kernels.Sum):
+            sides = [KernelPart(*side) for side in part.kernel.parts(part.params)]
+            for side, other in zip(sides, sides[::-1], strict=True):
+                product = isinstance(part.kernel, kernels.Product)
+                more = f" * {self.covariance(other, k)[0]}" if product else ""
+                yield from self._leaves(side, k, factor + more)
+        elif not isinstance(part.kernel, kernels.Constant):
+            yield self._leaf(part, k), isinstance(part.kernel, kernels.Stationary), factor
+
+    def _leaf(self, part: KernelPart, k: int) -> Leaf:
+        """A local array over the support points: xᵀz_j, or a profile of |x − z_j|."""
+        kernel, params = part.kernel, part.params
         if isinstance(kernel, kernels.Linear):
             # k = Σ_d (s σ_d)² x_d x′_d + σ_0²
-            bias = float(_row(kernel.bias_std(params), k).square())
-            common = kernel.shared and self.shared
+            bias, common = float(row_of(kernel.bias_std(params), k).square()), kernel.shared and self.shared
             size = float((2.0 * params["log_std"][k]).exp()) if common else 1.0
-            slope = params["log_slope_std"][0].exp() if common else _row(kernel.slope_std(params), k)
-            x, Z = self._x(kernel, k, slope), self._support(kernel, k) * slope
-            u = self._leaf((id(params["log_slope_std"]), 0 if common else k), "combine", x, Z)
-            square = " + ".join(f"({a}) * ({a})" for a in x)
-            return f"({size!r} * {u}[j] + {bias!r})", f"({size!r} * ({square}) + {bias!r})"
-        assert isinstance(kernel, kernels.Stationary)
-        variance, inverse = (
-            float(_row((2.0 * params["log_std"]).exp(), k)),
-            torch.exp(-params["log_lengthscale"]),
-        )
-        each, scale = 0 if self.shared and len(inverse) == 1 else k, _row(inverse, k)
-        x, Z = self._x(kernel, k, scale), self._support(kernel, k) * scale
-        u = self._leaf((id(params["log_lengthscale"]), each), type(kernel).__name__.lower(), x, Z)
-        return f"{variance!r} * {u}[j]", repr(variance)
+            scale = params["log_slope_std"][0].exp() if common else row_of(kernel.slope_std(params), k)
+            key, kind = (id(params["log_slope_std"]), 0 if common else k), "combine"
+        else:
+            assert isinstance(kernel, kernels.Stationary)
+            bias, size = 0.0, float(row_of((2.0 * params["log_std"]).exp(), k))
+            inverse, kind = torch.exp(-params["log_lengthscale"]), type(kernel).__name__.lower()
+            scale = row_of(inverse, k)
+            key = (id(params["log_lengthscale"]), 0 if self.shared and len(inverse) == 1 else k)
+        if key not in self._known:
+            columns = self.part.columns(kernel.inputs)
+            z, u = stacked(self.part.support, kernel.inputs), f"u{len(self._known)}"
+            Z = (z if z.ndim == 2 else z[k]) * scale
+            table = self.writer.array(Z.mT.flatten()) if len(Z) else ""
+            self._known[key] = Leaf(u, table, columns, scale.expand(len(columns)).tolist(), size, bias)
+            self.lines += self._array(self._known[key], kind, k)
+        return self._known[key]._replace(size=size, bias=bias)
 
-    def _support(self, kernel: kernels.Linear | kernels.Stationary, k: int) -> Tensor:
-        z = stacked(self.part.support, kernel.inputs)
-        return z if z.ndim == 2 else z[k]
+    def _x(self, leaf: Leaf, k: int) -> list[str]:
+        """The inputs of a leaf, each with its factor."""
+        first = 0 if self.shared else k * self._width
+        return [f"{s!r} * x[{first + c}]" for c, s in zip(leaf.columns, leaf.scale, strict=True)]
 
-    def _leaf(self, key: tuple[int, int], kind: str, x: list[str], Z: Tensor) -> str:
-        """A local array over the support points: xᵀz_j (`combine`), or a profile of |x − z_j|."""
-        m = self.part.size
-        if key not in self._known and m:
-            u = self._known[key] = f"u{len(self._known)}"
-            table = self.writer.array(Z.mT.flatten())
-            self.lines.append(f"  double {u}[{m}];\n  {{\n    const double scaled[] = {{{', '.join(x)}}};")
-            if kind == "combine":
-                self.lines.append(f"    combine({table}, scaled, {len(x)}, {m}, {u});\n  }}")
-            else:
-                self.lines.append(
-                    f"    squares(scaled, {table}, {len(x)}, {m}, {u});\n    {kind}({u}, {m});\n  }}"
-                )
-        return self._known.get(key, "")
-
-
-def _row(x: Tensor, k: int) -> Tensor:
-    """The row of component k, or the one that all share."""
-    return x[k if len(x) > 1 else 0]
+    def _array(self, leaf: Leaf, kind: str, k: int) -> list[str]:
+        """Code that computes a leaf."""
+        u, m, x = leaf.u, self.part.size, self._x(leaf, k)
+        if not m:
+            return []
+        lines = [f"  const double x_{u}[] = {{{', '.join(x)}}};\n  double {u}[{m}];"]
+        if kind == "combine":
+            return [*lines, f"  combine({leaf.table}, x_{u}, {len(x)}, {m}, {u});"]
+        lines.append(f"  squares(x_{u}, {leaf.table}, {len(x)}, {m}, {u});")
+        if self.differentiate:
+            lines.append(
+                f"  double d_{u}[{m}];\n  memcpy(d_{u}, {u}, sizeof {u});\n  {kind}_slope(d_{u}, {m});"
+            )
+        return [*lines, f"  {kind}({u}, {m});"]

@@ -1,0 +1,77 @@
+"""The posterior mean of a fit as a CasADi function, with exact derivatives of any order."""
+
+from __future__ import annotations
+
+import operator
+from collections.abc import Iterable, Mapping
+from pathlib import Path
+from typing import Any
+
+from forcegp.compiled.expression import Graph, Scalar
+from forcegp.destination import write_or_keep
+from forcegp.errors import optional_module
+from forcegp.files import written_folder
+from forcegp.models.export.mean import ARGUMENTS, DIFFERENTIATED, LearnedMotion
+from forcegp.models.export.model import ExportedModel
+from forcegp.models.export.source import template
+
+OPERATORS = {
+    "neg": operator.neg,
+    "+": operator.add,
+    "-": operator.sub,
+    "*": operator.mul,
+    "/": operator.truediv,
+}
+
+
+def casadi_function(model: ExportedModel, name: str = "forcegp") -> Any:
+    """A `casadi.Function` from (q, q̇, τ, closed) to the mean of each of `DIFFERENTIATED`.
+
+    `closed` has a 1 for each contact that is closed, and a 0 for one that is open. The closed contacts must
+    be independent of each other.
+
+    Raises:
+        ModelError: a part of the model has no such form; names it.
+        MissingDependencyError: CasADi is not installed.
+    """
+    ca: Any = optional_module("casadi", "a CasADi function")
+    model.check()
+    mean, nq = LearnedMotion(model, model.parts(), differentiate=False), model.system.robot.nq
+    sizes = dict(zip(ARGUMENTS, (nq, nq, nq, len(model.system.contacts)), strict=True))
+    given = {x: ca.SX.sym(x, n) for x, n in sizes.items()}
+    given |= {"sin": ca.sin(given["q"]), "cos": ca.cos(given["q"])}
+    values = mean.quantities()
+    results = [_vector(ca, mean.graph, given, values[x].flat) for x in DIFFERENTIATED]
+    names = list(ARGUMENTS), list(DIFFERENTIATED)
+    return ca.Function(name, [given[x] for x in ARGUMENTS], results, *names)
+
+
+def _vector(ca: Any, graph: Graph, given: Mapping[str, Any], outputs: Iterable[Scalar]) -> Any:
+    """Scalars as one CasADi vector."""
+    outputs, values = list(outputs), dict[int, Any]()
+    functions = {"step": lambda x: x > 0.0, "exp": ca.exp, "tanh": ca.tanh, "sqrt": ca.sqrt} | OPERATORS
+    for position in graph.live(outputs):
+        op, left, right = graph.nodes[position]
+        if op == "const":
+            values[position] = ca.SX(left)
+        elif op == "input":
+            values[position] = given[left][right]  # pyright: ignore[reportArgumentType]
+        else:
+            values[position] = functions[op](*(values[x] for x in (left, right) if isinstance(x, int)))
+    return ca.vertcat(*(values[x.position] for x in outputs)) if outputs else ca.SX(0, 1)
+
+
+def write_casadi(model: ExportedModel, path: Path, name: str) -> None:
+    """Write the function to a folder, with a README; errors as of `casadi_function`."""
+    function = casadi_function(model, name)
+    names = {"joints": model.system.robot.joint_names, "contacts": model.system.contact_names or ("none",)}
+    fields: dict[str, object] = {"name": name, "robot": model.system.robot.name}
+    fields |= {key: ", ".join(x) for key, x in names.items()}
+
+    def write(folder: Path) -> None:
+        with written_folder(folder) as temporary:
+            function.save(str(temporary / f"{name}.casadi"))
+            text = template("casadi.md.in", fields)
+            (temporary / "README.md").write_text(text, encoding="utf-8")
+
+    write_or_keep(write, path)
