@@ -13,7 +13,7 @@ from forcegp.errors import ModelError
 from forcegp.forces.noise import STICK_NOISE, TORQUE_NOISE
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import JointFrictionPrior
-from forcegp.forces.problem import force_posterior, kernel_parameters, log_likelihood, without_inducing
+from forcegp.forces.problem import force_posterior, kernel_parameters, without_inducing
 from forcegp.forces.quantities import affine_map
 from forces.cases import draw, logged, mixed_contacts, two_contacts
 from forces.textbook import Textbook
@@ -104,7 +104,7 @@ def test_a_power_of_the_likelihood_is_that_many_samples() -> None:
     torch.testing.assert_close(
         tempered.read_mean(twice.system, states, z), once.posterior.read_mean(twice.system, states, z)
     )
-    assert log_likelihood(tempered) < 0.0
+    assert tempered.latent.log_likelihood < 0.0
 
 
 def test_noise_of_a_predicted_measurement() -> None:
