@@ -52,12 +52,18 @@ from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.base import FittedModel
 from forcegp.models.export.folder import Export, write_export
 from forcegp.models.export.library import CompiledFit
-from forcegp.models.export.model import ExportedModel
+from forcegp.models.export.model import ExportedModel, Sampling
 from forcegp.models.external_wrench import ExternalWrench, external_wrench
 from forcegp.models.fit_result import FitResult
 from forcegp.models.prediction import Prediction, in_pieces
 from forcegp.models.structured_file import pack, unpack
-from forcegp.models.structured_learning import Specification, constant_inputs, prepared, training_for
+from forcegp.models.structured_learning import (
+    REST_SPEED,
+    Specification,
+    constant_inputs,
+    prepared,
+    training_for,
+)
 from forcegp.rollout.inputs import Disturbance
 from forcegp.storage.model_file import ModelHeader
 
@@ -232,7 +238,17 @@ class StructuredFit(FittedModel):
 
     def _exported(self, functions: int | None) -> ExportedModel:
         parts = self.system, self.posterior, self.hyperparameters, self.noise, self.torque_std
-        return ExportedModel(*parts, self.problem.external_std, functions)
+        return ExportedModel(*parts, self.problem.external_std, functions, self._sampling())
+
+    def _sampling(self) -> Sampling | None:
+        """How `update` makes rows of samples; `None` if noise of the state counts in them."""
+        if self.problem.state_std is not None:
+            return None
+        learned = self.hyperparameters.get(TORQUE_NOISE)
+        std = self.problem.torque_std if learned is None else learned.exp()
+        variance = torch.zeros_like(self.system.robot.mass) if std is None else std**2
+        rest = REST_SPEED if self.specification.noise.learns_torque else -1.0
+        return Sampling(variance.expand(self.system.robot.nq), self.problem.power, rest)
 
     def export(
         self, path: str | Path, *, language: str = "c", name: str = "controller", functions: int | None = None

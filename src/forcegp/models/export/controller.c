@@ -24,6 +24,10 @@ static void combine(const double *restrict C, const double *restrict x, int n, i
     for (int c = 0; c < m; ++c) y[c] += x[i] * C[(long)i * m + c];
 }
 
+#if !ONLINE
+typedef struct forcegp_learned forcegp_learned; /* no model of this kind learns online */
+#endif
+
 /* ---- the constrained equations of motion, M qdd = Q + Q_z + A^T lambda and A qdd = b ---- */
 
 typedef struct {
@@ -39,6 +43,7 @@ typedef struct {
   double M_inv[NQ][NQ], H[NQ][NQ];             /* H = M^-1 - L A M^-1, from force to acceleration */
   double L[NQ][SOME(ROWS)];                    /* L = M^-1 A^T (A M^-1 A^T)^+ */
   double S[SOME(ROWS)][SOME(ROWS)];            /* (A M^-1 A^T)^+ */
+  int rank;                                    /* of A */
   double qdd[NQ], load[SOME(ROWS)];            /* qdd and lambda of the analytical forces */
   int closed[SOME(CONTACTS)];
   touching contact[SOME(CONTACTS)];
@@ -134,9 +139,11 @@ static void contact_rows(int i, const double *restrict point, const double *rest
   }
 }
 
-/* P = W^+ `(NQ, ROWS)` by one-sided Jacobi rotations of the rows; small singular values count as zero */
-static void pseudo_inverse(double *restrict W, double *restrict P) {
+/* P = W^+ `(NQ, ROWS)` by one-sided Jacobi rotations of the rows of W, which they make orthogonal; small singular
+ * values count as zero. Returns the number of others */
+static int pseudo_inverse(double *restrict W, double *restrict P) {
   double V[ROWS * ROWS], square[ROWS], most = 0.0;
+  int rank = 0;
   for (int r = 0; r < ROWS * ROWS; ++r) V[r] = r % (ROWS + 1) == 0 ? 1.0 : 0.0;
   for (int sweep = 0; sweep < 30; ++sweep) {
     int turned = 0;
@@ -161,6 +168,7 @@ static void pseudo_inverse(double *restrict W, double *restrict P) {
     if (!turned) break;
   }
   for (int r = 0; r < ROWS; ++r) square[r] = dot(W + r * NQ, W + r * NQ, NQ), most = fmax(most, square[r]);
+  for (int r = 0; r < ROWS; ++r) rank += square[r] > RANK_TOLERANCE * RANK_TOLERANCE * most;
   for (int j = 0; j < NQ; ++j)
     for (int s = 0; s < ROWS; ++s) {
       double sum = 0.0;
@@ -168,6 +176,7 @@ static void pseudo_inverse(double *restrict W, double *restrict P) {
         if (square[r] > RANK_TOLERANCE * RANK_TOLERANCE * most) sum += W[r * NQ + j] / square[r] * V[s * ROWS + r];
       P[j * ROWS + s] = sum;
     }
+  return rank;
 }
 #endif
 
@@ -212,7 +221,7 @@ static int assemble(const double *restrict q, const double *restrict qd, const d
     for (int r = 0; r < ROWS; ++r) combine(&e->M_inv[0][0], e->A[r], NQ, NQ, along[r]);
     for (int r = 0; r < ROWS; ++r)
       for (int i = 0; i < NQ; ++i) W[r * NQ + i] = dot(K + i * NQ, e->A[r], i + 1);
-    pseudo_inverse(W, P);
+    e->rank = pseudo_inverse(W, P);
     for (int r = 0; r < ROWS; ++r)
       for (int s = 0; s < ROWS; ++s) {
         double sum = 0.0;
@@ -230,6 +239,7 @@ static int assemble(const double *restrict q, const double *restrict qd, const d
         for (int r = 0; r < ROWS; ++r) e->H[i][j] -= e->L[i][r] * along[r][j];
   }
 #else
+  e->rank = 0;
   (void)closed;
 #endif
   motion_under(e, Q, e->qdd, e->load);
@@ -359,7 +369,19 @@ typedef struct {
   double rest[COMPONENTS];                    /* diagonal part D of the posterior covariance */
   double E[COMPONENTS][NQ];                   /* generalized force of each f */
   double T[COMPONENTS][RANK];                 /* the covariance is D + T T^T or, with SIGN -1, D - T T^T */
+  const forcegp_learned *learned;             /* what was learned online, if anything */
+  double *functions;                          /* where whitened functions go, if nothing else is asked for */
 } latent;
+
+#if ONLINE
+/* row = V^T C of a component's functions, with C = K^T of what was learned */
+static void learned_row(const forcegp_learned *restrict s, const double *restrict V, int first, int n,
+                        double *restrict row) {
+  for (int j = 0; j < first; ++j) row[j] = 0.0;
+  for (int j = first; j < RANK; ++j)
+    row[j] = dot(s->root + (long)j * (j + 1) / 2 + first, V, j - first < n ? j - first + 1 : n);
+}
+#endif
 
 /* row = V^T C, the functions V of a component in the columns from `first` on */
 static void root_row(const double *restrict C, const double *restrict V, int n, int first, double *restrict row) {
@@ -372,19 +394,32 @@ static void root_row(const double *restrict C, const double *restrict V, int n, 
 static void component(const double *restrict V, int m, int features, double variance, const double *restrict weights,
                       const double *restrict whitening, int kept, const double *restrict C, int first, int spread,
                       int k, latent *restrict f) {
-  const double more = dot(V + m, V + m, features);
+  const double more = dot(V + m, V + m, features), *functions = V;
+  double white[MOST_FUNCTIONS];
+#if ONLINE
+  if (f->learned) weights = f->learned->folded + FOLDED[k];
+#endif
   f->mean[k] = dot(V, weights, m + features);
   f->prior[k] = variance + more;
   f->rest[k] = SIGN > 0.0 ? variance : variance + more;
   if (!spread) return;
   if (whitening) { /* D = k - |R^T k(Z, x)|^2, what the support points miss */
-    double white[MOST_FUNCTIONS];
     combine(whitening, V, m, kept, white);
     memcpy(white + kept, V + m, sizeof(double) * features);
     f->rest[k] = fmax(variance - dot(white, white, kept), 0.0);
-    root_row(C, white, kept + features, first, f->T[k]);
-  } else
-    root_row(C, V, m + features, first, f->T[k]);
+    functions = white, m = kept;
+  }
+#if ONLINE
+  if (f->functions) {
+    memcpy(f->functions + FUNCTION[k], functions, sizeof(double) * (m + features));
+    return;
+  }
+  if (f->learned) {
+    learned_row(f->learned, functions, FUNCTION[k], m + features, f->T[k]);
+    return;
+  }
+#endif
+  root_row(C, functions, m + features, first, f->T[k]);
 }
 
 /* HELPERS: each of these is written where a prior uses it */
@@ -499,6 +534,17 @@ static void inertial(const double *restrict q, const double *restrict qd, const 
 }
 #endif
 
+#ifdef PAYLOAD
+/* E = -Y_k(q, qdd, qd) S of mass and first moment of a payload on a link */
+static void payload(const double *restrict q, const double *restrict qd, const double *restrict qdd, latent *restrict f) {
+  double sine[NQ], cosine[NQ], Y[10 * NQ * NQ];
+  for (int i = 0; i < NQ; ++i) sine[i] = sin(q[i]), cosine[i] = cos(q[i]);
+  regressor(q, qd, qdd, sine, cosine, Y);
+  for (int k = 0; k < 4; ++k)
+    for (int j = 0; j < NQ; ++j) f->E[PAYLOAD + k][j] = -PAYLOAD_UNITS[k] * Y[(PAYLOAD_COLUMN + k) * NQ + j];
+}
+#endif
+
 /* ---- reading quantities off the posterior of the forces ---- */
 
 /* z = o + B_Q (m + sum of E f) + B_z ... */
@@ -517,18 +563,22 @@ static void read_mean(const affine *restrict z, const latent *restrict f, const 
               dot(z->B_N[a], force[CONSTRAINT], NQ) + dot(z->B_F[a], force[JOINT_FRICTION], NQ);
 }
 
+/* W = B E, from the latent forces to quantities */
+static void operators(const affine *restrict z, const latent *restrict f, int size, double (*restrict W)[COMPONENTS]) {
+  for (int a = 0; a < size; ++a)
+    for (int k = 0; k < COMPONENTS; ++k) {
+      const double *B = TARGET[k] == CONTACT ? z->B_z[a] : TARGET[k] == CONSTRAINT ? z->B_N[a] : z->B_Q[a];
+      W[a][k] = dot(B, f->E[k], NQ) + (IS_FRICTION[k] ? dot(z->B_F[a], f->E[k], NQ) : 0.0);
+    }
+}
+
 /* W D W^T + W T T^T W^T with W = B E, and the variance of unknown forces; 0 if a variance is rounding */
 static int read_covariance(const affine *restrict z, const latent *restrict f, const double *restrict unknown,
                            int size, double *restrict covariance) {
   double root[SIZE_OF_ALL][RANK], W[SIZE_OF_ALL][COMPONENTS], scaled[COMPONENTS];
   int resolved = 1;
-  for (int a = 0; a < size; ++a) {
-    for (int k = 0; k < COMPONENTS; ++k) {
-      const double *B = TARGET[k] == CONTACT ? z->B_z[a] : TARGET[k] == CONSTRAINT ? z->B_N[a] : z->B_Q[a];
-      W[a][k] = dot(B, f->E[k], NQ) + (IS_FRICTION[k] ? dot(z->B_F[a], f->E[k], NQ) : 0.0);
-    }
-    combine(&f->T[0][0], W[a], COMPONENTS, RANK, root[a]);
-  }
+  operators(z, f, size, W);
+  for (int a = 0; a < size; ++a) combine(&f->T[0][0], W[a], COMPONENTS, RANK, root[a]);
   for (int a = 0; a < size; ++a) {
     double before = 0.0, carried[NQ];
     for (int k = 0; k < COMPONENTS; ++k) scaled[k] = W[a][k] * f->rest[k], before += W[a][k] * W[a][k] * f->prior[k];
@@ -544,6 +594,12 @@ static int read_covariance(const affine *restrict z, const latent *restrict f, c
   return resolved;
 }
 
+/* m, the prior mean of Q */
+static void expected_force(const equations *restrict e, const double *restrict tau, double *restrict m) {
+  for (int i = 0; i < NQ; ++i)
+    m[i] = MEAN_TERMS[0] * e->Q_C[i] + MEAN_TERMS[1] * e->Q_G[i] + MEAN_TERMS[2] * e->Q_D[i] + MEAN_TERMS[3] * tau[i];
+}
+
 /* how far speed and torque lie beyond those of the training data, in their standard deviations */
 static void distance(const double *restrict qd, const double *restrict tau, double *restrict beyond) {
   for (int i = 0; i < NQ; ++i) {
@@ -553,8 +609,9 @@ static void distance(const double *restrict qd, const double *restrict tau, doub
   }
 }
 
-int forcegp_predict(const double *q, const double *qd, const double *tau, const unsigned char *closed,
-                    unsigned quantities, int noise, double *mean, double *covariance, double *beyond) {
+static int predict(const forcegp_learned *learned, const double *q, const double *qd, const double *tau,
+                   const unsigned char *closed, unsigned quantities, int noise, double *mean, double *covariance,
+                   double *beyond) {
   equations e;
   latent f;
   affine z;
@@ -568,9 +625,12 @@ int forcegp_predict(const double *q, const double *qd, const double *tau, const 
 #endif
   distance(qd, tau, far);
   if (beyond) memcpy(beyond, far, sizeof far);
-  for (int i = 0; i < NQ; ++i)
-    prior_mean[i] = MEAN_TERMS[0] * e.Q_C[i] + MEAN_TERMS[1] * e.Q_G[i] + MEAN_TERMS[2] * e.Q_D[i] + MEAN_TERMS[3] * tau[i];
+  expected_force(&e, tau, prior_mean);
+  f.learned = learned, f.functions = NULL;
   if ((status = latent_forces(q, qd, tau, &e, gain, covariance != NULL, &f)) != 0) return status;
+#ifdef PAYLOAD
+  payload(q, qd, e.qdd, &f);
+#endif
 #ifdef INERTIAL
   inertial(q, qd, e.qdd, &f);
   if (covariance) { /* errors of the inertia are multiplied by the predicted acceleration */
@@ -602,15 +662,26 @@ void forcegp_forward_dynamics(const double *q, const double *qd, const double *f
   forward_dynamics(q, qd, force, sine, cosine, qdd);
 }
 
-int forcegp_predict_many(long count, const double *q, const double *qd, const double *tau, const unsigned char *closed,
-                         unsigned quantities, int noise, double *mean, double *covariance, double *beyond) {
+static int predict_all(const forcegp_learned *learned, long count, const double *q, const double *qd,
+                       const double *tau, const unsigned char *closed, unsigned quantities, int noise, double *mean,
+                       double *covariance, double *beyond) {
   const int d = forcegp_size(quantities);
   int worst = 0;
   for (long i = 0; i < count; ++i) {
-    const int status =
-        forcegp_predict(q + i * NQ, qd + i * NQ, tau + i * NQ, closed ? closed + i * CONTACTS : NULL, quantities, noise,
-                        mean + i * d, covariance ? covariance + i * d * d : NULL, beyond ? beyond + i * NQ : NULL);
+    const int status = predict(learned, q + i * NQ, qd + i * NQ, tau + i * NQ, closed ? closed + i * CONTACTS : NULL,
+                               quantities, noise, mean + i * d, covariance ? covariance + i * d * d : NULL,
+                               beyond ? beyond + i * NQ : NULL);
     worst = worst ? worst : status;
   }
   return worst;
+}
+
+int forcegp_predict(const double *q, const double *qd, const double *tau, const unsigned char *closed,
+                    unsigned quantities, int noise, double *mean, double *covariance, double *beyond) {
+  return predict(NULL, q, qd, tau, closed, quantities, noise, mean, covariance, beyond);
+}
+
+int forcegp_predict_many(long count, const double *q, const double *qd, const double *tau, const unsigned char *closed,
+                         unsigned quantities, int noise, double *mean, double *covariance, double *beyond) {
+  return predict_all(NULL, count, q, qd, tau, closed, quantities, noise, mean, covariance, beyond);
 }

@@ -46,7 +46,7 @@ int forcegp_predict(const double *q, const double *qd, const double *tau, const 
 int forcegp_predict_many(long count, const double *q, const double *qd, const double *tau, const unsigned char *closed,
                          unsigned quantities, int noise, double *mean, double *covariance, double *beyond);
 
-/* Free acceleration M^-1 (force + Q_C + Q_G) of the robot alone. */
+@online@/* Free acceleration M^-1 (force + Q_C + Q_G) of the robot alone. */
 void forcegp_forward_dynamics(const double *q, const double *qd, const double *force, double *qdd);
 
 #ifdef __cplusplus

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import copy
 import ctypes
+import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
@@ -11,22 +13,33 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.errors import ModelError, NumericalError, check_name
+from forcegp.errors import ModelError, NumericalError, ShapeError, check_name
 from forcegp.forces.noise import LOW
 from forcegp.forces.quantities import ForceField, flat_states
+from forcegp.gp.basis import LatentBasis
+from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.export.model import ExportedModel
 from forcegp.models.export.source import READ, c_source
 from forcegp.models.prediction import Prediction, Predictor
 from forcegp.native import load_library
 
 NAME = "forcegp"
-JAMMED, UNRESOLVED, NO_INERTIA = 2, 3, 4
+JAMMED, UNRESOLVED, NO_INERTIA, AT_REST, NO_NOISE = 2, 3, 4, 5, 6
 """What the C code returns other than 0."""
 MESSAGES = {
     JAMMED: "friction of a contact would press harder than it opposes",
     UNRESOLVED: "double precision does not resolve a predicted variance",
     NO_INERTIA: "the mass matrix is not positive definite",
+    NO_NOISE: "an update needs the noise of a quantity that the fit did not measure: pass noise_std",
 }
+POINTER = ctypes.c_void_p
+ONLINE = {
+    "begin": [],
+    "update": [*[POINTER] * 4, ctypes.c_uint, POINTER, POINTER],
+    "forget": [ctypes.c_double, ctypes.c_int],
+    "drift": [ctypes.c_int, ctypes.c_double],
+}
+"""Arguments of the functions that change what is learned online, after a pointer to it."""
 
 
 class CompiledFit(Predictor):
@@ -40,9 +53,14 @@ class CompiledFit(Predictor):
         self.model, self.system = model, model.system
         header, source = c_source(model, NAME)
         self.library = load_library(source.replace(f'#include "{NAME}.h"\n', header), level="-O3")
-        self._many = self.library.forcegp_predict_many
-        self._many.argtypes = [ctypes.c_long, *[ctypes.c_void_p] * 4, ctypes.c_uint, ctypes.c_int]
-        self._many.argtypes += [ctypes.c_void_p] * 3
+        at, out = [ctypes.c_long, *[POINTER] * 4, ctypes.c_uint, ctypes.c_int], [POINTER] * 3
+        self.library.forcegp_predict_many.argtypes = at + out
+        if model.online is not None:
+            for name, arguments in ONLINE.items():
+                getattr(self.library, f"forcegp_{name}").argtypes = [POINTER, *arguments]
+            self.library.forcegp_predict_learned.argtypes = [POINTER, *at, *out]
+        self._learned: Tensor | None = None
+        self._root = slice(0, 0)
         self._sizes = {name: self.library.forcegp_size(1 << bit) for bit, name in enumerate(READ)}
         self._known: dict[str | tuple[str, ...], _Rows] = {}
 
@@ -56,7 +74,127 @@ class CompiledFit(Predictor):
 
     def force_field(self) -> ForceField:
         """Posterior mean of Q̄ = Q + Q_z, `(n, nq)` at states, in PyTorch."""
-        return self.model.posterior
+        if self._learned is None:
+            return self.model.posterior
+        latent, size = self.model.posterior.latent, self._online().size
+        assert isinstance(latent, SparsePosterior)
+        # A⁻¹ = KᵀK, so A = L Lᵀ with L = K⁻¹, and v = A w
+        K = torch.zeros_like(latent.L)
+        K[tuple(torch.tril_indices(size, size))] = self._learned[self._root]
+        L = torch.linalg.solve_triangular(K, torch.eye(size, dtype=K.dtype), upper=False)
+        moments = dataclasses.replace(latent.moments, v=L @ (L.mT @ self._learned[:size]))
+        return dataclasses.replace(
+            self.model.posterior, latent=SparsePosterior(latent.basis, moments, L, latent.jitter)
+        )
+
+    def update(
+        self,
+        q: Tensor,
+        qd: Tensor,
+        tau: Tensor,
+        measured: Tensor,
+        quantity: str = "qdd",
+        *,
+        active: Tensor | None = None,
+        noise_std: Tensor | None = None,
+    ) -> CompiledFit:
+        """The fit with more samples, as `StructuredFit.update` gives it; mean and covariance count them at once.
+
+        A sample at rest is left out where the fit learned the noise of the torques, as in the fit. The cost is
+        that of n² operations for n functions, however many samples came before.
+
+        Args:
+            q, qd, tau: `(*batch, nq)` states.
+            measured: `(*batch, d)` values at these states.
+            quantity: that was measured.
+            active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
+            noise_std: of the values `(d,)`; by default that of the fit.
+
+        Raises:
+            ModelError: the model cannot learn in C, or the fit did not measure the quantity and no noise is given.
+            ShapeError: an argument does not fit the system, or is not finite.
+            UnknownNameError: no such quantity.
+        """
+        read = self._read(quantity)
+        flat = flat_states(self.system, q, qd, tau, active)
+        shape = (len(flat.q), read.size)
+        if measured.shape[-1:] != (read.size,) or measured.numel() != shape[0] * shape[1]:
+            raise ShapeError(
+                f"values of {quantity!r} do not fit the states", expected=str(shape), got=tuple(measured.shape)
+            )
+        values = measured.reshape(shape).to(torch.float64).contiguous()
+        std = None if noise_std is None else noise_std.expand(read.size).to(torch.float64).contiguous()
+        newer = self._copy()
+        columns = [x.contiguous() for x in (*flat[:4], values)]
+        for row in zip(*columns, strict=True):
+            *state, value = (x.data_ptr() for x in row)
+            noise = None if std is None else std.data_ptr()
+            status = self.library.forcegp_update(newer._memory, *state, read.bits, value, noise)
+            if status not in (0, AT_REST):
+                kind = ModelError if status in (JAMMED, NO_NOISE) else NumericalError
+                raise kind(MESSAGES[status])
+        return newer
+
+    def forget(
+        self, factor: float, priors: Sequence[str] | None = None, *, budget: int | None = None
+    ) -> CompiledFit:
+        """The fit with all samples partly forgotten, as `StructuredFit.forget` gives it.
+
+        Args:
+            factor: what the weight of all samples so far is multiplied by, or, with `priors`, the correlation
+                of their forces with what they were.
+            priors: whose forces drift towards their prior, instead of forgetting samples.
+            budget: how many weights have their prior renewed, at the cost of a row each; the prior of others
+                waits for the next calls. All of them by default.
+
+        Raises:
+            ModelError: the model cannot learn in C, or the factor is out of range.
+            UnknownNameError: no such prior.
+        """
+        newer, names = self._copy(), [prior.name for prior in self.model.posterior.priors]
+        for name in priors or ():
+            check_name("force prior to forget", name, names)
+        if priors is None:
+            rows = self._online().size if budget is None else budget
+            status = self.library.forcegp_forget(newer._memory, factor, rows)
+        else:
+            drift = self.library.forcegp_drift
+            status = max((drift(newer._memory, names.index(name), factor) for name in priors), default=0)
+        if status:
+            raise ModelError("invalid forgetting factor", expected="above 0, at most 1", got=factor)
+        return newer
+
+    def _copy(self) -> CompiledFit:
+        """The fit with its own copy of what it learns.
+
+        Raises:
+            ModelError: the model cannot learn in C.
+        """
+        newer = copy.copy(self)
+        if self._learned is None:
+            n, folded = self._online().size, sum(part.weights.numel() for part in self.model.parts())
+            newer._learned = torch.empty(2 * n + folded + n * (n + 1) // 2 + 1, dtype=torch.float64)
+            newer._root = slice(n + folded, n + folded + n * (n + 1) // 2)
+            self.library.forcegp_begin(newer._memory)
+        else:
+            newer._learned = self._learned.clone()
+        return newer
+
+    @property
+    def _memory(self) -> int | None:
+        """Where the C code finds what was learned online."""
+        return None if self._learned is None else self._learned.data_ptr()
+
+    def _online(self) -> LatentBasis:
+        """The basis that is learned in; errors as of `_copy`."""
+        latent = self.model.posterior.latent
+        if self.model.online is None or not isinstance(latent, SparsePosterior):
+            raise ModelError(
+                "this fit cannot learn online in C",
+                expected="sparse inference with all functions, a state without noise, no inertia learned",
+                hint="call update of the fit",
+            )
+        return latent.basis
 
     def predict(
         self,
@@ -90,7 +228,11 @@ class CompiledFit(Predictor):
         mean, beyond = q.new_empty((*batch, read.size)), q.new_empty((*batch, nq))
         spread = q.new_empty((*batch, read.size, read.size)) if covariance else None
         pointers = [None if x is None else x.data_ptr() for x in (*arrays, mean, spread, beyond)]
-        status = self._many(batch.numel(), *pointers[:4], read.bits, noise, *pointers[4:])
+        arguments = batch.numel(), *pointers[:4], read.bits, noise, *pointers[4:]
+        if self._learned is None:
+            status = self.library.forcegp_predict_many(*arguments)
+        else:
+            status = self.library.forcegp_predict_learned(self._memory, *arguments)
         if status:
             flat_states(self.system, q, qd, tau, active)  # says which state is not finite
             raise (ModelError if status == JAMMED else NumericalError)(MESSAGES[status])

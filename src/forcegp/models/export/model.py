@@ -13,6 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -22,15 +23,16 @@ from forcegp.errors import ModelError
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors import contact, joint
 from forcegp.forces.priors.base import ForcePrior
-from forcegp.forces.priors.inertial import InertialPrior
+from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
 from forcegp.gp.basis import KernelPart, split
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.features import Features, points
 from forcegp.gp.kernels import Constant, Kernel, Linear, Matern32, Matern52, SquaredExponential, Sum, sub
 from forcegp.gp.sparse import SparsePosterior
 
-PRIORS = (joint.JointForcePrior, joint.JointFrictionPrior, InertialPrior, contact.NormalForcePrior)
-PRIORS += (contact.SlidingFrictionPrior, contact.ContactForcePrior, contact.CoulombErrorPrior)
+PRIORS = (joint.JointForcePrior, joint.JointFrictionPrior, InertialPrior, PayloadPrior)
+PRIORS += (contact.NormalForcePrior, contact.SlidingFrictionPrior, contact.ContactForcePrior)
+PRIORS += (contact.CoulombErrorPrior,)
 KERNELS = (Linear, Constant, SquaredExponential, Matern32, Matern52)
 LARGEST = 1700
 """Functions of a posterior that is not reduced; some 30 MB of text, which takes a compiler half a minute."""
@@ -75,6 +77,20 @@ class Functions:
         return 0 if self.rest is None else points(self.support)
 
 
+class Sampling(NamedTuple):
+    """How a new sample becomes rows of the posterior.
+
+    Attributes:
+        torque_variance: of the white noise of the motor torques in the samples of a fit `(nq,)`.
+        power: κ, by which rows are tempered.
+        rest_speed: speed of the fastest joint below which nothing is learned.
+    """
+
+    torque_variance: Tensor
+    power: float
+    rest_speed: float
+
+
 @dataclass(frozen=True, eq=False)
 class ExportedModel:
     """What is exported of a fit.
@@ -86,6 +102,7 @@ class ExportedModel:
         noise: standard deviation of a measurement of each measured quantity.
         torque_std, external_std: of the motor torques' noise and of unknown forces on joints, or `None`.
         functions: number r that the covariance is reduced to; `None` for all.
+        sampling: how it learns online; `None` for a model that cannot.
     """
 
     system: ConstrainedSystem
@@ -95,6 +112,12 @@ class ExportedModel:
     torque_std: Tensor | None
     external_std: Tensor | None
     functions: int | None = None
+    sampling: Sampling | None = None
+
+    @property
+    def online(self) -> Sampling | None:
+        """How it learns online, if it is over basis functions and all of its covariance is kept."""
+        return None if self.sign < 0 or self.posterior.process.pinned else self.sampling
 
     def check(self) -> None:
         """Check that all parts of the model have a C form.
@@ -112,11 +135,12 @@ class ExportedModel:
         if not isinstance(self.posterior.process.mean, joint.AnalyticalMean):
             raise _no_c("mean", "Q", self.posterior.process.mean, "an AnalyticalMean")
         for prior in self.posterior.priors:
-            if type(prior) not in PRIORS:
+            if type(prior) not in PRIORS or (isinstance(prior, PayloadPrior) and prior.known):
                 raise _no_c("force prior", prior.name, prior, ", ".join(x.__name__ for x in PRIORS))
             _check_kernel(prior.name, prior.kernel)
-        if sum(isinstance(prior, InertialPrior) for prior in self.posterior.priors) > 1:
-            raise ModelError("a fit with two priors on the inertia is not exported", expected="one at most")
+        for kind, what in ((InertialPrior, "the inertia"), (PayloadPrior, "a payload")):
+            if sum(isinstance(prior, kind) for prior in self.posterior.priors) > 1:
+                raise ModelError(f"a fit with two priors on {what} is not exported", expected="one at most")
         if self.functions is not None and self.functions < 1:
             raise ModelError(
                 "a posterior has one function at least", expected="1 or more", got=self.functions

@@ -22,12 +22,13 @@ from forcegp.constraints.gauss import rank_tolerance
 from forcegp.forces.noise import GROWTH, HIGH, LOW, SPREAD, STICK_NOISE, STICK_SPEED
 from forcegp.forces.priors import contact
 from forcegp.forces.priors.base import CONSTRAINT, CONTACT, JOINT, ForcePrior
-from forcegp.forces.priors.inertial import InertialPrior
+from forcegp.forces.priors.inertial import PER_PAYLOAD, InertialPrior, PayloadPrior
 from forcegp.forces.priors.joint import TERMS, JointForcePrior, JointFrictionPrior
 from forcegp.forces.quantities import QUANTITIES
 from forcegp.gp import kernels
 from forcegp.gp.basis import KernelPart
 from forcegp.gp.features import SMALLEST_FRACTION, stacked
+from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.export.model import ExportedModel, Functions
 
 READ = (*QUANTITIES, "joint_friction")
@@ -60,6 +61,7 @@ def c_source(model: ExportedModel, name: str) -> tuple[str, str]:
     head = '#include <math.h>\n#include <string.h>\n#include "forcegp.h"\n'
     head += "#ifdef __cplusplus\n#define restrict __restrict__\n#endif\n"
     blocks = [head, "\n".join(writer.lines), *_mechanics(model), before, *used, *priors, after]
+    blocks += [template("online.c")] if model.online is not None else []
     robot, contacts = model.system.robot, model.system.contact_names
     fields = {
         "nq": robot.nq,
@@ -67,6 +69,7 @@ def c_source(model: ExportedModel, name: str) -> tuple[str, str]:
         "joints": _comment(", ".join(robot.joint_names)),
         "touching": _comment(", ".join(contacts) or "none"),
         "bits": "\n".join(f"#define FORCEGP_{x.upper()} {1 << i}u" for i, x in enumerate(READ)),
+        "online": writer.online_header(),
     }
     return tuple(  # pyright: ignore[reportReturnType]
         text.replace("forcegp_", f"{name}_")
@@ -107,7 +110,7 @@ def _mechanics(model: ExportedModel) -> list[str]:
         "mechanics": Program(("q", "qd"), (len(outputs),), links.graph, outputs),
         "forward_dynamics": trace(robot, "forward_dynamics"),
     }
-    if any(isinstance(prior, InertialPrior) for prior in model.posterior.priors):
+    if any(isinstance(prior, InertialPrior | PayloadPrior) for prior in model.posterior.priors):
         programs["regressor"] = regressor_program(Links(robot))
     return [f"#define MECHANICS {len(outputs)}", *(c_function(*item) for item in programs.items())]
 
@@ -118,8 +121,10 @@ class Writer:
     def __init__(self, model: ExportedModel) -> None:
         self.model, self.parts, self.lines = model, model.parts(), []
         self.starts = list(accumulate((part.components for part in self.parts), initial=0))
+        self.tables: list[tuple[str, str, str]] = []
         self._constants()
         self._noise()
+        self._online()
 
     def array(self, values: Tensor | Iterable[float], name: str = "", kind: str = "double") -> str:
         """A constant array, and its name."""
@@ -167,6 +172,10 @@ class Writer:
             if isinstance(part.prior, InertialPrior):
                 self.lines.append(f"#define INERTIAL {start}")
                 self.array(part.prior.scale(robot), "INERTIAL_SCALE")
+            if isinstance(part.prior, PayloadPrior):
+                column = PER_PAYLOAD * part.prior.link(robot)
+                self.lines += [f"#define PAYLOAD {start}", f"#define PAYLOAD_COLUMN {column}"]
+                self.array(part.prior.units(robot.mass), "PAYLOAD_UNITS")
         if contacts:
             self._surfaces(contacts)
         if process.coulomb:
@@ -203,6 +212,42 @@ class Writer:
         omega, xi = (0.0, 0.0) if rule is None else (rule.natural_frequency, rule.damping_ratio)
         self.lines += [f"#define RATE_GAIN {2.0 * omega * xi!r}", f"#define ERROR_GAIN {omega**2!r}"]
 
+    def _online(self) -> None:
+        """Where the functions of each component lie in what is learned online, and the noise of samples."""
+        online = self.model.online
+        self.lines.append(f"#define ONLINE {int(online is not None)}")
+        if online is None:
+            return
+        latent = self.model.posterior.latent
+        assert isinstance(latent, SparsePosterior)
+        functions = [len(roots) for part in self.parts for roots in part.roots]
+        widths = [len(weights) for part in self.parts for weights in part.weights]
+        self.array(accumulate(functions, initial=0), "FUNCTION", "int")
+        self.array(accumulate(widths, initial=0), "FOLDED", "int")
+        self.array([part.size for part in self.parts for _ in range(part.components)], "POINTS", "int")
+        self.array(self.starts, "FIRST_COMPONENT", "int")
+        self.array(latent.weights, "WEIGHTS")
+        self.array(online.torque_variance, "LEARNED_TORQUE_VARIANCE")
+        nq, contacts = self.model.system.robot.nq, len(self.model.system.contacts)
+        self.lines += [
+            f"enum {{ PRIOR_COUNT = {len(self.parts)}, MOST_ROWS = {max(nq, 3 * contacts)} }};",
+            f"static const double REST_SPEED = {online.rest_speed!r}, TEMPERING = {online.power**0.5!r};",
+        ]
+        std = [self.array(self.model.noise[x]) if x in self.model.noise else "NULL" for x in READ]
+        self.lines.append(f"static const double *const NOISE_STD[] = {{{', '.join(std)}}};")
+
+    def online_header(self) -> str:
+        """The part of the header on learning online, if the model can."""
+        if self.model.online is None:
+            return ""
+        names = (f"{p} {_comment(part.prior.name)}" for p, part in enumerate(self.parts))
+        fields = {
+            "functions": self.parts[0].rank,
+            "folded": sum(part.weights.numel() for part in self.parts),
+            "priors": ", ".join(names),
+        }
+        return template("online.h", fields)
+
     def priors(self) -> list[str]:
         """A function for each prior, and the one that calls them all."""
         texts, calls = [], []
@@ -213,13 +258,16 @@ class Writer:
             unread = "  (void)q, (void)qd, (void)tau, (void)e, (void)gain, (void)spread;\n"
             texts.append(title + unread + "\n".join(body) + "\n  return 0;\n}\n")
             calls.append(f"  if (prior_{p}(q, qd, tau, e, gain, spread, f) != 0) return FORCEGP_JAMMED;\n")
+        names = ("FOLDED_WEIGHTS", "WHITENINGS", "ROOTS") if self.model.online is not None else ()
+        for name, column in zip(names, zip(*self.tables, strict=True), strict=False):
+            self.lines.append(f"static const double *const {name}[] = {{{', '.join(column)}}};")
         texts.append(f"static int latent_forces({ARGUMENTS}) {{\n{''.join(calls)}  return 0;\n}}\n")
         return texts
 
     def _operator(self, part: Functions, start: int) -> list[str]:
-        """Code of E(x), which carries f to generalized forces; that of `INERTIAL` is in `controller.c`."""
+        """Code of E(x), which carries f to generalized forces; that of `INERTIAL` and `PAYLOAD` is in `controller.c`."""
         prior, E = part.prior, f"f->E + {start}"
-        if isinstance(prior, InertialPrior):
+        if isinstance(prior, InertialPrior | PayloadPrior):
             return []
         if isinstance(prior, contact.NormalForcePrior):
             return [f"  along_constraint(e, {E});"]
@@ -255,7 +303,8 @@ class Writer:
             white, kept = "0", 0
             if part.whitening is not None and m:
                 white, kept = self.array(part.whitening[k].flatten()), part.whitening[k].shape[1]
-            tables = f"{self.array(part.weights[k])}, {white}, {kept}, {self.array(part.roots[k].flatten())}"
+            self.tables.append((self.array(part.weights[k]), white, self.array(part.roots[k].flatten())))
+            tables = f"{self.tables[-1][0]}, {white}, {kept}, {self.tables[-1][2]}"
             rest = f"{part.first[k]}, spread, {self.starts[p] + k}, f"
             lines.append(f"    component(V, {m}, {len(phi)}, {variance}, {tables}, {rest});\n  }}")
         return lines
