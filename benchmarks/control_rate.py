@@ -31,11 +31,13 @@ from forcegp.forces.priors.joint import JointForcePrior, JointFrictionPrior
 from forcegp.forces.priors.sets import friction_priors
 from forcegp.gp.kernels import Matern32
 from forcegp.gp.sparse import SparsePosterior
+from forcegp.models.export.library import CompiledFit
 from forcegp.models.prediction import Predictor
 from forcegp.models.structured_fit import StructuredFit
+from forcegp.models.structured_learning import REST_SPEED
 from forcegp.simulate import SimulationConfig, simulate
 
-POINTS, STATES, ROUNDS = 66, 256, 15
+POINTS, STATES, ROUNDS = 66, 256, 60
 LEVELS = {"-O3": ["-O3", "-march=native", "-ffp-contract=fast"], "-O2": ["-O2"]}
 BOUNDS = {  # µs, at -O3
     "friction mean": 8.0,
@@ -47,7 +49,10 @@ BOUNDS = {  # µs, at -O3
     "forward dynamics": 1.0,
     "python mean": 50.0,
     "python covariance": 150.0,
+    "residual update": 400.0,
+    "python update": 600.0,
 }
+KINDS = ("mean", "covariance", "forward dynamics", "update", "covariance after updates")
 PROGRAM = """\
 #define _POSIX_C_SOURCE 199309L
 #include <stdio.h>
@@ -63,22 +68,32 @@ static double now(void) {
 
 int main(void) {
   static double mean[64], covariance[64 * 64], beyond[64];
-  double best[3] = {1e30, 1e30, 1e30}, sink = 0.0;
+  static controller_learned learned;
+  double best[5] = {1e30, 1e30, 1e30, 1e30, 1e30}, sink = 0.0;
+  controller_begin(&learned);
   for (int round = 0; round < ROUNDS; ++round)
-    for (int kind = 0; kind < 3; ++kind) {
+    for (int kind = 0; kind < 5; ++kind) {
+      const int states = kind < 3 ? STATES : STATES / 64; /* short beside the slices of a shared core */
       const double start = now();
-      for (int i = 0; i < STATES; ++i) {
+      for (int i = 0; i < states; ++i) {
         if (kind == 2)
           controller_forward_dynamics(q[i], qd[i], tau[i], mean);
-        else if (controller_predict(q[i], qd[i], tau[i], NULL, CONTROLLER_QDD | CONTROLLER_MULTIPLIER, 0,
+        else if (kind == 3) {
+          if (controller_update(&learned, q[i], qd[i], tau[i], NULL, CONTROLLER_QDD, qdd[i], NULL)) return 2;
+        } else if (kind == 4) {
+          if (controller_predict_learned(&learned, 1, q[i], qd[i], tau[i], NULL, CONTROLLER_QDD | CONTROLLER_MULTIPLIER,
+                                         0, mean, covariance, beyond))
+            return 3;
+        } else if (controller_predict(q[i], qd[i], tau[i], NULL, CONTROLLER_QDD | CONTROLLER_MULTIPLIER, 0,
                                     mean, kind ? covariance : NULL, beyond))
           return 1;
         sink += mean[0];
       }
-      const double each = (now() - start) / STATES;
+      const double each = (now() - start) / states;
       best[kind] = each < best[kind] ? each : best[kind];
     }
-  printf("%g %g %g %g\\n", best[0], best[1], best[2], sink);
+  for (int kind = 0; kind < 5; ++kind) printf("%g ", best[kind]);
+  printf("%g\\n", sink);
   return 0;
 }
 """
@@ -106,17 +121,17 @@ def models() -> dict[str, StructuredFit]:
     return fits
 
 
-def logged(fit: StructuredFit) -> tuple[Tensor, Tensor, Tensor]:
-    """Training states."""
-    m = fit.training.measurements[0]
-    return m.q[:STATES], m.qd[:STATES], m.tau[:STATES]
+def logged(fit: StructuredFit) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Training states in motion, and accelerations there."""
+    m = fit.training.moving(REST_SPEED).measurements[0]
+    return m.q[:STATES], m.qd[:STATES], m.tau[:STATES], m.values[:STATES]
 
 
-def in_c(fit: StructuredFit, flags: list[str]) -> list[float]:
-    """µs of the mean, of mean and covariance, and of forward dynamics alone."""
+def in_c(fit: StructuredFit, flags: list[str]) -> dict[str, float]:
+    """µs of each of `KINDS`."""
     with tempfile.TemporaryDirectory() as place:
         folder = fit.export(Path(place) / "c").folder
-        tables = dict(zip(("q", "qd", "tau"), logged(fit), strict=True))
+        tables = dict(zip(("q", "qd", "tau", "qdd"), logged(fit), strict=True))
         lines = [f"enum {{ STATES = {STATES}, ROUNDS = {ROUNDS} }};"]
         for name, x in tables.items():
             rows = ", ".join("{" + ", ".join(map(repr, row)) + "}" for row in x.tolist())
@@ -126,13 +141,13 @@ def in_c(fit: StructuredFit, flags: list[str]) -> list[float]:
         command = ["gcc", "-std=c99", *flags, "time.c", "controller.c", "-o", "run", "-lm"]
         subprocess.run(command, cwd=folder, check=True)
         done = subprocess.run([str(folder / "run")], capture_output=True, text=True, check=True)
-    return [float(x) for x in done.stdout.split()[:3]]
+    return dict(zip(KINDS, map(float, done.stdout.split()), strict=False))
 
 
 def in_python(call: Callable[[int], object], calls: int = 32) -> float:
     """µs of a call from Python, the least mean of several rounds."""
     best = float("inf")
-    for _ in range(20):
+    for _ in range(640 // calls):
         start = time.perf_counter()
         for i in range(calls):
             call(i)
@@ -142,10 +157,23 @@ def in_python(call: Callable[[int], object], calls: int = 32) -> float:
 
 def predicting(predictor: Predictor, fit: StructuredFit, covariance: bool) -> float:
     """µs of `predict` of q̈ and λ at single states."""
-    q, qd, tau = logged(fit)
+    q, qd, tau, _ = logged(fit)
     return in_python(
         lambda i: predictor.predict(q[i], qd[i], tau[i], ["qdd", "multiplier"], covariance=covariance)
     )
+
+
+def updating(predictor: CompiledFit | StructuredFit, fit: StructuredFit) -> float:
+    """µs of `update` with one sample."""
+    q, qd, tau, qdd = logged(fit)
+    if isinstance(predictor, CompiledFit):
+        begun = predictor.update(q[0], qd[0], tau[0], qdd[0])
+        return in_python(lambda i: begun.update(q[i], qd[i], tau[i], qdd[i]), 4)
+    names, t = fit.system.robot.joint_names, torch.arange(len(q), dtype=torch.float64)
+    closed = {name: torch.ones(len(q), dtype=torch.bool) for name in fit.system.contact_names}
+    data = forcegp.Dataset(t, q, qd, tau, qdd, names, contact=closed)
+    samples = [data[i : i + 1] for i in range(4)]
+    return in_python(lambda i: predictor.update(samples[i]), 4)
 
 
 def pinocchio(fit: StructuredFit) -> float | None:
@@ -157,7 +185,7 @@ def pinocchio(fit: StructuredFit) -> float | None:
     path = Path(forcegp.__file__).parent / "robot/bundled/kuka_iiwa.urdf"
     pin: Any = pinocchio
     model = pin.buildModelFromUrdf(str(path))
-    data, states = model.createData(), [x.numpy() for x in logged(fit)]
+    data, states = model.createData(), [x.numpy() for x in logged(fit)[:3]]
     return in_python(lambda i: pin.aba(model, data, *(x[i] for x in states)))
 
 
@@ -169,13 +197,14 @@ def measure() -> dict[str, float]:
         assert isinstance(latent, SparsePosterior)
         result[f"{name} functions"] = latent.basis.size
         for level, flags in LEVELS.items():
-            times = in_c(fit, flags)
-            for what, value in zip(("mean", "covariance", "forward dynamics"), times, strict=True):
+            for what, value in in_c(fit, flags).items():
                 result[f"{name} {what} {level}"] = value
         fast = fit.compiled()
         for kind, predictor in (("compiled", fast), ("predict", fit)):
             for what, covariance in (("mean", False), ("covariance", True)):
                 result[f"{name} {what} python {kind}"] = predicting(predictor, fit, covariance)
+        result[f"{name} update python compiled"] = updating(fast, fit)
+        result[f"{name} update python predict"] = updating(fit, fit)
         if name == "friction" and (peer := pinocchio(fit)) is not None:
             result["forward dynamics pinocchio from python"] = peer
     return result
@@ -195,6 +224,7 @@ def main() -> None:
         "forward dynamics": result["friction forward dynamics -O3"],
         "python mean": result["friction mean python compiled"],
         "python covariance": result["friction covariance python compiled"],
+        "python update": result["residual update python compiled"],
     }
     for name, bound in BOUNDS.items():
         verdict = "holds" if found[name] <= bound else "MISSED"

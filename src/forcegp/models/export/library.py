@@ -6,6 +6,7 @@ import copy
 import ctypes
 import dataclasses
 from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
@@ -24,7 +25,7 @@ from forcegp.models.prediction import Prediction, Predictor
 from forcegp.native import load_library
 
 NAME = "forcegp"
-JAMMED, UNRESOLVED, NO_INERTIA, AT_REST, NO_NOISE = 2, 3, 4, 5, 6
+NOT_FINITE, JAMMED, UNRESOLVED, NO_INERTIA, AT_REST, NO_NOISE = 1, 2, 3, 4, 5, 6
 """What the C code returns other than 0."""
 MESSAGES = {
     JAMMED: "friction of a contact would press harder than it opposes",
@@ -120,7 +121,9 @@ class CompiledFit(Predictor):
         shape = (len(flat.q), read.size)
         if measured.shape[-1:] != (read.size,) or measured.numel() != shape[0] * shape[1]:
             raise ShapeError(
-                f"values of {quantity!r} do not fit the states", expected=str(shape), got=tuple(measured.shape)
+                f"values of {quantity!r} do not fit the states",
+                expected=str(shape),
+                got=tuple(measured.shape),
             )
         values = measured.reshape(shape).to(torch.float64).contiguous()
         std = None if noise_std is None else noise_std.expand(read.size).to(torch.float64).contiguous()
@@ -130,6 +133,8 @@ class CompiledFit(Predictor):
             *state, value = (x.data_ptr() for x in row)
             noise = None if std is None else std.data_ptr()
             status = self.library.forcegp_update(newer._memory, *state, read.bits, value, noise)
+            if status == NOT_FINITE:
+                raise ShapeError("a measured value is not finite, or its noise not positive")
             if status not in (0, AT_REST):
                 kind = ModelError if status in (JAMMED, NO_NOISE) else NumericalError
                 raise kind(MESSAGES[status])
@@ -170,15 +175,19 @@ class CompiledFit(Predictor):
         Raises:
             ModelError: the model cannot learn in C.
         """
+        learned = self._begun if self._learned is None else self._learned
         newer = copy.copy(self)
-        if self._learned is None:
-            n, folded = self._online().size, sum(part.weights.numel() for part in self.model.parts())
-            newer._learned = torch.empty(2 * n + folded + n * (n + 1) // 2 + 1, dtype=torch.float64)
-            newer._root = slice(n + folded, n + folded + n * (n + 1) // 2)
-            self.library.forcegp_begin(newer._memory)
-        else:
-            newer._learned = self._learned.clone()
+        newer._learned = learned.clone()
         return newer
+
+    @cached_property
+    def _begun(self) -> Tensor:
+        """What the fit has learned, as `forcegp_learned`."""
+        n, folded = self._online().size, sum(part.weights.numel() for part in self.model.parts())
+        self._root = slice(n + folded, n + folded + n * (n + 1) // 2)
+        begun = torch.empty(2 * n + folded + n * (n + 1) // 2 + 1, dtype=torch.float64)
+        self.library.forcegp_begin(begun.data_ptr())
+        return begun
 
     @property
     def _memory(self) -> int | None:
