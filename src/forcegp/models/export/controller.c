@@ -24,10 +24,6 @@ static void combine(const double *restrict C, const double *restrict x, int n, i
     for (int c = 0; c < m; ++c) y[c] += x[i] * C[(long)i * m + c];
 }
 
-#if !ONLINE
-typedef struct forcegp_learned forcegp_learned; /* no model of this kind learns online */
-#endif
-
 /* ---- the constrained equations of motion, M qdd = Q + Q_z + A^T lambda and A qdd = b ---- */
 
 typedef struct {
@@ -43,7 +39,6 @@ typedef struct {
   double M_inv[NQ][NQ], H[NQ][NQ];             /* H = M^-1 - L A M^-1, from force to acceleration */
   double L[NQ][SOME(ROWS)];                    /* L = M^-1 A^T (A M^-1 A^T)^+ */
   double S[SOME(ROWS)][SOME(ROWS)];            /* (A M^-1 A^T)^+ */
-  int rank;                                    /* of A */
   double qdd[NQ], load[SOME(ROWS)];            /* qdd and lambda of the analytical forces */
   int closed[SOME(CONTACTS)];
   touching contact[SOME(CONTACTS)];
@@ -139,11 +134,9 @@ static void contact_rows(int i, const double *restrict point, const double *rest
   }
 }
 
-/* P = W^+ `(NQ, ROWS)` by one-sided Jacobi rotations of the rows of W, which they make orthogonal; small singular
- * values count as zero. Returns the number of others */
-static int pseudo_inverse(double *restrict W, double *restrict P) {
+/* P = W^+ `(NQ, ROWS)` by one-sided Jacobi rotations of the rows; small singular values count as zero */
+static void pseudo_inverse(double *restrict W, double *restrict P) {
   double V[ROWS * ROWS], square[ROWS], most = 0.0;
-  int rank = 0;
   for (int r = 0; r < ROWS * ROWS; ++r) V[r] = r % (ROWS + 1) == 0 ? 1.0 : 0.0;
   for (int sweep = 0; sweep < 30; ++sweep) {
     int turned = 0;
@@ -168,7 +161,6 @@ static int pseudo_inverse(double *restrict W, double *restrict P) {
     if (!turned) break;
   }
   for (int r = 0; r < ROWS; ++r) square[r] = dot(W + r * NQ, W + r * NQ, NQ), most = fmax(most, square[r]);
-  for (int r = 0; r < ROWS; ++r) rank += square[r] > RANK_TOLERANCE * RANK_TOLERANCE * most;
   for (int j = 0; j < NQ; ++j)
     for (int s = 0; s < ROWS; ++s) {
       double sum = 0.0;
@@ -176,7 +168,6 @@ static int pseudo_inverse(double *restrict W, double *restrict P) {
         if (square[r] > RANK_TOLERANCE * RANK_TOLERANCE * most) sum += W[r * NQ + j] / square[r] * V[s * ROWS + r];
       P[j * ROWS + s] = sum;
     }
-  return rank;
 }
 #endif
 
@@ -221,7 +212,7 @@ static int assemble(const double *restrict q, const double *restrict qd, const d
     for (int r = 0; r < ROWS; ++r) combine(&e->M_inv[0][0], e->A[r], NQ, NQ, along[r]);
     for (int r = 0; r < ROWS; ++r)
       for (int i = 0; i < NQ; ++i) W[r * NQ + i] = dot(K + i * NQ, e->A[r], i + 1);
-    e->rank = pseudo_inverse(W, P);
+    pseudo_inverse(W, P);
     for (int r = 0; r < ROWS; ++r)
       for (int s = 0; s < ROWS; ++s) {
         double sum = 0.0;
@@ -239,7 +230,6 @@ static int assemble(const double *restrict q, const double *restrict qd, const d
         for (int r = 0; r < ROWS; ++r) e->H[i][j] -= e->L[i][r] * along[r][j];
   }
 #else
-  e->rank = 0;
   (void)closed;
 #endif
   motion_under(e, Q, e->qdd, e->load);
@@ -656,15 +646,24 @@ static int predict(const forcegp_learned *learned, const double *q, const double
   return status;
 }
 
+int forcegp_equations(const double *q, const double *qd, double *M, double *A) {
+  const double tau[NQ] = {0.0};
+  equations e;
+  if (!assemble(q, qd, tau, NULL, &e)) return FORCEGP_NO_INERTIA;
+  memcpy(M, e.M, sizeof e.M);
+  if (CONTACTS > 0) memcpy(A, e.A, sizeof e.A);
+  return 0;
+}
+
 void forcegp_forward_dynamics(const double *q, const double *qd, const double *force, double *qdd) {
   double sine[NQ], cosine[NQ];
   for (int i = 0; i < NQ; ++i) sine[i] = sin(q[i]), cosine[i] = cos(q[i]);
   forward_dynamics(q, qd, force, sine, cosine, qdd);
 }
 
-static int predict_all(const forcegp_learned *learned, long count, const double *q, const double *qd,
-                       const double *tau, const unsigned char *closed, unsigned quantities, int noise, double *mean,
-                       double *covariance, double *beyond) {
+int forcegp_predict_learned(const forcegp_learned *learned, long count, const double *q, const double *qd,
+                            const double *tau, const unsigned char *closed, unsigned quantities, int noise, double *mean,
+                            double *covariance, double *beyond) {
   const int d = forcegp_size(quantities);
   int worst = 0;
   for (long i = 0; i < count; ++i) {
@@ -683,5 +682,5 @@ int forcegp_predict(const double *q, const double *qd, const double *tau, const 
 
 int forcegp_predict_many(long count, const double *q, const double *qd, const double *tau, const unsigned char *closed,
                          unsigned quantities, int noise, double *mean, double *covariance, double *beyond) {
-  return predict_all(NULL, count, q, qd, tau, closed, quantities, noise, mean, covariance, beyond);
+  return forcegp_predict_learned(NULL, count, q, qd, tau, closed, quantities, noise, mean, covariance, beyond);
 }

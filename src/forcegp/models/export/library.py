@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import copy
 import ctypes
-import dataclasses
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
@@ -34,13 +33,14 @@ MESSAGES = {
     NO_NOISE: "an update needs the noise of a quantity that the fit did not measure: pass noise_std",
 }
 POINTER = ctypes.c_void_p
-ONLINE = {
+FUNCTIONS = {
+    "predict_learned": [ctypes.c_long, *[POINTER] * 4, ctypes.c_uint, ctypes.c_int, *[POINTER] * 3],
     "begin": [],
     "update": [*[POINTER] * 4, ctypes.c_uint, POINTER, POINTER],
     "forget": [ctypes.c_double, ctypes.c_int],
     "drift": [ctypes.c_int, ctypes.c_double],
 }
-"""Arguments of the functions that change what is learned online, after a pointer to it."""
+"""Arguments after a pointer to what was learned online; all but the first are for models that learn."""
 
 
 class CompiledFit(Predictor):
@@ -54,14 +54,10 @@ class CompiledFit(Predictor):
         self.model, self.system = model, model.system
         header, source = c_source(model, NAME)
         self.library = load_library(source.replace(f'#include "{NAME}.h"\n', header), level="-O3")
-        at, out = [ctypes.c_long, *[POINTER] * 4, ctypes.c_uint, ctypes.c_int], [POINTER] * 3
-        self.library.forcegp_predict_many.argtypes = at + out
-        if model.online is not None:
-            for name, arguments in ONLINE.items():
-                getattr(self.library, f"forcegp_{name}").argtypes = [POINTER, *arguments]
-            self.library.forcegp_predict_learned.argtypes = [POINTER, *at, *out]
+        for name in FUNCTIONS if model.online is not None else list(FUNCTIONS)[:1]:
+            getattr(self.library, f"forcegp_{name}").argtypes = [POINTER, *FUNCTIONS[name]]
+        self._many = self.library.forcegp_predict_learned
         self._learned: Tensor | None = None
-        self._root = slice(0, 0)
         self._sizes = {name: self.library.forcegp_size(1 << bit) for bit, name in enumerate(READ)}
         self._known: dict[str | tuple[str, ...], _Rows] = {}
 
@@ -75,18 +71,9 @@ class CompiledFit(Predictor):
 
     def force_field(self) -> ForceField:
         """Posterior mean of Q̄ = Q + Q_z, `(n, nq)` at states, in PyTorch."""
-        if self._learned is None:
-            return self.model.posterior
-        latent, size = self.model.posterior.latent, self._online().size
-        assert isinstance(latent, SparsePosterior)
-        # A⁻¹ = KᵀK, so A = L Lᵀ with L = K⁻¹, and v = A w
-        K = torch.zeros_like(latent.L)
-        K[tuple(torch.tril_indices(size, size))] = self._learned[self._root]
-        L = torch.linalg.solve_triangular(K, torch.eye(size, dtype=K.dtype), upper=False)
-        moments = dataclasses.replace(latent.moments, v=L @ (L.mT @ self._learned[:size]))
-        return dataclasses.replace(
-            self.model.posterior, latent=SparsePosterior(latent.basis, moments, L, latent.jitter)
-        )
+        if self._learned is not None:
+            raise ModelError("what was learned in C has no force field in PyTorch", hint="update the fit")
+        return self.model.posterior
 
     def update(
         self,
@@ -184,7 +171,6 @@ class CompiledFit(Predictor):
     def _begun(self) -> Tensor:
         """What the fit has learned, as `forcegp_learned`."""
         n, folded = self._online().size, sum(part.weights.numel() for part in self.model.parts())
-        self._root = slice(n + folded, n + folded + n * (n + 1) // 2)
         begun = torch.empty(2 * n + folded + n * (n + 1) // 2 + 1, dtype=torch.float64)
         self.library.forcegp_begin(begun.data_ptr())
         return begun
@@ -237,11 +223,7 @@ class CompiledFit(Predictor):
         mean, beyond = q.new_empty((*batch, read.size)), q.new_empty((*batch, nq))
         spread = q.new_empty((*batch, read.size, read.size)) if covariance else None
         pointers = [None if x is None else x.data_ptr() for x in (*arrays, mean, spread, beyond)]
-        arguments = batch.numel(), *pointers[:4], read.bits, noise, *pointers[4:]
-        if self._learned is None:
-            status = self.library.forcegp_predict_many(*arguments)
-        else:
-            status = self.library.forcegp_predict_learned(self._memory, *arguments)
+        status = self._many(self._memory, batch.numel(), *pointers[:4], read.bits, noise, *pointers[4:])
         if status:
             flat_states(self.system, q, qd, tau, active)  # says which state is not finite
             raise (ModelError if status == JAMMED else NumericalError)(MESSAGES[status])

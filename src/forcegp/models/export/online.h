@@ -1,13 +1,13 @@
 /* What is learned online. It belongs to the caller, who may keep several and copy them; one thread changes it at a
  * time, and any number predict from it meanwhile, if they have a copy. */
 #define FORCEGP_FUNCTIONS @functions@
-typedef struct {
+struct forcegp_learned {
   double weights[FORCEGP_FUNCTIONS];                               /* mean of the weights of all functions */
   double folded[@folded@];                                         /* the same of kernels and features */
   double root[FORCEGP_FUNCTIONS * (FORCEGP_FUNCTIONS + 1) / 2]; /* K, by rows; their covariance is K^T K */
   double faded[FORCEGP_FUNCTIONS];                                 /* share of each prior that waits to be renewed */
   int next;                                                        /* the first one that waits */
-} forcegp_learned;
+};
 
 #define FORCEGP_AT_REST 5      /* nothing is learned from a robot at rest, as in a fit */
 #define FORCEGP_NO_NOISE 6     /* not one quantity that the fit has measured, and no noise is given */
@@ -32,9 +32,4 @@ int forcegp_forget(forcegp_learned *learned, double factor, int budget);
 /* Let the forces of one prior drift towards what they were before any sample, with correlation `factor`.
  * Priors: @priors@ */
 int forcegp_drift(forcegp_learned *learned, int prior, double factor);
-
-/* As forcegp_predict_many, from what was learned. */
-int forcegp_predict_learned(const forcegp_learned *learned, long count, const double *q, const double *qd,
-                            const double *tau, const unsigned char *closed, unsigned quantities, int noise, double *mean,
-                            double *covariance, double *beyond);
 

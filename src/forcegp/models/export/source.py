@@ -121,7 +121,7 @@ class Writer:
     def __init__(self, model: ExportedModel) -> None:
         self.model, self.parts, self.lines = model, model.parts(), []
         self.starts = list(accumulate((part.components for part in self.parts), initial=0))
-        self.tables: list[tuple[str, str, str]] = []
+        self.tables: list[tuple[str, str]] = []
         self._constants()
         self._noise()
         self._online()
@@ -230,11 +230,9 @@ class Writer:
         self.array(online.torque_variance, "LEARNED_TORQUE_VARIANCE")
         nq, contacts = self.model.system.robot.nq, len(self.model.system.contacts)
         self.lines += [
-            f"enum {{ PRIOR_COUNT = {len(self.parts)}, MOST_ROWS = {max(nq, 3 * contacts)} }};",
+            f"enum {{ PRIOR_COUNT = {len(self.parts)}, GROUP = {max(nq, 3 * contacts)} }};",
             f"static const double REST_SPEED = {online.rest_speed!r}, TEMPERING = {online.power**0.5!r};",
         ]
-        std = [self.array(self.model.noise[x]) if x in self.model.noise else "NULL" for x in READ]
-        self.lines.append(f"static const double *const NOISE_STD[] = {{{', '.join(std)}}};")
 
     def online_header(self) -> str:
         """The part of the header on learning online, if the model can."""
@@ -258,7 +256,7 @@ class Writer:
             unread = "  (void)q, (void)qd, (void)tau, (void)e, (void)gain, (void)spread;\n"
             texts.append(title + unread + "\n".join(body) + "\n  return 0;\n}\n")
             calls.append(f"  if (prior_{p}(q, qd, tau, e, gain, spread, f) != 0) return FORCEGP_JAMMED;\n")
-        names = ("FOLDED_WEIGHTS", "WHITENINGS", "ROOTS") if self.model.online is not None else ()
+        names = ("WHITENINGS", "ROOTS") if self.model.online is not None else ()
         for name, column in zip(names, zip(*self.tables, strict=True), strict=False):
             self.lines.append(f"static const double *const {name}[] = {{{', '.join(column)}}};")
         texts.append(f"static int latent_forces({ARGUMENTS}) {{\n{''.join(calls)}  return 0;\n}}\n")
@@ -303,8 +301,9 @@ class Writer:
             white, kept = "0", 0
             if part.whitening is not None and m:
                 white, kept = self.array(part.whitening[k].flatten()), part.whitening[k].shape[1]
-            self.tables.append((self.array(part.weights[k]), white, self.array(part.roots[k].flatten())))
-            tables = f"{self.tables[-1][0]}, {white}, {kept}, {self.tables[-1][2]}"
+            weights, roots = self.array(part.weights[k]), self.array(part.roots[k].flatten())
+            tables = f"{weights}, {white}, {kept}, {roots}"
+            self.tables.append((white, roots))
             rest = f"{part.first[k]}, spread, {self.starts[p] + k}, f"
             lines.append(f"    component(V, {m}, {len(phi)}, {variance}, {tables}, {rest});\n  }}")
         return lines
