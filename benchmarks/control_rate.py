@@ -7,8 +7,9 @@ robot (some 50 functions); the same with uncertain inertia (some 120); and `resi
 of a residual force of 21 inputs (some 460). Nothing is learned: time does not depend on hyperparameters.
 The C code is compiled by gcc with `-O3 -march=native -ffp-contract=fast` and with `-O2`, both `-std=c99`,
 and runs on one core over 256 logged states, contact closed; the time is the least mean of several rounds.
-Peers in the same run: `StructuredFit.predict`, and for the mechanics alone Pinocchio's `aba` from Python,
-if it is installed.
+Peers in the same run: `StructuredFit.predict` and `update`; for the mechanics alone Pinocchio's `aba`, and for
+the Gaussian processes alone GPyTorch, both from Python, if they are installed. Updates are timed four at a
+time, to be short beside the time slices of a shared core.
 """
 
 from __future__ import annotations
@@ -81,8 +82,8 @@ int main(void) {
         else if (kind == 3) {
           if (controller_update(&learned, q[i], qd[i], tau[i], NULL, CONTROLLER_QDD, qdd[i], NULL)) return 2;
         } else if (kind == 4) {
-          if (controller_predict_learned(&learned, 1, q[i], qd[i], tau[i], NULL, CONTROLLER_QDD | CONTROLLER_MULTIPLIER,
-                                         0, mean, covariance, beyond))
+          if (controller_predict_learned(&learned, 1, q[i], qd[i], tau[i], NULL,
+                                         CONTROLLER_QDD | CONTROLLER_MULTIPLIER, 0, mean, covariance, beyond))
             return 3;
         } else if (controller_predict(q[i], qd[i], tau[i], NULL, CONTROLLER_QDD | CONTROLLER_MULTIPLIER, 0,
                                     mean, kind ? covariance : NULL, beyond))
@@ -189,6 +190,46 @@ def pinocchio(fit: StructuredFit) -> float | None:
     return in_python(lambda i: pin.aba(model, data, *(x[i] for x in states)))
 
 
+def gpytorch(fit: StructuredFit) -> dict[str, float]:
+    """µs of GPyTorch's fast predictive variances for the Gaussian processes of `residual` alone, one for each
+    joint over `POINTS` points, without mechanics."""
+    try:
+        import gpytorch as package
+    except ImportError:
+        return {}
+    gp: Any = package
+    q, qd, tau, qdd = logged(fit)
+    x, joints = torch.cat([q, qd, tau], dim=-1), torch.Size([7])
+
+    class Model(gp.models.ExactGP):
+        def __init__(self) -> None:
+            super().__init__(x[:POINTS].expand(7, -1, -1), qdd[:POINTS].mT, noise)
+            self.mean = gp.means.ZeroMean(batch_shape=joints)
+            kernel = gp.kernels.MaternKernel(nu=1.5, ard_num_dims=x.shape[1], batch_shape=joints)
+            self.kernel = gp.kernels.ScaleKernel(kernel, batch_shape=joints)
+
+        def forward(self, at: Tensor) -> Any:
+            return gp.distributions.MultivariateNormal(self.mean(at), self.kernel(at))
+
+    noise = gp.likelihoods.GaussianLikelihood(batch_shape=joints).double()
+    model = Model().double().eval()
+
+    def read(i: int, covariance: bool) -> object:
+        found = model(x[i].expand(7, 1, -1))
+        return (found.mean, found.variance) if covariance else found.mean
+
+    times = {}
+    for name, fast in (
+        ("mean", gp.settings.skip_posterior_variances),
+        ("variance", gp.settings.fast_pred_var),
+    ):
+        with torch.no_grad(), fast():
+            times[f"residual {name} gpytorch from python"] = in_python(
+                lambda i, spread=name == "variance": read(i, spread)
+            )
+    return times
+
+
 def measure() -> dict[str, float]:
     """All times, µs."""
     result: dict[str, float] = {}
@@ -205,6 +246,7 @@ def measure() -> dict[str, float]:
                 result[f"{name} {what} python {kind}"] = predicting(predictor, fit, covariance)
         result[f"{name} update python compiled"] = updating(fast, fit)
         result[f"{name} update python predict"] = updating(fit, fit)
+        result |= gpytorch(fit) if name == "residual" else {}
         if name == "friction" and (peer := pinocchio(fit)) is not None:
             result["forward dynamics pinocchio from python"] = peer
     return result

@@ -1,12 +1,13 @@
-"""A robot without a force sensor feels its tool: a C program estimates the force 1000 times a second, with bars.
+"""A robot without a force sensor feels its tool: a C program estimates the force at 1 kHz, with error bars.
 
     python examples/force_observer/force_observer.py [--seconds 60] [--plot] [figure.png]
 
-MuJoCo plays a KUKA iiwa whose masses and friction its file does not know. The arm first moves freely for 40 s,
-from which the model learns. Then it sends its state through a pipe to `observe.c`, while a tool is pressed on
-something, slides along it, carries a payload that appears, and is pushed. The force is compared with that of
-generalized-momentum observers, which read the same states: one with the robot file, and one with a robot and
-friction that least squares has identified. Their gain is the one with the least error on this very stream.
+MuJoCo plays a KUKA iiwa with masses and friction that its file does not have. The arm first moves freely for
+40 s, from which the model learns. Then it sends its state through a pipe to `observe.c`, while its tool is
+pressed on something, slides along it, carries a payload that appears, and is pushed. The force is compared
+with that of generalized-momentum observers, which read the same states: one with the robot file, and one with
+a robot and friction that least squares has identified. Their gain is the one with the least error on this
+very stream.
 """
 
 # %%
@@ -20,11 +21,11 @@ import time
 from pathlib import Path
 
 import matplotlib.pyplot as plt
-import mujoco
 import numpy as np
 import torch
 
 import forcegp
+from forcegp.errors import optional_module
 from forcegp.evaluation.least_squares import identify_rigid
 from forcegp.forces.external_wrench import WrenchFrame, momentum_force
 from forcegp.forces.noise import GROWTH
@@ -34,6 +35,7 @@ from forcegp.logs import parse_mapping
 from forcegp.models.external_wrench import velocity_noise
 from forcegp.simulate.urdf import write_urdf
 
+mujoco = optional_module("mujoco", "This example")
 STEP, TRAINING, EVERY = 0.001, 40.0, 20
 HOME = np.array([0.0, 0.6, 0.0, -1.4, 0.0, 1.0, 0.0])
 FRAME, TIP = "lbr_iiwa_link_7", (0.0, 0.0, 0.1)
@@ -159,9 +161,8 @@ READING = struct.Struct("11d")
 
 def stream(program: Path, robot: Robot, seconds: float, show) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """States, true forces and readings of the observer."""
-    pipes = {"stdin": subprocess.PIPE, "stdout": subprocess.PIPE}
-    readings, states, forces = [], [], []
-    with subprocess.Popen([str(program)], bufsize=0, **pipes) as process:
+    pipe, (readings, states, forces) = subprocess.PIPE, ([], [], [])
+    with subprocess.Popen([str(program)], bufsize=0, stdin=pipe, stdout=pipe) as process:
         assert process.stdin is not None and process.stdout is not None
 
         def listen(source) -> None:
@@ -264,7 +265,8 @@ def main() -> None:
         ax.plot(t, force[:, i], label="observed")
         ax.plot(t, truth[:, i], "k--", lw=1, label="true")
         ax.set(ylabel=f"f{'xyz'[i]} [N]")
-    axes[0].legend(ncols=3), axes[-1].set(xlabel="time [s]")
+    axes[0].legend(ncols=3)
+    axes[-1].set(xlabel="time [s]")
     plt.savefig(figure, dpi=150)
     print(f"figure: {figure}")
 

@@ -104,7 +104,11 @@ def test_thousands_of_samples_one_by_one_are_those_together(name: str) -> None:
 
 def test_a_budget_renews_the_prior_in_turns() -> None:
     fit, fast = fitted("sparse"), compiled("sparse")
-    functions, turns, factor = sum(part.roots[0].shape[0] * part.components for part in fast.model.parts()), 8, 0.98
+    functions, turns, factor = (
+        sum(part.roots[0].shape[0] * part.components for part in fast.model.parts()),
+        8,
+        0.98,
+    )
     budget = -(-functions // turns)
     state, active, data = samples(fit, slice(0, 2 * turns))
     few, all_, stds = fast, fast, []

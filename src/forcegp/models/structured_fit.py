@@ -52,18 +52,12 @@ from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.base import FittedModel
 from forcegp.models.export.folder import Export, write_export
 from forcegp.models.export.library import CompiledFit
-from forcegp.models.export.model import ExportedModel, Sampling
+from forcegp.models.export.model import ExportedModel
 from forcegp.models.external_wrench import ExternalWrench, external_wrench
 from forcegp.models.fit_result import FitResult
 from forcegp.models.prediction import Prediction, in_pieces
 from forcegp.models.structured_file import pack, unpack
-from forcegp.models.structured_learning import (
-    REST_SPEED,
-    Specification,
-    constant_inputs,
-    prepared,
-    training_for,
-)
+from forcegp.models.structured_learning import Specification, constant_inputs, prepared, training_for
 from forcegp.rollout.inputs import Disturbance
 from forcegp.storage.model_file import ModelHeader
 
@@ -238,17 +232,13 @@ class StructuredFit(FittedModel):
 
     def _exported(self, functions: int | None) -> ExportedModel:
         parts = self.system, self.posterior, self.hyperparameters, self.noise, self.torque_std
-        return ExportedModel(*parts, self.problem.external_std, functions, self._sampling())
-
-    def _sampling(self) -> Sampling | None:
-        """How `update` makes rows of samples; `None` if noise of the state counts in them."""
-        if self.problem.state_std is not None:
-            return None
-        learned = self.hyperparameters.get(TORQUE_NOISE)
-        std = self.problem.torque_std if learned is None else learned.exp()
-        variance = torch.zeros_like(self.system.robot.mass) if std is None else std**2
-        rest = REST_SPEED if self.specification.noise.learns_torque else -1.0
-        return Sampling(variance.expand(self.system.robot.nq), self.problem.power, rest)
+        learned, std = self.hyperparameters.get(TORQUE_NOISE), self.problem.torque_std
+        std = learned.exp() if learned is not None else 0.0 if std is None else std
+        variance = torch.zeros_like(self.system.robot.mass) + std**2
+        moving = self.specification.noise.learns_torque
+        # Noise of the state makes the rows of a sample depend on the slopes of the learned forces.
+        sampling = None if self.problem.state_std is not None else (variance, self.problem.power, moving)
+        return ExportedModel(*parts, self.problem.external_std, functions, sampling)
 
     def export(
         self, path: str | Path, *, language: str = "c", name: str = "controller", functions: int | None = None

@@ -363,16 +363,6 @@ typedef struct {
   double *functions;                          /* where whitened functions go, if nothing else is asked for */
 } latent;
 
-#if ONLINE
-/* row = V^T C of a component's functions, with C = K^T of what was learned */
-static void learned_row(const forcegp_learned *restrict s, const double *restrict V, int first, int n,
-                        double *restrict row) {
-  for (int j = 0; j < first; ++j) row[j] = 0.0;
-  for (int j = first; j < RANK; ++j)
-    row[j] = dot(s->root + (long)j * (j + 1) / 2 + first, V, j - first < n ? j - first + 1 : n);
-}
-#endif
-
 /* row = V^T C, the functions V of a component in the columns from `first` on */
 static void root_row(const double *restrict C, const double *restrict V, int n, int first, double *restrict row) {
   for (int c = 0; c < first; ++c) row[c] = 0.0;
@@ -400,14 +390,12 @@ static void component(const double *restrict V, int m, int features, double vari
     functions = white, m = kept;
   }
 #if ONLINE
-  if (f->functions) {
-    memcpy(f->functions + FUNCTION[k], functions, sizeof(double) * (m + features));
-    return;
-  }
-  if (f->learned) {
-    learned_row(f->learned, functions, FUNCTION[k], m + features, f->T[k]);
-    return;
-  }
+  if (f->functions) memcpy(f->functions + first, functions, sizeof(double) * (m + features));
+  for (int j = 0; f->learned && j < RANK; ++j) /* C = K^T */
+    f->T[k][j] = j < first ? 0.0
+                           : dot(f->learned->root + (long)j * (j + 1) / 2 + first, functions,
+                                 j - first < m + features ? j - first + 1 : m + features);
+  if (f->learned) return;
 #endif
   root_row(C, functions, m + features, first, f->T[k]);
 }
@@ -513,25 +501,15 @@ static void matern52(double *restrict u, int m) {
 
 /* PRIORS */
 
-#ifdef INERTIAL
-/* E = -Y(q, qdd, qd) S of errors of the inertial parameters */
-static void inertial(const double *restrict q, const double *restrict qd, const double *restrict qdd, latent *restrict f) {
-  double sine[NQ], cosine[NQ], *E = f->E[INERTIAL];
-  for (int i = 0; i < NQ; ++i) sine[i] = sin(q[i]), cosine[i] = cos(q[i]);
-  regressor(q, qd, qdd, sine, cosine, E);
-  for (int k = 0; k < 10 * NQ; ++k)
-    for (int j = 0; j < NQ; ++j) E[k * NQ + j] *= -INERTIAL_SCALE[k];
-}
-#endif
-
-#ifdef PAYLOAD
-/* E = -Y_k(q, qdd, qd) S of mass and first moment of a payload on a link */
-static void payload(const double *restrict q, const double *restrict qd, const double *restrict qdd, latent *restrict f) {
+#if defined INERTIAL || defined PAYLOAD
+/* E = -Y(q, qdd, qd) S of errors of some inertial parameters */
+static void inertial(const double *restrict q, const double *restrict qd, const double *restrict qdd, int start, int column,
+                     int count, const double *restrict scale, latent *restrict f) {
   double sine[NQ], cosine[NQ], Y[10 * NQ * NQ];
   for (int i = 0; i < NQ; ++i) sine[i] = sin(q[i]), cosine[i] = cos(q[i]);
   regressor(q, qd, qdd, sine, cosine, Y);
-  for (int k = 0; k < 4; ++k)
-    for (int j = 0; j < NQ; ++j) f->E[PAYLOAD + k][j] = -PAYLOAD_UNITS[k] * Y[(PAYLOAD_COLUMN + k) * NQ + j];
+  for (int k = 0; k < count; ++k)
+    for (int j = 0; j < NQ; ++j) f->E[start + k][j] = -scale[k] * Y[(column + k) * NQ + j];
 }
 #endif
 
@@ -599,6 +577,20 @@ static void distance(const double *restrict qd, const double *restrict tau, doub
   }
 }
 
+/* the equations of motion and the gain of friction at a state */
+static int prepare(const double *q, const double *qd, const double *tau, const unsigned char *closed, equations *e,
+                   double *gain) {
+  for (int i = 0; i < NQ; ++i)
+    if (!isfinite(q[i]) || !isfinite(qd[i]) || !isfinite(tau[i])) return FORCEGP_NOT_FINITE;
+  if (!assemble(q, qd, tau, closed, e)) return FORCEGP_NO_INERTIA;
+#if COULOMB > 0
+  if (!friction_gain(e, gain)) return FORCEGP_JAMMED;
+#else
+  (void)gain;
+#endif
+  return 0;
+}
+
 static int predict(const forcegp_learned *learned, const double *q, const double *qd, const double *tau,
                    const unsigned char *closed, unsigned quantities, int noise, double *mean, double *covariance,
                    double *beyond) {
@@ -607,27 +599,22 @@ static int predict(const forcegp_learned *learned, const double *q, const double
   affine z;
   double prior_mean[NQ], far[NQ], unknown[NQ], gain[NQ * SOME(ROWS)];
   int size, status;
-  for (int i = 0; i < NQ; ++i)
-    if (!isfinite(q[i]) || !isfinite(qd[i]) || !isfinite(tau[i])) return FORCEGP_NOT_FINITE;
-  if (!assemble(q, qd, tau, closed, &e)) return FORCEGP_NO_INERTIA;
-#if COULOMB > 0
-  if (!friction_gain(&e, gain)) return FORCEGP_JAMMED;
-#endif
+  if ((status = prepare(q, qd, tau, closed, &e, gain)) != 0) return status;
   distance(qd, tau, far);
   if (beyond) memcpy(beyond, far, sizeof far);
   expected_force(&e, tau, prior_mean);
   f.learned = learned, f.functions = NULL;
   if ((status = latent_forces(q, qd, tau, &e, gain, covariance != NULL, &f)) != 0) return status;
 #ifdef PAYLOAD
-  payload(q, qd, e.qdd, &f);
+  inertial(q, qd, e.qdd, PAYLOAD, PAYLOAD_COLUMN, 4, PAYLOAD_UNITS, &f);
 #endif
 #ifdef INERTIAL
-  inertial(q, qd, e.qdd, &f);
+  inertial(q, qd, e.qdd, INERTIAL, 0, 10 * NQ, INERTIAL_SCALE, &f);
   if (covariance) { /* errors of the inertia are multiplied by the predicted acceleration */
     double qdd[NQ];
     maps(&e, gain, FORCEGP_QDD, &z);
     read_mean(&z, &f, prior_mean, NQ, qdd);
-    inertial(q, qd, qdd, &f);
+    inertial(q, qd, qdd, INERTIAL, 0, 10 * NQ, INERTIAL_SCALE, &f);
   }
 #endif
   size = maps(&e, gain, quantities, &z);
@@ -678,9 +665,4 @@ int forcegp_predict_learned(const forcegp_learned *learned, long count, const do
 int forcegp_predict(const double *q, const double *qd, const double *tau, const unsigned char *closed,
                     unsigned quantities, int noise, double *mean, double *covariance, double *beyond) {
   return predict(NULL, q, qd, tau, closed, quantities, noise, mean, covariance, beyond);
-}
-
-int forcegp_predict_many(long count, const double *q, const double *qd, const double *tau, const unsigned char *closed,
-                         unsigned quantities, int noise, double *mean, double *covariance, double *beyond) {
-  return forcegp_predict_learned(NULL, count, q, qd, tau, closed, quantities, noise, mean, covariance, beyond);
 }

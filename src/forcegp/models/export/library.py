@@ -16,8 +16,6 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError, NumericalError, ShapeError, check_name
 from forcegp.forces.noise import LOW
 from forcegp.forces.quantities import ForceField, flat_states
-from forcegp.gp.basis import LatentBasis
-from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.export.model import ExportedModel
 from forcegp.models.export.source import READ, c_source
 from forcegp.models.prediction import Prediction, Predictor
@@ -26,6 +24,7 @@ from forcegp.native import load_library
 NAME = "forcegp"
 NOT_FINITE, JAMMED, UNRESOLVED, NO_INERTIA, AT_REST, NO_NOISE = 1, 2, 3, 4, 5, 6
 """What the C code returns other than 0."""
+EVERY = 2**30  # a budget that is never used up
 MESSAGES = {
     JAMMED: "friction of a contact would press harder than it opposes",
     UNRESOLVED: "double precision does not resolve a predicted variance",
@@ -54,10 +53,11 @@ class CompiledFit(Predictor):
         self.model, self.system = model, model.system
         header, source = c_source(model, NAME)
         self.library = load_library(source.replace(f'#include "{NAME}.h"\n', header), level="-O3")
-        for name in FUNCTIONS if model.online is not None else list(FUNCTIONS)[:1]:
+        for name in FUNCTIONS if model.online else list(FUNCTIONS)[:1]:
             getattr(self.library, f"forcegp_{name}").argtypes = [POINTER, *FUNCTIONS[name]]
         self._many = self.library.forcegp_predict_learned
         self._learned: Tensor | None = None
+        self._memory: int | None = None
         self._sizes = {name: self.library.forcegp_size(1 << bit) for bit, name in enumerate(READ)}
         self._known: dict[str | tuple[str, ...], _Rows] = {}
 
@@ -86,10 +86,7 @@ class CompiledFit(Predictor):
         active: Tensor | None = None,
         noise_std: Tensor | None = None,
     ) -> CompiledFit:
-        """The fit with more samples, as `StructuredFit.update` gives it; mean and covariance count them at once.
-
-        A sample at rest is left out where the fit learned the noise of the torques, as in the fit. The cost is
-        that of n² operations for n functions, however many samples came before.
+        """The fit with more samples, one after the other, as `StructuredFit.update` gives it.
 
         Args:
             q, qd, tau: `(*batch, nq)` states.
@@ -99,26 +96,20 @@ class CompiledFit(Predictor):
             noise_std: of the values `(d,)`; by default that of the fit.
 
         Raises:
-            ModelError: the model cannot learn in C, or the fit did not measure the quantity and no noise is given.
+            ModelError: the model cannot learn in C, or the noise of the quantity is unknown.
             ShapeError: an argument does not fit the system, or is not finite.
             UnknownNameError: no such quantity.
         """
         read = self._read(quantity)
         flat = flat_states(self.system, q, qd, tau, active)
-        shape = (len(flat.q), read.size)
-        if measured.shape[-1:] != (read.size,) or measured.numel() != shape[0] * shape[1]:
-            raise ShapeError(
-                f"values of {quantity!r} do not fit the states",
-                expected=str(shape),
-                got=tuple(measured.shape),
-            )
-        values = measured.reshape(shape).to(torch.float64).contiguous()
-        std = None if noise_std is None else noise_std.expand(read.size).to(torch.float64).contiguous()
-        newer = self._copy()
-        columns = [x.contiguous() for x in (*flat[:4], values)]
+        expected, got = (*flat.batch, read.size), tuple(measured.shape)
+        if expected != got:
+            raise ShapeError(f"values of {quantity!r} do not fit the states", expected=str(expected), got=got)
+        std = None if noise_std is None else noise_std.expand(read.size).double().contiguous()
+        noise, newer = None if std is None else std.data_ptr(), self._copy()
+        columns = [x.contiguous() for x in (*flat[:4], measured.double().reshape(-1, read.size))]
         for row in zip(*columns, strict=True):
             *state, value = (x.data_ptr() for x in row)
-            noise = None if std is None else std.data_ptr()
             status = self.library.forcegp_update(newer._memory, *state, read.bits, value, noise)
             if status == NOT_FINITE:
                 raise ShapeError("a measured value is not finite, or its noise not positive")
@@ -147,8 +138,7 @@ class CompiledFit(Predictor):
         for name in priors or ():
             check_name("force prior to forget", name, names)
         if priors is None:
-            rows = self._online().size if budget is None else budget
-            status = self.library.forcegp_forget(newer._memory, factor, rows)
+            status = self.library.forcegp_forget(newer._memory, factor, EVERY if budget is None else budget)
         else:
             drift = self.library.forcegp_drift
             status = max((drift(newer._memory, names.index(name), factor) for name in priors), default=0)
@@ -157,39 +147,26 @@ class CompiledFit(Predictor):
         return newer
 
     def _copy(self) -> CompiledFit:
-        """The fit with its own copy of what it learns.
-
-        Raises:
-            ModelError: the model cannot learn in C.
-        """
-        learned = self._begun if self._learned is None else self._learned
-        newer = copy.copy(self)
+        """The fit with its own copy of what it has learned."""
+        newer, learned = copy.copy(self), self._begun if self._learned is None else self._learned
         newer._learned = learned.clone()
+        newer._memory = newer._learned.data_ptr()
         return newer
 
     @cached_property
     def _begun(self) -> Tensor:
-        """What the fit has learned, as `forcegp_learned`."""
-        n, folded = self._online().size, sum(part.weights.numel() for part in self.model.parts())
-        begun = torch.empty(2 * n + folded + n * (n + 1) // 2 + 1, dtype=torch.float64)
-        self.library.forcegp_begin(begun.data_ptr())
-        return begun
-
-    @property
-    def _memory(self) -> int | None:
-        """Where the C code finds what was learned online."""
-        return None if self._learned is None else self._learned.data_ptr()
-
-    def _online(self) -> LatentBasis:
-        """The basis that is learned in; errors as of `_copy`."""
-        latent = self.model.posterior.latent
-        if self.model.online is None or not isinstance(latent, SparsePosterior):
+        """What the fit has learned, as the numbers of a `forcegp_learned`."""
+        if not self.model.online:
             raise ModelError(
                 "this fit cannot learn online in C",
                 expected="sparse inference with all functions, a state without noise, no inertia learned",
                 hint="call update of the fit",
             )
-        return latent.basis
+        parts = self.model.parts()
+        n, folded = parts[0].rank, sum(part.weights.numel() for part in parts)
+        begun = torch.empty(2 * n + folded + n * (n + 1) // 2 + 1, dtype=torch.float64)
+        self.library.forcegp_begin(begun.data_ptr())
+        return begun
 
     def predict(
         self,

@@ -13,7 +13,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -77,20 +76,6 @@ class Functions:
         return 0 if self.rest is None else points(self.support)
 
 
-class Sampling(NamedTuple):
-    """How a new sample becomes rows of the posterior.
-
-    Attributes:
-        torque_variance: of the white noise of the motor torques in the samples of a fit `(nq,)`.
-        power: κ, by which rows are tempered.
-        rest_speed: speed of the fastest joint below which nothing is learned.
-    """
-
-    torque_variance: Tensor
-    power: float
-    rest_speed: float
-
-
 @dataclass(frozen=True, eq=False)
 class ExportedModel:
     """What is exported of a fit.
@@ -102,7 +87,8 @@ class ExportedModel:
         noise: standard deviation of a measurement of each measured quantity.
         torque_std, external_std: of the motor torques' noise and of unknown forces on joints, or `None`.
         functions: number r that the covariance is reduced to; `None` for all.
-        sampling: how it learns online; `None` for a model that cannot.
+        sampling: of a sample learned online, the variance of the motor torques' noise `(nq,)`, the power κ of
+            its likelihood, and whether it must be in motion; `None` for a model that cannot.
     """
 
     system: ConstrainedSystem
@@ -112,12 +98,12 @@ class ExportedModel:
     torque_std: Tensor | None
     external_std: Tensor | None
     functions: int | None = None
-    sampling: Sampling | None = None
+    sampling: tuple[Tensor, float, bool] | None = None
 
     @property
-    def online(self) -> Sampling | None:
-        """How it learns online, if it is over basis functions and all of its covariance is kept."""
-        return None if self.sign < 0 or self.posterior.process.pinned else self.sampling
+    def online(self) -> bool:
+        """Whether it learns online: it is over basis functions, and all of its covariance is kept."""
+        return self.sign > 0 and not self.posterior.process.pinned and self.sampling is not None
 
     def check(self) -> None:
         """Check that all parts of the model have a C form.

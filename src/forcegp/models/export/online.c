@@ -30,16 +30,13 @@ void forcegp_begin(forcegp_learned *s) {
 /* X^-1 after X X^T has grown by p p^T, or without the direction p if that is `fixed`; g = X^-1 p. Returns gamma, or 0
  * if there is nothing to do */
 static double grow(double (*restrict X_inv)[GROUP], const double *restrict p, int fixed, double *restrict g) {
-  double h[GROUP] = {0.0}, square = 0.0, size = 0.0, gamma, b;
+  double h[GROUP], square = 0.0, size = 0.0, gamma, b;
   for (int k = 0; k < GROUP; ++k) {
-    g[k] = 0.0;
-    for (int l = 0; l < GROUP; ++l) g[k] += X_inv[k][l] * p[l];
-    square += g[k] * g[k], size += p[k] * p[k];
+    g[k] = dot(X_inv[k], p, GROUP), square += g[k] * g[k], size += p[k] * p[k];
   }
   if (square <= (fixed ? RANK_TOLERANCE * RANK_TOLERANCE * size : 0.0)) return 0.0;
   gamma = sqrt(1.0 + square), b = fixed ? 1.0 / square : 1.0 / (gamma * (gamma + 1.0));
-  for (int k = 0; k < GROUP; ++k)
-    for (int l = 0; l < GROUP; ++l) h[l] += g[k] * X_inv[k][l];
+  combine(&X_inv[0][0], g, GROUP, GROUP, h);
   for (int k = 0; k < GROUP; ++k)
     for (int l = 0; l < GROUP; ++l) X_inv[k][l] -= b * g[k] * h[l];
   return gamma;
@@ -70,43 +67,32 @@ static void learn_rows(forcegp_learned *restrict s, double (*restrict Phi)[RANK]
     for (int i = 0; i < RANK; ++i) s->weights[i] += gain[k] * Y[k][i];
 }
 
-static void identity_of_rows(double (*X_inv)[GROUP]) {
-  for (int k = 0; k < GROUP; ++k)
-    for (int l = 0; l < GROUP; ++l) X_inv[k][l] = k == l ? 1.0 : 0.0;
-}
-
 int forcegp_update(forcegp_learned *s, const double *q, const double *qd, const double *tau, const unsigned char *closed,
                    unsigned quantity, const double *measured, const double *noise) {
   equations e;
   latent f;
   affine z;
   double expected[NQ], gain[NQ * SOME(ROWS)], W[SIZE_OF_ALL][COMPONENTS], V[RANK], Phi[GROUP][RANK] = {{0.0}};
-  double y[GROUP] = {0.0}, std[GROUP], X_inv[GROUP][GROUP], p[GROUP] = {0.0}, g[GROUP], fastest = 0.0;
+  double y[GROUP] = {0.0}, std[GROUP], X_inv[GROUP][GROUP] = {{0.0}}, p[GROUP] = {0.0}, g[GROUP], fastest = 0.0;
   int size, status, bit = 0;
   while (bit < QUANTITIES && quantity != 1u << bit) ++bit;
   if (bit == QUANTITIES || !(noise || SENSOR_VARIANCE[bit])) return FORCEGP_NO_NOISE;
-  for (int i = 0; i < NQ; ++i) {
-    if (!isfinite(q[i]) || !isfinite(qd[i]) || !isfinite(tau[i])) return FORCEGP_NOT_FINITE;
-    fastest = fmax(fastest, fabs(qd[i]));
-  }
+  for (int i = 0; i < NQ; ++i) fastest = fmax(fastest, fabs(qd[i]));
   for (int a = 0; a < SIZES[bit]; ++a) {
     std[a] = noise ? noise[a] : sqrt(SENSOR_VARIANCE[bit][a]);
     if (!isfinite(measured[a]) || !(std[a] > 0.0 && isfinite(std[a]))) return FORCEGP_NOT_FINITE;
   }
+  if ((status = prepare(q, qd, tau, closed, &e, gain)) != 0) return status;
   if (fastest <= REST_SPEED) return FORCEGP_AT_REST;
-  if (!assemble(q, qd, tau, closed, &e)) return FORCEGP_NO_INERTIA;
-#if COULOMB > 0
-  if (!friction_gain(&e, gain)) return FORCEGP_JAMMED;
-#endif
   f.learned = s, f.functions = V;
   if ((status = latent_forces(q, qd, tau, &e, gain, 1, &f)) != 0) return status;
 #ifdef PAYLOAD
-  payload(q, qd, e.qdd, &f);
+  inertial(q, qd, e.qdd, PAYLOAD, PAYLOAD_COLUMN, 4, PAYLOAD_UNITS, &f);
 #endif
 #ifdef INERTIAL
-  inertial(q, qd, quantity == FORCEGP_QDD ? measured : e.qdd, &f);
+  inertial(q, qd, quantity == FORCEGP_QDD ? measured : e.qdd, INERTIAL, 0, 10 * NQ, INERTIAL_SCALE, &f);
 #endif
-  /* rows (W V^T, y - E[y]) / sigma with W = B E, of noise 1 + N N^T with N = B_Q Sigma_tau^1/2 / sigma */
+  /* rows (W V^T, y - E[y]) / sigma with W = B E, of noise (1 + N N^T) / kappa with N = B_Q Sigma_tau^1/2 / sigma */
   size = maps(&e, gain, quantity, &z);
   operators(&z, &f, size, W);
   expected_force(&e, tau, expected);
@@ -117,7 +103,7 @@ int forcegp_update(forcegp_learned *s, const double *q, const double *qd, const 
     for (int k = 0; k < COMPONENTS; ++k)
       for (int i = FUNCTION[k]; i < FUNCTION[k + 1]; ++i) Phi[a][i] = W[a][k] / std[a] * V[i];
   }
-  identity_of_rows(X_inv);
+  for (int k = 0; k < GROUP; ++k) X_inv[k][k] = TEMPERING;
   for (int r = 0; quantity == FORCEGP_QDD && r < ROWS; ++r) { /* A qdd = b fixes these directions */
     for (int a = 0; a < size; ++a) p[a] = e.A[r][a] * std[a];
     grow(X_inv, p, 1, g);
@@ -125,11 +111,9 @@ int forcegp_update(forcegp_learned *s, const double *q, const double *qd, const 
   for (int i = 0; i < NQ; ++i) {
     const double slow = qd[i] / STICK_SPEED[i], stick = STICK_VARIANCE[i] * exp(-slow * slow);
     const double torque = sqrt(LEARNED_TORQUE_VARIANCE[i] + EXTERNAL_VARIANCE[i] + stick);
-    for (int a = 0; a < size; ++a) p[a] = z.B_Q[a][i] * torque / std[a];
+    for (int a = 0; a < size; ++a) p[a] = z.B_Q[a][i] * torque / std[a] / TEMPERING;
     grow(X_inv, p, 0, g);
   }
-  for (int k = 0; k < GROUP; ++k)
-    for (int l = 0; l < GROUP; ++l) X_inv[k][l] *= TEMPERING;
   learn_rows(s, Phi, y, X_inv, 0);
   fold(s);
   return 0;
@@ -142,9 +126,9 @@ int forcegp_forget(forcegp_learned *s, double factor, int budget) {
   for (int i = 0; i < RANK; ++i) s->faded[i] = 1.0 - factor * (1.0 - s->faded[i]);
   /* the prior is no sample: its precision of `budget` weights returns to one, of the others later */
   for (int done = 0; done < budget && done < RANK;) {
-    double Phi[GROUP][RANK] = {{0.0}}, zero[GROUP] = {0.0}, X_inv[GROUP][GROUP];
+    double Phi[GROUP][RANK] = {{0.0}}, zero[GROUP] = {0.0}, X_inv[GROUP][GROUP] = {{0.0}};
     const int first = s->next;
-    identity_of_rows(X_inv);
+    for (int k = 0; k < GROUP; ++k) X_inv[k][k] = 1.0;
     for (int k = 0; k < GROUP && done < budget && s->next < RANK; ++k, ++done, ++s->next)
       Phi[k][s->next] = sqrt(s->faded[s->next]), s->faded[s->next] = 0.0;
     learn_rows(s, Phi, zero, X_inv, first);

@@ -1,5 +1,4 @@
-/* What is learned online. It belongs to the caller, who may keep several and copy them; one thread changes it at a
- * time, and any number predict from it meanwhile, if they have a copy. */
+/* What is learned online. It belongs to the caller; threads that predict while another one learns need a copy. */
 #define FORCEGP_FUNCTIONS @functions@
 struct forcegp_learned {
   double weights[FORCEGP_FUNCTIONS];                               /* mean of the weights of all functions */
@@ -16,12 +15,8 @@ struct forcegp_learned {
 /* What the fit has learned. */
 void forcegp_begin(forcegp_learned *learned);
 
-/* Learn from one sample; mean and covariance are those of a fit with the sample at once.
- *
- * quantity   what was measured, such as FORCEGP_QDD
- * measured   its components
- * noise      their standard deviations; NULL for those of the fit
- */
+/* Learn from one sample of a quantity such as FORCEGP_QDD; mean and covariance are those of a fit with it at once.
+ * `noise` are the standard deviations of what was measured; NULL for those of the fit. */
 int forcegp_update(forcegp_learned *learned, const double *q, const double *qd, const double *tau,
                    const unsigned char *closed, unsigned quantity, const double *measured, const double *noise);
 

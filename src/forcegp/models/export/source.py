@@ -30,6 +30,7 @@ from forcegp.gp.basis import KernelPart
 from forcegp.gp.features import SMALLEST_FRACTION, stacked
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.export.model import ExportedModel, Functions
+from forcegp.models.structured_learning import REST_SPEED
 
 READ = (*QUANTITIES, "joint_friction")
 """The quantities of the C code, in the order of its bits; the last one is not in `QUANTITIES`."""
@@ -61,7 +62,7 @@ def c_source(model: ExportedModel, name: str) -> tuple[str, str]:
     head = '#include <math.h>\n#include <string.h>\n#include "forcegp.h"\n'
     head += "#ifdef __cplusplus\n#define restrict __restrict__\n#endif\n"
     blocks = [head, "\n".join(writer.lines), *_mechanics(model), before, *used, *priors, after]
-    blocks += [template("online.c")] if model.online is not None else []
+    blocks += [template("online.c")] if model.online else []
     robot, contacts = model.system.robot, model.system.contact_names
     fields = {
         "nq": robot.nq,
@@ -214,37 +215,29 @@ class Writer:
 
     def _online(self) -> None:
         """Where the functions of each component lie in what is learned online, and the noise of samples."""
-        online = self.model.online
-        self.lines.append(f"#define ONLINE {int(online is not None)}")
-        if online is None:
+        self.lines.append(f"#define ONLINE {int(self.model.online)}")
+        if not self.model.online or self.model.sampling is None:
             return
-        latent = self.model.posterior.latent
+        variance, power, moving = self.model.sampling
+        parts, latent = self.parts, self.model.posterior.latent
         assert isinstance(latent, SparsePosterior)
-        functions = [len(roots) for part in self.parts for roots in part.roots]
-        widths = [len(weights) for part in self.parts for weights in part.weights]
-        self.array(accumulate(functions, initial=0), "FUNCTION", "int")
-        self.array(accumulate(widths, initial=0), "FOLDED", "int")
-        self.array([part.size for part in self.parts for _ in range(part.components)], "POINTS", "int")
-        self.array(self.starts, "FIRST_COMPONENT", "int")
         self.array(latent.weights, "WEIGHTS")
-        self.array(online.torque_variance, "LEARNED_TORQUE_VARIANCE")
-        nq, contacts = self.model.system.robot.nq, len(self.model.system.contacts)
-        self.lines += [
-            f"enum {{ PRIOR_COUNT = {len(self.parts)}, GROUP = {max(nq, 3 * contacts)} }};",
-            f"static const double REST_SPEED = {online.rest_speed!r}, TEMPERING = {online.power**0.5!r};",
-        ]
+        self.array(accumulate((len(C) for part in parts for C in part.roots), initial=0), "FUNCTION", "int")
+        self.array(accumulate((len(w) for part in parts for w in part.weights), initial=0), "FOLDED", "int")
+        self.array([part.size for part in parts for _ in range(part.components)], "POINTS", "int")
+        self.array(self.starts, "FIRST_COMPONENT", "int")
+        self.array(variance, "LEARNED_TORQUE_VARIANCE")
+        group = max(self.model.system.robot.nq, 3 * len(self.model.system.contacts))
+        self.lines.append(f"enum {{ PRIOR_COUNT = {len(parts)}, GROUP = {group} }};")
+        rest = REST_SPEED if moving else -1.0
+        self.lines.append(f"static const double REST_SPEED = {rest!r}, TEMPERING = {power**0.5!r};")
 
     def online_header(self) -> str:
         """The part of the header on learning online, if the model can."""
-        if self.model.online is None:
-            return ""
-        names = (f"{p} {_comment(part.prior.name)}" for p, part in enumerate(self.parts))
-        fields = {
-            "functions": self.parts[0].rank,
-            "folded": sum(part.weights.numel() for part in self.parts),
-            "priors": ", ".join(names),
-        }
-        return template("online.h", fields)
+        names = ", ".join(f"{p} {_comment(part.prior.name)}" for p, part in enumerate(self.parts))
+        folded = sum(part.weights.numel() for part in self.parts)
+        fields = {"functions": self.parts[0].rank, "folded": folded, "priors": names}
+        return template("online.h", fields) if self.model.online else ""
 
     def priors(self) -> list[str]:
         """A function for each prior, and the one that calls them all."""
@@ -256,14 +249,14 @@ class Writer:
             unread = "  (void)q, (void)qd, (void)tau, (void)e, (void)gain, (void)spread;\n"
             texts.append(title + unread + "\n".join(body) + "\n  return 0;\n}\n")
             calls.append(f"  if (prior_{p}(q, qd, tau, e, gain, spread, f) != 0) return FORCEGP_JAMMED;\n")
-        names = ("WHITENINGS", "ROOTS") if self.model.online is not None else ()
+        names = ("WHITENINGS", "ROOTS") if self.model.online else ()
         for name, column in zip(names, zip(*self.tables, strict=True), strict=False):
             self.lines.append(f"static const double *const {name}[] = {{{', '.join(column)}}};")
         texts.append(f"static int latent_forces({ARGUMENTS}) {{\n{''.join(calls)}  return 0;\n}}\n")
         return texts
 
     def _operator(self, part: Functions, start: int) -> list[str]:
-        """Code of E(x), which carries f to generalized forces; that of `INERTIAL` and `PAYLOAD` is in `controller.c`."""
+        """Code of E(x), from f to generalized forces; that of inertial errors is in `controller.c`."""
         prior, E = part.prior, f"f->E + {start}"
         if isinstance(prior, InertialPrior | PayloadPrior):
             return []
