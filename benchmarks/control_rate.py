@@ -7,9 +7,9 @@ robot (some 50 functions); the same with uncertain inertia (some 120); and `resi
 of a residual force of 21 inputs (some 460). Nothing is learned: time does not depend on hyperparameters.
 The C code is compiled by gcc with `-O3 -march=native -ffp-contract=fast` and with `-O2`, both `-std=c99`,
 and runs on one core over 256 logged states, contact closed; the time is the least mean of several rounds.
-Peers in the same run: `StructuredFit.predict` and `update`; for the mechanics alone Pinocchio's `aba`, and for
-the Gaussian processes alone GPyTorch, both from Python, if they are installed. Updates are timed four at a
-time, to be short beside the time slices of a shared core.
+Peers in the same run: `StructuredFit.predict` and `update`; for the mechanics alone Pinocchio's `aba`, and
+for the Gaussian processes alone GPyTorch, both from Python, if they are installed. Updates are timed four at
+a time, to be short beside the time slices of a shared core.
 """
 
 from __future__ import annotations

@@ -502,14 +502,14 @@ static void matern52(double *restrict u, int m) {
 /* PRIORS */
 
 #if defined INERTIAL || defined PAYLOAD
-/* E = -Y(q, qdd, qd) S of errors of some inertial parameters */
+/* E = -[Y(q, qdd, qd), diag qdd] S of errors of some inertial parameters of links, and of drives behind them */
 static void inertial(const double *restrict q, const double *restrict qd, const double *restrict qdd, int start, int column,
                      int count, const double *restrict scale, latent *restrict f) {
-  double sine[NQ], cosine[NQ], Y[10 * NQ * NQ];
-  for (int i = 0; i < NQ; ++i) sine[i] = sin(q[i]), cosine[i] = cos(q[i]);
-  regressor(q, qd, qdd, sine, cosine, Y);
+  double sine[NQ], cosine[NQ], Y[10 * NQ + NQ][NQ] = {{0.0}};
+  for (int i = 0; i < NQ; ++i) sine[i] = sin(q[i]), cosine[i] = cos(q[i]), Y[10 * NQ + i][i] = qdd[i];
+  regressor(q, qd, qdd, sine, cosine, Y[0]);
   for (int k = 0; k < count; ++k)
-    for (int j = 0; j < NQ; ++j) f->E[start + k][j] = -scale[k] * Y[(column + k) * NQ + j];
+    for (int j = 0; j < NQ; ++j) f->E[start + k][j] = -scale[k] * Y[column + k][j];
 }
 #endif
 
@@ -609,12 +609,12 @@ static int predict(const forcegp_learned *learned, const double *q, const double
   inertial(q, qd, e.qdd, PAYLOAD, PAYLOAD_COLUMN, 4, PAYLOAD_UNITS, &f);
 #endif
 #ifdef INERTIAL
-  inertial(q, qd, e.qdd, INERTIAL, 0, 10 * NQ, INERTIAL_SCALE, &f);
+  inertial(q, qd, e.qdd, INERTIAL, 0, INERTIAL_COLUMNS, INERTIAL_SCALE, &f);
   if (covariance) { /* errors of the inertia are multiplied by the predicted acceleration */
     double qdd[NQ];
     maps(&e, gain, FORCEGP_QDD, &z);
     read_mean(&z, &f, prior_mean, NQ, qdd);
-    inertial(q, qd, qdd, INERTIAL, 0, 10 * NQ, INERTIAL_SCALE, &f);
+    inertial(q, qd, qdd, INERTIAL, 0, INERTIAL_COLUMNS, INERTIAL_SCALE, &f);
   }
 #endif
   size = maps(&e, gain, quantities, &z);

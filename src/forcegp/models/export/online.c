@@ -90,7 +90,7 @@ int forcegp_update(forcegp_learned *s, const double *q, const double *qd, const 
   inertial(q, qd, e.qdd, PAYLOAD, PAYLOAD_COLUMN, 4, PAYLOAD_UNITS, &f);
 #endif
 #ifdef INERTIAL
-  inertial(q, qd, quantity == FORCEGP_QDD ? measured : e.qdd, INERTIAL, 0, 10 * NQ, INERTIAL_SCALE, &f);
+  inertial(q, qd, quantity == FORCEGP_QDD ? measured : e.qdd, INERTIAL, 0, INERTIAL_COLUMNS, INERTIAL_SCALE, &f);
 #endif
   /* rows (W V^T, y - E[y]) / sigma with W = B E, of noise (1 + N N^T) / kappa with N = B_Q Sigma_tau^1/2 / sigma */
   size = maps(&e, gain, quantity, &z);
