@@ -184,6 +184,7 @@ static void motion_under(const equations *restrict e, const double *restrict Q, 
 static int assemble(const double *restrict q, const double *restrict qd, const double *restrict tau,
                     const unsigned char *restrict closed, equations *restrict e) {
   double sine[NQ], cosine[NQ], out[MECHANICS], K[NQ * NQ], Q[NQ];
+  (void)closed;
   for (int i = 0; i < NQ; ++i) sine[i] = sin(q[i]), cosine[i] = cos(q[i]);
   mechanics(q, qd, sine, cosine, out);
   memcpy(e->M, out, sizeof e->M);
@@ -229,8 +230,6 @@ static int assemble(const double *restrict q, const double *restrict qd, const d
       for (int j = 0; j < NQ; ++j)
         for (int r = 0; r < ROWS; ++r) e->H[i][j] -= e->L[i][r] * along[r][j];
   }
-#else
-  (void)closed;
 #endif
   motion_under(e, Q, e->qdd, e->load);
   return 1;
@@ -391,10 +390,10 @@ static void component(const double *restrict V, int m, int features, double vari
   }
 #if ONLINE
   if (f->functions) memcpy(f->functions + first, functions, sizeof(double) * (m + features));
-  for (int j = 0; f->learned && j < RANK; ++j) /* C = K^T */
-    f->T[k][j] = j < first ? 0.0
-                           : dot(f->learned->root + (long)j * (j + 1) / 2 + first, functions,
-                                 j - first < m + features ? j - first + 1 : m + features);
+  for (int j = 0; f->learned && j < RANK; ++j) { /* C = K^T */
+    const int n = j < first ? 0 : j < first + m + features ? j - first + 1 : m + features;
+    f->T[k][j] = dot(f->learned->root + (long)j * (j + 1) / 2 + first, functions, n);
+  }
   if (f->learned) return;
 #endif
   root_row(C, functions, m + features, first, f->T[k]);
@@ -580,13 +579,12 @@ static void distance(const double *restrict qd, const double *restrict tau, doub
 /* the equations of motion and the gain of friction at a state */
 static int prepare(const double *q, const double *qd, const double *tau, const unsigned char *closed, equations *e,
                    double *gain) {
+  (void)gain;
   for (int i = 0; i < NQ; ++i)
     if (!isfinite(q[i]) || !isfinite(qd[i]) || !isfinite(tau[i])) return FORCEGP_NOT_FINITE;
   if (!assemble(q, qd, tau, closed, e)) return FORCEGP_NO_INERTIA;
 #if COULOMB > 0
   if (!friction_gain(e, gain)) return FORCEGP_JAMMED;
-#else
-  (void)gain;
 #endif
   return 0;
 }

@@ -13,7 +13,7 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.errors import ModelError, NumericalError, ShapeError, check_name
+from forcegp.errors import ForceGPError, ModelError, NumericalError, ShapeError, check_name
 from forcegp.forces.noise import LOW
 from forcegp.forces.quantities import ForceField, flat_states
 from forcegp.models.export.model import ExportedModel
@@ -24,13 +24,14 @@ from forcegp.native import load_library
 NAME = "forcegp"
 NOT_FINITE, JAMMED, UNRESOLVED, NO_INERTIA, AT_REST, NO_NOISE = 1, 2, 3, 4, 5, 6
 """What the C code returns other than 0."""
-EVERY = 2**30  # a budget that is never used up
 MESSAGES = {
     JAMMED: "friction of a contact would press harder than it opposes",
     UNRESOLVED: "double precision does not resolve a predicted variance",
     NO_INERTIA: "the mass matrix is not positive definite",
+    NOT_FINITE: "a measured value is not finite, or its noise not positive",
     NO_NOISE: "an update needs the noise of a quantity that the fit did not measure: pass noise_std",
 }
+KINDS: dict[int, type[ForceGPError]] = {JAMMED: ModelError, NO_NOISE: ModelError, NOT_FINITE: ShapeError}
 POINTER = ctypes.c_void_p
 FUNCTIONS = {
     "predict_learned": [ctypes.c_long, *[POINTER] * 4, ctypes.c_uint, ctypes.c_int, *[POINTER] * 3],
@@ -111,15 +112,12 @@ class CompiledFit(Predictor):
         for row in zip(*columns, strict=True):
             *state, value = (x.data_ptr() for x in row)
             status = self.library.forcegp_update(newer._memory, *state, read.bits, value, noise)
-            if status == NOT_FINITE:
-                raise ShapeError("a measured value is not finite, or its noise not positive")
             if status not in (0, AT_REST):
-                kind = ModelError if status in (JAMMED, NO_NOISE) else NumericalError
-                raise kind(MESSAGES[status])
+                raise KINDS.get(status, NumericalError)(MESSAGES[status])
         return newer
 
     def forget(
-        self, factor: float, priors: Sequence[str] | None = None, *, budget: int | None = None
+        self, factor: float, priors: Sequence[str] | None = None, *, budget: int = 2**30
     ) -> CompiledFit:
         """The fit with all samples partly forgotten, as `StructuredFit.forget` gives it.
 
@@ -138,7 +136,7 @@ class CompiledFit(Predictor):
         for name in priors or ():
             check_name("force prior to forget", name, names)
         if priors is None:
-            status = self.library.forcegp_forget(newer._memory, factor, EVERY if budget is None else budget)
+            status = self.library.forcegp_forget(newer._memory, factor, budget)
         else:
             drift = self.library.forcegp_drift
             status = max((drift(newer._memory, names.index(name), factor) for name in priors), default=0)
@@ -203,7 +201,7 @@ class CompiledFit(Predictor):
         status = self._many(self._memory, batch.numel(), *pointers[:4], read.bits, noise, *pointers[4:])
         if status:
             flat_states(self.system, q, qd, tau, active)  # says which state is not finite
-            raise (ModelError if status == JAMMED else NumericalError)(MESSAGES[status])
+            raise KINDS.get(status, NumericalError)(MESSAGES[status])
         if read.order is not None:
             mean = mean[..., read.order]
             spread = None if spread is None else spread[..., read.order, :][..., read.order]

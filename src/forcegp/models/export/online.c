@@ -1,4 +1,3 @@
-
 /* ---- learning online ----
  *
  * The covariance of the weights w of all functions is K^T K, with K lower triangular. Rows Phi w = y + noise of unit
@@ -8,13 +7,14 @@
  * In the end X X^T = noise + Phi A^-1 Phi^T and Y X^T = A^-1 Phi^T, so w' = w + Y X^-1 (y - Phi w). */
 
 /* weights of k(x, Z) and phi(x), from those of the whitened functions */
-static void fold(forcegp_learned *s) {
+static int fold(forcegp_learned *s) {
   for (int k = 0; k < COMPONENTS; ++k) {
     const double *w = s->weights + FUNCTION[k];
     const int m = POINTS[k], features = FOLDED[k + 1] - FOLDED[k] - m, kept = FUNCTION[k + 1] - FUNCTION[k] - features;
     for (int i = 0; i < m; ++i) s->folded[FOLDED[k] + i] = dot(WHITENINGS[k] + (long)i * kept, w, kept);
     memcpy(s->folded + FOLDED[k] + m, w + kept, sizeof(double) * features);
   }
+  return 0;
 }
 
 void forcegp_begin(forcegp_learned *s) {
@@ -45,7 +45,7 @@ static double grow(double (*restrict X_inv)[GROUP], const double *restrict p, in
 /* rows whose noise has the covariance X X^T; unused rows, and columns before `first`, are zero */
 static void learn_rows(forcegp_learned *restrict s, double (*restrict Phi)[RANK], const double *restrict y,
                        double (*restrict X_inv)[GROUP], int first) {
-  double Y[GROUP][RANK] = {{0.0}}, gain[GROUP] = {0.0};
+  double Y[GROUP][RANK] = {{0.0}}, gap[GROUP];
   for (int j = first; j < RANK; ++j) {
     double *restrict c = s->root + (long)j * (j + 1) / 2;
     double g[GROUP], p[GROUP], gamma, a, b;
@@ -59,12 +59,11 @@ static void learn_rows(forcegp_learned *restrict s, double (*restrict Phi)[RANK]
       for (int k = 0; k < GROUP; ++k) Y[k][i] += moved * g[k];
     }
   }
-  for (int l = 0; l < GROUP; ++l) {
-    const double gap = y[l] - dot(Phi[l], s->weights, RANK);
-    for (int k = 0; k < GROUP; ++k) gain[k] += X_inv[k][l] * gap;
+  for (int k = 0; k < GROUP; ++k) gap[k] = y[k] - dot(Phi[k], s->weights, RANK);
+  for (int k = 0; k < GROUP; ++k) {
+    const double gain = dot(X_inv[k], gap, GROUP);
+    for (int i = 0; i < RANK; ++i) s->weights[i] += gain * Y[k][i];
   }
-  for (int k = 0; k < GROUP; ++k)
-    for (int i = 0; i < RANK; ++i) s->weights[i] += gain[k] * Y[k][i];
 }
 
 int forcegp_update(forcegp_learned *s, const double *q, const double *qd, const double *tau, const unsigned char *closed,
@@ -115,27 +114,23 @@ int forcegp_update(forcegp_learned *s, const double *q, const double *qd, const 
     grow(X_inv, p, 0, g);
   }
   learn_rows(s, Phi, y, X_inv, 0);
-  fold(s);
-  return 0;
+  return fold(s);
 }
 
 int forcegp_forget(forcegp_learned *s, double factor, int budget) {
-  const double grown = 1.0 / sqrt(factor);
   if (!(factor > 0.0 && factor <= 1.0)) return FORCEGP_OUT_OF_RANGE;
-  for (long i = 0; factor < 1.0 && i < (long)RANK * (RANK + 1) / 2; ++i) s->root[i] *= grown;
+  for (long i = 0; factor < 1.0 && i < (long)RANK * (RANK + 1) / 2; ++i) s->root[i] /= sqrt(factor);
   for (int i = 0; i < RANK; ++i) s->faded[i] = 1.0 - factor * (1.0 - s->faded[i]);
   /* the prior is no sample: its precision of `budget` weights returns to one, of the others later */
   for (int done = 0; done < budget && done < RANK;) {
     double Phi[GROUP][RANK] = {{0.0}}, zero[GROUP] = {0.0}, X_inv[GROUP][GROUP] = {{0.0}};
     const int first = s->next;
-    for (int k = 0; k < GROUP; ++k) X_inv[k][k] = 1.0;
     for (int k = 0; k < GROUP && done < budget && s->next < RANK; ++k, ++done, ++s->next)
-      Phi[k][s->next] = sqrt(s->faded[s->next]), s->faded[s->next] = 0.0;
+      Phi[k][s->next] = sqrt(s->faded[s->next]), s->faded[s->next] = 0.0, X_inv[k][k] = 1.0;
     learn_rows(s, Phi, zero, X_inv, first);
     s->next %= RANK;
   }
-  fold(s);
-  return 0;
+  return fold(s);
 }
 
 int forcegp_drift(forcegp_learned *s, int prior, double factor) {
@@ -156,6 +151,5 @@ int forcegp_drift(forcegp_learned *s, int prior, double factor) {
       }
     }
   }
-  fold(s);
-  return 0;
+  return fold(s);
 }

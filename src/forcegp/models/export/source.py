@@ -122,7 +122,7 @@ class Writer:
     def __init__(self, model: ExportedModel) -> None:
         self.model, self.parts, self.lines = model, model.parts(), []
         self.starts = list(accumulate((part.components for part in self.parts), initial=0))
-        self.tables: list[tuple[str, str]] = []
+        self.tables: list[list[str]] = []
         self._constants()
         self._noise()
         self._online()
@@ -228,10 +228,11 @@ class Writer:
         self.array([part.size for part in parts for _ in range(part.components)], "POINTS", "int")
         self.array(self.starts, "FIRST_COMPONENT", "int")
         self.array(variance, "LEARNED_TORQUE_VARIANCE")
-        group = max(self.model.system.robot.nq, 3 * len(self.model.system.contacts))
-        self.lines.append(f"enum {{ PRIOR_COUNT = {len(parts)}, GROUP = {group} }};")
-        rest = REST_SPEED if moving else -1.0
-        self.lines.append(f"static const double REST_SPEED = {rest!r}, TEMPERING = {power**0.5!r};")
+        self.lines.append(
+            f"enum {{ PRIOR_COUNT = {len(parts)}, GROUP = CONTACTS * 3 > NQ ? CONTACTS * 3 : NQ }};"
+        )
+        self.lines.append(f"static const double REST_SPEED = {REST_SPEED if moving else -1.0!r};")
+        self.lines.append(f"static const double TEMPERING = {power**0.5!r};")
 
     def online_header(self) -> str:
         """The part of the header on learning online, if the model can."""
@@ -250,9 +251,9 @@ class Writer:
             unread = "  (void)q, (void)qd, (void)tau, (void)e, (void)gain, (void)spread;\n"
             texts.append(title + unread + "\n".join(body) + "\n  return 0;\n}\n")
             calls.append(f"  if (prior_{p}(q, qd, tau, e, gain, spread, f) != 0) return FORCEGP_JAMMED;\n")
-        names = ("WHITENINGS", "ROOTS") if self.model.online else ()
-        for name, column in zip(names, zip(*self.tables, strict=True), strict=False):
-            self.lines.append(f"static const double *const {name}[] = {{{', '.join(column)}}};")
+        for i, name in ((1, "WHITENINGS"), (3, "ROOTS")) if self.model.online else ():
+            column = ", ".join(tables[i] for tables in self.tables)
+            self.lines.append(f"static const double *const {name}[] = {{{column}}};")
         texts.append(f"static int latent_forces({ARGUMENTS}) {{\n{''.join(calls)}  return 0;\n}}\n")
         return texts
 
@@ -295,11 +296,10 @@ class Writer:
             white, kept = "0", 0
             if part.whitening is not None and m:
                 white, kept = self.array(part.whitening[k].flatten()), part.whitening[k].shape[1]
-            weights, roots = self.array(part.weights[k]), self.array(part.roots[k].flatten())
-            tables = f"{weights}, {white}, {kept}, {roots}"
-            self.tables.append((white, roots))
+            tables = [self.array(part.weights[k]), white, str(kept), self.array(part.roots[k].flatten())]
+            self.tables.append(tables)
             rest = f"{part.first[k]}, spread, {self.starts[p] + k}, f"
-            lines.append(f"    component(V, {m}, {len(phi)}, {variance}, {tables}, {rest});\n  }}")
+            lines.append(f"    component(V, {m}, {len(phi)}, {variance}, {', '.join(tables)}, {rest});\n  }}")
         return lines
 
     def _inputs(self, p: int, part: Functions) -> tuple[str, bool]:
