@@ -29,7 +29,7 @@ from forcegp.errors import (
 )
 from forcegp.forces.noise import unknown_variance
 from forcegp.forces.priors.contact import ContactForcePrior, NormalForcePrior, SlidingFrictionPrior
-from forcegp.forces.priors.inertial import InertialPrior
+from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
 from forcegp.forces.priors.joint import JointForcePrior, JointFrictionPrior
 from forcegp.forces.priors.sets import WHOLE, default_priors
 from forcegp.forces.quantities import QUANTITIES, states_at
@@ -362,7 +362,10 @@ class Bowl(forcegp.ImplicitSurface):
     ("priors", "named"),
     [
         ([forcegp.DisturbancePrior()], "'disturbance' .*DisturbancePrior"),
-        ([JointFrictionPrior(), forcegp.PayloadPrior()], "'payload' .*PayloadPrior"),
+        (
+            [JointFrictionPrior(), forcegp.PayloadPrior(known=(1.0, 0.0, 0.0, 0.0))],
+            "'payload' .*PayloadPrior",
+        ),
         ([forcegp.CoregionalPrior()], "'coregional' .*CoregionalPrior"),
         ([forcegp.OperatorForcePrior("wind", 7, lambda s, at: at.eom.M)], "'wind' .*OperatorForcePrior"),
     ],
@@ -396,15 +399,12 @@ def test_names_do_not_become_code() -> None:
         assert "int injected;" not in text and "\\" not in text.replace("\\\n", "") and "#error" not in text
 
 
-def test_two_priors_on_the_inertia_are_refused() -> None:
+@pytest.mark.parametrize(("kind", "what"), [(InertialPrior, "the inertia"), (PayloadPrior, "a payload")])
+def test_two_priors_on_the_inertia_are_refused(kind: type, what: str) -> None:
     robot = forcegp.load_robot("kuka_iiwa")
-    model = forcegp.StructuredGP(
-        forcegp.ConstrainedSystem(robot),
-        "analytical",
-        [InertialPrior(), InertialPrior(name="second")],
-        noise=0.1,
-    )
-    with pytest.raises(ModelError, match="two priors on the inertia"):
+    priors = [kind(), kind(name="second")]
+    model = forcegp.StructuredGP(forcegp.ConstrainedSystem(robot), "analytical", priors, noise=0.1)
+    with pytest.raises(ModelError, match=f"two priors on {what}"):
         model.fit(free_log(robot, 12), learn=[]).compiled()
 
 

@@ -180,9 +180,6 @@ def test_a_payload_that_appears_is_followed() -> None:
     assert differs(fast, slow, fit) < SAME
     before, after = (x.predict(q, qd, tau).mean - qdd for x in (fit, fast))
     assert float(after.square().mean()) < 0.1 * float(before.square().mean())
-    known = forcegp.StructuredGP(fit.system, "analytical", [PayloadPrior(known=(1.0, 0.0, 0.0, 0.0))], 0.1)
-    with pytest.raises(ModelError, match=r"(?s)force prior 'payload' .*PayloadPrior"):
-        known.fit(free_log(robot, 20), learn=[]).compiled()
 
 
 def test_a_robot_at_rest_teaches_nothing() -> None:
