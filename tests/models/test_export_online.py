@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import ctypes
+import subprocess
 from functools import cache
+from pathlib import Path
 
 import pytest
 import torch
@@ -18,7 +20,7 @@ from forcegp.models.export.library import CompiledFit
 from forcegp.models.prediction import Predictor
 from forcegp.models.structured_fit import StructuredFit
 from forces.cases import draw, logged, two_contacts
-from models.test_export import SAME, ZERO, compiled, fitted, free_log, needs_gcc, states
+from models.test_export import SAME, STRICT, ZERO, compiled, fitted, free_log, needs_gcc, states
 
 FEW = slice(0, 24)
 
@@ -220,7 +222,53 @@ def test_the_library_reports_what_it_does_not_learn() -> None:
 
     assert status(0) == status(3) == status(2) == 6
     qdd[2] = float("nan")
-    assert status() == 1 and ctypes.sizeof(ctypes.c_double) == 8
+    assert status() == 1
     qdd[2], q[0] = 0.0, float("inf")
     assert status() == 1
     assert torch.equal(before, fast._learned)  # type: ignore[arg-type]
+
+
+MAIN = """
+#include <stdio.h>
+#include "controller.h"
+static controller_learned learned;
+int main(void) {
+  const double q[7] = {0.1, 0.5, 0.2, -1.2, 0.3, 1.4, 0.4}, tau[7] = {1.0}, qdd[7] = {0.2};
+  double qd[7] = {0.1, 0.2, -0.3}, mean[9], covariance[81];
+  int error = 0;
+  controller_begin(&learned);
+  for (int i = 0; i < 5; ++i) {
+    qd[1] += 0.1;
+    error |= controller_forget(&learned, 0.9, 11);
+    error |= controller_drift(&learned, 0, 0.9);
+    error |= controller_update(&learned, q, qd, tau, NULL, CONTROLLER_QDD, qdd, NULL);
+  }
+  error |= controller_predict_learned(&learned, 1, q, qd, tau, NULL,
+                                      CONTROLLER_QDD | CONTROLLER_MULTIPLIER, 1, mean, covariance, NULL);
+  return error;
+}
+"""
+
+
+@needs_gcc
+@pytest.mark.parametrize("name", ["sparse", "one_contact"])
+def test_sanitizers_find_nothing_in_what_learns(name: str, tmp_path: Path) -> None:
+    folder = fitted(name).export(tmp_path / "c").folder
+    (folder / "main.c").write_text(MAIN)
+    sanitized = ["-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    command = ["gcc", *STRICT, "-O1", *sanitized, "main.c", "controller.c", "-o", "run", "-lm"]
+    done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[:3000]
+    ran = subprocess.run([str(folder / "run")], capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+
+
+def test_the_equations_of_motion_are_handed_out() -> None:
+    fit, fast = fitted("one_contact"), compiled("one_contact")
+    q, qd = (x[0].contiguous() for x in states(fit)[0][:2])
+    M, A = torch.empty(7, 7, dtype=torch.float64), torch.empty(1, 7, dtype=torch.float64)
+    pointers = [ctypes.c_void_p(x.data_ptr()) for x in (q, qd, M, A)]
+    assert fast.library.forcegp_equations(*pointers) == 0
+    eom = fit.system.equations(q, qd)
+    torch.testing.assert_close(M, eom.M, rtol=1e-12, atol=1e-14)
+    torch.testing.assert_close(A, eom.A, rtol=1e-12, atol=1e-14)
