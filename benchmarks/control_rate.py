@@ -8,8 +8,9 @@ of a residual force of 21 inputs (some 460). Nothing is learned: time does not d
 The C code is compiled by gcc with `-O3 -march=native -ffp-contract=fast` and with `-O2`, both `-std=c99`,
 and runs on one core over 256 logged states, contact closed; the time is the least mean of several rounds.
 The Jacobian is that of q̈ and λ by q, q̇ and τ, mean included; the CasADi function gives the same.
-Peers in the same run: `StructuredFit.predict` and `linearize`, and for the mechanics alone Pinocchio's `aba`
-from Python, if it is installed.
+Peers in the same run: `StructuredFit.predict`, `linearize` and `update`; for the mechanics alone Pinocchio's
+`aba`, and for the Gaussian processes alone GPyTorch, both from Python, if they are installed. Updates are
+timed four at a time, to be short beside the time slices of a shared core.
 """
 
 from __future__ import annotations
@@ -34,11 +35,13 @@ from forcegp.forces.priors.sets import friction_priors
 from forcegp.gp.kernels import Matern32
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.export.casadi_function import casadi_function
+from forcegp.models.export.library import CompiledFit
 from forcegp.models.prediction import Predictor
 from forcegp.models.structured_fit import StructuredFit
+from forcegp.models.structured_learning import REST_SPEED
 from forcegp.simulate import SimulationConfig, simulate
 
-POINTS, STATES, ROUNDS = 66, 256, 15
+POINTS, STATES, ROUNDS = 66, 256, 60
 LEVELS = {"-O3": ["-O3", "-march=native", "-ffp-contract=fast"], "-O2": ["-O2"]}
 BOUNDS = {  # µs, at -O3
     "friction mean": 8.0,
@@ -51,7 +54,10 @@ BOUNDS = {  # µs, at -O3
     "forward dynamics": 1.0,
     "python mean": 50.0,
     "python covariance": 150.0,
+    "residual update": 400.0,
+    "python update": 600.0,
 }
+KINDS = ("mean", "covariance", "forward dynamics", "update", "covariance after updates", "jacobian")
 PROGRAM = """\
 #define _POSIX_C_SOURCE 199309L
 #include <stdio.h>
@@ -67,26 +73,36 @@ static double now(void) {
 
 int main(void) {
   static double mean[64], covariance[64 * 64], beyond[64], jacobian[64 * 21];
-  double best[4] = {1e30, 1e30, 1e30, 1e30}, sink = 0.0;
+  static controller_learned learned;
+  double best[6] = {1e30, 1e30, 1e30, 1e30, 1e30, 1e30}, sink = 0.0;
+  controller_begin(&learned);
   for (int round = 0; round < ROUNDS; ++round)
-    for (int kind = 0; kind < 4; ++kind) {
+    for (int kind = 0; kind < 6; ++kind) {
+      const int states = kind < 3 || kind == 5 ? STATES : STATES / 64; /* short: a shared core */
       const double start = now();
-      for (int i = 0; i < STATES; ++i) {
+      for (int i = 0; i < states; ++i) {
         if (kind == 2)
           controller_forward_dynamics(q[i], qd[i], tau[i], mean);
         else if (kind == 3) {
+          if (controller_update(&learned, q[i], qd[i], tau[i], NULL, CONTROLLER_QDD, qdd[i], NULL)) return 2;
+        } else if (kind == 4) {
+          if (controller_predict_learned(&learned, 1, q[i], qd[i], tau[i], NULL,
+                                         CONTROLLER_QDD | CONTROLLER_MULTIPLIER, 0, mean, covariance, beyond))
+            return 3;
+        } else if (kind == 5) {
           if (controller_jacobian(q[i], qd[i], tau[i], NULL, CONTROLLER_QDD | CONTROLLER_MULTIPLIER, mean,
                                   jacobian))
-            return 1;
+            return 4;
         } else if (controller_predict(q[i], qd[i], tau[i], NULL, CONTROLLER_QDD | CONTROLLER_MULTIPLIER, 0,
                                     mean, kind ? covariance : NULL, beyond))
           return 1;
         sink += mean[0];
       }
-      const double each = (now() - start) / STATES;
+      const double each = (now() - start) / states;
       best[kind] = each < best[kind] ? each : best[kind];
     }
-  printf("%g %g %g %g %g\\n", best[0], best[1], best[2], best[3], sink);
+  for (int kind = 0; kind < 6; ++kind) printf("%g ", best[kind]);
+  printf("%g\\n", sink);
   return 0;
 }
 """
@@ -114,17 +130,17 @@ def models() -> dict[str, StructuredFit]:
     return fits
 
 
-def logged(fit: StructuredFit) -> tuple[Tensor, Tensor, Tensor]:
-    """Training states."""
-    m = fit.training.measurements[0]
-    return m.q[:STATES], m.qd[:STATES], m.tau[:STATES]
+def logged(fit: StructuredFit) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """Training states in motion, and accelerations there."""
+    m = fit.training.moving(REST_SPEED).measurements[0]
+    return m.q[:STATES], m.qd[:STATES], m.tau[:STATES], m.values[:STATES]
 
 
-def in_c(fit: StructuredFit, flags: list[str]) -> list[float]:
-    """µs of the mean, of mean and covariance, of forward dynamics alone, and of the mean with Jacobians."""
+def in_c(fit: StructuredFit, flags: list[str]) -> dict[str, float]:
+    """µs of each of `KINDS`."""
     with tempfile.TemporaryDirectory() as place:
         folder = fit.export(Path(place) / "c").folder
-        tables = dict(zip(("q", "qd", "tau"), logged(fit), strict=True))
+        tables = dict(zip(("q", "qd", "tau", "qdd"), logged(fit), strict=True))
         lines = [f"enum {{ STATES = {STATES}, ROUNDS = {ROUNDS} }};"]
         for name, x in tables.items():
             rows = ", ".join("{" + ", ".join(map(repr, row)) + "}" for row in x.tolist())
@@ -134,13 +150,13 @@ def in_c(fit: StructuredFit, flags: list[str]) -> list[float]:
         command = ["gcc", "-std=c99", *flags, "time.c", "controller.c", "-o", "run", "-lm"]
         subprocess.run(command, cwd=folder, check=True)
         done = subprocess.run([str(folder / "run")], capture_output=True, text=True, check=True)
-    return [float(x) for x in done.stdout.split()[:4]]
+    return dict(zip(KINDS, map(float, done.stdout.split()), strict=False))
 
 
 def in_python(call: Callable[[int], object], calls: int = 32) -> float:
     """µs of a call from Python, the least mean of several rounds."""
     best = float("inf")
-    for _ in range(20):
+    for _ in range(640 // calls):
         start = time.perf_counter()
         for i in range(calls):
             call(i)
@@ -150,7 +166,7 @@ def in_python(call: Callable[[int], object], calls: int = 32) -> float:
 
 def predicting(predictor: Predictor, fit: StructuredFit, covariance: bool) -> float:
     """µs of `predict` of q̈ and λ at single states."""
-    q, qd, tau = logged(fit)
+    q, qd, tau, _ = logged(fit)
     return in_python(
         lambda i: predictor.predict(q[i], qd[i], tau[i], ["qdd", "multiplier"], covariance=covariance)
     )
@@ -158,7 +174,7 @@ def predicting(predictor: Predictor, fit: StructuredFit, covariance: bool) -> fl
 
 def linearizing(predictor: Predictor, fit: StructuredFit) -> float:
     """µs of `linearize`: q̈ and λ with their Jacobians by q, q̇ and τ."""
-    q, qd, tau = logged(fit)
+    q, qd, tau, _ = logged(fit)
     return in_python(lambda i: predictor.linearize(q[i], qd[i], tau[i]))
 
 
@@ -167,7 +183,20 @@ def in_casadi(fit: StructuredFit) -> float:
     f = casadi_function(fit._exported(None))
     outputs = [f"jac:{z}:{x}" for z in ("qdd", "multiplier") for x in ("q", "qd", "tau")]
     slopes, states = f.factory("slopes", f.name_in(), ["qdd", "multiplier", *outputs]), logged(fit)
-    return in_python(lambda i: slopes(*(x[i].numpy() for x in states), 1.0))
+    return in_python(lambda i: slopes(*(x[i].numpy() for x in states[:3]), 1.0))
+
+
+def updating(predictor: CompiledFit | StructuredFit, fit: StructuredFit) -> float:
+    """µs of `update` with one sample."""
+    q, qd, tau, qdd = logged(fit)
+    if isinstance(predictor, CompiledFit):
+        begun = predictor.update(q[0], qd[0], tau[0], qdd[0])
+        return in_python(lambda i: begun.update(q[i], qd[i], tau[i], qdd[i]), 4)
+    names, t = fit.system.robot.joint_names, torch.arange(len(q), dtype=torch.float64)
+    closed = {name: torch.ones(len(q), dtype=torch.bool) for name in fit.system.contact_names}
+    data = forcegp.Dataset(t, q, qd, tau, qdd, names, contact=closed)
+    samples = [data[i : i + 1] for i in range(4)]
+    return in_python(lambda i: predictor.update(samples[i]), 4)
 
 
 def pinocchio(fit: StructuredFit) -> float | None:
@@ -179,8 +208,48 @@ def pinocchio(fit: StructuredFit) -> float | None:
     path = Path(forcegp.__file__).parent / "robot/bundled/kuka_iiwa.urdf"
     pin: Any = pinocchio
     model = pin.buildModelFromUrdf(str(path))
-    data, states = model.createData(), [x.numpy() for x in logged(fit)]
+    data, states = model.createData(), [x.numpy() for x in logged(fit)[:3]]
     return in_python(lambda i: pin.aba(model, data, *(x[i] for x in states)))
+
+
+def gpytorch(fit: StructuredFit) -> dict[str, float]:
+    """µs of GPyTorch's fast predictive variances for the Gaussian processes of `residual` alone, one for each
+    joint over `POINTS` points, without mechanics."""
+    try:
+        import gpytorch as package
+    except ImportError:
+        return {}
+    gp: Any = package
+    q, qd, tau, qdd = logged(fit)
+    x, joints = torch.cat([q, qd, tau], dim=-1), torch.Size([7])
+
+    class Model(gp.models.ExactGP):
+        def __init__(self) -> None:
+            super().__init__(x[:POINTS].expand(7, -1, -1), qdd[:POINTS].mT, noise)
+            self.mean = gp.means.ZeroMean(batch_shape=joints)
+            kernel = gp.kernels.MaternKernel(nu=1.5, ard_num_dims=x.shape[1], batch_shape=joints)
+            self.kernel = gp.kernels.ScaleKernel(kernel, batch_shape=joints)
+
+        def forward(self, at: Tensor) -> Any:
+            return gp.distributions.MultivariateNormal(self.mean(at), self.kernel(at))
+
+    noise = gp.likelihoods.GaussianLikelihood(batch_shape=joints).double()
+    model = Model().double().eval()
+
+    def read(i: int, covariance: bool) -> object:
+        found = model(x[i].expand(7, 1, -1))
+        return (found.mean, found.variance) if covariance else found.mean
+
+    times = {}
+    for name, fast in (
+        ("mean", gp.settings.skip_posterior_variances),
+        ("variance", gp.settings.fast_pred_var),
+    ):
+        with torch.no_grad(), fast():
+            times[f"residual {name} gpytorch from python"] = in_python(
+                lambda i, spread=name == "variance": read(i, spread)
+            )
+    return times
 
 
 def measure() -> dict[str, float]:
@@ -191,10 +260,7 @@ def measure() -> dict[str, float]:
         assert isinstance(latent, SparsePosterior)
         result[f"{name} functions"] = latent.basis.size
         for level, flags in LEVELS.items():
-            times = in_c(fit, flags)
-            for what, value in zip(
-                ("mean", "covariance", "forward dynamics", "jacobian"), times, strict=True
-            ):
+            for what, value in in_c(fit, flags).items():
                 result[f"{name} {what} {level}"] = value
         fast = fit.compiled()
         for kind, predictor in (("compiled", fast), ("predict", fit)):
@@ -203,6 +269,9 @@ def measure() -> dict[str, float]:
             result[f"{name} jacobian python {kind}"] = linearizing(predictor, fit)
         if importlib.util.find_spec("casadi"):
             result[f"{name} jacobian casadi"] = in_casadi(fit)
+        result[f"{name} update python compiled"] = updating(fast, fit)
+        result[f"{name} update python predict"] = updating(fit, fit)
+        result |= gpytorch(fit) if name == "residual" else {}
         if name == "friction" and (peer := pinocchio(fit)) is not None:
             result["forward dynamics pinocchio from python"] = peer
     return result
@@ -222,6 +291,7 @@ def main() -> None:
         "forward dynamics": result["friction forward dynamics -O3"],
         "python mean": result["friction mean python compiled"],
         "python covariance": result["friction covariance python compiled"],
+        "python update": result["residual update python compiled"],
     }
     for name, bound in BOUNDS.items():
         verdict = "holds" if found[name] <= bound else "MISSED"

@@ -114,6 +114,20 @@ def test_mpc_with_learned_friction(tmp_path: Path) -> None:
     assert solve < 20.0
 
 
+def test_force_observer(tmp_path: Path) -> None:
+    pytest.importorskip("mujoco")
+    figure = tmp_path / "force.png"
+    done = run("examples/force_observer/force_observer.py", "--seconds", "6", str(figure))
+    assert done.returncode == 0, done.stderr
+    assert figure.read_bytes().startswith(b"\x89PNG")
+    result = json.loads(done.stdout.partition("figure: ")[0])
+    assert result["samples"] == 6000 and result["errors"] == 0
+    assert result["rmse"] < 0.5 * result["rmse of the observer, file"]
+    assert result["rmse"] < result["rmse of the observer, identified"]
+    assert result["coverage"] > 0.8, "six seconds are few"
+    assert result["processor p50 [us]"] < 300.0
+
+
 @pytest.mark.slow
 def test_two_contacts(tmp_path: Path) -> None:
     text = example("two_contacts", tmp_path)

@@ -10,11 +10,13 @@ from torch import Tensor
 
 import forcegp
 from forcegp.errors import ModelError, NumericalError, ShapeError, UnknownNameError
+from forcegp.forces.priors.inertial import PayloadPrior
 from forcegp.forces.priors.joint import JointFrictionPrior
 from forcegp.models.export.library import CompiledFit
 from forcegp.models.export.mean import DIFFERENTIATED
 from forces.cases import two_contacts
 from models.test_export import CASES, compiled, fitted, free_log, states
+from slow import slow_except
 
 SAME = 1e-8
 """Of the largest entry of a Jacobian; the sums are the same in another order, and derivatives amplify."""
@@ -43,7 +45,9 @@ def finite_differences(fast: CompiledFit, state: tuple[Tensor, ...], active: Ten
     return found
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize(
+    "name", slow_except(CASES, "free_friction", "one_contact", "every_friction", "rounded_tip")
+)
 def test_jacobians_are_those_of_autograd_and_of_finite_differences(name: str) -> None:
     fit, fast = fitted(name), compiled(name)
     state, active = states(fit)
@@ -105,6 +109,28 @@ def test_contacts_that_hold_the_same_direction_have_no_jacobian() -> None:
         fast.jacobian(*state)
     one = fast.jacobian(*state, active=torch.tensor([True, False]))
     assert bool(one.dq.isfinite().all())
+
+
+def test_jacobians_with_a_payload() -> None:
+    robot = forcegp.load_robot("kuka_iiwa")
+    model = forcegp.StructuredGP(
+        forcegp.ConstrainedSystem(robot),
+        "analytical",
+        [JointFrictionPrior(), PayloadPrior(mass=2.0)],
+        noise=0.1,
+    )
+    fit = model.fit(free_log(robot, 40), learn=[])
+    state, active = states(fit)
+    fast = fit.compiled()
+    for a, b in zip(fast.linearize(*state, active=active), fit.linearize(*state, active=active), strict=True):
+        torch.testing.assert_close(a, b, rtol=SAME, atol=SAME * float(b.abs().max()) if b.numel() else 0.0)
+
+
+def test_what_has_learned_in_c_has_no_jacobian() -> None:
+    fit, fast = fitted("free_friction"), compiled("free_friction")
+    q, qd, tau = (x[0] for x in states(fit)[0])
+    with pytest.raises(ModelError, match="no Jacobian"):
+        fast.update(q, qd + 1.0, tau, tau).linearize(q, qd, tau)
 
 
 def test_what_has_no_jacobian_is_refused() -> None:

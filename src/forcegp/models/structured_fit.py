@@ -219,7 +219,13 @@ class StructuredFit(FittedModel):
 
     def _exported(self, functions: int | None) -> ExportedModel:
         parts = self.system, self.posterior, self.hyperparameters, self.noise, self.torque_std
-        return ExportedModel(*parts, self.problem.external_std, functions)
+        learned, std = self.hyperparameters.get(TORQUE_NOISE), self.problem.torque_std
+        std = learned.exp() if learned is not None else 0.0 if std is None else std
+        variance = torch.zeros_like(self.system.robot.mass) + std**2
+        moving = self.specification.noise.learns_torque
+        # Noise of the state makes the rows of a sample depend on the slopes of the learned forces.
+        sampling = None if self.problem.state_std is not None else (variance, self.problem.power, moving)
+        return ExportedModel(*parts, self.problem.external_std, functions, sampling)
 
     def export(
         self, path: str | Path, *, language: str = "c", name: str = "controller", functions: int | None = None

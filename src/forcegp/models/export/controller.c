@@ -117,6 +117,7 @@ static int assemble(const double *restrict q, const double *restrict qd, const d
                     const unsigned char *restrict closed, equations *restrict e) {
   double sine[NQ], cosine[NQ], out[MECHANICS], K[NQ * NQ], Q[NQ];
   const double *next = out + NQ * NQ + 3 * NQ;
+  (void)closed;
   for (int i = 0; i < NQ; ++i) sine[i] = sin(q[i]), cosine[i] = cos(q[i]);
   mechanics(q, qd, tau, sine, cosine, out);
   memcpy(e->M, out, sizeof e->M);
@@ -163,8 +164,6 @@ static int assemble(const double *restrict q, const double *restrict qd, const d
       for (int j = 0; j < NQ; ++j)
         for (int r = 0; r < ROWS; ++r) e->H[i][j] -= e->L[i][r] * along[r][j];
   }
-#else
-  (void)closed;
 #endif
   motion_under(e, Q, e->qdd, e->load);
   return 1;
@@ -293,6 +292,8 @@ typedef struct {
   double rest[COMPONENTS];                    /* diagonal part D of the posterior covariance */
   double E[COMPONENTS][NQ];                   /* generalized force of each f */
   double T[COMPONENTS][RANK];                 /* the covariance is D + T T^T or, with SIGN -1, D - T T^T */
+  const forcegp_learned *learned;             /* what was learned online, if anything */
+  double *functions;                          /* where whitened functions go, if nothing else is asked for */
 } latent;
 
 /* row = V^T C, the functions V of a component in the columns from `first` on */
@@ -306,19 +307,30 @@ static void root_row(const double *restrict C, const double *restrict V, int n, 
 static void component(const double *restrict V, int m, int features, double variance, const double *restrict weights,
                       const double *restrict whitening, int kept, const double *restrict C, int first, int spread,
                       int k, latent *restrict f) {
-  const double more = dot(V + m, V + m, features);
+  const double more = dot(V + m, V + m, features), *functions = V;
+  double white[MOST_FUNCTIONS];
+#if ONLINE
+  if (f->learned) weights = f->learned->folded + FOLDED[k];
+#endif
   f->mean[k] = dot(V, weights, m + features);
   f->prior[k] = variance + more;
   f->rest[k] = SIGN > 0.0 ? variance : variance + more;
   if (!spread) return;
   if (whitening) { /* D = k - |R^T k(Z, x)|^2, what the support points miss */
-    double white[MOST_FUNCTIONS];
     combine(whitening, V, m, kept, white);
     memcpy(white + kept, V + m, sizeof(double) * features);
     f->rest[k] = fmax(variance - dot(white, white, kept), 0.0);
-    root_row(C, white, kept + features, first, f->T[k]);
-  } else
-    root_row(C, V, m + features, first, f->T[k]);
+    functions = white, m = kept;
+  }
+#if ONLINE
+  if (f->functions) memcpy(f->functions + first, functions, sizeof(double) * (m + features));
+  for (int j = 0; f->learned && j < RANK; ++j) { /* C = K^T */
+    const int n = j < first ? 0 : j < first + m + features ? j - first + 1 : m + features;
+    f->T[k][j] = dot(f->learned->root + (long)j * (j + 1) / 2 + first, functions, n);
+  }
+  if (f->learned) return;
+#endif
+  root_row(C, functions, m + features, first, f->T[k]);
 }
 
 /* HELPERS: each of these is written where a prior uses it */
@@ -447,16 +459,15 @@ static void matern52(double *restrict u, int m) {
 
 /* PRIORS */
 
-#ifdef INERTIAL
-/* E = -[Y(q, qdd, qd), diag qdd] S of errors of the inertial parameters of links, and of drives where they have one */
-static void inertial(const double *restrict q, const double *restrict qd, const double *restrict qdd, latent *restrict f) {
-  double sine[NQ], cosine[NQ], *E = f->E[INERTIAL];
-  for (int i = 0; i < NQ; ++i) sine[i] = sin(q[i]), cosine[i] = cos(q[i]);
-  regressor(q, qd, qdd, sine, cosine, E);
-  for (int k = 10 * NQ; k < INERTIAL_COLUMNS; ++k)
-    for (int j = 0; j < NQ; ++j) E[k * NQ + j] = j == k - 10 * NQ ? qdd[j] : 0.0;
-  for (int k = 0; k < INERTIAL_COLUMNS; ++k)
-    for (int j = 0; j < NQ; ++j) E[k * NQ + j] *= -INERTIAL_SCALE[k];
+#if defined INERTIAL || defined PAYLOAD
+/* E = -[Y(q, qdd, qd), diag qdd] S of errors of some inertial parameters of links, and of drives behind them */
+static void inertial(const double *restrict q, const double *restrict qd, const double *restrict qdd, int start, int column,
+                     int count, const double *restrict scale, latent *restrict f) {
+  double sine[NQ], cosine[NQ], Y[10 * NQ + NQ][NQ] = {{0.0}};
+  for (int i = 0; i < NQ; ++i) sine[i] = sin(q[i]), cosine[i] = cos(q[i]), Y[10 * NQ + i][i] = qdd[i];
+  regressor(q, qd, qdd, sine, cosine, Y[0]);
+  for (int k = 0; k < count; ++k)
+    for (int j = 0; j < NQ; ++j) f->E[start + k][j] = -scale[k] * Y[column + k][j];
 }
 #endif
 
@@ -478,18 +489,22 @@ static void read_mean(const affine *restrict z, const latent *restrict f, const 
               dot(z->B_N[a], force[CONSTRAINT], NQ) + dot(z->B_F[a], force[JOINT_FRICTION], NQ);
 }
 
+/* W = B E, from the latent forces to quantities */
+static void operators(const affine *restrict z, const latent *restrict f, int size, double (*restrict W)[COMPONENTS]) {
+  for (int a = 0; a < size; ++a)
+    for (int k = 0; k < COMPONENTS; ++k) {
+      const double *B = TARGET[k] == CONTACT ? z->B_z[a] : TARGET[k] == CONSTRAINT ? z->B_N[a] : z->B_Q[a];
+      W[a][k] = dot(B, f->E[k], NQ) + (IS_FRICTION[k] ? dot(z->B_F[a], f->E[k], NQ) : 0.0);
+    }
+}
+
 /* W D W^T + W T T^T W^T with W = B E, and the variance of unknown forces; 0 if a variance is rounding */
 static int read_covariance(const affine *restrict z, const latent *restrict f, const double *restrict unknown,
                            int size, double *restrict covariance) {
   double root[SIZE_OF_ALL][RANK], W[SIZE_OF_ALL][COMPONENTS], scaled[COMPONENTS];
   int resolved = 1;
-  for (int a = 0; a < size; ++a) {
-    for (int k = 0; k < COMPONENTS; ++k) {
-      const double *B = TARGET[k] == CONTACT ? z->B_z[a] : TARGET[k] == CONSTRAINT ? z->B_N[a] : z->B_Q[a];
-      W[a][k] = dot(B, f->E[k], NQ) + (IS_FRICTION[k] ? dot(z->B_F[a], f->E[k], NQ) : 0.0);
-    }
-    combine(&f->T[0][0], W[a], COMPONENTS, RANK, root[a]);
-  }
+  operators(z, f, size, W);
+  for (int a = 0; a < size; ++a) combine(&f->T[0][0], W[a], COMPONENTS, RANK, root[a]);
   for (int a = 0; a < size; ++a) {
     double before = 0.0, carried[NQ];
     for (int k = 0; k < COMPONENTS; ++k) scaled[k] = W[a][k] * f->rest[k], before += W[a][k] * W[a][k] * f->prior[k];
@@ -505,6 +520,12 @@ static int read_covariance(const affine *restrict z, const latent *restrict f, c
   return resolved;
 }
 
+/* m, the prior mean of Q */
+static void expected_force(const equations *restrict e, const double *restrict tau, double *restrict m) {
+  for (int i = 0; i < NQ; ++i)
+    m[i] = MEAN_TERMS[0] * e->Q_C[i] + MEAN_TERMS[1] * e->Q_G[i] + MEAN_TERMS[2] * e->Q_D[i] + MEAN_TERMS[3] * tau[i];
+}
+
 /* how far speed and torque lie beyond those of the training data, in their standard deviations */
 static void distance(const double *restrict qd, const double *restrict tau, double *restrict beyond) {
   for (int i = 0; i < NQ; ++i) {
@@ -514,31 +535,43 @@ static void distance(const double *restrict qd, const double *restrict tau, doub
   }
 }
 
-int forcegp_predict(const double *q, const double *qd, const double *tau, const unsigned char *closed,
-                    unsigned quantities, int noise, double *mean, double *covariance, double *beyond) {
+/* the equations of motion and the gain of friction at a state */
+static int prepare(const double *q, const double *qd, const double *tau, const unsigned char *closed, equations *e,
+                   double *gain) {
+  (void)gain;
+  for (int i = 0; i < NQ; ++i)
+    if (!isfinite(q[i]) || !isfinite(qd[i]) || !isfinite(tau[i])) return FORCEGP_NOT_FINITE;
+  if (!assemble(q, qd, tau, closed, e)) return FORCEGP_NO_INERTIA;
+#if COULOMB > 0
+  if (!friction_gain(e, gain)) return FORCEGP_JAMMED;
+#endif
+  return 0;
+}
+
+static int predict(const forcegp_learned *learned, const double *q, const double *qd, const double *tau,
+                   const unsigned char *closed, unsigned quantities, int noise, double *mean, double *covariance,
+                   double *beyond) {
   equations e;
   latent f;
   affine z;
   double prior_mean[NQ], far[NQ], unknown[NQ], gain[NQ * SOME(ROWS)];
   int size, status;
-  for (int i = 0; i < NQ; ++i)
-    if (!isfinite(q[i]) || !isfinite(qd[i]) || !isfinite(tau[i])) return FORCEGP_NOT_FINITE;
-  if (!assemble(q, qd, tau, closed, &e)) return FORCEGP_NO_INERTIA;
-#if COULOMB > 0
-  if (!friction_gain(&e, gain)) return FORCEGP_JAMMED;
-#endif
+  if ((status = prepare(q, qd, tau, closed, &e, gain)) != 0) return status;
   distance(qd, tau, far);
   if (beyond) memcpy(beyond, far, sizeof far);
-  for (int i = 0; i < NQ; ++i)
-    prior_mean[i] = MEAN_TERMS[0] * e.Q_C[i] + MEAN_TERMS[1] * e.Q_G[i] + MEAN_TERMS[2] * e.Q_D[i] + MEAN_TERMS[3] * tau[i];
+  expected_force(&e, tau, prior_mean);
+  f.learned = learned, f.functions = NULL;
   if ((status = latent_forces(q, qd, tau, &e, gain, covariance != NULL, &f)) != 0) return status;
+#ifdef PAYLOAD
+  inertial(q, qd, e.qdd, PAYLOAD, PAYLOAD_COLUMN, 4, PAYLOAD_UNITS, &f);
+#endif
 #ifdef INERTIAL
-  inertial(q, qd, e.qdd, &f);
+  inertial(q, qd, e.qdd, INERTIAL, 0, INERTIAL_COLUMNS, INERTIAL_SCALE, &f);
   if (covariance) { /* errors of the inertia are multiplied by the predicted acceleration */
     double qdd[NQ];
     maps(&e, gain, FORCEGP_QDD, &z);
     read_mean(&z, &f, prior_mean, NQ, qdd);
-    inertial(q, qd, qdd, &f);
+    inertial(q, qd, qdd, INERTIAL, 0, INERTIAL_COLUMNS, INERTIAL_SCALE, &f);
   }
 #endif
   size = maps(&e, gain, quantities, &z);
@@ -604,21 +637,36 @@ int forcegp_jacobian_many(long count, const double *q, const double *qd, const d
   return worst;
 }
 
+int forcegp_equations(const double *q, const double *qd, double *M, double *A) {
+  const double tau[NQ] = {0.0};
+  equations e;
+  if (!assemble(q, qd, tau, NULL, &e)) return FORCEGP_NO_INERTIA;
+  memcpy(M, e.M, sizeof e.M);
+  if (CONTACTS > 0) memcpy(A, e.A, sizeof e.A);
+  return 0;
+}
+
 void forcegp_forward_dynamics(const double *q, const double *qd, const double *force, double *qdd) {
   double sine[NQ], cosine[NQ];
   for (int i = 0; i < NQ; ++i) sine[i] = sin(q[i]), cosine[i] = cos(q[i]);
   forward_dynamics(q, qd, force, sine, cosine, qdd);
 }
 
-int forcegp_predict_many(long count, const double *q, const double *qd, const double *tau, const unsigned char *closed,
-                         unsigned quantities, int noise, double *mean, double *covariance, double *beyond) {
+int forcegp_predict_learned(const forcegp_learned *learned, long count, const double *q, const double *qd,
+                            const double *tau, const unsigned char *closed, unsigned quantities, int noise, double *mean,
+                            double *covariance, double *beyond) {
   const int d = forcegp_size(quantities);
   int worst = 0;
   for (long i = 0; i < count; ++i) {
-    const int status =
-        forcegp_predict(q + i * NQ, qd + i * NQ, tau + i * NQ, closed ? closed + i * CONTACTS : NULL, quantities, noise,
-                        mean + i * d, covariance ? covariance + i * d * d : NULL, beyond ? beyond + i * NQ : NULL);
+    const int status = predict(learned, q + i * NQ, qd + i * NQ, tau + i * NQ, closed ? closed + i * CONTACTS : NULL,
+                               quantities, noise, mean + i * d, covariance ? covariance + i * d * d : NULL,
+                               beyond ? beyond + i * NQ : NULL);
     worst = worst ? worst : status;
   }
   return worst;
+}
+
+int forcegp_predict(const double *q, const double *qd, const double *tau, const unsigned char *closed,
+                    unsigned quantities, int noise, double *mean, double *covariance, double *beyond) {
+  return predict(NULL, q, qd, tau, closed, quantities, noise, mean, covariance, beyond);
 }

@@ -43,9 +43,14 @@ int forcegp_size(unsigned quantities);
 int forcegp_predict(const double *q, const double *qd, const double *tau, const unsigned char *closed,
                     unsigned quantities, int noise, double *mean, double *covariance, double *beyond);
 
-/* The same at `count` states, one after the other; returns the first error. */
-int forcegp_predict_many(long count, const double *q, const double *qd, const double *tau, const unsigned char *closed,
-                         unsigned quantities, int noise, double *mean, double *covariance, double *beyond);
+/* The same at `count` states, from what was learned online, or, with NULL, in the fit; returns the first error. */
+typedef struct forcegp_learned forcegp_learned;
+int forcegp_predict_learned(const forcegp_learned *learned, long count, const double *q, const double *qd,
+                            const double *tau, const unsigned char *closed, unsigned quantities, int noise, double *mean,
+                            double *covariance, double *beyond);
+
+@online@/* Mass matrix M and, of all contacts, the rows of A; these are the Jacobian of a tool in three planes through it. */
+int forcegp_equations(const double *q, const double *qd, double *M, double *A);
 
 /* Posterior mean and its Jacobian: of qdd, multiplier, contact force and joint friction.
  *

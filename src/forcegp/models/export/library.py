@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import copy
 import ctypes
 from collections.abc import Sequence
+from functools import cached_property
 from pathlib import Path
 from typing import NamedTuple
 
@@ -11,7 +13,7 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.errors import ForceGPError, ModelError, NumericalError, check_name
+from forcegp.errors import ForceGPError, ModelError, NumericalError, ShapeError, check_name
 from forcegp.forces.noise import LOW
 from forcegp.forces.quantities import ForceField, ForceLinearization, flat_states
 from forcegp.models.export.mean import DIFFERENTIATED
@@ -21,14 +23,26 @@ from forcegp.models.prediction import Prediction, Predictor
 from forcegp.native import load_library
 
 NAME = "forcegp"
-JAMMED, UNRESOLVED, NO_INERTIA, NO_JACOBIAN = 2, 3, 4, 5
+NOT_FINITE, JAMMED, UNRESOLVED, NO_INERTIA, NO_JACOBIAN, AT_REST, NO_NOISE = 1, 2, 3, 4, 5, 6, 7
 """What the C code returns other than 0."""
 MESSAGES = {
     JAMMED: "friction of a contact would press harder than it opposes",
     UNRESOLVED: "double precision does not resolve a predicted variance",
     NO_INERTIA: "the mass matrix is not positive definite",
     NO_JACOBIAN: "closed contacts hold the robot in the same direction, so that a Jacobian is not determined",
+    NOT_FINITE: "a measured value is not finite, or its noise not positive",
+    NO_NOISE: "an update needs the noise of a quantity that the fit did not measure: pass noise_std",
 }
+KINDS: dict[int, type[ForceGPError]] = {JAMMED: ModelError, NO_NOISE: ModelError, NOT_FINITE: ShapeError}
+POINTER = ctypes.c_void_p
+FUNCTIONS = {
+    "predict_learned": [ctypes.c_long, *[POINTER] * 4, ctypes.c_uint, ctypes.c_int, *[POINTER] * 3],
+    "begin": [],
+    "update": [*[POINTER] * 4, ctypes.c_uint, POINTER, POINTER],
+    "forget": [ctypes.c_double, ctypes.c_int],
+    "drift": [ctypes.c_int, ctypes.c_double],
+}
+"""Arguments after a pointer to what was learned online; all but the first are for models that learn."""
 
 
 class CompiledFit(Predictor):
@@ -42,11 +56,12 @@ class CompiledFit(Predictor):
         self.model, self.system = model, model.system
         header, source = c_source(model, NAME)
         self.library = load_library(source.replace(f'#include "{NAME}.h"\n', header), level="-O3")
-        self._many = self.library.forcegp_predict_many
-        self._many.argtypes = [ctypes.c_long, *[ctypes.c_void_p] * 4, ctypes.c_uint, ctypes.c_int]
-        self._many.argtypes += [ctypes.c_void_p] * 3
-        self._slopes = self.library.forcegp_jacobian_many
-        self._slopes.argtypes = [ctypes.c_long, *[ctypes.c_void_p] * 4, ctypes.c_uint, *[ctypes.c_void_p] * 2]
+        for name in FUNCTIONS if model.online else list(FUNCTIONS)[:1]:
+            getattr(self.library, f"forcegp_{name}").argtypes = [POINTER, *FUNCTIONS[name]]
+        self._many, self._slopes = self.library.forcegp_predict_learned, self.library.forcegp_jacobian_many
+        self._slopes.argtypes = [ctypes.c_long, *[POINTER] * 4, ctypes.c_uint, *[POINTER] * 2]
+        self._learned: Tensor | None = None
+        self._memory: int | None = None
         self._sizes = {name: self.library.forcegp_size(1 << bit) for bit, name in enumerate(READ)}
         self._known: dict[str | tuple[str, ...], _Rows] = {}
 
@@ -60,7 +75,99 @@ class CompiledFit(Predictor):
 
     def force_field(self) -> ForceField:
         """Posterior mean of Q̄ = Q + Q_z, `(n, nq)` at states, in PyTorch."""
+        if self._learned is not None:
+            raise ModelError("what was learned in C has no force field in PyTorch", hint="update the fit")
         return self.model.posterior
+
+    def update(
+        self,
+        q: Tensor,
+        qd: Tensor,
+        tau: Tensor,
+        measured: Tensor,
+        quantity: str = "qdd",
+        *,
+        active: Tensor | None = None,
+        noise_std: Tensor | None = None,
+    ) -> CompiledFit:
+        """The fit with more samples, one after the other, as `StructuredFit.update` gives it.
+
+        Args:
+            q, qd, tau: `(*batch, nq)` states.
+            measured: `(*batch, d)` values at these states.
+            quantity: that was measured.
+            active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
+            noise_std: of the values `(d,)`; by default that of the fit.
+
+        Raises:
+            ModelError: the model cannot learn in C, or the noise of the quantity is unknown.
+            ShapeError: an argument does not fit the system, or is not finite.
+            UnknownNameError: no such quantity.
+        """
+        read = self._read(quantity)
+        flat = flat_states(self.system, q, qd, tau, active)
+        expected, got = (*flat.batch, read.size), tuple(measured.shape)
+        if expected != got:
+            raise ShapeError(f"values of {quantity!r} do not fit the states", expected=str(expected), got=got)
+        std = None if noise_std is None else noise_std.expand(read.size).double().contiguous()
+        noise, newer = None if std is None else std.data_ptr(), self._copy()
+        columns = [x.contiguous() for x in (*flat[:4], measured.double().reshape(-1, read.size))]
+        for row in zip(*columns, strict=True):
+            *state, value = (x.data_ptr() for x in row)
+            status = self.library.forcegp_update(newer._memory, *state, read.bits, value, noise)
+            if status not in (0, AT_REST):
+                raise KINDS.get(status, NumericalError)(MESSAGES[status])
+        return newer
+
+    def forget(
+        self, factor: float, priors: Sequence[str] | None = None, *, budget: int = 2**30
+    ) -> CompiledFit:
+        """The fit with all samples partly forgotten, as `StructuredFit.forget` gives it.
+
+        Args:
+            factor: what the weight of all samples so far is multiplied by, or, with `priors`, the correlation
+                of their forces with what they were.
+            priors: whose forces drift towards their prior, instead of forgetting samples.
+            budget: how many weights have their prior renewed, at the cost of a row each; the prior of others
+                waits for the next calls. All of them by default.
+
+        Raises:
+            ModelError: the model cannot learn in C, or the factor is out of range.
+            UnknownNameError: no such prior.
+        """
+        newer, names = self._copy(), [prior.name for prior in self.model.posterior.priors]
+        for name in priors or ():
+            check_name("force prior to forget", name, names)
+        if priors is None:
+            status = self.library.forcegp_forget(newer._memory, factor, budget)
+        else:
+            drift = self.library.forcegp_drift
+            status = max((drift(newer._memory, names.index(name), factor) for name in priors), default=0)
+        if status:
+            raise ModelError("invalid forgetting factor", expected="above 0, at most 1", got=factor)
+        return newer
+
+    def _copy(self) -> CompiledFit:
+        """The fit with its own copy of what it has learned."""
+        newer, learned = copy.copy(self), self._begun if self._learned is None else self._learned
+        newer._learned = learned.clone()
+        newer._memory = newer._learned.data_ptr()
+        return newer
+
+    @cached_property
+    def _begun(self) -> Tensor:
+        """What the fit has learned, as the numbers of a `forcegp_learned`."""
+        if not self.model.online:
+            raise ModelError(
+                "this fit cannot learn online in C",
+                expected="sparse inference with all functions, a state without noise, no inertia learned",
+                hint="call update of the fit",
+            )
+        parts = self.model.parts()
+        n, folded = parts[0].rank, sum(part.weights.numel() for part in parts)
+        begun = torch.empty(2 * n + folded + n * (n + 1) // 2 + 1, dtype=torch.float64)
+        self.library.forcegp_begin(begun.data_ptr())
+        return begun
 
     def predict(
         self,
@@ -89,7 +196,7 @@ class CompiledFit(Predictor):
         mean, beyond = q.new_empty((*batch, read.size)), q.new_empty((*batch, nq))
         spread = q.new_empty((*batch, read.size, read.size)) if covariance else None
         pointers = [None if x is None else x.data_ptr() for x in (*arrays, mean, spread, beyond)]
-        status = self._many(batch.numel(), *pointers[:4], read.bits, noise, *pointers[4:])
+        status = self._many(self._memory, batch.numel(), *pointers[:4], read.bits, noise, *pointers[4:])
         if status:
             raise self._error(status, q, qd, tau, active)
         if read.order is not None:
@@ -116,9 +223,13 @@ class CompiledFit(Predictor):
 
         Raises:
             UnknownNameError: no such quantity.
-            ModelError: friction with which a contact jams.
+            ModelError: friction with which a contact jams, or a fit that has learned in C.
             NumericalError: closed contacts are not independent.
         """
+        if self._learned is not None:
+            raise ModelError(
+                "what was learned in C has no Jacobian", hint="update the fit, and compile it again"
+            )
         names = [quantity] if isinstance(quantity, str) else list(quantity)
         for name in names:
             check_name("quantity with a Jacobian", name, DIFFERENTIATED)
@@ -163,7 +274,7 @@ class CompiledFit(Predictor):
     def _error(self, status: int, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor | None) -> ForceGPError:
         """What the C code reports; raises at once if a state is not finite, and says which."""
         flat_states(self.system, q, qd, tau, active)
-        return (ModelError if status == JAMMED else NumericalError)(MESSAGES[status])
+        return KINDS.get(status, NumericalError)(MESSAGES[status])
 
     def _plain(self, *states: Tensor) -> bool:
         """Whether states can be read where they are."""

@@ -35,7 +35,7 @@ from forcegp.constraints import Cylinder, Plane, Sphere, SurfaceContact
 from forcegp.constraints.gauss import FACING_DOWN
 from forcegp.forces.priors import contact
 from forcegp.forces.priors.base import ForcePrior
-from forcegp.forces.priors.inertial import InertialPrior
+from forcegp.forces.priors.inertial import MASS_AND_MOMENT, InertialPrior, PayloadPrior
 from forcegp.forces.priors.joint import TERMS, JointForcePrior, JointFrictionPrior
 from forcegp.gp import kernels
 from forcegp.gp.basis import KernelPart
@@ -389,6 +389,10 @@ class LearnedMotion(Mean):
                 errors = f * np.array(prior.scale(self.robot).tolist())
                 links, drives = errors[: PARAMETERS * n].reshape(n, PARAMETERS), errors[PARAMETERS * n :]
                 Q = Q - self._inertial_force(links, drives)
+            elif isinstance(prior, PayloadPrior):
+                links, units = self.zeros(n, PARAMETERS), prior.units(self.robot.mass).tolist()
+                links[prior.link(self.robot), :MASS_AND_MOMENT] = f * np.array(units)
+                Q = Q - self._inertial_force(links, self.zeros(0))
             elif isinstance(prior, contact.NormalForcePrior):
                 # Aᵀ Lᵀ f: −Lᵀ f is the multiplier of M q̈ = f + Aᵀ λ, A q̈ = 0
                 Q = Q - _times(self.A.T, self._motion(f, (), pulled=False).multiplier, self.zeros(n))

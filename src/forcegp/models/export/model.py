@@ -23,15 +23,16 @@ from forcegp.errors import ModelError
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors import contact, joint
 from forcegp.forces.priors.base import ForcePrior
-from forcegp.forces.priors.inertial import InertialPrior
+from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
 from forcegp.gp.basis import KernelPart, split
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.features import Features, points
 from forcegp.gp.kernels import Constant, Kernel, Linear, Matern32, Matern52, SquaredExponential, Sum, sub
 from forcegp.gp.sparse import SparsePosterior
 
-PRIORS = (joint.JointForcePrior, joint.JointFrictionPrior, InertialPrior, contact.NormalForcePrior)
-PRIORS += (contact.SlidingFrictionPrior, contact.ContactForcePrior, contact.CoulombErrorPrior)
+PRIORS = (joint.JointForcePrior, joint.JointFrictionPrior, InertialPrior, PayloadPrior)
+PRIORS += (contact.NormalForcePrior, contact.SlidingFrictionPrior, contact.ContactForcePrior)
+PRIORS += (contact.CoulombErrorPrior,)
 KERNELS = (Linear, Constant, SquaredExponential, Matern32, Matern52)
 LARGEST = 1700
 """Functions of a posterior that is not reduced; some 30 MB of text, which takes a compiler half a minute."""
@@ -95,6 +96,8 @@ class ExportedModel:
         noise: standard deviation of a measurement of each measured quantity.
         torque_std, external_std: of the motor torques' noise and of unknown forces on joints, or `None`.
         functions: number r that the covariance is reduced to; `None` for all.
+        sampling: of a sample learned online, the variance of the motor torques' noise `(nq,)`, the power κ of
+            its likelihood, and whether it must be in motion; `None` for a model that cannot.
     """
 
     system: ConstrainedSystem
@@ -104,6 +107,12 @@ class ExportedModel:
     torque_std: Tensor | None
     external_std: Tensor | None
     functions: int | None = None
+    sampling: tuple[Tensor, float, bool] | None = None
+
+    @property
+    def online(self) -> bool:
+        """Whether it learns online: it is over basis functions, and all of its covariance is kept."""
+        return self.sign > 0 and not self.posterior.process.pinned and self.sampling is not None
 
     def check(self) -> None:
         """Check that all parts of the model have a C form.
@@ -121,11 +130,12 @@ class ExportedModel:
         if not isinstance(self.posterior.process.mean, joint.AnalyticalMean):
             raise _no_c("mean", "Q", self.posterior.process.mean, "an AnalyticalMean")
         for prior in self.posterior.priors:
-            if type(prior) not in PRIORS:
+            if type(prior) not in PRIORS or (isinstance(prior, PayloadPrior) and prior.known):
                 raise _no_c("force prior", prior.name, prior, ", ".join(x.__name__ for x in PRIORS))
             _check_kernel(prior.name, prior.kernel)
-        if sum(isinstance(prior, InertialPrior) for prior in self.posterior.priors) > 1:
-            raise ModelError("a fit with two priors on the inertia is not exported", expected="one at most")
+        for kind, what in ((InertialPrior, "the inertia"), (PayloadPrior, "a payload")):
+            if sum(isinstance(prior, kind) for prior in self.posterior.priors) > 1:
+                raise ModelError(f"a fit with two priors on {what} is not exported", expected="one at most")
         if self.functions is not None and self.functions < 1:
             raise ModelError(
                 "a posterior has one function at least", expected="1 or more", got=self.functions

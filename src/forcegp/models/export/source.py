@@ -22,14 +22,16 @@ from forcegp.constraints.gauss import rank_tolerance
 from forcegp.forces.noise import GROWTH, HIGH, LOW, SPREAD, STICK_NOISE, STICK_SPEED
 from forcegp.forces.priors import contact
 from forcegp.forces.priors.base import CONSTRAINT, CONTACT, JOINT
-from forcegp.forces.priors.inertial import InertialPrior
+from forcegp.forces.priors.inertial import PER_PAYLOAD, InertialPrior, PayloadPrior
 from forcegp.forces.priors.joint import TERMS, JointFrictionPrior
 from forcegp.forces.quantities import QUANTITIES
 from forcegp.gp import kernels
 from forcegp.gp.basis import KernelPart
 from forcegp.gp.features import SMALLEST_FRACTION, stacked
+from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.export.mean import ARGUMENTS, DIFFERENTIATED, LearnedMotion
 from forcegp.models.export.model import ExportedModel, Functions, row_of
+from forcegp.models.structured_learning import REST_SPEED
 
 READ = (*QUANTITIES, "joint_friction")
 """The quantities of the C code, in the order of its bits; the last one is not in `QUANTITIES`."""
@@ -56,6 +58,7 @@ def c_source(model: ExportedModel, name: str) -> tuple[str, str]:
     head = '#include <math.h>\n#include <string.h>\n#include "forcegp.h"\n'
     head += "#ifdef __cplusplus\n#define restrict __restrict__\n#endif\n"
     blocks = [head, "\n".join(writer.lines), *_programs(writer.mean), before, *used, *priors, after]
+    blocks += [template("online.c")] if model.online else []
     robot, contacts = model.system.robot, model.system.contact_names
     fields = {
         "nq": robot.nq,
@@ -63,6 +66,7 @@ def c_source(model: ExportedModel, name: str) -> tuple[str, str]:
         "joints": _comment(", ".join(robot.joint_names)),
         "touching": _comment(", ".join(contacts) or "none"),
         "bits": "\n".join(f"#define FORCEGP_{x.upper()} {1 << i}u" for i, x in enumerate(READ)),
+        "online": writer.online_header(),
     }
     return tuple(  # pyright: ignore[reportReturnType]
         text.replace("forcegp_", f"{name}_")
@@ -100,7 +104,7 @@ def _programs(mean: LearnedMotion) -> list[str]:
         "mechanics": mean.program(outputs, ARGUMENTS[:3]),
         "forward_dynamics": trace(robot, "forward_dynamics"),
     }
-    if any(isinstance(part.prior, InertialPrior) for part in mean.parts):
+    if any(isinstance(part.prior, InertialPrior | PayloadPrior) for part in mean.parts):
         programs["regressor"] = regressor_program(Links(robot))
     values = np.concatenate([quantities[x] for x in DIFFERENTIATED])
     programs["slopes_of_mean"] = mean.program(mean.tangents(values).flat, (*ARGUMENTS, "f", "slope"))
@@ -114,8 +118,10 @@ class Writer:
         self.model, self.parts, self.lines = model, model.parts(), list[str]()
         self.mean, self._tables = LearnedMotion(model, self.parts, differentiate=True), dict[str, str]()
         self.starts = list(accumulate((part.components for part in self.parts), initial=0))
+        self.tables: list[list[str]] = []
         self._constants()
         self._noise()
+        self._online()
 
     def array(self, values: Tensor | Iterable[float], name: str = "", kind: str = "double") -> str:
         """A constant array, and its name."""
@@ -173,6 +179,10 @@ class Writer:
                 self.lines.append(f"#define INERTIAL {start}")
                 self.lines.append(f"#define INERTIAL_COLUMNS {part.components}")
                 self.array(part.prior.scale(robot), "INERTIAL_SCALE")
+            if isinstance(part.prior, PayloadPrior):
+                column = PER_PAYLOAD * part.prior.link(robot)
+                self.lines += [f"#define PAYLOAD {start}", f"#define PAYLOAD_COLUMN {column}"]
+                self.array(part.prior.units(robot.mass), "PAYLOAD_UNITS")
         if process.coulomb:
             where = [system.contact_names.index(x.contact) for x in process.coulomb]
             self.array(where, "COULOMB_CONTACT", "int")
@@ -194,6 +204,33 @@ class Writer:
         sensors = [self.array(self.model.noise[x] ** 2) if x in self.model.noise else "0" for x in READ]
         self.lines.append(f"static const double *const SENSOR_VARIANCE[] = {{{', '.join(sensors)}}};")
 
+    def _online(self) -> None:
+        """Where the functions of each component lie in what is learned online, and the noise of samples."""
+        self.lines.append(f"#define ONLINE {int(self.model.online)}")
+        if not self.model.online or self.model.sampling is None:
+            return
+        variance, power, moving = self.model.sampling
+        parts, latent = self.parts, self.model.posterior.latent
+        assert isinstance(latent, SparsePosterior)
+        self.array(latent.weights, "WEIGHTS")
+        self.array(accumulate((len(C) for part in parts for C in part.roots), initial=0), "FUNCTION", "int")
+        self.array(accumulate((len(w) for part in parts for w in part.weights), initial=0), "FOLDED", "int")
+        self.array([part.size for part in parts for _ in range(part.components)], "POINTS", "int")
+        self.array(self.starts, "FIRST_COMPONENT", "int")
+        self.array(variance, "LEARNED_TORQUE_VARIANCE")
+        self.lines.append(
+            f"enum {{ PRIOR_COUNT = {len(parts)}, GROUP = CONTACTS * 3 > NQ ? CONTACTS * 3 : NQ }};"
+        )
+        self.lines.append(f"static const double REST_SPEED = {REST_SPEED if moving else -1.0!r};")
+        self.lines.append(f"static const double TEMPERING = {power**0.5!r};")
+
+    def online_header(self) -> str:
+        """The part of the header on learning online, if the model can."""
+        names = ", ".join(f"{p} {_comment(part.prior.name)}" for p, part in enumerate(self.parts))
+        folded = sum(part.weights.numel() for part in self.parts)
+        fields = {"functions": self.parts[0].rank, "folded": folded, "priors": names}
+        return template("online.h", fields) if self.model.online else ""
+
     def priors(self) -> list[str]:
         """A function for each prior, and the one that calls them all."""
         texts, calls = [], []
@@ -204,13 +241,16 @@ class Writer:
             unread = "  (void)q, (void)qd, (void)tau, (void)e, (void)gain, (void)spread;\n"
             texts.append(title + unread + "\n".join(body) + "\n  return 0;\n}\n")
             calls.append(f"  if (prior_{p}(q, qd, tau, e, gain, spread, f) != 0) return FORCEGP_JAMMED;\n")
+        for i, name in ((1, "WHITENINGS"), (3, "ROOTS")) if self.model.online else ():
+            column = ", ".join(tables[i] for tables in self.tables)
+            self.lines.append(f"static const double *const {name}[] = {{{column}}};")
         texts.append(f"static int latent_forces({GIVEN}) {{\n{''.join(calls)}  return 0;\n}}\n")
         return [*texts, *self._slopes()]
 
     def _operator(self, part: Functions, start: int) -> list[str]:
-        """Code of E(x), which carries f to generalized forces; that of `INERTIAL` is in `controller.c`."""
+        """Code of E(x), from f to generalized forces; that of inertial errors is in `controller.c`."""
         prior, E = part.prior, f"f->E + {start}"
-        if isinstance(prior, InertialPrior):
+        if isinstance(prior, InertialPrior | PayloadPrior):
             return []
         if isinstance(prior, contact.NormalForcePrior):
             return [f"  along_constraint(e, {E});"]
@@ -245,9 +285,10 @@ class Writer:
             white, kept = "0", 0
             if part.whitening is not None and m:
                 white, kept = self.array(part.whitening[k].flatten()), part.whitening[k].shape[1]
-            tables = f"{self.array(part.weights[k])}, {white}, {kept}, {self.array(part.roots[k].flatten())}"
+            tables = [self.array(part.weights[k]), white, str(kept), self.array(part.roots[k].flatten())]
+            self.tables.append(tables)
             rest = f"{part.first[k]}, spread, {self.starts[p] + k}, f"
-            lines.append(f"    component(V, {m}, {len(phi)}, {variance}, {tables}, {rest});\n  }}")
+            lines.append(f"    component(V, {m}, {len(phi)}, {variance}, {', '.join(tables)}, {rest});\n  }}")
         return lines
 
     def _slopes(self) -> list[str]:
