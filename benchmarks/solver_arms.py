@@ -202,10 +202,12 @@ class Arm:
             bristle[:] = end + (bristle - end) * np.exp(-np.abs(speed) * STEP / (self.distance * g))
         return self.dry * bristle + self.wrong.ripple * self.scale * np.sin(self.teeth * data.qpos)
 
-    def record(self, seconds: float, path: Path) -> None:
-        """A log in CSV of the arm under a computed-torque controller."""
+    def record(
+        self, seconds: float, path: Path, motion: tuple[NDArray, NDArray, NDArray] | None = None
+    ) -> None:
+        """A log in CSV of the arm under a computed-torque controller, along a motion like those of `sines`."""
         mujoco, random, wrong = self.mujoco, self.random, self.wrong
-        wanted = sines(self.robot, seconds, random)
+        wanted = sines(self.robot, seconds, random) if motion is None else motion
         data = mujoco.MjData(self.true)
         data.qpos[:], data.qvel[:] = wanted[0][0], wanted[1][0]
         bristle, late = np.zeros(self.robot.nq), round(wrong.delay / wrong.period)

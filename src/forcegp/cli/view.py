@@ -14,7 +14,7 @@ if TYPE_CHECKING:
     from forcegp.constraints import ConstrainedSystem
     from forcegp.data import Dataset
     from forcegp.models.base import FittedModel
-    from forcegp.view.shapes import Shape
+    from forcegp.robot.shapes import Shape
 
 
 def view(
@@ -91,8 +91,8 @@ def _target(target: str) -> tuple[ConstrainedSystem, FittedModel | None, list[Sh
     """The system, the model if the target is one, and what the robot looks like."""
     from forcegp.models.load import load_model
     from forcegp.robot.load import BUNDLED
+    from forcegp.robot.shapes import shapes_of
     from forcegp.storage.model_file import model_path
-    from forcegp.view.shapes import shapes_of
 
     if not target.endswith(".toml") and model_path(target).is_file():
         model = load_model(target)

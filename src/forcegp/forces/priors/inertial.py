@@ -222,9 +222,9 @@ class PayloadPrior(ForcePrior):
         if self.known:
             eom = system.with_robot(self.loaded(system.robot)).equations(at.q, at.qd, at.active)
         qdd = eom.acceleration(eom.Q_K + at.tau)
-        first = PER_PAYLOAD * self._link(system.robot)
+        first = PER_PAYLOAD * self.link(system.robot)
         Y = regressor(system.robot, at.q, at.qd, qdd)[..., first : first + MASS_AND_MOMENT]
-        return -Y * self._units(at.q)
+        return -Y * self.units(at.q)
 
     def around(self, mean: Tensor) -> PayloadPrior:
         """The prior with the acceleration of the arm with the estimated payload.
@@ -233,11 +233,11 @@ class PayloadPrior(ForcePrior):
             mean: of the latent constants `(4,)`; where it is not a point mass near the link, the arm is taken
                 without payload.
         """
-        mass, *moment = (mean * self._units(mean)).tolist()
+        mass, *moment = (mean * self.units(mean)).tolist()
         near = mass > 0.0 and math.hypot(*moment) <= FARTHEST * self.length * mass
         return dataclasses.replace(self, known=(mass, *moment) if near else ())
 
-    def _units(self, like: Tensor) -> Tensor:
+    def units(self, like: Tensor) -> Tensor:
         """Mass and first moment for each unit of the latent constants, `(4,)`."""
         return like.new_tensor([self.mass, *3 * [self.mass * self.length]])
 
@@ -248,15 +248,16 @@ class PayloadPrior(ForcePrior):
         J = pseudo_inertia(robot.mass, robot.com, robot.inertia)
         point = J.new_tensor([*self.known[1:], self.known[0]])
         J = J.index_add(
-            0, torch.tensor([self._link(robot)], device=J.device), (point.outer(point) / point[3])[None]
+            0, torch.tensor([self.link(robot)], device=J.device), (point.outer(point) / point[3])[None]
         )
         mass, com, inertia = from_pseudo_inertia(J)
         return robot.replace(mass=mass, com=com, inertia=inertia)
 
     def check(self, system: ConstrainedSystem) -> None:
-        self._link(system.robot)
+        self.link(system.robot)
 
-    def _link(self, robot: RobotModel) -> int:
+    def link(self, robot: RobotModel) -> int:
+        """Index of the link that carries it."""
         if self.joint is None:
             return robot.nq - 1
         if self.joint not in robot.joint_names:
