@@ -51,6 +51,7 @@ class Collisions:
         self._mujoco = mujoco = optional_module("mujoco", "Checking a motion for collisions")
         self.boxes, self.clearance = _checked(boxes), clearance
         spec, robot = mujoco.MjSpec.from_string(write_urdf(system.robot)), system.robot
+        spec.compiler.fusestatic = False  # or the surroundings become part of the base
         common = {"contype": 1, "conaffinity": 1, "condim": 1, "margin": clearance, "mass": 0.0}
         for k, shape in enumerate(shapes):
             mesh = spec.add_mesh(name=f"mesh_{k}")
@@ -67,6 +68,8 @@ class Collisions:
             body = spec.worldbody if link == BASE else spec.body(link_name(robot, link))
             body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0], pos=position, **common)
         self._model = model = spec.compile()
+        # Further contacts of a pair have distances that are approximate.
+        model.opt.disableflags |= getattr(mujoco.mjtDisableBit, "mjDSBL_MULTICCD", 0)
         self._data = mujoco.MjData(model)
         self._dof = np.array([model.joint(name).dofadr[0] for name in robot.joint_names])
         names = {link_name(robot, i): joint for i, joint in enumerate(robot.joint_names)}

@@ -413,8 +413,8 @@ def excite(
         unknowns: what is unknown before the motion; by default all, as in `Unknowns.of`.
         collisions: by default the robot's shapes and the surfaces of the contacts.
         start: `(nq,)` position at the start and the end; by default a free one near the middle.
-        criterion: `"A"`, mean variance of the torque in the region of `unknowns`, `"D"`, the determinant of the
-            covariance, or a function of the information.
+        criterion: `"A"`, mean variance of the torque in the region of `unknowns`, `"D"`, the determinant of
+            the covariance, or a function of the information.
         rate: of the samples that are returned [Hz].
         restarts: random starts that are optimised, the best of four times as many.
         seed: of the random starts.

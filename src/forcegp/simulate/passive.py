@@ -18,7 +18,7 @@ from forcegp.resources import one_thread
 class PassiveForces:
     """A force field as `mjcb_passive`: adds Q̄ − Q_C − Q_G − Q_u to `qfrc_passive`.
 
-    With the masses and drives of the fitted robot, `fit.system.robot` or a file with it, MuJoCo's acceleration
+    With masses and drives of the fitted robot, `fit.system.robot` or a file with it, MuJoCo's acceleration
     is M⁻¹Q̄, the prediction of the fit. Joint friction is part of Q̄: `installed` takes damping and
     friction loss out of the model meanwhile, so that they do not act twice. Friction that contacts have
     learned is not applied; the engine has its own. Q_u is `qfrc_applied` and the actuators' last forces.

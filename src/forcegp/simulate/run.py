@@ -176,7 +176,8 @@ def simulate(
             engine = ContactSolverEngine(system, config.dt, config.solver)
             with nullcontext() if forces is None else forces.installed(engine.model):
                 log = _follow_with_solver(system, config, plan, engine, generator, progress)
-            return make_result(system, config, plan, log, engine.name, generator)
+            name = engine.name if forces is None else f"{engine.name}, learned forces of joints"
+            return make_result(system, config, plan, log, name, generator)
         if forces is not None:
             raise ParameterError(
                 "learned forces need MuJoCo's solver", expected='contact = "solver"', got=config.contact
