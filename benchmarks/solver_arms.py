@@ -205,7 +205,7 @@ class Arm:
     def record(
         self, seconds: float, path: Path, motion: tuple[NDArray, NDArray, NDArray] | None = None
     ) -> None:
-        """A log in CSV of the arm under a computed-torque controller, along a motion like those of `sines`."""
+        """A log in CSV of the arm under a computed-torque controller, along `sines` or a motion like it."""
         mujoco, random, wrong = self.mujoco, self.random, self.wrong
         wanted = sines(self.robot, seconds, random) if motion is None else motion
         data = mujoco.MjData(self.true)

@@ -4,7 +4,6 @@ import json
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import pytest
 import torch
 from torch import Tensor
@@ -14,7 +13,7 @@ import forcegp
 from forcegp.cli.app import app
 from forcegp.control.information import Unknowns
 from forcegp.dynamics import inverse_dynamics, mass_matrix
-from forcegp.errors import ModelError, ParameterError, UnknownNameError
+from forcegp.errors import ModelError, ParameterError, UnknownNameError, optional_module
 from forcegp.forces.inertia import latent_precision, one_row
 from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
 from forcegp.forces.priors.joint import JointFrictionPrior
@@ -33,6 +32,7 @@ from forcegp.simulate.excite import Limits, excite, random_states
 from forcegp.simulate.passive import PassiveForces
 from forcegp.simulate.urdf import write_urdf
 
+mujoco = optional_module("mujoco", "These tests")
 DAMPING, DRY = (0.3, 0.1), (1.0, 0.4)
 NOISE = 0.05
 """Standard deviation of the torque [N m]."""

@@ -43,13 +43,13 @@ def short(seed: int = 0, boxes: tuple[list[float], ...] = (), **options: object)
 
 
 @pytest.mark.parametrize("criterion", CRITERIA)
-def test_the_gradient_is_that_of_finite_differences(criterion: str) -> None:
+def test_the_gradient_is_that_of_finite_differences(criterion: str, monkeypatch: pytest.MonkeyPatch) -> None:
     search = Search(Spline(np.array(START), 4.0), LIMITS, unknowns(), collisions(), CRITERIA[criterion])
     x = 1.5 * search.spline.random(LIMITS, np.random.default_rng(1))
     # Beyond limits of the joints, where hinges act; those of the clearance have a test of their own.
     used, _ = search.used(x, 0.1)
     assert used["acceleration"] > 1.0
-    search.collisions.penalty = lambda q, _: (0.0, np.zeros_like(q))
+    monkeypatch.setattr(search.collisions, "penalty", lambda q, _: (0.0, np.zeros_like(q)))
     w = search.flat(x)
     some = np.random.default_rng(0).choice(len(w), 12, replace=False)
 

@@ -6,9 +6,9 @@ Gaussian bumps. A motion x with noise Σ leaves
 
     Cov θ = U (1 + Uᵀ G U)⁻¹ Uᵀ,    G = Σ_i Φ(x_i)ᵀ Σ⁻¹ Φ(x_i),
 
-over independent looks i. `A` is the mean variance of the torque in a region, `D` the entropy of θ. Sources:
-Swevers et al., *Optimal robot excitation and identification* (IEEE T-RA 1997); Pukelsheim, *Optimal Design
-of Experiments* (1993).
+over independent looks i. `A` is the geometric mean over joints of the standard deviation of the torque in a
+region, `D` the entropy of θ. Sources: Swevers et al., *Optimal robot excitation and identification*
+(IEEE T-RA 1997); Pukelsheim, *Optimal Design of Experiments* (1993).
 """
 
 from __future__ import annotations
@@ -127,8 +127,9 @@ class Unknowns:
 
     @cached_property
     def wanted(self) -> Tensor:
-        """Mean of Φᵀ Φ over the region, summed over joints in units of their noise `(p, p)`."""
-        return self.information(self.columns(*self.region)[1], LOOK)
+        """Mean of φᵀ φ over the region for the row φ of each joint `(nq, p, p)`."""
+        Phi = self.columns(*self.region)[1].movedim(1, 0)
+        return Phi.mT @ Phi / Phi.shape[1]
 
     def covariance_root(self, G: Tensor) -> Tensor:
         """R with R Rᵀ = Cov θ after a motion."""
@@ -162,9 +163,9 @@ def rigid_torque(robot: RobotModel, q: Tensor, qd: Tensor, qdd: Tensor, Y: Tenso
 
 
 def a_optimal(G: Tensor, unknowns: Unknowns) -> Tensor:
-    """½ log of the mean variance of the torque in the region."""
+    """Mean over joints of the log standard deviation of the torque, root mean square over the region."""
     R = unknowns.covariance_root(G)
-    return 0.5 * (R * (unknowns.wanted @ R)).sum().log()
+    return 0.5 * (R * (unknowns.wanted @ R)).sum((-2, -1)).log().mean()
 
 
 def d_optimal(G: Tensor, unknowns: Unknowns) -> Tensor:

@@ -302,31 +302,23 @@ class Search:
     def used(self, x: Array, step: float) -> tuple[dict[str, float], Array]:
         """Largest share of each limit at instants of a period `step`, the clearance lacking, and where."""
         t = np.linspace(0.0, self.spline.seconds, round(self.spline.seconds / step) + 1)
-        worst, where, limits = (
-            dict.fromkeys(("position", "velocity", "acceleration", "torque"), 0.0),
-            [],
-            self.limits,
-        )
-        worst["clearance"] = 0.0
+        worst: dict[str, float] = {}
+        where, limits, near = [], self.limits, self.collisions
+        middle, half = 0.5 * (limits.low + limits.high), 0.5 * (limits.high - limits.low)
         for rows in np.split(t, range(CHUNK, len(t), CHUNK)):
             q, qd, qdd = (torch.from_numpy(m @ x) for m in self.spline.at(rows))
             q = q + torch.from_numpy(self.spline.start)
             torque = rigid_torque(self.unknowns.robot, q, qd, qdd)
-            middle, half = 0.5 * (limits.low + limits.high), 0.5 * (limits.high - limits.low)
             shares = {
-                "position": (q - middle).abs() / half,
-                "velocity": qd.abs() / limits.velocity,
-                "acceleration": qdd.abs() / limits.acceleration,
-                "torque": torque.abs() / limits.torque,
+                "position": (q - middle) / half,
+                "velocity": qd / limits.velocity,
+                "acceleration": qdd / limits.acceleration,
+                "torque": torque / limits.torque,
+                "clearance": 1.0 + torch.from_numpy(near.depth(q.numpy()))[:, None] / near.clearance,
             }
-            lacking = self.collisions.depth(q.numpy())
-            found = {name: share.amax(-1).numpy() for name, share in shares.items()}
-            found["clearance"] = 1.0 + TOLERANCE + lacking / self.collisions.clearance
-            beyond = np.zeros(len(rows), bool)
-            for name, share in found.items():
-                worst[name] = max(worst[name], float(share.max()))
-                beyond |= share > 1.0 + (2.0 if name == "clearance" else 1.0) * TOLERANCE
-            where.append(rows[beyond])
+            found = {name: share.abs().amax(-1).numpy() for name, share in shares.items()}
+            worst = {name: max(worst.get(name, 0.0), float(share.max())) for name, share in found.items()}
+            where.append(rows[np.max(list(found.values()), axis=0) > 1.0 + TOLERANCE])
         return worst, np.concatenate(where)
 
     def shrunk(self, x: Array, step: float) -> tuple[Array, dict[str, float]]:
@@ -340,7 +332,7 @@ class Search:
             used, where = self.used(share * x, step)
             if not len(where):
                 return share * x, used
-        broken = ", ".join(name for name, value in used.items() if value > 1.0 + 2.0 * TOLERANCE)
+        broken = ", ".join(name for name, value in used.items() if value > 1.0 + TOLERANCE)
         raise NumericalError(
             f"no motion from the start fits the limits of {broken}",
             expected="room for a small motion around the start, at rest and in motion",
@@ -413,7 +405,7 @@ def excite(
         unknowns: what is unknown before the motion; by default all, as in `Unknowns.of`.
         collisions: by default the robot's shapes and the surfaces of the contacts.
         start: `(nq,)` position at the start and the end; by default a free one near the middle.
-        criterion: `"A"`, mean variance of the torque in the region of `unknowns`, `"D"`, the determinant of
+        criterion: `"A"`, standard deviation of the torque in the region of `unknowns`, `"D"`, determinant of
             the covariance, or a function of the information.
         rate: of the samples that are returned [Hz].
         restarts: random starts that are optimised, the best of four times as many.

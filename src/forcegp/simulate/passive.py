@@ -32,12 +32,7 @@ class PassiveForces:
         ModelError: there are not as many names as joints.
 
     Example:
-        >>> import forcegp, torch
-        >>> system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
-        >>> field = forcegp.AnalyticalModel(system).fit(None).force_field()  # doctest: +SKIP
-        >>> forces = PassiveForces(system, field)  # doctest: +SKIP
-        >>> with forces.installed(model):  # doctest: +SKIP
-        ...     mujoco.mj_step(model, data)
+        `with PassiveForces(fit.system, fit.force_field()).installed(model): mujoco.mj_step(model, data)`
     """
 
     def __init__(
@@ -61,11 +56,10 @@ class PassiveForces:
     @torch.no_grad()
     def force(self, q: np.ndarray, qd: np.ndarray, tau: np.ndarray) -> np.ndarray:
         """The force `(nq,)` at a state `(nq,)` [N m, N]."""
-        state = (torch.tensor(x, dtype=self.system.robot.dtype)[None] for x in (q, qd, tau))
+        q_, qd_, tau_ = (torch.tensor(x, dtype=self.system.robot.dtype)[None] for x in (q, qd, tau))
+        open_ = torch.zeros(1, len(self.system.contacts), dtype=torch.bool)
         with one_thread():
-            at, _ = states_at(
-                self.system, *state, torch.zeros(1, len(self.system.contacts), dtype=torch.bool)
-            )
+            at, _ = states_at(self.system, q_, qd_, tau_, open_)
             force = self.field(self.system, at) - at.eom.Q_C - at.eom.Q_G - at.tau
         return force[0].double().numpy()
 
