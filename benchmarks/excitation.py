@@ -46,6 +46,8 @@ SPEED, RATE = 2.0, 6.0
 """Limits where a file has none, or larger ones [rad/s, rad/s²]."""
 SERIES = 20
 DESIGNS = 2
+LOST = 0.5
+"""An arm that is further from its motion than this has left it, as simulations that diverge do [rad]."""
 PLAIN = replace(WRONG, drive=0.0)
 SENSORS = {"plain": PLAIN, "noisy": replace(PLAIN, noise=0.02, ripple=0.02)}
 """Noise of `write_back.py`, and noise and ripple of 2 % of the largest torque."""
@@ -159,8 +161,14 @@ def main() -> None:
             found = {}
             with tempfile.TemporaryDirectory() as folder:
                 for label, motion in designs[seed % DESIGNS][0].items():
-                    found[label] = errors(arm, log(arm, motion, seed, Path(folder)), seed, options.fit)
+                    train = log(arm, motion, seed, Path(folder))
+                    wanted = np.array([np.interp(train.t, STEP * np.arange(len(q)), q) for q in motion[0].T])
+                    followed = float(np.abs(train.q.numpy() - wanted.T).max()) < LOST
+                    found[label] = errors(arm, train, seed, options.fit) if followed else {}
             result[name][f"{case}, seed {seed}"] = found
+            if lost := [label for label, value in found.items() if not value]:
+                print(f"seed {seed}", name, case, "left the motion:", *lost, flush=True)
+                continue
             for model in found["excited"]:
                 ratio = [np.divide(found["excited"][model], found[k][model]) for k in ("random", "condition")]
                 rows.append((name, case, model, *(float(np.exp(np.log(x).mean())) for x in ratio)))
