@@ -103,6 +103,8 @@ CASES = {
 }
 RIGHT_FILE = {"mass": 0.0, "drive": 0.0, "gain": 0.0}
 """Imperfections of an arm whose file is right about its inertia, with true torques."""
+FOLLOWED = 0.02
+"""Speed from which on a controller that follows a given motion overcomes dry friction [rad/s]."""
 STRIBECK_SPEED = 0.05
 """At which friction falls to that in motion [rad/s]."""
 
@@ -202,10 +204,12 @@ class Arm:
             bristle[:] = end + (bristle - end) * np.exp(-np.abs(speed) * STEP / (self.distance * g))
         return self.dry * bristle + self.wrong.ripple * self.scale * np.sin(self.teeth * data.qpos)
 
-    def record(self, seconds: float, path: Path) -> None:
-        """A log in CSV of the arm under a computed-torque controller."""
+    def record(
+        self, seconds: float, path: Path, motion: tuple[NDArray, NDArray, NDArray] | None = None
+    ) -> None:
+        """A log in CSV of the arm under a computed-torque controller, along `sines` or a motion like it."""
         mujoco, random, wrong = self.mujoco, self.random, self.wrong
-        wanted = sines(self.robot, seconds, random)
+        wanted = sines(self.robot, seconds, random) if motion is None else motion
         data = mujoco.MjData(self.true)
         data.qpos[:], data.qvel[:] = wanted[0][0], wanted[1][0]
         bristle, late = np.zeros(self.robot.nq), round(wrong.delay / wrong.period)
@@ -213,8 +217,12 @@ class Arm:
         for k in range(len(wanted[0])):
             if k % round(wrong.period / STEP) == 0:
                 q, qd, qdd = (x[k] for x in wanted)
-                feedback = 100.0 * (q - data.qpos) + 20.0 * (qd - data.qvel)
+                stiff = 1.0 if motion is None else 5.0
+                feedback = 100.0 * stiff**2 * (q - data.qpos) + 20.0 * stiff * (qd - data.qvel)
                 torques.append(self.torque(q, qd, qdd + feedback))
+                if motion is not None:  # a controller that follows overcomes friction that the file lacks
+                    dry = self.true.dof_frictionloss * np.tanh(qd / FOLLOWED)
+                    torques[-1] = torques[-1] + self.true.dof_damping * qd + dry
                 logged = self.gain * torques[max(0, len(torques) - 1 - late)] + self.offset
                 logged += wrong.noise * self.scale * random.normal(size=len(q))
                 angle = data.qpos + wrong.jitter * self.further.normal(size=len(q))

@@ -15,10 +15,10 @@ from forcegp.files import write_text
 from forcegp.gp.exact import MATRICES_TO_LEARN
 from forcegp.models.load import load_model
 from forcegp.resources import announce_memory, free_memory
+from forcegp.robot.shapes import shapes_of
 from forcegp.scene import load_scene
 from forcegp.view.motion import of_log, sampled_rollout, with_rollout
 from forcegp.view.page import write_view
-from forcegp.view.shapes import shapes_of
 from reproduction.covariance import CovarianceData, make_covariance
 from reproduction.fits import MODEL, Fit, fits_of
 from reproduction.identification import IdentificationData, make_identification

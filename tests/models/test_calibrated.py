@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
@@ -10,14 +11,28 @@ from typer.testing import CliRunner
 
 import forcegp
 from forcegp.cli.app import app
+from forcegp.control.information import Unknowns
 from forcegp.dynamics import inverse_dynamics, mass_matrix
-from forcegp.errors import ModelError, ParameterError
+from forcegp.errors import ModelError, ParameterError, UnknownNameError, optional_module
+from forcegp.forces.inertia import latent_precision, one_row
 from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
 from forcegp.forces.priors.joint import JointFrictionPrior
-from forcegp.models.calibrated import calibrated, sampled_robots, without_armature, write_calibrated
+from forcegp.forces.quantities import states_at
+from forcegp.models.calibrated import (
+    calibrated,
+    sampled_robots,
+    unknowns_after,
+    without_armature,
+    write_calibrated,
+)
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.robot.inertia import pseudo_inertia
+from forcegp.rollout import RolloutOptions
+from forcegp.simulate.excite import Limits, excite, random_states
+from forcegp.simulate.passive import PassiveForces
+from forcegp.simulate.urdf import write_urdf
 
+mujoco = optional_module("mujoco", "These tests")
 DAMPING, DRY = (0.3, 0.1), (1.0, 0.4)
 NOISE = 0.05
 """Standard deviation of the torque [N m]."""
@@ -179,3 +194,109 @@ def test_the_command_writes_the_file_a_report_and_samples(fit: StructuredFit, tm
         failed = runner.invoke(app, [*base, *arguments, "-o", str(tmp_path / "none.urdf")])
         assert failed.exit_code != 0 and not (tmp_path / "none.urdf").exists()
         assert message in f"{failed.output} {failed.exception}"
+
+
+AGREEMENT = 1e-9
+"""Of accelerations by MuJoCo with the learned forces and by the fit, over their size."""
+
+
+def mujoco_of(robot: forcegp.RobotModel) -> Any:
+    """The robot in MuJoCo, with friction that the learned forces must replace."""
+    model = mujoco.MjModel.from_xml_string(write_urdf(robot))
+    model.opt.gravity[:], model.opt.timestep = robot.gravity.numpy(), 0.002
+    model.dof_armature[:], model.dof_damping[:], model.dof_frictionloss[:] = robot.armature.numpy(), 0.7, 0.9
+    return model
+
+
+@pytest.mark.parametrize("sample", [False, True])
+def test_mujoco_accelerates_as_the_fit_predicts(fit: StructuredFit, sample: bool) -> None:
+    robot, model = fit.system.robot, mujoco_of(fit.system.robot)
+    field = fit.force_samples(1, torch.Generator().manual_seed(4)) if sample else fit.force_field()
+    forces, data = PassiveForces(fit.system, field), mujoco.MjData(model)
+    states = 3.0 * torch.randn(
+        3, 30, robot.nq, generator=torch.Generator().manual_seed(0), dtype=torch.float64
+    )
+    found = []
+    with forces.installed(model):
+        for q, qd, tau in states.unbind(1):
+            data.qpos[:], data.qvel[:], data.qfrc_applied[:] = q.numpy(), qd.numpy(), tau.numpy()
+            mujoco.mj_forward(model, data)
+            found.append(torch.from_numpy(data.qacc.copy()))
+    acceleration = torch.stack(found)
+    predicted = fit.predict(*states, "qdd_free").mean
+    if sample:
+        mean = predicted
+        each = [states_at(fit.system, *(x[k : k + 1] for x in states), None)[0] for k in range(30)]
+        predicted = torch.cat([at.eom.acceleration(field(fit.system, at)) for at in each])
+        assert float((predicted - mean).abs().max()) > 1e-3
+    assert float((acceleration - predicted).abs().max()) < AGREEMENT * float(predicted.abs().max())
+    assert mujoco.get_mjcb_passive() is None
+    assert model.dof_damping.tolist() == [0.7, 0.7] and model.dof_frictionloss.tolist() == [0.9, 0.9]
+
+
+def test_mujoco_moves_as_the_rollout_under_the_learned_forces(fit: StructuredFit) -> None:
+    model, steps = mujoco_of(fit.system.robot), 1000
+    model.opt.timestep, data = 0.0005, mujoco.MjData(model)
+    data.qpos[:] = (0.4, -0.2)
+    start, tau = torch.tensor([0.4, -0.2], dtype=torch.float64), torch.zeros(steps, 2).double()
+    options = RolloutOptions(0.0005, sticking=False)
+    path = fit.rollout(start, torch.zeros_like(start), tau, duration=0.5, options=options)
+    with PassiveForces(fit.system, fit.force_field()).installed(model):
+        for _ in range(steps):
+            mujoco.mj_step(model, data)
+    assert torch.allclose(torch.tensor(data.qpos), path.q[steps], atol=2e-3)
+    assert float((path.q[steps] - start).abs().max()) > 0.05
+
+
+def test_joints_that_the_simulation_lacks_are_named(fit: StructuredFit) -> None:
+    model = mujoco_of(fit.system.robot)
+    with pytest.raises(ModelError, match="2 names"):
+        PassiveForces(fit.system, fit.force_field(), ["shoulder"])
+    with (
+        pytest.raises(UnknownNameError, match="wrist"),
+        PassiveForces(fit.system, fit.force_field(), ["shoulder", "wrist"]).installed(model),
+    ):
+        pass
+
+
+def test_a_model_lowers_what_is_unknown_and_a_motion_lowers_it_further(fit: StructuredFit) -> None:
+    robot = fit.system.robot
+    limits = Limits.of(robot, velocity=[3.0], acceleration=[10.0], torque=[50.0])
+    region = random_states(robot, limits, 40)
+    before = Unknowns.of(robot, limits.low, limits.high, limits.velocity, region)
+    known = unknowns_after(fit, before)
+    stds = [x.torque_std() for x in (before, known)]
+    for part in ("all", "links", "friction"):
+        assert bool((stds[1][part] < stds[0][part]).all())
+    # The links have the covariance of the posterior, δ = S z.
+    prior = next(p for p in fit.force_priors if isinstance(p, InertialPrior))
+    index = next(k for k, x in enumerate(fit.force_priors) if x is prior)
+    precision = latent_precision(fit.posterior, one_row(fit.posterior, fit.problem), index, robot)
+    B = torch.from_numpy(before.base.combination) * prior.scale(robot)
+    exact = (B @ torch.linalg.solve(precision, B.mT)).diagonal().sqrt()
+    found = known.root[known.parts["links"]].norm(dim=-1)
+    assert torch.allclose(found, exact, rtol=0.15, atol=2e-3 * float(before.root.max()))
+    system = forcegp.ConstrainedSystem(robot)
+    motion = excite(system, 4.0, limits=limits, unknowns=known, restarts=1)
+    assert bool((motion.after.torque_std()["all"] < stds[1]["all"]).all())
+    assert float(motion.motion.qd.abs().max()) > 0.5
+
+
+def test_simulate_with_a_model_names_it_in_the_log(fit: StructuredFit, tmp_path: Path) -> None:
+    fit.save(tmp_path / "model")
+    scene, out = tmp_path / "arm.toml", tmp_path / "run.parquet"
+    motion = log_of(fit.system.robot, 20, 1)
+    motion.write(tmp_path / "motion.parquet")
+    scene.write_text('[robot]\nmodel = "double_pendulum"\n[simulation]\ndt = 0.01\n')
+    command = ["simulate", "-s", str(scene), "-m", str(tmp_path / "model"), "-o", str(out)]
+    said = CliRunner().invoke(app, [*command, "--motion", str(tmp_path / "motion.parquet")])
+    assert said.exit_code == 0, said.output
+    run = forcegp.Dataset.read(out)
+    assert "learned forces" in run.header.provenance[0]
+    # Torque and acceleration of the simulated arm are those of the fit.
+    predicted = fit.predict(run.q, run.qd, run.tau, "qdd_free").mean
+    assert float((predicted - run.qdd_clean).abs().max()) < 0.05 * float(predicted.abs().max())
+    with pytest.raises(ParameterError, match="--sample has no posterior"):
+        CliRunner().invoke(
+            app, ["simulate", "-s", str(scene), "--sample", "-o", str(out)], catch_exceptions=False
+        )

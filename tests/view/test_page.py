@@ -21,9 +21,9 @@ from forcegp import kinematics
 from forcegp.cli import app
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.report.animation import animation_source
+from forcegp.robot.shapes import shapes_of
 from forcegp.view.motion import Motion, at_rest, of_log, pictures, with_rollout
 from forcegp.view.page import ARROW, content_of, force_text, serve, write_view
-from forcegp.view.shapes import shapes_of
 from forces.cases import logged, two_contacts
 
 ROUNDED = 2e-5

@@ -106,9 +106,9 @@ _TABLE: dict[str, tuple[tuple[str, Severity, str, str], ...]] = {
     ),
     "excitation": (
         ("log-short", "warning", "too few rows", "record a longer log"),
-        ("joint-still", "warning", "a joint does not move", "move the joint through its range"),
+        ("joint-still", "warning", "a joint does not move", "move it: `forcegp excite` plans how"),
         ("few-reversals", "note", "few changes of direction", "reverse each joint several times"),
-        ("poor-excitation", "note", "parameters not identified", "add the motion stated"),
+        ("poor-excitation", "note", "parameters not identified", "record what `forcegp excite` plans"),
         ("faults-hidden", "note", "faults too small to be seen", "move these joints more"),
         ("force-directions", "warning", "one sliding direction", "slide in several directions"),
     ),

@@ -14,6 +14,7 @@ import typer
 
 from forcegp.cli.common import printable, warn
 from forcegp.cli.evaluate import evaluate
+from forcegp.cli.excite import excite
 from forcegp.cli.export import export
 from forcegp.cli.fit import fit, sweep
 from forcegp.cli.logs import check, import_, select
@@ -37,7 +38,7 @@ app = typer.Typer(
     rich_markup_mode="rich",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
-for command in (simulate, check, select, fit, predict, evaluate, rollout, export, sweep, view):
+for command in (simulate, check, select, fit, predict, evaluate, rollout, export, excite, sweep, view):
     app.command()(command)
 app.command("import")(import_)
 

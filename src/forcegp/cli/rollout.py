@@ -17,6 +17,8 @@ from forcegp.errors import DataError
 if TYPE_CHECKING:
     from torch import Tensor
 
+    from forcegp.simulate.passive import PassiveForces
+
 
 def rollout(
     model: ModelFile,
@@ -153,6 +155,23 @@ def _as_data(path: forcegp.Rollout, log: forcegp.Dataset, dt: float) -> forcegp.
     )
 
 
+def _learned(path: Path, sample: bool, seed: int) -> PassiveForces:
+    """The forces of a fitted model, or one function of its posterior."""
+    import torch
+
+    from forcegp.errors import ModelError
+    from forcegp.models.load import load_model
+    from forcegp.simulate.passive import PassiveForces
+
+    fit = load_model(path)
+    field = fit.force_field()
+    if field is None or (sample and not fit.has_function_samples):
+        raise ModelError(f"{path} has no forces to simulate with", expected="a structured GP", got=fit.kind)
+    if sample:
+        field = fit.force_samples(1, torch.Generator().manual_seed(seed))
+    return PassiveForces(fit.system, field)
+
+
 def simulate(
     scene: SceneName,
     out: Annotated[Path, typer.Option("--out", "-o", help="Where the log goes (.parquet).")],
@@ -163,9 +182,24 @@ def simulate(
         str | None,
         typer.Option(help="rigid, or solver for MuJoCo's own contact and friction; default: the scene's."),
     ] = None,
+    motion: Annotated[
+        Path | None, typer.Option(help="Data set whose joints are followed, as of `forcegp excite`.")
+    ] = None,
+    model: Annotated[
+        Path | None,
+        typer.Option(
+            "--model", "-m", help="Fitted model: its robot in MuJoCo, with the learned joint forces."
+        ),
+    ] = None,
+    sample: Annotated[
+        bool, typer.Option("--sample", help="One function of the posterior, by seed, in place of its mean.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Simulate the robot of a scene as it slides over its surface, and log the motion.
+    """Simulate the robot of a scene as it slides over its surface or follows a motion, and log it.
+
+    With a model, MuJoCo moves the fitted robot under the learned forces of its joints in place of their
+    friction; contacts are MuJoCo's.
 
     [bold]Examples[/bold]
 
@@ -174,15 +208,30 @@ def simulate(
     forcegp simulate --scene my_scene.toml --duration 10 --seed 3 --out run.parquet
 
     forcegp simulate --scene ur5_wiping --engine mujoco --contact solver --out run.parquet
+
+    forcegp simulate --scene ur5_free --model model --motion motion.csv --sample --seed 3 --out run.parquet
     """
+    from forcegp.errors import ParameterError
     from forcegp.simulate import simulate as run
 
-    check_data_destination(out)
+    check_data_destination(out, *(path for path in (motion, model) if path is not None))
+    if sample and model is None:
+        raise ParameterError("--sample has no posterior to draw from", hint="give --model")
     read = forcegp.load_scene(scene)
+    system = read.system()
+    path = None if motion is None else read_data(motion, system.robot)
+    if path is not None and duration is None:
+        duration = float(path.t[-1] - path.t[0])
     changes = {"duration": duration, "seed": seed, "engine": engine, "contact": contact}
     config = replace(read.simulation, **{name: v for name, v in changes.items() if v is not None})
-    system = read.system()
+    forces = None
+    if model is not None:
+        forces = _learned(model, sample, config.seed)
+        solver = replace(config.solver, joint_friction=(), joint_damping=())
+        config = replace(config, contact="solver", engine="mujoco", solver=solver)
+        robot = forces.system.robot
+        system = system.with_robot(robot.replace(stribeck=0.0 * robot.stribeck))
     with progress_bar("simulating", config.steps) as progress:
-        result = run(system, config, progress=lambda done, _: progress(done))
+        result = run(system, config, motion=path, forces=forces, progress=lambda done, _: progress(done))
     save(result.data.write, out)
     show({**result.summary(), "file": str(out)}, as_json)

@@ -14,7 +14,7 @@ from forcegp.errors import ParameterError
 
 if TYPE_CHECKING:
     from forcegp.models.base import FittedModel
-    from forcegp.view.shapes import Shape
+    from forcegp.robot.shapes import Shape
 
 
 def view(
@@ -89,8 +89,8 @@ def view(
 def _target(target: str) -> tuple[forcegp.ConstrainedSystem, FittedModel | None, list[Shape]]:
     """The system, the model if the target is one, and what the robot looks like."""
     from forcegp.robot.load import BUNDLED
+    from forcegp.robot.shapes import shapes_of
     from forcegp.storage.model_file import model_path
-    from forcegp.view.shapes import shapes_of
 
     if not target.endswith(".toml") and model_path(target).is_file():
         model = forcegp.load_model(target)

@@ -17,11 +17,19 @@ from torch import Tensor
 from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem
 from forcegp.constraints.contact import SurfaceContact
-from forcegp.control.task_space import Gains, Target, orientation_error, task_rows
+from forcegp.control.task_space import (
+    Gains,
+    JointTarget,
+    Target,
+    control_torque,
+    joint_torque,
+    orientation_error,
+    task_rows,
+)
 from forcegp.control.trajectory import Chart, Reference, draw_waypoints, straight_lines
 from forcegp.errors import NumericalError, ParameterError
 from forcegp.robot.model import RobotModel
-from forcegp.types import JointVector, Rotation, Vector3
+from forcegp.types import Array, JointVector, Rotation, Vector3
 
 NOT_NEGATIVE = "a finite number, 0 or above"
 
@@ -209,12 +217,18 @@ class Plan:
     frame: str
     point: Sequence[float]
     reference: Reference
-    targets: Target
+    targets: Target | JointTarget
     start: Tensor
 
-    def arrays(self) -> Target:
+    def arrays(self) -> Target | JointTarget:
         """The targets as NumPy arrays `(n, …)`."""
-        return Target(*(values.numpy() for values in self.targets))
+        return type(self.targets)(*(values.numpy() for values in self.targets))
+
+    def command(self, eom: Any, q: Array, qd: Array, target: Target | JointTarget, gains: Gains) -> Array:
+        """Motor torque `(nq,)` towards a target, not limited [N m]."""
+        if isinstance(target, JointTarget):
+            return joint_torque(eom, q, qd, target, gains)
+        return control_torque(eom.tool, eom, q, qd, target, self.press(eom), gains)
 
     def press(self, eom: Any) -> Any:
         """Generalized unit normal force on each of the tool's contacts, summed, Σ Jᵀn/|n| `(*batch, nq)`."""
@@ -273,6 +287,26 @@ def make_plan(system: ConstrainedSystem, config: MotionConfig, generator: torch.
         _draw_push(reference, config, generator),
     )
     return Plan(tuple(c.name for c in carried), frame, point, reference, targets, start)
+
+
+def joint_plan(system: ConstrainedSystem, config: MotionConfig, t: Tensor, motion: JointTarget) -> Plan:
+    """The plan that follows a motion of the joints `(n, nq)` at times t `(n,)`, interpolated linearly."""
+    robot = system.robot
+    touching = [c for c in system.contacts if isinstance(c, SurfaceContact)]
+    frame, point = (touching[0].frame, touching[0].point) if touching else (config.frame, config.point)
+    frame = robot.frame_names[-1] if frame is None else frame
+    steps = torch.arange(config.steps, dtype=t.dtype) * config.dt
+    after = torch.searchsorted(t - t[0], steps).clamp(1, len(t) - 1)
+    share = ((steps - (t[after - 1] - t[0])) / (t[after] - t[after - 1])).clamp(0.0, 1.0)[:, None]
+    targets = JointTarget(*(x[after - 1] + share * (x[after] - x[after - 1]) for x in motion))
+    poses = kinematics.link_poses(robot, targets.q)
+    moving = kinematics.link_motion(robot, poses, targets.qd)
+    tool = kinematics.point_motion(robot, poses, moving, targets.qd, frame, point)
+    acceleration = ((tool.jacobian @ targets.qdd[..., None])[..., 0] + tool.bias)[:, 3:]
+    none = torch.zeros(config.steps, dtype=torch.int64)
+    path = tool.position, tool.twist[:, 3:], acceleration
+    reference = Reference(steps, *path, none, none.bool(), tool.position[[0, -1]], steps[-1:], 0)
+    return Plan((), frame, point, reference, targets, targets.q[0])
 
 
 def _tool_axis(point: Tensor) -> Tensor:

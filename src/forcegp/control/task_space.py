@@ -65,6 +65,14 @@ class Target(NamedTuple):
     push: Array
 
 
+class JointTarget(NamedTuple):
+    """Positions, velocities and accelerations of the joints at an instant, `(*batch, nq)`."""
+
+    q: Array
+    qd: Array
+    qdd: Array
+
+
 def task_rows(nq: int) -> slice:
     """The rows of [ω; ṗ] that an arm of nq joints can follow: all of six joints, ṗ of fewer."""
     return slice(0 if nq >= POSE_ROWS else POSITION_ROWS, POSE_ROWS)
@@ -161,3 +169,9 @@ def control_torque(
     posture = gains.posture_stiffness * (target.posture - q) - gains.posture_damping * qd
     y = joint_acceleration(tool, task_acceleration(tool, target, gains), posture)
     return (eom.M @ y[..., None])[..., 0] - eom.Q_K - target.push[..., None] * press
+
+
+def joint_torque(eom: Any, q: Array, qd: Array, target: JointTarget, gains: Gains) -> Array:
+    """Motor torque M (q̈_d + k_D ė + k_P e) − Q_K `(*batch, nq)` of joints, with the gains of positions."""
+    y = target.qdd + gains.position_damping * (target.qd - qd) + gains.position_stiffness * (target.q - q)
+    return (eom.M @ y[..., None])[..., 0] - eom.Q_K

@@ -16,7 +16,7 @@ Samples are the same for functions drawn from the posterior, with inertial param
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -26,6 +26,8 @@ from scipy.optimize import lsq_linear
 from torch import Tensor
 
 from forcegp import dynamics
+from forcegp.control.information import SPEEDS as SPEED_BUMPS
+from forcegp.control.information import Unknowns
 from forcegp.errors import ModelError, ParameterError
 from forcegp.files import write_json
 from forcegp.forces.noise import HIGH, LOW
@@ -216,6 +218,60 @@ def write_calibrated(
     return found
 
 
+@torch.no_grad()
+def unknowns_after(fit: StructuredFit, unknowns: Unknowns, *, draws: int = DRAWS, seed: int = 0) -> Unknowns:
+    """What a fit leaves unknown before another motion, from the covariance of functions drawn from it.
+
+    Base parameters, payload and friction over speed have the posterior covariance; what the fit has no prior
+    for keeps that of `unknowns`. The noise is at least that of the torques of the fit.
+
+    Args:
+        fit: around the analytical forces.
+        unknowns: of its robot, without data.
+        draws: function samples.
+        seed: of these samples.
+
+    Raises:
+        ModelError: see `calibrated`.
+    """
+    reader = _Reader.of(fit, seed, unknowns.fastest)
+    drawn = fit.force_samples(draws, torch.Generator().manual_seed(seed))
+    assert isinstance(drawn, ForceSamples)
+    nq, links = unknowns.robot.nq, unknowns.base.rank
+    found: dict[int, Tensor] = {}
+    delta = reader.speeds.new_zeros(draws, nq * len(MOMENTS))
+    if reader.scale is not None:
+        delta += (reader._constants(drawn, InertialPrior)[1:].unflatten(-1, (nq, -1)) * reader.scale).flatten(
+            1
+        )
+    for prior in (p for p in fit.force_priors if isinstance(p, PayloadPrior)):
+        first = len(MOMENTS) * prior.link(unknowns.robot)
+        load = reader._constants(drawn, PayloadPrior)[1:] * prior.units(delta)
+        delta[:, first : first + load.shape[1]] += load
+    if reader.scale is not None:
+        found |= dict(enumerate((delta @ torch.from_numpy(unknowns.base.combination).mT).mT))
+    if any(isinstance(prior, JointFrictionPrior) for prior in fit.force_priors):
+        curves = torch.stack(list(reader._curves(drawn)))[1:]
+        basis = unknowns.basis(torch.zeros_like(reader.speeds), reader.speeds)[..., : 2 + SPEED_BUMPS]
+        weights = torch.linalg.pinv(basis.movedim(1, 0)) @ (curves - curves.mean(0)).movedim(0, -1).movedim(
+            1, 0
+        )
+        each = (len(unknowns.root) - links) // nq
+        found |= {links + each * j + k: w for j in range(nq) for k, w in enumerate(weights[j])}
+    if not found:
+        return unknowns
+    rows, samples = list(found), torch.stack(list(found.values()))
+    covariance, root = torch.cov(samples), unknowns.root.clone()
+    jitter = JITTER * torch.diag(root[rows].square().sum(-1))
+    root[rows] = 0.0
+    root[torch.tensor(rows)[:, None], rows] = torch.linalg.cholesky(covariance + jitter)
+    std = fit.torque_std
+    noise = unknowns.noise if std is None else torch.maximum(std.to(unknowns.noise), unknowns.noise)
+    return replace(unknowns, root=root, noise=noise)
+
+
+JITTER = 1e-6
+"""Of that covariance, over the prior variances."""
 Curve = tuple[Tensor, Tensor, Tensor]
 """Friction over speeds `(k, nq)`, what d q̇ + f sign q̇ leaves of it, and the offset `(nq,)`."""
 
@@ -237,7 +293,7 @@ class _Reader:
     seed: int
 
     @classmethod
-    def of(cls, fit: StructuredFit, seed: int) -> _Reader:
+    def of(cls, fit: StructuredFit, seed: int, fastest: Tensor | None = None) -> _Reader:
         mean = fit.problem.mean
         if not isinstance(mean, AnalyticalMean) or "actuation" not in mean.terms:
             raise ModelError(
@@ -246,9 +302,10 @@ class _Reader:
                 hint='fit StructuredGP(system, "analytical")',
             )
         robot, values = fit.system.robot, fit.hyperparameters
-        fastest = torch.full_like(robot.mass, UNTRAINED)
-        if LOW in values:
-            fastest = torch.maximum(-values[LOW][0], values[HIGH][0]).clamp(min=1e-6)
+        if fastest is None:
+            fastest = torch.full_like(robot.mass, UNTRAINED)
+            if LOW in values:
+                fastest = torch.maximum(-values[LOW][0], values[HIGH][0]).clamp(min=1e-6)
         up = torch.linspace(SLOWEST, 1.0, SPEEDS, dtype=robot.dtype, device=robot.device)
         speeds = torch.cat([-up.flip(0), up])[:, None] * fastest
         low, high = (x.clamp(-np.pi, np.pi) for x in (robot.lower, robot.upper))

@@ -59,14 +59,14 @@ class ContactSolverEngine(MuJoCoWorld):
         mujoco, robot = optional_module("mujoco", NEEDS_MUJOCO), system.robot
         self._substeps = solver.substeps(dt)
         super().__init__(robot, _compile(mujoco, system, solver), dt / self._substeps)
-        options = self._model.opt
+        options = self.model.opt
         options.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
         options.cone = mujoco.mjtCone.mjCONE_ELLIPTIC
         options.tolerance = SOLVED
         damping, friction = (_per_joint(robot, solver, name) for name in ("joint_damping", "joint_friction"))
-        self._model.dof_damping[self._dof] = robot.damping.numpy() + damping
-        self._model.dof_frictionloss[self._dof] = robot.friction.numpy() + friction
-        geom = self._model.geom
+        self.model.dof_damping[self._dof] = robot.damping.numpy() + damping
+        self.model.dof_frictionloss[self._dof] = robot.friction.numpy() + friction
+        geom = self.model.geom
         self._pairs = [(geom(f"surface_{i}").id, geom(f"tip_{i}").id) for i in range(len(system.contacts))]
 
     @property
@@ -82,8 +82,8 @@ class ContactSolverEngine(MuJoCoWorld):
         """
         data, dof = self._data, self._dof
         data.qfrc_applied[dof] = torque
-        self._mujoco.mj_forward(self._model, data)
-        M, hD = self._mass_matrix(data), self._model.opt.timestep * self._model.dof_damping
+        self._mujoco.mj_forward(self.model, data)
+        M, hD = self._mass_matrix(data), self.model.opt.timestep * self.model.dof_damping
         qdd = np.linalg.solve(M + np.diag(hD), M @ data.qacc)
         contacts = [self._contact_force(*pair) for pair in self._pairs]
         none = np.zeros((0, 2, len(dof))), np.zeros((0, 2, 3))
@@ -95,11 +95,11 @@ class ContactSolverEngine(MuJoCoWorld):
 
     def step(self) -> None:
         """Advance by the sampling period under the torque last given to `forces`."""
-        self._mujoco.mj_step(self._model, self._data, self._substeps)
+        self._mujoco.mj_step(self.model, self._data, self._substeps)
 
     def _contact_force(self, surface: int, tip: int) -> tuple[np.ndarray, np.ndarray]:
         """Normal and friction force of a surface on a tip, generalized `(2, nq)` and Cartesian `(2, 3)`."""
-        model, data = self._model, self._data
+        model, data = self.model, self._data
         Q, F = np.zeros((2, len(self._dof))), np.zeros((2, 3))
         wrench, jacobian = np.zeros(6), np.zeros((3, model.nv))
         for i in range(data.ncon):
@@ -128,12 +128,12 @@ def _compile(mujoco: Any, system: ConstrainedSystem, solver: ContactSolver) -> A
                 expected="contacts of a point with a surface",
                 hint='use contact = "rigid"',
             )
-        body, position, radius = _tip(robot, contact, solver.tip_radius)
+        body, position, radius = tip_of(robot, contact, solver.tip_radius)
         ghost = {"contype": 0, "conaffinity": 0, "mass": 0.0}
         link = spec.worldbody if body == BASE else spec.body(link_name(robot, body))
         sphere = mujoco.mjtGeom.mjGEOM_SPHERE
         link.add_geom(name=f"tip_{i}", type=sphere, size=[radius, 0, 0], pos=position, **ghost)
-        spec.worldbody.add_geom(name=f"surface_{i}", **_shape(mujoco, contact), **ghost)
+        spec.worldbody.add_geom(name=f"surface_{i}", **geometry_of(mujoco, contact), **ghost)
         pair = spec.add_pair(geomname1=f"surface_{i}", geomname2=f"tip_{i}")
         pair.condim = 3
         pair.friction = [solver.friction, solver.friction, 0.0, 0.0, 0.0]
@@ -154,7 +154,7 @@ def _per_joint(robot: RobotModel, solver: ContactSolver, name: str) -> np.ndarra
     return np.array(values or [0.0] * robot.nq)
 
 
-def _tip(robot: RobotModel, contact: SurfaceContact, radius: float) -> tuple[int, np.ndarray, float]:
+def tip_of(robot: RobotModel, contact: SurfaceContact, radius: float) -> tuple[int, np.ndarray, float]:
     """The link that carries the tip, the centre of the tip in the link's coordinates, and its radius.
 
     The tip is that of the contact. Where the contact is a point, the tip is a sphere that ends there, on the
@@ -171,7 +171,7 @@ def _tip(robot: RobotModel, contact: SurfaceContact, radius: float) -> tuple[int
     return robot.frame_parents[index], p + R @ center, radius
 
 
-def _shape(mujoco: Any, contact: SurfaceContact) -> dict[str, Any]:
+def geometry_of(mujoco: Any, contact: SurfaceContact) -> dict[str, Any]:
     """Type, size and pose of the geometry of a surface."""
     surface, geom = contact.surface, mujoco.mjtGeom
     if isinstance(surface, Plane):

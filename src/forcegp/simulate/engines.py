@@ -120,7 +120,7 @@ class MuJoCoWorld:
     """A robot in a compiled MuJoCo model with its joint names; gravity and drive inertia are the robot's."""
 
     def __init__(self, robot: RobotModel, model: Any, dt: float) -> None:
-        self._mujoco, self._robot, self._model = optional_module("mujoco", NEEDS_MUJOCO), robot, model
+        self._mujoco, self._robot, self.model = optional_module("mujoco", NEEDS_MUJOCO), robot, model
         model.opt.timestep = dt
         model.opt.gravity[:] = robot.gravity.numpy()
         self._dof = np.array([model.joint(name).dofadr[0] for name in robot.joint_names])
@@ -152,9 +152,9 @@ class MuJoCoWorld:
 
     def _mass_matrix(self, data: Any) -> np.ndarray:
         """M `(nv, nv)` of a state whose positions are up to date; `mj_fullM` differs between versions."""
-        M = np.zeros((self._model.nv, self._model.nv))
-        for column, unit in zip(M, np.eye(self._model.nv), strict=True):
-            self._mujoco.mj_mulM(self._model, data, column, unit)
+        M = np.zeros((self.model.nv, self.model.nv))
+        for column, unit in zip(M, np.eye(self.model.nv), strict=True):
+            self._mujoco.mj_mulM(self.model, data, column, unit)
         return M
 
 
@@ -168,28 +168,28 @@ class MuJoCoEngine(MuJoCoWorld, Engine):
     def __init__(self, robot: RobotModel, dt: float) -> None:
         mujoco = optional_module("mujoco", NEEDS_MUJOCO)
         super().__init__(robot, mujoco.MjModel.from_xml_string(write_urdf(robot)), dt)
-        self._model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
-        self._model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
-        self._scratch = mujoco.MjData(self._model)
+        self.model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
+        self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
+        self._scratch = mujoco.MjData(self.model)
 
     @property
     def dt(self) -> float:
-        return float(self._model.opt.timestep)
+        return float(self.model.opt.timestep)
 
     def step(self, force: JointVector) -> None:
         self._data.qfrc_applied[self._dof] = force.numpy()
-        self._mujoco.mj_step(self._model, self._data)
+        self._mujoco.mj_step(self.model, self._data)
 
     def mass_matrix(self, q: JointVector) -> JointMatrix:
         self._set(self._scratch, q, torch.zeros_like(q))
-        self._mujoco.mj_forward(self._model, self._scratch)
+        self._mujoco.mj_forward(self.model, self._scratch)
         return self._tensor(self._mass_matrix(self._scratch)[np.ix_(self._dof, self._dof)])
 
     def inverse_dynamics(self, q: JointVector, qd: JointVector, qdd: JointVector) -> JointVector:
         data = self._scratch
         self._set(data, q, qd)
         data.qacc[self._dof] = qdd.numpy()
-        self._mujoco.mj_inverse(self._model, data)
+        self._mujoco.mj_inverse(self.model, data)
         return self._tensor(data.qfrc_inverse[self._dof])
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from contextlib import closing
+from contextlib import closing, nullcontext
 
 import numpy as np
 import torch
@@ -16,15 +16,17 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.constraints.unilateral import any_row, contact_forces, land
-from forcegp.control.plan import MotionConfig, Plan, make_plan
-from forcegp.control.task_space import Target, control_torque
-from forcegp.errors import NumericalError
+from forcegp.control.plan import MotionConfig, Plan, joint_plan, make_plan
+from forcegp.control.task_space import JointTarget
+from forcegp.data import Dataset
+from forcegp.errors import NumericalError, ParameterError
 from forcegp.resources import one_thread
 from forcegp.simulate.config import Sensors, SimulationConfig
 from forcegp.simulate.contact_solver import NO_FORCE, ContactSolverEngine
 from forcegp.simulate.engine import Engine
 from forcegp.simulate.engines import make_engine
 from forcegp.simulate.mechanics import Mechanics
+from forcegp.simulate.passive import PassiveForces
 from forcegp.simulate.result import RunLog, SimulationResult, make_result, noise, write
 
 RUNAWAY_SPEED = 50.0
@@ -85,8 +87,8 @@ def _follow_with_solver(
         _check_speed(k * config.dt, true_q.numpy(), true_qd.numpy())
         q, qd = _measured_state(true_q, true_qd, sensors, generator)
         measured["q"][k], measured["qd"][k] = q, qd
-        eom, target = mechanics.equations(q.numpy(), qd.numpy()), Target(*(values[k] for values in targets))
-        command = control_torque(eom.tool, eom, q.numpy(), qd.numpy(), target, plan.press(eom), config.gains)
+        eom, target = mechanics.equations(q.numpy(), qd.numpy()), type(targets)(*(x[k] for x in targets))
+        command = plan.command(eom, q.numpy(), qd.numpy(), target, config.gains)
         Q_u = np.clip(command, -limit, limit)
         solution = engine.forces(Q_u)
         write(rows, k, q=true_q, qd=true_qd, tau=Q_u, saturated=(Q_u != command).any(), qdd=solution.qdd)
@@ -129,7 +131,12 @@ ON_SURFACE = 1e-8
 
 
 def simulate(
-    system: ConstrainedSystem, config: SimulationConfig, *, progress: Progress | None = None
+    system: ConstrainedSystem,
+    config: SimulationConfig,
+    *,
+    motion: Dataset | None = None,
+    forces: PassiveForces | None = None,
+    progress: Progress | None = None,
 ) -> SimulationResult:
     """Simulate a motion of the robot, in contact or free, and log it.
 
@@ -141,6 +148,8 @@ def simulate(
     Args:
         system: robot and contacts; without contacts the motion is free.
         config: what is simulated.
+        motion: joints to follow instead of the tool's random motion, as long as the configuration says.
+        forces: learned forces of joints, in place of the robot's friction; for `contact = "solver"`.
         progress: called every few steps, and after the last.
 
     Returns:
@@ -162,14 +171,29 @@ def simulate(
     system.announce_states(config.steps, 1.0, f"a simulation of {config.steps:,} steps")
     generator = torch.Generator().manual_seed(config.seed)
     with torch.no_grad(), one_thread():
-        plan = make_plan(system, config, generator)
+        plan = _plan(system, config, motion, generator)
         if config.contact == "solver":
             engine = ContactSolverEngine(system, config.dt, config.solver)
-            log = _follow_with_solver(system, config, plan, engine, generator, progress)
-            return make_result(system, config, plan, log, engine.name, generator)
+            with nullcontext() if forces is None else forces.installed(engine.model):
+                log = _follow_with_solver(system, config, plan, engine, generator, progress)
+            name = engine.name if forces is None else f"{engine.name}, learned forces of joints"
+            return make_result(system, config, plan, log, name, generator)
+        if forces is not None:
+            raise ParameterError(
+                "learned forces need MuJoCo's solver", expected='contact = "solver"', got=config.contact
+            )
         with closing(make_engine(system.robot, config.dt, config.engine)) as engine:
             log = _follow(system, config, plan, engine, progress)
             return make_result(system, config, plan, log, engine.name, generator)
+
+
+def _plan(
+    system: ConstrainedSystem, config: SimulationConfig, motion: Dataset | None, generator: torch.Generator
+) -> Plan:
+    if motion is None:
+        return make_plan(system, config, generator)
+    motion = motion.select(system.robot.joint_names)
+    return joint_plan(system, config, motion.t, JointTarget(motion.q, motion.qd, motion.qdd))
 
 
 def _follow(
@@ -192,8 +216,8 @@ def _follow(
         if landing.impact:
             qd = landing.qd
             engine.reset(torch.from_numpy(q), torch.from_numpy(qd))
-        eom, target = landing.eom, Target(*(values[k] for values in targets))
-        command = control_torque(eom.tool, eom, q, qd, target, plan.press(eom), config.gains)
+        eom, target = landing.eom, type(targets)(*(values[k] for values in targets))
+        command = plan.command(eom, q, qd, target, config.gains)
         Q_u = np.clip(command, -limit, limit)
         forces = contact_forces(mechanics, q, qd, landing, Q_u, config.viscous_friction)
         engine.step(torch.from_numpy(Q_u + forces.Q_D + forces.Q_I + forces.Q_z))

@@ -18,9 +18,9 @@ from forcegp.constraints.surface import Surface
 from forcegp.files import write_text
 from forcegp.report.animation import animation, animation_source, arm_points, rounded
 from forcegp.report.page import INK, render
+from forcegp.robot.shapes import Array, Shape, box, cylinder, sphere, turn_z
 from forcegp.rollout.comparison import tip_of
 from forcegp.view.motion import LOGGED, MEAN, Force, Motion
-from forcegp.view.shapes import Array, Shape, box, cylinder, sphere, turn_z
 
 ROBOT, BASE_COLOUR, SURFACE = "#607d96", "#464e56", "#e2cd96"
 OPACITY = 0.45
@@ -42,17 +42,17 @@ def content_of(motion: Motion, shapes: Sequence[Shape]) -> dict[str, Any]:
     R = torch.cat([robot.base_rotation.expand(len(frames), 1, 3, 3), poses.rotation], dim=1)
     p = torch.cat([torch.zeros_like(poses.position[:, :1]), poses.position], dim=1) + robot.base_position
     arm = arm_points(robot, motion.q, *tip_of(system))
-    solids = [_solid(x.points, ROBOT if x.link >= 0 else BASE_COLOUR, x.link + 1) for x in shapes]
+    solids = [solid(x.points, ROBOT if x.link >= 0 else BASE_COLOUR, x.link + 1) for x in shapes]
     for contact in system.contacts:
         if isinstance(contact, SurfaceContact):
             around = _around(motion, contact.name, arm[:, -1].detach().cpu().numpy())
-            solids.append(_solid(_patch(contact.surface, around), SURFACE, None))
+            solids.append(solid(_patch(contact.surface, around), SURFACE, None))
     largest = max((float(np.nanmax(abs(f.value), initial=0.0)) for f in motion.forces), default=0.0)
     return {
         "times": motion.t.tolist(),
         "bodies": arm.shape[1],
         "films": [{"label": robot.name, "colour": INK, "dash": [], "points": rounded(arm)}],
-        "solids": [solid for solid in solids if solid["points"]],
+        "solids": [each for each in solids if each["points"]],
         "poses": [[rounded(x) for x in frame] for frame in torch.cat([R.flatten(-2), p], dim=-1)],
         "paths": [
             dict(zip(("colour", "width"), PATHS.get(path.kind, SAMPLED), strict=True))
@@ -64,7 +64,8 @@ def content_of(motion: Motion, shapes: Sequence[Shape]) -> dict[str, Any]:
     }
 
 
-def _solid(points: Array, colour: str, link: int | None) -> dict[str, Any]:
+def solid(points: Array, colour: str, link: int | None) -> dict[str, Any]:
+    """A convex solid of an animation: corners in the frame of a link, or in the world."""
     style = {"colour": colour, "opacity": OPACITY, "link": link}
     return {"points": rounded(torch.from_numpy(points)), **style}
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -12,8 +13,8 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
-from forcegp.robot import RobotModel
 from forcegp.robot.load import BUNDLED
+from forcegp.robot.model import RobotModel
 from forcegp.robot.safety import parse_numbers, parse_xml, read_bytes
 
 Array = NDArray[np.float64]
@@ -65,10 +66,13 @@ def turn_z(direction: Array) -> Array:
     return Rotation.from_rotvec(axis / sine * np.arctan2(sine, cosine)).as_matrix()
 
 
-def shapes_of(robot: RobotModel, source: str | Path | None = None) -> list[Shape]:
+def shapes_of(
+    robot: RobotModel, source: str | Path | None = None, elements: Sequence[str] = ("visual",)
+) -> list[Shape]:
     """The parts of a robot, from its file or a bundled one; without a URDF file, rods between its joints.
 
-    By default a bundled robot of the same name and frames is recognised.
+    By default a bundled robot of the same name and frames is recognised. Of `elements`, `"visual"` and
+    `"collision"`, the first is taken that the file has.
 
     Raises:
         RobotFileError: the shapes of the file are not valid.
@@ -81,8 +85,8 @@ def shapes_of(robot: RobotModel, source: str | Path | None = None) -> list[Shape
     else:
         path = Path(source)
     root = parse_xml(read_bytes(path), str(path))
-    shapes = _visuals(root, path, robot) if root.tag == "robot" else []
-    return shapes or rods(robot)
+    found = (_parts(root, path, robot, element) for element in elements if root.tag == "robot")
+    return next(filter(None, found), None) or rods(robot)
 
 
 def rods(robot: RobotModel) -> list[Shape]:
@@ -101,8 +105,8 @@ def rods(robot: RobotModel) -> list[Shape]:
     ]
 
 
-def _visuals(root: Element, path: Path, robot: RobotModel) -> list[Shape]:
-    """The visual elements of the links of a URDF document that are frames of the robot."""
+def _parts(root: Element, path: Path, robot: RobotModel, element: str) -> list[Shape]:
+    """The visual or collision elements of the links of a URDF document that are frames of the robot."""
     parts = []
     for link in root.findall("link"):
         name = link.get("name", "")
@@ -111,16 +115,16 @@ def _visuals(root: Element, path: Path, robot: RobotModel) -> list[Shape]:
         index = robot.frame_index(name)
         R = robot.frame_rotation[index].detach().cpu().numpy()
         p = robot.frame_position[index].detach().cpu().numpy()
-        for visual in link.findall("visual"):
-            points = _corners(visual, f"{path}: link {name!r}", path.parent)
+        for part in link.findall(element):
+            points = _corners(part, f"{path}: link {name!r}", path.parent)
             if points is not None:
                 parts.append(Shape(robot.frame_parents[index], points @ R.T + p))
     return parts
 
 
-def _corners(visual: Element, where: str, folder: Path) -> Array | None:
-    """Corners of one visual element, in the frame of its link; `None` for what cannot be shown."""
-    origin, geometry = visual.find("origin"), visual.find("geometry")
+def _corners(part: Element, where: str, folder: Path) -> Array | None:
+    """Corners of one part, in the frame of its link; `None` for what cannot be shown."""
+    origin, geometry = part.find("origin"), part.find("geometry")
     if geometry is None or not len(geometry):
         return None
     place = {} if origin is None else origin.attrib

@@ -14,7 +14,7 @@ import forcegp
 from forcegp import kinematics
 from forcegp.errors import RobotFileError
 from forcegp.robot.load import BUNDLED
-from forcegp.view.shapes import box, cylinder, rods, shapes_of, sphere, turn_z
+from forcegp.robot.shapes import box, cylinder, rods, shapes_of, sphere, turn_z
 
 EXACT = 1e-12
 """Of products of a few rotations."""

@@ -1,0 +1,145 @@
+"""`forcegp excite`: the next motion to record."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated
+
+import typer
+
+from forcegp.cli.common import check_data_destination, check_output, progress_bar, read_data, save, show
+from forcegp.cli.options import AsJson, SceneName
+
+if TYPE_CHECKING:
+    from forcegp.simulate.excite import Excitation
+
+Numbers = Annotated[
+    str | None, typer.Option(metavar="X[,X...]", help="Largest one; one number or one per joint.")
+]
+
+
+def excite(
+    scene: SceneName,
+    out: Annotated[Path, typer.Option("--out", "-o", help="The motion, .csv or .parquet.")],
+    seconds: Annotated[float, typer.Option(help="Length of the motion.")] = 30.0,
+    model: Annotated[
+        Path | None, typer.Option("--model", "-m", help="Fitted model: continue from what it knows.")
+    ] = None,
+    region: Annotated[
+        Path | None,
+        typer.Option(
+            help="Data set with the states at which the torque shall be known; default: all states."
+        ),
+    ] = None,
+    start: Annotated[
+        str | None, typer.Option(metavar="Q,Q...", help="Position at start and end; default: a free one.")
+    ] = None,
+    velocity: Numbers = None,
+    acceleration: Numbers = None,
+    torque: Numbers = None,
+    share: Annotated[float, typer.Option(help="Share of the limits that the motion may use.")] = 0.9,
+    box: Annotated[
+        list[str] | None,
+        typer.Option(metavar="X,Y,Z,A,B,C", help="Box to stay away from: centre and sides [m]; repeatable."),
+    ] = None,
+    clearance: Annotated[float, typer.Option(min=1e-4, help="Distance of all parts from others [m].")] = 0.01,
+    criterion: Annotated[str, typer.Option(help="A: spread of the torque; D: determinant.")] = "A",
+    rate: Annotated[float, typer.Option(help="Samples per second.")] = 1000.0,
+    restarts: Annotated[int, typer.Option(min=1, help="Random starts that are optimised.")] = 2,
+    seed: Annotated[int, typer.Option(help="Seed of the random starts.")] = 0,
+    as_json: AsJson = False,
+) -> None:
+    """Plan the motion in free space whose log tells most about inertia and friction.
+
+    It starts and ends at rest, holds the limits of the robot file or those given, and keeps the robot from
+    itself, the surfaces of the scene, and boxes. Beside it, a page of the same name shows the motion, its
+    limits, and the expected standard deviation of the torque before and after its log.
+
+    [bold]Examples[/bold]
+
+    forcegp excite --scene ur5_free --seconds 30 --acceleration 6 --out motion.csv
+
+    forcegp excite -s ur5_free --model model --box 0.5,0,0.1,0.3,0.3,0.2 -o motion.csv
+    """
+    from forcegp.control.information import Unknowns
+    from forcegp.errors import ModelError
+    from forcegp.models.calibrated import unknowns_after
+    from forcegp.models.load import load_model
+    from forcegp.models.structured_fit import StructuredFit
+    from forcegp.robot.load import BUNDLED
+    from forcegp.robot.shapes import shapes_of
+    from forcegp.scene import load_scene
+    from forcegp.simulate.collisions import Collisions
+    from forcegp.simulate.excite import Limits, excite, random_states
+    from forcegp.view.excitation import write_excitation
+
+    inputs = [path for path in (model, region) if path is not None]
+    (check_output if out.suffix.lower() == ".csv" else check_data_destination)(out, *inputs)
+    page = out.with_suffix(".html")
+    check_output(page)
+    read = load_scene(scene)
+    system, named = read.system(), read.sections.robot.model
+    shapes = shapes_of(
+        system.robot, named if named in BUNDLED else read.folder / named, ("collision", "visual")
+    )
+    fit = None if model is None else load_model(model)
+    if fit is not None:
+        if not isinstance(fit, StructuredFit):
+            raise ModelError(
+                f"{model} has no forces to continue from", expected="a structured GP", got=fit.kind
+            )
+        fit.specified.robot.check_state(start=system.robot.lower)
+        system = system.with_robot(fit.system.robot)
+    limits = Limits.of(
+        system.robot,
+        velocity=_numbers("velocity", velocity),
+        acceleration=_numbers("acceleration", acceleration),
+        torque=_numbers("torque", torque),
+        share=share,
+    )
+    states = random_states(system.robot, limits)
+    if region is not None:
+        log = read_data(region, system.robot)
+        log = log[:: max(1, len(log) // len(states[0]))]
+        states = log.q, log.qd, log.qdd
+    unknowns = Unknowns.of(system.robot, limits.low, limits.high, limits.velocity, states)
+    collisions = Collisions(system, shapes, [_numbers("box", text) for text in box or ()], clearance)
+    with progress_bar("searching", 1) as advance:
+        result = excite(
+            system,
+            seconds,
+            limits=limits,
+            unknowns=unknowns if fit is None else unknowns_after(fit, unknowns),
+            collisions=collisions,
+            start=_numbers("start", start) or None,
+            criterion=criterion,
+            rate=rate,
+            restarts=restarts,
+            seed=seed,
+            progress=lambda done, total: advance(done, total),
+        )
+    save(result.write, out)
+    write_excitation(page, result, system, shapes, collisions.boxes, f"{scene}: the next motion")
+    show({**_summary(result), "page": str(page), "file": str(out)}, as_json)
+
+
+def _numbers(option: str, text: str | None) -> list[float]:
+    from forcegp.errors import ParameterError
+
+    try:
+        return [float(word) for word in (text or "").split(",") if word.strip()]
+    except ValueError:
+        raise ParameterError(
+            f"--{option} is not a list of numbers", expected="numbers with commas between", got=text
+        ) from None
+
+
+def _summary(result: Excitation) -> dict[str, object]:
+    before, after = (x.torque_std()["all"] for x in (result.before, result.after))
+    used = {f"used_{name}" if name != "clearance_m" else name: value for name, value in result.used.items()}
+    return {
+        "samples": len(result.motion),
+        **used,
+        "torque_std_before": [float(f"{x:.4g}") for x in before.tolist()],
+        "torque_std_after": [float(f"{x:.4g}") for x in after.tolist()],
+    }

@@ -1,0 +1,177 @@
+"""What a motion would tell about the unknown forces of a robot.
+
+The torque is linear in what is unknown, τ = τ₀ + Φ(q, q̇, q̈) θ with θ ~ N(0, U Uᵀ): base parameters of
+the links, and for each joint a function of its speed and one of its position, as viscous and dry friction and
+Gaussian bumps. A motion x with noise Σ leaves
+
+    Cov θ = U (1 + Uᵀ G U)⁻¹ Uᵀ,    G = Σ_i Φ(x_i)ᵀ Σ⁻¹ Φ(x_i),
+
+over independent looks i. `A` is the geometric mean over joints of the standard deviation of the torque in a
+region, `D` the entropy of θ. Sources: Swevers et al., *Optimal robot excitation and identification*
+(IEEE T-RA 1997); Pukelsheim, *Optimal Design of Experiments* (1993).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from functools import cached_property
+
+import torch
+from torch import Tensor
+
+from forcegp.dynamics import damping_force
+from forcegp.errors import ParameterError
+from forcegp.forces.priors.inertial import InertialPrior
+from forcegp.identification import BaseParameters, base_parameters, parameter_vector, regressor
+from forcegp.robot.model import RobotModel
+
+LOOK = 0.1
+"""Time after which a torque is independent of the one before [s]."""
+NOISE = 0.01
+"""Standard deviation of the noise of a torque, over the root mean square of the torques of the region."""
+FRICTION, BUMP = 0.1, 0.03
+"""Prior standard deviations of friction and of each bump, over the same."""
+SPEEDS, PLACES = 7, 5
+"""Bumps over the range of speeds, and of positions, of a joint."""
+DRY = 0.02
+"""Share of a joint's largest speed over which dry friction changes its sign."""
+
+States = tuple[Tensor, Tensor, Tensor]
+"""Positions, velocities and accelerations `(n, nq)`."""
+Criterion = Callable[[Tensor, "Unknowns"], Tensor]
+"""An objective to minimise, of the information G `(p, p)` of a motion."""
+
+
+@dataclass(frozen=True, eq=False)
+class Unknowns:
+    """Unknown forces of a robot before a motion.
+
+    Attributes:
+        robot: its kinematics, gravity and drives are used, its links as prior mean.
+        base: combinations of the inertial parameters that act on the motion.
+        low, high, fastest: `(nq,)` the range of positions and speeds that the functions span.
+        region: states `(m, nq)` at which the torque shall be known.
+        noise: `(nq,)` standard deviation of a look at the torque [N m, N].
+        root: U `(p, p)`: the covariance of θ before the motion is U Uᵀ.
+    """
+
+    robot: RobotModel
+    base: BaseParameters
+    low: Tensor
+    high: Tensor
+    fastest: Tensor
+    region: States
+    noise: Tensor
+    root: Tensor
+
+    @classmethod
+    def of(
+        cls,
+        robot: RobotModel,
+        low: Tensor,
+        high: Tensor,
+        fastest: Tensor,
+        region: States,
+        noise: Tensor | None = None,
+    ) -> Unknowns:
+        """Unknown forces of a robot without data.
+
+        Args:
+            robot: as in its file.
+            low, high, fastest, region: see the class.
+            noise: by default 1 % of each joint's torques in the region, and 0.1 % of the largest.
+
+        Raises:
+            ParameterError: the region is empty.
+        """
+        if not len(region[0]):
+            raise ParameterError("the region has no states", expected="one state or more", got="none")
+        torque = rigid_torque(robot, *region).square().mean(0).sqrt()
+        torque = torch.maximum(torque, 0.1 * torque.max()).clamp(min=1e-9)
+        functions = torque.new_tensor([FRICTION] * 2 + [BUMP] * (SPEEDS + PLACES))
+        base = base_parameters(robot)
+        # β = B π
+        links = torch.linalg.cholesky(
+            _squared(torch.from_numpy(base.combination) * InertialPrior().scale(robot))
+        )
+        root = torch.block_diag(links, torch.diag((torque[:, None] * functions).flatten()))
+        noise = NOISE * torque if noise is None else noise
+        return cls(robot, base, low, high, fastest, region, noise, root)
+
+    @property
+    def parts(self) -> dict[str, slice]:
+        """Where θ has the links and the functions of the joints."""
+        links = self.base.rank
+        return {"links": slice(0, links), "friction": slice(links, len(self.root))}
+
+    def basis(self, q: Tensor, qd: Tensor) -> Tensor:
+        """Functions of each joint `(n, nq, k)`: q̇ and tanh q̇ in units, bumps over q̇, bumps over q."""
+        u, place = qd / self.fastest, 2.0 * (q - self.low) / (self.high - self.low) - 1.0
+        bumps = [
+            torch.exp(-0.5 * ((x[..., None] - torch.linspace(-1.0, 1.0, k).to(x)) * (k - 1) / 2.0) ** 2)
+            for x, k in ((u, SPEEDS), (place, PLACES))
+        ]
+        return torch.cat([u[..., None], torch.tanh(u / DRY)[..., None], *bumps], dim=-1)
+
+    def columns(self, q: Tensor, qd: Tensor, qdd: Tensor) -> tuple[Tensor, Tensor]:
+        """Regressor Y of the links and Φ `(n, nq, p)` of all parameters at states `(n, nq)`."""
+        Y = regressor(self.robot, q, qd, qdd)
+        functions = torch.diag_embed(self.basis(q, qd).movedim(-1, 1)).movedim(1, -1)
+        return Y, torch.cat([Y[..., list(self.base.columns)], functions.flatten(-2)], dim=-1)
+
+    def information(self, Phi: Tensor, seconds: float) -> Tensor:
+        """G `(p, p)` of a motion that lasts some seconds, from Φ at states of it."""
+        A = (Phi / self.noise[:, None]).flatten(0, 1)
+        return A.mT @ A * (seconds / LOOK / len(Phi))
+
+    @cached_property
+    def wanted(self) -> Tensor:
+        """Mean of φᵀ φ over the region for the row φ of each joint `(nq, p, p)`."""
+        Phi = self.columns(*self.region)[1].movedim(1, 0)
+        return Phi.mT @ Phi / Phi.shape[1]
+
+    def covariance_root(self, G: Tensor) -> Tensor:
+        """R with R Rᵀ = Cov θ after a motion."""
+        eye = torch.eye(self.root.shape[1], dtype=G.dtype)
+        L = torch.linalg.cholesky(eye + self.root.mT @ G @ self.root)
+        return torch.linalg.solve_triangular(L, self.root.mT, upper=False).mT
+
+    def after(self, G: Tensor) -> Unknowns:
+        """What is unknown after a motion with information G."""
+        return replace(self, root=self.covariance_root(G))
+
+    def torque_std(self) -> Mapping[str, Tensor]:
+        """Root mean square over the region of the standard deviation of the torque `(nq,)` [N m, N].
+
+        By `all` parameters, and by the links or the friction alone.
+        """
+        Phi = self.columns(*self.region)[1]
+        parts = {"all": slice(None), **self.parts}
+        spread = {name: Phi[..., part] @ self.root[part] for name, part in parts.items()}
+        return {name: x.square().sum(-1).mean(0).sqrt() for name, x in spread.items()}
+
+
+def _squared(X: Tensor) -> Tensor:
+    return X @ X.mT
+
+
+def rigid_torque(robot: RobotModel, q: Tensor, qd: Tensor, qdd: Tensor, Y: Tensor | None = None) -> Tensor:
+    """Torque that a motion `(n, nq)` needs by the robot file: Y π + armature q̈ − Q_D [N m, N]."""
+    Y = regressor(robot, q, qd, qdd) if Y is None else Y
+    return Y @ parameter_vector(robot) + robot.armature * qdd - damping_force(robot, qd)
+
+
+def a_optimal(G: Tensor, unknowns: Unknowns) -> Tensor:
+    """Mean over joints of the log standard deviation of the torque, root mean square over the region."""
+    R = unknowns.covariance_root(G)
+    return 0.5 * (R * (unknowns.wanted @ R)).sum((-2, -1)).log().mean()
+
+
+def d_optimal(G: Tensor, unknowns: Unknowns) -> Tensor:
+    """½ log det Cov θ over what is known before, per parameter."""
+    eye = torch.eye(unknowns.root.shape[1], dtype=G.dtype)
+    return -0.5 * torch.logdet(eye + unknowns.root.mT @ G @ unknowns.root) / len(eye)
+
+
+CRITERIA: dict[str, Criterion] = {"A": a_optimal, "D": d_optimal}

@@ -1,0 +1,504 @@
+"""The motion whose log would tell most about the unknown forces, within limits and free of collisions.
+
+Joints follow uniform cubic B-splines that start and end at rest in the same position. Splines stay between
+their control points, so that bounds on these and on their differences hold the limits of position, velocity
+and acceleration at all times. L-BFGS minimises a criterion of the information (`control/information.py`)
+with squared hinges for all limits and the clearance, from random starts within all limits. The
+result is verified at 1 kHz; where it fails, these instants join the nodes of the hinges, and in the end the
+motion shrinks towards its start.
+"""
+
+from __future__ import annotations
+
+import io
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+import torch
+from scipy.optimize import minimize
+from torch import Tensor
+
+from forcegp.constraints import ConstrainedSystem
+from forcegp.control.information import CRITERIA, Criterion, States, Unknowns, rigid_torque
+from forcegp.data import Dataset
+from forcegp.data.fields import DataHeader
+from forcegp.errors import NumericalError, ParameterError, check_name
+from forcegp.files import write_text
+from forcegp.resources import one_thread
+from forcegp.robot.model import RobotModel
+from forcegp.robot.shapes import shapes_of
+from forcegp.simulate.collisions import Collisions
+from forcegp.types import Array
+
+KNOT, NODE, FINE = 0.5, 0.1, 0.001
+"""Time between control points, between nodes of the objective, and between instants that are verified [s]."""
+SINES, SLOWEST, QUICKEST = 6, 0.05, 0.6
+"""Sines of a random start, and their frequencies [Hz]."""
+STEEP = 5.0
+"""Weight of the squared hinges at first; each round that fails doubles it."""
+INSIDE = 0.97
+"""Share of a limit, and over the clearance its inverse, from which on a hinge acts."""
+KEEP = 1.5
+"""Distance from which on a hinge acts, over the clearance."""
+ROUNDS, STEPS, REPAIRS = 4, 150, 30
+"""Rounds of verification, and evaluations of the criterion in the first and in later ones."""
+SHARES = (1.0, 0.98, 0.95, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1, 0.05)
+"""Sizes of a motion that are tried until it holds all limits."""
+REGION = 300
+"""States of the default region."""
+CHUNK = 3000
+TOLERANCE = 1e-9
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Limits:
+    """Limits of a motion, `(nq,)` each; positions without a limit end at ± π.
+
+    Attributes:
+        low, high: positions [rad, m].
+        velocity, acceleration, torque: largest magnitudes.
+    """
+
+    low: Tensor
+    high: Tensor
+    velocity: Tensor
+    acceleration: Tensor
+    torque: Tensor
+
+    @classmethod
+    def of(
+        cls,
+        robot: RobotModel,
+        *,
+        velocity: Sequence[float] = (),
+        acceleration: Sequence[float] = (),
+        torque: Sequence[float] = (),
+        share: float = 0.9,
+    ) -> Limits:
+        """A share of the limits of a robot.
+
+        Args:
+            robot: its file's limits hold where no others are given.
+            velocity, acceleration, torque: one number for all joints or one per joint. By default, the file's
+                velocity and torque, and accelerations that reach the velocity in a quarter of a second.
+            share: of the limits of velocity, acceleration and torque; the rest is left to the controller.
+
+        Raises:
+            ParameterError: a limit is missing, or is not a positive number; the message names joint and
+                option.
+        """
+        if not 0.0 < share <= 1.0:
+            raise ParameterError(
+                "the share of the limits is out of range", expected="above 0, up to 1", got=share
+            )
+        speed = _given(robot, "velocity", velocity, robot.velocity_limit)
+        effort = _given(robot, "torque", torque, robot.effort_limit)
+        rate = _given(robot, "acceleration", acceleration, 4.0 * speed)
+        low, high = robot.lower.clamp(min=-torch.pi), robot.upper.clamp(max=torch.pi)
+        return cls(low, high, share * speed, share * rate, share * effort)
+
+
+def _given(robot: RobotModel, name: str, values: Sequence[float], default: Tensor) -> Tensor:
+    """Limits of all joints from those given, or else the robot's own."""
+    option = f"give --{name}, as one number or one per joint"
+    if len(values) not in (0, 1, robot.nq):
+        raise ParameterError(
+            f"limits of {name} do not fit the robot", expected=f"1 or {robot.nq} numbers", got=values
+        )
+    limit = default.new_tensor(values).expand(robot.nq) if len(values) else default
+    missing = [
+        n for n, x in zip(robot.joint_names, limit.tolist(), strict=True) if not 0.0 < x < float("inf")
+    ]
+    if missing:
+        raise ParameterError(
+            f"no limit of {name} for {', '.join(missing)} of robot {robot.name!r}",
+            expected="positive finite limits",
+            got=[round(x, 4) for x in limit.tolist()],
+            hint=f"{option}, or add it to the robot file",
+        )
+    return limit
+
+
+def random_states(robot: RobotModel, limits: Limits, count: int = REGION, seed: int = 0) -> States:
+    """Uniform states within the limits; those that need too much torque are slower."""
+    share = torch.rand(3, count, robot.nq, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
+    q = limits.low + share[0] * (limits.high - limits.low)
+    qd, qdd = (
+        (2.0 * x - 1.0) * y for x, y in zip(share[1:], (limits.velocity, limits.acceleration), strict=True)
+    )
+    for factor in (0.7, 0.7, 0.7, 0.5, 0.5, 0.0):
+        beyond = (rigid_torque(robot, q, qd, qdd).abs() > limits.torque).any(-1)[:, None]
+        qd, qdd = torch.where(beyond, factor * qd, qd), torch.where(beyond, factor * qdd, qdd)
+    return q, qd, qdd
+
+
+@dataclass(frozen=True, eq=False)
+class Excitation:
+    """A motion that excites a robot.
+
+    Attributes:
+        motion: positions, velocities, accelerations, and the torque by the robot file.
+        limits: what it holds.
+        used: largest share of each limit that it uses at 1 kHz, by name; `clearance_m` is what it keeps.
+        before, after: what is unknown before its log, and expected after.
+        criterion: value of the objective, by random start; the first is the one that was taken.
+    """
+
+    motion: Dataset
+    limits: Limits
+    used: Mapping[str, float]
+    before: Unknowns
+    after: Unknowns
+    criterion: tuple[float, ...]
+
+    def write(self, path: str | Path) -> None:
+        """Write the motion as a data set: CSV with columns t, q.<joint>, qd., qdd. and tau., or Parquet.
+
+        Raises:
+            DataError: the name ends in neither.
+            DestinationError: the place cannot be written.
+        """
+        if Path(path).suffix.lower() != ".csv":
+            return self.motion.write(path)
+        names = ("q", "qd", "qdd", "tau")
+        head = ["t", *(f"{name}.{joint}" for name in names for joint in self.motion.joint_names)]
+        rows = torch.cat([self.motion.t[:, None], *(getattr(self.motion, name) for name in names)], dim=1)
+        text = io.StringIO()
+        np.savetxt(text, rows.numpy(), fmt="%.9g", delimiter=",", header=",".join(head), comments="")
+        write_text(path, text.getvalue())
+
+
+class Spline:
+    """Motions of some seconds that start and end at rest at `start` `(nq,)`, by free control points."""
+
+    def __init__(self, start: Array, seconds: float) -> None:
+        self.start, self.seconds = start, seconds
+        self.spans = max(4, round(seconds / KNOT))
+        self.h, self.free = seconds / self.spans, self.spans - 3
+
+    def at(self, t: Array) -> tuple[Array, Array, Array]:
+        """Matrices `(n, free)` from control points, relative to the start, to q, q̇ and q̈ at times `(n,)`."""
+        s = np.clip(np.floor(t / self.h).astype(int), 0, self.spans - 1)
+        u, h = t / self.h - s, self.h
+        v = 1.0 - u
+        weights = (
+            (v**3 / 6, (3 * u**3 - 6 * u**2 + 4) / 6, (3 * v**3 - 6 * v**2 + 4) / 6, u**3 / 6),
+            (-(v**2) / 2 / h, (3 * u**2 - 4 * u) / 2 / h, -(3 * v**2 - 4 * v) / 2 / h, u**2 / 2 / h),
+            (v / h**2, (3 * u - 2) / h**2, (3 * v - 2) / h**2, u / h**2),
+        )
+        found = np.zeros((3, len(t), self.free + 6))
+        for matrix, columns in zip(found, weights, strict=True):
+            for k, column in enumerate(columns):
+                matrix[np.arange(len(t)), s + k] = column
+        return found[0][:, 3:-3], found[1][:, 3:-3], found[2][:, 3:-3]
+
+    def differences(self, x: Tensor) -> tuple[Tensor, Tensor]:
+        """Control points of the velocity and of the acceleration."""
+        zero = x.new_zeros(3, x.shape[1])
+        first = torch.cat([zero, x, zero]).diff(dim=0) / self.h
+        return first, first.diff(dim=0) / self.h
+
+    def random(self, limits: Limits, random: np.random.Generator) -> Array:
+        """Control points `(free, nq)` of a sum of sines within the limits of the kinematics."""
+        t = np.arange(1, self.free + 1)[:, None, None] * self.h
+        shape = (1, len(self.start), SINES)
+        w, phase = (
+            2.0 * np.pi * random.uniform(SLOWEST, QUICKEST, shape),
+            random.uniform(0.0, 2.0 * np.pi, shape),
+        )
+        size = random.uniform(0.2, 1.0, shape)
+        wave = (size * np.sin(w * t + phase)).sum(-1) / size.sum(-1)
+        low, high = limits.low.numpy(), limits.high.numpy()
+        target = np.clip(0.5 * (low + high) + random.uniform(0.3, 1.0) * (high - low) * wave, low, high)
+        ramp = np.clip(np.minimum(t, self.seconds - t)[..., 0] / min(3.0, 0.25 * self.seconds), 0.0, 1.0)
+        x = torch.from_numpy(ramp * (target - self.start))
+        ratios = zip(self.differences(x), (limits.velocity, limits.acceleration), strict=True)
+        largest = torch.stack([(y.abs() / limit).amax(0) for y, limit in ratios]).amax(0)
+        return (x * INSIDE / largest.clamp(min=INSIDE)).numpy()
+
+
+class Search:
+    """The objective of a motion over its control points.
+
+    Args:
+        spline, limits, collisions: of the motion.
+        unknowns: what it shall tell about.
+        criterion: objective of the information.
+    """
+
+    def __init__(
+        self, spline: Spline, limits: Limits, unknowns: Unknowns, collisions: Collisions, criterion: Criterion
+    ) -> None:
+        self.spline, self.limits, self.unknowns = spline, limits, unknowns
+        self.collisions, self.criterion = collisions, criterion
+        self.steep, self.extra = STEEP, np.zeros(0)
+        self.scale = self.scaled()
+        self.nodes = np.linspace(0.0, spline.seconds, round(spline.seconds / NODE) + 1)
+        self.look(np.zeros(0))
+
+    def look(self, times: Array) -> None:
+        """Let the hinges act at further times too."""
+        self.extra = np.union1d(self.extra, times)
+        self.matrices = [
+            torch.from_numpy(m) for m in self.spline.at(np.concatenate([self.nodes, self.extra]))
+        ]
+
+    def states(self, x: Tensor) -> States:
+        """Positions, velocities and accelerations at the nodes and the further times."""
+        q, qd, qdd = (matrix @ x for matrix in self.matrices)
+        return torch.from_numpy(self.spline.start) + q, qd, qdd
+
+    def scaled(self) -> Tensor:
+        """C `(nq, free, free)`: control points of joint j are C_j w_j, with hinges of even curvature in w.
+
+        C Cᵀ = (4/r² + D₁ᵀD₁/v² + D₂ᵀD₂/a²)⁻¹ with the differences D, the range r and the limits v and a.
+        """
+        limits, eye = self.limits, torch.eye(self.spline.free, dtype=torch.float64)
+        D1, D2 = self.spline.differences(eye)
+        r, v, a = (
+            (1.0 / x)[:, None, None] ** 2
+            for x in (limits.high - limits.low, limits.velocity, limits.acceleration)
+        )
+        L = torch.linalg.cholesky(4.0 * r * eye + v * (D1.mT @ D1) + a * (D2.mT @ D2))
+        return torch.linalg.solve_triangular(L, eye.expand_as(L), upper=False).mT
+
+    def __call__(self, flat: Array) -> tuple[float, Array]:
+        """Criterion and hinges, and their gradient, at scaled control points w."""
+        limits, n = self.limits, len(self.nodes)
+        w = torch.tensor(flat.reshape(len(self.spline.start), -1), requires_grad=True)
+        x = (self.scale @ w[..., None])[..., 0].mT
+        states = self.states(x)
+        Y, Phi = self.unknowns.columns(*states)
+        torque = rigid_torque(self.unknowns.robot, *states, Y)
+        value = self.criterion(self.unknowns.information(Phi[:n], self.spline.seconds), self.unknowns)
+        speed, rate = self.spline.differences(x)
+        middle, half = 0.5 * (limits.low + limits.high), 0.5 * (limits.high - limits.low)
+        place = torch.from_numpy(self.spline.start) + x - middle
+        bounds = (place, half), (speed, limits.velocity), (rate, limits.acceleration), (torque, limits.torque)
+        hinges = sum((y.abs() / (INSIDE * limit) - 1.0).clamp(min=0.0).square().sum() for y, limit in bounds)
+        near, slope = self.collisions.penalty(states[0].detach().numpy(), KEEP * self.collisions.clearance)
+        # The gradient of the clearance enters by its inner product with q.
+        away = (states[0] - states[0].detach()) * torch.from_numpy(slope)
+        objective = value + self.steep * (hinges + near + away.sum())
+        objective.backward()
+        return float(objective.detach()), w.grad.numpy().ravel()  # pyright: ignore[reportOptionalMemberAccess]
+
+    def flat(self, x: Array) -> Array:
+        """Scaled control points of control points `(free, nq)`."""
+        return torch.linalg.solve(self.scale, torch.from_numpy(x).mT[..., None]).numpy().ravel()
+
+    def minimised(self, x: Array, steps: int) -> tuple[Array, float]:
+        """Better control points, and the objective there."""
+        options = {"maxfun": steps, "maxiter": steps, "maxcor": 20}
+        found = minimize(self, self.flat(x), jac=True, method="L-BFGS-B", options=options)
+        w = torch.from_numpy(found.x.reshape(len(self.spline.start), -1))
+        return (self.scale @ w[..., None])[..., 0].mT.numpy(), float(found.fun)
+
+    @torch.no_grad()
+    def used(self, x: Array, step: float) -> tuple[dict[str, float], Array]:
+        """Largest share of each limit at instants of a period `step`, the clearance lacking, and where."""
+        t = np.linspace(0.0, self.spline.seconds, round(self.spline.seconds / step) + 1)
+        worst: dict[str, float] = {}
+        where, limits, near = [], self.limits, self.collisions
+        middle, half = 0.5 * (limits.low + limits.high), 0.5 * (limits.high - limits.low)
+        for rows in np.split(t, range(CHUNK, len(t), CHUNK)):
+            q, qd, qdd = (torch.from_numpy(m @ x) for m in self.spline.at(rows))
+            q = q + torch.from_numpy(self.spline.start)
+            torque = rigid_torque(self.unknowns.robot, q, qd, qdd)
+            shares = {
+                "position": (q - middle) / half,
+                "velocity": qd / limits.velocity,
+                "acceleration": qdd / limits.acceleration,
+                "torque": torque / limits.torque,
+                "clearance": 1.0 + torch.from_numpy(near.depth(q.numpy()))[:, None] / near.clearance,
+            }
+            found = {name: share.abs().amax(-1).numpy() for name, share in shares.items()}
+            worst = {name: max(worst.get(name, 0.0), float(share.max())) for name, share in found.items()}
+            where.append(rows[np.max(list(found.values()), axis=0) > 1.0 + TOLERANCE])
+        return worst, np.concatenate(where)
+
+    def shrunk(self, x: Array, step: float) -> tuple[Array, dict[str, float]]:
+        """The motion at the largest of `SHARES` at which it holds all limits.
+
+        Raises:
+            NumericalError: none does.
+        """
+        used: dict[str, float] = {}
+        for share in SHARES:
+            used, where = self.used(share * x, step)
+            if not len(where):
+                return share * x, used
+        broken = ", ".join(name for name, value in used.items() if value > 1.0 + TOLERANCE)
+        raise NumericalError(
+            f"no motion from the start fits the limits of {broken}",
+            expected="room for a small motion around the start, at rest and in motion",
+            got={name: round(value, 3) for name, value in used.items()},
+            hint="give another --start, wider limits, or less --clearance",
+        )
+
+
+def _start_of(
+    start: Sequence[float] | None, robot: RobotModel, limits: Limits, collisions: Collisions
+) -> Array:
+    """The position that was given, or the free one next to the middle of the limits.
+
+    Raises:
+        ParameterError: the start does not fit the robot, its limits, or its surroundings.
+    """
+    low, high = limits.low.numpy(), limits.high.numpy()
+    if start is None:
+        middle = 0.5 * (low + high)
+        tried = np.concatenate([middle[None], np.random.default_rng(0).uniform(low, high, (500, robot.nq))])
+        still = torch.zeros(len(tried), robot.nq, dtype=torch.float64)
+        torque = rigid_torque(robot, torch.from_numpy(tried), still, still)
+        free = (collisions.depth(tried) == 0.0) & (torque.abs() < INSIDE * limits.torque).all(-1).numpy()
+        if not free.any():
+            raise ParameterError(
+                "no position was found that is free of collisions and that the torques can hold",
+                expected=f"one of {len(tried)} positions within the limits",
+                hint="give --start, smaller boxes, or less --clearance",
+            )
+        distance = np.abs((tried - middle) / (high - low)).sum(-1)
+        return tried[np.where(free, distance, np.inf).argmin()]
+    q = np.array(start, dtype=float)
+    if q.shape != (robot.nq,) or not ((q >= low) & (q <= high)).all():
+        raise ParameterError(
+            "the start is not within the limits of the robot",
+            expected=[(round(a, 4), round(b, 4)) for a, b in zip(low.tolist(), high.tolist(), strict=True)],
+            got=q.tolist(),
+        )
+    if near := collisions.pairs(q):
+        pairs = ", ".join(f"{pair} ({1e3 * gap:.3g} mm)" for pair, gap in near.items())
+        raise ParameterError(
+            "the start is in collision",
+            expected=f"parts at least {1e3 * collisions.clearance:.3g} mm apart",
+            got=pairs,
+            hint="give another --start, or less --clearance",
+        )
+    return q
+
+
+def excite(
+    system: ConstrainedSystem,
+    seconds: float = 30.0,
+    *,
+    limits: Limits | None = None,
+    unknowns: Unknowns | None = None,
+    collisions: Collisions | None = None,
+    start: Sequence[float] | None = None,
+    criterion: str | Criterion = "A",
+    rate: float = 1000.0,
+    restarts: int = 2,
+    seed: int = 0,
+    progress: Progress | None = None,
+) -> Excitation:
+    """The motion in free space whose log tells most about the unknown forces.
+
+    Args:
+        system: robot, and contacts whose surfaces it keeps away from.
+        seconds: its length [s].
+        limits: by default `Limits.of(robot)`.
+        unknowns: what is unknown before the motion; by default all, as in `Unknowns.of`.
+        collisions: by default the robot's shapes and the surfaces of the contacts.
+        start: `(nq,)` position at the start and the end; by default a free one near the middle.
+        criterion: `"A"`, standard deviation of the torque in the region of `unknowns`, `"D"`, determinant of
+            the covariance, or a function of the information.
+        rate: of the samples that are returned [Hz].
+        restarts: random starts that are optimised, the best of four times as many.
+        seed: of the random starts.
+        progress: called with the number of rounds done, and of all.
+
+    Example:
+        >>> import forcegp
+        >>> from forcegp.simulate.excite import excite
+        >>> system = forcegp.ConstrainedSystem(forcegp.load_robot("ur5"))
+        >>> len(excite(system, 4.0, rate=100.0, restarts=1).motion)
+        401
+
+    Raises:
+        ParameterError: limits are missing, the start is in collision or beyond limits, or an option is out of
+            range.
+        NumericalError: no motion from the start fits the limits.
+        MissingDependencyError: MuJoCo is not installed.
+    """
+    if not (2.0 <= seconds <= 600.0 and 0.0 < rate <= 1e5 and restarts >= 1):
+        expected = "2 to 600 seconds, a positive rate, and one restart or more"
+        raise ParameterError("the motion is out of range", expected=expected, got=(seconds, rate, restarts))
+    robot = system.robot.to("cpu", torch.float64)
+    limits = limits or Limits.of(robot)
+    collisions = collisions or Collisions(system, shapes_of(robot, elements=("collision", "visual")))
+    with one_thread():
+        if unknowns is None:
+            region = random_states(robot, limits)
+            unknowns = Unknowns.of(robot, limits.low, limits.high, limits.velocity, region)
+        if isinstance(criterion, str):
+            check_name("criterion", criterion, CRITERIA)
+            criterion = CRITERIA[criterion]
+        spline = Spline(_start_of(start, robot, limits, collisions), seconds)
+        search = Search(spline, limits, unknowns, collisions, criterion)
+        found = _searched(search, restarts, np.random.default_rng(seed), progress or (lambda *_: None))
+        values, x, used = found
+        return _result(system, search, x, used, values, rate, seed)
+
+
+def _searched(
+    search: Search, restarts: int, random: np.random.Generator, progress: Progress
+) -> tuple[tuple[float, ...], Array, dict[str, float]]:
+    """Objectives of the random starts, the best first, the control points there, and what they use."""
+    rounds = restarts + ROUNDS
+    drawn = (search.spline.random(search.limits, random) for _ in range(4 * restarts))
+    starts = [search.shrunk(x, NODE)[0] for x in drawn]
+    starts.sort(key=lambda x: search(search.flat(x))[0])
+    best = []
+    for k, x in enumerate(starts[:restarts]):
+        best.append(search.minimised(x, STEPS))
+        progress(k + 1, rounds)
+    best.sort(key=lambda pair: pair[1])
+    x = best[0][0]
+    for k in range(ROUNDS):
+        _, where = search.used(x, FINE)
+        progress(restarts + k + 1, rounds)
+        if not len(where) or k == ROUNDS - 1:
+            break
+        # One instant of each stretch of a node's length is enough.
+        search.look(where[np.unique((where / (0.25 * NODE)).astype(int), return_index=True)[1]])
+        search.steep *= 2.0
+        x, _ = search.minimised(x, REPAIRS)
+    x, used = search.shrunk(x, FINE)
+    return tuple(value for _, value in best), x, used
+
+
+@torch.no_grad()
+def _result(
+    system: ConstrainedSystem,
+    search: Search,
+    x: Array,
+    used: dict[str, float],
+    values: tuple[float, ...],
+    rate: float,
+    seed: int,
+) -> Excitation:
+    robot, spline, unknowns = search.unknowns.robot, search.spline, search.unknowns
+    count = round(spline.seconds * rate) + 1
+    t = np.linspace(0.0, spline.seconds, count)
+    q, qd, qdd = (torch.from_numpy(m @ x) for m in spline.at(t))
+    q = q + torch.from_numpy(spline.start)
+    header = DataHeader(
+        dt=float(t[1]),
+        robot=robot.name,
+        robot_fingerprint=system.robot.fingerprint,
+        seed=seed,
+        provenance=(f"planned by forcegp excite: {spline.seconds:g} s",),
+        joint_names=robot.joint_names,
+    )
+    tau = rigid_torque(robot, q, qd, qdd)
+    motion = Dataset(torch.from_numpy(t), q, qd, tau, qdd, robot.joint_names, header=header)
+    Phi = unknowns.columns(*search.states(torch.from_numpy(x)))[1][: len(search.nodes)]
+    after = unknowns.after(unknowns.information(Phi, spline.seconds))
+    clearance = search.collisions.clearance
+    kept = {name: value for name, value in used.items() if name != "clearance"}
+    return Excitation(motion, search.limits, kept | {"clearance_m": clearance}, unknowns, after, values)

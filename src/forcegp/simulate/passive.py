@@ -1,0 +1,91 @@
+"""Learned forces as MuJoCo's callback for passive forces, in simulations of one's own too."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from typing import Any
+
+import numpy as np
+import torch
+
+from forcegp.constraints import ConstrainedSystem
+from forcegp.errors import ModelError, check_name, optional_module
+from forcegp.forces.quantities import ForceField, states_at
+from forcegp.resources import one_thread
+
+
+class PassiveForces:
+    """A force field as `mjcb_passive`: adds Q̄ − Q_C − Q_G − Q_u to `qfrc_passive`.
+
+    With masses and drives of the fitted robot, `fit.system.robot` or a file with it, MuJoCo's acceleration
+    is M⁻¹Q̄, the prediction of the fit. Joint friction is part of Q̄: `installed` takes damping and
+    friction loss out of the model meanwhile, so that they do not act twice. Friction that contacts have
+    learned is not applied; the engine has its own. Q_u is `qfrc_applied` and the actuators' last forces.
+
+    Args:
+        system: the fitted robot.
+        field: `fit.force_field()`, or one function of the posterior, `fit.force_samples(1, generator)`.
+        joint_names: of the joints in the MuJoCo model; by default the robot's.
+
+    Raises:
+        ModelError: there are not as many names as joints.
+
+    Example:
+        `with PassiveForces(fit.system, fit.force_field()).installed(model): mujoco.mj_step(model, data)`
+    """
+
+    def __init__(
+        self, system: ConstrainedSystem, field: ForceField, joint_names: Sequence[str] | None = None
+    ) -> None:
+        self.system, self.field = system, field
+        self.joint_names = tuple(joint_names or system.robot.joint_names)
+        if len(self.joint_names) != system.robot.nq:
+            raise ModelError(
+                "the joint names do not fit the robot",
+                expected=f"{system.robot.nq} names in the order of {', '.join(system.robot.joint_names)}",
+                got=", ".join(self.joint_names),
+            )
+
+    def __call__(self, model: Any, data: Any) -> None:
+        """Add the forces at the present state of `data`."""
+        dof, qpos = self._places(model)
+        tau = data.qfrc_applied[dof] + data.qfrc_actuator[dof]
+        data.qfrc_passive[dof] += self.force(data.qpos[qpos], data.qvel[dof], tau)
+
+    @torch.no_grad()
+    def force(self, q: np.ndarray, qd: np.ndarray, tau: np.ndarray) -> np.ndarray:
+        """The force `(nq,)` at a state `(nq,)` [N m, N]."""
+        q_, qd_, tau_ = (torch.tensor(x, dtype=self.system.robot.dtype)[None] for x in (q, qd, tau))
+        open_ = torch.zeros(1, len(self.system.contacts), dtype=torch.bool)
+        with one_thread():
+            at, _ = states_at(self.system, q_, qd_, tau_, open_)
+            force = self.field(self.system, at) - at.eom.Q_C - at.eom.Q_G - at.tau
+        return force[0].double().numpy()
+
+    def _places(self, model: Any) -> tuple[np.ndarray, np.ndarray]:
+        """Degrees of freedom and positions of the joints in a model."""
+        known = [model.joint(k).name for k in range(model.njnt)]
+        for name in self.joint_names:
+            check_name("joint of the MuJoCo model", name, known)
+        joints = [model.joint(name) for name in self.joint_names]
+        return np.array([j.dofadr[0] for j in joints]), np.array([j.qposadr[0] for j in joints])
+
+    @contextmanager
+    def installed(self, model: Any) -> Iterator[None]:
+        """The callback of all simulations within the block, with the model's joint friction taken out.
+
+        Raises:
+            UnknownNameError: the model lacks a joint of the robot.
+        """
+        mujoco = optional_module("mujoco", "Learned forces in a simulation")
+        dof, _ = self._places(model)
+        kept = model.dof_damping[dof], model.dof_frictionloss[dof]
+        before = mujoco.get_mjcb_passive()
+        model.dof_damping[dof] = model.dof_frictionloss[dof] = 0.0
+        mujoco.set_mjcb_passive(self)
+        try:
+            yield
+        finally:
+            mujoco.set_mjcb_passive(before)
+            model.dof_damping[dof], model.dof_frictionloss[dof] = kept

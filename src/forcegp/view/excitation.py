@@ -1,0 +1,98 @@
+"""The page of a motion that excites a robot: in three dimensions, its limits, and what its log would tell."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+from matplotlib.figure import Figure
+
+from forcegp.constraints import ConstrainedSystem
+from forcegp.files import write_text
+from forcegp.plots import as_array
+from forcegp.report.animation import animation, animation_source
+from forcegp.report.page import INK, Picture, PictureBlock, Table, draw, render
+from forcegp.robot.shapes import Shape, box
+from forcegp.simulate.excite import Excitation
+from forcegp.types import Array
+from forcegp.view.motion import MEAN, Motion, Path3D, pictures, tip_path
+from forcegp.view.page import SURFACE, content_of, solid
+
+MOST = 1500
+"""Instants that curves are drawn through."""
+
+
+def draw_limits(result: Excitation) -> Picture:
+    """Position, velocity, acceleration and torque of each joint as shares of their limits over time."""
+    limits, motion = result.limits, result.motion[:: -(-len(result.motion) // MOST)]
+    middle, half = 0.5 * (limits.low + limits.high), 0.5 * (limits.high - limits.low)
+    curves = {
+        "position": (motion.q - middle) / half,
+        "velocity": motion.qd / limits.velocity,
+        "acceleration": motion.qdd / limits.acceleration,
+        "torque": motion.tau / limits.torque,
+    }
+
+    def paint(figure: Figure) -> None:
+        for axes, (name, values) in zip(figure.subplots(4, 1, sharex=True), curves.items(), strict=True):
+            for j, joint in enumerate(motion.joint_names):
+                axes.plot(motion.t, values[:, j], linewidth=0.9, label=joint)
+            for edge in (-1.0, 1.0):
+                axes.axhline(edge, color=INK, linewidth=0.8, linestyle=(0, (4, 2)))
+            axes.set(ylabel=name, ylim=(-1.15, 1.15))
+            axes.margins(x=0.0)
+        figure.axes[-1].set_xlabel("time [s]")
+        figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=4)
+
+    alt = "Position, velocity, acceleration and torque of each joint over time, as shares of their limits."
+    return draw(paint, (12.0, 7.0), alt)
+
+
+def expected_table(result: Excitation) -> Table:
+    """Standard deviation of the torque in the region, before and after the log."""
+    head = ["joint"]
+    columns: list[list[float]] = []
+    for part in ("all", "links", "friction"):
+        for when, unknowns in (("before", result.before), ("after", result.after)):
+            head.append(f"{'torque' if part == 'all' else part} {when}")
+            columns.append(unknowns.torque_std()[part].tolist())
+    rows = [
+        (joint, *(f"{x:.3g}" for x in row))
+        for joint, row in zip(result.motion.joint_names, zip(*columns, strict=True), strict=True)
+    ]
+    return Table("Expected standard deviation of the torque in the region [N m, N]", tuple(head), tuple(rows))
+
+
+def write_excitation(
+    path: str | Path,
+    result: Excitation,
+    system: ConstrainedSystem,
+    shapes: Sequence[Shape],
+    boxes: Array = np.zeros((0, 6)),  # noqa: B008
+    title: str = "forcegp",
+) -> Path:
+    """Write the page of a motion as one HTML file that needs no other and no network."""
+    motion = result.motion
+    rows = pictures(motion.t)
+    paths = [Path3D(MEAN, tip_path(system, motion.q[rows]))]
+    content = content_of(Motion(system, as_array(motion.t[rows]), motion.q[rows], paths=paths), shapes)
+    content["solids"] += [solid(box(*each[3:]) + each[:3], SURFACE, None) for each in boxes]
+    used = ", ".join(f"{name} {value:.0%}" for name, value in result.used.items() if name != "clearance_m")
+    limits = PictureBlock(
+        "Limits",
+        f"Largest shares at 1 kHz: {used}. All parts stay {1e3 * result.used['clearance_m']:.3g} mm apart.",
+        (draw_limits(result),),
+        "the motion's file",
+        wide=True,
+    )
+    text = render(
+        "excitation.html.j2",
+        title=title,
+        animation=animation(content, "The robot in motion, with its surroundings and the path of the tip"),
+        script=animation_source(),
+        expected=expected_table(result),
+        limits=limits,
+    )
+    write_text(path, text)
+    return Path(path)

@@ -1,0 +1,202 @@
+"""Motions that excite a robot: gradient, limits at 1 kHz, collisions, and what their logs would tell."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+from scipy.optimize import approx_fprime
+from typer.testing import CliRunner
+
+import forcegp
+from forcegp.cli.app import app
+from forcegp.control.information import CRITERIA, LOOK, Unknowns, rigid_torque
+from forcegp.dynamics import damping_force, inverse_dynamics
+from forcegp.errors import DataError, NumericalError, ParameterError, UnknownNameError
+from forcegp.robot.shapes import shapes_of
+from forcegp.simulate.collisions import Collisions
+from forcegp.simulate.excite import Excitation, Limits, Search, Spline, excite, random_states
+
+ROBOT = forcegp.load_robot("ur5")
+FREE = forcegp.ConstrainedSystem(ROBOT)
+LIMITS = Limits.of(ROBOT, velocity=[2.0], acceleration=[6.0])
+BOX = [0.3, 0.45, 0.3, 0.3, 0.3, 0.6]
+START = [0.0, -1.5, 1.5, 0.0, 1.5, 0.0]
+ROUNDING = 1e-8
+"""Of limits, as a share."""
+
+
+def unknowns(robot: forcegp.RobotModel = ROBOT, limits: Limits = LIMITS) -> Unknowns:
+    return Unknowns.of(robot, limits.low, limits.high, limits.velocity, random_states(robot, limits, 50))
+
+
+def collisions(boxes: tuple[list[float], ...] = ()) -> Collisions:
+    return Collisions(FREE, shapes_of(ROBOT), boxes)
+
+
+def short(seed: int = 0, boxes: tuple[list[float], ...] = (), **options: object) -> Excitation:
+    near = collisions(boxes)
+    settings: dict = {"limits": LIMITS, "collisions": near, "start": START, "seed": seed, "restarts": 1}
+    return excite(FREE, 4.0, **settings | options)
+
+
+@pytest.mark.parametrize("criterion", CRITERIA)
+def test_the_gradient_is_that_of_finite_differences(criterion: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    search = Search(Spline(np.array(START), 4.0), LIMITS, unknowns(), collisions(), CRITERIA[criterion])
+    x = 1.5 * search.spline.random(LIMITS, np.random.default_rng(1))
+    # Beyond limits of the joints, where hinges act; those of the clearance have a test of their own.
+    used, _ = search.used(x, 0.1)
+    assert used["acceleration"] > 1.0
+    monkeypatch.setattr(search.collisions, "penalty", lambda q, _: (0.0, np.zeros_like(q)))
+    w = search.flat(x)
+    some = np.random.default_rng(0).choice(len(w), 12, replace=False)
+
+    def along(part: np.ndarray) -> float:
+        moved = w.copy()
+        moved[some] = part
+        return search(moved)[0]
+
+    step = 1e-5
+    numeric = [
+        (along(w[some] + step * e) - along(w[some] - step * e)) / (2.0 * step) for e in np.eye(len(some))
+    ]
+    gradient = search(w)[1]
+    assert np.abs(numeric - gradient[some]).max() < 1e-6 * np.abs(gradient).max()
+
+
+def test_the_gradient_of_the_clearance_is_that_of_finite_differences() -> None:
+    near, margin, tested = collisions((BOX,)), 0.05, 0
+    for q in np.random.default_rng(0).uniform(-2.0, 2.0, (300, 6)):
+        if not 0.0 < near.penalty(q[None], margin)[0] < 0.9 or len(near.pairs(q)):
+            continue  # apart, or in each other, where MuJoCo's distance is approximate
+        numeric = approx_fprime(q, lambda x: near.penalty(x[None], margin)[0], 1e-7)
+        gradient = near.penalty(q[None], margin)[1][0]
+        assert np.abs(numeric - gradient).max() < 1e-3 * np.abs(gradient).max()
+        tested += 1
+    assert tested > 5
+
+
+def test_splines_start_and_end_at_rest_and_have_their_derivatives() -> None:
+    spline = Spline(np.array(START), 4.0)
+    x = spline.random(LIMITS, np.random.default_rng(0))
+    t = np.linspace(0.0, 4.0, 40001)
+    q, qd, qdd = (matrix @ x for matrix in spline.at(t))
+    for values in (q, qd, qdd):
+        assert np.abs(values[[0, -1]]).max() < 1e-12
+    assert np.abs(np.gradient(q, t, axis=0)[1:-1] - qd[1:-1]).max() < 1e-6
+    assert np.abs(np.gradient(qd, t, axis=0)[1:-1] - qdd[1:-1]).max() < 1e-2  # q̈ has corners
+    speed, rate = spline.differences(torch.from_numpy(x))
+    assert (
+        np.abs(qd).max() <= float(speed.abs().max()) and np.abs(qdd).max() <= float(rate.abs().max()) + 1e-12
+    )
+
+
+@pytest.mark.parametrize("seed", [0, 1, 2])
+def test_all_limits_hold_at_1_khz_and_the_robot_stays_clear(seed: int) -> None:
+    found = short(seed, (BOX,))
+    motion = found.motion
+    assert len(motion) == 4001 and float(motion.t[1]) == pytest.approx(1e-3)
+    edge = 1.0 + ROUNDING
+    assert bool((motion.q >= LIMITS.low).all() and (motion.q <= LIMITS.high).all())
+    for values, limit in ((motion.qd, LIMITS.velocity), (motion.qdd, LIMITS.acceleration)):
+        assert bool((values.abs() <= edge * limit).all())
+    torque = inverse_dynamics(ROBOT, motion.q, motion.qd, motion.qdd) - damping_force(ROBOT, motion.qd)
+    assert bool((torque.abs() <= edge * LIMITS.torque).all())
+    assert torch.allclose(torque, motion.tau, atol=1e-8)
+    assert collisions((BOX,)).depth(motion.q.numpy()).max() < 1e-9
+    for rest in (motion.qd, motion.qdd):
+        assert float(rest[[0, -1]].abs().max()) < 1e-9
+    assert np.allclose(motion.q[0].numpy(), START) and np.allclose(motion.q[-1].numpy(), START)
+
+
+def test_the_box_is_in_the_way_of_the_motion_without_it() -> None:
+    assert collisions((BOX,)).depth(short(0).motion.q.numpy()).max() > 0.01
+
+
+def test_the_motion_tells_more_than_its_random_start_and_the_same_seed_gives_it_again() -> None:
+    found = short(5)
+    search = Search(Spline(np.array(START), 4.0), LIMITS, found.before, collisions(), CRITERIA["A"])
+    random = np.random.default_rng(5)
+    starts = [search.shrunk(search.spline.random(LIMITS, random), 0.05)[0] for _ in range(4)]
+    assert found.criterion[0] < min(search(search.flat(x))[0] for x in starts) - 0.2
+    assert torch.equal(short(5).motion.q, found.motion.q)
+
+
+def test_the_expected_covariance_is_that_of_the_dense_formula() -> None:
+    before = unknowns()
+    states = random_states(ROBOT, LIMITS, 30, seed=1)
+    _, Phi = before.columns(*states)
+    after = before.after(before.information(Phi, 30 * LOOK))
+    A = (Phi / before.noise[:, None]).flatten(0, 1)
+    prior = before.root @ before.root.mT
+    exact = torch.linalg.inv(torch.linalg.inv(prior) + A.mT @ A)
+    assert torch.allclose(after.root @ after.root.mT, exact, rtol=1e-4, atol=1e-6 * float(exact.abs().max()))
+    assert bool((after.torque_std()["all"] < before.torque_std()["all"]).all())
+
+
+def test_columns_of_the_links_are_torques_of_other_links() -> None:
+    before = unknowns()
+    q, qd, qdd = random_states(ROBOT, LIMITS, 20, seed=2)
+    heavier = ROBOT.replace(mass=1.1 * ROBOT.mass, inertia=1.1 * ROBOT.inertia)
+    delta = torch.from_numpy(before.base.of(heavier) - before.base.of(ROBOT))
+    _, Phi = before.columns(q, qd, qdd)
+    change = rigid_torque(heavier, q, qd, qdd) - rigid_torque(ROBOT, q, qd, qdd)
+    assert torch.allclose(Phi[..., before.parts["links"]] @ delta, change, atol=1e-8)
+
+
+def test_missing_limits_are_named_with_their_option() -> None:
+    robot = ROBOT.replace(
+        velocity_limit=ROBOT.velocity_limit.clone().index_fill(0, torch.tensor([1]), torch.inf)
+    )
+    with pytest.raises(ParameterError, match=r"velocity for shoulder_lift_joint(?s:.*)--velocity"):
+        Limits.of(robot)
+    robot = ROBOT.replace(effort_limit=torch.full_like(ROBOT.effort_limit, torch.inf))
+    with pytest.raises(ParameterError, match=r"torque for shoulder_pan_joint(?s:.*)--torque"):
+        Limits.of(robot)
+    with pytest.raises(ParameterError, match="1 or 6 numbers"):
+        Limits.of(ROBOT, acceleration=[1.0, 2.0])
+    with pytest.raises(ParameterError, match="above 0, up to 1"):
+        Limits.of(ROBOT, share=1.5)
+
+
+def test_starts_in_collision_and_limits_without_room_are_refused() -> None:
+    with pytest.raises(ParameterError, match=r"start is in collision(?s:.*)surroundings and link of wrist_3"):
+        short(boxes=([0.5, 0.115, 0.42, 0.1, 0.1, 0.1],))
+    with pytest.raises(ParameterError, match="not within the limits"):
+        short(start=[9.0] * 6)
+    weak = Limits.of(ROBOT, acceleration=[6.0], torque=[1.0])
+    with pytest.raises(
+        NumericalError, match=r"no motion from the start fits the limits of torque(?s:.*)--start"
+    ):
+        short(limits=weak)
+    with pytest.raises(ParameterError, match="no position was found"):
+        short(limits=Limits.of(ROBOT, torque=[0.01]), start=None)
+    with pytest.raises(UnknownNameError, match="criterion"):
+        short(criterion="B")
+    with pytest.raises(ParameterError, match="six finite numbers"):
+        collisions(([0.0, 0.0, 0.0, 1.0, 1.0, -1.0],))
+    with pytest.raises(ParameterError, match="2 to 600 seconds"):
+        excite(FREE, 0.5)
+
+
+def test_the_command_writes_a_motion_that_simulate_follows(tmp_path: Path) -> None:
+    run, motion, out = CliRunner().invoke, tmp_path / "motion.csv", tmp_path / "run.parquet"
+    scene = tmp_path / "arm.toml"
+    scene.write_text('[robot]\nmodel = "ur5"\n[simulation]\ncontact = "solver"\ndt = 0.004\n')
+    options = ["--seconds", "3", "--acceleration", "5", "--restarts", "1", "--box", "0.9,0.9,0.5,0.2,0.2,0.2"]
+    said = run(app, ["excite", "-s", str(scene), *options, "-o", str(motion)], catch_exceptions=False)
+    assert said.exit_code == 0, said.output
+    page = motion.with_suffix(".html").read_text()
+    assert "shoulder_pan_joint" in page and "torque after" in page
+    read = forcegp.Dataset.read(motion)
+    assert len(read) == 3001 and read.joint_names == ROBOT.joint_names
+    assert run(app, ["simulate", "-s", str(scene), "--motion", str(motion), "-o", str(out)]).exit_code == 0
+    log = forcegp.Dataset.read(out)
+    assert float(log.t[-1]) == pytest.approx(2.996)
+    assert float((log.q - read.q[::4][: len(log)]).abs().max()) < 5e-3
+    with pytest.raises(DataError, match=r"end the name in \.parquet"):
+        run(app, ["excite", "-s", "ur5_free", "-o", str(tmp_path / "motion.txt")], catch_exceptions=False)
+    with pytest.raises(ParameterError, match="--box is not a list of numbers"):
+        run(app, ["excite", "-s", "ur5_free", "--box", "a,b", "-o", str(motion)], catch_exceptions=False)
