@@ -48,13 +48,13 @@ def check_expansion(source: str, size: int, file: int, free: int | None = None) 
 
 
 def allowed_bytes(file: int, free: int | None = None) -> int:
-    """How many bytes a file of `file` bytes may unpack to, `free` of them whatever its size."""
+    """Number of bytes that a file of `file` bytes may unpack to, `free` of them whatever its size."""
     return max(free or limits.FREE_TABLE_BYTES, limits.TABLE_EXPANSION * file)
 
 
 @dataclass
 class Unpacking:
-    """What a log with compressed parts has unpacked to so far, bounded in proportion to its file.
+    """Unpacked size so far of a log with compressed parts, bounded in proportion to its file.
 
     Attributes:
         source: the log, for messages.

@@ -40,7 +40,7 @@ Tried = tuple[Hypothesis, TorqueFit]
 
 @dataclass(frozen=True)
 class Explanation:
-    """What explains the torque: faults of the log, which are undone, and of the robot file.
+    """Explanation of the torque: faults of the log, which are undone, and of the robot file.
 
     Attributes:
         system, log, rows: robot and contacts, the log without the faults, and the rows that are looked at.
@@ -224,8 +224,8 @@ ALONE = 2.0
 """Standard errors by which an alternative must lower the held-out error on its own, which chance exceeds in 4
 % of cases: it is already known that something is wrong."""
 TESTS = {
-    "torque-gain": "hang a known weight from the tip: its torque shows the gain, whatever the masses",
-    "torque-current": "hang a known weight from the tip: its torque shows the gains, whatever the masses",
+    "torque-gain": "hang a known weight from the tip: its torque gives the gain, whatever the masses",
+    "torque-current": "hang a known weight from the tip: its torque gives the gains, whatever the masses",
     "torque-sign": "push a joint in its positive direction while the arm holds still: its torque must fall",
     "torque-order": "twist one joint after another, without loading the others: only its torque must change",
     "torque-delay": "apply a torque step to one joint: its acceleration must change in the same sample",

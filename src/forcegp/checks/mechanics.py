@@ -1,4 +1,4 @@
-"""What remains of the torque once the faults are explained: friction, offsets, disturbances, and how much."""
+"""Residual torque once the faults are explained: friction, offsets, disturbances, and how much."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ ONE_SIGMA = 84.13
 
 
 def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Signs, orders, gains, delays, gravity, tool, masses, friction, offsets: all that the torque tells."""
+    """Signs, orders, gains, delays, gravity, tool, masses, friction, offsets: all that torques determine."""
     if len(log.rows(LEAST_ROWS)) < LEAST_ROWS:
         raise NotJudgedError(f"fewer than {LEAST_ROWS} usable rows")
     passive = _without_torque(log)
@@ -88,7 +88,7 @@ def _without_torque(log: Log) -> list[Finding]:
         return []
     joints = log.named(still)
     word = "zero" if zero[still].all() else "constant"
-    # One passive joint is a design; an arm without any torque is a missing column.
+    # One joint may be passive; if all torques are zero, the column is missing.
     weight = "error" if still.all() else "warning"
     text = f"the torque of {', '.join(joints)} is {word} throughout"
     return [Finding("torque-zero", text, log.all_rows, joints, weight=weight)]

@@ -41,9 +41,9 @@ def evaluate(
     """Compare a model's predictions with a data set and with trivial predictors.
 
     The trivial predictors are the mean, the robot file alone, and least squares of inertial parameters,
-    viscous and Coulomb friction and offsets. The verdict says how much of the torque beyond gravity the model
-    explains, how far off its motion is in open loop, and its force in contact, if one is logged; the next
-    line whether it is better than each predictor in torque and in acceleration. Errors are in rad/s² (m/s²
+    viscous and Coulomb friction and offsets. The verdict states the share of the torque beyond gravity that
+    the model explains, how far off its motion is in open loop, and its force in contact, if one is logged;
+    the next line compares it with each predictor in torque and in acceleration. Errors are in rad/s² (m/s²
     for sliding joints); coverage is the share of samples within two standard deviations.
 
     With --out, prints the path of a page with the verdict, the errors by joint, the calibration and the
@@ -82,7 +82,7 @@ def evaluate(
 def _written(
     out: Path, scores: Evaluation, model: Predictor, test: Dataset, names: tuple[str, str, str | None]
 ) -> dict[str, object]:
-    """Write the page and its data, and say where they are; `names` are of the files in the title."""
+    """Write the page and its data, and print their paths; `names` are of the files in the title."""
     from forcegp.destination import write_or_keep
     from forcegp.files import write_json, written_folder
     from forcegp.report.evaluation import PAGE, write_evaluation
@@ -113,7 +113,7 @@ def _model(model: Path | None, scene: str | None, config: Path | None, train: Pa
         return load_model(model)
     if scene is None or train is None:
         raise ForceGPError(
-            "nothing says which model to evaluate",
+            "the model to evaluate is not named",
             expected="--model FOLDER, or --scene and --train to fit one",
         )
     system = load_scene(scene).system()

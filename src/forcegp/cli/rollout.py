@@ -82,7 +82,7 @@ def rollout(
 
 
 def _figures(path: Rollout, rolled: Dataset, dt: float) -> dict[str, object]:
-    """What the command reports, up to where the prediction diverged."""
+    """Report of the command, up to the divergence of the prediction."""
     error = (rolled.q - rolled.q_logged).abs()
     figures: dict[str, object] = {
         "duration_s": dt * (len(rolled) - 1),
@@ -159,7 +159,7 @@ def _as_data(path: Rollout, log: Dataset, dt: float) -> Dataset:
 
 def simulate(
     scene: SceneName,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Where the log goes (.parquet).")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Path of the log (.parquet).")],
     duration: SimulatedTime = None,
     seed: Annotated[int | None, typer.Option(help="Seed of motion and noise; default: the scene's.")] = None,
     engine: Annotated[str | None, typer.Option(help="pybullet, mujoco or auto; default: scene's.")] = None,

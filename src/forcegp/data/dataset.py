@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 
 def summary(data: Fields) -> str:
-    """What a data set logs, without the numbers: samples, joints, duration, contacts, further quantities."""
+    """Contents of a data set in words: samples, joints, duration, contacts, further quantities."""
     robot = f" of {data.header.robot!r}" if data.header.robot else ""
     parts = [f"{len(data)} samples of {len(data.joint_names)} joints"]
     if len(data):
@@ -129,7 +129,7 @@ class Dataset:
         return self.t.shape[0]
 
     def __repr__(self) -> str:
-        """One line that says what is logged, without the numbers."""
+        """One line on the contents, without the numbers."""
         return summary(self)
 
     def __getattr__(self, name: str) -> Any:
@@ -182,7 +182,7 @@ class Dataset:
         """`(n, len(contacts))` bool: which of the named contacts are closed.
 
         Raises:
-            DataError: the data do not say whether a contact is closed.
+            DataError: the state of a contact is not logged.
         """
         return contact_table(self, contacts)
 
@@ -219,7 +219,7 @@ class Dataset:
             RobotMismatchWarning: the parameters of the robot differ from those of the logged one.
 
         Raises:
-            DataError: joints are missing, unknown or in another order; the hint says what to call.
+            DataError: joints are missing, unknown or in another order; the hint names the remedy.
         """
         check_robot(self, robot)
 

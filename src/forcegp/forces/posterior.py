@@ -106,7 +106,7 @@ class ForcePosterior:
         return self.process.priors
 
     def shift(self, p: int, features: Features) -> Tensor | float:
-        """What samples of the latent force of prior p must be moved by to have the mean that is predicted."""
+        """Shift of samples of the latent force of prior p that gives them the predicted mean."""
         if not self.process.pinned:
             return 0.0
         return self.means.latent_mean(p, features) - self.latent.latent_mean(p, features)
@@ -271,8 +271,8 @@ LARGE_JITTER = 0.01
 def force_correlation(posterior: ForcePosterior, system: ConstrainedSystem, at: States) -> Tensor:
     """Posterior correlation of Q and Q_z at each state and joint, `(n, nq)`; 0 where one of them is certain.
 
-    corr_i = Cov(Q_i, Q_z,i) / √(Var Q_i Var Q_z,i). The part of Q along the constraint, which accelerations
-    never show, is left out.
+    corr_i = Cov(Q_i, Q_z,i) / √(Var Q_i Var Q_z,i). The part of Q along the constraint, without effect
+    on accelerations, is left out.
 
     Args:
         posterior: over latent forces.
@@ -294,7 +294,7 @@ def force_correlation(posterior: ForcePosterior, system: ConstrainedSystem, at: 
 
 @dataclass(frozen=True)
 class Doubts:
-    """What a fit is doubtful about.
+    """Doubts about a fit.
 
     Attributes:
         correlation: mean correlation of Q and Q_z over some of the training states, where both have priors.
@@ -308,7 +308,7 @@ class Doubts:
 def doubts_of(
     posterior: ForcePosterior, system: ConstrainedSystem, training: Training, power: float = 1.0
 ) -> Doubts:
-    """What a posterior is doubtful about, at some of its training states in contact and on the whole.
+    """Doubts about a posterior, at some of its training states in contact and on the whole.
 
     Args:
         posterior: over latent forces.

@@ -115,7 +115,7 @@ def multiplier(signals: Signals, system: ConstrainedSystem, contact: SurfaceCont
 def _evidence(
     signals: Signals, system: ConstrainedSystem, mapping: Mapping, contact: SurfaceContact, source: str
 ) -> Array:
-    """What a contact's state is read from, `(n,)`: c(q) [m], the sensor's n·F [N], or λ [N]."""
+    """Signal that determines a contact's state, `(n,)`: c(q) [m], the sensor's n·F [N], or λ [N]."""
 
     def normal_force(q: torch.Tensor, reading: torch.Tensor) -> torch.Tensor:
         force = _wrench(system.robot, mapping, q, reading)[0]
@@ -149,7 +149,7 @@ BINS = 512
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a contact's state was read from: `wrench`, `multiplier` or `distance`, in N or m.
+    """Source of a contact's state: `wrench`, `multiplier` or `distance`, in N or m.
 
     Closed from `threshold` on, and then up to `release` on either side; median and deviation of the evidence
     in each state, NaN where it does not occur; first and last time of each closed interval [s]; and how many
@@ -208,7 +208,7 @@ def detect(
         if name not in sections:
             raise mapping.error(
                 ("contact",),
-                f"nothing says whether contact {name!r} is closed",
+                f"no source determines whether contact {name!r} is closed",
                 f"[contact.{name}] with source = column, wrench, multiplier, distance, always or never",
             )
         source = sections[name].source

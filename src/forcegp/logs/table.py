@@ -1,4 +1,4 @@
-"""What every reader returns: named columns of numbers by the clock that they share."""
+"""Result of every reader: named columns of numbers by the clock that they share."""
 
 from __future__ import annotations
 

@@ -60,7 +60,7 @@ class Change(NamedTuple):
 
 @dataclass(frozen=True)
 class WrittenRobot:
-    """What was written.
+    """Files of a write-back.
 
     Attributes:
         changes: figures that changed.
@@ -246,7 +246,7 @@ def _body(pose: Tensor, J: Tensor) -> Inertial | None:
 
 
 def _losses(robot: RobotModel, figures: Mapping[str, str]) -> tuple[str, ...]:
-    """What the format has no place for."""
+    """Parameters without a place in the format."""
     losses = []
     for figure in ("damping", "friction", "stribeck", "armature"):
         values = getattr(robot, figure)

@@ -1,4 +1,4 @@
-"""What a rollout is given: a model, and motor torques as an array, a log, a feedback law or a controller."""
+"""Inputs of a rollout: a model, and motor torques as an array, a log, a feedback law or a controller."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ EVEN = 0.02
 
 @runtime_checkable
 class ForwardModel(Protocol):
-    """What a rollout asks of a model of the forward dynamics."""
+    """Interface of a model to a rollout."""
 
     @property
     def kind(self) -> str:
@@ -54,7 +54,7 @@ class ForwardModel(Protocol):
 
     @property
     def disturbance(self) -> Disturbance | None:
-        """What disturbs the torques of function samples, `None` for nothing."""
+        """Disturbance of the torques of function samples, `None` for nothing."""
         ...
 
     def predict(
@@ -77,7 +77,7 @@ class Disturbance(NamedTuple):
     Attributes:
         density: root of the spectral density of the logged torques' noise `(nq,)` [N m √s, N √s].
         constant: standard deviation of an unknown force on each joint `(nq,)` [N m, N], kept for the whole
-            trajectory, since nothing says how it varies.
+            trajectory, since its variation is unknown.
     """
 
     density: Tensor

@@ -41,7 +41,7 @@ class Scene:
 
     @property
     def simulation(self) -> SimulationConfig:
-        """How to simulate the scene."""
+        """Settings to simulate the scene."""
         return self.sections.simulation
 
     @property

@@ -21,7 +21,7 @@ from forcegp.native import load_library
 
 NAME = "forcegp"
 JAMMED, UNRESOLVED, NO_INERTIA = 2, 3, 4
-"""What the C code returns other than 0."""
+"""Error codes of the C code."""
 MESSAGES = {
     JAMMED: "friction of a contact would press harder than it opposes",
     UNRESOLVED: "double precision does not resolve a predicted variance",
@@ -111,7 +111,7 @@ class CompiledFit(Predictor):
         )
 
     def _read(self, quantity: str | tuple[str, ...]) -> _Rows:
-        """The rows of quantities as they are asked for, and where the C code puts them."""
+        """The rows of requested quantities, and their place in the C code."""
         if quantity in self._known:
             return self._known[quantity]
         names = [quantity] if isinstance(quantity, str) else list(dict.fromkeys(quantity))
