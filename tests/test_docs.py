@@ -191,3 +191,12 @@ def test_the_site_and_the_readme_stay_short() -> None:
 def test_pages_do_not_edit_files_by_patterns() -> None:
     for page in PAGES:
         assert "sed -i" not in page.read_text(encoding="utf-8"), page
+
+
+def test_the_version_is_the_same_everywhere() -> None:
+    root = DOCS.parent
+    version = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+    assert f"\n## [{version}] - " in (root / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert f"\nversion: {version}\n" in (root / "CITATION.cff").read_text(encoding="utf-8")
+    for page in (root / "README.md", DOCS / "index.md"):
+        assert set(re.findall(r"forcegp-([\d.]+)-py3", page.read_text(encoding="utf-8"))) == {version}, page
