@@ -200,3 +200,14 @@ def test_the_version_is_the_same_everywhere() -> None:
     assert f"\nversion: {version}\n" in (root / "CITATION.cff").read_text(encoding="utf-8")
     for page in (root / "README.md", DOCS / "index.md"):
         assert set(re.findall(r"forcegp-([\d.]+)-py3", page.read_text(encoding="utf-8"))) == {version}, page
+
+
+def test_messages_of_troubleshooting_exist() -> None:
+    sources = "".join(path.read_text(encoding="utf-8") for path in (DOCS.parent / "src").rglob("*.py"))
+    sources = " ".join(re.sub(r'"\n\s+f?"', "", sources).split())
+    page = (DOCS / "troubleshooting.md").read_text(encoding="utf-8")
+    named = re.findall(r"^\| `([^`]*)` \|", page[: page.index("## Results that look wrong")], flags=re.M)
+    assert len(named) == 20
+    for message in named:
+        for part in message.split("…"):
+            assert part.strip(" '") in sources, message

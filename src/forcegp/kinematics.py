@@ -250,7 +250,7 @@ def point_motion(
     frame: str,
     point: object = (0.0, 0.0, 0.0),
 ) -> PointMotion:
-    """The motion of a point fixed in a frame, from links whose motion is known.
+    """The motion of a point fixed in a frame, from links with known motion.
 
     Raises:
         UnknownNameError: no such frame.

@@ -76,7 +76,7 @@ class LearningOptions:
 
 @dataclass(frozen=True)
 class Learned:
-    """End of learning.
+    """Result of learning.
 
     Attributes:
         tensors: the best ones seen.

@@ -46,7 +46,7 @@ class Scene:
 
     @property
     def model(self) -> ModelTable:
-        """Which model to fit, and how."""
+        """Settings of the model to fit."""
         return ModelTable(self.sections.model, self.document)
 
     def robot(self, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> RobotModel:

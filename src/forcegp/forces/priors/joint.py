@@ -188,7 +188,7 @@ class JointFrictionPrior(PerJointPrior):
 
     @property
     def sharpest(self) -> int:
-        """Which Coulomb feature is the dry friction of a joint that may stick."""
+        """Index of the Coulomb feature that is the dry friction of a joint that may stick."""
         return self.speeds.index(min(self.speeds))
 
     def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
