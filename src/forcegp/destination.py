@@ -46,7 +46,7 @@ def write_or_keep(write: Callable[[Path], object], path: str | Path) -> None:
     """Write a result by `write(path)`; if that fails, write it to another place, which the error names.
 
     Raises:
-        DestinationError: the place cannot be written; the message names the path of the result.
+        DestinationError: the place cannot be written; the message says where the result is instead.
         ForceGPError: the result cannot be written anywhere, for a reason of its own.
     """
     target = Path(path)

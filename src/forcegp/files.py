@@ -1,4 +1,4 @@
-"""Files that are never half written, and JSON headers with format and version."""
+"""Files that are never half written, and JSON headers that say which format and version they are."""
 
 from __future__ import annotations
 
@@ -207,7 +207,7 @@ def validated(
     place: tuple[str, ...] = (),
     what: str = "field",
 ) -> M:
-    """Instance of a pydantic model from the content of a file.
+    """What was read as an instance of a pydantic model.
 
     Args:
         kind: the model.

@@ -54,7 +54,7 @@ def allowed_bytes(file: int, free: int | None = None) -> int:
 
 @dataclass
 class Unpacking:
-    """Unpacked size so far of a log with compressed parts, bounded in proportion to its file.
+    """What a log with compressed parts has unpacked to so far, bounded in proportion to its file.
 
     Attributes:
         source: the log, for messages.

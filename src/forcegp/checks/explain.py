@@ -40,7 +40,7 @@ Tried = tuple[Hypothesis, TorqueFit]
 
 @dataclass(frozen=True)
 class Explanation:
-    """Explanation of the torque: faults of the log, which are undone, and of the robot file.
+    """What explains the torque: faults of the log, which are undone, and of the robot file.
 
     Attributes:
         system, log, rows: robot and contacts, the log without the faults, and the rows that are looked at.

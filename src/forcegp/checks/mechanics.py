@@ -88,7 +88,7 @@ def _without_torque(log: Log) -> list[Finding]:
         return []
     joints = log.named(still)
     word = "zero" if zero[still].all() else "constant"
-    # One joint may be passive; if all torques are zero, the column is missing.
+    # One passive joint is a design; an arm without any torque is a missing column.
     weight = "error" if still.all() else "warning"
     text = f"the torque of {', '.join(joints)} is {word} throughout"
     return [Finding("torque-zero", text, log.all_rows, joints, weight=weight)]

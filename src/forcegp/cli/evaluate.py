@@ -82,7 +82,7 @@ def evaluate(
 def _written(
     out: Path, scores: Evaluation, model: Predictor, test: Dataset, names: tuple[str, str, str | None]
 ) -> dict[str, object]:
-    """Write the page and its data, and print their paths; `names` are of the files in the title."""
+    """Write the page and its data, and say where they are; `names` are of the files in the title."""
     from forcegp.destination import write_or_keep
     from forcegp.files import write_json, written_folder
     from forcegp.report.evaluation import PAGE, write_evaluation

@@ -73,7 +73,7 @@ def export(
 def _written_back(
     fit: StructuredFit, to: str, robot: str | None, out: Path, samples: int, seed: int
 ) -> dict[str, object]:
-    """Write the robot file, and print the changes."""
+    """Write the robot file, and say what changed."""
     from forcegp.errors import ModelError, RobotFileError
     from forcegp.models.calibrated import write_calibrated
     from forcegp.robot.write_back import is_mjcf

@@ -286,7 +286,7 @@ def select(
 
 
 def _written(data: Dataset, parts: Split, how: str, out: Path, rest: Path | None) -> dict[str, object]:
-    """Write training and test points, and print a summary."""
+    """Write training and test points, and say what was written."""
     from forcegp.destination import write_or_keep
 
     result: dict[str, object] = {}

@@ -82,7 +82,7 @@ def rollout(
 
 
 def _figures(path: Rollout, rolled: Dataset, dt: float) -> dict[str, object]:
-    """Report of the command, up to the divergence of the prediction."""
+    """What the command reports, up to where the prediction diverged."""
     error = (rolled.q - rolled.q_logged).abs()
     figures: dict[str, object] = {
         "duration_s": dt * (len(rolled) - 1),

@@ -35,7 +35,7 @@ if TYPE_CHECKING:
 
 
 def summary(data: Fields) -> str:
-    """Contents of a data set in words: samples, joints, duration, contacts, further quantities."""
+    """What a data set logs, without the numbers: samples, joints, duration, contacts, further quantities."""
     robot = f" of {data.header.robot!r}" if data.header.robot else ""
     parts = [f"{len(data)} samples of {len(data.joint_names)} joints"]
     if len(data):
@@ -129,7 +129,7 @@ class Dataset:
         return self.t.shape[0]
 
     def __repr__(self) -> str:
-        """One line on the contents, without the numbers."""
+        """One line that says what is logged, without the numbers."""
         return summary(self)
 
     def __getattr__(self, name: str) -> Any:

@@ -62,7 +62,7 @@ AXES = ("x", "y", "z")
 
 @runtime_checkable
 class Fields(Protocol):
-    """Fields of a data set; `Dataset` documents each one."""
+    """What a data set holds; `Dataset` documents each field."""
 
     @property
     def t(self) -> Tensor: ...

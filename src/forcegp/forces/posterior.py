@@ -271,8 +271,8 @@ LARGE_JITTER = 0.01
 def force_correlation(posterior: ForcePosterior, system: ConstrainedSystem, at: States) -> Tensor:
     """Posterior correlation of Q and Q_z at each state and joint, `(n, nq)`; 0 where one of them is certain.
 
-    corr_i = Cov(Q_i, Q_z,i) / √(Var Q_i Var Q_z,i). The part of Q along the constraint, without effect
-    on accelerations, is left out.
+    corr_i = Cov(Q_i, Q_z,i) / √(Var Q_i Var Q_z,i). The part of Q along the constraint, which accelerations
+    never show, is left out.
 
     Args:
         posterior: over latent forces.
@@ -294,7 +294,7 @@ def force_correlation(posterior: ForcePosterior, system: ConstrainedSystem, at: 
 
 @dataclass(frozen=True)
 class Doubts:
-    """Doubts about a fit.
+    """What a fit is doubtful about.
 
     Attributes:
         correlation: mean correlation of Q and Q_z over some of the training states, where both have priors.
@@ -308,7 +308,7 @@ class Doubts:
 def doubts_of(
     posterior: ForcePosterior, system: ConstrainedSystem, training: Training, power: float = 1.0
 ) -> Doubts:
-    """Doubts about a posterior, at some of its training states in contact and on the whole.
+    """What a posterior is doubtful about, at some of its training states in contact and on the whole.
 
     Args:
         posterior: over latent forces.

@@ -9,12 +9,12 @@ from typing import Any
 CHECK = "# CHECK: "
 """Start of a comment on what the user must check."""
 CURRENT = {"side": "motor", "gear_ratio": 1.0, "torque_constant": 1.0}
-"""Keys that a current needs beside its unit."""
+"""What a current needs beside its unit."""
 
 
 @dataclass
 class Family:
-    """Columns of one quantity, one for each joint; `declared`, if the log contains their unit.
+    """Columns of one quantity, one for each joint; `declared`, if the log says their unit.
 
     `columns` has what stands for `{joint}` in the common pattern → column; `by_joint` joint of the robot →
     column, where that does not name the joints as the positions do.

@@ -27,7 +27,7 @@ EVEN = 0.02
 
 @runtime_checkable
 class ForwardModel(Protocol):
-    """Interface of a model to a rollout."""
+    """What a rollout asks of a model of the forward dynamics."""
 
     @property
     def kind(self) -> str:
@@ -54,7 +54,7 @@ class ForwardModel(Protocol):
 
     @property
     def disturbance(self) -> Disturbance | None:
-        """Disturbance of the torques of function samples, `None` for nothing."""
+        """What disturbs the torques of function samples, `None` for nothing."""
         ...
 
     def predict(
