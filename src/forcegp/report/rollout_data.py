@@ -167,5 +167,5 @@ def _bands(rolled, values: Tensor, n: int) -> list[Band]:
 
 
 def _sound(q: Tensor) -> int:
-    """Number of leading times `(T, nq)` with a finite state."""
+    """How many leading times `(T, nq)` hold a finite state."""
     return int(torch.isfinite(q).all(-1).sum())

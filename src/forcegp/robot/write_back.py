@@ -60,7 +60,7 @@ class Change(NamedTuple):
 
 @dataclass(frozen=True)
 class WrittenRobot:
-    """Files of a write-back.
+    """What was written.
 
     Attributes:
         changes: figures that changed.

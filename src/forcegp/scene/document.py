@@ -35,7 +35,7 @@ _TOKEN = re.compile(rf"({_NAME})|(\.)|[^\S\n]+|(.|\n)")
 
 
 class Document:
-    """A parsed TOML file with the line of each key.
+    """A parsed TOML file that knows the line of each key.
 
     Args:
         content: the bytes of the file.

@@ -229,7 +229,7 @@ class _StoredGradient(torch.autograd.Function):
 
 
 def _bytes_of(value: object) -> bytes:
-    """Bytes of a value in a digest; type and shape of a tensor tell it from another with the same bytes."""
+    """What a digest sees of a value; type and shape of a tensor tell it from another with the same bytes."""
     if not isinstance(value, Tensor):
         return repr(value).encode()
     flat = value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy()

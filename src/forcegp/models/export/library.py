@@ -21,7 +21,7 @@ from forcegp.native import load_library
 
 NAME = "forcegp"
 JAMMED, UNRESOLVED, NO_INERTIA = 2, 3, 4
-"""Error codes of the C code."""
+"""What the C code returns other than 0."""
 MESSAGES = {
     JAMMED: "friction of a contact would press harder than it opposes",
     UNRESOLVED: "double precision does not resolve a predicted variance",
