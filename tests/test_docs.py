@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 import importlib.util
 import re
 import sys
@@ -17,6 +18,7 @@ else:
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGES = sorted(path for path in DOCS.rglob("*.md"))
+OTHERS = [DOCS.parent / name for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md")]
 EXECUTED = "{code-cell} python"
 DIRECTIVES = ("{toctree}", "{include}", "{eval-rst}")
 INSTALLED = ("pip install", "make ", "torchrun --nnodes", "python benchmarks/", "python -W")
@@ -155,20 +157,34 @@ SPEAKING = re.compile(rf"\b({SUBJECTS})( \w+)? (shows?|knows?|tells?|says?|asks?
 
 
 def texts() -> list[Path]:
-    """Pages, sources with their docstrings, messages and comments, examples and notes."""
+    """Pages, and sources with docstrings and messages."""
     root = DOCS.parent
     sources = [path for folder in ("src", "examples") for path in (root / folder).rglob("*.py")]
-    return [*PAGES, root / "README.md", root / "CONTRIBUTING.md", *sources]
+    return [*PAGES, *OTHERS, *sources]
+
+
+def sentences(path: Path) -> str:
+    """The text of a page, or the docstrings and messages of a source, in lower case on one line."""
+    text = path.read_text(encoding="utf-8")
+    if path.suffix == ".py":
+        nodes = ast.walk(ast.parse(text))
+        values = [node.value for node in nodes if isinstance(node, ast.Constant)]
+        text = " | ".join(value for value in values if isinstance(value, str))
+    return " ".join(text.split()).lower()
 
 
 @pytest.mark.parametrize("path", texts(), ids=lambda path: f"{path.parent.name}/{path.name}")
 def test_phrases_that_were_rewritten_do_not_come_back(path: Path) -> None:
-    text = " ".join(re.sub(r"^\s*# |\"\n\s+f?\"", " ", path.read_text(encoding="utf-8"), flags=re.M).split())
+    text = sentences(path)
     for phrase in PHRASES:
         pattern = rf"\b{re.escape(phrase)}\b" if phrase[0].isalpha() else re.escape(phrase)
-        assert not re.search(pattern, text.lower()), phrase
-    found = SPEAKING.search(text)
-    assert found is None, text[max(0, found.start() - 60) : found.end() + 60]
+        assert not re.search(pattern, text), phrase
+
+
+@pytest.mark.parametrize("page", [*PAGES, DOCS.parent / "README.md"], ids=lambda page: page.name)
+def test_data_and_forces_do_not_speak(page: Path) -> None:
+    found = SPEAKING.search(sentences(page))
+    assert found is None, found.group()
 
 
 WORDS = 20_000

@@ -1,4 +1,4 @@
-"""Style of plots: colours, names and sizes; and plots as SVG text for a page."""
+"""How plots look: colours, names and sizes; and plots as SVG text for a page."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ KINDS = {
     "independent_gp": "GP",
     "structured_gp": "Structured GP",
 }
-"""Names of the kinds of saved models."""
+"""What the kinds of saved models are called."""
 OTHER = "#0072b2"
 """Colour of a model without one of its own; not black, as measurements are."""
 INK = "#222222"
@@ -48,7 +48,7 @@ LABELS = {
     "sgp-mean-se": "S-GP, analytical mean, paper's kernel",
     "sgp-contact-se": "S-GP, mean and contact prior, paper's kernel",
 }
-"""Name of a model in plots and tables."""
+"""What a model is called in plots and tables."""
 
 STYLE = Path(__file__).parent / "templates" / "forcegp.mplstyle"
 """Fonts, sizes and lines of plots."""
@@ -69,7 +69,7 @@ class Picture:
 
 
 def label(model: str) -> str:
-    """Name of a model."""
+    """What a model is called."""
     return LABELS.get(model) or KINDS.get(model, model)
 
 
