@@ -26,7 +26,6 @@ Bounds = Mapping[str, tuple[float | Tensor, float | Tensor]]
 OPTIMIZERS = ("lbfgs", "adam")
 FIRST_STEP = 2.0
 """Largest change of an entry in the first step of L-BFGS in a box; of logarithms, two e-folds."""
-
 STOPPED = ("converged", "stopped at the limit of iterations", "the line search found no smaller objective")
 
 

@@ -156,8 +156,7 @@ class StructuredGP(Model[StructuredFit]):
             The fitted model. Fitting twice gives the same bits.
 
         Raises:
-            ModelError, DataError, UnknownNameError: the data, the earlier fit, or the checkpoint do not fit
-                the model.
+            ModelError, DataError, UnknownNameError: data, earlier fit, or checkpoint do not fit the model.
             NumericalError: the likelihood cannot be computed.
         """
         spec = self.specification if after is None else self._continued(after)
