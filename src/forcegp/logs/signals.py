@@ -1,5 +1,5 @@
-"""Data passed between the steps of an import: the quantities of a log, in SI units, in the robot's joint
-order and on one clock, and the report."""
+"""What the steps of an import hand on: the quantities of a log, in SI units and in the robot's joint order on
+one clock, and the report of what was found and done."""
 
 from __future__ import annotations
 
@@ -70,7 +70,7 @@ class ImportFinding:
 
 @dataclass
 class ImportReport:
-    """Findings and steps, in order; `steps` are lines of provenance.
+    """What was found and done, in order; `steps` are lines of provenance.
 
     `rows_read` counts the rows of the stream that sets the clock.
     """

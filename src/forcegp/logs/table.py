@@ -1,4 +1,4 @@
-"""Result of every reader: named columns of numbers by the clock that they share."""
+"""What every reader returns: named columns of numbers by the clock that they share."""
 
 from __future__ import annotations
 
