@@ -262,7 +262,8 @@ def mass_matrices(arm: Arm, fit: StructuredFit, q: Tensor) -> dict:
             zero, eye = torch.zeros_like(q), torch.eye(robot.nq, dtype=q.dtype)
             still = regressor(robot, q, zero, zero)
             columns = [(regressor(robot, q, zero, e.expand_as(q)) - still)[:, j] for j, e in enumerate(eye)]
-            C = torch.stack([column.mean(0) for column in columns]) * prior.scale(robot)
+            links = torch.stack([column.mean(0) for column in columns])
+            C = torch.cat([links, eye[:, : len(prior.drives)]], dim=-1) * prior.scale(robot)
             inverse = latent_precision(posterior, one_row(posterior, fit.problem), p, robot)
             std = (C @ torch.linalg.solve(inverse, C.mT)).diagonal().sqrt().numpy()
             tolerance = arm.wrong.gain / 3.0**0.5 * exact

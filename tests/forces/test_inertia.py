@@ -12,7 +12,7 @@ from forcegp import dynamics
 from forcegp.data import DataHeader
 from forcegp.errors import UnknownNameError
 from forcegp.forces.calibration import correlation_times
-from forcegp.forces.inertia import Inertia, inertia_of
+from forcegp.forces.inertia import Inertia, inertia_of, latent_precision, one_row
 from forcegp.forces.inverse_dynamics import (
     APART,
     Rows,
@@ -26,6 +26,8 @@ from forcegp.forces.inverse_dynamics import (
 from forcegp.forces.measurements import Observation, training_of
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import AnalyticalMean, JointFrictionPrior
+from forcegp.forces.quantities import states
+from forcegp.identification import regressor
 from forcegp.robot.model import RobotModel
 
 NOISE = torch.tensor([0.2, 0.05], dtype=torch.float64)
@@ -149,6 +151,46 @@ def test_links_and_drives_are_identified_together(file: RobotModel) -> None:
     result = found(file, data)
     assert result.identified and "the drives have inertia" in result.doubts[1]
     assert inertia_error(result.robot, truth, data) < 0.15 * inertia_error(file, truth, data)
+
+
+def test_a_drive_and_the_link_that_it_turns_share_their_uncertainty(file: RobotModel) -> None:
+    """Joint 1 turns link 1 about a fixed axis, so no motion tells the two apart: their sum is known alone."""
+    truth = file.replace(mass=1.3 * file.mass, com=0.9 * file.com)
+    data = log(truth, 800)
+    fit = forcegp.StructuredGP(forcegp.ConstrainedSystem(file), "analytical").fit(data)
+    (p,) = (p for p, prior in enumerate(fit.force_priors) if isinstance(prior, InertialPrior))
+    prior, robot = fit.force_priors[p], fit.system.robot
+    inputs = one_row(fit.posterior, fit.problem)
+    delta = fit.posterior.latent.latent_mean(p, inputs[p])[0]
+    covariance = torch.linalg.inv(latent_precision(fit.posterior, inputs, p, robot))
+    q, zero = data.q[::10], torch.zeros_like(data.q[::10])
+    # M_jj of unit errors: torque of joint j at its unit acceleration, without weight
+    columns = []
+    for j, one in enumerate(torch.eye(2, dtype=torch.float64)):
+        links = regressor(robot, q, zero, one.expand_as(q)) - regressor(robot, q, zero, zero)
+        columns.append(torch.cat([links[:, j].mean(0), one]) * prior.scale(robot))
+    C = torch.stack(columns)
+    std = (C @ covariance @ C.mT).diagonal().sqrt()
+    M, exact = (dynamics.mass_matrix(x, q).diagonal(dim1=-2, dim2=-1).mean(0) for x in (robot, truth))
+    assert bool(((M + C @ delta - exact).abs() <= 3.0 * std).all()) and bool((std < 0.05 * exact).all())
+    drive = covariance.diagonal()[-2:].sqrt() * prior.scale(robot)[-2:]
+    assert float(drive[0]) > 3.0 * float(std[0]), "the drive alone is not known as well as M"
+
+
+def test_the_force_of_a_drive_is_the_derivative_of_inverse_dynamics(file: RobotModel) -> None:
+    q, qd, qdd, tau = torch.randn(4, 5, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    prior = InertialPrior().around(file).with_drives(torch.tensor([0.5, 2.0], dtype=torch.float64))
+    active = torch.zeros(5, 0, dtype=torch.bool)
+    Q = prior.operator(
+        forcegp.ConstrainedSystem(file), states(forcegp.ConstrainedSystem(file), q, qd, tau, active, qdd)
+    )
+    for j, scale in enumerate(prior.drives):
+        step = scale * torch.eye(2, dtype=torch.float64)[j]
+        with_drive = file.replace(armature=file.armature + step)
+        change = dynamics.inverse_dynamics(with_drive, q, qd, qdd) - dynamics.inverse_dynamics(
+            file, q, qd, qdd
+        )
+        torch.testing.assert_close(Q[..., 20 + j], -change)
 
 
 @pytest.mark.parametrize("noise", [0.0, 10.0])

@@ -286,8 +286,8 @@ def _drives(given: NormalEquations, noise: Tensor, M: Tensor, weight: float) -> 
 def with_updated_robot(problem: Problem, values: Mapping[str, Tensor]) -> Problem:
     """The problem with the robot at the posterior mean of its inertial parameters (a Gauss–Newton step)."""
     for p, prior in enumerate(problem.priors):
-        contained = prior.name in problem.pinned
-        if isinstance(prior, InertialPrior) and problem.parameters is None and not contained:
+        moves = prior.name not in problem.pinned and problem.parameters is None
+        if isinstance(prior, InertialPrior) and moves and not prior.drives:
             posterior = force_posterior(problem, values)
             features = one_row(posterior, problem)
             mean = posterior.latent.latent_mean(p, features[p])[0]

@@ -261,10 +261,13 @@ class _Reader:
 
     @property
     def scale(self) -> Tensor | None:
-        """Prior standard deviation of the inertial parameters `(nq, 10)`; `None` where they were kept."""
+        """Prior standard deviations of links and drives `(nq, 11)`; `None` where all was kept."""
+        robot = self.fit.system.robot
         for prior in self.fit.force_priors:
             if isinstance(prior, InertialPrior):
-                return prior.scale(self.fit.system.robot).reshape(-1, len(MOMENTS))
+                links = prior.scale(robot)[: robot.nq * len(MOMENTS)].view(-1, len(MOMENTS))
+                drives = links.new_tensor(prior.drives or robot.nq * [0.0])
+                return torch.cat([links, drives[:, None]], dim=-1)
         return None
 
     def robots(self, draws: int) -> list[tuple[RobotModel, Curve]]:
@@ -325,7 +328,11 @@ class _Reader:
         damping, friction, left, offset = _projected(self.speeds, curve)
         robot = robot.replace(damping=damping, friction=friction, stribeck=0.0 * friction)
         if self.scale is not None:
-            robot = _moved(robot, delta.reshape(self.scale.shape) * self.scale)
+            links, drives = delta.split([robot.nq * len(MOMENTS), delta.numel() - robot.nq * len(MOMENTS)])
+            robot = _moved(robot, links.view(robot.nq, -1) * self.scale[:, :-1])
+            if len(drives):
+                armature = (robot.armature + drives * self.scale[:, -1]).clamp(min=0.0)
+                robot = robot.replace(armature=armature)
         prior = next((p for p in self.fit.force_priors if isinstance(p, PayloadPrior)), None)
         if prior is not None:
             robot = prior.around(load).loaded(robot)
@@ -450,8 +457,8 @@ def _parameters(
         before, after = value(file), value(robot)
         std = torch.stack([value(each) for each in samples]).std(0)
         prior = after.abs()
-        if name in MOMENTS and scale is not None:
-            prior = scale[:, MOMENTS.index(name)]
+        if scale is not None and name in (*MOMENTS, "armature"):
+            prior = scale[:, (*MOMENTS, "armature").index(name)]
         determined = (std > 0.0) & (std <= DETERMINED * prior)
         columns = (x.tolist() for x in (before, after, std, determined))
         rows = zip(robot.joint_names, *columns, strict=True)

@@ -245,7 +245,7 @@ def trained(
         train: the half.
         begin: hyperparameters to begin with.
     """
-    spec, pinned = identified(spec) if inertia.identified else (spec, {})
+    spec, pinned = identified(spec, train) if inertia.identified else (spec, {})
     rows = scaled(train.evenly(ROWS), spec.system, spec.priors, {}, spec.options.standardize)
     few = problem = Task(spec, rows, inertia.robot, pinned).problem()
     if not is_finite(problem.priors):

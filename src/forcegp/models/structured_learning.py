@@ -25,10 +25,11 @@ from torch import Tensor, nn
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
+from forcegp.dynamics import mass_matrix
 from forcegp.errors import UnknownNameError
 from forcegp.forces.calibration import calibrated_noise, likelihood_power, residual_times
 from forcegp.forces.friction_memory import MEMORY, memory_of
-from forcegp.forces.inertia import Inertia, inertia_of, with_updated_robot
+from forcegp.forces.inertia import VOLUME_STATES, Inertia, inertia_of, with_updated_robot
 from forcegp.forces.inverse_dynamics import LEAST
 from forcegp.forces.measurements import (
     Observation,
@@ -242,15 +243,17 @@ def task_of(
     doubts = (*doubts, *found.doubts)
     if not found.identified:
         return Task(spec, training, found.robot, doubts=doubts)
-    spec, pinned = identified(spec)
+    spec, pinned = identified(spec, training)
     training, _ = training_for(spec, before, data, chosen)
     return Task(spec, training, found.robot, pinned, doubts)
 
 
-def identified(spec: Specification) -> tuple[Specification, dict[str, Tensor]]:
-    """The model of a robot whose links were identified: errors of its inertia remain, with mean zero."""
+def identified(spec: Specification, training: Training) -> tuple[Specification, dict[str, Tensor]]:
+    """The model of a robot with identified inertia: errors of links and drives remain, with mean zero."""
     robot = spec.system.robot
-    errors = InertialPrior().around(robot)
+    q = torch.cat([m.q for m in training.evenly(VOLUME_STATES).measurements])
+    size = mass_matrix(robot, q).diagonal(dim1=-2, dim2=-1).mean(0)
+    errors = InertialPrior().around(robot).with_drives(size)
     pinned = {errors.name: robot.mass.new_zeros(errors.outputs(robot))}
     return dataclasses.replace(spec, priors=(*spec.priors, errors)), pinned
 

@@ -40,7 +40,9 @@ PER_LINK = 10
 
 @dataclass(frozen=True)
 class InertialPrior(ForcePrior):
-    """Q = −Y(q, q̇, q̈) S δ, δ ~ N(0, diag(s_k²)): one learned scale s_k per link k, 1 at the start.
+    """Q = −[Y(q, q̇, q̈), diag q̈] S δ, δ ~ N(0, diag(s_k²)): one learned scale s_k per link k, 1 at the start.
+
+    Without `drives`, Q = −Y S δ.
 
     Args:
         mass: relative standard deviation of each link's mass.
@@ -50,6 +52,7 @@ class InertialPrior(ForcePrior):
         kernel: covariance of the constants.
         name: prefix of the hyperparameters.
         scales: S `(10 nq,)`; that of the robot by default.
+        drives: standard deviation of the inertia of each joint's drive [kg m², kg]; all are known by default.
 
     Example:
         >>> import torch, forcegp
@@ -65,13 +68,22 @@ class InertialPrior(ForcePrior):
     name: str = "inertial"
     target: str = JOINT
     scales: tuple[float, ...] | None = None
+    drives: tuple[float, ...] = ()
 
     def around(self, robot: RobotModel) -> InertialPrior:
         """The prior with the scale of this robot, whatever robot it is read on."""
-        return dataclasses.replace(self, scales=tuple(self.scale(robot).tolist()))
+        return dataclasses.replace(self, scales=tuple(self.scale(robot)[: PER_LINK * robot.nq].tolist()))
+
+    def with_drives(self, std: Tensor) -> InertialPrior:
+        """The prior with unknown inertia of drives of some standard deviation `(nq,)` too.
+
+        Motion hardly tells the inertia of a drive from that of the links that it turns. With the drives taken
+        as known, any error of theirs would be one of the links, with too small a standard deviation.
+        """
+        return dataclasses.replace(self, drives=tuple(std.tolist()), kernel=Constant())
 
     def outputs(self, robot: RobotModel) -> int:
-        return PER_LINK * robot.nq
+        return PER_LINK * robot.nq + len(self.drives)
 
     def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
         return {"one": torch.zeros_like(at.q[:, :1])}
@@ -81,19 +93,22 @@ class InertialPrior(ForcePrior):
         qdd = at.qdd
         if qdd is None:
             qdd = at.eom.acceleration(at.eom.Q_K + at.tau)
-        return -regressor(system.robot, at.q, at.qd, qdd) * self.scale(system.robot)
+        columns = regressor(system.robot, at.q, at.qd, qdd)
+        if self.drives:
+            columns = torch.cat([columns, torch.diag_embed(qdd)], dim=-1)
+        return -columns * self.scale(system.robot)
 
     def scale(self, robot: RobotModel) -> Tensor:
-        """S `(10 nq,)`: standard deviations of π before a link's scale is learned."""
+        """S `(10 nq,)`, `(11 nq,)` with drives: standard deviations before a link's scale is learned."""
         if self.scales is not None:
-            return robot.mass.new_tensor(self.scales)
+            return robot.mass.new_tensor((*self.scales, *self.drives))
         m, J = robot.mass[:, None], inertial_parameters(robot.mass, robot.com, robot.inertia)
         gyration = J[:, [4, 7, 9]].clamp(min=0.0).sqrt()
         products = [
             gyration[:, a] * gyration[:, b] for a, b in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
         ]
         parts = [self.mass * m, (self.length * m).expand(-1, 3), self.inertia * torch.stack(products, dim=-1)]
-        return torch.cat(parts, dim=-1).flatten().detach()
+        return torch.cat([torch.cat(parts, dim=-1).flatten().detach(), m.new_tensor(self.drives)])
 
     def updated(
         self,

@@ -489,12 +489,14 @@ static void matern52(double *restrict u, int m) {
 /* PRIORS */
 
 #ifdef INERTIAL
-/* E = -Y(q, qdd, qd) S of errors of the inertial parameters */
+/* E = -[Y(q, qdd, qd), diag qdd] S of errors of the inertial parameters of links, and of drives where they have one */
 static void inertial(const double *restrict q, const double *restrict qd, const double *restrict qdd, latent *restrict f) {
   double sine[NQ], cosine[NQ], *E = f->E[INERTIAL];
   for (int i = 0; i < NQ; ++i) sine[i] = sin(q[i]), cosine[i] = cos(q[i]);
   regressor(q, qd, qdd, sine, cosine, E);
-  for (int k = 0; k < 10 * NQ; ++k)
+  for (int k = 10 * NQ; k < INERTIAL_COLUMNS; ++k)
+    for (int j = 0; j < NQ; ++j) E[k * NQ + j] = j == k - 10 * NQ ? qdd[j] : 0.0;
+  for (int k = 0; k < INERTIAL_COLUMNS; ++k)
     for (int j = 0; j < NQ; ++j) E[k * NQ + j] *= -INERTIAL_SCALE[k];
 }
 #endif

@@ -166,6 +166,7 @@ class Writer:
         for part, start in zip(self.parts, self.starts, strict=False):
             if isinstance(part.prior, InertialPrior):
                 self.lines.append(f"#define INERTIAL {start}")
+                self.lines.append(f"#define INERTIAL_COLUMNS {part.components}")
                 self.array(part.prior.scale(robot), "INERTIAL_SCALE")
         if contacts:
             self._surfaces(contacts)
