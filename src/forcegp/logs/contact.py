@@ -149,7 +149,7 @@ BINS = 512
 
 @dataclass(frozen=True)
 class Evidence:
-    """Source of a contact's state: `wrench`, `multiplier` or `distance`, in N or m.
+    """What a contact's state was read from: `wrench`, `multiplier` or `distance`, in N or m.
 
     Closed from `threshold` on, and then up to `release` on either side; median and deviation of the evidence
     in each state, NaN where it does not occur; first and last time of each closed interval [s]; and how many

@@ -41,7 +41,7 @@ _UNIT = re.compile(r"^[\[(]?\s*([A-Za-zµ°%][\w°²^/*·. -]{0,15}|-|1)?\s*[\])
 
 @dataclass(frozen=True)
 class Dialect:
-    """Format of a text table, after `first_line` lines without numbers.
+    """How a text table is written, after `first_line` lines without numbers.
 
     Each column is a `number`, `bool`, `date`, `text` or `empty`; a line below the heading may declare units.
     """
