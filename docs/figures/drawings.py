@@ -107,7 +107,7 @@ def forces_to_quantities() -> None:
     box(axis, 3.8, 1.5, 2.3, 1.7, "forces\n$\\bar Q = m + \\sum E_p f_p$\n$= Q + Q_z$", ORANGE, 10)
     box(axis, 3.5, 3.65, 2.9, 0.75, "robot file: mean $m(x)$", GRAY)
     arrow(axis, (4.95, 3.63), (4.95, 3.22), GRAY, 1.2)
-    axis.text(7.2, 3.8, "$B_Q,\\ B_z,\\ o$", fontsize=9, color=GREEN, ha="right")
+    axis.text(6.95, 4.4, "$B_Q,\\ B_z,\\ o$", fontsize=9, color=GREEN, ha="center")
     quantities = ("acceleration $\\ddot q$", "multiplier $\\lambda$", "contact force", "joint force $Q$")
     for k, name in enumerate(quantities):
         box(axis, 7.8, 3.55 - 1.1 * k, 2.5, 0.85, name, GREEN)
