@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import hashlib
 import os
+import re
 import sys
-from importlib.metadata import version as version_of
 from pathlib import Path
 
 HERE = Path(__file__).resolve().parent
@@ -14,7 +14,7 @@ sys.path.insert(0, str(HERE / "_ext"))
 project = "forcegp"
 author = "forcegp developers"
 copyright = f"2026, {author}"
-release = version = version_of("forcegp")
+release = version = re.findall(r'^version = "(.*)"', (HERE.parent / "pyproject.toml").read_text(), re.M)[0]
 
 extensions = [
     "myst_nb",
@@ -23,6 +23,7 @@ extensions = [
     "sphinx.ext.viewcode",
     "sphinx_copybutton",
     "mathml",
+    "messages",
     "plain_docstrings",
     "shell_cells",
 ]
@@ -32,7 +33,8 @@ nitpicky = False
 suppress_warnings = ["myst.header"]  # CHANGELOG.md repeats headings and skips levels
 
 # -- pages: MyST Markdown, executed -----------------------------------------------------------
-myst_enable_extensions = ["dollarmath", "amsmath", "colon_fence", "deflist"]
+myst_enable_extensions = ["dollarmath", "amsmath", "colon_fence", "deflist", "substitution"]
+myst_substitutions = {"version": version}
 myst_heading_anchors = 3
 myst_links_external_new_tab = False
 
@@ -40,8 +42,8 @@ myst_links_external_new_tab = False
 def _code_key() -> str:
     """Hash of what the pages run: outputs are cached until the library or an example changes."""
     digest = hashlib.sha256()
-    for folder in ("src/forcegp", "examples", "docs/_ext"):
-        for path in sorted((HERE.parent / folder).rglob("*")):
+    for folder in ("src/forcegp", "examples", "docs/_ext/kernel_start.py"):
+        for path in sorted([HERE.parent / folder, *(HERE.parent / folder).rglob("*")]):
             if path.is_file() and path.suffix in (".py", ".toml", ".urdf", ".csv", ".parquet"):
                 digest.update(path.read_bytes())
     return digest.hexdigest()[:16]
@@ -80,7 +82,7 @@ add_module_names = False
 
 # -- appearance: no request to another host ------------------------------------------------------
 html_theme = "furo"
-html_title = "forcegp"
+html_title = f"forcegp {version}"
 html_static_path = ["_static"]
 html_css_files = ["site.css"]
 html_show_sphinx = False
@@ -89,4 +91,3 @@ html_copy_source = False
 # -- links ---------------------------------------------------------------------------------------
 linkcheck_timeout = 20
 linkcheck_retries = 2
-linkcheck_ignore = [r"https://github\.com/forcegp/.*"]

@@ -1,4 +1,4 @@
-"""The paper's task: a KUKA iiwa slides over a table, and the model knows no friction of the contact.
+"""The paper's task: a KUKA iiwa slides over a table, with contact friction that the model lacks.
 
 python examples/kuka_on_the_table.py [figure.png]
 """

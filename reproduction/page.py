@@ -1,4 +1,4 @@
-"""The page of a reproduction and `docs/results.md`: every figure and table, ours beside the paper's."""
+"""The page of a reproduction and its `results.md`: every figure and table, ours beside the paper's."""
 
 from __future__ import annotations
 

@@ -50,7 +50,7 @@ class Score(Record):
 
 
 class Results(Header):
-    """Every number of a reproduction, from which the page's tables and `docs/results.md` are made.
+    """Every number of a reproduction, from which the tables of the page and of `results.md` are made.
 
     Attributes:
         profile: name of the profile.

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import ast
+import importlib.util
 import re
 import sys
 from pathlib import Path
+from types import ModuleType
 
 import pytest
 
@@ -15,6 +18,7 @@ else:
 
 DOCS = Path(__file__).parents[1] / "docs"
 PAGES = sorted(path for path in DOCS.rglob("*.md"))
+OTHERS = [DOCS.parent / name for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md")]
 EXECUTED = "{code-cell} python"
 DIRECTIVES = ("{toctree}", "{include}", "{eval-rst}")
 INSTALLED = ("pip install", "make ", "torchrun --nnodes", "python benchmarks/", "python -W")
@@ -66,3 +70,160 @@ def test_public_names_are_in_the_reference() -> None:
     for public in forcegp.__all__:
         directive = "automodule" if public in modules else "auto(?:class|function)"
         assert re.search(rf"^\.\. {directive}:: forcegp\.{public}$", text, flags=re.M), public
+
+
+def messages() -> ModuleType:
+    """The extension that makes the page of messages."""
+    spec = importlib.util.spec_from_file_location("messages", DOCS / "_ext" / "messages.py")
+    assert spec is not None and spec.loader is not None
+    module = importlib.util.module_from_spec(spec)
+    spec.loader.exec_module(module)
+    return module
+
+
+def test_every_finding_and_every_error_is_on_the_page_of_messages() -> None:
+    from forcegp.checks import KINDS
+
+    page = (DOCS / "reference" / "messages.md").read_text(encoding="utf-8")
+    assert "<!-- generated: findings -->" in page and "<!-- generated: errors -->" in page
+    findings, errors = messages().findings(), messages().errors()
+    for name, kind in KINDS.items():
+        assert f"| `{name}` | {kind.family} | {kind.severity} | {kind.title} | {kind.remedy} |" in findings
+    assert "## RobotFileError\n" in errors
+    assert "| cannot select … of … points |" in errors
+
+
+def links(text: str) -> list[str]:
+    """Files that a page links to, without their anchors."""
+    targets = re.findall(r"\]\(([^)#\s]+)(?:#[^)]*)?\)", text)
+    return [target for target in targets if "://" not in target]
+
+
+@pytest.mark.parametrize(
+    "page",
+    [*PAGES, *(DOCS.parent / name for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md"))],
+    ids=str,
+)
+def test_links_lead_to_files(page: Path) -> None:
+    text = re.sub(r"^```.*?^```", "", page.read_text(encoding="utf-8"), flags=re.S | re.M)
+    for target in links(text):
+        assert (page.parent / target).exists(), target
+
+
+PHRASES = """
+ends with the place of the page
+any of those that a log holds can be what is learned from
+±2 std holds noisy ones
+wrong input ends in one message that says what to change
+limits the wrong way round
+so many points cannot be selected
+no such way to treat a divergence
+the hyperparameters to begin with do not fit
+whether accelerations show the force
+takes its smoothness for knowledge of that part
+the data tell their sum only
+for no fewer samples than take longer than starting it
+give back what the engine holds
+too sure or too unsure of itself
+one a joint
+learning its figures
+priors stand for the forces that the rigid-body model does not know
+which noisy samples do not tell
+for the posterior finds forces that read less of q̇
+whether the payload is another one
+leave a variance of at most M over all rows together
+of which the truth is known and that play no part elsewhere
+has the lightest of theirs
+which those of a contact are not
+has friction of each joint and of the contact
+is hard to beat by much
+fewer of joints that others tell of
+and any other is read off
+a new motion tells nothing of it
+leaves every piece but the r-th of each k empty
+remove what killed writers of a target left beside it
+accelerations are those of no smooth motion
+can be written, apart from the data and from each other
+as JSON holds it
+q and qd are not one batch
+the batches do not fit each other
+one passive joint is a design; an arm without any torque is a missing column
+""".lower().split("\n")[1:-1]
+"""Phrases that were found here and rewritten."""
+
+SUBJECTS = "data|logs?|forces?|samples?|accelerations?|torques?|rows?|files?|models?|stretches|evidence"
+SPEAKING = re.compile(rf"\b({SUBJECTS})( \w+)? (shows?|knows?|tells?|says?|asks?|sees?|wants?)\b", flags=re.I)
+"""Data and forces that speak, know or see."""
+
+
+def texts() -> list[Path]:
+    """Pages, and sources with docstrings and messages."""
+    root = DOCS.parent
+    sources = [path for folder in ("src", "examples") for path in (root / folder).rglob("*.py")]
+    return [*PAGES, *OTHERS, *sources]
+
+
+def sentences(path: Path) -> str:
+    """The text of a page, or the docstrings and messages of a source, in lower case on one line."""
+    text = path.read_text(encoding="utf-8")
+    if path.suffix == ".py":
+        nodes = ast.walk(ast.parse(text))
+        values = [node.value for node in nodes if isinstance(node, ast.Constant)]
+        text = " | ".join(value for value in values if isinstance(value, str))
+    return " ".join(text.split()).lower()
+
+
+@pytest.mark.parametrize("path", texts(), ids=lambda path: f"{path.parent.name}/{path.name}")
+def test_phrases_that_were_rewritten_do_not_come_back(path: Path) -> None:
+    text = sentences(path)
+    for phrase in PHRASES:
+        pattern = rf"\b{re.escape(phrase)}\b" if phrase[0].isalpha() else re.escape(phrase)
+        assert not re.search(pattern, text), phrase
+
+
+@pytest.mark.parametrize("page", [*PAGES, DOCS.parent / "README.md"], ids=lambda page: page.name)
+def test_data_and_forces_do_not_speak(page: Path) -> None:
+    found = SPEAKING.search(sentences(page))
+    assert found is None, found.group()
+
+
+WORDS = 20_000
+"""Words of the site in prose and tables: without code, addresses, the API reference and generated pages."""
+
+
+def prose(text: str) -> list[str]:
+    """The words of a page."""
+    text = re.sub(r"\A---.*?^---$|^```.*?^```$", "", text, flags=re.S | re.M)
+    text = re.sub(r"\]\([^)]*\)", "]", text)
+    return [word for word in text.split() if re.search(r"\w", word)]
+
+
+def test_the_site_and_the_readme_stay_short() -> None:
+    pages = [page for page in PAGES if page.parent.name != "reference"]
+    assert sum(len(prose(page.read_text(encoding="utf-8"))) for page in pages) <= WORDS
+    assert len((DOCS.parent / "README.md").read_text(encoding="utf-8").split()) <= 700
+
+
+def test_pages_do_not_edit_files_by_patterns() -> None:
+    for page in PAGES:
+        assert "sed -i" not in page.read_text(encoding="utf-8"), page
+
+
+def test_the_version_is_the_same_everywhere() -> None:
+    root = DOCS.parent
+    version = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+    assert f"\n## [{version}] - " in (root / "CHANGELOG.md").read_text(encoding="utf-8")
+    assert f"\nversion: {version}\n" in (root / "CITATION.cff").read_text(encoding="utf-8")
+    for page in (root / "README.md", DOCS / "index.md"):
+        assert set(re.findall(r"forcegp-([\d.]+)-py3", page.read_text(encoding="utf-8"))) == {version}, page
+
+
+def test_messages_of_troubleshooting_exist() -> None:
+    sources = "".join(path.read_text(encoding="utf-8") for path in (DOCS.parent / "src").rglob("*.py"))
+    sources = " ".join(re.sub(r'"\n\s+f?"', "", sources).split())
+    page = (DOCS / "troubleshooting.md").read_text(encoding="utf-8")
+    named = re.findall(r"^\| `([^`]*)` \|", page[: page.index("## Results that look wrong")], flags=re.M)
+    assert len(named) == 20
+    for message in named:
+        for part in message.split("…"):
+            assert part.strip(" '") in sources, message

@@ -205,7 +205,7 @@ def test_wrong_shapes_are_named() -> None:
     q = torch.zeros(4, 7, dtype=torch.float64)
     with pytest.raises(ShapeError, match=r"force does not fit robot 'kuka_iiwa'(.|\n)*got: \(4, 6\)"):
         dynamics.forward_dynamics(robot, q, q, q[:, :6])
-    with pytest.raises(ShapeError, match=r"batches of q, qd, force do not fit each other(.|\n)*qd \(3, 7\)"):
+    with pytest.raises(ShapeError, match=r"batch shapes of q, qd, force do not broadcast(.|\n)*qd \(3, 7\)"):
         dynamics.forward_dynamics(robot, q, q[:3], q)
     with pytest.raises(ShapeError, match=r"torch.float64 on cpu(.|\n)*hint: convert q"):
         dynamics.mass_matrix(robot, q.float())

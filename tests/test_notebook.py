@@ -91,4 +91,7 @@ def test_a_fit_shows_its_progress_in_a_notebook(monkeypatch: pytest.MonkeyPatch)
     )
     assert len(outputs) == 1
     assert len(outputs[0]) >= fit.result.evaluations > 1
-    assert outputs[0][-1].startswith(f'<progress value="{fit.result.evaluations}" max=')
+    count = fit.result.evaluations
+    assert outputs[0][-1].startswith(
+        f'<progress value="{count}" max="{count}"></progress> {count} evaluations, '
+    )

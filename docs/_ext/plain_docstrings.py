@@ -1,7 +1,11 @@
-"""Docstrings are plain text with code in single backticks; this makes them valid reStructuredText."""
+"""Docstrings are plain text with code in single backticks; this makes them valid reStructuredText.
+
+Default values that a dataclass makes anew, which Python shows as `<factory>`, are written out.
+"""
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from typing import Any
 
@@ -26,7 +30,24 @@ def _process(_: Sphinx, what: str, name: str, obj: object, options: Any, lines: 
     lines[:] = [escaped(line) for line in lines]
 
 
+def made(value: object) -> str:
+    """A default value in short: an empty container, or the name of its class."""
+    return repr(value) if isinstance(value, dict | list | tuple) else f"{type(value).__name__}()"
+
+
+def _defaults(
+    _: Sphinx, what: str, name: str, obj: object, options: Any, signature: str | None, returned: str | None
+) -> tuple[str, str | None] | None:
+    if what != "class" or signature is None or not dataclasses.is_dataclass(obj):
+        return None
+    for field in dataclasses.fields(obj):
+        if field.init and field.default_factory is not dataclasses.MISSING:
+            signature = signature.replace("<factory>", made(field.default_factory()), 1)
+    return signature, returned
+
+
 def setup(app: Sphinx) -> dict[str, Any]:
     """Run before Napoleon."""
     app.connect("autodoc-process-docstring", _process, priority=100)
+    app.connect("autodoc-process-signature", _defaults)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -19,35 +19,14 @@ from forcegp.logs import parse_mapping
 
 HERE = Path(__file__).resolve().parent
 LOG = HERE.parents[1] / "examples" / "data" / "ur5_wiping.csv"
-MAPPING = """
-[time]
-column = "timestamp"
-[joints]
-shoulder_pan_joint = "0"
-shoulder_lift_joint = "1"
-elbow_joint = "2"
-wrist_1_joint = "3"
-wrist_2_joint = "4"
-wrist_3_joint = "5"
-[position]
-column = "actual_q_{joint}"
-unit = "rad"
-[velocity]
-column = "actual_qd_{joint}"
-unit = "rad/s"
-[torque]
-column = "actual_torque_{joint}"
-unit = "Nm"
-[contact.table]
-source = "distance"
-"""
+MAPPING = LOG.with_suffix(".mapping.toml")
 SPLIT, STEP = 15.0, 16
 """End of the training data [s], and which of their samples are taken: every STEP-th."""
 
 
 def main() -> None:
     system = forcegp.load_scene("ur5_wiping").system()
-    data = forcegp.read_log(LOG, system, parse_mapping(MAPPING.encode(), "mapping"))
+    data = forcegp.read_log(LOG, system, parse_mapping(MAPPING.read_bytes(), "mapping"))
     load_cell = torch.tensor(csv.read_csv(LOG)["table_force"].to_numpy())
     quiet = data.impact["table"] == 0
     fit = forcegp.StructuredGP(system, mean="analytical").fit(data[(data.t < SPLIT) & quiet][::STEP])

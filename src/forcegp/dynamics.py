@@ -93,7 +93,7 @@ def _bias_force(robot: RobotModel, poses: LinkPoses, links: LinkInertia, motion:
 def known_terms(
     robot: RobotModel, poses: LinkPoses, motion: LinkMotion, qd: JointVector
 ) -> tuple[JointMatrix, JointVector, JointVector, JointVector]:
-    """M, Q_C, Q_G and Q_D, all that the robot file knows, from links whose motion is known."""
+    """M, Q_C, Q_G and Q_D, all forces of the robot file, from links with known motion."""
     links, Q_D = link_inertia(robot, poses), damping_force(robot, qd)
     M, Q_C = mass_matrix_of(robot, poses, links), _bias_force(robot, poses, links, motion)
     Q_G = _gravity_force(robot, poses, links)

@@ -21,9 +21,9 @@ class ForceGPError(Exception):
     """Base of every error that a user of the library can cause.
 
     Args:
-        message: one sentence that says what is wrong and where (file, joint, row).
-        expected: what would have been right.
-        got: what was found instead.
+        message: one sentence on the fault and its place (file, joint, row).
+        expected: the valid value.
+        got: the value found.
         hint: what to change.
     """
 
@@ -55,7 +55,7 @@ class ForceGPError(Exception):
             raise cls.at(place, cause) from cause
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """How to copy the error, or to send it to another process: its text and plain values."""
+        """Recipe to copy the error, or to send it to another process: its text and plain values."""
         state = {name: _plain(value) for name, value in self.__dict__.items()}
         return _rebuilt, (type(self), tuple(map(_plain, self.args)), state)
 
@@ -149,7 +149,7 @@ class MappingError(ForceGPError, ValueError):
 
 
 class ModelError(ForceGPError, ValueError):
-    """A model that is asked for what it cannot do, or a saved model that cannot be read."""
+    """A model without the requested ability, or a saved model that cannot be read."""
 
 
 class NumericalError(ForceGPError, ArithmeticError):

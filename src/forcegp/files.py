@@ -158,7 +158,7 @@ def _sync(path: Path) -> None:
 
 @contextmanager
 def _temporary(target: Path, *, folder: bool, mode: int) -> Iterator[Path]:
-    """What a target is written to; gone when the block ends, unless it was moved."""
+    """Temporary file of a target; gone when the block ends, unless it was moved."""
     with writable(target):
         check_kind(target, folder=folder)
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -323,7 +323,7 @@ def _json_object(text: str | bytes, source: str, error: type[ForceGPError], most
 
 
 def depth(value: object) -> int:
-    """How many mappings and lists lie inside each other at most, found without recursion."""
+    """Largest depth of nested mappings and lists, found without recursion."""
     level, levels = [value], 0
     while level := [part for part in level if isinstance(part, dict | list)]:
         levels += 1

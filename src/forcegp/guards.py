@@ -48,7 +48,7 @@ def check_expansion(source: str, size: int, file: int, free: int | None = None) 
 
 
 def allowed_bytes(file: int, free: int | None = None) -> int:
-    """How many bytes a file of `file` bytes may unpack to, `free` of them whatever its size."""
+    """Number of bytes that a file of `file` bytes may unpack to, `free` of them whatever its size."""
     return max(free or limits.FREE_TABLE_BYTES, limits.TABLE_EXPANSION * file)
 
 

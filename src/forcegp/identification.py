@@ -30,7 +30,7 @@ RANK = 1e-9
 STATES = 100
 """Random states at which the rank is found."""
 MASS_SHARE, MOMENT_ARM = 0.3, 0.1
-"""How far the mass m of a link may be off a robot file, as a share, and its centre of mass [m]: the standard
+"""Tolerance of a robot file: of the mass m of a link, as a share, and its centre of mass [m]: the standard
 deviations of its parameters are 30 % of m, m · 0.1 m and m · (0.1 m)²."""
 PARAMETER_NAMES = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
 

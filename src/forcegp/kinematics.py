@@ -107,7 +107,7 @@ def common_states(robot: RobotModel, **states: Tensor) -> tuple[Tensor, ...]:
     except RuntimeError:
         shapes = ", ".join(f"{name} {tuple(value.shape)}" for name, value in states.items())
         raise ShapeError(
-            f"the batches of {', '.join(states)} do not fit each other",
+            f"the batch shapes of {', '.join(states)} do not broadcast",
             expected=f"batch shapes that broadcast, each followed by {robot.nq}",
             got=shapes,
         ) from None
@@ -250,7 +250,7 @@ def point_motion(
     frame: str,
     point: object = (0.0, 0.0, 0.0),
 ) -> PointMotion:
-    """The motion of a point fixed in a frame, from links whose motion is known.
+    """The motion of a point fixed in a frame, from links with known motion.
 
     Raises:
         UnknownNameError: no such frame.

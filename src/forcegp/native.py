@@ -42,7 +42,7 @@ def find_compiler() -> str:
 
 
 def _machine() -> str:
-    """What `-march=native` depends on."""
+    """Processor features that `-march=native` depends on."""
     try:
         text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
     except OSError:
@@ -94,7 +94,7 @@ def _compiled(compiler: Sequence[str], source: str, folder: Path) -> bytes:
 
 
 def _built(compiler: Sequence[str], source: str, folder: Path) -> bytes:
-    """What the compiler writes into a private folder, which is held open: its name may change hands."""
+    """Output of the compiler in a private folder, which is held open: its name may change hands."""
     if not PROC.is_dir():  # no folder has a name by its descriptor here
         _run_compiler(compiler, source, folder)
         return (folder / LIBRARY).read_bytes()
@@ -122,7 +122,7 @@ def _run_compiler(compiler: Sequence[str], source: str, folder: Path) -> None:
 
 
 def cache_directory() -> Path:
-    """Where compiled kernels are kept: `$FORCEGP_CACHE`, or `forcegp` in the user's cache folder."""
+    """Folder of compiled kernels: `$FORCEGP_CACHE`, or `forcegp` in the user's cache folder."""
     chosen = os.environ.get("FORCEGP_CACHE")
     if chosen:
         return Path(chosen)

@@ -1,4 +1,4 @@
-"""What notebooks show: small HTML tables, every text in them escaped, and the progress of a fit."""
+"""Output in notebooks: small HTML tables, every text in them escaped, and the progress of a fit."""
 
 from __future__ import annotations
 
@@ -75,4 +75,5 @@ class FitBar:
     def html(self) -> str:
         """The bar, and its numbers."""
         bar = f'<progress value="{self.done}" max="{self.total}"></progress>'
-        return f"{bar} {self.done} of at most {self.total} evaluations, objective {text(self.objective)}"
+        most = f" of at most {self.total}" if self.done < self.total else ""
+        return f"{bar} {self.done}{most} evaluations, objective {text(self.objective)}"

@@ -138,7 +138,7 @@ def as_array(values: Any) -> Array:
 
 
 Target = Axes | Iterable[Axes] | None
-"""Where to draw: axes of the caller, one per panel, or `None` for a new figure."""
+"""Axes to draw on: of the caller, one per panel, or `None` for a new figure."""
 WIDTH, ROW, MARGIN = 7.0, 1.25, 0.9
 """Size of a new figure [inch]."""
 

@@ -69,7 +69,7 @@ def _available() -> int | None:
 
 
 def _container_memory() -> int | None:
-    """What the limit of the control group leaves (version 2, then 1)."""
+    """Memory that the limit of the control group leaves (version 2, then 1)."""
     for most, used in (
         ("memory.max", "memory.current"),
         ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"),

@@ -69,11 +69,3 @@ def test_an_unknown_kind_is_refused() -> None:
 
     with pytest.raises(UnknownNameError, match="did you mean 'time-gap'"):
         Finding("time-gab", "", ((0, 1),))
-
-
-def test_every_kind_is_documented() -> None:
-    from forcegp.checks import KINDS
-
-    page = (Path(__file__).parents[2] / "docs/checking.md").read_text(encoding="utf-8")
-    for name, kind in KINDS.items():
-        assert f"| `{name}` | {kind.family} | {kind.severity} | {kind.title} | {kind.remedy} |" in page

@@ -66,7 +66,7 @@ def test_what_is_missing_is_said_in_one_message(
     assert "--scene or --robot" in fail(monkeypatch, capfd, log, "--out", out)
     assert "--out log.parquet" in fail(monkeypatch, capfd, log, "--robot", "double_pendulum")
     said = fail(monkeypatch, capfd, log, "--robot", "double_pendulum", "--out", out)
-    assert "do not say what they are" in said and "--guess" in said
+    assert "the quantities of the columns are unclear" in said and "--guess" in said
     wrong = tmp_path / "m.toml"
     wrong.write_text("[time]\ncolum = 't'\n")
     said = fail(monkeypatch, capfd, log, "--robot", "double_pendulum", "--mapping", wrong, "--out", out)

@@ -99,5 +99,5 @@ def test_redundant_contacts_change_nothing() -> None:
 def test_arguments_are_checked() -> None:
     system = system_of((PLANE,))
     q = torch.zeros(2, 7, dtype=torch.float64)
-    with pytest.raises(ShapeError, match="q and force are not one batch"):
+    with pytest.raises(ShapeError, match="q and force have unequal batch shapes"):
         system.linearize(q, q, q[0])

@@ -133,7 +133,7 @@ def test_what_is_not_said_of_a_contact_is_an_error(
     text = (
         b'[time]\ncolumn = "t"\n[position]\ncolumn = "q"\nunit = "rad"\n[torque]\ncolumn = "i"\nunit = "Nm"\n'
     )
-    with pytest.raises(MappingError, match="nothing says whether contact 'table' is closed"):
+    with pytest.raises(MappingError, match="no source determines whether contact 'table' is closed"):
         contact.detect(signals, system, parse_mapping(text, "m.toml"), ImportReport("log"))
     contact.detect(signals, system, mapping("always"), ImportReport("log"))  # type: ignore[arg-type]
     assert signals.contact["table"].all()

@@ -66,7 +66,7 @@ def test_a_data_set_is_imported_without_a_mapping(tmp_path: Path, robot: forcegp
 
 def test_columns_without_a_meaning_are_refused(tmp_path: Path, robot: forcegp.RobotModel) -> None:
     path, _ = write_csv(tmp_path, motion())
-    with pytest.raises(MappingError, match=r"do not say what they are(?s:.*)q.shoulder(?s:.*)--guess"):
+    with pytest.raises(MappingError, match=r"quantities of the columns(?s:.*)q.shoulder(?s:.*)--guess"):
         read_log(path, robot)
 
 

@@ -38,7 +38,7 @@ def check_robot(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_import(system: ConstrainedSystem, log: Log) -> Outcome:
-    """What the import of the log found, but for the contacts, which are checked themselves."""
+    """Findings of the import, without those on contacts, which are checked here."""
     doubts = [text for kind, text in log.header.imported if kind == "doubt"]
     others = [text for kind, text in log.header.imported if kind not in ("doubt", "contact")]
     pairs = ("import-doubt", doubts), ("import-found", others)
@@ -96,7 +96,7 @@ def check(system: ConstrainedSystem, data: Dataset | Log, *, progress: Progress 
         progress: called with the number of checks done and their number.
 
     Returns:
-        The findings, the gravest first; `report.usable` says whether to go on.
+        The findings, the gravest first; `report.usable` is true if a model can be fitted.
 
     Raises:
         DataError: a joint of the robot is not in the log, or the log is empty.

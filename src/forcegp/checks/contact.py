@@ -1,4 +1,4 @@
-"""Does the tip touch the surface of the scene where the log says so, and what force does a contact carry?
+"""Distance of the tip from the surface while a contact is labelled closed, and forces of contacts.
 
 The surface must push, and friction opposes the sliding.
 """
@@ -71,7 +71,7 @@ class Path:
 def tip_path(
     system: ConstrainedSystem, contact: SurfaceContact, log: Log, rows: np.ndarray | None = None
 ) -> Path:
-    """Where the touching point was at some rows, or at all rows, with NaN in those that are not finite."""
+    """Position of the touching point at some rows, or at all rows, with NaN in those that are not finite."""
     parts = np.array_split(np.arange(len(log)) if rows is None else rows, -(-len(log) // CHUNK))
     paths = []
     with torch.no_grad():
@@ -261,7 +261,7 @@ NARROW = 0.05
 
 
 def check_forces(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Normal force, friction and directions of sliding of each contact, where the arm can tell the force."""
+    """Normal force, friction and directions of sliding of each contact, if the arm determines the force."""
     findings = []
     for contact, rows in touching(system, log):
         finding = partial(Finding, intervals=intervals(log.contact[contact.name]), contact=contact.name)

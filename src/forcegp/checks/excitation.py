@@ -1,4 +1,4 @@
-"""What the motion lets one learn: joints that move, changes of direction, parameters that are identified, and
+"""Information in the motion: joints that move, changes of direction, parameters that are identified, and
 how large a fault must be to be seen in this log.
 
 A fault of size θ adds θ φ to the unexplained torque r, and the held-out residual is linear in it,
@@ -24,13 +24,13 @@ from forcegp.identification import base_parameters, parameter_vector, regressor
 STILL = 0.05
 """Range of motion below which a joint does not move [rad, m]."""
 REVERSALS = 4
-"""Changes of direction that tell Coulomb friction from an offset of the torque."""
+"""Changes of direction that separate Coulomb friction from an offset of the torque."""
 HYSTERESIS = 0.05
 """Share of its largest speed that a joint must reach for a change of direction to count."""
 SHORT_SECONDS, ROWS = 2.0, 1000
 """Length of a log below which little is learned [s]; rows of which the regressor is made."""
 LOOK = 0.1
-"""Time after which the torque says something new [s]."""
+"""Time after which the torque contains new information [s]."""
 LEARNED = 0.5
 """Standard deviation after the log, as a share of that before it, below which a parameter is identified."""
 
@@ -101,7 +101,7 @@ def _sharpness(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> tuple[A
     tau = np.sqrt((log.tau[rows] ** 2).mean(axis=0))
     noise = np.maximum(0.01 * tau, 1e-3 * tau.max()) + 1e-12
     A = (Y / noise[:, None]).reshape(-1, len(columns)) * inertial_spread(robot)[columns]
-    # Neighbouring rows tell the same: the log counts as one look per tenth of a second.
+    # Neighbouring rows repeat each other: the log counts as one row per tenth of a second.
     looks = int(log.usable.sum()) * log.dt / LOOK if log.header.ordered else len(rows)
     gram = A.T @ A * (looks / len(rows))
     after = np.linalg.inv(gram + np.eye(len(columns)))
@@ -175,7 +175,7 @@ def _at_contact(explanation: Explanation, fault: Fault, size: float) -> str:
 
 
 def visible_size(explanation: Explanation, fault: Fault) -> float:
-    """Size from which on the torque shows a fault of either sign, or `LARGEST`."""
+    """Smallest detectable size of a fault of either sign, or `LARGEST`."""
     problem = explanation.problem
     rest = held_out(problem, explanation.columns, explanation.prior)
     added = held_out(replace(problem, r=fault.column), explanation.columns, explanation.prior)

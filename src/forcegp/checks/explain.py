@@ -218,8 +218,8 @@ ALONE = 2.0
 """Standard errors by which an alternative must lower the held-out error on its own, which chance exceeds in 4
 % of cases: it is already known that something is wrong."""
 TESTS = {
-    "torque-gain": "hang a known weight from the tip: its torque shows the gain, whatever the masses",
-    "torque-current": "hang a known weight from the tip: its torque shows the gains, whatever the masses",
+    "torque-gain": "hang a known weight from the tip: its torque gives the gain, whatever the masses",
+    "torque-current": "hang a known weight from the tip: its torque gives the gains, whatever the masses",
     "torque-sign": "push a joint in its positive direction while the arm holds still: its torque must fall",
     "torque-order": "twist one joint after another, without loading the others: only its torque must change",
     "torque-delay": "apply a torque step to one joint: its acceleration must change in the same sample",

@@ -139,7 +139,7 @@ class Finding:
         evidence: the numbers behind the message, by name.
         weight: severity where it differs from that of the kind.
         alternatives: what else explains the log as well, so that only one of them need be true.
-        told_apart_by: what would tell them apart.
+        told_apart_by: test that tells them apart.
 
     Raises:
         UnknownNameError: no such kind.
@@ -175,7 +175,7 @@ class Finding:
 
     @property
     def remedy(self) -> str:
-        """What to do about it; with alternatives, the test that tells them apart and the remedy of each."""
+        """The remedy; with alternatives, the test that tells them apart and the remedy of each."""
         if not self.alternatives:
             return KINDS[self.kind].remedy
         each = "; ".join(f"{kind}: {KINDS[kind].remedy}" for kind in self.kinds)
@@ -187,7 +187,7 @@ class Finding:
         return sum(stop - start for start, stop in self.intervals)
 
     def to_dict(self) -> dict[str, Any]:
-        """The finding as JSON holds it."""
+        """The finding as JSON-compatible values."""
         plain = ("kind", "severity", "message", "remedy", "contact", "told_apart_by")
         return {name: getattr(self, name) for name in plain} | {
             "kinds": list(self.kinds),
@@ -230,7 +230,7 @@ class Report:
 
     @property
     def verdict(self) -> str:
-        """One line that says whether to go on."""
+        """One line on whether a model can be fitted."""
         errors, warnings = self.count("error"), self.count("warning")
         if errors:
             return f"verdict: stop; repair {errors} error{'s' * (errors > 1)} before fitting a model"
@@ -239,7 +239,7 @@ class Report:
         return "verdict: go on"
 
     def to_dict(self) -> dict[str, Any]:
-        """The report as JSON holds it."""
+        """The report as JSON-compatible values."""
         return {
             "samples": self.samples,
             "joint_names": list(self.joint_names),

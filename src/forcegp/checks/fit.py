@@ -1,4 +1,4 @@
-"""How well a hypothesis explains the torque: least squares on all blocks of a log but one.
+"""Fit of a hypothesis to the torque: least squares on all blocks of a log but one.
 
 What is to be explained is the torque that the robot file leaves, without what a labelled contact may
 contribute: r = M q̈ − Q_C − Q_G − Q_D − Q_u is Aᵀλ + Q_z = Jᵀ F where a point touches, and zero elsewhere.
@@ -133,7 +133,7 @@ def cross_validate(
     """Fit the nuisance and the columns of a hypothesis, and test them on held-out blocks.
 
     Minimises |P(r − N η − Φ θ)/σ|² + |θ/s|², with P the projector that takes contact forces out. Φ are the
-    columns `(n, nq, p)`, none by default; the prior s `(p,)` says how large parameters may be; the first
+    columns `(n, nq, p)`, none by default; the prior s `(p,)` bounds the parameters; the first
     parameters scale the torque of the joints `gains`. Instruments Z replace least squares by
     Zᵀ P (r − N η − Φ θ) = 0, for columns that hold errors (Wooldridge, *Introductory Econometrics*, ch. 15).
     """

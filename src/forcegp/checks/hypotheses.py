@@ -1,4 +1,4 @@
-"""What may be wrong with a log or a robot file, the finding that it makes, and the log without the fault."""
+"""Possible faults of a log or a robot file, their findings, and the log without the fault."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ from forcegp.robot.model import RobotModel
 LAGS = (1, 2, 3, 4, 6, 8, 11, 15, 20)
 """Delays between torque and motion that are tried, in samples either way."""
 TOOL_MASS = 5.0
-"""How heavy a tool may be that the robot file lacks [kg]."""
+"""Largest mass of a tool that the robot file lacks [kg]."""
 RISES = (0.3, 2.0, 10.0)
 """Factors by which the rise of dry friction may differ from the declared one: its law near rest is rarely
 known, and that of MuJoCo is more gentle."""
@@ -197,7 +197,7 @@ def robot_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray, name: s
 
 
 def inertial_spread(robot: RobotModel) -> Array:
-    """How far the inertial parameters of a robot file may be off, `(10 nq,)`."""
+    """Tolerances of the inertial parameters of a robot file, `(10 nq,)`."""
     mass = robot.mass.numpy()[:, None]
     share = np.repeat([MASS_SHARE, MOMENT_ARM, MOMENT_ARM**2], (1, 3, 6))
     return (np.maximum(mass, 0.01 * mass.max()) * share).ravel()
@@ -244,7 +244,7 @@ DISCRETE = {
 
 
 def plausible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit) -> bool:
-    """Whether the parameters are what a hypothesis says: a tool has a mass, an offset is not a trifle."""
+    """Whether the parameters agree with the hypothesis: a tool has a mass, an offset is not a trifle."""
     if hypothesis.name == "encoder-offset":
         least = max(SMALL_ANGLE, SIGNIFICANT * fit.spread[0])
         return bool(least < abs(fit.theta[0]) <= LARGEST_ANGLE)

@@ -128,7 +128,7 @@ def _clock_finding(log: Log, factor: float) -> Outcome:
     near = [unit for unit in UNITS if abs(factor / unit - 1.0) <= UNIT_TOLERANCE]
     if near:
         kind, repaired = "time-unit", log.t * near[0]
-        text = f"time advances by {log.dt:.4g} per row, and the motion says {factor * log.dt:.4g} s"
+        text = f"time advances by {log.dt:.4g} per row, and by the motion {factor * log.dt:.4g} s"
     else:
         kind, repaired = "time-scale", log.t * factor
         text = f"positions and velocities change {factor:.4g} times as far as the clock allows"
@@ -200,7 +200,7 @@ def _mismatch(kind: str, log: Log, level: Match, wrong: np.ndarray, rate: str, v
 
 
 def _coarse(log: Log, level: Match) -> np.ndarray:
-    """Joints whose changes are of the size of encoder steps, so that nothing can be told of their rate."""
+    """Joints whose changes are of the size of encoder steps, so that their rate cannot be judged."""
     size = np.sqrt((level.change**2).mean(axis=0))
     moves = np.abs(np.diff(log.q, axis=0))
     steps = np.nanmedian(np.where(moves > 0.0, moves, np.nan), axis=0)
@@ -258,7 +258,7 @@ def check_acceleration(system: ConstrainedSystem, log: Log) -> Outcome:
         return [], log
     related = np.abs(level.correlation) > 0.3
     wrong = level.moving & related & ~level.right(tolerance=INSTANT, least=_held_torque(system, log))
-    # An acceleration without relation to the motion shows where its integral is as large as the change.
+    # An acceleration without relation to the motion is found if its integral is as large as the change.
     size = np.sqrt((level.integral**2).sum(axis=0) / np.maximum((level.change**2).sum(axis=0), 1e-300))
     wrong |= level.moving & ~related & ((size < 3.0) | (level.correlation < -0.3))
     if not wrong.any():

@@ -30,7 +30,7 @@ MOVES = 0.02
 OFTEN = 0.05
 """Share of rows beyond the limits from which a wrong unit is considered."""
 UNIT_ROWS = 400
-"""Rows whose torque tells degrees from joints that turn more than once."""
+"""Rows in which the torque separates degrees from joints that turn more than once."""
 
 
 def _limits(system: ConstrainedSystem) -> dict[str, tuple[Array, Array]]:
@@ -65,7 +65,7 @@ def check_degrees(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def _misfit(system: ConstrainedSystem, log: Log) -> float:
-    """Held-out error of the torque, each joint's up to a gain; 0 where no torque tells anything."""
+    """Held-out error of the torque, each joint's up to a gain; 0 where no torque is informative."""
     rows = log.rows(UNIT_ROWS)
     if len(rows) < UNIT_ROWS or not log.tau[rows].any():
         return 0.0

@@ -186,7 +186,7 @@ class Log:
 
 
 Outcome = tuple[list[Finding], Log]
-"""What a check returns: its findings, and the log as those after it should see it."""
+"""Result of a check: its findings, and the corrected log for the checks after it."""
 
 
 def log_of(data: Dataset) -> Log:

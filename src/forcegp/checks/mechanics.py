@@ -1,4 +1,4 @@
-"""What remains of the torque once the faults are explained: friction, offsets, disturbances, and how much."""
+"""Residual torque once the faults are explained: friction, offsets, disturbances, and how much."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ ONE_SIGMA = 84.13
 
 
 def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Signs, orders, gains, delays, gravity, tool, masses, friction, offsets: all that the torque tells."""
+    """Signs, orders, gains, delays, gravity, tool, masses, friction, offsets: all that torques determine."""
     if len(log.rows(LEAST_ROWS)) < LEAST_ROWS:
         raise NotJudgedError(f"fewer than {LEAST_ROWS} usable rows")
     passive = _without_torque(log)

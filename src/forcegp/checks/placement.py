@@ -1,4 +1,4 @@
-"""Do the joint angles place the tip on the surface where the log says that it touches?
+"""Do the joint angles place the tip on the surface in rows labelled as contact?
 
 A tip is centimetres off because the surface lies elsewhere, and the distance is a plane over the path; or
 because the angles are wrong, and one change of them takes it onto the surface in all rows.
@@ -105,7 +105,7 @@ def _offsets(
 def _finding(robot: RobotModel, log: Log, contact: SurfaceContact, alike: list[Hypothesis]) -> Finding:
     names = tuple(dict.fromkeys(log.joint_names[j] for h in alike for j in h.joints))
     listed = (" and " if alike[0].name == "joint-order" and len(alike) == 1 else " or ").join(names)
-    touches = f"the tip touches {contact.name!r} where the log says so if"
+    touches = f"the tip touches {contact.name!r} in rows labelled as contact if"
     if alike[0].name == "encoder-offset":
         offset = float(alike[0].columns[0])  # type: ignore[index]
         added = displacement(robot, alike[0].joints[0], offset)

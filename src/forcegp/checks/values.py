@@ -144,7 +144,7 @@ def check_stuck(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def _expected_change(log: Log, name: str, j: int, a: int, b: int) -> float:
-    """How far a channel should have moved over rows a to b, judged by the channels of the same joint."""
+    """Expected motion of a channel over rows a to b, judged by the channels of the same joint."""
     if name == "q":
         return float(np.ptp(np.cumsum(log.qd[a:b, j])) * log.dt)
     if name == "qd":

@@ -1,4 +1,4 @@
-"""What several commands share: progress bars, results, and reading data for a robot."""
+"""Shared by commands: progress bars, results, and reading data for a robot."""
 
 from __future__ import annotations
 
@@ -141,7 +141,7 @@ def fitted(model: Configured, data: Any, **options: Any) -> FittedModel:
 def check_robot_named(scene: str | None, robot: str | None) -> None:
     """Check that either a scene or a robot was given."""
     if (scene is None) == (robot is None):
-        problems = "nothing says which robot moved", "both --scene and --robot name a robot"
+        problems = "the robot is not named", "both --scene and --robot name a robot"
         raise ForceGPError(problems[scene is not None], hint="give either --scene or --robot")
 
 

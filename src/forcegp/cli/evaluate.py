@@ -41,9 +41,9 @@ def evaluate(
     """Compare a model's predictions with a data set and with trivial predictors.
 
     The trivial predictors are the mean, the robot file alone, and least squares of inertial parameters,
-    viscous and Coulomb friction and offsets. The verdict says how much of the torque beyond gravity the model
-    explains, how far off its motion is in open loop, and its force in contact, if one is logged; the next
-    line whether it is better than each predictor in torque and in acceleration. Errors are in rad/s² (m/s²
+    viscous and Coulomb friction and offsets. The verdict states the share of the torque beyond gravity that
+    the model explains, how far off its motion is in open loop, and its force in contact, if one is logged;
+    the next line compares it with each predictor in torque and in acceleration. Errors are in rad/s² (m/s²
     for sliding joints); coverage is the share of samples within two standard deviations.
 
     With --out, prints the path of a page with the verdict, the errors by joint, the calibration and the
@@ -112,7 +112,7 @@ def _model(model: Path | None, scene: str | None, config: Path | None, train: Pa
         return forcegp.load_model(model)
     if scene is None or train is None:
         raise ForceGPError(
-            "nothing says which model to evaluate",
+            "the model to evaluate is not named",
             expected="--model FOLDER, or --scene and --train to fit one",
         )
     system = forcegp.load_scene(scene).system()

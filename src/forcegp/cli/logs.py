@@ -28,9 +28,7 @@ def import_(
     mapping: Annotated[
         str | None, typer.Option("--mapping", "-m", help="Mapping file, or the name of a bundled one.")
     ] = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Where the data set goes (.parquet).")
-    ] = None,
+    out: Annotated[Path | None, typer.Option("--out", "-o", help="Path of the data set (.parquet).")] = None,
     guess: Annotated[
         Path | None, typer.Option(help="Write a mapping to this file for you to check, and import nothing.")
     ] = None,
@@ -49,7 +47,7 @@ def import_(
 ) -> None:
     """Import a log: CSV, text, Parquet, NumPy, MATLAB, HDF5, ROS bags, MCAP or LeRobot.
 
-    A mapping in TOML says which column is which joint, with units, signs and frames; --guess writes one.
+    A mapping in TOML assigns columns to joints, with units, signs and frames; --guess writes one.
 
     [bold]Examples[/bold]
 
@@ -158,7 +156,7 @@ def check(
 ) -> None:
     """Check a log against a scene before fitting: clock, units, signs, masses, contact, noise, motion.
 
-    The last line says whether to go on. The exit code is 0 where a model can be fitted, 1 where a finding
+    The last line is the verdict. The exit code is 0 where a model can be fitted, 1 where a finding
     makes a fit worthless, and 2 where scene or log cannot be read.
 
     [bold]Examples[/bold]
@@ -222,8 +220,8 @@ def _print(report: Report) -> None:
 def select(
     log: Annotated[Path, typer.Argument(help="Data set to select from, .parquet or .csv.")],
     count: Annotated[int, typer.Option("--count", "-n", min=1, help="Number of training points.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Where the training points go (.parquet).")],
-    rest: Annotated[Path | None, typer.Option(help="Where the test points go (.parquet).")] = None,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Path of the training points (.parquet).")],
+    rest: Annotated[Path | None, typer.Option(help="Path of the test points (.parquet).")] = None,
     split: Annotated[
         Literal["selection", "stretches"],
         typer.Option(help="Test on all points not selected (the paper), or on held-out stretches of motion."),
@@ -232,7 +230,7 @@ def select(
     fraction: Annotated[float, typer.Option(help="Part of the motion that is held out.")] = 0.2,
     margin: Annotated[float, typer.Option(help="Time kept free beside held-out stretches in seconds.")] = 0.0,
     method: Annotated[
-        Literal["farthest", "even", "random"], typer.Option(help="How training points are chosen.")
+        Literal["farthest", "even", "random"], typer.Option(help="Selection of training points.")
     ] = "farthest",
     keep_impacts: Annotated[
         bool, typer.Option("--keep-impacts", help="Keep rows that the log marks as near an impact.")

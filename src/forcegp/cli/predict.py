@@ -28,7 +28,7 @@ WRENCH = "external_wrench"
 def predict(
     model: ModelFile,
     data: DataFile,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Where the predictions go (.parquet).")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Path of the predictions (.parquet).")],
     quantity: Annotated[
         str,
         typer.Option(
@@ -51,7 +51,7 @@ def predict(
         typer.Option(
             "--noise/--no-noise",
             help="Whether the standard deviation is that of a measurement, with the noise of the motor "
-            "torque and of the sensor (of models that know it).",
+            "torque and of the sensor (for models with such noise).",
         ),
     ] = True,
     sensor: Annotated[
@@ -64,7 +64,7 @@ def predict(
 ) -> None:
     """Predict a quantity at the states of a data set.
 
-    The output is the data set with the columns predicted_<quantity> and, for models that know their
+    The output is the data set with the columns predicted_<quantity> and, for models with an
     uncertainty, predicted_<quantity>_std: that of a measurement, with the noise of the motor torque and of
     the sensor; --no-noise leaves these out, as predict in Python does.
 

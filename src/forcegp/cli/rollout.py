@@ -174,7 +174,7 @@ def _learned(path: Path, sample: bool, seed: int) -> PassiveForces:
 
 def simulate(
     scene: SceneName,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Where the log goes (.parquet).")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Path of the log (.parquet).")],
     duration: SimulatedTime = None,
     seed: Annotated[int | None, typer.Option(help="Seed of motion and noise; default: the scene's.")] = None,
     engine: Annotated[str | None, typer.Option(help="pybullet, mujoco or auto; default: scene's.")] = None,

@@ -38,7 +38,7 @@ def view(
         int,
         typer.Option(min=0, help="Function samples whose paths of the tip are drawn, of a structured model."),
     ] = 8,
-    horizon: Annotated[float, typer.Option(min=0.01, help="How far ahead the paths reach in seconds.")] = 1.0,
+    horizon: Annotated[float, typer.Option(min=0.01, help="Length of the predicted paths in seconds.")] = 1.0,
     port: Annotated[int, typer.Option(min=1024, max=65535, help="Port of the page.")] = 8080,
     as_json: AsJson = False,
 ) -> None:

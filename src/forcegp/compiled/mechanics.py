@@ -1,4 +1,4 @@
-"""What the equations of motion of a state need, from one compiled call: M, Q_C, Q_G and moving points."""
+"""Terms of the equations of motion of a state, from one compiled call: M, Q_C, Q_G and moving points."""
 
 from __future__ import annotations
 

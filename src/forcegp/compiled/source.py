@@ -220,7 +220,7 @@ Kernel = Callable[[Sequence[Tensor], Tensor], None]
 """Reads contiguous arrays `(B, nq)` and fills the contiguous result `(B, …)`."""
 
 SAMPLES_PER_THREAD = 512
-"""A thread is started for no fewer samples than take longer than starting it."""
+"""Minimum number of samples per thread, to amortise its start-up."""
 
 
 def cpu_kernel(text: str) -> Kernel:

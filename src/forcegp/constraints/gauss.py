@@ -114,8 +114,8 @@ class Equations:
         c, cd: `(*batch, m)` constraint error and its rate, of all contacts, active or not.
         Q_C, Q_G, Q_D: `(*batch, nq)` bias, gravity and dissipative joint force.
         contact_points: the touching point of each surface contact, by name.
-        links: computes the poses and the motion of the links at the states, where more of the kinematics is
-            asked for.
+        links: computes the poses and the motion of the links at the states, where more of the
+            kinematics is needed.
         holds: `(*batch, m)` bool, rows of A that hold: those of closed contacts, along the surface where they
             stick.
     """
@@ -138,12 +138,12 @@ class Equations:
 
     @property
     def poses(self) -> LinkPoses:
-        """Where the links are."""
+        """Poses of the links."""
         return self._links[0]
 
     @property
     def motion(self) -> LinkMotion:
-        """How the links move."""
+        """Velocities of the links."""
         return self._links[1]
 
     @cached_property
@@ -222,7 +222,7 @@ class Equations:
 
     @property
     def Q_K(self) -> JointVector:
-        """Q_C + Q_G + Q_D, the force that the robot file knows, without actuation."""
+        """Q_C + Q_G + Q_D, the force of the robot file without actuation."""
         return self.Q_C + self.Q_G + self.Q_D
 
     def free_acceleration(self, Q: JointVector) -> JointVector:

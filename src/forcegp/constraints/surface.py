@@ -45,7 +45,7 @@ class Surface(ABC):
             distance: along the normal [m].
 
         Raises:
-            ParameterError: the surface does not know its distance.
+            ParameterError: the surface has no signed distance.
         """
         raise ParameterError(
             f"{type(self).__name__} cannot be raised by {distance} m",
@@ -209,7 +209,7 @@ class Cylinder(_Round):
 
 
 SurfaceSchema = Annotated[Plane | Sphere | Cylinder, Field(discriminator="type")]
-"""The surfaces that a file can describe; a file says `type = "plane"`, `"sphere"` or `"cylinder"`."""
+"""The surfaces that a file can describe, with `type = "plane"`, `"sphere"` or `"cylinder"`."""
 
 
 @dataclass(frozen=True)

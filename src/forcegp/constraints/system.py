@@ -211,7 +211,7 @@ class ConstrainedSystem:
         robot = self.robot
         robot.check_state(q=q, qd=qd)
         if q.shape != qd.shape:
-            raise ShapeError("q and qd are not one batch", expected=tuple(q.shape), got=tuple(qd.shape))
+            raise ShapeError("q and qd have different batch shapes", expected=[*q.shape], got=[*qd.shape])
         poses, motion, terms = self._terms(q, qd)
         robot_terms = dynamics.known_terms(robot, poses, motion, qd)
         return self._assembled(q, qd, active, robot_terms, terms, lambda: (poses, motion))
@@ -257,7 +257,7 @@ class ConstrainedSystem:
         """
         self.robot.check_state(force=force)
         if force.shape != q.shape:
-            raise ShapeError("q and force are not one batch", expected=tuple(q.shape), got=tuple(force.shape))
+            raise ShapeError("q and force have unequal batch shapes", expected=[*q.shape], got=[*force.shape])
         with torch.no_grad():
             eom = self.equations(q, qd, active)
 
@@ -273,7 +273,7 @@ class ConstrainedSystem:
         return torch.tensor(rows, dtype=torch.int64, device=self.robot.device)
 
     def _terms(self, q: Tensor, qd: Tensor) -> tuple[LinkPoses, LinkMotion, list[ConstraintTerms]]:
-        """Where the links are and how they move, and what the constraints say there."""
+        """Poses and velocities of the links, with the constraints there."""
         poses = kinematics.link_poses(self.robot, q)
         motion = kinematics.link_motion(self.robot, poses, qd)
 

@@ -36,7 +36,7 @@ MAX_STEP = 0.2
 
 @runtime_checkable
 class ContactSystem(Protocol):
-    """What contact mechanics ask of a robot with its constraints."""
+    """Interface of a robot with constraints to contact mechanics."""
 
     @property
     def contacts(self) -> Sequence[Constraint]:

@@ -203,7 +203,7 @@ STARTS = 64
 
 @dataclass(frozen=True)
 class Plan:
-    """What the controller follows.
+    """Reference of the controller.
 
     Attributes:
         contacts: names of the tool's contacts, none in free space.

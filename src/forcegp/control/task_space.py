@@ -48,7 +48,7 @@ class Gains:
 
 
 class Target(NamedTuple):
-    """What the controller is to reach at an instant.
+    """Target of the controller at an instant.
 
     Attributes:
         position, velocity, acceleration: `(*batch, 3)` of the tool point [m], [m/s], [m/s²].

@@ -190,7 +190,7 @@ def check_joints(have: Sequence[str], want: Sequence[str], robot: str) -> None:
 
 
 def lock_hint(joints: Sequence[str]) -> str:
-    """How to treat joints that a log lacks, such as those of a gripper, as fixed."""
+    """Hint to treat joints that a log lacks, such as those of a gripper, as fixed."""
     positions = ", ".join(f"{joint} = 0.0" for joint in joints)
     return f"if they did not move, lock them: locked_joints = {{ {positions} }} under [robot] in a scene file"
 

@@ -142,7 +142,7 @@ class Dataset(Fields):
         """`(n, len(contacts))` bool: which of the named contacts are closed.
 
         Raises:
-            DataError: the data do not say whether a contact is closed.
+            DataError: the state of a contact is not logged.
         """
         return checks.contact_table(self, contacts)
 
@@ -179,7 +179,7 @@ class Dataset(Fields):
             RobotMismatchWarning: the parameters of the robot differ from those of the logged one.
 
         Raises:
-            DataError: joints are missing, unknown or in another order; the hint says what to call.
+            DataError: joints are missing, unknown or in another order; the hint names the remedy.
         """
         checks.check_robot(self, robot)
 

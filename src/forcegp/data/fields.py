@@ -1,4 +1,4 @@
-"""Header and columns of a data set, as its checks and its files see them."""
+"""Header and columns of a data set, for its checks and files."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ class DataHeader(Header):
         derived: joint vectors that a filter computed from others of the log.
         imported: kind and sentence of what an import found in the log, doubts about its mapping among them.
         unmeasured_torques: joints whose motor torque was not measured; theirs is 0 in the columns.
-        joint_names, contact_names: in the order of the columns; empty where a log does not say.
+        joint_names, contact_names: in the order of the columns; empty if not logged.
     """
 
     FORMAT: ClassVar[str] = "forcegp-dataset"

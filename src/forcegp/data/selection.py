@@ -1,4 +1,4 @@
-"""How a log is prepared for learning: points selected, stretches held out, impacts left out, noise added.
+"""Preparation of a log for learning: points selected, stretches held out, impacts left out, noise added.
 
 Farthest point sampling selects few points that cover the inputs of a log (section 5.3 of the paper). If
 training points come from the same stretch as the test rows, as in the paper, the test error measures
@@ -19,7 +19,7 @@ from forcegp.data.dataset import Dataset
 from forcegp.errors import DataError, check_name
 
 INPUTS = ("q", "qd", "tau")
-"""What a regression model sees of a sample."""
+"""Inputs of a regression model."""
 
 
 def standardized_inputs(data: Dataset) -> Float[Tensor, "n d"]:

@@ -209,7 +209,7 @@ class StreamedDataset:
 
     @cached_property
     def header(self) -> DataHeader:
-        """What the headers of all files agree on."""
+        """Common content of the headers of all files."""
         headers = [header for _, header in self._shapes]
         return headers[0] if len(headers) == 1 else common_header(headers)
 
@@ -222,7 +222,7 @@ class StreamedDataset:
 
         Args:
             start: number of pieces to skip.
-            share: (r, k) leaves every piece but the r-th of each k empty, as it belongs to another process.
+            share: (r, k) yields data only for piece r of every k, as it belongs to another process.
 
         Raises:
             DataError: a file is damaged or not a valid log, or differs from the first one in its columns.

@@ -35,7 +35,7 @@ GROUP_ROWS = 1 << 18
 
 
 class IgnoredColumnsWarning(UserWarning):
-    """Columns of a log that are not of a name this library knows were left out."""
+    """Columns of a log with unknown names were left out."""
 
 
 def check_ending(path: str | Path) -> None:

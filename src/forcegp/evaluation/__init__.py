@@ -1,4 +1,4 @@
-"""How good a model is: errors and uncertainty by joint, trivial predictors beside it, and a verdict."""
+"""Quality of a model: errors and uncertainty by joint, trivial predictors beside it, and a verdict."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""What a user wants of a model: torque explained beyond gravity, motion in open loop, response to a torque.
+"""Criteria of a good model: torque explained beyond gravity, motion in open loop, response to a torque.
 
 A torque error is that of the inverse dynamics, M(q)(predicted − measured q̈) with the mass matrix of the
 predictor's robot: the torque that it lacks for the measured acceleration. Of the torque beyond gravity, a

@@ -48,7 +48,7 @@ Moments = tuple[Tensor, Tensor | None]
 def in_chunks(
     predict: Callable[[Dataset], Moments], data: Dataset, progress: Progress | None = None
 ) -> Moments:
-    """What `predict` returns for all samples, asked for `CHUNK_STATES` at a time."""
+    """Results of `predict` for all samples, `CHUNK_STATES` at a time."""
     parts = []
     for first in range(0, len(data), CHUNK_STATES):
         parts.append(predict(data[first : first + CHUNK_STATES]))

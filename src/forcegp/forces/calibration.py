@@ -1,4 +1,4 @@
-"""What is left of measured torques after a fit: its correlation in time, and its size on held-out stretches.
+"""Residual torques of a fit: their correlation in time, and their size on held-out stretches.
 
 Temperature, hysteresis and filters leave residuals that are correlated in time, so a log holds less evidence
 than its samples suggest. The integrated autocorrelation time says how much less. The variance of a new
@@ -109,7 +109,7 @@ def _covariance(x: Tensor, segment: Tensor, lag: int) -> Tensor:
 
 
 def _motions(training: Training) -> list[int]:
-    """Measurements of accelerations, or of the joint forces that they and a force sensor show."""
+    """Measurements of accelerations, or of the joint forces from them and a force sensor."""
     return [i for i, quantity in enumerate(training.quantities) if quantity in ("qdd", "joint_force")]
 
 
@@ -199,8 +199,8 @@ def calibrated_noise(problem: Problem, hyperparameters: Mapping[str, Tensor]) ->
 def held_out_torque_std(problem: Problem, hyperparameters: Mapping[str, Tensor], least: Tensor) -> Tensor:
     """Standard deviation of torque noise `(nq,)` with which held-out stretches have unit normalised errors.
 
-    Each stretch is predicted from all others with the hyperparameters as they are. What accelerations show
-    of the error of the force is r = M(q̈ − E q̈) = P ε, with P = I in free motion. Of joint i, s_i² solves
+    Each stretch is predicted from all others with the hyperparameters as they are. The error of the
+    force in accelerations is r = M(q̈ − E q̈) = P ε, with P = I in free motion. Of joint i, s_i² solves
     mean(r_i² / (Σ_k P_ik² s_k² + Var r_i)) = 1 over all samples at which P_ii is more than a half.
 
     Args:

@@ -150,7 +150,7 @@ def momentum_force(robot: RobotModel, q: Tensor, qd: Tensor) -> tuple[Tensor, Te
 
 @dataclass(frozen=True)
 class MomentumLog:
-    """What the filter reads of a log, as arrays over n samples in order of time.
+    """Inputs of the filter, as arrays over n samples in order of time.
 
     Attributes:
         t: `(n,)` time [s].

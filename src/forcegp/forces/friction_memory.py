@@ -60,7 +60,7 @@ def _weight(robot: RobotModel, q: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class FrictionMemory:
-    """What a fit corrects of its torques.
+    """Corrections of the torques of a fit.
 
     Attributes:
         weights: of the features, `(nq, f)` [N m, N].
@@ -75,7 +75,7 @@ class FrictionMemory:
 
     @classmethod
     def of(cls, hyperparameters: Mapping[str, Tensor]) -> FrictionMemory | None:
-        """What a fit has learned, if its log shows it."""
+        """The memory that a fit has learned, if its log determines it."""
         if WEIGHTS not in hyperparameters:
             return None
         return cls(*(hyperparameters[name] for name in (WEIGHTS, SHARE, CORRELATION)))

@@ -1,6 +1,6 @@
 """Which inertia a measured robot has: that of its file, with drives that the file lacks, or another one.
 
-Held-out stretches of the log say whether an estimate predicts torques better than the file
+Held-out stretches of the log decide whether an estimate predicts torques better than the file
 (`inverse_dynamics.py`). Least squares make inertia too small where accelerations are noisy, and the
 likelihood of accelerations given torques makes it too large where the torque is noisy and a controller chose
 the motion. The equations of motion a little earlier and later are instruments that neither disturbs. The
@@ -153,12 +153,12 @@ WEIGHTS = tuple(2.0 ** (-k / 2) for k in range(20, -1, -1))
 
 @dataclass(frozen=True)
 class Inertia:
-    """What the log says of the inertia.
+    """Inertia that the log determines.
 
     Attributes:
         robot: that of the file, with the inertia that was found.
         identified: whether inertial parameters of links were, of which some uncertainty remains.
-        doubts: what a user should know.
+        doubts: warnings for the user.
     """
 
     robot: RobotModel
@@ -170,7 +170,7 @@ class Inertia:
 def inertia_of(
     system: ConstrainedSystem, friction: JointFrictionPrior, mean: ForceMean, training: Training
 ) -> Inertia:
-    """What the samples in free motion say of the inertia of a measured robot.
+    """Identify the inertia of a measured robot from samples in free motion.
 
     Args:
         system: robot and contacts of the robot file.
@@ -183,7 +183,7 @@ def inertia_of(
     remembering = rows.with_memory()
     identified = rigid_robot(robot, remembering)
     if identified is not None:
-        text = "held-out torques ask for other inertial parameters than the robot file's, now identified"
+        text = "held-out torques favour other inertial parameters than the robot file's, now identified"
         return Inertia(identified, True, (text, *_told(robot, identified.armature - robot.armature)))
     M = mass_matrix(robot, rows.q)
     armature = _damped(rows, M, _lacking(remembering, M))
@@ -194,7 +194,7 @@ def inertia_of(
 
 
 def _told(robot: RobotModel, armature: Tensor) -> tuple[str, ...]:
-    """What a user is told of drives whose inertia was found `(nq,)`."""
+    """Message on drives with identified inertia `(nq,)`."""
     pairs = zip(robot.joint_names, armature.tolist(), strict=True)
     found = ", ".join(f"{name} {a:.2g}" for name, a in pairs if a > 0.0)
     lacks = "the drives have inertia that the robot file lacks [kg m², kg for sliding joints]"
@@ -242,7 +242,7 @@ def _damped(rows: Rows, M: Tensor, found: Tensor) -> Tensor:
 
     Args:
         M: mass matrix of the file at the samples.
-        found: inertia of drives that torques ask for.
+        found: inertia of drives identified from torques.
     """
     remembering, C = rows.with_memory(), torch.diag_embed(rows.qdd)
     if _excess(remembering, sums(remembering, C).total(), M, found) <= 0.0:

@@ -56,8 +56,8 @@ class Rows:
         q, qd, qdd: `(n, nq)`.
         residual: torque that the robot of the file leaves `(n, nq)`.
         friction: Φ, features of the friction of each joint and its offset `(n, nq, f)`.
-        slides: `(n, nq)` bool, joints that move; the friction of one that sticks is whatever holds it, so its
-            torque says nothing there.
+        slides: `(n, nq)` bool, joints that move; the friction of one that sticks holds it, so its
+            torque is uninformative there.
         group: stretch of each sample `(n,)`, from 0 without gaps.
         segment: `(n,)`.
         partner: index of each sample's partner `(n,)`; its own where the log has none.

@@ -84,7 +84,7 @@ class Measurement:
 
 @dataclass(frozen=True)
 class Training:
-    """What a posterior is conditioned on.
+    """Data that a posterior is conditioned on.
 
     Attributes:
         measurements: the values.
@@ -126,7 +126,7 @@ class Training:
 
     @property
     def quantities(self) -> tuple[str, ...]:
-        """What was measured."""
+        """The measured quantities."""
         return tuple(m.quantity for m in self.measurements)
 
     @property
@@ -343,7 +343,7 @@ COLUMNS: Mapping[str, Callable[[Dataset, ConstrainedSystem], Tensor]] = {
     "contact_friction": lambda data, _: data.Q_z,
     "total_force": lambda data, _: data.Q + data.Q_z,
 }
-"""Where a data set holds each quantity that can be measured."""
+"""Columns of each quantity that can be measured."""
 
 
 def measurement_of(

@@ -120,14 +120,14 @@ and g `(nq,)` [N m, N]."""
 OUTERMOST = 0.01
 """Share of the training samples that lies beyond either limit of the region."""
 RELATIVE = 0.05
-"""Growth g over the typical load of a joint that is expected before the log says more: torque constants and
+"""Growth g over the typical load of a joint that is expected before learning: torque constants and
 friction that depends on load are uncertain by some 5 %."""
 FAR = 3.0
 """Distance beyond the trained region from which a prediction warns."""
 
 
 def initial_torque_noise(residual: Tensor) -> dict[str, Tensor]:
-    """Where learning begins, from the root mean square of unexplained torque `(nq,)` [N m, N]."""
+    """Start of learning, from the root mean square of unexplained torque `(nq,)` [N m, N]."""
     std = (0.5 * residual).clamp(min=1e-4).log().double()
     return {
         TORQUE_NOISE: std,
@@ -200,7 +200,7 @@ def warnings_beyond(distance: Tensor, joints: Sequence[str]) -> tuple[str, ...]:
 
 
 def hidden_variance(tensors: Mapping[str, Tensor], at: States, external: Tensor | None) -> Tensor:
-    """Variance of forces that neither the state nor a torque sensor tells, `(n, nq)`: of joints that stick,
+    """Variance of forces that neither state nor torque sensor determines, `(n, nq)`: of joints that stick,
     and unknown ones of stated size `(nq,)`."""
     variance = stick_variance(tensors, at)
     return variance if external is None else variance + external**2

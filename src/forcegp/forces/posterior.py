@@ -104,7 +104,7 @@ class ForcePosterior:
         return self.process.priors
 
     def shift(self, p: int, features: Features) -> Tensor | float:
-        """What samples of the latent force of prior p must be moved by to have the mean that is predicted."""
+        """Shift of samples of the latent force of prior p that gives them the predicted mean."""
         if not self.process.pinned:
             return 0.0
         return self.means.latent_mean(p, features) - self.latent.latent_mean(p, features)

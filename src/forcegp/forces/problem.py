@@ -38,7 +38,7 @@ OWN = tuple(name + "." for name in RESERVED)
 MIXED = "." + MIXING
 """End of the names of what operators learn."""
 SHOWN = 10.0
-"""Independent samples at which accelerations show the torque of a joint, from which its noise is learned."""
+"""Independent samples with accelerations sensitive to a joint's torque, from which its noise is learned."""
 UNSHOWN = 0.1
 """Part of its load by which the torque of a joint is uncertain, with its friction, where nothing shows it."""
 
@@ -61,7 +61,7 @@ def noise_key(measurement: int) -> str:
 
 @dataclass(frozen=True)
 class Problem:
-    """What the likelihood of force priors is made of.
+    """Parts of the likelihood of force priors.
 
     Attributes:
         system: robot and contacts, with the robot as it is where θ_A is not learned.
@@ -207,7 +207,7 @@ class Problem:
 
     @torch.no_grad()
     def hidden_torque(self) -> Tensor:
-        """Standard deviation of what may act on joints that accelerations hardly show, 0 for others `(nq,)`.
+        """Standard deviation of torques with hardly any effect on accelerations, 0 for other joints `(nq,)`.
 
         In contact, a force along the constraint changes no acceleration. A joint that pushes there has P_ii
         near zero, and neither its noise nor its friction can be told from that of other joints. At most, it
@@ -269,7 +269,7 @@ PIECE_SAMPLES = 8192
 
 @dataclass(frozen=True, eq=False)
 class Totals:
-    """What sparse conditioning keeps of the pieces that it has seen.
+    """State of sparse conditioning after some pieces.
 
     Attributes:
         sums: over the whitened rows.
@@ -380,7 +380,7 @@ def is_sparse(inference: str, priors: Sequence[ForcePrior], samples: int) -> boo
     """Whether inference is sparse: on request, for finite priors, and beyond `EXACT_SAMPLES`.
 
     Raises:
-        ModelError: sparse inference is asked for, and a force is a function of time.
+        ModelError: sparse inference with a force that is a function of time.
     """
     if any(prior.in_time for prior in priors):
         if inference == "sparse":
@@ -456,7 +456,7 @@ def lost_by_inducing(posterior: ForcePosterior) -> tuple[dict[str, Any], tuple[s
     """Which inference a posterior has, and what a sparse one loses by its inducing points.
 
     Returns:
-        The fields of `FitResult`, and a warning where the points miss much of what the data could tell.
+        The fields of `FitResult`, and a warning where the points miss much of the information in the data.
     """
     if not isinstance(posterior.latent, SparsePosterior):
         return {"inference": "exact"}, ()

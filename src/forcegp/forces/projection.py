@@ -188,7 +188,7 @@ def whiten(
         )
         / std[..., None],
     )
-    # Noise of the state reaches the directions that the constraint fixes too, so their rows tell of it.
+    # Noise of the state reaches the directions that the constraint fixes too, so their rows contain it.
     if measurement.quantity == "qdd" and system.m > 0 and noise.state is None:
         return _without_fixed(everything, at.eom, measurement.values, std, noise.weight)
     block, log_determinant = everything.whitened(noise.weight)

@@ -28,7 +28,7 @@ from forcegp.errors import ModelError, ShapeError, UnknownNameError
 
 @dataclass(frozen=True)
 class States:
-    """A batch of robot states with what the equations of motion say there.
+    """A batch of robot states with their equations of motion.
 
     Attributes:
         q, qd, tau: `(n, nq)`.
@@ -261,16 +261,16 @@ OPEN = (
     "the point of contact {} cannot move against it: its force is not determined",
     "contacts {} hold the robot in the same direction: only the sum of their forces is determined",
 )
-"""What motion leaves open of the forces of contacts."""
+"""Contact forces that motion does not determine."""
 
 
 class Hidden(NamedTuple):
-    """What motion leaves open of quantities.
+    """Parts of quantities that motion does not determine.
 
     Attributes:
         whole: `(n, d)` bool, components that are not determined at all.
         shared: `(n, d, d)` C R Cᵀ, how contacts share their load, where R projects on Aᵀμ = 0.
-        seen: `(n,)` number of directions that motion shows of the load that is shared.
+        seen: `(n,)` number of directions of the shared load that motion determines.
         doubts: the same in words.
     """
 
@@ -294,7 +294,7 @@ class Hidden(NamedTuple):
 def hidden_forces(
     system: ConstrainedSystem, at: States, parts: Mapping[str, slice], never: Sequence[str] = ()
 ) -> Hidden | None:
-    """What is hidden of some quantities; `None` where all of them are determined.
+    """Undetermined parts of some quantities; `None` if all of them are determined.
 
     Args:
         parts: the rows of each quantity, as `affine_maps` gives them.

@@ -1,4 +1,4 @@
-"""Where L-BFGS starts, and the search from there: initial values, bounds, weak priors, warm starts, restarts.
+"""Search for hyperparameters by L-BFGS: initial values, bounds, weak priors, warm starts, restarts.
 
 Inputs are standardized, so a length-scale of about the square root of their number relates typical samples. A
 log-normal prior around this start, with a different width on either side, keeps the length-scales of
@@ -37,7 +37,7 @@ LIMITS = {
 }
 """Bounds of what has a scale of its own, whatever the start."""
 REACH = {"log_lengthscale": (4.0, 8.0)}
-"""How far the others may move below and above their start, in e-folds; `FAR` where not named. An input with a
+"""Range of the others below and above their start, in e-folds; `FAR` where not named. An input with a
 length-scale 8 e-folds above its start no longer matters."""
 FAR = (7.0, 7.0)
 AT_BOUND = 1e-6
@@ -141,7 +141,7 @@ def initial_hyperparameters(
 def _force_scale(p: int, blocks: Sequence[Block], commensurate: bool, beyond_noise: bool) -> Tensor:
     """Root mean square of the least-squares force of prior p, `(components,)`.
 
-    Rows tell only the sum of components that act along one direction. The least norm divides it evenly where
+    Rows only determine sums of components along one direction. The least norm divides it evenly where
     all have one unit; that of viscous and dry friction it would divide by their units, so each of these
     starts as if it were alone.
     """
@@ -221,7 +221,7 @@ def doubts_at_bounds(tensors: Mapping[str, Tensor], box: Bounds) -> tuple[str, .
 
 
 def _kind(key: str) -> str:
-    """What a hyperparameter is, the last part of its name."""
+    """The kind of a hyperparameter, the last part of its name."""
     return key.rsplit(".", 1)[-1]
 
 
@@ -278,7 +278,7 @@ def warm_start_sizes(samples: int, first: int | None) -> list[int]:
 
 @dataclass(frozen=True)
 class Search:
-    """How hyperparameters are searched.
+    """Search of hyperparameters.
 
     Attributes:
         start: default initial values of what is learned, and centre of the weak priors.
@@ -328,7 +328,7 @@ class Search:
         return problem.negative_log_likelihood(kernel_parameters({**self.held, **tensors}), rows) + weak
 
     def _warmed(self, problem: Problem, cold: Tensors) -> Tensors:
-        """Where to begin on all data: what fewer samples taught, unless the cold start is better."""
+        """Start on all data: the end of learning on fewer samples, unless the cold start is better."""
         first = cold
         for samples in warm_start_sizes(problem.training.samples, self.options.warm_start):
             small = dataclasses.replace(problem, training=problem.training.thinned(samples))

@@ -25,7 +25,7 @@ TRUNCATION = 1e-12
 """Eigenvalues of the inducing points' covariance below this fraction of the largest are dropped.
 
 Kernels are accurate to about 10⁻¹⁵ of their scale, so an eigenvalue at the threshold is to 10⁻³. Where the
-prior is a million times as strong as the noise, a threshold of 10⁻¹⁰ loses what the data could tell.
+prior is a million times as strong as the noise, a threshold of 10⁻¹⁰ loses information in the data.
 """
 
 

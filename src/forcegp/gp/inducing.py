@@ -1,4 +1,4 @@
-"""Where inducing points are and how many, from the data: greedy conditional variance.
+"""Selection of inducing points from the data: greedy conditional variance.
 
 Each step adds the sample of which the points so far miss most, Σ_k S_kk Var(f_k(x) | f(Z)): what the trace
 term of the collapsed bound counts (pivoted partial Cholesky factorisation; Burt, Rasmussen & van der Wilk
@@ -57,7 +57,7 @@ def select_inducing(
 ) -> list[Selection]:
     """Choose inducing points of each process among the samples of blocks.
 
-    A process that no row shows, or whose kernel has a finite number of features, gets none.
+    A process without effect on any row, or with a finite number of features, gets none.
 
     Args:
         rows: number of rows that will be conditioned on, of which these are a part; all by default.

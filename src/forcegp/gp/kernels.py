@@ -34,7 +34,7 @@ Initial = dict[str, Tensor]
 LARGEST_EXPONENT = 300.0
 """exp(−300) is far below rounding and far above the denormal numbers that slow processors down."""
 LINEAR_PAIRS = 8
-"""How many times fewer random features a factor of a product has for each linear factor of the other one."""
+"""Divisor of the random features of a factor of a product for each linear factor of the other one."""
 
 
 def sub(params: Parameters, prefix: str) -> dict[str, Tensor]:

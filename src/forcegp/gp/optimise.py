@@ -26,11 +26,12 @@ Bounds = Mapping[str, tuple[float | Tensor, float | Tensor]]
 OPTIMIZERS = ("lbfgs", "adam")
 FIRST_STEP = 2.0
 """Largest change of an entry in the first step of L-BFGS in a box; of logarithms, two e-folds."""
+STOPPED = ("converged", "stopped at the limit of iterations", "the line search found no smaller objective")
 
 
 @dataclass(frozen=True)
 class LearningOptions:
-    """How to learn.
+    """Options of learning.
 
     Args:
         optimizer: `"lbfgs"` or `"adam"`.
@@ -73,7 +74,7 @@ class LearningOptions:
 
 @dataclass(frozen=True)
 class Learned:
-    """Where learning ended.
+    """Result of learning.
 
     Attributes:
         tensors: the best ones seen.
@@ -97,7 +98,7 @@ class Learned:
 
     @property
     def outcome(self) -> dict[str, Any]:
-        """How learning went, by the fields of `FitResult`."""
+        """Course of learning, by the fields of `FitResult`."""
         return {
             "converged": self.converged,
             "evaluations": self.evaluations,
@@ -217,8 +218,7 @@ def _lbfgs(
         )
     except _SpentError:
         return False, f"stopped after {options.max_evaluations} evaluations"
-    message = result.message if isinstance(result.message, str) else result.message.decode()
-    return bool(result.success), message
+    return bool(result.success), STOPPED[min(result.status, 2)]
 
 
 def _flattened(tensors: Iterable[Tensor]) -> np.ndarray:

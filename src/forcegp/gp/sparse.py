@@ -78,7 +78,7 @@ MISSED = 0.1
 
 @dataclass(frozen=True)
 class Diagnostics:
-    """What a sparse posterior loses by its inducing points.
+    """Loss of a sparse posterior by its inducing points.
 
     Attributes:
         size: number of basis functions.
@@ -201,7 +201,7 @@ class SparsePosterior:
 
     @cached_property
     def measured(self) -> tuple[bool, ...]:
-        """Of each process, whether any row shows it; the samples change nothing about the others."""
+        """Of each process, whether it affects any row; the samples change nothing about the others."""
         # The factor of A = I + G is that of the identity where G is zero.
         diagonal = self.L.diagonal().abs()
         slices = (self.basis.of_process(p) for p in range(len(self.basis.parts)))
@@ -305,7 +305,7 @@ class SparsePosterior:
 
     @cached_property
     def diagnostics(self) -> Diagnostics:
-        """What the inducing points miss of what the samples determine."""
+        """Variance that the samples determine and the inducing points miss."""
         # tr A⁻¹G = size − tr A⁻¹ = size − |L⁻ᵀ|²
         inverse = sum((block**2).sum() for block in self._inverse_factor)
         size = self.basis.size

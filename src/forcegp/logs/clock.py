@@ -139,7 +139,7 @@ def join_stream(
 UNEVEN = 0.02
 """Largest departure of a time step from the usual one, as a fraction, that passes for even."""
 SMOOTH = ("q", "qd")
-"""What is interpolated by a cubic spline; noisier quantities are interpolated linearly."""
+"""Quantities interpolated by a cubic spline; noisier quantities are interpolated linearly."""
 
 
 def onto(t: Array, values: Array, at: Array, cubic: bool = False) -> Array:

@@ -105,7 +105,7 @@ def multiplier(signals: Signals, system: ConstrainedSystem, contact: SurfaceCont
 def _evidence(
     signals: Signals, system: ConstrainedSystem, mapping: Mapping, contact: SurfaceContact, source: str
 ) -> Array:
-    """What a contact's state is read from, `(n,)`: c(q) [m], the sensor's n·F [N], or λ [N]."""
+    """Signal that determines a contact's state, `(n,)`: c(q) [m], the sensor's n·F [N], or λ [N]."""
 
     def normal_force(q: torch.Tensor, reading: torch.Tensor) -> torch.Tensor:
         force = _wrench(system.robot, mapping, q, reading)[0]
@@ -191,7 +191,7 @@ def detect(
         if name not in sections:
             raise mapping.error(
                 ("contact",),
-                f"nothing says whether contact {name!r} is closed",
+                f"no source determines whether contact {name!r} is closed",
                 f"[contact.{name}] with source = column, wrench, multiplier, distance, always or never",
             )
         source = sections[name].source

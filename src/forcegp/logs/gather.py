@@ -1,7 +1,7 @@
 """From a table and its mapping to quantities in SI units, in the robot's joint order.
 
 Motor side and joint side, currents and torques, signs and offsets are one factor per joint. A reading r is
-y = s k (r − o): o what the sensor shows at zero, in the unit of the column; s = ±1; and k the unit, times the
+y = s k (r − o): o the reading at zero, in the unit of the column; s = ±1; and k the unit, times the
 torque constant K_t for a current. Through a gear of ratio N, a motor turns N times as fast as its joint and a
 joint bears N times the motor's torque: q = q_m / N, τ = N τ_m.
 """

@@ -1,4 +1,4 @@
-"""What headings say: the column of time, families of columns with one member per joint, units, sensors.
+"""Contents of headings: the column of time, families of columns with one member per joint, units, sensors.
 
 Columns without headings are recognised by their values.
 """
@@ -173,7 +173,7 @@ def _families(stream: Stream, robot: RobotModel) -> list[Family]:
 
 
 def _rate(family: Family, quantity: str) -> float:
-    """How well a family's name fits a quantity; 0 where it does not."""
+    """Agreement of a family's name with a quantity; 0 for none."""
     words = tokens(family.pattern.replace("{joint}", " "))
     if not any(word in WORDS[quantity] for word in words):
         return 0.0
@@ -185,7 +185,7 @@ def _rate(family: Family, quantity: str) -> float:
 
 
 def _match_joints(robot: RobotModel, draft: Draft) -> None:
-    """What the log calls each joint, from the names of the positions."""
+    """Names of the joints in the log, from the names of the positions."""
     names = list(draft.families["position"].columns)
     if all(name.isdigit() for name in names):
         draft.say("joints", "the log numbers its joints; they were taken from base to tip", doubt=True)

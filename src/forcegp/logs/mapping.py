@@ -315,7 +315,7 @@ def parse_mapping(content: bytes, source: str) -> Mapping:
 
 
 def _check(mapping: Mapping) -> None:
-    """What the tables cannot say by themselves: units, and keys that need each other."""
+    """Checks across tables: units, and keys that need each other."""
     sections = mapping.sections
     for name in ("position", "velocity", "acceleration", "torque"):
         section = mapping.quantity(name)
@@ -388,7 +388,7 @@ def default_mapping(path: str | Path, system: ConstrainedSystem) -> Mapping:
     if "header" in names and names >= {f"{n}.{joint}" for n in ("position", "effort") for joint in joints}:
         return load_mapping("ros_joint_states")
     raise MappingError(
-        f"{path}: the names of the columns do not say what they are",
+        f"{path}: the quantities of the columns are unclear",
         expected=f"t, q.{joints[0]}, tau.{joints[0]}, …, or a mapping",
         got=", ".join(table.names[:12]) + (", …" if len(table.names) > 12 else ""),
         hint="write a mapping by --guess mapping.toml, check it, and pass it by --mapping",

@@ -32,7 +32,7 @@ LEARNED_ROWS = 2000
 LOG_RHO = (-30.0, 8.0)
 """Range of log ρ: from a parabola over any window to no smoothing at all."""
 DIFFUSE = 1e8
-"""Prior variance of the scaled state about the first row, in units of σ²: it says nothing."""
+"""Prior variance of the scaled state about the first row, in units of σ²: uninformative."""
 SETTLED = 1e-10
 """Relative change of the covariance from row to row below which it counts as stationary."""
 

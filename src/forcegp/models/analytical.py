@@ -37,7 +37,7 @@ ADAM = BatchOptions(epochs=30, batch=128, learning_rate=0.05, patience=10)
 
 
 class AnalyticalSettings(Window):
-    """What is kept of an analytical model besides its tensors; the robot is the learned one."""
+    """Saved settings of an analytical model besides its tensors; the robot is the learned one."""
 
     analytical_parameters: dict[str, tuple[str, ...]]
     seed: int

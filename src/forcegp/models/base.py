@@ -1,6 +1,6 @@
 """Models of the forward dynamics: a specification, and the fitted model that predicts.
 
-`AccelerationFit` is that of models of accelerations alone, which know neither contacts nor forces.
+`AccelerationFit` is that of models of accelerations alone, which have neither contacts nor forces.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class FittedModel(HasResult, Predictor):
         return fit_table(repr(self), self.result, self.described())
 
     def described(self) -> list[tuple[str, object]]:
-        """What was learned, by name, for tables."""
+        """Learned values, by name, for tables."""
         return []
 
     @classmethod
@@ -139,7 +139,7 @@ class PointwiseFit(FittedModel):
     ) -> Prediction:
         """Mean `(*batch, d)` of a quantity and, if the model has one, its covariance without noise.
 
-        The arguments are those of `Predictor.predict`; a model that knows forces takes several names.
+        The arguments are those of `Predictor.predict`; a model with forces takes several names.
 
         Raises:
             UnknownNameError: no such quantity.
@@ -169,7 +169,7 @@ class PointwiseFit(FittedModel):
 
 
 class AccelerationFit(PointwiseFit):
-    """Predicts accelerations of the system that it was fitted on; it knows neither forces nor contacts."""
+    """Predicts accelerations of the system that it was fitted on; it has neither forces nor contacts."""
 
     def at(
         self, at: FlatStates, quantity: str | Sequence[str], system: ConstrainedSystem, variance: bool
@@ -183,7 +183,7 @@ class AccelerationFit(PointwiseFit):
             )
         if system is not self.system:
             raise ModelError(
-                f"a {self.kind!r} model knows no forces, so it cannot predict on another system",
+                f"a {self.kind!r} model has no forces, so it cannot predict on another system",
                 hint="use StructuredGP, or leave out `system`",
             )
         mean, spread = self.accelerations(at, variance)

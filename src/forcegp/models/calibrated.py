@@ -1,12 +1,12 @@
 """The robot that a fit found, as figures that robot files hold, with samples of it.
 
-Links have the identified inertia. Robot files know joint friction as d q̇ + f sign q̇ only; d and f are those
+Links have the identified inertia. Robot files have joint friction as d q̇ + f sign q̇ only; d and f are those
 nearest to the learned friction Q_D(q̇) over the trained speeds, by least squares with an offset,
 
     min Σ_v (Q_D(v) + d v + f sign v − c)²,   d, f ≥ 0,
 
-averaged over poses where friction depends on the load. What is left, and the offset c, are losses. A log
-seldom tells an offset from the weight of the links: where zero is within 2σ of an offset, all the rest is
+averaged over poses where friction depends on the load. What is left, and the offset c, are losses. A
+log seldom separates an offset from the weight of links: if zero is within 2σ of an offset, all the rest is
 conditioned on c = 0. URDF has no armature a either: inertia a about the joint's axis, and as little across it
 as the link needs to stay physically consistent, goes to the link if that brings the mass matrix closer.
 Samples are the same for functions drawn from the posterior, with inertial parameters π + S δ
@@ -45,7 +45,7 @@ SPEEDS, POSES = 20, 20
 SLOWEST = 0.05
 """Least of these speeds, over the largest trained one: below it, dry friction is smooth in the fit."""
 UNTRAINED = 1.0
-"""Largest speed where the fit does not say which it has seen [rad/s, m/s]."""
+"""Largest speed if the fit does not contain its trained speeds [rad/s, m/s]."""
 DRAWS = 400
 """Function samples from which standard deviations are taken."""
 OPEN = 2.0
@@ -72,7 +72,7 @@ class Parameter:
         element: joint whose figure it is; inertia is that of the link that it moves.
         name: of the figure.
         file, estimate, std: SI units.
-        determined: whether the data say more about it than the prior.
+        determined: whether the data determine it beyond the prior.
     """
 
     element: str
@@ -106,7 +106,7 @@ class Calibration:
 
     @property
     def losses(self) -> tuple[str, ...]:
-        """What the robot does not contain of the learned forces, one sentence for each joint."""
+        """Learned forces that the robot file cannot contain, one sentence for each joint."""
         joints = zip(self.robot.joint_names, self.left.tolist(), self.offset.tolist(), strict=True)
         return tuple(
             f"joint {joint!r}: friction beyond d q̇ + f sign q̇ of {left:.3g} (root mean square), and a "

@@ -100,7 +100,7 @@ def false_alarm_rate(threshold: float) -> float:
 
 @runtime_checkable
 class LearnedForces(Protocol):
-    """What a fit knows of the forces: its posterior, the noise beside it, and the robot."""
+    """Forces of a fit: its posterior, the noise beside it, and the robot."""
 
     @property
     def system(self) -> ConstrainedSystem: ...
@@ -175,7 +175,7 @@ class Reading:
     def of(
         cls, fit: LearnedForces, data: Dataset, frame: WrenchFrame, external: Mapping[str, float] | None
     ) -> Reading:
-        """A log, with the friction with memory that the fit's training log shows."""
+        """A log, with the friction with memory of the fit's training log."""
         memory = FrictionMemory.of(fit.hyperparameters) if data.header.ordered else None
         force = torch.zeros_like(data.q) if memory is None else memory.force(fit.system.robot, data)
         return cls(fit, data, frame, memory, force, external_std(external, fit.system.robot))
@@ -234,7 +234,7 @@ class Reading:
         return mean, covariance
 
     def momenta(self, trajectory: Tensor, noise: Tensor, correlation: Tensor) -> MomentumLog:
-        """What the momentum filter reads of one trajectory, given by its rows."""
+        """Inputs of the momentum filter for one trajectory, given by its rows."""
         robot, columns, prior = self.fit.system.robot, [], self.frame.prior
         for rows in trajectory.split(CHUNK):
             q, qd = self.data.q[rows], self.data.qd[rows]

@@ -59,7 +59,7 @@ class Compared:
 
 @dataclass(frozen=True)
 class FitResult:
-    """How a fit went; all but the history is kept in saved files.
+    """Course of a fit; saved files contain all but the history.
 
     Attributes:
         converged: whether the optimiser reached its tolerance.
@@ -161,7 +161,7 @@ def _outcome(result: FitResult) -> str:
 
 
 def fit_table(title: str, result: FitResult | None, learned: Sequence[tuple[str, object]]) -> str:
-    """How a fit went and what it learned, as HTML."""
+    """Course and result of a fit, as HTML."""
     rows: list[tuple[object, ...]] = []
     notes: Sequence[str] = ()
     if result is not None:

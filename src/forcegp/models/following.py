@@ -1,7 +1,7 @@
 """Following forces that change at once, such as a payload that is picked up.
 
 A memory that fades with time forgets a payload while the arm moves too little to show it, and takes time
-to notice a new one. So what earlier samples say is forgotten on evidence: with D the new samples, where
+to notice a new one. So earlier samples are forgotten on evidence: with D the new samples, where
 
     p(D | payload anew from its prior) · p(change) > p(D | payload as it was).
 
@@ -82,13 +82,13 @@ def follow(
 def _knowing(
     fit: StructuredFit, estimate: StructuredFit, priors: Sequence[str], begin: bool = True
 ) -> StructuredFit:
-    """The fit with payload priors that know the payload of an estimate.
+    """The fit with payload priors around an estimate.
 
     Args:
         fit: whose priors are replaced.
         estimate: fit that shows the payloads.
         priors: names of the priors that are followed.
-        begin: whether priors that know no payload are replaced too.
+        begin: whether priors without known payload are replaced too.
     """
     one = {"one": torch.zeros(1, 1, dtype=torch.float64)}
     updated_priors = tuple(

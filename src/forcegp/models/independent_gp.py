@@ -44,7 +44,7 @@ LEARNING = 6
 
 @dataclass(frozen=True)
 class IndependentTraining:
-    """What a fitted model keeps of its training data.
+    """Training data that a fitted model keeps.
 
     Attributes:
         features: inputs before standardization, `(n, nq)` by name.
@@ -81,7 +81,7 @@ class IndependentTraining:
 
 
 class IndependentSettings(KernelOptions):
-    """What is kept of independent Gaussian processes besides their tensors."""
+    """Saved settings of independent Gaussian processes besides their tensors."""
 
     noise_std: PositiveFloat | tuple[PositiveFloat, ...] | None
 
@@ -89,7 +89,7 @@ class IndependentSettings(KernelOptions):
 class IndependentGP(Model["IndependentFit"]):
     """Independent zero-mean Gaussian processes, one per joint acceleration, on standardized (q, q̇, τ).
 
-    Contacts are not an input: the model sees only states and torques.
+    Contacts are not an input: inputs are states and torques only.
 
     Args:
         system: robot and contacts; the contacts serve to evaluate the model, not to learn it.
@@ -112,7 +112,7 @@ class IndependentGP(Model["IndependentFit"]):
         stated = Noise.of(noise)
         if stated != Noise(stated.acceleration):
             raise ModelError(
-                "independent Gaussian processes know white noise of accelerations alone",
+                "independent Gaussian processes have white noise of accelerations only",
                 expected="a number, one per joint, or Noise(acceleration)",
                 got=noise,
             )

@@ -56,7 +56,7 @@ def load_model(path: str | Path, *, system: ConstrainedSystem | None = None) -> 
 
     Raises:
         ModelError: no model is there, it is damaged, or a constraint is to be given.
-        UnknownNameError: the model is of a kind that this release does not know.
+        UnknownNameError: the model is of a kind unknown to this release.
     """
     return _restored(*read_model(path), str(model_path(path)), system)
 
@@ -93,7 +93,7 @@ def register() -> None:
 
 
 def _sent(model: FittedModel) -> tuple[Any, ...]:
-    """How a model is made again: from the content of its file.
+    """Recipe to restore a model from the content of its file.
 
     Raises:
         ModelError: a part of the model is Python code.

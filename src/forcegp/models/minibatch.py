@@ -23,7 +23,7 @@ Loss = Callable[[Mapping[str, Tensor], Tensor], Tensor]
 
 @dataclass(frozen=True)
 class BatchOptions:
-    """How to train on batches.
+    """Options of training on batches.
 
     Args:
         epochs: passes over the data at most; the learning rate falls to 0 along a half cosine over them.

@@ -30,7 +30,7 @@ DEEP = BatchOptions(epochs=300, batch=256, learning_rate=0.003)
 
 
 class NetworkSettings(Record):
-    """What is kept of a neural network besides its tensors."""
+    """Saved settings of a neural network besides its tensors."""
 
     hidden: tuple[int, ...]
     seed: int

@@ -1,4 +1,4 @@
-"""What predicts, and a predicted quantity with its uncertainty; scores and plots beside what was measured."""
+"""Predictors, and predicted quantities with their uncertainty; scores and plots beside what was measured."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ CHUNK = 2000
 CHECKED = 1 << 16
 """Covariances that are checked at once."""
 MOST_SAMPLES = 2000
-"""Samples that are predicted and drawn: more cannot be told apart."""
+"""Samples that are predicted and drawn: more are indistinguishable."""
 
 
 NEGATIVE = 0.01
@@ -176,7 +176,7 @@ class Prediction:
 def in_pieces(
     at: FlatStates, read: Callable[[FlatStates], tuple[Tensor | None, ...]]
 ) -> tuple[Tensor | None, ...]:
-    """What `read` gives at states, asked for `CHUNK` at a time; memory holds the result and one piece."""
+    """Results of `read` at states, `CHUNK` at a time; memory holds the result and one piece."""
     whole, n = list[Tensor | None](), len(at.q)
     for first in range(0, max(n, 1), CHUNK):
         piece = read(at.rows(slice(first, first + CHUNK)))
@@ -199,7 +199,7 @@ def measured(system: ConstrainedSystem, data: Dataset, quantity: str) -> Tensor:
 
 
 def component_names(system: ConstrainedSystem, quantity: str) -> list[str]:
-    """What the components of a quantity belong to: joints, contacts, or axes of a contact's force."""
+    """Owners of the components of a quantity: joints, contacts, or axes of a contact's force."""
     if quantity == "contact_force":
         contacts = [c.name for c in system.contacts if isinstance(c, SurfaceContact)]
         return [f"{name} {axis}" for name in contacts for axis in AXES]
@@ -260,7 +260,7 @@ class Predictor(ForwardModel):
             system: another system to predict on.
 
         Raises:
-            ModelError: the model knows no forces.
+            ModelError: the model has no forces.
             ShapeError: an argument does not fit the system.
         """
         force = self.force_field()
@@ -296,7 +296,7 @@ class Predictor(ForwardModel):
         """Coefficient of determination R² of the predicted mean on a data set, as in scikit-learn.
 
         R² = 1 − Σ(measured − predicted)² / Σ(measured − mean)², averaged over the components: 1 is perfect, 0
-        as good as the mean of the data, and negative worse. It says nothing about the uncertainty;
+        as good as the mean of the data, and negative worse. It ignores the uncertainty;
         `forcegp.evaluate` does.
 
         Args:
@@ -363,7 +363,7 @@ class Predictor(ForwardModel):
         return draw_panels(panels, time, [data.contact[c] for c in system.contact_names], ax)
 
     def _at_logged(self, data: Dataset, quantity: str, **settings: Any) -> Prediction:
-        """The prediction at logged states; contacts are closed where the log says so."""
+        """The prediction at logged states; contacts are closed as logged."""
         active = data.active((settings.get("system") or self.system).contact_names)
         return self.predict(data.q, data.qd, data.tau, quantity, active=active, **settings)
 

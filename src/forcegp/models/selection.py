@@ -1,4 +1,4 @@
-"""Which set of force priors a log asks for.
+"""Selection of a set of force priors by a log.
 
 Each candidate, a set of `SETS` with or without the question whether the inertia differs from that of the
 robot file, is trained on one half of the log and tested on the other, both ways. A half consists of
@@ -51,7 +51,7 @@ ROWS = 400
 LEARN_ROWS = 150
 """Rows that hyperparameters are learned on if a prior is not a finite number of features."""
 QUICK = LearningOptions(tolerance=1e-5, max_evaluations=150)
-"""How candidates learn: their scores differ by more than the last digits of a likelihood."""
+"""Options of learning candidates: their scores differ by more than the last digits of a likelihood."""
 DROPPED = 2.0
 """Standard errors behind the best after which a candidate is not tried on the second half."""
 
@@ -134,7 +134,7 @@ def with_priors(
 
 @dataclass
 class Trial:
-    """What is known of a candidate so far.
+    """Scores of a candidate so far.
 
     Attributes:
         candidate: what is tried.
@@ -285,6 +285,6 @@ def blocks_of(density: Tensor) -> Tensor:
 
 
 def difference(best: Tensor, own: Tensor) -> tuple[float, float]:
-    """How far a score lies behind the best, and the standard error of that, from blocks `(k,)` of each."""
+    """Distance of a score from the best, and its standard error, from blocks `(k,)` of each."""
     behind = best - own
     return float(behind.mean()), float(behind.std() / math.sqrt(len(behind)))

@@ -55,7 +55,7 @@ def with_sensor(data: Dataset, system: ConstrainedSystem, noise_std: float) -> l
 
 @torch.no_grad()
 def with_sensed_forces(data: Dataset, system: ConstrainedSystem, force_std: float) -> list[Observation]:
-    """The joint forces that a force sensor and the accelerations show together, Q̄ = M q̈ − J_Eᵀ F.
+    """The joint forces from a force sensor and the accelerations together, Q̄ = M q̈ − J_Eᵀ F.
 
     Both contain the same errors of the torques, which two measurements would count twice. Learn from them
     without the contact, `StructuredGP(ConstrainedSystem(system.robot), …)`: its force is measured. A joint
@@ -149,7 +149,7 @@ def force_from_sensor(fit: StructuredFit, data: Dataset) -> tuple[Tensor, Tensor
         data: states with `F_sensor`.
 
     Raises:
-        ModelError: the fit does not know the sensor's noise, or the log has no sensor.
+        ModelError: the fit has no noise of the sensor, or the log has no sensor.
     """
     if "multiplier" not in fit.noise or not has_sensor(data, fit.system):
         raise ModelError(

@@ -67,11 +67,11 @@ CLASSES: dict[str, type] = {
     "contact": ContactForcePrior,
     "sliding_friction": SlidingFrictionPrior,
 }
-"""What can be saved, by the name in the file."""
+"""Classes that can be saved, by the name in the file."""
 COLUMNS = ("q", "qd", "tau", "active", "values")
-"""What is kept of each measurement."""
+"""Saved parts of each measurement."""
 IN_TIME = ("segment", "t")
-"""What is kept beside it where a prior is a function of time."""
+"""Saved beside it if a prior is a function of time."""
 NOT_REAL = (
     (re.compile(r"data\.\d+\.active"), torch.bool),
     (re.compile(r"added|data\.\d+\.segment|sparse\..*\.(components|dropped)"), torch.int64),
@@ -95,7 +95,7 @@ class NoiseSettings(Record):
 
 
 class StructuredSettings(StructuredOptions):
-    """What is kept of a structured Gaussian process besides its tensors."""
+    """Saved settings of a structured Gaussian process besides its tensors."""
 
     mean: tuple[str, ...]
     noise: NoiseSettings
@@ -176,7 +176,7 @@ def _conditioned_on(spec: Specification, training: Training, posterior: ForcePos
 
 
 def _columns(spec: Specification) -> tuple[str, ...]:
-    """What is kept of each measurement."""
+    """Saved parts of each measurement."""
     return COLUMNS + (IN_TIME if any(prior.in_time for prior in spec.priors) else ())
 
 

@@ -91,7 +91,7 @@ class StructuredFit(FittedModel):
 
     @property
     def training(self) -> Training:
-        """What the posterior is conditioned on."""
+        """Data that the posterior is conditioned on."""
         return self.problem.training
 
     @property
@@ -265,7 +265,7 @@ class StructuredFit(FittedModel):
         return CompiledFit(self._exported(functions))
 
     def beyond(self, qd: Tensor, tau: Tensor) -> Tensor | None:
-        """How far the speed and torque of each joint lie beyond those of the training data, in training
+        """Distance of the speed and torque of each joint beyond those of the training data, in training
         standard deviations `(*batch, nq)`; `None` where no torque noise was learned."""
         return distance_beyond(self.hyperparameters, qd, tau) if LOW in self.hyperparameters else None
 
@@ -360,7 +360,7 @@ class StructuredFit(FittedModel):
         Args:
             what: a factor between 0 and 1, such as exp(−Δt/T) for a memory of T seconds, which the weight of
                 all samples so far is multiplied by; or samples of the fit, which are removed.
-            priors: forget only what the samples say about the forces of these priors, such as a payload: they
+            priors: forget the forces of these priors only, such as a payload: they
                 drift towards their prior, and the factor is the correlation with what they were.
 
         Raises:

@@ -53,9 +53,9 @@ class StructuredGP(Model[StructuredFit]):
             as learned tensors; `None` keeps the robot as it is.
         inference: `"exact"`, `"sparse"` or `"auto"`.
         inducing_points: maximum number of inducing points of one prior; fewer are taken where they suffice,
-            and the result of the fit says where more would help.
-        inertia: `"file"` keeps that of the robot; `"auto"` identifies links and drives where held-out
-            stretches of the log ask for it (`forces/inertia.py`); `None` leaves that to the data if they
+            and the result of the fit reports if more would help.
+        inertia: `"file"` keeps that of the robot; `"auto"` identifies links and drives if held-out
+            stretches of the log favour it (`forces/inertia.py`); `None` leaves that to the data if they
             choose the priors, and is `"file"` elsewhere. It needs a `JointFrictionPrior` and a mean with the
             motor torque.
         standardize: whether the inputs of kernels are standardized; otherwise they enter in their units, as
@@ -150,8 +150,7 @@ class StructuredGP(Model[StructuredFit]):
             The fitted model. Fitting twice gives the same bits.
 
         Raises:
-            ModelError, DataError, UnknownNameError: the data, the earlier fit, or the checkpoint do not fit
-                the model.
+            ModelError, DataError, UnknownNameError: data, earlier fit, or checkpoint do not fit the model.
             NumericalError: the likelihood cannot be computed.
         """
         spec = self.specification if after is None else self._continued(after)
@@ -179,6 +178,8 @@ class StructuredGP(Model[StructuredFit]):
             forces = whole.forces(*lesson.problem.with_coulomb_errors(values))
         warnings = (*task.doubts, *lesson.warnings)
         fit = conditioned(spec, lesson.problem, values, lesson.learned, warnings, lesson.learned_on, forces)
+        if progress is not None:
+            progress(fit.result.evaluations, fit.result.evaluations, fit.result.objective)
         missed = (each.doubt for each in comparison if each.chosen and each.doubt)
         warnings = (*fit.result.warnings, *missed, *self._without_effect(fit))
         result = dataclasses.replace(fit.result, comparison=comparison, warnings=warnings)

@@ -1,12 +1,12 @@
-"""What a structured Gaussian process is made of, and how it is learned: on which samples, in which steps.
+"""Parts of a structured Gaussian process, and the steps of learning it.
 
-1. Samples at rest say nothing but that friction is below a limit, and impacts break the equations of motion;
+1. Samples at rest only bound the friction, and impacts break the equations of motion;
    robots that are measured learn from motion without impacts.
 2. Hyperparameters are learned on a part of a long log, or on all of a short one.
 3. Residuals that are correlated in time temper the likelihood, and hyperparameters are learned once more;
    unless a `DisturbancePrior` explains them.
 4. Inertial parameters move to their posterior mean: one Gauss–Newton step, physically consistent.
-5. The noise of the torque is enlarged to what held-out stretches of the training log ask for, and how it
+5. The noise of the torque is enlarged to that on held-out stretches of the training log, and how it
    grows beyond the trained speeds and torques is learned from held-out regimes; dry friction with memory is
    learned from what is left, for logs in order of time.
 6. The posterior is conditioned on all samples.
@@ -71,7 +71,7 @@ FIRST_POWER = 0.25
 
 @dataclass(frozen=True, eq=False)
 class Specification:
-    """What a structured Gaussian process is made of before it sees data.
+    """Parts of a structured Gaussian process before it is fitted.
 
     Attributes:
         system: robot and contacts.
@@ -118,7 +118,7 @@ class Specification:
         return dataclasses.replace(self, priors=priors, noise=noise, automatic=False)
 
     def inertia_of(self, training: Training) -> Inertia:
-        """The robot that the training samples ask for, where the model is to find it."""
+        """The robot identified from the training samples, if the model is to find it."""
         friction = next((prior for prior in self.priors if isinstance(prior, JointFrictionPrior)), None)
         asks = (
             self.options.inertia == "auto"
@@ -170,7 +170,7 @@ def constant_inputs(problem: Problem) -> tuple[str, ...]:
 
 @dataclass(frozen=True)
 class Lesson:
-    """What was learned, and the problem that the posterior is conditioned on.
+    """Result of learning, and the problem that the posterior is conditioned on.
 
     Attributes:
         problem: all samples, the updated robot, and the noise.
@@ -189,7 +189,7 @@ class Lesson:
 
 @dataclass(frozen=True)
 class Task:
-    """What a fit learns from.
+    """Inputs of a fit.
 
     Attributes:
         specification: the model; a first fit that identifies the robot adds a prior on what it does not know.
@@ -224,7 +224,7 @@ def task_of(
     data: Dataset | Sequence[Observation],
     chosen: Sequence[str] | None,
 ) -> Task:
-    """What a fit to data learns from, after the problem of an earlier fit or as the first."""
+    """Inputs of a fit to data, after the problem of an earlier fit or as the first."""
     training, doubts = training_for(spec, before, data, chosen)
     if before is not None and not any(bool(value.any()) for value in before.pinned.values()):
         return Task(spec, training, before.system.robot, before.pinned, doubts)
@@ -256,7 +256,7 @@ def training_for(
     learned: Sequence[str] | None,
     fewest: int = FEWEST_MOVING,
 ) -> tuple[Training, tuple[str, ...]]:
-    """What is learned from, with doubts about it.
+    """Training data, with doubts about them.
 
     Priors that are not learned (`None`: all are) keep the scales of their inputs. With fewer samples in
     motion than `fewest`, those at rest are kept.
@@ -289,7 +289,7 @@ def search_of(
     chosen: Sequence[str] | None,
     options: LearningOptions | None,
 ) -> Search:
-    """What is learned of a problem, from where, and what keeps its known value.
+    """Learned parts of a problem, their start, and parts with a known value.
 
     The scale of a force that the robot contains is not learned.
     """
@@ -315,7 +315,7 @@ def in_motion(
     moving = training.moving(REST_SPEED)
     if moving.samples < fewest:
         return training, (
-            f"only {moving.samples} samples are in motion: friction cannot be told from noise at rest",
+            f"only {moving.samples} samples are in motion: friction cannot be separated from noise at rest",
         )
     moving, impacts = without_impacts(moving, system)
     if not impacts:
@@ -466,7 +466,7 @@ def _at_the_rate_of_the_log(part: Problem, values: Mapping[str, Tensor], trainin
 
 
 def prepared(spec: Specification, problem: Problem, values: Mapping[str, Tensor]) -> Problem:
-    """The problem with the inference that its samples ask for, and their weights under heavy-tailed noise."""
+    """The problem with the inference for its samples, and their weights under heavy-tailed noise."""
     if is_sparse(spec.options.inference, problem.priors, problem.training.all_samples):
         # Sums over samples have the slopes of the robot file.
         problem = dataclasses.replace(problem, training=dataclasses.replace(problem.training, slopes=None))

@@ -37,7 +37,7 @@ SAMPLE_ROWS = 20_000
 
 @dataclass(frozen=True)
 class Sample:
-    """What one pass over a log keeps of it; all of a log in memory.
+    """Part of a log that one pass keeps; all of a log in memory.
 
     Attributes:
         data: the samples: evenly spaced ones of a log that is read piece by piece.
@@ -70,11 +70,11 @@ class Sample:
 
 @torch.no_grad()
 def sample_of(spec: Specification, data: StreamedDataset) -> Sample:
-    """What a model learns from: evenly spaced samples of a log, in motion where the model asks for that.
+    """Training sample: evenly spaced samples of a log, in motion if the model requires it.
 
     Raises:
         DataError: a file is damaged, or holds no samples.
-        ModelError: processes read different logs, or exact inference is asked for on more samples than are
+        ModelError: processes read different logs, or exact inference on more samples than are
             read at once.
     """
     if data.distributed:
@@ -224,7 +224,7 @@ class Pass:
 
 
 def _tensors(basis: LatentBasis, total: Totals) -> dict[str, Tensor]:
-    """What a pass has computed so far, by name."""
+    """Results of a pass so far, by name."""
     tensors = {f"basis.{name}": value for name, value in basis.tensors().items()}
     tensors |= {f"sums.{i}": value for i, value in enumerate(total.sums.tensors)}
     counts = {"constant": total.constant, "samples": total.samples, "pieces": torch.tensor(total.pieces)}

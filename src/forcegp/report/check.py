@@ -22,7 +22,7 @@ from forcegp.rows import describe
 
 COLOURS = {"error": "#a1121f", "warning": "#d08c00", "note": "#0072b2"}
 POINTS = 1500
-"""Points of a curve: more cannot be told apart on a page."""
+"""Points of a curve: more are indistinguishable on a page."""
 CONTEXT = 3.0
 """Rows shown, in lengths of the interval."""
 LEAST_ROWS = 200
@@ -61,7 +61,7 @@ def draw_overview(report: Report, log: Log) -> Picture:
 
 
 def picture_of(finding: Finding, system: ConstrainedSystem, log: Log) -> Picture | None:
-    """What a finding looks like, by its family; nothing for what an import found."""
+    """Picture of a finding, by its family; none for findings of an import."""
     rows, family = _window(finding, log), KINDS[finding.kind].family
     if family == "import":
         return None

@@ -30,7 +30,7 @@ NAMES = {
     "residual_max": "largest constraint residual |A q̈ − b| [m/s²]",
     "seconds_per_state": "prediction time [s/sample]",
 }
-"""What the scores over all joints are called."""
+"""Names of the scores over all joints."""
 
 
 def write_evaluation(

@@ -36,7 +36,7 @@ LIMB_JOINTS, WALKING_JOINTS, BODY_MASS = 2, 6, 1.0
 """Joints from which a chain counts as a limb; those of all limbs and mass of the base [kg] from which a robot
 may walk: a hand is lighter."""
 OF_JOINTS = ("axis", "damping", "friction", "armature", "lower", "upper", "velocity_limit", "effort_limit")
-"""What the robot takes from the joints of the file as it is."""
+"""Joint attributes that the robot takes unchanged from the file."""
 
 
 @dataclass(frozen=True)
@@ -233,7 +233,7 @@ def load_robot(
     Raises:
         UnknownNameError: no such bundled robot, or no such joint to lock.
         RobotFileError: the file cannot be read or is not a valid robot; the message names link or joint.
-        UnsupportedRobotError: a joint is floating, planar, ball or mimic; the hint says how to lock it.
+        UnsupportedRobotError: a joint is floating, planar, ball or mimic; the hint names its position.
         MissingDependencyError: the file is MJCF and MuJoCo is not installed.
         InertiaError: the inertia of a link is not physical.
         ShapeError: base_position, base_rpy or gravity is not a vector of three finite numbers.

@@ -137,7 +137,7 @@ def _without(element: Element, names: tuple[str, ...]) -> dict[str, str]:
 
 
 def _copy_actuators(section: Element) -> Element:
-    """Actuators of joints, reduced to their limits; the name says whether the control is the force."""
+    """Actuators of joints, reduced to their limits; the name states whether the control is the force."""
     copy = Element("actuator")
     for i, actuator in enumerate(section):
         if actuator.tag in _ACTUATORS and actuator.get("joint"):

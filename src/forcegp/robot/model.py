@@ -85,7 +85,7 @@ class RobotModel:
     remarks: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
-        """One line that says which robot it is, without the numbers."""
+        """One line that names the robot, without the numbers."""
         moving = self.joint_types.count("prismatic")
         kinds = f", {moving} of them prismatic" if moving else ""
         mass = float(self.mass.detach().sum())

@@ -1,4 +1,4 @@
-"""What a robot looks like: the shapes of its URDF file, or else rods between its joints, as convex solids."""
+"""Appearance of a robot: the shapes of its URDF file, or else rods between its joints, as convex solids."""
 
 from __future__ import annotations
 

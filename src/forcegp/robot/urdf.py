@@ -33,7 +33,7 @@ _INSTEAD = {
     "spherical": "write it as three revolute joints with links without mass between them",
     "planar": "write it as two prismatic joints and a revolute one",
 }
-"""What to write for joint types that are not supported."""
+"""Remedies for unsupported joint types."""
 _KINDS = ("revolute", "continuous", "prismatic", "fixed")
 WORLD = "world"
 """Name of the fixed surroundings, which some files use as a link without declaring it."""

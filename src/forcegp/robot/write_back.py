@@ -225,7 +225,7 @@ def _body(pose: Tensor, J: Tensor) -> Inertial | None:
 
 
 def _losses(robot: RobotModel, figures: Mapping[str, str]) -> tuple[str, ...]:
-    """What the format has no place for."""
+    """Parameters without a place in the format."""
     losses = []
     for figure in ("damping", "friction", "stribeck", "armature"):
         values = getattr(robot, figure)

@@ -149,7 +149,7 @@ def _listed(problem: RolloutProblem, state: State, crossed: Tensor) -> list[Cont
 def contact_loss_probability(
     model: ForwardModel, q: Tensor, qd: Tensor, tau: Tensor, *, active: Tensor | None = None
 ) -> Tensor:
-    """Probability `(*batch, m)` that a contact would have to pull at states `(*batch, nq)`, and opens.
+    """Probability `(*batch, m)` that λ < 0 at states `(*batch, nq)`, so that the contact opens.
 
     P(λ < 0) = Φ(−μ/σ) of the multiplier's posterior N(μ, σ²); 1 for a contact that is open already. `active`
     `(*batch, n_contacts)` are the closed contacts; default all.

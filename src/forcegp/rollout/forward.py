@@ -38,7 +38,7 @@ ON_DIVERGENCE = ("raise", "keep")
 
 @dataclass(frozen=True)
 class RolloutOptions:
-    """How a rollout is computed.
+    """Options of a rollout.
 
     Args:
         dt: step, period of the output, and sampling period of torques passed as an array [s]. By default
@@ -231,7 +231,7 @@ def _run(
     unilateral = options.unilateral and len(system.contacts) > 0
     if unilateral and not law.has_multiplier:
         raise ModelError(
-            "a model of accelerations alone has no multiplier that could tell when contact is lost",
+            "a model of accelerations alone has no multiplier to detect the loss of contact",
             hint="pass unilateral=False, or use a model with forces",
         )
     inputs = inputs_of(tau, whole if batch is None else batch, n, options.dt, options.interpolation)

@@ -1,4 +1,4 @@
-"""What a rollout is given: a model, and motor torques as an array, a log, a feedback law or a controller."""
+"""Inputs of a rollout: a model, and motor torques as an array, a log, a feedback law or a controller."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ class Disturbance(NamedTuple):
     Attributes:
         density: root of the spectral density of the logged torques' noise `(nq,)` [N m √s, N √s].
         constant: standard deviation of an unknown force on each joint `(nq,)` [N m, N], kept for the whole
-            trajectory, since nothing says how it varies.
+            trajectory, since its variation is unknown.
     """
 
     density: Tensor

@@ -229,10 +229,10 @@ class Law(ABC):
 
     @abstractmethod
     def motion(self, system: ConstrainedSystem, at: States) -> tuple[Tensor, Tensor]:
-        """q̈ `(n, nq)` and λ `(n, m)` at states; NaN where the law knows no forces."""
+        """q̈ `(n, nq)` and λ `(n, m)` at states; NaN if the law has no forces."""
 
     def dry_friction(self, system: ConstrainedSystem) -> Callable[[States], DryFriction] | None:
-        """What tells the dry friction of joints apart at states; `None` where there is no such friction."""
+        """Dry friction of the joints at states, separated from other forces; `None` without such friction."""
         return None
 
     @property

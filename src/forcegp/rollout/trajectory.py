@@ -85,7 +85,7 @@ class Rollout:
         system: robot and contacts, with the stabilization of the rollout.
         t: `(T,)` [s].
         q, qd, qdd, tau: `(*batch, T, nq)`.
-        multiplier: λ `(*batch, T, m)` [N]; NaN where the model knows no forces.
+        multiplier: λ `(*batch, T, m)` [N]; NaN if the model has no forces.
         c, cd: `(*batch, T, m)` constraint error and its rate, of all contacts, open or closed [m], [m/s].
         active: `(*batch, T, n_contacts)` bool, closed contacts.
         events: contacts that opened and closed.

@@ -41,12 +41,12 @@ class Scene:
 
     @property
     def simulation(self) -> SimulationConfig:
-        """How to simulate the scene."""
+        """Settings to simulate the scene."""
         return self.sections.simulation
 
     @property
     def model(self) -> ModelTable:
-        """Which model to fit, and how."""
+        """Settings of the model to fit."""
         return ModelTable(self.sections.model, self.document)
 
     def robot(self, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> RobotModel:

@@ -62,7 +62,7 @@ class ContactSolver:
 
 @dataclass(frozen=True)
 class Sensors:
-    """Imperfect sensors; the controller and the log see what they measure. The defaults are perfect.
+    """Imperfect sensors; the controller and the log get their values. The defaults are perfect.
 
     Args:
         encoder_resolution: step of the measured joint positions [rad, m].
@@ -86,7 +86,7 @@ class Sensors:
 
 @dataclass(frozen=True)
 class SimulationConfig(MotionConfig):
-    """What is simulated; the defaults are the paper's task on the bundled arm.
+    """Settings of a simulation; the defaults are the paper's task on the bundled arm.
 
     The settings of the motion (`MotionConfig`) come first; these are added:
 

@@ -25,7 +25,7 @@ NO_FORCE = 1e-9
 
 
 class SolvedForces(NamedTuple):
-    """What the engine's solver gives at a state under a torque.
+    """Result of the engine's solver at a state under a torque.
 
     Attributes:
         qdd: `(nq,)` acceleration [rad/s², m/s²].

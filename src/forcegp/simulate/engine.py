@@ -1,4 +1,4 @@
-"""What a physics engine must offer to simulate a robot, and how it compares with our equations of motion."""
+"""Protocol of a physics engine, and its comparison with our equations of motion."""
 
 from __future__ import annotations
 

@@ -94,9 +94,9 @@ class StateEquations:
 
 
 class Mechanics:
-    """A system whose equations of motion are asked for at one state at a time; the plan names the tool point.
+    """A system with equations of motion at one state at a time; the plan names the tool point.
 
-    `contacts` and `m` are those of the system; `compiled` tells whether the kernel is used.
+    `contacts` and `m` are those of the system; `compiled` is true if the kernel is used.
     """
 
     def __init__(self, system: ConstrainedSystem, plan: Plan) -> None:

@@ -1,4 +1,4 @@
-"""What a simulated run leaves behind."""
+"""Result of a simulated run."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ CHUNK = 8192
 
 @dataclass(frozen=True)
 class RunLog:
-    """What is written down at every step.
+    """Quantities recorded at every step.
 
     Attributes:
         q, qd, qdd, tau, Q, Q_I, Q_z: `(n, nq)`; qdd is the engine's acceleration, without noise.
         multiplier, c: `(n, m)`.
         contact, saturated: `(n, n_contacts)` and `(n,)` bool; whether a torque limit was hit.
         contact_forces: `F_I`, `F_z` → contact → `(n, 3)`, where an engine of its own computed them [N].
-        measured: what sensors say instead of `q`, `qd`, `tau`, where they are not perfect.
+        measured: sensor values in place of `q`, `qd`, `tau`, where they are not perfect.
     """
 
     q: Tensor

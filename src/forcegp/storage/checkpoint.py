@@ -25,7 +25,7 @@ INTERVAL = 10.0
 """Least time between two writings [s]."""
 NAMES = ("positions", "objectives", "gradients")
 SUFFIX = ".sums"
-"""What the name of the file adds to that of the checkpoint of learning."""
+"""Suffix added to the name of the checkpoint of learning."""
 
 
 def beside(checkpoint: str | Path) -> Path:
@@ -103,7 +103,7 @@ class Evaluations:
     """Every evaluation of an objective: position, value and gradient, kept in a checkpoint.
 
     A resumed fit runs the optimiser again from the start on the recorded values, which takes no time, and so
-    ends with the same bits as a fit that was not interrupted. If the optimiser asks for another point (on
+    ends with the same bits as a fit that was not interrupted. If the optimiser requests another point (on
     another machine or release of a library), the rest of the record is dropped and evaluated anew.
 
     Args:

@@ -17,7 +17,7 @@ O = TypeVar("O", bound="KernelOptions")
 
 
 class Window(Record):
-    """How far from the parameters of the robot file learning starts.
+    """Window around the parameters of the robot file in which learning starts.
 
     Attributes:
         relative: half width for logarithms of masses, moments and friction; 0.5 is a factor of 0.37 to
@@ -70,7 +70,7 @@ class StructuredOptions(KernelOptions):
     Attributes:
         inference: how to condition; `"auto"` by the number of samples.
         inducing_points: maximum number of inducing points of one prior.
-        inertia: `"file"`, or `"auto"` where the log may show another one; `None` leaves that to the data if
+        inertia: `"file"`, or `"auto"` if the log may determine another one; `None` leaves that to the data if
             they choose the priors, and is `"file"` elsewhere.
     """
 

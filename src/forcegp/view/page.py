@@ -36,7 +36,7 @@ LOCAL, PORT = "127.0.0.1", 8080
 
 
 def content_of(motion: Motion, shapes: Sequence[Shape]) -> dict[str, Any]:
-    """What `report.animation` draws of a motion: robot, surfaces, paths, forces and their texts."""
+    """Drawing of a motion for `report.animation`: robot, surfaces, paths, forces and their texts."""
     system, frames = motion.system, range(len(motion.t))
     robot, poses = system.robot, kinematics.link_poses(system.robot, motion.q)
     R = torch.cat([robot.base_rotation.expand(len(frames), 1, 3, 3), poses.rotation], dim=1)

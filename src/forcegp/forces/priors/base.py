@@ -34,9 +34,9 @@ ForceMean = Callable[[ConstrainedSystem, States], Tensor]
 class ForcePrior(ABC):
     """A zero-mean prior on an unknown force f(x), carried to generalized forces by a known operator E(x).
 
-    The generalized force is E(x) f(x); `target` says whether it is part of Q, of Q_z, or of Q along the
+    The generalized force is E(x) f(x); `target` is the part of Q̄ that it belongs to: Q, Q_z, or Q along the
     constraint. A subclass has a `name`, a `kernel` and a `target`, and implements `outputs`, `features` and
-    `operator`; a saved model knows the classes among `CLASSES` in `models/structured_file.py`.
+    `operator`; classes among `CLASSES` can be saved, see `models/structured_file.py`.
     """
 
     name: str
@@ -77,7 +77,7 @@ class ForcePrior(ABC):
         """E(x) `(n, nq, outputs)`."""
 
     def initial_parameters(self, robot: RobotModel) -> dict[str, Tensor]:
-        """Where learning what the operator E contains begins, by name; nothing for most priors."""
+        """Start of learned parameters of the operator E, by name; nothing for most priors."""
         return {}
 
     def with_parameters(self, params: Mapping[str, Tensor]) -> ForcePrior:

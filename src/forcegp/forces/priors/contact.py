@@ -1,6 +1,6 @@
 """Forces at a contact with a surface: along it, against it, and Coulomb friction from the multiplier.
 
-What touches knows no world axes: vectors along the surface have two coordinates in a tangent frame that turns
+Contact has no world axes: vectors along the surface have two coordinates in a tangent frame that turns
 with the surface. The frame at normal n is (R e_x, R e_y), with the smallest rotation R that takes e_z to n.
 So what is learned on one surface holds on one that is raised, tilted or curved. A force against the surface
 changes no acceleration.
@@ -261,7 +261,7 @@ class SlidingFrictionPrior(SurfaceForcePrior):
 
 @dataclass(frozen=True)
 class NormalForcePrior(ForcePrior):
-    """What accelerations in contact never show: a joint force along the constraint, E = Aᵀ Lᵀ = I − P.
+    """A joint force along the constraint, E = Aᵀ Lᵀ = I − P, without effect on accelerations in contact.
 
     H Aᵀ = 0, so a force Aᵀ g(x) changes the multiplier by −g(x) and no acceleration. A joint force prior
     alone is overconfident along the normal. This independent process, with the hyperparameters of the joint
@@ -302,7 +302,7 @@ SHARP = 1e-6
 
 
 FRICTION_COEFFICIENT = 0.2
-"""Where learning a friction coefficient begins."""
+"""Start of learning a friction coefficient."""
 NEARLY_JAMMED = 0.95
 """Largest friction coefficient that is considered, relative to the one at which the contact jams."""
 LEARNED = 2
@@ -330,7 +330,7 @@ def coulomb_keys(contact: str) -> tuple[str, str]:
 
 
 def initial_coulomb(priors: Iterable[ForcePrior], like: Tensor) -> dict[str, Tensor]:
-    """Where learning friction begins, for contacts whose prior is coupled with the multiplier."""
+    """Start of learning friction, for contacts whose prior is coupled with the multiplier."""
     start = {}
     for prior in _coupled_priors(priors):
         coefficient, smoothing = coulomb_keys(prior.contact)

@@ -176,7 +176,7 @@ class InertialPrior(ForcePrior):
 DIVERGENCE = 0.01
 """Weight of the divergence [nats]: enough to keep a link that the log does not determine from vanishing."""
 CONSISTENT = LearningOptions(tolerance=1e-12, max_evaluations=500)
-"""How the consistent robot is found."""
+"""Options of the search for the consistent robot."""
 
 
 PER_PAYLOAD = len(PARAMETER_NAMES)

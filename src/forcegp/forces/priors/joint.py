@@ -1,4 +1,4 @@
-"""What is known of the joint force Q before data: its mean from the robot file, and priors on the rest.
+"""The joint force Q before data: its mean from the robot file, and priors on the rest.
 
 - `JointForcePrior`: any force, one process per joint.
 - `JointFrictionPrior`: friction that no robot file declares (viscous, Coulomb, a transition between the two,
@@ -135,7 +135,7 @@ SPEEDS = (0.02, 0.1, 0.5)
 """Velocities at which the Coulomb features saturate [rad/s, m/s]: a sharp step, and two slower
 transitions."""
 OFFSET = 0.3
-"""Where the standard deviation of an offset starts, as a fraction of that of a friction weight."""
+"""Initial standard deviation of an offset, as a fraction of that of a friction weight."""
 
 
 @dataclass(frozen=True)
@@ -186,7 +186,7 @@ class JointFrictionPrior(PerJointPrior):
 
     @property
     def sharpest(self) -> int:
-        """Which Coulomb feature is the dry friction of a joint that may stick."""
+        """Index of the Coulomb feature that is the dry friction of a joint that may stick."""
         return self.speeds.index(min(self.speeds))
 
     def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
@@ -208,9 +208,9 @@ NEW_MOTION = -1.0
 class DisturbancePrior(PerJointPrior):
     """Q_i = d_i(t), an Ornstein–Uhlenbeck process of each joint, independent from one trajectory to the next.
 
-    Its standard deviation σ_i and correlation time T_i are learned. A new motion tells nothing of it, so it
-    adds σ_i² to the variance of the joint force there, and zero to the mean. Inference is exact: sums over
-    samples, as in sparse inference, take samples to be independent.
+    Its standard deviation σ_i and correlation time T_i are learned. It cannot be predicted on new
+    motions, so it adds σ_i² to the variance of the joint force there, and zero to the mean. Inference is
+    exact: sums over samples, as in sparse inference, take samples to be independent.
 
     Args:
         kernel: covariance over time.

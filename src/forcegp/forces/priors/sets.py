@@ -15,7 +15,7 @@ from forcegp.gp.kernels import Kernel, Linear, SquaredExponential
 PAPER = SquaredExponential()
 """The paper's kernel of a joint force (eq. 31)."""
 ANGLES, RATES = SquaredExponential(("q",), shared=True), Linear(("qd",), shared=True)
-"""What depends on the configuration; what is linear in the speed of the joints."""
+"""Kernel of the configuration; what is linear in the speed of the joints."""
 WHOLE = Linear(("tau",)) + ANGLES + RATES * RATES * ANGLES + SquaredExponential(("qd",), shared=True)
 """Of a force that includes the motor torque, which enters linearly: weight, which the configuration decides,
 bias and damping, which there are quadratic and linear in the speed, and any friction of the joints."""

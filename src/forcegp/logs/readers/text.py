@@ -24,14 +24,14 @@ if TYPE_CHECKING:
 
 
 SAMPLE_BYTES = 1 << 18
-"""How much of a file is looked at."""
+"""Size of the part of a file that is inspected."""
 SAMPLE_LINES = 200
-"""How many lines of numbers must agree."""
+"""Number of lines of numbers that must agree."""
 
 SEPARATORS = (";", "\t", ",", "|", " ")
 """Candidates; a space stands for any run of blanks."""
 MISSING = ("", "nan", "NaN", "NAN", "null", "NULL", "NA", "N/A", "None", "-nan", "#N/A")
-"""Fields that say that there is no value."""
+"""Fields that mark a missing value."""
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?$|[+-]?(inf|infinity)$", re.IGNORECASE)
 _COMMA_NUMBER = re.compile(r"[+-]?(\d+,?\d*|,\d+)([eE][+-]?\d+)?$")
@@ -85,7 +85,7 @@ def split(line: str, separator: str) -> list[str]:
 
 
 def is_number(field: str, decimal: str = ".") -> bool:
-    """Whether a field is a number, or says that there is none."""
+    """Whether a field is a number, or marks a missing one."""
     if field in MISSING:
         return True
     return bool((_COMMA_NUMBER if decimal == "," else _NUMBER).match(field))
@@ -105,7 +105,7 @@ def _decode(path: Path, head: bytes) -> tuple[str, str]:
 
 
 def _try(lines: list[str], separator: str, decimal: str) -> tuple[float, str, str, int]:
-    """How well a separator and a decimal mark explain the lines: fields with a value, times their share."""
+    """Score of a separator and a decimal mark: fields with a value, times their share."""
     kept = [(i, split(line, separator)) for i, line in enumerate(lines) if line.strip()]
     rows = [(i, fields) for i, fields in kept if _numeric(fields, decimal)]
     if not rows:
@@ -172,7 +172,7 @@ def _kind(fields: list[str], decimal: str) -> str:
 
 
 BLOCK_BYTES = 4 << 20
-"""How much text is parsed at a time."""
+"""Size of the text that is parsed at a time."""
 
 _BLANKS = re.compile(rb"[ \t]+")
 _EDGES = re.compile(rb"(?m)^ | (?=\r?$)")

@@ -29,7 +29,7 @@ TOLERANCE, ZERO = 1e-10, 1e-5
 
 @dataclass(frozen=True)
 class Export:
-    """What was written.
+    """Files of an export.
 
     Attributes:
         folder: where.

@@ -287,7 +287,7 @@ class CompiledFit(Predictor):
         )
 
     def _read(self, quantity: str | tuple[str, ...]) -> _Rows:
-        """The rows of quantities as they are asked for, and where the C code puts them."""
+        """The rows of requested quantities, and their place in the C code."""
         if quantity in self._known:
             return self._known[quantity]
         names = [quantity] if isinstance(quantity, str) else list(dict.fromkeys(quantity))

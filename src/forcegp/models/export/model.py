@@ -87,7 +87,7 @@ class Functions:
 
 @dataclass(frozen=True, eq=False)
 class ExportedModel:
-    """What is exported of a fit.
+    """The exported part of a fit.
 
     Attributes:
         system: robot and contacts.

@@ -1,0 +1,79 @@
+"""Pages generated from the code: error messages with their remedies, and findings of `forcegp check`.
+
+A line `<!-- generated: errors -->` or `<!-- generated: findings -->` of a page is replaced by a table.
+"""
+
+from __future__ import annotations
+
+import ast
+import re
+from collections import defaultdict
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+from sphinx.application import Sphinx
+
+SOURCE = Path(__file__).resolve().parents[2] / "src" / "forcegp"
+TYPED = set(re.findall(r"^class (\w+)\(", (SOURCE / "errors.py").read_text(encoding="utf-8"), flags=re.M))
+
+
+def template(node: ast.expr | None) -> str:
+    """The text of a message, with … for what is inserted; empty where it is not written out."""
+    if isinstance(node, ast.Constant) and isinstance(node.value, str):
+        return node.value
+    if isinstance(node, ast.JoinedStr):
+        return "".join(part.value if isinstance(part, ast.Constant) else "…" for part in node.values)
+    return ""
+
+
+def raised(source: Path = SOURCE) -> Iterator[tuple[str, str, str]]:
+    """Class, message and hint of each error that is constructed with its message written out."""
+    for path in sorted(source.rglob("*.py")):
+        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in TYPED:
+                message = template(node.args[0]) if node.args else ""
+                hints = [template(keyword.value) for keyword in node.keywords if keyword.arg == "hint"]
+                if message:
+                    yield node.func.id, message, "".join(hints)
+
+
+def cell(text: str) -> str:
+    """Text of a table: no markup."""
+    return re.sub(r"([|*_`<>\[\]$\\])", r"\\\1", " ".join(text.split()))
+
+
+def errors() -> str:
+    """A section with a table for each class of errors."""
+    sections: dict[str, set[tuple[str, str]]] = defaultdict(set)
+    for name, message, hint in raised():
+        sections[name].add((message, hint))
+    text = ""
+    for name, rows in sorted(sections.items()):
+        text += f"\n## {name}\n\n| message | hint |\n|---|---|\n"
+        text += "".join(f"| {cell(message)} | {cell(hint)} |\n" for message, hint in sorted(rows))
+    return text
+
+
+def findings() -> str:
+    """All kinds of findings of `forcegp check`."""
+    from forcegp.checks import KINDS
+
+    head = "| kind | family | severity | meaning | remedy |\n|---|---|---|---|---|\n"
+    return head + "".join(
+        f"| `{name}` | {kind.family} | {kind.severity} | {kind.title} | {kind.remedy} |\n"
+        for name, kind in KINDS.items()
+    )
+
+
+def _insert(app: Sphinx, docname: str, source: list[str]) -> None:
+    for name, made in (("errors", errors), ("findings", findings)):
+        mark = f"<!-- generated: {name} -->"
+        if mark in source[0]:
+            source[0] = source[0].replace(mark, made())
+
+
+def setup(app: Sphinx) -> dict[str, Any]:
+    """Replace the marks when a page is read."""
+    app.connect("source-read", _insert)
+    return {"parallel_read_safe": True, "parallel_write_safe": True}
