@@ -57,7 +57,7 @@ Motion = tuple[np.ndarray, np.ndarray, np.ndarray]
 def condition(G: Tensor, unknowns: Unknowns) -> Tensor:
     """Log condition number of the regressor, columns in units of their prior standard deviations."""
     links = unknowns.base.rank
-    each = (len(unknowns.root) - links) // unknowns.robot.nq
+    each = (unknowns.parts["friction"].stop - links) // unknowns.robot.nq
     columns = [*range(links), *(links + each * j + k for j in range(unknowns.robot.nq) for k in (0, 1))]
     scale = unknowns.root[columns].norm(dim=-1)
     values = torch.linalg.eigvalsh(scale[:, None] * G[columns][:, columns] * scale)

@@ -31,6 +31,7 @@ from forcegp.rollout import RolloutOptions
 from forcegp.simulate.excite import Limits, excite, random_states
 from forcegp.simulate.passive import PassiveForces
 from forcegp.simulate.urdf import write_urdf
+from forces.test_inertia import log
 
 mujoco = optional_module("mujoco", "These tests")
 DAMPING, DRY = (0.3, 0.1), (1.0, 0.4)
@@ -272,14 +273,30 @@ def test_a_model_lowers_what_is_unknown_and_a_motion_lowers_it_further(fit: Stru
     prior = next(p for p in fit.force_priors if isinstance(p, InertialPrior))
     index = next(k for k, x in enumerate(fit.force_priors) if x is prior)
     precision = latent_precision(fit.posterior, one_row(fit.posterior, fit.problem), index, robot)
-    B = torch.from_numpy(before.base.combination) * prior.scale(robot)
+    links, drives = (torch.from_numpy(before.base.combination), torch.eye(len(prior.drives)).double())
+    B = torch.block_diag(links, drives) * prior.scale(robot)
     exact = (B @ torch.linalg.solve(precision, B.mT)).diagonal().sqrt()
-    found = known.root[known.parts["links"]].norm(dim=-1)
+    found = torch.cat([known.root[known.parts[x]] for x in ("links", "drives")]).norm(dim=-1)[: len(B)]
     assert torch.allclose(found, exact, rtol=0.15, atol=2e-3 * float(before.root.max()))
     system = forcegp.ConstrainedSystem(robot)
     motion = excite(system, 4.0, limits=limits, unknowns=known, restarts=1)
     assert bool((motion.after.torque_std()["all"] < stds[1]["all"]).all())
     assert float(motion.motion.qd.abs().max()) > 0.5
+
+
+def test_drives_of_an_identified_robot_are_unknown_with_its_links() -> None:
+    """Joint 1 of the pendulum turns about a fixed axis: torque tells the sum of link and drive."""
+    robot = forcegp.load_robot("double_pendulum")
+    truth = robot.replace(mass=1.3 * robot.mass, com=0.9 * robot.com)
+    fit = forcegp.StructuredGP(forcegp.ConstrainedSystem(robot), "analytical").fit(log(truth, 800))
+    limits = Limits.of(robot, velocity=[3.0], acceleration=[10.0], torque=[50.0])
+    before = Unknowns.of(robot, limits.low, limits.high, limits.velocity, random_states(robot, limits, 40))
+    known = unknowns_after(fit, before)
+    drive = known.root[known.parts["drives"]].norm(dim=-1)[0]
+    still = torch.zeros(2, 2, dtype=torch.float64)
+    Phi = known.columns(still, still, torch.tensor([[0.0, 0.0], [1.0, 0.0]], dtype=torch.float64))[1][:, 0]
+    both = ((Phi[1] - Phi[0]) @ known.root).norm()
+    assert 0.0 < float(both) < 0.3 * float(drive)
 
 
 def test_simulate_with_a_model_names_it_in_the_log(fit: StructuredFit, tmp_path: Path) -> None:

@@ -1,8 +1,9 @@
 """What a motion would tell about the unknown forces of a robot.
 
 The torque is linear in what is unknown, τ = τ₀ + Φ(q, q̇, q̈) θ with θ ~ N(0, U Uᵀ): base parameters of
-the links, and for each joint a function of its speed and one of its position, as viscous and dry friction and
-Gaussian bumps. A motion x with noise Σ leaves
+the links; for each joint a function of its speed and one of its position, as viscous and dry friction and
+Gaussian bumps; inertia of the drives, which is known until a fit has learned it with that of the links.
+A motion x with noise Σ leaves
 
     Cov θ = U (1 + Uᵀ G U)⁻¹ Uᵀ,    G = Σ_i Φ(x_i)ᵀ Σ⁻¹ Φ(x_i),
 
@@ -95,15 +96,16 @@ class Unknowns:
         links = torch.linalg.cholesky(
             _squared(torch.from_numpy(base.combination) * InertialPrior().scale(robot))
         )
-        root = torch.block_diag(links, torch.diag((torque[:, None] * functions).flatten()))
+        friction, drives = (torque[:, None] * functions).flatten().diag(), torch.zeros_like(torque).diag()
+        root = torch.block_diag(links, friction, drives)
         noise = NOISE * torque if noise is None else noise
         return cls(robot, base, low, high, fastest, region, noise, root)
 
     @property
     def parts(self) -> dict[str, slice]:
-        """Where θ has the links and the functions of the joints."""
-        links = self.base.rank
-        return {"links": slice(0, links), "friction": slice(links, len(self.root))}
+        """Where θ has the links, the functions of the joints, and the drives."""
+        links, drives = self.base.rank, len(self.root) - self.robot.nq
+        return {"links": slice(0, links), "friction": slice(links, drives), "drives": slice(drives, None)}
 
     def basis(self, q: Tensor, qd: Tensor) -> Tensor:
         """Functions of each joint `(n, nq, k)`: q̇ and tanh q̇ in units, bumps over q̇, bumps over q."""
@@ -118,7 +120,8 @@ class Unknowns:
         """Regressor Y of the links and Φ `(n, nq, p)` of all parameters at states `(n, nq)`."""
         Y = regressor(self.robot, q, qd, qdd)
         functions = torch.diag_embed(self.basis(q, qd).movedim(-1, 1)).movedim(1, -1)
-        return Y, torch.cat([Y[..., list(self.base.columns)], functions.flatten(-2)], dim=-1)
+        parts = [Y[..., list(self.base.columns)], functions.flatten(-2), torch.diag_embed(qdd)]
+        return Y, torch.cat(parts, dim=-1)
 
     def information(self, Phi: Tensor, seconds: float) -> Tensor:
         """G `(p, p)` of a motion that lasts some seconds, from Φ at states of it."""

@@ -240,23 +240,22 @@ def unknowns_after(fit: StructuredFit, unknowns: Unknowns, *, draws: int = DRAWS
     nq, links = unknowns.robot.nq, unknowns.base.rank
     found: dict[int, Tensor] = {}
     delta = reader.speeds.new_zeros(draws, nq * len(MOMENTS))
-    if reader.scale is not None:
-        delta += (reader._constants(drawn, InertialPrior)[1:].unflatten(-1, (nq, -1)) * reader.scale).flatten(
-            1
-        )
-    for prior in (p for p in fit.force_priors if isinstance(p, PayloadPrior)):
-        first = len(MOMENTS) * prior.link(unknowns.robot)
-        load = reader._constants(drawn, PayloadPrior)[1:] * prior.units(delta)
+    prior = next((p for p in fit.force_priors if isinstance(p, InertialPrior)), None)
+    if prior is not None:
+        errors = reader._constants(drawn, InertialPrior)[1:] * prior.scale(unknowns.robot)
+        delta += errors[:, : delta.shape[1]]
+        found |= dict(enumerate(errors[:, delta.shape[1] :].mT, unknowns.parts["drives"].start))
+    for payload in (p for p in fit.force_priors if isinstance(p, PayloadPrior)):
+        first = len(MOMENTS) * payload.link(unknowns.robot)
+        load = reader._constants(drawn, PayloadPrior)[1:] * payload.units(delta)
         delta[:, first : first + load.shape[1]] += load
-    if reader.scale is not None:
+    if prior is not None:
         found |= dict(enumerate((delta @ torch.from_numpy(unknowns.base.combination).mT).mT))
     if any(isinstance(prior, JointFrictionPrior) for prior in fit.force_priors):
         curves = torch.stack(list(reader._curves(drawn)))[1:]
-        basis = unknowns.basis(torch.zeros_like(reader.speeds), reader.speeds)[..., : 2 + SPEED_BUMPS]
-        weights = torch.linalg.pinv(basis.movedim(1, 0)) @ (curves - curves.mean(0)).movedim(0, -1).movedim(
-            1, 0
-        )
-        each = (len(unknowns.root) - links) // nq
+        basis = unknowns.basis(torch.zeros_like(reader.speeds), reader.speeds)
+        spread, each = (curves - curves.mean(0)).permute(2, 1, 0), basis.shape[-1]
+        weights = torch.linalg.pinv(basis[..., : 2 + SPEED_BUMPS].movedim(1, 0)) @ spread
         found |= {links + each * j + k: w for j in range(nq) for k, w in enumerate(weights[j])}
     if not found:
         return unknowns
