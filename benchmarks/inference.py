@@ -58,7 +58,7 @@ def unfitted(mean: str = "zero") -> forcegp.StructuredGP:
 def start_of(data: forcegp.Dataset) -> tuple[forcegp.StructuredGP, Problem, dict[str, Tensor]]:
     system = forcegp.load_scene("kuka_plane").system()
     # The dense formula is the paper's, kernel included.
-    model = forcegp.StructuredGP(system, force_priors=default_priors(system, "zero", PAPER))
+    model = forcegp.StructuredGP(system, "zero", force_priors=default_priors(system, "zero", PAPER))
     training, _ = training_for(model.specification, None, data, None)
     problem = model.specification.problem(training)
     return model, problem, initial(problem, learn_noise=False)

@@ -59,7 +59,7 @@ def test_other_threads_and_later_calls_keep_their_number() -> None:
 
 def test_threads_that_predict_get_the_same_numbers() -> None:
     system = table_system()
-    model = forcegp.StructuredGP(system, noise=0.1).fit(
+    model = forcegp.StructuredGP(system, "zero", noise=0.1).fit(
         random_data(system, 12), options=forcegp.LearningOptions(max_evaluations=2)
     )
     test = random_data(system, 20, seed=1)

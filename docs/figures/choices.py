@@ -76,7 +76,7 @@ def model() -> None:
     train, test = logs()
     models = {
         "gp": forcegp.IndependentGP(system()),
-        "sgp-zero": forcegp.StructuredGP(system()),
+        "sgp-zero": forcegp.StructuredGP(system(), "zero"),
         "sgp": forcegp.StructuredGP(system(), mean="analytical"),
     }
     draw_errors(errors(models, train, test), nominal(test), "model")

@@ -105,4 +105,4 @@ def test_without_impacts_little_is_lost() -> None:
 @pytest.mark.parametrize("degrees", [2.0, -1.0, float("nan")])
 def test_degrees_that_are_not_valid(degrees: float) -> None:
     with pytest.raises(ModelError, match="degrees of freedom"):
-        forcegp.StructuredGP(two_contacts(), noise=forcegp.Noise(degrees_of_freedom=degrees))
+        forcegp.StructuredGP(two_contacts(), "zero", noise=forcegp.Noise(degrees_of_freedom=degrees))

@@ -168,7 +168,7 @@ def test_a_payload_is_part_of_the_robot() -> None:
 
 def test_forces_around_zero_are_no_calibration(fit: StructuredFit) -> None:
     robot = fit.specified.robot
-    blind = forcegp.StructuredGP(forcegp.ConstrainedSystem(robot)).fit(log_of(robot, 60, 1))
+    blind = forcegp.StructuredGP(forcegp.ConstrainedSystem(robot), "zero").fit(log_of(robot, 60, 1))
     with pytest.raises(ModelError, match="not those that the robot file lacks"):
         calibrated(blind)
 

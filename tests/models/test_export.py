@@ -105,7 +105,7 @@ def exact() -> StructuredFit:
 
 def zero_mean() -> StructuredFit:
     """The whole force: products of linear and stationary kernels, sines of angles."""
-    priors = (JointForcePrior(WHOLE, periodic=True), *default_priors(two_contacts())[1:])
+    priors = (JointForcePrior(WHOLE, periodic=True), *default_priors(two_contacts(), "zero")[1:])
     priors = (priors[0], NormalForcePrior(priors[0]))
     model = forcegp.StructuredGP(
         two_contacts(), "zero", priors, noise=0.1, inference="sparse", inducing_points=12

@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from forcegp.errors import ModelError, UnknownNameError
+from forcegp.forces.priors.joint import AnalyticalMean
 from forcegp.models.independent_gp import IndependentGP, IndependentSettings
 from forcegp.models.structured_file import StructuredSettings
 from forcegp.models.structured_gp import StructuredGP
@@ -52,6 +53,13 @@ def test_a_wrong_option_is_refused_by_name(options: dict[str, Any], kind: type, 
 
 
 def test_options_are_kept_for_the_fit() -> None:
-    spec = StructuredGP(SYSTEM, inference="sparse", inducing_points=7, standardize=False).specification
+    spec = StructuredGP(
+        SYSTEM, "zero", inference="sparse", inducing_points=7, standardize=False
+    ).specification
     assert spec.options == StructuredOptions(inference="sparse", inducing_points=7, standardize=False)
     assert spec.with_options(inertia="auto").options.inducing_points == 7
+
+
+def test_the_mean_is_analytical_unless_another_is_named() -> None:
+    assert StructuredGP(SYSTEM).mean.terms == AnalyticalMean().terms
+    assert StructuredGP(SYSTEM, "zero").mean.terms == ()

@@ -41,7 +41,7 @@ def predicted(model: StructuredFit, quantity: str) -> torch.Tensor:
 
 @pytest.mark.slow
 def test_a_worker_predicts_the_same_bits_and_raises_the_same_error(pool: ProcessPoolExecutor) -> None:
-    model = forcegp.StructuredGP(table_system(), noise=0.1).fit(DATA, options=FEW)
+    model = forcegp.StructuredGP(table_system(), "zero", noise=0.1).fit(DATA, options=FEW)
     here = predicted(model, "qdd")
     assert pool.submit(predicted, model, "qdd").result(timeout=120).tolist() == here.tolist()
     with pytest.raises(ForceGPError, match="unknown quantity") as there:
@@ -57,12 +57,12 @@ def fitted(model: forcegp.StructuredGP) -> list[float]:
 
 
 def test_a_worker_fits_a_model_to_the_same_bits(pool: ProcessPoolExecutor) -> None:
-    model = forcegp.StructuredGP(table_system(), noise=0.1)
+    model = forcegp.StructuredGP(table_system(), "zero", noise=0.1)
     assert pool.submit(fitted, model).result(timeout=120) == fitted(model)
 
 
 def test_a_fit_of_python_code_says_so_before_it_is_sent(pool: ProcessPoolExecutor) -> None:
     hill = forcegp.OperatorForcePrior("own", 7, identity)
-    fit = forcegp.StructuredGP(table_system(), force_priors=[hill], noise=0.1).fit(DATA, learn=[])
+    fit = forcegp.StructuredGP(table_system(), "zero", force_priors=[hill], noise=0.1).fit(DATA, learn=[])
     with pytest.raises(ModelError, match="holds Python code"):
         pool.submit(predicted, fit, "qdd").result(timeout=120)

@@ -30,7 +30,7 @@ CASES: dict[str, tuple[Callable[[], Any], Any]] = {
         forcegp.LearningOptions(max_evaluations=4),
     ),
     "structured": (
-        lambda: forcegp.StructuredGP(table_system(), noise=0.1),
+        lambda: forcegp.StructuredGP(table_system(), "zero", noise=0.1),
         forcegp.LearningOptions(max_evaluations=8),
     ),
 }
@@ -102,9 +102,9 @@ def test_a_checkpoint_of_other_data_is_refused(case: tuple[Callable[[], Any], An
 )
 def test_a_checkpoint_of_another_objective_is_refused(other: dict[str, Any], tmp_path: Path) -> None:
     file, options = tmp_path / "fit.ckpt", forcegp.LearningOptions(max_evaluations=3)
-    forcegp.StructuredGP(table_system(), noise=0.1).fit(DATA, options=options, checkpoint=file)
+    forcegp.StructuredGP(table_system(), "zero", noise=0.1).fit(DATA, options=options, checkpoint=file)
     with pytest.raises(ModelError, match="belongs to another fit"):
-        forcegp.StructuredGP(table_system(), **{"noise": 0.1, **other}).fit(
+        forcegp.StructuredGP(table_system(), "zero", **{"noise": 0.1, **other}).fit(
             DATA, options=options, checkpoint=file
         )
 

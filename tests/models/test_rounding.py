@@ -99,7 +99,7 @@ def test_an_acceleration_of_1e8_is_noise_of_the_torque_if_that_is_learned(scene:
 def test_a_noise_below_rounding_is_refused(noise: float) -> None:
     system, train, _ = drawn("kuka_plane", 30)
     with pytest.raises(NumericalError, match=r"noise at least [\d.e+]+ times as large"):
-        forcegp.StructuredGP(system, noise=noise).fit(train, options=FEW)
+        forcegp.StructuredGP(system, "zero", noise=noise).fit(train, options=FEW)
 
 
 def test_noise_learned_from_noise_free_accelerations_warns_and_is_right() -> None:
@@ -112,7 +112,7 @@ def test_noise_learned_from_noise_free_accelerations_warns_and_is_right() -> Non
 
 def test_a_variance_that_is_rounding_and_a_negative_eigenvalue_are_refused() -> None:
     system, train, test = drawn("pendulum_wire", 40)
-    fit = forcegp.StructuredGP(system).fit(train, options=FEW)
+    fit = forcegp.StructuredGP(system, "zero").fit(train, options=FEW)
     strong = {k: v + 16.0 if k.endswith("_std") else v for k, v in fit.hyperparameters.items()}
     with pytest.raises(NumericalError, match="does not resolve"):
         fit.condition(train, strong)

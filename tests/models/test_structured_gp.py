@@ -236,7 +236,7 @@ def test_learned_noise_and_honest_flags() -> None:
     assert fit.evaluations == len(fit.history) and fit.seconds > 0.0
     again = fit.condition(rows)
     assert again.log_marginal_likelihood == pytest.approx(fit.log_marginal_likelihood)
-    assert not StructuredGP(table).fit(rows, options=LearningOptions(max_evaluations=2)).converged
+    assert not StructuredGP(table, "zero").fit(rows, options=LearningOptions(max_evaluations=2)).converged
     with pytest.raises(
         ModelError, match=r"learned noise belongs to other measurements[\s\S]*expected: qdd\n"
     ):
@@ -245,7 +245,7 @@ def test_learned_noise_and_honest_flags() -> None:
 
 def test_progress_is_reported() -> None:
     seen: list[tuple[int, int, float]] = []
-    StructuredGP(table).fit(data, options=SHORT, progress=lambda *args: seen.append(args))
+    StructuredGP(table, "zero").fit(data, options=SHORT, progress=lambda *args: seen.append(args))
     assert [n for n, _, _ in seen] == list(range(1, len(seen) + 1))
     assert {most for _, most, _ in seen} == {4}
 
@@ -348,22 +348,22 @@ def test_hostile_files_are_refused_when_they_are_read(
 
 REFUSED: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
     "no prior": (
-        lambda: StructuredGP(table, force_priors=[]),
+        lambda: StructuredGP(table, "zero", force_priors=[]),
         ModelError,
         "distinct names, and one at least",
     ),
     "same names": (
-        lambda: StructuredGP(table, force_priors=[both[0], both[0]]),
+        lambda: StructuredGP(table, "zero", force_priors=[both[0], both[0]]),
         ModelError,
         "distinct names",
     ),
     "name": (
-        lambda: StructuredGP(table, force_priors=[JointForcePrior(name="noise")]),
+        lambda: StructuredGP(table, "zero", force_priors=[JointForcePrior(name="noise")]),
         ModelError,
         "'noise'",
     ),
     "dots": (
-        lambda: StructuredGP(table, force_priors=[JointForcePrior(name="a.b")]),
+        lambda: StructuredGP(table, "zero", force_priors=[JointForcePrior(name="a.b")]),
         ModelError,
         "without dots",
     ),
@@ -389,7 +389,7 @@ REFUSED: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
         "kernel input 'x'",
     ),
     "learn": (
-        lambda: StructuredGP(table).fit(data, learn=["jont"]),
+        lambda: StructuredGP(table, "zero").fit(data, learn=["jont"]),
         UnknownNameError,
         "did you mean 'joint'",
     ),
@@ -400,19 +400,19 @@ REFUSED: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
     ),
     "noise zero": (lambda: fitted(noise=0.0), ModelError, "must be positive and finite"),
     "no rows": (lambda: fitted(data[:0]), ModelError, "no samples to learn from"),
-    "no observation": (lambda: StructuredGP(table).fit([]), ModelError, "no samples to learn from"),
+    "no observation": (lambda: StructuredGP(table, "zero").fit([]), ModelError, "no samples to learn from"),
     "noise of a sensor": (
-        lambda: StructuredGP(table).fit([Observation(data, "joint_force")]),
+        lambda: StructuredGP(table, "zero").fit([Observation(data, "joint_force")]),
         DataError,
         "'Q' is not logged",
     ),
     "quantity": (
-        lambda: StructuredGP(table).fit([Observation(data, "qdd_free")]),
+        lambda: StructuredGP(table, "zero").fit([Observation(data, "qdd_free")]),
         UnknownNameError,
         "qdd_free",
     ),
     "sensor": (
-        lambda: StructuredGP(table).fit([Observation(data, "multiplier", 1.0)]),
+        lambda: StructuredGP(table, "zero").fit([Observation(data, "multiplier", 1.0)]),
         UnknownNameError,
         "unknown contact with a logged multiplier 'table'",
     ),
@@ -467,7 +467,7 @@ def test_a_fit_resumes_from_its_checkpoint(tmp_path: Path, monkeypatch: pytest.M
         if evaluations == 6:
             raise Interrupted
 
-    model = forcegp.StructuredGP(two_contacts())
+    model = forcegp.StructuredGP(two_contacts(), "zero")
     with pytest.raises(Interrupted):
         model.fit(data, options=options, progress=stop, checkpoint=path)
     assert path.is_file()
@@ -476,7 +476,7 @@ def test_a_fit_resumes_from_its_checkpoint(tmp_path: Path, monkeypatch: pytest.M
     resumed = model.fit(data, options=options, progress=note, checkpoint=path)
     assert again[: len(seen)] == seen
     assert path.is_file(), "kept until the caller has saved the fit"
-    whole = forcegp.StructuredGP(two_contacts()).fit(data, options=options)
+    whole = forcegp.StructuredGP(two_contacts(), "zero").fit(data, options=options)
     assert resumed.history == whole.history
     assert all(torch.equal(x, resumed.hyperparameters[key]) for key, x in whole.hyperparameters.items())
 
@@ -486,17 +486,17 @@ def test_a_checkpoint_of_another_fit_is_refused(tmp_path: Path) -> None:
     start = {"joint.log_std": torch.zeros(7, dtype=torch.float64)}
     Evaluations(Checkpoint(path, "another")).recorded(lambda tensors: tensors["joint.log_std"].sum())(start)
     with pytest.raises(ModelError, match="belongs to another fit"):
-        forcegp.StructuredGP(two_contacts()).fit(logged(two_contacts(), 5), checkpoint=path)
+        forcegp.StructuredGP(two_contacts(), "zero").fit(logged(two_contacts(), 5), checkpoint=path)
     path.write_bytes(b"not a checkpoint")
     with pytest.raises(ModelError, match="damaged"):
-        forcegp.StructuredGP(two_contacts()).fit(logged(two_contacts(), 5), checkpoint=path)
+        forcegp.StructuredGP(two_contacts(), "zero").fit(logged(two_contacts(), 5), checkpoint=path)
 
 
 @pytest.mark.slow
 def test_warm_start_ends_as_well_and_restarts_no_worse() -> None:
     data = logged(two_contacts(), 24)
     cold, warm, many = (
-        forcegp.StructuredGP(two_contacts()).fit(data, options=forcegp.LearningOptions(**options))
+        forcegp.StructuredGP(two_contacts(), "zero").fit(data, options=forcegp.LearningOptions(**options))
         for options in ({"warm_start": None}, {"warm_start": 8}, {"warm_start": None, "restarts": 1})
     )
     assert cold.converged and warm.converged
@@ -525,7 +525,7 @@ def test_a_fit_begins_at_the_hyperparameters_of_another() -> None:
 
 def test_a_part_of_the_data_has_distinct_states() -> None:
     data = logged(two_contacts(), 10)
-    fit = forcegp.StructuredGP(two_contacts()).fit(data[torch.arange(10).repeat(3)], learn=[])
+    fit = forcegp.StructuredGP(two_contacts(), "zero").fit(data[torch.arange(10).repeat(3)], learn=[])
     (few,) = fit.training.thinned(6).measurements
     assert len(few.q) == 6 and len(few.q.unique(dim=0)) == 6
     (all_,) = fit.training.thinned(30).measurements
@@ -536,10 +536,10 @@ def test_the_normal_force_prior_changes_multipliers_alone() -> None:
     data = logged(two_contacts(), 10)
     joint = forcegp.JointForcePrior()
     normal = forcegp.NormalForcePrior(joint)
-    plain = forcegp.StructuredGP(two_contacts(), force_priors=[joint]).fit(
+    plain = forcegp.StructuredGP(two_contacts(), "zero", force_priors=[joint]).fit(
         data, options=forcegp.LearningOptions(max_evaluations=5)
     )
-    open_ = forcegp.StructuredGP(two_contacts(), force_priors=[joint, normal]).fit(data, learn=[])
+    open_ = forcegp.StructuredGP(two_contacts(), "zero", force_priors=[joint, normal]).fit(data, learn=[])
     start, learned = open_.hyperparameters, plain.hyperparameters
     for values in (start, learned):
         # The search itself amplifies rounding: data that differ by 10⁻¹⁵ are learned 10⁻⁵ apart.
@@ -565,7 +565,7 @@ def test_contact_data_alone_tell_the_sum_of_two_forces() -> None:
         target="contact",
     )
     closed = logged(system, 12, active=torch.ones(12, 2, dtype=torch.bool))
-    model = forcegp.StructuredGP(system, force_priors=[forcegp.JointForcePrior(), same])
+    model = forcegp.StructuredGP(system, "zero", force_priors=[forcegp.JointForcePrior(), same])
     held = model.fit(closed, options=forcegp.LearningOptions(max_evaluations=2))
     assert held.force_correlation is not None
     assert held.force_correlation < -0.2

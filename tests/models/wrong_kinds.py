@@ -17,7 +17,7 @@ from raw_errors import outcomes
 SYSTEM = table_system()
 DATA = random_data(SYSTEM, 8)
 Q, QD, TAU = DATA.q, DATA.qd, DATA.tau
-MODEL = forcegp.StructuredGP(SYSTEM, noise=0.1)
+MODEL = forcegp.StructuredGP(SYSTEM, "zero", noise=0.1)
 ROBOT = SYSTEM.robot
 
 
@@ -48,8 +48,8 @@ CALLS = {
     "noise=text": lambda: fit_with(noise="loud"),
     "noise=negative": lambda: fit_with(noise=-0.1),
     "noise=[None]": lambda: fit_with(noise=[None] * 7),
-    "data=list": lambda: forcegp.StructuredGP(SYSTEM, noise=0.1).fit([1, 2]),
-    "data=None": lambda: forcegp.StructuredGP(SYSTEM, noise=0.1).fit(None),
+    "data=list": lambda: forcegp.StructuredGP(SYSTEM, "zero", noise=0.1).fit([1, 2]),
+    "data=None": lambda: forcegp.StructuredGP(SYSTEM, "zero", noise=0.1).fit(None),
     "checkpoint=folder": lambda: MODEL.fit(DATA, checkpoint=tempfile.gettempdir()),
     "mass_matrix(list)": lambda: forcegp.dynamics.mass_matrix(ROBOT, [0.0] * 7),
     "frame_pose(list)": lambda: forcegp.kinematics.frame_pose(ROBOT, [0.0] * 7, ROBOT.frame_names[-1]),

@@ -187,12 +187,12 @@ def test_a_checkpoint_of_another_robot_or_surface_is_refused(fresh: Callable[[],
     data, path = random_data(system(), 6), fresh().checkpoint.path
     options = LearningOptions(max_evaluations=5, warm_start=None)
     with pytest.raises(KeyboardInterrupt):
-        forcegp.StructuredGP(system(), noise=0.1).fit(
+        forcegp.StructuredGP(system(), "zero", noise=0.1).fit(
             data, options=options, progress=interrupt(2), checkpoint=path
         )
     for other in (system(offset=0.06), system(mass=1.01)):
         with pytest.raises(ModelError, match="belongs to another fit"):
-            forcegp.StructuredGP(other, noise=0.1).fit(data, options=options, checkpoint=path)
+            forcegp.StructuredGP(other, "zero", noise=0.1).fit(data, options=options, checkpoint=path)
 
 
 def test_a_resumed_fit_with_restarts_keeps_the_best_and_its_file(
@@ -200,7 +200,7 @@ def test_a_resumed_fit_with_restarts_keeps_the_best_and_its_file(
 ) -> None:
     data, path = random_data(system(), 12), fresh().checkpoint.path
     options = LearningOptions(max_evaluations=4, warm_start=4, restarts=1)
-    whole = forcegp.StructuredGP(system(), noise=0.1).fit(data, options=options)
+    whole = forcegp.StructuredGP(system(), "zero", noise=0.1).fit(data, options=options)
     seen: list[int] = []
 
     def stop(done: int, most: int, value: float) -> None:
@@ -208,7 +208,7 @@ def test_a_resumed_fit_with_restarts_keeps_the_best_and_its_file(
         if len(seen) == 6:
             raise KeyboardInterrupt
 
-    model = forcegp.StructuredGP(system(), noise=0.1)
+    model = forcegp.StructuredGP(system(), "zero", noise=0.1)
     with pytest.raises(KeyboardInterrupt):
         model.fit(data, options=options, progress=stop, checkpoint=path)
     resumed = model.fit(data, options=options, checkpoint=path)

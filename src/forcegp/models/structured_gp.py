@@ -40,7 +40,7 @@ class StructuredGP(Model[StructuredFit]):
 
     Args:
         system: robot and contacts.
-        mean: `"zero"`, `"analytical"`, or an `AnalyticalMean` with some terms left out.
+        mean: `"analytical"`, `"zero"`, or an `AnalyticalMean` with some terms left out.
         force_priors: priors on the unknown forces; the name of a set of `SETS` (`"sliding"`, `"friction"`,
             `"friction+residual"`); or `"auto"`. Then, around the analytical forces, held-out stretches of the
             training log choose the set (`models/selection.py`), and `fit.result.comparison` has the table.
@@ -81,7 +81,7 @@ class StructuredGP(Model[StructuredFit]):
     def __init__(
         self,
         system: ConstrainedSystem,
-        mean: str | AnalyticalMean = "zero",
+        mean: str | AnalyticalMean = "analytical",
         force_priors: str | Sequence[ForcePrior] = "auto",
         noise: NoiseStd | Noise | None = None,
         analytical_parameters: nn.Module | None = None,

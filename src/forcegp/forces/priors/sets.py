@@ -27,7 +27,7 @@ learns to cancel it."""
 
 
 def default_priors(
-    system: ConstrainedSystem, mean: str | AnalyticalMean = "zero", kernel: Kernel | None = None
+    system: ConstrainedSystem, mean: str | AnalyticalMean = "analytical", kernel: Kernel | None = None
 ) -> tuple[ForcePrior, ...]:
     """A joint force prior, with what accelerations do not show left open where there are contacts.
 
