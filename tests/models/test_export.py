@@ -329,7 +329,7 @@ def test_two_models_fit_into_one_program(tmp_path: Path) -> None:
 
 
 @needs_gcc
-@pytest.mark.parametrize("name", ["sparse", "exact"])
+@pytest.mark.parametrize("name", slow_except(["sparse", "exact"], "exact"))
 def test_a_reduced_covariance_is_wider_by_no_more_than_stated(name: str, tmp_path: Path) -> None:
     fit = fitted(name)
     written = fit.export(tmp_path / "c", functions=30)
@@ -347,6 +347,7 @@ def test_a_reduced_covariance_is_wider_by_no_more_than_stated(name: str, tmp_pat
     assert float(growth.max()) == pytest.approx(written.widest, rel=1e-6)
 
 
+@pytest.mark.slow
 def test_more_functions_lose_less() -> None:
     fit = fitted("sparse")
     state, active = states(fit)

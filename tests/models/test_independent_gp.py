@@ -125,7 +125,7 @@ def test_batches_of_any_shape_and_chunks_agree(
 
 
 def test_wrong_use_is_refused(model: IndependentFit) -> None:
-    with pytest.raises(ModelError, match="white noise of accelerations alone"):
+    with pytest.raises(ModelError, match="white noise of accelerations only"):
         IndependentGP(system, noise=Noise(0.1, torque="learn"))
     with pytest.raises(ModelError, match="predicts accelerations only"):
         model.predict(test.q, test.qd, test.tau, "multiplier")

@@ -49,7 +49,7 @@ def excite(
     seed: Annotated[int, typer.Option(help="Seed of the random starts.")] = 0,
     as_json: AsJson = False,
 ) -> None:
-    """Plan the motion in free space whose log tells most about inertia and friction.
+    """Plan the motion in free space that identifies inertia and friction best.
 
     It starts and ends at rest, holds the limits of the robot file or those given, and keeps the robot from
     itself, the surfaces of the scene, and boxes. Beside it, a page of the same name shows the motion, its

@@ -247,7 +247,7 @@ class Problem:
 
     def negative_log_likelihood(self, params: Tensors, rows: WhitenedRows) -> Tensor:
         """Of the rows, with their constant; of the weights of features where inference is sparse."""
-        exact = self.inducing is None
+        exact = self.inducing is None or not is_finite(self.priors)
         of = negative_log_likelihood if exact else negative_log_likelihood_of_weights
         return of(self.priors, params, rows.blocks) + rows.constant
 

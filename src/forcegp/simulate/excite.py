@@ -1,4 +1,4 @@
-"""The motion whose log would tell most about the unknown forces, within limits and free of collisions.
+"""The motion that would identify the unknown forces best, within limits and free of collisions.
 
 Joints follow uniform cubic B-splines that start and end at rest in the same position. Splines stay between
 their control points, so that bounds on these and on their differences hold the limits of position, velocity
@@ -396,7 +396,7 @@ def excite(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Excitation:
-    """The motion in free space whose log tells most about the unknown forces.
+    """The motion in free space that identifies the unknown forces best.
 
     Args:
         system: robot, and contacts whose surfaces it keeps away from.
