@@ -6,7 +6,9 @@
 Arms of `solver_arms.py` whose links are off by up to 30 % and whose joints have friction and drives that the
 file lacks. The calibrated URDF is read back, and MuJoCo computes from it the torques of another motion, and
 the motion of the next second under the logged torques. `least squares` is physically consistent too, and has
-drives only as inertia of links; its torque error is that of its own equations.
+drives only as inertia of links; its torque error is that of its own equations. `within` counts the base
+parameters of links and drives, and the damping and dry friction of joints, that lie within two standard
+deviations of 200 sampled robots from the truth.
 """
 
 from __future__ import annotations
@@ -27,11 +29,15 @@ from results_page import table
 from solver_arms import ARMS, STEP, Arm, Imperfections, case_of
 
 import forcegp
-from forcegp.dynamics import inverse_dynamics
+from forcegp.dynamics import inverse_dynamics, mass_matrix
 from forcegp.errors import optional_module
 from forcegp.evaluation.least_squares import identify_rigid
+from forcegp.forces.priors.inertial import InertialPrior
+from forcegp.identification import regressor
 from forcegp.kinematics import frame_pose
-from forcegp.models.calibrated import write_calibrated
+from forcegp.models.calibrated import sampled_robots, write_calibrated
+from forcegp.models.structured_fit import StructuredFit
+from forcegp.robot.inertia import inertial_parameters
 from forcegp.robot.model import RobotModel
 from forcegp.simulate.urdf import write_urdf
 
@@ -39,6 +45,8 @@ mujoco = optional_module("mujoco", "This benchmark")
 WRONG = Imperfections(mass=0.3, gain=0.0, offset=0.0)
 """Links off by up to 30 %, undeclared friction and drives; torque sensors are right."""
 RIGHT = replace(WRONG, mass=0.0, drive=0.0, dry=0.0, viscous=0.0)
+SAMPLES, SMALLEST = 200, 1e-6
+"""Sampled robots, and the least eigenvalue of the information on a base parameter, over the largest."""
 STARTS, AHEAD = 30, 1.0
 """Open-loop motions, and how long each lasts [s]."""
 
@@ -84,6 +92,34 @@ def ahead(robot: RobotModel, log: forcegp.Dataset) -> Array:
     return np.array(found)
 
 
+def deviations(fit: StructuredFit, arm: Arm, log: forcegp.Dataset) -> dict[str, list[float]]:
+    """Errors of base parameters and friction, in standard deviations of sampled robots."""
+    robot, nq, true = arm.robot, arm.robot.nq, arm.true
+    S = InertialPrior().with_drives(mass_matrix(robot, log.q).diagonal(dim1=-2, dim2=-1).mean(0)).scale(robot)
+
+    def parameters(each: RobotModel) -> torch.Tensor:
+        links = inertial_parameters(each.mass, each.com, each.inertia)
+        return torch.cat([links.flatten(), each.armature]) / S
+
+    columns = torch.cat([regressor(robot, log.q, log.qd, log.qdd), torch.diag_embed(log.qdd)], dim=-1) * S
+    A = (columns / log.tau.std(0)[:, None]).flatten(0, 1)
+    values, vectors = torch.linalg.eigh(A.mT @ A)
+    B = vectors[:, values > SMALLEST * values[-1]].mT
+    factor = torch.from_numpy(true.body_mass[1:]) / robot.mass
+    truth = robot.replace(
+        mass=factor * robot.mass,
+        inertia=factor[:, None, None] * robot.inertia,
+        armature=torch.from_numpy(true.dof_armature),
+    )
+    friction = torch.from_numpy(np.concatenate([true.dof_damping, true.dof_frictionloss + arm.dry]))
+    samples = sampled_robots(fit, SAMPLES)
+    base = torch.stack([B @ parameters(each) for each in samples]), B @ parameters(truth)
+    dry = torch.stack([torch.cat([each.damping, each.friction]) for each in samples]), friction
+    assert len(friction) == 2 * nq
+    scores = {name: (x.mean(0) - y) / x.std(0) for name, (x, y) in (("base", base), ("friction", dry))}
+    return {name: x.tolist() for name, x in scores.items()}
+
+
 def tip_error(robot: RobotModel, log: forcegp.Dataset) -> float:
     """Median distance of the last frame from where it was a second after each start [m]."""
     found = ahead(robot, log)
@@ -112,6 +148,7 @@ def measured(name: str, seed: int, wrong: Imperfections, folder: Path) -> dict:
     tip = {key: tip_error(each, test) for key, each in files.items()}
     by_file, by_squares = rmse["calibrated"] / rmse["file"], rmse["calibrated"] / rmse["least squares"]
     return {
+        "deviations": deviations(fit, arm, rows[::10]),
         "torque_rmse": {key: value.tolist() for key, value in rmse.items()},
         "over_file": float(np.exp(np.log(by_file).mean())),
         "over_least_squares": float(np.exp(np.log(by_squares).mean())),
@@ -142,6 +179,9 @@ def main() -> None:
             print(f"{name}, seed {seed}:", *(f"{key} {found[key]:.3f}" for key in keys), flush=True)
     head = ["arm, seed", "torque ÷ file", "÷ least squares", "worst joint", "tip after 1 s ÷ file"]
     print(table(head, [[name, *(f"{found[key]:.2f}" for key in keys)] for name, found in result.items()]))
+    for kind in ("base", "friction"):
+        z = np.abs(np.concatenate([found["deviations"][kind] for found in result.values()]))
+        print(f"{kind}: {(z <= 2.0).mean():.2f} of {len(z)} within 2σ, median {np.median(z):.2f}σ")
     if options.json:
         options.json.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
 

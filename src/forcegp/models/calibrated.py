@@ -7,8 +7,7 @@ nearest to the learned friction Q_D(q̇) over the trained speeds, by least squar
 
 averaged over poses where friction depends on the load. What is left, and the offset c, are losses. A
 log seldom separates an offset from the weight of links: if zero is within 2σ of an offset, all the rest is
-conditioned on c = 0. URDF has no armature a either: inertia a about the joint's axis, and as little across it
-as the link needs to stay physically consistent, goes to the link if that brings the mass matrix closer.
+conditioned on c = 0. URDF has no armature a either: the links take its inertia as far as bodies can.
 Samples are the same for functions drawn from the posterior, with inertial parameters π + S δ
 (`forces/priors/inertial.py`).
 """
@@ -35,6 +34,7 @@ from forcegp.forces.posterior import ForceSamples
 from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
 from forcegp.forces.priors.joint import AnalyticalMean, JointFrictionPrior
 from forcegp.forces.quantities import States, states_at
+from forcegp.identification import regressor
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.robot.inertia import from_pseudo_inertia, inertial_parameters, pseudo_inertia
 from forcegp.robot.model import RobotModel
@@ -53,11 +53,13 @@ OPEN = 2.0
 DETERMINED = 0.5
 """A parameter is determined from this fraction of its prior standard deviation, or of its own size, on."""
 SMALLEST = 1e-2
-"""ε, the smallest eigenvalue of a sampled link's pseudo-inertia in units of the estimate."""
-MARGIN = 1e-6
-"""Distance from the triangle inequality, so that the text of a file keeps it."""
-HALVINGS = 40
-"""Steps that find the least inertia across an axis."""
+"""ε, the smallest eigenvalue of a link's pseudo-inertia in units of the identified one."""
+ROUNDS, RELAXATION = 300, 1.6
+"""Of the search for the nearest bodies."""
+STATES, RATE = 400, 4.0
+"""Random states at which links take the inertia of drives, and accelerations over speeds there [1/s]."""
+WANTED = 0.01
+"""ε, the wanted error of a torque over its size."""
 MOMENTS = ("mass", "mass·x", "mass·y", "mass·z", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
 """The inertial parameters of a link, about its origin [kg, kg m, kg m²]."""
 FIGURES = ("damping", "friction", *MOMENTS, "armature")
@@ -148,8 +150,8 @@ def sampled_robots(fit: StructuredFit, samples: int, *, seed: int = 0) -> list[R
     """Robots drawn from the joint posterior of inertia, drives' links, payload and friction; each is
     physically consistent.
 
-    A link of a sample that no body could be is replaced by the nearest one (eigenvalues of its pseudo-inertia
-    over the estimate are at least ε = 0.01).
+    Samples whose links no body could have are replaced by the nearest robot in the metric of the posterior
+    (eigenvalues of pseudo-inertias over the identified ones are at least ε = 0.01).
 
     Args:
         fit: around the analytical forces.
@@ -197,7 +199,7 @@ def write_calibrated(
     losses: tuple[str, ...] = ()
     for k, robot in enumerate(robots):
         path = out.with_name(f"{out.stem}.sample_{k - 1:03d}{out.suffix}") if k else out
-        holding = without_armature(robot) if drives else robot
+        holding = without_armature(robot, found.speeds[-1]) if drives else robot
         losses = losses or write_robot(holding, source, path, locked_joints=locked_joints).losses
     if drives:
         values = ", ".join(f"{x:.4g}" for x in found.robot.armature.tolist())
@@ -341,8 +343,50 @@ class _Reader:
         sizes = [part.shape[-1] for part in parts]
         offset, (kept,) = self._offsets(curves), self._offsets(self._kept()[None])
         free = _without_offsets(offset, offset[0] - kept, torch.cat(parts, dim=-1))
-        rows = (row.split(sizes) for row in free)
+        rows = (row.split(sizes) for row in self._consistent(free, sizes[0]))
         return [self._robot(curve.view_as(self.speeds), delta, load) for curve, delta, load in rows]
+
+    def _consistent(self, values: Tensor, first: int) -> Tensor:
+        """Mean and samples `(1 + samples, d)` with the most probable links that are bodies.
+
+        min_x ½ (x − x₀)ᵀ Σ⁻¹ (x − x₀) with the samples' covariance Σ, over the entries x of J₀^-½ ΔJ J₀^-½ of
+        each link from −1 + ε on, by ADMM; links are in the columns from `first` on. Other columns follow by
+        their covariance with the links, and a link of the file that no body could be stays as it is.
+        Source: Boyd et al., *Distributed optimization and statistical learning via ADMM* (2011), section 5.
+        """
+        if self.scale is None:
+            return values
+        robot, n = self.fit.system.robot, len(MOMENTS)
+        w, U = torch.linalg.eigh(pseudo_inertia(robot.mass, robot.com, robot.inertia))
+        sound, one = w[:, 0] > 0.0, torch.eye(4).to(w)
+        root = (U @ torch.diag_embed(torch.where(sound[:, None], w, 1.0).rsqrt()) @ U.mT)[:, None]
+        row, column = torch.triu_indices(4, 4)
+        weight = torch.where(row == column, 1.0, 2.0**0.5).to(w)
+        entries = root @ (_pseudo(torch.eye(n).to(w)) * self.scale[:, :n, None, None]) @ root
+        entries = torch.where(sound[:, None, None], entries[..., row, column] * weight, torch.eye(n).to(w))
+        T, links = torch.block_diag(*entries), slice(first, first + robot.nq * n)
+
+        def bodies(x: Tensor) -> Tensor:
+            X = x.new_zeros(len(x), robot.nq, 4, 4)
+            X[..., row, column] = X[..., column, row] = x.view(len(x), robot.nq, n) / weight
+            w, V = torch.linalg.eigh(X + one)
+            X = V @ torch.diag_embed(w.clamp(min=SMALLEST)) @ V.mT - one
+            return (X[..., row, column] * weight * sound[:, None]).flatten(1)
+
+        x0, spread = values[:, links] @ T, values[1:] - values[1:].mean(0)
+        inverse = torch.linalg.inv(T)
+        known = torch.linalg.pinv(spread[:, links].mT @ spread[:, links], hermitian=True)
+        precision = (len(spread) - 1) * inverse @ known @ inverse.mT
+        pull = torch.linalg.inv(precision + torch.eye(len(T)).to(w))
+        z, u = bodies(x0), torch.zeros_like(x0)
+        for _ in range(ROUNDS):
+            x = (x0 @ precision + z - u) @ pull
+            x = RELAXATION * x + (1.0 - RELAXATION) * z
+            z = bodies(x + u)
+            u = u + x - z
+        moved = values + (z - x0) @ inverse @ known @ (spread[:, links].mT @ spread)
+        moved[:, links] = z @ inverse
+        return moved
 
     def _offsets(self, curves: Tensor) -> Tensor:
         """The offset of each curve by least squares `(1 + samples, nq)`."""
@@ -419,7 +463,10 @@ def _without_offsets(offset: Tensor, mean: Tensor, values: Tensor) -> Tensor:
         values: to be conditioned.
     """
     c = offset[:, mean.abs() <= OPEN * offset[1:].std(0)]
-    gain = torch.linalg.lstsq(c[1:] - c[1:].mean(0), values[1:] - values[1:].mean(0)).solution
+    around = c[1:] - c[1:].mean(0)
+    gain = (
+        torch.linalg.pinv(around.mT @ around, hermitian=True) @ around.mT @ (values[1:] - values[1:].mean(0))
+    )
     return values - c @ gain
 
 
@@ -436,26 +483,10 @@ def _projected(speeds: Tensor, curve: Tensor) -> tuple[Tensor, Tensor, Tensor, T
 
 
 def _moved(robot: RobotModel, change: Tensor) -> RobotModel:
-    """The robot with inertial parameters π + change `(nq, 10)`, or the nearest that some body has.
-
-    J = J₀^½ V max(w, ε) Vᵀ J₀^½ with the eigenvalues w of J₀^-½ (J₀ + ΔJ) J₀^-½; a link that no body could be
-    stays as it is.
-    """
+    """The robot with inertial parameters π + change `(nq, 10)`."""
     J = pseudo_inertia(robot.mass, robot.com, robot.inertia)
-    values, vectors = torch.linalg.eigh(J)
-    sound = values[:, 0] > 0.0
-    values = torch.where(sound[:, None], values, 1.0)
-    root = vectors @ torch.diag_embed(values.sqrt()) @ vectors.mT
-    inverse = vectors @ torch.diag_embed(values.rsqrt()) @ vectors.mT
-    w, V = torch.linalg.eigh(inverse @ (J + _pseudo(change)) @ inverse)
-    moved = root @ V @ torch.diag_embed(w.clamp(min=SMALLEST)) @ V.mT @ root
-    mass, com, inertia = from_pseudo_inertia(torch.where(sound[:, None, None], moved, J))
-    kept = sound[:, None]
-    return robot.replace(
-        mass=torch.where(sound, mass, robot.mass),
-        com=torch.where(kept, com, robot.com),
-        inertia=torch.where(kept[..., None], inertia, robot.inertia),
-    )
+    mass, com, inertia = from_pseudo_inertia(J + _pseudo(change))
+    return robot.replace(mass=mass, com=com, inertia=inertia)
 
 
 def _pseudo(pi: Tensor) -> Tensor:
@@ -466,48 +497,29 @@ def _pseudo(pi: Tensor) -> Tensor:
     return torch.cat([top, torch.cat([pi[:, None, 1:4], pi[:, None, :1]], dim=-1)], dim=-2)
 
 
-def without_armature(robot: RobotModel) -> RobotModel:
-    """The robot whose links have the inertia of the drives, where that brings its mass matrix closer.
+def without_armature(robot: RobotModel, fastest: Tensor) -> RobotModel:
+    """The robot whose links have the inertia of the drives as far as bodies can.
 
-    Joints are taken in the order of their armature, the largest first.
+    Over random states, it minimises the mean square of each joint's error of τ over the torque itself:
+
+        min_δ ½ Σ_j E(Y_j S δ − a_j q̈_j)² / (ε² E τ_j²), with the divergence of `InertialPrior.updated`.
+
+    Args:
+        robot: with armature a.
+        fastest: speeds of these states `(nq,)`, reached in a quarter of a second [rad/s, m/s].
     """
-    share = torch.rand(POSES, robot.nq, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-    q = (2.0 * torch.pi * share).to(robot.mass)
-
-    def diagonal(each: RobotModel) -> Tensor:
-        return dynamics.mass_matrix(each, q).diagonal(dim1=-2, dim2=-1).log()
-
-    exact, held = diagonal(robot), robot.replace(armature=torch.zeros_like(robot.armature))
-    error = (diagonal(held) - exact).square().sum()
-    for i in robot.armature.argsort(descending=True).tolist():
-        if robot.joint_types[i] == "revolute" and float(robot.armature[i]) > 0.0:
-            tried = _with_ring(held, i, robot.armature[i])
-            closer = (diagonal(tried) - exact).square().sum()
-            if closer < error:
-                held, error = tried, closer
-    return held
-
-
-def _with_ring(robot: RobotModel, i: int, a: Tensor) -> RobotModel:
-    """The robot with inertia a about the axis of joint i in its link, and across it the least needed."""
-    along = robot.axis[i].outer(robot.axis[i])
-    across = torch.eye(3).to(along) - along
-    ring = robot.inertia[i] + a * along
-    # tr I/2 − I > 0 holds across the axis where I_axis ≤ the sum of the others
-    low, high = torch.zeros_like(a), 0.5 * a
-    for _ in range(HALVINGS if not _physical(ring) else 0):
-        middle = 0.5 * (low + high)
-        low, high = (low, middle) if _physical(ring + middle * across) else (middle, high)
-    needed = 0.0 if _physical(ring) else high
-    return robot.replace(
-        inertia=robot.inertia.index_put((torch.tensor([i]),), (ring + needed * across)[None])
+    held, errors = robot.replace(armature=torch.zeros_like(robot.armature)), InertialPrior()
+    generator = torch.Generator().manual_seed(0)
+    u = torch.rand(3, STATES, robot.nq, generator=generator, dtype=robot.dtype).to(robot.mass)
+    low, high = (x.clamp(-np.pi, np.pi) for x in (robot.lower, robot.upper))
+    q, qd, qdd = low + (high - low) * u[0], fastest * (2.0 * u[1] - 1.0), RATE * fastest * (2.0 * u[2] - 1.0)
+    size = dynamics.inverse_dynamics(robot, q, qd, qdd).square().sum(0).sqrt() * WANTED
+    A = (regressor(held, q, qd, qdd) * (errors.scale(held) / size[:, None])).flatten(0, 1)
+    precision = A.mT @ A
+    mean = torch.linalg.pinv(precision, rtol=1e-12, hermitian=True) @ (
+        A.mT @ (robot.armature * qdd / size).flatten()
     )
-
-
-def _physical(inertia: Tensor) -> bool:
-    """Whether some body has the inertia about its centre of mass."""
-    moments = torch.linalg.eigvalsh(inertia)
-    return float(moments[0]) > 0.0 and float(moments[2]) <= (1.0 - MARGIN) * float(moments[0] + moments[1])
+    return errors.updated(held, mean, precision)[0]
 
 
 def _figures(robot: RobotModel) -> Tensor:
