@@ -158,16 +158,14 @@ def stick_variance(tensors: Mapping[str, Tensor], at: States) -> Tensor:
     return std**2 * torch.exp(-((at.qd / speed) ** 2))
 
 
-def trained_region(
-    qd: Tensor, tau: Tensor, load: Tensor, hidden: Tensor | None = None
-) -> dict[str, Tensor]:
+def trained_region(qd: Tensor, tau: Tensor, load: Tensor, hidden: Tensor | None = None) -> dict[str, Tensor]:
     """The region of the training samples `(n, nq)`, by the names of `LOW`, `HIGH` and `SPREAD`.
 
     Args:
         qd, tau: of samples in motion.
         load: typical torque of each joint `(nq,)`, a fraction of which is the least spread of its torque.
-        hidden: `(nq,)` bool, joints whose torque no acceleration shows: rare torques are not learned from, and
-            the region is a standard deviation around the mean.
+        hidden: `(nq,)` bool, joints whose torque has no effect on accelerations: rare torques are not learned
+            from, and their region is a standard deviation around the mean.
     """
     x = torch.stack([qd, tau], dim=1)
     low, high = x.quantile(torch.tensor([OUTERMOST, 1.0 - OUTERMOST]).to(x), dim=0)
