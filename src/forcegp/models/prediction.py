@@ -16,7 +16,7 @@ from forcegp.data import Dataset
 from forcegp.data.fields import AXES
 from forcegp.errors import DataError, ForceGPError, ModelError, NumericalError, ShapeError, check_name
 from forcegp.forces.measurements import COLUMNS
-from forcegp.forces.noise import warnings_beyond
+from forcegp.forces.posterior import warnings_beyond
 from forcegp.forces.quantities import FlatStates, ForceLinearization, linearize_field
 from forcegp.rollout.forward import rollout_model
 from forcegp.rollout.inputs import ForwardModel, Torque

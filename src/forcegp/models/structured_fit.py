@@ -18,8 +18,15 @@ from forcegp.errors import ModelError, check_name
 from forcegp.files import Record
 from forcegp.forces.external_wrench import WrenchFrame
 from forcegp.forces.measurements import Observation, Training
-from forcegp.forces.noise import LOW, TORQUE_NOISE, distance_beyond, learned_slopes, unknown_variance
-from forcegp.forces.posterior import ForcePosterior, doubts_of, draw_samples
+from forcegp.forces.noise import TORQUE_NOISE, learned_slopes
+from forcegp.forces.posterior import (
+    LOW,
+    ForcePosterior,
+    distance_beyond,
+    doubts_of,
+    draw_samples,
+    unknown_variance,
+)
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.problem import Problem, forces_and_constant, is_sparse, lost_by_inducing, typical

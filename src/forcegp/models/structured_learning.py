@@ -40,8 +40,9 @@ from forcegp.forces.measurements import (
     unmeasured_forces,
     without_impacts,
 )
-from forcegp.forces.noise import REGION, TORQUE_NOISE, Noise, external_std, state_std_of
+from forcegp.forces.noise import TORQUE_NOISE, Noise, external_std, state_std_of
 from forcegp.forces.noise_learning import left_out, weighted, with_learned_slopes, with_learned_weights
+from forcegp.forces.posterior import REGION
 from forcegp.forces.priors.base import ANALYTICAL, COULOMB, NOISE, ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import AnalyticalMean, JointFrictionPrior
