@@ -25,8 +25,8 @@ from torch.linalg import vecdot
 from torch.nn.functional import normalize
 
 from forcegp import dynamics
-from forcegp.batchlast import mass_factor
 from forcegp.derivatives import inverse_dynamics_derivatives
+from forcegp.errors import MassMatrixError
 from forcegp.kinematics import LinkMotion, LinkPoses, PointMotion
 from forcegp.robot.model import RobotModel
 from forcegp.types import ConstraintInverse, ConstraintMatrix, ConstraintVector, JointMatrix, JointVector
@@ -151,7 +151,10 @@ class Equations:
     @cached_property
     def M_cholesky(self) -> JointMatrix:
         """Lower Cholesky factor of M; `NumericalError` where M is not positive definite."""
-        return mass_factor(self.M)
+        try:
+            return torch.linalg.cholesky(self.M)
+        except torch.linalg.LinAlgError as cause:  # pyright: ignore[reportPrivateImportUsage]
+            raise MassMatrixError(cause) from cause
 
     @cached_property
     def M_inv_At(self) -> ConstraintInverse:
