@@ -78,7 +78,7 @@ def sum_over(E: Tensor, x: Tensor) -> Tensor:
 
 
 def take(x: Tensor, joints: Sequence[int]) -> Tensor:
-    """The entries of some joints of `(…, nq, B)`; a view where they are evenly spaced."""
+    """The entries of some joints of `(…, nq, B)`; a view if they are evenly spaced."""
     first, last, count = joints[0], joints[-1], len(joints)
     step = (last - first) // (count - 1) if count > 1 else 1
     if step > 0 and list(joints) == list(range(first, last + 1, step)):
@@ -90,7 +90,7 @@ def mass_factor(M: Tensor) -> Tensor:
     """Lower Cholesky factor of mass matrices `(*batch, n, n)`.
 
     Raises:
-        NumericalError: one is not positive definite, as of a robot with negative masses.
+        NumericalError: a matrix is not positive definite, for example because of a negative mass.
     """
     try:
         return torch.linalg.cholesky(M)
@@ -102,7 +102,7 @@ def mass_factor(M: Tensor) -> Tensor:
 def solve_spd(M: Tensor, rhs: Tensor) -> Tensor:
     """M⁻¹ rhs for symmetric positive definite `(n, n, B)` and `(n, k, B)`.
 
-    Large batches are eliminated without pivoting (stable for such M), every step over all samples at once.
+    Large batches use elimination without pivoting (stable for such M), vectorized over the samples.
     """
     n, B = M.shape[0], M.shape[-1]
     if M.numel() < _SMALL:

@@ -1,6 +1,6 @@
-"""Contact with a surface, which pushes and never pulls: opening, closing, impact and sliding friction.
+"""Unilateral contact with a surface: opening, closing, impact and sliding friction.
 
-A closed contact opens where its multiplier would turn negative. An open contact closes where c ≤ 0 and ċ < 0,
+A closed contact opens when its multiplier would become negative. An open contact closes when c ≤ 0 and ċ < 0,
 with an inelastic impact. Other constraints, such as a connection of two points, never change. The formulas
 take tensors of any batch, for rollouts, or NumPy arrays of one state, for the simulator.
 """
@@ -36,7 +36,7 @@ MAX_STEP = 0.2
 
 @runtime_checkable
 class ContactSystem(Protocol):
-    """Interface of a robot with constraints to contact mechanics."""
+    """Interface that contact mechanics requires of a robot with constraints."""
 
     @property
     def contacts(self) -> Sequence[Constraint]:
@@ -49,7 +49,9 @@ class ContactSystem(Protocol):
         ...
 
     def equations(self, q: Any, qd: Any, active: Any = None) -> Any:
-        """The equations of motion with the active constraints: `Equations`, or the same of one state."""
+        """The equations of motion with the active constraints: `Equations`, or their NumPy form for one
+        state.
+        """
         ...
 
 
@@ -75,7 +77,7 @@ class ContactForces(NamedTuple):
     Attributes:
         closed: `(n_contacts,)` bool.
         c: `(m,)` constraint error, open or closed [m].
-        multiplier: λ `(m,)`, zero where open.
+        multiplier: λ `(m,)`, zero for open contacts.
         Q: `(nq,)` Q_C + Q_G + Q_D + Q_u [N m].
         Q_D, Q_I, Q_z: `(nq,)` joint friction, and normal and friction force of the contacts [N m].
     """
@@ -119,12 +121,12 @@ def normal_rows(system: ContactSystem, rows: Array) -> Array:
 
 
 def pulling(system: ContactSystem, active: Array, multiplier: Array) -> Array:
-    """Closed contacts `(*batch, n_contacts)` that would have to pull, λ `(*batch, m)` < 0, and that open."""
+    """Closed contacts `(*batch, n_contacts)` that open since they would pull, λ `(*batch, m)` < 0."""
     return normal_rows(system, multiplier < -PULL) & can_open(system, active) & active
 
 
 def reached(system: ContactSystem, active: Array, c: Array, cd: Array) -> Array:
-    """Open contacts `(*batch, n_contacts)` that the robot has reached, c ≤ 0 while ċ < 0, and that close."""
+    """Open contacts `(*batch, n_contacts)` that close: c ≤ 0 and ċ < 0."""
     return normal_rows(system, (c <= 0.0) & (cd < -APPROACH)) & can_open(system, active) & ~active
 
 
@@ -139,14 +141,15 @@ def project_velocity(eom: Any, qd: Array) -> Array:
 def project_state(
     system: ConstrainedSystem, q: JointVector, qd: JointVector, active: ActiveContacts | None = None
 ) -> tuple[JointVector, JointVector]:
-    """The state on the constraint manifold next to (q, q̇) `(*batch, nq)`, in the metric of M.
+    """Project (q, q̇) `(*batch, nq)` onto the constraint manifold, in the metric of M.
 
     Newton's iteration q ← q − M⁻¹Aᵀ(A M⁻¹ Aᵀ)⁺ c moves along the directions in which constraint forces push;
-    q̇ ← q̇ − L A q̇ is the velocity on the manifold that is nearest in kinetic energy. For the contacts that
-    are `active` `(*batch, n_contacts)`, by default all, |c(q)| ≤ 1e−12 m (1e−5 m in float32) and A q̇ = 0.
+    q̇ ← q̇ − L A q̇ is the nearest velocity on the manifold in the metric of the kinetic energy. For the
+    contacts that are `active` `(*batch, n_contacts)`, by default all, |c(q)| ≤ 1e−12 m (1e−5 m in float32)
+    and A q̇ = 0.
 
     Raises:
-        NumericalError: the iteration does not converge, as where the surface is out of reach.
+        NumericalError: the iteration does not converge, for example if the surface is out of reach.
     """
     rows = system.active_rows(active, q.shape[:-1])
     tolerance = max(POSITION_TOLERANCE, ROUNDING * torch.finfo(q.dtype).eps)
@@ -185,7 +188,7 @@ def sliding_friction(system: ContactSystem, eom: Any, active: Array, viscous_fri
 
 
 def land(system: ContactSystem, q: Array, qd: Array, closed: Array) -> Landing:
-    """Close the contacts that one state `(nq,)` has reached, with their impact."""
+    """Close the contacts reached by one state `(nq,)`, with their impact."""
     eom = system.equations(q, qd, active=closed)
     new = reached(system, closed, eom.c, eom.cd)
     if not bool(new.any()):
@@ -203,7 +206,8 @@ def contact_forces(
     Q_u: Array,
     viscous_friction: float,
 ) -> ContactForces:
-    """Normal and friction force at a state `(nq,)` under the torque Q_u [N m], once no contact has to pull.
+    """Normal and friction force at a state `(nq,)` under the torque Q_u [N m], after opening contacts that
+    would pull.
 
     `landing` holds the closed contacts and their equations of motion, `viscous_friction` is θ_v [N s/m].
     """
