@@ -25,7 +25,7 @@ from forcegp.robot.model import BASE, RobotModel
 
 
 class CompiledMechanics:
-    """Mechanics of one robot on the CPU and of some of its points, as a compiled function of (q, q̇).
+    """Mechanics of one robot and of some of its points on the CPU, as a compiled function of (q, q̇).
 
     `batch` gives M, Q_C and Q_G, then for each point: axes of its frame `(3, 3)` and position in the world,
     Jacobian J `(6, nq)` with [ω; ṗ] = J q̇, and bias acceleration J̇ q̇ `(6,)`.

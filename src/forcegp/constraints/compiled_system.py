@@ -34,7 +34,7 @@ _SYSTEMS: WeakKeyDictionary[ConstrainedSystem, ConstrainedSystem] = WeakKeyDicti
 
 @dataclass(frozen=True, eq=False, repr=False)
 class CompiledSystem(ConstrainedSystem):
-    """A constrained system whose equations of motion come from a kernel wherever no gradient is asked for.
+    """A constrained system whose equations of motion use a compiled kernel if no gradient is required.
 
     Made by `compiled_system`; the kernel also has the motion of further `points`.
     """
@@ -50,7 +50,7 @@ class CompiledSystem(ConstrainedSystem):
         return _kernel(self.robot, self._anchors)
 
     def with_robot(self, robot: RobotModel) -> ConstrainedSystem:
-        """The same constraints on a robot with other parameters, which are not those of the kernel."""
+        """The same constraints on a robot with other parameters, without the kernel."""
         return ConstrainedSystem(robot, self.contacts, self.baumgarte)
 
     def equations(self, q: JointVector, qd: JointVector, active: Tensor | None = None) -> Equations:
@@ -73,7 +73,7 @@ class CompiledSystem(ConstrainedSystem):
 def compiled_system(system: ConstrainedSystem, *points: Anchor) -> ConstrainedSystem:
     """The system with compiled equations of motion, for many evaluations of one robot.
 
-    The first call for a robot compiles for some seconds; later ones, in any process, read the cache. It
+    The first call for a robot takes some seconds to compile; later ones, in any process, read the cache. It
     is returned unchanged without a compiler, or if the robot's parameters require gradients or lie on a GPU.
     `points` are further points of which `Equations.point_motion` is asked.
 

@@ -32,8 +32,8 @@ CERTAIN = 0.25
 class Baumgarte:
     """Makes the constraint error a damped oscillator, c̈ + 2ωξ ċ + ω² c = 0 (eq. 29).
 
-    The right-hand side becomes b̃ = b − 2ωξ A q̇ − ω² c; the signs that the paper prints in eq. (30)
-    are the opposite ones, with which the error grows.
+    The right-hand side becomes b̃ = b − 2ωξ A q̇ − ω² c; eq. (30) of the paper has the opposite signs, with
+    which the error grows.
 
     Args:
         natural_frequency: ω > 0 [rad/s].
@@ -154,7 +154,7 @@ class ConstrainedSystem:
 
     @property
     def state_bytes(self) -> int:
-        """Upper bound on the memory that the equations of motion of one state take [bytes]."""
+        """Upper bound on the memory of the equations of motion at one state [bytes]."""
         width = self.robot.nq + self.m
         return 8 * (SQUARE * width**2 + LINEAR * width)
 
@@ -164,7 +164,7 @@ class ConstrainedSystem:
         `copies` is the peak in units of the memory of one state's equations of motion; `what` is the work.
 
         Raises:
-            MemoryLimitError: it certainly needs more than is free.
+            MemoryLimitError: the work needs more memory than is free.
         """
         needed = int(copies * states * self.state_bytes)
         announce_memory(needed, what, certain=int(CERTAIN * needed))
@@ -242,14 +242,15 @@ class ConstrainedSystem:
     def linearize(
         self, q: JointVector, qd: JointVector, force: JointVector, active: Tensor | None = None
     ) -> Linearization:
-        """The constrained acceleration and the multiplier with their Jacobians by q, q̇ and force.
+        """The constrained acceleration and the multiplier with their Jacobians with respect to q, q̇ and
+        force.
 
         q̈(q, q̇, Q) = L b + H (Q_C + Q_G + Q_D + Q) with its exact derivatives, detached from the graph.
         If Q depends on the state, as learned forces do, add `dforce` times the derivative of Q.
 
         Args:
             q, qd: `(*batch, nq)` joint positions and velocities.
-            force: `(*batch, nq)` Q, the motor torques and all other forces that the robot file does not know.
+            force: `(*batch, nq)` Q, the motor torques and all other forces beyond the robot file.
             active: `(*batch, n_contacts)` bool, which contacts are closed in each sample; default all.
 
         Raises:

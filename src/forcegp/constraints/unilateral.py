@@ -1,4 +1,4 @@
-"""Contact with a surface, which pushes and never pulls: opening, closing, impact and sliding friction.
+"""Unilateral contact with a surface: opening, closing, impact and sliding friction.
 
 A closed contact opens where its multiplier would turn negative. An open contact closes where c ≤ 0 and ċ < 0,
 with an inelastic impact. Other constraints, such as a connection of two points, never change.
@@ -53,7 +53,7 @@ class ContactForces(NamedTuple):
     Attributes:
         closed: `(n_contacts,)` bool.
         c: `(m,)` constraint error, open or closed [m].
-        multiplier: λ `(m,)`, zero where open.
+        multiplier: λ `(m,)`, zero for open contacts.
         Q: `(nq,)` Q_C + Q_G + Q_D + Q_u [N m].
         Q_D, Q_I, Q_z: `(nq,)` joint friction, and normal and friction force of the contacts [N m].
     """
@@ -110,14 +110,15 @@ def project_velocity(eom: Equations, qd: Tensor) -> Tensor:
 def project_state(
     system: ConstrainedSystem, q: JointVector, qd: JointVector, active: ActiveContacts | None = None
 ) -> tuple[JointVector, JointVector]:
-    """The state on the constraint manifold next to (q, q̇) `(*batch, nq)`, in the metric of M.
+    """Project (q, q̇) `(*batch, nq)` onto the constraint manifold, in the metric of M.
 
     Newton's iteration q ← q − M⁻¹Aᵀ(A M⁻¹ Aᵀ)⁺ c moves along the directions in which constraint forces push;
-    q̇ ← q̇ − L A q̇ is the velocity on the manifold that is nearest in kinetic energy. For the contacts that
-    are `active` `(*batch, n_contacts)`, by default all, |c(q)| ≤ 1e−12 m (1e−5 m in float32) and A q̇ = 0.
+    q̇ ← q̇ − L A q̇ is the nearest velocity on the manifold in the metric of the kinetic energy. For the
+    contacts that are `active` `(*batch, n_contacts)`, by default all, |c(q)| ≤ 1e−12 m (1e−5 m in float32)
+    and A q̇ = 0.
 
     Raises:
-        NumericalError: the iteration does not converge, as where the surface is out of reach.
+        NumericalError: the iteration does not converge, for example if the surface is out of reach.
     """
     rows = system.active_rows(active, q.shape[:-1])
     tolerance = max(POSITION_TOLERANCE, ROUNDING * torch.finfo(q.dtype).eps)
@@ -176,7 +177,8 @@ def contact_forces(
     Q_u: Tensor,
     viscous_friction: float,
 ) -> ContactForces:
-    """Normal and friction force at a state `(nq,)` under the torque Q_u [N m], once no contact has to pull.
+    """Normal and friction force at a state `(nq,)` under the torque Q_u [N m], after opening contacts that
+    would pull.
 
     `landing` holds the closed contacts and their equations of motion, `viscous_friction` is θ_v [N s/m].
     """

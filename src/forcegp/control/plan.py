@@ -1,6 +1,6 @@
 """The plan of a motion: reference, posture, orientation and start, drawn before anything moves.
 
-`MotionConfig` says where the tool goes, how fast, how hard it presses, and how it is controlled. Inverse
+`MotionConfig` defines path, speed, pressing force and control of the tool. Inverse
 kinematics finds the joint positions that put the tool at a pose.
 """
 
@@ -53,12 +53,12 @@ class MotionConfig:
         max_acceleration: of the end-effector along a line [m/s²].
         lift_probability: probability that a waypoint lies above the surface; 0 stays in contact.
         lift_height: range of heights of such a waypoint [m].
-        pressing_force: range of the force that presses on the surface, drawn for each line [N].
+        pressing_force: range of the force on the surface, drawn for each line [N].
         elbow_swing: how far the posture in the null space varies from line to line [rad].
-        tool_turn: turn of the tool about the surface's normal, for arms that reach better so [rad].
+        tool_turn: rotation of the tool about the surface's normal, for better reach [rad].
         gains: gains of the controller.
         torque_limit: one per joint, or `None` for the robot's own limits [N m].
-        frame, point: the tool where there is no contact; by default the last frame of the robot.
+        frame, point: the tool without contact; by default the last frame of the robot.
 
     Raises:
         ParameterError: a value is out of range; the message names it.
@@ -124,9 +124,9 @@ def inverse_kinematics(
 ) -> JointVector:
     """Joint positions `(nq,)` that put a point of a frame at a pose, by damped least squares from `starts`.
 
-    Each step is Jᵀ(J Jᵀ + μ I)⁻¹ e; the first half of them also move to `near` `(nq,)` in the null space of
-    J, and of the solutions from `starts` `(k, nq)` the one next to it is taken. The pose in the world is
-    `(3,)` [m] and `(3, 3)`; an arm with fewer than six joints is asked for the position alone.
+    Each step is Jᵀ(J Jᵀ + μ I)⁻¹ e; the first half of the steps also move towards `near` `(nq,)` in the null
+    space of J, and the solution from `starts` `(k, nq)` closest to it is returned. The pose in the world is
+    `(3,)` [m] and `(3, 3)`; for an arm with fewer than six joints only the position is matched.
 
     Raises:
         NumericalError: no start leads to the pose within the joint limits.
@@ -180,7 +180,7 @@ def _damped_step(J: Tensor, error: Tensor, leaning: Tensor) -> Tensor:
 
 
 def tool_rotation(normal: Vector3, ahead: Vector3, tool_axis: Vector3) -> Rotation:
-    """Axes `(3, 3)` of a frame whose `tool_axis` points into the surface, turned by π about the side axis.
+    """Axes `(3, 3)` of a frame with its `tool_axis` into the surface, rotated by π about the side axis.
 
     `normal` and `ahead` are the unit normal out of the surface and a unit tangent, `(3,)` each.
     """

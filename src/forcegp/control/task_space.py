@@ -1,4 +1,4 @@
-"""Task-space inverse dynamics control with null-space control of the remaining freedom.
+"""Task-space inverse dynamics control with null-space control of the redundant degrees of freedom.
 
 The task is the pose of the tool, or its position alone for an arm with fewer than six joints. A redundant arm
 moves its elbow in the null space of the task's Jacobian, which leaves the task's error dynamics untouched
@@ -47,8 +47,8 @@ class Target(NamedTuple):
     Attributes:
         position, velocity, acceleration: `(*batch, 3)` of the tool point [m], [m/s], [m/s²].
         rotation: `(*batch, 3, 3)` constant axes of the tool's frame.
-        posture: `(*batch, nq)` joint positions that the null space leans to [rad].
-        push: `(*batch,)` force that the tool is to exert on the surface it touches, along its normal [N].
+        posture: `(*batch, nq)` preferred joint positions in the null space [rad].
+        push: `(*batch,)` desired normal force of the tool on the surface [N].
     """
 
     position: Tensor
@@ -68,7 +68,7 @@ class JointTarget(NamedTuple):
 
 
 def task_rows(nq: int) -> slice:
-    """The rows of [ω; ṗ] that an arm of nq joints can follow: all of six joints, ṗ of fewer."""
+    """The rows of [ω; ṗ] that an arm of nq joints can follow: all for six joints, ṗ for fewer."""
     return slice(0 if nq >= POSE_ROWS else POSITION_ROWS, POSE_ROWS)
 
 
@@ -101,10 +101,10 @@ def joint_acceleration(tool: PointMotion, task: Tensor, posture: Tensor) -> Tens
     """y = J⁺(a − J̇q̇) + (I − J⁺J) y₀: the task's acceleration, and the posture's in its null space.
 
     a `(*batch, 6)` is the task's and y₀ `(*batch, nq)` the posture's. J are the rows of the tool's Jacobian
-    that the arm can follow (`task_rows`); an arm with fewer joints than these comes as close as it can.
+    that the arm can follow (`task_rows`); an arm with fewer joints follows in the least-squares sense.
 
     Raises:
-        NumericalError: the arm is singular, so that the task cannot be reached.
+        NumericalError: the arm is in a singular pose, so the task cannot be reached.
     """
     nq = tool.jacobian.shape[-1]
     rows = task_rows(nq)
@@ -137,9 +137,9 @@ def control_torque(
         tool: the tool at the state.
         eom: the equations of motion at the state; M and Q_K = Q_C + Q_G + Q_D are used.
         q, qd: `(*batch, nq)` the state.
-        target: what is to be reached; F is its `push`.
-        press: Q_n `(*batch, nq)`, Jᵀn of unit normal forces where the tool is, summed over its contacts;
-            along the normal of the reference, the push would drive the tool away on a convex surface.
+        target: desired motion; F is its `push`.
+        press: Q_n `(*batch, nq)`, Jᵀn of unit normal forces at the actual tool position, summed over its
+            contacts; along the normal of the reference, the force would push the tool off a convex surface.
         gains: feedback gains.
 
     Raises:
