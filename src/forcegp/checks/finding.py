@@ -61,6 +61,7 @@ _TABLE: dict[str, tuple[tuple[str, Severity, str, str], ...]] = {
     ),
     "kinematics": (
         ("velocity-mismatch", "error", "qd is not the derivative of q", "recompute qd from q"),
+        ("velocity-delay", "warning", "qd is late", "recompute qd from q, or log it unfiltered"),
         ("velocity-sign", "error", "wrong velocity sign", "change the sign of the named velocities"),
         ("velocity-order", "error", "velocity columns are permuted", "match columns by joint name"),
         ("acceleration-mismatch", "error", "qdd is not the derivative of qd", "recompute qdd"),
