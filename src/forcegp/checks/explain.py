@@ -1,7 +1,7 @@
 """Which fault explains the torque best: greedy choice by cross-validation, one-standard-error rule.
 
-The simplest hypothesis within one standard error of the best is taken (Breiman, Friedman, Olshen, Stone,
-*Classification and Regression Trees*, 1984, sec. 3.4.3), the log corrected, and a further one looked for.
+The simplest hypothesis within one standard error of the best is accepted (Breiman, Friedman, Olshen, Stone,
+*Classification and Regression Trees*, 1984, sec. 3.4.3), the log is corrected, and the search repeated.
 """
 
 from __future__ import annotations
@@ -40,10 +40,10 @@ Tried = tuple[Hypothesis, TorqueFit]
 
 @dataclass(frozen=True)
 class Explanation:
-    """What explains the torque: faults of the log, which are undone in `log`, and of the robot file.
+    """Faults that explain the torque: of the log, corrected in `log`, and of the robot file.
 
     `problem` has the torques that remain over `rows`; `columns`, `prior` and the names `robot` are those of
-    the accepted hypotheses on the robot, which stay in the model; `repairs` take the faults out of a log, in
+    the accepted hypotheses on the robot, which stay in the model; `repairs` correct the faults of a log, in
     order.
     """
 
@@ -60,16 +60,16 @@ class Explanation:
 
     @cached_property
     def fit(self) -> TorqueFit:
-        """The model that remains."""
+        """The remaining model."""
         return cross_validate(self.problem, self.columns, self.prior)
 
     def on(self, log: Log, rows: np.ndarray | None = None) -> TorqueProblem:
-        """The problem on a log that a hypothesis has changed, with the present weights of the joints."""
+        """The problem on a log changed by a hypothesis, with the current weights of the joints."""
         rows = self.rows if rows is None else rows
         return hypotheses.problem_of(self.system, log, rows, self.problem.scale)
 
     def weighed(self) -> Explanation:
-        """The same with joints weighed by the noise that it leaves."""
+        """The same with joints weighted by their residual noise."""
         result = self
         for _ in range(2):
             # The typical block counts: a disturbance must not make a joint look noisy.
@@ -79,7 +79,7 @@ class Explanation:
         return result
 
     def with_(self, hypothesis: Hypothesis) -> TorqueFit:
-        """Fit of a hypothesis with parameters, beside those that the model holds already."""
+        """Fit a hypothesis with parameters, in addition to those already in the model."""
         assert hypothesis.columns is not None and hypothesis.prior is not None
         columns = np.concatenate([hypothesis.columns, self.columns], axis=-1)
         gains = hypothesis.joints if hypothesis.name == "gains" else ()
@@ -88,7 +88,7 @@ class Explanation:
 
 
 def explain(system: ConstrainedSystem, log: Log) -> Explanation:
-    """Find the faults that explain the torque that the robot file leaves."""
+    """Find the faults that explain the residual torque of the robot file."""
     rows = log.rows(ROWS, margin=max(hypotheses.LAGS))
     problem = hypotheses.problem_of(system, log, rows)
     model = Explanation(system, log, rows, problem, np.zeros((*problem.r.shape, 0)), np.zeros(0)).weighed()
@@ -204,7 +204,7 @@ def _currents(model: Explanation) -> Iterator[Tried]:
 
 
 def significant(better: Array, worse: Array, concerned: int) -> bool:
-    """Whether a drop of the score of shares `(blocks, nq)` matters for the joints and is not chance."""
+    """Whether a decrease of the score of shares `(blocks, nq)` is material and significant."""
     least = max(MATERIAL, MATERIAL_EACH * concerned)
     gains = gain_of(score_of(better), score_of(worse)), pooled_gain_of(better, worse)
     # A drop that only quiet blocks show is an artefact of them: the other mean must bear it out.
@@ -238,7 +238,7 @@ TESTS = {
 def alternatives_of(
     system: ConstrainedSystem, chosen: Tried, tried: Iterable[Tried], null: TorqueFit
 ) -> Iterator[Tried]:
-    """The hypotheses that held-out blocks cannot tell from the chosen one to a standard error, best first."""
+    """The hypotheses within a standard error of the chosen one on held-out blocks, best first."""
     for hypothesis, fit in sorted(tried, key=lambda one: one[1].score.mean()):
         if _says_the_same(chosen[0], hypothesis):
             continue
@@ -265,7 +265,7 @@ def _possible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit)
 
 
 def with_alternatives(finding: Finding, others: Iterable[Finding]) -> Finding:
-    """The finding with its alternatives, if there are any, and a test that tells them apart."""
+    """The finding with its alternatives, if any, and a test that distinguishes them."""
     alternatives: list[Finding] = []
     for other in others:
         alike = (f for f in (finding, *alternatives) if f.kind == other.kind)

@@ -17,7 +17,7 @@ Severity = Literal["note", "warning", "error"]
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of finding: the part of the log that it concerns, its usual weight, title and remedy."""
+    """A kind of finding: its part of the log, usual severity, title and remedy."""
 
     family: str
     severity: Severity
@@ -128,18 +128,18 @@ SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 
 @dataclass(frozen=True)
 class Finding:
-    """One thing that a check found in a log.
+    """A fault or property that a check found in a log.
 
     Args:
         kind: one of `KINDS`.
-        message: what was found, with its numbers.
+        message: one sentence with the numbers.
         intervals: rows concerned, half-open and increasing, counted from 0.
         joints: the joints concerned.
-        contact: the contact concerned, if one is.
+        contact: the contact concerned, if any.
         evidence: the numbers behind the message, by name.
-        weight: severity where it differs from that of the kind.
-        alternatives: what else explains the log as well, so that only one of them need be true.
-        told_apart_by: test that tells them apart.
+        weight: severity, if it differs from that of the kind.
+        alternatives: other explanations that fit the log equally well.
+        told_apart_by: a test that distinguishes them.
 
     Raises:
         UnknownNameError: no such kind.
@@ -162,7 +162,7 @@ class Finding:
     def severity(self) -> Severity:
         """`"error"` makes a fit worthless, `"warning"` biases it, `"note"` is worth knowing.
 
-        A finding with alternatives has the lightest of their severities.
+        A finding with alternatives takes their lowest severity.
         """
         weight: Severity = self.weight or KINDS[self.kind].severity
         every = {weight, *(other.severity for other in self.alternatives)}
@@ -175,7 +175,7 @@ class Finding:
 
     @property
     def remedy(self) -> str:
-        """The remedy; with alternatives, the test that tells them apart and the remedy of each."""
+        """The remedy; with alternatives, the test that distinguishes them and the remedy of each."""
         if not self.alternatives:
             return KINDS[self.kind].remedy
         each = "; ".join(f"{kind}: {KINDS[kind].remedy}" for kind in self.kinds)
@@ -201,18 +201,18 @@ class Finding:
 def at_rows(
     mask: NDArray[np.bool_], kind: str, text: str, joints: tuple[str, ...] = (), **evidence: SupportsFloat
 ) -> list[Finding]:
-    """The finding on the rows of a mask, which end its text; none where the mask picks no row."""
+    """A finding on the rows of a mask, appended to its text; empty if the mask has no row."""
     rows = intervals(mask)
     return [Finding(kind, f"{text} {describe(rows)}", rows, joints, evidence=evidence)] if rows else []
 
 
 class NotJudgedError(Exception):
-    """A check cannot be made on this log; the message is the reason that `Report.skipped` gives."""
+    """A check that cannot be made on this log; `Report.skipped` contains the message."""
 
 
 @dataclass(frozen=True)
 class Report:
-    """All findings on a log, the gravest first, and the checks that could not be made, with the reason."""
+    """All findings on a log, the most severe first, and the checks that were skipped, with the reason."""
 
     findings: tuple[Finding, ...]
     samples: int

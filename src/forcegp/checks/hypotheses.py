@@ -41,10 +41,10 @@ SLOW, GRAVITY = 0.01, 10.0
 class Hypothesis:
     """One explanation, named by a kind of finding, or a family of kinds.
 
-    `size` counts parameters, discrete choices as none; `change` makes the log as it would be, were the
-    hypothesis right, parameters aside. `columns` `(n, nq, p)` are the torque that parameters of size `prior`
-    `(p,)` add to r, `instruments` of the same shape replace least squares on columns that hold errors, and
-    `shift` is a delay of the torque in samples.
+    `size` counts parameters, discrete choices as none; `change` corrects the log under this hypothesis, apart
+    from parameters. `columns` `(n, nq, p)` are the torque that parameters of size `prior` `(p,)` add to r,
+    `instruments` of the same shape replace least squares for columns with errors, and `shift` is a delay
+    of the torque in samples.
     """
 
     name: str
@@ -60,7 +60,7 @@ class Hypothesis:
 def problem_of(
     system: ConstrainedSystem, log: Log, rows: np.ndarray, scale: Array | None = None
 ) -> TorqueProblem:
-    """The torques of some rows, to be explained by joint friction and an offset per joint."""
+    """The torque problem of some rows, with joint friction and an offset per joint."""
     nuisance = friction_columns(system, log, rows)
     size = np.sqrt((log.tau[rows] ** 2).mean(axis=0))
     size = np.maximum(size, 1e-3 * size.max())
@@ -75,14 +75,14 @@ def friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> A
 
 
 def other_rise_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
-    """Declared Coulomb friction with another smoothing velocity, less that at all of it `(n, nq, p)`."""
+    """Change of the declared Coulomb friction with the smoothing velocity `(n, nq, p)`."""
     x, declared = log.qd[rows] / system.robot.friction_velocity.numpy(), system.robot.friction.numpy() > 0.0
     columns = [_diagonal(np.tanh(k * x) - np.tanh(x))[..., np.flatnonzero(declared)] for k in RISES]
     return np.concatenate(columns, axis=-1)
 
 
 def contact_friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
-    """Viscous and dry friction of each contact of which only the normal force is taken out, `(n, nq, p)`."""
+    """Viscous and dry friction of each contact with only the normal force removed, `(n, nq, p)`."""
     contacts = [] if takes_friction_out(system, log) else labelled_contacts(system, log)
     touching = [c for c in contacts if isinstance(c, SurfaceContact)]
     empty = np.zeros((len(rows), log.nq, 0))
@@ -105,7 +105,7 @@ def _diagonal(x: Array) -> Array:
 
 
 def unchanged(log: Log) -> Log:
-    """The log itself."""
+    """The unchanged log."""
     return log
 
 
@@ -117,7 +117,7 @@ def changed(log: Log, names: tuple[str, ...], *, order: Sequence[int] = (), flip
 
 
 def delayed(log: Log, shift: int) -> Log:
-    """The log with the torque of `shift` rows later, within each stretch; rows without one are masked."""
+    """The log with the torque shifted by some rows within each stretch; rows without torque are masked."""
     tau, lost = log.tau.copy(), np.ones(len(log), bool)
     for s in log.stretches:
         source = np.arange(s.start, s.stop) + shift
@@ -127,7 +127,7 @@ def delayed(log: Log, shift: int) -> Log:
 
 
 def discrete(log: Log) -> Iterator[Hypothesis]:
-    """Signs, orders and delays: explanations without a parameter to fit."""
+    """Signs, orders and delays: hypotheses without parameters."""
     every, motion = tuple(range(log.nq)), ("q", "qd", "qdd")
     if log.nq > 1:
         yield Hypothesis("torque-sign", 0, partial(changed, names=("tau",), flip=every), joints=every)
@@ -148,7 +148,7 @@ def delays(log: Log) -> Iterator[Hypothesis]:
 
 
 def continuous(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterator[Hypothesis]:
-    """Gains, encoder offsets, gravity, tool and masses: explanations with parameters."""
+    """Gains, encoder offsets, gravity, tool and masses: hypotheses with parameters."""
     for j in range(log.nq):
         yield gain_hypothesis(log, rows, (j,))
         yield encoder_hypothesis(system, log, rows, j)
@@ -164,13 +164,15 @@ def gain_hypothesis(log: Log, rows: np.ndarray, joints: tuple[int, ...]) -> Hypo
 def current_hypothesis(
     log: Log, rows: np.ndarray, problem: TorqueProblem, joints: tuple[int, ...]
 ) -> Hypothesis:
-    """Gains with the torque that the motion needs as instrument: errors of the logged one would bias them."""
+    """Gains with the torque required by the motion as instrument, since errors of the logged torque bias
+    them.
+    """
     needed = _diagonal(problem.r + log.tau[rows])[..., list(joints)]
     return replace(gain_hypothesis(log, rows, joints), instruments=needed)
 
 
 def robot_hypotheses(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterator[Hypothesis]:
-    """Explanations by the robot file, which leave the log as it is."""
+    """Hypotheses on the robot file, which do not change the log."""
     for name in ROBOT:
         columns, prior = robot_columns(system, log, rows, name)
         yield Hypothesis(name, columns.shape[-1], unchanged, columns, prior)
@@ -181,7 +183,7 @@ ROBOT = ("gravity", "payload", "masses")
 
 
 def robot_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray, name: str) -> tuple[Array, Array]:
-    """Torque `(n, nq, p)` per unit of each parameter that may be off, and how far it may be `(p,)`."""
+    """Torque `(n, nq, p)` per unit of each uncertain parameter, and its tolerance `(p,)`."""
     robot = system.robot
     q, qd, qdd = tensors(log, rows, "q", "qd", "qdd")
     with torch.no_grad():
@@ -244,7 +246,7 @@ DISCRETE = {
 
 
 def plausible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit) -> bool:
-    """Whether the parameters agree with the hypothesis: a tool has a mass, an offset is not a trifle."""
+    """Whether the parameters are physically plausible, such as a positive tool mass."""
     if hypothesis.name == "encoder-offset":
         least = max(SMALL_ANGLE, SIGNIFICANT * fit.spread[0])
         return bool(least < abs(fit.theta[0]) <= LARGEST_ANGLE)
@@ -266,7 +268,7 @@ def plausible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit)
 
 
 def corrected(log: Log, hypothesis: Hypothesis, theta: Array) -> Log:
-    """The log without the fault; unchanged where the robot is at fault."""
+    """The log without the fault; unchanged if the robot is at fault."""
     joints = list(hypothesis.joints)
     if hypothesis.name == "gains":
         tau = log.tau.copy()
@@ -283,7 +285,7 @@ def corrected(log: Log, hypothesis: Hypothesis, theta: Array) -> Log:
 def finding_of(
     system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: TorqueFit, alike: tuple[int, ...] = ()
 ) -> Finding:
-    """The finding that a hypothesis stands for; `alike` are the joints of those that explain the same."""
+    """The finding of a hypothesis; `alike` are the joints of equivalent hypotheses."""
     name, theta, spread = hypothesis.name, fit.theta, fit.spread
     one_of = name == "joint-sign" and len(alike) > 1
     names = tuple(log.joint_names[j] for j in (alike if one_of else hypothesis.joints))

@@ -1,9 +1,9 @@
 """Is qd the derivative of q, and qdd that of qd? Units of time and angle, signs, order, and noise of columns.
 
-A rate is at fault where both bounds of its slope are: noise in either flattens one of the two regression
-lines of the change of x over short windows on the integral of its logged rate. Is the noise on the
-acceleration white, and as large as the header says? White noise shows alike in the departures of samples from
-the cubic through their neighbours at distances of one and of three samples; filtered noise does not.
+A rate is wrong if both bounds of its slope are: noise flattens one of the two regression lines of the change
+of x over short windows on the integral of its logged rate. Is the noise on the acceleration white, and as
+large as the header says? For white noise, the deviations from cubics through neighbours at distances of one
+and of three samples agree; for filtered noise they do not.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ UNIT_TOLERANCE = 0.1
 @dataclass(frozen=True)
 class Match:
     """Changes and integrals of one level `(w, nq)` over windows, zero where an impact crosses one (`whole`:
-    as they are), bounds of the slopes between them `(nq,)`, and joints whose change stands out from noise.
+    as they are), bounds of the slopes between them `(nq,)`, and joints that change significantly.
     """
 
     change: Array
@@ -68,7 +68,7 @@ class Match:
 
 
 def match(log: Log, value: str, rate: str) -> Match | None:
-    """Compare changes of a column with integrals of its rate; `None` where there are too few windows."""
+    """Compare changes of a column with integrals of its rate; `None` if there are too few windows."""
     x, v = getattr(log, value), getattr(log, rate)
     width = max(2, round(WINDOW / log.dt)) if log.dt < WINDOW else 2
     changes, integrals = [], []
@@ -98,7 +98,7 @@ def match(log: Log, value: str, rate: str) -> Match | None:
 
 
 def check_clock_unit(system: ConstrainedSystem, log: Log) -> Outcome:
-    """One factor between changes and integrals of all joints and both levels: the clock is at fault."""
+    """Find a common factor between changes and integrals of all joints and both levels: a wrong clock."""
     if not log.stretches:
         return [], log
     if "qd" in log.derived:  # only the length of a step says anything
@@ -145,7 +145,7 @@ def _one_factor(level: Match, factor: float) -> bool:
 
 
 def check_velocity(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Velocities that are not the derivative of the positions: unit, sign, order, or nothing alike."""
+    """Find velocities that are not the derivative of the positions: unit, sign, order, or other."""
     if "qd" in log.derived:
         return [], log
     level = match(log, "q", "qd")
@@ -250,7 +250,7 @@ def _held_torque(system: ConstrainedSystem, log: Log) -> Array:
 
 
 def check_acceleration(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Accelerations that are not the derivative of the velocities, beyond what their noise explains."""
+    """Find accelerations that differ from the derivative of the velocities by more than noise."""
     if log.derived:
         return [], log
     level = match(log, "qd", "qdd")
@@ -280,7 +280,7 @@ NOISE_ROWS = 100
 
 
 def noise_levels(log: Log) -> tuple[Array, Array] | None:
-    """Standard deviation `(nq,)` of white noise as neighbours at distance 1 and at distance 3 show it."""
+    """Standard deviation `(nq,)` of white noise, estimated from neighbours at distances 1 and 3."""
     from scipy.ndimage import correlate1d
 
     levels = []
@@ -296,7 +296,7 @@ def noise_levels(log: Log) -> tuple[Array, Array] | None:
 
 
 def check_noise(system: ConstrainedSystem, log: Log) -> Outcome:
-    """The noise of the logged acceleration against that of the header."""
+    """Compare the noise of the logged acceleration with that of the header."""
     levels = noise_levels(log) if "qdd" not in log.derived else None
     if levels is None:
         return [], log

@@ -1,4 +1,4 @@
-"""Residual torque once the faults are explained: friction, offsets, disturbances, and how much."""
+"""Residual torque after the faults are explained: friction, offsets, disturbances."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ ONE_SIGMA = 84.13
 
 
 def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Signs, orders, gains, delays, gravity, tool, masses, friction, offsets: all that torques determine."""
+    """Check signs, orders, gains, delays, gravity, tool, masses, friction and offsets by the torques."""
     if len(log.rows(LEAST_ROWS)) < LEAST_ROWS:
         raise NotJudgedError(f"fewer than {LEAST_ROWS} usable rows")
     passive = _without_torque(log)
@@ -252,7 +252,7 @@ def _upper_spread(level: Array) -> float:
 
 
 def residual_trace(system: ConstrainedSystem, explanation: Explanation, rows: np.ndarray) -> Array:
-    """Torque that remains at some rows, contact forces taken out, `(n, nq)` [N m, N]."""
+    """Residual torque at some rows without contact forces, `(n, nq)` [N m, N]."""
     log, scale = explanation.log, explanation.problem.scale
     parts, coefficients = [], robust_parameters(explanation.problem, explanation.columns, explanation.prior)
     for index in np.array_split(rows, max(1, len(rows) // 2048)):

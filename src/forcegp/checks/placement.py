@@ -1,7 +1,7 @@
 """Do the joint angles place the tip on the surface in rows labelled as contact?
 
-A tip is centimetres off because the surface lies elsewhere, and the distance is a plane over the path; or
-because the angles are wrong, and one change of them takes it onto the surface in all rows.
+If the surface is displaced, the distance of the tip is a plane over the path; if the angles are wrong, one
+change of them moves the tip onto the surface in all rows.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ STEPS = 6
 
 
 def check_placement(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Joints that turn the other way, are exchanged or have an offset, told by the tip in contact."""
+    """Find joints with wrong sign, order or offset from the position of the tip in contact."""
     for contact, rows in touching(system, log):
         path = tip_path(system, contact, log, rows)
         if abs(np.median(path.c)) <= FAR:
@@ -58,7 +58,7 @@ def check_placement(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def leaves_surface(system: ConstrainedSystem, before: Log, after: Log) -> bool:
-    """Whether changed angles take a tip off the surface in rows that are labelled as contact."""
+    """Whether changed angles move a tip off the surface in rows labelled as contact."""
     if after.q is before.q:
         return False
     for contact, rows in touching(system, before):

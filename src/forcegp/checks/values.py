@@ -1,4 +1,4 @@
-"""Each column by itself: an even clock, numbers that a sensor can have meant, steps of the state."""
+"""Checks of single columns: an even clock, plausible values, steps of the state."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ from forcegp.rows import describe, intervals
 
 
 def check_order(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Time stamps that repeat or run backward within a segment."""
+    """Find time stamps that repeat or run backward within a segment."""
     repeated, backward = (np.append(False, wrong) for wrong in (log.steps == 0.0, log.steps < 0.0))
     findings = at_rows(repeated, "time-repeated", "time repeats in", steps=repeated.sum())
     findings += at_rows(backward, "time-backward", "time runs backward in", steps=backward.sum())
@@ -25,7 +25,7 @@ def check_order(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_gaps(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Steps that are longer than the clock's jitter allows: samples are missing."""
+    """Find steps longer than the clock's jitter: missing samples."""
     with np.errstate(invalid="ignore"):
         gaps = log.steps > log.longest_step
     if log.masked is not None:
@@ -42,7 +42,7 @@ def check_gaps(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_jitter(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Steps that are so uneven that filters for even sampling do not apply."""
+    """Find steps too uneven for filters that assume even sampling."""
     with np.errstate(invalid="ignore"):
         regular = log.steps[(log.steps > 0.0) & (log.steps <= log.longest_step)]
     spread = float(robust_std(regular) / log.dt) if len(regular) > 1 else 0.0
@@ -53,7 +53,7 @@ def check_jitter(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_period(system: ConstrainedSystem, log: Log) -> Outcome:
-    """The sampling period against that of the header."""
+    """Compare the sampling period with that of the header."""
     stated = log.header.dt
     if stated is None or not abs(log.dt / stated - 1.0) > UNIFORM_TOLERANCE:
         return [], log
@@ -89,7 +89,7 @@ def logged(log: Log) -> dict[str, Array]:
 
 
 def check_finite(system: ConstrainedSystem, log: Log) -> Outcome:
-    """NaN and infinite values, by column."""
+    """Find NaN and infinite values, by column."""
     vectors, bad = logged(log), ~np.isfinite(log.t)
     columns = ["t"] if bad.any() else []
     for name, value in vectors.items():
@@ -102,7 +102,7 @@ def check_finite(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_held(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Rows in which every logged channel repeats while the arm moves."""
+    """Find rows that repeat every channel while the arm moves."""
     same = np.ones(len(log) - 1, bool)
     for value in logged(log).values():
         same &= (np.diff(value, axis=0) == 0.0).all(axis=1)
@@ -115,7 +115,7 @@ def check_held(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_stuck(system: ConstrainedSystem, log: Log) -> Outcome:
-    """A channel that keeps one value while its joint moves by more than its own resolution explains."""
+    """Find channels that keep one value while the joint moves by more than their resolution."""
     if not np.isfinite(log.dt):
         return [], log
     least, findings, bad = max(5, round(STUCK_SECONDS / log.dt)), [], np.zeros(len(log), bool)
@@ -158,7 +158,7 @@ def _expected_change(log: Log, name: str, j: int, a: int, b: int) -> float:
 
 
 def check_spikes(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Single values far off the curve through their neighbours."""
+    """Find single values far from the curve through their neighbours."""
     bad, hit, joints, vectors = np.zeros(len(log), bool), [], [], logged(log)
     departures = {name: _departures(log, value) for name, value in vectors.items()}
     near = np.zeros(len(log), bool)
@@ -248,7 +248,7 @@ def _within_two(x: Array) -> Array:
 
 
 def resolution(x: Array) -> Array:
-    """Step between the values that a column takes, where it takes few; else zero."""
+    """Step between the values of a column with few values, else zero."""
     steps = np.zeros(x.shape[1])
     for j, levels in enumerate(map(np.unique, x.T)):
         if 2 < len(levels) < 0.75 * len(x):
@@ -260,7 +260,7 @@ def resolution(x: Array) -> Array:
 
 
 def check_resolution(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Encoder steps so coarse that they dominate a differentiated position."""
+    """Find encoder steps so coarse that they dominate a differentiated position."""
     q = log.q[log.usable]
     if len(q) < FEWEST:
         return [], log
@@ -302,7 +302,7 @@ def _jumps(x: Array, rate: Array, log: Log) -> np.ndarray:
 
 
 def check_jumps(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Positions that jump beyond what the velocity accounts for: rows are missing, or a joint wrapped."""
+    """Find position jumps that the velocity does not explain: missing rows, or a wrapped joint."""
     if "qd" in log.derived:
         return [], log
     jumps = _jumps(log.q, log.qd, log)
@@ -312,7 +312,7 @@ def check_jumps(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_impacts(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Velocities that jump where the acceleration does not account for it: impacts."""
+    """Find velocity jumps that the acceleration does not explain: impacts."""
     if log.derived:
         return [], log
     jumps = _jumps(log.qd, log.qdd, log)

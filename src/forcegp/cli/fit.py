@@ -49,8 +49,8 @@ def fit(
 ) -> None:
     """Fit a model of the forward dynamics to logged motion.
 
-    The table \\[model] of the scene, or of --config, chooses priors, kernels, noise, robot parameters and how
-    to learn; the options override it.
+    The table \\[model] of the scene, or of --config, defines priors, kernels, noise, robot parameters and
+    learning; the options override it.
 
     Structured models read Parquet logs of more than 100,000 rows, and several files, piece by piece.
 
@@ -127,7 +127,7 @@ def sweep(
 ) -> None:
     """Simulate, fit and score several models on several robots, with several seeds.
 
-    Fits that are done are not run again. Needs the extra `sweep` (Dask).
+    Finished fits are not run again. Needs the extra `sweep` (Dask).
 
     [bold]Examples[/bold]
 
