@@ -12,7 +12,7 @@ from torch import Tensor
 import forcegp
 from forcegp import dynamics, kinematics
 from forcegp.cli.common import warn_beyond
-from forcegp.forces.noise import GROWTH, RELATIVE, STICKING, distance_beyond, trained_region
+from forcegp.forces.posterior import GROWTH, RELATIVE, STICKING, distance_beyond, trained_region
 from forcegp.models.structured_fit import StructuredFit
 
 LEG = """<robot name="leg">

@@ -16,15 +16,15 @@ import torch
 from torch import Tensor
 
 from forcegp.forces.measurements import Measurement, Training
-from forcegp.forces.noise import (
+from forcegp.forces.noise import TORQUE_NOISE
+from forcegp.forces.posterior import (
     GROWTH,
     RELATIVE,
-    TORQUE_NOISE,
+    ForcePosterior,
     distance_beyond,
     hidden_variance,
     trained_region,
 )
-from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.problem import UNSHOWN, Problem, force_posterior, typical
 from forcegp.forces.quantities import States, affine_map
 

@@ -26,8 +26,8 @@ from forcegp.forces.external_wrench import (
     over_levers,
 )
 from forcegp.forces.friction_memory import FrictionMemory
-from forcegp.forces.noise import distance_beyond, external_std, stick_variance, unknown_variance
-from forcegp.forces.posterior import ForcePosterior
+from forcegp.forces.noise import external_std
+from forcegp.forces.posterior import ForcePosterior, distance_beyond, stick_variance, unknown_variance
 from forcegp.forces.problem import Problem
 from forcegp.forces.quantities import affine_map, states_at
 from forcegp.models.prediction import CHUNK, Prediction
