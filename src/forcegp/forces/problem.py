@@ -40,8 +40,8 @@ MIXED = "." + MIXING
 SHOWN = 10.0
 """Independent samples with accelerations sensitive to a joint's torque, from which its noise is learned."""
 UNSHOWN = 0.1
-"""Part of its load by which the torque of a joint, with its friction, is uncertain where nothing shows it, and
-growth of that with each training standard deviation beyond; 0.08 on a real iiwa 14."""
+"""Part of its load by which the torque of a joint, with its friction, is uncertain where nothing shows
+it, and how that grows with each training standard deviation beyond; 0.08 on a real iiwa 14."""
 
 
 def kernel_parameters(tensors: Mapping[str, Tensor]) -> Tensors:
