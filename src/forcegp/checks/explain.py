@@ -89,7 +89,7 @@ class Explanation:
 
 def explain(system: ConstrainedSystem, log: Log) -> Explanation:
     """Find the faults that explain the residual torque of the robot file."""
-    rows = log.rows(ROWS, margin=max(hypotheses.LAGS))
+    rows = log.rows(ROWS, margin=max(hypotheses.lags(log)))
     problem = hypotheses.problem_of(system, log, rows)
     model = Explanation(system, log, rows, problem, np.zeros((*problem.r.shape, 0)), np.zeros(0)).weighed()
     for _ in range(ROUNDS):
@@ -172,7 +172,8 @@ def _fits(model: Explanation) -> Iterator[Tried]:
     else:
         few = model.rows[::SCREENING]
         null = cross_validate(model.on(log, few)).score.mean()
-        for hypothesis in hypotheses.discrete(log):
+        late = hypotheses.joint_delays(log, rows, model.problem)
+        for hypothesis in (*hypotheses.discrete(log), *late):
             changed = hypothesis.change(log)
             if cross_validate(model.on(changed, few)).score.mean() < null:
                 yield hypothesis, cross_validate(model.on(changed))
