@@ -10,7 +10,7 @@ from forcegp.checks.excitation import still_joints
 from forcegp.checks.finding import Finding, at_rows
 from forcegp.checks.fit import tensors
 from forcegp.checks.limits import limits_of
-from forcegp.checks.log import Array, Log, Outcome, spikes
+from forcegp.checks.log import DEPARTURE, Array, Log, Outcome, spikes
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data.derivative import UNIFORM_TOLERANCE
 from forcegp.data.fields import JOINT_VECTORS
@@ -238,8 +238,7 @@ def _size(log: Log, name: str, departure: Array, around: Array, scale: Array) ->
 def _one_value(departure: Array, scale: Array) -> np.ndarray:
     """`(n, d)` bool, departures h with −4h/6 and h/6 around: one wrong value makes them, a kink does not."""
     around = np.lib.stride_tricks.sliding_window_view(np.pad(departure, ((2, 2), (0, 0))), 5, axis=0)
-    shape = departure[..., None] * np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0
-    misfit = np.abs(around - shape).max(axis=-1)
+    misfit = np.abs(around - departure[..., None] * DEPARTURE).max(axis=-1)
     return misfit <= SPIKE_SHAPE * np.abs(departure) + SPIKE_NOISE * scale
 
 
