@@ -78,10 +78,8 @@ def displacement(robot: RobotModel, j: int | np.integer, offset: float) -> str:
 GAP, CLOCK_SPREAD = 1.5, 10.0
 """A gap is longer than this multiple of the median step, as half a sample is missing, and this many robust
 standard deviations of the steps longer than it, as clocks jitter."""
-SHORTEST = 8
-"""Rows of the shortest stretch that is looked at."""
-SMOOTHING = 0.1
-"""Length of the filter that derives missing accelerations [s]."""
+SHORTEST, SMOOTHING = 8, 0.1
+"""Rows of the shortest stretch that is looked at; length of the filter of missing accelerations [s]."""
 
 
 @dataclass(frozen=True, eq=False)
