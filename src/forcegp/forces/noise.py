@@ -1,14 +1,13 @@
-"""The noise of what a log measures: accelerations, motor torques, and the state.
+"""Measurement noise of a log: accelerations, motor torques, and the state.
 
-**Forces that are no function of the state.** Inside its static friction, the friction of a joint is whatever
-balances the other forces. A joint that hardly moves therefore has an unknown force of variance
-σ_s² e^{−(q̇/v_s)²} more. And noise learned where nothing moves says little about a jump: beyond the range of
-speeds and torques that a joint was trained on, its force has a standard deviation g D more, with D the
+**Forces that are no function of the state.** At rest, the friction of a joint balances the other forces. A
+joint that hardly moves therefore has an additional unknown force of variance σ_s² e^{−(q̇/v_s)²}. Beyond the
+trained range of speeds and torques of a joint, its force has an additional standard deviation g D, with D the
 distance from that range in training standard deviations. `calibration.growth` estimates g.
 
 **Noise of the state**, to first order. At a measured state x + δ, with δ ~ N(0, Σ_x), the model predicts
-z(x + δ) ≈ z(x) + G δ, so a sample's rows have the noise G Σ_x Gᵀ more, with G = ∂z/∂(q, q̇) (McHutchon and
-Rasmussen, *Gaussian process training with input noise*, 2011). G is that of the robot file's equations of
+z(x + δ) ≈ z(x) + G δ, so a sample's rows have the additional noise G Σ_x Gᵀ, with G = ∂z/∂(q, q̇) (McHutchon
+and Rasmussen, *Gaussian process training with input noise*, 2011). G is that of the robot file's equations of
 motion under the measured torque, or, once forces have been learned, that of q̈ = L b + H F̄ with their
 posterior mean F̄ (`forces/noise_learning.py`).
 """
@@ -40,7 +39,7 @@ class Noise:
     Args:
         acceleration: standard deviation of measured accelerations [rad/s², m/s²], one or one per joint; by
             default what the log states (`qdd_std` by sample, else its header), else 0.1.
-        learn: whether it is a hyperparameter, which starts there.
+        learn: whether it is a hyperparameter, starting at this value.
         torque: standard deviation of the motor torque's white noise [N m, N], one or one per joint;
             `"learn"`, `None` for none, or `"auto"`: learned with the priors of measured robots.
         state: standard deviations of the white noise of measured q and q̇ [rad, rad/s], each one number or
@@ -48,8 +47,8 @@ class Noise:
         degrees_of_freedom: ν > 2 of a Student t distribution of each sample's noise, such as 4, for logs with
             impacts and other outliers; `None` for Gaussian noise (`forces/noise_learning.py`).
         external: standard deviation of an unknown force on some joints, by name [N m, N]: of a joint without
-            a torque sensor, or one that somebody moves by hand. Joints whose torque the log does not have
-            get the size of the force that moves them.
+            a torque sensor, or one that somebody moves by hand. Joints without a logged torque get the size
+            of the force that moves them.
 
     Example:
         >>> Noise(0.1, torque="learn").learns_torque
@@ -91,7 +90,7 @@ class Noise:
 
     @classmethod
     def of(cls, noise: NoiseStd | Noise | None) -> Noise:
-        """A noise as given, or that of accelerations alone."""
+        """The given `Noise`, or one of accelerations alone."""
         return noise if isinstance(noise, cls) else cls(noise)  # pyright: ignore[reportArgumentType]
 
     @property
@@ -100,7 +99,7 @@ class Noise:
         return self.torque == "learn" if isinstance(self.torque, str) else False
 
     def for_priors(self, priors: Sequence[ForcePrior]) -> Noise:
-        """The noise with that of the torque learned beside priors of measured robots, if it was left open."""
+        """The noise with `torque="auto"` resolved: learned with the priors of measured robots."""
         if not isinstance(self.torque, str) or self.torque != "auto":
             return self
         measured = any(isinstance(prior, JointFrictionPrior | InertialPrior) for prior in priors)
@@ -151,7 +150,7 @@ def external_std(external: Mapping[str, float] | None, robot: RobotModel) -> Ten
 
 
 def stick_variance(tensors: Mapping[str, Tensor], at: States) -> Tensor:
-    """Variance of the friction of joints that stick, `(n, nq)`; zero where it is not learned."""
+    """Variance of the friction of joints that stick, `(n, nq)`; zero if it is not learned."""
     if STICK_NOISE not in tensors:
         return torch.zeros_like(at.q)
     std, speed = tensors[STICK_NOISE].exp(), tensors[STICK_SPEED].exp()
@@ -163,7 +162,8 @@ def trained_region(qd: Tensor, tau: Tensor, load: Tensor) -> dict[str, Tensor]:
 
     Args:
         qd, tau: of samples in motion.
-        load: typical torque of each joint `(nq,)`, a fraction of which is the least spread of its torque.
+        load: typical torque of each joint `(nq,)`, a fraction of which bounds the spread of its torque from
+            below.
     """
     x = torch.stack([qd, tau], dim=1)
     low, high = x.quantile(torch.tensor([OUTERMOST, 1.0 - OUTERMOST]).to(x), dim=0)
@@ -172,8 +172,9 @@ def trained_region(qd: Tensor, tau: Tensor, load: Tensor) -> dict[str, Tensor]:
 
 
 def distance_beyond(tensors: Mapping[str, Tensor], qd: Tensor, tau: Tensor) -> Tensor:
-    """D of each joint `(*batch, nq)` in training standard deviations; zero inside the trained region, or
-    where none is known."""
+    """D of each joint `(*batch, nq)` in training standard deviations; zero inside the trained region, or if
+    it is unknown.
+    """
     if LOW not in tensors:
         return torch.zeros_like(qd)
     x = torch.stack([qd, tau], dim=-2)
@@ -182,7 +183,7 @@ def distance_beyond(tensors: Mapping[str, Tensor], qd: Tensor, tau: Tensor) -> T
 
 
 def warnings_beyond(distance: Tensor, joints: Sequence[str]) -> tuple[str, ...]:
-    """A warning where states lie far beyond the trained region.
+    """A warning if states lie far beyond the trained region.
 
     Args:
         distance: D `(*batch, nq)`.
@@ -200,15 +201,17 @@ def warnings_beyond(distance: Tensor, joints: Sequence[str]) -> tuple[str, ...]:
 
 
 def hidden_variance(tensors: Mapping[str, Tensor], at: States, external: Tensor | None) -> Tensor:
-    """Variance of forces that neither state nor torque sensor determines, `(n, nq)`: of joints that stick,
-    and unknown ones of stated size `(nq,)`."""
+    """Variance of forces determined by neither state nor torque sensor, `(n, nq)`: of joints that stick, and
+    of unknown forces of stated size `(nq,)`.
+    """
     variance = stick_variance(tensors, at)
     return variance if external is None else variance + external**2
 
 
 def unknown_variance(tensors: Mapping[str, Tensor], at: States, external: Tensor | None) -> Tensor:
-    """Variance of forces beside the learned ones in a prediction `(n, nq)`: hidden ones, and g² D² beyond the
-    trained region."""
+    """Additional variance of forces in a prediction `(n, nq)`: hidden forces, and g² D² beyond the trained
+    region.
+    """
     variance = hidden_variance(tensors, at, external)
     if GROWTH not in tensors:
         return variance
@@ -225,8 +228,8 @@ class SampleNoise:
 
     Attributes:
         std: σ of each component, `(d,)` or `(n, d)`.
-        force: Σ_τ, which reaches the values as the joint force does.
-        state: G Σ_x½ `(n, d, 2 nq)`, the factor of what noise of the state gives the values.
+        force: Σ_τ, the variance of the joint force.
+        state: G Σ_x½ `(n, d, 2 nq)`, factor of the noise of the state.
         weight: w of each sample `(n,)`; `None` for one.
     """
 

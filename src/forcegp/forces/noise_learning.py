@@ -13,15 +13,14 @@ where the first derivative is at fixed F̄; likewise for multipliers. The poster
 robot file, for example far from other samples, so the slopes are kept only if the evidence of the training
 data, with the weak priors, increases.
 
-**Weights.** Impacts, dropped packets and shocks of a gear break the equations of motion for a few samples,
-and under a Gaussian likelihood these decide what is learned. With y_i | w_i ~ N(E y_i, Σ_i/w_i) and
-w_i ~ Γ(ν/2, ν/2) the noise of sample i, d numbers that share one w_i, has a t distribution with ν degrees of
-freedom. Given the weights all is Gaussian, so inference stays exact. Expectation maximisation alternates
-learning with
+**Weights.** Impacts, dropped packets and gear shocks violate the equations of motion for a few samples, which
+would dominate a Gaussian likelihood. With y_i | w_i ~ N(E y_i, Σ_i/w_i) and w_i ~ Γ(ν/2, ν/2) the noise of
+sample i, d numbers that share one w_i, has a t distribution with ν degrees of freedom. Given the weights all
+is Gaussian, so inference stays exact. Expectation maximisation alternates learning with
 
     w_i = (ν + d) / (ν + E[r_iᵀ Σ_i⁻¹ r_i]),
 
-r_i the residual under the posterior: samples far outside the noise count for next to nothing (Lange, Little
+r_i the residual under the posterior: samples far outside the noise have almost no weight (Lange, Little
 and Taylor, *Robust statistical modeling using the t distribution*, 1989).
 """
 
@@ -56,16 +55,15 @@ IGNORED = 0.1
 def with_learned_slopes(
     problem: Problem, search: Search, learned: Learned, progress: Progress | None = None
 ) -> tuple[Problem, Learned, tuple[str, ...]]:
-    """The problem with the slopes of its learned forces, and what is learned with them.
+    """The problem with the slopes of its learned forces, and the result of learning with them.
 
-    Nothing changes if a force is a function of time, or if the slopes cannot be computed or learned with, as
-    those of a force that is not made of tensors; a warning says so.
+    Nothing changes, with a warning, if a force is a function of time, or if its slopes cannot be computed.
 
     Args:
         problem: exact, with noise of the state and the slopes of the robot file.
 
     Returns:
-        The problem, what is learned, and warnings.
+        The problem, the result of learning, and warnings.
     """
     if any(prior.in_time for prior in problem.priors):
         return problem, learned, ()
@@ -90,7 +88,7 @@ def with_learned_slopes(
 def with_learned_weights(
     problem: Problem, search: Search, learned: Learned, degrees: float, progress: Progress | None = None
 ) -> tuple[Problem, Learned]:
-    """The problem with the weights of its samples, and what is learned with them.
+    """The problem with the weights of its samples, and the result of learning with them.
 
     Args:
         degrees: ν.
@@ -103,7 +101,7 @@ def with_learned_weights(
 
 @torch.no_grad()
 def weighted(problem: Problem, values: Mapping[str, Tensor], degrees: float) -> Problem:
-    """The problem with the weights of its samples after `STEPS` steps, from those that it has.
+    """The problem with the weights of its samples after `STEPS` further steps.
 
     Args:
         degrees: ν.
@@ -121,7 +119,7 @@ def weighted(problem: Problem, values: Mapping[str, Tensor], degrees: float) -> 
 
 
 def left_out(problem: Problem) -> int:
-    """Number of samples that count for next to nothing."""
+    """Number of samples with almost no weight."""
     return sum(int((w < IGNORED).sum()) for w in problem.training.weights or ())
 
 

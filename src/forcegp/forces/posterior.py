@@ -1,13 +1,12 @@
 """The impressed forces before data, after them (eqs. 22 to 25), and as functions drawn from the posterior.
 
-Q̄ = m + Σ_p E_p f_p with f_p ~ GP(0, k_p), and Coulomb friction of contacts, which goes with the multiplier.
-Every quantity z = B_Q Q + B_z Q_z + o is an affine map of the latent forces f_p, so that their posterior
+Q̄ = m + Σ_p E_p f_p with f_p ~ GP(0, k_p), and Coulomb friction of contacts, proportional to the multiplier.
+Every quantity z = B_Q Q + B_z Q_z + o is an affine map of the latent forces f_p, so their posterior
 determines it. Each function drawn from it is a deterministic force field that can be integrated.
 
-Accelerations in contact depend on Q + Q_z alone (remark 3.3). The two are told apart by where they act (Q_z
-only in contact, along the tangent), by their inputs, and by measurements of either. Their posterior
-correlation measures the separation: at −1 only the sum is identifiable, at 0 each is known as well as the
-data allow.
+Accelerations in contact depend on Q + Q_z alone (remark 3.3). The two are distinguished by their directions
+(Q_z acts only in contact, along the tangent), by their inputs, and by measurements of either. Their posterior
+correlation measures the separation: at −1 only the sum is identifiable, at 0 they are separated.
 """
 
 from __future__ import annotations
@@ -34,7 +33,7 @@ from forcegp.gp.sparse import SparsePosterior
 
 @dataclass(frozen=True, eq=False)
 class ForceProcess:
-    """Priors on forces with what their operators have learned.
+    """Priors on forces with learned parameters of their operators.
 
     Attributes:
         priors, scales: the force priors and the standardization of their inputs.
@@ -88,7 +87,7 @@ LatentPosterior = ExactPosterior | SparsePosterior
 
 @dataclass(frozen=True, eq=False)
 class ForcePosterior:
-    """Latent forces conditioned on data; independent of the constraint under which it is read.
+    """Latent forces conditioned on data; independent of the constraint at prediction.
 
     Attributes:
         process: the forces before the data.
@@ -104,14 +103,14 @@ class ForcePosterior:
         return self.process.priors
 
     def shift(self, p: int, features: Features) -> Tensor | float:
-        """Shift of samples of the latent force of prior p that gives them the predicted mean."""
+        """Shift of samples of latent force p to the predicted mean."""
         if not self.process.pinned:
             return 0.0
         return self.means.latent_mean(p, features) - self.latent.latent_mean(p, features)
 
     @cached_property
     def means(self) -> LatentPosterior:
-        """The processes that means are read from: those given the forces that the robot contains."""
+        """The processes for means, given the forces that the robot contains."""
         means = self.latent
         for p, value in self.process.pinned.items():
             means = means.knowing(p, {"one": value.new_zeros(1, 1)}, value)
@@ -161,7 +160,7 @@ class ForceSamples:
     """Forces drawn from the posterior.
 
     Attributes:
-        posterior: what they are drawn from.
+        posterior: source of the samples.
         functions: the latent functions.
     """
 
@@ -218,7 +217,7 @@ def draw_samples(
 
     Args:
         generator: source of randomness, on the CPU.
-        features: random features per component; by default as many as the kind of posterior needs.
+        features: random features per component; by default a number that depends on the posterior.
     """
     size = () if features is None else (features,)
     return ForceSamples(posterior, posterior.latent.draw(count, generator, *size))
@@ -237,10 +236,10 @@ LARGE_JITTER = 0.01
 
 
 def force_correlation(posterior: ForcePosterior, system: ConstrainedSystem, at: States) -> Tensor:
-    """Posterior correlation of Q and Q_z at each state and joint, `(n, nq)`; 0 where one of them is certain.
+    """Posterior correlation of Q and Q_z at each state and joint, `(n, nq)`; 0 if one of them is certain.
 
-    corr_i = Cov(Q_i, Q_z,i) / √(Var Q_i Var Q_z,i). The part of Q along the constraint, which accelerations
-    never show, is left out.
+    corr_i = Cov(Q_i, Q_z,i) / √(Var Q_i Var Q_z,i). The part of Q along the constraint, which does not affect
+    accelerations, is excluded.
     """
     z = affine_map(system, at, ("joint_force", "contact_friction"))
     rows = posterior.rows(system, at, z)
@@ -258,7 +257,7 @@ def force_correlation(posterior: ForcePosterior, system: ConstrainedSystem, at: 
 def doubts_of(
     posterior: ForcePosterior, system: ConstrainedSystem, training: Training, power: float
 ) -> tuple[float | None, tuple[str, ...]]:
-    """Doubts about a posterior of rows to a power, at training states in contact and on the whole.
+    """Doubts about a posterior with a tempered likelihood, at training states in contact and overall.
 
     Returns:
         Mean correlation of Q and Q_z over some of these states, where both have priors; and warnings, each

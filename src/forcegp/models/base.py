@@ -1,6 +1,6 @@
 """Models of the forward dynamics: a specification, and the fitted model that predicts.
 
-`AccelerationFit` is that of models of accelerations alone, which have neither contacts nor forces.
+`AccelerationFit` belongs to models of accelerations alone, which have neither contacts nor forces.
 """
 
 from __future__ import annotations
@@ -44,11 +44,11 @@ class FittedModel(HasResult, Predictor):
     def restored(
         cls, header: ModelHeader, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
     ) -> FittedModel:
-        """The model that `save` wrote.
+        """Restore a saved model.
 
         Args:
-            header: of the file, with the settings that `record` gave.
-            tensors: as `record` gave them.
+            header: of the file, with the settings of `record`.
+            tensors: those of `record`.
             system: robot and contacts.
             source: name of the file, for messages.
 
@@ -58,7 +58,7 @@ class FittedModel(HasResult, Predictor):
 
     @abstractmethod
     def record(self) -> tuple[Record, dict[str, Tensor]]:
-        """Settings and tensors that the model can be restored from."""
+        """Settings and tensors from which the model can be restored."""
 
     def save(self, path: str | Path) -> None:
         write_model(path, self.kind, self.system, *self.record())
@@ -113,7 +113,7 @@ class Model(ABC, Generic[F]):
 
         Args:
             data: states and measurements.
-            progress: called now and then.
+            progress: called from time to time.
             checkpoint: file that records a long fit; a fit that finds it resumes there, to the same bits.
                 Remove it once the fitted model is saved.
 
@@ -123,7 +123,7 @@ class Model(ABC, Generic[F]):
 
 
 class PointwiseFit(FittedModel):
-    """Predicts each state by itself, some at a time."""
+    """Predictor of single states, evaluated in chunks."""
 
     @torch.no_grad()
     def predict(
@@ -164,12 +164,13 @@ class PointwiseFit(FittedModel):
     def at(
         self, at: FlatStates, quantity: str | Sequence[str], system: ConstrainedSystem, variance: bool
     ) -> tuple[Tensor, Tensor | None, dict[str, slice], tuple[str, ...]]:
-        """Mean `(n, d)`, variance `(n, d)` if the model has one, the slice of each quantity, and what is NaN
-        since it is not determined, in words."""
+        """Mean `(n, d)`, variance `(n, d)` if the model has one, the slice of each quantity, and descriptions
+        of undetermined components, which are NaN.
+        """
 
 
 class AccelerationFit(PointwiseFit):
-    """Predicts accelerations of the system that it was fitted on; it has neither forces nor contacts."""
+    """Predictor of accelerations of its own system, without forces or contacts."""
 
     def at(
         self, at: FlatStates, quantity: str | Sequence[str], system: ConstrainedSystem, variance: bool
@@ -191,4 +192,4 @@ class AccelerationFit(PointwiseFit):
 
     @abstractmethod
     def accelerations(self, at: FlatStates, variance: bool) -> tuple[Tensor, Tensor | None]:
-        """Mean `(n, nq)` at states and, on request and where the model has one, variance `(n, nq)`."""
+        """Mean `(n, nq)` at states and, on request and if the model has one, variance `(n, nq)`."""

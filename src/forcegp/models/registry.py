@@ -29,8 +29,8 @@ class Entry:
         made: class of the model.
         description: one line for help texts and the report.
         options: arguments of the class.
-        priors: force priors of a system with a mean and a kernel, if the set is not left to the class.
-        kernel: of these priors, if not their own.
+        priors: force priors of a system with a mean and a kernel, unless the class chooses them.
+        kernel: of these priors, if not the default.
     """
 
     made: type[Any]

@@ -1,15 +1,14 @@
 """Parts of a structured Gaussian process, and the steps of learning it.
 
 1. Samples at rest only bound the friction, and impacts break the equations of motion;
-   robots that are measured learn from motion without impacts.
+   measured robots learn from motion without impacts.
 2. Hyperparameters are learned on a part of a long log, or on all of a short one.
 3. Residuals that are correlated in time temper the likelihood, and hyperparameters are learned once more;
    unless a `DisturbancePrior` explains them.
 4. Inertial parameters move to their posterior mean: one Gauss–Newton step, physically consistent.
-5. The noise of the torque is enlarged to that on held-out stretches of the training log, and how it
-   grows beyond the trained speeds and torques is learned from held-out regimes; dry friction with memory is
-   learned from what is left, for logs in order of time.
-6. The posterior is conditioned on all samples.
+5. Torque noise is increased to that on held-out stretches of the training log, and its growth beyond the
+trained speeds and torques is learned from held-out regimes; dry friction with memory is learned from the
+residuals of logs in order of time. 6. The posterior is conditioned on all samples.
 """
 
 from __future__ import annotations
@@ -92,10 +91,10 @@ class Specification:
     options: StructuredOptions = field(default_factory=StructuredOptions)
 
     def for_data(self, data: Dataset | Sequence[Observation]) -> Specification:
-        """The specification with the noise that was left to the data.
+        """The specification with the noise resolved for given data.
 
-        The noise of accelerations is learned with that of the torque, or to compare sets of priors, if nobody
-        states it. Joints without a measured torque carry an unknown force.
+        Unless it is stated, the noise of accelerations is learned together with that of the torque, or to
+        compare sets of priors. Joints without a measured torque have an unknown force.
         """
         observations, noise = observations_of(data), self.noise
         learns = noise.learns_torque or self.automatic
@@ -111,14 +110,14 @@ class Specification:
         return dataclasses.replace(self, options=self.options.model_copy(update=changed))
 
     def with_set(self, chosen: PriorSet) -> Specification:
-        """The specification with a set of priors, and the noise of the torque that goes with it."""
+        """The specification with a set of priors and its torque noise."""
         priors, noise = chosen.priors(self.system), self.noise
         if isinstance(noise.torque, str) and noise.torque == "auto":
             noise = noise.for_priors(priors)
         return dataclasses.replace(self, priors=priors, noise=noise, automatic=False)
 
     def inertia_of(self, training: Training) -> Inertia:
-        """The robot identified from the training samples, if the model is to find it."""
+        """The robot identified from the training samples, if requested."""
         friction = next((prior for prior in self.priors if isinstance(prior, JointFrictionPrior)), None)
         asks = (
             self.options.inertia == "auto"
@@ -174,10 +173,10 @@ class Lesson:
 
     Attributes:
         problem: all samples, the updated robot, and the noise.
-        hyperparameters: learned and held.
-        learned: how the optimisation went.
-        learned_on: number of samples that were learned on.
-        warnings: doubts that came up.
+        hyperparameters: learned and fixed.
+        learned: course of the optimisation.
+        learned_on: number of samples used for learning.
+        warnings: doubts.
     """
 
     problem: Problem
@@ -192,9 +191,9 @@ class Task:
     """Inputs of a fit.
 
     Attributes:
-        specification: the model; a first fit that identifies the robot adds a prior on what it does not know.
+        specification: the model; a first fit that identifies the robot adds a prior on its remaining errors.
         training: the samples.
-        robot: to learn with.
+        robot: used for learning.
         pinned: values of forces that the robot contains, by prior.
         doubts: about the samples and the robot.
     """
@@ -209,7 +208,7 @@ class Task:
         """The learning problem.
 
         Args:
-            samples: number of samples that are conditioned on, if the training samples are a part of them.
+            samples: number of samples to condition on, if the training samples are a part of them.
         """
         problem = self.specification.problem(dataclasses.replace(self.training, part_of=samples))
         if self.robot is self.specification.system.robot:
@@ -224,7 +223,7 @@ def task_of(
     data: Dataset | Sequence[Observation],
     chosen: Sequence[str] | None,
 ) -> Task:
-    """Inputs of a fit to data, after the problem of an earlier fit or as the first."""
+    """Inputs of a fit to data, continuing an earlier fit if given."""
     training, doubts = training_for(spec, before, data, chosen)
     if before is not None and not any(bool(value.any()) for value in before.pinned.values()):
         return Task(spec, training, before.system.robot, before.pinned, doubts)
@@ -258,8 +257,8 @@ def training_for(
 ) -> tuple[Training, tuple[str, ...]]:
     """Training data, with doubts about them.
 
-    Priors that are not learned (`None`: all are) keep the scales of their inputs. With fewer samples in
-    motion than `fewest`, those at rest are kept.
+    Priors that are not learned (`None`: all are) keep the scales of their inputs. If fewer than `fewest`
+    samples are in motion, those at rest are kept.
     """
     kept = {}
     if before is not None and learned is not None:
@@ -272,10 +271,10 @@ def training_for(
 
 
 def check_learned(spec: Specification, learn: Iterable[str]) -> None:
-    """Check the names of what is learned, the prefixes of its tensors.
+    """Check the names of learned parts, the prefixes of their tensors.
 
     Raises:
-        UnknownNameError: one is neither a prior nor something else that can be learned.
+        UnknownNameError: a name is neither a prior nor another learnable part.
     """
     names = (*(prior.name for prior in spec.priors), NOISE, ANALYTICAL, COULOMB)
     for name in learn:
@@ -348,10 +347,10 @@ def learned(
     begin: Mapping[str, Tensor] | None,
     neighbours: Training | None,
 ) -> Lesson:
-    """Learn what is free in a search, and record it; where nothing is free, prepare the problem alone.
+    """Learn the free parts of a search, and record the evaluations.
 
     Args:
-        file: records the evaluations; learning that finds it goes on from there, to the same bits.
+        file: record of the evaluations, from which learning resumes with the same result to the bit.
 
     Raises:
         ModelError: the file belongs to other learning.
@@ -411,10 +410,10 @@ def solve(
     begin: Mapping[str, Tensor] | None = None,
     neighbours: Training | None = None,
 ) -> Lesson:
-    """Learn what is free in a search, then prepare the problem that is conditioned on.
+    """Learn the free parts of a search, then prepare the problem for conditioning.
 
     Args:
-        neighbours: samples as close in time as those of the log, where those of the problem are a part of it.
+        neighbours: samples at the rate of the log, if those of the problem are only a part of it.
     """
     part = subset(spec, problem)
     if part.inducing is None:

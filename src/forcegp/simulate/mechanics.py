@@ -1,8 +1,8 @@
 """Equations of motion and tool motion of one state at a time, in NumPy.
 
-At a single state, the overhead of tensors is many times the work on them. So the simulator takes the robot's
-mechanics from a compiled kernel where the machine has a C++ compiler, and otherwise from the functions for
-batches, and solves for the multiplier in NumPy. Constraints, contact mechanics and control are shared.
+At a single state, the overhead of tensors dominates. So the simulator uses a compiled kernel for the robot's
+mechanics if there is a C++ compiler, otherwise the functions for batches, and solves for the multiplier in
+NumPy. Constraints, contact mechanics and control are shared.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ class StateEquations:
     """The constrained equations of motion at one state; see `forcegp.constraints.gauss.Equations`.
 
     Attributes:
-        M, A, b, c, cd, Q_C, Q_D, Q_K: as there, without a batch.
+        M, A, b, c, cd, Q_C, Q_D, Q_K: as in `Equations`, without a batch.
         contact_points: the touching point of each surface contact, by name.
         tool: motion of the tool.
     """
