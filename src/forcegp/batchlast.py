@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from forcegp.errors import NumericalError
+from forcegp.errors import MassMatrixError
 
 _SMALL = 4096
 """Below so many elements the number of operations counts, above it the time each one takes."""
@@ -86,19 +86,6 @@ def take(x: Tensor, joints: Sequence[int]) -> Tensor:
     return x[..., list(joints), :]
 
 
-def mass_factor(M: Tensor) -> Tensor:
-    """Lower Cholesky factor of mass matrices `(*batch, n, n)`.
-
-    Raises:
-        NumericalError: a matrix is not positive definite, for example because of a negative mass.
-    """
-    try:
-        return torch.linalg.cholesky(M)
-    except torch.linalg.LinAlgError as cause:  # pyright: ignore[reportPrivateImportUsage]
-        text, hint = "a mass matrix is not positive definite", "check the robot's masses and inertias"
-        raise NumericalError(text, got=str(cause)[:200], hint=hint) from cause
-
-
 def solve_spd(M: Tensor, rhs: Tensor) -> Tensor:
     """M⁻¹ rhs for symmetric positive definite `(n, n, B)` and `(n, k, B)`.
 
@@ -106,7 +93,10 @@ def solve_spd(M: Tensor, rhs: Tensor) -> Tensor:
     """
     n, B = M.shape[0], M.shape[-1]
     if M.numel() < _SMALL:
-        factor = mass_factor(M.movedim(-1, 0))
+        try:
+            factor = torch.linalg.cholesky(M.movedim(-1, 0))
+        except torch.linalg.LinAlgError as cause:  # pyright: ignore[reportPrivateImportUsage]
+            raise MassMatrixError(cause) from cause
         return torch.cholesky_solve(rhs.movedim(-1, 0), factor).movedim(0, -1)
     rest, rows = torch.cat([M, rhs], dim=1), []
     for _ in range(n):

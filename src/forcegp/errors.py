@@ -156,6 +156,14 @@ class NumericalError(ForceGPError, ArithmeticError):
     """A computation without a trustworthy result (an indefinite matrix, a diverging run)."""
 
 
+class MassMatrixError(NumericalError):
+    """A mass matrix that is not positive definite, as of a robot with negative masses."""
+
+    def __init__(self, cause: Exception) -> None:
+        text, hint = "a mass matrix is not positive definite", "check the robot's masses and inertias"
+        super().__init__(text, got=str(cause)[:200], hint=hint)
+
+
 class MissingDependencyError(ForceGPError, ImportError):
     """A required optional package that is not installed."""
 

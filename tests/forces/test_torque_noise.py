@@ -10,7 +10,8 @@ import torch
 
 import forcegp
 from forcegp.errors import ModelError
-from forcegp.forces.noise import STICK_NOISE, TORQUE_NOISE
+from forcegp.forces.noise import TORQUE_NOISE
+from forcegp.forces.posterior import STICK_NOISE
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import JointFrictionPrior
 from forcegp.forces.problem import force_posterior, kernel_parameters, without_inducing

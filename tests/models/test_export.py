@@ -27,7 +27,7 @@ from forcegp.errors import (
     ShapeError,
     UnknownNameError,
 )
-from forcegp.forces.noise import unknown_variance
+from forcegp.forces.posterior import unknown_variance
 from forcegp.forces.priors.contact import ContactForcePrior, NormalForcePrior, SlidingFrictionPrior
 from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
 from forcegp.forces.priors.joint import JointForcePrior, JointFrictionPrior

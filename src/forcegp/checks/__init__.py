@@ -11,12 +11,13 @@ import torch
 
 from forcegp.checks import contact, excitation, kinematics, limits, mechanics, placement, values
 from forcegp.checks.finding import KINDS, SEVERITIES, Finding, NotJudgedError, Report
+from forcegp.checks.limits import clipped_torques
 from forcegp.checks.log import Log, Outcome, log_of, of_robot, read_log
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data.dataset import Dataset
 from forcegp.resources import announce_memory
 
-__all__ = ["KINDS", "Finding", "Log", "Report", "check", "log_of", "read_log"]
+__all__ = ["KINDS", "Finding", "Log", "Report", "check", "clipped_torques", "log_of", "read_log"]
 
 NUMBERS = 24
 """Upper bound on the numbers of one joint in one row that are held at a time; twenty were measured."""

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from forcegp.checks.finding import at_rows
 from forcegp.checks.fit import cross_validate
 from forcegp.checks.hypotheses import gain_hypothesis, problem_of
-from forcegp.checks.log import Array, Log, Outcome
+from forcegp.checks.log import Array, Log, Outcome, log_of
 from forcegp.constraints import ConstrainedSystem
+from forcegp.data import Dataset
 from forcegp.rows import Intervals, intervals
 
 DEGREE = np.pi / 180.0
@@ -101,7 +103,26 @@ def check_limits(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_saturation(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find torques that stay at their largest value for several rows: the amplifier clips."""
+    """Torques that stay at their largest value for several rows: the amplifier clips."""
+    clipped = clipped_torques(log)
+    joints = log.named(clipped.any(axis=0))
+    text = f"the torque of {', '.join(joints)} stays at its largest value in"
+    return at_rows(np.asarray(clipped.any(axis=1)), "torque-saturated", text, joints), log
+
+
+def clipped_torques(data: Dataset | Log) -> NDArray[np.bool_]:
+    """Where the torque of a joint stays at its largest or smallest value, `(n, nq)` bool.
+
+    Look at a log as it was recorded: a filter rounds the plateaus off. Leave these rows out of training data,
+    or state their noise in `extras["tau_std"]` for an external wrench.
+
+    Args:
+        data: a log in order of time.
+
+    Example:
+        `train = log[torch.from_numpy(~clipped_torques(log).any(-1))]`
+    """
+    log = data if isinstance(data, Log) else log_of(data)
     clipped = np.zeros(log.tau.shape, bool)
     for j in range(log.nq):
         tau = log.tau[:, j]
@@ -111,9 +132,7 @@ def check_saturation(system: ConstrainedSystem, log: Log) -> Outcome:
         for extreme in (usable.max(), usable.min()):
             for first, last in _plateaus(log, j, extreme):
                 clipped[first:last, j] = True
-    joints = log.named(clipped.any(axis=0))
-    text = f"the torque of {', '.join(joints)} stays at its largest value in"
-    return at_rows(np.asarray(clipped.any(axis=1)), "torque-saturated", text, joints), log
+    return clipped
 
 
 def _plateaus(log: Log, j: int, extreme: float) -> Intervals:

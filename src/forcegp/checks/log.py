@@ -18,11 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forcegp.checks.finding import Finding
-from forcegp.data.checks import check_joints
 from forcegp.data.columns import parse
 from forcegp.data.dataset import Dataset
 from forcegp.data.derivative import SavitzkyGolay, differentiate
-from forcegp.data.fields import JOINT_VECTORS, DataHeader
+from forcegp.data.fields import JOINT_VECTORS, DataHeader, check_joints
 from forcegp.data.table import read_table
 from forcegp.errors import DataError
 from forcegp.robot.model import RobotModel

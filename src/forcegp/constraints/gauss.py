@@ -14,7 +14,7 @@ of constant rank do no harm.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -25,9 +25,9 @@ from torch.linalg import vecdot
 from torch.nn.functional import normalize
 
 from forcegp import dynamics
-from forcegp.batchlast import mass_factor
 from forcegp.derivatives import inverse_dynamics_derivatives
-from forcegp.kinematics import LinkMotion, LinkPoses
+from forcegp.errors import MassMatrixError
+from forcegp.kinematics import LinkMotion, LinkPoses, PointMotion
 from forcegp.robot.model import RobotModel
 from forcegp.types import ConstraintInverse, ConstraintMatrix, ConstraintVector, JointMatrix, JointVector
 
@@ -114,9 +114,11 @@ class Equations:
         c, cd: `(*batch, m)` constraint error and its rate, of all contacts, active or not.
         Q_C, Q_G, Q_D: `(*batch, nq)` bias, gravity and dissipative joint force.
         contact_points: the touching point of each surface contact, by name.
-        links: function that returns the poses and the motion of the links at the states.
-        holds: `(*batch, m)` bool, rows of A that hold: those of closed contacts, including tangential rows if
-            they stick.
+        point_motion: computes the motion of a point `(frame, point)` of the robot at the states.
+        links: computes the poses and the motion of the links at the states, where more of the
+            kinematics is needed.
+        holds: `(*batch, m)` bool, rows of A that hold: those of closed contacts, along the surface where they
+            stick.
     """
 
     M: JointMatrix
@@ -128,6 +130,7 @@ class Equations:
     Q_G: JointVector
     Q_D: JointVector
     contact_points: dict[str, ContactPoint]
+    point_motion: Callable[[str, Sequence[float]], PointMotion]
     links: Callable[[], tuple[LinkPoses, LinkMotion]]
     holds: Tensor
 
@@ -147,8 +150,11 @@ class Equations:
 
     @cached_property
     def M_cholesky(self) -> JointMatrix:
-        """Lower Cholesky factor of M; raises `NumericalError` if M is not positive definite."""
-        return mass_factor(self.M)
+        """Lower Cholesky factor of M; `NumericalError` where M is not positive definite."""
+        try:
+            return torch.linalg.cholesky(self.M)
+        except torch.linalg.LinAlgError as cause:  # pyright: ignore[reportPrivateImportUsage]
+            raise MassMatrixError(cause) from cause
 
     @cached_property
     def M_inv_At(self) -> ConstraintInverse:

@@ -9,13 +9,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from forcegp import kinematics
-from forcegp.constraints import ConstrainedSystem
+from forcegp.constraints import ConstrainedSystem, Equations
 from forcegp.constraints.contact import SurfaceContact
 from forcegp.control.task_space import (
     Gains,
@@ -29,7 +28,7 @@ from forcegp.control.task_space import (
 from forcegp.control.trajectory import Chart, Reference, draw_waypoints, straight_lines
 from forcegp.errors import NumericalError, ParameterError
 from forcegp.robot.model import RobotModel
-from forcegp.types import Array, JointVector, Rotation, Vector3
+from forcegp.types import JointVector, Rotation, Vector3
 
 NOT_NEGATIVE = "a finite number, 0 or above"
 
@@ -220,23 +219,20 @@ class Plan:
     targets: Target | JointTarget
     start: Tensor
 
-    def arrays(self) -> Target | JointTarget:
-        """The targets as NumPy arrays `(n, …)`."""
-        return type(self.targets)(*(values.numpy() for values in self.targets))
-
-    def command(self, eom: Any, q: Array, qd: Array, target: Target | JointTarget, gains: Gains) -> Array:
-        """Motor torque `(nq,)` towards a target, not limited [N m]."""
+    def command(self, eom: Equations, q: Tensor, qd: Tensor, k: int | Tensor, gains: Gains) -> Tensor:
+        """Motor torque `(*batch, nq)` towards the targets of samples `(*batch,)`, not limited [N m]."""
+        target = type(self.targets)(*(values[k] for values in self.targets))
         if isinstance(target, JointTarget):
             return joint_torque(eom, q, qd, target, gains)
-        return control_torque(eom.tool, eom, q, qd, target, self.press(eom), gains)
+        tool = eom.point_motion(self.frame, self.point)
+        return control_torque(tool, eom, q, qd, target, self.press(eom), gains)
 
-    def press(self, eom: Any) -> Any:
+    def press(self, eom: Equations) -> Tensor:
         """Generalized unit normal force on each of the tool's contacts, summed, Σ Jᵀn/|n| `(*batch, nq)`."""
         total = 0.0 * eom.Q_C
         for name in self.contacts:
             at = eom.contact_points[name]
-            unit = at.normal / ((at.normal * at.normal).sum(-1) ** 0.5)[..., None]
-            total = total + (at.jacobian.swapaxes(-1, -2) @ unit[..., None])[..., 0]
+            total = total + (at.jacobian.mT @ at.unit_normal[..., None])[..., 0]
         return total
 
 

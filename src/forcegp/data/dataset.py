@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from forcegp.data import checks
+from forcegp.data import fields
 from forcegp.data.columns import as_tensors, parse, unparse
 from forcegp.data.derivative import SavitzkyGolay
 from forcegp.data.fields import JOINT_VECTORS, Fields, mapped
@@ -73,12 +73,12 @@ class Dataset(Fields):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "joint_names", tuple(self.joint_names))
-        checks.check_tensors(self)
+        fields.check_tensors(self)
         if self.segment is None:
             zero = torch.zeros(self.t.shape, dtype=torch.int64, device=self.t.device)
             object.__setattr__(self, "segment", zero)
-        checks.check_layout(self)
-        checks.check_values(self)
+        fields.check_layout(self)
+        fields.check_values(self)
 
     def __repr__(self) -> str:
         """What is logged, without the numbers: samples, joints, duration, contacts, further quantities."""
@@ -113,7 +113,7 @@ class Dataset(Fields):
         Raises:
             DataError: a mask of another length, or an index that does not exist.
         """
-        index = checks.row_indices(rows, len(self), self.t.device)
+        index = fields.row_indices(rows, len(self), self.t.device)
         ordered = self.header.ordered and bool((index[1:] > index[:-1]).all())
         header = self.header.model_copy(update={"ordered": ordered})
         return self._map(lambda value: value[index], header=header)
@@ -144,7 +144,7 @@ class Dataset(Fields):
         Raises:
             DataError: the state of a contact is not logged.
         """
-        return checks.contact_table(self, contacts)
+        return fields.contact_table(self, contacts)
 
     def replace(self, **fields: object) -> Dataset:
         """A data set with some fields changed."""
@@ -181,7 +181,7 @@ class Dataset(Fields):
         Raises:
             DataError: joints are missing, unknown or in another order; the hint names the remedy.
         """
-        checks.check_robot(self, robot)
+        fields.check_robot(self, robot)
 
     def plot(
         self, quantity: str | None = None, *, joints: Sequence[str] | None = None, ax: Target = None
@@ -222,13 +222,13 @@ class Dataset(Fields):
         Raises:
             DataError: no parts, or their joints, contacts, extras, precision or device differ.
         """
-        checks.check_alike(parts)
+        fields.check_alike(parts)
         segments, start = [], 0
         for part in parts:
             _, numbers = torch.unique_consecutive(part.segment, return_inverse=True)
             segments.append(numbers + start)
             start += int(numbers.max()) + 1 if len(part) else 0
-        header = checks.common_header([part.header for part in parts])
+        header = fields.common_header([part.header for part in parts])
         own = {"joint_names": parts[0].joint_names, "segment": torch.cat(segments), "header": header}
         return Dataset(**mapped(parts, torch.cat) | own)
 

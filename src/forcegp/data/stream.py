@@ -16,11 +16,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from forcegp.data.checks import check_alike, common_header
 from forcegp.data.columns import as_tensors, parse
 from forcegp.data.dataset import Dataset
 from forcegp.data.derivative import SavitzkyGolay
-from forcegp.data.fields import DataHeader
+from forcegp.data.fields import DataHeader, check_alike, common_header
 from forcegp.data.table import Columns, IgnoredColumnsWarning, existing, numeric, opened_parquet
 from forcegp.errors import DataError
 

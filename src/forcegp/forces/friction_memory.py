@@ -23,7 +23,8 @@ from forcegp.data import Dataset
 from forcegp.forces.calibration import CHUNK_STATES, autocorrelation_time, stretches
 from forcegp.forces.inverse_dynamics import bristles
 from forcegp.forces.measurements import Measurement, Training
-from forcegp.forces.noise import TORQUE_NOISE, stick_variance
+from forcegp.forces.noise import TORQUE_NOISE
+from forcegp.forces.posterior import stick_variance
 from forcegp.forces.priors.base import NOISE
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import SPEEDS

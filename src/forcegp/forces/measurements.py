@@ -17,7 +17,7 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset, farthest_points, standardized
-from forcegp.data.checks import check_robot, contact_table
+from forcegp.data.fields import check_robot, contact_table
 from forcegp.errors import ModelError, UnknownNameError
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.quantities import QUANTITIES, States, states

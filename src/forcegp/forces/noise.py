@@ -1,10 +1,5 @@
 """Measurement noise of a log: accelerations, motor torques, and the state.
 
-**Forces that are no function of the state.** At rest, the friction of a joint balances the other forces. A
-joint that hardly moves therefore has an additional unknown force of variance σ_s² e^{−(q̇/v_s)²}. Beyond the
-trained range of speeds and torques of a joint, its force has an additional standard deviation g D, with D the
-distance from that range in training standard deviations. `calibration.growth` estimates g.
-
 **Noise of the state**, to first order. At a measured state x + δ, with δ ~ N(0, Σ_x), the model predicts
 z(x + δ) ≈ z(x) + G δ, so a sample's rows have the additional noise G Σ_x Gᵀ, with G = ∂z/∂(q, q̇) (McHutchon
 and Rasmussen, *Gaussian process training with input noise*, 2011). G is that of the robot file's equations of
@@ -25,6 +20,7 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError, UnknownNameError
 from forcegp.forces.measurements import Measurement, NoiseStd, Training
+from forcegp.forces.posterior import STICK_NOISE, STICK_SPEED, STICKING
 from forcegp.forces.priors.base import NOISE, ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import JointFrictionPrior
@@ -108,21 +104,6 @@ class Noise:
 
 TORQUE_NOISE = f"{NOISE}.torque.log_noise_std"
 """Name of the learned noise of the motor torque."""
-STICK_NOISE, STICK_SPEED = f"{NOISE}.stick.log_noise_std", f"{NOISE}.stick.log_speed"
-"""Names of the learned σ_s and v_s of each joint."""
-STICKING = 0.02
-"""v_s where learning begins [rad/s, m/s]."""
-REGION = f"{NOISE}.region."
-LOW, HIGH, SPREAD, GROWTH = (REGION + name for name in ("low", "high", "spread", "growth"))
-"""Names of the trained region: limits and standard deviation of the speed and torque of each joint `(2, nq)`,
-and g `(nq,)` [N m, N]."""
-OUTERMOST = 0.01
-"""Share of the training samples that lies beyond either limit of the region."""
-RELATIVE = 0.05
-"""Growth g over the typical load of a joint that is expected before learning: torque constants and
-friction that depends on load are uncertain by some 5 %."""
-FAR = 3.0
-"""Distance beyond the trained region from which a prediction warns."""
 
 
 def initial_torque_noise(residual: Tensor) -> dict[str, Tensor]:
@@ -147,75 +128,6 @@ def external_std(external: Mapping[str, float] | None, robot: RobotModel) -> Ten
     if not external:
         return None
     return robot.mass.new_tensor([external.get(joint, 0.0) for joint in robot.joint_names])
-
-
-def stick_variance(tensors: Mapping[str, Tensor], at: States) -> Tensor:
-    """Variance of the friction of joints that stick, `(n, nq)`; zero if it is not learned."""
-    if STICK_NOISE not in tensors:
-        return torch.zeros_like(at.q)
-    std, speed = tensors[STICK_NOISE].exp(), tensors[STICK_SPEED].exp()
-    return std**2 * torch.exp(-((at.qd / speed) ** 2))
-
-
-def trained_region(qd: Tensor, tau: Tensor, load: Tensor) -> dict[str, Tensor]:
-    """The region of the training samples `(n, nq)`, by the names of `LOW`, `HIGH` and `SPREAD`.
-
-    Args:
-        qd, tau: of samples in motion.
-        load: typical torque of each joint `(nq,)`, a fraction of which bounds the spread of its torque from
-            below.
-    """
-    x = torch.stack([qd, tau], dim=1)
-    low, high = x.quantile(torch.tensor([OUTERMOST, 1.0 - OUTERMOST]).to(x), dim=0)
-    least = torch.stack([torch.full_like(load, STICKING), RELATIVE * load])
-    return {LOW: low, HIGH: high, SPREAD: x.std(0, correction=0).maximum(least)}
-
-
-def distance_beyond(tensors: Mapping[str, Tensor], qd: Tensor, tau: Tensor) -> Tensor:
-    """D of each joint `(*batch, nq)` in training standard deviations; zero inside the trained region, or if
-    it is unknown.
-    """
-    if LOW not in tensors:
-        return torch.zeros_like(qd)
-    x = torch.stack([qd, tau], dim=-2)
-    beyond = (tensors[LOW] - x).maximum(x - tensors[HIGH]).clamp(min=0.0)
-    return (beyond / tensors[SPREAD]).norm(dim=-2)
-
-
-def warnings_beyond(distance: Tensor, joints: Sequence[str]) -> tuple[str, ...]:
-    """A warning if states lie far beyond the trained region.
-
-    Args:
-        distance: D `(*batch, nq)`.
-    """
-    rows = distance.reshape(-1, distance.shape[-1])
-    far = int((rows > FAR).any(-1).sum())
-    if not far:
-        return ()
-    most, joint = rows.amax(0).max(0)
-    return (
-        f"{far} of {len(rows)} states lie beyond the trained speeds and torques, by up to {float(most):.3g} "
-        f"training standard deviations ({joints[int(joint)]}); their error bars are a guess: train on such "
-        "motion",
-    )
-
-
-def hidden_variance(tensors: Mapping[str, Tensor], at: States, external: Tensor | None) -> Tensor:
-    """Variance of forces determined by neither state nor torque sensor, `(n, nq)`: of joints that stick, and
-    of unknown forces of stated size `(nq,)`.
-    """
-    variance = stick_variance(tensors, at)
-    return variance if external is None else variance + external**2
-
-
-def unknown_variance(tensors: Mapping[str, Tensor], at: States, external: Tensor | None) -> Tensor:
-    """Additional variance of forces in a prediction `(n, nq)`: hidden forces, and g² D² beyond the trained
-    region.
-    """
-    variance = hidden_variance(tensors, at, external)
-    if GROWTH not in tensors:
-        return variance
-    return variance + (tensors[GROWTH] * distance_beyond(tensors, at.qd, at.tau)).square()
 
 
 ForceNoise = Callable[[States], Tensor]

@@ -4,15 +4,22 @@ Q̄ = m + Σ_p E_p f_p with f_p ~ GP(0, k_p), and Coulomb friction of contacts, 
 Every quantity z = B_Q Q + B_z Q_z + o is an affine map of the latent forces f_p, so their posterior
 determines it. Each function drawn from it is a deterministic force field that can be integrated.
 
-Accelerations in contact depend on Q + Q_z alone (remark 3.3). The two are distinguished by their directions
-(Q_z acts only in contact, along the tangent), by their inputs, and by measurements of either. Their posterior
-correlation measures the separation: at −1 only the sum is identifiable, at 0 they are separated.
+Accelerations in contact depend on Q + Q_z alone (remark 3.3). The two are told apart by where they act (Q_z
+only in contact, along the tangent), by their inputs, and by measurements of either. Their posterior
+correlation measures the separation: at −1 only the sum is identifiable, at 0 each is known as well as the
+data allow.
+
+**Forces that are no function of the state.** Inside its static friction, the friction of a joint is whatever
+balances the other forces. A joint that hardly moves therefore has an unknown force of variance
+σ_s² e^{−(q̇/v_s)²} more. And noise learned where nothing moves says little about a jump: beyond the range of
+speeds and torques that a joint was trained on, its force has a standard deviation g D more, with D the
+distance from that range in training standard deviations. `calibration.growth` estimates g.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -22,13 +29,29 @@ from torch.linalg import vecdot
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.forces.measurements import Training
-from forcegp.forces.priors.base import CONSTRAINT, CONTACT, JOINT, ForceMean, ForcePrior
+from forcegp.forces.priors.base import CONSTRAINT, CONTACT, JOINT, NOISE, ForceMean, ForcePrior
 from forcegp.forces.priors.contact import CoulombFriction, coupled, with_coulomb
 from forcegp.forces.quantities import OPEN, AffineMap, States, affine_map, hidden_forces
 from forcegp.gp.draws import FunctionSamples
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.features import Block, Features, Standardization
 from forcegp.gp.sparse import SparsePosterior
+
+STICK_NOISE, STICK_SPEED = f"{NOISE}.stick.log_noise_std", f"{NOISE}.stick.log_speed"
+"""Names of the learned σ_s and v_s of each joint."""
+STICKING = 0.02
+"""v_s where learning begins [rad/s, m/s]."""
+REGION = f"{NOISE}.region."
+LOW, HIGH, SPREAD, GROWTH = (REGION + name for name in ("low", "high", "spread", "growth"))
+"""Names of the trained region: limits and standard deviation of the speed and torque of each joint `(2, nq)`,
+and g `(nq,)` [N m, N]."""
+OUTERMOST = 0.01
+"""Share of the training samples that lies beyond either limit of the region."""
+RELATIVE = 0.05
+"""Growth g over the typical load of a joint that is expected before learning: torque constants and
+friction that depends on load are uncertain by some 5 %."""
+FAR_BEYOND = 3.0
+"""Distance beyond the trained region from which a prediction warns."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -149,6 +172,77 @@ class ForcePosterior:
         """Posterior mean o + B(m + Σ E f) of a quantity at states, `(n, d)`."""
         rows = self.rows(system, at, z)
         return rows.target + self.means.mean(rows)
+
+
+def stick_variance(tensors: Mapping[str, Tensor], at: States) -> Tensor:
+    """Variance of the friction of joints that stick, `(n, nq)`; zero where it is not learned."""
+    if STICK_NOISE not in tensors:
+        return torch.zeros_like(at.q)
+    std, speed = tensors[STICK_NOISE].exp(), tensors[STICK_SPEED].exp()
+    return std**2 * torch.exp(-((at.qd / speed) ** 2))
+
+
+def trained_region(qd: Tensor, tau: Tensor, load: Tensor, hidden: Tensor | None = None) -> dict[str, Tensor]:
+    """The region of the training samples `(n, nq)`, by the names of `LOW`, `HIGH` and `SPREAD`.
+
+    Args:
+        qd, tau: of samples in motion.
+        load: typical torque of each joint `(nq,)`, a fraction of which is the least spread of its torque.
+        hidden: `(nq,)` bool, joints whose torque has no effect on accelerations: rare torques are not learned
+            from, and their region is a standard deviation around the mean.
+    """
+    x = torch.stack([qd, tau], dim=1)
+    low, high = x.quantile(torch.tensor([OUTERMOST, 1.0 - OUTERMOST]).to(x), dim=0)
+    least = torch.stack([torch.full_like(load, STICKING), RELATIVE * load])
+    spread = x.std(0, correction=0).maximum(least)
+    if hidden is not None:
+        mean, std = tau.mean(0), spread[1]
+        low[1], high[1] = torch.where(hidden, mean - std, low[1]), torch.where(hidden, mean + std, high[1])
+    return {LOW: low, HIGH: high, SPREAD: spread}
+
+
+def distance_beyond(tensors: Mapping[str, Tensor], qd: Tensor, tau: Tensor) -> Tensor:
+    """D of each joint `(*batch, nq)` in training standard deviations; zero inside the trained region, or
+    where none is known."""
+    if LOW not in tensors:
+        return torch.zeros_like(qd)
+    x = torch.stack([qd, tau], dim=-2)
+    beyond = (tensors[LOW] - x).maximum(x - tensors[HIGH]).clamp(min=0.0)
+    return (beyond / tensors[SPREAD]).norm(dim=-2)
+
+
+def warnings_beyond(distance: Tensor, joints: Sequence[str]) -> tuple[str, ...]:
+    """A warning where states lie far beyond the trained region.
+
+    Args:
+        distance: D `(*batch, nq)`.
+    """
+    rows = distance.reshape(-1, distance.shape[-1])
+    far = int((rows > FAR_BEYOND).any(-1).sum())
+    if not far:
+        return ()
+    most, joint = rows.amax(0).max(0)
+    return (
+        f"{far} of {len(rows)} states lie beyond the trained speeds and torques, by up to {float(most):.3g} "
+        f"training standard deviations ({joints[int(joint)]}); their error bars are a guess: train on such "
+        "motion",
+    )
+
+
+def hidden_variance(tensors: Mapping[str, Tensor], at: States, external: Tensor | None) -> Tensor:
+    """Variance of forces that neither state nor torque sensor determines, `(n, nq)`: of joints that stick,
+    and unknown ones of stated size `(nq,)`."""
+    variance = stick_variance(tensors, at)
+    return variance if external is None else variance + external**2
+
+
+def unknown_variance(tensors: Mapping[str, Tensor], at: States, external: Tensor | None) -> Tensor:
+    """Variance of forces beside the learned ones in a prediction `(n, nq)`: hidden ones, and g² D² beyond the
+    trained region."""
+    variance = hidden_variance(tensors, at, external)
+    if GROWTH not in tensors:
+        return variance
+    return variance + (tensors[GROWTH] * distance_beyond(tensors, at.qd, at.tau)).square()
 
 
 CHUNK_STATES = 256

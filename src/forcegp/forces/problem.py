@@ -18,8 +18,8 @@ from torch import Tensor, nn
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError
 from forcegp.forces.measurements import Training
-from forcegp.forces.noise import TORQUE_NOISE, ForceNoise, SampleNoise, hidden_variance, state_jacobian
-from forcegp.forces.posterior import ForcePosterior, ForceProcess
+from forcegp.forces.noise import TORQUE_NOISE, ForceNoise, SampleNoise, state_jacobian
+from forcegp.forces.posterior import ForcePosterior, ForceProcess, hidden_variance
 from forcegp.forces.priors.base import ANALYTICAL, MIXING, NOISE, RESERVED, ForceMean, ForcePrior
 from forcegp.forces.priors.contact import CoulombErrorPrior, CoulombFriction, coulomb_of
 from forcegp.forces.projection import WhitenedRows, combine, whiten

@@ -16,8 +16,8 @@ import torch
 
 from forcegp import dynamics
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
-from forcegp.data.checks import MOST_RADIANS
 from forcegp.data.derivative import cross_validated_window
+from forcegp.data.fields import MOST_RADIANS
 from forcegp.errors import DataError
 from forcegp.guards import foreign
 from forcegp.logs import units

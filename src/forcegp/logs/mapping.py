@@ -19,7 +19,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.data.checks import lock_hint
+from forcegp.data.fields import lock_hint
 from forcegp.errors import MappingError, did_you_mean
 from forcegp.guards import is_file
 from forcegp.logs import units

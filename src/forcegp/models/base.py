@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
@@ -17,10 +17,10 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import ModelError
 from forcegp.files import Record
-from forcegp.forces.quantities import FlatStates, flat_states
+from forcegp.forces.quantities import FlatStates
 from forcegp.gp.optimise import FitProgress
 from forcegp.models.fit_result import HasResult, fit_table, model_line
-from forcegp.models.prediction import Prediction, Predictor, in_pieces
+from forcegp.models.prediction import Answer, Predictor, Query
 from forcegp.storage.model_file import ModelHeader, write_model
 
 
@@ -122,73 +122,25 @@ class Model(ABC, Generic[F]):
         """
 
 
-class PointwiseFit(FittedModel):
-    """Predictor of single states, evaluated in chunks."""
+class AccelerationFit(FittedModel):
+    """Predicts accelerations of the system that it was fitted on; it has neither forces nor contacts."""
 
-    @torch.no_grad()
-    def predict(
-        self,
-        q: Tensor,
-        qd: Tensor,
-        tau: Tensor,
-        quantity: str | Sequence[str] = "qdd",
-        *,
-        active: Tensor | None = None,
-        covariance: bool = True,
-        system: ConstrainedSystem | None = None,
-    ) -> Prediction:
-        """Mean `(*batch, d)` of a quantity and, if the model has one, its covariance without noise.
-
-        The arguments are those of `Predictor.predict`; a model with forces takes several names.
-
-        Raises:
-            UnknownNameError: no such quantity.
-            ModelError: a model of accelerations alone is asked for another quantity, or on another system.
-            ShapeError: a state does not fit the robot.
-        """
-        system, parts, doubts = system or self.system, dict[str, slice](), dict[str, None]()
-
-        def read(at: FlatStates) -> tuple[Tensor | None, ...]:
-            mean, variance, slices, own = self.at(at, quantity, system, covariance)
-            parts.update(slices)
-            doubts.update(dict.fromkeys(own))
-            return mean, variance
-
-        mean, variance = in_pieces(flat_states(system, q, qd, tau, active), read)
-        assert mean is not None
-        spread = None if variance is None else torch.diag_embed(variance)
-        determined = ~mean.isnan() if doubts else None
-        return Prediction(mean, spread, parts, determined=determined, doubts=tuple(doubts))
-
-    @abstractmethod
-    def at(
-        self, at: FlatStates, quantity: str | Sequence[str], system: ConstrainedSystem, variance: bool
-    ) -> tuple[Tensor, Tensor | None, dict[str, slice], tuple[str, ...]]:
-        """Mean `(n, d)`, variance `(n, d)` if the model has one, the slice of each quantity, and descriptions
-        of undetermined components, which are NaN.
-        """
-
-
-class AccelerationFit(PointwiseFit):
-    """Predictor of accelerations of its own system, without forces or contacts."""
-
-    def at(
-        self, at: FlatStates, quantity: str | Sequence[str], system: ConstrainedSystem, variance: bool
-    ) -> tuple[Tensor, Tensor | None, dict[str, slice], tuple[str, ...]]:
-        if quantity != "qdd":
+    def at(self, flat: FlatStates, query: Query) -> Answer:
+        if query.quantity != "qdd":
             raise ModelError(
                 f"a {self.kind!r} model predicts accelerations only",
                 expected="qdd",
-                got=quantity,
+                got=query.quantity,
                 hint="use StructuredGP for forces and multipliers",
             )
-        if system is not self.system:
+        if query.system not in (None, self.system):
             raise ModelError(
                 f"a {self.kind!r} model has no forces, so it cannot predict on another system",
                 hint="use StructuredGP, or leave out `system`",
             )
-        mean, spread = self.accelerations(at, variance)
-        return mean, spread, {"qdd": slice(0, mean.shape[-1])}, ()
+        mean, variance = self.accelerations(flat, query.covariance)
+        spread = None if variance is None else torch.diag_embed(variance)
+        return (mean, spread, None, None), {"qdd": slice(0, mean.shape[-1])}, ()
 
     @abstractmethod
     def accelerations(self, at: FlatStates, variance: bool) -> tuple[Tensor, Tensor | None]:

@@ -29,8 +29,7 @@ from forcegp.control.information import SPEEDS as SPEED_BUMPS
 from forcegp.control.information import Unknowns
 from forcegp.errors import ModelError, ParameterError
 from forcegp.files import write_json
-from forcegp.forces.noise import HIGH, LOW
-from forcegp.forces.posterior import ForceSamples
+from forcegp.forces.posterior import HIGH, LOW, ForceSamples
 from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
 from forcegp.forces.priors.joint import AnalyticalMean, JointFrictionPrior
 from forcegp.forces.quantities import States, states_at

@@ -6,7 +6,7 @@ from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -16,8 +16,8 @@ from forcegp.data import Dataset
 from forcegp.data.fields import AXES
 from forcegp.errors import DataError, ForceGPError, ModelError, NumericalError, ShapeError, check_name
 from forcegp.forces.measurements import COLUMNS
-from forcegp.forces.noise import warnings_beyond
-from forcegp.forces.quantities import FlatStates, ForceLinearization, linearize_field
+from forcegp.forces.posterior import warnings_beyond
+from forcegp.forces.quantities import FlatStates, ForceLinearization, flat_states, linearize_field
 from forcegp.rollout.forward import rollout_model
 from forcegp.rollout.inputs import ForwardModel, Torque
 from forcegp.rollout.trajectory import Rollout
@@ -174,6 +174,20 @@ class Prediction:
         return Panel(name, label, [*curves, Curve(self.mean[:, i], "predicted", PREDICTED, band)])
 
 
+class Query(NamedTuple):
+    """What `Predictor.predict` is asked for; no system stands for that of the fit."""
+
+    quantity: str | Sequence[str]
+    system: ConstrainedSystem | None
+    covariance: bool
+    noise: bool
+
+
+Answer = tuple[tuple[Tensor | None, ...], dict[str, slice], tuple[str, ...]]
+"""Mean `(n, d)`, covariance `(n, d, d)`, distance beyond the trained region `(n, nq)` and components that are
+determined `(n, d)`; the slice of each quantity; what is not determined, in words."""
+
+
 def in_pieces(
     at: FlatStates, read: Callable[[FlatStates], tuple[Tensor | None, ...]]
 ) -> tuple[Tensor | None, ...]:
@@ -217,27 +231,63 @@ def component_names(system: ConstrainedSystem, quantity: str) -> list[str]:
 class Predictor(ForwardModel):
     """A predictor of the forward dynamics (q, q̇, τ) ↦ q̈."""
 
-    @abstractmethod
+    has_noise: bool = False
+    """Whether it can predict measurements, their noise included."""
+
+    @torch.no_grad()
     def predict(
         self,
         q: Tensor,
         qd: Tensor,
         tau: Tensor,
-        quantity: str = "qdd",
+        quantity: str | Sequence[str] = "qdd",
         *,
         active: Tensor | None = None,
         covariance: bool = True,
         system: ConstrainedSystem | None = None,
+        noise: bool = False,
     ) -> Prediction:
-        """Predict a quantity at states `(*batch, nq)`.
+        """Mean and covariance of a quantity, of a `StructuredGP` those of the posterior (eqs. 22 to 25).
 
         Args:
             q, qd, tau: `(*batch, nq)` states.
-            quantity: what to predict.
+            quantity: a name of `QUANTITIES`, or of a model with forces several for their joint distribution.
             active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
-            covariance: whether to compute the covariance.
-            system: another system to predict on, for models of forces.
+            covariance: whether to compute the covariance, which costs more than the mean.
+            system: of a model with forces, read them on another system, such as another surface or none at
+                all; on that of the fit, contacts that the training data never close have no determined force.
+            noise: whether the covariance is that of a measurement, noise of torque and sensor included.
+
+        Returns:
+            Mean `(*batch, d)` and, if the model has one, covariance `(*batch, d, d)`, without measurement
+            noise by default.
+
+        Raises:
+            UnknownNameError: no such quantity.
+            ShapeError: a state or `active` does not fit the system.
+            ModelError: nothing but forces of contacts that were closed in no training sample; or a model of
+                accelerations alone is asked for another quantity, for another system, or for noise.
         """
+        if noise and not self.has_noise:
+            raise ModelError(f"a {self.kind!r} model has no noise of measurements", hint="use StructuredGP")
+        query, parts = Query(quantity, system, covariance, noise), dict[str, slice]()
+        doubts = dict[str, None]()
+
+        def read(flat: FlatStates) -> tuple[Tensor | None, ...]:
+            values, slices, own = self.at(flat, query)
+            parts.update(slices)
+            doubts.update(dict.fromkeys(own))
+            return values
+
+        own = system or self.system
+        mean, spread, beyond, determined = in_pieces(flat_states(own, q, qd, tau, active), read)
+        assert mean is not None
+        joints, known = own.robot.joint_names, determined if doubts else None
+        return Prediction(mean, spread, parts, beyond, joints, determined=known, doubts=tuple(doubts))
+
+    def at(self, flat: FlatStates, query: Query) -> Answer:
+        """The answer to a query at n states."""
+        raise NotImplementedError
 
     @property
     def specified(self) -> ConstrainedSystem:

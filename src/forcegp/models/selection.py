@@ -34,7 +34,6 @@ from forcegp.models.fit_result import Compared
 from forcegp.models.structured_fit import StructuredFit, conditioned
 from forcegp.models.structured_learning import (
     Specification,
-    Task,
     identified,
     in_motion,
     prepared,
@@ -246,7 +245,7 @@ def trained(
     """
     spec, pinned = identified(spec, train) if inertia.identified else (spec, {})
     rows = scaled(train.evenly(ROWS), spec.system, spec.priors, {}, spec.options.standardize)
-    few = problem = Task(spec, rows, inertia.robot, pinned).problem()
+    few = problem = spec.problem(rows, inertia.robot, pinned)
     if not is_finite(problem.priors):
         few = dataclasses.replace(problem, training=rows.evenly(LEARN_ROWS))
     search = search_of(spec, few, {}, None, QUICK)

@@ -18,8 +18,15 @@ from forcegp.errors import ModelError, check_name
 from forcegp.files import Record
 from forcegp.forces.external_wrench import WrenchFrame
 from forcegp.forces.measurements import Observation, Training
-from forcegp.forces.noise import LOW, TORQUE_NOISE, distance_beyond, learned_slopes, unknown_variance
-from forcegp.forces.posterior import ForcePosterior, doubts_of, draw_samples
+from forcegp.forces.noise import TORQUE_NOISE, learned_slopes
+from forcegp.forces.posterior import (
+    LOW,
+    ForcePosterior,
+    distance_beyond,
+    doubts_of,
+    draw_samples,
+    unknown_variance,
+)
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.problem import Problem, forces_and_constant, is_sparse, lost_by_inducing, typical
@@ -42,7 +49,7 @@ from forcegp.models.export.library import CompiledFit
 from forcegp.models.export.model import ExportedModel
 from forcegp.models.external_wrench import ExternalWrench, external_wrench
 from forcegp.models.fit_result import FitResult
-from forcegp.models.prediction import Prediction, in_pieces
+from forcegp.models.prediction import Answer, Query, in_pieces
 from forcegp.models.structured_file import pack, unpack
 from forcegp.models.structured_learning import Specification, constant_inputs, prepared, training_for
 from forcegp.rollout.inputs import Disturbance
@@ -79,6 +86,7 @@ class StructuredFit(FittedModel):
 
     kind = KIND
     has_function_samples = True
+    has_noise = True
 
     def described(self) -> list[tuple[str, object]]:
         return [
@@ -99,74 +107,23 @@ class StructuredFit(FittedModel):
         """Priors on the unknown forces, including those selected by the data."""
         return self.posterior.priors
 
-    @torch.no_grad()
-    def predict(
-        self,
-        q: Tensor,
-        qd: Tensor,
-        tau: Tensor,
-        quantity: str | Sequence[str] = "qdd",
-        *,
-        active: Tensor | None = None,
-        covariance: bool = True,
-        system: ConstrainedSystem | None = None,
-        noise: bool = False,
-    ) -> Prediction:
-        """Posterior mean and covariance of a quantity (eqs. 22 to 25).
-
-        Args:
-            q, qd, tau: `(*batch, nq)` states.
-            quantity: a name of `QUANTITIES`, or several for their joint distribution.
-            active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
-            covariance: whether to compute the covariance, which costs more than the mean.
-            system: predict on another system, such as another surface or no contact; on that of the fit,
-                contacts that are never closed in the training data have undetermined forces.
-            noise: whether the covariance is that of a measurement, including noise of torque and sensor.
-
-        Returns:
-            Mean `(*batch, d)` and covariance `(*batch, d, d)`, without measurement noise by default.
-
-        Raises:
-            UnknownNameError: no such quantity.
-            ShapeError: a state or `active` does not fit the system.
-            ModelError: only forces of contacts that are never closed in the training data.
-        """
-        unseen, system = (self.result.never_closed, self.system) if system is None else ((), system)
-        slices, doubts = dict[str, slice](), dict[str, None]()
-
-        def read(flat: FlatStates) -> tuple[Tensor | None, ...]:
-            at = flat.with_equations(system)
-            if covariance and any(isinstance(prior, InertialPrior) for prior in self.posterior.priors):
-                # Errors of the inertia are multiplied by the predicted acceleration.
-                qdd = self.posterior.read_mean(system, at, affine_map(system, at, "qdd"))
-                at = dataclasses.replace(at, qdd=qdd)
-            z, parts = affine_maps(system, at, quantity)
-            slices.update(parts)
-            if covariance:
-                mean, spread = self._read(system, at, z, parts, noise)
-            else:
-                mean, spread = self.posterior.read_mean(system, at, z), None
-            determined, hidden = (
-                torch.ones_like(mean, dtype=torch.bool),
-                hidden_forces(system, at, parts, unseen),
-            )
-            if hidden is not None:
-                mean, spread = hidden.applied(mean, spread)
-                determined = ~hidden.whole
-                doubts.update(dict.fromkeys(hidden.doubts))
-            return mean, spread, self.beyond(at.qd, at.tau), determined
-
-        mean, spread, beyond, determined = in_pieces(flat_states(system, q, qd, tau, active), read)
-        assert mean is not None
-        return Prediction(
-            mean,
-            spread,
-            slices,
-            beyond,
-            system.robot.joint_names,
-            determined=determined if doubts else None,
-            doubts=tuple(doubts),
-        )
+    def at(self, flat: FlatStates, query: Query) -> Answer:
+        system = query.system or self.system
+        unseen = self.result.never_closed if query.system is None else ()
+        at = flat.with_equations(system)
+        if query.covariance and any(isinstance(prior, InertialPrior) for prior in self.posterior.priors):
+            # Errors of the inertia are multiplied by the predicted acceleration.
+            qdd = self.posterior.read_mean(system, at, affine_map(system, at, "qdd"))
+            at = dataclasses.replace(at, qdd=qdd)
+        z, parts = affine_maps(system, at, query.quantity)
+        if query.covariance:
+            mean, spread = self._read(system, at, z, parts, query.noise)
+        else:
+            mean, spread = self.posterior.read_mean(system, at, z), None
+        hidden, beyond = hidden_forces(system, at, parts, unseen), self.beyond(at.qd, at.tau)
+        if hidden is None:
+            return (mean, spread, beyond, torch.ones_like(mean, dtype=torch.bool)), parts, ()
+        return (*hidden.applied(mean, spread), beyond, ~hidden.whole), parts, hidden.doubts
 
     def _read(
         self, system: ConstrainedSystem, at: States, z: AffineMap, parts: Mapping[str, slice], noise: bool

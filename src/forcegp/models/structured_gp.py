@@ -27,7 +27,7 @@ from forcegp.gp.optimise import LearningOptions
 from forcegp.models.base import FitProgress, Model
 from forcegp.models.selection import with_priors
 from forcegp.models.structured_fit import KIND, StructuredFit, conditioned
-from forcegp.models.structured_learning import Specification, check_learned, learned, search_of, task_of
+from forcegp.models.structured_learning import Specification, check_learned, learned, problem_for, search_of
 from forcegp.models.structured_stream import Pass, Sample, sample_of
 from forcegp.storage.options import StructuredOptions
 
@@ -160,10 +160,10 @@ class StructuredGP(Model[StructuredFit]):
         check_learned(spec, chosen or ())
         if chosen == () and after is not None and sample.log is None:
             return dataclasses.replace(after, specification=spec).condition(sample.data)
-        task = task_of(spec, None if after is None else after.problem, sample.data, chosen)
-        spec, count = task.specification, task.training.samples
+        earlier, before = (None, {}) if after is None else (after.problem, after.hyperparameters)
+        spec, problem, doubts = problem_for(spec, earlier, sample.data, chosen, sample.count)
+        count = problem.training.samples
         spec.system.announce_states(count, FIT_COPIES, f"a fit to {count:,} samples")
-        problem, before = task.problem(sample.count), {} if after is None else after.hyperparameters
         search = search_of(spec, problem, before, chosen, options)
         begins = chosen is None and after is not None
         begin = {key: before[key] for key in search.start if key in before} if begins else None
@@ -174,7 +174,7 @@ class StructuredGP(Model[StructuredFit]):
         if sample.log is not None and lesson.problem.inducing is not None:
             whole = Pass(spec, sample.log, sample, file, progress)
             forces = whole.forces(*lesson.problem.with_coulomb_errors(values))
-        warnings = (*task.doubts, *lesson.warnings)
+        warnings = (*doubts, *lesson.warnings)
         fit = conditioned(spec, lesson.problem, values, lesson.learned, warnings, lesson.learned_on, forces)
         if progress is not None:
             progress(fit.result.evaluations, fit.result.evaluations, fit.result.objective)

@@ -39,8 +39,9 @@ from forcegp.forces.measurements import (
     unmeasured_forces,
     without_impacts,
 )
-from forcegp.forces.noise import REGION, TORQUE_NOISE, Noise, external_std, state_std_of
+from forcegp.forces.noise import TORQUE_NOISE, Noise, external_std, state_std_of
 from forcegp.forces.noise_learning import left_out, weighted, with_learned_slopes, with_learned_weights
+from forcegp.forces.posterior import REGION
 from forcegp.forces.priors.base import ANALYTICAL, COULOMB, NOISE, ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import AnalyticalMean, JointFrictionPrior
@@ -130,21 +131,28 @@ class Specification:
             return Inertia(self.system.robot, doubts=_unchecked_masses(training))
         return inertia_of(self.system, friction, self.mean, training)
 
-    def problem(self, training: Training) -> Problem:
-        """The learning problem of training data."""
-        robot, noise = self.system.robot, self.noise
-        std = None
+    def problem(
+        self, training: Training, robot: RobotModel | None = None, pinned: Mapping[str, Tensor] | None = None
+    ) -> Problem:
+        """The learning problem of training data.
+
+        Args:
+            robot: to learn with, if it is another one than that of the file.
+            pinned: values of forces that it contains, by prior.
+        """
+        system = self.system if robot in (None, self.system.robot) else self.system.with_robot(robot)
+        noise, robot, std = self.noise, self.system.robot, None
         if noise.torque is not None and not isinstance(noise.torque, str):
             std = torch.as_tensor(noise.torque, dtype=robot.dtype, device=robot.device).expand(robot.nq)
-        state_std, theta = state_std_of(noise.state, robot), self.analytical_parameters
         return Problem(
-            self.system,
+            system,
             self.priors,
             self.mean,
             training,
-            theta,
+            self.analytical_parameters,
             std,
-            state_std=state_std,
+            pinned=pinned or {},
+            state_std=state_std_of(noise.state, robot),
             external_std=external_std(noise.external, robot),
         )
 
@@ -186,56 +194,33 @@ class Lesson:
     warnings: tuple[str, ...] = ()
 
 
-@dataclass(frozen=True)
-class Task:
-    """Inputs of a fit.
-
-    Attributes:
-        specification: the model; a first fit that identifies the robot adds a prior on its remaining errors.
-        training: the samples.
-        robot: used for learning.
-        pinned: values of forces that the robot contains, by prior.
-        doubts: about the samples and the robot.
-    """
-
-    specification: Specification
-    training: Training
-    robot: RobotModel
-    pinned: Mapping[str, Tensor] = field(default_factory=dict)
-    doubts: tuple[str, ...] = ()
-
-    def problem(self, samples: int = 0) -> Problem:
-        """The learning problem.
-
-        Args:
-            samples: number of samples to condition on, if the training samples are a part of them.
-        """
-        problem = self.specification.problem(dataclasses.replace(self.training, part_of=samples))
-        if self.robot is self.specification.system.robot:
-            return problem
-        system = self.specification.system.with_robot(self.robot)
-        return dataclasses.replace(problem, system=system, pinned=self.pinned)
-
-
-def task_of(
+def problem_for(
     spec: Specification,
     before: Problem | None,
     data: Dataset | Sequence[Observation],
     chosen: Sequence[str] | None,
-) -> Task:
-    """Inputs of a fit to data, continuing an earlier fit if given."""
+    part_of: int = 0,
+) -> tuple[Specification, Problem, tuple[str, ...]]:
+    """The learning problem of a fit to data, after the problem of an earlier fit or as the first.
+
+    Args:
+        part_of: number of samples that are conditioned on, if the data are a part of them.
+
+    Returns:
+        The model, to which a first fit that identifies the robot adds a prior on errors that remain; the
+        problem; and doubts about the samples and the robot.
+    """
     training, doubts = training_for(spec, before, data, chosen)
+    robot, pinned = spec.system.robot, dict[str, Tensor]()
     if before is not None and not any(bool(value.any()) for value in before.pinned.values()):
-        return Task(spec, training, before.system.robot, before.pinned, doubts)
-    if before is not None or chosen is not None:
-        return Task(spec, training, spec.system.robot, doubts=doubts)
-    found = spec.inertia_of(training)
-    doubts = (*doubts, *found.doubts)
-    if not found.identified:
-        return Task(spec, training, found.robot, doubts=doubts)
-    spec, pinned = identified(spec, training)
-    training, _ = training_for(spec, before, data, chosen)
-    return Task(spec, training, found.robot, pinned, doubts)
+        robot, pinned = before.system.robot, before.pinned
+    elif before is None and chosen is None:
+        found = spec.inertia_of(training)
+        robot, doubts = found.robot, (*doubts, *found.doubts)
+        if found.identified:
+            spec, pinned = identified(spec, training)
+            training, _ = training_for(spec, before, data, chosen)
+    return spec, spec.problem(dataclasses.replace(training, part_of=part_of), robot, pinned), doubts
 
 
 def identified(spec: Specification, training: Training) -> tuple[Specification, dict[str, Tensor]]:

@@ -11,7 +11,7 @@ from torch import Tensor
 
 from forcegp.constraints import Baumgarte, ConstrainedSystem
 from forcegp.constraints.compiled_system import compiled_system
-from forcegp.constraints.unilateral import any_row, can_open
+from forcegp.constraints.unilateral import any_row
 from forcegp.data import Dataset
 from forcegp.errors import ForceGPError, ModelError, check_name
 from forcegp.resources import one_thread
@@ -278,7 +278,7 @@ def _touching(system: ConstrainedSystem, q: Tensor, qd: Tensor) -> Tensor:
     """Contacts that touch, or cannot open `(n, n_contacts)`."""
     with torch.no_grad():
         is_open = any_row(system, system.equations(q, qd).c.abs() > CLOSED)
-    return ~(is_open & can_open(system, is_open))
+    return ~(is_open & system.can_open)
 
 
 def share_of(progress: Progress | None, part: int, parts: int) -> Progress | None:

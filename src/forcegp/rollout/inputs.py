@@ -12,11 +12,10 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem, Equations
 from forcegp.control.plan import Plan
-from forcegp.control.task_space import Gains, Target, control_torque
+from forcegp.control.task_space import Gains
 from forcegp.data import Dataset
 from forcegp.errors import DataError, ModelError, ShapeError, UnknownNameError
 from forcegp.forces.quantities import ForceField
-from forcegp.kinematics import point_motion
 
 INTERPOLATIONS = ("hold", "linear")
 EDGE = 1e-6
@@ -216,10 +215,8 @@ class TaskSpaceControl(Inputs):
         robot, eom, q, qd = self.system.robot, at.eom, at.q, at.qd
         if at.system.robot is not robot:
             eom = self.system.equations(q, qd)
-        tool = point_motion(robot, eom.poses, eom.motion, qd, self.plan.frame, self.plan.point)
         k = torch.floor(t[:, 0] / self.dt + EDGE).long().clamp(max=len(self.plan.reference.t) - 1)
-        target = Target(*(values[k] for values in self.plan.targets))
-        command = control_torque(tool, eom, q, qd, target, self.plan.press(eom), self.gains)
+        command = self.plan.command(eom, q, qd, k, self.gains)
         limit = robot.effort_limit if self.limit is None else self.limit
         return command.clamp(-limit, limit)
 

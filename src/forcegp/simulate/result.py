@@ -2,9 +2,8 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field, fields
+from dataclasses import dataclass, field
 
-import numpy as np
 import torch
 from torch import Tensor
 
@@ -58,16 +57,10 @@ class RunLog:
         contact, saturated = columns(len(system.contacts), torch.bool), columns(1, torch.bool)[:, 0]
         return RunLog(q, qd, qdd, tau, Q, Q_I, Q_z, columns(m), columns(m), contact, saturated)
 
-    def arrays(self) -> dict[str, np.ndarray]:
-        """The columns as arrays that share their memory, to write single rows."""
-        names = (f.name for f in fields(self))
-        return {n: x.numpy() for n in names if isinstance(x := getattr(self, n), Tensor)}
-
-
-def write(rows: dict[str, np.ndarray], k: int, **values: object) -> None:
-    """Write values of row k, by column."""
-    for name, value in values.items():
-        rows[name][k] = value
+    def write(self, k: int, **values: Tensor) -> None:
+        """Write values of row k, by column."""
+        for name, value in values.items():
+            getattr(self, name)[k] = value
 
 
 def noise(like: Tensor, generator: torch.Generator) -> Tensor:

@@ -13,7 +13,7 @@ from forcegp.destination import check_destination, write_or_keep
 from forcegp.errors import ParameterError, check_name
 from forcegp.files import written_folder
 from forcegp.forces.measurements import Training
-from forcegp.forces.noise import HIGH, LOW
+from forcegp.forces.posterior import HIGH, LOW
 from forcegp.models.export.casadi_function import write_casadi
 from forcegp.models.export.library import CompiledFit
 from forcegp.models.export.model import ExportedModel

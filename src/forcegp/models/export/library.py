@@ -16,7 +16,7 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ForceGPError, ModelError, NumericalError, ShapeError, check_name
-from forcegp.forces.noise import LOW
+from forcegp.forces.posterior import LOW
 from forcegp.forces.quantities import ForceField, ForceLinearization, flat_states
 from forcegp.models.export.mean import DIFFERENTIATED
 from forcegp.models.export.model import ExportedModel

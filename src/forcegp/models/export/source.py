@@ -19,7 +19,7 @@ from forcegp.compiled.program import Links, regressor_program, trace
 from forcegp.compiled.source import c_function
 from forcegp.constraints import SurfaceContact
 from forcegp.constraints.gauss import rank_tolerance
-from forcegp.forces.noise import GROWTH, HIGH, LOW, SPREAD, STICK_NOISE, STICK_SPEED
+from forcegp.forces.posterior import GROWTH, HIGH, LOW, SPREAD, STICK_NOISE, STICK_SPEED
 from forcegp.forces.priors import contact
 from forcegp.forces.priors.base import CONSTRAINT, CONTACT, JOINT
 from forcegp.forces.priors.inertial import PER_PAYLOAD, InertialPrior, PayloadPrior
