@@ -103,7 +103,7 @@ def check_limits(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_saturation(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Torques that stay at their largest value for several rows: the amplifier clips."""
+    """Find torques that stay at their largest value for several rows: the amplifier clips."""
     clipped = clipped_torques(log)
     joints = log.named(clipped.any(axis=0))
     text = f"the torque of {', '.join(joints)} stays at its largest value in"

@@ -4,15 +4,13 @@ Q̄ = m + Σ_p E_p f_p with f_p ~ GP(0, k_p), and Coulomb friction of contacts, 
 Every quantity z = B_Q Q + B_z Q_z + o is an affine map of the latent forces f_p, so their posterior
 determines it. Each function drawn from it is a deterministic force field that can be integrated.
 
-Accelerations in contact depend on Q + Q_z alone (remark 3.3). The two are told apart by where they act (Q_z
-only in contact, along the tangent), by their inputs, and by measurements of either. Their posterior
-correlation measures the separation: at −1 only the sum is identifiable, at 0 each is known as well as the
-data allow.
+Accelerations in contact depend on Q + Q_z alone (remark 3.3). The two are distinguished by their directions
+(Q_z acts only in contact, along the tangent), by their inputs, and by measurements of either. Their posterior
+correlation measures the separation: at −1 only the sum is identifiable, at 0 they are separated.
 
-**Forces that are no function of the state.** Inside its static friction, the friction of a joint is whatever
-balances the other forces. A joint that hardly moves therefore has an unknown force of variance
-σ_s² e^{−(q̇/v_s)²} more. And noise learned where nothing moves says little about a jump: beyond the range of
-speeds and torques that a joint was trained on, its force has a standard deviation g D more, with D the
+**Forces that are no function of the state.** At rest, the friction of a joint balances the other forces. A
+joint that hardly moves therefore has an additional unknown force of variance σ_s² e^{−(q̇/v_s)²}. Beyond the
+trained range of speeds and torques of a joint, its force has an additional standard deviation g D, with D the
 distance from that range in training standard deviations. `calibration.growth` estimates g.
 """
 
@@ -175,7 +173,7 @@ class ForcePosterior:
 
 
 def stick_variance(tensors: Mapping[str, Tensor], at: States) -> Tensor:
-    """Variance of the friction of joints that stick, `(n, nq)`; zero where it is not learned."""
+    """Variance of the friction of joints that stick, `(n, nq)`; zero if it is not learned."""
     if STICK_NOISE not in tensors:
         return torch.zeros_like(at.q)
     std, speed = tensors[STICK_NOISE].exp(), tensors[STICK_SPEED].exp()
@@ -187,7 +185,8 @@ def trained_region(qd: Tensor, tau: Tensor, load: Tensor, hidden: Tensor | None 
 
     Args:
         qd, tau: of samples in motion.
-        load: typical torque of each joint `(nq,)`, a fraction of which is the least spread of its torque.
+        load: typical torque of each joint `(nq,)`, a fraction of which bounds the spread of its torque from
+            below.
         hidden: `(nq,)` bool, joints whose torque has no effect on accelerations: rare torques are not learned
             from, and their region is a standard deviation around the mean.
     """
@@ -202,8 +201,9 @@ def trained_region(qd: Tensor, tau: Tensor, load: Tensor, hidden: Tensor | None 
 
 
 def distance_beyond(tensors: Mapping[str, Tensor], qd: Tensor, tau: Tensor) -> Tensor:
-    """D of each joint `(*batch, nq)` in training standard deviations; zero inside the trained region, or
-    where none is known."""
+    """D of each joint `(*batch, nq)` in training standard deviations; zero inside the trained region, or if
+    it is unknown.
+    """
     if LOW not in tensors:
         return torch.zeros_like(qd)
     x = torch.stack([qd, tau], dim=-2)
@@ -212,7 +212,7 @@ def distance_beyond(tensors: Mapping[str, Tensor], qd: Tensor, tau: Tensor) -> T
 
 
 def warnings_beyond(distance: Tensor, joints: Sequence[str]) -> tuple[str, ...]:
-    """A warning where states lie far beyond the trained region.
+    """A warning if states lie far beyond the trained region.
 
     Args:
         distance: D `(*batch, nq)`.
@@ -230,15 +230,17 @@ def warnings_beyond(distance: Tensor, joints: Sequence[str]) -> tuple[str, ...]:
 
 
 def hidden_variance(tensors: Mapping[str, Tensor], at: States, external: Tensor | None) -> Tensor:
-    """Variance of forces that neither state nor torque sensor determines, `(n, nq)`: of joints that stick,
-    and unknown ones of stated size `(nq,)`."""
+    """Variance of forces determined by neither state nor torque sensor, `(n, nq)`: of joints that stick, and
+    of unknown forces of stated size `(nq,)`.
+    """
     variance = stick_variance(tensors, at)
     return variance if external is None else variance + external**2
 
 
 def unknown_variance(tensors: Mapping[str, Tensor], at: States, external: Tensor | None) -> Tensor:
-    """Variance of forces beside the learned ones in a prediction `(n, nq)`: hidden ones, and g² D² beyond the
-    trained region."""
+    """Additional variance of forces in a prediction `(n, nq)`: hidden forces, and g² D² beyond the trained
+    region.
+    """
     variance = hidden_variance(tensors, at, external)
     if GROWTH not in tensors:
         return variance

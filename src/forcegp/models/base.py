@@ -123,7 +123,7 @@ class Model(ABC, Generic[F]):
 
 
 class AccelerationFit(FittedModel):
-    """Predicts accelerations of the system that it was fitted on; it has neither forces nor contacts."""
+    """Predictor of accelerations of its own system, without forces or contacts."""
 
     def at(self, flat: FlatStates, query: Query) -> Answer:
         if query.quantity != "qdd":

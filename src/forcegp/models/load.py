@@ -36,7 +36,7 @@ def load_model(path: str | Path, *, system: ConstrainedSystem | None = None) -> 
     """Read a saved model; its predictions are the same bit for bit.
 
     Args:
-        path: the file; `.safetensors` is added if it is left out.
+        path: the file; `.safetensors` is added if missing.
         system: source of constraints defined in Python (an `ImplicitSurface`); robot and other constraints
             are those in the file.
 

@@ -256,7 +256,7 @@ class Predictor(ForwardModel):
             covariance: whether to compute the covariance, which costs more than the mean.
             system: of a model with forces, read them on another system, such as another surface or none at
                 all; on that of the fit, contacts that the training data never close have no determined force.
-            noise: whether the covariance is that of a measurement, noise of torque and sensor included.
+            noise: whether the covariance is that of a measurement, including noise of torque and sensor.
 
         Returns:
             Mean `(*batch, d)` and, if the model has one, covariance `(*batch, d, d)`, without measurement
