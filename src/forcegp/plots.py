@@ -94,7 +94,7 @@ class Timeline:
 
     @classmethod
     def of(cls, t: Tensor, segment: Tensor | None = None, ordered: bool = True) -> Timeline:
-        """Place samples on the time axis; segments whose times overlap are placed one after another.
+        """Place samples on the time axis; overlapping segments are placed one after the other.
 
         Args:
             t: `(n,)` [s].

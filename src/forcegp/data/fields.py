@@ -249,7 +249,7 @@ def check_time(data: Fields) -> None:
 
 
 def row_indices(rows: object, n: int, device: torch.device) -> Tensor:
-    """Row numbers `(k,)` of a slice, mask or list, negative from the end; `DataError` if there is none."""
+    """Row numbers `(k,)` of a slice, mask or list; negative ones count from the end."""
     if isinstance(rows, slice):
         return torch.tensor(range(n)[rows], dtype=torch.int64, device=device)
     rule = "rows are selected by a slice, a mask or a list of row numbers"

@@ -66,7 +66,8 @@ class WrenchFrame:
 
     Raises:
         UnknownNameError: no such reference or component.
-        ParameterError: no component, one twice, or a standard deviation that is not positive and finite.
+        ParameterError: no component, a repeated component, or a standard deviation that is not positive and
+            finite.
     """
 
     frame: str

@@ -89,7 +89,7 @@ class Training:
         measurements: the values.
         noise_std: of each measurement, `(d,)` or `(n, d)`.
         scales: standardization of the inputs of each prior.
-        part_of: number of samples that are conditioned on, of which these are a part; 0 if these are all.
+        part_of: number of all samples to condition on; 0 if these are all.
         period: sampling period of the log [s]; 0 if its rows are not in order.
         filter_span: of the filter that computed the accelerations [s]; 0 if unknown.
         weights: of the samples of each measurement `(n,)`, divisors of their noise variance; `None` for one.
@@ -113,7 +113,7 @@ class Training:
 
     @property
     def all_samples(self) -> int:
-        """Number of samples that are conditioned on, of which these may be a part."""
+        """Number of all samples to condition on."""
         return self.part_of or self.samples
 
     def pieces(self, samples: int) -> Iterator[Training]:
@@ -252,7 +252,7 @@ class Observation:
 
     Args:
         data: states, contacts and measured values.
-        quantity: what is measured: `qdd` (in contact or free), `multiplier`, `contact_force`,
+        quantity: the measured quantity: `qdd` (in contact or free), `multiplier`, `contact_force`,
             `constraint_force`, `joint_force`, `contact_friction` or `total_force`.
         noise_std: standard deviation of the measurement: one number, one per component, or `(n, d)`. For
             `qdd`, the default is that of the model, else the `qdd_std` of the log, else that of its header.
@@ -303,7 +303,7 @@ def states_noise(observations: Sequence[Observation]) -> bool:
 
 @torch.no_grad()
 def unmeasured_forces(system: ConstrainedSystem, observations: Sequence[Observation]) -> dict[str, float]:
-    """Root mean square of M q̈ − Q_C − Q_G of the joints whose torque a log lacks, by name [N m, N]."""
+    """Root mean square of M q̈ − Q_C − Q_G of the joints without a logged torque, by name [N m, N]."""
     sizes: dict[str, float] = {}
     for data in (o.data for o in observations if o.data.header.unmeasured_torques):
         eom = system.equations(data.q, data.qd, contact_table(data, system.contact_names))
@@ -411,7 +411,7 @@ def training_of(
     """Measurements with their noise and input scales.
 
     Args:
-        noise_std: of accelerations whose noise is not stated.
+        noise_std: of accelerations without a stated noise.
         kept: earlier scales to keep, by name of the prior.
         standardize: whether to standardize the inputs of kernels.
 

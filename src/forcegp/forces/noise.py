@@ -34,7 +34,7 @@ class Noise:
 
     Args:
         acceleration: standard deviation of measured accelerations [rad/s², m/s²], one or one per joint; by
-            default what the log states (`qdd_std` by sample, else its header), else 0.1.
+            default the value in the log (`qdd_std` by sample, else its header), else 0.1.
         learn: whether it is a hyperparameter, starting at this value.
         torque: standard deviation of the motor torque's white noise [N m, N], one or one per joint;
             `"learn"`, `None` for none, or `"auto"`: learned with the priors of measured robots.

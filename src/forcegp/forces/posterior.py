@@ -187,8 +187,8 @@ def trained_region(qd: Tensor, tau: Tensor, load: Tensor, hidden: Tensor | None 
         qd, tau: of samples in motion.
         load: typical torque of each joint `(nq,)`, a fraction of which bounds the spread of its torque from
             below.
-        hidden: `(nq,)` bool, joints whose torque has no effect on accelerations: rare torques are not learned
-            from, and their region is a standard deviation around the mean.
+        hidden: `(nq,)` bool, joints without effect of the torque on accelerations; their region is one
+            standard deviation around the mean.
     """
     x = torch.stack([qd, tau], dim=1)
     low, high = x.quantile(torch.tensor([OUTERMOST, 1.0 - OUTERMOST]).to(x), dim=0)

@@ -68,7 +68,7 @@ class Problem:
         priors: the force priors.
         mean: prior mean of Q.
         training: measurements, noise and input scales.
-        parameters: module whose `forward()` gives the robot at θ_A, or `None`.
+        parameters: module with a `forward()` that returns the robot at θ_A, or `None`.
         torque_std: standard deviation of the white noise of the motor torque, `(nq,)`, unless it is learned.
         power: exponent κ of the likelihood; below 1 for correlated samples.
         correlation: correlation time of the noise of each torque, `(nq,)` [s]; `None` if unknown.
@@ -288,7 +288,7 @@ class Totals:
         return cls(Sums.zero(basis, like), like.new_zeros(()), like.new_zeros(()), 0)
 
     def over_processes(self) -> Totals:
-        """The totals of all processes of `torch.distributed` added, the same in each of them."""
+        """Add the totals of all processes of `torch.distributed`; each process gets the same result."""
         constant, samples = add_over_processes(torch.stack([self.constant, self.samples])).unbind()
         return Totals(reduce_sums(self.sums), constant, samples, self.pieces)
 

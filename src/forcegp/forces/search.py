@@ -281,7 +281,7 @@ class Search:
     """Search of hyperparameters.
 
     Attributes:
-        start: default initial values of what is learned, and centre of the weak priors.
+        start: default initial values, and centre of the weak priors.
         held: values that are not learned.
         options: optimiser and its limits.
         recorded: wraps the objective, such as `Checkpoint.recorded`.

@@ -71,7 +71,7 @@ class Standardization:
 
         Args:
             features: named inputs `(n, w)`.
-            vectors: inputs whose columns are components of one vector.
+            vectors: inputs with columns that are components of one vector.
             centred: whether the mean is subtracted.
         """
         mean = {name: x.mean(0) if centred else torch.zeros_like(x[0]) for name, x in features.items()}

@@ -60,7 +60,7 @@ def select_inducing(
     A process without effect on any row, or with a finite number of features, gets none.
 
     Args:
-        rows: number of rows that will be conditioned on, of which these are a part; all by default.
+        rows: number of all rows to condition on; by default these.
         limit: maximum number of points of one process.
         share: missed variance of all rows at which to stop, as a fraction of the variance that the noise
             leaves.

@@ -218,7 +218,7 @@ class Conditioned:
     Attributes:
         L: lower Cholesky factor of K + I `(rows, rows)`.
         alpha: (K + I)⁻¹ y `(rows,)`.
-        jitter: what was added to the diagonal, 0.0 as a rule.
+        jitter: addition to the diagonal, usually 0.0.
     """
 
     L: Tensor

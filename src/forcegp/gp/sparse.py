@@ -114,7 +114,7 @@ class SparsePosterior:
         basis: basis functions.
         moments: sums over the samples except for G, which follows from the factor.
         L: lower Cholesky factor of A = I + G.
-        jitter: what was added to the diagonal, 0.0 as a rule.
+        jitter: addition to the diagonal, usually 0.0.
     """
 
     basis: LatentBasis

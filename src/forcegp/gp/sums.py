@@ -121,7 +121,7 @@ def accumulate(basis: LatentBasis, blocks: Iterable[Block], chunk: int = CHUNK_S
 
     Args:
         blocks: whitened rows; may be a generator.
-        chunk: samples whose basis functions are held at a time.
+        chunk: number of samples per chunk.
     """
     total: Sums | None = None
     for block in chunked(blocks, chunk):

@@ -114,8 +114,8 @@ class Model(ABC, Generic[F]):
         Args:
             data: states and measurements.
             progress: called from time to time.
-            checkpoint: file that records a long fit; a fit that finds it resumes there, to the same bits.
-                Remove it once the fitted model is saved.
+            checkpoint: file that records a long fit; a fit that finds it resumes there, with the same result
+                to the bit. Remove it once the fitted model is saved.
 
         Returns:
             The fitted model. Fitting twice gives the same bits.

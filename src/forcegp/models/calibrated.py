@@ -94,7 +94,7 @@ class Calibration:
         speeds, friction, friction_std: `(k, nq)` the learned friction of each joint over its trained speeds
             [rad/s, m/s], [N m, N].
         left: `(nq,)` root mean square of the friction not explained by d q̇ + f sign q̇ [N m, N].
-        offset: `(nq,)` constant force beside it [N m, N].
+        offset: `(nq,)` additional constant force [N m, N].
     """
 
     robot: RobotModel
@@ -150,7 +150,7 @@ def sampled_robots(fit: StructuredFit, samples: int, *, seed: int = 0) -> list[R
     """Robots drawn from the joint posterior of inertia, drives' links, payload and friction; each is
     physically consistent.
 
-    Samples whose links no body could have are replaced by the nearest robot in the metric of the posterior
+    Samples with unphysical links are replaced by the nearest robot in the metric of the posterior
     (eigenvalues of pseudo-inertias over the identified ones are at least ε = 0.01).
 
     Args:
@@ -498,7 +498,7 @@ def _pseudo(pi: Tensor) -> Tensor:
 
 
 def without_armature(robot: RobotModel, fastest: Tensor) -> RobotModel:
-    """The robot whose links have the inertia of the drives as far as bodies can.
+    """The robot with the inertia of its drives added to the links as far as physically possible.
 
     Over random states, it minimises the mean square of each joint's error of τ over the torque itself:
 

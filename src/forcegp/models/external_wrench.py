@@ -100,7 +100,7 @@ def false_alarm_rate(threshold: float) -> float:
 
 @runtime_checkable
 class LearnedForces(Protocol):
-    """Forces of a fit: its posterior, the noise beside it, and the robot."""
+    """Forces of a fit: posterior, noise, and robot."""
 
     @property
     def system(self) -> ConstrainedSystem: ...
@@ -158,7 +158,7 @@ class Reading:
     """A log for the estimation of a wrench.
 
     Attributes:
-        fit, data, frame: the learned forces, the log, and what is estimated.
+        fit, data, frame: the learned forces, the log, and the estimated components.
         memory: friction with memory, for logs in order of time.
         remembered: its force `(n, nq)`, or zero.
         external: standard deviation of further unknown forces on the joints `(nq,)`, or `None`.

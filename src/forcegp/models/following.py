@@ -53,7 +53,7 @@ def follow(
     Args:
         fit: with sparse inference.
         data: a few new samples, such as those of 0.05 s.
-        priors: names of the priors whose forces may change, such as `payload`.
+        priors: names of the priors with forces that may change, such as `payload`.
         factor: correlation of these forces with those at the last call, for additional slow drift.
         change: prior probability of a change between two calls.
 

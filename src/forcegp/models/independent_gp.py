@@ -94,7 +94,7 @@ class IndependentGP(Model["IndependentFit"]):
     Args:
         system: robot and contacts; the contacts serve to evaluate the model, not to learn it.
         noise: standard deviation of measured accelerations [rad/s², m/s²], one or one per joint; by
-            default what the log states, else 0.1.
+            default the value in the log, else 0.1.
         standardize: whether to standardize the inputs; the paper does not.
 
     Raises:

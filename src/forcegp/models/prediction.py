@@ -1,4 +1,4 @@
-"""Predictors, and predicted quantities with their uncertainty; scores and plots beside what was measured."""
+"""Predictors, and predicted quantities with their uncertainty; scores, and plots with measured values."""
 
 from __future__ import annotations
 
@@ -175,7 +175,7 @@ class Prediction:
 
 
 class Query(NamedTuple):
-    """What `Predictor.predict` is asked for; no system stands for that of the fit."""
+    """Arguments of `Predictor.predict`; without a system, that of the fit is used."""
 
     quantity: str | Sequence[str]
     system: ConstrainedSystem | None
@@ -247,15 +247,16 @@ class Predictor(ForwardModel):
         system: ConstrainedSystem | None = None,
         noise: bool = False,
     ) -> Prediction:
-        """Mean and covariance of a quantity, of a `StructuredGP` those of the posterior (eqs. 22 to 25).
+        """Mean and covariance of a quantity; for a `StructuredGP`, of its posterior (eqs. 22 to 25).
 
         Args:
             q, qd, tau: `(*batch, nq)` states.
-            quantity: a name of `QUANTITIES`, or of a model with forces several for their joint distribution.
+            quantity: a name of `QUANTITIES`, or, for models with forces, several for their joint
+                distribution.
             active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
             covariance: whether to compute the covariance, which costs more than the mean.
-            system: of a model with forces, read them on another system, such as another surface or none at
-                all; on that of the fit, contacts that the training data never close have no determined force.
+            system: another system to predict on, such as another surface or none, for models with forces; on
+                that of the fit, contacts that are never closed in the training data have undetermined forces.
             noise: whether the covariance is that of a measurement, including noise of torque and sensor.
 
         Returns:
@@ -265,8 +266,8 @@ class Predictor(ForwardModel):
         Raises:
             UnknownNameError: no such quantity.
             ShapeError: a state or `active` does not fit the system.
-            ModelError: nothing but forces of contacts that were closed in no training sample; or a model of
-                accelerations alone is asked for another quantity, for another system, or for noise.
+            ModelError: only forces of contacts that are never closed in the training data; or another
+                quantity, another system or noise for a model of accelerations alone.
         """
         if noise and not self.has_noise:
             raise ModelError(f"a {self.kind!r} model has no noise of measurements", hint="use StructuredGP")
@@ -286,7 +287,7 @@ class Predictor(ForwardModel):
         return Prediction(mean, spread, parts, beyond, joints, determined=known, doubts=tuple(doubts))
 
     def at(self, flat: FlatStates, query: Query) -> Answer:
-        """The answer to a query at n states."""
+        """The result of a query at n states."""
         raise NotImplementedError
 
     @property

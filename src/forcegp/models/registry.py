@@ -95,7 +95,7 @@ def create(
     Args:
         name: a key of `MODELS`.
         system: robot and contacts.
-        noise: of measured accelerations, for models that have one; by default what the log states.
+        noise: of measured accelerations, for models that have one; by default the value in the log.
         seed: of random initial values, for models that have any.
         options: further arguments of the model's class.
 

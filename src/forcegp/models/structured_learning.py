@@ -78,7 +78,7 @@ class Specification:
         mean: prior mean of Q.
         priors: on the unknown forces.
         noise: of measured accelerations, torques and states.
-        analytical_parameters: module whose `forward()` gives the robot at θ_A, or `None`.
+        analytical_parameters: module with a `forward()` that returns the robot at θ_A, or `None`.
         automatic: whether the data choose the priors among `SETS`.
         options: plain values.
     """

@@ -47,7 +47,7 @@ class Span:
 
 
 class EditableXml:
-    """An XML document whose attributes can be changed in place.
+    """An XML document with attributes that can be changed in place.
 
     Args:
         data: the document.

@@ -54,7 +54,7 @@ class AnalyticalParameters(nn.Module):
     Raises:
         UnknownNameError: a quantity or a joint does not exist.
         ModelError: no parameter is selected, or the inertia of a link is selected twice.
-        InertiaError: `inertia` is learned for a link whose inertia is not physical.
+        InertiaError: `inertia` is learned for a link with unphysical inertia.
     """
 
     def __init__(self, robot: RobotModel, learn: Mapping[str, Sequence[str] | Literal["all"]]) -> None:

@@ -114,7 +114,7 @@ def write_robot(
 
 
 def is_mjcf(source: str | Path) -> bool:
-    """Whether a robot file is MJCF, whose joints have an armature; otherwise it is URDF."""
+    """Whether a robot file is MJCF (with armature of joints) rather than URDF."""
     path = robot_path(source)
     return parse_xml(read_bytes(path), str(path)).tag == "mujoco"
 

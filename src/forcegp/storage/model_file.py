@@ -1,4 +1,4 @@
-"""A saved model: one safetensors file whose metadata hold a versioned header, all of it under one hash.
+"""A saved model: one safetensors file with a versioned header in its metadata and a hash of all its content.
 
 The hash is the SHA-256 of the file with 64 zeros in place of the hash, so any changed bit of header or
 tensors is detected. The file is replaced by one `os.replace`: a reader sees the old model or the new one.
