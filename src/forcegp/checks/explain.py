@@ -1,4 +1,4 @@
-"""Which fault explains the torque best: greedy choice by cross-validation, one-standard-error rule.
+"""Greedy search for the faults that explain the torque, by cross-validation and the one-standard-error rule.
 
 The simplest hypothesis within one standard error of the best is accepted (Breiman, Friedman, Olshen, Stone,
 *Classification and Regression Trees*, 1984, sec. 3.4.3), the log is corrected, and the search repeated.

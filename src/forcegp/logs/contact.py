@@ -251,7 +251,7 @@ def _misplaced(
 
 
 def exchanged_joints(system: ConstrainedSystem, contact: SurfaceContact, q: Array) -> tuple[int, ...]:
-    """The two joints whose exchange puts the tip on its surface in some of the rows, if there are such."""
+    """The two joints that move the tip onto its surface in some of the rows when exchanged, if any."""
     q = q[:: max(1, len(q) // TRIED_ROWS)]
     for pair in combinations(range(q.shape[1]) if len(q) else (), 2):
         order = np.arange(q.shape[1])

@@ -137,7 +137,7 @@ def error_tables(evaluation: Evaluation) -> tuple[Table, ...]:
 
 
 def uncertainty_tables(evaluation: Evaluation) -> tuple[Table, ...]:
-    """Coverage by joint, density beside the trivial predictors, and λ against its sensor."""
+    """Coverage by joint, density of the model and of trivial predictors, and λ compared with its sensor."""
     tables = []
     if evaluation.uncertainty is not None:
         shares = zip(evaluation.joint_names, evaluation.uncertainty.coverage_by_joint, strict=True)

@@ -185,7 +185,7 @@ def _bands(rolled, values: Tensor, n: int) -> list[Band]:
 
 
 def _sound(q: Tensor) -> int:
-    """How many leading times `(T, nq)` hold a finite state."""
+    """Number of leading times `(T, nq)` hold a finite state."""
     return int(torch.isfinite(q).all(-1).sum())
 
 

@@ -158,7 +158,7 @@ class CompiledFit(Predictor):
 
     @cached_property
     def _begun(self) -> Tensor:
-        """What the fit has learned, as the numbers of a `forcegp_learned`."""
+        """The learned state of the fit, as the numbers of a `forcegp_learned`."""
         if not self.model.online:
             raise ModelError(
                 "this fit cannot learn online in C",
@@ -274,7 +274,7 @@ class CompiledFit(Predictor):
         return tuple(x.contiguous() for x in given), batch
 
     def _error(self, status: int, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor | None) -> ForceGPError:
-        """What the C code reports; raises at once if a state is not finite, and says which."""
+        """The error that the C code reports; raises at once and names the state if it is not finite."""
         flat_states(self.system, q, qd, tau, active)
         return KINDS.get(status, NumericalError)(MESSAGES[status])
 

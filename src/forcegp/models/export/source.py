@@ -205,7 +205,7 @@ class Writer:
         self.lines.append(f"static const double *const SENSOR_VARIANCE[] = {{{', '.join(sensors)}}};")
 
     def _online(self) -> None:
-        """Where the functions of each component lie in what is learned online, and the noise of samples."""
+        """Add the positions of each component's functions in the online state, and the noise of samples."""
         self.lines.append(f"#define ONLINE {int(self.model.online)}")
         if not self.model.online or self.model.sampling is None:
             return
