@@ -14,7 +14,7 @@ import torch
 
 from forcegp import kinematics
 from forcegp.checks.finding import Finding
-from forcegp.checks.fit import BLOCKS, CHUNK, blocks_of, labelled_contacts, residual, tensors
+from forcegp.checks.fit import BLOCKS, CHUNK, blocks_of, labelled_contacts, residual, tensors, unmeasured
 from forcegp.checks.log import Array, Log, Outcome, evenly
 from forcegp.constraints import ConstrainedSystem, Plane, SurfaceContact
 from forcegp.logs.contact import LEVEL, TOUCHING
@@ -277,11 +277,11 @@ def _force(system: ConstrainedSystem, log: Log, rows: np.ndarray, path: Path) ->
     """Force `(n, 3)` that explains the torque best, r = Jᵀ F; along the normal for up to three torques."""
     r, J = residual(system, log, rows)
     if log.nq <= 3:
-        A = J[:, 0]
+        A = J[:, 0] * ~np.isin(np.arange(log.nq), unmeasured(log))
         size = np.maximum((A * A).sum(axis=1), 1e-12)
         return ((A * r).sum(axis=1) / size)[:, None] * path.normal
     gram = J @ J.transpose(0, 2, 1)
-    return np.linalg.solve(gram + 1e-9 * np.eye(3), (J @ r[..., None]))[..., 0]
+    return np.linalg.solve(gram + 1e-9 * np.eye(J.shape[1]), (J @ r[..., None]))[:, :3, 0]
 
 
 def _pulls(finding: partial[Finding], path: Path, force: Array) -> list[Finding]:

@@ -16,7 +16,7 @@ import torch
 
 from forcegp.checks.explain import Explanation, significant
 from forcegp.checks.finding import Finding
-from forcegp.checks.fit import BLOCKS, blocks_of, held_out, residual, tensors
+from forcegp.checks.fit import BLOCKS, blocks_of, held_out, residual, tensors, unmeasured
 from forcegp.checks.hypotheses import encoder_hypothesis, inertial_spread, robot_columns
 from forcegp.checks.log import Array, Log, Outcome, position_unit
 from forcegp.constraints import ConstrainedSystem
@@ -167,6 +167,7 @@ def check_visibility(system: ConstrainedSystem, explanation: Explanation) -> lis
 def _at_contact(explanation: Explanation, fault: Fault, size: float) -> str:
     """The force at the tip that a fault of the whole arm passes for, root mean square."""
     J = explanation.problem.J
+    J = J[:, : J.shape[1] - len(unmeasured(explanation.log))]
     touching = (J != 0.0).any(axis=(1, 2))
     if fault.joint or size >= MOST.get(fault.kind, LARGEST) or touching.sum() < LEAST_TOUCHING:
         return ""

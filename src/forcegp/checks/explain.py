@@ -13,7 +13,7 @@ from functools import cached_property, partial
 import numpy as np
 
 from forcegp.checks import hypotheses
-from forcegp.checks.finding import Finding
+from forcegp.checks.finding import TESTS, Finding
 from forcegp.checks.fit import TorqueFit, TorqueProblem, cross_validate, gain_of, pooled_gain_of, score_of
 from forcegp.checks.hypotheses import Hypothesis, corrected
 from forcegp.checks.log import Array, Log
@@ -89,7 +89,7 @@ class Explanation:
 
 def explain(system: ConstrainedSystem, log: Log) -> Explanation:
     """Find the faults that explain the residual torque of the robot file."""
-    rows = log.rows(ROWS, margin=max(hypotheses.LAGS))
+    rows = log.rows(ROWS, margin=max(hypotheses.lags(log)))
     problem = hypotheses.problem_of(system, log, rows)
     model = Explanation(system, log, rows, problem, np.zeros((*problem.r.shape, 0)), np.zeros(0)).weighed()
     for _ in range(ROUNDS):
@@ -172,7 +172,8 @@ def _fits(model: Explanation) -> Iterator[Tried]:
     else:
         few = model.rows[::SCREENING]
         null = cross_validate(model.on(log, few)).score.mean()
-        for hypothesis in hypotheses.discrete(log):
+        late = hypotheses.joint_delays(log, rows, model.problem)
+        for hypothesis in (*hypotheses.discrete(log), *late):
             changed = hypothesis.change(log)
             if cross_validate(model.on(changed, few)).score.mean() < null:
                 yield hypothesis, cross_validate(model.on(changed))
@@ -217,22 +218,6 @@ SMALL_MASS = 1e-6
 ALONE = 2.0
 """Standard errors by which an alternative must lower the held-out error on its own, which chance exceeds in 4
 % of cases: it is already known that something is wrong."""
-TESTS = {
-    "torque-gain": "hang a known weight from the tip: its torque gives the gain, whatever the masses",
-    "torque-current": "hang a known weight from the tip: its torque gives the gains, whatever the masses",
-    "torque-sign": "push a joint in its positive direction while the arm holds still: its torque must fall",
-    "torque-order": "twist one joint after another, without loading the others: only its torque must change",
-    "torque-delay": "apply a torque step to one joint: its acceleration must change in the same sample",
-    "torque-without-gravity": "hold the arm outstretched and still: the torque must balance gravity",
-    "joint-sign": "turn one joint after another by hand, and watch the sign of its position",
-    "joint-order": "turn one joint after another by hand, and watch which position changes",
-    "encoder-offset": "move the joint to its zero mark: its position must be zero there",
-    "base-tilted": "put a spirit level on the base",
-    "gravity-direction": "check how the base is mounted",
-    "payload-missing": "weigh what is mounted on the last link",
-    "masses-mismatch": "compare the masses with the manufacturer's data",
-}
-"""A test for each kind of fault, in order of preference."""
 
 
 def alternatives_of(

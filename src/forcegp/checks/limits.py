@@ -129,10 +129,22 @@ def clipped_torques(data: Dataset | Log) -> NDArray[np.bool_]:
         usable = tau[log.usable]
         if not len(usable) or np.ptp(usable) == 0.0:
             continue
-        for extreme in (usable.max(), usable.min()):
+        for extreme in limits_of(usable):
             for first, last in _plateaus(log, j, extreme):
                 clipped[first:last, j] = True
     return clipped
+
+
+def limits_of(values: Array) -> tuple[float, float]:
+    """Value taken most often near the maximum, and near the minimum: a filter overshoots a limit."""
+    limits = []
+    for extreme in (values.max(), values.min()):
+        near, counts = np.unique(
+            values[np.abs(values - extreme) <= BAND * np.ptp(values)], return_counts=True
+        )
+        often = near[counts == counts.max()]
+        limits.append(float(often[np.abs(often - extreme).argmin()]))
+    return limits[0], limits[1]
 
 
 def _plateaus(log: Log, j: int, extreme: float) -> Intervals:

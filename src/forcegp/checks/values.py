@@ -6,8 +6,10 @@ import numpy as np
 import torch
 
 from forcegp import dynamics
+from forcegp.checks.excitation import still_joints
 from forcegp.checks.finding import Finding, at_rows
 from forcegp.checks.fit import tensors
+from forcegp.checks.limits import limits_of
 from forcegp.checks.log import Array, Log, Outcome, spikes
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data.derivative import UNIFORM_TOLERANCE
@@ -119,11 +121,12 @@ def check_stuck(system: ConstrainedSystem, log: Log) -> Outcome:
     if not np.isfinite(log.dt):
         return [], log
     least, findings, bad = max(5, round(STUCK_SECONDS / log.dt)), [], np.zeros(len(log), bool)
+    still = still_joints(log)
     for name, value in logged(log).items():
         for j, joint in enumerate(log.joint_names):
             x = value[:, j]
             steps = np.abs(np.diff(x))
-            if (steps > 0.0).mean() < 0.1:
+            if (steps > 0.0).mean() < 0.1 or (still[j] and name != "tau"):
                 continue
             visible = STUCK_VISIBLE * np.ptp(np.percentile(x[log.usable], (0.5, 99.5)))
             runs = [
@@ -131,7 +134,7 @@ def check_stuck(system: ConstrainedSystem, log: Log) -> Outcome:
                 for a, b in intervals((steps == 0.0) & log.usable[1:] & log.usable[:-1])
                 if b - a >= least
                 # A torque that stays at its extreme is clipped, which is another finding.
-                and not (name == "tau" and x[a] in (x[log.usable].min(), x[log.usable].max()))
+                and not (name == "tau" and x[a] in limits_of(x[log.usable]))
                 and _expected_change(log, name, j, a, b) > visible
             ]
             if runs:

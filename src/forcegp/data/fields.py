@@ -55,6 +55,15 @@ class DataHeader(Header):
     joint_names: tuple[str, ...] = ()
     contact_names: tuple[str, ...] = ()
 
+    @property
+    def filter_variance(self) -> float:
+        """Second moment of the weights with which the filter averages q̈ over time [s²]; 0 if unknown.
+
+        The second derivative of cubics fitted to positions over a span T is q̈ + T²/56 d²q̈/dt² + …, as is an
+        average with the variance T²/28; the first derivative of cubics fitted to q̇ has no such term.
+        """
+        return (self.filter_span or 0.0) ** 2 / 28.0 if {"qd", "qdd"} <= set(self.derived) else 0.0
+
     def with_step(self, step: str, **fields: object) -> DataHeader:
         """The header with fields changed and one more line of provenance."""
         return self.model_copy(update={"provenance": (*self.provenance, step), **fields})

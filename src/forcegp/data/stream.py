@@ -195,7 +195,7 @@ class StreamedDataset:
     @cached_property
     def _shapes(self) -> tuple[tuple[int, DataHeader], ...]:
         """Rows and header of each file."""
-        return tuple(shape_of(path) for path in self.files)
+        return tuple(map(shape_of, self.files))
 
     def __len__(self) -> int:
         """Number of samples."""

@@ -92,6 +92,7 @@ class Training:
         part_of: number of all samples to condition on; 0 if these are all.
         period: sampling period of the log [s]; 0 if its rows are not in order.
         filter_span: of the filter that computed the accelerations [s]; 0 if unknown.
+        filter_variance: of its weights over time [s²], as in `DataHeader`.
         weights: of the samples of each measurement `(n,)`, divisors of their noise variance; `None` for one.
         slopes: G = dz/d(q, q̇) `(n, d, 2 nq)` of each measurement with learned forces, `None` for a quantity
             without; `None` for those of the robot file (`forces/noise.py`).
@@ -103,6 +104,7 @@ class Training:
     part_of: int = 0
     period: float = 0.0
     filter_span: float = 0.0
+    filter_variance: float = 0.0
     weights: tuple[Tensor, ...] | None = None
     slopes: tuple[Tensor | None, ...] | None = None
 
@@ -426,6 +428,7 @@ def training_of(
         scales=(),
         period=_period(observations[0].data),
         filter_span=max(o.data.header.filter_span or 0.0 for o in observations),
+        filter_variance=max(o.data.header.filter_variance for o in observations),
     )
     return scaled(training, system, priors, kept, standardize)
 

@@ -203,7 +203,10 @@ def write_calibrated(
         losses = losses or write_robot(holding, source, path, locked_joints=locked_joints).losses
     if drives:
         values = ", ".join(f"{x:.4g}" for x in found.robot.armature.tolist())
-        losses = (f"URDF has no armature ({values}): links have its inertia as far as physically possible", *losses)
+        losses = (
+            f"URDF has no armature ({values}): links have its inertia as far as physically possible",
+            *losses,
+        )
     report = {
         "parameters": [vars(parameter) for parameter in found.parameters],
         "losses": [*losses, *found.losses],

@@ -5,7 +5,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from functools import cached_property
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -22,6 +23,17 @@ EDGE = 1e-6
 """Part of a sampling period within which a time counts as a sampling time, against rounding."""
 EVEN = 0.02
 """Largest deviation of a step from the sampling period, relative to the period, in a log that is replayed."""
+
+
+@runtime_checkable
+class CompiledMotion(Protocol):
+    """The motion of trajectories, without gradients."""
+
+    def __call__(
+        self, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor, h: Tensor, sticking: bool
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """q̈, λ, constraint error and its rate, and joints that friction holds over steps h `(n, 1)`."""
+        ...
 
 
 class ForwardModel(ABC):
@@ -56,6 +68,10 @@ class ForwardModel(ABC):
             f"a {self.kind!r} model has no function samples", hint="use StructuredGP, or samples=0"
         )
 
+    def compiled_motion(self, system: ConstrainedSystem, force: ForceField) -> CompiledMotion | None:
+        """The motion of a system under the mean force or its samples by C code; `None` without such code."""
+        return None
+
     @property
     def disturbance(self) -> Disturbance | None:
         """Additional forces that disturb rollouts of function samples, `None` for none."""
@@ -88,19 +104,25 @@ class Disturbance(NamedTuple):
     constant: Tensor
 
 
-class Reached(NamedTuple):
+@dataclass(frozen=True)
+class Reached:
     """The current states of a rollout.
 
     Attributes:
         system: robot and contacts.
-        eom: their equations of motion.
         q, qd: `(n, nq)`.
+        active: `(n, n_contacts)` bool, closed contacts.
     """
 
     system: ConstrainedSystem
-    eom: Equations
     q: Tensor
     qd: Tensor
+    active: Tensor
+
+    @cached_property
+    def eom(self) -> Equations:
+        """The equations of motion there."""
+        return self.system.equations(self.q, self.qd, self.active)
 
 
 class Inputs(ABC):

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field
 
 import torch
@@ -181,6 +182,12 @@ def _dataset(
         joint_names=robot.joint_names,
         contact_names=names,
     )
+    ends = itertools.accumulate(contact.rows for contact in system.contacts)
+    multipliers = {
+        contact.name: log.multiplier[:, end - contact.rows]
+        for contact, end in zip(system.contacts, ends, strict=True)
+        if isinstance(contact, SurfaceContact)
+    }
     clean = {f"{name}_clean": getattr(log, name) for name in ("qdd", *log.measured)}
     return Dataset(
         t=plan.reference.t,
@@ -191,16 +198,6 @@ def _dataset(
         joint_names=robot.joint_names,
         contact={name: log.contact[:, i] for i, name in enumerate(names)},
         extras={**clean, "Q": log.Q, "Q_z": log.Q_z, "Q_I": log.Q_I},
-        contact_extras=_multipliers(system, log) | log.contact_forces,
+        contact_extras=({"multiplier": multipliers} if multipliers else {}) | log.contact_forces,
         header=header,
     )
-
-
-def _multipliers(system: ConstrainedSystem, log: RunLog) -> dict[str, dict[str, Tensor]]:
-    """Normal force of each contact with a surface."""
-    if not system.contacts:
-        return {}
-    parts = log.multiplier.split([contact.rows for contact in system.contacts], dim=-1)
-    named = zip(system.contacts, parts, strict=True)
-    single = {contact.name: part[:, 0] for contact, part in named if isinstance(contact, SurfaceContact)}
-    return {"multiplier": single} if single else {}
