@@ -78,7 +78,7 @@ def sum_over(E: Tensor, x: Tensor) -> Tensor:
 
 
 def take(x: Tensor, joints: Sequence[int]) -> Tensor:
-    """The entries of some joints of `(…, nq, B)`; a view where they are evenly spaced."""
+    """The entries of some joints of `(…, nq, B)`; a view if they are evenly spaced."""
     first, last, count = joints[0], joints[-1], len(joints)
     step = (last - first) // (count - 1) if count > 1 else 1
     if step > 0 and list(joints) == list(range(first, last + 1, step)):
@@ -89,7 +89,7 @@ def take(x: Tensor, joints: Sequence[int]) -> Tensor:
 def solve_spd(M: Tensor, rhs: Tensor) -> Tensor:
     """M⁻¹ rhs for symmetric positive definite `(n, n, B)` and `(n, k, B)`.
 
-    Large batches are eliminated without pivoting (stable for such M), every step over all samples at once.
+    Large batches use elimination without pivoting (stable for such M), vectorized over the samples.
     """
     n, B = M.shape[0], M.shape[-1]
     if M.numel() < _SMALL:

@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -69,7 +69,7 @@ class LinkMotion:
 
 
 class PointMotion(NamedTuple):
-    """The motion of a point fixed in a frame of the robot, world axes; tensors, or arrays of one state.
+    """The motion of a point fixed in a frame of the robot, world axes.
 
     Attributes:
         rotation: `(*batch, 3, 3)` axes of the frame.
@@ -79,11 +79,11 @@ class PointMotion(NamedTuple):
         bias: J̇ q̇ `(*batch, 6)`, the acceleration [ω̇; p̈] at q̈ = 0.
     """
 
-    rotation: Any
-    position: Any
-    twist: Any
-    jacobian: Any
-    bias: Any
+    rotation: Tensor
+    position: Tensor
+    twist: Tensor
+    jacobian: Tensor
+    bias: Tensor
 
     @classmethod
     def of(cls, blocks: Sequence[Tensor], qd: Tensor) -> PointMotion:

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from forcegp.checks.finding import at_rows
 from forcegp.checks.fit import cross_validate
 from forcegp.checks.hypotheses import gain_hypothesis, problem_of
-from forcegp.checks.log import Array, Log, Outcome
+from forcegp.checks.log import Array, Log, Outcome, log_of
 from forcegp.constraints import ConstrainedSystem
+from forcegp.data import Dataset
 from forcegp.rows import Intervals, intervals
 
 DEGREE = np.pi / 180.0
@@ -41,7 +43,7 @@ def _limits(system: ConstrainedSystem) -> dict[str, tuple[Array, Array]]:
 
 
 def check_degrees(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Angles that often leave the joint's range, stay within it in degrees, and then fit the torque."""
+    """Find angles in degrees: they leave the joint's range, and fit range and torque once converted."""
     low, high = _limits(system)["q"]
     turning = system.robot.revolute.cpu().numpy() > 0.0
     low, high = np.where(np.isfinite(low), low, -TURN), np.where(np.isfinite(high), high, TURN)
@@ -102,18 +104,47 @@ def check_limits(system: ConstrainedSystem, log: Log) -> Outcome:
 
 def check_saturation(system: ConstrainedSystem, log: Log) -> Outcome:
     """Torques that stay at their largest value for several rows: the amplifier clips."""
+    clipped = clipped_torques(log)
+    joints = log.named(clipped.any(axis=0))
+    text = f"the torque of {', '.join(joints)} stays at its largest value in"
+    return at_rows(np.asarray(clipped.any(axis=1)), "torque-saturated", text, joints), log
+
+
+def clipped_torques(data: Dataset | Log) -> NDArray[np.bool_]:
+    """Where the torque of a joint stays at its largest or smallest value, `(n, nq)` bool.
+
+    Look at a log as it was recorded: a filter rounds the plateaus off. Leave these rows out of training data,
+    or state their noise in `extras["tau_std"]` for an external wrench.
+
+    Args:
+        data: a log in order of time.
+
+    Example:
+        `train = log[torch.from_numpy(~clipped_torques(log).any(-1))]`
+    """
+    log = data if isinstance(data, Log) else log_of(data)
     clipped = np.zeros(log.tau.shape, bool)
     for j in range(log.nq):
         tau = log.tau[:, j]
         usable = tau[log.usable]
         if not len(usable) or np.ptp(usable) == 0.0:
             continue
-        for extreme in (usable.max(), usable.min()):
+        for extreme in limits_of(usable):
             for first, last in _plateaus(log, j, extreme):
                 clipped[first:last, j] = True
-    joints = log.named(clipped.any(axis=0))
-    text = f"the torque of {', '.join(joints)} stays at its largest value in"
-    return at_rows(np.asarray(clipped.any(axis=1)), "torque-saturated", text, joints), log
+    return clipped
+
+
+def limits_of(values: Array) -> tuple[float, float]:
+    """Value taken most often near the maximum, and near the minimum: a filter overshoots a limit."""
+    limits = []
+    for extreme in (values.max(), values.min()):
+        near, counts = np.unique(
+            values[np.abs(values - extreme) <= BAND * np.ptp(values)], return_counts=True
+        )
+        often = near[counts == counts.max()]
+        limits.append(float(often[np.abs(often - extreme).argmin()]))
+    return limits[0], limits[1]
 
 
 def _plateaus(log: Log, j: int, extreme: float) -> Intervals:

@@ -1,8 +1,8 @@
-"""A log as it was recorded, valid or not, and the filter that torques are explained after.
+"""A log as it was recorded, valid or not, and the filter of the torque checks.
 
 Noise ε on q̈ enters the explained torque as M ε, and a fit gains by shrinking the inertia, as any regression
 on noisy columns does. The same filter of a tenth of a second on positions, velocities, accelerations and
-torques takes that away, and leaves M q̈ = Q true up to changes of M and of the bias force within it.
+torques removes the noise and preserves M q̈ = Q, up to changes of M and of the bias force within its window.
 """
 
 from __future__ import annotations
@@ -42,11 +42,11 @@ contrast over the one of the middle value, for white noise."""
 
 
 def spikes(x: Array) -> tuple[Array, Array]:
-    """Departure of each value from the cubic through its four neighbours, and how well six neighbours agree.
+    """Deviation of each value from the cubic through its four neighbours, and that of its neighbours.
 
-    e_i = x_i − (−x_{i−2} + 4 x_{i−1} + 4 x_{i+1} − x_{i+2})/6. The second result is the same departure
-    measured on the neighbours alone, without x_i: a kink of the motion raises both, a spike the first only.
-    Values are evenly sampled, `(n, d)` with n ≥ 7; both results are zero in the three outermost rows.
+    e_i = x_i − (−x_{i−2} + 4 x_{i−1} + 4 x_{i+1} − x_{i+2})/6. The second result is the same deviation for
+    the neighbours alone, without x_i: a kink of the motion increases both, a spike only the first. Values are
+    evenly sampled, `(n, d)` with n ≥ 7; both results are zero in the three outermost rows.
     """
     departure, around = np.zeros_like(x), np.zeros_like(x)
     a, b, c, middle, d, e, f = (x[k : len(x) - 6 + k] for k in range(7))
@@ -68,7 +68,7 @@ def force_unit(robot: RobotModel, j: int | np.integer) -> str:
 
 
 def displacement(robot: RobotModel, j: int | np.integer, offset: float) -> str:
-    """An offset of the position of joint j in words, an angle in degrees too."""
+    """An offset of the position of joint j in words, with angles also in degrees."""
     degrees = f" ({np.degrees(offset):+.2f}°)" if robot.joint_types[j] == "revolute" else ""
     return f"{offset:+.4f} {position_unit(robot, j)}{degrees}"
 
@@ -119,12 +119,12 @@ class Log:
         return Finding(kind, text, self.all_rows, joints, evidence=evidence)
 
     def on_joints(self, kind: str, mask: Array, text: str, **evidence: Any) -> list[Finding]:
-        """A finding on the joints that a mask picks, listed at the `{}` of its text; none without a joint."""
+        """A finding on the joints of a mask, inserted at the `{}` of its text; empty without a joint."""
         joints = self.named(mask)
         return [self.finding(kind, text.format(", ".join(joints)), joints, **evidence)] if joints else []
 
     def named(self, joints: Array | np.bool_) -> tuple[str, ...]:
-        """Names of the joints that a mask picks."""
+        """Names of the joints of a mask."""
         return tuple(self.joint_names[j] for j in np.flatnonzero(joints))
 
     def replace(self, **fields: Any) -> Log:
@@ -171,7 +171,7 @@ class Log:
 
     @cached_property
     def stretches(self) -> list[slice]:
-        """Unbroken runs of usable rows: finite, not masked, one segment, time that steps on without a gap."""
+        """Contiguous runs of usable rows: finite, not masked, in one segment, without a gap in time."""
         linked = (self.steps > 0.0) & (self.steps <= self.longest_step) & self.usable[1:] & self.usable[:-1]
         runs = intervals(linked) if self.header.ordered else ()
         return [slice(a, b + 1) for a, b in runs if b + 1 - a >= SHORTEST]
@@ -202,7 +202,7 @@ def log_of(data: Dataset) -> Log:
 def read_log(path: str | Path) -> Log:
     """Read a log from Parquet or CSV without refusing NaN, empty values or time that runs backward.
 
-    The columns are those of docs/formats.md; q̇ and q̈ that it lacks are derived by a Savitzky-Golay filter.
+    The columns are those of docs/formats.md; missing q̇ and q̈ are computed by a Savitzky-Golay filter.
 
     Raises:
         DataError: the file is damaged, or a column is missing.
@@ -218,7 +218,7 @@ def read_log(path: str | Path) -> Log:
 
 
 def derive(log: Log, absent: list[str]) -> Log:
-    """The log with absent derivatives computed on each unbroken stretch; NaN where there is none."""
+    """The log with missing derivatives computed on each contiguous stretch, NaN elsewhere."""
     logged = [name for name in JOINT_VECTORS if name not in absent]
     filled = log.replace(**{name: np.zeros_like(log.q) for name in absent})
     values = {name: np.full_like(log.q, np.nan) for name in absent}
@@ -251,7 +251,7 @@ SMOOTHED_SECONDS, SMOOTHED_ORDER = 0.1, 3
 
 
 def smoothed(log: Log) -> Log:
-    """The log after a Savitzky-Golay filter between contact switches, ends masked, if it is in order."""
+    """The log, if valid, after a Savitzky-Golay filter between contact switches, with masked ends."""
     from scipy.signal import savgol_filter
 
     half = round(SMOOTHED_SECONDS / log.dt / 2.0) if np.isfinite(log.dt) and log.header.ordered else 0

@@ -1,4 +1,4 @@
-"""Residual torque once the faults are explained: friction, offsets, disturbances, and how much."""
+"""Residual torque after the faults are explained: friction, offsets, disturbances."""
 
 from __future__ import annotations
 
@@ -10,7 +10,16 @@ from forcegp.checks import hypotheses
 from forcegp.checks.excitation import check_visibility, still_joints
 from forcegp.checks.explain import Explanation, explain
 from forcegp.checks.finding import Finding, NotJudgedError
-from forcegp.checks.fit import FLOOR, Array, cross_validate, gain_of, projector, residual, robust_parameters
+from forcegp.checks.fit import (
+    FLOOR,
+    Array,
+    cross_validate,
+    gain_of,
+    projector,
+    residual,
+    robust_parameters,
+    unmeasured,
+)
 from forcegp.checks.log import Log, Outcome, force_unit, position_unit, smoothed
 from forcegp.constraints import ConstrainedSystem
 from forcegp.robot.model import RobotModel
@@ -39,7 +48,7 @@ ONE_SIGMA = 84.13
 
 
 def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Signs, orders, gains, delays, gravity, tool, masses, friction, offsets: all that torques determine."""
+    """Check signs, orders, gains, delays, gravity, tool, masses, friction and offsets by the torques."""
     if len(log.rows(LEAST_ROWS)) < LEAST_ROWS:
         raise NotJudgedError(f"fewer than {LEAST_ROWS} usable rows")
     passive = _without_torque(log)
@@ -47,7 +56,7 @@ def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
         return passive, log
     smooth = smoothed(log)
     if not _enough(smooth):
-        inner = f"rows that lie {max(hypotheses.LAGS)} from the ends of a stretch"
+        inner = f"rows that lie {max(hypotheses.lags(smooth))} from the ends of a stretch"
         raise NotJudgedError(f"fewer than {LEAST_ROWS} {inner}")
     explanation = explain(system, smooth)
     disturbed, rows = [], np.zeros(len(log), bool)
@@ -76,13 +85,14 @@ def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def _enough(log: Log) -> bool:
-    return len(log.rows(LEAST_ROWS, margin=max(hypotheses.LAGS))) == LEAST_ROWS
+    return len(log.rows(LEAST_ROWS, margin=max(hypotheses.lags(log)))) == LEAST_ROWS
 
 
 def _without_torque(log: Log) -> list[Finding]:
     """Torques that are constant though the joint moves."""
     rows = log.usable
     still = (np.ptp(log.tau[rows], axis=0) == 0.0) & (np.ptp(log.q[rows], axis=0) > 0.0)
+    still[unmeasured(log)] = False
     zero = still & (log.tau[rows] == 0.0).all(axis=0)
     word = "zero" if zero[still].all() else "constant"
     findings = log.on_joints("torque-zero", still, f"the torque of {{}} is {word} throughout")
@@ -252,7 +262,7 @@ def _upper_spread(level: Array) -> float:
 
 
 def residual_trace(system: ConstrainedSystem, explanation: Explanation, rows: np.ndarray) -> Array:
-    """Torque that remains at some rows, contact forces taken out, `(n, nq)` [N m, N]."""
+    """Residual torque at some rows without contact forces, `(n, nq)` [N m, N]."""
     log, scale = explanation.log, explanation.problem.scale
     parts, coefficients = [], robust_parameters(explanation.problem, explanation.columns, explanation.prior)
     for index in np.array_split(rows, max(1, len(rows) // 2048)):

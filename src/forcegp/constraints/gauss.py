@@ -14,7 +14,7 @@ of constant rank do no harm.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -27,7 +27,7 @@ from torch.nn.functional import normalize
 from forcegp import dynamics
 from forcegp.derivatives import inverse_dynamics_derivatives
 from forcegp.errors import MassMatrixError
-from forcegp.kinematics import LinkMotion, LinkPoses
+from forcegp.kinematics import LinkMotion, LinkPoses, PointMotion
 from forcegp.robot.model import RobotModel
 from forcegp.types import ConstraintInverse, ConstraintMatrix, ConstraintVector, JointMatrix, JointVector
 
@@ -45,7 +45,7 @@ def rank_tolerance(dtype: torch.dtype) -> float:
 
 
 def nothing(dtype: torch.dtype) -> float:
-    """Size of a row of A G⁻ᵀ that is rounding of zero [1/√kg]: of a point that cannot move."""
+    """Size below which a row of A G⁻ᵀ counts as zero [1/√kg]: its point cannot move."""
     return ROUNDING * torch.finfo(dtype).eps
 
 
@@ -69,13 +69,13 @@ def tangent_frame(n: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class ContactPoint:
-    """The point of the robot that touches a surface; of a rounded tip, the material point that touches now.
+    """The point of the robot that touches a surface; for a rounded tip, the current material point.
 
     Attributes:
         position, velocity: `(*batch, 3)` in the world [m], [m/s].
         jacobian: J_E `(*batch, 3, nq)`, world axes.
         normal: ∇c `(*batch, 3)` at the point.
-        sticks: `(*batch,)` bool, whether it rests on the surface; `None` where the contact always slides.
+        sticks: `(*batch,)` bool, whether it rests on the surface; `None` if the contact always slides.
     """
 
     position: Tensor
@@ -114,6 +114,7 @@ class Equations:
         c, cd: `(*batch, m)` constraint error and its rate, of all contacts, active or not.
         Q_C, Q_G, Q_D: `(*batch, nq)` bias, gravity and dissipative joint force.
         contact_points: the touching point of each surface contact, by name.
+        point_motion: computes the motion of a point `(frame, point)` of the robot at the states.
         links: computes the poses and the motion of the links at the states, where more of the
             kinematics is needed.
         holds: `(*batch, m)` bool, rows of A that hold: those of closed contacts, along the surface where they
@@ -129,6 +130,7 @@ class Equations:
     Q_G: JointVector
     Q_D: JointVector
     contact_points: dict[str, ContactPoint]
+    point_motion: Callable[[str, Sequence[float]], PointMotion]
     links: Callable[[], tuple[LinkPoses, LinkMotion]]
     holds: Tensor
 
@@ -198,8 +200,9 @@ class Equations:
 
     @cached_property
     def hidden(self) -> Tensor:
-        """Projector on multipliers of rows that hold and change no motion, Aᵀμ = 0 `(*batch, m, m)`: ones of
-        points that cannot move, fractions where contacts share their load."""
+        """Projector on multipliers of rows that hold and change no motion, Aᵀμ = 0 `(*batch, m, m)`: one for
+        points that cannot move, fractions for contacts that share their load.
+        """
         # R = 1 − W W⁺
         return torch.diag_embed(self.holds.to(self.M)) - self.scaled_jacobian @ self.scaled_inverse
 
@@ -246,7 +249,7 @@ class Equations:
         return free + (self.L @ self._gap(free)[..., None])[..., 0]
 
     def motion_under(self, Q_bar: JointVector) -> tuple[JointVector, ConstraintVector]:
-        """q̈ = q̈′ + M⁻¹Aᵀ λ and λ together, as a step of a rollout needs them."""
+        """q̈ = q̈′ + M⁻¹Aᵀ λ and λ together, for a step of a rollout."""
         free = self.free_acceleration(Q_bar)
         multiplier = (self.constraint_inertia @ self._gap(free)[..., None])[..., 0]
         return free + (self.M_inv_At @ multiplier[..., None])[..., 0], multiplier

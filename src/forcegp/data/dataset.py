@@ -37,7 +37,7 @@ def _time(data: Fields) -> str:
 
 
 class NotLoggedError(DataError, AttributeError):
-    """A quantity that the data set does not hold."""
+    """A quantity that is not in the data set."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +52,7 @@ class Dataset(Fields):
         contact: name → `(n,)` bool, whether the contact is closed.
         extras: name → `(n, nq)` further logged joint vectors: `qdd_clean`, `Q`, `Q_z`, `Q_I`, …
         contact_extras: name → contact → `(n,)` or `(n, 3)`: `multiplier`, `F_I`, …
-        segment: `(n,)` number of the trajectory that a row belongs to; default one trajectory.
+        segment: `(n,)` number of the trajectory of each row; default one trajectory.
         header: noise, sampling period, robot, seed and provenance.
 
     Extras are attributes too: `data.Q_z`, `data.multiplier["table"]`.
@@ -195,7 +195,7 @@ class Dataset(Fields):
             ax: matplotlib axes to draw on, one per panel; default a new figure.
 
         Raises:
-            ForceGPError: no such quantity or joint, or the number of axes is not that of the panels.
+            ForceGPError: no such quantity or joint, or the number of axes differs from that of the panels.
         """
         from forcegp.data.plot import plot
 
@@ -217,7 +217,7 @@ class Dataset(Fields):
 
     @staticmethod
     def concatenate(parts: Sequence[Dataset]) -> Dataset:
-        """Data sets one after another, each with segments of its own.
+        """Concatenate data sets, with separate segments.
 
         Raises:
             DataError: no parts, or their joints, contacts, extras, precision or device differ.
@@ -245,7 +245,7 @@ class Dataset(Fields):
 
         Args:
             path: the file.
-            differentiate: how to compute the columns `qd` and `qdd` where the log has none.
+            differentiate: how to compute the columns `qd` and `qdd` if the log lacks them.
             dtype, device: of the tensors.
 
         Raises:
@@ -261,7 +261,7 @@ class Dataset(Fields):
 
         Raises:
             DataError: the name does not end in `.parquet`.
-            OSError: the place cannot be written.
+            OSError: the path cannot be written.
         """
         check_ending(path)
         write_parquet(path, *unparse(self))

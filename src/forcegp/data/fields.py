@@ -23,17 +23,17 @@ class DataHeader(Header):
     Attributes:
         dt: sampling period [s].
         noise_std: standard deviation of the noise on q̈ [rad/s²].
-        filtered: q̈ was computed by a filter, so that its noise is correlated in time; otherwise `noise_std`
-            claims white noise.
+        filtered: q̈ was computed by a filter, so its noise is correlated in time; otherwise `noise_std`
+            refers to white noise.
         filter_span: of the filter that computed q̈ [s]: its noise is uncorrelated further apart in time.
         robot: name of the robot.
         robot_fingerprint: `RobotModel.fingerprint` of the robot that moved.
         seed: seed of the random numbers that went into the data.
-        ordered: rows follow time within each segment (not so for points in order of selection).
-        provenance: what was done to the data, oldest first, one line per step.
-        derived: joint vectors that a filter computed from others of the log.
-        imported: kind and sentence of what an import found in the log, doubts about its mapping among them.
-        unmeasured_torques: joints whose motor torque was not measured; theirs is 0 in the columns.
+        ordered: rows are in order of time within each segment (false for points in order of selection).
+        provenance: processing steps of the data, oldest first.
+        derived: joint vectors computed by a filter.
+        imported: kind and sentence of each finding of the import, including doubts about its mapping.
+        unmeasured_torques: joints whose motor torque was not measured; the column is 0.
         joint_names, contact_names: in the order of the columns; empty if not logged.
     """
 
@@ -55,6 +55,15 @@ class DataHeader(Header):
     joint_names: tuple[str, ...] = ()
     contact_names: tuple[str, ...] = ()
 
+    @property
+    def filter_variance(self) -> float:
+        """Second moment of the weights with which the filter averages q̈ over time [s²]; 0 if unknown.
+
+        The second derivative of cubics fitted to positions over a span T is q̈ + T²/56 d²q̈/dt² + …, as is an
+        average with the variance T²/28; the first derivative of cubics fitted to q̇ has no such term.
+        """
+        return (self.filter_span or 0.0) ** 2 / 28.0 if {"qd", "qdd"} <= set(self.derived) else 0.0
+
     def with_step(self, step: str, **fields: object) -> DataHeader:
         """The header with fields changed and one more line of provenance."""
         return self.model_copy(update={"provenance": (*self.provenance, step), **fields})
@@ -68,7 +77,7 @@ AXES = ("x", "y", "z")
 
 @dataclass(frozen=True, eq=False)
 class Fields:
-    """What a data set holds; `Dataset` documents each field."""
+    """Fields of a data set; `Dataset` documents them."""
 
     t: Tensor
     q: Tensor
@@ -95,7 +104,7 @@ def component_names(name: str, value: Tensor, joint_names: Sequence[str]) -> lis
 
 
 def named_columns(data: Fields) -> dict[str, Tensor]:
-    """Every floating-point column but time by its name on disk, vectors whole."""
+    """Every floating-point column except time, by its name on disk; vectors are not split."""
     named = {name: getattr(data, name) for name in JOINT_VECTORS} | dict(data.extras)
     for name, group in data.contact_extras.items():
         named |= {f"{name}.{contact}": value for contact, value in group.items()}

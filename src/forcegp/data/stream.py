@@ -1,4 +1,4 @@
-"""A long log in Parquet files, read a piece at a time; a window sees the pieces beside its own."""
+"""A long log in Parquet files, read piece by piece; filter windows overlap neighbouring pieces."""
 
 from __future__ import annotations
 
@@ -126,7 +126,7 @@ class _Trajectories:
         self.time = -np.inf if t is None else float(t[-1])
 
     def peek(self, columns: Columns) -> None:
-        """Number rows that come next, without passing on to them."""
+        """Number the next rows without advancing."""
         columns["segment"] = self.last_number + np.cumsum(self._starts(columns["segment"]))
 
     def _starts(self, raw: NDArray[np.generic]) -> NDArray[np.bool_]:
@@ -141,9 +141,9 @@ Keep = Callable[[Dataset], Tensor]
 
 @dataclass(frozen=True)
 class StreamedDataset:
-    """A log of any length in one or several Parquet files, one after another, with trajectories of their own.
+    """A log of any length in one or several Parquet files, each with separate trajectories.
 
-    What the files lack is computed as by `Dataset.read`; its noise is estimated piece by piece.
+    Missing columns are computed as in `Dataset.read`; their noise is estimated piece by piece.
 
     Args:
         paths: the files; their joints, contacts and further columns must agree.
@@ -184,7 +184,7 @@ class StreamedDataset:
 
     @property
     def digest(self) -> int:
-        """A number that belongs to the bytes of all files."""
+        """A hash of the bytes of all files."""
         digest = hashlib.sha256()
         for path in self.files:
             with path.open("rb") as file:
@@ -195,7 +195,7 @@ class StreamedDataset:
     @cached_property
     def _shapes(self) -> tuple[tuple[int, DataHeader], ...]:
         """Rows and header of each file."""
-        return tuple(shape_of(path) for path in self.files)
+        return tuple(map(shape_of, self.files))
 
     def __len__(self) -> int:
         """Number of samples."""
@@ -221,7 +221,7 @@ class StreamedDataset:
 
         Args:
             start: number of pieces to skip.
-            share: (r, k) yields data only for piece r of every k, as it belongs to another process.
+            share: (r, k) yields data only for piece r of every k; the others belong to other processes.
 
         Raises:
             DataError: a file is damaged or not a valid log, or differs from the first one in its columns.
@@ -259,8 +259,8 @@ class StreamedDataset:
 
 
 def spaced_sample(pieces: Iterable[Dataset], count: int, keep: Keep | None = None) -> tuple[Dataset, int]:
-    """Evenly spaced rows of a log of unknown length, `count` to twice as many if there are so many, in one
-    pass, and the number of all rows that count by `keep`; `DataError` without any piece.
+    """Evenly spaced rows of a log of unknown length, `count` to twice as many if available, in one pass, and
+    the number of all rows kept by `keep`; `DataError` without any piece.
     """
     kept: list[tuple[Tensor, Dataset]] = []
     step, total = 1, 0

@@ -68,20 +68,15 @@ def predict_all(
         active, began = part.active(model.system.contact_names), time.perf_counter()
         predicted = model.predict(part.q, part.qd, part.tau, active=active)
         seconds.append(time.perf_counter() - began)
-        residuals.append(_residual(system, part, predicted.mean))
+        # |A q̈ − b| of the rows of closed contacts
+        closed, qdd = part.active(system.contact_names), predicted.mean
+        eom = system.equations(part.q, part.qd, closed)
+        residual = ((eom.A @ qdd[..., None])[..., 0] - eom.b).abs()
+        residuals.append(residual[system.active_rows(closed, qdd.shape[:-1])].detach())
         return predicted.mean, predicted.variance
 
     mean, variance = in_chunks(predict, data, progress)
     return Predicted(mean, variance, _noise_std(model, data), torch.cat(residuals), sum(seconds))
-
-
-@torch.no_grad()
-def _residual(system: ConstrainedSystem, data: Dataset, qdd: Tensor) -> Tensor:
-    """|A q̈ − b| of the rows of closed contacts, `(k,)`."""
-    active = data.active(system.contact_names)
-    eom = system.equations(data.q, data.qd, active)
-    residual = ((eom.A @ qdd[..., None])[..., 0] - eom.b).abs()
-    return residual[system.active_rows(active, qdd.shape[:-1])]
 
 
 def _noise_std(model: Predictor, data: Dataset) -> Tensor | None:

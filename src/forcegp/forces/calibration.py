@@ -25,7 +25,7 @@ from forcegp.forces.posterior import (
     hidden_variance,
     trained_region,
 )
-from forcegp.forces.problem import Problem, force_posterior, typical
+from forcegp.forces.problem import UNSHOWN, Problem, force_posterior, typical
 from forcegp.forces.quantities import States, affine_map
 
 STRETCHES = 8
@@ -189,11 +189,13 @@ def _torque_noise(
 def calibrated_noise(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Torque noise calibrated on held-out samples, the trained region, and the growth of errors beyond it."""
     load, training = problem.typical_load(), problem.training
-    learned = hyperparameters[TORQUE_NOISE].exp().maximum(problem.hidden_torque())
+    least = problem.hidden_torque()
+    hidden, learned = least > 0.0, hyperparameters[TORQUE_NOISE].exp().maximum(least)
     noise = {TORQUE_NOISE: held_out_torque_std(problem, hyperparameters, learned).log()}
     qd, tau = (torch.cat([getattr(m, name) for m in training.measurements]) for name in ("qd", "tau"))
-    region = trained_region(qd, tau, load)
-    return {**noise, **region, GROWTH: growth(problem, {**hyperparameters, **noise}, load)}
+    grows = growth(problem, {**hyperparameters, **noise}, load)
+    grows = torch.where(hidden, grows.maximum(UNSHOWN * load), grows)
+    return {**noise, **trained_region(qd, tau, load, hidden), GROWTH: grows}
 
 
 def held_out_torque_std(problem: Problem, hyperparameters: Mapping[str, Tensor], least: Tensor) -> Tensor:

@@ -40,6 +40,8 @@ APART = 0.05
 """Time between a sample and its partner [s], where no filter of accelerations spans more."""
 DISTANCES = (0.01, 0.03, 0.1)
 """Distances over which friction with memory develops [rad, m]."""
+REACH = 3.0
+"""Standard deviations after which Gaussian weights end."""
 LEAST_SQUARE = 1e-300
 """Mean square of a joint that does not move in a stretch, which has no error."""
 TOLERATED = 0.02
@@ -62,6 +64,8 @@ class Rows:
         segment: `(n,)`.
         partner: index of each sample's partner `(n,)`; its own where the log has none.
         memory: friction with memory, further features `(n, nq, k)`.
+        step: time between neighbours [s]; 0 if they are not in order.
+        filter_variance: of the weights with which a filter averaged q̈ over time [s²].
     """
 
     q: Tensor
@@ -74,6 +78,8 @@ class Rows:
     segment: Tensor
     partner: Tensor
     memory: Tensor
+    step: float = 0.0
+    filter_variance: float = 0.0
 
     def with_memory(self) -> Rows:
         """The samples with all features of friction in Φ."""
@@ -168,7 +174,9 @@ def free_rows(
     if not paired:
         return _rows(system, prior, mean, m[first], memory[first], group, i)
     both, n = torch.cat([first, later[first]]), len(first)
-    return _rows(system, prior, mean, m[both], memory[both], group.repeat(2), torch.cat([i + n, i]))
+    rows = _rows(system, prior, mean, m[both], memory[both], group.repeat(2), torch.cat([i + n, i]))
+    step = max(0.0, float(m.t[first].diff().median()))
+    return dataclasses.replace(rows, step=step, filter_variance=training.filter_variance)
 
 
 def _in_time(m: Measurement | Dataset) -> Tensor:
@@ -260,6 +268,56 @@ def _slides(moving: Tensor, Phi: Tensor, residual: Tensor) -> Tensor:
     )
     sticks = (at_rest > SCATTER * sliding) & (moving.double().mean(0) >= MOVES)
     return moving | ~sticks
+
+
+def averaged(rows: Rows, columns: Tensor, inertial: Tensor, width: float) -> tuple[Rows, Tensor]:
+    """Equations averaged over time with Gaussian weights; any sum of equations is one.
+
+    Noise of differentiated positions has high frequencies, the motion low ones. And a filter has averaged the
+    accelerations, so that the other terms are averaged by its variance more.
+
+    Args:
+        columns: C `(n, nq, p)`.
+        inertial: M₀ q̈ `(n, nq)`, a part of the residual.
+        width: standard deviation of the weights [s].
+
+    Returns:
+        Samples in motion around which all those of the average are of one stretch, and their columns.
+    """
+    stds = [x / rows.step for x in (width, math.hypot(width, math.sqrt(rows.filter_variance)))]
+    reach, stride = math.ceil(REACH * stds[1]), max(1, int(0.5 * stds[0]))
+    offset = torch.arange(-reach, reach + 1).to(columns)
+    narrow, wide = (torch.softmax(-0.5 * (offset / max(std, 1e-9)) ** 2, 0) for std in stds)
+    n = rows.leading
+    starts = range(0, len(rows.q), n)
+    count = len(range(reach, n - reach, stride))
+
+    def over(x: Tensor, weights: Tensor) -> Tensor:
+        total = x.new_zeros(len(starts), count, *x.shape[1:])
+        for k, w in enumerate(weights.tolist()):
+            for part, first in zip(total, starts, strict=True):
+                part += w * x[first + k : first + n - 2 * reach + k : stride]
+        return total.flatten(0, 1)
+
+    def shifted(x: Tensor, k: int) -> Tensor:
+        return torch.cat([x[first + k : first + n - 2 * reach + k : stride] for first in starts])
+
+    whole = torch.stack([shifted(x, 0) == shifted(x, 2 * reach) for x in (rows.group, rows.segment)]).all(0)
+    slides = (over(rows.slides.to(columns), torch.ones_like(offset)) > len(offset) - 0.5) & whole[:, None]
+    centre = {name: shifted(getattr(rows, name), reach) for name in ("q", "qd", "qdd", "group", "segment")}
+    i = torch.arange(count, device=columns.device)
+    result = dataclasses.replace(
+        rows,
+        **centre,
+        residual=over(rows.residual + inertial, wide) - over(inertial, narrow),
+        friction=over(rows.friction, wide),
+        memory=over(rows.memory, wide),
+        slides=slides,
+        partner=torch.cat([i + count, i]) if len(starts) == 2 else i,
+        step=stride * rows.step,
+        filter_variance=0.0,
+    )
+    return result, over(columns, narrow)
 
 
 def sums(rows: Rows, columns: Tensor) -> NormalEquations:

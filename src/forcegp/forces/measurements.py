@@ -93,6 +93,7 @@ class Training:
         part_of: number of samples that are conditioned on, of which these are a part; 0 where these are all.
         period: sampling period of the log that these are from [s]; 0 where its rows are not in order.
         filter_span: of the filter that computed the accelerations [s]; 0 where the log does not state it.
+        filter_variance: of its weights over time [s²], as in `DataHeader`.
         weights: of the samples of each measurement `(n,)`, which their noise variance is divided by; `None`
             for one.
         slopes: G = dz/d(q, q̇) `(n, d, 2 nq)` of each measurement with learned forces, `None` for a quantity
@@ -105,6 +106,7 @@ class Training:
     part_of: int = 0
     period: float = 0.0
     filter_span: float = 0.0
+    filter_variance: float = 0.0
     weights: tuple[Tensor, ...] | None = None
     slopes: tuple[Tensor | None, ...] | None = None
 
@@ -428,6 +430,7 @@ def training_of(
         scales=(),
         period=_period(observations[0].data),
         filter_span=max(o.data.header.filter_span or 0.0 for o in observations),
+        filter_variance=max(o.data.header.filter_variance for o in observations),
     )
     return scaled(training, system, priors, kept, standardize)
 

@@ -182,17 +182,23 @@ def stick_variance(tensors: Mapping[str, Tensor], at: States) -> Tensor:
     return std**2 * torch.exp(-((at.qd / speed) ** 2))
 
 
-def trained_region(qd: Tensor, tau: Tensor, load: Tensor) -> dict[str, Tensor]:
+def trained_region(qd: Tensor, tau: Tensor, load: Tensor, hidden: Tensor | None = None) -> dict[str, Tensor]:
     """The region of the training samples `(n, nq)`, by the names of `LOW`, `HIGH` and `SPREAD`.
 
     Args:
         qd, tau: of samples in motion.
         load: typical torque of each joint `(nq,)`, a fraction of which is the least spread of its torque.
+        hidden: `(nq,)` bool, joints whose torque has no effect on accelerations: rare torques are not learned
+            from, and their region is a standard deviation around the mean.
     """
     x = torch.stack([qd, tau], dim=1)
     low, high = x.quantile(torch.tensor([OUTERMOST, 1.0 - OUTERMOST]).to(x), dim=0)
     least = torch.stack([torch.full_like(load, STICKING), RELATIVE * load])
-    return {LOW: low, HIGH: high, SPREAD: x.std(0, correction=0).maximum(least)}
+    spread = x.std(0, correction=0).maximum(least)
+    if hidden is not None:
+        mean, std = tau.mean(0), spread[1]
+        low[1], high[1] = torch.where(hidden, mean - std, low[1]), torch.where(hidden, mean + std, high[1])
+    return {LOW: low, HIGH: high, SPREAD: spread}
 
 
 def distance_beyond(tensors: Mapping[str, Tensor], qd: Tensor, tau: Tensor) -> Tensor:

@@ -168,10 +168,12 @@ class FeatureTerm:
     Attributes:
         values: φ.
         scale: a `(k, f)`.
+        waves: inputs, frequencies and phases, if φ is cos(ωᵀx + φ) as of `fourier_features`.
     """
 
     values: Basis
     scale: Tensor
+    waves: tuple[tuple[str, ...] | None, Tensor, Tensor] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -281,7 +283,8 @@ def fourier_features(inputs: tuple[str, ...] | None, omega: Tensor, phase: Tenso
     count = phase.shape[-1]
     scale = (math.sqrt(2.0 / count) * std)[:, None].expand(-1, count)
     turn, shift = omega.mT, phase[:, None, :]
-    return FeatureMap((FeatureTerm(lambda x: torch.cos(stacked(x, inputs) @ turn + shift), scale),))
+    waves = inputs, omega, phase
+    return FeatureMap((FeatureTerm(lambda x: torch.cos(stacked(x, inputs) @ turn + shift), scale, waves),))
 
 
 def linear_features(x: Features, inputs: tuple[str, ...] | None, slope: Tensor, bias: Tensor) -> FeatureMap:

@@ -19,31 +19,10 @@ from forcegp.logs.table import LogTable, Stream
 from forcegp.robot import RobotModel
 from forcegp.robust import robust_std
 
-WORDS = {
-    "acceleration": (
-        "qdd", "ddq", "acc", "accel", "acceleration", "accelerations", "qddot", "beschleunigung",
-    ),
-    "velocity": (
-        "qd", "dq", "vel", "velocity", "velocities", "speed", "omega", "qdot", "mdq", "w",
-        "geschwindigkeit", "drehzahl",
-    ),
-    "torque": (
-        "tau", "torque", "torques", "effort", "trq", "mtorque", "moment", "tq", "current", "currents",
-        "drehmoment",
-    ),
-    "position": (
-        "q", "pos", "position", "positions", "angle", "angles", "theta", "mq", "phi", "state", "joint",
-        "winkel",
-    ),
-}  # fmt: skip
+WORDS: dict[str, list[str]] = units.VOCABULARY["words"]
 """Words that name a quantity, by quantity, in the order in which they are looked for."""
-MEASURED = ("meas", "measured", "actual", "act", "msr", "sensor", "observation")
-"""Words of columns that were measured."""
-COMMANDED = (
-    "des", "desired", "target", "cmd", "command", "commanded", "ref", "reference", "con", "set", "goal",
-    "filt", "filtered", "fric", "err", "error", "action", "temperature", "temp", "voltage", "mode", "status",
-)  # fmt: skip
-"""Words of columns that are not what is looked for."""
+MEASURED, COMMANDED = (units.VOCABULARY["columns"][kind] for kind in ("measured", "commanded"))
+"""Words of columns that were measured, and of columns that are not what is looked for."""
 _TIME = re.compile(
     r"^(.*[ _./])?(t|mt|time|times|timestamp|stamp|clock|sec|secs|seconds|ms|millis|zeit)([ _./\[(].*)?$"
 )

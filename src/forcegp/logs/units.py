@@ -4,6 +4,9 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping
+from importlib.resources import files
+
+from forcegp.scene.document import tomllib
 
 DEG = math.pi / 180.0
 RPM = 2.0 * math.pi / 60.0
@@ -34,18 +37,9 @@ QUANTITY: Mapping[str, Mapping[str, float]] = {
 SI = {"position": "rad", "velocity": "rad/s", "acceleration": "rad/s2", "torque": "Nm"}
 """Unit of each joint vector of a rotating joint that is assumed before any is known."""
 
-_SPELLINGS = {
-    "sec": "s", "secs": "s", "second": "s", "seconds": "s", "msec": "ms", "millis": "ms",
-    "milliseconds": "ms", "usec": "us", "micros": "us", "microseconds": "us", "nsec": "ns",
-    "nanoseconds": "ns", "nanos": "ns", "µs": "us", "radian": "rad", "radians": "rad", "degree": "deg",
-    "degrees": "deg", "°": "deg", "turn": "rev", "rev/min": "rpm", "1/min": "rpm", "°/s": "deg/s",
-    "dps": "deg/s", "degps": "deg/s", "radps": "rad/s", "rads": "rad/s", "degs": "deg/s",
-    "rad/sec": "rad/s", "deg/sec": "deg/s", "rad/s^2": "rad/s2", "rad/s²": "rad/s2",
-    "deg/s^2": "deg/s2", "deg/s²": "deg/s2", "°/s²": "deg/s2", "°/s^2": "deg/s2", "n": "N",
-    "m/s^2": "m/s2", "m/s²": "m/s2", "n m": "Nm", "n*m": "Nm", "n·m": "Nm", "nm": "Nm", "n.m": "Nm",
-    "mnm": "mNm", "ncm": "Ncm", "kn": "kN", "knm": "kNm", "amp": "A", "amps": "A", "ampere": "A",
-    "a": "A", "ma": "mA", "amperes": "A", "milliampere": "mA",
-}  # fmt: skip
+VOCABULARY = tomllib.loads((files("forcegp.logs") / "vocabulary.toml").read_text(encoding="utf-8"))
+"""Words of headings, and spellings of units."""
+_SPELLINGS = {text: unit for unit, texts in VOCABULARY["spellings"].items() for text in texts}
 
 
 def spelled(text: str) -> str | None:

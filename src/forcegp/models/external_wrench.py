@@ -190,6 +190,8 @@ class Reading:
         stick = stick_variance(fit.hyperparameters, at)
         beyond = unknown_variance(fit.hyperparameters, at, fit.problem.external_std) - stick
         beyond = beyond if self.external is None else beyond + self.external**2
+        stated = data.extras.get("tau_std")
+        beyond = beyond if stated is None else beyond + stated**2
         torque = torch.zeros_like(stick) if fit.torque_std is None else fit.torque_std.square() + 0.0 * stick
         noise = torch.stack([torque, stick], dim=-1)
         noise = noise if self.memory is None else noise * self.memory.share

@@ -47,6 +47,7 @@ from forcegp.models.base import FittedModel
 from forcegp.models.export.folder import Export, write_export
 from forcegp.models.export.library import CompiledFit
 from forcegp.models.export.model import ExportedModel
+from forcegp.models.export.motion import CompiledMotion, compiled_motion
 from forcegp.models.external_wrench import ExternalWrench, external_wrench
 from forcegp.models.fit_result import FitResult
 from forcegp.models.prediction import Answer, Query, in_pieces
@@ -175,6 +176,8 @@ class StructuredFit(FittedModel):
         return external_wrench(self, data, WrenchFrame(frame, **components), method, external)
 
     def _exported(self, functions: int | None) -> ExportedModel:
+        if functions is not None and functions < 1:
+            raise ModelError("a posterior has one function at least", expected="1 or more", got=functions)
         parts = self.system, self.posterior, self.hyperparameters, self.noise, self.torque_std
         learned, std = self.hyperparameters.get(TORQUE_NOISE), self.problem.torque_std
         std = learned.exp() if learned is not None else 0.0 if std is None else std
@@ -233,6 +236,11 @@ class StructuredFit(FittedModel):
     def force_samples(self, samples: int, generator: torch.Generator) -> ForceField:
         """Force functions drawn from the posterior."""
         return draw_samples(self.posterior, samples, generator)
+
+    def compiled_motion(self, system: ConstrainedSystem, force: ForceField) -> CompiledMotion | None:
+        """The motion under the posterior mean, or under function samples of it, by C code."""
+        model = dataclasses.replace(self._exported(None), system=system, functions=0)
+        return compiled_motion(model, force, self.specified)
 
     def condition(
         self, data: Dataset | Sequence[Observation], hyperparameters: Mapping[str, Tensor] | None = None

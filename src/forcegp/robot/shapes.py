@@ -58,7 +58,7 @@ def sphere(radius: float) -> Array:
 
 
 def turn_z(direction: Array) -> Array:
-    """A rotation that turns the z axis to a unit direction, `(3, 3)`."""
+    """The shortest rotation that turns the z axis to a unit direction, `(3, 3)`."""
     axis = np.cross([0.0, 0.0, 1.0], direction)
     sine, cosine = float(np.linalg.norm(axis)), float(direction[2])
     if sine < 1e-12:

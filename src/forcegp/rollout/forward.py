@@ -11,7 +11,7 @@ from torch import Tensor
 
 from forcegp.constraints import Baumgarte, ConstrainedSystem
 from forcegp.constraints.compiled_system import compiled_system
-from forcegp.constraints.unilateral import any_row, can_open
+from forcegp.constraints.unilateral import any_row
 from forcegp.data import Dataset
 from forcegp.errors import ForceGPError, ModelError, check_name
 from forcegp.resources import one_thread
@@ -179,7 +179,7 @@ def rollout_model(
     law, system = law_of(model, system), system or model.system
     shares, start = (2 if samples else 1), (q0, qd0)
     report = share_of(progress, 0, shares)
-    rollout = _run(law, system, start, tau, duration, batch, active, options, report)
+    rollout = _run(law, system, start, tau, duration, batch, active, options, report, model=model)
     if samples:
         generator = torch.Generator().manual_seed(seed)
         force = ForceLaw(model.force_samples(samples, generator))
@@ -187,7 +187,7 @@ def rollout_model(
         disturbance = model.disturbance if options.torque_noise else None
         noise = None if disturbance is None else (disturbance, generator)
         given = force, system, start, tau, duration, whole, active, options, report
-        sampled = _run(*given, batch=batch, noise=noise)
+        sampled = _run(*given, batch=batch, noise=noise, model=model)
         rollout = dataclasses.replace(rollout, samples=sampled)
     return _checked(rollout, options)
 
@@ -224,6 +224,7 @@ def _run(
     *,
     batch: torch.Size | None = None,
     noise: tuple[Disturbance, torch.Generator] | None = None,
+    model: ForwardModel | None = None,
 ) -> Rollout:
     """Flatten the batch, integrate, and give the result the shape of the whole batch."""
     n, system = whole.numel(), options.stabilized(system)
@@ -240,8 +241,12 @@ def _run(
     if noise is not None:
         inputs = Disturbed.drawn(inputs, noise[0], n, steps, dt, noise[1])
     system.announce_states(n * (1 + steps // STEPS_PER_STATE), 1.0, f"{n:,} trajectories of {steps:,} steps")
-    mechanics = compiled_system(system) if steps >= COMPILED_STEPS else system
-    problem = RolloutProblem(mechanics, law, inputs, unilateral, options.sticking)
+    mechanics, motion = system, None
+    if steps >= COMPILED_STEPS:
+        mechanics = compiled_system(system)
+        if model is not None and isinstance(law, ForceLaw):
+            motion = model.compiled_motion(system, law.force)
+    problem = RolloutProblem(mechanics, law, inputs, unilateral, options.sticking, motion)
     with one_thread() if n <= FEW else nullcontext():
         trajectories = integrate(
             problem,
@@ -279,7 +284,7 @@ def _touching(system: ConstrainedSystem, q: Tensor, qd: Tensor) -> Tensor:
     """Contacts that touch, or cannot open `(n, n_contacts)`."""
     with torch.no_grad():
         is_open = any_row(system, system.equations(q, qd).c.abs() > CLOSED)
-    return ~(is_open & can_open(system, is_open))
+    return ~(is_open & system.can_open)
 
 
 def share_of(progress: Progress | None, part: int, parts: int) -> Progress | None:

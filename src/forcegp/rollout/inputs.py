@@ -5,24 +5,35 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from functools import cached_property
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem, Equations
 from forcegp.control.plan import Plan
-from forcegp.control.task_space import Gains, Target, control_torque
+from forcegp.control.task_space import Gains
 from forcegp.data import Dataset
 from forcegp.errors import DataError, ModelError, ShapeError, UnknownNameError
 from forcegp.forces.quantities import ForceField
-from forcegp.kinematics import point_motion
 
 INTERPOLATIONS = ("hold", "linear")
 EDGE = 1e-6
 """Part of a sampling period within which a time counts as a sampling time, against rounding."""
 EVEN = 0.02
 """Largest deviation of a step from the sampling period, relative to the period, in a log that is replayed."""
+
+
+@runtime_checkable
+class CompiledMotion(Protocol):
+    """The motion of trajectories, without gradients."""
+
+    def __call__(
+        self, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor, h: Tensor, sticking: bool
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """q̈, λ, constraint error and its rate, and joints that friction holds over steps h `(n, 1)`."""
+        ...
 
 
 class ForwardModel(ABC):
@@ -57,6 +68,10 @@ class ForwardModel(ABC):
             f"a {self.kind!r} model has no function samples", hint="use StructuredGP, or samples=0"
         )
 
+    def compiled_motion(self, system: ConstrainedSystem, force: ForceField) -> CompiledMotion | None:
+        """The motion of a system under the mean force or its samples by C code; `None` without such code."""
+        return None
+
     @property
     def disturbance(self) -> Disturbance | None:
         """Forces beside the learned ones that disturb rollouts of function samples, `None` for none."""
@@ -89,19 +104,25 @@ class Disturbance(NamedTuple):
     constant: Tensor
 
 
-class Reached(NamedTuple):
+@dataclass(frozen=True)
+class Reached:
     """The states that a rollout has come to.
 
     Attributes:
         system: robot and contacts.
-        eom: their equations of motion.
         q, qd: `(n, nq)`.
+        active: `(n, n_contacts)` bool, closed contacts.
     """
 
     system: ConstrainedSystem
-    eom: Equations
     q: Tensor
     qd: Tensor
+    active: Tensor
+
+    @cached_property
+    def eom(self) -> Equations:
+        """The equations of motion there."""
+        return self.system.equations(self.q, self.qd, self.active)
 
 
 class Inputs(ABC):
@@ -216,10 +237,8 @@ class TaskSpaceControl(Inputs):
         robot, eom, q, qd = self.system.robot, at.eom, at.q, at.qd
         if at.system.robot is not robot:
             eom = self.system.equations(q, qd)
-        tool = point_motion(robot, eom.poses, eom.motion, qd, self.plan.frame, self.plan.point)
         k = torch.floor(t[:, 0] / self.dt + EDGE).long().clamp(max=len(self.plan.reference.t) - 1)
-        target = Target(*(values[k] for values in self.plan.targets))
-        command = control_torque(tool, eom, q, qd, target, self.plan.press(eom), self.gains)
+        command = self.plan.command(eom, q, qd, k, self.gains)
         limit = robot.effort_limit if self.limit is None else self.limit
         return command.clamp(-limit, limit)
 

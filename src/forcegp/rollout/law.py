@@ -40,7 +40,7 @@ from forcegp.forces.priors.contact import CoulombFriction, SurfaceForcePrior, co
 from forcegp.forces.priors.joint import AnalyticalMean
 from forcegp.forces.quantities import ForceField, States, affine_map
 from forcegp.rollout.cone import accelerating, arrested, sliding_away, sticking_contacts
-from forcegp.rollout.inputs import ForwardModel, Inputs, Reached
+from forcegp.rollout.inputs import CompiledMotion, ForwardModel, Inputs, Reached
 
 REGULARIZATION = 1e-10
 """Compliance of sticking, relative to that of a free joint. In contact more joints can stick than can move,
@@ -361,7 +361,8 @@ class RolloutProblem:
     """q̈ = law(q, q̇, τ(t, q, q̇)) on a constrained system with the stabilization of the rollout.
 
     `unilateral` lets contacts with a surface open and close, `sticking` dry friction hold joints. Whether the
-    friction of contacts is known is asked once, where a contact first sticks.
+    friction of contacts is known is asked once, where a contact first sticks. `compiled` is the same motion
+    by C code, which is used where no gradient is asked for.
     """
 
     system: ConstrainedSystem
@@ -369,6 +370,7 @@ class RolloutProblem:
     inputs: Inputs
     unilateral: bool
     sticking: bool = False
+    compiled: CompiledMotion | None = None
 
     _known: list[bool] = field(default_factory=list, init=False)
 
@@ -386,9 +388,13 @@ class RolloutProblem:
 
     def evaluate(self, state: State, end: Tensor) -> Instant:
         """The motion at a state, within a step that ends at `end` `(n, 1)`."""
-        eom = self.system.equations(state.q, state.qd, state.active)
-        tau = self.inputs.torque(state.t, end, Reached(self.system, eom, state.q, state.qd))
-        at, h = States(state.q, state.qd, tau, state.active, eom), end - state.t
+        at, h = Reached(self.system, state.q, state.qd, state.active), end - state.t
+        tau = self.inputs.torque(state.t, end, at)
+        if self.compiled is not None and not any(x.requires_grad for x in (state.q, state.qd, tau)):
+            sticks = self.dry_friction is not None
+            qdd, multiplier, c, cd, held = self.compiled(state.q, state.qd, tau, state.active, h, sticks)
+            return Instant(tau, qdd, multiplier, c, cd, held if sticks else None)
+        at = States(state.q, state.qd, tau, state.active, at.eom)
         now, rough = self._instant(at, h), self.rough
         if not rough or not bool((sticks := sticking_contacts(self.system, at, rough)).any()):
             return now

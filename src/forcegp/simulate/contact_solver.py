@@ -10,6 +10,7 @@ from scipy.spatial.transform import Rotation
 from forcegp.constraints import ConstrainedSystem, Cylinder, Plane, Sphere, SurfaceContact
 from forcegp.errors import ForceGPError, UnsupportedRobotError, optional_module
 from forcegp.robot.model import BASE, RobotModel
+from forcegp.robot.shapes import turn_z
 from forcegp.simulate.config import ContactSolver
 from forcegp.simulate.engines import NEEDS_MUJOCO, MuJoCoWorld
 from forcegp.simulate.urdf import link_name, write_urdf
@@ -174,15 +175,17 @@ def tip_of(robot: RobotModel, contact: SurfaceContact, radius: float) -> tuple[i
 def geometry_of(mujoco: Any, contact: SurfaceContact) -> dict[str, Any]:
     """Type, size and pose of the geometry of a surface."""
     surface, geom = contact.surface, mujoco.mjtGeom
+    if isinstance(surface, Plane | Cylinder):
+        axis = np.array(surface.normal if isinstance(surface, Plane) else surface.axis)
+        quaternion = Rotation.from_matrix(turn_z(axis)).as_quat()[[3, 0, 1, 2]]
     if isinstance(surface, Plane):
-        normal = np.array(surface.normal)
-        pose = {"pos": surface.offset * normal, "quat": _turn_of_z(normal)}
+        pose = {"pos": surface.offset * axis, "quat": quaternion}
         return {"type": geom.mjGEOM_PLANE, "size": [0.0, 0.0, 1.0], **pose}
     if isinstance(surface, Sphere):
         return {"type": geom.mjGEOM_SPHERE, "size": [surface.radius, 0.0, 0.0], "pos": [*surface.center]}
     if isinstance(surface, Cylinder):
         size = [surface.radius, CYLINDER_LENGTH, 0.0]
-        pose = {"pos": [*surface.center], "quat": _turn_of_z(surface.axis)}
+        pose = {"pos": [*surface.center], "quat": quaternion}
         return {"type": geom.mjGEOM_CYLINDER, "size": size, **pose}
     raise ForceGPError(
         f"the contact solver has no geometry for the surface of {contact.name!r}",
@@ -190,9 +193,3 @@ def geometry_of(mujoco: Any, contact: SurfaceContact) -> dict[str, Any]:
         got=type(surface).__name__,
         hint='use contact = "rigid"',
     )
-
-
-def _turn_of_z(axis: Any) -> np.ndarray:
-    """Quaternion `(w, x, y, z)` of a rotation that takes the z axis to a unit vector."""
-    rotation = Rotation.align_vectors(np.reshape(axis, (1, 3)), [[0.0, 0.0, 1.0]])[0]
-    return rotation.as_quat()[[3, 0, 1, 2]]

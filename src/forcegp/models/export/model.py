@@ -95,7 +95,7 @@ class ExportedModel:
         tensors: all hyperparameters.
         noise: standard deviation of a measurement of each measured quantity.
         torque_std, external_std: of the motor torques' noise and of unknown forces on joints, or `None`.
-        functions: number r that the covariance is reduced to; `None` for all.
+        functions: number r that the covariance is reduced to; `None` for all, 0 for the mean alone.
         sampling: of a sample learned online, the variance of the motor torques' noise `(nq,)`, the power κ of
             its likelihood, and whether it must be in motion; `None` for a model that cannot.
     """
@@ -136,10 +136,6 @@ class ExportedModel:
         for kind, what in ((InertialPrior, "the inertia"), (PayloadPrior, "a payload")):
             if sum(isinstance(prior, kind) for prior in self.posterior.priors) > 1:
                 raise ModelError(f"a fit with two priors on {what} is not exported", expected="one at most")
-        if self.functions is not None and self.functions < 1:
-            raise ModelError(
-                "a posterior has one function at least", expected="1 or more", got=self.functions
-            )
         latent = self.posterior.latent
         size = latent.basis.size if isinstance(latent, SparsePosterior) else len(latent.alpha)
         if self.functions is None and size > LARGEST:
@@ -167,6 +163,8 @@ class ExportedModel:
             eye = torch.eye(len(latent.L), dtype=latent.L.dtype)
             # C = L⁻ᵀ, upper triangular
             C = torch.linalg.solve_triangular(latent.L, eye, upper=False).mT
+        elif not self.functions:
+            C = latent.L.new_zeros(len(latent.L), 1)
         else:
             # C = U √(1 − Λ⁻¹)
             values, vectors = torch.linalg.eigh(latent.L @ latent.L.mT)
@@ -193,6 +191,8 @@ class ExportedModel:
         assert isinstance(means, ExactPosterior)
         if self.functions is None:
             rows = torch.linalg.solve_triangular(L, torch.eye(len(L), dtype=L.dtype), upper=False).mT
+        elif not self.functions:
+            rows = L.new_zeros(len(L), 1)
         else:
             values, vectors = torch.linalg.eigh(L @ L.mT)
             rows = vectors[:, -self.functions :] * values[-self.functions :].rsqrt()
