@@ -87,7 +87,7 @@ class Explanation:
 
 def explain(system: ConstrainedSystem, log: Log) -> Explanation:
     """Find the faults that explain the residual torque of the robot file."""
-    rows = log.rows(ROWS, margin=max(hypotheses.lags(log)))
+    rows = log.rows(ROWS, margin=max(hypotheses.LAGS))
     problem = hypotheses.problem_of(system, log, rows)
     model = Explanation(system, log, rows, problem, np.zeros((*problem.r.shape, 0)), np.zeros(0)).weighed()
     for _ in range(ROUNDS):
