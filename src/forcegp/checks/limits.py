@@ -85,7 +85,7 @@ def _angles(log: Log, turning: np.ndarray) -> list[str]:
 
 
 def check_limits(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Positions, velocities and torques beyond the limits of the robot file."""
+    """Find positions, velocities and torques beyond the limits of the robot file."""
     kinds = {"q": "position-limit", "qd": "velocity-limit", "tau": "torque-limit"}
     findings = []
     for name, (low, high) in _limits(system).items():
@@ -100,7 +100,7 @@ def check_limits(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_saturation(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Torques that stay at their largest value for several rows: the amplifier clips."""
+    """Find torques that stay at their largest value for several rows: the amplifier clips."""
     clipped = clipped_torques(log)
     joints = log.named(clipped.any(axis=0))
     text = f"the torque of {', '.join(joints)} stays at its largest value in"
@@ -108,9 +108,9 @@ def check_saturation(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def clipped_torques(data: Dataset | Log) -> NDArray[np.bool_]:
-    """Where the torque of a joint stays at its largest or smallest value, `(n, nq)` bool.
+    """Mask `(n, nq)` of torques that stay at the largest or smallest value of their joint.
 
-    Look at a log as it was recorded: a filter rounds the plateaus off. Leave these rows out of training data,
+    Use the unfiltered log, since filters smooth the plateaus. Exclude these rows from training data,
     or state their noise in `extras["tau_std"]` for an external wrench.
 
     Args:

@@ -52,7 +52,7 @@ def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
         return passive, log
     smooth = smoothed(log)
     if not _enough(smooth):
-        inner = f"rows that lie {max(hypotheses.lags(smooth))} from the ends of a stretch"
+        inner = f"rows that lie {max(hypotheses.LAGS)} from the ends of a stretch"
         raise NotJudgedError(f"fewer than {LEAST_ROWS} {inner}")
     explanation = explain(system, smooth)
     disturbed, rows = [], np.zeros(len(log), bool)
@@ -81,7 +81,7 @@ def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def _enough(log: Log) -> bool:
-    return len(log.rows(LEAST_ROWS, margin=max(hypotheses.lags(log)))) == LEAST_ROWS
+    return len(log.rows(LEAST_ROWS, margin=max(hypotheses.LAGS))) == LEAST_ROWS
 
 
 def _without_torque(log: Log) -> list[Finding]:

@@ -2,8 +2,8 @@
 
 Motor side and joint side, currents and torques, signs and offsets are one factor per joint. A reading r is
 y = s k (r − o): o the reading at zero, in the unit of the column; s = ±1; and k the unit, times the
-torque constant K_t for a current. Through a gear of ratio N, a motor turns N times as fast as its joint and a
-joint bears N times the motor's torque: q = q_m / N, τ = N τ_m.
+torque constant K_t for a current. Through a gear of ratio N, a motor turns N times as fast as its joint, and
+the joint torque is N times the motor torque: q = q_m / N, τ = N τ_m.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ def gather(
     progress: Progress | None = None,
     rows: int | None = None,
 ) -> Signals:
-    """Read the mapped columns of a log onto one clock, at most `rows` rows where the format allows it."""
+    """Read the mapped columns of a log onto one clock, at most `rows` rows if the format allows it."""
     sections = mapping.sections
     needed = {sections.time.column, sections.time.segment or sections.time.column}
     for name in SYMBOLS:

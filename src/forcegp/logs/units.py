@@ -1,4 +1,4 @@
-"""Units that a log may be in, as factors to SI and radians."""
+"""Units of logs, as factors to SI and radians."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ SI = {name: next(iter(_UNITS[name])) for name in ("position", "velocity", "accel
 
 
 def spelled(text: str) -> str | None:
-    """The name in this file of a unit as people write it, or `None` where it is not known.
+    """The canonical name of a unit in common notation, or `None` if it is unknown.
 
     >>> spelled("[deg/sec]"), spelled("Seconds"), spelled("furlong")
     ('deg/s', 's', None)

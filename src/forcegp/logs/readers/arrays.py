@@ -1,6 +1,6 @@
 """Files of named arrays: NumPy archives without pickled objects, HDF5 and MATLAB.
 
-MATLAB files of version 7.3 are read as the HDF5 files that they are, version 4 by SciPy. Of versions 5 to 7
+MATLAB files of version 7.3 are read as HDF5 files, version 4 by SciPy. Of versions 5 to 7
 every tag is checked before it is followed, as SciPy's reader crashes the process on some damaged files; the
 layout is that of "MAT-File Format" (MathWorks), chapter 1. Links out of an HDF5 file are not followed.
 """
@@ -74,7 +74,7 @@ def _array(source: str, name: str, file: Any, size: int) -> Arrays:
 
 
 def read_hdf5(path: Path, **_: object) -> LogTable:
-    """Read the numeric data sets of an HDF5 file; one in a group is `group/name`."""
+    """Read the numeric data sets of an HDF5 file; those in groups are named `group/name`."""
     remarks: list[str] = []
     return table.table_of_arrays(path, "hdf5", _hdf5_arrays(path, "/", remarks), remarks)
 
@@ -136,7 +136,7 @@ COMPLEX = 0x08
 
 
 class Variable(NamedTuple):
-    """An array by name, `struct.field` in a struct, or why there is none."""
+    """A named array (`struct.field` in a struct), or the reason why it cannot be read."""
 
     name: str
     value: NDArray[np.generic] | str
@@ -148,7 +148,7 @@ class _Element(NamedTuple):
 
 
 def variables(content: bytes, source: str) -> Iterator[Variable]:
-    """The variables of a file with that content, in their order; `source` names it in messages."""
+    """The variables of a file from its content, in order; `source` is its name in messages."""
     order = {b"IM": "<", b"MI": ">"}.get(content[126:128])
     if order is None:
         raise DataError(f"{source}: not a MATLAB file of versions 5 to 7", got=content[:20])
