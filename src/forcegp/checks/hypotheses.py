@@ -235,17 +235,13 @@ CURRENT = 1.6
 """Gains of all joints beyond this factor are no calibration error: another quantity was logged."""
 TILT = 30.0
 """Largest angle at which a base counts as tilted, not as mounted another way round [degrees]."""
-WEIGHTLESS = 0.3
-"""Share of gravity below which the torque holds none of it."""
-SIGNIFICANT = 3.0
-"""Standard errors from which a parameter of a tool counts."""
+WEIGHTLESS, SIGNIFICANT = 0.3, 3.0
+"""Share of gravity below which the torque has none; standard errors from which a tool's parameter counts."""
 SMALL_ANGLE, LARGEST_ANGLE = np.radians(0.5), 1.0
 """Encoder offsets below the first are within calibration, or an error of a centre of mass; one beyond the
 second is none that a slope of the torque determines [rad, m]."""
-SMALL_GAIN = 0.2
-"""Gains closer to 1 than this may as well be errors of the masses of a robot file."""
-EXPLAINED = 0.5
-"""Share of the torque that a gain may leave unexplained, as any useful model may."""
+SMALL_GAIN, EXPLAINED = 0.2, 0.5
+"""Gains closer to 1 may as well be errors of masses; share of the torque that a gain may not explain."""
 SMALL_TILT, EARTH = 1.0, 9.81
 """Tilts that are errors of the masses [degrees]; size of gravity where the scene has none [m/s²]."""
 SAME_GRAVITY = 0.2, 0.5
