@@ -18,7 +18,7 @@ from forcegp.checks.finding import Finding
 from forcegp.checks.fit import cross_validate, tensors
 from forcegp.checks.hypotheses import problem_of
 from forcegp.checks.limits import DEGREE
-from forcegp.checks.log import DEPARTURE, Array, Log, Outcome
+from forcegp.checks.log import DEPARTURE, Array, Log, Outcome, derive
 from forcegp.constraints import ConstrainedSystem
 from forcegp.robust import robust_std
 
@@ -135,9 +135,13 @@ def _clock_finding(log: Log, factor: float) -> Outcome:
         kind, repaired = "time-scale", log.t * factor
         text = f"positions and velocities change {factor:.4g} times as far as the clock allows"
     found = log.finding(kind, text, seconds_per_unit=factor, period=log.dt)
-    if "qdd" in log.derived | {*log.header.derived}:  # by the wrong clock
-        log = log.replace(qdd=log.qdd * (log.t[-1] - log.t[0]) / (repaired[-1] - repaired[0]))
-    return [found], log.replace(t=repaired)
+    ratio, log = log.t[1] - log.t[0], log.replace(t=repaired)
+    ratio, second = ratio / (log.t[1] - log.t[0]), match(log, "qd", "qdd")
+    if "qdd" in log.derived | {*log.header.derived} and second is not None and second.moving.any():
+        slope = max(float(np.median(second.low[second.moving])), 1e-300)
+        if abs(np.log(slope / ratio)) < abs(np.log(slope)):  # derived by the wrong clock
+            log = log.replace(qdd=log.qdd * ratio)
+    return [found], log
 
 
 def _one_factor(level: Match, factor: float) -> bool:
@@ -158,7 +162,10 @@ def check_velocity(system: ConstrainedSystem, log: Log) -> Outcome:
         return [], log
     wrong = level.moving & (~level.right() | (np.abs(level.correlation) < RELATED)) & ~_coarse(log, level)
     if not wrong.any():
-        return _late(log, level), log
+        if late := _late(log, level):
+            computed = log.derived | {*log.header.derived}
+            log = derive(log, ["qd", "qdd"] if "qdd" in computed else ["qd"])
+        return late, log
     if "qd" in log.header.derived:
         return _mismatch("filter-wide", log, level, wrong, "qd", "q"), log
     permutation = _permutation(level)
