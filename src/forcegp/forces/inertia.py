@@ -82,11 +82,12 @@ def rigid_robot(robot: RobotModel, rows: Rows) -> RobotModel | None:
     links = regressor(robot, rows.q, rows.qd, rows.qdd) * prior.scale(robot)
     C = torch.cat([size * torch.diag_embed(rows.qdd), links], dim=-1)
     regressions, judged = tuple(_over_widths(rows, C, M)), products(rows, C)
+    single = regressions[0]
     found = max(regressions, key=lambda each: float(torch.logdet(each.normal()[1])))
 
     def compared(estimate: Estimate) -> Tensor:
-        """Held-out errors of single samples in units of their noise."""
-        return held_out(found.by_stretch, estimate, judged) / regressions[0].noise ** 2
+        """Held-out errors of single samples in units of their noise; averages hardly show sharp friction."""
+        return held_out(single.by_stretch, estimate, judged, found.by_stretch) / single.noise**2
 
     nothing = torch.zeros_like(found.mean)
     drives = _drives_alone(found.by_stretch.total(), found.noise, n)
@@ -100,7 +101,7 @@ def rigid_robot(robot: RobotModel, rows: Rows) -> RobotModel | None:
     consistent, moved = prior.updated(driven, found.mean[n:], precision[n:, n:])
     delta = torch.cat([found.mean[:n], moved])
     before, after = (
-        acceleration_errors(rows, found.by_stretch, C, x, mass_matrix(each, rows.q))
+        acceleration_errors(rows, single.by_stretch, C, x, mass_matrix(each, rows.q))
         for each, x in ((robot, nothing), (consistent, delta))
     )
     better = _is_better(compared(lambda _: delta), known)
@@ -125,7 +126,7 @@ def _over_widths(rows: Rows, C: Tensor, M: Tensor) -> Iterator[_Regression]:
     inertial = (M @ rows.qdd[..., None])[..., 0]
     for width in WIDTHS if rows.step else WIDTHS[:1]:
         used, columns = averaged(rows, C, inertial, width) if rows.step else (rows, C)
-        if width and int(used.slides.sum(0).min()) < LEAST:
+        if width and (int(used.slides.sum(0).min()) < LEAST or int(used.group.max()) < int(rows.group.max())):
             break
         by_stretch = instrumental(used, columns)
         every, mean, noise, power = by_stretch.total(), C.new_zeros(C.shape[-1]), C.new_ones(C.shape[1]), 1.0

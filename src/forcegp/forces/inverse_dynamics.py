@@ -360,19 +360,23 @@ def _by_stretch(rows: Rows, Z: Tensor, X: Tensor, s: Tensor, r: Tensor) -> Norma
 
 
 def held_out(
-    by_stretch: NormalEquations, estimate: Estimate, judged: NormalEquations | None = None
+    by_stretch: NormalEquations,
+    estimate: Estimate,
+    judged: NormalEquations | None = None,
+    source: NormalEquations | None = None,
 ) -> Tensor:
     """Mean squares of torque errors on stretches that neither δ nor friction have seen, `(groups, nq)`.
 
     Args:
-        by_stretch: what is estimated from.
+        by_stretch: what friction is estimated from.
         estimate: δ from all stretches but one.
         judged: what errors are computed from, such as `products`; by default the same.
+        source: what δ is estimated from, such as averaged equations; by default the same as friction.
     """
     errors = []
     for g in range(len(by_stretch.gram)):
         rest = by_stretch.without(g)
-        delta = estimate(rest)
+        delta = estimate(rest if source is None else source.without(g))
         errors.append((judged or by_stretch).of(g).error(delta, rest.friction(delta)))
     return torch.stack(errors)
 
