@@ -36,6 +36,7 @@ from torch import Tensor
 
 import forcegp
 from forcegp import kinematics
+from forcegp.checks import clipped_torques
 from forcegp.data.derivative import cross_validated_window
 from forcegp.errors import DataError
 from forcegp.models.sensed import SENSOR, with_sensed_forces
@@ -52,8 +53,6 @@ LIFTED = 0.009
 height sensor is off in contact, and the 11 to 15 mm of the flight."""
 NEVER_SLIDES = 1.0
 """Speed below which the rubber foot sticks [m/s], above that of any row in contact."""
-SATURATED = 2.69
-"""Torque of the knee from which its drive is saturated [N m]."""
 HAND = 30.0
 """Size of the unknown force on the base while somebody pushes it [N]."""
 UNKNOWN = 1e4
@@ -81,18 +80,22 @@ def filtered(x: NDArray[np.float64], window: int, degree: int = 0) -> Tensor:
     return torch.from_numpy(np.ascontiguousarray(smooth))
 
 
+def torques(raw: dict[str, NDArray[np.float64]]) -> NDArray[np.float64]:
+    """The logged torques; that of the slider is zero."""
+    return np.concatenate([np.zeros((len(raw[FORCE]), 1)), raw["joint_torques"]], axis=1)
+
+
 def dataset(
     robot: forcegp.RobotModel, q: NDArray[np.float64], raw: dict[str, NDArray[np.float64]], window: int
 ) -> forcegp.Dataset:
     """A log of the leg, filtered; the slider has neither a motor nor a sensor of its force."""
-    tau = np.concatenate([np.zeros((len(q), 1)), raw["joint_torques"]], axis=1)
     header = forcegp.data.DataHeader(unmeasured_torques=(robot.joint_names[0],))
     return forcegp.Dataset(
         t=DT * torch.arange(len(q), dtype=torch.float64),
         q=filtered(q, window),
         qd=filtered(q, window, 1),
         qdd=filtered(q, window, 2),
-        tau=filtered(tau, window),
+        tau=filtered(torques(raw), window),
         joint_names=robot.joint_names,
         contact={"ground": torch.ones(len(q), dtype=torch.bool)},
         contact_extras={SENSOR: {"ground": filtered(raw[FORCE], window)}},
@@ -126,10 +129,12 @@ def pushed(robot: forcegp.RobotModel, logs: Path, window: int) -> tuple[forcegp.
     raw = columns(logs / "hopper" / "pushed", SIGNALS)
     q = np.concatenate([np.zeros((len(raw[FORCE]), 1)), raw["joint_positions"]], axis=1)
     q[:, 0] -= kinematics.frame_pose(robot, torch.from_numpy(q), "contact")[1][:, 2].numpy()
-    saturated = binary_dilation(np.abs(raw["joint_torques"][:, 1]) > SATURATED, iterations=window // 2)
+    data = dataset(robot, q, raw, window)
+    recorded = data.replace(tau=torch.from_numpy(torques(raw)))
+    saturated = binary_dilation(clipped_torques(recorded).any(-1), iterations=window // 2)
     rows = torch.from_numpy(np.asarray(saturated)).logical_not()
     rows[: window // 2], rows[-(window // 2) :] = False, False
-    return dataset(robot, q, raw, window), rows
+    return data, rows
 
 
 def between(data: forcegp.Dataset, half: tuple[float, float]) -> forcegp.Dataset:

@@ -181,26 +181,52 @@ def test_phrases_that_were_rewritten_do_not_come_back(path: Path) -> None:
         assert not re.search(pattern, text), phrase
 
 
-@pytest.mark.parametrize("page", [*PAGES, DOCS.parent / "README.md"], ids=lambda page: page.name)
-def test_data_and_forces_do_not_speak(page: Path) -> None:
-    found = SPEAKING.search(sentences(page))
+@pytest.mark.parametrize("path", texts(), ids=lambda path: f"{path.parent.name}/{path.name}")
+def test_data_and_forces_do_not_speak(path: Path) -> None:
+    found = SPEAKING.search(sentences(path))
     assert found is None, found.group()
 
 
+DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+
+
+@pytest.mark.parametrize("path", texts(), ids=lambda path: f"{path.parent.name}/{path.name}")
+def test_no_questions_in_place_of_names(path: Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    if path.suffix == ".py":
+        nodes = [node for node in ast.walk(ast.parse(text)) if isinstance(node, DOCUMENTED)]
+        docstrings = [ast.get_docstring(node) or "" for node in nodes]
+        assert not [doc for doc in docstrings if re.match(r"(What|Where|How|Why|Which|Who)\b", doc)]
+    elif path in PAGES:
+        assert not re.search(r"\b(whose|of which)\b", " ".join(seen(path)))
+
+
 WORDS = 20_000
-"""Words of the site in prose and tables: without code, addresses, the API reference and generated pages."""
+"""Words that a reader of the site sees: prose, tables and code, without API reference and messages."""
+
+UNSEEN = re.compile(r"remove-cell|remove-input|^```\{toctree\}")
+"""Blocks that the built page does not show."""
 
 
-def prose(text: str) -> list[str]:
-    """The words of a page."""
-    text = re.sub(r"\A---.*?^---$|^```.*?^```$", "", text, flags=re.S | re.M)
-    text = re.sub(r"\]\([^)]*\)", "]", text)
-    return [word for word in text.split() if re.search(r"\w", word)]
+def seen(page: Path) -> list[str]:
+    """The words of a page and of the files that it includes, without markup and addresses."""
+    text = page.read_text(encoding="utf-8")
+    text = re.sub(r"\A---.*?^---$", "", text, flags=re.S | re.M)
+    included = [
+        word
+        for name in re.findall(r"^```\{include\} (\S+)$", text, re.M)
+        for word in seen(page.parent / name)
+    ]
+    text = re.sub(
+        r"^```.*?^```$", lambda block: "" if UNSEEN.search(block[0]) else block[0], text, flags=re.S | re.M
+    )
+    text = re.sub(r"\]\([^)]*\)|^```\{.*$|^:tags:.*$", " ", text, flags=re.M)
+    return included + [word for word in text.split() if re.search(r"\w", word)]
 
 
 def test_the_site_and_the_readme_stay_short() -> None:
     pages = [page for page in PAGES if page.parent.name != "reference"]
-    assert sum(len(prose(page.read_text(encoding="utf-8"))) for page in pages) <= WORDS
+    assert sum(len(seen(page)) for page in pages) <= WORDS
     assert len((DOCS.parent / "README.md").read_text(encoding="utf-8").split()) <= 700
 
 

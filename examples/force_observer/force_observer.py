@@ -28,7 +28,7 @@ import forcegp
 from forcegp.errors import optional_module
 from forcegp.evaluation.least_squares import identify_rigid
 from forcegp.forces.external_wrench import WrenchFrame, momentum_force
-from forcegp.forces.noise import GROWTH
+from forcegp.forces.posterior import GROWTH
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import JointFrictionPrior
 from forcegp.logs import parse_mapping

@@ -1,4 +1,4 @@
-"""Arithmetic on many small vectors and matrices whose batch is the last dimension.
+"""Arithmetic on many small vectors and matrices, with the batch as the last dimension.
 
 Public tensors have their batch first. Inside kinematics and dynamics it is last and flat, so that one
 element-wise operation runs along memory over all samples instead of one small matrix at a time: a vector
@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import torch
 from torch import Tensor
 
-from forcegp.errors import NumericalError
+from forcegp.errors import MassMatrixError
 
 _SMALL = 4096
 """Below so many elements the number of operations counts, above it the time each one takes."""
@@ -78,7 +78,7 @@ def sum_over(E: Tensor, x: Tensor) -> Tensor:
 
 
 def take(x: Tensor, joints: Sequence[int]) -> Tensor:
-    """The entries of some joints of `(…, nq, B)`; a view where they are evenly spaced."""
+    """The entries of some joints of `(…, nq, B)`; a view if they are evenly spaced."""
     first, last, count = joints[0], joints[-1], len(joints)
     step = (last - first) // (count - 1) if count > 1 else 1
     if step > 0 and list(joints) == list(range(first, last + 1, step)):
@@ -86,27 +86,17 @@ def take(x: Tensor, joints: Sequence[int]) -> Tensor:
     return x[..., list(joints), :]
 
 
-def mass_factor(M: Tensor) -> Tensor:
-    """Lower Cholesky factor of mass matrices `(*batch, n, n)`.
-
-    Raises:
-        NumericalError: one is not positive definite, as of a robot with negative masses.
-    """
-    try:
-        return torch.linalg.cholesky(M)
-    except torch.linalg.LinAlgError as cause:  # pyright: ignore[reportPrivateImportUsage]
-        text, hint = "a mass matrix is not positive definite", "check the robot's masses and inertias"
-        raise NumericalError(text, got=str(cause)[:200], hint=hint) from cause
-
-
 def solve_spd(M: Tensor, rhs: Tensor) -> Tensor:
     """M⁻¹ rhs for symmetric positive definite `(n, n, B)` and `(n, k, B)`.
 
-    Large batches are eliminated without pivoting (stable for such M), every step over all samples at once.
+    Large batches use elimination without pivoting (stable for such M), vectorized over the samples.
     """
     n, B = M.shape[0], M.shape[-1]
     if M.numel() < _SMALL:
-        factor = mass_factor(M.movedim(-1, 0))
+        try:
+            factor = torch.linalg.cholesky(M.movedim(-1, 0))
+        except torch.linalg.LinAlgError as cause:  # pyright: ignore[reportPrivateImportUsage]
+            raise MassMatrixError(cause) from cause
         return torch.cholesky_solve(rhs.movedim(-1, 0), factor).movedim(0, -1)
     rest, rows = torch.cat([M, rhs], dim=1), []
     for _ in range(n):

@@ -103,7 +103,7 @@ def _inverse_derivatives(
 def inverse_dynamics_derivatives(
     robot: RobotModel, q: JointVector, qd: JointVector, qdd: JointVector
 ) -> InverseDynamicsDerivatives:
-    """Jacobians of `inverse_dynamics` by q, q̇ and q̈ at states `(*batch, nq)`.
+    """Jacobians of `inverse_dynamics` with respect to q, q̇ and q̈ at states `(*batch, nq)`.
 
     Raises:
         ShapeError: an argument does not fit the robot.
@@ -119,7 +119,8 @@ def inverse_dynamics_derivatives(
 def forward_dynamics_derivatives(
     robot: RobotModel, q: JointVector, qd: JointVector, force: JointVector
 ) -> ForwardDynamicsDerivatives:
-    """Jacobians of `forward_dynamics` by q, q̇ and force: −M⁻¹ ∂ID/∂q, −M⁻¹ ∂ID/∂q̇ and M⁻¹, at its q̈.
+    """Jacobians of `forward_dynamics` with respect to q, q̇ and force: −M⁻¹ ∂ID/∂q, −M⁻¹ ∂ID/∂q̇ and M⁻¹, at
+    its q̈.
 
     Raises:
         ShapeError: an argument does not fit the robot.

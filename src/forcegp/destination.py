@@ -1,4 +1,4 @@
-"""Whether a result can be written, asked before the work starts; and a second place if writing fails."""
+"""Checks, before the work starts, that a result can be written; and a fallback path if writing fails."""
 
 from __future__ import annotations
 
@@ -20,11 +20,12 @@ PROBE_BYTES = 1 << 16
 def check_destination(path: str | Path, *, folder: bool = False, own_files: Iterable[str] = ()) -> None:
     """Check, before long work, that a file or folder can be written, without leaving anything behind.
 
-    A folder may replace an empty one or one of nothing but `own_files` (patterns; with none, any folder).
+    A folder may replace an empty folder or one that contains only `own_files` (patterns; any folder without
+    patterns).
 
     Raises:
-        DestinationError: a file is to replace a folder or the reverse, the folder holds other files, or the
-            place cannot be written or is full.
+        DestinationError: a file would replace a folder or the reverse, the folder contains other files, or
+            the path cannot be written or the disk is full.
     """
     target = Path(path)
     with writable(target):
@@ -39,7 +40,7 @@ def check_destination(path: str | Path, *, folder: bool = False, own_files: Iter
 
 
 def write_or_keep(write: Callable[[Path], object], path: str | Path) -> None:
-    """Write a result by `write(path)`, or else to another place, which the `DestinationError` names."""
+    """Write a result by `write(path)`, or else to another path named in the `DestinationError`."""
     target = Path(path)
     try:
         write(target)

@@ -72,7 +72,7 @@ def momentum(links: LinkInertia, w: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
 def link_force(
     links: LinkInertia, motion: LinkMotion, alpha: Tensor, acceleration: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Torque and force I a + V ×* I V, `(3, nq, B)`, that links moving at V with acceleration a need."""
+    """Torque and force I a + V ×* I V, `(3, nq, B)`, of links with velocity V and acceleration a."""
     n, l = momentum(links, motion.omega, motion.velocity)
     torque, force = momentum(links, alpha, acceleration)
     torque = torque + cross(motion.omega, n) + cross(motion.velocity, l)
@@ -93,7 +93,7 @@ def _bias_force(robot: RobotModel, poses: LinkPoses, links: LinkInertia, motion:
 def known_terms(
     robot: RobotModel, poses: LinkPoses, motion: LinkMotion, qd: JointVector
 ) -> tuple[JointMatrix, JointVector, JointVector, JointVector]:
-    """M, Q_C, Q_G and Q_D, all forces of the robot file, from links with known motion."""
+    """M, Q_C, Q_G and Q_D, all forces of the robot file, from the motion of the links."""
     links, Q_D = link_inertia(robot, poses), damping_force(robot, qd)
     M, Q_C = mass_matrix_of(robot, poses, links), _bias_force(robot, poses, links, motion)
     Q_G = _gravity_force(robot, poses, links)
@@ -103,7 +103,9 @@ def known_terms(
 def accelerations(
     robot: RobotModel, poses: LinkPoses, motion: LinkMotion, qdd: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Spatial accelerations `(3, nq, B)` of the links at q̈ `(nq, B)`; gravity enters as one of the base."""
+    """Spatial accelerations `(3, nq, B)` of the links at q̈ `(nq, B)`; gravity enters as an acceleration of
+    the base.
+    """
     E = robot.ancestors
     linear = motion.acceleration + sum_over(E, poses.linear * qdd) - robot.gravity[:, None, None]
     return motion.alpha + sum_over(E, poses.angular * qdd), linear
@@ -174,7 +176,7 @@ def damping_force(robot: RobotModel, qd: JointVector, slip: JointVector | None =
 
 
 def inverse_dynamics(robot: RobotModel, q: JointVector, qd: JointVector, qdd: JointVector) -> JointVector:
-    """Force Q_D + Q_u that the motion needs, M q̈ − Q_C − Q_G (Newton-Euler), `(*batch, nq)` [N m, N].
+    """Force Q_D + Q_u required by a motion, M q̈ − Q_C − Q_G (Newton-Euler), `(*batch, nq)` [N m, N].
 
     Example:
         >>> import torch, forcegp

@@ -1,4 +1,4 @@
-"""Typed errors: what was expected, what was got, and what to change."""
+"""Typed errors: the expected value, the given value, and a remedy."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ class ForceGPError(Exception):
     """Base of every error that a user of the library can cause.
 
     Args:
-        message: one sentence on the fault and its place (file, joint, row).
+        message: one sentence with the fault and its location (file, joint, row).
         expected: the valid value.
         got: the value found.
         hint: what to change.
@@ -39,7 +39,7 @@ class ForceGPError(Exception):
 
     @classmethod
     def at(cls: type[E], place: str, cause: ForceGPError) -> E:
-        """An error of this class that adds to another one where it arose (a file, a line)."""
+        """An error of this class that adds the location (a file, a line) to another error."""
         message = f"{place}: {cause.message}"
         error = cls.__new__(cls)
         ForceGPError.__init__(error, message, expected=cause.expected, got=cause.got, hint=cause.hint)
@@ -48,7 +48,7 @@ class ForceGPError(Exception):
     @classmethod
     @contextmanager
     def within(cls, place: str) -> Iterator[None]:
-        """Errors of the library in the block as errors of this class that name a place (a file, a line)."""
+        """Re-raise errors of the library in the block as errors of this class that name a file or a line."""
         try:
             yield
         except ForceGPError as cause:
@@ -74,7 +74,7 @@ def _rebuilt(kind: type[E], args: tuple[object, ...], state: dict[str, object]) 
 
 
 def near_names(name: object, valid: Iterable[str], cutoff: float = 0.6) -> list[str]:
-    """The valid name nearest to a misspelt one, or none; long names and long lists are not compared."""
+    """The valid name nearest to a misspelt one, if any; long names and long lists are not compared."""
     text = str(name)
     if len(text) > NAME_COMPARED:
         return []
@@ -93,7 +93,7 @@ class RobotFileError(ForceGPError, ValueError):
 
 
 class UnsupportedRobotError(RobotFileError):
-    """A robot file that is valid but uses what this library does not model (the message names the joint)."""
+    """A valid robot file with unsupported elements (the message names the joint)."""
 
 
 class InertiaError(RobotFileError):
@@ -101,7 +101,7 @@ class InertiaError(RobotFileError):
 
 
 class RobotFileWarning(UserWarning):
-    """A robot file that is usable but doubtful; the same sentence is kept in `RobotModel.remarks`."""
+    """A robot file that is usable but doubtful; the message is also in `RobotModel.remarks`."""
 
 
 class UnknownNameError(ForceGPError, LookupError):
@@ -133,7 +133,7 @@ def _shortened(text: str, length: int) -> str:
 
 
 class ShapeError(ForceGPError, ValueError):
-    """A tensor whose shape, dtype or device does not fit."""
+    """A tensor with a wrong shape, dtype or device."""
 
 
 class DataError(ForceGPError, ValueError):
@@ -153,19 +153,27 @@ class ModelError(ForceGPError, ValueError):
 
 
 class NumericalError(ForceGPError, ArithmeticError):
-    """A computation that has no trustworthy result (a matrix not positive definite, a diverging run)."""
+    """A computation without a trustworthy result (an indefinite matrix, a diverging run)."""
+
+
+class MassMatrixError(NumericalError):
+    """A mass matrix that is not positive definite, as of a robot with negative masses."""
+
+    def __init__(self, cause: Exception) -> None:
+        text, hint = "a mass matrix is not positive definite", "check the robot's masses and inertias"
+        super().__init__(text, got=str(cause)[:200], hint=hint)
 
 
 class MissingDependencyError(ForceGPError, ImportError):
-    """An optional package that the request needs and that is not installed."""
+    """A required optional package that is not installed."""
 
 
 class DestinationError(ForceGPError, OSError):
-    """A place where results are to be written and cannot be; names where they were kept, if they exist."""
+    """A path that cannot be written; the message names where the results were kept, if they exist."""
 
 
 class MemoryLimitError(ForceGPError, RuntimeError):
-    """Work that needs more memory than is free, refused before it starts."""
+    """Work that needs more memory than is free; it was not started."""
 
 
 def optional_module(name: str, purpose: str, extra: str | None = None) -> Any:
@@ -173,7 +181,7 @@ def optional_module(name: str, purpose: str, extra: str | None = None) -> Any:
 
     Args:
         name: the module to import.
-        purpose: what needs it, the subject of the message, such as `"Reading MJCF files"`.
+        purpose: the subject of the message, such as `"Reading MJCF files"`.
         extra: the extra of this library that installs it; default its own name.
 
     Returns:

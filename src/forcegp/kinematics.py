@@ -1,15 +1,15 @@
 """Poses, Jacobians and bias accelerations of a tree of joints, batched over states.
 
-Spatial vectors are `[angular, linear]`, in world axes, about the origin of the base. With the joint screws
-s_j so expressed and the ancestor matrix E, the twist of link i is V_i = Σ_j E_ij s_j q̇_j, so only the poses
-need a recursion, over the depth of the tree.
+Spatial vectors are `[angular, linear]`, in world axes, about the origin of the base. With joint screws s_j in
+this form and the ancestor matrix E, the twist of link i is V_i = Σ_j E_ij s_j q̇_j, so only the poses need a
+recursion, over the depth of the tree.
 """
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
@@ -69,7 +69,7 @@ class LinkMotion:
 
 
 class PointMotion(NamedTuple):
-    """The motion of a point fixed in a frame of the robot, world axes; tensors, or arrays of one state.
+    """The motion of a point fixed in a frame of the robot, world axes.
 
     Attributes:
         rotation: `(*batch, 3, 3)` axes of the frame.
@@ -79,15 +79,15 @@ class PointMotion(NamedTuple):
         bias: J̇ q̇ `(*batch, 6)`, the acceleration [ω̇; p̈] at q̈ = 0.
     """
 
-    rotation: Any
-    position: Any
-    twist: Any
-    jacobian: Any
-    bias: Any
+    rotation: Tensor
+    position: Tensor
+    twist: Tensor
+    jacobian: Tensor
+    bias: Tensor
 
     @classmethod
     def of(cls, blocks: Sequence[Tensor], qd: Tensor) -> PointMotion:
-        """From rotation, position, J and J̇ q̇, as compiled kernels give them, and q̇."""
+        """From rotation, position, J and J̇ q̇ of a compiled kernel, and q̇."""
         rotation, position, J, bias = blocks
         return cls(rotation, position, vecdot(J, qd[..., None, :]), J, bias)
 
@@ -264,7 +264,7 @@ def point_motion(
 
 
 def jacobian_of_poses(robot: RobotModel, poses: LinkPoses, index: int, point: Tensor) -> FrameJacobian:
-    """`frame_jacobian` from poses already known."""
+    """`frame_jacobian` from known poses."""
     rotation, origin = _frame_in_base(robot, poses, index)
     x = origin + batchlast.apply(rotation, point[:, None])
     return batch_first(_jacobian(robot, poses, index, x), poses.batch)

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 Array = Any
-"""Tensors of any batch or NumPy arrays of one state, in formulas that serve both (shapes in docstrings)."""
+"""NumPy arrays (shapes in docstrings)."""
 Scalars = Float[Tensor, "*batch"]
 Vector3 = Float[Tensor, "*batch 3"]
 Rotation = Float[Tensor, "*batch 3 3"]

@@ -17,7 +17,7 @@ from forcegp import evaluate
 from forcegp.errors import DataError
 from forcegp.forces.priors.sets import default_priors
 from forcegp.gp.optimise import LearningOptions
-from forcegp.models.base import Prediction, Predictor
+from forcegp.models.prediction import Prediction, Predictor
 from random_data import NOISE_STD, random_data, table_system
 
 ROUNDING = 1e-12

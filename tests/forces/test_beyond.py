@@ -12,7 +12,7 @@ from torch import Tensor
 import forcegp
 from forcegp import dynamics, kinematics
 from forcegp.cli.common import warn_beyond
-from forcegp.forces.noise import GROWTH, RELATIVE, STICKING, distance_beyond, trained_region
+from forcegp.forces.posterior import GROWTH, RELATIVE, STICKING, distance_beyond, trained_region
 from forcegp.models.structured_fit import StructuredFit
 
 LEG = """<robot name="leg">
@@ -49,6 +49,12 @@ def test_distance_from_the_trained_region() -> None:
     expected = torch.tensor([[0.0, 0.0], [math.hypot(speed, load), 0.0], [0.0, 0.2 / STICKING]]).double()
     torch.testing.assert_close(found, expected, rtol=2e-3, atol=0.0)
     assert not distance_beyond({}, at, torque).any()
+    # Without any effect of the first torque on accelerations: 10 ± 2/√3 instead of 10 ± 1.96.
+    hidden = trained_region(qd, tau, torch.tensor([20.0, 1.0]).double(), torch.tensor([True, False]))
+    assert float(distance_beyond(hidden, at[:1], torque[:1] + 4.0)[0, 0]) == pytest.approx(
+        5.0 * math.sqrt(3.0) / 2.0 - 1.0, rel=1e-3
+    )
+    torch.testing.assert_close(distance_beyond(hidden, at[2:], torque[2:])[:, 1], expected[2:, 1])
 
 
 def swing(robot: forcegp.RobotModel, n: int, speed: float, drag: float, seed: int) -> forcegp.Dataset:

@@ -112,6 +112,19 @@ def test_the_wrench_turns_with_its_axes() -> None:
     assert bool((forces.std <= world.std[:, :3] + 1e-9).all())
 
 
+def test_a_torque_that_clips_is_not_trusted() -> None:
+    """With the third torque wrong by 40 N m and said to be unknown, the other five still find the force."""
+    data, truth = pushed()
+    off = torch.tensor([0.0, 0.0, 40.0, 0.0, 0.0, 0.0], dtype=torch.float64)
+    wrong = data.replace(tau=data.tau + off)
+    stated = wrong.replace(extras={**data.extras, "tau_std": off.expand_as(data.tau)})
+    error, doubted = (fitted().external_wrench(log, TOOL).mean - truth for log in (wrong, stated))
+    assert float(doubted[:, :3].norm(dim=-1).mean()) < 0.25 * float(error[:, :3].norm(dim=-1).mean())
+    found = fitted().external_wrench(stated, TOOL)
+    assert found.std is not None
+    assert float(((found.mean - truth).abs() <= 2.0 * found.std).double().mean()) > 0.9
+
+
 def test_contacts_are_detected_without_false_alarms() -> None:
     data, truth = pushed()
     found = fitted().external_wrench(data, TOOL).detect()

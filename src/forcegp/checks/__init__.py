@@ -11,12 +11,13 @@ import torch
 
 from forcegp.checks import contact, excitation, kinematics, limits, mechanics, placement, values
 from forcegp.checks.finding import KINDS, SEVERITIES, Finding, NotJudgedError, Report
+from forcegp.checks.limits import clipped_torques
 from forcegp.checks.log import Log, Outcome, log_of, of_robot, read_log
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data.dataset import Dataset
 from forcegp.resources import announce_memory
 
-__all__ = ["KINDS", "Finding", "Log", "Report", "check", "log_of", "read_log"]
+__all__ = ["KINDS", "Finding", "Log", "Report", "check", "clipped_torques", "log_of", "read_log"]
 
 NUMBERS = 24
 """Upper bound on the numbers of one joint in one row that are held at a time; twenty were measured."""
@@ -29,7 +30,7 @@ Progress = Callable[[int, int], None]
 
 
 def check_robot(system: ConstrainedSystem, log: Log) -> Outcome:
-    """The robot that the header names against that of the scene."""
+    """Compare the robot named in the header with that of the scene."""
     logged = log.header.robot_fingerprint
     if logged is None or logged == system.robot.fingerprint:
         return [], log
@@ -87,16 +88,16 @@ VOIDS = {"dynamics": _MOTION, "contact force": _MOTION | _ROBOT, "excitation": _
 def check(system: ConstrainedSystem, data: Dataset | Log, *, progress: Progress | None = None) -> Report:
     """Check a log against a scene before a model is fitted to it.
 
-    Each check is silent on a log that is in order. A fault that is found is undone for the checks after it,
-    so that one fault is reported once; the log itself is not changed.
+    Checks return no findings for a valid log. A fault is corrected before the next check, so that it is
+    reported once; the log itself is not changed.
 
     Args:
         system: robot and contacts.
         data: the log; `forcegp.checks.read_log` reads one that `Dataset` refuses.
-        progress: called with the number of checks done and their number.
+        progress: called with the number of completed checks and their total number.
 
     Returns:
-        The findings, the gravest first; `report.usable` is true if a model can be fitted.
+        The findings, the most severe first; `report.usable` is true if a model can be fitted.
 
     Raises:
         DataError: a joint of the robot is not in the log, or the log is empty.
@@ -135,5 +136,6 @@ def check(system: ConstrainedSystem, data: Dataset | Log, *, progress: Progress 
             skipped |= {other: "no row is usable" for other, _ in CHECKS[done + 1 :]}
             break
     order = list(KINDS)
-    findings.sort(key=lambda finding: (SEVERITIES.index(finding.severity), order.index(finding.kind)))
+    # What concerns most of the log comes before what concerns a few rows of it.
+    findings.sort(key=lambda f: (SEVERITIES.index(f.severity), 2 * f.rows < samples, order.index(f.kind)))
     return Report(tuple(findings), samples, system.robot.joint_names, skipped)

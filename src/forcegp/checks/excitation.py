@@ -1,8 +1,9 @@
 """Information in the motion: joints that move, changes of direction, parameters that are identified, and
-how large a fault must be to be seen in this log.
+the size of the faults that this log can reveal.
 
 A fault of size θ adds θ φ to the unexplained torque r, and the held-out residual is linear in it,
-e(r + θ φ) = e(r) + θ e(φ). The fault is seen where `explain.significant` accepts the rise of its size.
+e(r + θ φ) = e(r) + θ e(φ). The fault is detected if `explain.significant` accepts the increase of the
+residual.
 """
 
 from __future__ import annotations
@@ -15,7 +16,7 @@ import torch
 
 from forcegp.checks.explain import Explanation, significant
 from forcegp.checks.finding import Finding
-from forcegp.checks.fit import BLOCKS, blocks_of, held_out, residual, tensors
+from forcegp.checks.fit import BLOCKS, blocks_of, held_out, residual, tensors, unmeasured
 from forcegp.checks.hypotheses import encoder_hypothesis, inertial_spread, robot_columns
 from forcegp.checks.log import Array, Log, Outcome, position_unit
 from forcegp.constraints import ConstrainedSystem
@@ -23,20 +24,18 @@ from forcegp.identification import base_parameters, parameter_vector, regressor
 
 STILL = 0.05
 """Range of motion below which a joint does not move [rad, m]."""
-REVERSALS = 4
-"""Changes of direction that separate Coulomb friction from an offset of the torque."""
-HYSTERESIS = 0.05
-"""Share of its largest speed that a joint must reach for a change of direction to count."""
+REVERSALS, HYSTERESIS = 4, 0.05
+"""Changes of direction that separate Coulomb friction from an offset of the torque; share of its largest
+speed that a joint must reach for one to count."""
 SHORT_SECONDS, ROWS = 2.0, 1000
 """Length of a log below which little is learned [s]; rows of which the regressor is made."""
-LOOK = 0.1
-"""Time after which the torque contains new information [s]."""
-LEARNED = 0.5
-"""Standard deviation after the log, as a share of that before it, below which a parameter is identified."""
+LOOK, LEARNED = 0.1, 0.5
+"""Time after which the torque contains new information [s]; standard deviation after the log, as a share of
+that before it, below which a parameter is identified."""
 
 
 def check_length(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Logs too short for anything."""
+    """Check that the log is long enough."""
     seconds = len(log.rows(len(log))) * log.dt if np.isfinite(log.dt) else 0.0
     if not log.header.ordered or seconds >= SHORT_SECONDS:
         return [], log
@@ -45,12 +44,12 @@ def check_length(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def still_joints(log: Log) -> np.ndarray:
-    """`(nq,)` bool, joints that stay within a hair of one position."""
+    """`(nq,)` bool, joints that do not move."""
     return log.reach("q") < STILL if log.usable.any() else np.zeros(log.nq, bool)
 
 
 def check_motion(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Joints that do not move, or hardly ever change direction."""
+    """Find joints that do not move or rarely change direction."""
     still = still_joints(log)
     unit = " or ".join(dict.fromkeys(position_unit(system.robot, j) for j in np.flatnonzero(still)))
     text = f"range of {{}} below {STILL} {unit}: friction and inertia are not seen"
@@ -66,7 +65,7 @@ def check_motion(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_excitation(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Base parameters that the torque would not sharpen, and the motion that is missing for them."""
+    """Find base parameters that the log does not determine, and the motion that would."""
     rows = log.rows(ROWS)
     if len(rows) < 50 or still_joints(log).all():
         return [], log
@@ -130,7 +129,7 @@ is hidden, and its size in words; what concerns the whole arm comes first."""
 
 @dataclass(frozen=True)
 class Fault:
-    """A fault of unit size: its kind, its joint, if it has one, and the torque `(n, nq)` that it adds."""
+    """A fault of unit size: its kind, its joint if any, and the torque `(n, nq)` that it adds."""
 
     kind: str
     joint: str
@@ -139,7 +138,7 @@ class Fault:
 
 
 def check_visibility(system: ConstrainedSystem, explanation: Explanation) -> list[Finding]:
-    """A note on the faults that would stay unseen in this log."""
+    """Note the faults that this log would hide."""
     faults = list(_faults(system, explanation.log, explanation.rows))
     sizes = [visible_size(explanation, fault) for fault in faults]
     hidden = [(f, size) for f, size in zip(faults, sizes, strict=True) if size > HIDDEN[f.kind][0]]
@@ -166,6 +165,7 @@ def check_visibility(system: ConstrainedSystem, explanation: Explanation) -> lis
 def _at_contact(explanation: Explanation, fault: Fault, size: float) -> str:
     """The force at the tip that a fault of the whole arm passes for, root mean square."""
     J = explanation.problem.J
+    J = J[:, : J.shape[1] - len(unmeasured(explanation.log))]
     touching = (J != 0.0).any(axis=(1, 2))
     if fault.joint or size >= MOST.get(fault.kind, LARGEST) or touching.sum() < LEAST_TOUCHING:
         return ""

@@ -1,7 +1,7 @@
-"""Which fault explains the torque best: greedy choice by cross-validation, one-standard-error rule.
+"""Greedy search for the faults that explain the torque, by cross-validation and the one-standard-error rule.
 
-The simplest hypothesis within one standard error of the best is taken (Breiman, Friedman, Olshen, Stone,
-*Classification and Regression Trees*, 1984, sec. 3.4.3), the log corrected, and a further one looked for.
+The simplest hypothesis within one standard error of the best is accepted (Breiman, Friedman, Olshen, Stone,
+*Classification and Regression Trees*, 1984, sec. 3.4.3), the log is corrected, and the search repeated.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from functools import cached_property, partial
 import numpy as np
 
 from forcegp.checks import hypotheses
-from forcegp.checks.finding import Finding
+from forcegp.checks.finding import TESTS, Finding
 from forcegp.checks.fit import TorqueFit, TorqueProblem, cross_validate, gain_of, pooled_gain_of, score_of
 from forcegp.checks.hypotheses import Hypothesis, corrected
 from forcegp.checks.log import Array, Log
@@ -26,10 +26,8 @@ ROUNDS = 5
 """Faults that are looked for at most."""
 SIGNIFICANT = 4.0
 """Standard errors by which the held-out score must drop; there are about a hundred hypotheses."""
-SHARE = 0.03
-"""Share of the best drop that a simpler hypothesis may leave to a second round."""
-SAME = 1e-3
-"""Relative difference of errors that are equal."""
+SHARE, SAME = 0.03, 1e-3
+"""Share of the best drop that a simpler hypothesis may leave to a second round; equal errors."""
 DETERMINED = 3.0
 """A gain counts as known if it exceeds this many standard errors."""
 MATERIAL, MATERIAL_EACH = 0.15, 0.05
@@ -40,10 +38,10 @@ Tried = tuple[Hypothesis, TorqueFit]
 
 @dataclass(frozen=True)
 class Explanation:
-    """What explains the torque: faults of the log, which are undone in `log`, and of the robot file.
+    """Faults that explain the torque: of the log, corrected in `log`, and of the robot file.
 
     `problem` has the torques that remain over `rows`; `columns`, `prior` and the names `robot` are those of
-    the accepted hypotheses on the robot, which stay in the model; `repairs` take the faults out of a log, in
+    the accepted hypotheses on the robot, which stay in the model; `repairs` correct the faults of a log, in
     order.
     """
 
@@ -60,16 +58,16 @@ class Explanation:
 
     @cached_property
     def fit(self) -> TorqueFit:
-        """The model that remains."""
+        """The remaining model."""
         return cross_validate(self.problem, self.columns, self.prior)
 
     def on(self, log: Log, rows: np.ndarray | None = None) -> TorqueProblem:
-        """The problem on a log that a hypothesis has changed, with the present weights of the joints."""
+        """The problem on a log changed by a hypothesis, with the current weights of the joints."""
         rows = self.rows if rows is None else rows
         return hypotheses.problem_of(self.system, log, rows, self.problem.scale)
 
     def weighed(self) -> Explanation:
-        """The same with joints weighed by the noise that it leaves."""
+        """The same with joints weighted by their residual noise."""
         result = self
         for _ in range(2):
             # The typical block counts: a disturbance must not make a joint look noisy.
@@ -79,7 +77,7 @@ class Explanation:
         return result
 
     def with_(self, hypothesis: Hypothesis) -> TorqueFit:
-        """Fit of a hypothesis with parameters, beside those that the model holds already."""
+        """Fit a hypothesis with parameters, in addition to those already in the model."""
         assert hypothesis.columns is not None and hypothesis.prior is not None
         columns = np.concatenate([hypothesis.columns, self.columns], axis=-1)
         gains = hypothesis.joints if hypothesis.name == "gains" else ()
@@ -88,7 +86,7 @@ class Explanation:
 
 
 def explain(system: ConstrainedSystem, log: Log) -> Explanation:
-    """Find the faults that explain the torque that the robot file leaves."""
+    """Find the faults that explain the residual torque of the robot file."""
     rows = log.rows(ROWS, margin=max(hypotheses.LAGS))
     problem = hypotheses.problem_of(system, log, rows)
     model = Explanation(system, log, rows, problem, np.zeros((*problem.r.shape, 0)), np.zeros(0)).weighed()
@@ -172,7 +170,8 @@ def _fits(model: Explanation) -> Iterator[Tried]:
     else:
         few = model.rows[::SCREENING]
         null = cross_validate(model.on(log, few)).score.mean()
-        for hypothesis in hypotheses.discrete(log):
+        late = hypotheses.joint_delays(log, rows, model.problem)
+        for hypothesis in (*hypotheses.discrete(log), *late):
             changed = hypothesis.change(log)
             if cross_validate(model.on(changed, few)).score.mean() < null:
                 yield hypothesis, cross_validate(model.on(changed))
@@ -204,7 +203,7 @@ def _currents(model: Explanation) -> Iterator[Tried]:
 
 
 def significant(better: Array, worse: Array, concerned: int) -> bool:
-    """Whether a drop of the score of shares `(blocks, nq)` matters for the joints and is not chance."""
+    """Whether a decrease of the score of shares `(blocks, nq)` is material and significant."""
     least = max(MATERIAL, MATERIAL_EACH * concerned)
     gains = gain_of(score_of(better), score_of(worse)), pooled_gain_of(better, worse)
     # A drop that only quiet blocks show is an artefact of them: the other mean must bear it out.
@@ -217,28 +216,12 @@ SMALL_MASS = 1e-6
 ALONE = 2.0
 """Standard errors by which an alternative must lower the held-out error on its own, which chance exceeds in 4
 % of cases: it is already known that something is wrong."""
-TESTS = {
-    "torque-gain": "hang a known weight from the tip: its torque gives the gain, whatever the masses",
-    "torque-current": "hang a known weight from the tip: its torque gives the gains, whatever the masses",
-    "torque-sign": "push a joint in its positive direction while the arm holds still: its torque must fall",
-    "torque-order": "twist one joint after another, without loading the others: only its torque must change",
-    "torque-delay": "apply a torque step to one joint: its acceleration must change in the same sample",
-    "torque-without-gravity": "hold the arm outstretched and still: the torque must balance gravity",
-    "joint-sign": "turn one joint after another by hand, and watch the sign of its position",
-    "joint-order": "turn one joint after another by hand, and watch which position changes",
-    "encoder-offset": "move the joint to its zero mark: its position must be zero there",
-    "base-tilted": "put a spirit level on the base",
-    "gravity-direction": "check how the base is mounted",
-    "payload-missing": "weigh what is mounted on the last link",
-    "masses-mismatch": "compare the masses with the manufacturer's data",
-}
-"""A test for each kind of fault, in order of preference."""
 
 
 def alternatives_of(
     system: ConstrainedSystem, chosen: Tried, tried: Iterable[Tried], null: TorqueFit
 ) -> Iterator[Tried]:
-    """The hypotheses that held-out blocks cannot tell from the chosen one to a standard error, best first."""
+    """The hypotheses within a standard error of the chosen one on held-out blocks, best first."""
     for hypothesis, fit in sorted(tried, key=lambda one: one[1].score.mean()):
         if _says_the_same(chosen[0], hypothesis):
             continue
@@ -265,7 +248,7 @@ def _possible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit)
 
 
 def with_alternatives(finding: Finding, others: Iterable[Finding]) -> Finding:
-    """The finding with its alternatives, if there are any, and a test that tells them apart."""
+    """The finding with its alternatives, if any, and a test that distinguishes them."""
     alternatives: list[Finding] = []
     for other in others:
         alike = (f for f in (finding, *alternatives) if f.kind == other.kind)

@@ -1,8 +1,8 @@
 """Fit of a hypothesis to the torque: least squares on all blocks of a log but one.
 
-What is to be explained is the torque that the robot file leaves, without what a labelled contact may
-contribute: r = M q̈ − Q_C − Q_G − Q_D − Q_u is Aᵀλ + Q_z = Jᵀ F where a point touches, and zero elsewhere.
-Projecting r on the null space of J takes any contact force out, normal and tangential, known or not.
+The residual torque of the robot file is explained, without possible contributions of a labelled contact: r =
+M q̈ − Q_C − Q_G − Q_D − Q_u is Aᵀλ + Q_z = Jᵀ F in contact, and zero elsewhere. Projecting r on the null
+space of J removes any contact force, normal and tangential.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ CHUNK = 8192
 
 
 def tensors(log: Log, rows: np.ndarray, *names: str) -> list[Tensor]:
-    """Columns at some rows, as tensors."""
+    """Selected rows of columns, as tensors."""
     return [torch.from_numpy(np.ascontiguousarray(getattr(log, name)[rows])) for name in names]
 
 
 def residual(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> tuple[Array, Array]:
-    """Unexplained torque r `(n, nq)` [N m, N], and J `(n, k, nq)` of the points, 0 where they are off."""
+    """Unexplained torque r `(n, nq)` [N m, N], and J `(n, k, nq)` of the points, 0 without contact."""
     robot, r, J = system.robot, [], []
     with torch.no_grad():
         for part in np.array_split(rows, max(1, -(-len(rows) // CHUNK))):
@@ -39,20 +39,29 @@ def residual(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> tuple[Arr
 
 
 def labelled_contacts(system: ConstrainedSystem, log: Log) -> list[Constraint]:
-    """The contacts whose state is logged."""
+    """The contacts with a logged state."""
     return [c for c in system.contacts if c.name in log.contact]
 
 
 def takes_friction_out(system: ConstrainedSystem, log: Log) -> bool:
-    """Whether enough torques are left once any force at the contacts is taken out, not the normal alone."""
+    """Whether enough torques remain after removing any force at the contacts, not only the normal force."""
     return 3 * len(labelled_contacts(system, log)) < log.nq
 
 
+def unmeasured(log: Log) -> list[int]:
+    """Joints whose torque the header says is not logged."""
+    return [j for j, name in enumerate(log.joint_names) if name in log.header.unmeasured_torques]
+
+
 def _contact_jacobian(system: ConstrainedSystem, log: Log, rows: np.ndarray, q: Tensor, qd: Tensor) -> Array:
-    """Rows of J of all contacts, those of the surface normal alone where all of J would leave no torque."""
+    """Rows of J of all contacts, those of the surface normal alone where all of J would leave no torque.
+
+    Torques that are not logged follow as rows of their own: they may be anything.
+    """
     contacts, whole = labelled_contacts(system, log), takes_friction_out(system, log)
+    free = np.broadcast_to(np.eye(log.nq)[unmeasured(log)], (len(rows), len(unmeasured(log)), log.nq))
     if not contacts or not len(rows):
-        return np.zeros((len(rows), 0, log.nq))
+        return free
     parts = []
     for c in contacts:
         if whole and isinstance(c, SurfaceContact):
@@ -60,11 +69,11 @@ def _contact_jacobian(system: ConstrainedSystem, log: Log, rows: np.ndarray, q: 
         else:
             J = ConstrainedSystem(system.robot, [c]).equations(q, qd).A.numpy()
         parts.append(J * log.contact[c.name][rows][:, None, None])
-    return np.concatenate(parts, axis=1)
+    return np.concatenate([*parts, free], axis=1)
 
 
 def projector(J: Array, scale: Array) -> Array:
-    """Projector `(n, nq, nq)` on torques r/scale that no force at the touching points can make."""
+    """Projector `(n, nq, nq)` on torques r/scale that no force at the touching points can produce."""
     J = J * (1.0 / scale)
     eye = np.broadcast_to(np.eye(J.shape[-1]), (len(J), *2 * (J.shape[-1],))).copy()
     touching = (J != 0.0).any(axis=(1, 2))
@@ -85,8 +94,8 @@ FLOOR = 0.03
 @dataclass(frozen=True)
 class TorqueProblem:
     """Unexplained torque r `(n, nq)` [N m, N], Jacobian J of the touching points `(n, k, nq)`, columns that
-    every hypothesis may use `(n, nq, p)`, size of the logged torque, and scale of its noise, which weighs the
-    joints.
+    every hypothesis may use `(n, nq, p)`, size of the logged torque, and scale of its noise, which weights
+    the joints.
     """
 
     r: Array
@@ -132,10 +141,10 @@ def cross_validate(
 ) -> TorqueFit:
     """Fit the nuisance and the columns of a hypothesis, and test them on held-out blocks.
 
-    Minimises |P(r − N η − Φ θ)/σ|² + |θ/s|², with P the projector that takes contact forces out. Φ are the
+    Minimises |P(r − N η − Φ θ)/σ|² + |θ/s|², with P the projector that removes contact forces. Φ are the
     columns `(n, nq, p)`, none by default; the prior s `(p,)` bounds the parameters; the first
     parameters scale the torque of the joints `gains`. Instruments Z replace least squares by
-    Zᵀ P (r − N η − Φ θ) = 0, for columns that hold errors (Wooldridge, *Introductory Econometrics*, ch. 15).
+    Zᵀ P (r − N η − Φ θ) = 0, for columns with errors (Wooldridge, *Introductory Econometrics*, ch. 15).
     """
     p = columns.shape[-1] if columns is not None else 0
     A, y, unit, weight = _equations(problem, columns, prior)
@@ -218,21 +227,21 @@ def _solve(gram: Array, side: Array, weight: Array, symmetric: bool = True) -> A
 
 
 def score_of(shares: Array) -> Array:
-    """`(blocks,)` Σ_j log error_j of errors `(blocks, nq)`, with a floor where they do not matter."""
+    """`(blocks,)` Σ_j log error_j of errors `(blocks, nq)`, with a floor for negligible errors."""
     return 0.5 * np.log(shares**2 + FLOOR**2).sum(axis=1)
 
 
 def gain_of(better: Array, worse: Array) -> tuple[float, float]:
-    """Mean drop of a score by block, and its standard error."""
+    """Mean decrease of a score by block, and its standard error."""
     drop = worse - better
     return float(drop.mean()), float(drop.std(ddof=1) / np.sqrt(len(drop)))
 
 
 def pooled_gain_of(better: Array, worse: Array) -> tuple[float, float]:
-    """Drop of Σ_j log of errors `(blocks, nq)` over all blocks, and its standard error by the jackknife.
+    """Decrease of Σ_j log of errors `(blocks, nq)` over all blocks, and its standard error by the jackknife.
 
-    Unlike the mean over blocks it does not scatter with what they show (Cochran, *Sampling Techniques*, ch.
-    6).
+    Unlike the mean over blocks, it does not depend on the excitation of single blocks (Cochran, *Sampling
+    Techniques*, ch. 6).
     """
 
     def drop(rows: Array) -> float:

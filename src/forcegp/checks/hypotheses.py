@@ -41,10 +41,10 @@ SLOW, GRAVITY = 0.01, 10.0
 class Hypothesis:
     """One explanation, named by a kind of finding, or a family of kinds.
 
-    `size` counts parameters, discrete choices as none; `change` makes the log as it would be, were the
-    hypothesis right, parameters aside. `columns` `(n, nq, p)` are the torque that parameters of size `prior`
-    `(p,)` add to r, `instruments` of the same shape replace least squares on columns that hold errors, and
-    `shift` is a delay of the torque in samples.
+    `size` counts parameters, discrete choices as none; `change` corrects the log under this hypothesis, apart
+    from parameters. `columns` `(n, nq, p)` are the torque that parameters of size `prior` `(p,)` add to r,
+    `instruments` of the same shape replace least squares for columns with errors, and `shift` is a delay
+    of the torque in samples.
     """
 
     name: str
@@ -60,7 +60,7 @@ class Hypothesis:
 def problem_of(
     system: ConstrainedSystem, log: Log, rows: np.ndarray, scale: Array | None = None
 ) -> TorqueProblem:
-    """The torques of some rows, to be explained by joint friction and an offset per joint."""
+    """The torque problem of some rows, with joint friction and an offset per joint."""
     nuisance = friction_columns(system, log, rows)
     size = np.sqrt((log.tau[rows] ** 2).mean(axis=0))
     size = np.maximum(size, 1e-3 * size.max())
@@ -75,14 +75,14 @@ def friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> A
 
 
 def other_rise_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
-    """Declared Coulomb friction with another smoothing velocity, less that at all of it `(n, nq, p)`."""
+    """Change of the declared Coulomb friction with the smoothing velocity `(n, nq, p)`."""
     x, declared = log.qd[rows] / system.robot.friction_velocity.numpy(), system.robot.friction.numpy() > 0.0
     columns = [_diagonal(np.tanh(k * x) - np.tanh(x))[..., np.flatnonzero(declared)] for k in RISES]
     return np.concatenate(columns, axis=-1)
 
 
 def contact_friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
-    """Viscous and dry friction of each contact of which only the normal force is taken out, `(n, nq, p)`."""
+    """Viscous and dry friction of each contact with only the normal force removed, `(n, nq, p)`."""
     contacts = [] if takes_friction_out(system, log) else labelled_contacts(system, log)
     touching = [c for c in contacts if isinstance(c, SurfaceContact)]
     empty = np.zeros((len(rows), log.nq, 0))
@@ -105,7 +105,7 @@ def _diagonal(x: Array) -> Array:
 
 
 def unchanged(log: Log) -> Log:
-    """The log itself."""
+    """The unchanged log."""
     return log
 
 
@@ -116,18 +116,20 @@ def changed(log: Log, names: tuple[str, ...], *, order: Sequence[int] = (), flip
     return log.replace(**{name: getattr(log, name)[:, index] * sign for name in names})
 
 
-def delayed(log: Log, shift: int) -> Log:
-    """The log with the torque of `shift` rows later, within each stretch; rows without one are masked."""
+def delayed(log: Log, shift: int, joints: tuple[int, ...] = ()) -> Log:
+    """The log with torques, all or some, of `shift` rows later in each stretch; rows without are masked."""
     tau, lost = log.tau.copy(), np.ones(len(log), bool)
+    columns = list(joints) or list(range(log.nq))
     for s in log.stretches:
         source = np.arange(s.start, s.stop) + shift
         inside = (source >= s.start) & (source < s.stop)
-        tau[s][inside], lost[s] = log.tau[source[inside]], ~inside
+        tau[np.ix_(source[inside] - shift, columns)] = log.tau[np.ix_(source[inside], columns)]
+        lost[s] = ~inside
     return log.replace(tau=tau).mask(lost)
 
 
 def discrete(log: Log) -> Iterator[Hypothesis]:
-    """Signs, orders and delays: explanations without a parameter to fit."""
+    """Signs, orders and delays: hypotheses without parameters."""
     every, motion = tuple(range(log.nq)), ("q", "qd", "qdd")
     if log.nq > 1:
         yield Hypothesis("torque-sign", 0, partial(changed, names=("tau",), flip=every), joints=every)
@@ -147,8 +149,21 @@ def delays(log: Log) -> Iterator[Hypothesis]:
         yield Hypothesis("torque-delay", 1, partial(delayed, shift=shift), shift=shift)
 
 
+def joint_delays(log: Log, rows: np.ndarray, problem: TorqueProblem) -> Iterator[Hypothesis]:
+    """The torque of one joint, logged before or after the motion: its best delay beside friction."""
+    shifts = [sign * lag for lag in (LAGS if log.stretches else ()) for sign in (1, -1)]
+    needed = problem.r + log.tau[rows]
+    for j in range(log.nq if log.nq > 1 and shifts else 0):
+        x = log.qd[rows, j]
+        Q = np.linalg.qr(np.column_stack([x, np.sign(x), np.ones(len(x))]))[0]
+        rest = needed[:, [j]] - np.column_stack([log.tau[rows + shift, j] for shift in shifts])
+        shift = shifts[int(((rest - Q @ (Q.T @ rest)) ** 2).sum(axis=0).argmin())]
+        change = partial(delayed, shift=shift, joints=(j,))
+        yield Hypothesis("torque-delay", 1, change, joints=(j,), shift=shift)
+
+
 def continuous(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterator[Hypothesis]:
-    """Gains, encoder offsets, gravity, tool and masses: explanations with parameters."""
+    """Gains, encoder offsets, gravity, tool and masses: hypotheses with parameters."""
     for j in range(log.nq):
         yield gain_hypothesis(log, rows, (j,))
         yield encoder_hypothesis(system, log, rows, j)
@@ -164,13 +179,15 @@ def gain_hypothesis(log: Log, rows: np.ndarray, joints: tuple[int, ...]) -> Hypo
 def current_hypothesis(
     log: Log, rows: np.ndarray, problem: TorqueProblem, joints: tuple[int, ...]
 ) -> Hypothesis:
-    """Gains with the torque that the motion needs as instrument: errors of the logged one would bias them."""
+    """Gains with the torque required by the motion as instrument, since errors of the logged torque bias
+    them.
+    """
     needed = _diagonal(problem.r + log.tau[rows])[..., list(joints)]
     return replace(gain_hypothesis(log, rows, joints), instruments=needed)
 
 
 def robot_hypotheses(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterator[Hypothesis]:
-    """Explanations by the robot file, which leave the log as it is."""
+    """Hypotheses on the robot file, which do not change the log."""
     for name in ROBOT:
         columns, prior = robot_columns(system, log, rows, name)
         yield Hypothesis(name, columns.shape[-1], unchanged, columns, prior)
@@ -181,7 +198,7 @@ ROBOT = ("gravity", "payload", "masses")
 
 
 def robot_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray, name: str) -> tuple[Array, Array]:
-    """Torque `(n, nq, p)` per unit of each parameter that may be off, and how far it may be `(p,)`."""
+    """Torque `(n, nq, p)` per unit of each uncertain parameter, and its tolerance `(p,)`."""
     robot = system.robot
     q, qd, qdd = tensors(log, rows, "q", "qd", "qdd")
     with torch.no_grad():
@@ -218,17 +235,13 @@ CURRENT = 1.6
 """Gains of all joints beyond this factor are no calibration error: another quantity was logged."""
 TILT = 30.0
 """Largest angle at which a base counts as tilted, not as mounted another way round [degrees]."""
-WEIGHTLESS = 0.3
-"""Share of gravity below which the torque holds none of it."""
-SIGNIFICANT = 3.0
-"""Standard errors from which a parameter of a tool counts."""
+WEIGHTLESS, SIGNIFICANT = 0.3, 3.0
+"""Share of gravity below which the torque has none; standard errors from which a tool's parameter counts."""
 SMALL_ANGLE, LARGEST_ANGLE = np.radians(0.5), 1.0
 """Encoder offsets below the first are within calibration, or an error of a centre of mass; one beyond the
 second is none that a slope of the torque determines [rad, m]."""
-SMALL_GAIN = 0.2
-"""Gains closer to 1 than this may as well be errors of the masses of a robot file."""
-EXPLAINED = 0.5
-"""Share of the torque that a gain may leave unexplained, as any useful model may."""
+SMALL_GAIN, EXPLAINED = 0.2, 0.5
+"""Gains closer to 1 may as well be errors of masses; share of the torque that a gain may not explain."""
 SMALL_TILT, EARTH = 1.0, 9.81
 """Tilts that are errors of the masses [degrees]; size of gravity where the scene has none [m/s²]."""
 SAME_GRAVITY = 0.2, 0.5
@@ -244,7 +257,7 @@ DISCRETE = {
 
 
 def plausible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit) -> bool:
-    """Whether the parameters agree with the hypothesis: a tool has a mass, an offset is not a trifle."""
+    """Whether the parameters are physically plausible, such as a positive tool mass."""
     if hypothesis.name == "encoder-offset":
         least = max(SMALL_ANGLE, SIGNIFICANT * fit.spread[0])
         return bool(least < abs(fit.theta[0]) <= LARGEST_ANGLE)
@@ -266,7 +279,7 @@ def plausible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit)
 
 
 def corrected(log: Log, hypothesis: Hypothesis, theta: Array) -> Log:
-    """The log without the fault; unchanged where the robot is at fault."""
+    """The log without the fault; unchanged if the robot is at fault."""
     joints = list(hypothesis.joints)
     if hypothesis.name == "gains":
         tau = log.tau.copy()
@@ -283,7 +296,7 @@ def corrected(log: Log, hypothesis: Hypothesis, theta: Array) -> Log:
 def finding_of(
     system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: TorqueFit, alike: tuple[int, ...] = ()
 ) -> Finding:
-    """The finding that a hypothesis stands for; `alike` are the joints of those that explain the same."""
+    """The finding of a hypothesis; `alike` are the joints of equivalent hypotheses."""
     name, theta, spread = hypothesis.name, fit.theta, fit.spread
     one_of = name == "joint-sign" and len(alike) > 1
     names = tuple(log.joint_names[j] for j in (alike if one_of else hypothesis.joints))
@@ -298,7 +311,9 @@ def finding_of(
     elif name == "torque-delay":
         rows, seconds = abs(hypothesis.shift), abs(hypothesis.shift) * log.dt
         word = "after" if hypothesis.shift > 0 else "before"
-        text = f"the torque is logged about {1e3 * seconds:.3g} ms ({rows} rows) {word} the motion"
+        which = f" of {listed}" if hypothesis.joints else ""
+        about = "about" if rows < LAGS[-1] else "at least"
+        text = f"the torque{which} is logged {about} {1e3 * seconds:.3g} ms ({rows} rows) {word} the motion"
         evidence = {"rows": hypothesis.shift, "seconds": seconds}
     elif name == "encoder-offset":
         added = displacement(system.robot, hypothesis.joints[0], float(theta[0]))

@@ -1,9 +1,9 @@
 """Is qd the derivative of q, and qdd that of qd? Units of time and angle, signs, order, and noise of columns.
 
-A rate is at fault where both bounds of its slope are: noise in either flattens one of the two regression
-lines of the change of x over short windows on the integral of its logged rate. Is the noise on the
-acceleration white, and as large as the header says? White noise shows alike in the departures of samples from
-the cubic through their neighbours at distances of one and of three samples; filtered noise does not.
+A rate is wrong if both bounds of its slope are: noise flattens one of the two regression lines of the change
+of x over short windows on the integral of its logged rate. Is the noise on the acceleration white, and as
+large as the header says? For white noise, the deviations from cubics through neighbours at distances of one
+and of three samples agree; for filtered noise they do not.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from forcegp.checks.finding import Finding
 from forcegp.checks.fit import cross_validate, tensors
 from forcegp.checks.hypotheses import problem_of
 from forcegp.checks.limits import DEGREE
-from forcegp.checks.log import Array, Log, Outcome
+from forcegp.checks.log import DEPARTURE, Array, Log, Outcome
 from forcegp.constraints import ConstrainedSystem
 from forcegp.robust import robust_std
 
@@ -28,10 +28,12 @@ TOLERANCE, INSTANT = 0.05, 0.15
 """A slope within this of 1 is right: filters cost a few percent, and accelerations change within a period."""
 RELATED = 0.7
 """Correlation below which a velocity does not belong to its position, encoder steps aside."""
-EXCHANGED = 0.9
-"""Correlation with another joint's rate from which columns are exchanged."""
-CLEARLY = 5.0
-"""Factor of unexplained variance by which that order must be better."""
+EXCHANGED, CLEARLY = 0.9, 5.0
+"""Correlation with another joint's rate from which columns are exchanged; factor of unexplained variance by
+which that order must be better."""
+LATE, PERSISTS = 0.1, 0.5
+"""Share of the motion that a filtered velocity misses, and correlation of what it misses in neighbouring
+windows: noise has none."""
 JUMPS = 0.05
 """Largest share of windows that impacts cross: the velocity jumps there, which no acceleration holds."""
 INERTIA_ROWS = 200
@@ -48,7 +50,7 @@ UNIT_TOLERANCE = 0.1
 @dataclass(frozen=True)
 class Match:
     """Changes and integrals of one level `(w, nq)` over windows, zero where an impact crosses one (`whole`:
-    as they are), bounds of the slopes between them `(nq,)`, and joints whose change stands out from noise.
+    as they are), bounds of the slopes between them `(nq,)`, and joints that change significantly.
     """
 
     change: Array
@@ -68,7 +70,7 @@ class Match:
 
 
 def match(log: Log, value: str, rate: str) -> Match | None:
-    """Compare changes of a column with integrals of its rate; `None` where there are too few windows."""
+    """Compare changes of a column with integrals of its rate; `None` if there are too few windows."""
     x, v = getattr(log, value), getattr(log, rate)
     width = max(2, round(WINDOW / log.dt)) if log.dt < WINDOW else 2
     changes, integrals = [], []
@@ -98,7 +100,7 @@ def match(log: Log, value: str, rate: str) -> Match | None:
 
 
 def check_clock_unit(system: ConstrainedSystem, log: Log) -> Outcome:
-    """One factor between changes and integrals of all joints and both levels: the clock is at fault."""
+    """Find a common factor between changes and integrals of all joints and both levels: a wrong clock."""
     if not log.stretches:
         return [], log
     if "qd" in log.derived:  # only the length of a step says anything
@@ -109,7 +111,7 @@ def check_clock_unit(system: ConstrainedSystem, log: Log) -> Outcome:
     if first is None or not first.moving.any():
         return [], log
     factor = float(np.median(first.low[first.moving]))
-    if log.derived:
+    if log.derived or "qdd" in log.header.derived:
         near = any(abs(factor / unit - 1.0) <= UNIT_TOLERANCE for unit in UNITS)
         return _clock_finding(log, factor) if near or _one_factor(first, factor) else ([], log)
     second = match(log, "qd", "qdd")
@@ -132,7 +134,10 @@ def _clock_finding(log: Log, factor: float) -> Outcome:
     else:
         kind, repaired = "time-scale", log.t * factor
         text = f"positions and velocities change {factor:.4g} times as far as the clock allows"
-    return [log.finding(kind, text, seconds_per_unit=factor, period=log.dt)], log.replace(t=repaired)
+    found = log.finding(kind, text, seconds_per_unit=factor, period=log.dt)
+    if "qdd" in log.derived | {*log.header.derived}:  # by the wrong clock
+        log = log.replace(qdd=log.qdd * (log.t[-1] - log.t[0]) / (repaired[-1] - repaired[0]))
+    return [found], log.replace(t=repaired)
 
 
 def _one_factor(level: Match, factor: float) -> bool:
@@ -145,7 +150,7 @@ def _one_factor(level: Match, factor: float) -> bool:
 
 
 def check_velocity(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Velocities that are not the derivative of the positions: unit, sign, order, or nothing alike."""
+    """Find velocities that are not the derivative of the positions: unit, sign, order, or other."""
     if "qd" in log.derived:
         return [], log
     level = match(log, "q", "qd")
@@ -153,7 +158,7 @@ def check_velocity(system: ConstrainedSystem, log: Log) -> Outcome:
         return [], log
     wrong = level.moving & (~level.right() | (np.abs(level.correlation) < RELATED)) & ~_coarse(log, level)
     if not wrong.any():
-        return [], log
+        return _late(log, level), log
     if "qd" in log.header.derived:
         return _mismatch("filter-wide", log, level, wrong, "qd", "q"), log
     permutation = _permutation(level)
@@ -167,6 +172,20 @@ def check_velocity(system: ConstrainedSystem, log: Log) -> Outcome:
         return findings, log.replace(qd=log.qd[:, permutation], qdd=qdd)
     findings, factor = _velocity_findings(log, level, wrong)
     return findings, log.replace(qd=log.qd * factor)
+
+
+def _late(log: Log, level: Match) -> list[Finding]:
+    """Velocities after a filter of their own: a delay L leaves Δq − ∫q̇ dt = L Δq̇, which persists."""
+    rates = match(log, "qd", "qdd")
+    if rates is None or "qd" in log.header.derived:
+        return []
+    misfit, step = level.change - level.integral, rates.whole[0]
+    square, change = (misfit**2).sum(axis=0), (level.change**2).sum(axis=0)
+    delay = (misfit * step).sum(axis=0) / np.maximum((step**2).sum(axis=0), 1e-300)
+    persists = (misfit[1:] * misfit[:-1]).sum(axis=0) > PERSISTS * square
+    late = level.moving & persists & (square > LATE**2 * change) & (delay > log.dt)
+    shown = ", ".join(f"{1e3 * x:.2g} ms" for x in delay[late])
+    return log.on_joints("velocity-delay", late, f"qd of {{}} is {shown} behind the rate of change of q")
 
 
 def _velocity_findings(log: Log, level: Match, wrong: np.ndarray) -> tuple[list[Finding], Array]:
@@ -250,7 +269,7 @@ def _held_torque(system: ConstrainedSystem, log: Log) -> Array:
 
 
 def check_acceleration(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Accelerations that are not the derivative of the velocities, beyond what their noise explains."""
+    """Find accelerations that differ from the derivative of the velocities by more than noise."""
     if log.derived:
         return [], log
     level = match(log, "qd", "qdd")
@@ -270,17 +289,16 @@ def check_acceleration(system: ConstrainedSystem, log: Log) -> Outcome:
     return findings, log.replace(qdd=qdd, derived=log.derived | {"qdd"})
 
 
-DEPARTURE, DEPARTURE_STRIDE = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0, 3
-"""The departure, zero on cubics; at this stride it shows noise below the corner of a filter."""
-NOISE_FACTOR = 2.0
-"""Ratio of noise found to noise stated that is reported."""
-FILTERED = 0.4
-"""Noise at the highest frequency, as a share of that at a third of it, that tells a filter."""
+DEPARTURE_STRIDE = 3
+"""At this stride the departure, zero on cubics, shows noise below the corner of a filter."""
+NOISE_FACTOR, FILTERED = 2.0, 0.4
+"""Ratio of noise found to noise stated that is reported; noise at the highest frequency, as a share of that
+at a third of it, of a filter."""
 NOISE_ROWS = 100
 
 
 def noise_levels(log: Log) -> tuple[Array, Array] | None:
-    """Standard deviation `(nq,)` of white noise as neighbours at distance 1 and at distance 3 show it."""
+    """Standard deviation `(nq,)` of white noise, estimated from neighbours at distances 1 and 3."""
     from scipy.ndimage import correlate1d
 
     levels = []
@@ -296,7 +314,7 @@ def noise_levels(log: Log) -> tuple[Array, Array] | None:
 
 
 def check_noise(system: ConstrainedSystem, log: Log) -> Outcome:
-    """The noise of the logged acceleration against that of the header."""
+    """Compare the noise of the logged acceleration with that of the header."""
     levels = noise_levels(log) if "qdd" not in log.derived else None
     if levels is None:
         return [], log

@@ -3,22 +3,23 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
 from forcegp.checks.finding import at_rows
 from forcegp.checks.fit import cross_validate
 from forcegp.checks.hypotheses import gain_hypothesis, problem_of
-from forcegp.checks.log import Array, Log, Outcome
+from forcegp.checks.log import Array, Log, Outcome, log_of
 from forcegp.constraints import ConstrainedSystem
+from forcegp.data import Dataset
 from forcegp.rows import Intervals, intervals
 
 DEGREE = np.pi / 180.0
 TURN = 2.0 * np.pi
 SLACK = 1e-3
 """Share of a limit by which it may be exceeded: rounding, and encoders that read a little beyond a stop."""
-CLIPPED_RUN = 3
-"""Rows in a row at the same extreme value that make a plateau."""
-OFTENER = 5.0
-"""Factor by which a clipped value occurs more often than its neighbours; at the peaks of a sine, 2.4."""
+CLIPPED_RUN, OFTENER = 3, 5.0
+"""Successive rows at an extreme value that make a plateau; factor by which a clipped value occurs more
+often than its neighbours; at the peaks of a sine, 2.4."""
 BAND = 0.03
 """Part of the range of a torque that noise of a clipped one stays within."""
 PLATEAUS, FLAT_ROWS, FLAT = 3, 10, 0.35
@@ -27,10 +28,8 @@ twice that of the values in their middle halves: 1 for white noise about a limit
 real drive, 0.05 to 0.3 at smooth peaks."""
 MOVES = 0.02
 """Part of its largest speed from which a joint moves; the torque of one that rests is constant."""
-OFTEN = 0.05
-"""Share of rows beyond the limits from which a wrong unit is considered."""
-UNIT_ROWS = 400
-"""Rows in which the torque separates degrees from joints that turn more than once."""
+OFTEN, UNIT_ROWS = 0.05, 400
+"""Share of rows beyond the limits from which a wrong unit is considered, and rows whose torque tells it."""
 
 
 def _limits(system: ConstrainedSystem) -> dict[str, tuple[Array, Array]]:
@@ -41,7 +40,7 @@ def _limits(system: ConstrainedSystem) -> dict[str, tuple[Array, Array]]:
 
 
 def check_degrees(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Angles that often leave the joint's range, stay within it in degrees, and then fit the torque."""
+    """Find angles in degrees: they leave the joint's range, and fit range and torque once converted."""
     low, high = _limits(system)["q"]
     turning = system.robot.revolute.cpu().numpy() > 0.0
     low, high = np.where(np.isfinite(low), low, -TURN), np.where(np.isfinite(high), high, TURN)
@@ -86,7 +85,7 @@ def _angles(log: Log, turning: np.ndarray) -> list[str]:
 
 
 def check_limits(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Positions, velocities and torques beyond the limits of the robot file."""
+    """Find positions, velocities and torques beyond the limits of the robot file."""
     kinds = {"q": "position-limit", "qd": "velocity-limit", "tau": "torque-limit"}
     findings = []
     for name, (low, high) in _limits(system).items():
@@ -101,19 +100,48 @@ def check_limits(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_saturation(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Torques that stay at their largest value for several rows: the amplifier clips."""
+    """Find torques that stay at their largest value for several rows: the amplifier clips."""
+    clipped = clipped_torques(log)
+    joints = log.named(clipped.any(axis=0))
+    text = f"the torque of {', '.join(joints)} stays at its largest value in"
+    return at_rows(np.asarray(clipped.any(axis=1)), "torque-saturated", text, joints), log
+
+
+def clipped_torques(data: Dataset | Log) -> NDArray[np.bool_]:
+    """Mask `(n, nq)` of torques that stay at the largest or smallest value of their joint.
+
+    Use the unfiltered log, since filters smooth the plateaus. Exclude these rows from training data,
+    or state their noise in `extras["tau_std"]` for an external wrench.
+
+    Args:
+        data: a log in order of time.
+
+    Example:
+        `train = log[torch.from_numpy(~clipped_torques(log).any(-1))]`
+    """
+    log = data if isinstance(data, Log) else log_of(data)
     clipped = np.zeros(log.tau.shape, bool)
     for j in range(log.nq):
         tau = log.tau[:, j]
         usable = tau[log.usable]
         if not len(usable) or np.ptp(usable) == 0.0:
             continue
-        for extreme in (usable.max(), usable.min()):
+        for extreme in limits_of(usable):
             for first, last in _plateaus(log, j, extreme):
                 clipped[first:last, j] = True
-    joints = log.named(clipped.any(axis=0))
-    text = f"the torque of {', '.join(joints)} stays at its largest value in"
-    return at_rows(np.asarray(clipped.any(axis=1)), "torque-saturated", text, joints), log
+    return clipped
+
+
+def limits_of(values: Array) -> tuple[float, float]:
+    """Value taken most often near the maximum, and near the minimum: a filter overshoots a limit."""
+    limits = []
+    for extreme in (values.max(), values.min()):
+        near, counts = np.unique(
+            values[np.abs(values - extreme) <= BAND * np.ptp(values)], return_counts=True
+        )
+        often = near[counts == counts.max()]
+        limits.append(float(often[np.abs(often - extreme).argmin()]))
+    return limits[0], limits[1]
 
 
 def _plateaus(log: Log, j: int, extreme: float) -> Intervals:

@@ -1,8 +1,8 @@
-"""A log as it was recorded, valid or not, and the filter that torques are explained after.
+"""A log as it was recorded, valid or not, and the filter of the torque checks.
 
 Noise ε on q̈ enters the explained torque as M ε, and a fit gains by shrinking the inertia, as any regression
 on noisy columns does. The same filter of a tenth of a second on positions, velocities, accelerations and
-torques takes that away, and leaves M q̈ = Q true up to changes of M and of the bias force within it.
+torques removes the noise and preserves M q̈ = Q, up to changes of M and of the bias force within its window.
 """
 
 from __future__ import annotations
@@ -18,11 +18,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forcegp.checks.finding import Finding
-from forcegp.data.checks import check_joints
 from forcegp.data.columns import parse
 from forcegp.data.dataset import Dataset
 from forcegp.data.derivative import SavitzkyGolay, differentiate
-from forcegp.data.fields import JOINT_VECTORS, DataHeader
+from forcegp.data.fields import JOINT_VECTORS, DataHeader, check_joints
 from forcegp.data.table import read_table
 from forcegp.errors import DataError
 from forcegp.robot.model import RobotModel
@@ -37,24 +36,26 @@ def evenly(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
     return rows[np.unique(np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(np.int64))]
 
 
-OUTER, SPREAD = np.array([-10.0, 10.0, -5.0, 2.0]) / 3.0, 3.7
-"""Minus the weights that carry a cubic from x = −2, −1, 1, 2 to −3, and the standard deviation of that
-contrast over the one of the middle value, for white noise."""
+DEPARTURE = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0
+"""Weights of the departure of a value from the cubic through its four neighbours."""
+OUTER, SPREAD = np.array([3.0, -10.0, 10.0, 0.0, -5.0, 2.0, 0.0]) / 3.0, 3.7
+"""Weights of the departure at x = −3 from the cubic through x = −2, −1, 1, 2, and the standard deviation of
+that contrast over the one of the middle value, for white noise."""
 
 
 def spikes(x: Array) -> tuple[Array, Array]:
-    """Departure of each value from the cubic through its four neighbours, and how well six neighbours agree.
+    """Deviation of each value from the cubic through its four neighbours, and that of its neighbours.
 
-    e_i = x_i − (−x_{i−2} + 4 x_{i−1} + 4 x_{i+1} − x_{i+2})/6. The second result is the same departure
-    measured on the neighbours alone, without x_i: a kink of the motion raises both, a spike the first only.
-    Values are evenly sampled, `(n, d)` with n ≥ 7; both results are zero in the three outermost rows.
+    e_i = x_i − (−x_{i−2} + 4 x_{i−1} + 4 x_{i+1} − x_{i+2})/6. The second result is the same deviation for
+    the neighbours alone, without x_i: a kink of the motion increases both, a spike only the first. Values are
+    evenly sampled, `(n, d)` with n ≥ 7; both results are zero in the three outermost rows.
     """
-    departure, around = np.zeros_like(x), np.zeros_like(x)
-    a, b, c, middle, d, e, f = (x[k : len(x) - 6 + k] for k in range(7))
-    departure[3:-3] = middle - (-b + 4.0 * c + 4.0 * d - e) / 6.0
-    left = a + sum(w * v for w, v in zip(OUTER, (b, c, d, e), strict=True))
-    right = f + sum(w * v for w, v in zip(OUTER, (e, d, c, b), strict=True))
-    around[3:-3] = np.maximum(np.abs(left), np.abs(right)) / SPREAD
+    from scipy.ndimage import correlate1d
+
+    departure, left, right = (correlate1d(x, w, axis=0) for w in (DEPARTURE, OUTER, OUTER[::-1]))
+    around = np.maximum(np.abs(left), np.abs(right)) / SPREAD
+    for value in (departure, around):
+        value[:3] = value[-3:] = 0.0
     return departure, around
 
 
@@ -69,7 +70,7 @@ def force_unit(robot: RobotModel, j: int | np.integer) -> str:
 
 
 def displacement(robot: RobotModel, j: int | np.integer, offset: float) -> str:
-    """An offset of the position of joint j in words, an angle in degrees too."""
+    """An offset of the position of joint j in words, with angles also in degrees."""
     degrees = f" ({np.degrees(offset):+.2f}°)" if robot.joint_types[j] == "revolute" else ""
     return f"{offset:+.4f} {position_unit(robot, j)}{degrees}"
 
@@ -77,10 +78,8 @@ def displacement(robot: RobotModel, j: int | np.integer, offset: float) -> str:
 GAP, CLOCK_SPREAD = 1.5, 10.0
 """A gap is longer than this multiple of the median step, as half a sample is missing, and this many robust
 standard deviations of the steps longer than it, as clocks jitter."""
-SHORTEST = 8
-"""Rows of the shortest stretch that is looked at."""
-SMOOTHING = 0.1
-"""Length of the filter that derives missing accelerations [s]."""
+SHORTEST, SMOOTHING = 8, 0.1
+"""Rows of the shortest stretch that is looked at; length of the filter of missing accelerations [s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -120,12 +119,12 @@ class Log:
         return Finding(kind, text, self.all_rows, joints, evidence=evidence)
 
     def on_joints(self, kind: str, mask: Array, text: str, **evidence: Any) -> list[Finding]:
-        """A finding on the joints that a mask picks, listed at the `{}` of its text; none without a joint."""
+        """A finding on the joints of a mask, inserted at the `{}` of its text; empty without a joint."""
         joints = self.named(mask)
         return [self.finding(kind, text.format(", ".join(joints)), joints, **evidence)] if joints else []
 
     def named(self, joints: Array | np.bool_) -> tuple[str, ...]:
-        """Names of the joints that a mask picks."""
+        """Names of the joints of a mask."""
         return tuple(self.joint_names[j] for j in np.flatnonzero(joints))
 
     def replace(self, **fields: Any) -> Log:
@@ -172,7 +171,7 @@ class Log:
 
     @cached_property
     def stretches(self) -> list[slice]:
-        """Unbroken runs of usable rows: finite, not masked, one segment, time that steps on without a gap."""
+        """Contiguous runs of usable rows: finite, not masked, in one segment, without a gap in time."""
         linked = (self.steps > 0.0) & (self.steps <= self.longest_step) & self.usable[1:] & self.usable[:-1]
         runs = intervals(linked) if self.header.ordered else ()
         return [slice(a, b + 1) for a, b in runs if b + 1 - a >= SHORTEST]
@@ -203,7 +202,7 @@ def log_of(data: Dataset) -> Log:
 def read_log(path: str | Path) -> Log:
     """Read a log from Parquet or CSV without refusing NaN, empty values or time that runs backward.
 
-    The columns are those of docs/formats.md; q̇ and q̈ that it lacks are derived by a Savitzky-Golay filter.
+    The columns are those of docs/formats.md; missing q̇ and q̈ are computed by a Savitzky-Golay filter.
 
     Raises:
         DataError: the file is damaged, or a column is missing.
@@ -219,7 +218,7 @@ def read_log(path: str | Path) -> Log:
 
 
 def derive(log: Log, absent: list[str]) -> Log:
-    """The log with absent derivatives computed on each unbroken stretch; NaN where there is none."""
+    """The log with missing derivatives computed on each contiguous stretch, NaN elsewhere."""
     logged = [name for name in JOINT_VECTORS if name not in absent]
     filled = log.replace(**{name: np.zeros_like(log.q) for name in absent})
     values = {name: np.full_like(log.q, np.nan) for name in absent}
@@ -252,7 +251,7 @@ SMOOTHED_SECONDS, SMOOTHED_ORDER = 0.1, 3
 
 
 def smoothed(log: Log) -> Log:
-    """The log after a Savitzky-Golay filter between contact switches, ends masked, if it is in order."""
+    """The log, if valid, after a Savitzky-Golay filter between contact switches, with masked ends."""
     from scipy.signal import savgol_filter
 
     half = round(SMOOTHED_SECONDS / log.dt / 2.0) if np.isfinite(log.dt) and log.header.ordered else 0

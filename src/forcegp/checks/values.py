@@ -1,4 +1,4 @@
-"""Each column by itself: an even clock, numbers that a sensor can have meant, steps of the state."""
+"""Checks of single columns: an even clock, plausible values, steps of the state."""
 
 from __future__ import annotations
 
@@ -6,9 +6,11 @@ import numpy as np
 import torch
 
 from forcegp import dynamics
+from forcegp.checks.excitation import still_joints
 from forcegp.checks.finding import Finding, at_rows
 from forcegp.checks.fit import tensors
-from forcegp.checks.log import Array, Log, Outcome, spikes
+from forcegp.checks.limits import limits_of
+from forcegp.checks.log import DEPARTURE, Array, Log, Outcome, spikes
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data.derivative import UNIFORM_TOLERANCE
 from forcegp.data.fields import JOINT_VECTORS
@@ -17,7 +19,7 @@ from forcegp.rows import describe, intervals
 
 
 def check_order(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Time stamps that repeat or run backward within a segment."""
+    """Find time stamps that repeat or run backward within a segment."""
     repeated, backward = (np.append(False, wrong) for wrong in (log.steps == 0.0, log.steps < 0.0))
     findings = at_rows(repeated, "time-repeated", "time repeats in", steps=repeated.sum())
     findings += at_rows(backward, "time-backward", "time runs backward in", steps=backward.sum())
@@ -25,7 +27,7 @@ def check_order(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_gaps(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Steps that are longer than the clock's jitter allows: samples are missing."""
+    """Find steps longer than the clock's jitter: missing samples."""
     with np.errstate(invalid="ignore"):
         gaps = log.steps > log.longest_step
     if log.masked is not None:
@@ -42,7 +44,7 @@ def check_gaps(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_jitter(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Steps that are so uneven that filters for even sampling do not apply."""
+    """Find steps too uneven for filters that assume even sampling."""
     with np.errstate(invalid="ignore"):
         regular = log.steps[(log.steps > 0.0) & (log.steps <= log.longest_step)]
     spread = float(robust_std(regular) / log.dt) if len(regular) > 1 else 0.0
@@ -53,7 +55,7 @@ def check_jitter(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_period(system: ConstrainedSystem, log: Log) -> Outcome:
-    """The sampling period against that of the header."""
+    """Compare the sampling period with that of the header."""
     stated = log.header.dt
     if stated is None or not abs(log.dt / stated - 1.0) > UNIFORM_TOLERANCE:
         return [], log
@@ -65,16 +67,13 @@ HELD_RUN = 2
 """A logger that fails to update repeats a row at least this often before it is reported as held."""
 STUCK_SECONDS, STUCK_VISIBLE = 0.05, 0.02
 """A channel that repeats one value for so long [s] should have moved by this share of its range."""
-SPIKE = 12.0
-"""Robust standard deviations beyond which a single value is a spike: never reached by normal noise."""
-SPIKE_ALONE = 4.0
-"""Factor by which a spike stands out from the misfit of its neighbours."""
+SPIKE, SPIKE_ALONE = 12.0, 4.0
+"""Robust standard deviations of a spike, never reached by noise; its factor over the neighbours' misfit."""
 SPIKE_SHAPE, SPIKE_NOISE = 0.2, 4.0
 """Share of a wrong value, and robust deviations, by which departures of its neighbours may differ."""
-SPIKE_SHARED = 0.05
-"""A departure of another channel by this share of a value's own says that the motion jumped."""
-DRIVEN = 0.5
-"""Share of a departing acceleration that a step of the torque must make to be its cause."""
+SPIKE_SHARED, DRIVEN = 0.05, 0.5
+"""The motion jumped where another channel departs by this share of a value's own; a step of the torque is the
+cause of a departing acceleration from this share on."""
 FEWEST = 50
 """Values that a scale is taken from."""
 SPIKE_VISIBLE = (0.01, 0.002)
@@ -89,7 +88,7 @@ def logged(log: Log) -> dict[str, Array]:
 
 
 def check_finite(system: ConstrainedSystem, log: Log) -> Outcome:
-    """NaN and infinite values, by column."""
+    """Find NaN and infinite values, by column."""
     vectors, bad = logged(log), ~np.isfinite(log.t)
     columns = ["t"] if bad.any() else []
     for name, value in vectors.items():
@@ -102,7 +101,7 @@ def check_finite(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_held(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Rows in which every logged channel repeats while the arm moves."""
+    """Find rows that repeat every channel while the arm moves."""
     same = np.ones(len(log) - 1, bool)
     for value in logged(log).values():
         same &= (np.diff(value, axis=0) == 0.0).all(axis=1)
@@ -115,15 +114,16 @@ def check_held(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_stuck(system: ConstrainedSystem, log: Log) -> Outcome:
-    """A channel that keeps one value while its joint moves by more than its own resolution explains."""
+    """Find channels that keep one value while the joint moves by more than their resolution."""
     if not np.isfinite(log.dt):
         return [], log
     least, findings, bad = max(5, round(STUCK_SECONDS / log.dt)), [], np.zeros(len(log), bool)
+    still = still_joints(log)
     for name, value in logged(log).items():
         for j, joint in enumerate(log.joint_names):
             x = value[:, j]
             steps = np.abs(np.diff(x))
-            if (steps > 0.0).mean() < 0.1:
+            if (steps > 0.0).mean() < 0.1 or (still[j] and name != "tau"):
                 continue
             visible = STUCK_VISIBLE * np.ptp(np.percentile(x[log.usable], (0.5, 99.5)))
             runs = [
@@ -131,7 +131,7 @@ def check_stuck(system: ConstrainedSystem, log: Log) -> Outcome:
                 for a, b in intervals((steps == 0.0) & log.usable[1:] & log.usable[:-1])
                 if b - a >= least
                 # A torque that stays at its extreme is clipped, which is another finding.
-                and not (name == "tau" and x[a] in (x[log.usable].min(), x[log.usable].max()))
+                and not (name == "tau" and x[a] in limits_of(x[log.usable]))
                 and _expected_change(log, name, j, a, b) > visible
             ]
             if runs:
@@ -158,7 +158,7 @@ def _expected_change(log: Log, name: str, j: int, a: int, b: int) -> float:
 
 
 def check_spikes(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Single values far off the curve through their neighbours."""
+    """Find single values far from the curve through their neighbours."""
     bad, hit, joints, vectors = np.zeros(len(log), bool), [], [], logged(log)
     departures = {name: _departures(log, value) for name, value in vectors.items()}
     near = np.zeros(len(log), bool)
@@ -235,8 +235,7 @@ def _size(log: Log, name: str, departure: Array, around: Array, scale: Array) ->
 def _one_value(departure: Array, scale: Array) -> np.ndarray:
     """`(n, d)` bool, departures h with −4h/6 and h/6 around: one wrong value makes them, a kink does not."""
     around = np.lib.stride_tricks.sliding_window_view(np.pad(departure, ((2, 2), (0, 0))), 5, axis=0)
-    shape = departure[..., None] * np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0
-    misfit = np.abs(around - shape).max(axis=-1)
+    misfit = np.abs(around - departure[..., None] * DEPARTURE).max(axis=-1)
     return misfit <= SPIKE_SHAPE * np.abs(departure) + SPIKE_NOISE * scale
 
 
@@ -248,7 +247,7 @@ def _within_two(x: Array) -> Array:
 
 
 def check_resolution(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Encoder steps so coarse that they dominate a differentiated position."""
+    """Find encoder steps so coarse that they dominate a differentiated position."""
     q = log.q[log.usable]
     if len(q) < FEWEST:
         return [], log
@@ -290,7 +289,7 @@ def _jumps(x: Array, rate: Array, log: Log) -> np.ndarray:
 
 
 def check_jumps(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Positions that jump beyond what the velocity accounts for: rows are missing, or a joint wrapped."""
+    """Find position jumps that the velocity does not explain: missing rows, or a wrapped joint."""
     if "qd" in log.derived:
         return [], log
     jumps = _jumps(log.q, log.qd, log)
@@ -300,7 +299,7 @@ def check_jumps(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_impacts(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Velocities that jump where the acceleration does not account for it: impacts."""
+    """Find velocity jumps that the acceleration does not explain: impacts."""
     if log.derived:
         return [], log
     jumps = _jumps(log.qd, log.qdd, log)

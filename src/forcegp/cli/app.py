@@ -1,4 +1,4 @@
-"""The commands together, and what becomes of an error: one message on stderr, exit code 2, no traceback."""
+"""All commands, and error handling: one message on stderr, exit code 2, no traceback."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ def _options(
 
 
 def main(program: typer.Typer = app) -> None:
-    """Run a command line; errors that a user can cause end in one message and code 2, an interrupt in 130.
+    """Run a command line; user errors exit with one message and code 2, an interrupt with 130.
 
     Temporary files that an interrupt leaves are removed by the next run, as after a crash.
     """

@@ -21,13 +21,13 @@ if TYPE_CHECKING:
 
 
 class Advance(Protocol):
-    """Moves a progress bar; `note` is a word on how it goes, such as the objective."""
+    """Move a progress bar; `note` is a short status, such as the objective."""
 
     def __call__(self, done: int, total: int | None = None, note: str = "") -> None: ...
 
 
 def printable(text: object) -> str:
-    """Text with control characters escaped: names in files may hold commands for the terminal.
+    """Text with control characters escaped: names in files may contain terminal commands.
 
     >>> printable("a\\x1b[2Jb")
     'a\\\\x1b[2Jb'
@@ -73,7 +73,7 @@ def show(result: Mapping[str, object], as_json: bool) -> None:
 
 
 def check_output(out: Path, *inputs: Path) -> None:
-    """Check, before long work, that a file can be written and is none that the result is made from."""
+    """Check, before long work, that a file can be written and is not an input of the result."""
     from forcegp.destination import check_destination
 
     check_destination(out)
@@ -82,14 +82,14 @@ def check_output(out: Path, *inputs: Path) -> None:
 
 
 def save(write: Callable[[Path], object], out: Path) -> None:
-    """Write a result by `write(out)`; if that fails, to another place, which the error names."""
+    """Write a result by `write(out)`; if that fails, to another path named in the error."""
     from forcegp.destination import write_or_keep
 
     write_or_keep(write, out)
 
 
 def check_data_destination(path: Path, *inputs: Path) -> None:
-    """Check, before long work, that a data set can be written without losing what it is made from."""
+    """Check, before long work, that a data set can be written without overwriting its inputs."""
     from forcegp.data.table import check_ending
 
     check_ending(path)
@@ -146,7 +146,7 @@ def check_robot_named(scene: str | None, robot: str | None) -> None:
 
 
 def system_of(scene: str | None, robot: str | None) -> forcegp.ConstrainedSystem:
-    """The robot of a scene with its contacts, or a robot without any."""
+    """The robot of a scene with its contacts, or a robot without contacts."""
     check_robot_named(scene, robot)
     if scene is not None:
         return forcegp.load_scene(scene).system()
@@ -154,7 +154,7 @@ def system_of(scene: str | None, robot: str | None) -> forcegp.ConstrainedSystem
 
 
 def model_table(config: Path | None, scene: str | None) -> ModelTable:
-    """The table [model] of a file of its own if one is given, else that of the scene, if there is one."""
+    """The table [model] of a separate file if one is given, else that of the scene, if any."""
     from forcegp.scene import default_model_table, load_model_table
 
     if config is not None:
@@ -163,8 +163,8 @@ def model_table(config: Path | None, scene: str | None) -> ModelTable:
 
 
 def warn_beyond(model: Predictor, data: forcegp.Dataset, doubts: Iterable[str] = ()) -> None:
-    """Print doubts about predictions, and whether states are far from those that the model was trained on."""
-    from forcegp.forces.noise import warnings_beyond
+    """Print doubts about predictions, and whether states are far from the training data."""
+    from forcegp.forces.posterior import warnings_beyond
     from forcegp.models.structured_fit import StructuredFit
 
     beyond = model.beyond(data.qd, data.tau) if isinstance(model, StructuredFit) else None

@@ -1,4 +1,4 @@
-"""`forcegp evaluate`: how good a model's predictions are."""
+"""`forcegp evaluate`: compare a model's predictions with a log."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ def evaluate(
 
     The trivial predictors are the mean, the robot file alone, and least squares of inertial parameters,
     viscous and Coulomb friction and offsets. The verdict states the share of the torque beyond gravity that
-    the model explains, how far off its motion is in open loop, and its force in contact, if one is logged;
+    the model explains, its error of motion in open loop, and its contact force, if one is logged;
     the next line compares it with each predictor in torque and in acceleration. Errors are in rad/s² (m/s²
     for sliding joints); coverage is the share of samples within two standard deviations.
 

@@ -51,8 +51,8 @@ def excite(
 ) -> None:
     """Plan the motion in free space that identifies inertia and friction best.
 
-    It starts and ends at rest, holds the limits of the robot file or those given, and keeps the robot from
-    itself, the surfaces of the scene, and boxes. Beside it, a page of the same name shows the motion, its
+    It starts and ends at rest, respects the limits of the robot file or the given ones, and avoids collisions
+    with the robot, the surfaces of the scene, and boxes. A page of the same name shows the motion, its
     limits, and the expected standard deviation of the torque before and after its log.
 
     [bold]Examples[/bold]

@@ -1,4 +1,4 @@
-"""`forcegp export`: a fitted model as code of a controller, or as figures in a robot file."""
+"""`forcegp export`: a fitted model as code for a controller, or as parameters in a robot file."""
 
 from __future__ import annotations
 
@@ -43,13 +43,13 @@ def export(
     """Write a structured Gaussian process as C99 or for CasADi, or into the file of its robot.
 
     C: one .h and one .c file: state and closed contacts to accelerations, multipliers and forces, each with
-    mean and covariance, and Jacobians of the mean. It needs libm alone. Beside them a test program with
-    reference values, CMakeLists.txt and a README.
+    mean and covariance, and Jacobians of the mean. It needs only libm. A test program with reference values,
+    CMakeLists.txt and a README are included.
 
     CasADi: the mean as a function with exact derivatives, in a file for `casadi.Function.load`.
 
-    URDF, MJCF: a copy of the robot's file with identified inertia, damping and friction, in which nothing
-    else changes. Beside it a report with standard deviations and losses, and robots drawn from the posterior.
+    URDF, MJCF: a copy of the robot's file with identified inertia, damping and friction, and no other change;
+        a report with standard deviations and losses; and robots drawn from the posterior.
 
     [bold]Examples[/bold]
 

@@ -49,8 +49,8 @@ def fit(
 ) -> None:
     """Fit a model of the forward dynamics to logged motion.
 
-    The table \\[model] of the scene, or of --config, chooses priors, kernels, noise, robot parameters and how
-    to learn; the options override it.
+    The table \\[model] of the scene, or of --config, defines priors, kernels, noise, robot parameters and
+    learning; the options override it.
 
     Structured models read Parquet logs of more than 100,000 rows, and several files, piece by piece.
 
@@ -79,7 +79,9 @@ def fit(
     if checkpoint is not None:
         for file in (checkpoint, beside(checkpoint)):
             file.unlink(missing_ok=True)
-    _warn(learned.result)
+    doubts = () if learned.result.converged else (f"the fit did not converge: {learned.result.message}",)
+    for doubt in (*doubts, *learned.result.warnings):
+        common.warn(doubt)
     result: dict[str, object] = {"model": regression.name, "training_points": len(training)}
     show({**result, **_figures(learned.result, as_json), "file": str(model_path(out))}, as_json)
 
@@ -106,13 +108,6 @@ def _training(
     return parts[0] if len(parts) == 1 else forcegp.Dataset.concatenate(parts)
 
 
-def _warn(result: FitResult) -> None:
-    """Print what is doubtful about a fit."""
-    doubts = () if result.converged else (f"the fit did not converge: {result.message}",)
-    for doubt in (*doubts, *result.warnings):
-        common.warn(doubt)
-
-
 def sweep(
     scene: Annotated[list[str], typer.Option("--scene", "-s", help="Scene; may be given several times.")],
     model: Annotated[list[str], typer.Option("--model", "-m", help="Model; may be given several times.")],
@@ -127,7 +122,7 @@ def sweep(
 ) -> None:
     """Simulate, fit and score several models on several robots, with several seeds.
 
-    Fits that are done are not run again. Needs the extra `sweep` (Dask).
+    Finished fits are not run again. Needs the extra `sweep` (Dask).
 
     [bold]Examples[/bold]
 

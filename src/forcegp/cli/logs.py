@@ -156,8 +156,8 @@ def check(
 ) -> None:
     """Check a log against a scene before fitting: clock, units, signs, masses, contact, noise, motion.
 
-    The last line is the verdict. The exit code is 0 where a model can be fitted, 1 where a finding
-    makes a fit worthless, and 2 where scene or log cannot be read.
+    The last line is the verdict. The exit code is 0 if a model can be fitted, 1 if a finding makes a fit
+    worthless, and 2 if scene or log cannot be read.
 
     [bold]Examples[/bold]
 

@@ -39,11 +39,11 @@ def rollout(
     seed: Annotated[int, typer.Option(help="Seed of the samples.")] = 0,
     as_json: AsJson = False,
 ) -> None:
-    """Simulate forward with a model, from a logged state and under the logged torques.
+    """Simulate forward with a model, from a logged state under the logged torques.
 
-    The folder gets rollout.parquet: the predicted motion, the logged one as q_logged, and, with samples,
-    the spread of the sampled motions as q_std; and rollout.html with plots and an animation of the arm,
-    the plots as SVG and their data as rollout.json.
+    The folder receives rollout.parquet (the predicted motion, the logged one as q_logged, and with samples
+    their spread as q_std), rollout.html with plots and an animation of the arm, the plots as SVG, and their
+    data as rollout.json.
 
     [bold]Examples[/bold]
 
@@ -81,7 +81,7 @@ def rollout(
 
 
 def _figures(path: forcegp.Rollout, rolled: forcegp.Dataset, dt: float) -> dict[str, object]:
-    """What the command reports, up to where the prediction diverged."""
+    """Numbers reported by the command, up to a divergence of the prediction."""
     error = (rolled.q - rolled.q_logged).abs()
     figures: dict[str, object] = {
         "duration_s": dt * (len(rolled) - 1),

@@ -1,7 +1,7 @@
 """Opt-in compiled dynamics: one fused kernel per robot and quantity, cached on disk.
 
-The robot's parameters are folded into the kernel. The eager functions of `forcegp.dynamics` need no
-compiler and take robots that are being learned; these are for many evaluations of one robot.
+The robot's parameters are folded into the kernel. The eager functions of `forcegp.dynamics` need no compiler
+and accept learned robots; these are for many evaluations of one robot.
 """
 
 from __future__ import annotations
@@ -30,9 +30,9 @@ def _stacked_derivatives(robot: RobotModel, q: Tensor, qd: Tensor, force: Tensor
 class CompiledDynamics:
     """One quantity of one robot as a compiled function of the joint-space arguments.
 
-    Call it as the eager function of the same name, without the robot. Its derivatives are those of the
-    eager function, of any order; the first derivatives of the forward dynamics have a kernel of their own,
-    built when they are first asked for.
+    Call it like the eager function of the same name, without the robot. Its derivatives are those of the
+    eager function, of any order; the first derivatives of the forward dynamics have a separate kernel,
+    built on first use.
     """
 
     def __init__(self, robot: RobotModel, quantity: str) -> None:
@@ -68,7 +68,7 @@ class CompiledDynamics:
         return _Kernel.apply(self, *common)  # pyright: ignore[reportReturnType]
 
     def eager(self, *states: Tensor) -> Tensor:
-        """The same by the eager function."""
+        """Evaluate the eager function instead."""
         return self._eager(self.robot, *states)
 
     def pull(self, gradient: Tensor, *states: Tensor) -> tuple[Tensor, ...]:

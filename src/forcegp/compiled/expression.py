@@ -22,13 +22,13 @@ Tangents = dict[int, "Scalar"]
 
 @dataclass
 class Graph:
-    """The nodes of a program, each one once, operands before their use."""
+    """The nodes of a program without duplicates, operands before their use."""
 
     nodes: list[Node] = field(default_factory=list)
     _positions: dict[Node, int] = field(default_factory=dict)
 
     def scalar(self, node: Node) -> Scalar:
-        """The scalar that a node computes; an equal node is used again."""
+        """The scalar computed by a node; an equal node is reused."""
         position = self._positions.setdefault(node, len(self.nodes))
         if position == len(self.nodes):
             self.nodes.append(node)
@@ -49,8 +49,9 @@ class Graph:
         return self.scalar(("input", name, index))
 
     def live(self, outputs: list[Scalar], known: Container[int] = ()) -> list[int]:
-        """Positions of the nodes that the outputs depend on, in order of computation, not looking behind
-        those that are known."""
+        """Positions of the nodes that the outputs depend on, in order of computation, stopping at known
+        nodes.
+        """
         needed, open_ = set(), [x.position for x in outputs]
         while open_:
             position = open_.pop()
@@ -64,8 +65,8 @@ class Graph:
     def tangents(self, outputs: list[Scalar], seeds: dict[int, Tangents]) -> list[Tangents]:
         """Derivatives of the outputs by forward mode, from those of `seeds` by position.
 
-        A seed need not be an input: what is the solution of an equation is given its derivative so, and a
-        scalar without directions counts as a constant.
+        A seed need not be an input: the solution of an equation can be seeded with its derivative. A scalar
+            without directions counts as a constant.
         """
         found = dict(seeds)
         for position in self.live(outputs, seeds):
@@ -105,13 +106,13 @@ class Scalar:
 
     @property
     def value(self) -> float | None:
-        """The number, where it is a constant."""
+        """The number, if it is a constant."""
         op, value, _ = self.graph.nodes[self.position]
         return value if op == "const" else None  # pyright: ignore[reportReturnType]
 
     @property
     def negated(self) -> Scalar | None:
-        """x, where this is −x."""
+        """x, if this is −x."""
         op, operand, _ = self.graph.nodes[self.position]
         return Scalar(self.graph, operand) if op == "neg" else None  # pyright: ignore[reportArgumentType]
 

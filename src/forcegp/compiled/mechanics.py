@@ -7,7 +7,6 @@ from itertools import pairwise
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch import Tensor
 
 from forcegp.compiled.program import (
@@ -24,14 +23,12 @@ from forcegp.compiled.source import cpu_kernel, cpu_source
 from forcegp.kinematics import Anchor
 from forcegp.robot.model import BASE, RobotModel
 
-Vector = NDArray[np.floating]
-
 
 class CompiledMechanics:
-    """Mechanics of one robot on the CPU and of some of its points, as a compiled function of (q, q̇).
+    """Mechanics of one robot and of some of its points on the CPU, as a compiled function of (q, q̇).
 
-    A call returns M, Q_C and Q_G, then for each point: axes of its frame `(3, 3)` and position in the world,
-    Jacobian J `(6, nq)` with [ω; ṗ] = J q̇, and bias acceleration J̇ q̇ `(6,)`. `batch` does so for tensors.
+    `batch` gives M, Q_C and Q_G, then for each point: axes of its frame `(3, 3)` and position in the world,
+    Jacobian J `(6, nq)` with [ω; ṗ] = J q̇, and bias acceleration J̇ q̇ `(6,)`.
 
     Raises:
         MissingDependencyError: there is no C++ compiler.
@@ -49,16 +46,8 @@ class CompiledMechanics:
         source = cpu_source(program, robot.nq, robot.dtype)
         self._arrays, self._kernel, self._dtype = source.arrays, cpu_kernel(source.text), robot.dtype
 
-    def __call__(self, q: Vector, qd: Vector) -> list[Vector]:
-        """The mechanics at a state `(nq,)`, `(nq,)`."""
-        values = {"q": q, "qd": qd, "sin": np.sin(q), "cos": np.cos(q)}
-        out = torch.empty(1, self._places[-1][0].stop, dtype=self._dtype)
-        self._kernel([torch.from_numpy(np.ascontiguousarray(values[name])) for name in self._arrays], out)
-        flat = out.numpy()[0]
-        return [flat[place].reshape(shape) for place, shape in self._places]
-
     def batch(self, q: Tensor, qd: Tensor) -> list[Tensor]:
-        """The same at states `(*batch, nq)`, `(*batch, nq)`, outside of autograd."""
+        """The mechanics at states `(*batch, nq)`, `(*batch, nq)`, outside of autograd."""
         shape, q, qd = q.shape[:-1], q.reshape(-1, q.shape[-1]), qd.reshape(-1, qd.shape[-1])
         values = {"q": lambda: q, "qd": lambda: qd, "sin": lambda: torch.sin(q), "cos": lambda: torch.cos(q)}
         out = torch.empty(len(q), self._places[-1][0].stop, dtype=self._dtype)

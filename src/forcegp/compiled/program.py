@@ -24,7 +24,7 @@ def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
 
 
 def skew(v: np.ndarray) -> np.ndarray:
-    """[v]× of expressions."""
+    """Cross-product matrix [v]× of expressions."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
@@ -74,7 +74,7 @@ class Links:
         return [self.graph.input(name, i) for i in range(len(self.parents))]
 
     def composite(self, values: list) -> list:
-        """Sums over the subtree of each link, the link itself included."""
+        """Sums over the subtree of each link, including the link."""
         total = list(values)
         for i in reversed(range(len(total))):
             if (parent := self.parents[i]) != BASE:
@@ -90,12 +90,12 @@ class Links:
 
 
 def numbers(x: Tensor) -> np.ndarray:
-    """A tensor as numbers that are folded into the expressions."""
+    """A tensor as constants of the expressions."""
     return x.detach().cpu().double().numpy()
 
 
 def congruent(R: np.ndarray, inertia: np.ndarray) -> np.ndarray:
-    """R I Rᵀ with its six different entries computed once."""
+    """R I Rᵀ, computing each of its six distinct entries once."""
     turned = R @ inertia
     upper = {(r, c): turned[r] @ R[c] for r in range(3) for c in range(r, 3)}
     return np.array([[upper[min(r, c), max(r, c)] for c in range(3)] for r in range(3)], dtype=object)

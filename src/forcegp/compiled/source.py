@@ -1,4 +1,4 @@
-"""C++ and CUDA source text of a straight-line program, and the kernel that it becomes.
+"""C++ and CUDA source text of a straight-line program, and its compiled kernel.
 
 Kernels are built from C++ on the CPU and by NVRTC on a GPU.
 """
@@ -78,7 +78,7 @@ class Source:
 
 
 def statements(program: Program, load: dict[tuple[str, int], str], store: str) -> str:
-    """One statement a live node, then the stores, on vectors `V` of numbers `T`."""
+    """One statement per live node, then the stores, on vectors `V` of numbers `T`."""
     nodes, lines = program.graph.nodes, []
     name: dict[int, str] = {}
     for position in program.graph.live(program.outputs):
@@ -106,7 +106,7 @@ def _operation(op: str, left: str, right: str = "") -> str:
 
 
 def inputs_of(program: Program) -> tuple[tuple[str, ...], list[tuple[str, int]]]:
-    """The arrays that are read, and their entries that are used."""
+    """The arrays that are read, and the entries in use."""
     nodes = (program.graph.nodes[i] for i in program.graph.live(program.outputs))
     entries = sorted((str(name), int(index)) for op, name, index in nodes if op == "input")  # pyright: ignore[reportArgumentType]
     return tuple(sorted({name for name, _ in entries})), entries
@@ -117,7 +117,7 @@ def _type(dtype: torch.dtype) -> str:
 
 
 def cpu_source(program: Program, nq: int, dtype: torch.dtype) -> Source:
-    """C++ that computes a vector of samples at a time and shares the batch among threads."""
+    """C++ that computes a vector of samples at a time and distributes the batch over threads."""
     arrays, entries = inputs_of(program)
     load = "\n".join(
         f"    entry[{k}][lane] = in[{arrays.index(name)}][row * {nq} + {index}];"
@@ -144,9 +144,9 @@ STATEMENTS = 500
 
 
 def c_function(name: str, program: Program) -> str:
-    """A static C99 function of one state: the arguments, sin q and cos q, then where the result goes.
+    """A static C99 function of one state: the arguments, sin q and cos q, then the result.
 
-    A long program becomes several functions that pass on what later ones need in an array.
+    A long program becomes several functions that pass intermediate values in an array.
     """
     names = (*program.arguments, "sin_q", "cos_q")
     entry = {"sin": "sin_q", "cos": "cos_q"}
@@ -202,7 +202,7 @@ def c_function(name: str, program: Program) -> str:
 
 
 def cuda_source(program: Program, nq: int, dtype: torch.dtype) -> Source:
-    """CUDA C++ that computes one sample a thread."""
+    """CUDA C++ that computes one sample per thread."""
     arrays, entries = inputs_of(program)
     text = _CUDA.format(
         type=_type(dtype),

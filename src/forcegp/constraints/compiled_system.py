@@ -6,6 +6,7 @@ machine's C++ compiler and kept on disk.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from weakref import WeakKeyDictionary
@@ -33,21 +34,23 @@ _SYSTEMS: WeakKeyDictionary[ConstrainedSystem, ConstrainedSystem] = WeakKeyDicti
 
 @dataclass(frozen=True, eq=False, repr=False)
 class CompiledSystem(ConstrainedSystem):
-    """A constrained system whose equations of motion come from a kernel wherever no gradient is asked for.
+    """A constrained system whose equations of motion use a compiled kernel if no gradient is required.
 
-    Made by `compiled_system`.
+    Made by `compiled_system`; the kernel also has the motion of further `points`.
     """
+
+    points: tuple[Anchor, ...] = ()
 
     @cached_property
     def _anchors(self) -> tuple[Anchor, ...]:
-        return _anchors_of(self)
+        return _anchors_of(self, self.points)
 
     @cached_property
     def _mechanics(self) -> CompiledMechanics | None:
         return _kernel(self.robot, self._anchors)
 
     def with_robot(self, robot: RobotModel) -> ConstrainedSystem:
-        """The same constraints on a robot with other parameters, which are not those of the kernel."""
+        """The same constraints on a robot with other parameters, without the kernel."""
         return ConstrainedSystem(robot, self.contacts, self.baumgarte)
 
     def equations(self, q: JointVector, qd: JointVector, active: Tensor | None = None) -> Equations:
@@ -56,24 +59,23 @@ class CompiledSystem(ConstrainedSystem):
             return super().equations(q, qd, active)
         self.robot.check_state(q=q, qd=qd)
         M, Q_C, Q_G, *blocks = self._mechanics.batch(q, qd)
-        points = {}
-        for anchor, i in zip(self._anchors, range(0, len(blocks), POINT), strict=True):
-            points[anchor] = kinematics.PointMotion.of(blocks[i : i + POINT], qd)
-        terms = [c.terms_of([points[_key(a)] for a in c.anchors]) for c in self.contacts]
+        parts = zip(self._anchors, range(0, len(blocks), POINT), strict=True)
+        points = {a: kinematics.PointMotion.of(blocks[i : i + POINT], qd) for a, i in parts}
 
-        def links() -> tuple[kinematics.LinkPoses, kinematics.LinkMotion]:
-            poses = kinematics.link_poses(self.robot, q)
-            return poses, kinematics.link_motion(self.robot, poses, qd)
+        def point_motion(frame: str, point: Sequence[float]) -> kinematics.PointMotion:
+            known = points.get(_key((frame, point)))
+            return self._moving(q, qd)[2](frame, point) if known is None else known
 
         robot_terms = M, Q_C, Q_G, dynamics.damping_force(self.robot, qd)
-        return self._assembled(q, qd, active, robot_terms, terms, links)
+        return self._assembled(q, qd, active, robot_terms, point_motion, lambda: self._moving(q, qd)[:2])
 
 
-def compiled_system(system: ConstrainedSystem) -> ConstrainedSystem:
+def compiled_system(system: ConstrainedSystem, *points: Anchor) -> ConstrainedSystem:
     """The system with compiled equations of motion, for many evaluations of one robot.
 
-    The first call for a robot compiles for some seconds; later ones, in any process, read the cache. It
+    The first call for a robot takes some seconds to compile; later ones, in any process, read the cache. It
     is returned unchanged without a compiler, or if the robot's parameters require gradients or lie on a GPU.
+    `points` are further points for `Equations.point_motion`.
 
     Example:
         >>> import torch, forcegp
@@ -82,16 +84,17 @@ def compiled_system(system: ConstrainedSystem) -> ConstrainedSystem:
         >>> float(compiled_system(system).equations(q, qd).c - system.equations(q, qd).c)
         0.0
     """
-    if system not in _SYSTEMS:
-        if isinstance(system, CompiledSystem) or _kernel(system.robot, _anchors_of(system)) is None:
-            return system
-        _SYSTEMS[system] = CompiledSystem(system.robot, system.contacts, system.baumgarte)
-    return _SYSTEMS[system]
+    if isinstance(system, CompiledSystem) or _kernel(system.robot, _anchors_of(system, points)) is None:
+        return system
+    if points:
+        return CompiledSystem(system.robot, system.contacts, system.baumgarte, points)
+    return _SYSTEMS.setdefault(system, CompiledSystem(system.robot, system.contacts, system.baumgarte))
 
 
-def _anchors_of(system: ConstrainedSystem) -> tuple[Anchor, ...]:
-    """The points that constraints read, each once."""
-    return tuple(dict.fromkeys(_key(a) for contact in system.contacts for a in contact.anchors))
+def _anchors_of(system: ConstrainedSystem, points: Sequence[Anchor]) -> tuple[Anchor, ...]:
+    """The points that constraints read, and further ones, each once."""
+    read = (anchor for contact in system.contacts for anchor in contact.anchors)
+    return tuple(dict.fromkeys(map(_key, (*read, *points))))
 
 
 def _key(anchor: Anchor) -> Anchor:

@@ -49,7 +49,7 @@ class Constraint(ABC):
     @property
     @abstractmethod
     def anchors(self) -> tuple[Anchor, ...]:
-        """The points of the robot that the constraint reads, each with its frame."""
+        """The points of the robot on which the constraint depends, each with its frame."""
 
     @abstractmethod
     def terms_of(self, points: Sequence[PointMotion]) -> ConstraintTerms:
@@ -69,20 +69,19 @@ class Constraint(ABC):
 class SurfaceContact(Constraint):
     """A point or a ball of the robot that slides on a surface, c(q) = c_surface(p(q)) − r.
 
-    A = ∇cᵀ J_p and b = −(∇cᵀ J̇_p q̇ + ṗᵀ ∇²c ṗ); the multiplier is the normal force where |∇c| = 1. A
-    rounded tip is a ball of radius r around p. It touches in p − r n, whose material velocity is ṗ + ω × (−r
-    n), so J_E = J_p + r [n]ₓ J_ω: friction at a rounded tip has the lever arm −r n, the normal force has
-    none.
+    A = ∇cᵀ J_p and b = −(∇cᵀ J̇_p q̇ + ṗᵀ ∇²c ṗ); the multiplier is the normal force if |∇c| = 1. A rounded
+    tip is a ball of radius r around p. It touches at p − r n, whose material velocity is ṗ + ω × (−r n), so
+    J_E = J_p + r [n]ₓ J_ω: friction at a rounded tip has the lever arm −r n, the normal force has none.
 
     A contact that may stick has two more rows, (t_1, t_2)ᵀ J_E q̇ = 0 with the tangent frame of the surface,
-    which hold while the touching point moves along it by less than `stick_speed`. Their multipliers are
-    the components of a tangential force that no law of sliding gives. A rollout ends sticking where that
-    force exceeds the friction that a prior of the model gives the contact (`rollout/cone.py`).
+    which hold while the touching point moves along it by less than `stick_speed`. Their multipliers are the
+    components of the tangential force. In a rollout, sticking ends when that force exceeds the friction
+    predicted by the model (`rollout/cone.py`).
 
     Args:
         name: name of the contact, as in `contact.<name>` of a data set.
         frame: link or frame that carries the point.
-        point: coordinates in that frame [m]; of a rounded tip, its centre.
+        point: coordinates in that frame [m]; for a rounded tip, those of its centre.
         surface: the surface, in the world.
         radius: r of a rounded tip; 0 is a sharp one [m].
         stick_speed: speed along the surface below which the touching point sticks [m/s]; `None` for a contact
@@ -126,7 +125,7 @@ class SurfaceContact(Constraint):
 
     @property
     def center_surface(self) -> Surface:
-        """The surface that `point` moves on: that of the contact, raised by the radius of the tip."""
+        """The surface on which `point` moves: that of the contact, raised by the radius of the tip."""
         return self.surface.raised(self.radius) if self.radius else self.surface
 
     def check(self, robot: RobotModel) -> None:
@@ -178,7 +177,7 @@ class PointConnection(Constraint):
     Args:
         name: name of the constraint.
         frame, point: first frame, and the point in its coordinates [m].
-        other_frame, other_point: the second; `None` holds the first point at a place of the world.
+        other_frame, other_point: the second; `None` fixes the first point in the world.
     """
 
     name: str

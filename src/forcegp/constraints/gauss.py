@@ -14,7 +14,7 @@ of constant rank do no harm.
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import NamedTuple
@@ -25,9 +25,9 @@ from torch.linalg import vecdot
 from torch.nn.functional import normalize
 
 from forcegp import dynamics
-from forcegp.batchlast import mass_factor
 from forcegp.derivatives import inverse_dynamics_derivatives
-from forcegp.kinematics import LinkMotion, LinkPoses
+from forcegp.errors import MassMatrixError
+from forcegp.kinematics import LinkMotion, LinkPoses, PointMotion
 from forcegp.robot.model import RobotModel
 from forcegp.types import ConstraintInverse, ConstraintMatrix, ConstraintVector, JointMatrix, JointVector
 
@@ -45,7 +45,7 @@ def rank_tolerance(dtype: torch.dtype) -> float:
 
 
 def nothing(dtype: torch.dtype) -> float:
-    """Size of a row of A G⁻ᵀ that is rounding of zero [1/√kg]: of a point that cannot move."""
+    """Size below which a row of A G⁻ᵀ counts as zero [1/√kg]: its point cannot move."""
     return ROUNDING * torch.finfo(dtype).eps
 
 
@@ -69,13 +69,13 @@ def tangent_frame(n: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class ContactPoint:
-    """The point of the robot that touches a surface; of a rounded tip, the material point that touches now.
+    """The point of the robot that touches a surface; for a rounded tip, the current material point.
 
     Attributes:
         position, velocity: `(*batch, 3)` in the world [m], [m/s].
         jacobian: J_E `(*batch, 3, nq)`, world axes.
         normal: ∇c `(*batch, 3)` at the point.
-        sticks: `(*batch,)` bool, whether it rests on the surface; `None` where the contact always slides.
+        sticks: `(*batch,)` bool, whether it rests on the surface; `None` if the contact always slides.
     """
 
     position: Tensor
@@ -114,10 +114,10 @@ class Equations:
         c, cd: `(*batch, m)` constraint error and its rate, of all contacts, active or not.
         Q_C, Q_G, Q_D: `(*batch, nq)` bias, gravity and dissipative joint force.
         contact_points: the touching point of each surface contact, by name.
-        links: computes the poses and the motion of the links at the states, where more of the
-            kinematics is needed.
-        holds: `(*batch, m)` bool, rows of A that hold: those of closed contacts, along the surface where they
-            stick.
+        point_motion: computes the motion of a point `(frame, point)` of the robot at the states.
+        links: function that returns the poses and the motion of the links at the states.
+        holds: `(*batch, m)` bool, rows of A that hold: those of closed contacts, including tangential rows if
+            they stick.
     """
 
     M: JointMatrix
@@ -129,6 +129,7 @@ class Equations:
     Q_G: JointVector
     Q_D: JointVector
     contact_points: dict[str, ContactPoint]
+    point_motion: Callable[[str, Sequence[float]], PointMotion]
     links: Callable[[], tuple[LinkPoses, LinkMotion]]
     holds: Tensor
 
@@ -148,8 +149,11 @@ class Equations:
 
     @cached_property
     def M_cholesky(self) -> JointMatrix:
-        """Lower Cholesky factor of M; `NumericalError` where M is not positive definite."""
-        return mass_factor(self.M)
+        """Lower Cholesky factor of M; raises `NumericalError` if M is not positive definite."""
+        try:
+            return torch.linalg.cholesky(self.M)
+        except torch.linalg.LinAlgError as cause:  # pyright: ignore[reportPrivateImportUsage]
+            raise MassMatrixError(cause) from cause
 
     @cached_property
     def M_inv_At(self) -> ConstraintInverse:
@@ -195,8 +199,9 @@ class Equations:
 
     @cached_property
     def hidden(self) -> Tensor:
-        """Projector on multipliers of rows that hold and change no motion, Aᵀμ = 0 `(*batch, m, m)`: ones of
-        points that cannot move, fractions where contacts share their load."""
+        """Projector on multipliers of rows that hold and change no motion, Aᵀμ = 0 `(*batch, m, m)`: one for
+        points that cannot move, fractions for contacts that share their load.
+        """
         # R = 1 − W W⁺
         return torch.diag_embed(self.holds.to(self.M)) - self.scaled_jacobian @ self.scaled_inverse
 
@@ -243,7 +248,7 @@ class Equations:
         return free + (self.L @ self._gap(free)[..., None])[..., 0]
 
     def motion_under(self, Q_bar: JointVector) -> tuple[JointVector, ConstraintVector]:
-        """q̈ = q̈′ + M⁻¹Aᵀ λ and λ together, as a step of a rollout needs them."""
+        """q̈ = q̈′ + M⁻¹Aᵀ λ and λ together, for a step of a rollout."""
         free = self.free_acceleration(Q_bar)
         multiplier = (self.constraint_inertia @ self._gap(free)[..., None])[..., 0]
         return free + (self.M_inv_At @ multiplier[..., None])[..., 0], multiplier

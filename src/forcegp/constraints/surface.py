@@ -1,10 +1,10 @@
 """Rigid surfaces as implicit functions c(p) of a point: zero on the surface, positive outside the solid.
 
-The gradient points out of the solid, so a contact that presses has a multiplier λ ≥ 0. For the surfaces
-of this file but `ImplicitSurface`, c is the signed distance and the gradient the unit normal.
+The gradient points out of the solid, so a contact that presses has a multiplier λ ≥ 0. Except for
+`ImplicitSurface`, c is the signed distance and the gradient the unit normal.
 
 `SurfaceSchema` is the one description of surfaces in files: scene files and saved models are validated
-against these classes, which a field `type` tells apart.
+against these classes, selected by a field `type`.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ class Surface(ABC):
         """vᵀ ∇²c(p) v, `(*batch,)`."""
 
     def raised(self, distance: float) -> Surface:
-        """The surface at a distance above this one, c(p) − distance, where c is a signed distance.
+        """The surface at a distance above this one, c(p) − distance, if c is a signed distance.
 
         Args:
             distance: along the normal [m].
@@ -217,8 +217,8 @@ class ImplicitSurface(Surface):
     """Any smooth c(p), differentiated automatically.
 
     Args:
-        function: maps one point `(3,)` to a scalar tensor, positive outside the solid, in operations
-            that PyTorch differentiates twice. The multiplier is in newtons where |∇c| = 1.
+        function: maps one point `(3,)` to a scalar tensor, positive outside the solid, twice differentiable
+            by PyTorch. The multiplier is in newtons if |∇c| = 1.
 
     Example:
         >>> import torch

@@ -6,7 +6,7 @@ import dataclasses
 import itertools
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import torch
 from torch import Tensor
@@ -16,7 +16,7 @@ from forcegp import dynamics, kinematics
 from forcegp.constraints.contact import Constraint, ConstraintTerms, SurfaceContact
 from forcegp.constraints.gauss import Equations, Linearization, linearize
 from forcegp.errors import ParameterError, ShapeError, UnknownNameError
-from forcegp.kinematics import LinkMotion, LinkPoses
+from forcegp.kinematics import LinkMotion, LinkPoses, PointMotion
 from forcegp.notebook import html_table
 from forcegp.resources import announce_memory
 from forcegp.robot.model import RobotModel
@@ -32,8 +32,8 @@ CERTAIN = 0.25
 class Baumgarte:
     """Makes the constraint error a damped oscillator, c̈ + 2ωξ ċ + ω² c = 0 (eq. 29).
 
-    The right-hand side becomes b̃ = b − 2ωξ A q̇ − ω² c; the signs that the paper prints in eq. (30)
-    are the opposite ones, with which the error grows.
+    The right-hand side becomes b̃ = b − 2ωξ A q̇ − ω² c; eq. (30) of the paper has the opposite signs, with
+    which the error grows.
 
     Args:
         natural_frequency: ω > 0 [rad/s].
@@ -146,9 +146,15 @@ class ConstrainedSystem:
             if isinstance(contact, SurfaceContact) and contact.stick_speed is not None
         ]
 
+    @cached_property
+    def can_open(self) -> Tensor:
+        """Mask `(n_contacts,)` of the constraints that are contacts with a surface."""
+        flags = [isinstance(contact, SurfaceContact) for contact in self.contacts]
+        return torch.tensor(flags, dtype=torch.bool, device=self.robot.device)
+
     @property
     def state_bytes(self) -> int:
-        """Upper bound on the memory that the equations of motion of one state take [bytes]."""
+        """Upper bound on the memory of the equations of motion at one state [bytes]."""
         width = self.robot.nq + self.m
         return 8 * (SQUARE * width**2 + LINEAR * width)
 
@@ -158,7 +164,7 @@ class ConstrainedSystem:
         `copies` is the peak in units of the memory of one state's equations of motion; `what` is the work.
 
         Raises:
-            MemoryLimitError: it certainly needs more than is free.
+            MemoryLimitError: the work needs more memory than is free.
         """
         needed = int(copies * states * self.state_bytes)
         announce_memory(needed, what, certain=int(CERTAIN * needed))
@@ -212,9 +218,9 @@ class ConstrainedSystem:
         robot.check_state(q=q, qd=qd)
         if q.shape != qd.shape:
             raise ShapeError("q and qd have different batch shapes", expected=[*q.shape], got=[*qd.shape])
-        poses, motion, terms = self._terms(q, qd)
+        poses, motion, point_motion = self._moving(q, qd)
         robot_terms = dynamics.known_terms(robot, poses, motion, qd)
-        return self._assembled(q, qd, active, robot_terms, terms, lambda: (poses, motion))
+        return self._assembled(q, qd, active, robot_terms, point_motion, lambda: (poses, motion))
 
     def _assembled(
         self,
@@ -222,27 +228,29 @@ class ConstrainedSystem:
         qd: Tensor,
         active: Tensor | None,
         robot_terms: tuple[Tensor, Tensor, Tensor, Tensor],
-        terms: Sequence[ConstraintTerms],
+        point_motion: Callable[[str, Sequence[float]], PointMotion],
         links: Callable[[], tuple[LinkPoses, LinkMotion]],
     ) -> Equations:
-        """The equations of motion from M, Q_C, Q_G and Q_D of the robot and the terms of the constraints."""
+        """The equations of motion from M, Q_C, Q_G and Q_D of the robot and the motion of its points."""
+        terms = self._terms(point_motion)
         c, cd, A, b, holds = self._rows(q, qd, terms, active)
         touching = zip(self.contact_names, (term.point for term in terms), strict=True)
         points = {name: point for name, point in touching if point is not None}
         M, Q_C, Q_G, Q_D = robot_terms
-        return Equations(M, A, b, c, cd, Q_C, Q_G, Q_D, points, links, holds)
+        return Equations(M, A, b, c, cd, Q_C, Q_G, Q_D, points, point_motion, links, holds)
 
     def linearize(
         self, q: JointVector, qd: JointVector, force: JointVector, active: Tensor | None = None
     ) -> Linearization:
-        """The constrained acceleration and the multiplier with their Jacobians by q, q̇ and force.
+        """The constrained acceleration and the multiplier with their Jacobians with respect to q, q̇ and
+        force.
 
         q̈(q, q̇, Q) = L b + H (Q_C + Q_G + Q_D + Q) with its exact derivatives, detached from the graph.
         If Q depends on the state, as learned forces do, add `dforce` times the derivative of Q.
 
         Args:
             q, qd: `(*batch, nq)` joint positions and velocities.
-            force: `(*batch, nq)` Q, the motor torques and all other forces that the robot file does not know.
+            force: `(*batch, nq)` Q, the motor torques and all other forces beyond the robot file.
             active: `(*batch, n_contacts)` bool, which contacts are closed in each sample; default all.
 
         Raises:
@@ -262,7 +270,7 @@ class ConstrainedSystem:
             eom = self.equations(q, qd, active)
 
         def rows(q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
-            return self._rows(q, qd, self._terms(q, qd)[2], active)[2:4]
+            return self._rows(q, qd, self._terms(self._moving(q, qd)[2]), active)[2:4]
 
         return linearize(self.robot, eom, rows, q, qd, force)
 
@@ -272,16 +280,17 @@ class ConstrainedSystem:
         rows = [i for i, contact in enumerate(self.contacts) for _ in range(contact.rows)]
         return torch.tensor(rows, dtype=torch.int64, device=self.robot.device)
 
-    def _terms(self, q: Tensor, qd: Tensor) -> tuple[LinkPoses, LinkMotion, list[ConstraintTerms]]:
-        """Poses and velocities of the links, with the constraints there."""
+    def _moving(
+        self, q: Tensor, qd: Tensor
+    ) -> tuple[LinkPoses, LinkMotion, Callable[[str, Sequence[float]], PointMotion]]:
+        """Poses and velocities of the links, and the motion of points of them."""
         poses = kinematics.link_poses(self.robot, q)
         motion = kinematics.link_motion(self.robot, poses, qd)
+        return poses, motion, partial(kinematics.point_motion, self.robot, poses, motion, qd)
 
-        def moving(frame: str, point: Sequence[float]) -> kinematics.PointMotion:
-            return kinematics.point_motion(self.robot, poses, motion, qd, frame, point)
-
-        terms = [contact.terms_of([moving(*at) for at in contact.anchors]) for contact in self.contacts]
-        return poses, motion, terms
+    def _terms(self, point_motion: Callable[[str, Sequence[float]], PointMotion]) -> list[ConstraintTerms]:
+        """The constraints where their points are."""
+        return [c.terms_of([point_motion(*anchor) for anchor in c.anchors]) for c in self.contacts]
 
     def _rows(
         self, q: Tensor, qd: Tensor, terms: Sequence[ConstraintTerms], active: Tensor | None

@@ -1,23 +1,20 @@
-"""Contact with a surface, which pushes and never pulls: opening, closing, impact and sliding friction.
+"""Unilateral contact with a surface: opening, closing, impact and sliding friction.
 
-A closed contact opens where its multiplier would turn negative. An open contact closes where c ≤ 0 and ċ < 0,
-with an inelastic impact. Other constraints, such as a connection of two points, never change. The formulas
-take tensors of any batch, for rollouts, or NumPy arrays of one state, for the simulator.
+A closed contact opens when its multiplier would become negative. An open contact closes when c ≤ 0 and ċ < 0,
+with an inelastic impact. Other constraints, such as a connection of two points, never change.
 """
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple
 
-import numpy as np
 import torch
 from torch import Tensor
 
-from forcegp.constraints.contact import Constraint, SurfaceContact
+from forcegp.constraints.gauss import Equations
 from forcegp.constraints.system import ConstrainedSystem
 from forcegp.errors import NumericalError
-from forcegp.types import ActiveContacts, Array, JointVector
+from forcegp.types import ActiveContacts, JointVector
 
 PULL = 1e-9
 """A contact pulls if λ is below minus this [N]; rounding must not open a contact that carries no load."""
@@ -34,25 +31,6 @@ MAX_STEP = 0.2
 """Largest move of a joint in one iteration [rad, m]; light wrist joints are asked for more than they give."""
 
 
-@runtime_checkable
-class ContactSystem(Protocol):
-    """Interface of a robot with constraints to contact mechanics."""
-
-    @property
-    def contacts(self) -> Sequence[Constraint]:
-        """The constraints."""
-        ...
-
-    @property
-    def m(self) -> int:
-        """Number of constraint rows."""
-        ...
-
-    def equations(self, q: Any, qd: Any, active: Any = None) -> Any:
-        """The equations of motion with the active constraints: `Equations`, or the same of one state."""
-        ...
-
-
 class Landing(NamedTuple):
     """The contacts at the start of a step, before any force is known.
 
@@ -63,9 +41,9 @@ class Landing(NamedTuple):
         impact: whether a contact has just closed.
     """
 
-    closed: Array
-    qd: Array
-    eom: Any
+    closed: Tensor
+    qd: Tensor
+    eom: Equations
     impact: bool
 
 
@@ -75,60 +53,53 @@ class ContactForces(NamedTuple):
     Attributes:
         closed: `(n_contacts,)` bool.
         c: `(m,)` constraint error, open or closed [m].
-        multiplier: λ `(m,)`, zero where open.
+        multiplier: λ `(m,)`, zero for open contacts.
         Q: `(nq,)` Q_C + Q_G + Q_D + Q_u [N m].
         Q_D, Q_I, Q_z: `(nq,)` joint friction, and normal and friction force of the contacts [N m].
     """
 
-    closed: Array
-    c: Array
-    multiplier: Array
-    Q: Array
-    Q_D: Array
-    Q_I: Array
-    Q_z: Array
+    closed: Tensor
+    c: Tensor
+    multiplier: Tensor
+    Q: Tensor
+    Q_D: Tensor
+    Q_I: Tensor
+    Q_z: Tensor
 
 
-def can_open(system: ContactSystem, like: Array) -> Array:
-    """Which constraints are contacts with a surface, `(n_contacts,)` bool, an array like another one."""
-    flags = [isinstance(contact, SurfaceContact) for contact in system.contacts]
-    if isinstance(like, Tensor):
-        return torch.tensor(flags, dtype=torch.bool, device=like.device)
-    return np.array(flags, dtype=bool)
-
-
-def rows_of(system: ContactSystem, active: Tensor) -> Tensor:
+def rows_of(system: ConstrainedSystem, active: Tensor) -> Tensor:
     """The rows of the active contacts, `(*batch, m)` bool."""
     repeats = torch.tensor([contact.rows for contact in system.contacts], device=active.device)
     return active.repeat_interleave(repeats, dim=-1)
 
 
-def any_row(system: ContactSystem, rows: Array) -> Array:
+def any_row(system: ConstrainedSystem, rows: Tensor) -> Tensor:
     """Whether any row of each constraint is set: `(*batch, n_contacts)` bool from `(*batch, m)` bool."""
     if system.m == len(system.contacts):
         return rows
-    ends = np.cumsum([contact.rows for contact in system.contacts])
-    parts = [rows[..., end - c.rows : end].any(-1) for c, end in zip(system.contacts, ends, strict=True)]
-    return torch.stack(parts, -1) if isinstance(rows, Tensor) else np.stack(parts, -1)
+    parts = rows.split([contact.rows for contact in system.contacts], dim=-1)
+    return torch.stack([part.any(-1) for part in parts], dim=-1)
 
 
-def normal_rows(system: ContactSystem, rows: Array) -> Array:
+def normal_rows(system: ConstrainedSystem, rows: Tensor) -> Tensor:
     """The first row of each contact, that of its normal: `(*batch, n_contacts)` from `(*batch, m)`."""
+    if system.m == len(system.contacts):
+        return rows
     first = [sum(contact.rows for contact in system.contacts[:i]) for i in range(len(system.contacts))]
     return rows[..., first]
 
 
-def pulling(system: ContactSystem, active: Array, multiplier: Array) -> Array:
-    """Closed contacts `(*batch, n_contacts)` that would have to pull, λ `(*batch, m)` < 0, and that open."""
-    return normal_rows(system, multiplier < -PULL) & can_open(system, active) & active
+def pulling(system: ConstrainedSystem, active: Tensor, multiplier: Tensor) -> Tensor:
+    """Closed contacts `(*batch, n_contacts)` that open since they would pull, λ `(*batch, m)` < 0."""
+    return normal_rows(system, multiplier < -PULL) & system.can_open & active
 
 
-def reached(system: ContactSystem, active: Array, c: Array, cd: Array) -> Array:
-    """Open contacts `(*batch, n_contacts)` that the robot has reached, c ≤ 0 while ċ < 0, and that close."""
-    return normal_rows(system, (c <= 0.0) & (cd < -APPROACH)) & can_open(system, active) & ~active
+def reached(system: ConstrainedSystem, active: Tensor, c: Tensor, cd: Tensor) -> Tensor:
+    """Open contacts `(*batch, n_contacts)` that close: c ≤ 0 and ċ < 0."""
+    return normal_rows(system, (c <= 0.0) & (cd < -APPROACH)) & system.can_open & ~active
 
 
-def project_velocity(eom: Any, qd: Array) -> Array:
+def project_velocity(eom: Equations, qd: Tensor) -> Tensor:
     """Velocity `(*batch, nq)` after an inelastic impact without friction on the active constraints.
 
     M (q̇⁺ − q̇⁻) = Aᵀ Λ with A q̇⁺ = 0, so q̇⁺ = T q̇⁻ = q̇⁻ − L A q̇⁻.
@@ -139,14 +110,15 @@ def project_velocity(eom: Any, qd: Array) -> Array:
 def project_state(
     system: ConstrainedSystem, q: JointVector, qd: JointVector, active: ActiveContacts | None = None
 ) -> tuple[JointVector, JointVector]:
-    """The state on the constraint manifold next to (q, q̇) `(*batch, nq)`, in the metric of M.
+    """Project (q, q̇) `(*batch, nq)` onto the constraint manifold, in the metric of M.
 
     Newton's iteration q ← q − M⁻¹Aᵀ(A M⁻¹ Aᵀ)⁺ c moves along the directions in which constraint forces push;
-    q̇ ← q̇ − L A q̇ is the velocity on the manifold that is nearest in kinetic energy. For the contacts that
-    are `active` `(*batch, n_contacts)`, by default all, |c(q)| ≤ 1e−12 m (1e−5 m in float32) and A q̇ = 0.
+    q̇ ← q̇ − L A q̇ is the nearest velocity on the manifold in the metric of the kinetic energy. For the
+    contacts that are `active` `(*batch, n_contacts)`, by default all, |c(q)| ≤ 1e−12 m (1e−5 m in float32)
+    and A q̇ = 0.
 
     Raises:
-        NumericalError: the iteration does not converge, as where the surface is out of reach.
+        NumericalError: the iteration does not converge, for example if the surface is out of reach.
     """
     rows = system.active_rows(active, q.shape[:-1])
     tolerance = max(POSITION_TOLERANCE, ROUNDING * torch.finfo(q.dtype).eps)
@@ -167,7 +139,9 @@ def project_state(
     )
 
 
-def sliding_friction(system: ContactSystem, eom: Any, active: Array, viscous_friction: float) -> Array:
+def sliding_friction(
+    system: ConstrainedSystem, eom: Equations, active: Tensor, viscous_friction: float
+) -> Tensor:
     """Friction of the active contacts `(*batch, nq)`: Q_z = Σ J_Eᵀ F_z, F_z = −θ_v (I − n nᵀ) ṗ_E [N m, N].
 
     `active` is `(*batch, n_contacts)` bool, `viscous_friction` θ_v [N s/m].
@@ -180,12 +154,12 @@ def sliding_friction(system: ContactSystem, eom: Any, active: Array, viscous_fri
             n, v = at.normal, at.velocity
             sliding = v - ((v * n).sum(-1) / (n * n).sum(-1))[..., None] * n
             force = (-viscous_friction * active[..., i, None]) * sliding
-            Q_z = Q_z + (at.jacobian.swapaxes(-1, -2) @ force[..., None])[..., 0]
+            Q_z = Q_z + (at.jacobian.mT @ force[..., None])[..., 0]
     return Q_z
 
 
-def land(system: ContactSystem, q: Array, qd: Array, closed: Array) -> Landing:
-    """Close the contacts that one state `(nq,)` has reached, with their impact."""
+def land(system: ConstrainedSystem, q: Tensor, qd: Tensor, closed: Tensor) -> Landing:
+    """Close the contacts reached by one state `(nq,)`, with their impact."""
     eom = system.equations(q, qd, active=closed)
     new = reached(system, closed, eom.c, eom.cd)
     if not bool(new.any()):
@@ -196,14 +170,15 @@ def land(system: ContactSystem, q: Array, qd: Array, closed: Array) -> Landing:
 
 
 def contact_forces(
-    system: ContactSystem,
-    q: Array,
-    qd: Array,
+    system: ConstrainedSystem,
+    q: Tensor,
+    qd: Tensor,
     landing: Landing,
-    Q_u: Array,
+    Q_u: Tensor,
     viscous_friction: float,
 ) -> ContactForces:
-    """Normal and friction force at a state `(nq,)` under the torque Q_u [N m], once no contact has to pull.
+    """Normal and friction force at a state `(nq,)` under the torque Q_u [N m], after opening contacts that
+    would pull.
 
     `landing` holds the closed contacts and their equations of motion, `viscous_friction` is θ_v [N s/m].
     """

@@ -1,13 +1,12 @@
-"""What a motion would tell about the unknown forces of a robot.
+"""Information of a motion about the unknown forces of a robot.
 
-The torque is linear in what is unknown, τ = τ₀ + Φ(q, q̇, q̈) θ with θ ~ N(0, U Uᵀ): base parameters of
+The torque is linear in the unknowns, τ = τ₀ + Φ(q, q̇, q̈) θ with θ ~ N(0, U Uᵀ): base parameters of
 the links; for each joint a function of its speed and one of its position, as viscous and dry friction and
-Gaussian bumps; inertia of the drives, which is known until a fit has learned it with that of the links.
-A motion x with noise Σ leaves
+Gaussian bumps; inertia of the drives, after a fit has learned it. After a motion x with noise Σ
 
     Cov θ = U (1 + Uᵀ G U)⁻¹ Uᵀ,    G = Σ_i Φ(x_i)ᵀ Σ⁻¹ Φ(x_i),
 
-over independent looks i. `A` is the geometric mean over joints of the standard deviation of the torque in a
+over independent samples i. `A` is the geometric mean over joints of the standard deviation of the torque in a
 region, `D` the entropy of θ. Sources: Swevers et al., *Optimal robot excitation and identification*
 (IEEE T-RA 1997); Pukelsheim, *Optimal Design of Experiments* (1993).
 """
@@ -52,8 +51,8 @@ class Unknowns:
         robot: its kinematics, gravity and drives are used, its links as prior mean.
         base: combinations of the inertial parameters that act on the motion.
         low, high, fastest: `(nq,)` the range of positions and speeds that the functions span.
-        region: states `(m, nq)` at which the torque shall be known.
-        noise: `(nq,)` standard deviation of a look at the torque [N m, N].
+        region: states `(m, nq)` at which the torque is to be predicted.
+        noise: `(nq,)` standard deviation of a torque sample [N m, N].
         root: U `(p, p)`: the covariance of θ before the motion is U Uᵀ.
     """
 
@@ -103,7 +102,7 @@ class Unknowns:
 
     @property
     def parts(self) -> dict[str, slice]:
-        """Where θ has the links, the functions of the joints, and the drives."""
+        """Positions of links, joint functions and drives in θ."""
         links, drives = self.base.rank, len(self.root) - self.robot.nq
         return {"links": slice(0, links), "friction": slice(links, drives), "drives": slice(drives, None)}
 
@@ -124,7 +123,7 @@ class Unknowns:
         return Y, torch.cat(parts, dim=-1)
 
     def information(self, Phi: Tensor, seconds: float) -> Tensor:
-        """G `(p, p)` of a motion that lasts some seconds, from Φ at states of it."""
+        """G `(p, p)` of a motion of given duration, from Φ at its states."""
         A = (Phi / self.noise[:, None]).flatten(0, 1)
         return A.mT @ A * (seconds / LOOK / len(Phi))
 
@@ -141,7 +140,7 @@ class Unknowns:
         return torch.linalg.solve_triangular(L, self.root.mT, upper=False).mT
 
     def after(self, G: Tensor) -> Unknowns:
-        """What is unknown after a motion with information G."""
+        """The unknowns after a motion with information G."""
         return replace(self, root=self.covariance_root(G))
 
     def torque_std(self) -> Mapping[str, Tensor]:
@@ -160,7 +159,7 @@ def _squared(X: Tensor) -> Tensor:
 
 
 def rigid_torque(robot: RobotModel, q: Tensor, qd: Tensor, qdd: Tensor, Y: Tensor | None = None) -> Tensor:
-    """Torque that a motion `(n, nq)` needs by the robot file: Y π + armature q̈ − Q_D [N m, N]."""
+    """Torque of a motion `(n, nq)` according to the robot file: Y π + armature q̈ − Q_D [N m, N]."""
     Y = regressor(robot, q, qd, qdd) if Y is None else Y
     return Y @ parameter_vector(robot) + robot.armature * qdd - damping_force(robot, qd)
 
@@ -172,7 +171,7 @@ def a_optimal(G: Tensor, unknowns: Unknowns) -> Tensor:
 
 
 def d_optimal(G: Tensor, unknowns: Unknowns) -> Tensor:
-    """½ log det Cov θ over what is known before, per parameter."""
+    """½ log of det Cov θ relative to its prior, per parameter."""
     eye = torch.eye(unknowns.root.shape[1], dtype=G.dtype)
     return -0.5 * torch.logdet(eye + unknowns.root.mT @ G @ unknowns.root) / len(eye)
 

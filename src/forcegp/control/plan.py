@@ -1,6 +1,6 @@
 """The plan of a motion: reference, posture, orientation and start, drawn before anything moves.
 
-`MotionConfig` says where the tool goes, how fast, how hard it presses, and how it is controlled. Inverse
+`MotionConfig` defines path, speed, pressing force and control of the tool. Inverse
 kinematics finds the joint positions that put the tool at a pose.
 """
 
@@ -9,13 +9,12 @@ from __future__ import annotations
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
 
 import torch
 from torch import Tensor
 
 from forcegp import kinematics
-from forcegp.constraints import ConstrainedSystem
+from forcegp.constraints import ConstrainedSystem, Equations
 from forcegp.constraints.contact import SurfaceContact
 from forcegp.control.task_space import (
     Gains,
@@ -29,7 +28,8 @@ from forcegp.control.task_space import (
 from forcegp.control.trajectory import Chart, Reference, draw_waypoints, straight_lines
 from forcegp.errors import NumericalError, ParameterError
 from forcegp.robot.model import RobotModel
-from forcegp.types import Array, JointVector, Rotation, Vector3
+from forcegp.robot.shapes import turn_z
+from forcegp.types import JointVector, Rotation, Vector3
 
 NOT_NEGATIVE = "a finite number, 0 or above"
 
@@ -53,12 +53,12 @@ class MotionConfig:
         max_acceleration: of the end-effector along a line [m/s²].
         lift_probability: probability that a waypoint lies above the surface; 0 stays in contact.
         lift_height: range of heights of such a waypoint [m].
-        pressing_force: range of the force that presses on the surface, drawn for each line [N].
+        pressing_force: range of the force on the surface, drawn for each line [N].
         elbow_swing: how far the posture in the null space varies from line to line [rad].
-        tool_turn: turn of the tool about the surface's normal, for arms that reach better so [rad].
+        tool_turn: rotation of the tool about the surface's normal, for better reach [rad].
         gains: gains of the controller.
         torque_limit: one per joint, or `None` for the robot's own limits [N m].
-        frame, point: the tool where there is no contact; by default the last frame of the robot.
+        frame, point: the tool without contact; by default the last frame of the robot.
 
     Raises:
         ParameterError: a value is out of range; the message names it.
@@ -124,9 +124,9 @@ def inverse_kinematics(
 ) -> JointVector:
     """Joint positions `(nq,)` that put a point of a frame at a pose, by damped least squares from `starts`.
 
-    Each step is Jᵀ(J Jᵀ + μ I)⁻¹ e; the first half of them also move to `near` `(nq,)` in the null space of
-    J, and of the solutions from `starts` `(k, nq)` the one next to it is taken. The pose in the world is
-    `(3,)` [m] and `(3, 3)`; an arm with fewer than six joints is asked for the position alone.
+    Each step is Jᵀ(J Jᵀ + μ I)⁻¹ e; the first half of the steps also move towards `near` `(nq,)` in the null
+    space of J, and the solution from `starts` `(k, nq)` closest to it is returned. The pose in the world is
+    `(3,)` [m] and `(3, 3)`; for an arm with fewer than six joints only the position is matched.
 
     Raises:
         NumericalError: no start leads to the pose within the joint limits.
@@ -180,21 +180,12 @@ def _damped_step(J: Tensor, error: Tensor, leaning: Tensor) -> Tensor:
 
 
 def tool_rotation(normal: Vector3, ahead: Vector3, tool_axis: Vector3) -> Rotation:
-    """Axes `(3, 3)` of a frame whose `tool_axis` points into the surface, turned by π about the side axis.
+    """Axes `(3, 3)` of a frame with its `tool_axis` into the surface, rotated by π about the side axis.
 
     `normal` and `ahead` are the unit normal out of the surface and a unit tangent, `(3,)` each.
     """
-    z = torch.tensor([0.0, 0.0, 1.0], dtype=normal.dtype)
     down = torch.stack([-ahead, torch.linalg.cross(normal, ahead), -normal], dim=-1)
-    return down @ _shortest_turn(tool_axis, z)
-
-
-def _shortest_turn(a: Vector3, b: Vector3) -> Rotation:
-    """The rotation that takes the unit vector a to the z axis b on the shortest way (Rodrigues' formula)."""
-    if float(a @ b) < -1.0 + POSE_TOLERANCE:
-        return torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=a.dtype))
-    K = kinematics.skew(torch.linalg.cross(a, b))
-    return torch.eye(3, dtype=a.dtype) + K + K @ K / (1.0 + a @ b)
+    return down @ torch.from_numpy(turn_z(tool_axis.double().numpy()).T).to(down)
 
 
 STARTS = 64
@@ -220,23 +211,20 @@ class Plan:
     targets: Target | JointTarget
     start: Tensor
 
-    def arrays(self) -> Target | JointTarget:
-        """The targets as NumPy arrays `(n, …)`."""
-        return type(self.targets)(*(values.numpy() for values in self.targets))
-
-    def command(self, eom: Any, q: Array, qd: Array, target: Target | JointTarget, gains: Gains) -> Array:
-        """Motor torque `(nq,)` towards a target, not limited [N m]."""
+    def command(self, eom: Equations, q: Tensor, qd: Tensor, k: int | Tensor, gains: Gains) -> Tensor:
+        """Motor torque `(*batch, nq)` towards the targets of samples `(*batch,)`, not limited [N m]."""
+        target = type(self.targets)(*(values[k] for values in self.targets))
         if isinstance(target, JointTarget):
             return joint_torque(eom, q, qd, target, gains)
-        return control_torque(eom.tool, eom, q, qd, target, self.press(eom), gains)
+        tool = eom.point_motion(self.frame, self.point)
+        return control_torque(tool, eom, q, qd, target, self.press(eom), gains)
 
-    def press(self, eom: Any) -> Any:
+    def press(self, eom: Equations) -> Tensor:
         """Generalized unit normal force on each of the tool's contacts, summed, Σ Jᵀn/|n| `(*batch, nq)`."""
         total = 0.0 * eom.Q_C
         for name in self.contacts:
             at = eom.contact_points[name]
-            unit = at.normal / ((at.normal * at.normal).sum(-1) ** 0.5)[..., None]
-            total = total + (at.jacobian.swapaxes(-1, -2) @ unit[..., None])[..., 0]
+            total = total + (at.jacobian.mT @ at.unit_normal[..., None])[..., 0]
         return total
 
 

@@ -1,9 +1,8 @@
-"""Task-space inverse dynamics control with null-space control of the remaining freedom.
+"""Task-space inverse dynamics control with null-space control of the redundant degrees of freedom.
 
 The task is the pose of the tool, or its position alone for an arm with fewer than six joints. A redundant arm
-moves its elbow in the null space of the task's Jacobian, which leaves the task's error dynamics untouched
-(Siciliano et al., *Robotics: Modelling, Planning and Control*, p. 347 and section 3.5.1). The control law
-takes tensors of any batch, for rollouts, or NumPy arrays of one state, for the simulator.
+moves its elbow in the null space of the task's Jacobian, which does not affect the task's error dynamics
+(Siciliano et al., *Robotics: Modelling, Planning and Control*, p. 347 and section 3.5.1).
 """
 
 from __future__ import annotations
@@ -11,17 +10,12 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Any, NamedTuple
 
-import numpy as np
 import torch
-from scipy.linalg import get_lapack_funcs
 from torch import Tensor
 
 from forcegp.errors import NumericalError
 from forcegp.kinematics import PointMotion
-from forcegp.types import Array
 
-POTRF, POTRS = get_lapack_funcs(("potrf", "potrs"), dtype=np.float64)
-"""LAPACK's Cholesky factorisation and solve, without the overhead of wrappers."""
 POSE_ROWS, POSITION_ROWS = 6, 3
 SINGULAR = 1e-3
 """Below this smallest pivot of √(J Jᵀ) the task asks for joint speeds a thousand times its own."""
@@ -53,42 +47,42 @@ class Target(NamedTuple):
     Attributes:
         position, velocity, acceleration: `(*batch, 3)` of the tool point [m], [m/s], [m/s²].
         rotation: `(*batch, 3, 3)` constant axes of the tool's frame.
-        posture: `(*batch, nq)` joint positions that the null space leans to [rad].
-        push: `(*batch,)` force that the tool is to exert on the surface it touches, along its normal [N].
+        posture: `(*batch, nq)` preferred joint positions in the null space [rad].
+        push: `(*batch,)` desired normal force of the tool on the surface [N].
     """
 
-    position: Array
-    velocity: Array
-    acceleration: Array
-    rotation: Array
-    posture: Array
-    push: Array
+    position: Tensor
+    velocity: Tensor
+    acceleration: Tensor
+    rotation: Tensor
+    posture: Tensor
+    push: Tensor
 
 
 class JointTarget(NamedTuple):
     """Positions, velocities and accelerations of the joints at an instant, `(*batch, nq)`."""
 
-    q: Array
-    qd: Array
-    qdd: Array
+    q: Tensor
+    qd: Tensor
+    qdd: Tensor
 
 
 def task_rows(nq: int) -> slice:
-    """The rows of [ω; ṗ] that an arm of nq joints can follow: all of six joints, ṗ of fewer."""
+    """The rows of [ω; ṗ] that an arm of nq joints can follow: all for six joints, ṗ for fewer."""
     return slice(0 if nq >= POSE_ROWS else POSITION_ROWS, POSE_ROWS)
 
 
-def orientation_error(rotation: Array, target: Array) -> Array:
+def orientation_error(rotation: Tensor, target: Tensor) -> Tensor:
     """e_O = ½ Σᵢ rᵢ × rᵢᵈ of axes `(*batch, 3, 3)`: sin(angle) times the axis of the turn, `(*batch, 3)`.
 
     The sum is the vector of the skew part of R_d Rᵀ, in world axes (Siciliano et al., eq. 3.98).
     """
-    E = target @ rotation.swapaxes(-1, -2)
-    skew = E - E.swapaxes(-1, -2)
-    return 0.5 * _package(E).stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], -1)
+    E = target @ rotation.mT
+    skew = E - E.mT
+    return 0.5 * torch.stack([skew[..., 2, 1], skew[..., 0, 2], skew[..., 1, 0]], -1)
 
 
-def task_acceleration(tool: PointMotion, target: Target, gains: Gains) -> Array:
+def task_acceleration(tool: PointMotion, target: Target, gains: Gains) -> Tensor:
     """[ω̇; p̈] `(*batch, 6)` that makes both errors damped oscillators, ë + k_D ė + k_P e = 0."""
     omega, velocity = tool.twist[..., :3], tool.twist[..., 3:]
     turning = (
@@ -100,67 +94,52 @@ def task_acceleration(tool: PointMotion, target: Target, gains: Gains) -> Array:
         + gains.position_damping * (target.velocity - velocity)
         + gains.position_stiffness * (target.position - tool.position)
     )
-    return _package(omega).concatenate([turning, moving], -1)
+    return torch.cat([turning, moving], -1)
 
 
-def joint_acceleration(tool: PointMotion, task: Array, posture: Array) -> Array:
+def joint_acceleration(tool: PointMotion, task: Tensor, posture: Tensor) -> Tensor:
     """y = J⁺(a − J̇q̇) + (I − J⁺J) y₀: the task's acceleration, and the posture's in its null space.
 
     a `(*batch, 6)` is the task's and y₀ `(*batch, nq)` the posture's. J are the rows of the tool's Jacobian
-    that the arm can follow (`task_rows`); an arm with fewer joints than these comes as close as it can.
+    that the arm can follow (`task_rows`); an arm with fewer joints follows in the least-squares sense.
 
     Raises:
-        NumericalError: the arm is singular, so that the task cannot be reached.
+        NumericalError: the arm is in a singular pose, so the task cannot be reached.
     """
     nq = tool.jacobian.shape[-1]
     rows = task_rows(nq)
     J = tool.jacobian[..., rows, :]
-    Jt = J.swapaxes(-1, -2)
+    Jt = J.mT
     missing = ((task - tool.bias)[..., rows] - (J @ posture[..., None])[..., 0])[..., None]
     few = nq < J.shape[-2]
-    solved, pivot = _solve(Jt @ J, Jt @ missing) if few else _solve(J @ Jt, missing)
-    if not pivot >= SINGULAR:
+    factor, failed = torch.linalg.cholesky_ex(Jt @ J if few else J @ Jt)
+    if bool(failed.any()) or not float(factor.diagonal(dim1=-2, dim2=-1).min()) >= SINGULAR:
         raise NumericalError(
             "the arm is singular: its joints cannot give the tool every velocity",
             hint="a smaller rectangle, or one nearer to the centre of the workspace",
         )
+    solved = torch.cholesky_solve(Jt @ missing if few else missing, factor)
     return posture + (solved if few else Jt @ solved)[..., 0]
-
-
-def _solve(G: Array, x: Array) -> tuple[Array, float]:
-    """G⁻¹ x of symmetric positive definite matrices, and the smallest pivot; 0 if one is not definite."""
-    if isinstance(G, Tensor):
-        factor, failed = torch.linalg.cholesky_ex(G)
-        pivot = 0.0 if bool(failed.any()) else float(factor.diagonal(dim1=-2, dim2=-1).min())
-        return torch.cholesky_solve(x, factor), pivot
-    factor, failed = POTRF(G, lower=1)
-    solved, _ = POTRS(factor, x, lower=1)
-    return solved, 0.0 if failed else float(factor.diagonal().min())
-
-
-def _package(like: Array) -> Any:
-    """The package of an array's functions."""
-    return torch if isinstance(like, Tensor) else np
 
 
 def control_torque(
     tool: PointMotion,
     eom: Any,
-    q: Array,
-    qd: Array,
+    q: Tensor,
+    qd: Tensor,
     target: Target,
-    press: Array,
+    press: Tensor,
     gains: Gains,
-) -> Array:
+) -> Tensor:
     """Motor torque Q_u = M y − Q_K − Q_n F `(*batch, nq)` of inverse dynamics control, not limited [N m].
 
     Args:
         tool: the tool at the state.
         eom: the equations of motion at the state; M and Q_K = Q_C + Q_G + Q_D are used.
         q, qd: `(*batch, nq)` the state.
-        target: what is to be reached; F is its `push`.
-        press: Q_n `(*batch, nq)`, Jᵀn of unit normal forces where the tool is, summed over its contacts;
-            along the normal of the reference, the push would drive the tool away on a convex surface.
+        target: desired motion; F is its `push`.
+        press: Q_n `(*batch, nq)`, Jᵀn of unit normal forces at the actual tool position, summed over its
+            contacts; along the normal of the reference, the force would push the tool off a convex surface.
         gains: feedback gains.
 
     Raises:
@@ -171,7 +150,7 @@ def control_torque(
     return (eom.M @ y[..., None])[..., 0] - eom.Q_K - target.push[..., None] * press
 
 
-def joint_torque(eom: Any, q: Array, qd: Array, target: JointTarget, gains: Gains) -> Array:
+def joint_torque(eom: Any, q: Tensor, qd: Tensor, target: JointTarget, gains: Gains) -> Tensor:
     """Motor torque M (q̈_d + k_D ė + k_P e) − Q_K `(*batch, nq)` of joints, with the gains of positions."""
     y = target.qdd + gains.position_damping * (target.qd - qd) + gains.position_stiffness * (target.q - q)
     return (eom.M @ y[..., None])[..., 0] - eom.Q_K

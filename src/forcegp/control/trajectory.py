@@ -1,8 +1,8 @@
 """Reference motions of the end-effector: random points joined by straight lines (section 5.2 of the paper).
 
-Points are drawn in a chart (u, v, h): u and v along the sides of a rectangle that touches the surface in
-its centre, h the height above the surface. A line of the chart is run through with a trapezoidal velocity
-profile (Siciliano et al., *Robotics*, section 4.2.1) and then laid onto the surface.
+Points are drawn in a chart (u, v, h): u and v along the sides of a rectangle that touches the surface at its
+centre, h the height above the surface. A line of the chart is traversed with a trapezoidal velocity profile
+(Siciliano et al., *Robotics*, section 4.2.1) and then mapped onto the surface.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ class Trapezoid(NamedTuple):
     Attributes:
         length: `(*batch,)` distance travelled [m].
         travel_time: `(*batch,)` [s].
-        blend_time: `(*batch,)` time of speeding up, and of slowing down [s].
+        blend_time: `(*batch,)` duration of acceleration and of deceleration [s].
         acceleration: `(*batch,)` during the blends [m/s²].
     """
 
@@ -55,8 +55,8 @@ class Trapezoid(NamedTuple):
 def trapezoid(length: Tensor, travel_time: float, max_acceleration: float) -> Trapezoid:
     """Profiles of lengths d `(*batch,)` [m] and travel time T that accelerate with the maximum, a.
 
-    The blend time is t_c = T/2 − ½ √(T² − 4 d/a). Where a cannot cover d in T, the `travel_time` of
-    the result is 2 √(d/a). Source: Siciliano et al., eqs. 4.7 and 4.8.
+    The blend time is t_c = T/2 − ½ √(T² − 4 d/a). If the acceleration a is too small to cover d in T, the
+    `travel_time` of the result is 2 √(d/a). Source: Siciliano et al., eqs. 4.7 and 4.8.
 
     Raises:
         ForceGPError: the time or the acceleration is not positive.
@@ -72,10 +72,10 @@ def trapezoid(length: Tensor, travel_time: float, max_acceleration: float) -> Tr
 
 @dataclass(frozen=True)
 class Chart:
-    """Coordinates (u, v, h) about a place: along the surface, across it, and above it.
+    """Coordinates (u, v, h) about a point: two along the surface, and the height above it.
 
     Args:
-        center: `(3,)` origin, on the surface where there is one [m].
+        center: `(3,)` origin, on the surface if there is one [m].
         axes: `(3, 3)` rows: directions of u, v, and the normal at the centre.
         surface: the curved surface under u and v; `None` for a linear chart, on a plane and in free space.
     """
@@ -86,7 +86,7 @@ class Chart:
 
     @staticmethod
     def about(center: Tensor, surface: Surface | None) -> Chart:
-        """The chart about the point of the surface next to `center`; u points along the world's x axis.
+        """The chart about the point of the surface closest to `center`; u points along the world's x axis.
 
         In free space the normal is the world's z axis.
         """
@@ -139,11 +139,11 @@ class Reference:
     Attributes:
         t: `(n,)` [s].
         position, velocity, acceleration: `(n, 3)` in the world [m], [m/s], [m/s²].
-        segment: `(n,)` index of the line that is run through.
+        segment: `(n,)` index of the current line.
         on_surface: `(n,)` bool, whether that line lies on the surface.
-        waypoints: `(segments + 1, 3)` the points that the lines join, in the world [m].
+        waypoints: `(segments + 1, 3)` end points of the lines, in the world [m].
         travel_time: `(segments,)` [s].
-        lengthened: number of segments whose travel time the maximum acceleration made longer.
+        lengthened: number of segments slowed down to respect the maximum acceleration.
     """
 
     t: Tensor

@@ -1,10 +1,10 @@
 """Logged motion: the data set and its files, derivatives, noise, selection and splits."""
 
-from forcegp.data.checks import RobotMismatchWarning as RobotMismatchWarning
 from forcegp.data.dataset import Dataset as Dataset
 from forcegp.data.dataset import NotLoggedError as NotLoggedError
 from forcegp.data.derivative import SavitzkyGolay as SavitzkyGolay
 from forcegp.data.fields import DataHeader as DataHeader
+from forcegp.data.fields import RobotMismatchWarning as RobotMismatchWarning
 from forcegp.data.selection import Split as Split
 from forcegp.data.selection import complement as complement
 from forcegp.data.selection import farthest_points as farthest_points

@@ -21,7 +21,7 @@ Arrays = dict[str, Any]
 
 
 def unparse(data: Fields) -> tuple[Columns, DataHeader]:
-    """Columns and header of a data set, as they are written."""
+    """Columns and header of a data set in the form of the file."""
     columns: dict[str, Tensor] = {"t": data.t, "segment": data.segment}
     columns |= {f"contact.{name}": value for name, value in data.contact.items()}
     for name, value in named_columns(data).items():
@@ -33,7 +33,7 @@ def unparse(data: Fields) -> tuple[Columns, DataHeader]:
 
 
 def parse(source: str, raw: Columns, header: DataHeader, method: SavitzkyGolay | None) -> Arrays:
-    """Arrays of a data set from a file's columns; a `DataError` has the name nearest to a missing one."""
+    """Arrays of a data set from a file's columns; a `DataError` names the nearest existing column."""
     joints = header.joint_names or tuple(name[2:] for name in raw if name.startswith("q."))
     if not joints:
         raise DataError(f"{source}: no column 'q.<joint>'", expected="one per joint", got=_listing(raw))
@@ -63,7 +63,7 @@ def parse(source: str, raw: Columns, header: DataHeader, method: SavitzkyGolay |
 
 
 def as_tensors(fields: Arrays, dtype: torch.dtype, device: torch.device) -> Arrays:
-    """The arrays of `parse` as tensors, real numbers in the precision asked for."""
+    """The arrays of `parse` as tensors, real numbers in the requested precision."""
 
     def convert(value: Any) -> Any:
         if isinstance(value, dict):

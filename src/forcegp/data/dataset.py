@@ -11,7 +11,7 @@ from typing import TYPE_CHECKING, Any
 import torch
 from torch import Tensor
 
-from forcegp.data import checks
+from forcegp.data import fields
 from forcegp.data.columns import as_tensors, parse, unparse
 from forcegp.data.derivative import SavitzkyGolay
 from forcegp.data.fields import JOINT_VECTORS, Fields, mapped
@@ -37,7 +37,7 @@ def _time(data: Fields) -> str:
 
 
 class NotLoggedError(DataError, AttributeError):
-    """A quantity that the data set does not hold."""
+    """A quantity that is not in the data set."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,7 +52,7 @@ class Dataset(Fields):
         contact: name → `(n,)` bool, whether the contact is closed.
         extras: name → `(n, nq)` further logged joint vectors: `qdd_clean`, `Q`, `Q_z`, `Q_I`, …
         contact_extras: name → contact → `(n,)` or `(n, 3)`: `multiplier`, `F_I`, …
-        segment: `(n,)` number of the trajectory that a row belongs to; default one trajectory.
+        segment: `(n,)` number of the trajectory of each row; default one trajectory.
         header: noise, sampling period, robot, seed and provenance.
 
     Extras are attributes too: `data.Q_z`, `data.multiplier["table"]`.
@@ -73,15 +73,17 @@ class Dataset(Fields):
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "joint_names", tuple(self.joint_names))
-        checks.check_tensors(self)
+        fields.check_tensors(self)
         if self.segment is None:
             zero = torch.zeros(self.t.shape, dtype=torch.int64, device=self.t.device)
             object.__setattr__(self, "segment", zero)
-        checks.check_layout(self)
-        checks.check_values(self)
+        fields.check_layout(self)
+        fields.check_values(self)
 
     def __repr__(self) -> str:
-        """What is logged, without the numbers: samples, joints, duration, contacts, further quantities."""
+        """Summary of the columns without their numbers: samples, joints, duration, contacts, further
+        quantities.
+        """
         robot = f" of {self.header.robot!r}" if self.header.robot else ""
         parts = [f"{len(self)} samples of {self.nq} joints"]
         if len(self):
@@ -113,7 +115,7 @@ class Dataset(Fields):
         Raises:
             DataError: a mask of another length, or an index that does not exist.
         """
-        index = checks.row_indices(rows, len(self), self.t.device)
+        index = fields.row_indices(rows, len(self), self.t.device)
         ordered = self.header.ordered and bool((index[1:] > index[:-1]).all())
         header = self.header.model_copy(update={"ordered": ordered})
         return self._map(lambda value: value[index], header=header)
@@ -144,7 +146,7 @@ class Dataset(Fields):
         Raises:
             DataError: the state of a contact is not logged.
         """
-        return checks.contact_table(self, contacts)
+        return fields.contact_table(self, contacts)
 
     def replace(self, **fields: object) -> Dataset:
         """A data set with some fields changed."""
@@ -181,7 +183,7 @@ class Dataset(Fields):
         Raises:
             DataError: joints are missing, unknown or in another order; the hint names the remedy.
         """
-        checks.check_robot(self, robot)
+        fields.check_robot(self, robot)
 
     def plot(
         self, quantity: str | None = None, *, joints: Sequence[str] | None = None, ax: Target = None
@@ -195,7 +197,7 @@ class Dataset(Fields):
             ax: matplotlib axes to draw on, one per panel; default a new figure.
 
         Raises:
-            ForceGPError: no such quantity or joint, or the number of axes is not that of the panels.
+            ForceGPError: no such quantity or joint, or the number of axes differs from that of the panels.
         """
         from forcegp.data.plot import plot
 
@@ -217,18 +219,18 @@ class Dataset(Fields):
 
     @staticmethod
     def concatenate(parts: Sequence[Dataset]) -> Dataset:
-        """Data sets one after another, each with segments of its own.
+        """Concatenate data sets, with separate segments.
 
         Raises:
             DataError: no parts, or their joints, contacts, extras, precision or device differ.
         """
-        checks.check_alike(parts)
+        fields.check_alike(parts)
         segments, start = [], 0
         for part in parts:
             _, numbers = torch.unique_consecutive(part.segment, return_inverse=True)
             segments.append(numbers + start)
             start += int(numbers.max()) + 1 if len(part) else 0
-        header = checks.common_header([part.header for part in parts])
+        header = fields.common_header([part.header for part in parts])
         own = {"joint_names": parts[0].joint_names, "segment": torch.cat(segments), "header": header}
         return Dataset(**mapped(parts, torch.cat) | own)
 
@@ -245,7 +247,7 @@ class Dataset(Fields):
 
         Args:
             path: the file.
-            differentiate: how to compute the columns `qd` and `qdd` where the log has none.
+            differentiate: how to compute the columns `qd` and `qdd` if the log lacks them.
             dtype, device: of the tensors.
 
         Raises:
@@ -261,7 +263,7 @@ class Dataset(Fields):
 
         Raises:
             DataError: the name does not end in `.parquet`.
-            OSError: the place cannot be written.
+            OSError: the path cannot be written.
         """
         check_ending(path)
         write_parquet(path, *unparse(self))

@@ -1,4 +1,4 @@
-"""Velocities and accelerations from logged positions or velocities, with the noise they inherit."""
+"""Velocities and accelerations from logged positions or velocities, with their noise."""
 
 from __future__ import annotations
 
@@ -23,7 +23,7 @@ class SavitzkyGolay:
     """Differentiation of the polynomial fitted by least squares to a moving window.
 
     A wider window means less noise and more bias; a higher order the reverse. The noise of neighbouring
-    results is correlated over about one window, which a likelihood with white noise does not know.
+    results is correlated over about one window, which a likelihood with white noise ignores.
 
     Args:
         window: number of samples, odd.
@@ -48,16 +48,16 @@ class SavitzkyGolay:
 def cross_validated_window(
     signals: Sequence[NDArray[np.float64]], order: int = 3, most: int | None = None
 ) -> int:
-    """The window that predicts the noisiest of some signals best, each sample from the others in its window.
+    """The window that best predicts each sample of the noisiest signal from the others in the window.
 
-    With h the weight of a sample in its own fit, the sample is off the fit to the others by (x − x̂)/(1 − h).
-    Each column has the window with the least mean square of that (leave-one-out cross-validation), and the
-    widest of these windows is taken, so that all signals have one bandwidth.
+    With h the weight of a sample in its own fit, its leave-one-out error is (x − x̂)/(1 − h). Each column has
+    the window with the least mean square error, and the widest of these windows is returned, so that all
+    signals have the same bandwidth.
 
     Args:
         signals: logged values, `(n, d)` each, evenly spaced in time.
         order: degree of the polynomial.
-        most: widest window that is tried; by default as many samples as there are.
+        most: maximum window; by default the number of samples.
 
     Raises:
         DataError: a signal has fewer samples than the narrowest window.
@@ -98,8 +98,8 @@ def differentiate(
 
     The derivative is Σ_k w_k x_{i+k}, so white noise of standard deviation σ on x becomes σ |w|. The median
     absolute residual of the fit gives σ of each column: residuals scatter by σ √(1 − h), with h the weight of
-    a sample in its own fit. The outermost fits give the ends of each segment, with larger noise. Time t
-    `(n,)` [s] is evenly spaced within each segment, and no window reaches across two.
+    a sample in its own fit. The outermost fits are used at the ends of each segment, with larger noise. Time
+    t `(n,)` [s] is evenly spaced within each segment, and no window reaches across two.
 
     Raises:
         DataError: a segment is shorter than the window, or its time steps are uneven.

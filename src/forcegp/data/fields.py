@@ -1,15 +1,20 @@
-"""Header and columns of a data set, for its checks and files."""
+"""Header and columns of a data set, and whether they are valid and fit a robot, contacts and each other."""
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
+import torch
 from pydantic import NonNegativeFloat, PositiveFloat
 from torch import Tensor
 
+from forcegp.errors import DataError, near_names
 from forcegp.files import Header
+from forcegp.limits import LOGGED_VALUE
+from forcegp.robot.model import RobotModel
 
 
 class DataHeader(Header):
@@ -18,17 +23,17 @@ class DataHeader(Header):
     Attributes:
         dt: sampling period [s].
         noise_std: standard deviation of the noise on q̈ [rad/s²].
-        filtered: q̈ was computed by a filter, so that its noise is correlated in time; otherwise `noise_std`
-            claims white noise.
+        filtered: q̈ was computed by a filter, so its noise is correlated in time; otherwise `noise_std`
+            refers to white noise.
         filter_span: of the filter that computed q̈ [s]: its noise is uncorrelated further apart in time.
         robot: name of the robot.
         robot_fingerprint: `RobotModel.fingerprint` of the robot that moved.
         seed: seed of the random numbers that went into the data.
-        ordered: rows follow time within each segment (not so for points in order of selection).
-        provenance: what was done to the data, oldest first, one line per step.
-        derived: joint vectors that a filter computed from others of the log.
-        imported: kind and sentence of what an import found in the log, doubts about its mapping among them.
-        unmeasured_torques: joints whose motor torque was not measured; theirs is 0 in the columns.
+        ordered: rows are in order of time within each segment (false for points in order of selection).
+        provenance: processing steps of the data, oldest first.
+        derived: joint vectors computed by a filter.
+        imported: kind and sentence of each finding of the import, including doubts about its mapping.
+        unmeasured_torques: joints whose motor torque was not measured; the column is 0.
         joint_names, contact_names: in the order of the columns; empty if not logged.
     """
 
@@ -72,7 +77,7 @@ AXES = ("x", "y", "z")
 
 @dataclass(frozen=True, eq=False)
 class Fields:
-    """What a data set holds; `Dataset` documents each field."""
+    """Fields of a data set; `Dataset` documents them."""
 
     t: Tensor
     q: Tensor
@@ -99,7 +104,7 @@ def component_names(name: str, value: Tensor, joint_names: Sequence[str]) -> lis
 
 
 def named_columns(data: Fields) -> dict[str, Tensor]:
-    """Every floating-point column but time by its name on disk, vectors whole."""
+    """Every floating-point column except time, by its name on disk; vectors are not split."""
     named = {name: getattr(data, name) for name in JOINT_VECTORS} | dict(data.extras)
     for name, group in data.contact_extras.items():
         named |= {f"{name}.{contact}": value for contact, value in group.items()}
@@ -118,3 +123,266 @@ def mapped(parts: Sequence[Fields], change: Callable[[list[Tensor]], Tensor]) ->
             for name, group in first.contact_extras.items()
         },
     }
+
+
+def check_tensors(data: Fields) -> None:
+    """Check that every column is a tensor, and every group of columns a mapping, before they are used."""
+    for name in ("contact", "extras", "contact_extras"):
+        _check_kind(name, getattr(data, name), Mapping, "a mapping of names to tensors")
+    for name, group in data.contact_extras.items():
+        _check_kind(name, group, Mapping, "a mapping of contacts to tensors")
+    named = {"t": data.t, **named_columns(data)}
+    named |= {f"contact.{name}": value for name, value in data.contact.items()}
+    named |= {} if data.segment is None else {"segment": data.segment}
+    for name, value in named.items():
+        _check_kind(name, value, Tensor, "a tensor", f"call torch.tensor({name}, dtype=torch.float64)")
+
+
+def _check_kind(name: str, value: object, kind: type, expected: str, hint: str | None = None) -> None:
+    if not isinstance(value, kind):
+        raise DataError(
+            f"column {name!r} is not a tensor" if kind is Tensor else f"{name!r} is not a mapping",
+            expected=expected,
+            got=type(value).__name__,
+            hint=hint,
+        )
+
+
+def check_layout(data: Fields) -> None:
+    """Check shapes, types and device of the columns, and the names of joints and contacts."""
+    n, nq = len(data.t) if data.t.ndim == 1 else -1, len(data.joint_names)
+    if n < 0:
+        raise DataError("column 't' has the wrong shape", expected="(n,)", got=tuple(data.t.shape))
+    if nq == 0 or len(set(data.joint_names)) < nq:
+        raise DataError(
+            "the joint names are not valid", expected="one or more distinct", got=data.joint_names
+        )
+    shared = sorted(set(data.joint_names) & set(data.contact))
+    if shared:
+        raise DataError(f"{shared[0]!r} is the name of a joint and of a contact", hint="rename the contact")
+    _check_names(data)
+    for name, value in (("t", data.t), *named_columns(data).items()):
+        _check_type(name, value, data.t)
+    for name in (*JOINT_VECTORS, *data.extras):
+        _check_shape(name, getattr(data, name), (n, nq), f"{n} samples of {nq} joints")
+    for name, value in (("segment", data.segment), *data.contact.items()):
+        _check_shape(name, value, (n,), f"{n} samples")
+    for name, group in data.contact_extras.items():
+        for contact, value in group.items():
+            if contact not in data.contact:
+                raise DataError(
+                    f"{name!r} is logged of contact {contact!r}, whose state is not logged",
+                    expected=f"a contact column for one of {', '.join(data.contact) or 'no contacts'}",
+                )
+            if value.shape != (n, 3):
+                _check_shape(f"{name}.{contact}", value, (n,), f"{n} samples")
+    for name, value in data.contact.items():
+        if value.dtype != torch.bool:
+            raise DataError(f"column 'contact.{name}' has the wrong type", expected="bool", got=value.dtype)
+    if data.segment.dtype != torch.int64:
+        raise DataError("column 'segment' has the wrong type", expected="int64", got=data.segment.dtype)
+
+
+def _check_names(data: Fields) -> None:
+    """Extras must not hide a field, nor each other, and a dot in their name would cut it on disk."""
+    taken = set(vars(data))
+    for name in (*data.extras, *data.contact_extras):
+        if name in taken or "." in name or not name:
+            raise DataError(
+                f"{name!r} cannot be the name of a further logged quantity",
+                expected="a name of its own without a dot",
+                hint=f"{', '.join(sorted(taken))} are taken",
+            )
+        taken.add(name)
+
+
+def _check_type(name: str, value: Tensor, like: Tensor) -> None:
+    if not value.is_floating_point() or value.dtype != like.dtype or value.device != like.device:
+        wanted = f"{like.dtype} on {like.device}" if like.is_floating_point() else "a floating-point type"
+        raise DataError(
+            f"column {name!r} is of another type or on another device than 't'",
+            expected=wanted,
+            got=f"{value.dtype} on {value.device}",
+        )
+
+
+def _check_shape(name: str, value: Tensor, shape: tuple[int, ...], meaning: str) -> None:
+    if tuple(value.shape) != shape:
+        raise DataError(
+            f"column {name!r} has the wrong shape", expected=f"{shape}, {meaning}", got=tuple(value.shape)
+        )
+
+
+def check_values(data: Fields) -> None:
+    """Check that numbers are finite, except for undetermined predictions, and that time increases."""
+    for name, value in (("t", data.t), *named_columns(data).items()):
+        wrong = ~(value.abs() <= LOGGED_VALUE)
+        if name.startswith("predicted_"):
+            wrong &= ~value.isnan()
+        if bool(wrong.any()):
+            place = torch.nonzero(wrong)[0].tolist()
+            column = component_names(name, value, data.joint_names)[place[1] if len(place) > 1 else 0]
+            raise DataError(
+                f"column {column!r} holds {value[tuple(place)].item()} in row {place[0]}",
+                expected=f"a finite number in every row, up to ±{LOGGED_VALUE:g}",
+                got=f"{int(wrong.sum())} values in {name!r} that are not",
+                hint="drop or repair these rows before using the log",
+            )
+    if data.header.ordered:
+        check_time(data)
+
+
+def check_time(data: Fields) -> None:
+    """Check that the rows of each segment are contiguous with strictly increasing time; `DataError` names the
+    row.
+    """
+    t, segment = data.t, data.segment
+    same = segment[1:] == segment[:-1]
+    back = same & (t[1:] <= t[:-1])
+    if bool(back.any()):
+        row = int(torch.nonzero(back)[0]) + 1
+        raise DataError(
+            f"column 't' does not increase in row {row}",
+            expected=f"more than {t[row - 1].item():.9g} s",
+            got=f"{t[row].item():.9g} s",
+            hint="sort the log by time, or number its trajectories in a column 'segment'; select points with "
+            "data[rows], or pass header=DataHeader(ordered=False) if the rows are points in any order",
+        )
+    runs = segment[torch.cat([same.new_ones(min(len(segment), 1)), ~same])]
+    if len(runs.unique()) < len(runs):
+        seen, values = set(), runs.tolist()
+        twice = next(value for value in values if value in seen or seen.add(value))
+        raise DataError(
+            f"the rows of segment {twice} are not together", hint="sort the log by 'segment' and 't'"
+        )
+
+
+def row_indices(rows: object, n: int, device: torch.device) -> Tensor:
+    """Row numbers `(k,)` of a slice, mask or list; negative ones count from the end."""
+    if isinstance(rows, slice):
+        return torch.tensor(range(n)[rows], dtype=torch.int64, device=device)
+    rule = "rows are selected by a slice, a mask or a list of row numbers"
+    try:
+        index = torch.as_tensor(rows, device=device)
+    except (TypeError, ValueError, RuntimeError) as error:
+        raise DataError(rule, got=repr(rows)[:80]) from error
+    if index.ndim != 1 or (index.is_floating_point() and len(index)):
+        raise DataError(rule, got=f"a tensor of shape {tuple(index.shape)} and type {index.dtype}")
+    if index.dtype == torch.bool:
+        if len(index) != n:
+            raise DataError("the mask has another length than the data set", expected=n, got=len(index))
+        return torch.nonzero(index)[:, 0]
+    outside = (index < -n) | (index >= n)
+    if bool(outside.any()):
+        raise DataError("there is no such row", expected=f"0 to {n - 1}", got=int(index[outside][0]))
+    return torch.where(index < 0, index + n, index).to(torch.int64)
+
+
+TURN, MOST_RADIANS = 6.3, 60.0
+"""Angles beyond which a joint has turned once, and at most, if it has no limit [rad]."""
+
+
+class RobotMismatchWarning(UserWarning):
+    """The data were logged on a robot with other parameters than the current robot."""
+
+
+def check_joints(have: Sequence[str], want: Sequence[str], robot: str) -> None:
+    """Check that the joints of a log are those of a robot, in its order."""
+    if tuple(have) == tuple(want):
+        return
+    missing = [joint for joint in want if joint not in have]
+    if missing:
+        near = near_names(missing[0], (joint for joint in have if joint not in want))
+        problem = f"joint {missing[0]!r} of robot {robot!r} is not in the data"
+        same = f"is {near[0]!r} in the data the same joint? Rename its columns" if near else None
+        hint = same or lock_hint(missing)
+    else:
+        problem = f"the joints of the data are not those of robot {robot!r} in its order"
+        hint = "call data.select(robot.joint_names)"
+    raise DataError(problem, expected=", ".join(want), got=", ".join(have), hint=hint)
+
+
+def lock_hint(joints: Sequence[str]) -> str:
+    """Hint to treat joints that a log lacks, such as those of a gripper, as fixed."""
+    positions = ", ".join(f"{joint} = 0.0" for joint in joints)
+    return f"if they did not move, lock them: locked_joints = {{ {positions} }} under [robot] in a scene file"
+
+
+def check_robot(data: Fields, robot: RobotModel) -> None:
+    """Check that a log has the robot's joints, in its order; warn of other robot parameters and of angles
+    that look like degrees.
+    """
+    check_joints(data.joint_names, robot.joint_names, robot.name)
+    q, free = data.q.to(robot.lower) * robot.revolute, torch.full_like(robot.lower, MOST_RADIANS)
+    low, high = (
+        robot.lower.where(robot.lower.isfinite(), -free),
+        robot.upper.where(robot.upper.isfinite(), free),
+    )
+    beyond, most = int(((q < low) | (q > high)).any(-1).sum()), float(q.abs().max()) if len(data) else 0.0
+    if most > TURN and 2 * beyond > len(data):
+        warnings.warn(
+            f"angles reach {most:.4g} rad, beyond the range of {robot.name!r} in {beyond} of {len(data)} "
+            "rows: were they logged in degrees? (`forcegp check`)",
+            RobotMismatchWarning,
+            stacklevel=3,
+        )
+    logged = data.header.robot_fingerprint
+    if logged is not None and logged != robot.fingerprint:
+        warnings.warn(
+            f"the data were logged on robot {data.header.robot!r} (fingerprint {logged}) and are used with "
+            f"{robot.name!r} ({robot.fingerprint}): inertia, kinematics, base or gravity differ",
+            RobotMismatchWarning,
+            stacklevel=3,
+        )
+
+
+def contact_table(data: Fields, contacts: Sequence[str]) -> Tensor:
+    """`(n, len(contacts))` bool: which of the named contacts are closed."""
+    for name in contacts:
+        if name not in data.contact:
+            raise DataError(
+                f"column 'contact.{name}' is missing",
+                expected=f"contact.{name}, 1 where the contact is closed and 0 elsewhere",
+                got=", ".join(f"contact.{c}" for c in data.contact) or "no contact column",
+            )
+    closed = [data.contact[name] for name in contacts]
+    return torch.stack(closed, dim=-1) if closed else data.segment.new_zeros(len(data), 0).bool()
+
+
+def check_alike(parts: Sequence[Fields]) -> None:
+    """Check that data sets have the same columns, so that they can be concatenated."""
+    if not parts:
+        raise DataError("no data sets to concatenate", expected="one or more data sets")
+
+    def layout(data: Fields) -> dict[str, object]:
+        return {
+            "joints": data.joint_names,
+            "contacts": tuple(data.contact),
+            "extras": sorted(data.extras),
+            "contact extras": sorted((name, *sorted(group)) for name, group in data.contact_extras.items()),
+            "types": (data.q.dtype, data.q.device),
+        }
+
+    first = layout(parts[0])
+    for number, part in enumerate(parts[1:], start=1):
+        for what, value in layout(part).items():
+            if value != first[what]:
+                raise DataError(
+                    f"the {what} of data set {number} differ from those of data set 0",
+                    expected=first[what],
+                    got=value,
+                )
+
+
+def common_header(headers: Sequence[DataHeader]) -> DataHeader:
+    """The fields on which headers agree; the others get their default."""
+    first = headers[0].model_dump()
+    agreed = {name: v for name, v in first.items() if all(getattr(h, name) == v for h in headers)}
+    steps = tuple(dict.fromkeys(step for header in headers for step in header.provenance))
+    agreed["provenance"] = (*steps, f"concatenated {len(headers)} data sets")
+    for name in ("derived", "imported"):
+        agreed[name] = tuple(dict.fromkeys(value for header in headers for value in getattr(header, name)))
+    agreed["ordered"] = all(header.ordered for header in headers)
+    agreed["filtered"] = any(header.filtered for header in headers)
+    agreed["filter_span"] = max((h.filter_span for h in headers if h.filter_span is not None), default=None)
+    return DataHeader(**agreed)

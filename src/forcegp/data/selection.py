@@ -23,7 +23,7 @@ INPUTS = ("q", "qd", "tau")
 
 
 def standardized_inputs(data: Dataset) -> Float[Tensor, "n d"]:
-    """(q, q̇, τ) of each sample with zero mean and unit variance a column; constant columns become zero."""
+    """(q, q̇, τ) of each sample with zero mean and unit variance per column; constant columns become zero."""
     return standardized(torch.cat([getattr(data, name) for name in INPUTS], dim=-1))
 
 
@@ -43,10 +43,10 @@ def farthest_points(
     start: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Int[Tensor, " count"]:
-    """Indices of points each of which is farthest from those before it, by exact Euclidean distance.
+    """Indices of points, each the farthest from its predecessors, by exact Euclidean distance.
 
-    i_{k+1} = argmax_i min_{j ≤ k} |x_i − x_{i_j}|; of equal distances the lowest index wins, so the result
-    is deterministic, and the first k of it are the result for k points. O(n d) per point, O(n) memory.
+    i_{k+1} = argmax_i min_{j ≤ k} |x_i − x_{i_j}|; ties go to the lowest index, so the result is
+    deterministic, and its first k entries are the result for k points. O(n d) per point, O(n) memory.
 
     Args:
         x: `(n, d)` points.
@@ -100,7 +100,7 @@ def select_points(
         data: the log.
         count: how many points.
         method: `"farthest"` (on standardized q, q̇, τ), `"even"` (evenly spaced rows, in their order), or
-            `"random"` for comparison. Farthest points favour outliers, which a measured log has.
+            `"random"` for comparison. Farthest points favour the outliers of measured logs.
         seed: of the random choice.
         candidates: row numbers to choose from; default all.
         progress: called with the number of points chosen so far.
@@ -122,7 +122,7 @@ def select_points(
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """Rows to train on, in the order of selection, rows to test on, increasing, and the held-out stretches as
+    """Training rows in the order of selection, test rows in increasing order, and the held-out stretches as
     (first row, one past the last).
     """
 
@@ -169,7 +169,7 @@ def split_by_stretches(
         count: how many training points.
         stretch: approximate duration of the equal stretches that each trajectory is cut into [s].
         fraction: part of the stretches that is held out.
-        margin: time beside each held-out stretch from which no training point is taken either [s].
+        margin: time around each held-out stretch without training points [s].
         method: see `select_points`.
         seed: of the draw of stretches (and of a random selection).
         progress: called with the number of points chosen so far.
@@ -231,7 +231,7 @@ IMPACT = "impact"
 
 
 def without_marked_impacts(data: Dataset) -> Dataset:
-    """The rows that no mask `impact.<contact>` marks; all rows of a log without masks."""
+    """The rows not marked by any mask `impact.<contact>`; all rows of a log without masks."""
     marked = torch.zeros(len(data), dtype=torch.bool, device=data.t.device)
     for mask in data.contact_extras.get(IMPACT, {}).values():
         marked |= mask > 0.0
@@ -242,9 +242,9 @@ def without_marked_impacts(data: Dataset) -> Dataset:
 
 
 def with_noise(data: Dataset, std: float, generator: torch.Generator) -> Dataset:
-    """Gaussian noise on q̈, beside the noise-free value: q̈ = q̈_clean + std ε, ε ~ N(0, I).
+    """Add Gaussian noise to q̈ and keep the noise-free value: q̈ = q̈_clean + std ε, ε ~ N(0, I).
 
-    If the data hold `qdd_clean`, the noise is added to that, so that it never adds up.
+    If the data contain `qdd_clean`, the noise is added to that, so that repeated calls do not accumulate.
 
     Args:
         data: the log.

@@ -1,4 +1,4 @@
-"""A long log in Parquet files, read a piece at a time; a window sees the pieces beside its own."""
+"""A long log in Parquet files, read piece by piece; filter windows overlap neighbouring pieces."""
 
 from __future__ import annotations
 
@@ -16,11 +16,10 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
-from forcegp.data.checks import check_alike, common_header
 from forcegp.data.columns import as_tensors, parse
 from forcegp.data.dataset import Dataset
 from forcegp.data.derivative import SavitzkyGolay
-from forcegp.data.fields import DataHeader
+from forcegp.data.fields import DataHeader, check_alike, common_header
 from forcegp.data.table import Columns, IgnoredColumnsWarning, existing, numeric, opened_parquet
 from forcegp.errors import DataError
 
@@ -127,7 +126,7 @@ class _Trajectories:
         self.time = -np.inf if t is None else float(t[-1])
 
     def peek(self, columns: Columns) -> None:
-        """Number rows that come next, without passing on to them."""
+        """Number the next rows without advancing."""
         columns["segment"] = self.last_number + np.cumsum(self._starts(columns["segment"]))
 
     def _starts(self, raw: NDArray[np.generic]) -> NDArray[np.bool_]:
@@ -142,13 +141,13 @@ Keep = Callable[[Dataset], Tensor]
 
 @dataclass(frozen=True)
 class StreamedDataset:
-    """A log of any length in one or several Parquet files, one after another, with trajectories of their own.
+    """A log of any length in one or several Parquet files, each with separate trajectories.
 
-    What the files lack is computed as by `Dataset.read`; its noise is estimated piece by piece.
+    Missing columns are computed as in `Dataset.read`; their noise is estimated piece by piece.
 
     Args:
         paths: the files; their joints, contacts and further columns must agree.
-        differentiate: how to compute the columns `qd` and `qdd` where the log has none.
+        differentiate: how to compute the columns `qd` and `qdd` if the log lacks them.
         joints: the joints wanted, in this order; by default those of the files.
         dtype, device: of the tensors.
         distributed: whether the processes of `torch.distributed` share the pieces in a fit. Each of them
@@ -185,7 +184,7 @@ class StreamedDataset:
 
     @property
     def digest(self) -> int:
-        """A number that belongs to the bytes of all files."""
+        """A hash of the bytes of all files."""
         digest = hashlib.sha256()
         for path in self.files:
             with path.open("rb") as file:
@@ -196,7 +195,7 @@ class StreamedDataset:
     @cached_property
     def _shapes(self) -> tuple[tuple[int, DataHeader], ...]:
         """Rows and header of each file."""
-        return tuple(shape_of(path) for path in self.files)
+        return tuple(map(shape_of, self.files))
 
     def __len__(self) -> int:
         """Number of samples."""
@@ -222,7 +221,7 @@ class StreamedDataset:
 
         Args:
             start: number of pieces to skip.
-            share: (r, k) yields data only for piece r of every k, as it belongs to another process.
+            share: (r, k) yields data only for piece r of every k; the others belong to other processes.
 
         Raises:
             DataError: a file is damaged or not a valid log, or differs from the first one in its columns.
@@ -260,8 +259,8 @@ class StreamedDataset:
 
 
 def spaced_sample(pieces: Iterable[Dataset], count: int, keep: Keep | None = None) -> tuple[Dataset, int]:
-    """Evenly spaced rows of a log of unknown length, `count` to twice as many if there are so many, in one
-    pass, and the number of all rows that count by `keep`; `DataError` without any piece.
+    """Evenly spaced rows of a log of unknown length, `count` to twice as many if available, in one pass, and
+    the number of all rows kept by `keep`; `DataError` without any piece.
     """
     kept: list[tuple[Tensor, Dataset]] = []
     step, total = 1, 0

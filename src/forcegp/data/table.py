@@ -45,7 +45,7 @@ def check_ending(path: str | Path) -> None:
 
 
 def write_parquet(path: str | Path, columns: Columns, header: DataHeader) -> None:
-    """Write columns and header to a Parquet file, whole or not at all; `OSError` where that fails."""
+    """Write columns and header to a Parquet file, whole or not at all; `OSError` if that fails."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -64,8 +64,8 @@ def write_parquet(path: str | Path, columns: Columns, header: DataHeader) -> Non
 def read_table(
     path: str | Path, *, missing: Literal["refuse", "nan"] = "refuse"
 ) -> tuple[Columns, DataHeader]:
-    """Numeric columns of a Parquet or CSV file, and its header (defaults where it has none); an empty value
-    is an error, or NaN where `missing` is `"nan"`. A `DataError` says why a file cannot be read.
+    """Numeric columns of a Parquet or CSV file, and its header (defaults if there is none); an empty value is
+    an error, or NaN if `missing` is `"nan"`. A `DataError` states why a file cannot be read.
     """
     file = existing(path)
     readers = {".parquet": _read_parquet, ".csv": _read_csv}
@@ -77,7 +77,7 @@ def read_table(
 
 
 def existing(path: str | Path) -> Path:
-    """The path of a file that exists, else a `DataError` whose hint names the nearest one."""
+    """The path of a file that exists, else a `DataError` with the nearest name as hint."""
     file = Path(path)
     with foreign(str(path), "a path"):
         if file.is_file():

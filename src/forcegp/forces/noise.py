@@ -1,14 +1,8 @@
-"""The noise of what a log measures: accelerations, motor torques, and the state.
-
-**Forces that are no function of the state.** Inside its static friction, the friction of a joint is whatever
-balances the other forces. A joint that hardly moves therefore has an unknown force of variance
-σ_s² e^{−(q̇/v_s)²} more. And noise learned where nothing moves says little about a jump: beyond the range of
-speeds and torques that a joint was trained on, its force has a standard deviation g D more, with D the
-distance from that range in training standard deviations. `calibration.growth` estimates g.
+"""Measurement noise of a log: accelerations, motor torques, and the state.
 
 **Noise of the state**, to first order. At a measured state x + δ, with δ ~ N(0, Σ_x), the model predicts
-z(x + δ) ≈ z(x) + G δ, so a sample's rows have the noise G Σ_x Gᵀ more, with G = ∂z/∂(q, q̇) (McHutchon and
-Rasmussen, *Gaussian process training with input noise*, 2011). G is that of the robot file's equations of
+z(x + δ) ≈ z(x) + G δ, so a sample's rows have the additional noise G Σ_x Gᵀ, with G = ∂z/∂(q, q̇) (McHutchon
+and Rasmussen, *Gaussian process training with input noise*, 2011). G is that of the robot file's equations of
 motion under the measured torque, or, once forces have been learned, that of q̈ = L b + H F̄ with their
 posterior mean F̄ (`forces/noise_learning.py`).
 """
@@ -26,6 +20,7 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError, UnknownNameError
 from forcegp.forces.measurements import Measurement, NoiseStd, Training
+from forcegp.forces.posterior import STICK_NOISE, STICK_SPEED, STICKING
 from forcegp.forces.priors.base import NOISE, ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import JointFrictionPrior
@@ -39,8 +34,8 @@ class Noise:
 
     Args:
         acceleration: standard deviation of measured accelerations [rad/s², m/s²], one or one per joint; by
-            default what the log states (`qdd_std` by sample, else its header), else 0.1.
-        learn: whether it is a hyperparameter, which starts there.
+            default the value in the log (`qdd_std` by sample, else its header), else 0.1.
+        learn: whether it is a hyperparameter, starting at this value.
         torque: standard deviation of the motor torque's white noise [N m, N], one or one per joint;
             `"learn"`, `None` for none, or `"auto"`: learned with the priors of measured robots.
         state: standard deviations of the white noise of measured q and q̇ [rad, rad/s], each one number or
@@ -48,8 +43,8 @@ class Noise:
         degrees_of_freedom: ν > 2 of a Student t distribution of each sample's noise, such as 4, for logs with
             impacts and other outliers; `None` for Gaussian noise (`forces/noise_learning.py`).
         external: standard deviation of an unknown force on some joints, by name [N m, N]: of a joint without
-            a torque sensor, or one that somebody moves by hand. Joints whose torque the log does not have
-            get the size of the force that moves them.
+            a torque sensor, or one that somebody moves by hand. Joints without a logged torque get the size
+            of the force that moves them.
 
     Example:
         >>> Noise(0.1, torque="learn").learns_torque
@@ -91,7 +86,7 @@ class Noise:
 
     @classmethod
     def of(cls, noise: NoiseStd | Noise | None) -> Noise:
-        """A noise as given, or that of accelerations alone."""
+        """The given `Noise`, or one of accelerations alone."""
         return noise if isinstance(noise, cls) else cls(noise)  # pyright: ignore[reportArgumentType]
 
     @property
@@ -100,7 +95,7 @@ class Noise:
         return self.torque == "learn" if isinstance(self.torque, str) else False
 
     def for_priors(self, priors: Sequence[ForcePrior]) -> Noise:
-        """The noise with that of the torque learned beside priors of measured robots, if it was left open."""
+        """The noise with `torque="auto"` resolved: learned with the priors of measured robots."""
         if not isinstance(self.torque, str) or self.torque != "auto":
             return self
         measured = any(isinstance(prior, JointFrictionPrior | InertialPrior) for prior in priors)
@@ -109,21 +104,6 @@ class Noise:
 
 TORQUE_NOISE = f"{NOISE}.torque.log_noise_std"
 """Name of the learned noise of the motor torque."""
-STICK_NOISE, STICK_SPEED = f"{NOISE}.stick.log_noise_std", f"{NOISE}.stick.log_speed"
-"""Names of the learned σ_s and v_s of each joint."""
-STICKING = 0.02
-"""v_s where learning begins [rad/s, m/s]."""
-REGION = f"{NOISE}.region."
-LOW, HIGH, SPREAD, GROWTH = (REGION + name for name in ("low", "high", "spread", "growth"))
-"""Names of the trained region: limits and standard deviation of the speed and torque of each joint `(2, nq)`,
-and g `(nq,)` [N m, N]."""
-OUTERMOST = 0.01
-"""Share of the training samples that lies beyond either limit of the region."""
-RELATIVE = 0.05
-"""Growth g over the typical load of a joint that is expected before learning: torque constants and
-friction that depends on load are uncertain by some 5 %."""
-FAR = 3.0
-"""Distance beyond the trained region from which a prediction warns."""
 
 
 def initial_torque_noise(residual: Tensor) -> dict[str, Tensor]:
@@ -150,71 +130,6 @@ def external_std(external: Mapping[str, float] | None, robot: RobotModel) -> Ten
     return robot.mass.new_tensor([external.get(joint, 0.0) for joint in robot.joint_names])
 
 
-def stick_variance(tensors: Mapping[str, Tensor], at: States) -> Tensor:
-    """Variance of the friction of joints that stick, `(n, nq)`; zero where it is not learned."""
-    if STICK_NOISE not in tensors:
-        return torch.zeros_like(at.q)
-    std, speed = tensors[STICK_NOISE].exp(), tensors[STICK_SPEED].exp()
-    return std**2 * torch.exp(-((at.qd / speed) ** 2))
-
-
-def trained_region(qd: Tensor, tau: Tensor, load: Tensor) -> dict[str, Tensor]:
-    """The region of the training samples `(n, nq)`, by the names of `LOW`, `HIGH` and `SPREAD`.
-
-    Args:
-        qd, tau: of samples in motion.
-        load: typical torque of each joint `(nq,)`, a fraction of which is the least spread of its torque.
-    """
-    x = torch.stack([qd, tau], dim=1)
-    low, high = x.quantile(torch.tensor([OUTERMOST, 1.0 - OUTERMOST]).to(x), dim=0)
-    least = torch.stack([torch.full_like(load, STICKING), RELATIVE * load])
-    return {LOW: low, HIGH: high, SPREAD: x.std(0, correction=0).maximum(least)}
-
-
-def distance_beyond(tensors: Mapping[str, Tensor], qd: Tensor, tau: Tensor) -> Tensor:
-    """D of each joint `(*batch, nq)` in training standard deviations; zero inside the trained region, or
-    where none is known."""
-    if LOW not in tensors:
-        return torch.zeros_like(qd)
-    x = torch.stack([qd, tau], dim=-2)
-    beyond = (tensors[LOW] - x).maximum(x - tensors[HIGH]).clamp(min=0.0)
-    return (beyond / tensors[SPREAD]).norm(dim=-2)
-
-
-def warnings_beyond(distance: Tensor, joints: Sequence[str]) -> tuple[str, ...]:
-    """A warning where states lie far beyond the trained region.
-
-    Args:
-        distance: D `(*batch, nq)`.
-    """
-    rows = distance.reshape(-1, distance.shape[-1])
-    far = int((rows > FAR).any(-1).sum())
-    if not far:
-        return ()
-    most, joint = rows.amax(0).max(0)
-    return (
-        f"{far} of {len(rows)} states lie beyond the trained speeds and torques, by up to {float(most):.3g} "
-        f"training standard deviations ({joints[int(joint)]}); their error bars are a guess: train on such "
-        "motion",
-    )
-
-
-def hidden_variance(tensors: Mapping[str, Tensor], at: States, external: Tensor | None) -> Tensor:
-    """Variance of forces that neither state nor torque sensor determines, `(n, nq)`: of joints that stick,
-    and unknown ones of stated size `(nq,)`."""
-    variance = stick_variance(tensors, at)
-    return variance if external is None else variance + external**2
-
-
-def unknown_variance(tensors: Mapping[str, Tensor], at: States, external: Tensor | None) -> Tensor:
-    """Variance of forces beside the learned ones in a prediction `(n, nq)`: hidden ones, and g² D² beyond the
-    trained region."""
-    variance = hidden_variance(tensors, at, external)
-    if GROWTH not in tensors:
-        return variance
-    return variance + (tensors[GROWTH] * distance_beyond(tensors, at.qd, at.tau)).square()
-
-
 ForceNoise = Callable[[States], Tensor]
 """Variance of the white noise on the joint force at states, `(n, nq)`."""
 
@@ -225,8 +140,8 @@ class SampleNoise:
 
     Attributes:
         std: σ of each component, `(d,)` or `(n, d)`.
-        force: Σ_τ, which reaches the values as the joint force does.
-        state: G Σ_x½ `(n, d, 2 nq)`, the factor of what noise of the state gives the values.
+        force: Σ_τ, the variance of the joint force.
+        state: G Σ_x½ `(n, d, 2 nq)`, factor of the noise of the state.
         weight: w of each sample `(n,)`; `None` for one.
     """
 

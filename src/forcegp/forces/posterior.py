@@ -1,19 +1,23 @@
 """The impressed forces before data, after them (eqs. 22 to 25), and as functions drawn from the posterior.
 
-Q̄ = m + Σ_p E_p f_p with f_p ~ GP(0, k_p), and Coulomb friction of contacts, which goes with the multiplier.
-Every quantity z = B_Q Q + B_z Q_z + o is an affine map of the latent forces f_p, so that their posterior
+Q̄ = m + Σ_p E_p f_p with f_p ~ GP(0, k_p), and Coulomb friction of contacts, proportional to the multiplier.
+Every quantity z = B_Q Q + B_z Q_z + o is an affine map of the latent forces f_p, so their posterior
 determines it. Each function drawn from it is a deterministic force field that can be integrated.
 
-Accelerations in contact depend on Q + Q_z alone (remark 3.3). The two are told apart by where they act (Q_z
-only in contact, along the tangent), by their inputs, and by measurements of either. Their posterior
-correlation measures the separation: at −1 only the sum is identifiable, at 0 each is known as well as the
-data allow.
+Accelerations in contact depend on Q + Q_z alone (remark 3.3). The two are distinguished by their directions
+(Q_z acts only in contact, along the tangent), by their inputs, and by measurements of either. Their posterior
+correlation measures the separation: at −1 only the sum is identifiable, at 0 they are separated.
+
+**Forces that are no function of the state.** At rest, the friction of a joint balances the other forces. A
+joint that hardly moves therefore has an additional unknown force of variance σ_s² e^{−(q̇/v_s)²}. Beyond the
+trained range of speeds and torques of a joint, its force has an additional standard deviation g D, with D the
+distance from that range in training standard deviations. `calibration.growth` estimates g.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -23,7 +27,7 @@ from torch.linalg import vecdot
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.forces.measurements import Training
-from forcegp.forces.priors.base import CONSTRAINT, CONTACT, JOINT, ForceMean, ForcePrior
+from forcegp.forces.priors.base import CONSTRAINT, CONTACT, JOINT, NOISE, ForceMean, ForcePrior
 from forcegp.forces.priors.contact import CoulombFriction, coupled, with_coulomb
 from forcegp.forces.quantities import OPEN, AffineMap, States, affine_map, hidden_forces
 from forcegp.gp.draws import FunctionSamples
@@ -31,10 +35,26 @@ from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.features import Block, Features, Standardization
 from forcegp.gp.sparse import SparsePosterior
 
+STICK_NOISE, STICK_SPEED = f"{NOISE}.stick.log_noise_std", f"{NOISE}.stick.log_speed"
+"""Names of the learned σ_s and v_s of each joint."""
+STICKING = 0.02
+"""v_s where learning begins [rad/s, m/s]."""
+REGION = f"{NOISE}.region."
+LOW, HIGH, SPREAD, GROWTH = (REGION + name for name in ("low", "high", "spread", "growth"))
+"""Names of the trained region: limits and standard deviation of the speed and torque of each joint `(2, nq)`,
+and g `(nq,)` [N m, N]."""
+OUTERMOST = 0.01
+"""Share of the training samples that lies beyond either limit of the region."""
+RELATIVE = 0.05
+"""Growth g over the typical load of a joint that is expected before learning: torque constants and
+friction that depends on load are uncertain by some 5 %."""
+FAR_BEYOND = 3.0
+"""Distance beyond the trained region from which a prediction warns."""
+
 
 @dataclass(frozen=True, eq=False)
 class ForceProcess:
-    """Priors on forces with what their operators have learned.
+    """Priors on forces with learned parameters of their operators.
 
     Attributes:
         priors, scales: the force priors and the standardization of their inputs.
@@ -88,7 +108,7 @@ LatentPosterior = ExactPosterior | SparsePosterior
 
 @dataclass(frozen=True, eq=False)
 class ForcePosterior:
-    """Latent forces conditioned on data; independent of the constraint under which it is read.
+    """Latent forces conditioned on data; independent of the constraint at prediction.
 
     Attributes:
         process: the forces before the data.
@@ -104,14 +124,14 @@ class ForcePosterior:
         return self.process.priors
 
     def shift(self, p: int, features: Features) -> Tensor | float:
-        """Shift of samples of the latent force of prior p that gives them the predicted mean."""
+        """Shift of samples of latent force p to the predicted mean."""
         if not self.process.pinned:
             return 0.0
         return self.means.latent_mean(p, features) - self.latent.latent_mean(p, features)
 
     @cached_property
     def means(self) -> LatentPosterior:
-        """The processes that means are read from: those given the forces that the robot contains."""
+        """The processes for means, given the forces that the robot contains."""
         means = self.latent
         for p, value in self.process.pinned.items():
             means = means.knowing(p, {"one": value.new_zeros(1, 1)}, value)
@@ -152,6 +172,81 @@ class ForcePosterior:
         return rows.target + self.means.mean(rows)
 
 
+def stick_variance(tensors: Mapping[str, Tensor], at: States) -> Tensor:
+    """Variance of the friction of joints that stick, `(n, nq)`; zero if it is not learned."""
+    if STICK_NOISE not in tensors:
+        return torch.zeros_like(at.q)
+    std, speed = tensors[STICK_NOISE].exp(), tensors[STICK_SPEED].exp()
+    return std**2 * torch.exp(-((at.qd / speed) ** 2))
+
+
+def trained_region(qd: Tensor, tau: Tensor, load: Tensor, hidden: Tensor | None = None) -> dict[str, Tensor]:
+    """The region of the training samples `(n, nq)`, by the names of `LOW`, `HIGH` and `SPREAD`.
+
+    Args:
+        qd, tau: of samples in motion.
+        load: typical torque of each joint `(nq,)`, a fraction of which bounds the spread of its torque from
+            below.
+        hidden: `(nq,)` bool, joints without effect of the torque on accelerations; their region is one
+            standard deviation around the mean.
+    """
+    x = torch.stack([qd, tau], dim=1)
+    low, high = x.quantile(torch.tensor([OUTERMOST, 1.0 - OUTERMOST]).to(x), dim=0)
+    least = torch.stack([torch.full_like(load, STICKING), RELATIVE * load])
+    spread = x.std(0, correction=0).maximum(least)
+    if hidden is not None:
+        mean, std = tau.mean(0), spread[1]
+        low[1], high[1] = torch.where(hidden, mean - std, low[1]), torch.where(hidden, mean + std, high[1])
+    return {LOW: low, HIGH: high, SPREAD: spread}
+
+
+def distance_beyond(tensors: Mapping[str, Tensor], qd: Tensor, tau: Tensor) -> Tensor:
+    """D of each joint `(*batch, nq)` in training standard deviations; zero inside the trained region, or if
+    it is unknown.
+    """
+    if LOW not in tensors:
+        return torch.zeros_like(qd)
+    x = torch.stack([qd, tau], dim=-2)
+    beyond = (tensors[LOW] - x).maximum(x - tensors[HIGH]).clamp(min=0.0)
+    return (beyond / tensors[SPREAD]).norm(dim=-2)
+
+
+def warnings_beyond(distance: Tensor, joints: Sequence[str]) -> tuple[str, ...]:
+    """A warning if states lie far beyond the trained region.
+
+    Args:
+        distance: D `(*batch, nq)`.
+    """
+    rows = distance.reshape(-1, distance.shape[-1])
+    far = int((rows > FAR_BEYOND).any(-1).sum())
+    if not far:
+        return ()
+    most, joint = rows.amax(0).max(0)
+    return (
+        f"{far} of {len(rows)} states lie beyond the trained speeds and torques, by up to {float(most):.3g} "
+        f"training standard deviations ({joints[int(joint)]}); their error bars are a guess: train on such "
+        "motion",
+    )
+
+
+def hidden_variance(tensors: Mapping[str, Tensor], at: States, external: Tensor | None) -> Tensor:
+    """Variance of forces determined by neither state nor torque sensor, `(n, nq)`: of joints that stick, and
+    of unknown forces of stated size `(nq,)`.
+    """
+    variance = stick_variance(tensors, at)
+    return variance if external is None else variance + external**2
+
+
+def unknown_variance(tensors: Mapping[str, Tensor], at: States, external: Tensor | None) -> Tensor:
+    """Additional variance of forces in a prediction `(n, nq)`: hidden forces, and g² D² beyond the trained
+    region.
+    """
+    variance = hidden_variance(tensors, at, external)
+    if GROWTH not in tensors:
+        return variance
+    return variance + (tensors[GROWTH] * distance_beyond(tensors, at.qd, at.tau)).square()
+
+
 CHUNK_STATES = 256
 """States at which samples are evaluated at once, so that intermediate arrays stay in the cache."""
 
@@ -161,7 +256,7 @@ class ForceSamples:
     """Forces drawn from the posterior.
 
     Attributes:
-        posterior: what they are drawn from.
+        posterior: source of the samples.
         functions: the latent functions.
     """
 
@@ -218,7 +313,7 @@ def draw_samples(
 
     Args:
         generator: source of randomness, on the CPU.
-        features: random features per component; by default as many as the kind of posterior needs.
+        features: random features per component; by default a number that depends on the posterior.
     """
     size = () if features is None else (features,)
     return ForceSamples(posterior, posterior.latent.draw(count, generator, *size))
@@ -237,10 +332,10 @@ LARGE_JITTER = 0.01
 
 
 def force_correlation(posterior: ForcePosterior, system: ConstrainedSystem, at: States) -> Tensor:
-    """Posterior correlation of Q and Q_z at each state and joint, `(n, nq)`; 0 where one of them is certain.
+    """Posterior correlation of Q and Q_z at each state and joint, `(n, nq)`; 0 if one of them is certain.
 
-    corr_i = Cov(Q_i, Q_z,i) / √(Var Q_i Var Q_z,i). The part of Q along the constraint, which accelerations
-    never show, is left out.
+    corr_i = Cov(Q_i, Q_z,i) / √(Var Q_i Var Q_z,i). The part of Q along the constraint, which does not affect
+    accelerations, is excluded.
     """
     z = affine_map(system, at, ("joint_force", "contact_friction"))
     rows = posterior.rows(system, at, z)
@@ -258,7 +353,7 @@ def force_correlation(posterior: ForcePosterior, system: ConstrainedSystem, at: 
 def doubts_of(
     posterior: ForcePosterior, system: ConstrainedSystem, training: Training, power: float
 ) -> tuple[float | None, tuple[str, ...]]:
-    """Doubts about a posterior of rows to a power, at training states in contact and on the whole.
+    """Doubts about a posterior with a tempered likelihood, at training states in contact and overall.
 
     Returns:
         Mean correlation of Q and Q_z over some of these states, where both have priors; and warnings, each

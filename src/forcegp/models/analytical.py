@@ -19,11 +19,12 @@ from forcegp.errors import ForceGPError, ModelError
 from forcegp.files import Record
 from forcegp.forces.measurements import Measurement, Observation, measurement_of
 from forcegp.forces.priors.joint import AnalyticalMean
-from forcegp.forces.quantities import FlatStates, ForceField, affine_maps, hidden_forces, states
+from forcegp.forces.quantities import FlatStates, ForceField, affine_maps, hidden_forces
 from forcegp.gp.optimise import LearningOptions
-from forcegp.models.base import FitProgress, Model, PointwiseFit
+from forcegp.models.base import FitProgress, FittedModel, Model
 from forcegp.models.fit_result import FitResult
 from forcegp.models.minibatch import BatchOptions, train
+from forcegp.models.prediction import Answer, Query
 from forcegp.robot.parameters import AnalyticalParameters
 from forcegp.storage.model_file import ModelHeader
 from forcegp.storage.options import Window
@@ -51,8 +52,8 @@ class AnalyticalModel(Model["AnalyticalFit"]):
 
     Args:
         system: robot and contacts.
-        analytical_parameters: what is learned: joint names by quantity, as for `AnalyticalParameters`.
-        window: how far from the parameters of the file learning starts.
+        analytical_parameters: learned parameters: joint names by quantity, as for `AnalyticalParameters`.
+        window: size of the window around the parameters of the file in which learning starts.
         seed: of the start.
 
     Raises:
@@ -119,14 +120,14 @@ class AnalyticalModel(Model["AnalyticalFit"]):
 
 
 @dataclass(frozen=True, eq=False, repr=False)
-class AnalyticalFit(PointwiseFit):
+class AnalyticalFit(FittedModel):
     """The equations of motion of a robot with learned parameters.
 
     Attributes:
         system: robot and contacts.
         parameters: the learned coordinates.
-        window, seed: where learning started.
-        result: how the fit went.
+        window, seed: of the start of learning.
+        result: course of the fit.
     """
 
     system: ConstrainedSystem
@@ -139,22 +140,21 @@ class AnalyticalFit(PointwiseFit):
 
     @property
     def specified(self) -> ConstrainedSystem:
-        """The system with the robot that learning started from."""
+        """The system with the initial robot."""
         return self.system.with_robot(self.parameters.start)
 
     def described(self) -> list[tuple[str, object]]:
         return [(name, getattr(self.system.robot, name)) for name in ("mass", "damping")]
 
-    def at(
-        self, at: FlatStates, quantity: str | Sequence[str], system: ConstrainedSystem, variance: bool
-    ) -> tuple[Tensor, None, dict[str, slice], tuple[str, ...]]:
-        here = states(system, at.q, at.qd, at.tau, at.active)
-        z, parts = affine_maps(system, here, quantity)
+    def at(self, flat: FlatStates, query: Query) -> Answer:
+        system = query.system or self.system
+        here = flat.with_equations(system)
+        z, parts = affine_maps(system, here, query.quantity)
         mean = z.o + (z.B_Q @ AnalyticalMean()(system, here)[..., None])[..., 0]
         hidden = hidden_forces(system, here, parts)
         if hidden is None:
-            return mean, None, parts, ()
-        return hidden.applied(mean, None)[0], None, parts, hidden.doubts
+            return (mean, None, None, torch.ones_like(mean, dtype=torch.bool)), parts, ()
+        return (hidden.applied(mean, None)[0], None, None, ~hidden.whole), parts, hidden.doubts
 
     def force_field(self) -> ForceField:
         """Q_C + Q_G + Q_D + Q_u at states."""

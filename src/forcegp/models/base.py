@@ -1,12 +1,12 @@
 """Models of the forward dynamics: a specification, and the fitted model that predicts.
 
-`AccelerationFit` is that of models of accelerations alone, which have neither contacts nor forces.
+`AccelerationFit` belongs to models of accelerations alone, which have neither contacts nor forces.
 """
 
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Generic, TypeVar
 
@@ -17,15 +17,18 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import ModelError
 from forcegp.files import Record
-from forcegp.forces.quantities import FlatStates, flat_states
+from forcegp.forces.quantities import FlatStates
 from forcegp.gp.optimise import FitProgress
-from forcegp.models.fit_result import HasResult, fit_table, model_line
-from forcegp.models.prediction import Prediction, Predictor, in_pieces
+from forcegp.models.fit_result import FitResult, fit_table, model_line
+from forcegp.models.prediction import Answer, Predictor, Query
 from forcegp.storage.model_file import ModelHeader, write_model
 
 
-class FittedModel(HasResult, Predictor):
+class FittedModel(Predictor):
     """A model with learned parameters; immutable."""
+
+    result: FitResult
+    """How the fit went."""
 
     def __repr__(self) -> str:
         """One line: robot, contacts, and how the fit went."""
@@ -44,11 +47,11 @@ class FittedModel(HasResult, Predictor):
     def restored(
         cls, header: ModelHeader, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
     ) -> FittedModel:
-        """The model that `save` wrote.
+        """Restore a saved model.
 
         Args:
-            header: of the file, with the settings that `record` gave.
-            tensors: as `record` gave them.
+            header: of the file, with the settings of `record`.
+            tensors: those of `record`.
             system: robot and contacts.
             source: name of the file, for messages.
 
@@ -58,7 +61,7 @@ class FittedModel(HasResult, Predictor):
 
     @abstractmethod
     def record(self) -> tuple[Record, dict[str, Tensor]]:
-        """Settings and tensors that the model can be restored from."""
+        """Settings and tensors from which the model can be restored."""
 
     def save(self, path: str | Path) -> None:
         write_model(path, self.kind, self.system, *self.record())
@@ -113,82 +116,35 @@ class Model(ABC, Generic[F]):
 
         Args:
             data: states and measurements.
-            progress: called now and then.
-            checkpoint: file that records a long fit; a fit that finds it resumes there, to the same bits.
-                Remove it once the fitted model is saved.
+            progress: called from time to time.
+            checkpoint: file that records a long fit; a fit that finds it resumes there, with the same result
+                to the bit. Remove it once the fitted model is saved.
 
         Returns:
             The fitted model. Fitting twice gives the same bits.
         """
 
 
-class PointwiseFit(FittedModel):
-    """Predicts each state by itself, some at a time."""
+class AccelerationFit(FittedModel):
+    """Predictor of accelerations of its own system, without forces or contacts."""
 
-    @torch.no_grad()
-    def predict(
-        self,
-        q: Tensor,
-        qd: Tensor,
-        tau: Tensor,
-        quantity: str | Sequence[str] = "qdd",
-        *,
-        active: Tensor | None = None,
-        covariance: bool = True,
-        system: ConstrainedSystem | None = None,
-    ) -> Prediction:
-        """Mean `(*batch, d)` of a quantity and, if the model has one, its covariance without noise.
-
-        The arguments are those of `Predictor.predict`; a model with forces takes several names.
-
-        Raises:
-            UnknownNameError: no such quantity.
-            ModelError: a model of accelerations alone is asked for another quantity, or on another system.
-            ShapeError: a state does not fit the robot.
-        """
-        system, parts, doubts = system or self.system, dict[str, slice](), dict[str, None]()
-
-        def read(at: FlatStates) -> tuple[Tensor | None, ...]:
-            mean, variance, slices, own = self.at(at, quantity, system, covariance)
-            parts.update(slices)
-            doubts.update(dict.fromkeys(own))
-            return mean, variance
-
-        mean, variance = in_pieces(flat_states(system, q, qd, tau, active), read)
-        assert mean is not None
-        spread = None if variance is None else torch.diag_embed(variance)
-        determined = ~mean.isnan() if doubts else None
-        return Prediction(mean, spread, parts, determined=determined, doubts=tuple(doubts))
-
-    @abstractmethod
-    def at(
-        self, at: FlatStates, quantity: str | Sequence[str], system: ConstrainedSystem, variance: bool
-    ) -> tuple[Tensor, Tensor | None, dict[str, slice], tuple[str, ...]]:
-        """Mean `(n, d)`, variance `(n, d)` if the model has one, the slice of each quantity, and what is NaN
-        since it is not determined, in words."""
-
-
-class AccelerationFit(PointwiseFit):
-    """Predicts accelerations of the system that it was fitted on; it has neither forces nor contacts."""
-
-    def at(
-        self, at: FlatStates, quantity: str | Sequence[str], system: ConstrainedSystem, variance: bool
-    ) -> tuple[Tensor, Tensor | None, dict[str, slice], tuple[str, ...]]:
-        if quantity != "qdd":
+    def at(self, flat: FlatStates, query: Query) -> Answer:
+        if query.quantity != "qdd":
             raise ModelError(
                 f"a {self.kind!r} model predicts accelerations only",
                 expected="qdd",
-                got=quantity,
+                got=query.quantity,
                 hint="use StructuredGP for forces and multipliers",
             )
-        if system is not self.system:
+        if query.system not in (None, self.system):
             raise ModelError(
                 f"a {self.kind!r} model has no forces, so it cannot predict on another system",
                 hint="use StructuredGP, or leave out `system`",
             )
-        mean, spread = self.accelerations(at, variance)
-        return mean, spread, {"qdd": slice(0, mean.shape[-1])}, ()
+        mean, variance = self.accelerations(flat, query.covariance)
+        spread = None if variance is None else torch.diag_embed(variance)
+        return (mean, spread, None, None), {"qdd": slice(0, mean.shape[-1])}, ()
 
     @abstractmethod
     def accelerations(self, at: FlatStates, variance: bool) -> tuple[Tensor, Tensor | None]:
-        """Mean `(n, nq)` at states and, on request and where the model has one, variance `(n, nq)`."""
+        """Mean `(n, nq)` at states and, on request and if the model has one, variance `(n, nq)`."""

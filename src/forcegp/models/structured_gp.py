@@ -27,7 +27,7 @@ from forcegp.gp.optimise import LearningOptions
 from forcegp.models.base import FitProgress, Model
 from forcegp.models.selection import with_priors
 from forcegp.models.structured_fit import KIND, StructuredFit, conditioned
-from forcegp.models.structured_learning import Specification, check_learned, learned, search_of, task_of
+from forcegp.models.structured_learning import Specification, check_learned, learned, problem_for, search_of
 from forcegp.models.structured_stream import Pass, Sample, sample_of
 from forcegp.storage.options import StructuredOptions
 
@@ -42,24 +42,23 @@ class StructuredGP(Model[StructuredFit]):
         system: robot and contacts.
         mean: `"analytical"`, `"zero"`, or an `AnalyticalMean` with some terms left out.
         force_priors: priors on the unknown forces; the name of a set of `SETS` (`"sliding"`, `"friction"`,
-            `"friction+residual"`); or `"auto"`. Then, around the analytical forces, held-out stretches of the
-            training log choose the set (`models/selection.py`), and `fit.result.comparison` has the table.
-            Logs of fewer than 100 samples, and fits with `learn=`, get `"friction"`. Around a mean without
-            the motor torque, `"auto"` stands for `default_priors`: a `JointForcePrior`, and in contact its
-            `NormalForcePrior`, which changes no acceleration but keeps the uncertainty of multipliers honest.
-        noise: standard deviation of measured accelerations [rad/s², m/s²], one or one per joint, or a `Noise`
-            that also states that of torques and states; by default what the log states, else 0.1.
-        analytical_parameters: a module whose `forward()` gives the robot with its analytical parameters θ_A
-            as learned tensors; `None` keeps the robot as it is.
+            `"friction+residual"`); or `"auto"`. With `"auto"` and the analytical mean, the set is chosen on
+            held-out stretches of the training log (`models/selection.py`); `fit.result.comparison` contains
+            the scores. Logs of fewer than 100 samples, and fits with `learn=`, get `"friction"`. If the mean
+            lacks the motor torque, `"auto"` means `default_priors`: a `JointForcePrior`, and in contact its
+            `NormalForcePrior`, which only affects multipliers.
+        noise: standard deviation of measured accelerations [rad/s², m/s²], one or one per joint, or a
+            `Noise`, which includes the noise of torques and states; by default the value stated in the log,
+            else 0.1.
+        analytical_parameters: a module with a `forward()` that returns the robot with learned analytical
+            parameters θ_A; `None` keeps the robot unchanged.
         inference: `"exact"`, `"sparse"` or `"auto"`.
-        inducing_points: maximum number of inducing points of one prior; fewer are taken where they suffice,
-            and the result of the fit reports if more would help.
-        inertia: `"file"` keeps that of the robot; `"auto"` identifies links and drives if held-out
-            stretches of the log favour it (`forces/inertia.py`); `None` leaves that to the data if they
-            choose the priors, and is `"file"` elsewhere. It needs a `JointFrictionPrior` and a mean with the
-            motor torque.
-        standardize: whether the inputs of kernels are standardized; otherwise they enter in their units, as
-            in the paper.
+        inducing_points: maximum number of inducing points per prior; fewer are used if they suffice, and the
+            result of the fit reports if more would help.
+        inertia: `"file"` keeps the inertia of the robot; `"auto"` identifies links and drives if held-out
+            stretches of the log favour it (`forces/inertia.py`), which needs a `JointFrictionPrior` and a
+            mean with the motor torque. `None` is `"auto"` for automatically chosen priors, else `"file"`.
+        standardize: whether to standardize the inputs of kernels; the paper does not.
 
     Example:
         >>> import forcegp, torch
@@ -133,18 +132,17 @@ class StructuredGP(Model[StructuredFit]):
         Args:
             data: measured accelerations, any mixture of measurements, or a log that is read piece by piece,
                 in memory that does not grow with its length.
-            learn: what is learned: names of priors, `"noise"`, `"analytical_parameters"`. Everything else
-                keeps the values (and input scales) of the fit `after`, or else the initial ones. Default all;
-                an empty list conditions only.
-            after: an earlier fit of this model, such as one to other or less data. What `learn` does not name
-                keeps its values; without `learn` learning begins there, by default on fewer samples
-                (`options.warm_start`).
+            learn: parts to learn: names of priors, `"noise"`, `"analytical_parameters"`. All others keep the
+                values (and input scales) of the fit `after`, or else the initial ones. Default all; an empty
+                list only conditions.
+            after: an earlier fit of this model, for example to other or fewer data. It provides the values of
+                parts that are not learned, and without `learn` the start of learning.
             options: optimiser and its limits; L-BFGS by default, to a tolerance of 1e-9 where θ_A is learned.
             progress: called after each evaluation; for a streamed log also after each piece, with the samples
                 so far, the number of all, and NaN.
             checkpoint: file that records the evaluations of a long fit, and beside it the sums over a
-                streamed log; a fit that finds it resumes there, to the same bits as one without a break.
-                Remove it once the fitted model is saved.
+                streamed log; a fit that finds it resumes there, with the same result to the bit. Remove it
+                once the fitted model is saved.
 
         Returns:
             The fitted model. Fitting twice gives the same bits.
@@ -162,10 +160,10 @@ class StructuredGP(Model[StructuredFit]):
         check_learned(spec, chosen or ())
         if chosen == () and after is not None and sample.log is None:
             return dataclasses.replace(after, specification=spec).condition(sample.data)
-        task = task_of(spec, None if after is None else after.problem, sample.data, chosen)
-        spec, count = task.specification, task.training.samples
+        earlier, before = (None, {}) if after is None else (after.problem, after.hyperparameters)
+        spec, problem, doubts = problem_for(spec, earlier, sample.data, chosen, sample.count)
+        count = problem.training.samples
         spec.system.announce_states(count, FIT_COPIES, f"a fit to {count:,} samples")
-        problem, before = task.problem(sample.count), {} if after is None else after.hyperparameters
         search = search_of(spec, problem, before, chosen, options)
         begins = chosen is None and after is not None
         begin = {key: before[key] for key in search.start if key in before} if begins else None
@@ -176,7 +174,7 @@ class StructuredGP(Model[StructuredFit]):
         if sample.log is not None and lesson.problem.inducing is not None:
             whole = Pass(spec, sample.log, sample, file, progress)
             forces = whole.forces(*lesson.problem.with_coulomb_errors(values))
-        warnings = (*task.doubts, *lesson.warnings)
+        warnings = (*doubts, *lesson.warnings)
         fit = conditioned(spec, lesson.problem, values, lesson.learned, warnings, lesson.learned_on, forces)
         if progress is not None:
             progress(fit.result.evaluations, fit.result.evaluations, fit.result.objective)

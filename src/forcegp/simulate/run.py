@@ -1,7 +1,6 @@
-"""A simulated run: plan a motion, move the robot through it in a physics engine, log what a robot would.
+"""A simulated run: plan a motion, move the robot through it in a physics engine, and log it.
 
-Contacts are those of our own equations of motion, or made by MuJoCo's solver and seen through sensors. Every
-loop has torque limits, a bound on joint speeds, and progress.
+Contact forces follow from the library's equations of motion, or from MuJoCo's solver with simulated sensors.
 """
 
 from __future__ import annotations
@@ -10,11 +9,11 @@ import dataclasses
 from collections.abc import Callable
 from contextlib import closing, nullcontext
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
+from forcegp.constraints.compiled_system import compiled_system
 from forcegp.constraints.unilateral import any_row, contact_forces, land
 from forcegp.control.plan import MotionConfig, Plan, joint_plan, make_plan
 from forcegp.control.task_space import JointTarget
@@ -25,9 +24,8 @@ from forcegp.simulate.config import Sensors, SimulationConfig
 from forcegp.simulate.contact_solver import NO_FORCE, ContactSolverEngine
 from forcegp.simulate.engine import Engine
 from forcegp.simulate.engines import make_engine
-from forcegp.simulate.mechanics import Mechanics
 from forcegp.simulate.passive import PassiveForces
-from forcegp.simulate.result import RunLog, SimulationResult, make_result, noise, write
+from forcegp.simulate.result import RunLog, SimulationResult, make_result, noise
 
 RUNAWAY_SPEED = 50.0
 """A joint faster than this [rad/s] has left any planned motion."""
@@ -48,13 +46,13 @@ def _torque_limit(system: ConstrainedSystem, config: MotionConfig) -> Tensor:
     return limit
 
 
-def _check_speed(t: float, q: np.ndarray, qd: np.ndarray) -> None:
+def _check_speed(t: float, q: Tensor, qd: Tensor) -> None:
     """Stop a run that diverges.
 
     Raises:
         NumericalError: a joint is too fast, or the state is not finite; names time and state.
     """
-    if not (np.isfinite(q).all() and np.abs(qd).max() < RUNAWAY_SPEED):
+    if not (bool(q.isfinite().all()) and float(qd.abs().max()) < RUNAWAY_SPEED):
         raise NumericalError(
             f"the simulation diverges at t = {t:.4f} s",
             expected=f"joint speeds below {RUNAWAY_SPEED:g} rad/s",
@@ -77,23 +75,25 @@ def _follow_with_solver(
     progress: Progress | None,
 ) -> RunLog:
     """Step the engine through the plan; the controller sees what the sensors measure."""
-    log, mechanics, sensors = RunLog.empty(config.steps, system), Mechanics(system, plan), config.sensors
-    rows, limit, targets = log.arrays(), _torque_limit(system, config).numpy(), plan.arrays()
+    log, sensors, limit = RunLog.empty(config.steps, system), config.sensors, _torque_limit(system, config)
+    seen = compiled_system(system, (plan.frame, plan.point))
     measured = {"q": torch.zeros_like(log.q), "qd": torch.zeros_like(log.qd)}
     F_I, F_z = (log.q.new_zeros(config.steps, len(system.contacts), 3) for _ in range(2))
     engine.reset(plan.start, torch.zeros_like(plan.start))
     for k in range(config.steps):
         true_q, true_qd = engine.state()
-        _check_speed(k * config.dt, true_q.numpy(), true_qd.numpy())
-        q, qd = _measured_state(true_q, true_qd, sensors, generator)
+        _check_speed(k * config.dt, true_q, true_qd)
+        q, qd = true_q, true_qd
+        if sensors.encoder_resolution > 0.0:
+            q = (q / sensors.encoder_resolution).round() * sensors.encoder_resolution
+        if sensors.velocity_noise > 0.0:
+            qd = qd + sensors.velocity_noise * noise(qd, generator)
         measured["q"][k], measured["qd"][k] = q, qd
-        eom, target = mechanics.equations(q.numpy(), qd.numpy()), type(targets)(*(x[k] for x in targets))
-        command = plan.command(eom, q.numpy(), qd.numpy(), target, config.gains)
-        Q_u = np.clip(command, -limit, limit)
-        solution = engine.forces(Q_u)
-        write(rows, k, q=true_q, qd=true_qd, tau=Q_u, saturated=(Q_u != command).any(), qdd=solution.qdd)
-        write(rows, k, Q=solution.Q, Q_I=solution.Q_I, Q_z=solution.Q_z, multiplier=solution.multiplier)
-        F_I[k], F_z[k] = torch.from_numpy(solution.F_I), torch.from_numpy(solution.F_z)
+        command = plan.command(seen.equations(q, qd), q, qd, k, config.gains)
+        Q_u = command.clamp(-limit, limit)
+        solution = {name: torch.from_numpy(x) for name, x in engine.forces(Q_u.numpy())._asdict().items()}
+        F_I[k], F_z[k] = solution.pop("F_I"), solution.pop("F_z")
+        log.write(k, q=true_q, qd=true_qd, tau=Q_u, saturated=(Q_u != command).any(), **solution)
         engine.step()
         _report(progress, k + 1, config.steps)
     log.c.copy_(system.equations(log.q, log.qd).c)
@@ -103,27 +103,11 @@ def _follow_with_solver(
         for name, F in (("F_I", F_I), ("F_z", F_z))
         if system.contacts
     }
-    measured["tau"] = _measured_torque(log.tau, config, generator)
-    seen = {} if sensors == Sensors() else measured
-    return dataclasses.replace(log, contact_forces=forces, measured=seen)
-
-
-def _measured_state(
-    q: Tensor, qd: Tensor, sensors: Sensors, generator: torch.Generator
-) -> tuple[Tensor, Tensor]:
-    """Joint positions at the resolution of the encoders, and noisy velocities."""
-    if sensors.encoder_resolution > 0.0:
-        q = (q / sensors.encoder_resolution).round() * sensors.encoder_resolution
-    if sensors.velocity_noise > 0.0:
-        qd = qd + sensors.velocity_noise * noise(qd, generator)
-    return q, qd
-
-
-def _measured_torque(tau: Tensor, config: SimulationConfig, generator: torch.Generator) -> Tensor:
-    """The torque as it is logged: late by whole samples, the first one repeated, and noisy."""
-    late = round(config.sensors.torque_delay / config.dt)
-    rows = (torch.arange(len(tau)) - late).clamp(min=0)
-    return tau[rows] + config.sensors.torque_noise * noise(tau, generator)
+    # The torque is logged late by whole samples, the first one repeated, and noisy.
+    late = (torch.arange(len(log.tau)) - round(sensors.torque_delay / config.dt)).clamp(min=0)
+    measured["tau"] = log.tau[late] + sensors.torque_noise * noise(log.tau, generator)
+    measured = {} if sensors == Sensors() else measured
+    return dataclasses.replace(log, contact_forces=forces, measured=measured)
 
 
 ON_SURFACE = 1e-8
@@ -142,12 +126,12 @@ def simulate(
 
     The engine moves the robot under Q_u + Q_D + Q_I + Q_z: the motor torque of a task-space controller, joint
     friction, the normal force of the constrained equations of motion with their Baumgarte terms, and viscous
-    friction at the contact (section 5 of the paper). A contact opens when its multiplier would turn negative,
-    and closes with an inelastic impact. The run is computed on the CPU, where the data stay.
+    friction at the contact (section 5 of the paper). A contact opens when its multiplier would become
+    negative, and closes with an inelastic impact. The run is computed on the CPU.
 
     Args:
         system: robot and contacts; without contacts the motion is free.
-        config: what is simulated.
+        config: settings of the simulation.
         motion: joints to follow instead of the tool's random motion, as long as the configuration says.
         forces: learned forces of joints, in place of the robot's friction; for `contact = "solver"`.
         progress: called every few steps, and after the last.
@@ -171,7 +155,12 @@ def simulate(
     system.announce_states(config.steps, 1.0, f"a simulation of {config.steps:,} steps")
     generator = torch.Generator().manual_seed(config.seed)
     with torch.no_grad(), one_thread():
-        plan = _plan(system, config, motion, generator)
+        if motion is None:
+            plan = make_plan(system, config, generator)
+        else:
+            followed = motion.select(system.robot.joint_names)
+            joints = JointTarget(followed.q, followed.qd, followed.qdd)
+            plan = joint_plan(system, config, followed.t, joints)
         if config.contact == "solver":
             engine = ContactSolverEngine(system, config.dt, config.solver)
             with nullcontext() if forces is None else forces.installed(engine.model):
@@ -187,15 +176,6 @@ def simulate(
             return make_result(system, config, plan, log, engine.name, generator)
 
 
-def _plan(
-    system: ConstrainedSystem, config: SimulationConfig, motion: Dataset | None, generator: torch.Generator
-) -> Plan:
-    if motion is None:
-        return make_plan(system, config, generator)
-    motion = motion.select(system.robot.joint_names)
-    return joint_plan(system, config, motion.t, JointTarget(motion.q, motion.qd, motion.qdd))
-
-
 def _follow(
     system: ConstrainedSystem,
     config: SimulationConfig,
@@ -204,27 +184,26 @@ def _follow(
     progress: Progress | None,
 ) -> RunLog:
     """Step the engine through the plan."""
-    log, mechanics = RunLog.empty(config.steps, system), Mechanics(system, plan)
-    rows, limit, targets = log.arrays(), _torque_limit(system, config).numpy(), plan.arrays()
+    log, limit = RunLog.empty(config.steps, system), _torque_limit(system, config)
+    system = compiled_system(system, (plan.frame, plan.point))
     engine.reset(plan.start, torch.zeros_like(plan.start))
-    q, qd = (x.numpy() for x in engine.state())
+    q, qd = engine.state()
     # Inverse kinematics puts the tool on the surface, up to rounding.
-    closed = ~any_row(mechanics, np.abs(mechanics.equations(q, qd).c) > ON_SURFACE)
+    closed = ~any_row(system, system.equations(q, qd).c.abs() > ON_SURFACE)
     for k in range(config.steps):
         _check_speed(k * config.dt, q, qd)
-        landing = land(mechanics, q, qd, closed)
+        landing = land(system, q, qd, closed)
         if landing.impact:
             qd = landing.qd
-            engine.reset(torch.from_numpy(q), torch.from_numpy(qd))
-        eom, target = landing.eom, type(targets)(*(values[k] for values in targets))
-        command = plan.command(eom, q, qd, target, config.gains)
-        Q_u = np.clip(command, -limit, limit)
-        forces = contact_forces(mechanics, q, qd, landing, Q_u, config.viscous_friction)
-        engine.step(torch.from_numpy(Q_u + forces.Q_D + forces.Q_I + forces.Q_z))
-        q_next, qd_next = (x.numpy() for x in engine.state())
-        write(rows, k, q=q, qd=qd, qdd=(qd_next - qd) / config.dt, tau=Q_u, saturated=(Q_u != command).any())
-        write(rows, k, Q=forces.Q, Q_I=forces.Q_I, Q_z=forces.Q_z)
-        write(rows, k, multiplier=forces.multiplier, c=forces.c, contact=forces.closed)
+            engine.reset(q, qd)
+        command = plan.command(landing.eom, q, qd, k, config.gains)
+        Q_u = command.clamp(-limit, limit)
+        forces = contact_forces(system, q, qd, landing, Q_u, config.viscous_friction)
+        engine.step(Q_u + forces.Q_D + forces.Q_I + forces.Q_z)
+        q_next, qd_next = engine.state()
+        log.write(k, q=q, qd=qd, qdd=(qd_next - qd) / config.dt, tau=Q_u, saturated=(Q_u != command).any())
+        log.write(k, Q=forces.Q, Q_I=forces.Q_I, Q_z=forces.Q_z)
+        log.write(k, multiplier=forces.multiplier, c=forces.c, contact=forces.closed)
         closed, q, qd = forces.closed, q_next, qd_next
         _report(progress, k + 1, config.steps)
     return log
