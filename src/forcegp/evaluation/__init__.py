@@ -98,7 +98,7 @@ class Evaluation:
         if self.motion is not None:
             at = min(1, len(self.motion.horizons) - 1)
             off, file = (
-                "more than it moves" if x is None or x > 1.0 else f"{_percent(x)} of its motion"
+                "more than its motion" if x is None or x > 1.0 else f"{_percent(x)} of its motion"
                 for x in (self.motion.model[at], self.motion.robot_file[at])
             )
             after = f"{self.motion.horizons[at]:g} s in open loop"
