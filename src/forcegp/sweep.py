@@ -76,8 +76,8 @@ def run_fit(fit: SweptFit, out: str) -> dict[str, Any]:
         **asdict(fit),
         **{name: scores[name] for name in ("noisy_mae", "clean_mae", "coverage_noisy")},
         "samples": fitted.result.samples,
-        "seconds": fitted.seconds,
-        "converged": fitted.converged,
+        "seconds": fitted.result.seconds,
+        "converged": fitted.result.converged,
     }
     with written_folder(folder) as temporary:
         fitted.save(temporary / MODEL)

@@ -17,10 +17,9 @@ DEGREE = np.pi / 180.0
 TURN = 2.0 * np.pi
 SLACK = 1e-3
 """Share of a limit by which it may be exceeded: rounding, and encoders that read a little beyond a stop."""
-CLIPPED_RUN = 3
-"""Rows in a row at the same extreme value that make a plateau."""
-OFTENER = 5.0
-"""Factor by which a clipped value occurs more often than its neighbours; at the peaks of a sine, 2.4."""
+CLIPPED_RUN, OFTENER = 3, 5.0
+"""Successive rows at an extreme value that make a plateau; factor by which a clipped value occurs more
+often than its neighbours; at the peaks of a sine, 2.4."""
 BAND = 0.03
 """Part of the range of a torque that noise of a clipped one stays within."""
 PLATEAUS, FLAT_ROWS, FLAT = 3, 10, 0.35
@@ -29,10 +28,8 @@ twice that of the values in their middle halves: 1 for white noise about a limit
 real drive, 0.05 to 0.3 at smooth peaks."""
 MOVES = 0.02
 """Part of its largest speed from which a joint moves; the torque of one that rests is constant."""
-OFTEN = 0.05
-"""Share of rows beyond the limits from which a wrong unit is considered."""
-UNIT_ROWS = 400
-"""Rows in which the torque separates degrees from joints that turn more than once."""
+OFTEN, UNIT_ROWS = 0.05, 400
+"""Share of rows beyond the limits from which a wrong unit is considered, and rows whose torque tells it."""
 
 
 def _limits(system: ConstrainedSystem) -> dict[str, tuple[Array, Array]]:

@@ -110,6 +110,13 @@ class Evaluation:
         return f"{text[:1].upper()}{text[1:]}." if parts else ""
 
     @property
+    def poor(self) -> bool:
+        """Whether there are doubts, or the model explains no torque, or less than the robot file."""
+        shares = {p.name: x for p in self.predictors if (x := p.beyond_gravity) is not None}
+        model = shares.get("model", 1.0)
+        return bool(self.doubts) or model <= 0.0 or model < shares.get("robot file", 0.0)
+
+    @property
     def comparison(self) -> str:
         """Whether the model is better than the trivial predictors in torque and in acceleration."""
         return sentence(self.verdicts)

@@ -14,12 +14,17 @@ S is the posterior covariance of the learned forces with the noise of the torque
   torque residuals in the training log. The observer of De Luca and Mattone (*Sensorless robot collision
   detection and hybrid force/motion control*, ICRA 2005) is the steady filter without errors of the forces.
 
+- **With an unknown lever** (`over_levers`): a moment about the point is a force times its distance. The
+  estimate is a mixture over priors with moments of several sizes, weighted by their evidence at the sample.
+  That decides along directions that the arm hardly feels.
+
 The wrench is that of the environment on the robot. Multipliers of closed contacts are unknown too.
 """
 
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,6 +45,8 @@ FORCE_STD, MOMENT_STD = 30.0, 5.0
 """Standard deviation of each force [N] and moment [N m] before the data: wide beside pushes by hand."""
 FORCE_CHANGE, MOMENT_CHANGE = 10.0, 1.0
 """By how much they change within a second, in the momentum filter."""
+LEVERS = (1.0, 0.3, 0.1)
+"""Sizes of moments beside forces over that of the prior, each as likely before the data."""
 MULTIPLIER_STD = 1e4
 """Of the multipliers of declared contacts [N], which are left open."""
 ROWS = {name: row for row, name in enumerate((*MOMENTS, *FORCES))}
@@ -105,6 +112,12 @@ class WrenchFrame:
         force, moment = pair
         return torch.tensor([force if axis in FORCES else moment for axis in self.axes], dtype=torch.float64)
 
+    @property
+    def levers(self) -> list[Tensor]:
+        """Factors on `prior` `(k,)` for each of `LEVERS`, if there are forces and moments."""
+        both = len({axis in FORCES for axis in self.axes}) == 2
+        return [self._each((1.0, lever)) for lever in (LEVERS if both else (1.0,))]
+
     def jacobian(self, robot: RobotModel, q: Tensor) -> Tensor:
         """J `(*batch, k, nq)` of the components at q `(*batch, nq)`; the joint force is Jᵀ w.
 
@@ -138,6 +151,40 @@ def least_squares(J: Tensor, r: Tensor, S: Tensor, prior: Tensor) -> tuple[Tenso
     V = torch.cholesky_inverse(torch.linalg.cholesky(B @ B.mT + torch.eye(J.shape[-2]).to(B)))
     mean = (V @ (B @ e))[..., 0] * prior
     return mean, V * prior[..., :, None] * prior[..., None, :]
+
+
+def over_levers(
+    mean: Tensor, covariance: Tensor, prior: Tensor, levers: Sequence[Tensor]
+) -> tuple[Tensor, Tensor]:
+    """An estimate under w ~ N(0, W), W = diag prior², for a mixture of priors W_s = diag (s prior)², s ≤ 1.
+
+    C_s⁻¹ = C⁻¹ + W_s⁻¹ − W⁻¹ and m_s = C_s C⁻¹ m, with evidence ∝ (|C_s| / |W_s|)^½ exp(½ m_sᵀ C_s⁻¹ m_s).
+
+    Args:
+        mean, covariance: m `(n, k)` and C `(n, k, k)`.
+        prior: `(k,)` standard deviations.
+        levers: s of each prior `(k,)`, which are as likely before the data.
+
+    Returns:
+        Mean `(n, k)` and covariance `(n, k, k)` of the mixture.
+    """
+    # In units of the prior
+    precision = torch.cholesky_inverse(torch.linalg.cholesky(covariance / (prior[:, None] * prior[None, :])))
+    v = (precision @ (mean / prior)[..., None])[..., 0]
+    logs, means, covariances = [], [], []
+    for s in levers:
+        L = torch.linalg.cholesky(precision + torch.diag(s**-2 - 1.0))
+        C = torch.cholesky_inverse(L)
+        m = (C @ v[..., None])[..., 0]
+        logs.append(0.5 * (m * v).sum(-1) - L.diagonal(dim1=-2, dim2=-1).log().sum(-1) - s.log().sum())
+        means.append(m)
+        covariances.append(C)
+    weight = torch.softmax(torch.stack(logs), dim=0)[..., None]
+    m, C = torch.stack(means), torch.stack(covariances)
+    mixed = (weight * m).sum(0)
+    apart = m - mixed
+    spread = (weight[..., None] * (C + apart[..., :, None] * apart[..., None, :])).sum(0)
+    return mixed * prior, spread * prior[:, None] * prior[None, :]
 
 
 def momentum_force(robot: RobotModel, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:

@@ -16,13 +16,10 @@ import numpy as np
 from forcegp.errors import DataError
 from forcegp.logs import units
 from forcegp.logs.clock import drop_repeated, find_held, join_stream, split_trajectories
-from forcegp.logs.mapping import Mapping
+from forcegp.logs.mapping import SYMBOLS, Mapping
 from forcegp.logs.readers import read
 from forcegp.logs.table import Array, ImportReport, LogTable, Progress, Signals, Stream
 from forcegp.rows import describe, numbered
-
-SYMBOLS = {"position": "q", "velocity": "qd", "acceleration": "qdd", "torque": "tau"}
-"""Quantity of a mapping → name in a data set."""
 
 
 def gather(

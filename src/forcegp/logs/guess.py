@@ -35,14 +35,10 @@ ROWS, TRIED_ROWS = 100_000, 3000
 """Rows that are looked at; rows on which the inverse dynamics are evaluated."""
 LEAST_DEGREES = 3.2
 """Largest position [°] below which an arm in degrees would hardly move."""
-CLEARER = 1.5
-"""A unit is certain if the torque fits so much better than in the other one."""
-NEAR = 1.3
-"""A ratio is that of a unit if it is within this factor."""
-TRAJECTORY = 10
-"""Windows have at most one in so many samples of a trajectory."""
-LEAST_FORCE = 1.0
-"""A contact that is always closed presses with more than this [N]."""
+CLEARER, NEAR = 1.5, 1.3
+"""A unit is certain if the torque fits so much better in it; a ratio is that of a unit within this factor."""
+TRAJECTORY, LEAST_FORCE = 10, 1.0
+"""Windows have at most one in so many samples; a contact that is always closed presses with more [N]."""
 
 
 def guess_mapping(path: str | Path, system: ConstrainedSystem, progress: Progress | None = None) -> Draft:

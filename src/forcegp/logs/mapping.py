@@ -110,6 +110,8 @@ def _value(value: object) -> str:
     return json.dumps(value)
 
 
+SYMBOLS = {"position": "q", "velocity": "qd", "acceleration": "qdd", "torque": "tau"}
+"""Quantity of a mapping → name in a data set."""
 PerJoint = float | dict[str, float]
 """One number for all joints, or one for each by name."""
 
@@ -375,8 +377,7 @@ def default_mapping(path: str | Path, system: ConstrainedSystem) -> Mapping:
     """The mapping of a log with unambiguous names; otherwise `MappingError`, with a hint."""
     table, robot = read(path, rows=1), system.robot
     names, joints = set(table.names), robot.joint_names
-    symbols = {"position": "q", "velocity": "qd", "acceleration": "qdd", "torque": "tau"}
-    logged = {n: s for n, s in symbols.items() if names >= {f"{s}.{joint}" for joint in joints}}
+    logged = {n: s for n, s in SYMBOLS.items() if names >= {f"{s}.{joint}" for joint in joints}}
     if {"position", "torque"} <= set(logged) and "t" in names:
         draft = Draft(str(path), {"column": "t", "segment": "segment" if "segment" in names else None})
         for name, symbol in logged.items():

@@ -27,14 +27,10 @@ from forcegp.rows import runs
 
 STATES, SHORTEST = 4, 8
 """Size of the state, position to jerk, and rows that a piece needs."""
-LEARNED_ROWS = 2000
-"""Rows from which ρ is learned: the longest pieces, up to so many."""
-LOG_RHO = (-30.0, 8.0)
-"""Range of log ρ: from a parabola over any window to no smoothing at all."""
-DIFFUSE = 1e8
-"""Prior variance of the scaled state about the first row, in units of σ²: uninformative."""
-SETTLED = 1e-10
-"""Relative change of the covariance from row to row below which it counts as stationary."""
+LEARNED_ROWS, LOG_RHO = 2000, (-30.0, 8.0)
+"""Rows of the longest pieces that ρ is learned from, and range of log ρ: from a parabola to no smoothing."""
+DIFFUSE, SETTLED = 1e8, 1e-10
+"""Uninformative prior variance of the first scaled state [σ²]; change of a stationary covariance."""
 
 A = np.array([[1.0 / factorial(j - i) if j >= i else 0.0 for j in range(STATES)] for i in range(STATES)])
 TAYLOR = np.array([1.0 / factorial(3 - i) for i in range(STATES)])

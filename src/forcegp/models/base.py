@@ -19,13 +19,16 @@ from forcegp.errors import ModelError
 from forcegp.files import Record
 from forcegp.forces.quantities import FlatStates
 from forcegp.gp.optimise import FitProgress
-from forcegp.models.fit_result import HasResult, fit_table, model_line
+from forcegp.models.fit_result import FitResult, fit_table, model_line
 from forcegp.models.prediction import Answer, Predictor, Query
 from forcegp.storage.model_file import ModelHeader, write_model
 
 
-class FittedModel(HasResult, Predictor):
+class FittedModel(Predictor):
     """A model with learned parameters; immutable."""
+
+    result: FitResult
+    """How the fit went."""
 
     def __repr__(self) -> str:
         """One line: robot, contacts, and how the fit went."""

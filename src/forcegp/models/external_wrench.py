@@ -23,6 +23,7 @@ from forcegp.forces.external_wrench import (
     least_squares,
     momentum_force,
     observe,
+    over_levers,
 )
 from forcegp.forces.friction_memory import FrictionMemory
 from forcegp.forces.noise import external_std
@@ -132,9 +133,13 @@ def external_wrench(
     else:
         mean, covariance = reading.from_momenta()
     k = len(frame.axes)
+    pairs = zip(mean[:, :k].split(CHUNK), covariance[:, :k, :k].split(CHUNK), strict=True)
+    prior, levers = frame.prior.to(mean), [lever.to(mean) for lever in frame.levers]
+    parts = (over_levers(m, C, prior, levers) for m, C in pairs)
+    mean, covariance = map(torch.cat, zip(*parts, strict=True))
     return ExternalWrench(
-        mean[:, :k],
-        covariance[:, :k, :k],
+        mean,
+        covariance,
         {"external_wrench": slice(0, k)},
         distance_beyond(fit.hyperparameters, data.qd, data.tau),
         fit.system.robot.joint_names,

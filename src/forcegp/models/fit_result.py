@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Generic, TypeVar
 
 from pydantic import NonNegativeFloat, NonNegativeInt
 from torch import Tensor
@@ -108,41 +107,6 @@ class FitResult:
     more_points_would_help: bool | None = None
     comparison: tuple[Compared, ...] = ()
     never_closed: tuple[str, ...] = ()
-
-
-T = TypeVar("T")
-
-
-class _OfResult(Generic[T]):
-    """A field of the result as an attribute of the fit."""
-
-    def __init__(self, doc: str) -> None:
-        self.__doc__ = doc
-
-    def __set_name__(self, owner: type, name: str) -> None:
-        self.name = name
-
-    def __get__(self, fit: HasResult | None, owner: type) -> T:
-        return self if fit is None else getattr(fit.result, self.name)  # pyright: ignore[reportReturnType]
-
-
-class HasResult:
-    """Base class with the result of a fit and access to its fields."""
-
-    result: FitResult
-
-    converged = _OfResult[bool]("Whether the optimiser reached its tolerance.")
-    evaluations = _OfResult[int]("Number of evaluations of the objective.")
-    seconds = _OfResult[float]("Duration of the fit.")
-    objective = _OfResult[float]("Final value of the objective.")
-    log_marginal_likelihood = _OfResult["float | None"](
-        "log p(y | X, θ) of the training data, `None` for models without one."
-    )
-    jitter = _OfResult[float]("Added to the diagonal of the covariance, relative to unit noise.")
-    constant_inputs = _OfResult[tuple[str, ...]]("Inputs that do not vary in the training data.")
-    message = _OfResult[str]("Why the optimiser stopped.")
-    history = _OfResult[tuple[float, ...]]("The objective at each evaluation.")
-    force_correlation = _OfResult["float | None"]("Mean posterior correlation of Q and Q_z.")
 
 
 def model_line(kind: str, system: ConstrainedSystem, result: FitResult | None) -> str:

@@ -3,8 +3,8 @@
 1. Samples at rest only bound the friction, and impacts break the equations of motion;
    measured robots learn from motion without impacts.
 2. Hyperparameters are learned on a part of a long log, or on all of a short one.
-3. Residuals that are correlated in time temper the likelihood, and hyperparameters are learned once more;
-   unless a `DisturbancePrior` explains them.
+3. Residuals that are correlated in time temper the likelihood, unless a `DisturbancePrior` explains them;
+   they also determine slopes and weights (`forces/noise_learning.py`), and hyperparameters are learned again.
 4. Inertial parameters move to their posterior mean: one Gauss–Newton step, physically consistent.
 5. Torque noise is increased to that on held-out stretches of the training log, and its growth beyond the
 trained speeds and torques is learned from held-out regimes; dry friction with memory is learned from the
@@ -40,7 +40,7 @@ from forcegp.forces.measurements import (
     without_impacts,
 )
 from forcegp.forces.noise import TORQUE_NOISE, Noise, external_std, state_std_of
-from forcegp.forces.noise_learning import left_out, weighted, with_learned_slopes, with_learned_weights
+from forcegp.forces.noise_learning import left_out, weighted, with_learned_slopes
 from forcegp.forces.posterior import REGION
 from forcegp.forces.priors.base import ANALYTICAL, COULOMB, NOISE, ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior
@@ -67,6 +67,9 @@ FEWEST_MOVING = 20
 """With fewer samples in motion, samples at rest are kept."""
 FIRST_POWER = 0.25
 """Power of the likelihood before the correlation of its residuals is known."""
+
+ROUNDS = 2
+"""Times that hyperparameters are learned again with what the residuals determine."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -397,6 +400,9 @@ def solve(
 ) -> Lesson:
     """Learn the free parts of a search, then prepare the problem for conditioning.
 
+    The residuals determine the power of the likelihood, slopes that carry noise of the state, and weights of
+    the samples; each time these change, hyperparameters are learned again, `ROUNDS` times at most.
+
     Args:
         neighbours: samples at the rate of the log, if those of the problem are only a part of it.
     """
@@ -408,18 +414,22 @@ def solve(
     if correlated:
         part = dataclasses.replace(part, power=FIRST_POWER)
     learned, learned_on = search.solve(part, progress, begin), part.training.samples
+    sloped = part.state_std is not None and not any(prior.in_time for prior in part.priors)
+    sloped &= not is_sparse(spec.options.inference, part.priors, problem.training.all_samples)
     warnings: list[str] = []
-    if part.state_std is not None and not is_sparse(
-        spec.options.inference, part.priors, problem.training.all_samples
-    ):
-        part, learned, doubts = with_learned_slopes(part, search, learned, progress)
-        warnings += doubts
-    if spec.noise.degrees_of_freedom is not None:
-        part, learned = with_learned_weights(part, search, learned, spec.noise.degrees_of_freedom, progress)
-    if correlated:
-        power, _ = residual_times(part, search.values(learned), part.training)
-        part = dataclasses.replace(part, power=power)
-        learned = search.solve(part, progress, learned.tensors)
+    for number in range(ROUNDS):
+        before, values = part, search.values(learned)
+        if correlated and number == 0:
+            part = dataclasses.replace(part, power=residual_times(part, values, part.training)[0])
+        if spec.noise.degrees_of_freedom is not None:
+            part = weighted(part, values, spec.noise.degrees_of_freedom)
+        if part is not before:
+            learned = search.solve(part, progress, learned.tensors)
+        if sloped:
+            part, learned, doubts = with_learned_slopes(part, search, learned, progress)
+            warnings += doubts
+        if part is before:
+            break
     values = search.values(learned)
     if calibrated and any(isinstance(prior, InertialPrior) for prior in part.priors):
         part = with_updated_robot(part, values)
@@ -433,7 +443,7 @@ def solve(
     if spec.noise.degrees_of_freedom is not None and (count := left_out(whole)):
         samples = whole.training.samples
         warnings.append(f"{count} of {samples} samples lie far outside the noise and hardly count")
-    return Lesson(whole, values, learned, learned_on, tuple(warnings))
+    return Lesson(whole, values, learned, learned_on, tuple(dict.fromkeys(warnings)))
 
 
 def _at_the_rate_of_the_log(part: Problem, values: Mapping[str, Tensor], training: Training) -> Problem:

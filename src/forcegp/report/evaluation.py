@@ -77,7 +77,9 @@ def write_evaluation(
 
 
 def _blocks(window: WindowData, pictures: list[Picture], force: Picture | None) -> list[PictureBlock]:
-    caption = "The normal force λ while the contact is closed, over the same seconds as below, with ±2σ."
+    caption = (
+        "The normal force λ of the closed contact, over the same seconds, with ±2σ if the model gives it."
+    )
     blocks = [PictureBlock("Contact force", caption, (force,), WINDOW, wide=True)] if force else []
     blocks += [
         PictureBlock(

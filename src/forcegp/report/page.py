@@ -130,15 +130,6 @@ class Table:
     rows: tuple[tuple[str, ...], ...]
     bad: frozenset[tuple[int, int]] = frozenset()
 
-    def markdown(self) -> str:
-        """The table with its caption as Markdown."""
-
-        def line(cells: tuple[str, ...]) -> str:
-            return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
-
-        rule = "|" + "---|" * len(self.head)
-        return "\n".join([f"{self.caption}:", "", line(self.head), rule, *map(line, self.rows)])
-
 
 def cell(value: object, digits: int = 4) -> str:
     """One value as text: floats with significant digits, a dash for a missing value."""

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -175,17 +176,20 @@ def tip_of(robot: RobotModel, contact: SurfaceContact, radius: float) -> tuple[i
 def geometry_of(mujoco: Any, contact: SurfaceContact) -> dict[str, Any]:
     """Type, size and pose of the geometry of a surface."""
     surface, geom = contact.surface, mujoco.mjtGeom
-    if isinstance(surface, Plane | Cylinder):
-        axis = np.array(surface.normal if isinstance(surface, Plane) else surface.axis)
-        quaternion = Rotation.from_matrix(turn_z(axis)).as_quat()[[3, 0, 1, 2]]
+
+    def along(axis: Sequence[float]) -> np.ndarray:
+        """Quaternion (w, x, y, z) of a rotation from z to an axis."""
+        return Rotation.from_matrix(turn_z(np.array(axis))).as_quat()[[3, 0, 1, 2]]
+
     if isinstance(surface, Plane):
-        pose = {"pos": surface.offset * axis, "quat": quaternion}
+        position = surface.offset * np.array(surface.normal)
+        pose = {"pos": position, "quat": along(surface.normal)}
         return {"type": geom.mjGEOM_PLANE, "size": [0.0, 0.0, 1.0], **pose}
     if isinstance(surface, Sphere):
         return {"type": geom.mjGEOM_SPHERE, "size": [surface.radius, 0.0, 0.0], "pos": [*surface.center]}
     if isinstance(surface, Cylinder):
         size = [surface.radius, CYLINDER_LENGTH, 0.0]
-        pose = {"pos": [*surface.center], "quat": quaternion}
+        pose = {"pos": [*surface.center], "quat": along(surface.axis)}
         return {"type": geom.mjGEOM_CYLINDER, "size": size, **pose}
     raise ForceGPError(
         f"the contact solver has no geometry for the surface of {contact.name!r}",

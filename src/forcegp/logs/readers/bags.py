@@ -27,8 +27,7 @@ from forcegp.logs.table import Column, LogTable, Progress, Stream, Wanted
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 WRENCH = "geometry_msgs/msg/WrenchStamped"
-KINDS = (JOINT_STATE, WRENCH)
-"""Message types that are read."""
+KINDS = (JOINT_STATE, WRENCH)  # that are read
 UNITS = {"position": "rad", "velocity": "rad/s", "effort": "Nm", "force": "N", "torque": "Nm"}
 """Units of the quantities of a joint state, by REP 103, and of a wrench."""
 CLOCKS = ("header", "receive")

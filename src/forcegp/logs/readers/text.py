@@ -23,10 +23,8 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 
-SAMPLE_BYTES = 1 << 18
-"""Size of the part of a file that is inspected."""
-SAMPLE_LINES = 200
-"""Number of lines of numbers that must agree."""
+SAMPLE_BYTES, SAMPLE_LINES = 1 << 18, 200
+"""Size of the part of a file that is inspected, and lines of numbers that must agree."""
 
 SEPARATORS = (";", "\t", ",", "|", " ")
 """Candidates; a space stands for any run of blanks."""
