@@ -139,7 +139,7 @@ class Evaluation:
         return tuple(found)
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything in JSON types."""
+        """All scores as JSON-compatible values."""
         texts = [verdict.text() for verdict in self.verdicts]
         said = {"verdict": self.verdict, "comparison": self.comparison, "doubts": self.doubts}
         return asdict(self) | said | {"verdict_texts": texts}
