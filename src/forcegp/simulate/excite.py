@@ -405,8 +405,9 @@ def excite(
         unknowns: what is unknown before the motion; by default all, as in `Unknowns.of`.
         collisions: by default the robot's shapes and the surfaces of the contacts.
         start: `(nq,)` position at the start and the end; by default a free one near the middle.
-        criterion: `"A"`, standard deviation of the torque in the region of `unknowns`, `"D"`, determinant of
-            the covariance, or a function of the information.
+        criterion: `"A"`, standard deviation of the torque in the region of `unknowns`, `"V"`, the same by
+            links, viscous and dry friction alone, `"D"`, determinant of the covariance, or a function of the
+            information.
         rate: of the samples that are returned [Hz].
         restarts: random starts that are optimised, the best of four times as many.
         seed: of the random starts.
