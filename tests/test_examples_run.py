@@ -114,6 +114,19 @@ def test_mpc_with_learned_friction(tmp_path: Path) -> None:
     assert solve < 20.0
 
 
+@pytest.mark.slow
+def test_mpc_holds_a_force(tmp_path: Path) -> None:
+    for package in ("mujoco", "casadi"):
+        pytest.importorskip(package)
+    text = example("mpc_holds_a_force", tmp_path)
+    (file, _), (learned, solve) = (
+        numbers(rf"{name}: outside 10 ± 3 N in ([\d.]+)% of the steps, solve ([\d.]+) ms", text)
+        for name in ("robot file", "learned")
+    )
+    assert learned <= 5.0 < file
+    assert solve < 20.0
+
+
 def test_force_observer(tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     figure = tmp_path / "force.png"

@@ -1,4 +1,4 @@
-"""Levels and standard deviations that outliers do not spoil."""
+"""Levels and standard deviations that are robust to outliers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def robust_std(x: NDArray[Any]) -> NDArray[Any]:
 
 
 def level_of(x: NDArray[Any], width: float, share: float) -> float | None:
-    """Median of the values within `width` of the fullest bin, if these are more than a share of all.
+    """Median of the values within `width` of the mode of a histogram, if they exceed a share of all values.
 
     >>> level_of(np.array([5.0, 5.1, 4.9, 40.0, -7.0]), 1.0, 0.5)
     5.0
@@ -27,3 +27,15 @@ def level_of(x: NDArray[Any], width: float, share: float) -> float | None:
     bins, counts = np.unique(np.floor(x / width), return_counts=True)
     near = x[np.abs(x - width * (bins[counts.argmax()] + 0.5)) <= width]
     return float(np.median(near)) if len(near) > share * len(x) else None
+
+
+def resolution(x: NDArray[Any]) -> NDArray[Any]:
+    """Step between the values of a column with few values, else zero."""
+    steps = np.zeros(x.shape[1])
+    for j, levels in enumerate(map(np.unique, x.T)):
+        if 2 < len(levels) < 0.75 * len(x):
+            gaps = np.diff(levels)
+            # Rounding in the last digit makes two levels of one; those gaps are not steps.
+            gaps = gaps[gaps > 1e-6 * gaps.max()]
+            steps[j] = np.median(gaps)
+    return steps

@@ -18,7 +18,7 @@ from forcegp.checks.finding import Finding
 from forcegp.checks.fit import cross_validate, tensors
 from forcegp.checks.hypotheses import problem_of
 from forcegp.checks.limits import DEGREE
-from forcegp.checks.log import Array, Log, Outcome
+from forcegp.checks.log import DEPARTURE, Array, Log, Outcome, derive
 from forcegp.constraints import ConstrainedSystem
 from forcegp.robust import robust_std
 
@@ -28,10 +28,9 @@ TOLERANCE, INSTANT = 0.05, 0.15
 """A slope within this of 1 is right: filters cost a few percent, and accelerations change within a period."""
 RELATED = 0.7
 """Correlation below which a velocity does not belong to its position, encoder steps aside."""
-EXCHANGED = 0.9
-"""Correlation with another joint's rate from which columns are exchanged."""
-CLEARLY = 5.0
-"""Factor of unexplained variance by which that order must be better."""
+EXCHANGED, CLEARLY = 0.9, 5.0
+"""Correlation with another joint's rate from which columns are exchanged; factor of unexplained variance by
+which that order must be better."""
 LATE, PERSISTS = 0.1, 0.5
 """Share of the motion that a filtered velocity misses, and correlation of what it misses in neighbouring
 windows: noise has none."""
@@ -136,9 +135,13 @@ def _clock_finding(log: Log, factor: float) -> Outcome:
         kind, repaired = "time-scale", log.t * factor
         text = f"positions and velocities change {factor:.4g} times as far as the clock allows"
     found = log.finding(kind, text, seconds_per_unit=factor, period=log.dt)
-    if "qdd" in log.derived | {*log.header.derived}:  # by the wrong clock
-        log = log.replace(qdd=log.qdd * (log.t[-1] - log.t[0]) / (repaired[-1] - repaired[0]))
-    return [found], log.replace(t=repaired)
+    ratio, log = log.t[1] - log.t[0], log.replace(t=repaired)
+    ratio, second = ratio / (log.t[1] - log.t[0]), match(log, "qd", "qdd")
+    if "qdd" in log.derived | {*log.header.derived} and second is not None and second.moving.any():
+        slope = max(float(np.median(second.low[second.moving])), 1e-300)
+        if abs(np.log(slope / ratio)) < abs(np.log(slope)):  # derived by the wrong clock
+            log = log.replace(qdd=log.qdd * ratio)
+    return [found], log
 
 
 def _one_factor(level: Match, factor: float) -> bool:
@@ -159,7 +162,10 @@ def check_velocity(system: ConstrainedSystem, log: Log) -> Outcome:
         return [], log
     wrong = level.moving & (~level.right() | (np.abs(level.correlation) < RELATED)) & ~_coarse(log, level)
     if not wrong.any():
-        return _late(log, level), log
+        if late := _late(log, level):
+            computed = log.derived | {*log.header.derived}
+            log = derive(log, ["qd", "qdd"] if "qdd" in computed else ["qd"])
+        return late, log
     if "qd" in log.header.derived:
         return _mismatch("filter-wide", log, level, wrong, "qd", "q"), log
     permutation = _permutation(level)
@@ -290,12 +296,11 @@ def check_acceleration(system: ConstrainedSystem, log: Log) -> Outcome:
     return findings, log.replace(qdd=qdd, derived=log.derived | {"qdd"})
 
 
-DEPARTURE, DEPARTURE_STRIDE = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0, 3
-"""The departure, zero on cubics; at this stride it shows noise below the corner of a filter."""
-NOISE_FACTOR = 2.0
-"""Ratio of noise found to noise stated that is reported."""
-FILTERED = 0.4
-"""Noise at the highest frequency, as a share of that at a third of it, that tells a filter."""
+DEPARTURE_STRIDE = 3
+"""At this stride the departure, zero on cubics, shows noise below the corner of a filter."""
+NOISE_FACTOR, FILTERED = 2.0, 0.4
+"""Ratio of noise found to noise stated that is reported; noise at the highest frequency, as a share of that
+at a third of it, of a filter."""
 NOISE_ROWS = 100
 
 

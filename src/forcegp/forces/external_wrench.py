@@ -1,14 +1,14 @@
 """The external wrench on a frame of the robot, from the equations of motion beyond the learned forces.
 
-A wrench w that nobody declared acts on a frame with Jacobian J:
+An undeclared wrench w acts on a frame with Jacobian J:
 
     M q̈ = Q̄ + Aᵀλ + Jᵀ w,   Q̄ ~ N(E Q̄, S).
 
 S is the posterior covariance of the learned forces with the noise of the torques.
 
 - **From accelerations** (`least_squares`): r = M q̈ − E Q̄ = Jᵀ w + e with Cov(e) = S + M Σ_q̈ Mᵀ and a prior
-  w ~ N(0, W), by generalized least squares: C = (J Cov(e)⁻¹ Jᵀ + W⁻¹)⁻¹, E w = C J Cov(e)⁻¹ r. Along a
-  direction that the arm cannot feel, the covariance is that of the prior.
+  w ~ N(0, W), by generalized least squares: C = (J Cov(e)⁻¹ Jᵀ + W⁻¹)⁻¹, E w = C J Cov(e)⁻¹ r. Along
+  directions without effect on the joints, the covariance is that of the prior.
 - **From momenta** (`observe`), without accelerations: p = M q̇ obeys ṗ = Q̄ − Q_C + ½ ∂(q̇ᵀM q̇)/∂q + Jᵀ w. A
   Kalman filter estimates p, w, and the error of the learned forces, whose correlation in time is that of the
   torque residuals in the training log. The observer of De Luca and Mattone (*Sensorless robot collision
@@ -61,10 +61,11 @@ class WrenchFrame:
         frame: frame of the robot.
         reference: axes of the components, `"world"` or `"local"` (those of the frame).
         axes: components of `AXES` that are estimated, in this order; the others are zero.
-        point: where the force acts, and what moments refer to, in coordinates of the frame [m].
+        point: point of application of the force and reference point of moments, in coordinates of the frame
+            [m].
         prior_std: standard deviation of forces [N] and moments [N m] before the data.
-        change: by how much a force [N] and a moment [N m] change within a second (a standard deviation), for
-            the momentum filter: it follows faster, with more noise, where that is more.
+        change: standard deviation of the change of a force [N] and a moment [N m] within a second, for the
+            momentum filter; larger values make it faster and noisier.
 
     Example:
         >>> WrenchFrame("tool", axes=("fx", "fz")).prior.tolist()
@@ -72,7 +73,8 @@ class WrenchFrame:
 
     Raises:
         UnknownNameError: no such reference or component.
-        ParameterError: no component, one twice, or a standard deviation that is not positive and finite.
+        ParameterError: no component, a repeated component, or a standard deviation that is not positive and
+            finite.
     """
 
     frame: str
@@ -117,7 +119,7 @@ class WrenchFrame:
         return [self._each((1.0, lever)) for lever in (LEVERS if both else (1.0,))]
 
     def jacobian(self, robot: RobotModel, q: Tensor) -> Tensor:
-        """J of the components at q `(*batch, nq)`: the joints feel Jᵀ w, `(*batch, k, nq)`.
+        """J `(*batch, k, nq)` of the components at q `(*batch, nq)`; the joint force is Jᵀ w.
 
         Raises:
             UnknownNameError: no such frame.
@@ -135,7 +137,7 @@ def least_squares(J: Tensor, r: Tensor, S: Tensor, prior: Tensor) -> tuple[Tenso
 
     Args:
         J: `(n, k, nq)`.
-        r: `(n, nq)` joint force that the model leaves.
+        r: `(n, nq)` residual joint force.
         S: `(n, nq, nq)` its covariance for w = 0.
         prior: `(k,)` or `(n, k)` standard deviations.
 
@@ -186,7 +188,7 @@ def over_levers(
 
 
 def momentum_force(robot: RobotModel, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
-    """M `(n, nq, nq)` and ½ ∂(q̇ᵀM q̇)/∂q = Ṁ q̇ + Q_C `(n, nq)`, what inertia adds to ṗ besides forces."""
+    """M `(n, nq, nq)` and ½ ∂(q̇ᵀM q̇)/∂q = Ṁ q̇ + Q_C `(n, nq)`, the contribution of inertia to ṗ."""
     with torch.enable_grad():
         x = q.detach().clone().requires_grad_()
         M = dynamics.mass_matrix(robot, x)
@@ -204,7 +206,7 @@ class MomentumLog:
         p: M q̇ `(n, nq)`, with covariance `p_noise` `(n, nq, nq)` of its noise.
         u: `(n, nq)` mean of ṗ without the wrench.
         J: `(n, k, nq)` of the unknown components.
-        prior, change: `(k,)` their standard deviations, and how much they change within a second.
+        prior, change: `(k,)` their standard deviations, and those of their change within a second.
         factor: `(n, nq, nq)` lower Cholesky factor of S.
         correlation: `(nq,)` integral of the autocorrelation of the forces' error over all lags [s].
     """

@@ -1,19 +1,18 @@
-"""Which inertia a measured robot has: that of its file, with drives that the file lacks, or another one.
+"""Inertia of a measured robot: that of its file, with drives that the file lacks, or identified inertia.
 
 Held-out stretches of the log decide whether an estimate predicts torques better than the file
-(`inverse_dynamics.py`). Least squares make inertia too small where accelerations are noisy, and the
-likelihood of accelerations given torques makes it too large where the torque is noisy and a controller chose
-the motion. The equations of motion a little earlier and later are instruments that neither disturbs. The
-unknowns are Gaussian around the robot file, each link stays physically consistent, and the inertia of a drive
-is not negative.
+(`inverse_dynamics.py`). With noisy accelerations, least squares underestimates inertia; with noisy torques in
+closed loop, the likelihood of accelerations given torques overestimates it. The equations of motion a little
+earlier and later are instruments without either bias. The unknowns are Gaussian around the robot file, each
+link stays physically consistent, and the inertia of a drive is not negative.
 
-Torques do not settle everything. In a closed loop the noise of the torque sensor exceeds the torque
-that accelerates a light joint; divided by the inertia of the file it predicts accelerations that are larger
-than all that were measured. Where that is so, the drives get the inertia that maximises
-−½ Σ ε²/s² + v Σ log |M|, with the smallest v ≤ 1 at which accelerations are predicted as well as by their
-mean, as long as the error of no joint's torque on held-out stretches grows by more than 2 %.
+Torques alone do not suffice. In a closed loop the noise of the torque sensor exceeds the torque
+that accelerates a light joint; divided by the inertia of the file it predicts accelerations far larger than
+the measured ones. In that case, the drives get the inertia that maximises −½ Σ ε²/s² + v Σ log |M|, with the
+smallest v ≤ 1 at which accelerations are predicted as well as by their mean, as long as the error of no
+joint's torque on held-out stretches grows by more than 2 %.
 
-Where a caller asks for an `InertialPrior` itself, the robot moves to the posterior mean of its inertial
+If an `InertialPrior` is given, the robot moves to the posterior mean of its inertial
 parameters: one Gauss–Newton step, physically consistent.
 """
 
@@ -68,9 +67,8 @@ WIDTHS = (0.0, 0.02, 0.05, 0.12)
 def rigid_robot(robot: RobotModel, rows: Rows) -> RobotModel | None:
     """The physically consistent robot that predicts held-out torques better than the file, or `None`.
 
-    It has to do so significantly, by more than two standard errors over stretches of the log: better than the
-    file, and better than the file with drives that it lacks. And no joint's held-out acceleration error may
-    grow.
+    The improvement must exceed two standard errors over stretches of the log, over the file and over the file
+    with additional drives, and no joint's held-out acceleration error may grow.
 
     Args:
         robot: of the file.
@@ -81,25 +79,27 @@ def rigid_robot(robot: RobotModel, rows: Rows) -> RobotModel | None:
     size = M.diagonal(dim1=-2, dim2=-1).mean(0)
     links = regressor(robot, rows.q, rows.qd, rows.qdd) * prior.scale(robot)
     C = torch.cat([size * torch.diag_embed(rows.qdd), links], dim=-1)
-    found = max(_over_widths(rows, C, M), key=lambda each: float(torch.logdet(each.normal()[1])))
-    noise = found.noise
+    regressions, judged = tuple(_over_widths(rows, C, M)), products(rows, C)
+    single = regressions[0]
+    found = max(regressions, key=lambda each: float(torch.logdet(each.normal()[1])))
 
     def compared(estimate: Estimate) -> Tensor:
-        """Held-out errors in units of the noise."""
-        return held_out(found.by_stretch, estimate, found.judged) / noise**2
+        """Held-out errors of single samples in units of their noise; averages hardly show sharp friction."""
+        return held_out(single.by_stretch, estimate, judged, found.by_stretch) / single.noise**2
 
-    nothing, drives = torch.zeros_like(found.mean), _drives_alone(found.by_stretch.total(), noise, n)
+    nothing = torch.zeros_like(found.mean)
+    drives = _drives_alone(found.by_stretch.total(), found.noise, n)
     known = min(
         (compared(lambda _, x=x: x) for x in (nothing, drives)), key=lambda error: float(error.mean())
     )
-    if not _is_better(compared(lambda rest: _estimate(rest, noise, found.power)), known):
+    if not _is_better(compared(lambda rest: _estimate(rest, found.noise, found.power)), known):
         return None
     driven = robot.replace(armature=robot.armature + size * found.mean[:n])
     _, precision = found.normal()
     consistent, moved = prior.updated(driven, found.mean[n:], precision[n:, n:])
     delta = torch.cat([found.mean[:n], moved])
     before, after = (
-        acceleration_errors(rows, found.by_stretch, C, x, mass_matrix(each, rows.q))
+        acceleration_errors(rows, single.by_stretch, C, x, mass_matrix(each, rows.q))
         for each, x in ((robot, nothing), (consistent, delta))
     )
     better = _is_better(compared(lambda _: delta), known)
@@ -111,7 +111,6 @@ class _Regression:
     """Unknowns by instrumental variables, with the noise `(nq,)` and the power κ that they leave."""
 
     by_stretch: NormalEquations
-    judged: NormalEquations
     mean: Tensor
     noise: Tensor
     power: float
@@ -125,7 +124,7 @@ def _over_widths(rows: Rows, C: Tensor, M: Tensor) -> Iterator[_Regression]:
     inertial = (M @ rows.qdd[..., None])[..., 0]
     for width in WIDTHS if rows.step else WIDTHS[:1]:
         used, columns = averaged(rows, C, inertial, width) if rows.step else (rows, C)
-        if width and int(used.slides.sum(0).min()) < LEAST:
+        if width and (int(used.slides.sum(0).min()) < LEAST or int(used.group.max()) < int(rows.group.max())):
             break
         by_stretch = instrumental(used, columns)
         every, mean, noise, power = by_stretch.total(), C.new_zeros(C.shape[-1]), C.new_ones(C.shape[1]), 1.0
@@ -135,7 +134,7 @@ def _over_widths(rows: Rows, C: Tensor, M: Tensor) -> Iterator[_Regression]:
             noise = (left.square().sum(0) / used.slides.sum(0).clamp(min=1)).sqrt().clamp(min=1e-300)
             power = _power(used, left / noise)
             mean = _estimate(every, noise, power)
-        yield _Regression(by_stretch, products(used, columns), mean, noise, power)
+        yield _Regression(by_stretch, mean, noise, power)
 
 
 def _power(rows: Rows, left: Tensor) -> float:
@@ -187,8 +186,8 @@ class Inertia:
     """Inertia that the log determines.
 
     Attributes:
-        robot: that of the file, with the inertia that was found.
-        identified: whether inertial parameters of links were, of which some uncertainty remains.
+        robot: that of the file, with the identified inertia.
+        identified: whether inertial parameters of links were identified, so that some uncertainty remains.
         doubts: warnings for the user.
     """
 
@@ -205,7 +204,7 @@ def inertia_of(
 
     Args:
         system: robot and contacts of the robot file.
-        friction: what the friction of a joint depends on.
+        friction: inputs of the friction of a joint.
         mean: prior mean of Q, with the motor torque.
         training: samples in motion, `LEAST` of them free.
     """

@@ -1,4 +1,4 @@
-"""How plots look: colours, names and sizes; pages as single HTML files, with plots as SVG text and tables."""
+"""Style of plots: colours, names and sizes; pages as single HTML files, with plots as SVG text and tables."""
 
 from __future__ import annotations
 
@@ -15,53 +15,24 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from forcegp.notebook import text
+from forcegp.scene.document import tomllib
 
-COLOURS = {
-    "analytical": "#9c2f1a",
-    "nn": "#d08c00",
-    "gp": "#0072b2",
-    "sgp-zero": "#c4488c",
-    "sgp-mean": "#6a3d9a",
-    "sgp-contact": "#007a5e",
-}
-"""One colour per model, distinguishable by colour-blind readers and in print."""
-DASHES = {"nn-30-20": (1.0, 1.2), "nn-200x4": (5.0, 1.5, 1.0, 1.5)}
-"""Dashes and gaps, in line widths, of the networks that share the first one's colour."""
-KINDS = {
-    "analytical": "Analytical model",
-    "neural_network": "Neural network",
-    "independent_gp": "GP",
-    "structured_gp": "Structured GP",
-}
-"""What the kinds of saved models are called."""
+TEMPLATES = Path(__file__).parent / "templates"
+STYLE = TEMPLATES / "forcegp.mplstyle"
+"""Fonts, sizes and lines of plots."""
+NAMES = tomllib.loads((TEMPLATES / "names.toml").read_text(encoding="utf-8"))
+COLOURS, DASHES, KINDS, LABELS = (NAMES[table] for table in ("colours", "dashes", "kinds", "labels"))
+"""Looks of models, what kinds of saved models are called, and what models are called in plots and tables."""
 OTHER = "#0072b2"
 """Colour of a model without one of its own; not black, as measurements are."""
 INK = "#222222"
 AXES = ("#0072b2", "#d55e00", "#007a5e")
 """Colours of the Cartesian axes x, y, z."""
-LABELS = {
-    "analytical": "Analytical model",
-    "nn": "Neural network, 80",
-    "nn-80": "Neural network, 80",
-    "nn-30-20": "Neural network, 30-20",
-    "nn-200x4": "Neural network, 4×200",
-    "gp": "GP",
-    "sgp-zero": "S-GP, zero mean",
-    "sgp-mean": "S-GP, analytical mean",
-    "sgp-contact": "S-GP, mean and contact prior",
-    "sgp-zero-se": "S-GP, zero mean, paper's kernel",
-    "sgp-mean-se": "S-GP, analytical mean, paper's kernel",
-    "sgp-contact-se": "S-GP, mean and contact prior, paper's kernel",
-}
-"""What a model is called in plots and tables."""
-
-STYLE = Path(__file__).parent / "templates" / "forcegp.mplstyle"
-"""Fonts, sizes and lines of plots."""
 
 
 @dataclass(frozen=True)
 class Picture:
-    """A drawn plot as the text of an SVG file; `alt` describes it for readers who cannot see it."""
+    """A drawn plot as the text of an SVG file; `alt` is its text alternative."""
 
     svg: str
     alt: str
@@ -74,7 +45,7 @@ class Picture:
 
 
 def label(model: str) -> str:
-    """What a model is called."""
+    """The display name of a model."""
     return LABELS.get(model) or KINDS.get(model, model)
 
 
@@ -104,7 +75,7 @@ DIGITS = 7
 
 
 def series(values: Tensor) -> Series:
-    """A tensor `(n,)` as numbers for a file, rounded to what a plot can show."""
+    """A tensor `(n,)` as numbers for a file, rounded to the resolution of a plot."""
     return [float(f"{value:.{DIGITS}g}") for value in values.detach().cpu().tolist()]
 
 
@@ -123,31 +94,24 @@ NONE = "–"
 
 @dataclass(frozen=True)
 class Table:
-    """A table as text; the first column names the rows, `bad` holds `(row, column)` of cells in red."""
+    """A table as text; the first column names the rows, `bad` contains `(row, column)` of red cells."""
 
     caption: str
     head: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
     bad: frozenset[tuple[int, int]] = frozenset()
 
-    def markdown(self) -> str:
-        """The table with its caption as Markdown."""
-
-        def line(cells: tuple[str, ...]) -> str:
-            return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
-
-        rule = "|" + "---|" * len(self.head)
-        return "\n".join([f"{self.caption}:", "", line(self.head), rule, *map(line, self.rows)])
-
 
 def cell(value: object, digits: int = 4) -> str:
-    """One value as text: floats with significant digits, a dash for nothing."""
+    """One value as text: floats with significant digits, a dash for a missing value."""
     return NONE if value is None else text(value, digits)
 
 
 @dataclass(frozen=True)
 class PictureBlock:
-    """Pictures under one heading and caption, as wide as the page if `wide`; `source` has their data."""
+    """Pictures under one heading and caption, with the width of the page if `wide`; `source` is the file with
+    their data.
+    """
 
     heading: str
     caption: str
@@ -157,7 +121,7 @@ class PictureBlock:
 
 
 def render(template: str, package: str = "forcegp.report", **values: object) -> str:
-    """Fill in a template under `templates/` of the package, or of this one; a missing value is an error."""
+    """Render a template under `templates/` of the package, or of this one; a missing value is an error."""
     packages = dict.fromkeys((package, "forcegp.report"))
     environment = jinja2.Environment(
         loader=jinja2.ChoiceLoader([jinja2.PackageLoader(name) for name in packages]),

@@ -41,7 +41,7 @@ class Band(Record):
 
 
 class ModelPath(Record):
-    """The first predicted trajectory of one model, up to where it diverged.
+    """The first predicted trajectory of one model, up to its divergence.
 
     Attributes:
         model: name.
@@ -51,11 +51,11 @@ class ModelPath(Record):
         drift: constraint error c(q) [m]; empty without contacts.
         multiplier: λ [N]; empty for models without forces.
         multiplier_band: over samples.
-        lost: probability that contact was lost by then, over samples; empty without samples.
+        lost: probability that contact was lost by each time, over samples; empty without samples.
         errors: tip error after each horizon, median over the starts [m]; `None` if over half diverged.
         coverage: share of logged tip coordinates within the band; `None` without samples.
         inflation: factor on the band, calibrated on another motion; `None` without one.
-        calibrated_coverage: coverage of the band widened by that factor.
+        calibrated_coverage: coverage of the band scaled by that factor.
         worst_drift: largest constraint error of mean and samples over all starts [m].
         diverged_at: time of the first divergence [s].
     """
@@ -115,7 +115,9 @@ class RolloutData(Header):
 
 
 def rollout_data(comparison: Comparison, calibration: Comparison | None = None) -> RolloutData:
-    """The data of the section, curves of the first start; `calibration`, on another motion, widens bands."""
+    """The data of the section, with curves of the first start; `calibration` on another motion scales the
+    bands.
+    """
     horizons = [h for h in HORIZONS if h <= float(comparison.t[-1]) * (1.0 + 1e-9)]
     stride = max(1, round(1.0 / (FRAMES_PER_SECOND * float(comparison.t[1] - comparison.t[0]))))
     tip = comparison.frame, comparison.point
@@ -183,7 +185,7 @@ def _bands(rolled, values: Tensor, n: int) -> list[Band]:
 
 
 def _sound(q: Tensor) -> int:
-    """How many leading times `(T, nq)` hold a finite state."""
+    """Number of leading times `(T, nq)` hold a finite state."""
     return int(torch.isfinite(q).all(-1).sum())
 
 
@@ -207,7 +209,7 @@ PAGE, DATA = "rollout.html", "rollout.json"
 
 
 def draw_tip(data: RolloutData) -> Picture:
-    """Position of the tip by axis, logged and predicted, for as long as there are bands over samples."""
+    """Draw the position of the tip by axis, logged and predicted, for the duration of the bands."""
 
     def paint(figure: Figure) -> None:
         for axis, axes in enumerate(figure.subplots(3, 1, sharex=True)):
@@ -279,11 +281,15 @@ def _curve(axes: Axes, data: RolloutData, path: ModelPath, values: Series, band:
     axes.plot(data.t[: len(values)], values, label=label(path.model), **style)
 
 
+def _starts(number: int) -> str:
+    return f"{number} start" + "s" * (number != 1)
+
+
 def rollout_pictures(data: RolloutData) -> tuple[Picture, ...]:
-    """The plots of the section for which there are data."""
+    """The plots of the section with data."""
     log = "logarithmic scale, one curve per model."
     errors = [(path, path.tip_error) for path in data.models]
-    alt = f"Tip error over time, median over {data.starts} starts, {log}"
+    alt = f"Tip error over time, median over {_starts(data.starts)}, {log}"
     picture = _draw_logarithmic(data, errors, 1e-9, "tip error [m]", alt, "Tip error over time")
     pictures = [draw_tip(data), picture]
     if drifts := [(path, path.drift) for path in data.models if path.drift]:
@@ -305,11 +311,11 @@ def rollout_table(data: RolloutData) -> Table:
         widened = NONE if calibrated is None else f"{calibrated:.3f} (× {path.inflation:.2f})"
         drift = NONE if path.worst_drift is None else f"{path.worst_drift:.1e}"
         rows.append((label(path.model), *errors, coverage, widened, drift))
-    caption = f"Tip error in open loop (median over {data.starts} starts)"
+    caption = f"Tip error in open loop (median over {_starts(data.starts)})"
     if any(path.coverage is not None for path in data.models):
         caption += (
             f"; share of logged tip positions inside the {data.level:.0%} bands over function samples "
-            f"({data.band_starts} starts, {data.band_seconds:.3g} s), and inside the bands widened by the "
+            f"({_starts(data.band_starts)}, {data.band_seconds:.3g} s), and inside the bands widened by the "
             "factor calibrated on held-out stretches of the training run"
         )
     return Table(caption, head, tuple(rows))
@@ -317,7 +323,9 @@ def rollout_table(data: RolloutData) -> Table:
 
 @dataclass(frozen=True)
 class RolloutSection:
-    """Plots, table and animation of trajectories; `script` is the hash for the page's security policy."""
+    """Plots, table and animation of trajectories; `script` is the hash of the script for the page's security
+    policy.
+    """
 
     block: PictureBlock
     table: Table
@@ -335,8 +343,8 @@ def rollout_section(data: RolloutData, source: str = DATA) -> RolloutSection:
     caption = (
         f"Open loop from a logged state under the logged torques, {data.t[-1]:.3g} s ahead: logged in "
         f"black, predicted in colour{band if sampled else ''}. Position and contact force are shown for the "
-        f"first {data.band_seconds:.3g} s. Errors are medians over {data.starts} starts. A curve ends where "
-        f"its prediction diverged.{why if sampled else ''}"
+        f"first {data.band_seconds:.3g} s. Errors are medians over {_starts(data.starts)}. A curve ends "
+        f"where its prediction diverged.{why if sampled else ''}"
     )
     block = PictureBlock("Trajectories predicted in open loop", caption, rollout_pictures(data), source)
     return RolloutSection(block, rollout_table(data), _animation(data), animation_source())
