@@ -18,8 +18,7 @@ from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.contact import ContactForcePrior, SlidingFrictionPrior
 from forcegp.forces.priors.joint import AnalyticalMean, JointForcePrior
 from forcegp.gp import kernels
-from forcegp.gp.kernels import Linear, Matern52, SquaredExponential, Sum
-from forcegp.gp.ornstein_uhlenbeck import OrnsteinUhlenbeck
+from forcegp.gp.kernels import Linear, Matern52, OrnsteinUhlenbeck, SquaredExponential, Sum
 from forcegp.models.analytical import ADAM, AnalyticalModel, Window
 from forcegp.models.configured import Configured, configured, keys_of
 from forcegp.models.independent_gp import IndependentGP
