@@ -32,7 +32,7 @@ from forcegp.simulate import simulate
 
 HERE = Path(__file__).resolve().parents[1]
 REAL = HERE / "../shared/real"
-Table = dict[str, NDArray[np.float64]]
+Table = dict[str, NDArray[Any]]
 Log = tuple[ConstrainedSystem, Table]
 Plant = Callable[[Log], Log]
 

@@ -295,7 +295,7 @@ def test_the_folder_compiles_without_warnings_and_passes_its_test(
     names = {"controller.h", "controller.c", "test_controller.c", "CMakeLists.txt", "README.md"}
     assert {path.name for path in written.folder.iterdir()} == names
     assert len((written.folder / "README.md").read_text().splitlines()) <= 10
-    ran = built(written.folder, "-O2", compiler=compiler)
+    ran = built(written.folder, "-O2")
     assert ran.returncode == 0, ran.stdout
     source = (written.folder / "controller.c").read_text()
     assert "malloc" not in source
@@ -342,7 +342,7 @@ def test_a_reduced_covariance_is_wider_by_no_more_than_stated(name: str, tmp_pat
     written = fit.export(tmp_path / "c", functions=30)
     assert written.functions == 30 and 0.0 < written.wider <= written.widest
     assert f"{written.widest:.2g}" in (written.folder / "README.md").read_text()
-    ran = built(written.folder, "-O2", compiler=compiler)
+    ran = built(written.folder, "-O2")
     assert ran.returncode == 0, ran.stdout
     small, m = fit.compiled(functions=30), fit.training.measurements[0]
     read = [x.predict(m.q, m.qd, m.tau, ["qdd", "multiplier"], active=m.active) for x in (small, fit)]

@@ -24,16 +24,14 @@ from forcegp.identification import base_parameters, parameter_vector, regressor
 
 STILL = 0.05
 """Range of motion below which a joint does not move [rad, m]."""
-REVERSALS = 4
-"""Changes of direction that separate Coulomb friction from an offset of the torque."""
-HYSTERESIS = 0.05
-"""Share of its largest speed that a joint must reach for a change of direction to count."""
+REVERSALS, HYSTERESIS = 4, 0.05
+"""Changes of direction that separate Coulomb friction from an offset of the torque; share of its largest
+speed that a joint must reach for one to count."""
 SHORT_SECONDS, ROWS = 2.0, 1000
 """Length of a log below which little is learned [s]; rows of which the regressor is made."""
-LOOK = 0.1
-"""Time after which the torque contains new information [s]."""
-LEARNED = 0.5
-"""Standard deviation after the log, as a share of that before it, below which a parameter is identified."""
+LOOK, LEARNED = 0.1, 0.5
+"""Time after which the torque contains new information [s]; standard deviation after the log, as a share of
+that before it, below which a parameter is identified."""
 
 
 def check_length(system: ConstrainedSystem, log: Log) -> Outcome:

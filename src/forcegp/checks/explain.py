@@ -1,4 +1,4 @@
-"""Which fault explains the torque best: greedy choice by cross-validation, one-standard-error rule.
+"""Greedy search for the faults that explain the torque, by cross-validation and the one-standard-error rule.
 
 The simplest hypothesis within one standard error of the best is accepted (Breiman, Friedman, Olshen, Stone,
 *Classification and Regression Trees*, 1984, sec. 3.4.3), the log is corrected, and the search repeated.
@@ -26,10 +26,8 @@ ROUNDS = 5
 """Faults that are looked for at most."""
 SIGNIFICANT = 4.0
 """Standard errors by which the held-out score must drop; there are about a hundred hypotheses."""
-SHARE = 0.03
-"""Share of the best drop that a simpler hypothesis may leave to a second round."""
-SAME = 1e-3
-"""Relative difference of errors that are equal."""
+SHARE, SAME = 0.03, 1e-3
+"""Share of the best drop that a simpler hypothesis may leave to a second round; equal errors."""
 DETERMINED = 3.0
 """A gain counts as known if it exceeds this many standard errors."""
 MATERIAL, MATERIAL_EACH = 0.15, 0.05
@@ -89,7 +87,7 @@ class Explanation:
 
 def explain(system: ConstrainedSystem, log: Log) -> Explanation:
     """Find the faults that explain the residual torque of the robot file."""
-    rows = log.rows(ROWS, margin=max(hypotheses.lags(log)))
+    rows = log.rows(ROWS, margin=max(hypotheses.LAGS))
     problem = hypotheses.problem_of(system, log, rows)
     model = Explanation(system, log, rows, problem, np.zeros((*problem.r.shape, 0)), np.zeros(0)).weighed()
     for _ in range(ROUNDS):

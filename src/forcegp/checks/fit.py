@@ -39,7 +39,7 @@ def residual(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> tuple[Arr
 
 
 def labelled_contacts(system: ConstrainedSystem, log: Log) -> list[Constraint]:
-    """The contacts whose state is logged."""
+    """The contacts with a logged state."""
     return [c for c in system.contacts if c.name in log.contact]
 
 
@@ -94,8 +94,8 @@ FLOOR = 0.03
 @dataclass(frozen=True)
 class TorqueProblem:
     """Unexplained torque r `(n, nq)` [N m, N], Jacobian J of the touching points `(n, k, nq)`, columns that
-    every hypothesis may use `(n, nq, p)`, size of the logged torque, and scale of its noise, which weighs the
-    joints.
+    every hypothesis may use `(n, nq, p)`, size of the logged torque, and scale of its noise, which weights
+    the joints.
     """
 
     r: Array

@@ -26,8 +26,8 @@ from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.identification import MASS_SHARE, MOMENT_ARM, regressor
 from forcegp.robot.model import RobotModel
 
-LAGS, LONGEST = (1, 2, 3, 4, 6, 8, 11, 15, 20, 27, 36, 48, 64, 85), 0.085
-"""Delays between torque and motion that are tried, in samples either way, and the longest [s] beyond 20."""
+LAGS = (1, 2, 3, 4, 6, 8, 11, 15, 20)
+"""Delays between torque and motion that are tried, in samples either way."""
 TOOL_MASS = 5.0
 """Largest mass of a tool that the robot file lacks [kg]."""
 RISES = (0.3, 2.0, 10.0)
@@ -116,11 +116,6 @@ def changed(log: Log, names: tuple[str, ...], *, order: Sequence[int] = (), flip
     return log.replace(**{name: getattr(log, name)[:, index] * sign for name in names})
 
 
-def lags(log: Log) -> tuple[int, ...]:
-    """Delays that are tried on a log, in rows."""
-    return tuple(lag for lag in LAGS if lag <= max(20, LONGEST / log.dt))
-
-
 def delayed(log: Log, shift: int, joints: tuple[int, ...] = ()) -> Log:
     """The log with torques, all or some, of `shift` rows later in each stretch; rows without are masked."""
     tau, lost = log.tau.copy(), np.ones(len(log), bool)
@@ -150,13 +145,13 @@ def discrete(log: Log) -> Iterator[Hypothesis]:
 
 def delays(log: Log) -> Iterator[Hypothesis]:
     """Torques that are logged before or after the motion."""
-    for shift in (sign * lag for lag in (lags(log) if log.stretches else ()) for sign in (1, -1)):
+    for shift in (sign * lag for lag in (LAGS if log.stretches else ()) for sign in (1, -1)):
         yield Hypothesis("torque-delay", 1, partial(delayed, shift=shift), shift=shift)
 
 
 def joint_delays(log: Log, rows: np.ndarray, problem: TorqueProblem) -> Iterator[Hypothesis]:
     """The torque of one joint, logged before or after the motion: its best delay beside friction."""
-    shifts = [sign * lag for lag in (lags(log) if log.stretches else ()) for sign in (1, -1)]
+    shifts = [sign * lag for lag in (LAGS if log.stretches else ()) for sign in (1, -1)]
     needed = problem.r + log.tau[rows]
     for j in range(log.nq if log.nq > 1 and shifts else 0):
         x = log.qd[rows, j]
@@ -240,17 +235,13 @@ CURRENT = 1.6
 """Gains of all joints beyond this factor are no calibration error: another quantity was logged."""
 TILT = 30.0
 """Largest angle at which a base counts as tilted, not as mounted another way round [degrees]."""
-WEIGHTLESS = 0.3
-"""Share of gravity below which the torque holds none of it."""
-SIGNIFICANT = 3.0
-"""Standard errors from which a parameter of a tool counts."""
+WEIGHTLESS, SIGNIFICANT = 0.3, 3.0
+"""Share of gravity below which the torque has none; standard errors from which a tool's parameter counts."""
 SMALL_ANGLE, LARGEST_ANGLE = np.radians(0.5), 1.0
 """Encoder offsets below the first are within calibration, or an error of a centre of mass; one beyond the
 second is none that a slope of the torque determines [rad, m]."""
-SMALL_GAIN = 0.2
-"""Gains closer to 1 than this may as well be errors of the masses of a robot file."""
-EXPLAINED = 0.5
-"""Share of the torque that a gain may leave unexplained, as any useful model may."""
+SMALL_GAIN, EXPLAINED = 0.2, 0.5
+"""Gains closer to 1 may as well be errors of masses; share of the torque that a gain may not explain."""
 SMALL_TILT, EARTH = 1.0, 9.81
 """Tilts that are errors of the masses [degrees]; size of gravity where the scene has none [m/s²]."""
 SAME_GRAVITY = 0.2, 0.5
@@ -321,7 +312,8 @@ def finding_of(
         rows, seconds = abs(hypothesis.shift), abs(hypothesis.shift) * log.dt
         word = "after" if hypothesis.shift > 0 else "before"
         which = f" of {listed}" if hypothesis.joints else ""
-        text = f"the torque{which} is logged about {1e3 * seconds:.3g} ms ({rows} rows) {word} the motion"
+        about = "about" if rows < LAGS[-1] else "at least"
+        text = f"the torque{which} is logged {about} {1e3 * seconds:.3g} ms ({rows} rows) {word} the motion"
         evidence = {"rows": hypothesis.shift, "seconds": seconds}
     elif name == "encoder-offset":
         added = displacement(system.robot, hypothesis.joints[0], float(theta[0]))

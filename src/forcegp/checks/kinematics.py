@@ -18,7 +18,7 @@ from forcegp.checks.finding import Finding
 from forcegp.checks.fit import cross_validate, tensors
 from forcegp.checks.hypotheses import problem_of
 from forcegp.checks.limits import DEGREE
-from forcegp.checks.log import Array, Log, Outcome
+from forcegp.checks.log import DEPARTURE, Array, Log, Outcome
 from forcegp.constraints import ConstrainedSystem
 from forcegp.robust import robust_std
 
@@ -28,10 +28,9 @@ TOLERANCE, INSTANT = 0.05, 0.15
 """A slope within this of 1 is right: filters cost a few percent, and accelerations change within a period."""
 RELATED = 0.7
 """Correlation below which a velocity does not belong to its position, encoder steps aside."""
-EXCHANGED = 0.9
-"""Correlation with another joint's rate from which columns are exchanged."""
-CLEARLY = 5.0
-"""Factor of unexplained variance by which that order must be better."""
+EXCHANGED, CLEARLY = 0.9, 5.0
+"""Correlation with another joint's rate from which columns are exchanged; factor of unexplained variance by
+which that order must be better."""
 LATE, PERSISTS = 0.1, 0.5
 """Share of the motion that a filtered velocity misses, and correlation of what it misses in neighbouring
 windows: noise has none."""
@@ -290,12 +289,11 @@ def check_acceleration(system: ConstrainedSystem, log: Log) -> Outcome:
     return findings, log.replace(qdd=qdd, derived=log.derived | {"qdd"})
 
 
-DEPARTURE, DEPARTURE_STRIDE = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0, 3
-"""The departure, zero on cubics; at this stride it shows noise below the corner of a filter."""
-NOISE_FACTOR = 2.0
-"""Ratio of noise found to noise stated that is reported."""
-FILTERED = 0.4
-"""Noise at the highest frequency, as a share of that at a third of it, that tells a filter."""
+DEPARTURE_STRIDE = 3
+"""At this stride the departure, zero on cubics, shows noise below the corner of a filter."""
+NOISE_FACTOR, FILTERED = 2.0, 0.4
+"""Ratio of noise found to noise stated that is reported; noise at the highest frequency, as a share of that
+at a third of it, of a filter."""
 NOISE_ROWS = 100
 
 

@@ -30,19 +30,15 @@ LEAST_ROWS = 200
 """Rows from which dynamics are judged."""
 SIGNIFICANT, MATERIAL = 3.0, 0.1
 """Standard errors over blocks, and drop of a joint's log error, from which friction or offsets count."""
-SPEEDS = (25.0, 95.0)
-"""Percentiles of a joint's speed between which friction resists."""
-UNEXPLAINED = 0.5
-"""Share of the torque, in root mean square, that a useful model may leave unexplained."""
+SPEEDS, UNEXPLAINED = (25.0, 95.0), 0.5
+"""Percentiles of speed between which friction resists; share of the torque (RMS) that may be left."""
 TRACE_ROWS, DISTURBANCE_SECONDS = 20_000, 0.1
 """Rows at which the residual is looked at over time; length over which the residual is averaged [s]."""
 DISTURBANCE, LOUD = 5.0, 4.0
 """A stretch of time stands out by so many robust standard deviations of the log residual, or by this factor
 over the residual of the worst tenth of the motion."""
-MOVING = 0.05
-"""Share of the largest speed from which an arm moves."""
-VISIBLE = 0.1
-"""A disturbance must exceed this share of the joint's torque plus the dry friction of the joint."""
+MOVING, VISIBLE = 0.05, 0.1
+"""Share of the largest speed of an arm that moves; least disturbance, beyond dry friction, as a share."""
 ONE_SIGMA = 84.13
 """Percentile of a normal distribution at one standard deviation above the mean."""
 
@@ -56,7 +52,7 @@ def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
         return passive, log
     smooth = smoothed(log)
     if not _enough(smooth):
-        inner = f"rows that lie {max(hypotheses.lags(smooth))} from the ends of a stretch"
+        inner = f"rows that lie {max(hypotheses.LAGS)} from the ends of a stretch"
         raise NotJudgedError(f"fewer than {LEAST_ROWS} {inner}")
     explanation = explain(system, smooth)
     disturbed, rows = [], np.zeros(len(log), bool)
@@ -85,7 +81,7 @@ def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def _enough(log: Log) -> bool:
-    return len(log.rows(LEAST_ROWS, margin=max(hypotheses.lags(log)))) == LEAST_ROWS
+    return len(log.rows(LEAST_ROWS, margin=max(hypotheses.LAGS))) == LEAST_ROWS
 
 
 def _without_torque(log: Log) -> list[Finding]:

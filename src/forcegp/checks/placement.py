@@ -11,19 +11,11 @@ from dataclasses import replace
 
 import numpy as np
 
+from forcegp.checks import hypotheses
 from forcegp.checks.contact import FAR, OFFSET, SLIDING_SLOW, fit_surface, tip_path, touching
 from forcegp.checks.finding import Finding
 from forcegp.checks.fit import cross_validate, labelled_contacts
-from forcegp.checks.hypotheses import (
-    LARGEST_ANGLE,
-    SMALL_ANGLE,
-    Hypothesis,
-    changed,
-    corrected,
-    discrete,
-    problem_of,
-    unchanged,
-)
+from forcegp.checks.hypotheses import Hypothesis, changed, corrected, discrete, unchanged
 from forcegp.checks.log import Array, Log, Outcome, displacement, evenly
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.logs.contact import LEVEL, TOUCHING, TRIED_ROWS, exchanged_joints
@@ -100,7 +92,7 @@ def _chosen(
 ) -> Outcome:
     """Changes that place the tip alike, as those of two joints in one plane; the torque chooses one."""
     rows = evenly(np.flatnonzero(log.usable), TRIED_ROWS)
-    scores = [cross_validate(problem_of(system, other, rows)).score.mean() for _, other in near]
+    scores = [cross_validate(hypotheses.problem_of(system, other, rows)).score.mean() for _, other in near]
     best, repaired = near[int(np.argmin(scores))]
     alike = [h for h, _ in near if h.name == best.name]
     return [_finding(system.robot, log, contact, alike, where)], repaired
@@ -155,8 +147,9 @@ def _offsets(
             total = slope**2 if share is not None else (slope**2).sum()
             ascent = slope * c if share is not None else (slope * c).sum()
             offset = offset - ascent / np.maximum(total, 1e-12)
-        offset = offset if share is None else np.array([level_of(offset, SMALL_ANGLE, share) or 0.0])
-        if abs(offset[0]) <= LARGEST_ANGLE:
+        if share is not None:
+            offset = np.array([level_of(offset, hypotheses.SMALL_ANGLE, share) or 0.0])
+        if abs(offset[0]) <= hypotheses.LARGEST_ANGLE:
             yield replace(hypothesis, columns=offset[:1]), corrected(log, hypothesis, offset[:1])
 
 

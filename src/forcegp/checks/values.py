@@ -10,7 +10,7 @@ from forcegp.checks.excitation import still_joints
 from forcegp.checks.finding import Finding, at_rows
 from forcegp.checks.fit import tensors
 from forcegp.checks.limits import limits_of
-from forcegp.checks.log import Array, Log, Outcome, spikes
+from forcegp.checks.log import DEPARTURE, Array, Log, Outcome, spikes
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data.derivative import UNIFORM_TOLERANCE
 from forcegp.data.fields import JOINT_VECTORS
@@ -67,16 +67,13 @@ HELD_RUN = 2
 """A logger that fails to update repeats a row at least this often before it is reported as held."""
 STUCK_SECONDS, STUCK_VISIBLE = 0.05, 0.02
 """A channel that repeats one value for so long [s] should have moved by this share of its range."""
-SPIKE = 12.0
-"""Robust standard deviations beyond which a single value is a spike: never reached by normal noise."""
-SPIKE_ALONE = 4.0
-"""Factor by which a spike stands out from the misfit of its neighbours."""
+SPIKE, SPIKE_ALONE = 12.0, 4.0
+"""Robust standard deviations of a spike, never reached by noise; its factor over the neighbours' misfit."""
 SPIKE_SHAPE, SPIKE_NOISE = 0.2, 4.0
 """Share of a wrong value, and robust deviations, by which departures of its neighbours may differ."""
-SPIKE_SHARED = 0.05
-"""A departure of another channel by this share of a value's own says that the motion jumped."""
-DRIVEN = 0.5
-"""Share of a departing acceleration that a step of the torque must make to be its cause."""
+SPIKE_SHARED, DRIVEN = 0.05, 0.5
+"""The motion jumped where another channel departs by this share of a value's own; a step of the torque is the
+cause of a departing acceleration from this share on."""
 FEWEST = 50
 """Values that a scale is taken from."""
 SPIKE_VISIBLE = (0.01, 0.002)
@@ -238,8 +235,7 @@ def _size(log: Log, name: str, departure: Array, around: Array, scale: Array) ->
 def _one_value(departure: Array, scale: Array) -> np.ndarray:
     """`(n, d)` bool, departures h with −4h/6 and h/6 around: one wrong value makes them, a kink does not."""
     around = np.lib.stride_tricks.sliding_window_view(np.pad(departure, ((2, 2), (0, 0))), 5, axis=0)
-    shape = departure[..., None] * np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0
-    misfit = np.abs(around - shape).max(axis=-1)
+    misfit = np.abs(around - departure[..., None] * DEPARTURE).max(axis=-1)
     return misfit <= SPIKE_SHAPE * np.abs(departure) + SPIKE_NOISE * scale
 
 

@@ -79,7 +79,7 @@ def fit(
     if checkpoint is not None:
         for file in (checkpoint, beside(checkpoint)):
             file.unlink(missing_ok=True)
-    doubts = () if learned.converged else (f"the fit did not converge: {learned.result.message}",)
+    doubts = () if learned.result.converged else (f"the fit did not converge: {learned.result.message}",)
     for doubt in (*doubts, *learned.result.warnings):
         common.warn(doubt)
     result: dict[str, object] = {"model": regression.name, "training_points": len(training)}

@@ -3,9 +3,9 @@
 Least squares identifies a rigid robot with physically consistent inertial parameters,
 τ = M q̈ − Q_C − Q_G − Q_D + Y(q, q̇, q̈) δπ + d q̇ + f tanh(q̇/v₀) + o + noise, where δπ corrects the
 inertial parameters of every link, and d, f, o are viscous friction, Coulomb friction and offset of every
-joint. A ridge holds every unknown near the robot file. Log-Cholesky coordinates keep every link physical
+joint. A ridge keeps all unknowns near the robot file. Log-Cholesky coordinates keep every link physical
 (Rucker and Wensing 2022), so that the mass matrix stays positive definite. In contact the equations are
-projected onto the directions in which the constraint force does not act.
+projected onto the directions without constraint force.
 """
 
 from __future__ import annotations
@@ -60,7 +60,7 @@ class LeastSquares:
         return eom.acceleration(eom.Q_K + data.tau - self.losses(data.qd))
 
     def losses(self, qd: Tensor) -> Tensor:
-        """Torque that the identified friction and offsets take away `(n, nq)`, at velocities `(n, nq)`."""
+        """Torque of the identified friction and offsets `(n, nq)` at velocities `(n, nq)`."""
         return (_friction_columns(self.system.robot, qd) @ self.friction[:, None])[..., 0]
 
 
@@ -70,7 +70,9 @@ def data_chunks(data: Dataset) -> Iterator[Dataset]:
 
 
 def identify_rigid(system: ConstrainedSystem, train: Dataset) -> LeastSquares:
-    """Identify inertial parameters, friction, offsets; what is not excited stays as in the robot file."""
+    """Identify inertial parameters, friction and offsets; parameters without excitation stay as in the robot
+    file.
+    """
     rows = torch.linspace(0, len(train) - 1, min(len(train), MOST)).round().long()
     train, robot = train[rows.unique()], system.robot
     prior = _prior_std(robot, train)
@@ -178,7 +180,8 @@ def _minimise(
         return (C.mT @ torch.block_diag(*by_link, torch.eye(len(friction)).double())).numpy()
 
     start = torch.cat([theta.flatten(), friction]).numpy()
-    found = torch.from_numpy(least_squares(residual, start, jacobian, x_scale="jac", max_nfev=STEPS).x)
+    result = least_squares(residual, start, jacobian, x_scale="jac", max_nfev=STEPS)  # pyright: ignore[reportArgumentType]
+    found = torch.from_numpy(result.x)
     return found[:n].reshape(-1, 10).to(like), at(found).to(like)
 
 
@@ -196,9 +199,9 @@ class Baseline:
     """A trivial predictor of accelerations.
 
     Attributes:
-        name, system: what it is called, and the robot by whose mass matrix its errors become torques.
+        name, system: its name, and the robot with the mass matrix that converts its errors to torques.
         predict: accelerations `(n, nq)` of a data set.
-        std: `(nq,)` root-mean-square error on its training data, its constant uncertainty.
+        std: `(nq,)` root-mean-square error on its training data, used as its uncertainty.
     """
 
     name: str

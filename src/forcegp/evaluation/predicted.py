@@ -29,7 +29,7 @@ class Predicted:
 
     Attributes:
         mean, variance: `(n, nq)`; no variance for a model without a covariance.
-        noise_std: `(n, nq)` assumed for measured accelerations, if known; noise of the torque included.
+        noise_std: `(n, nq)` assumed for measured accelerations, if known, including torque noise.
         residual: `(k,)` |A q̈ − b| of all rows of closed contacts.
         seconds: time taken.
     """
@@ -100,8 +100,7 @@ class MultiplierScore:
         samples: in contact.
         bias, spread, level: mean and standard deviation of predicted less logged λ, and mean logged λ [N].
         correlation: of predicted and logged λ, `None` if either is constant.
-        coverage: share of logged values within ±2σ, noise of the torque included; `None` without a
-            covariance.
+        coverage: share of logged values within ±2σ, including torque noise; `None` without a covariance.
     """
 
     contact: str
@@ -121,7 +120,7 @@ class MultiplierScore:
 
 @torch.no_grad()
 def multiplier_scores(model: Predictor, data: Dataset) -> tuple[MultiplierScore, ...]:
-    """Compare λ with what a simulator or a sensor logged, by contact with two samples in contact or more."""
+    """Compare λ with logged values of a simulator or sensor, for each contact with at least two samples."""
     if not logged_forces(model, data):
         return ()
     return _scores(model, data, *in_chunks(lambda part: predicted_forces(model, part), data))
@@ -140,8 +139,9 @@ def predicted_forces(model: Predictor, data: Dataset) -> Moments:
 
 
 def logged_forces(model: Predictor, data: Dataset) -> dict[str, Tensor]:
-    """Normal force `(n,)` of contacts that were closed in training, by name: `multiplier`, or the sensor's if
-    there is one contact."""
+    """Normal force `(n,)` of contacts closed in training, by name: `multiplier`, or the sensor's for a single
+    contact.
+    """
     never = model.result.never_closed if isinstance(model, StructuredFit) else ()
     names = [name for name in model.system.contact_names if name not in never]
     logged = data.contact_extras.get("multiplier", {})

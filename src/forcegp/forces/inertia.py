@@ -1,19 +1,18 @@
-"""Which inertia a measured robot has: that of its file, with drives that the file lacks, or another one.
+"""Inertia of a measured robot: that of its file, with drives that the file lacks, or identified inertia.
 
 Held-out stretches of the log decide whether an estimate predicts torques better than the file
-(`inverse_dynamics.py`). Least squares make inertia too small where accelerations are noisy, and the
-likelihood of accelerations given torques makes it too large where the torque is noisy and a controller chose
-the motion. The equations of motion a little earlier and later are instruments that neither disturbs. The
-unknowns are Gaussian around the robot file, each link stays physically consistent, and the inertia of a drive
-is not negative.
+(`inverse_dynamics.py`). With noisy accelerations, least squares underestimates inertia; with noisy torques in
+closed loop, the likelihood of accelerations given torques overestimates it. The equations of motion a little
+earlier and later are instruments without either bias. The unknowns are Gaussian around the robot file, each
+link stays physically consistent, and the inertia of a drive is not negative.
 
-Torques do not settle everything. In a closed loop the noise of the torque sensor exceeds the torque
-that accelerates a light joint; divided by the inertia of the file it predicts accelerations that are larger
-than all that were measured. Where that is so, the drives get the inertia that maximises
-−½ Σ ε²/s² + v Σ log |M|, with the smallest v ≤ 1 at which accelerations are predicted as well as by their
-mean, as long as the error of no joint's torque on held-out stretches grows by more than 2 %.
+Torques alone do not suffice. In a closed loop the noise of the torque sensor exceeds the torque
+that accelerates a light joint; divided by the inertia of the file it predicts accelerations far larger than
+the measured ones. In that case, the drives get the inertia that maximises −½ Σ ε²/s² + v Σ log |M|, with the
+smallest v ≤ 1 at which accelerations are predicted as well as by their mean, as long as the error of no
+joint's torque on held-out stretches grows by more than 2 %.
 
-Where a caller asks for an `InertialPrior` itself, the robot moves to the posterior mean of its inertial
+If an `InertialPrior` is given, the robot moves to the posterior mean of its inertial
 parameters: one Gauss–Newton step, physically consistent.
 """
 
@@ -68,9 +67,8 @@ WIDTHS = (0.0, 0.02, 0.05, 0.12)
 def rigid_robot(robot: RobotModel, rows: Rows) -> RobotModel | None:
     """The physically consistent robot that predicts held-out torques better than the file, or `None`.
 
-    It has to do so significantly, by more than two standard errors over stretches of the log: better than the
-    file, and better than the file with drives that it lacks. And no joint's held-out acceleration error may
-    grow.
+    The improvement must exceed two standard errors over stretches of the log, over the file and over the file
+    with additional drives, and no joint's held-out acceleration error may grow.
 
     Args:
         robot: of the file.
@@ -187,8 +185,8 @@ class Inertia:
     """Inertia that the log determines.
 
     Attributes:
-        robot: that of the file, with the inertia that was found.
-        identified: whether inertial parameters of links were, of which some uncertainty remains.
+        robot: that of the file, with the identified inertia.
+        identified: whether inertial parameters of links were identified, so that some uncertainty remains.
         doubts: warnings for the user.
     """
 
@@ -205,7 +203,7 @@ def inertia_of(
 
     Args:
         system: robot and contacts of the robot file.
-        friction: what the friction of a joint depends on.
+        friction: inputs of the friction of a joint.
         mean: prior mean of Q, with the motor torque.
         training: samples in motion, `LEAST` of them free.
     """

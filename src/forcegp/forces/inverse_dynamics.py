@@ -1,12 +1,12 @@
 """Inverse dynamics of a measured robot as a linear regression, with held-out stretches of the log.
 
-In free motion τ + Q_C + Q_G + Q_D − M₀ q̈ = C δ + Φ w + ε, with friction Φ w of each joint on its own. Each
+In free motion τ + Q_C + Q_G + Q_D − M₀ q̈ = C δ + Φ w + ε, with separate friction Φ w of each joint. Each
 column of C is the torque of one unknown: the inertia of a drive, or an inertial parameter of a link.
 
-Noise of the accelerations in C makes inertia look smaller than it is to least squares. So each sample has a
-partner, further away in time than noise is correlated: columns C′ of the partner serve as instruments,
-C′ᵀ(C δ + Φ w − r) = 0, and errors are judged by the product ε ε′, in which noise vanishes in expectation
-(Söderström and Stoica, *Instrumental Variable Methods for System Identification*, 1983).
+Because of the noise of the accelerations in C, least squares underestimates inertia. So each sample has a
+partner at a time lag beyond the correlation of the noise, and its columns C′ serve as instruments, C′ᵀ(C δ +
+Φ w − r) = 0, and errors are judged by the product ε ε′, in which noise vanishes in expectation (Söderström
+and Stoica, *Instrumental Variable Methods for System Identification*, 1983).
 """
 
 from __future__ import annotations
@@ -56,13 +56,12 @@ class Rows:
 
     Attributes:
         q, qd, qdd: `(n, nq)`.
-        residual: torque that the robot of the file leaves `(n, nq)`.
+        residual: torque that the robot file does not explain `(n, nq)`.
         friction: Φ, features of the friction of each joint and its offset `(n, nq, f)`.
-        slides: `(n, nq)` bool, joints that move; the friction of one that sticks holds it, so its
-            torque is uninformative there.
+        slides: `(n, nq)` bool, joints that move; the torque of a joint that sticks is uninformative.
         group: stretch of each sample `(n,)`, from 0 without gaps.
         segment: `(n,)`.
-        partner: index of each sample's partner `(n,)`; its own where the log has none.
+        partner: index of each sample's partner `(n,)`; its own index if there is none.
         memory: friction with memory, further features `(n, nq, k)`.
         step: time between neighbours [s]; 0 if they are not in order.
         filter_variance: of the weights with which a filter averaged q̈ over time [s²].
@@ -124,7 +123,7 @@ class NormalEquations:
         )
 
     def friction(self, delta: Tensor) -> Tensor:
-        """w `(nq, f)` that explains what δ leaves."""
+        """Friction weights w `(nq, f)` that fit the residual at δ."""
         p = self.unknowns
         right = self.right[:, p:] - self.gram[:, p:, :p] @ delta
         return torch.linalg.solve(self._stiff(), right[..., None])[..., 0]
@@ -135,7 +134,7 @@ class NormalEquations:
         return self.gram[:, p:, p:] + RIDGE * self.count[:, None, None] * eye
 
     def quadratic(self, noise: Tensor) -> tuple[Tensor, Tensor]:
-        """H and h of H δ = h, with friction at its best; of Σ_j |ε_j|²/s_j² without instruments."""
+        """H and h of H δ = h, with optimal friction; of Σ_j |ε_j|²/s_j² without instruments."""
         # Friction eliminated, by Schur complement: H_j = G_δδ − G_δf (G_ff + D)⁻¹ G_fδ, H = Σ_j H_j/s_j²
         p = self.unknowns
         friction = torch.cat([self.gram[:, p:, :p], self.right[:, p:, None]], dim=-1)
@@ -159,7 +158,7 @@ Estimate = Callable[[NormalEquations], Tensor]
 def free_rows(
     system: ConstrainedSystem, prior: JointFrictionPrior, mean: ForceMean, training: Training
 ) -> Rows:
-    """Samples in free motion and their partners, of which there are `LEAST` or more in a measurement."""
+    """Samples in free motion and their partners, at least `LEAST` per measurement."""
     motions = (m for m in training.measurements if m.quantity == "qdd")
     free = ((m, (~m.active.any(-1)).nonzero()[:, 0]) for m in motions)
     m = next(m[rows] for m, rows in free if len(rows) >= LEAST)
@@ -189,7 +188,7 @@ def bristles(m: Measurement | Dataset) -> Tensor:
     """Friction with memory: z of Dahl's model dz/dt = q̇/δ − |q̇| z/δ for some distances δ, `(n, nq, k)`.
 
     Within δ of a reversal this friction is a spring, and its torque is about proportional to −q̈: without
-    these columns it passes for negative inertia.
+    these columns it resembles negative inertia.
     """
     order = _in_time(m)
     t, qd, segment = m.t[order], m.qd[order], m.segment[order]
@@ -211,10 +210,10 @@ def bristles(m: Measurement | Dataset) -> Tensor:
 
 
 def partners(m: Measurement, filter_span: float = 0.0) -> Tensor:
-    """The sample of the same trajectory that is later by `APART`, or −1, `(n,)`.
+    """Index of the sample of the same trajectory that is later by `APART`, or −1, `(n,)`.
 
-    By less where velocities would change too much meanwhile, but never by less than the span of a filter that
-    the log states [s]: noise within it is correlated, and instruments have that noise too.
+    The lag is shorter if velocities would change too much, but never shorter than the span of the log's
+    filter [s], within which noise is correlated.
     """
     later = torch.full((len(m.t),), -1, device=m.t.device)
     order = _in_time(m)
@@ -327,7 +326,7 @@ def sums(rows: Rows, columns: Tensor) -> NormalEquations:
 
 
 def instrumental(rows: Rows, columns: Tensor) -> NormalEquations:
-    """The same with the columns of partners as instruments; velocities, and so friction, are precise."""
+    """The same with the columns of partners as instruments; velocities and friction are taken as precise."""
     X, r = _equations(rows, columns, paired=True)
     p = columns.shape[-1]
     return _by_stretch(rows, torch.cat([X[rows.partner][..., :p], X[..., p:]], dim=-1), X, r, r)
@@ -362,12 +361,12 @@ def _by_stretch(rows: Rows, Z: Tensor, X: Tensor, s: Tensor, r: Tensor) -> Norma
 def held_out(
     by_stretch: NormalEquations, estimate: Estimate, judged: NormalEquations | None = None
 ) -> Tensor:
-    """Mean squares of torque errors on stretches that neither δ nor friction have seen, `(groups, nq)`.
+    """Mean squares of torque errors on stretches held out from δ and friction, `(groups, nq)`.
 
     Args:
-        by_stretch: what is estimated from.
+        by_stretch: the sums to estimate from.
         estimate: δ from all stretches but one.
-        judged: what errors are computed from, such as `products`; by default the same.
+        judged: the sums to compute errors from, such as `products`; by default the same.
     """
     errors = []
     for g in range(len(by_stretch.gram)):
@@ -380,7 +379,7 @@ def held_out(
 def acceleration_errors(
     rows: Rows, by_stretch: NormalEquations, columns: Tensor, delta: Tensor, M: Tensor
 ) -> Tensor:
-    """Mean squares of acceleration errors at δ on stretches that friction has not seen, `(groups, nq)`."""
+    """Mean squares of acceleration errors at δ on stretches held out from friction, `(groups, nq)`."""
     residual, errors = rows.residual - columns @ delta, []
     for g in range(len(by_stretch.gram)):
         inside = rows.group == g
@@ -391,12 +390,12 @@ def acceleration_errors(
 
 
 def log_ratio(after: Tensor, before: Tensor) -> Tensor:
-    """Of the roots of mean squares; zero for a joint that does not move in a stretch."""
+    """Logarithm of the ratio of root mean squares; zero for a joint that does not move in a stretch."""
     return 0.5 * (after.clamp(min=LEAST_SQUARE) / before.clamp(min=LEAST_SQUARE)).log()
 
 
 def is_harmless(after: Tensor, before: Tensor) -> bool:
-    """Whether the errors of no joint are larger by more than is tolerated."""
+    """Whether no joint's error grows beyond the tolerance."""
     return bool((log_ratio(after, before).mean(0) <= TOLERATED).all())
 
 

@@ -13,15 +13,14 @@ where the first derivative is at fixed F̄; likewise for multipliers. The poster
 robot file, for example far from other samples, so new slopes are taken only if the evidence of the training
 data, with the weak priors, increases.
 
-**Weights.** Impacts, dropped packets and shocks of a gear break the equations of motion for a few samples,
-and under a Gaussian likelihood these decide what is learned. With y_i | w_i ~ N(E y_i, Σ_i/w_i) and
-w_i ~ Γ(ν/2, ν/2) the noise of sample i, d numbers that share one w_i, has a t distribution with ν degrees of
-freedom. Given the weights all is Gaussian, so inference stays exact. Expectation maximisation alternates
-learning with
+**Weights.** Impacts, dropped packets and gear shocks violate the equations of motion for a few samples, which
+would dominate a Gaussian likelihood. With y_i | w_i ~ N(E y_i, Σ_i/w_i) and w_i ~ Γ(ν/2, ν/2) the noise of
+sample i, d numbers that share one w_i, has a t distribution with ν degrees of freedom. Given the weights all
+is Gaussian, so inference stays exact. Expectation maximisation alternates learning with
 
     w_i = (ν + d) / (ν + E[r_iᵀ Σ_i⁻¹ r_i]),
 
-r_i the residual under the posterior: samples far outside the noise count for next to nothing (Lange, Little
+r_i the residual under the posterior: samples far outside the noise have almost no weight (Lange, Little
 and Taylor, *Robust statistical modeling using the t distribution*, 1989).
 """
 
@@ -74,7 +73,7 @@ def with_learned_slopes(
 
 @torch.no_grad()
 def weighted(problem: Problem, values: Mapping[str, Tensor], degrees: float) -> Problem:
-    """The problem with the weights of its samples after `STEPS` steps, from those that it has.
+    """The problem with the weights of its samples after `STEPS` further steps.
 
     Args:
         degrees: ν.
@@ -92,7 +91,7 @@ def weighted(problem: Problem, values: Mapping[str, Tensor], degrees: float) -> 
 
 
 def left_out(problem: Problem) -> int:
-    """Number of samples that count for next to nothing."""
+    """Number of samples with almost no weight."""
     return sum(int((w < IGNORED).sum()) for w in problem.training.weights or ())
 
 

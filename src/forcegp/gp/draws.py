@@ -201,7 +201,7 @@ by about 1/√MISSED_FEATURES of its scale, and that of the rest not at all."""
 def draw_functions(
     basis: LatentBasis, weights: Tensor, generator: torch.Generator, features: int
 ) -> FunctionSamples:
-    """Functions with given weights of the basis functions, and what these miss drawn from the prior.
+    """Functions with given weights of the basis functions, and the missed part drawn from the prior.
 
     Args:
         weights: drawn from their posterior `(size, samples)`.

@@ -71,8 +71,8 @@ def shapes_of(
 ) -> list[Shape]:
     """The parts of a robot, from its file or a bundled one; without a URDF file, rods between its joints.
 
-    By default a bundled robot of the same name and frames is recognised. Of `elements`, `"visual"` and
-    `"collision"`, the first is taken that the file has.
+    By default a bundled robot of the same name and frames is recognised. The first of `elements` (`"visual"`,
+    `"collision"`) in the file is used.
 
     Raises:
         RobotFileError: the shapes of the file are not valid.

@@ -37,7 +37,7 @@ class CompiledMotion(Protocol):
 
 
 class ForwardModel(ABC):
-    """What a rollout asks of a model of the forward dynamics."""
+    """Interface that a rollout requires of a model of the forward dynamics."""
 
     kind: str
     """Name of the class of models in saved files."""
@@ -59,7 +59,7 @@ class ForwardModel(ABC):
             generator: source of the draws.
 
         Returns:
-            A force field on `(S * k, nq)` states, of which the s-th run of k belongs to function s.
+            A force field on `(S * k, nq)` states; the s-th run of k states belongs to function s.
 
         Raises:
             ModelError: the model has no posterior over force functions.
@@ -74,7 +74,7 @@ class ForwardModel(ABC):
 
     @property
     def disturbance(self) -> Disturbance | None:
-        """Forces beside the learned ones that disturb rollouts of function samples, `None` for none."""
+        """Additional forces that disturb rollouts of function samples, `None` for none."""
         return None
 
     @abstractmethod
@@ -92,7 +92,7 @@ class ForwardModel(ABC):
 
 
 class Disturbance(NamedTuple):
-    """Forces beside the learned ones, as function samples meet them.
+    """Additional forces on function samples.
 
     Attributes:
         density: root of the spectral density of the logged torques' noise `(nq,)` [N m √s, N √s].
@@ -106,7 +106,7 @@ class Disturbance(NamedTuple):
 
 @dataclass(frozen=True)
 class Reached:
-    """The states that a rollout has come to.
+    """The current states of a rollout.
 
     Attributes:
         system: robot and contacts.
@@ -139,9 +139,9 @@ class Inputs(ABC):
 
         Args:
             t: `(n, 1)` time [s].
-            end: `(n, 1)` end of the step that the torque is for; at t = end a torque that jumps has
-                the value before the jump.
-            at: the state, and the equations of motion there.
+            end: `(n, 1)` end of the current step; at t = end a torque that jumps has the value before the
+                jump.
+            at: the state with its equations of motion.
         """
 
 
@@ -246,11 +246,10 @@ class TaskSpaceControl(Inputs):
 def inputs_of(
     tau: Torque, batch: torch.Size, rows: int, dt: float | None, interpolation: str = "hold"
 ) -> Inputs:
-    """Inputs from what a caller passes, for `rows` trajectories, a multiple of the batch of initial states.
+    """Inputs from the argument `tau`, for `rows` trajectories, a multiple of the batch of initial states.
 
-    `tau` is `(*batch, samples, nq)` or `(samples, nq)` with a period dt [s], a log, which has its own period,
-    a law of (t, q, q̇), or inputs; a single sample is a constant torque. `interpolation` is `"hold"` or
-    `"linear"`.
+    `tau` is `(*batch, samples, nq)` or `(samples, nq)` with a period dt [s], a log, a feedback law of (t, q,
+    q̇), or inputs; a single sample is a constant torque. `interpolation` is `"hold"` or `"linear"`.
 
     Raises:
         UnknownNameError: unknown interpolation.

@@ -28,8 +28,8 @@ class RunLog:
         q, qd, qdd, tau, Q, Q_I, Q_z: `(n, nq)`; qdd is the engine's acceleration, without noise.
         multiplier, c: `(n, m)`.
         contact, saturated: `(n, n_contacts)` and `(n,)` bool; whether a torque limit was hit.
-        contact_forces: `F_I`, `F_z` → contact → `(n, 3)`, where an engine of its own computed them [N].
-        measured: sensor values in place of `q`, `qd`, `tau`, where they are not perfect.
+        contact_forces: `F_I`, `F_z` → contact → `(n, 3)`, if the engine's solver computed them [N].
+        measured: sensor values of `q`, `qd`, `tau`, if the sensors are imperfect.
     """
 
     q: Tensor
@@ -48,7 +48,7 @@ class RunLog:
 
     @staticmethod
     def empty(steps: int, system: ConstrainedSystem) -> RunLog:
-        """Room for a number of steps."""
+        """An empty log for a number of steps."""
 
         def columns(width: int, dtype: torch.dtype = system.robot.dtype) -> Tensor:
             return torch.zeros(steps, width, dtype=dtype)
@@ -65,7 +65,7 @@ class RunLog:
 
 
 def noise(like: Tensor, generator: torch.Generator) -> Tensor:
-    """White noise of unit variance, drawn in double precision whatever the type."""
+    """White noise of unit variance, drawn in double precision for any type."""
     return torch.randn(like.shape, dtype=torch.float64, generator=generator).to(like.dtype)
 
 
@@ -96,7 +96,7 @@ class SimulationResult:
     engine: str
 
     def summary(self) -> dict[str, float | int | str]:
-        """Figures on the run, by name, with their units in the name."""
+        """Numbers describing the run, by name, with units in the names."""
         touching = torch.stack(list(self.data.contact.values()), dim=-1) if self.data.contact else None
         figures: dict[str, float | int | str] = {
             "engine": self.engine,

@@ -1,7 +1,6 @@
-"""A simulated run: plan a motion, move the robot through it in a physics engine, log what a robot would.
+"""A simulated run: plan a motion, move the robot through it in a physics engine, and log it.
 
-Contacts are those of our own equations of motion, or made by MuJoCo's solver and seen through sensors. Every
-loop has torque limits, a bound on joint speeds, and progress.
+Contact forces follow from the library's equations of motion, or from MuJoCo's solver with simulated sensors.
 """
 
 from __future__ import annotations
@@ -127,12 +126,12 @@ def simulate(
 
     The engine moves the robot under Q_u + Q_D + Q_I + Q_z: the motor torque of a task-space controller, joint
     friction, the normal force of the constrained equations of motion with their Baumgarte terms, and viscous
-    friction at the contact (section 5 of the paper). A contact opens when its multiplier would turn negative,
-    and closes with an inelastic impact. The run is computed on the CPU, where the data stay.
+    friction at the contact (section 5 of the paper). A contact opens when its multiplier would become
+    negative, and closes with an inelastic impact. The run is computed on the CPU.
 
     Args:
         system: robot and contacts; without contacts the motion is free.
-        config: what is simulated.
+        config: settings of the simulation.
         motion: joints to follow instead of the tool's random motion, as long as the configuration says.
         forces: learned forces of joints, in place of the robot's friction; for `contact = "solver"`.
         progress: called every few steps, and after the last.

@@ -1,4 +1,4 @@
-"""A robot model written as URDF, so that every physics engine is given the same parameters."""
+"""A robot model written as URDF, so that all physics engines have the same parameters."""
 
 from __future__ import annotations
 
@@ -17,8 +17,8 @@ WORLD = "world"
 def write_urdf(robot: RobotModel) -> str:
     """The robot as URDF text: inertial parameters and joints only, mounted in the world at its base pose.
 
-    Shapes, joint limits, damping and friction are left out: an engine that reads the file adds no force
-    of its own.
+    Shapes, joint limits, damping and friction are left out: an engine that loads the file adds no further
+        force.
     """
     root = Element("robot", name=robot.name)
     _link(root, WORLD, 1.0, torch.zeros(3), torch.eye(3), torch.ones(3))

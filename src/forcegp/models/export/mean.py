@@ -1,9 +1,9 @@
 """The posterior mean of a fit in scalars, the source of its C code, its Jacobians and its CasADi function.
 
-What depends on the state alone is a straight-line program: mechanics, touching points, inputs and features of
+All terms of the state alone form a straight-line program: mechanics, touching points, inputs and features of
 the priors. The functions of the priors that have support points are loops, and enter as inputs f with their
-slopes ∂f/∂x. A motion M q̈ = Q + (A + U)ᵀ λ, A q̈ = b with friction U λ that goes with the multiplier is
-differentiated as the solution that it is: at fixed q̈ and λ the equations change by dR and dg, and
+slopes ∂f/∂x. A motion M q̈ = Q + (A + U)ᵀ λ, A q̈ = b with friction U λ proportional to the multiplier is
+differentiated implicitly: at fixed q̈ and λ the equations change by dR and dg, and
 
     (I + LᵀU) dλ = (A M⁻¹ Aᵀ)⁻¹ dg − Lᵀ dR,   dq̈ = M⁻¹ (dR + (Aᵀ + U) dλ),
 
@@ -89,7 +89,7 @@ class Mean:
     Attributes:
         M, Q_C, Q_G, Q_D: mass matrix, bias, gravity and damping force.
         touching: each contact, as if it were closed.
-        A, b: rows of the contacts, zero for those that are open.
+        A, b: rows of the contacts, zero for open contacts.
         x: standardized inputs of each prior, `(1 or components, width)`.
         phi: features of each component of each prior.
     """
@@ -112,7 +112,7 @@ class Mean:
         self.phi = [self._all_features(p, x) for p, x in enumerate(self.x)]
 
     def program(self, outputs: Iterable[Scalar], arguments: Sequence[str]) -> Program:
-        """A program of these arguments."""
+        """A program with these arguments."""
         outputs = list(outputs)
         return Program(tuple(arguments), (len(outputs),), self.graph, outputs)
 

@@ -1,6 +1,6 @@
 """C99 source text of a fitted model: its numbers, its straight-line mechanics, and the code of its priors.
 
-What does not depend on the model, from the equations of motion to reading a quantity, is in `controller.c`.
+Code that does not depend on the model is in `controller.c`.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def c_source(model: ExportedModel, name: str, rollout: bool = False) -> tuple[st
 
 
 def template(name: str, fields: dict[str, object] | None = None) -> str:
-    """A file beside this one, each `@field@` filled in."""
+    """A template file with each `@field@` filled in."""
     text = files("forcegp.models.export").joinpath(name).read_text(encoding="utf-8")
     for field, value in (fields or {}).items():
         text = text.replace(f"@{field}@", str(value))
@@ -226,7 +226,7 @@ class Writer:
         self.lines.append(f"static const double *const SENSOR_VARIANCE[] = {{{', '.join(sensors)}}};")
 
     def _online(self) -> None:
-        """Where the functions of each component lie in what is learned online, and the noise of samples."""
+        """Add the positions of each component's functions in the online state, and the noise of samples."""
         self.lines.append(f"#define ONLINE {int(self.model.online)}")
         if not self.model.online or self.model.sampling is None:
             return
@@ -252,7 +252,7 @@ class Writer:
         return template("online.h", fields) if self.model.online else ""
 
     def priors(self) -> list[str]:
-        """A function for each prior, and the one that calls them all."""
+        """A function for each prior, and one that calls all of them."""
         texts, calls = [], []
         for p, part in enumerate(self.parts):
             body = [*self._operator(part, self.starts[p]), *self._functions(p, part)]
@@ -363,8 +363,9 @@ class Writer:
 
 
 class Leaf(NamedTuple):
-    """A kernel of support points in C: its array `u`, their table, its inputs with their factors, and what
-    the array is multiplied by and added to."""
+    """A kernel of support points in C: its array `u`, their table, its inputs with their factors, its factor,
+    and the array that it is added to.
+    """
 
     u: str
     table: str
@@ -375,7 +376,7 @@ class Leaf(NamedTuple):
 
 
 class KernelCode:
-    """C code of the kernel of one prior; what a leaf needs is computed once in front of its use."""
+    """C code of the kernel of one prior; terms of a leaf are computed once before use."""
 
     def __init__(self, writer: Writer, p: int, lines: list[str], x: str, differentiate: bool = False) -> None:
         self.writer, self.part, self.lines = writer, writer.parts[p], lines
