@@ -15,7 +15,7 @@ from forcegp.errors import ModelError
 from forcegp.forces.priors.joint import DisturbancePrior, JointFrictionPrior
 from forcegp.forces.problem import kernel_parameters
 from forcegp.forces.quantities import affine_map
-from forcegp.gp.ornstein_uhlenbeck import OrnsteinUhlenbeck
+from forcegp.gp.kernels import OrnsteinUhlenbeck
 from forcegp.models.structured_fit import StructuredFit
 from forces.cases import draw, logged, mixed_contacts, two_contacts
 from forces.textbook import Textbook

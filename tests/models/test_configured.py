@@ -18,8 +18,7 @@ from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.contact import ContactForcePrior, SlidingFrictionPrior
 from forcegp.forces.priors.joint import AnalyticalMean, JointForcePrior
 from forcegp.gp import kernels
-from forcegp.gp.kernels import Linear, Matern52, SquaredExponential, Sum
-from forcegp.gp.ornstein_uhlenbeck import OrnsteinUhlenbeck
+from forcegp.gp.kernels import Linear, Matern52, OrnsteinUhlenbeck, SquaredExponential, Sum
 from forcegp.models.analytical import ADAM, AnalyticalModel, Window
 from forcegp.models.configured import Configured, configured, keys_of
 from forcegp.models.independent_gp import IndependentGP
@@ -248,4 +247,4 @@ def test_a_table_learns_what_the_same_arguments_learn(made) -> None:
     prior = JointForcePrior(SquaredExponential(shared=True))
     model = StructuredGP(SYSTEM, "analytical", [prior])
     plain = model.fit(data, options=LearningOptions(max_evaluations=5))
-    assert found.log_marginal_likelihood == plain.result.log_marginal_likelihood
+    assert found.result.log_marginal_likelihood == plain.result.log_marginal_likelihood

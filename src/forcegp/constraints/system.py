@@ -126,6 +126,12 @@ class ConstrainedSystem:
         """Number of constraint rows."""
         return sum(contact.rows for contact in self.contacts)
 
+    @property
+    def row_names(self) -> list[str]:
+        """A name for each constraint row: that of the constraint, numbered where it has several."""
+        rows = ((c.name, c.rows, row + 1) for c in self.contacts for row in range(c.rows))
+        return [name if count == 1 else f"{name} {row}" for name, count, row in rows]
+
     def contact(self, name: str) -> Constraint:
         """A constraint by name.
 

@@ -218,14 +218,7 @@ def component_names(system: ConstrainedSystem, quantity: str) -> list[str]:
     if quantity == "contact_force":
         contacts = [c.name for c in system.contacts if isinstance(c, SurfaceContact)]
         return [f"{name} {axis}" for name in contacts for axis in AXES]
-    if quantity != "multiplier":
-        return list(system.robot.joint_names)
-    return [
-        name if contact.rows == 1 else f"{name} {row + 1}"
-        for contact in system.contacts
-        for name in [contact.name]
-        for row in range(contact.rows)
-    ]
+    return system.row_names if quantity == "multiplier" else list(system.robot.joint_names)
 
 
 class Predictor(ForwardModel):

@@ -37,7 +37,6 @@ from forcegp.forces.quantities import states
 from forcegp.gp import kernels
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.features import Standardization
-from forcegp.gp.ornstein_uhlenbeck import OrnsteinUhlenbeck
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.fit_result import FitResult
 from forcegp.models.structured_learning import Specification, constant_inputs
@@ -57,7 +56,7 @@ CLASSES: dict[str, type] = {
     "sum": kernels.Sum,
     "product": kernels.Product,
     "constant": kernels.Constant,
-    "ornstein_uhlenbeck": OrnsteinUhlenbeck,
+    "ornstein_uhlenbeck": kernels.OrnsteinUhlenbeck,
     "joint": JointForcePrior,
     "joint_friction": JointFrictionPrior,
     "disturbance": DisturbancePrior,

@@ -68,7 +68,7 @@ FEWEST_MOVING = 20
 FIRST_POWER = 0.25
 """Power of the likelihood before the correlation of its residuals is known."""
 
-ROUNDS = 2
+ROUNDS = 3
 """Times that hyperparameters are learned again with what the residuals determine."""
 
 
@@ -418,16 +418,17 @@ def solve(
     sloped &= not is_sparse(spec.options.inference, part.priors, problem.training.all_samples)
     warnings: list[str] = []
     for number in range(ROUNDS):
-        before, values = part, search.values(learned)
+        before = part
+        if sloped:
+            part, learned, doubts = with_learned_slopes(part, search, learned, progress)
+            warnings += doubts
+        rest, values = part, search.values(learned)
         if correlated and number == 0:
             part = dataclasses.replace(part, power=residual_times(part, values, part.training)[0])
         if spec.noise.degrees_of_freedom is not None:
             part = weighted(part, values, spec.noise.degrees_of_freedom)
-        if part is not before:
+        if part is not rest:
             learned = search.solve(part, progress, learned.tensors)
-        if sloped:
-            part, learned, doubts = with_learned_slopes(part, search, learned, progress)
-            warnings += doubts
         if part is before:
             break
     values = search.values(learned)

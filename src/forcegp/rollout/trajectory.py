@@ -150,7 +150,7 @@ class Rollout:
             )
         robot = self.system.robot
         of_joints = quantity in JOINT_QUANTITIES
-        names = robot.joint_names if of_joints else _row_names(self.system)
+        names = robot.joint_names if of_joints else self.system.row_names
         values = getattr(self, quantity).reshape(len(self.t), -1)
         std = _spread(self, quantity)
         logged = None if log is None else _logged(self, log, quantity)
@@ -221,15 +221,6 @@ class Rollout:
         return dataclasses.replace(self, **chosen, samples=samples)
 
 
-def _row_names(system: ConstrainedSystem) -> list[str]:
-    """One name per row of the constraints."""
-    return [
-        contact.name if contact.rows == 1 else f"{contact.name} {row + 1}"
-        for contact in system.contacts
-        for row in range(contact.rows)
-    ]
-
-
 def _spread(path: Rollout, quantity: str) -> Tensor | None:
     """Standard deviation `(T, d)` over the function samples, of which a finite one is needed at each time."""
     if path.samples is None:
@@ -251,4 +242,4 @@ def _logged(path: Rollout, log: Dataset, quantity: str) -> Tensor | None:
         return getattr(log.select(path.system.robot.joint_names), quantity)[: len(path.t)]
     columns = [log.contact_extras.get(quantity, {}).get(name) for name in path.system.contact_names]
     present = [column[: len(path.t), None] for column in columns if column is not None]
-    return torch.cat(present, dim=-1) if len(present) == len(_row_names(path.system)) > 0 else None
+    return torch.cat(present, dim=-1) if len(present) == len(path.system.row_names) > 0 else None

@@ -26,8 +26,7 @@ from forcegp.dynamics import damping_force
 from forcegp.errors import ModelError, check_name
 from forcegp.forces.priors.base import JOINT, MIXING, ForcePrior, check_inputs
 from forcegp.forces.quantities import States
-from forcegp.gp.kernels import Kernel, Linear, SquaredExponential
-from forcegp.gp.ornstein_uhlenbeck import SEGMENT, TIME, OrnsteinUhlenbeck
+from forcegp.gp.kernels import SEGMENT, TIME, Kernel, Linear, OrnsteinUhlenbeck, SquaredExponential
 from forcegp.robot.model import RobotModel
 
 TERMS = ("bias", "gravity", "friction", "actuation")
