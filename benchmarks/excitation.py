@@ -5,11 +5,12 @@
 
 Arms of `solver_arms.py` whose links are off by up to 30 % and whose joints have friction that the file
 lacks record 30 s of each motion, all within the same limits and free of collisions. The motions are
-planned from the file alone, for two seeds of the search, which the seeds of the arms share. `condition` is
-the condition number of the weighted regressor of base parameters, viscous and dry friction, minimised by the
-same search. `random` is the largest of twenty random Fourier series. Errors are those of the identified links
-and friction against the true ones, as torques along a third motion, by physically consistent least squares
-and, with `--fit`, by the robot calibrated by the default structured GP.
+planned from the file alone, for two seeds of the search, which the seeds of the arms share. `excited` has the
+criterion V: links, viscous and dry friction are unknown, which are what least squares identify. `condition`
+is the condition number of the weighted regressor of the same, minimised by the same search. `random` is the
+largest of twenty random Fourier series. Errors are those of the identified links and friction against the
+true ones, as torques along a third motion, by physically consistent least squares and, with `--fit`, by the
+robot calibrated by the default structured GP.
 """
 
 from __future__ import annotations
@@ -70,7 +71,7 @@ def motions(name: str, seed: int) -> tuple[dict[str, Motion], dict[str, Any]]:
     system = forcegp.ConstrainedSystem(robot)
     limits = Limits.of(robot, velocity=robot.velocity_limit.clamp(max=SPEED).tolist(), acceleration=[RATE])
     found, notes = {}, {}
-    for label, criterion in {"excited": "A", "condition": condition}.items():
+    for label, criterion in {"excited": "V", "condition": condition}.items():
         began, cpu = time.perf_counter(), time.process_time()
         result = excite(system, SECONDS, limits=limits, criterion=criterion, rate=1.0 / STEP, seed=seed)
         notes[label] = {

@@ -28,7 +28,7 @@ from pathlib import Path
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from real_cases import existing
+from real_cases import evenly, existing, iiwa14, moving
 from results_page import table
 from scipy.ndimage import binary_dilation
 from scipy.signal import savgol_coeffs, savgol_filter
@@ -298,6 +298,17 @@ def hop(logs: Path) -> dict[str, object]:
     return result
 
 
+def torque_shares(logs: Path) -> dict[str, object]:
+    """Root mean square over the load of all joints of M q̈ − Q, for each joint of the iiwa 14 and for all: by
+    how much torques of a robot file without friction are wrong, `UNSHOWN` of `forcegp.forces.problem`."""
+    (case,) = iiwa14(logs)
+    data = evenly(moving(case.train), 4000)
+    eom = case.system.equations(data.q, data.qd)
+    wrong = ((eom.M @ data.qdd[..., None])[..., 0] - eom.Q_K - data.tau).square().mean(0)
+    load = (data.tau**2 + eom.Q_G**2 + eom.Q_C**2).mean()
+    return {"joints": (wrong / load).sqrt().tolist(), "all": float((wrong.mean() / load).sqrt())}
+
+
 def jump(height: Tensor, lifted: int, flight: float) -> dict[str, float]:
     """Time in the air, and rise of the base from lift-off to its highest point."""
     return {"flight_s": flight, "rise_m": float(height.nan_to_num(-1.0).max() - height[lifted])}
@@ -365,6 +376,7 @@ def main() -> None:
             "pushed": pushed_scores(options.logs),
             "contact labels": contact_labels(options.logs),
             "hop": hop(options.logs),
+            "torque shares": torque_shares(options.logs),
         }
     except DataError as error:
         sys.exit(str(error))
@@ -380,6 +392,7 @@ def main() -> None:
     print({name: part["window"] for name, part in result.items() if "window" in part})
     print(result["contact labels"])
     print(result["hop"])
+    print(result["torque shares"])
     if options.figure:
         draw(options.logs, options.figure)
     if options.json:

@@ -334,11 +334,13 @@ def main() -> None:
     parser.add_argument("--case", choices=CASES, nargs="*", default=["plain"])
     parser.add_argument("--seed", type=int, nargs="*", default=[0, 1])
     parser.add_argument("--right-file", action="store_true", help="true masses, drives and torques")
+    parser.add_argument("--gain", type=float, help="largest relative error of the torque sensors")
     parser.add_argument("--json", type=Path, help="write all results to this file")
     options = parser.parse_args()
     result = {}
     for case, name, seed in itertools.product(options.case, options.arm, options.seed):
         wrong = replace(CASES[case], **(RIGHT_FILE if options.right_file else {}))
+        wrong = wrong if options.gain is None else replace(wrong, gain=options.gain)
         arm = Arm(forcegp.load_robot(name), wrong, np.random.default_rng(seed))
         with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
             warnings.simplefilter("ignore")

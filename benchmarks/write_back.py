@@ -4,11 +4,11 @@
     python benchmarks/write_back.py --arm ur5 --seed 0 1 2 3 4 --right-file
 
 Arms of `solver_arms.py` whose links are off by up to 30 % and whose joints have friction and drives that the
-file lacks. The calibrated URDF is read back, and MuJoCo computes from it the torques of another motion, and
-the motion of the next second under the logged torques. `least squares` is physically consistent too, and has
-drives only as inertia of links; its torque error is that of its own equations. `within` counts the base
-parameters of links and drives, and the damping and dry friction of joints, that lie within two standard
-deviations of 200 sampled robots from the truth.
+file lacks. The calibrated files, a URDF and an MJCF of the same arm, are read back, and MuJoCo computes from
+them the torques of another motion, and the motion of the next second under the logged torques. `least
+squares` is physically consistent too, and has drives only as inertia of links; its torque error is that of
+its own equations, with offsets. `within` counts the base parameters of links and drives, and the damping and
+dry friction of joints, that lie within two standard deviations of 200 sampled robots from the truth.
 """
 
 from __future__ import annotations
@@ -45,6 +45,7 @@ mujoco = optional_module("mujoco", "This benchmark")
 WRONG = Imperfections(mass=0.3, gain=0.0, offset=0.0)
 """Links off by up to 30 %, undeclared friction and drives; torque sensors are right."""
 RIGHT = replace(WRONG, mass=0.0, drive=0.0, dry=0.0, viscous=0.0)
+FORMATS = ("urdf", "xml")
 SAMPLES, SMALLEST = 200, 1e-6
 """Sampled robots, and the least eigenvalue of the information on a base parameter, over the largest."""
 STARTS, AHEAD = 30, 1.0
@@ -120,9 +121,9 @@ def deviations(fit: StructuredFit, arm: Arm, log: forcegp.Dataset) -> dict[str, 
     return {name: x.tolist() for name, x in scores.items()}
 
 
-def tip_error(robot: RobotModel, log: forcegp.Dataset) -> float:
-    """Median distance of the last frame from where it was a second after each start [m]."""
-    found = ahead(robot, log)
+def tip_error(robot: RobotModel, file: RobotModel, log: forcegp.Dataset) -> float:
+    """Median distance of the last frame of `robot`, moved as `file`, from where it was a second later [m]."""
+    found = ahead(file, log)
     rows, frame = found[:, 0].astype(int), robot.frame_names[-1]
     there, was = (
         frame_pose(robot, q, frame)[1] for q in (torch.from_numpy(found[:, 1:].copy()), log.q[rows])
@@ -137,25 +138,32 @@ def measured(name: str, seed: int, wrong: Imperfections, folder: Path) -> dict:
     case = case_of(name, arm, folder)
     test = case.tests["test"]
     fit = forcegp.StructuredGP(case.system, "analytical").fit(case.train)
-    write_calibrated(fit, name, folder / "calibrated.urdf")
-    files = {"file": robot, "calibrated": forcegp.load_robot(folder / "calibrated.urdf")}
+    mujoco.mj_saveLastXML(str(folder / "file.xml"), mujoco.MjModel.from_xml_string(write_urdf(robot)))
+    files = {"file": robot}
+    for kind, source in {"urdf": name, "xml": folder / "file.xml"}.items():
+        write_calibrated(fit, source, folder / f"calibrated.{kind}")
+        files[kind] = forcegp.load_robot(folder / f"calibrated.{kind}")
     rows = moving(test)
     errors = {key: torques(each, rows) - rows.tau.numpy() for key, each in files.items()}
     squares = identify_rigid(case.system, case.train)
     rigid = inverse_dynamics(squares.system.robot, rows.q, rows.qd, rows.qdd)
     errors["least squares"] = (rigid + squares.losses(rows.qd) - rows.tau).numpy()
     rmse = {key: np.sqrt((error**2).mean(0)) for key, error in errors.items()}
-    tip = {key: tip_error(each, test) for key, each in files.items()}
-    by_file, by_squares = rmse["calibrated"] / rmse["file"], rmse["calibrated"] / rmse["least squares"]
-    return {
+    tip = {key: tip_error(robot, each, test) for key, each in files.items()}
+    found: dict[str, Any] = {
         "deviations": deviations(fit, arm, rows[::10]),
         "torque_rmse": {key: value.tolist() for key, value in rmse.items()},
-        "over_file": float(np.exp(np.log(by_file).mean())),
-        "over_least_squares": float(np.exp(np.log(by_squares).mean())),
-        "worst_joint_over_least_squares": float(by_squares.max()),
         "tip_m": tip,
-        "tip_over_file": tip["calibrated"] / tip["file"],
     }
+    for kind in FORMATS:
+        by_file, by_squares = rmse[kind] / rmse["file"], rmse[kind] / rmse["least squares"]
+        found[kind] = {
+            "over_file": float(np.exp(np.log(by_file).mean())),
+            "over_least_squares": float(np.exp(np.log(by_squares).mean())),
+            "worst_joint_over_least_squares": float(by_squares.max()),
+            "tip_over_file": tip[kind] / tip["file"],
+        }
+    return found
 
 
 def main() -> None:
@@ -171,14 +179,17 @@ def main() -> None:
     torch.set_num_threads(1)
     result = {}
     keys = ("over_file", "over_least_squares", "worst_joint_over_least_squares", "tip_over_file")
+    rows = []
     for name in options.arm:
         for seed in options.seed:
             with tempfile.TemporaryDirectory() as folder:
                 wrong = RIGHT if options.right_file else WRONG
                 found = result[f"{name}, seed {seed}"] = measured(name, seed, wrong, Path(folder))
-            print(f"{name}, seed {seed}:", *(f"{key} {found[key]:.3f}" for key in keys), flush=True)
-    head = ["arm, seed", "torque ÷ file", "÷ least squares", "worst joint", "tip after 1 s ÷ file"]
-    print(table(head, [[name, *(f"{found[key]:.2f}" for key in keys)] for name, found in result.items()]))
+            for kind in FORMATS:
+                rows.append([f"{name}, seed {seed}", kind, *(f"{found[kind][key]:.3f}" for key in keys)])
+                print(*rows[-1], flush=True)
+    head = ["arm, seed", "format", "torque ÷ file", "÷ least squares", "worst joint", "tip after 1 s ÷ file"]
+    print(table(head, rows))
     for kind in ("base", "friction"):
         z = np.abs(np.concatenate([found["deviations"][kind] for found in result.values()]))
         print(f"{kind}: {(z <= 2.0).mean():.2f} of {len(z)} within 2σ, median {np.median(z):.2f}σ")

@@ -91,6 +91,7 @@ def test_every_finding_and_every_error_is_on_the_page_of_messages() -> None:
         assert f"| `{name}` | {kind.family} | {kind.severity} | {kind.title} | {kind.remedy} |" in findings
     assert "## RobotFileError\n" in errors
     assert "| cannot select … of … points |" in errors
+    assert errors.count("](../troubleshooting.md)") >= 10
 
 
 def links(text: str) -> list[str]:

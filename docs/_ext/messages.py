@@ -43,15 +43,26 @@ def cell(text: str) -> str:
     return re.sub(r"([|*_`<>\[\]$\\])", r"\\\1", " ".join(text.split()))
 
 
+def explained() -> list[list[str]]:
+    """The messages of the page on troubleshooting, split at what is inserted."""
+    page = (SOURCE.parents[1] / "docs" / "troubleshooting.md").read_text(encoding="utf-8")
+    rows = re.findall(r"^\| `([^`]*)` \|", page[: page.index("## Results that look wrong")], flags=re.M)
+    return [[part.strip() for part in row.split("…") if part.strip()] for row in rows]
+
+
 def errors() -> str:
-    """A section with a table for each class of errors."""
+    """A section with a table for each class of errors; the commonest messages link to cause and cure."""
+    common = explained()
     sections: dict[str, set[tuple[str, str]]] = defaultdict(set)
     for name, message, hint in raised():
         sections[name].add((message, hint))
     text = ""
     for name, rows in sorted(sections.items()):
         text += f"\n## {name}\n\n| message | hint |\n|---|---|\n"
-        text += "".join(f"| {cell(message)} | {cell(hint)} |\n" for message, hint in sorted(rows))
+        for message, hint in sorted(rows):
+            cure = " ([cause and cure](../troubleshooting.md))"
+            linked = any(all(part in message for part in parts) for parts in common)
+            text += f"| {cell(message)} | {cell(hint)}{cure if linked else ''} |\n"
     return text
 
 

@@ -27,3 +27,15 @@ def level_of(x: NDArray[Any], width: float, share: float) -> float | None:
     bins, counts = np.unique(np.floor(x / width), return_counts=True)
     near = x[np.abs(x - width * (bins[counts.argmax()] + 0.5)) <= width]
     return float(np.median(near)) if len(near) > share * len(x) else None
+
+
+def resolution(x: NDArray[Any]) -> NDArray[Any]:
+    """Step between the values of a column with few values, else zero."""
+    steps = np.zeros(x.shape[1])
+    for j, levels in enumerate(map(np.unique, x.T)):
+        if 2 < len(levels) < 0.75 * len(x):
+            gaps = np.diff(levels)
+            # Rounding in the last digit makes two levels of one; those gaps are not steps.
+            gaps = gaps[gaps > 1e-6 * gaps.max()]
+            steps[j] = np.median(gaps)
+    return steps

@@ -2,9 +2,13 @@
 
 from __future__ import annotations
 
+import math
+
 import torch
 
+import forcegp
 from forcegp.forces.calibration import unit_scales
+from forcegp.forces.noise import TORQUE_NOISE
 
 SAMPLES = 4000
 TRUE = torch.tensor([0.5, 0.2, 0.05], dtype=torch.float64)
@@ -30,3 +34,16 @@ def test_noise_is_not_lowered_below_what_was_learned() -> None:
     P = torch.eye(3, dtype=torch.float64).expand(SAMPLES, 3, 3)
     r = TRUE * torch.randn(SAMPLES, 3, generator=torch.Generator().manual_seed(1), dtype=torch.float64)
     assert torch.equal(unit_scales(r**2, torch.zeros_like(r), P, least), least)
+
+
+def test_noise_is_at_least_that_of_the_rounding_of_the_torque() -> None:
+    """Where a log happens to agree with the rounded torques, others will not."""
+    system, step = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum")), 0.5
+    random, n = torch.Generator().manual_seed(0), 100
+    q, qd, tau = torch.randn(3, n, 2, generator=random, dtype=torch.float64)
+    tau = step * (4.0 * tau / step).round()
+    qdd = forcegp.dynamics.forward_dynamics(system.robot, q, qd, tau - 0.1 * torch.tanh(qd))
+    t = torch.arange(n, dtype=torch.float64)
+    data = forcegp.Dataset(t, q, qd, tau, qdd, system.robot.joint_names)
+    fit = forcegp.StructuredGP(system, force_priors=[forcegp.JointFrictionPrior()]).fit(data)
+    assert bool((fit.hyperparameters[TORQUE_NOISE].exp() >= 0.999 * step / math.sqrt(12.0)).all())

@@ -66,6 +66,20 @@ def test_the_gradient_is_that_of_finite_differences(criterion: str, monkeypatch:
     assert np.abs(numeric - gradient[some]).max() < 1e-6 * np.abs(gradient).max()
 
 
+def test_the_criterion_of_least_squares_has_no_bumps() -> None:
+    found, q = unknowns(), torch.randn(3, 40, 6, dtype=torch.float64)
+    links, each = found.base.rank, (found.parts["friction"].stop - found.base.rank) // 6
+    columns = [*range(links), *(links + each * j + k for j in range(6) for k in (0, 1))]
+    Phi = found.columns(*q)[1]
+    A = (Phi[..., columns] / found.noise[:, None]).flatten(0, 1) * (10.0 / LOOK / 40) ** 0.5
+    prior = found.root[columns][:, columns]
+    covariance = torch.linalg.inv(torch.linalg.inv(prior @ prior.mT) + A.mT @ A)
+    rows = found.columns(*found.region)[1][..., columns]
+    variance = torch.einsum("njp,pk,njk->nj", rows, covariance, rows).mean(0)
+    value = float(CRITERIA["V"](found.information(Phi, 10.0), found))
+    assert value == pytest.approx(0.5 * float(variance.log().mean()), rel=1e-6)
+
+
 def test_the_gradient_of_the_clearance_is_that_of_finite_differences() -> None:
     near, margin, tested = collisions((BOX,)), 0.05, 0
     for q in np.random.default_rng(0).uniform(-2.0, 2.0, (300, 6)):

@@ -29,7 +29,7 @@ real drive, 0.05 to 0.3 at smooth peaks."""
 MOVES = 0.02
 """Part of its largest speed from which a joint moves; the torque of one that rests is constant."""
 OFTEN, UNIT_ROWS = 0.05, 400
-"""Share of rows beyond the limits from which a wrong unit is considered, and rows whose torque tells it."""
+"""Share of rows beyond the limits that suggests a wrong unit, and number of rows for comparing torques."""
 
 
 def _limits(system: ConstrainedSystem) -> dict[str, tuple[Array, Array]]:

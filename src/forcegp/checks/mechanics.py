@@ -165,7 +165,7 @@ def _friction(robot: RobotModel, explanation: Explanation) -> list[Finding]:
             sizes = (f"{x:.3g} ± {s:.1g} {unit}" if s else "not determined" for x, s, unit in pairs)
             parts.append(f"{log.joint_names[j]} {', '.join(sizes)}")
         listed = "; ".join(parts)
-        text = f"joints show {word} friction than the robot file declares (viscous, Coulomb): {listed}"
+        text = f"joints have {word} friction than the robot file declares (viscous, Coulomb): {listed}"
         evidence = {
             f"{word} {log.joint_names[j]}": value[j]
             for word, value in (("viscous", viscous), ("coulomb", coulomb))

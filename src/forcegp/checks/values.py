@@ -14,7 +14,7 @@ from forcegp.checks.log import DEPARTURE, Array, Log, Outcome, spikes
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data.derivative import UNIFORM_TOLERANCE
 from forcegp.data.fields import JOINT_VECTORS
-from forcegp.robust import robust_std
+from forcegp.robust import resolution, robust_std
 from forcegp.rows import describe, intervals
 
 
@@ -244,18 +244,6 @@ def _within_two(x: Array) -> Array:
     from scipy.ndimage import maximum_filter1d
 
     return maximum_filter1d(x, 5, axis=0, mode="constant")
-
-
-def resolution(x: Array) -> Array:
-    """Step between the values of a column with few values, else zero."""
-    steps = np.zeros(x.shape[1])
-    for j, levels in enumerate(map(np.unique, x.T)):
-        if 2 < len(levels) < 0.75 * len(x):
-            gaps = np.diff(levels)
-            # Rounding in the last digit makes two levels of one; those gaps are not steps.
-            gaps = gaps[gaps > 1e-6 * gaps.max()]
-            steps[j] = np.median(gaps)
-    return steps
 
 
 def check_resolution(system: ConstrainedSystem, log: Log) -> Outcome:

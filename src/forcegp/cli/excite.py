@@ -43,7 +43,9 @@ def excite(
         typer.Option(metavar="X,Y,Z,A,B,C", help="Box to stay away from: centre and sides [m]; repeatable."),
     ] = None,
     clearance: Annotated[float, typer.Option(min=1e-4, help="Distance of all parts from others [m].")] = 0.01,
-    criterion: Annotated[str, typer.Option(help="A: spread of the torque; D: determinant.")] = "A",
+    criterion: Annotated[
+        str, typer.Option(help="A: spread of the torque; V: by links and friction alone; D: determinant.")
+    ] = "A",
     rate: Annotated[float, typer.Option(help="Samples per second.")] = 1000.0,
     restarts: Annotated[int, typer.Option(min=1, help="Random starts that are optimised.")] = 2,
     seed: Annotated[int, typer.Option(help="Seed of the random starts.")] = 0,

@@ -53,6 +53,7 @@ def rollout(
     """
     from forcegp.destination import check_destination
     from forcegp.files import written_folder
+    from forcegp.report.page import label
     from forcegp.report.rollouts import rollout_data, write_rollouts
     from forcegp.rollout import beside_log
     from forcegp.rollout.forward import replayed
@@ -73,7 +74,7 @@ def rollout(
     def write(folder: Path) -> None:
         with written_folder(folder) as temporary:
             rolled.with_step(step).write(temporary / "rollout.parquet")
-            write_rollouts(temporary, f"{regression.kind} rolled out on {data}", compared)
+            write_rollouts(temporary, f"{label(regression.kind)} rolled out on {data}", compared)
 
     save(write, out)
     written = {"page": str(out / "rollout.html"), "file": str(out / "rollout.parquet")}

@@ -139,6 +139,13 @@ class Unknowns:
         L = torch.linalg.cholesky(eye + self.root.mT @ G @ self.root)
         return torch.linalg.solve_triangular(L, self.root.mT, upper=False).mT
 
+    def without_bumps(self) -> Unknowns:
+        """The unknowns with viscous and dry friction as the only functions."""
+        known = torch.ones_like(self.root[:, 0])
+        functions = known[self.parts["friction"]].view(self.robot.nq, -1)
+        functions[:, 2:] = 0.0
+        return replace(self, root=known[:, None] * self.root)
+
     def after(self, G: Tensor) -> Unknowns:
         """The unknowns after a motion with information G."""
         return replace(self, root=self.covariance_root(G))
@@ -166,7 +173,15 @@ def rigid_torque(robot: RobotModel, q: Tensor, qd: Tensor, qdd: Tensor, Y: Tenso
 
 def a_optimal(G: Tensor, unknowns: Unknowns) -> Tensor:
     """Mean over joints of the log standard deviation of the torque, root mean square over the region."""
-    R = unknowns.covariance_root(G)
+    return _log_std(unknowns.covariance_root(G), unknowns)
+
+
+def v_optimal(G: Tensor, unknowns: Unknowns) -> Tensor:
+    """The same by links, viscous and dry friction, which are all that least squares identify."""
+    return _log_std(unknowns.without_bumps().covariance_root(G), unknowns)
+
+
+def _log_std(R: Tensor, unknowns: Unknowns) -> Tensor:
     return 0.5 * (R * (unknowns.wanted @ R)).sum((-2, -1)).log().mean()
 
 
@@ -176,4 +191,4 @@ def d_optimal(G: Tensor, unknowns: Unknowns) -> Tensor:
     return -0.5 * torch.logdet(eye + unknowns.root.mT @ G @ unknowns.root) / len(eye)
 
 
-CRITERIA: dict[str, Criterion] = {"A": a_optimal, "D": d_optimal}
+CRITERIA: dict[str, Criterion] = {"A": a_optimal, "V": v_optimal, "D": d_optimal}

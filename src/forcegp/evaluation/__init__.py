@@ -98,7 +98,7 @@ class Evaluation:
         if self.motion is not None:
             at = min(1, len(self.motion.horizons) - 1)
             off, file = (
-                "more than it moves" if x is None or x > 1.0 else f"{_percent(x)} of its motion"
+                "more than its motion" if x is None or x > 1.0 else f"{_percent(x)} of its motion"
                 for x in (self.motion.model[at], self.motion.robot_file[at])
             )
             after = f"{self.motion.horizons[at]:g} s in open loop"
@@ -139,7 +139,7 @@ class Evaluation:
         return tuple(found)
 
     def to_dict(self) -> dict[str, Any]:
-        """Everything in JSON types."""
+        """All scores as JSON-compatible values."""
         texts = [verdict.text() for verdict in self.verdicts]
         said = {"verdict": self.verdict, "comparison": self.comparison, "doubts": self.doubts}
         return asdict(self) | said | {"verdict_texts": texts}

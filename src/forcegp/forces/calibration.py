@@ -27,6 +27,7 @@ from forcegp.forces.posterior import (
 )
 from forcegp.forces.problem import UNSHOWN, Problem, force_posterior, typical
 from forcegp.forces.quantities import States, affine_map
+from forcegp.robust import resolution
 
 STRETCHES = 8
 """Contiguous stretches that a log of fewer than three segments is divided into."""
@@ -189,10 +190,12 @@ def _torque_noise(
 def calibrated_noise(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Torque noise calibrated on held-out samples, the trained region, and the growth of errors beyond it."""
     load, training = problem.typical_load(), problem.training
-    least = problem.hidden_torque()
-    hidden, learned = least > 0.0, hyperparameters[TORQUE_NOISE].exp().maximum(least)
-    noise = {TORQUE_NOISE: held_out_torque_std(problem, hyperparameters, learned).log()}
     qd, tau = (torch.cat([getattr(m, name) for m in training.measurements]) for name in ("qd", "tau"))
+    # Rounding to steps h has the variance h²/12.
+    rounding = torch.from_numpy(resolution(tau.cpu().numpy())).to(tau) / math.sqrt(12.0)
+    least = problem.hidden_torque()
+    hidden, learned = least > 0.0, hyperparameters[TORQUE_NOISE].exp().maximum(least).maximum(rounding)
+    noise = {TORQUE_NOISE: held_out_torque_std(problem, hyperparameters, learned).log()}
     grows = growth(problem, {**hyperparameters, **noise}, load)
     grows = torch.where(hidden, grows.maximum(UNSHOWN * load), grows)
     return {**noise, **trained_region(qd, tau, load, hidden), GROWTH: grows}

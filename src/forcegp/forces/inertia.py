@@ -79,25 +79,27 @@ def rigid_robot(robot: RobotModel, rows: Rows) -> RobotModel | None:
     size = M.diagonal(dim1=-2, dim2=-1).mean(0)
     links = regressor(robot, rows.q, rows.qd, rows.qdd) * prior.scale(robot)
     C = torch.cat([size * torch.diag_embed(rows.qdd), links], dim=-1)
-    found = max(_over_widths(rows, C, M), key=lambda each: float(torch.logdet(each.normal()[1])))
-    noise = found.noise
+    regressions, judged = tuple(_over_widths(rows, C, M)), products(rows, C)
+    single = regressions[0]
+    found = max(regressions, key=lambda each: float(torch.logdet(each.normal()[1])))
 
     def compared(estimate: Estimate) -> Tensor:
-        """Held-out errors in units of the noise."""
-        return held_out(found.by_stretch, estimate, found.judged) / noise**2
+        """Held-out errors of single samples in units of their noise; averages hardly show sharp friction."""
+        return held_out(single.by_stretch, estimate, judged, found.by_stretch) / single.noise**2
 
-    nothing, drives = torch.zeros_like(found.mean), _drives_alone(found.by_stretch.total(), noise, n)
+    nothing = torch.zeros_like(found.mean)
+    drives = _drives_alone(found.by_stretch.total(), found.noise, n)
     known = min(
         (compared(lambda _, x=x: x) for x in (nothing, drives)), key=lambda error: float(error.mean())
     )
-    if not _is_better(compared(lambda rest: _estimate(rest, noise, found.power)), known):
+    if not _is_better(compared(lambda rest: _estimate(rest, found.noise, found.power)), known):
         return None
     driven = robot.replace(armature=robot.armature + size * found.mean[:n])
     _, precision = found.normal()
     consistent, moved = prior.updated(driven, found.mean[n:], precision[n:, n:])
     delta = torch.cat([found.mean[:n], moved])
     before, after = (
-        acceleration_errors(rows, found.by_stretch, C, x, mass_matrix(each, rows.q))
+        acceleration_errors(rows, single.by_stretch, C, x, mass_matrix(each, rows.q))
         for each, x in ((robot, nothing), (consistent, delta))
     )
     better = _is_better(compared(lambda _: delta), known)
@@ -109,7 +111,6 @@ class _Regression:
     """Unknowns by instrumental variables, with the noise `(nq,)` and the power κ that they leave."""
 
     by_stretch: NormalEquations
-    judged: NormalEquations
     mean: Tensor
     noise: Tensor
     power: float
@@ -123,7 +124,7 @@ def _over_widths(rows: Rows, C: Tensor, M: Tensor) -> Iterator[_Regression]:
     inertial = (M @ rows.qdd[..., None])[..., 0]
     for width in WIDTHS if rows.step else WIDTHS[:1]:
         used, columns = averaged(rows, C, inertial, width) if rows.step else (rows, C)
-        if width and int(used.slides.sum(0).min()) < LEAST:
+        if width and (int(used.slides.sum(0).min()) < LEAST or int(used.group.max()) < int(rows.group.max())):
             break
         by_stretch = instrumental(used, columns)
         every, mean, noise, power = by_stretch.total(), C.new_zeros(C.shape[-1]), C.new_ones(C.shape[1]), 1.0
@@ -133,7 +134,7 @@ def _over_widths(rows: Rows, C: Tensor, M: Tensor) -> Iterator[_Regression]:
             noise = (left.square().sum(0) / used.slides.sum(0).clamp(min=1)).sqrt().clamp(min=1e-300)
             power = _power(used, left / noise)
             mean = _estimate(every, noise, power)
-        yield _Regression(by_stretch, products(used, columns), mean, noise, power)
+        yield _Regression(by_stretch, mean, noise, power)
 
 
 def _power(rows: Rows, left: Tensor) -> float:

@@ -359,19 +359,23 @@ def _by_stretch(rows: Rows, Z: Tensor, X: Tensor, s: Tensor, r: Tensor) -> Norma
 
 
 def held_out(
-    by_stretch: NormalEquations, estimate: Estimate, judged: NormalEquations | None = None
+    by_stretch: NormalEquations,
+    estimate: Estimate,
+    judged: NormalEquations | None = None,
+    source: NormalEquations | None = None,
 ) -> Tensor:
     """Mean squares of torque errors on stretches held out from δ and friction, `(groups, nq)`.
 
     Args:
-        by_stretch: the sums to estimate from.
+        by_stretch: the sums to estimate friction from.
         estimate: δ from all stretches but one.
         judged: the sums to compute errors from, such as `products`; by default the same.
+        source: the sums to estimate δ from, such as averaged equations; by default those of friction.
     """
     errors = []
     for g in range(len(by_stretch.gram)):
         rest = by_stretch.without(g)
-        delta = estimate(rest)
+        delta = estimate(rest if source is None else source.without(g))
         errors.append((judged or by_stretch).of(g).error(delta, rest.friction(delta)))
     return torch.stack(errors)
 

@@ -40,7 +40,8 @@ MIXED = "." + MIXING
 SHOWN = 10.0
 """Independent samples with accelerations sensitive to a joint's torque, from which its noise is learned."""
 UNSHOWN = 0.1
-"""Part of its load by which the torque of a joint is uncertain, with its friction, where nothing shows it."""
+"""Part of its load by which the torque of a joint is uncertain, with its friction, where nothing shows it, and
+which that grows by with each training standard deviation; 0.08 on a real iiwa 14."""
 
 
 def kernel_parameters(tensors: Mapping[str, Tensor]) -> Tensors:

@@ -171,7 +171,8 @@ def _torque(draft: Draft, trial: Signals, system: ConstrainedSystem) -> None:
     words = tokens(family.pattern)
     if not family.declared and ("current" in words or "currents" in words):
         family.unit = "A"
-        draft.say("torque", "a current: give the gear ratio and the torque constant [N m/A]", doubt=True)
+        text = "a current: give the gear ratio and the torque constant [N m/A]; DrivePrior learns its error"
+        draft.say("torque", text, doubt=True)
     elif not family.declared and 1000.0 / NEAR**2 < size < 1000.0 * NEAR**2:
         family.unit = "mNm"
         draft.say("torque", f"{size:.4g} times the inverse dynamics: taken for mNm", doubt=True)

@@ -503,9 +503,9 @@ def _pseudo(pi: Tensor) -> Tensor:
 def without_armature(robot: RobotModel, fastest: Tensor) -> RobotModel:
     """The robot with the inertia of its drives added to the links as far as physically possible.
 
-    Over random states, it minimises the mean square of each joint's error of τ over the torque itself:
+    Over n random states, it minimises the square of each joint's error of τ over the torque itself:
 
-        min_δ ½ Σ_j E(Y_j S δ − a_j q̈_j)² / (ε² E τ_j²), with the divergence of `InertialPrior.updated`.
+        min_δ ½ n Σ_j E(Y_j S δ − a_j q̈_j)² / (ε² E τ_j²), with the divergence of `InertialPrior.updated`.
 
     Args:
         robot: with armature a.
@@ -516,7 +516,7 @@ def without_armature(robot: RobotModel, fastest: Tensor) -> RobotModel:
     u = torch.rand(3, STATES, robot.nq, generator=generator, dtype=robot.dtype).to(robot.mass)
     low, high = (x.clamp(-np.pi, np.pi) for x in (robot.lower, robot.upper))
     q, qd, qdd = low + (high - low) * u[0], fastest * (2.0 * u[1] - 1.0), RATE * fastest * (2.0 * u[2] - 1.0)
-    size = dynamics.inverse_dynamics(robot, q, qd, qdd).square().sum(0).sqrt() * WANTED
+    size = dynamics.inverse_dynamics(robot, q, qd, qdd).square().mean(0).sqrt() * WANTED
     A = (regressor(held, q, qd, qdd) * (errors.scale(held) / size[:, None])).flatten(0, 1)
     precision = A.mT @ A
     mean = torch.linalg.pinv(precision, rtol=1e-12, hermitian=True) @ (

@@ -22,6 +22,7 @@ from forcegp.forces.measurements import Measurement, Training, plain
 from forcegp.forces.noise import Noise
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import ANALYTICAL
+from forcegp.forces.priors.constants import DrivePrior, PerRecording
 from forcegp.forces.priors.contact import ContactForcePrior, NormalForcePrior, SlidingFrictionPrior
 from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
 from forcegp.forces.priors.joint import (
@@ -64,6 +65,8 @@ CLASSES: dict[str, type] = {
     "inertial": InertialPrior,
     "normal": NormalForcePrior,
     "payload": PayloadPrior,
+    "drives": DrivePrior,
+    "per_recording": PerRecording,
     "contact": ContactForcePrior,
     "sliding_friction": SlidingFrictionPrior,
 }
@@ -71,7 +74,7 @@ CLASSES: dict[str, type] = {
 COLUMNS = ("q", "qd", "tau", "active", "values")
 """Saved parts of each measurement."""
 IN_TIME = ("segment", "t")
-"""Saved beside it if a prior is a function of time."""
+"""Saved beside it if a prior depends on time or recording."""
 NOT_REAL = (
     (re.compile(r"data\.\d+\.active"), torch.bool),
     (re.compile(r"added|data\.\d+\.segment|sparse\..*\.(components|dropped)"), torch.int64),
@@ -177,7 +180,8 @@ def _conditioned_on(spec: Specification, training: Training, posterior: ForcePos
 
 def _columns(spec: Specification) -> tuple[str, ...]:
     """Saved parts of each measurement."""
-    return COLUMNS + (IN_TIME if any(prior.in_time for prior in spec.priors) else ())
+    dated = any(prior.in_time or isinstance(prior, PerRecording) for prior in spec.priors)
+    return COLUMNS + (IN_TIME if dated else ())
 
 
 def _kept(hyper: Mapping[str, Tensor], own: AnalyticalParameters | None) -> dict[str, Tensor]:

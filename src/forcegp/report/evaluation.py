@@ -12,25 +12,11 @@ from forcegp.evaluation import Evaluation
 from forcegp.evaluation.scores import JointErrors
 from forcegp.files import write_text
 from forcegp.models.fit_result import Compared
-from forcegp.report.page import INK, Picture, PictureBlock, Table, cell, colour, draw, label, render
+from forcegp.report.page import INK, NAMES, Picture, PictureBlock, Table, cell, colour, draw, label, render
 from forcegp.report.window import WindowData, draw_errors, draw_forces, draw_predictions
 
 PAGE, WINDOW = "evaluation.html", "window.json"
 PLOTS = ("predictions.svg", "errors.svg", "calibration.svg")
-NAMES = {
-    "samples": "samples",
-    "noisy_mae": "mean absolute error, measured q̈ [rad/s²]",
-    "noisy_rmse": "root-mean-square error, measured q̈ [rad/s²]",
-    "clean_mae": "mean absolute error, noise-free q̈ [rad/s²]",
-    "clean_rmse": "root-mean-square error, noise-free q̈ [rad/s²]",
-    "coverage_noisy": "±2σ coverage, measured q̈ (nominal 0.954)",
-    "coverage_clean": "±2σ coverage, noise-free q̈ (nominal 0.954)",
-    "nlpd": "negative log predictive density [nats]",
-    "residual": "mean constraint residual |A q̈ − b| [m/s²]",
-    "residual_max": "largest constraint residual |A q̈ − b| [m/s²]",
-    "seconds_per_state": "prediction time [s/sample]",
-}
-"""Names of the scores over all joints."""
 
 
 def write_evaluation(
@@ -165,7 +151,9 @@ def uncertainty_tables(evaluation: Evaluation) -> tuple[Table, ...]:
 def score_table(evaluation: Evaluation) -> Table:
     """The scores over all joints, with units."""
     scores = evaluation.summary()
-    rows = tuple((name, cell(scores[key])) for key, name in NAMES.items() if scores[key] is not None)
+    rows = tuple(
+        (name, cell(scores[key])) for key, name in NAMES["scores"].items() if scores[key] is not None
+    )
     return Table("Scores over all joints", ("score", "value"), rows)
 
 

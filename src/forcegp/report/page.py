@@ -15,48 +15,19 @@ from matplotlib.figure import Figure
 from torch import Tensor
 
 from forcegp.notebook import text
+from forcegp.scene.document import tomllib
 
-COLOURS = {
-    "analytical": "#9c2f1a",
-    "nn": "#d08c00",
-    "gp": "#0072b2",
-    "sgp-zero": "#c4488c",
-    "sgp-mean": "#6a3d9a",
-    "sgp-contact": "#007a5e",
-}
-"""One colour per model, distinguishable by colour-blind readers and in print."""
-DASHES = {"nn-30-20": (1.0, 1.2), "nn-200x4": (5.0, 1.5, 1.0, 1.5)}
-"""Dashes and gaps, in line widths, of the networks that share the first one's colour."""
-KINDS = {
-    "analytical": "Analytical model",
-    "neural_network": "Neural network",
-    "independent_gp": "GP",
-    "structured_gp": "Structured GP",
-}
-"""What the kinds of saved models are called."""
+TEMPLATES = Path(__file__).parent / "templates"
+STYLE = TEMPLATES / "forcegp.mplstyle"
+"""Fonts, sizes and lines of plots."""
+NAMES = tomllib.loads((TEMPLATES / "names.toml").read_text(encoding="utf-8"))
+COLOURS, DASHES, KINDS, LABELS = (NAMES[table] for table in ("colours", "dashes", "kinds", "labels"))
+"""Looks of models, what kinds of saved models are called, and what models are called in plots and tables."""
 OTHER = "#0072b2"
 """Colour of a model without one of its own; not black, as measurements are."""
 INK = "#222222"
 AXES = ("#0072b2", "#d55e00", "#007a5e")
 """Colours of the Cartesian axes x, y, z."""
-LABELS = {
-    "analytical": "Analytical model",
-    "nn": "Neural network, 80",
-    "nn-80": "Neural network, 80",
-    "nn-30-20": "Neural network, 30-20",
-    "nn-200x4": "Neural network, 4×200",
-    "gp": "GP",
-    "sgp-zero": "S-GP, zero mean",
-    "sgp-mean": "S-GP, analytical mean",
-    "sgp-contact": "S-GP, mean and contact prior",
-    "sgp-zero-se": "S-GP, zero mean, paper's kernel",
-    "sgp-mean-se": "S-GP, analytical mean, paper's kernel",
-    "sgp-contact-se": "S-GP, mean and contact prior, paper's kernel",
-}
-"""What a model is called in plots and tables."""
-
-STYLE = Path(__file__).parent / "templates" / "forcegp.mplstyle"
-"""Fonts, sizes and lines of plots."""
 
 
 @dataclass(frozen=True)

@@ -281,11 +281,15 @@ def _curve(axes: Axes, data: RolloutData, path: ModelPath, values: Series, band:
     axes.plot(data.t[: len(values)], values, label=label(path.model), **style)
 
 
+def _starts(number: int) -> str:
+    return f"{number} start" + "s" * (number != 1)
+
+
 def rollout_pictures(data: RolloutData) -> tuple[Picture, ...]:
     """The plots of the section with data."""
     log = "logarithmic scale, one curve per model."
     errors = [(path, path.tip_error) for path in data.models]
-    alt = f"Tip error over time, median over {data.starts} starts, {log}"
+    alt = f"Tip error over time, median over {_starts(data.starts)}, {log}"
     picture = _draw_logarithmic(data, errors, 1e-9, "tip error [m]", alt, "Tip error over time")
     pictures = [draw_tip(data), picture]
     if drifts := [(path, path.drift) for path in data.models if path.drift]:
@@ -307,11 +311,11 @@ def rollout_table(data: RolloutData) -> Table:
         widened = NONE if calibrated is None else f"{calibrated:.3f} (× {path.inflation:.2f})"
         drift = NONE if path.worst_drift is None else f"{path.worst_drift:.1e}"
         rows.append((label(path.model), *errors, coverage, widened, drift))
-    caption = f"Tip error in open loop (median over {data.starts} starts)"
+    caption = f"Tip error in open loop (median over {_starts(data.starts)})"
     if any(path.coverage is not None for path in data.models):
         caption += (
             f"; share of logged tip positions inside the {data.level:.0%} bands over function samples "
-            f"({data.band_starts} starts, {data.band_seconds:.3g} s), and inside the bands widened by the "
+            f"({_starts(data.band_starts)}, {data.band_seconds:.3g} s), and inside the bands widened by the "
             "factor calibrated on held-out stretches of the training run"
         )
     return Table(caption, head, tuple(rows))
@@ -339,8 +343,8 @@ def rollout_section(data: RolloutData, source: str = DATA) -> RolloutSection:
     caption = (
         f"Open loop from a logged state under the logged torques, {data.t[-1]:.3g} s ahead: logged in "
         f"black, predicted in colour{band if sampled else ''}. Position and contact force are shown for the "
-        f"first {data.band_seconds:.3g} s. Errors are medians over {data.starts} starts. A curve ends where "
-        f"its prediction diverged.{why if sampled else ''}"
+        f"first {data.band_seconds:.3g} s. Errors are medians over {_starts(data.starts)}. A curve ends "
+        f"where its prediction diverged.{why if sampled else ''}"
     )
     block = PictureBlock("Trajectories predicted in open loop", caption, rollout_pictures(data), source)
     return RolloutSection(block, rollout_table(data), _animation(data), animation_source())

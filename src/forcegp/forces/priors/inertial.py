@@ -203,7 +203,13 @@ class PayloadPrior(ForcePrior):
         length: standard deviation of the first moment over that of the mass [m].
         kernel: covariance of the constants.
         name: prefix of the hyperparameters.
+<<<<<<< HEAD
+        known: mass [kg] and first moment [kg m] of the payload that the acceleration is taken with.
+        measured: take the measured acceleration where there is one: exact for any payload, but its noise
+            makes the payload too small where the arm hardly accelerates.
+=======
         known: mass [kg] and first moment [kg m] of the payload at which the acceleration is computed.
+>>>>>>> main
 
     Raises:
         ModelError: the known payload is not a mass and a moment.
@@ -216,6 +222,7 @@ class PayloadPrior(ForcePrior):
     name: str = "payload"
     target: str = JOINT
     known: tuple[float, ...] = ()
+    measured: bool = False
 
     def __post_init__(self) -> None:
         if self.known and not (len(self.known) == MASS_AND_MOMENT and self.known[0] > 0.0):
@@ -232,11 +239,12 @@ class PayloadPrior(ForcePrior):
         return {"one": at.q.new_zeros(len(at.q), 1)}
 
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
-        # Not the measured one: where the arm hardly accelerates, its noise would be taken for a payload.
-        eom = at.eom
-        if self.known:
-            eom = system.with_robot(self.loaded(system.robot)).equations(at.q, at.qd, at.active)
-        qdd = eom.acceleration(eom.Q_K + at.tau)
+        qdd = at.qdd
+        if qdd is None or not self.measured:
+            eom = at.eom
+            if self.known:
+                eom = system.with_robot(self.loaded(system.robot)).equations(at.q, at.qd, at.active)
+            qdd = eom.acceleration(eom.Q_K + at.tau)
         first = PER_PAYLOAD * self.link(system.robot)
         Y = regressor(system.robot, at.q, at.qd, qdd)[..., first : first + MASS_AND_MOMENT]
         return -Y * self.units(at.q)

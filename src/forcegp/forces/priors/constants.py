@@ -1,0 +1,117 @@
+"""Constants of drives, and constants that differ between recordings."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import torch
+from torch import Tensor
+
+from forcegp.constraints import ConstrainedSystem
+from forcegp.errors import ModelError
+from forcegp.forces.priors.base import JOINT, ForcePrior
+from forcegp.forces.quantities import States
+from forcegp.gp.kernels import Constant, Kernel
+from forcegp.robot.model import RobotModel
+
+
+@dataclass(frozen=True)
+class DrivePrior(ForcePrior):
+    """Q_i = s τ_i δ_i, δ_i ~ N(0, 1): the drive constant (torque constant times gear ratio) is off by s δ_i.
+
+    Logged currents become torques by nominal drive constants (`torque_constant`, `gear_ratio` of a mapping);
+    the true ones are (1 + s δ_i) times these. Only the ratio of drive constants to inertia acts on a motion,
+    so links that are unknown too leave them open: give known masses, or record a known payload.
+
+    Args:
+        std: s, relative standard deviation of the drive constants.
+        kernel: covariance of δ.
+        name: prefix of the hyperparameters.
+
+    Example:
+        >>> import forcegp
+        >>> DrivePrior().outputs(forcegp.load_robot("ur5"))
+        6
+
+    Raises:
+        ModelError: the standard deviation is not positive.
+    """
+
+    std: float = 0.2
+    kernel: Kernel = field(default_factory=Constant)
+    name: str = "drives"
+    target: str = JOINT
+
+    def __post_init__(self) -> None:
+        if not self.std > 0.0:
+            raise ModelError(
+                f"force prior {self.name!r} has no such standard deviation",
+                expected="a positive number",
+                got=self.std,
+            )
+
+    def outputs(self, robot: RobotModel) -> int:
+        return robot.nq
+
+    def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
+        return {"one": torch.zeros_like(at.q[:, :1])}
+
+    def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
+        return self.std * torch.diag_embed(at.tau)
+
+
+@dataclass(frozen=True)
+class PerRecording(ForcePrior):
+    """E(x) f_r for states of recording r: constants of a prior, such as a payload, one set per recording.
+
+    All other priors are shared, so that one fit of several recordings learns their friction from all of them.
+    New states have the constants of the last recording.
+
+    Args:
+        prior: of the force in each recording, whose hyperparameters have its name.
+        starts: the first segment of each recording, as in `Dataset.segment`.
+
+    Example:
+        >>> import forcegp
+        >>> prior = PerRecording(forcegp.PayloadPrior(measured=True), starts=(0, 1))
+        >>> prior.outputs(forcegp.load_robot("ur5"))
+        8
+
+    Raises:
+        ModelError: the starts do not ascend, or the prior is not one of constants.
+    """
+
+    prior: ForcePrior
+    starts: tuple[int, ...]
+    name: str = field(init=False)
+    kernel: Kernel = field(init=False)
+    target: str = field(init=False)
+
+    def __post_init__(self) -> None:
+        if not self.starts or list(self.starts) != sorted(set(self.starts)):
+            raise ModelError("recordings need ascending first segments", expected="(0, 1)", got=self.starts)
+        if not isinstance(self.prior.kernel, Constant):
+            raise ModelError(
+                f"force prior {self.prior.name!r} is not one of constants",
+                expected="a prior with a Constant kernel, such as PayloadPrior()",
+                got=type(self.prior.kernel).__name__,
+            )
+        for name in ("name", "kernel", "target"):
+            object.__setattr__(self, name, getattr(self.prior, name))
+
+    def outputs(self, robot: RobotModel) -> int:
+        return len(self.starts) * self.prior.outputs(robot)
+
+    def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
+        return self.prior.features(system, at)
+
+    def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
+        recording = torch.full((len(at.q),), len(self.starts) - 1, device=at.q.device)
+        if at.time is not None:
+            starts, segment = torch.tensor(self.starts, device=at.q.device), at.time[:, 1].long()
+            recording = (segment[:, None] >= starts).sum(-1).sub(1).clamp(min=0)
+        mine = torch.nn.functional.one_hot(recording, len(self.starts)).to(at.q)
+        return (mine[:, None, :, None] * self.prior.operator(system, at)[:, :, None]).flatten(2)
+
+    def check(self, system: ConstrainedSystem) -> None:
+        self.prior.check(system)
