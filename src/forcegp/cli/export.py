@@ -49,7 +49,7 @@ def export(
     CasADi: the mean as a function with exact derivatives, in a file for `casadi.Function.load`.
 
     URDF, MJCF: a copy of the robot's file with identified inertia, damping and friction, and no other change;
-        a report with standard deviations and losses; and robots drawn from the posterior.
+    a report with standard deviations and losses; and robots drawn from the posterior.
 
     [bold]Examples[/bold]
 

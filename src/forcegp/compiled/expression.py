@@ -66,7 +66,7 @@ class Graph:
         """Derivatives of the outputs by forward mode, from those of `seeds` by position.
 
         A seed need not be an input: the solution of an equation can be seeded with its derivative. A scalar
-            without directions counts as a constant.
+        without directions counts as a constant.
         """
         found = dict(seeds)
         for position in self.live(outputs, seeds):

@@ -121,7 +121,7 @@ class Linear(Kernel):
     """k = s² Σ_d σ_d² x_d x′_d + σ_0²: functions that are linear in the inputs.
 
     Fewer hyperparameters to overfit: with `ard=False` all inputs have one σ, so learning cannot set single
-        slopes to zero; with `shared=True` all outputs share the σ_d, and each has its own s and σ_0.
+    slopes to zero; with `shared=True` all outputs share the σ_d, and each has its own s and σ_0.
     With an `offset` σ_0 is that fraction of the root mean square σ_d: a learned ratio, which starts there and
     is the same for all outputs. The constant of a single output does not determine σ_0.
     """

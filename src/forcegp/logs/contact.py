@@ -284,7 +284,7 @@ def touching(distance: Array) -> float:
     """Distance up to which a contact is closed [m], at most `TOUCHING`.
 
     Most rows within this distance belong to the closed contact: the threshold, their median plus
-        `DISTANCE_STD` deviations, separates them from approach and departure.
+    `DISTANCE_STD` deviations, separates them from approach and departure.
 
     >>> touching(np.array([0.0, 0.001, -0.001, 0.0, 0.002, 0.9, 30.0]) * 1e-3) < 1e-5
     True

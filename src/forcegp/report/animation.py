@@ -26,7 +26,7 @@ def animation(content: Mapping[str, object], label: str) -> Markup:
         content: input of `templates/animation.js`: `times` of the frames [s]; `bodies`, points of an arm;
             `films`, arms with `label`, `colour`, `dash` and flat `points` (frames, bodies, 3) [m].
             Optional: convex `solids` with `colour`, `opacity`, flat `points` [m] and `link`, their column in
-                `poses` (frames, links, 12); `paths` with `colour`, `width` and `points`;
+            `poses` (frames, links, 12); `paths` with `colour`, `width` and `points`;
             `forces` with `start`, `tip` and `bar` in each frame; `texts` of each frame.
         label: text alternative of the canvas.
     """

@@ -18,7 +18,7 @@ def write_urdf(robot: RobotModel) -> str:
     """The robot as URDF text: inertial parameters and joints only, mounted in the world at its base pose.
 
     Shapes, joint limits, damping and friction are left out: an engine that loads the file adds no further
-        force.
+    force.
     """
     root = Element("robot", name=robot.name)
     _link(root, WORLD, 1.0, torch.zeros(3), torch.eye(3), torch.ones(3))

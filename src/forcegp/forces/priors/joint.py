@@ -142,8 +142,8 @@ class JointFrictionPrior(PerJointPrior):
     """Q_i = w_i·φ(q̇_i) + c_i with φ = (q̇_i, tanh(q̇_i/v_1), tanh(q̇_i/v_2), …, |Q_G,i| tanh(q̇_i/v_1)).
 
     The weights w_i and the offset c_i are Gaussian and marginalised. Three scales are learned: the friction
-        of each joint, the relevance of each feature, and the offsets relative to friction; the last two are
-        shared by all joints. A joint that moved in one direction only does not separate offset and
+    of each joint, the relevance of each feature, and the offsets relative to friction; the last two are
+    shared by all joints. A joint that moved in one direction only does not separate offset and
     friction, but the other joints indicate which is likely. With a separate standard deviation for each
     weight, learning would set most of them to zero, and be overconfident on new motions. A kernel with a
     smooth part, such as `Linear(shared=True, offset=0.3) + SquaredExponential(("velocity",))`, adds a smooth
