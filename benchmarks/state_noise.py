@@ -70,7 +70,7 @@ def run(data: forcegp.Dataset, seed: int, mean: str, samples: int, way: str) -> 
         "clean": float((error < 2.0 * std).double().mean()),
         "noisy": float(noisy.double().mean()),
         "std": float(std.mean()),
-        "evidence": fit.log_marginal_likelihood,
+        "evidence": fit.result.log_marginal_likelihood,
         "learned_slopes": fit.training.slopes is not None,
     }
 

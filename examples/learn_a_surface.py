@@ -1,4 +1,4 @@
-"""Where is the table? Its height and tilt, with error bars, from the path of a tip that slid on it.
+"""Height and tilt of a table, with error bars, from the path of a tip that slides on it.
 
     python examples/learn_a_surface.py [figure.png]
 

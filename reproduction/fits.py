@@ -148,11 +148,11 @@ def fit_and_score(
         seed=task.seed,
         **{measure: summary[measure] for measure in MEASURES},
         test_samples=found.samples,
-        fit_seconds=fit.seconds,
+        fit_seconds=fit.result.seconds,
         predict_seconds=found.seconds_per_state * found.samples,
         peak_memory=peak,
-        evaluations=fit.evaluations,
-        converged=fit.converged,
+        evaluations=fit.result.evaluations,
+        converged=fit.result.converged,
     )
     write_text(folder / SCORE, score.model_dump_json(indent=2))
 

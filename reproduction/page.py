@@ -11,7 +11,7 @@ from reproduction.covariance import CovarianceData, covariance_block
 from reproduction.identification import IdentificationData, identification_block, identification_finding
 from reproduction.multiplier import MultiplierData, draw_multiplier, multiplier_block, multiplier_finding
 from reproduction.results import PaperNumbers, Results, paper_numbers
-from reproduction.statements import Statement
+from reproduction.statements import Statement, markdown
 from reproduction.task_space import TaskSpaceData, task_space_block
 from reproduction.trajectories import bands, tip_error
 
@@ -152,7 +152,7 @@ def settings_table(results: Results) -> report.Table:
 def render_markdown(results: Results, figures: FigureData) -> str:
     """The numbers of a reproduction beside the paper's, as Markdown."""
     paper = paper_numbers()
-    tables = {name: table.markdown() for name, table in _tables(results, paper).items()}
+    tables = {name: markdown(table) for name, table in _tables(results, paper).items()}
     said = findings(results, paper, figures)
     parts = [
         "# Results",
@@ -166,7 +166,7 @@ def render_markdown(results: Results, figures: FigureData) -> str:
         "## Uncertainty, constraint, cost",
         *(tables[name] for name in ("quality", "residual")),
         "## Trajectories",
-        report.rollout_table(figures.rollouts).markdown(),
+        markdown(report.rollout_table(figures.rollouts)),
         "## Runs and settings",
         *(tables[name] for name in ("simulation", "settings")),
     ]

@@ -16,7 +16,7 @@ from forcegp.scene import load_scene
 from reproduction import real_contact
 from reproduction.multiplier import MultiplierBand, MultiplierData, draw_multiplier, spans
 from reproduction.stages import Say, Stage, run_stages
-from reproduction.statements import Statement
+from reproduction.statements import Statement, markdown
 
 PROFILE, PAGE, RESULTS, MARKDOWN = "real-contact", "report.html", "results.json", "results.md"
 DURATION = 60.0
@@ -70,7 +70,7 @@ def run_real_contact(
     }
     seconds = sum(header.seconds for stage in stages if (header := stage.found()) is not None)
     write_json(root / RESULTS, results)
-    write_text(root / MARKDOWN, "\n\n".join(t.markdown() for t in tables(results)) + "\n")
+    write_text(root / MARKDOWN, "\n\n".join(markdown(t) for t in tables(results)) + "\n")
     page = report.render(
         "real_contact.html.j2",
         package="reproduction",

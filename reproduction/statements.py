@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from forcegp.report import NONE
+from forcegp.report import NONE, Table
 
 
 def number(values: Sequence[float | int | None], digits: int = 3) -> str:
@@ -40,3 +40,13 @@ class Statement:
     def verdict(self) -> str | None:
         """The verdict, or `None` if no claim is made."""
         return None if self.agrees is None else self.words[0 if self.agrees else 1]
+
+
+def markdown(table: Table) -> str:
+    """A table with its caption as Markdown."""
+
+    def line(cells: Sequence[str]) -> str:
+        return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
+
+    rule = "|" + "---|" * len(table.head)
+    return "\n".join([f"{table.caption}:", "", line(table.head), rule, *map(line, table.rows)])

@@ -202,6 +202,12 @@ def _gap(system: ConstrainedSystem, log: Log) -> tuple[ConstrainedSystem, Log, R
     return system, _keep(log, keep), (k, k + 1)
 
 
+def _late_velocity(system: ConstrainedSystem, log: Log) -> tuple[ConstrainedSystem, Log, Rows]:
+    qd, j, width = log.qd.copy(), joint(log, 2), round(0.2 / log.dt)
+    qd[:, j] = np.convolve(np.pad(qd[:, j], (width - 1, 0), "edge"), np.ones(width) / width, "valid")
+    return system, log.replace(qd=qd), None
+
+
 def _missing_rows(system: ConstrainedSystem, log: Log) -> tuple[ConstrainedSystem, Log, Rows]:
     """Rows are lost and the clock does not know: the position jumps."""
     rows = _moving_rows(log, 40)
@@ -411,6 +417,7 @@ FAULTS = (
     Fault("velocities alone in degrees", "degrees", _change(qd=lambda log: DEG * log.qd)),
     Fault("a velocity of the wrong sign", "velocity-sign", _change(qd=lambda g: g.qd * _sign(g, 3)), joint=3),
     Fault("velocities exchanged", "velocity-order", _change(qd=lambda g: g.qd[:, _swap(g, 1, 3)]), joint=1),
+    Fault("a velocity filtered over 0.2 s", "velocity-delay", _late_velocity, joint=2),
     Fault("velocities of another run", "velocity-mismatch", _change(qd=lambda g: g.qd[::-1].copy())),
     Fault("accelerations 30 % too large", "acceleration-mismatch", _change(qdd=lambda g: 1.3 * g.qdd)),
     Fault("torque of the wrong sign", "torque-sign", _change(tau=lambda g: -g.tau)),
@@ -435,6 +442,13 @@ FAULTS = (
         "torque-delay",
         _change(tau=lambda g: np.roll(g.tau, round(0.04 / g.dt), axis=0)),
         amount=0.04,
+    ),
+    Fault(
+        "a torque of one joint 60 ms late",
+        "torque-delay",
+        _change(tau=lambda g: np.where(_joint(g, 1, 1.0), np.roll(g.tau, round(0.06 / g.dt), axis=0), g.tau)),
+        joint=1,
+        amount=0.06,
     ),
     Fault("torque less gravity", "torque-without-gravity", _without_gravity),
     Fault("torques exchanged", "torque-order", _change(tau=lambda g: g.tau[:, _swap(g, 1, 3)]), joint=1),

@@ -181,10 +181,24 @@ def test_phrases_that_were_rewritten_do_not_come_back(path: Path) -> None:
         assert not re.search(pattern, text), phrase
 
 
-@pytest.mark.parametrize("page", [*PAGES, DOCS.parent / "README.md"], ids=lambda page: page.name)
-def test_data_and_forces_do_not_speak(page: Path) -> None:
-    found = SPEAKING.search(sentences(page))
+@pytest.mark.parametrize("path", texts(), ids=lambda path: f"{path.parent.name}/{path.name}")
+def test_data_and_forces_do_not_speak(path: Path) -> None:
+    found = SPEAKING.search(sentences(path))
     assert found is None, found.group()
+
+
+DOCUMENTED = (ast.Module, ast.ClassDef, ast.FunctionDef, ast.AsyncFunctionDef)
+
+
+@pytest.mark.parametrize("path", texts(), ids=lambda path: f"{path.parent.name}/{path.name}")
+def test_no_questions_in_place_of_names(path: Path) -> None:
+    text = path.read_text(encoding="utf-8")
+    if path.suffix == ".py":
+        nodes = [node for node in ast.walk(ast.parse(text)) if isinstance(node, DOCUMENTED)]
+        docstrings = [ast.get_docstring(node) or "" for node in nodes]
+        assert not [doc for doc in docstrings if re.match(r"(What|Where|How|Why|Which|Who)\b", doc)]
+    elif path in PAGES:
+        assert not re.search(r"\b(whose|of which)\b", " ".join(seen(path)))
 
 
 WORDS = 20_000

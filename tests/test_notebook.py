@@ -65,7 +65,7 @@ def test_a_fit_says_how_it_went() -> None:
     words = Tags(fit._repr_html_()).words
     assert words[words.index("training samples") + 1] == "8"
     assert words[words.index("noise of qdd") + 1].startswith("0.1, 0.1")
-    assert words[words.index("log marginal likelihood") + 1] == f"{fit.log_marginal_likelihood:.4g}"
+    assert words[words.index("log marginal likelihood") + 1] == f"{fit.result.log_marginal_likelihood:.4g}"
     for one in (fit, fit.predict(*(x[:2] for x in (fit.training.measurements[0].states[:3])))):
         assert len(repr(one)) < 200, "no tensors are printed"
 

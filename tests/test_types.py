@@ -34,7 +34,7 @@ path = fit.rollout(data.q[0], data.qd[0], data, samples=3, options=forcegp.Rollo
 print(path.q.shape, path.multiplier)
 fit.save("model")
 second = model.fit(data, learn=["noise"], after=fit).update(data)
-print(second.condition(data).log_marginal_likelihood, second.forget(0.9).training.samples)
+print(second.condition(data).result.log_marginal_likelihood, second.forget(0.9).training.samples)
 loaded = forcegp.load_model("model")
 print(forcegp.evaluate(loaded, data).verdict, forcegp.check(system, data).verdict)
 eom = other.equations(data.q, data.qd)

@@ -1,4 +1,4 @@
-"""Arithmetic on many small vectors and matrices whose batch is the last dimension.
+"""Arithmetic on many small vectors and matrices, with the batch as the last dimension.
 
 Public tensors have their batch first. Inside kinematics and dynamics it is last and flat, so that one
 element-wise operation runs along memory over all samples instead of one small matrix at a time: a vector

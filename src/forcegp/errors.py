@@ -133,7 +133,7 @@ def _shortened(text: str, length: int) -> str:
 
 
 class ShapeError(ForceGPError, ValueError):
-    """A tensor whose shape, dtype or device does not fit."""
+    """A tensor with a wrong shape, dtype or device."""
 
 
 class DataError(ForceGPError, ValueError):

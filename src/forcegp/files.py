@@ -1,8 +1,8 @@
-"""Files that are never half written, and JSON headers that say which format and version they are.
+"""Files that are written atomically, and JSON headers with format and version.
 
-What is under construction is hidden, locked while its writer lives, and deleted once that is dead: a file
+A file under construction is hidden, locked while its writer lives, and deleted after a crash. Its name is
 `.forcegp-new-<12 hex digits>-<name of the target>`. The lock (flock) ends with the process; without flock
-(Windows, some network file systems) such files stay unread.
+(Windows, some network file systems) such files remain.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ class Temporary:
                 return
 
     def close(self) -> None:
-        """Release the lock, and remove what is still there."""
+        """Release the lock, and remove any remaining files."""
         if self._descriptor is not None:
             os.close(self._descriptor)
             self._descriptor = None
@@ -87,7 +87,7 @@ def sweep(target: Path) -> None:
 
 
 def discard(path: Path) -> None:
-    """Remove a file or folder, as far as it can be removed."""
+    """Remove a file or folder as far as possible."""
     try:
         if stat.S_ISDIR(path.lstat().st_mode):
             shutil.rmtree(path, ignore_errors=True)
@@ -130,9 +130,9 @@ def writable(target: Path) -> Iterator[None]:
 
 
 def check_kind(target: Path, *, folder: bool) -> None:
-    """Check that nothing but a folder, or nothing but a regular file, would be replaced.
+    """Check that only a folder, or only a regular file, would be replaced.
 
-    The path is looked at once: between `exists` and `is_dir` another writer can change it.
+    The path is inspected once, since another writer could change it between `exists` and `is_dir`.
     """
     if "\0" in str(target):
         raise DestinationError("a path holds a null byte", got=repr(str(target)))
@@ -172,7 +172,7 @@ def _temporary(target: Path, *, folder: bool, mode: int) -> Iterator[Path]:
 
 @contextmanager
 def atomic_file(path: str | Path, mode: int = 0o666) -> Iterator[Path]:
-    """A temporary path beside `path` that takes its place when the block ends without an error.
+    """A temporary path that replaces `path` when the block ends without an error.
 
     Temporary files of crashed writers of the same file are removed.
 
@@ -184,7 +184,7 @@ def atomic_file(path: str | Path, mode: int = 0o666) -> Iterator[Path]:
         Where to write. A reader of `path` sees the old file or the whole new one.
 
     Raises:
-        DestinationError: the place cannot be written, or `path` is a folder, a pipe or a device.
+        DestinationError: the path cannot be written, or is a folder, a pipe or a device.
 
     Example:
         >>> import os, tempfile
@@ -208,14 +208,14 @@ def atomic_file(path: str | Path, mode: int = 0o666) -> Iterator[Path]:
 def written_folder(path: str | Path) -> Iterator[Path]:
     """A temporary folder; its files move into the target folder when the block ends without an error.
 
-    Each file replaces its namesake in one step, in the order in which they were written, so that the last one
-    is there only with the others; then what else was in the folder is removed. Symbolic links are followed.
+    Each file replaces its namesake in one step, in the order of writing, so that the last one exists only
+    with the others; then all other files of the folder are removed. Symbolic links are followed.
 
     Yields:
         The folder to write the files to.
 
     Raises:
-        DestinationError: the place cannot be written, or `path` is a file.
+        DestinationError: the path cannot be written, or is a file.
 
     Example:
         >>> import os, tempfile
@@ -297,7 +297,7 @@ def validated(
     place: tuple[str, ...] = (),
     what: str = "field",
 ) -> M:
-    """What was read as a pydantic model; an `error` names `source`, `place` and the wrong field."""
+    """Validate values as a pydantic model; an `error` names `source`, `place` and the invalid field."""
     try:
         return kind.model_validate(fields)
     except ValidationError as cause:

@@ -1,6 +1,6 @@
-"""Guards of readers: what a file claims is bounded before the work that it asks for, and errors are typed.
+"""Guards of readers: the claimed size of a file is checked before it is read, and errors are typed.
 
-A small compressed file can claim to hold more than memory does. The bounds are in `forcegp.limits`.
+A small compressed file can claim to contain more than fits into memory. The bounds are in `forcegp.limits`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from forcegp.errors import DataError, ForceGPError, optional_module
 
 
 def check_count(source: str, what: str, count: int, most: int) -> None:
-    """Raise `DataError` if a log claims more than `most` of something, named in the plural.
+    """Raise `DataError` if a log claims more than `most` items, named in the plural.
 
     >>> check_count("run.csv", "columns", 12, limits.COLUMNS)
     """
@@ -36,7 +36,7 @@ def check_count(source: str, what: str, count: int, most: int) -> None:
 
 
 def check_expansion(source: str, size: int, file: int, free: int | None = None) -> None:
-    """Raise `DataError` if a small file, of `file` bytes, claims to hold far more, `size` bytes."""
+    """Raise `DataError` if a small file, of `file` bytes, claims to contain far more, `size` bytes."""
     allowed = allowed_bytes(file, free)
     if size > allowed:
         raise DataError(
@@ -48,7 +48,7 @@ def check_expansion(source: str, size: int, file: int, free: int | None = None) 
 
 
 def allowed_bytes(file: int, free: int | None = None) -> int:
-    """Number of bytes that a file of `file` bytes may unpack to, `free` of them whatever its size."""
+    """Number of bytes that a file of `file` bytes may unpack to, at least `free`."""
     return max(free or limits.FREE_TABLE_BYTES, limits.TABLE_EXPANSION * file)
 
 
@@ -62,7 +62,7 @@ class Unpacking:
     records: int = 0
 
     def unpack(self, packed: bytes, compression: str) -> bytes:
-        """The content of a part, of which no more is unpacked than is allowed."""
+        """Unpack a part, up to the allowed size."""
         left = allowed_bytes(self.file, limits.FREE_BAG_BYTES) - self.size
         content = _opened(packed, compression).read(left + 1)
         self.read(len(content))
@@ -96,7 +96,7 @@ def _opened(packed: bytes, compression: str) -> Any:
 
 
 def bounded(reader: Any, unpacking: Unpacking) -> Any:
-    """The reader of ROS 1 bags with bounds on what chunks unpack to and on the index."""
+    """The reader of ROS 1 bags with bounds on unpacked chunks and on the index."""
 
     class Bounded(reader):
         indexed = 0
@@ -129,7 +129,7 @@ def check_tables(file: Path) -> None:
 
 
 def is_file(path: Path) -> bool:
-    """Whether a file is there; a name that no file can have is none."""
+    """Whether a file exists; false for invalid names."""
     try:
         return path.is_file()
     except (OSError, ValueError):
@@ -148,7 +148,7 @@ DEFLATE_RATIO = 1032
 
 
 def check_chunks(dataset: Any, file: int) -> None:
-    """Check that no chunk of an h5py data set unpacks to more than it should, as HDF5 itself does not; a
+    """Check that no chunk of an h5py data set exceeds its declared size, which HDF5 does not check; a
     chunk of another compression is a `DataError` too.
     """
     source, properties = f"{dataset.file.filename}: {dataset.name!r}", dataset.id.get_create_plist()
@@ -173,7 +173,7 @@ def check_chunks(dataset: Any, file: int) -> None:
 
 
 def within(folder: Path, files: Iterable[Path]) -> list[Path]:
-    """Files of a folder that is read as one log; `DataError` names one that a link leads out of it."""
+    """Files of a folder that is read as one log; `DataError` names a link that leads out of it."""
     files, root = list(files), folder.resolve()
     for file in files:
         if not file.resolve().is_relative_to(root):
@@ -186,7 +186,7 @@ def within(folder: Path, files: Iterable[Path]) -> list[Path]:
 
 @contextmanager
 def foreign(source: str, kind: str) -> Iterator[None]:
-    """Turn whatever a third-party parser raises on a damaged file into `DataError`."""
+    """Convert any exception of a third-party parser on a damaged file to `DataError`."""
     try:
         yield
     except ForceGPError:
@@ -199,7 +199,7 @@ def foreign(source: str, kind: str) -> Iterator[None]:
 
 
 def damaged(source: str, kind: str, cause: BaseException) -> DataError:
-    """The error for a file that a parser of some kind of files fails on."""
+    """The error for a file that cannot be parsed."""
     lines = str(cause).splitlines()
     return DataError(
         f"{source}: the file is damaged, truncated or not {kind}",

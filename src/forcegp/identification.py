@@ -38,8 +38,8 @@ PARAMETER_NAMES = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", 
 def regressor(robot: RobotModel, q: JointVector, qd: JointVector, qdd: JointVector) -> Regressor:
     """Y `(*batch, nq, 10 nq)` with Y π = M q̈ − Q_C − Q_G without drives, π as in `parameter_vector`.
 
-    Inverse dynamics is linear in π, so column k of link i holds the forces of that link with unit π_k. Only
-    the kinematics and the gravity of the robot enter.
+    Inverse dynamics is linear in π, so column k of link i contains the forces of that link with unit π_k.
+    Only kinematics and gravity of the robot are used.
 
     Example:
         >>> import torch, forcegp
@@ -88,7 +88,7 @@ class BaseParameters:
     """The combinations β = B π that act on the motion.
 
     Attributes:
-        columns: indices in π of the r independent parameters that lead the combinations.
+        columns: indices in π of the r independent parameters, one per combination.
         combination: B `(r, 10 nq)`, the identity in these columns.
         names: of the combinations, such as `"Izz[joint_1] + 3 more"`.
     """
@@ -110,7 +110,7 @@ class BaseParameters:
 def base_parameters(robot: RobotModel) -> BaseParameters:
     """Base parameters by rank-revealing QR of the regressor at random states (Gautier 1991).
 
-    Runs in double precision on the CPU, wherever the robot is. Only its kinematics and gravity enter.
+    Runs in double precision on the CPU. Only kinematics and gravity of the robot are used.
 
     Example:
         >>> import torch, forcegp
@@ -154,11 +154,11 @@ class Identification:
     """Least-squares estimate of the base parameters from a log.
 
     Attributes:
-        base: what the base parameters are.
+        base: definition of the base parameters.
         value, standard_error: `(r,)` estimate of β and its standard error.
         covariance: `(r, r)` covariance of the estimate.
-        damping, friction: `(nq,)` viscous and Coulomb friction if they were asked for, else None.
-        noise_std: `(nq,)` standard deviation of the torque that remains [N m, N].
+        damping, friction: `(nq,)` viscous and Coulomb friction if requested, else None.
+        noise_std: `(nq,)` standard deviation of the torque residual [N m, N].
         condition: condition number of the scaled problem; beyond about 100 the motion excites too little.
     """
 
@@ -184,12 +184,12 @@ def identify(
     """Identify base parameters from a log of free motion by weighted linear least squares.
 
     Solves τ − armature q̈ = Y_b β (+ d q̇ + f_c tanh(q̇/v_0)) + ε, first with equal weights, then with each
-    joint weighted by the noise that the first pass leaves. The accelerations are taken as exact.
+    joint weighted by its residual noise. The accelerations are treated as exact.
 
     Args:
         robot: its kinematics, gravity, drive inertia and v_0 are used, its inertial parameters are not.
         q, qd, qdd: `(n, nq)` the motion.
-        tau: `(n, nq)` measured joint force; without `friction`, less the dissipative part [N m, N].
+        tau: `(n, nq)` measured joint force, without the dissipative part unless `friction` [N m, N].
         friction: identify viscous and Coulomb friction with the inertial parameters.
 
     Example:

@@ -1,8 +1,8 @@
 """Poses, Jacobians and bias accelerations of a tree of joints, batched over states.
 
-Spatial vectors are `[angular, linear]`, in world axes, about the origin of the base. With the joint screws
-s_j so expressed and the ancestor matrix E, the twist of link i is V_i = Σ_j E_ij s_j q̇_j, so only the poses
-need a recursion, over the depth of the tree.
+Spatial vectors are `[angular, linear]`, in world axes, about the origin of the base. With joint screws s_j in
+this form and the ancestor matrix E, the twist of link i is V_i = Σ_j E_ij s_j q̇_j, so only the poses need a
+recursion, over the depth of the tree.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ class PointMotion(NamedTuple):
 
     @classmethod
     def of(cls, blocks: Sequence[Tensor], qd: Tensor) -> PointMotion:
-        """From rotation, position, J and J̇ q̇, as compiled kernels give them, and q̇."""
+        """From rotation, position, J and J̇ q̇ of a compiled kernel, and q̇."""
         rotation, position, J, bias = blocks
         return cls(rotation, position, vecdot(J, qd[..., None, :]), J, bias)
 
@@ -264,7 +264,7 @@ def point_motion(
 
 
 def jacobian_of_poses(robot: RobotModel, poses: LinkPoses, index: int, point: Tensor) -> FrameJacobian:
-    """`frame_jacobian` from poses already known."""
+    """`frame_jacobian` from known poses."""
     rotation, origin = _frame_in_base(robot, poses, index)
     x = origin + batchlast.apply(rotation, point[:, None])
     return batch_first(_jacobian(robot, poses, index, x), poses.batch)

@@ -1,7 +1,7 @@
-"""Bounds on what is read from files, in one place: each is checked before the work that it bounds.
+"""Bounds on the content of files, each checked before the corresponding work.
 
-They leave room for every robot, log and model that we know of, and keep a file of a few kilobytes from
-taking more than about 1 GiB of memory or a few seconds.
+They admit every robot, log and model that we know of, and prevent a file of a few kilobytes from using more
+than about 1 GiB of memory or a few seconds.
 """
 
 from __future__ import annotations

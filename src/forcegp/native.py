@@ -1,8 +1,8 @@
 """From C++ source text to a shared library: the system's compiler, and a cache on disk.
 
-Compiled kernels are code: they are kept where only their owner writes, and checked before they run. A kernel
-is named `<key>-<SHA-256 of the file>.so`; the key identifies what was compiled, and the digest a whole file.
-The folder is private (0700) and so are the files (0600), whatever the umask.
+Compiled kernels are code: they are stored in a folder that only their owner can write to, and checked before
+they run. A kernel is named `<key>-<SHA-256 of the file>.so`; the key identifies the source, and the digest a
+complete file. The folder is private (0700) and so are the files (0600), whatever the umask.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ def _machine() -> str:
 
 
 def load_library(source: str, level: str = "-O2") -> ctypes.CDLL:
-    """The library of a C++ text, compiled unless it is cached; `MissingDependencyError` if it cannot be."""
+    """The library of a C++ text, compiled unless it is cached; `MissingDependencyError` if that fails."""
     compiler = find_compiler()
     try:
         version = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=False).stdout
@@ -130,7 +130,7 @@ def cache_directory() -> Path:
 
 
 def private_folder(folder: Path) -> Path:
-    """The folder, private to its owner; `MissingDependencyError` names one that others can replace."""
+    """A folder that is private to its owner; `MissingDependencyError` if others can replace it."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     with contextlib.suppress(FileExistsError):
         folder.mkdir(mode=0o700)
@@ -176,7 +176,7 @@ def _untrusted(folder: Path, place: Path, got: str) -> MissingDependencyError:
 
 
 def find(folder: Path, key: str) -> Path | None:
-    """The kernel of a key, if the folder has one that is whole and the user's own; others are removed."""
+    """The kernel of a key, if the folder has a complete one of this user; others are removed."""
     for path in sorted(folder.glob(f"{key}-*.so")):
         if _trusted(path):
             return path

@@ -1,4 +1,4 @@
-"""Output in notebooks: small HTML tables, every text in them escaped, and the progress of a fit."""
+"""Output in notebooks: small HTML tables with escaped text, and the progress of a fit."""
 
 from __future__ import annotations
 

@@ -1,7 +1,7 @@
-"""Plots over time: what `plot` of data sets, predictions, models and rollouts draws with matplotlib.
+"""Plots over time of data sets, predictions, models and rollouts with matplotlib.
 
-Panels stand one above the other on a common time axis, with curves, bands of ±2 standard deviations, and
-contact. Segments follow one after another, with gaps left open.
+Panels share a time axis and show curves, bands of ±2 standard deviations, and contact. Segments are placed
+one after the other, with gaps between them.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ CARTESIAN = {"multiplier": "N", "contact_force": "N", "c": "m", "cd": "m/s"}
 def unit(quantity: str, kinds: Sequence[str] = ()) -> str:
     """The unit of a quantity of `SYMBOLS`, without brackets; empty for an unknown quantity.
 
-    Without the kinds of the joints on the axis (`"revolute"` or `"prismatic"`) both units are given.
+    Without the kinds of the joints on the axis (`"revolute"` or `"prismatic"`) both units are returned.
 
     Example:
         >>> unit("qdd", ["revolute"]), unit("tau"), unit("multiplier")
@@ -82,7 +82,7 @@ class Timeline:
     Attributes:
         x, order: `(n,)` increasing time [s], and the row of each position.
         breaks: positions before which a curve is interrupted.
-        ordered: whether the samples are a time series, which is drawn as a curve.
+        ordered: whether the samples are a time series, drawn as a curve.
         label: of the axis.
     """
 
@@ -94,12 +94,12 @@ class Timeline:
 
     @classmethod
     def of(cls, t: Tensor, segment: Tensor | None = None, ordered: bool = True) -> Timeline:
-        """Place samples on the time axis; segments whose times overlap are placed one after another.
+        """Place samples on the time axis; overlapping segments are placed one after the other.
 
         Args:
             t: `(n,)` [s].
             segment: `(n,)` trajectory of each sample; default one.
-            ordered: whether the rows follow time within each segment.
+            ordered: whether the rows are in order of time within each segment.
         """
         x, segments = as_array(t), np.zeros(len(t)) if segment is None else as_array(segment)
         order = np.arange(len(x)) if ordered else np.lexsort((x, segments))
@@ -119,11 +119,11 @@ class Timeline:
         return as_array(values)[self.order]
 
     def open(self, values: Array) -> Array:
-        """Placed values `(n,)` with a NaN where a curve is interrupted."""
+        """Placed values `(n,)` with NaN at interruptions of the curve."""
         return np.insert(values, self.breaks, np.nan)
 
     def spans(self, closed: Tensor) -> list[tuple[float, float]]:
-        """Times between which a flag `(n,)` is true; none where the samples are no time series."""
+        """Intervals of time in which a flag `(n,)` is true; none if the samples are not a time series."""
         flags = as_array(closed)[self.order] > 0
         if not self.ordered or not len(flags):
             return []
@@ -168,10 +168,10 @@ def draw_panels(
 ) -> list[Axes]:
     """Draw panels from top to bottom on `ax`, by default a new figure, and return their axes.
 
-    The time in which any contact is `closed` `(n,)` is shaded.
+    Intervals with any `closed` `(n,)` contact are shaded.
 
     Raises:
-        ParameterError: another number of axes is given.
+        ParameterError: the number of axes is wrong.
     """
     axes = _axes(len(panels), ax)
     spans = time.spans(sum(flags.double() for flags in closed) > 0) if closed else []  # pyright: ignore
@@ -224,7 +224,7 @@ def _draw(axes: Axes, curve: Curve, time: Timeline) -> None:
 
 
 def chosen(wanted: Sequence[str] | None, names: Sequence[str], kind: str) -> list[int]:
-    """Indices of the wanted names, by default all; an unknown name raises `UnknownNameError`."""
+    """Indices of the selected names, by default all; an unknown name raises `UnknownNameError`."""
     for name in wanted or ():
         check_name(kind, name, names)
     return [list(names).index(name) for name in (names if wanted is None else wanted)]

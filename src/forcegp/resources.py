@@ -25,7 +25,7 @@ _TURN = RLock()
 
 
 class MemoryNeedWarning(UserWarning):
-    """Work needs more than half of the memory that is free."""
+    """Work that needs more than half of the free memory."""
 
 
 def free_memory() -> int | None:
@@ -37,8 +37,8 @@ def free_memory() -> int | None:
 def announce_memory(needed: int, what: str, *, certain: int | None = None) -> None:
     """Announce work that needs more than half of the free memory; `MemoryLimitError` if more than all of it.
 
-    Call it before the allocation, with an upper bound [bytes], and where that is rough what is `certain` to
-    be needed; `what` is the subject of a sentence: "the covariance of 20,000 points".
+    Call it before the allocation, with an upper bound [bytes], and a `certain` lower bound if the upper one
+    is rough; `what` is the subject of a sentence: "the covariance of 20,000 points".
     """
     free = free_memory()
     if free is None or needed <= LARGE * free:
@@ -83,10 +83,10 @@ def _container_memory() -> int | None:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """PyTorch on one thread within the block, for the calling thread alone.
+    """Run PyTorch on one thread within the block, in the calling thread only.
 
-    Threads cost more than they save on small matrices. OpenMP keeps the number per thread;
-    `torch.set_num_threads` would change it for other threads too, and for good.
+    Threads cost more than they save on small matrices. OpenMP has this setting per thread;
+    `torch.set_num_threads` would change it permanently for all threads.
     """
     if torch.get_num_threads() == 1:
         yield
@@ -97,10 +97,10 @@ def one_thread() -> Iterator[None]:
 
 @contextmanager
 def threads_of_pytorch() -> Iterator[None]:
-    """SciPy's and NumPy's BLAS on as many threads as PyTorch within the block.
+    """Run SciPy's and NumPy's BLAS on as many threads as PyTorch within the block.
 
-    OpenBLAS starts one spinning thread per processor, which slows several processes down a lot. It keeps the
-    number per process, so blocks of several threads take turns.
+    OpenBLAS starts one spinning thread per processor, which slows down several processes considerably. Its
+    setting is per process, so blocks of several threads take turns.
     """
     threads = torch.get_num_threads()
     with _TURN:

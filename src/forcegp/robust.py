@@ -1,4 +1,4 @@
-"""Levels and standard deviations that outliers do not spoil."""
+"""Levels and standard deviations that are robust to outliers."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ def robust_std(x: NDArray[Any]) -> NDArray[Any]:
 
 
 def level_of(x: NDArray[Any], width: float, share: float) -> float | None:
-    """Median of the values within `width` of the fullest bin, if these are more than a share of all.
+    """Median of the values within `width` of the mode of a histogram, if they exceed a share of all values.
 
     >>> level_of(np.array([5.0, 5.1, 4.9, 40.0, -7.0]), 1.0, 0.5)
     5.0

@@ -1,4 +1,4 @@
-"""Stretches of rows of a log, and how messages name them."""
+"""Stretches of rows of a log, and their description in messages."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Intervals = tuple[tuple[int, int], ...]
 
 
 def runs(*keys: NDArray[Any]) -> list[slice]:
-    """Stretches of rows on which none of the keys changes.
+    """Stretches of rows with constant keys.
 
     >>> runs(np.array([0, 0, 1, 1]), np.array([True, True, True, False]))
     [slice(0, 2, None), slice(2, 3, None), slice(3, 4, None)]
@@ -27,7 +27,7 @@ def runs(*keys: NDArray[Any]) -> list[slice]:
 
 
 def intervals(mask: NDArray[np.bool_], join: int = 0) -> Intervals:
-    """Runs of true rows; runs that are at most `join` rows apart become one.
+    """Runs of true rows; runs at most `join` rows apart are merged.
 
     >>> intervals(np.array([True, True, False, True]))
     ((0, 2), (3, 4))

@@ -1,6 +1,6 @@
 """Fits of several models to several robots and seeds, on the workers of a Dask cluster.
 
-Each fit is one task that leaves a folder, so that a sweep which was interrupted goes on with what is missing.
+Each fit is one task that writes a folder, so an interrupted sweep continues with the missing fits.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ SCORE, MODEL = "score.json", "model"
 
 @dataclass(frozen=True)
 class SweptFit:
-    """One fit of a sweep: a scene with its simulated motion, a model, and a seed of everything random.
+    """One fit of a sweep: a scene with its simulated motion, a model, and a seed.
 
     `duration` is the simulated time [s]; `None` for the scene's.
     """
@@ -48,7 +48,7 @@ class SweptFit:
 def fits_of(
     scenes: Sequence[str], models: Sequence[str], seeds: Sequence[int], duration: float | None = None
 ) -> list[SweptFit]:
-    """Every model on every robot with every seed.
+    """All fits of the given models, robots and seeds.
 
     Example:
         >>> [fit.name for fit in fits_of(["kuka_plane"], ["sgp-mean", "gp"], [0])]
@@ -58,7 +58,7 @@ def fits_of(
 
 
 def run_fit(fit: SweptFit, out: str) -> dict[str, Any]:
-    """Simulate, fit and score, unless that has been done; runs on a worker, in one thread."""
+    """Simulate, fit and score, unless already done; runs on a worker in one thread."""
     folder = Path(out) / fit.name
     if (folder / SCORE).is_file():
         return json.loads((folder / SCORE).read_text(encoding="utf-8"))
@@ -76,8 +76,8 @@ def run_fit(fit: SweptFit, out: str) -> dict[str, Any]:
         **asdict(fit),
         **{name: scores[name] for name in ("noisy_mae", "clean_mae", "coverage_noisy")},
         "samples": fitted.result.samples,
-        "seconds": fitted.seconds,
-        "converged": fitted.converged,
+        "seconds": fitted.result.seconds,
+        "converged": fitted.result.converged,
     }
     with written_folder(folder) as temporary:
         fitted.save(temporary / MODEL)
@@ -93,14 +93,14 @@ def sweep(
     address: str | None = None,
     say: Callable[[int, dict[str, Any]], None] = lambda _, __: None,
 ) -> list[dict[str, Any]]:
-    """Run fits on a Dask cluster: one of this machine, or one that is running.
+    """Run fits on a Dask cluster: a new one on this machine, or a running one.
 
     Args:
-        fits: what is fitted.
-        out: folder for the fits, which all workers see.
+        fits: the fits to run.
+        out: folder for the fits, accessible to all workers.
         processes: workers of one thread each on this machine.
         address: of the scheduler of a running cluster, such as `tcp://host:8786`.
-        say: called with the number of fits that have ended and the score of the last one.
+        say: called with the number of finished fits and the score of the last one.
 
     Returns:
         The scores, in the order of the fits.

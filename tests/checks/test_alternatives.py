@@ -9,7 +9,8 @@ import pytest
 
 import forcegp
 from forcegp.checks import KINDS, Finding, Report
-from forcegp.checks.explain import TESTS, alternatives_of, with_alternatives
+from forcegp.checks.explain import alternatives_of, with_alternatives
+from forcegp.checks.finding import TESTS
 from forcegp.checks.fit import BLOCKS, TorqueFit
 from forcegp.checks.hypotheses import Hypothesis, unchanged
 from forcegp.constraints import ConstrainedSystem

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+import forcegp
 from forcegp.checks import Log, check, log_of
 from forcegp.checks.explain import _possible, with_alternatives
 from forcegp.checks.finding import Finding
@@ -15,6 +16,7 @@ from forcegp.checks.hypotheses import Hypothesis, problem_of, unchanged
 from forcegp.constraints import ConstrainedSystem
 from forcegp.scene import load_scene
 from forcegp.simulate import simulate
+from planted_faults import free_log
 
 Case = tuple[ConstrainedSystem, Log]
 
@@ -119,3 +121,35 @@ def test_a_link_without_mass_may_stay_without(wire: Case, change: float, possibl
     theta = np.zeros(10 * log.nq)
     theta[10 * int(np.argmax(robot.mass.numpy()))] = change
     assert _possible(massless, masses, replace(fit, theta=theta)) == possible
+
+
+def test_what_concerns_the_whole_log_comes_first() -> None:
+    """A spike of one row must not hide that the clock is wrong; both are warnings."""
+    robot = forcegp.load_robot("double_pendulum")
+    log = free_log(robot, seconds=6.0)
+    q, k = log.q.copy(), len(log) // 2
+    q[k, 0] += 0.3
+    report = check(forcegp.ConstrainedSystem(robot), log.replace(q=q, tau=log.tau + np.array([3.0, 0.0])))
+    warnings = [finding.kind for finding in report.findings if finding.severity == "warning"]
+    assert warnings[:2] == ["torque-offset", "spike"]
+
+
+def test_a_torque_that_is_not_logged_is_no_fault() -> None:
+    """A motor without a sensor, declared in the header: its column holds zeros, and no finding names it."""
+    robot = forcegp.load_robot("double_pendulum")
+    log = free_log(robot, seconds=10.0)
+    header = log.header.model_copy(update={"unmeasured_torques": (robot.joint_names[0],)})
+    blind = log.replace(tau=log.tau * [0.0, 1.0])
+    system = forcegp.ConstrainedSystem(robot)
+    assert "torque-zero" in {finding.kind for finding in check(system, blind).findings}
+    report = check(system, blind.replace(header=header))
+    assert [finding.kind for finding in report.findings if finding.severity != "note"] == []
+
+
+def test_milliseconds_beside_an_acceleration_that_the_import_derived() -> None:
+    robot = forcegp.load_robot("double_pendulum")
+    log = free_log(robot, seconds=6.0, noise=0.0)
+    header = log.header.model_copy(update={"derived": ("qdd",), "dt": 1e3 * log.dt})
+    late = log.replace(t=1e3 * log.t, qdd=1e-3 * log.qdd, header=header)
+    kinds = [finding.kind for finding in check(forcegp.ConstrainedSystem(robot), late).findings]
+    assert kinds[0] == "time-unit" and "filter-wide" not in kinds and "masses-mismatch" not in kinds

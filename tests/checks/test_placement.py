@@ -73,3 +73,28 @@ def test_exchanged_joints_of_a_log_whose_labels_were_lost_with_the_tip(
     assert found.kind == "joint-order" and (corrected.q == log.q).all()
     assert found.severity == "error" and found.joints == ("lbr_iiwa_joint_2", "lbr_iiwa_joint_3")
     assert "mm from the surface of 'table'" in found.message
+
+
+@pytest.mark.parametrize(("names", "kind"), [(("q", "qd", "qdd"), "joint-sign"), (("q",), "encoder-offset")])
+def test_angles_of_a_log_whose_labels_were_lost_with_the_tip(
+    unlabelled: tuple[ConstrainedSystem, Log], names: tuple[str, ...], kind: str
+) -> None:
+    """The torque tells whether its sign is right; an offset of 11° moves the tip by centimetres."""
+    system, log = unlabelled
+    j = np.arange(7) == 3
+    wrong = {"q": log.q + 0.2 * j}
+    if kind == "joint-sign":
+        wrong = {name: getattr(log, name) * np.where(j, -1.0, 1.0) for name in names}
+    (found,), corrected = check_placement(system, log.replace(**wrong))
+    assert found.kind == kind and found.joints == ("lbr_iiwa_joint_4",)
+    assert "closed in no row" in found.message and corrected.contact["table"].mean() > 0.5
+    np.testing.assert_allclose(corrected.q, log.q, atol=2e-3)
+    assert (corrected.tau == log.tau).all()
+
+
+def test_free_motion_is_not_taken_for_a_displaced_tip(unlabelled: tuple[ConstrainedSystem, Log]) -> None:
+    system, log = unlabelled
+    t = log.t[:, None]
+    q = log.q[:1] + 0.3 * np.sin(t * np.linspace(1.0, 2.0, 7)) - 0.3 * (np.arange(7) == 1)
+    free = log.replace(q=q, qd=np.gradient(q, log.dt, axis=0), qdd=0.0 * q)
+    assert check_placement(system, free)[0] == []

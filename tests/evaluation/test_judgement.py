@@ -40,7 +40,7 @@ def test_the_right_robot_explains_all_the_torque_and_the_motion() -> None:
     found = evaluate(forcegp.AnalyticalModel(FREE).nominal(), swinging())
     assert found.verdict.startswith("The model explains 100 % of the torque beyond gravity")
     assert found.motion is not None and max(x or 0.0 for x in found.motion.model) < 0.05
-    assert found.response == pytest.approx((1.0, 1.0), abs=1e-9) and found.doubts == ()
+    assert found.response == pytest.approx((1.0, 1.0), abs=1e-9) and found.doubts == () and not found.poor
 
 
 def test_a_robot_that_is_too_heavy_is_measured_by_its_own_mass_matrix() -> None:
@@ -53,6 +53,7 @@ def test_a_robot_that_is_too_heavy_is_measured_by_its_own_mass_matrix() -> None:
     assert model.torque.all == pytest.approx(lacks.square().mean(0).sqrt().tolist(), rel=1e-6)
     rest, _ = beyond_gravity(FREE, data)
     assert model.explained == pytest.approx(explained(lacks, rest), rel=1e-6)
+    assert found.poor, "the page of a model that is worse than the robot file opens in red"
 
 
 def test_a_log_whose_torque_is_gravity_is_named() -> None:

@@ -9,7 +9,6 @@ import torch
 import forcegp
 from forcegp.evaluation import least_squares
 from forcegp.evaluation.least_squares import LeastSquares, as_torque, baselines, identify_rigid
-from forcegp.robot.inertia import from_log_cholesky, from_pseudo_inertia, inertial_parameters
 from random_data import random_data, table_system
 
 system = table_system()
@@ -72,16 +71,6 @@ def test_an_interior_optimum_is_the_ridge_regression_of_a_textbook() -> None:
     # Physical links restrict the parameters, so that the unrestricted optimum is a lower bound.
     assert np.sum((A @ ridge - b) ** 2) <= physical * (1 + 1e-9)
     assert physical < 1.05 * np.sum((A @ ridge - b) ** 2)
-
-
-def test_slopes_of_the_inertial_parameters_are_those_of_automatic_differentiation() -> None:
-    theta = 0.3 * torch.randn(5, 10, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
-
-    def parameters(t: torch.Tensor) -> torch.Tensor:
-        return inertial_parameters(*from_pseudo_inertia(from_log_cholesky(t)))
-
-    expected = torch.func.vmap(torch.func.jacrev(parameters))(theta)
-    torch.testing.assert_close(least_squares._slopes(theta), expected, rtol=1e-12, atol=1e-12)
 
 
 def test_identified_links_are_physical_even_from_few_samples() -> None:

@@ -59,7 +59,7 @@ def dense(model: StructuredFit, values: dict[str, Tensor]) -> tuple[Tensor, Tens
 def test_likelihood_and_mean_are_the_dense_ones() -> None:
     model = conditioned(inference="exact")
     nll, mean = dense(model, dict(model.hyperparameters))
-    assert model.log_marginal_likelihood == pytest.approx(-float(nll), rel=EXACT)
+    assert model.result.log_marginal_likelihood == pytest.approx(-float(nll), rel=EXACT)
     m = model.training.measurements[0]
     found = model.predict(m.q, m.qd, m.tau, active=m.active).mean
     torch.testing.assert_close(found, mean, rtol=1e-8, atol=1e-8)

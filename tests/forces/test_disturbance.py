@@ -64,7 +64,7 @@ def test_likelihood_is_the_dense_one() -> None:
     L = torch.linalg.cholesky(K)
     alpha = torch.cholesky_solve(y[:, None], L)[:, 0]
     expected = -float(0.5 * y @ alpha + L.diagonal().log().sum() + 0.5 * len(y) * math.log(2 * math.pi))
-    assert found.log_marginal_likelihood == pytest.approx(expected, rel=EXACT)
+    assert found.result.log_marginal_likelihood == pytest.approx(expected, rel=EXACT)
 
 
 def test_gradient() -> None:

@@ -16,6 +16,7 @@ from forcegp.forces.external_wrench import (
     least_squares,
     momentum_force,
     observe,
+    over_levers,
 )
 from pinocchio_oracle import Oracle
 from robots import ARMS
@@ -56,6 +57,31 @@ def test_least_squares_is_the_dense_formula(joints: int) -> None:
     conditioned = W - W @ J @ torch.linalg.solve(J.mT @ W @ J + S, J.mT @ W)
     torch.testing.assert_close(mean, dense, rtol=1e3 * EXACT, atol=EXACT)
     torch.testing.assert_close(covariance, conditioned, rtol=1e3 * EXACT, atol=1e4 * EXACT)
+
+
+def test_the_estimate_over_levers_is_the_dense_mixture() -> None:
+    """With the marginal likelihood of the joint forces under each prior."""
+    J, r, A, frame = normal(5, 6, 7), 5.0 * normal(5, 7), normal(5, 7, 7), WrenchFrame("tool")
+    S = A @ A.mT + 0.1 * torch.eye(7, dtype=torch.float64)
+    weights, parts = [], []
+    for lever in frame.levers:
+        prior = lever * frame.prior
+        marginal = torch.distributions.MultivariateNormal(
+            torch.zeros(7, dtype=torch.float64), S + J.mT @ torch.diag(prior**2) @ J
+        )
+        weights.append(marginal.log_prob(r))
+        parts.append(least_squares(J, r, S, prior))
+    weight = torch.softmax(torch.stack(weights), 0)
+    mean = sum(w[:, None] * m for w, (m, _) in zip(weight, parts, strict=True))
+    second = sum(
+        w[:, None, None] * (C + m[:, :, None] * m[:, None, :])
+        for w, (m, C) in zip(weight, parts, strict=True)
+    )
+    assert bool((weight.amax(0) < 0.99).any())
+    found = over_levers(*least_squares(J, r, S, frame.prior), frame.prior, frame.levers)
+    torch.testing.assert_close(found[0], mean, rtol=1e3 * EXACT, atol=1e2 * EXACT)
+    expected = second - mean[:, :, None] * mean[:, None, :]
+    torch.testing.assert_close(found[1], expected, rtol=1e3 * EXACT, atol=1e4 * EXACT)
 
 
 def test_a_direction_that_no_joint_feels_keeps_the_prior() -> None:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import numpy as np
 import pytest
 import torch
 from scipy.signal import savgol_coeffs
@@ -16,6 +17,7 @@ from forcegp.forces.inertia import Inertia, inertia_of, latent_precision, one_ro
 from forcegp.forces.inverse_dynamics import (
     APART,
     Rows,
+    averaged,
     instrumental,
     is_harmless,
     log_ratio,
@@ -206,17 +208,49 @@ def test_noise_of_accelerations_does_not_make_inertia_smaller(file: RobotModel, 
     torch.testing.assert_close(own, exact, rtol=0.04, atol=0.0)
 
 
-def test_instruments_are_further_apart_than_a_filter_spans(file: RobotModel) -> None:
-    """Within the span noise is correlated, and M too far off."""
+def test_correlated_noise_of_a_filter_leaves_the_inertia_right(file: RobotModel) -> None:
+    """Whether or not the log states the span of the filter, within which instruments have the noise too."""
     truth = file.replace(mass=1.3 * file.mass, com=0.9 * file.com)
     data = log(truth, 6400, 0.6, acceleration_noise=0.7, window=11)
-    unstated = data.replace(header=DataHeader())
     exact = dynamics.mass_matrix(truth, data.q).diagonal(dim1=-2, dim2=-1).mean(0)
-    off = [
-        float((dynamics.mass_matrix(found(file, each).robot, data.q).diagonal(dim1=-2, dim2=-1).mean(0)
-               / exact - 1.0).abs().max()) for each in (data, unstated)
-    ]  # fmt: skip
-    assert off[0] < 0.05 < off[1]
+    for each in (data, data.replace(header=DataHeader())):
+        M = dynamics.mass_matrix(found(file, each).robot, data.q).diagonal(dim1=-2, dim2=-1).mean(0)
+        assert float((M / exact - 1.0).abs().max()) < 0.01
+
+
+def test_a_filter_averages_accelerations_with_the_variance_that_is_stated() -> None:
+    """Acceleration of a slow sine, from cubics fitted to positions, is too small by ω²/2 times that."""
+    w, dt = 2.0, 0.001
+    header = DataHeader(filter_span=151 * dt, derived=("qd", "qdd"))
+    offset = (np.arange(151) - 75) * dt
+    lost = 1.0 + savgol_coeffs(151, 3, deriv=2, delta=dt, use="dot") @ np.cos(w * offset) / w**2
+    np.testing.assert_allclose(lost, 0.5 * w**2 * header.filter_variance, rtol=0.02)
+    assert DataHeader(filter_span=0.1, derived=("qdd",)).filter_variance == 0.0
+
+
+def test_averaged_equations_are_sums_of_neighbours_within_a_stretch() -> None:
+    random = torch.Generator().manual_seed(0)
+    n, nq, p = 120, 2, 3
+    C, Phi, r = (torch.randn(2 * n, nq, k, generator=random, dtype=torch.float64) for k in (p, 4, 1))
+    r, inertial = r[..., 0], torch.randn(2 * n, nq, generator=random, dtype=torch.float64)
+    i, group = torch.arange(n), (torch.arange(n) // 60).repeat(2)
+    slides = torch.ones_like(r, dtype=torch.bool)
+    slides[30, 0] = False
+    rows = Rows(r, r, r, r, Phi, slides, group, group, torch.cat([i + n, i]), Phi[..., :0], 0.01, 0.03**2)
+    mean, columns = averaged(rows, C, inertial, 0.04)
+    assert mean.step == 0.02 and len(columns) == 2 * len(range(15, n - 15, 2))
+    k = torch.arange(-15, 16).double()
+    narrow, wide = (torch.exp(-0.5 * (k / std) ** 2) for std in (4.0, 5.0))
+    at = n + 15 + 2 * 30 + torch.arange(-15, 16)
+    row = len(columns) // 2 + 30
+    torch.testing.assert_close(columns[row], torch.einsum("k,kjp->jp", narrow / narrow.sum(), C[at]))
+    force = torch.einsum("k,kj->j", wide / wide.sum(), (r + inertial)[at])
+    expected = force - torch.einsum("k,kj->j", narrow / narrow.sum(), inertial[at])
+    torch.testing.assert_close(mean.residual[row], expected)
+    torch.testing.assert_close(mean.friction[row], torch.einsum("k,kjf->jf", wide / wide.sum(), Phi[at]))
+    inside = torch.tensor([15 <= c % 60 < 45 for c in range(15, n - 15, 2)]).repeat(2)
+    assert bool((mean.slides[:, 1] == inside).all()), "no average reaches across stretches"
+    assert not bool(mean.slides[: len(inside) // 2, 0][:15].any()), "nor over a joint that sticks"
 
 
 def test_a_partner_is_later_in_the_same_trajectory(file: RobotModel) -> None:

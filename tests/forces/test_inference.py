@@ -50,7 +50,7 @@ mixtures = pytest.mark.parametrize("quantities", MIXTURES.values(), ids=MIXTURES
 def test_likelihood(quantities: tuple[str, ...]) -> None:
     model = conditioned(observed(*quantities))
     expected = -float(Textbook(model).negative_log_likelihood())
-    assert model.log_marginal_likelihood == pytest.approx(expected, rel=LIKELIHOOD)
+    assert model.result.log_marginal_likelihood == pytest.approx(expected, rel=LIKELIHOOD)
 
 
 @pytest.mark.parametrize("closed", [True, False])
@@ -58,7 +58,7 @@ def test_likelihood_all_closed_or_all_free(closed: bool) -> None:
     data = logged(two_contacts(), 7, active=torch.full((7, 2), closed))
     model = conditioned(data)
     expected = -float(Textbook(model).negative_log_likelihood())
-    assert model.log_marginal_likelihood == pytest.approx(expected, rel=LIKELIHOOD)
+    assert model.result.log_marginal_likelihood == pytest.approx(expected, rel=LIKELIHOOD)
 
 
 def gradients(model: StructuredFit, start: dict) -> tuple[dict, dict]:
@@ -181,7 +181,7 @@ def test_noise_of_the_dense_formula_matters() -> None:
     """The check above can fail: another noise gives another likelihood."""
     data = logged(two_contacts(), 6)
     one, two = (conditioned(data, noise=std) for std in (0.1, 0.101))
-    assert abs(one.log_marginal_likelihood - two.log_marginal_likelihood) > 1e-3
+    assert abs(one.result.log_marginal_likelihood - two.result.log_marginal_likelihood) > 1e-3
 
 
 @pytest.mark.parametrize("angle", [0.0, 1e-12, 1e-9, 1e-7, 1e-5, 1e-2])
@@ -196,4 +196,4 @@ def test_redundant_and_nearly_redundant_contacts(angle: float) -> None:
     model = forcegp.StructuredGP(system, "analytical", priors, noise=0.1).fit(data, learn=[])
     expected = -float(Textbook(model).negative_log_likelihood())
     # Dropping a row leaves an error of the order of the angle.
-    assert model.log_marginal_likelihood == pytest.approx(expected, rel=1e-5)
+    assert model.result.log_marginal_likelihood == pytest.approx(expected, rel=1e-5)

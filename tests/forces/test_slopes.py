@@ -14,6 +14,7 @@ from forcegp.forces import noise_learning
 from forcegp.forces.measurements import Measurement, Training
 from forcegp.forces.noise import learned_slopes, state_jacobian
 from forcegp.forces.quantities import States, states
+from forcegp.models import structured_learning
 from forcegp.models.structured_fit import StructuredFit
 from forces.cases import draw, mixed_contacts, two_contacts
 
@@ -98,7 +99,7 @@ def error_of(model: StructuredFit, seed: int) -> float:
 def test_learned_slopes_are_better(mean: str, monkeypatch: pytest.MonkeyPatch) -> None:
     learned = [fitted(seed, mean) for seed in SEEDS]
     assert all(model.training.slopes is not None for model in learned)
-    monkeypatch.setattr(noise_learning, "ROUNDS", 0)
+    monkeypatch.setattr(structured_learning, "ROUNDS", 0)
     of_file = [fitted(seed, mean) for seed in SEEDS]
     assert all(model.training.slopes is None for model in of_file)
     one, two = (sum(map(error_of, models, SEEDS)) for models in (learned, of_file))
@@ -147,6 +148,6 @@ def test_forces_without_slopes_are_told(monkeypatch: pytest.MonkeyPatch) -> None
 
 def test_a_fit_that_learns_nothing_conditions_as_it_was_learned() -> None:
     fit, more = fitted(1), measured(8, 20)[0]
-    value = fit.condition(more).log_marginal_likelihood
+    value = fit.condition(more).result.log_marginal_likelihood
     again = model().fit(more, learn=[], after=fit)
-    assert again.training.slopes is not None and again.log_marginal_likelihood == value
+    assert again.training.slopes is not None and again.result.log_marginal_likelihood == value

@@ -65,13 +65,15 @@ def test_likelihood_with_state_noise_is_the_dense_one() -> None:
     L = torch.linalg.cholesky(K)
     alpha = torch.cholesky_solve(y[:, None], L)[:, 0]
     dense = -float(0.5 * y @ alpha + L.diagonal().log().sum() + 0.5 * len(y) * math.log(2 * math.pi))
-    assert fit.log_marginal_likelihood == pytest.approx(dense, rel=LIKELIHOOD)
+    assert fit.result.log_marginal_likelihood == pytest.approx(dense, rel=LIKELIHOOD)
 
 
 def test_no_state_noise_is_the_projected_likelihood() -> None:
     data = logged(two_contacts(), 8)
     without, zero = model().fit(data, learn=[]), model((0.0, 0.0)).fit(data, learn=[])
-    assert zero.log_marginal_likelihood == pytest.approx(without.log_marginal_likelihood, rel=1e-9)
+    assert zero.result.log_marginal_likelihood == pytest.approx(
+        without.result.log_marginal_likelihood, rel=1e-9
+    )
 
 
 @pytest.mark.slow

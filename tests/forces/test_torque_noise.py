@@ -56,7 +56,7 @@ def test_likelihood_with_torque_noise_is_the_dense_one(priors: list) -> None:
     L = torch.linalg.cholesky(K)
     alpha = torch.cholesky_solve(y[:, None], L)[:, 0]
     dense = -float(0.5 * y @ alpha + L.diagonal().log().sum() + 0.5 * len(y) * math.log(2 * math.pi))
-    assert fit.log_marginal_likelihood == pytest.approx(dense, rel=EXACT)
+    assert fit.result.log_marginal_likelihood == pytest.approx(dense, rel=EXACT)
 
 
 def test_gradient_for_torque_noise() -> None:
@@ -81,7 +81,7 @@ def test_finite_priors_are_inferred_sparsely_and_exactly() -> None:
     q, qd, tau = draw(5, seed=4)
     one, two = fitted(FINITE, inference="exact"), fitted(FINITE, inference="sparse")
     assert two.problem.inducing is not None and one.problem.inducing is None
-    assert one.log_marginal_likelihood == pytest.approx(two.log_marginal_likelihood, rel=EXACT)
+    assert one.result.log_marginal_likelihood == pytest.approx(two.result.log_marginal_likelihood, rel=EXACT)
     for quantity in ("qdd", "multiplier", "joint_force"):
         a, b = (f.predict(q, qd, tau, quantity, active=mixed_contacts(5)) for f in (one, two))
         torch.testing.assert_close(a.mean, b.mean, rtol=1e-7, atol=1e-7)

@@ -62,6 +62,6 @@ def run(rank: int, processes: int, folder: str, stops: bool = False) -> None:
         dist.destroy_process_group()
         return
     latent = fit.posterior.latent
-    likelihood = torch.tensor(fit.log_marginal_likelihood, dtype=torch.float64)
+    likelihood = torch.tensor(fit.result.log_marginal_likelihood, dtype=torch.float64)
     save_file({"weights": latent.weights, "likelihood": likelihood}, Path(folder) / f"{rank}.safetensors")  # type: ignore[attr-defined]
     dist.destroy_process_group()

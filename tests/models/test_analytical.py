@@ -63,7 +63,7 @@ def test_mass_and_damping_are_found_again() -> None:
     names = ("lbr_iiwa_joint_6", "lbr_iiwa_joint_7")
     model = AnalyticalModel(system, analytical_parameters={"mass": names, "damping": names}, seed=3)
     fit = model.fit(frictionless, options=LBFGS)
-    assert fit.converged and fit.history[0] > 10.0 * fit.objective
+    assert fit.result.converged and fit.result.history[0] > 10.0 * fit.result.objective
     robot, true = fit.system.robot, system.robot
     # Noise of 0.1 rad/s² on 840 accelerations leaves the masses uncertain by some parts in a thousand.
     torch.testing.assert_close(robot.mass[5:], true.mass[5:], rtol=0.02, atol=0.0)
@@ -76,8 +76,8 @@ def test_mass_and_damping_are_found_again() -> None:
 )
 def test_every_link_is_learned_and_stays_physical(options: LearningOptions | BatchOptions) -> None:
     fit = AnalyticalModel(system).fit(frictionless, options=options)
-    assert fit.evaluations == len(fit.history)
-    assert fit.objective < 0.2 * fit.history[0]
+    assert fit.result.evaluations == len(fit.result.history)
+    assert fit.result.objective < 0.2 * fit.result.history[0]
     robot = fit.system.robot
     assert float(torch.linalg.eigvalsh(pseudo_inertia(robot.mass, robot.com, robot.inertia)).min()) > 0.0
     assert bool((robot.damping > 0.0).all())

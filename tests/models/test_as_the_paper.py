@@ -39,7 +39,7 @@ def test_inputs_enter_in_their_units() -> None:
     L = torch.linalg.cholesky(K)
     alpha = torch.cholesky_solve(y[:, None], L)[:, 0]
     dense = -float(0.5 * y @ alpha + L.diagonal().log().sum() + 0.5 * len(y) * math.log(2 * math.pi))
-    assert fit.log_marginal_likelihood == pytest.approx(dense, rel=1e-9)
+    assert fit.result.log_marginal_likelihood == pytest.approx(dense, rel=1e-9)
 
 
 def test_the_objective_is_the_likelihood_alone() -> None:

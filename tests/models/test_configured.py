@@ -248,4 +248,4 @@ def test_a_table_learns_what_the_same_arguments_learn(made) -> None:
     prior = JointForcePrior(SquaredExponential(shared=True))
     model = StructuredGP(SYSTEM, "analytical", [prior])
     plain = model.fit(data, options=LearningOptions(max_evaluations=5))
-    assert found.log_marginal_likelihood == plain.log_marginal_likelihood
+    assert found.log_marginal_likelihood == plain.result.log_marginal_likelihood

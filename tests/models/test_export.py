@@ -47,6 +47,10 @@ ZERO = 1e-5  # of the largest component of a state: SAME times that is 5 ε of i
 STRICT = ["-std=c99", "-Wall", "-Wextra", "-pedantic", "-Werror"]
 ALL = list(QUANTITIES)
 
+COMPILERS = [
+    pytest.param(name, marks=pytest.mark.skipif(shutil.which(name) is None, reason=f"needs {name}"))
+    for name in ("gcc", "clang")
+]
 needs_gcc = pytest.mark.skipif(shutil.which("gcc") is None, reason="needs gcc")
 
 
@@ -272,19 +276,21 @@ def test_forward_dynamics_of_the_robot_alone() -> None:
     )
 
 
-def built(folder: Path, *flags: str) -> subprocess.CompletedProcess[str]:
+def built(folder: Path, *flags: str, compiler: str = "gcc") -> subprocess.CompletedProcess[str]:
     """Compile the code and its test program without a warning, and run it."""
-    command = ["gcc", *STRICT, *flags, "controller.c", "test_controller.c", "-o", "run", "-lm"]
+    command = [compiler, *STRICT, *flags, "controller.c", "test_controller.c", "-o", "run", "-lm"]
     done = subprocess.run(command, cwd=folder, capture_output=True, text=True, check=False)
     assert done.returncode == 0, done.stderr[:3000]
     return subprocess.run([str(folder / "run")], capture_output=True, text=True, check=False)
 
 
-@needs_gcc
+@pytest.mark.parametrize("compiler", COMPILERS)
 @pytest.mark.parametrize(
     "name", slow_except(["free_inertial", "zero_mean", "every_friction", "rounded_tip"], "every_friction")
 )
-def test_the_folder_compiles_without_warnings_and_passes_its_test(name: str, tmp_path: Path) -> None:
+def test_the_folder_compiles_without_warnings_and_passes_its_test(
+    name: str, compiler: str, tmp_path: Path
+) -> None:
     written = fitted(name).export(tmp_path / "c")
     names = {"controller.h", "controller.c", "test_controller.c", "CMakeLists.txt", "README.md"}
     assert {path.name for path in written.folder.iterdir()} == names
@@ -297,11 +303,12 @@ def test_the_folder_compiles_without_warnings_and_passes_its_test(name: str, tmp
         assert not line.startswith("static double ") or "(" in line, "global state that can change"
 
 
-@needs_gcc
+@pytest.mark.parametrize("compiler", COMPILERS)
 @pytest.mark.parametrize("name", slow_except(["sparse", "exact"], "exact"))
-def test_sanitizers_find_nothing(name: str, tmp_path: Path) -> None:
+def test_sanitizers_find_nothing(name: str, compiler: str, tmp_path: Path) -> None:
     folder = fitted(name).export(tmp_path / "c").folder
-    ran = built(folder, "-O0", "-fsanitize=address,undefined", "-fno-sanitize-recover=all")
+    sanitized = ["-O0", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    ran = built(folder, *sanitized, compiler=compiler)
     assert ran.returncode == 0, ran.stdout + ran.stderr
 
 

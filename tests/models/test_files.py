@@ -71,7 +71,7 @@ def test_an_analytical_model_that_was_read_learns_the_same(tmp_path: Path) -> No
     assert isinstance(read, AnalyticalFit)
     start = system.with_robot(read.parameters.start)
     again = forcegp.AnalyticalModel(start, read.parameters.joints, read.window, read.seed)
-    assert again.fit(data, options=SHORT).history == model.history
+    assert again.fit(data, options=SHORT).result.history == model.result.history
 
 
 def test_a_surface_in_python_is_given_when_reading(tmp_path: Path) -> None:

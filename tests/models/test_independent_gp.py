@@ -69,7 +69,7 @@ def test_posterior_is_the_textbook_one(model: IndependentFit) -> None:
 
 def test_likelihood_is_the_textbook_one(model: IndependentFit) -> None:
     expected = -sum(float(textbook(model, joint)[2]) for joint in range(7))
-    assert model.log_marginal_likelihood == pytest.approx(expected, rel=ROUNDING)
+    assert model.result.log_marginal_likelihood == pytest.approx(expected, rel=ROUNDING)
 
 
 def test_gradient_is_that_of_the_textbook_formula(model: IndependentFit) -> None:
@@ -92,7 +92,7 @@ def test_gradient_is_that_of_the_textbook_formula(model: IndependentFit) -> None
 def test_it_has_154_hyperparameters_and_learning_raises_the_likelihood(model: IndependentFit) -> None:
     assert sum(value.numel() for value in model.hyperparameters.values()) == 154
     start = IndependentGP(system, noise=NOISE_STD).fit(data, options=LearningOptions(max_evaluations=1))
-    assert model.log_marginal_likelihood > start.log_marginal_likelihood + 10.0
+    assert model.result.log_marginal_likelihood > start.result.log_marginal_likelihood + 10.0
 
 
 def test_the_fit_reports_all_joints() -> None:
@@ -102,10 +102,10 @@ def test_the_fit_reports_all_joints() -> None:
         options=LearningOptions(max_evaluations=2),
         progress=lambda done, most, _: calls.append((done, most)),
     )
-    assert calls[-1][0] == result.evaluations == len(result.history) == len(calls)
+    assert calls[-1][0] == result.result.evaluations == len(result.result.history) == len(calls)
     assert calls[-1][1] == 7 * 2
-    assert not result.converged
-    assert result.jitter == 0.0
+    assert not result.result.converged
+    assert result.result.jitter == 0.0
 
 
 def test_batches_of_any_shape_and_chunks_agree(

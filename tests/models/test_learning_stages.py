@@ -45,7 +45,7 @@ def test_analytical_parameters_are_learned_alone_and_frozen_later() -> None:
 
 def test_nothing_to_learn_conditions_only() -> None:
     fit = model(analytical_parameters=theta()).fit(data, learn=[])
-    assert fit.evaluations == 0 and fit.message == "conditioned, nothing learned"
+    assert fit.result.evaluations == 0 and fit.result.message == "conditioned, nothing learned"
     torch.testing.assert_close(fit.system.robot.mass, two_contacts().robot.mass)
 
 
@@ -100,7 +100,9 @@ def test_the_normal_force_is_no_contact_friction() -> None:
     for quantity in ("contact_friction", "qdd"):
         torch.testing.assert_close(read["bare"][quantity], read["normal"][quantity])
     assert bool((read["normal"]["multiplier"][0] > read["bare"]["multiplier"][0]).any())
-    assert fits["normal"].force_correlation == pytest.approx(fits["bare"].force_correlation, abs=1e-9)
+    assert fits["normal"].result.force_correlation == pytest.approx(
+        fits["bare"].result.force_correlation, abs=1e-9
+    )
 
 
 def test_the_correlation_does_not_depend_on_the_order_of_observations() -> None:
@@ -109,8 +111,8 @@ def test_the_correlation_does_not_depend_on_the_order_of_observations() -> None:
     one, two = model(), model()
     a = one.fit([Observation(free), Observation(closed)], learn=[])
     b = two.fit([Observation(closed), Observation(free)], learn=[])
-    assert a.force_correlation is not None and a.force_correlation != 0.0
-    assert a.force_correlation == pytest.approx(b.force_correlation, rel=1e-8)
+    assert a.result.force_correlation is not None and a.result.force_correlation != 0.0
+    assert a.result.force_correlation == pytest.approx(b.result.force_correlation, rel=1e-8)
 
 
 def test_an_undetermined_multiplier_is_a_warning() -> None:

@@ -57,8 +57,8 @@ def test_the_networks_of_the_paper_learn(hidden: tuple[int, ...]) -> None:
     # Four layers of 200 units move slowly in the few steps of a test.
     options = BatchOptions(epochs=25, batch=20, learning_rate=0.005)
     fit = NeuralNetwork(system, hidden).fit(data, options=options)
-    assert fit.evaluations == len(fit.history) == 25
-    assert fit.objective == min(fit.history) < 0.9 * fit.history[0]
+    assert fit.result.evaluations == len(fit.result.history) == 25
+    assert fit.result.objective == min(fit.result.history) < 0.9 * fit.result.history[0]
     widths = [layer.out_features for layer in fit.network if isinstance(layer, torch.nn.Linear)]
     assert widths == [*hidden, 7]
 

@@ -69,13 +69,13 @@ def test_a_resumed_fit_ends_with_the_same_bits(
         make().fit(DATA, options=options, checkpoint=file, progress=Interruption(at))
     assert file.is_file()
     resumed = make().fit(DATA, options=options, checkpoint=file)
-    assert resumed.history == whole.history
+    assert resumed.result.history == whole.result.history
     expected, found = tensors(whole), tensors(resumed)
     assert found.keys() == expected.keys()
     assert all(torch.equal(found[name], expected[name]) for name in expected)
     assert file.is_file(), "kept until the caller has saved the fit"
     again = make().fit(DATA, options=options, checkpoint=file)
-    assert again.history == whole.history
+    assert again.result.history == whole.result.history
 
 
 def test_a_training_by_epochs_does_not_repeat_them(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

@@ -62,7 +62,7 @@ def test_two_fits_have_the_same_bits(kind: type) -> None:
     model.fit(DATA[:12], options=options)
     torch.rand(5)
     second = model.fit(DATA, options=options)
-    assert first.history == second.history
+    assert first.result.history == second.result.history
     one, two = first.record()[1], second.record()[1]
     assert one.keys() == two.keys()
     assert all(torch.equal(value, two[name]) for name, value in one.items())

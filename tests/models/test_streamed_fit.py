@@ -46,7 +46,7 @@ def assert_same(one: StructuredFit, other: StructuredFit, tolerance: float) -> N
         a, b = (m.predict(q, qd, tau, quantity, active=mixed_contacts(5)) for m in (one, other))
         torch.testing.assert_close(a.mean, b.mean, rtol=tolerance, atol=tolerance)
         torch.testing.assert_close(a.covariance, b.covariance, rtol=tolerance, atol=tolerance)
-    assert one.log_marginal_likelihood == pytest.approx(other.log_marginal_likelihood, rel=SAME)
+    assert one.result.log_marginal_likelihood == pytest.approx(other.result.log_marginal_likelihood, rel=SAME)
 
 
 def test_as_in_memory(files: StreamedDataset) -> None:
@@ -139,7 +139,7 @@ def test_two_processes_equal_one(tmp_path: Path) -> None:
         got = load_file(tmp_path / f"{rank}.safetensors")
         want = fit.posterior.latent.weights  # type: ignore[attr-defined]
         assert float((got["weights"] - want).abs().max()) < ADDED * float(want.abs().max())
-        assert float(got["likelihood"]) == pytest.approx(fit.log_marginal_likelihood, rel=ADDED)
+        assert float(got["likelihood"]) == pytest.approx(fit.result.log_marginal_likelihood, rel=ADDED)
 
 
 def refusals(folder: Path, processes: int, stops: bool = False) -> list[str]:

@@ -98,7 +98,7 @@ def test_a_joint_that_never_moves_is_reported_and_left_unscaled() -> None:
     qdd = table.equations(q, qd, active).acceleration(data.tau)
     still = dataclasses.replace(data, q=q, qd=qd, qdd=qdd, extras={})
     fit = StructuredGP(table, "analytical", both).fit(still, options=SHORT)
-    assert fit.constant_inputs == ("joint.q[2]", "joint.qd[2]")
+    assert fit.result.constant_inputs == ("joint.q[2]", "joint.qd[2]")
     is_right(fit)
 
 
@@ -119,9 +119,9 @@ def test_little_noise(std: float) -> None:
     clean = dataclasses.replace(data, qdd=data.qdd_clean)
     fit = StructuredGP(table, "analytical", both, noise=std).fit(clean, options=SHORT)
     found = fit.predict(data.q, data.qd, data.tau, active=data.active(["table"]))
-    effective = std * math.sqrt(1.0 + fit.jitter)
+    effective = std * math.sqrt(1.0 + fit.result.jitter)
     assert float((found.mean - clean.qdd).abs().max()) < 100.0 * effective
-    assert math.isfinite(fit.log_marginal_likelihood or math.nan)
+    assert math.isfinite(fit.result.log_marginal_likelihood or math.nan)
 
 
 def test_contradicting_duplicates_without_noise_are_refused() -> None:
@@ -215,9 +215,13 @@ def test_conditioning_on_other_data_is_a_fit_that_learns_nothing(model: Structur
     assert again.training.scales[0].mean["q"].tolist() == model.training.scales[0].mean["q"].tolist()
     mean = again.predict(other.q, other.qd, other.tau).mean
     held = StructuredGP(table, "analytical", both).fit(other, learn=[], after=model)
-    assert (held.converged, held.evaluations, held.message) == (True, 0, "conditioned, nothing learned")
+    assert (held.result.converged, held.result.evaluations, held.result.message) == (
+        True,
+        0,
+        "conditioned, nothing learned",
+    )
     assert torch.equal(held.predict(other.q, other.qd, other.tau).mean, mean)
-    assert held.log_marginal_likelihood == again.log_marginal_likelihood
+    assert held.result.log_marginal_likelihood == again.result.log_marginal_likelihood
 
 
 def test_learned_noise_and_honest_flags() -> None:
@@ -233,10 +237,12 @@ def test_learned_noise_and_honest_flags() -> None:
     assert noise.shape == (7,)
     # Sixty samples leave room to take some noise of single joints for force.
     assert abs(float(noise.log().mean()) - math.log(0.1)) < 0.4, "the data have noise of 0.1"
-    assert fit.evaluations == len(fit.history) and fit.seconds > 0.0
+    assert fit.result.evaluations == len(fit.result.history) and fit.result.seconds > 0.0
     again = fit.condition(rows)
-    assert again.log_marginal_likelihood == pytest.approx(fit.log_marginal_likelihood)
-    assert not StructuredGP(table, "zero").fit(rows, options=LearningOptions(max_evaluations=2)).converged
+    assert again.result.log_marginal_likelihood == pytest.approx(fit.result.log_marginal_likelihood)
+    assert (
+        not StructuredGP(table, "zero").fit(rows, options=LearningOptions(max_evaluations=2)).result.converged
+    )
     with pytest.raises(
         ModelError, match=r"learned noise belongs to other measurements[\s\S]*expected: qdd\n"
     ):
@@ -260,7 +266,7 @@ def same(one: StructuredFit, two: object, seed: int = 1) -> None:
     for quantity in ("qdd", "multiplier", "contact_friction"):
         a, b = (m.predict(q, qd, tau, quantity, active=active) for m in (one, two))
         assert torch.equal(a.mean, b.mean) and torch.equal(a.covariance, b.covariance)  # type: ignore[arg-type]
-    assert one.log_marginal_likelihood == two.log_marginal_likelihood
+    assert one.result.log_marginal_likelihood == two.result.log_marginal_likelihood
 
 
 def test_saved_models_are_exact_whatever_they_are_made_of(tmp_path: Path) -> None:
@@ -477,7 +483,7 @@ def test_a_fit_resumes_from_its_checkpoint(tmp_path: Path, monkeypatch: pytest.M
     assert again[: len(seen)] == seen
     assert path.is_file(), "kept until the caller has saved the fit"
     whole = forcegp.StructuredGP(two_contacts(), "zero").fit(data, options=options)
-    assert resumed.history == whole.history
+    assert resumed.result.history == whole.result.history
     assert all(torch.equal(x, resumed.hyperparameters[key]) for key, x in whole.hyperparameters.items())
 
 
@@ -499,9 +505,11 @@ def test_warm_start_ends_as_well_and_restarts_no_worse() -> None:
         forcegp.StructuredGP(two_contacts(), "zero").fit(data, options=forcegp.LearningOptions(**options))
         for options in ({"warm_start": None}, {"warm_start": 8}, {"warm_start": None, "restarts": 1})
     )
-    assert cold.converged and warm.converged
-    assert warm.objective < cold.objective + 1.0  # a different optimum may be found, not a worse one by much
-    assert many.objective <= cold.objective
+    assert cold.result.converged and warm.result.converged
+    assert (
+        warm.result.objective < cold.result.objective + 1.0
+    )  # a different optimum may be found, not a worse one by much
+    assert many.result.objective <= cold.result.objective
 
 
 def test_a_fit_begins_at_the_hyperparameters_of_another() -> None:
@@ -514,7 +522,7 @@ def test_a_fit_begins_at_the_hyperparameters_of_another() -> None:
     start = model.fit(data, learn=[])
     prior = float(negative_log_prior(small.hyperparameters, start.hyperparameters))
     again = start.condition(data, small.hyperparameters)
-    assert seen[0] == pytest.approx(prior - again.log_marginal_likelihood, rel=1e-9)
+    assert seen[0] == pytest.approx(prior - again.result.log_marginal_likelihood, rel=1e-9)
     assert min(seen) < seen[0]
     missing = {key: value for key, value in small.hyperparameters.items() if "bias" not in key}
     with pytest.raises(
@@ -544,7 +552,9 @@ def test_the_normal_force_prior_changes_multipliers_alone() -> None:
     for values in (start, learned):
         # The search itself amplifies rounding: data that differ by 10⁻¹⁵ are learned 10⁻⁵ apart.
         plain, open_ = plain.condition(data, values), open_.condition(data, values)
-        assert open_.log_marginal_likelihood == pytest.approx(plain.log_marginal_likelihood, rel=1e-12)
+        assert open_.result.log_marginal_likelihood == pytest.approx(
+            plain.result.log_marginal_likelihood, rel=1e-12
+        )
     assert learned.keys() == start.keys()
     state = (data.q, data.qd, data.tau)
     a, b = plain.predict(*state), open_.predict(*state)
@@ -567,8 +577,8 @@ def test_contact_data_alone_tell_the_sum_of_two_forces() -> None:
     closed = logged(system, 12, active=torch.ones(12, 2, dtype=torch.bool))
     model = forcegp.StructuredGP(system, "zero", force_priors=[forcegp.JointForcePrior(), same])
     held = model.fit(closed, options=forcegp.LearningOptions(max_evaluations=2))
-    assert held.force_correlation is not None
-    assert held.force_correlation < -0.2
+    assert held.result.force_correlation is not None
+    assert held.result.force_correlation < -0.2
 
 
 MEMORY = """

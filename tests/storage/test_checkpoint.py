@@ -212,7 +212,7 @@ def test_a_resumed_fit_with_restarts_keeps_the_best_and_its_file(
     with pytest.raises(KeyboardInterrupt):
         model.fit(data, options=options, progress=stop, checkpoint=path)
     resumed = model.fit(data, options=options, checkpoint=path)
-    assert resumed.objective == whole.objective
-    assert resumed.history == whole.history
-    assert model.fit(data, options=options, checkpoint=path).objective == whole.objective
+    assert resumed.result.objective == whole.result.objective
+    assert resumed.result.history == whole.result.history
+    assert model.fit(data, options=options, checkpoint=path).result.objective == whole.result.objective
     assert path.is_file()

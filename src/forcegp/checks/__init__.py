@@ -136,5 +136,6 @@ def check(system: ConstrainedSystem, data: Dataset | Log, *, progress: Progress 
             skipped |= {other: "no row is usable" for other, _ in CHECKS[done + 1 :]}
             break
     order = list(KINDS)
-    findings.sort(key=lambda finding: (SEVERITIES.index(finding.severity), order.index(finding.kind)))
+    # What concerns most of the log comes before what concerns a few rows of it.
+    findings.sort(key=lambda f: (SEVERITIES.index(f.severity), 2 * f.rows < samples, order.index(f.kind)))
     return Report(tuple(findings), samples, system.robot.joint_names, skipped)

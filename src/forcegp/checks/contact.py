@@ -14,7 +14,7 @@ import torch
 
 from forcegp import kinematics
 from forcegp.checks.finding import Finding
-from forcegp.checks.fit import BLOCKS, CHUNK, blocks_of, labelled_contacts, residual, tensors
+from forcegp.checks.fit import BLOCKS, CHUNK, blocks_of, labelled_contacts, residual, tensors, unmeasured
 from forcegp.checks.log import Array, Log, Outcome, evenly
 from forcegp.constraints import ConstrainedSystem, Plane, SurfaceContact
 from forcegp.logs.contact import LEVEL, TOUCHING
@@ -32,10 +32,9 @@ CREEP = 1e-3
 """Speed along the normal that a touching tip may have, at least [m/s]."""
 LANDING, STOPS = 5, 2.0
 """Rows within which a tip that lands stops, and the factor by which it is faster than one that rests."""
-DRIFT = 2e-3
-"""Distance that a tip may gain and lose while it touches: soft ground, a bent arm, a drift [m]."""
-RUN_SECONDS = 0.02
-"""Shortest run of rows that a wrong label is reported for [s]."""
+DRIFT, RUN_SECONDS = 2e-3, 0.02
+"""Distance that a tip may gain and lose while it touches [m]: soft ground, a bent arm, a drift; shortest run
+of rows that a wrong label is reported for [s]."""
 MISSED_SECONDS, MISSED_DISTANCE = 0.1, 2e-3
 """Shortest time [s] and way [m] along the surface that count as a contact that was not labelled."""
 LEAST_ROWS = 20
@@ -250,14 +249,10 @@ FORCE_ROWS = 4000
 """Contact rows whose force is computed."""
 PULLS = 0.5
 """Share of contact rows with a pulling force from which the normal must be the wrong way round."""
-SIGNIFICANT = 4.0
-"""Standard errors over blocks from which friction is there."""
-LARGEST_FRICTION = 2.0
-"""Coefficients beyond this, which hardly any two materials have, are errors of the torques."""
-SLIDING_SLOW = 0.01
-"""Speed below which the direction of sliding is unknown [m/s]."""
-NARROW = 0.05
-"""Share of the sliding motion that the second direction must have."""
+SIGNIFICANT, LARGEST_FRICTION = 4.0, 2.0
+"""Standard errors over blocks from which friction is there, and coefficients of hardly any materials."""
+SLIDING_SLOW, NARROW = 0.01, 0.05
+"""Speed below which the direction of sliding is unknown [m/s]; least share of the second direction."""
 
 
 def check_forces(system: ConstrainedSystem, log: Log) -> Outcome:
@@ -277,11 +272,11 @@ def _force(system: ConstrainedSystem, log: Log, rows: np.ndarray, path: Path) ->
     """Force `(n, 3)` that explains the torque best, r = Jᵀ F; along the normal for up to three torques."""
     r, J = residual(system, log, rows)
     if log.nq <= 3:
-        A = J[:, 0]
+        A = J[:, 0] * ~np.isin(np.arange(log.nq), unmeasured(log))
         size = np.maximum((A * A).sum(axis=1), 1e-12)
         return ((A * r).sum(axis=1) / size)[:, None] * path.normal
     gram = J @ J.transpose(0, 2, 1)
-    return np.linalg.solve(gram + 1e-9 * np.eye(3), (J @ r[..., None]))[..., 0]
+    return np.linalg.solve(gram + 1e-9 * np.eye(J.shape[1]), (J @ r[..., None]))[:, :3, 0]
 
 
 def _pulls(finding: partial[Finding], path: Path, force: Array) -> list[Finding]:

@@ -16,7 +16,7 @@ import torch
 
 from forcegp.checks.explain import Explanation, significant
 from forcegp.checks.finding import Finding
-from forcegp.checks.fit import BLOCKS, blocks_of, held_out, residual, tensors
+from forcegp.checks.fit import BLOCKS, blocks_of, held_out, residual, tensors, unmeasured
 from forcegp.checks.hypotheses import encoder_hypothesis, inertial_spread, robot_columns
 from forcegp.checks.log import Array, Log, Outcome, position_unit
 from forcegp.constraints import ConstrainedSystem
@@ -24,16 +24,14 @@ from forcegp.identification import base_parameters, parameter_vector, regressor
 
 STILL = 0.05
 """Range of motion below which a joint does not move [rad, m]."""
-REVERSALS = 4
-"""Changes of direction that separate Coulomb friction from an offset of the torque."""
-HYSTERESIS = 0.05
-"""Share of its largest speed that a joint must reach for a change of direction to count."""
+REVERSALS, HYSTERESIS = 4, 0.05
+"""Changes of direction that separate Coulomb friction from an offset of the torque; share of its largest
+speed that a joint must reach for one to count."""
 SHORT_SECONDS, ROWS = 2.0, 1000
 """Length of a log below which little is learned [s]; rows of which the regressor is made."""
-LOOK = 0.1
-"""Time after which the torque contains new information [s]."""
-LEARNED = 0.5
-"""Standard deviation after the log, as a share of that before it, below which a parameter is identified."""
+LOOK, LEARNED = 0.1, 0.5
+"""Time after which the torque contains new information [s]; standard deviation after the log, as a share of
+that before it, below which a parameter is identified."""
 
 
 def check_length(system: ConstrainedSystem, log: Log) -> Outcome:
@@ -167,6 +165,7 @@ def check_visibility(system: ConstrainedSystem, explanation: Explanation) -> lis
 def _at_contact(explanation: Explanation, fault: Fault, size: float) -> str:
     """The force at the tip that a fault of the whole arm passes for, root mean square."""
     J = explanation.problem.J
+    J = J[:, : J.shape[1] - len(unmeasured(explanation.log))]
     touching = (J != 0.0).any(axis=(1, 2))
     if fault.joint or size >= MOST.get(fault.kind, LARGEST) or touching.sum() < LEAST_TOUCHING:
         return ""

@@ -1,4 +1,4 @@
-"""Which fault explains the torque best: greedy choice by cross-validation, one-standard-error rule.
+"""Greedy search for the faults that explain the torque, by cross-validation and the one-standard-error rule.
 
 The simplest hypothesis within one standard error of the best is accepted (Breiman, Friedman, Olshen, Stone,
 *Classification and Regression Trees*, 1984, sec. 3.4.3), the log is corrected, and the search repeated.
@@ -13,7 +13,7 @@ from functools import cached_property, partial
 import numpy as np
 
 from forcegp.checks import hypotheses
-from forcegp.checks.finding import Finding
+from forcegp.checks.finding import TESTS, Finding
 from forcegp.checks.fit import TorqueFit, TorqueProblem, cross_validate, gain_of, pooled_gain_of, score_of
 from forcegp.checks.hypotheses import Hypothesis, corrected
 from forcegp.checks.log import Array, Log
@@ -26,10 +26,8 @@ ROUNDS = 5
 """Faults that are looked for at most."""
 SIGNIFICANT = 4.0
 """Standard errors by which the held-out score must drop; there are about a hundred hypotheses."""
-SHARE = 0.03
-"""Share of the best drop that a simpler hypothesis may leave to a second round."""
-SAME = 1e-3
-"""Relative difference of errors that are equal."""
+SHARE, SAME = 0.03, 1e-3
+"""Share of the best drop that a simpler hypothesis may leave to a second round; equal errors."""
 DETERMINED = 3.0
 """A gain counts as known if it exceeds this many standard errors."""
 MATERIAL, MATERIAL_EACH = 0.15, 0.05
@@ -172,7 +170,8 @@ def _fits(model: Explanation) -> Iterator[Tried]:
     else:
         few = model.rows[::SCREENING]
         null = cross_validate(model.on(log, few)).score.mean()
-        for hypothesis in hypotheses.discrete(log):
+        late = hypotheses.joint_delays(log, rows, model.problem)
+        for hypothesis in (*hypotheses.discrete(log), *late):
             changed = hypothesis.change(log)
             if cross_validate(model.on(changed, few)).score.mean() < null:
                 yield hypothesis, cross_validate(model.on(changed))
@@ -217,22 +216,6 @@ SMALL_MASS = 1e-6
 ALONE = 2.0
 """Standard errors by which an alternative must lower the held-out error on its own, which chance exceeds in 4
 % of cases: it is already known that something is wrong."""
-TESTS = {
-    "torque-gain": "hang a known weight from the tip: its torque gives the gain, whatever the masses",
-    "torque-current": "hang a known weight from the tip: its torque gives the gains, whatever the masses",
-    "torque-sign": "push a joint in its positive direction while the arm holds still: its torque must fall",
-    "torque-order": "twist one joint after another, without loading the others: only its torque must change",
-    "torque-delay": "apply a torque step to one joint: its acceleration must change in the same sample",
-    "torque-without-gravity": "hold the arm outstretched and still: the torque must balance gravity",
-    "joint-sign": "turn one joint after another by hand, and watch the sign of its position",
-    "joint-order": "turn one joint after another by hand, and watch which position changes",
-    "encoder-offset": "move the joint to its zero mark: its position must be zero there",
-    "base-tilted": "put a spirit level on the base",
-    "gravity-direction": "check how the base is mounted",
-    "payload-missing": "weigh what is mounted on the last link",
-    "masses-mismatch": "compare the masses with the manufacturer's data",
-}
-"""A test for each kind of fault, in order of preference."""
 
 
 def alternatives_of(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
+from importlib.resources import files
 from typing import Any, Literal, SupportsFloat
 
 import numpy as np
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from forcegp.errors import check_name
 from forcegp.rows import Intervals, describe, intervals
+from forcegp.scene.document import tomllib
 
 Severity = Literal["note", "warning", "error"]
 
@@ -25,100 +27,10 @@ class Kind:
     remedy: str
 
 
-_TABLE: dict[str, tuple[tuple[str, Severity, str, str], ...]] = {
-    "clock": (
-        ("time-repeated", "error", "repeated time stamps", "drop the duplicate rows"),
-        ("time-backward", "error", "time runs backward", "sort by time, or start a new segment there"),
-        ("time-gap", "warning", "samples are missing", "start a new segment after each gap"),
-        ("time-jitter", "warning", "uneven sampling", "resample the log to an even period"),
-        ("time-unit", "error", "time is not in seconds", "convert the time column to seconds"),
-        ("time-scale", "error", "the clock runs at another rate", "correct the sampling period"),
-        ("period-header", "warning", "the header states another period", "correct `dt` in the header"),
-    ),
-    "values": (
-        ("not-finite", "error", "NaN or infinite values", "drop these rows, or start a new segment"),
-        ("rows-held", "warning", "rows that repeat the previous one", "drop the held rows"),
-        ("channel-stuck", "error", "a channel stands still", "drop the interval; check the sensor"),
-        ("torque-saturated", "warning", "torque at its limit", "mask these rows, or reduce the motion"),
-        ("position-limit", "warning", "position limit exceeded", "check units, zero and joint order"),
-        ("velocity-limit", "warning", "velocity limit exceeded", "check the units of the velocity"),
-        ("torque-limit", "warning", "torque limit exceeded", "check units and gear ratio"),
-        ("degrees", "error", "degrees instead of radians", "multiply the named columns by π/180"),
-        ("quantised", "note", "coarse resolution", "smooth before differentiating; log filtered values"),
-        ("spike", "warning", "isolated outliers", "drop or interpolate these rows"),
-        ("position-jump", "error", "the position jumps", "start a new segment at each jump"),
-        ("impact", "note", "the velocity jumps", "mask the rows around the impact"),
-    ),
-    "torque": (
-        ("torque-zero", "error", "no torque is logged", "log the motor torque, or use another column"),
-        ("torque-sign", "error", "wrong torque sign", "change the sign of the named torques"),
-        ("torque-gain", "warning", "torque scaled wrongly", "correct gear ratio or motor constant"),
-        ("torque-current", "error", "current instead of torque", "multiply by motor constant and gear"),
-        ("torque-offset", "warning", "torque sensor offset", "subtract the offset, or learn a constant"),
-        ("torque-delay", "warning", "torque and motion are not in step", "shift the torque in time"),
-        ("torque-without-gravity", "error", "torque lacks gravity", "add the gravity torque back"),
-        ("torque-order", "error", "torque columns are permuted", "match torque columns by joint name"),
-    ),
-    "kinematics": (
-        ("velocity-mismatch", "error", "qd is not the derivative of q", "recompute qd from q"),
-        ("velocity-sign", "error", "wrong velocity sign", "change the sign of the named velocities"),
-        ("velocity-order", "error", "velocity columns are permuted", "match columns by joint name"),
-        ("acceleration-mismatch", "error", "qdd is not the derivative of qd", "recompute qdd"),
-        ("filter-wide", "warning", "the filter of a derivative is too wide", "import with a narrower window"),
-        ("joint-order", "error", "joints are permuted", "match columns to joints by name"),
-        ("joint-sign", "error", "joint turns the other way", "change the sign of all its columns"),
-        ("encoder-offset", "warning", "encoder offset", "add the stated offset to q"),
-    ),
-    "mechanics": (
-        ("gravity-direction", "error", "gravity points elsewhere", "correct gravity or base_rpy"),
-        ("base-tilted", "warning", "the base is tilted", "correct `base_rpy` in the scene"),
-        ("friction-undeclared", "warning", "undeclared joint friction", "learn joint friction"),
-        ("masses-mismatch", "warning", "inertial parameters do not fit", "identify them from the log"),
-        ("payload-missing", "warning", "a tool or payload is missing", "add it to the robot file"),
-        ("torque-unexplained", "error", "the model explains too little", "check robot file and scene"),
-        ("disturbance", "warning", "unmodelled torque for a while", "label the contact, or mask it"),
-        ("robot-mismatch", "warning", "logged on another robot", "use the scene of that robot"),
-    ),
-    "import": (
-        (
-            "import-doubt",
-            "warning",
-            "the mapping was not checked",
-            "correct or delete its lines marked CHECK",
-        ),
-        ("import-found", "note", "found at import", "see the import's report"),
-    ),
-    "contact": (
-        ("contact-unlabelled", "error", "contact state is not logged", "add a contact column"),
-        ("surface-offset", "warning", "the surface is displaced", "move the surface in the scene"),
-        ("surface-tilted", "warning", "the surface is tilted", "correct the normal in the scene"),
-        ("contact-early", "warning", "contact is labelled too early", "start the label later"),
-        ("contact-late", "warning", "contact is labelled for too long", "end the label earlier"),
-        ("contact-far", "error", "in contact far from the surface", "check surface, point and label"),
-        ("contact-missed", "warning", "contact is not labelled", "label these rows as contact"),
-        ("contact-pulls", "error", "the surface pulls", "reverse the surface normal"),
-        ("contact-friction", "note", "friction at the contact", "add a contact friction prior"),
-    ),
-    "noise": (
-        ("noise-understated", "warning", "more noise than stated", "raise noise_std, or learn it"),
-        ("noise-overstated", "warning", "less noise than stated", "lower noise_std, or learn it"),
-        ("noise-filtered", "warning", "filtered data, not white noise", "downsample; learn the noise"),
-    ),
-    "excitation": (
-        ("log-short", "warning", "too few rows", "record a longer log"),
-        ("joint-still", "warning", "a joint does not move", "move it: `forcegp excite` plans how"),
-        ("few-reversals", "note", "few changes of direction", "reverse each joint several times"),
-        ("poor-excitation", "note", "parameters not identified", "record what `forcegp excite` plans"),
-        ("faults-hidden", "note", "faults too small to be seen", "move these joints more"),
-        ("force-directions", "warning", "one sliding direction", "slide in several directions"),
-    ),
-}
-
-KINDS: dict[str, Kind] = {
-    name: Kind(family, severity, title, remedy)
-    for family, rows in _TABLE.items()
-    for name, severity, title, remedy in rows
-}
+_FAMILIES = tomllib.loads((files("forcegp.checks") / "kinds.toml").read_text(encoding="utf-8"))
+TESTS: dict[str, str] = _FAMILIES.pop("tests")
+"""A test for each kind of fault, in order of preference."""
+KINDS = {name: Kind(family, *row) for family, rows in _FAMILIES.items() for name, row in rows.items()}
 """Every kind of finding by name, family by family."""
 
 

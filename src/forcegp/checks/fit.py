@@ -39,7 +39,7 @@ def residual(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> tuple[Arr
 
 
 def labelled_contacts(system: ConstrainedSystem, log: Log) -> list[Constraint]:
-    """The contacts whose state is logged."""
+    """The contacts with a logged state."""
     return [c for c in system.contacts if c.name in log.contact]
 
 
@@ -48,11 +48,20 @@ def takes_friction_out(system: ConstrainedSystem, log: Log) -> bool:
     return 3 * len(labelled_contacts(system, log)) < log.nq
 
 
+def unmeasured(log: Log) -> list[int]:
+    """Joints whose torque the header says is not logged."""
+    return [j for j, name in enumerate(log.joint_names) if name in log.header.unmeasured_torques]
+
+
 def _contact_jacobian(system: ConstrainedSystem, log: Log, rows: np.ndarray, q: Tensor, qd: Tensor) -> Array:
-    """Rows of J of all contacts, those of the surface normal alone where all of J would leave no torque."""
+    """Rows of J of all contacts, those of the surface normal alone where all of J would leave no torque.
+
+    Torques that are not logged follow as rows of their own: they may be anything.
+    """
     contacts, whole = labelled_contacts(system, log), takes_friction_out(system, log)
+    free = np.broadcast_to(np.eye(log.nq)[unmeasured(log)], (len(rows), len(unmeasured(log)), log.nq))
     if not contacts or not len(rows):
-        return np.zeros((len(rows), 0, log.nq))
+        return free
     parts = []
     for c in contacts:
         if whole and isinstance(c, SurfaceContact):
@@ -60,7 +69,7 @@ def _contact_jacobian(system: ConstrainedSystem, log: Log, rows: np.ndarray, q: 
         else:
             J = ConstrainedSystem(system.robot, [c]).equations(q, qd).A.numpy()
         parts.append(J * log.contact[c.name][rows][:, None, None])
-    return np.concatenate(parts, axis=1)
+    return np.concatenate([*parts, free], axis=1)
 
 
 def projector(J: Array, scale: Array) -> Array:
@@ -85,8 +94,8 @@ FLOOR = 0.03
 @dataclass(frozen=True)
 class TorqueProblem:
     """Unexplained torque r `(n, nq)` [N m, N], Jacobian J of the touching points `(n, k, nq)`, columns that
-    every hypothesis may use `(n, nq, p)`, size of the logged torque, and scale of its noise, which weighs the
-    joints.
+    every hypothesis may use `(n, nq, p)`, size of the logged torque, and scale of its noise, which weights
+    the joints.
     """
 
     r: Array

@@ -116,13 +116,15 @@ def changed(log: Log, names: tuple[str, ...], *, order: Sequence[int] = (), flip
     return log.replace(**{name: getattr(log, name)[:, index] * sign for name in names})
 
 
-def delayed(log: Log, shift: int) -> Log:
-    """The log with the torque shifted by some rows within each stretch; rows without torque are masked."""
+def delayed(log: Log, shift: int, joints: tuple[int, ...] = ()) -> Log:
+    """The log with torques, all or some, of `shift` rows later in each stretch; rows without are masked."""
     tau, lost = log.tau.copy(), np.ones(len(log), bool)
+    columns = list(joints) or list(range(log.nq))
     for s in log.stretches:
         source = np.arange(s.start, s.stop) + shift
         inside = (source >= s.start) & (source < s.stop)
-        tau[s][inside], lost[s] = log.tau[source[inside]], ~inside
+        tau[np.ix_(source[inside] - shift, columns)] = log.tau[np.ix_(source[inside], columns)]
+        lost[s] = ~inside
     return log.replace(tau=tau).mask(lost)
 
 
@@ -145,6 +147,19 @@ def delays(log: Log) -> Iterator[Hypothesis]:
     """Torques that are logged before or after the motion."""
     for shift in (sign * lag for lag in (LAGS if log.stretches else ()) for sign in (1, -1)):
         yield Hypothesis("torque-delay", 1, partial(delayed, shift=shift), shift=shift)
+
+
+def joint_delays(log: Log, rows: np.ndarray, problem: TorqueProblem) -> Iterator[Hypothesis]:
+    """The torque of one joint, logged before or after the motion: its best delay beside friction."""
+    shifts = [sign * lag for lag in (LAGS if log.stretches else ()) for sign in (1, -1)]
+    needed = problem.r + log.tau[rows]
+    for j in range(log.nq if log.nq > 1 and shifts else 0):
+        x = log.qd[rows, j]
+        Q = np.linalg.qr(np.column_stack([x, np.sign(x), np.ones(len(x))]))[0]
+        rest = needed[:, [j]] - np.column_stack([log.tau[rows + shift, j] for shift in shifts])
+        shift = shifts[int(((rest - Q @ (Q.T @ rest)) ** 2).sum(axis=0).argmin())]
+        change = partial(delayed, shift=shift, joints=(j,))
+        yield Hypothesis("torque-delay", 1, change, joints=(j,), shift=shift)
 
 
 def continuous(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterator[Hypothesis]:
@@ -220,17 +235,13 @@ CURRENT = 1.6
 """Gains of all joints beyond this factor are no calibration error: another quantity was logged."""
 TILT = 30.0
 """Largest angle at which a base counts as tilted, not as mounted another way round [degrees]."""
-WEIGHTLESS = 0.3
-"""Share of gravity below which the torque holds none of it."""
-SIGNIFICANT = 3.0
-"""Standard errors from which a parameter of a tool counts."""
+WEIGHTLESS, SIGNIFICANT = 0.3, 3.0
+"""Share of gravity below which the torque has none; standard errors from which a tool's parameter counts."""
 SMALL_ANGLE, LARGEST_ANGLE = np.radians(0.5), 1.0
 """Encoder offsets below the first are within calibration, or an error of a centre of mass; one beyond the
 second is none that a slope of the torque determines [rad, m]."""
-SMALL_GAIN = 0.2
-"""Gains closer to 1 than this may as well be errors of the masses of a robot file."""
-EXPLAINED = 0.5
-"""Share of the torque that a gain may leave unexplained, as any useful model may."""
+SMALL_GAIN, EXPLAINED = 0.2, 0.5
+"""Gains closer to 1 may as well be errors of masses; share of the torque that a gain may not explain."""
 SMALL_TILT, EARTH = 1.0, 9.81
 """Tilts that are errors of the masses [degrees]; size of gravity where the scene has none [m/s²]."""
 SAME_GRAVITY = 0.2, 0.5
@@ -300,7 +311,9 @@ def finding_of(
     elif name == "torque-delay":
         rows, seconds = abs(hypothesis.shift), abs(hypothesis.shift) * log.dt
         word = "after" if hypothesis.shift > 0 else "before"
-        text = f"the torque is logged about {1e3 * seconds:.3g} ms ({rows} rows) {word} the motion"
+        which = f" of {listed}" if hypothesis.joints else ""
+        about = "about" if rows < LAGS[-1] else "at least"
+        text = f"the torque{which} is logged {about} {1e3 * seconds:.3g} ms ({rows} rows) {word} the motion"
         evidence = {"rows": hypothesis.shift, "seconds": seconds}
     elif name == "encoder-offset":
         added = displacement(system.robot, hypothesis.joints[0], float(theta[0]))

@@ -18,7 +18,7 @@ from forcegp.checks.finding import Finding
 from forcegp.checks.fit import cross_validate, tensors
 from forcegp.checks.hypotheses import problem_of
 from forcegp.checks.limits import DEGREE
-from forcegp.checks.log import Array, Log, Outcome
+from forcegp.checks.log import DEPARTURE, Array, Log, Outcome
 from forcegp.constraints import ConstrainedSystem
 from forcegp.robust import robust_std
 
@@ -28,10 +28,12 @@ TOLERANCE, INSTANT = 0.05, 0.15
 """A slope within this of 1 is right: filters cost a few percent, and accelerations change within a period."""
 RELATED = 0.7
 """Correlation below which a velocity does not belong to its position, encoder steps aside."""
-EXCHANGED = 0.9
-"""Correlation with another joint's rate from which columns are exchanged."""
-CLEARLY = 5.0
-"""Factor of unexplained variance by which that order must be better."""
+EXCHANGED, CLEARLY = 0.9, 5.0
+"""Correlation with another joint's rate from which columns are exchanged; factor of unexplained variance by
+which that order must be better."""
+LATE, PERSISTS = 0.1, 0.5
+"""Share of the motion that a filtered velocity misses, and correlation of what it misses in neighbouring
+windows: noise has none."""
 JUMPS = 0.05
 """Largest share of windows that impacts cross: the velocity jumps there, which no acceleration holds."""
 INERTIA_ROWS = 200
@@ -109,7 +111,7 @@ def check_clock_unit(system: ConstrainedSystem, log: Log) -> Outcome:
     if first is None or not first.moving.any():
         return [], log
     factor = float(np.median(first.low[first.moving]))
-    if log.derived:
+    if log.derived or "qdd" in log.header.derived:
         near = any(abs(factor / unit - 1.0) <= UNIT_TOLERANCE for unit in UNITS)
         return _clock_finding(log, factor) if near or _one_factor(first, factor) else ([], log)
     second = match(log, "qd", "qdd")
@@ -132,7 +134,10 @@ def _clock_finding(log: Log, factor: float) -> Outcome:
     else:
         kind, repaired = "time-scale", log.t * factor
         text = f"positions and velocities change {factor:.4g} times as far as the clock allows"
-    return [log.finding(kind, text, seconds_per_unit=factor, period=log.dt)], log.replace(t=repaired)
+    found = log.finding(kind, text, seconds_per_unit=factor, period=log.dt)
+    if "qdd" in log.derived | {*log.header.derived}:  # by the wrong clock
+        log = log.replace(qdd=log.qdd * (log.t[-1] - log.t[0]) / (repaired[-1] - repaired[0]))
+    return [found], log.replace(t=repaired)
 
 
 def _one_factor(level: Match, factor: float) -> bool:
@@ -153,7 +158,7 @@ def check_velocity(system: ConstrainedSystem, log: Log) -> Outcome:
         return [], log
     wrong = level.moving & (~level.right() | (np.abs(level.correlation) < RELATED)) & ~_coarse(log, level)
     if not wrong.any():
-        return [], log
+        return _late(log, level), log
     if "qd" in log.header.derived:
         return _mismatch("filter-wide", log, level, wrong, "qd", "q"), log
     permutation = _permutation(level)
@@ -167,6 +172,20 @@ def check_velocity(system: ConstrainedSystem, log: Log) -> Outcome:
         return findings, log.replace(qd=log.qd[:, permutation], qdd=qdd)
     findings, factor = _velocity_findings(log, level, wrong)
     return findings, log.replace(qd=log.qd * factor)
+
+
+def _late(log: Log, level: Match) -> list[Finding]:
+    """Velocities after a filter of their own: a delay L leaves Δq − ∫q̇ dt = L Δq̇, which persists."""
+    rates = match(log, "qd", "qdd")
+    if rates is None or "qd" in log.header.derived:
+        return []
+    misfit, step = level.change - level.integral, rates.whole[0]
+    square, change = (misfit**2).sum(axis=0), (level.change**2).sum(axis=0)
+    delay = (misfit * step).sum(axis=0) / np.maximum((step**2).sum(axis=0), 1e-300)
+    persists = (misfit[1:] * misfit[:-1]).sum(axis=0) > PERSISTS * square
+    late = level.moving & persists & (square > LATE**2 * change) & (delay > log.dt)
+    shown = ", ".join(f"{1e3 * x:.2g} ms" for x in delay[late])
+    return log.on_joints("velocity-delay", late, f"qd of {{}} is {shown} behind the rate of change of q")
 
 
 def _velocity_findings(log: Log, level: Match, wrong: np.ndarray) -> tuple[list[Finding], Array]:
@@ -270,12 +289,11 @@ def check_acceleration(system: ConstrainedSystem, log: Log) -> Outcome:
     return findings, log.replace(qdd=qdd, derived=log.derived | {"qdd"})
 
 
-DEPARTURE, DEPARTURE_STRIDE = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0, 3
-"""The departure, zero on cubics; at this stride it shows noise below the corner of a filter."""
-NOISE_FACTOR = 2.0
-"""Ratio of noise found to noise stated that is reported."""
-FILTERED = 0.4
-"""Noise at the highest frequency, as a share of that at a third of it, that tells a filter."""
+DEPARTURE_STRIDE = 3
+"""At this stride the departure, zero on cubics, shows noise below the corner of a filter."""
+NOISE_FACTOR, FILTERED = 2.0, 0.4
+"""Ratio of noise found to noise stated that is reported; noise at the highest frequency, as a share of that
+at a third of it, of a filter."""
 NOISE_ROWS = 100
 
 

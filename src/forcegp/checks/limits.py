@@ -17,10 +17,9 @@ DEGREE = np.pi / 180.0
 TURN = 2.0 * np.pi
 SLACK = 1e-3
 """Share of a limit by which it may be exceeded: rounding, and encoders that read a little beyond a stop."""
-CLIPPED_RUN = 3
-"""Rows in a row at the same extreme value that make a plateau."""
-OFTENER = 5.0
-"""Factor by which a clipped value occurs more often than its neighbours; at the peaks of a sine, 2.4."""
+CLIPPED_RUN, OFTENER = 3, 5.0
+"""Successive rows at an extreme value that make a plateau; factor by which a clipped value occurs more
+often than its neighbours; at the peaks of a sine, 2.4."""
 BAND = 0.03
 """Part of the range of a torque that noise of a clipped one stays within."""
 PLATEAUS, FLAT_ROWS, FLAT = 3, 10, 0.35
@@ -29,10 +28,8 @@ twice that of the values in their middle halves: 1 for white noise about a limit
 real drive, 0.05 to 0.3 at smooth peaks."""
 MOVES = 0.02
 """Part of its largest speed from which a joint moves; the torque of one that rests is constant."""
-OFTEN = 0.05
-"""Share of rows beyond the limits from which a wrong unit is considered."""
-UNIT_ROWS = 400
-"""Rows in which the torque separates degrees from joints that turn more than once."""
+OFTEN, UNIT_ROWS = 0.05, 400
+"""Share of rows beyond the limits from which a wrong unit is considered, and rows whose torque tells it."""
 
 
 def _limits(system: ConstrainedSystem) -> dict[str, tuple[Array, Array]]:
@@ -88,7 +85,7 @@ def _angles(log: Log, turning: np.ndarray) -> list[str]:
 
 
 def check_limits(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Positions, velocities and torques beyond the limits of the robot file."""
+    """Find positions, velocities and torques beyond the limits of the robot file."""
     kinds = {"q": "position-limit", "qd": "velocity-limit", "tau": "torque-limit"}
     findings = []
     for name, (low, high) in _limits(system).items():
@@ -103,7 +100,7 @@ def check_limits(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_saturation(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Torques that stay at their largest value for several rows: the amplifier clips."""
+    """Find torques that stay at their largest value for several rows: the amplifier clips."""
     clipped = clipped_torques(log)
     joints = log.named(clipped.any(axis=0))
     text = f"the torque of {', '.join(joints)} stays at its largest value in"
@@ -111,9 +108,9 @@ def check_saturation(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def clipped_torques(data: Dataset | Log) -> NDArray[np.bool_]:
-    """Where the torque of a joint stays at its largest or smallest value, `(n, nq)` bool.
+    """Mask `(n, nq)` of torques that stay at the largest or smallest value of their joint.
 
-    Look at a log as it was recorded: a filter rounds the plateaus off. Leave these rows out of training data,
+    Use the unfiltered log, since filters smooth the plateaus. Exclude these rows from training data,
     or state their noise in `extras["tau_std"]` for an external wrench.
 
     Args:
@@ -129,10 +126,22 @@ def clipped_torques(data: Dataset | Log) -> NDArray[np.bool_]:
         usable = tau[log.usable]
         if not len(usable) or np.ptp(usable) == 0.0:
             continue
-        for extreme in (usable.max(), usable.min()):
+        for extreme in limits_of(usable):
             for first, last in _plateaus(log, j, extreme):
                 clipped[first:last, j] = True
     return clipped
+
+
+def limits_of(values: Array) -> tuple[float, float]:
+    """Value taken most often near the maximum, and near the minimum: a filter overshoots a limit."""
+    limits = []
+    for extreme in (values.max(), values.min()):
+        near, counts = np.unique(
+            values[np.abs(values - extreme) <= BAND * np.ptp(values)], return_counts=True
+        )
+        often = near[counts == counts.max()]
+        limits.append(float(often[np.abs(often - extreme).argmin()]))
+    return limits[0], limits[1]
 
 
 def _plateaus(log: Log, j: int, extreme: float) -> Intervals:

@@ -36,9 +36,11 @@ def evenly(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
     return rows[np.unique(np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(np.int64))]
 
 
-OUTER, SPREAD = np.array([-10.0, 10.0, -5.0, 2.0]) / 3.0, 3.7
-"""Minus the weights that carry a cubic from x = −2, −1, 1, 2 to −3, and the standard deviation of that
-contrast over the one of the middle value, for white noise."""
+DEPARTURE = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0
+"""Weights of the departure of a value from the cubic through its four neighbours."""
+OUTER, SPREAD = np.array([3.0, -10.0, 10.0, 0.0, -5.0, 2.0, 0.0]) / 3.0, 3.7
+"""Weights of the departure at x = −3 from the cubic through x = −2, −1, 1, 2, and the standard deviation of
+that contrast over the one of the middle value, for white noise."""
 
 
 def spikes(x: Array) -> tuple[Array, Array]:
@@ -48,12 +50,12 @@ def spikes(x: Array) -> tuple[Array, Array]:
     the neighbours alone, without x_i: a kink of the motion increases both, a spike only the first. Values are
     evenly sampled, `(n, d)` with n ≥ 7; both results are zero in the three outermost rows.
     """
-    departure, around = np.zeros_like(x), np.zeros_like(x)
-    a, b, c, middle, d, e, f = (x[k : len(x) - 6 + k] for k in range(7))
-    departure[3:-3] = middle - (-b + 4.0 * c + 4.0 * d - e) / 6.0
-    left = a + sum(w * v for w, v in zip(OUTER, (b, c, d, e), strict=True))
-    right = f + sum(w * v for w, v in zip(OUTER, (e, d, c, b), strict=True))
-    around[3:-3] = np.maximum(np.abs(left), np.abs(right)) / SPREAD
+    from scipy.ndimage import correlate1d
+
+    departure, left, right = (correlate1d(x, w, axis=0) for w in (DEPARTURE, OUTER, OUTER[::-1]))
+    around = np.maximum(np.abs(left), np.abs(right)) / SPREAD
+    for value in (departure, around):
+        value[:3] = value[-3:] = 0.0
     return departure, around
 
 
@@ -76,10 +78,8 @@ def displacement(robot: RobotModel, j: int | np.integer, offset: float) -> str:
 GAP, CLOCK_SPREAD = 1.5, 10.0
 """A gap is longer than this multiple of the median step, as half a sample is missing, and this many robust
 standard deviations of the steps longer than it, as clocks jitter."""
-SHORTEST = 8
-"""Rows of the shortest stretch that is looked at."""
-SMOOTHING = 0.1
-"""Length of the filter that derives missing accelerations [s]."""
+SHORTEST, SMOOTHING = 8, 0.1
+"""Rows of the shortest stretch that is looked at; length of the filter of missing accelerations [s]."""
 
 
 @dataclass(frozen=True, eq=False)

@@ -10,7 +10,16 @@ from forcegp.checks import hypotheses
 from forcegp.checks.excitation import check_visibility, still_joints
 from forcegp.checks.explain import Explanation, explain
 from forcegp.checks.finding import Finding, NotJudgedError
-from forcegp.checks.fit import FLOOR, Array, cross_validate, gain_of, projector, residual, robust_parameters
+from forcegp.checks.fit import (
+    FLOOR,
+    Array,
+    cross_validate,
+    gain_of,
+    projector,
+    residual,
+    robust_parameters,
+    unmeasured,
+)
 from forcegp.checks.log import Log, Outcome, force_unit, position_unit, smoothed
 from forcegp.constraints import ConstrainedSystem
 from forcegp.robot.model import RobotModel
@@ -21,19 +30,15 @@ LEAST_ROWS = 200
 """Rows from which dynamics are judged."""
 SIGNIFICANT, MATERIAL = 3.0, 0.1
 """Standard errors over blocks, and drop of a joint's log error, from which friction or offsets count."""
-SPEEDS = (25.0, 95.0)
-"""Percentiles of a joint's speed between which friction resists."""
-UNEXPLAINED = 0.5
-"""Share of the torque, in root mean square, that a useful model may leave unexplained."""
+SPEEDS, UNEXPLAINED = (25.0, 95.0), 0.5
+"""Percentiles of speed between which friction resists; share of the torque (RMS) that may be left."""
 TRACE_ROWS, DISTURBANCE_SECONDS = 20_000, 0.1
 """Rows at which the residual is looked at over time; length over which the residual is averaged [s]."""
 DISTURBANCE, LOUD = 5.0, 4.0
 """A stretch of time stands out by so many robust standard deviations of the log residual, or by this factor
 over the residual of the worst tenth of the motion."""
-MOVING = 0.05
-"""Share of the largest speed from which an arm moves."""
-VISIBLE = 0.1
-"""A disturbance must exceed this share of the joint's torque plus the dry friction of the joint."""
+MOVING, VISIBLE = 0.05, 0.1
+"""Share of the largest speed of an arm that moves; least disturbance, beyond dry friction, as a share."""
 ONE_SIGMA = 84.13
 """Percentile of a normal distribution at one standard deviation above the mean."""
 
@@ -83,6 +88,7 @@ def _without_torque(log: Log) -> list[Finding]:
     """Torques that are constant though the joint moves."""
     rows = log.usable
     still = (np.ptp(log.tau[rows], axis=0) == 0.0) & (np.ptp(log.q[rows], axis=0) > 0.0)
+    still[unmeasured(log)] = False
     zero = still & (log.tau[rows] == 0.0).all(axis=0)
     word = "zero" if zero[still].all() else "constant"
     findings = log.on_joints("torque-zero", still, f"the torque of {{}} is {word} throughout")

@@ -11,15 +11,16 @@ from dataclasses import replace
 
 import numpy as np
 
+from forcegp.checks import hypotheses
 from forcegp.checks.contact import FAR, OFFSET, SLIDING_SLOW, fit_surface, tip_path, touching
 from forcegp.checks.finding import Finding
-from forcegp.checks.fit import labelled_contacts
-from forcegp.checks.hypotheses import LARGEST_ANGLE, Hypothesis, changed, corrected, discrete, unchanged
-from forcegp.checks.log import Log, Outcome, displacement, evenly
+from forcegp.checks.fit import cross_validate, labelled_contacts
+from forcegp.checks.hypotheses import Hypothesis, changed, corrected, discrete, unchanged
+from forcegp.checks.log import Array, Log, Outcome, displacement, evenly
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
-from forcegp.logs.contact import LEVEL, TOUCHING, exchanged_joints
+from forcegp.logs.contact import LEVEL, TOUCHING, TRIED_ROWS, exchanged_joints
 from forcegp.robot.model import RobotModel
-from forcegp.robust import robust_std
+from forcegp.robust import level_of, robust_std
 
 ROWS = 2000
 """Contact rows that are looked at."""
@@ -54,7 +55,47 @@ def check_placement(system: ConstrainedSystem, log: Log) -> Outcome:
                 )
                 found = log.finding("joint-order", text, both)
                 return [found], changed(log, ("q", "qd", "qdd", "tau"), order=pair)
+            if not on and level_of(path.c[moves], TOUCHING, LEVEL) is None:
+                rows = evenly(np.flatnonzero(moves), TRIED_ROWS)
+                outcome = _never_closed(system, contact, log, rows) if len(rows) else None
+                if outcome is not None:
+                    return outcome
     return [], log
+
+
+def _never_closed(
+    system: ConstrainedSystem, contact: SurfaceContact, log: Log, rows: np.ndarray
+) -> Outcome | None:
+    """The one change of angles that takes a tip that never touches to the surface, if there is one."""
+    signs = ((h, h.change(log)) for h in discrete(log) if h.name == "joint-sign")
+    tried = []
+    for h, other in (*signs, *_offsets(system, contact, log, rows, LEVEL)):
+        share = float((np.abs(tip_path(system, contact, other, rows).c) <= TOUCHING).mean())
+        tried += [(share, h, other)] if share > LEVEL else []
+    if not tried:
+        return None
+    most, near = max(share for share, _, _ in tried), []
+    for h, other in ((h, other) for share, h, other in tried if share == most):
+        closed = np.abs(tip_path(system, contact, other).c) <= TOUCHING
+        near.append((h, other.replace(contact={**log.contact, contact.name: closed})))
+    motion = f"{100 * most:.0f} % of the motion"
+    where = f"{contact.name!r} is closed in no row, and the tip touches it in {motion} if"
+    return _chosen(system, contact, log, near, where)
+
+
+def _chosen(
+    system: ConstrainedSystem,
+    contact: SurfaceContact,
+    log: Log,
+    near: list[tuple[Hypothesis, Log]],
+    where: str,
+) -> Outcome:
+    """Changes that place the tip alike, as those of two joints in one plane; the torque chooses one."""
+    rows = evenly(np.flatnonzero(log.usable), TRIED_ROWS)
+    scores = [cross_validate(hypotheses.problem_of(system, other, rows)).score.mean() for _, other in near]
+    best, repaired = near[int(np.argmin(scores))]
+    alike = [h for h, _ in near if h.name == best.name]
+    return [_finding(system.robot, log, contact, alike, where)], repaired
 
 
 def leaves_surface(system: ConstrainedSystem, before: Log, after: Log) -> bool:
@@ -76,9 +117,8 @@ def _explanation(
     for candidates in (angles, _offsets(system, contact, log, rows)):
         near = [(h, other) for h, other in candidates if _off(system, contact, other, rows) <= most]
         if near:
-            # Two joints that turn in one plane and their mirror image touch alike.
-            alike = [h for h, _ in near if h.name == near[0][0].name]
-            return [_finding(system.robot, log, contact, alike)], near[0][1]
+            where = f"the tip touches {contact.name!r} in rows labelled as contact if"
+            return _chosen(system, contact, log, near, where)
     return None
 
 
@@ -88,24 +128,42 @@ def _off(system: ConstrainedSystem, contact: SurfaceContact, log: Log, rows: np.
 
 
 def _offsets(
-    system: ConstrainedSystem, contact: SurfaceContact, log: Log, rows: np.ndarray
+    system: ConstrainedSystem,
+    contact: SurfaceContact,
+    log: Log,
+    rows: np.ndarray,
+    share: float | None = None,
 ) -> Iterator[tuple[Hypothesis, Log]]:
-    """Each encoder with the offset that takes the tip to the surface, by Gauss-Newton steps."""
+    """Each encoder with the offset that takes the tip to the surface, by Gauss-Newton steps.
+
+    With a share, rows have offsets of their own, and one that this share of them agrees on is taken.
+    """
+    few = log.replace(q=log.q[rows], qd=log.qd[rows])
     for j in range(log.nq):
-        hypothesis, offset = Hypothesis("encoder-offset", 1, unchanged, joints=(j,)), np.zeros(1)
+        hypothesis, offset = Hypothesis("encoder-offset", 1, unchanged, joints=(j,)), np.zeros(len(rows))
         for _ in range(STEPS):
-            c = tip_path(system, contact, corrected(log, hypothesis, offset), rows).c
-            ahead = tip_path(system, contact, corrected(log, hypothesis, offset + 1e-5), rows).c
+            c, ahead = (_moved(system, contact, few, j, offset + step) for step in (0.0, 1e-5))
             slope = (ahead - c) / 1e-5
-            offset = offset - (slope @ c) / max(slope @ slope, 1e-12)
-        if abs(offset[0]) <= LARGEST_ANGLE:
-            yield replace(hypothesis, columns=offset), corrected(log, hypothesis, offset)
+            total = slope**2 if share is not None else (slope**2).sum()
+            ascent = slope * c if share is not None else (slope * c).sum()
+            offset = offset - ascent / np.maximum(total, 1e-12)
+        if share is not None:
+            offset = np.array([level_of(offset, hypotheses.SMALL_ANGLE, share) or 0.0])
+        if abs(offset[0]) <= hypotheses.LARGEST_ANGLE:
+            yield replace(hypothesis, columns=offset[:1]), corrected(log, hypothesis, offset[:1])
 
 
-def _finding(robot: RobotModel, log: Log, contact: SurfaceContact, alike: list[Hypothesis]) -> Finding:
+def _moved(system: ConstrainedSystem, contact: SurfaceContact, few: Log, j: int, offset: Array) -> Array:
+    """Distance of the tip from the surface with offsets of joint j added to the positions `(n,)`."""
+    shifted = few.replace(q=few.q + offset[:, None] * np.eye(few.nq)[j])
+    return tip_path(system, contact, shifted, np.arange(len(offset))).c
+
+
+def _finding(
+    robot: RobotModel, log: Log, contact: SurfaceContact, alike: list[Hypothesis], touches: str
+) -> Finding:
     names = tuple(dict.fromkeys(log.joint_names[j] for h in alike for j in h.joints))
     listed = (" and " if alike[0].name == "joint-order" and len(alike) == 1 else " or ").join(names)
-    touches = f"the tip touches {contact.name!r} in rows labelled as contact if"
     if alike[0].name == "encoder-offset":
         offset = float(alike[0].columns[0])  # type: ignore[index]
         added = displacement(robot, alike[0].joints[0], offset)

@@ -6,9 +6,11 @@ import numpy as np
 import torch
 
 from forcegp import dynamics
+from forcegp.checks.excitation import still_joints
 from forcegp.checks.finding import Finding, at_rows
 from forcegp.checks.fit import tensors
-from forcegp.checks.log import Array, Log, Outcome, spikes
+from forcegp.checks.limits import limits_of
+from forcegp.checks.log import DEPARTURE, Array, Log, Outcome, spikes
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data.derivative import UNIFORM_TOLERANCE
 from forcegp.data.fields import JOINT_VECTORS
@@ -65,16 +67,13 @@ HELD_RUN = 2
 """A logger that fails to update repeats a row at least this often before it is reported as held."""
 STUCK_SECONDS, STUCK_VISIBLE = 0.05, 0.02
 """A channel that repeats one value for so long [s] should have moved by this share of its range."""
-SPIKE = 12.0
-"""Robust standard deviations beyond which a single value is a spike: never reached by normal noise."""
-SPIKE_ALONE = 4.0
-"""Factor by which a spike stands out from the misfit of its neighbours."""
+SPIKE, SPIKE_ALONE = 12.0, 4.0
+"""Robust standard deviations of a spike, never reached by noise; its factor over the neighbours' misfit."""
 SPIKE_SHAPE, SPIKE_NOISE = 0.2, 4.0
 """Share of a wrong value, and robust deviations, by which departures of its neighbours may differ."""
-SPIKE_SHARED = 0.05
-"""A departure of another channel by this share of a value's own says that the motion jumped."""
-DRIVEN = 0.5
-"""Share of a departing acceleration that a step of the torque must make to be its cause."""
+SPIKE_SHARED, DRIVEN = 0.05, 0.5
+"""The motion jumped where another channel departs by this share of a value's own; a step of the torque is the
+cause of a departing acceleration from this share on."""
 FEWEST = 50
 """Values that a scale is taken from."""
 SPIKE_VISIBLE = (0.01, 0.002)
@@ -119,11 +118,12 @@ def check_stuck(system: ConstrainedSystem, log: Log) -> Outcome:
     if not np.isfinite(log.dt):
         return [], log
     least, findings, bad = max(5, round(STUCK_SECONDS / log.dt)), [], np.zeros(len(log), bool)
+    still = still_joints(log)
     for name, value in logged(log).items():
         for j, joint in enumerate(log.joint_names):
             x = value[:, j]
             steps = np.abs(np.diff(x))
-            if (steps > 0.0).mean() < 0.1:
+            if (steps > 0.0).mean() < 0.1 or (still[j] and name != "tau"):
                 continue
             visible = STUCK_VISIBLE * np.ptp(np.percentile(x[log.usable], (0.5, 99.5)))
             runs = [
@@ -131,7 +131,7 @@ def check_stuck(system: ConstrainedSystem, log: Log) -> Outcome:
                 for a, b in intervals((steps == 0.0) & log.usable[1:] & log.usable[:-1])
                 if b - a >= least
                 # A torque that stays at its extreme is clipped, which is another finding.
-                and not (name == "tau" and x[a] in (x[log.usable].min(), x[log.usable].max()))
+                and not (name == "tau" and x[a] in limits_of(x[log.usable]))
                 and _expected_change(log, name, j, a, b) > visible
             ]
             if runs:
@@ -235,8 +235,7 @@ def _size(log: Log, name: str, departure: Array, around: Array, scale: Array) ->
 def _one_value(departure: Array, scale: Array) -> np.ndarray:
     """`(n, d)` bool, departures h with −4h/6 and h/6 around: one wrong value makes them, a kink does not."""
     around = np.lib.stride_tricks.sliding_window_view(np.pad(departure, ((2, 2), (0, 0))), 5, axis=0)
-    shape = departure[..., None] * np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0
-    misfit = np.abs(around - shape).max(axis=-1)
+    misfit = np.abs(around - departure[..., None] * DEPARTURE).max(axis=-1)
     return misfit <= SPIKE_SHAPE * np.abs(departure) + SPIKE_NOISE * scale
 
 

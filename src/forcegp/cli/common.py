@@ -163,7 +163,7 @@ def model_table(config: Path | None, scene: str | None) -> ModelTable:
 
 
 def warn_beyond(model: Predictor, data: forcegp.Dataset, doubts: Iterable[str] = ()) -> None:
-    """Print doubts about predictions, and whether states are far from those that the model was trained on."""
+    """Print doubts about predictions, and whether states are far from the training data."""
     from forcegp.forces.posterior import warnings_beyond
     from forcegp.models.structured_fit import StructuredFit
 

@@ -79,7 +79,9 @@ def fit(
     if checkpoint is not None:
         for file in (checkpoint, beside(checkpoint)):
             file.unlink(missing_ok=True)
-    _warn(learned.result)
+    doubts = () if learned.result.converged else (f"the fit did not converge: {learned.result.message}",)
+    for doubt in (*doubts, *learned.result.warnings):
+        common.warn(doubt)
     result: dict[str, object] = {"model": regression.name, "training_points": len(training)}
     show({**result, **_figures(learned.result, as_json), "file": str(model_path(out))}, as_json)
 
@@ -104,13 +106,6 @@ def _training(
             return log
     parts = [common.read_data(file, robot, differentiate) for file in files]
     return parts[0] if len(parts) == 1 else forcegp.Dataset.concatenate(parts)
-
-
-def _warn(result: FitResult) -> None:
-    """Print what is doubtful about a fit."""
-    doubts = () if result.converged else (f"the fit did not converge: {result.message}",)
-    for doubt in (*doubts, *result.warnings):
-        common.warn(doubt)
 
 
 def sweep(

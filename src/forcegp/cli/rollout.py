@@ -81,7 +81,7 @@ def rollout(
 
 
 def _figures(path: forcegp.Rollout, rolled: forcegp.Dataset, dt: float) -> dict[str, object]:
-    """What the command reports, up to where the prediction diverged."""
+    """Numbers reported by the command, up to a divergence of the prediction."""
     error = (rolled.q - rolled.q_logged).abs()
     figures: dict[str, object] = {
         "duration_s": dt * (len(rolled) - 1),

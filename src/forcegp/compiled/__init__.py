@@ -31,7 +31,7 @@ class CompiledDynamics:
     """One quantity of one robot as a compiled function of the joint-space arguments.
 
     Call it like the eager function of the same name, without the robot. Its derivatives are those of the
-    eager function, of any order; the first derivatives of the forward dynamics have a kernel of their own,
+    eager function, of any order; the first derivatives of the forward dynamics have a separate kernel,
     built on first use.
     """
 

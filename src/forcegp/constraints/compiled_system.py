@@ -75,7 +75,7 @@ def compiled_system(system: ConstrainedSystem, *points: Anchor) -> ConstrainedSy
 
     The first call for a robot takes some seconds to compile; later ones, in any process, read the cache. It
     is returned unchanged without a compiler, or if the robot's parameters require gradients or lie on a GPU.
-    `points` are further points of which `Equations.point_motion` is asked.
+    `points` are further points for `Equations.point_motion`.
 
     Example:
         >>> import torch, forcegp

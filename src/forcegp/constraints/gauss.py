@@ -115,10 +115,9 @@ class Equations:
         Q_C, Q_G, Q_D: `(*batch, nq)` bias, gravity and dissipative joint force.
         contact_points: the touching point of each surface contact, by name.
         point_motion: computes the motion of a point `(frame, point)` of the robot at the states.
-        links: computes the poses and the motion of the links at the states, where more of the
-            kinematics is needed.
-        holds: `(*batch, m)` bool, rows of A that hold: those of closed contacts, along the surface where they
-            stick.
+        links: function that returns the poses and the motion of the links at the states.
+        holds: `(*batch, m)` bool, rows of A that hold: those of closed contacts, including tangential rows if
+            they stick.
     """
 
     M: JointMatrix
@@ -150,7 +149,7 @@ class Equations:
 
     @cached_property
     def M_cholesky(self) -> JointMatrix:
-        """Lower Cholesky factor of M; `NumericalError` where M is not positive definite."""
+        """Lower Cholesky factor of M; raises `NumericalError` if M is not positive definite."""
         try:
             return torch.linalg.cholesky(self.M)
         except torch.linalg.LinAlgError as cause:  # pyright: ignore[reportPrivateImportUsage]

@@ -148,7 +148,7 @@ class ConstrainedSystem:
 
     @cached_property
     def can_open(self) -> Tensor:
-        """Which constraints are contacts with a surface, `(n_contacts,)` bool."""
+        """Mask `(n_contacts,)` of the constraints that are contacts with a surface."""
         flags = [isinstance(contact, SurfaceContact) for contact in self.contacts]
         return torch.tensor(flags, dtype=torch.bool, device=self.robot.device)
 

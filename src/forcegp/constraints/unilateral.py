@@ -1,6 +1,6 @@
 """Unilateral contact with a surface: opening, closing, impact and sliding friction.
 
-A closed contact opens where its multiplier would turn negative. An open contact closes where c ≤ 0 and ċ < 0,
+A closed contact opens when its multiplier would become negative. An open contact closes when c ≤ 0 and ċ < 0,
 with an inelastic impact. Other constraints, such as a connection of two points, never change.
 """
 
@@ -90,12 +90,12 @@ def normal_rows(system: ConstrainedSystem, rows: Tensor) -> Tensor:
 
 
 def pulling(system: ConstrainedSystem, active: Tensor, multiplier: Tensor) -> Tensor:
-    """Closed contacts `(*batch, n_contacts)` that would have to pull, λ `(*batch, m)` < 0, and that open."""
+    """Closed contacts `(*batch, n_contacts)` that open since they would pull, λ `(*batch, m)` < 0."""
     return normal_rows(system, multiplier < -PULL) & system.can_open & active
 
 
 def reached(system: ConstrainedSystem, active: Tensor, c: Tensor, cd: Tensor) -> Tensor:
-    """Open contacts `(*batch, n_contacts)` that the robot has reached, c ≤ 0 while ċ < 0, and that close."""
+    """Open contacts `(*batch, n_contacts)` that close: c ≤ 0 and ċ < 0."""
     return normal_rows(system, (c <= 0.0) & (cd < -APPROACH)) & system.can_open & ~active
 
 
@@ -159,7 +159,7 @@ def sliding_friction(
 
 
 def land(system: ConstrainedSystem, q: Tensor, qd: Tensor, closed: Tensor) -> Landing:
-    """Close the contacts that one state `(nq,)` has reached, with their impact."""
+    """Close the contacts reached by one state `(nq,)`, with their impact."""
     eom = system.equations(q, qd, active=closed)
     new = reached(system, closed, eom.c, eom.cd)
     if not bool(new.any()):

@@ -28,6 +28,7 @@ from forcegp.control.task_space import (
 from forcegp.control.trajectory import Chart, Reference, draw_waypoints, straight_lines
 from forcegp.errors import NumericalError, ParameterError
 from forcegp.robot.model import RobotModel
+from forcegp.robot.shapes import turn_z
 from forcegp.types import JointVector, Rotation, Vector3
 
 NOT_NEGATIVE = "a finite number, 0 or above"
@@ -183,17 +184,8 @@ def tool_rotation(normal: Vector3, ahead: Vector3, tool_axis: Vector3) -> Rotati
 
     `normal` and `ahead` are the unit normal out of the surface and a unit tangent, `(3,)` each.
     """
-    z = torch.tensor([0.0, 0.0, 1.0], dtype=normal.dtype)
     down = torch.stack([-ahead, torch.linalg.cross(normal, ahead), -normal], dim=-1)
-    return down @ _shortest_turn(tool_axis, z)
-
-
-def _shortest_turn(a: Vector3, b: Vector3) -> Rotation:
-    """The rotation that takes the unit vector a to the z axis b on the shortest way (Rodrigues' formula)."""
-    if float(a @ b) < -1.0 + POSE_TOLERANCE:
-        return torch.diag(torch.tensor([1.0, -1.0, -1.0], dtype=a.dtype))
-    K = kinematics.skew(torch.linalg.cross(a, b))
-    return torch.eye(3, dtype=a.dtype) + K + K @ K / (1.0 + a @ b)
+    return down @ torch.from_numpy(turn_z(tool_axis.double().numpy()).T).to(down)
 
 
 STARTS = 64

@@ -1,7 +1,7 @@
 """Task-space inverse dynamics control with null-space control of the redundant degrees of freedom.
 
 The task is the pose of the tool, or its position alone for an arm with fewer than six joints. A redundant arm
-moves its elbow in the null space of the task's Jacobian, which leaves the task's error dynamics untouched
+moves its elbow in the null space of the task's Jacobian, which does not affect the task's error dynamics
 (Siciliano et al., *Robotics: Modelling, Planning and Control*, p. 347 and section 3.5.1).
 """
 

@@ -81,7 +81,9 @@ class Dataset(Fields):
         fields.check_values(self)
 
     def __repr__(self) -> str:
-        """What is logged, without the numbers: samples, joints, duration, contacts, further quantities."""
+        """Summary of the columns without their numbers: samples, joints, duration, contacts, further
+        quantities.
+        """
         robot = f" of {self.header.robot!r}" if self.header.robot else ""
         parts = [f"{len(self)} samples of {self.nq} joints"]
         if len(self):

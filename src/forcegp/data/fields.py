@@ -55,6 +55,15 @@ class DataHeader(Header):
     joint_names: tuple[str, ...] = ()
     contact_names: tuple[str, ...] = ()
 
+    @property
+    def filter_variance(self) -> float:
+        """Second moment of the weights with which the filter averages q̈ over time [s²]; 0 if unknown.
+
+        The second derivative of cubics fitted to positions over a span T is q̈ + T²/56 d²q̈/dt² + …, as is an
+        average with the variance T²/28; the first derivative of cubics fitted to q̇ has no such term.
+        """
+        return (self.filter_span or 0.0) ** 2 / 28.0 if {"qd", "qdd"} <= set(self.derived) else 0.0
+
     def with_step(self, step: str, **fields: object) -> DataHeader:
         """The header with fields changed and one more line of provenance."""
         return self.model_copy(update={"provenance": (*self.provenance, step), **fields})
@@ -205,7 +214,7 @@ def _check_shape(name: str, value: Tensor, shape: tuple[int, ...], meaning: str)
 
 
 def check_values(data: Fields) -> None:
-    """Check that numbers, but for predictions of what is not determined, are finite, and time increases."""
+    """Check that numbers are finite, except for undetermined predictions, and that time increases."""
     for name, value in (("t", data.t), *named_columns(data).items()):
         wrong = ~(value.abs() <= LOGGED_VALUE)
         if name.startswith("predicted_"):
@@ -224,7 +233,9 @@ def check_values(data: Fields) -> None:
 
 
 def check_time(data: Fields) -> None:
-    """Check that a segment's rows are together, with strictly increasing time; `DataError` names the row."""
+    """Check that the rows of each segment are contiguous with strictly increasing time; `DataError` names the
+    row.
+    """
     t, segment = data.t, data.segment
     same = segment[1:] == segment[:-1]
     back = same & (t[1:] <= t[:-1])
@@ -247,7 +258,7 @@ def check_time(data: Fields) -> None:
 
 
 def row_indices(rows: object, n: int, device: torch.device) -> Tensor:
-    """Row numbers `(k,)` of a slice, mask or list, negative from the end; `DataError` if there is none."""
+    """Row numbers `(k,)` of a slice, mask or list; negative ones count from the end."""
     if isinstance(rows, slice):
         return torch.tensor(range(n)[rows], dtype=torch.int64, device=device)
     rule = "rows are selected by a slice, a mask or a list of row numbers"
@@ -272,7 +283,7 @@ TURN, MOST_RADIANS = 6.3, 60.0
 
 
 class RobotMismatchWarning(UserWarning):
-    """The data were logged on a robot whose parameters differ from those of the robot they are used with."""
+    """The data were logged on a robot with other parameters than the current robot."""
 
 
 def check_joints(have: Sequence[str], want: Sequence[str], robot: str) -> None:
@@ -298,8 +309,9 @@ def lock_hint(joints: Sequence[str]) -> str:
 
 
 def check_robot(data: Fields, robot: RobotModel) -> None:
-    """Check that a log is of a robot's joints, in its order; other parameters of the robot are a warning, and
-    so are angles that look like degrees."""
+    """Check that a log has the robot's joints, in its order; warn of other robot parameters and of angles
+    that look like degrees.
+    """
     check_joints(data.joint_names, robot.joint_names, robot.name)
     q, free = data.q.to(robot.lower) * robot.revolute, torch.full_like(robot.lower, MOST_RADIANS)
     low, high = (
@@ -338,7 +350,7 @@ def contact_table(data: Fields, contacts: Sequence[str]) -> Tensor:
 
 
 def check_alike(parts: Sequence[Fields]) -> None:
-    """Check that data sets hold the same columns, so that they can be put one after another."""
+    """Check that data sets have the same columns, so that they can be concatenated."""
     if not parts:
         raise DataError("no data sets to concatenate", expected="one or more data sets")
 

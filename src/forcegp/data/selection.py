@@ -23,7 +23,7 @@ INPUTS = ("q", "qd", "tau")
 
 
 def standardized_inputs(data: Dataset) -> Float[Tensor, "n d"]:
-    """(q, q̇, τ) of each sample with zero mean and unit variance a column; constant columns become zero."""
+    """(q, q̇, τ) of each sample with zero mean and unit variance per column; constant columns become zero."""
     return standardized(torch.cat([getattr(data, name) for name in INPUTS], dim=-1))
 
 

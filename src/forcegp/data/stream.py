@@ -147,7 +147,7 @@ class StreamedDataset:
 
     Args:
         paths: the files; their joints, contacts and further columns must agree.
-        differentiate: how to compute the columns `qd` and `qdd` where the log has none.
+        differentiate: how to compute the columns `qd` and `qdd` if the log lacks them.
         joints: the joints wanted, in this order; by default those of the files.
         dtype, device: of the tensors.
         distributed: whether the processes of `torch.distributed` share the pieces in a fit. Each of them
@@ -195,7 +195,7 @@ class StreamedDataset:
     @cached_property
     def _shapes(self) -> tuple[tuple[int, DataHeader], ...]:
         """Rows and header of each file."""
-        return tuple(shape_of(path) for path in self.files)
+        return tuple(map(shape_of, self.files))
 
     def __len__(self) -> int:
         """Number of samples."""

@@ -77,7 +77,7 @@ def read_table(
 
 
 def existing(path: str | Path) -> Path:
-    """The path of a file that exists, else a `DataError` whose hint names the nearest one."""
+    """The path of a file that exists, else a `DataError` with the nearest name as hint."""
     file = Path(path)
     with foreign(str(path), "a path"):
         if file.is_file():

@@ -42,15 +42,15 @@ GRAVITY_ALONE, LEAST_RESPONSE = 0.99, 0.5
 
 @dataclass(frozen=True)
 class Evaluation:
-    """The predictions of a model against a data set.
+    """Scores of a model's predictions on a data set.
 
     Attributes:
         kind: of the model.
-        samples: how many were predicted.
-        joint_names: the joints, in the order of everything that is given by joint.
+        samples: number of predictions.
+        joint_names: the joints, in the order of all scores by joint.
         noisy: errors against the measured accelerations.
         clean: errors against the noise-free ones, `None` if they are not logged.
-        uncertainty: coverage and density, `None` for a model without a covariance or unknown noise.
+        uncertainty: coverage and density, `None` without a covariance or with unknown noise.
         residual, residual_max: mean and largest |A q̈ − b| of the predicted mean over closed contacts
             [m/s²], `None` without contacts.
         noise_std: assumed for the measured accelerations, one per joint.
@@ -59,8 +59,9 @@ class Evaluation:
         verdicts: the model against each trivial predictor; empty if there are too few samples.
         multipliers: λ against the logged one, for models of forces and logs that contain it.
         sensed: the same with the log's force sensor as a measurement at each state, for models fitted to it.
-        gravity: share R² of the torque that gravity alone explains; close to 1, a log hardly tests a model.
-        response: share by joint of a torque nobody chose that acts: 1 of a rigid robot, 0 of a model that has
+        gravity: share R² of the torque explained by gravity alone; if it is close to 1, the log hardly tests
+            a model.
+        response: share by joint of an added torque that acts: 1 for a rigid robot, 0 for a model that has
             learned the controller; `None` without free motion.
         motion: in open loop, for models of forces and data in the order of time.
     """
@@ -107,6 +108,13 @@ class Evaluation:
         parts += [score.text() for score in self.multipliers]
         text = "; ".join(parts)
         return f"{text[:1].upper()}{text[1:]}." if parts else ""
+
+    @property
+    def poor(self) -> bool:
+        """Whether there are doubts, or the model explains no torque, or less than the robot file."""
+        shares = {p.name: x for p in self.predictors if (x := p.beyond_gravity) is not None}
+        model = shares.get("model", 1.0)
+        return bool(self.doubts) or model <= 0.0 or model < shares.get("robot file", 0.0)
 
     @property
     def comparison(self) -> str:
@@ -164,16 +172,16 @@ def evaluate(
     system: ConstrainedSystem | None = None,
     progress: Progress | None = None,
 ) -> Evaluation:
-    """Predict the accelerations of a data set and compare with them, and with trivial predictors.
+    """Compare predicted accelerations with those of a data set and with trivial predictors.
 
     Args:
         model: a fitted model.
         data: states and measured accelerations, and noise-free ones as `qdd_clean` if known.
-        train: data that the trivial predictors are fitted to; by default each half of `data` (in order
-            of its rows) is predicted by those fitted to the other half.
+        train: data to fit the trivial predictors to; by default each half of `data` (in order of its rows) is
+            predicted by those fitted to the other half.
         compare: whether to fit the trivial predictors at all.
         system: robot and contacts for the constraint residual, the torque errors and the trivial
-            predictors; by default those of the model, before it learned any parameters of theirs.
+            predictors; by default those of the model before learning.
         progress: called with the number of states predicted and their total number.
 
     Raises:

@@ -1,9 +1,8 @@
 """Criteria of a good model: torque explained beyond gravity, motion in open loop, response to a torque.
 
 A torque error is that of the inverse dynamics, M(q)(predicted − measured q̈) with the mass matrix of the
-predictor's robot: the torque that it lacks for the measured acceleration. Of the torque beyond gravity, a
-predictor of forces explains R² = 1 − Σ (N M Δq̈)² / Σ (N (τ − τ_g))². Gravity and constant τ_g are those that
-fit the torques best, and N = 1 − A⁺A takes the constraint force out.
+predictor's robot. Of the torque beyond gravity, a predictor of forces explains R² = 1 − Σ (N M Δq̈)² / Σ (N
+(τ − τ_g))². Gravity and constant τ_g are fitted to the torques, and N = 1 − A⁺A removes the constraint force.
 """
 
 from __future__ import annotations
@@ -55,7 +54,7 @@ class Motion:
 
 @torch.no_grad()
 def beyond_gravity(system: ConstrainedSystem, data: Dataset) -> tuple[Tensor, float]:
-    """N (τ − τ_g) `(n, nq)`, and the share R² of the variance of the torques that gravity alone explains."""
+    """N (τ − τ_g) `(n, nq)`, and the share R² of the variance of the torques explained by gravity alone."""
     scale = data.tau.std(0).clamp(min=1e-9)
 
     def rows(part: Dataset) -> tuple[Tensor, Tensor]:
@@ -78,7 +77,9 @@ def beyond_gravity(system: ConstrainedSystem, data: Dataset) -> tuple[Tensor, fl
 
 
 def explained(error: Tensor, rest: Tensor) -> tuple[float | None, ...]:
-    """R² by joint of torque errors, given what gravity leaves, `(n, nq)` each; `None` if that is `FAINT`."""
+    """R² by joint of torque errors relative to the torque beyond gravity, `(n, nq)` each; `None` if that is
+    `FAINT`.
+    """
     left, whole = (error**2).sum(0), (rest**2).sum(0)
     shares, seen = (1.0 - left / whole).tolist(), (whole > FAINT**2 * whole.max()).tolist()
     return tuple(share if clear else None for share, clear in zip(shares, seen, strict=True))
@@ -86,10 +87,10 @@ def explained(error: Tensor, rest: Tensor) -> tuple[float | None, ...]:
 
 @torch.no_grad()
 def torque_response(model: FittedModel, data: Dataset) -> tuple[float, ...] | None:
-    """Share of an added torque that acts, by joint: 1 of a rigid robot, 0 of a model that cancels the torque.
+    """Share of an added torque that acts, by joint: 1 for a rigid robot, 0 for a model that cancels it.
 
-    Random torques of a tenth of the spread of those logged, which no controller chose, are added in free
-    motion; what acts is M(q) times the change of the predicted acceleration. `None` without free motion.
+    Random torques of a tenth of the logged spread are added in free motion; the acting torque is M(q) times
+    the change of the predicted acceleration. `None` without free motion.
     """
     closed = data.active(model.system.contact_names)
     free = (~closed.any(-1)).nonzero()[:, 0]
@@ -109,7 +110,7 @@ def torque_response(model: FittedModel, data: Dataset) -> tuple[float, ...] | No
 
 @torch.no_grad()
 def open_loop(model: FittedModel, system: ConstrainedSystem, data: Dataset) -> Motion | None:
-    """The motion of a model of forces and that of the robot file; `None` where the data are too short."""
+    """The motion of a model of forces and that of the robot file; `None` if the data are too short."""
     if model.force_field() is None or not data.header.ordered or len(data) < 2:
         return None
     dt = data.header.dt or float((data.t[1:] - data.t[:-1]).median())

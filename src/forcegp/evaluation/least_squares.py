@@ -3,9 +3,9 @@
 Least squares identifies a rigid robot with physically consistent inertial parameters,
 τ = M q̈ − Q_C − Q_G − Q_D + Y(q, q̇, q̈) δπ + d q̇ + f tanh(q̇/v₀) + o + noise, where δπ corrects the
 inertial parameters of every link, and d, f, o are viscous friction, Coulomb friction and offset of every
-joint. A ridge holds every unknown near the robot file. Log-Cholesky coordinates keep every link physical
+joint. A ridge keeps all unknowns near the robot file. Log-Cholesky coordinates keep every link physical
 (Rucker and Wensing 2022), so that the mass matrix stays positive definite. In contact the equations are
-projected onto the directions in which the constraint force does not act.
+projected onto the directions without constraint force.
 """
 
 from __future__ import annotations
@@ -13,14 +13,22 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
+import numpy as np
 import torch
+from scipy.optimize import least_squares
 from torch import Tensor
+from torch.func import jacfwd, vmap
 
 from forcegp import dynamics
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.identification import MASS_SHARE, MOMENT_ARM, parameter_vector, regressor
-from forcegp.robot.inertia import from_log_cholesky, from_pseudo_inertia, log_cholesky
+from forcegp.robot.inertia import (
+    from_log_cholesky,
+    from_pseudo_inertia,
+    inertial_parameters,
+    log_cholesky,
+)
 from forcegp.robot.inertia import pseudo_inertia as pseudo_inertia_of
 from forcegp.robot.model import RobotModel
 
@@ -31,7 +39,7 @@ MOST = 4000
 WIDE = 10.0
 """Prior standard deviation of friction and offset, relative to the largest torque of the joint."""
 NOISE_PASSES, STEPS = 3, 30
-"""Re-estimations of the noise of every joint, and Levenberg-Marquardt steps in each."""
+"""Re-estimations of the noise of every joint, and steps of least squares in each."""
 POINT = 1e-4
 """Share of the largest mass, at 0.1 m, that spreads a link whose parameters no extended body has."""
 
@@ -52,7 +60,7 @@ class LeastSquares:
         return eom.acceleration(eom.Q_K + data.tau - self.losses(data.qd))
 
     def losses(self, qd: Tensor) -> Tensor:
-        """Torque that the identified friction and offsets take away `(n, nq)`, at velocities `(n, nq)`."""
+        """Torque of the identified friction and offsets `(n, nq)` at velocities `(n, nq)`."""
         return (_friction_columns(self.system.robot, qd) @ self.friction[:, None])[..., 0]
 
 
@@ -62,7 +70,9 @@ def data_chunks(data: Dataset) -> Iterator[Dataset]:
 
 
 def identify_rigid(system: ConstrainedSystem, train: Dataset) -> LeastSquares:
-    """Identify inertial parameters, friction, offsets; what is not excited stays as in the robot file."""
+    """Identify inertial parameters, friction and offsets; parameters without excitation stay as in the robot
+    file.
+    """
     rows = torch.linspace(0, len(train) - 1, min(len(train), MOST)).round().long()
     train, robot = train[rows.unique()], system.robot
     prior = _prior_std(robot, train)
@@ -150,57 +160,34 @@ def _start(robot: RobotModel) -> Tensor:
 def _minimise(
     robot: RobotModel, gram: Tensor, right: Tensor, prior: Tensor, theta: Tensor, friction: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Levenberg-Marquardt on ½ xᵀ gram x − rightᵀ x over x = ((π(θ) − π₀)/S, friction)."""
-    centre, links = parameter_vector(robot).detach().reshape(-1, 10), prior.reshape(-1, 10)
+    """Least of ½ xᵀ gram x − rightᵀ x over x = ((π(θ) − π₀)/S, friction), as ½ |Cᵀx − C⁻¹ right|²."""
+    like, n = friction, theta.numel()
+    gram, right, prior, theta, friction = (x.double() for x in (gram, right, prior, theta, friction))
+    centre, links = parameter_vector(robot).detach().double().reshape(-1, 10), prior.reshape(-1, 10)
+    # gram = C Cᵀ; its eigenvalues are 1 or more by the ridge, up to rounding
+    values, vectors = torch.linalg.eigh(gram)
+    root = values.clamp(min=1.0).sqrt()
+    C, target = vectors * root, (vectors.mT @ right) / root
 
-    def at(t: Tensor, f: Tensor) -> Tensor:
-        return torch.cat([((_parameters(from_log_cholesky(t)) - centre) / links).flatten(), f])
+    def at(p: Tensor) -> Tensor:
+        return torch.cat([((_parameters(p[:n].reshape(-1, 10)) - centre) / links).flatten(), p[n:]])
 
-    x, damping = at(theta, friction), 1e-3
-    value = 0.5 * x @ gram @ x - right @ x
-    for _ in range(STEPS):
-        by_link = _slopes(theta) / links[..., None]
-        J = torch.block_diag(*by_link, torch.eye(len(friction), dtype=x.dtype))
-        H, slope = J.mT @ gram @ J, J.mT @ (gram @ x - right)
-        step = torch.linalg.solve(H + damping * H.diagonal().clamp(min=1e-12).diag(), -slope)
-        t = theta + step[: theta.numel()].reshape(theta.shape)
-        f = friction + step[theta.numel() :]
-        x_new = at(t, f)
-        new = 0.5 * x_new @ gram @ x_new - right @ x_new
-        if bool(new < value):
-            done = bool(value - new < 1e-8 * value.abs())
-            theta, friction, x, value, damping = t, f, x_new, new, 0.1 * damping
-            if done:
-                break
-        else:
-            damping *= 10.0
-    return theta, x
+    def residual(p: np.ndarray) -> np.ndarray:
+        return (C.mT @ at(torch.from_numpy(p)) - target).numpy()
+
+    def jacobian(p: np.ndarray) -> np.ndarray:
+        by_link = vmap(jacfwd(_parameters))(torch.from_numpy(p[:n]).reshape(-1, 10)) / links[..., None]
+        return (C.mT @ torch.block_diag(*by_link, torch.eye(len(friction)).double())).numpy()
+
+    start = torch.cat([theta.flatten(), friction]).numpy()
+    result = least_squares(residual, start, jacobian, x_scale="jac", max_nfev=STEPS)  # pyright: ignore[reportArgumentType]
+    found = torch.from_numpy(result.x)
+    return found[:n].reshape(-1, 10).to(like), at(found).to(like)
 
 
-def _parameters(J: Tensor) -> Tensor:
-    """π `(..., 10)` of pseudo-inertias `(..., 4, 4)`, a linear map: I_o = tr(Σ) 1 − Σ."""
-    S = J[..., :3, :3]
-    I = S.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None] * torch.eye(3, dtype=J.dtype) - S
-    rows, columns = (0, 0, 0, 1, 1, 2), (0, 1, 2, 1, 2, 2)
-    return torch.cat([J[..., 3, 3:], J[..., :3, 3], I[..., rows, columns]], dim=-1)
-
-
-def _slopes(theta: Tensor) -> Tensor:
-    """∂π/∂θ `(nq, 10, 10)` in closed form: J = U Uᵀ, and every entry of U depends on α and one more."""
-    scale = theta[:, 0].exp()
-    dU = theta.new_zeros(len(theta), 10, 4, 4)
-    places = (0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2), (0, 3), (1, 3), (2, 3)
-    for k, (i, j) in enumerate(places, start=1):
-        dU[:, k, i, j] = scale * (theta[:, k].exp() if i == j else 1.0)
-    s12, s23, s13, *t = (scale * theta[:, k] for k in range(4, 10))
-    for k, value in (((0, 1), s12), ((1, 2), s23), ((0, 2), s13), *(((i, 3), t[i]) for i in range(3))):
-        dU[:, 0, k[0], k[1]] = value
-    for i in range(3):
-        dU[:, 0, i, i] = dU[:, i + 1, i, i]
-    U = dU[:, 0].clone()
-    dU[:, 0, 3, 3] = U[:, 3, 3] = scale
-    dJ = dU @ U[:, None].mT
-    return _parameters(dJ + dJ.mT).mT
+def _parameters(theta: Tensor) -> Tensor:
+    """π `(..., 10)` of log-Cholesky coordinates `(..., 10)`."""
+    return inertial_parameters(*from_pseudo_inertia(from_log_cholesky(theta)))
 
 
 FEWEST_TRAINING = 20
@@ -212,9 +199,9 @@ class Baseline:
     """A trivial predictor of accelerations.
 
     Attributes:
-        name, system: what it is called, and the robot by whose mass matrix its errors become torques.
+        name, system: its name, and the robot with the mass matrix that converts its errors to torques.
         predict: accelerations `(n, nq)` of a data set.
-        std: `(nq,)` root-mean-square error on its training data, its constant uncertainty.
+        std: `(nq,)` root-mean-square error on its training data, used as its uncertainty.
     """
 
     name: str

@@ -29,7 +29,7 @@ class Predicted:
 
     Attributes:
         mean, variance: `(n, nq)`; no variance for a model without a covariance.
-        noise_std: `(n, nq)` assumed for measured accelerations, if known; noise of the torque included.
+        noise_std: `(n, nq)` assumed for measured accelerations, if known, including torque noise.
         residual: `(k,)` |A q̈ − b| of all rows of closed contacts.
         seconds: time taken.
     """
@@ -68,20 +68,15 @@ def predict_all(
         active, began = part.active(model.system.contact_names), time.perf_counter()
         predicted = model.predict(part.q, part.qd, part.tau, active=active)
         seconds.append(time.perf_counter() - began)
-        residuals.append(_residual(system, part, predicted.mean))
+        # |A q̈ − b| of the rows of closed contacts
+        closed, qdd = part.active(system.contact_names), predicted.mean
+        eom = system.equations(part.q, part.qd, closed)
+        residual = ((eom.A @ qdd[..., None])[..., 0] - eom.b).abs()
+        residuals.append(residual[system.active_rows(closed, qdd.shape[:-1])].detach())
         return predicted.mean, predicted.variance
 
     mean, variance = in_chunks(predict, data, progress)
     return Predicted(mean, variance, _noise_std(model, data), torch.cat(residuals), sum(seconds))
-
-
-@torch.no_grad()
-def _residual(system: ConstrainedSystem, data: Dataset, qdd: Tensor) -> Tensor:
-    """|A q̈ − b| of the rows of closed contacts, `(k,)`."""
-    active = data.active(system.contact_names)
-    eom = system.equations(data.q, data.qd, active)
-    residual = ((eom.A @ qdd[..., None])[..., 0] - eom.b).abs()
-    return residual[system.active_rows(active, qdd.shape[:-1])]
 
 
 def _noise_std(model: Predictor, data: Dataset) -> Tensor | None:
@@ -105,8 +100,7 @@ class MultiplierScore:
         samples: in contact.
         bias, spread, level: mean and standard deviation of predicted less logged λ, and mean logged λ [N].
         correlation: of predicted and logged λ, `None` if either is constant.
-        coverage: share of logged values within ±2σ, noise of the torque included; `None` without a
-            covariance.
+        coverage: share of logged values within ±2σ, including torque noise; `None` without a covariance.
     """
 
     contact: str
@@ -126,7 +120,7 @@ class MultiplierScore:
 
 @torch.no_grad()
 def multiplier_scores(model: Predictor, data: Dataset) -> tuple[MultiplierScore, ...]:
-    """Compare λ with what a simulator or a sensor logged, by contact with two samples in contact or more."""
+    """Compare λ with logged values of a simulator or sensor, for each contact with at least two samples."""
     if not logged_forces(model, data):
         return ()
     return _scores(model, data, *in_chunks(lambda part: predicted_forces(model, part), data))
@@ -145,8 +139,9 @@ def predicted_forces(model: Predictor, data: Dataset) -> Moments:
 
 
 def logged_forces(model: Predictor, data: Dataset) -> dict[str, Tensor]:
-    """Normal force `(n,)` of contacts that were closed in training, by name: `multiplier`, or the sensor's if
-    there is one contact."""
+    """Normal force `(n,)` of contacts closed in training, by name: `multiplier`, or the sensor's for a single
+    contact.
+    """
     never = model.result.never_closed if isinstance(model, StructuredFit) else ()
     names = [name for name in model.system.contact_names if name not in never]
     logged = data.contact_extras.get("multiplier", {})

@@ -136,7 +136,7 @@ def nlpd(error: Tensor, std: Tensor) -> float:
 
 
 def share(inside: Tensor) -> float:
-    """Share of what is true."""
+    """Share of true entries."""
     return float(inside.to(torch.float64).mean())
 
 
@@ -167,7 +167,7 @@ class PredictorScores:
 
     @property
     def beyond_gravity(self) -> float | None:
-        """Median over the joints of the share that is explained."""
+        """Median over the joints of the explained share."""
         known = [share for share in self.explained if share is not None]
         return median(known) if known else None
 
@@ -201,7 +201,7 @@ class Verdict:
 
 
 def verdicts(scores: Sequence[PredictorScores], joint_names: Sequence[str]) -> tuple[Verdict, ...]:
-    """The first predictor, the model, against each of the others."""
+    """Compare the first predictor, the model, with each of the others."""
     model, *others = scores
     result = []
     for other in others:
@@ -221,7 +221,7 @@ def _ratios(ours: JointErrors, theirs: JointErrors) -> list[float]:
 
 
 def sentence(comparisons: Sequence[Verdict]) -> str:
-    """The verdict in one sentence, or "" where there was nothing to compare with."""
+    """The verdict in one sentence, or "" without a comparison."""
     better = _listed([_noun(v.against) for v in comparisons if v.better])
     worse = _listed([_noun(v.against) for v in comparisons if not v.better])
     parts = [f"is better than {better}"] if better else []

@@ -1,8 +1,8 @@
 """Residual torques of a fit: their correlation in time, and their size on held-out stretches.
 
 Temperature, hysteresis and filters leave residuals that are correlated in time, so a log holds less evidence
-than its samples suggest. The integrated autocorrelation time says how much less. The variance of a new
-motion is measured where it counts: on stretches of the training log that the posterior has not seen.
+than its samples suggest. The integrated autocorrelation time is the factor. The variance on new motions is
+measured on stretches of the training log that the posterior was not conditioned on.
 """
 
 from __future__ import annotations
@@ -56,7 +56,7 @@ at least."""
 def autocorrelation_time(x: Tensor, segment: Tensor, white: Tensor | float = 0.0) -> Tensor:
     """Integrated autocorrelation time of each column, 1 + 2 Σ ρ_k, in samples `(d,)`.
 
-    The sum ends where ρ falls below 0.05, and at half the longest segment. It is 1 for a column whose
+    The sum ends when ρ falls below 0.05, and at half the longest segment. It is 1 for a column whose
     neighbours have no significant covariance (two standard errors of that of white noise).
 
     Args:
@@ -201,12 +201,12 @@ def calibrated_noise(problem: Problem, hyperparameters: Mapping[str, Tensor]) ->
 def held_out_torque_std(problem: Problem, hyperparameters: Mapping[str, Tensor], least: Tensor) -> Tensor:
     """Standard deviation of torque noise `(nq,)` with which held-out stretches have unit normalised errors.
 
-    Each stretch is predicted from all others with the hyperparameters as they are. The error of the
-    force in accelerations is r = M(q̈ − E q̈) = P ε, with P = I in free motion. Of joint i, s_i² solves
-    mean(r_i² / (Σ_k P_ik² s_k² + Var r_i)) = 1 over all samples at which P_ii is more than a half.
+    Each stretch is predicted from all others with the given hyperparameters. The error of the force in
+    accelerations is r = M(q̈ − E q̈) = P ε, with P = I in free motion. For joint i, s_i² solves mean(r_i² /
+    (Σ_k P_ik² s_k² + Var r_i)) = 1 over all samples with P_ii above one half.
 
     Args:
-        least: the learned standard deviation, which is kept where the errors ask for less.
+        least: the learned standard deviation, a lower bound.
     """
     parts = []
     for i in _motions(problem.training):
@@ -220,16 +220,16 @@ def held_out_torque_std(problem: Problem, hyperparameters: Mapping[str, Tensor],
 
 
 def growth(problem: Problem, hyperparameters: Mapping[str, Tensor], load: Tensor) -> Tensor:
-    """g `(nq,)`: by how much the standard deviation of each torque grows beyond the trained region.
+    """g `(nq,)`: growth of the standard deviation of each torque beyond the trained region.
 
     The fastest and the most loaded quarter of the training samples are predicted from the rest. With
     g = c · load, one c for all joints, and D the distance beyond the region of the rest, c is most probable
     under r_i ~ N(0, V_i + Σ_k P_ik² (s_k² + g_k² D_k²)), tempered like the likelihood, and a scaled
-    inverse-χ² prior, which decides where the log has only one regime.
+    inverse-χ² prior, which dominates if the log has only one regime.
 
     Args:
-        problem: what was learned, with the power of its likelihood.
-        hyperparameters: with the noise of the torque as it is predicted.
+        problem: the learned problem, with the power of its likelihood.
+        hyperparameters: including the predicted torque noise.
         load: typical torque of each joint `(nq,)` [N m, N].
     """
     s2, square, known, slope = hyperparameters[TORQUE_NOISE].exp() ** 2, [], [], []
@@ -262,7 +262,7 @@ def growth(problem: Problem, hyperparameters: Mapping[str, Tensor], load: Tensor
 
 
 def stretches(segment: Tensor) -> Tensor:
-    """Which stretch each sample belongs to: its segment, or an eighth of the log where segments are few."""
+    """Index of each sample's stretch: its segment, or an eighth of the log if there are few segments."""
     _, own = segment.unique(return_inverse=True)
     if int(own.max()) + 1 >= 3:
         return own % MOST_STRETCHES
@@ -296,8 +296,8 @@ def unit_scales(r2: Tensor, V: Tensor, share: Tensor, least: Tensor) -> Tensor:
     """s with mean(r_i² / (Σ_k share_ik s_k² + V_i)) = 1 for each joint i, found joint by joint.
 
     Args:
-        r2, V: `(n, nq)` squared errors, and their variance but for the noise.
-        share: `(n, nq, nq)` P_ik², how much of the noise of joint k is in the error of joint i.
+        r2, V: `(n, nq)` squared errors, and their variance without noise.
+        share: `(n, nq, nq)` P_ik², the share of the noise of joint k in the error of joint i.
         least: `(nq,)` smallest values.
     """
     s = least.clone()

@@ -1,18 +1,22 @@
 """The external wrench on a frame of the robot, from the equations of motion beyond the learned forces.
 
-A wrench w that nobody declared acts on a frame with Jacobian J:
+An undeclared wrench w acts on a frame with Jacobian J:
 
     M q̈ = Q̄ + Aᵀλ + Jᵀ w,   Q̄ ~ N(E Q̄, S).
 
 S is the posterior covariance of the learned forces with the noise of the torques.
 
 - **From accelerations** (`least_squares`): r = M q̈ − E Q̄ = Jᵀ w + e with Cov(e) = S + M Σ_q̈ Mᵀ and a prior
-  w ~ N(0, W), by generalized least squares: C = (J Cov(e)⁻¹ Jᵀ + W⁻¹)⁻¹, E w = C J Cov(e)⁻¹ r. Along a
-  direction that the arm cannot feel, the covariance is that of the prior.
+  w ~ N(0, W), by generalized least squares: C = (J Cov(e)⁻¹ Jᵀ + W⁻¹)⁻¹, E w = C J Cov(e)⁻¹ r. Along
+  directions without effect on the joints, the covariance is that of the prior.
 - **From momenta** (`observe`), without accelerations: p = M q̇ obeys ṗ = Q̄ − Q_C + ½ ∂(q̇ᵀM q̇)/∂q + Jᵀ w. A
   Kalman filter estimates p, w, and the error of the learned forces, whose correlation in time is that of the
   torque residuals in the training log. The observer of De Luca and Mattone (*Sensorless robot collision
   detection and hybrid force/motion control*, ICRA 2005) is the steady filter without errors of the forces.
+
+- **With an unknown lever** (`over_levers`): a moment about the point is a force times its distance. The
+  estimate is a mixture over priors with moments of several sizes, weighted by their evidence at the sample.
+  That decides along directions that the arm hardly feels.
 
 The wrench is that of the environment on the robot. Multipliers of closed contacts are unknown too.
 """
@@ -20,6 +24,7 @@ The wrench is that of the environment on the robot. Multipliers of closed contac
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -40,6 +45,8 @@ FORCE_STD, MOMENT_STD = 30.0, 5.0
 """Standard deviation of each force [N] and moment [N m] before the data: wide beside pushes by hand."""
 FORCE_CHANGE, MOMENT_CHANGE = 10.0, 1.0
 """By how much they change within a second, in the momentum filter."""
+LEVERS = (1.0, 0.3, 0.1)
+"""Sizes of moments beside forces over that of the prior, each as likely before the data."""
 MULTIPLIER_STD = 1e4
 """Of the multipliers of declared contacts [N], which are left open."""
 ROWS = {name: row for row, name in enumerate((*MOMENTS, *FORCES))}
@@ -54,10 +61,11 @@ class WrenchFrame:
         frame: frame of the robot.
         reference: axes of the components, `"world"` or `"local"` (those of the frame).
         axes: components of `AXES` that are estimated, in this order; the others are zero.
-        point: where the force acts, and what moments refer to, in coordinates of the frame [m].
+        point: point of application of the force and reference point of moments, in coordinates of the frame
+            [m].
         prior_std: standard deviation of forces [N] and moments [N m] before the data.
-        change: by how much a force [N] and a moment [N m] change within a second (a standard deviation), for
-            the momentum filter: it follows faster, with more noise, where that is more.
+        change: standard deviation of the change of a force [N] and a moment [N m] within a second, for the
+            momentum filter; larger values make it faster and noisier.
 
     Example:
         >>> WrenchFrame("tool", axes=("fx", "fz")).prior.tolist()
@@ -65,7 +73,8 @@ class WrenchFrame:
 
     Raises:
         UnknownNameError: no such reference or component.
-        ParameterError: no component, one twice, or a standard deviation that is not positive and finite.
+        ParameterError: no component, a repeated component, or a standard deviation that is not positive and
+            finite.
     """
 
     frame: str
@@ -103,8 +112,14 @@ class WrenchFrame:
         force, moment = pair
         return torch.tensor([force if axis in FORCES else moment for axis in self.axes], dtype=torch.float64)
 
+    @property
+    def levers(self) -> list[Tensor]:
+        """Factors on `prior` `(k,)` for each of `LEVERS`, if there are forces and moments."""
+        both = len({axis in FORCES for axis in self.axes}) == 2
+        return [self._each((1.0, lever)) for lever in (LEVERS if both else (1.0,))]
+
     def jacobian(self, robot: RobotModel, q: Tensor) -> Tensor:
-        """J of the components at q `(*batch, nq)`: the joints feel Jᵀ w, `(*batch, k, nq)`.
+        """J `(*batch, k, nq)` of the components at q `(*batch, nq)`; the joint force is Jᵀ w.
 
         Raises:
             UnknownNameError: no such frame.
@@ -122,7 +137,7 @@ def least_squares(J: Tensor, r: Tensor, S: Tensor, prior: Tensor) -> tuple[Tenso
 
     Args:
         J: `(n, k, nq)`.
-        r: `(n, nq)` joint force that the model leaves.
+        r: `(n, nq)` residual joint force.
         S: `(n, nq, nq)` its covariance for w = 0.
         prior: `(k,)` or `(n, k)` standard deviations.
 
@@ -138,8 +153,42 @@ def least_squares(J: Tensor, r: Tensor, S: Tensor, prior: Tensor) -> tuple[Tenso
     return mean, V * prior[..., :, None] * prior[..., None, :]
 
 
+def over_levers(
+    mean: Tensor, covariance: Tensor, prior: Tensor, levers: Sequence[Tensor]
+) -> tuple[Tensor, Tensor]:
+    """An estimate under w ~ N(0, W), W = diag prior², for a mixture of priors W_s = diag (s prior)², s ≤ 1.
+
+    C_s⁻¹ = C⁻¹ + W_s⁻¹ − W⁻¹ and m_s = C_s C⁻¹ m, with evidence ∝ (|C_s| / |W_s|)^½ exp(½ m_sᵀ C_s⁻¹ m_s).
+
+    Args:
+        mean, covariance: m `(n, k)` and C `(n, k, k)`.
+        prior: `(k,)` standard deviations.
+        levers: s of each prior `(k,)`, which are as likely before the data.
+
+    Returns:
+        Mean `(n, k)` and covariance `(n, k, k)` of the mixture.
+    """
+    # In units of the prior
+    precision = torch.cholesky_inverse(torch.linalg.cholesky(covariance / (prior[:, None] * prior[None, :])))
+    v = (precision @ (mean / prior)[..., None])[..., 0]
+    logs, means, covariances = [], [], []
+    for s in levers:
+        L = torch.linalg.cholesky(precision + torch.diag(s**-2 - 1.0))
+        C = torch.cholesky_inverse(L)
+        m = (C @ v[..., None])[..., 0]
+        logs.append(0.5 * (m * v).sum(-1) - L.diagonal(dim1=-2, dim2=-1).log().sum(-1) - s.log().sum())
+        means.append(m)
+        covariances.append(C)
+    weight = torch.softmax(torch.stack(logs), dim=0)[..., None]
+    m, C = torch.stack(means), torch.stack(covariances)
+    mixed = (weight * m).sum(0)
+    apart = m - mixed
+    spread = (weight[..., None] * (C + apart[..., :, None] * apart[..., None, :])).sum(0)
+    return mixed * prior, spread * prior[:, None] * prior[None, :]
+
+
 def momentum_force(robot: RobotModel, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
-    """M `(n, nq, nq)` and ½ ∂(q̇ᵀM q̇)/∂q = Ṁ q̇ + Q_C `(n, nq)`, what inertia adds to ṗ besides forces."""
+    """M `(n, nq, nq)` and ½ ∂(q̇ᵀM q̇)/∂q = Ṁ q̇ + Q_C `(n, nq)`, the contribution of inertia to ṗ."""
     with torch.enable_grad():
         x = q.detach().clone().requires_grad_()
         M = dynamics.mass_matrix(robot, x)
@@ -157,7 +206,7 @@ class MomentumLog:
         p: M q̇ `(n, nq)`, with covariance `p_noise` `(n, nq, nq)` of its noise.
         u: `(n, nq)` mean of ṗ without the wrench.
         J: `(n, k, nq)` of the unknown components.
-        prior, change: `(k,)` their standard deviations, and how much they change within a second.
+        prior, change: `(k,)` their standard deviations, and those of their change within a second.
         factor: `(n, nq, nq)` lower Cholesky factor of S.
         correlation: `(nq,)` integral of the autocorrelation of the forces' error over all lags [s].
     """

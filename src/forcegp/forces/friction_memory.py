@@ -1,12 +1,12 @@
-"""Dry friction with memory, in what a fit leaves of its training torques.
+"""Dry friction with memory in the torque residuals of a fit.
 
-Friction that is a function of the velocity jumps where a joint reverses. Real friction develops over a
+Friction as a function of the velocity jumps when a joint reverses. Real friction develops over a
 distance δ: in Dahl's model it is proportional to z, dz/dt = q̇/δ − |q̇| z/δ (Dahl 1976, *Solid friction
-damping of mechanical vibrations*). Force priors depend on the state alone, so around each reversal they are
-wrong by up to the whole friction, and what else they learn is less certain. In a log in order of time z
-follows from the velocities. A ridge regression, of the torque that a fit leaves, on z for some δ, on
-functions of the velocity, and on the weight of the links corrects that. A joint is corrected only if that
-explains stretches of the training log that the regression has not seen.
+damping of mechanical vibrations*). Force priors depend only on the state, so around each reversal they are
+wrong by up to the whole friction, which makes other learned forces less certain. In a log in order of time z
+follows from the velocities. The correction is a ridge regression of the torque residual on z for some δ, on
+functions of the velocity, and on the weight of the links. A joint is corrected only if that explains held-out
+stretches of the training log.
 """
 
 from __future__ import annotations
@@ -65,9 +65,9 @@ class FrictionMemory:
 
     Attributes:
         weights: of the features, `(nq, f)` [N m, N].
-        share: what remains of the variance of the torque's noise, and of that of joints that stick,
-            `(nq, 2)`.
-        correlation: integral of the autocorrelation of what is left over all lags, `(nq,)` [s].
+        share: remaining share of the variance of the torque noise, and of that of joints that stick, `(nq,
+            2)`.
+        correlation: integral of the autocorrelation of the residual over all lags, `(nq,)` [s].
     """
 
     weights: Tensor
@@ -76,7 +76,7 @@ class FrictionMemory:
 
     @classmethod
     def of(cls, hyperparameters: Mapping[str, Tensor]) -> FrictionMemory | None:
-        """The memory that a fit has learned, if its log determines it."""
+        """The memory learned by a fit, if its log determines it."""
         if WEIGHTS not in hyperparameters:
             return None
         return cls(*(hyperparameters[name] for name in (WEIGHTS, SHARE, CORRELATION)))
@@ -90,11 +90,11 @@ class FrictionMemory:
 def memory_of(
     problem: Problem, hyperparameters: Mapping[str, Tensor], training: Training
 ) -> dict[str, Tensor]:
-    """The correction as hyperparameters, from samples in free motion; empty where these are not in order of
+    """The correction as hyperparameters, from samples in free motion; empty if these are not in order of
     time, or too far apart.
 
     Args:
-        training: samples whose residuals are looked at.
+        training: samples with the residuals to explain.
     """
     if not training.period:
         return {}
@@ -134,11 +134,10 @@ def learn_memory(
     """Learn the correction from training samples in free motion.
 
     Args:
-        residual: joint force that the fit leaves, M q̈ − E Q̄ `(n, nq)`.
+        residual: joint force that the fit does not explain, M q̈ − E Q̄ `(n, nq)`.
         white: its variance that noise of the accelerations explains, `(n, nq)`.
         forces: its variance that the learned forces explain, `(n, nq)`.
-        noise: its variance that noise of the torques and sticking explain, `(n, nq, 2)`, of which shares
-            remain.
+        noise: its variance that torque noise and sticking explain, `(n, nq, 2)`.
 
     Returns:
         The correction, or `None` if the samples are too far apart.

@@ -1,19 +1,18 @@
-"""Which inertia a measured robot has: that of its file, with drives that the file lacks, or another one.
+"""Inertia of a measured robot: that of its file, with drives that the file lacks, or identified inertia.
 
 Held-out stretches of the log decide whether an estimate predicts torques better than the file
-(`inverse_dynamics.py`). Least squares make inertia too small where accelerations are noisy, and the
-likelihood of accelerations given torques makes it too large where the torque is noisy and a controller chose
-the motion. The equations of motion a little earlier and later are instruments that neither disturbs. The
-unknowns are Gaussian around the robot file, each link stays physically consistent, and the inertia of a drive
-is not negative.
+(`inverse_dynamics.py`). With noisy accelerations, least squares underestimates inertia; with noisy torques in
+closed loop, the likelihood of accelerations given torques overestimates it. The equations of motion a little
+earlier and later are instruments without either bias. The unknowns are Gaussian around the robot file, each
+link stays physically consistent, and the inertia of a drive is not negative.
 
-Torques do not settle everything. In a closed loop the noise of the torque sensor exceeds the torque
-that accelerates a light joint; divided by the inertia of the file it predicts accelerations that are larger
-than all that were measured. Where that is so, the drives get the inertia that maximises
-−½ Σ ε²/s² + v Σ log |M|, with the smallest v ≤ 1 at which accelerations are predicted as well as by their
-mean, as long as the error of no joint's torque on held-out stretches grows by more than 2 %.
+Torques alone do not suffice. In a closed loop the noise of the torque sensor exceeds the torque
+that accelerates a light joint; divided by the inertia of the file it predicts accelerations far larger than
+the measured ones. In that case, the drives get the inertia that maximises −½ Σ ε²/s² + v Σ log |M|, with the
+smallest v ≤ 1 at which accelerations are predicted as well as by their mean, as long as the error of no
+joint's torque on held-out stretches grows by more than 2 %.
 
-Where a caller asks for an `InertialPrior` itself, the robot moves to the posterior mean of its inertial
+If an `InertialPrior` is given, the robot moves to the posterior mean of its inertial
 parameters: one Gauss–Newton step, physically consistent.
 """
 
@@ -21,7 +20,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -33,10 +32,12 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.dynamics import mass_matrix
 from forcegp.forces.calibration import autocorrelation_time
 from forcegp.forces.inverse_dynamics import (
+    LEAST,
     Estimate,
     NormalEquations,
     Rows,
     acceleration_errors,
+    averaged,
     free_rows,
     held_out,
     instrumental,
@@ -59,52 +60,80 @@ from forcegp.robot.model import RobotModel
 
 PASSES = 3
 """Estimates of the unknowns, each with the noise that the one before left."""
+WIDTHS = (0.0, 0.02, 0.05, 0.12)
+"""Standard deviations of averages over time that are tried [s]; the narrowest posterior is taken."""
 
 
 def rigid_robot(robot: RobotModel, rows: Rows) -> RobotModel | None:
     """The physically consistent robot that predicts held-out torques better than the file, or `None`.
 
-    It has to do so significantly, by more than two standard errors over stretches of the log: better than the
-    file, and better than the file with drives that it lacks. And no joint's held-out acceleration error may
-    grow.
+    The improvement must exceed two standard errors over stretches of the log, over the file and over the file
+    with additional drives, and no joint's held-out acceleration error may grow.
 
     Args:
         robot: of the file.
         rows: samples in free motion.
     """
     prior, n = InertialPrior(), robot.nq
-    size = mass_matrix(robot, rows.q).diagonal(dim1=-2, dim2=-1).mean(0)
+    M = mass_matrix(robot, rows.q)
+    size = M.diagonal(dim1=-2, dim2=-1).mean(0)
     links = regressor(robot, rows.q, rows.qd, rows.qdd) * prior.scale(robot)
     C = torch.cat([size * torch.diag_embed(rows.qdd), links], dim=-1)
-    by_stretch, judged = instrumental(rows, C), products(rows, C)
-    every = by_stretch.total()
-    mean, noise, power = C.new_zeros(C.shape[-1]), C.new_ones(n), 1.0
-    for _ in range(PASSES):
-        left = rows.slides * (rows.residual - C @ mean - (rows.friction * every.friction(mean)).sum(-1))
-        noise = (left.square().sum(0) / rows.slides.sum(0).clamp(min=1)).sqrt().clamp(min=1e-300)
-        power = _power(rows, left / noise)
-        mean = _estimate(every, noise, power)
+    found = max(_over_widths(rows, C, M), key=lambda each: float(torch.logdet(each.normal()[1])))
+    noise = found.noise
 
     def compared(estimate: Estimate) -> Tensor:
         """Held-out errors in units of the noise."""
-        return held_out(by_stretch, estimate, judged) / noise**2
+        return held_out(found.by_stretch, estimate, found.judged) / noise**2
 
-    nothing, drives = torch.zeros_like(mean), _drives_alone(every, noise, n)
+    nothing, drives = torch.zeros_like(found.mean), _drives_alone(found.by_stretch.total(), noise, n)
     known = min(
         (compared(lambda _, x=x: x) for x in (nothing, drives)), key=lambda error: float(error.mean())
     )
-    if not _is_better(compared(lambda rest: _estimate(rest, noise, power)), known):
+    if not _is_better(compared(lambda rest: _estimate(rest, noise, found.power)), known):
         return None
-    driven = robot.replace(armature=robot.armature + size * mean[:n])
-    _, precision = _normal(every, noise, power)
-    consistent, moved = prior.updated(driven, mean[n:], precision[n:, n:])
-    found = torch.cat([mean[:n], moved])
+    driven = robot.replace(armature=robot.armature + size * found.mean[:n])
+    _, precision = found.normal()
+    consistent, moved = prior.updated(driven, found.mean[n:], precision[n:, n:])
+    delta = torch.cat([found.mean[:n], moved])
     before, after = (
-        acceleration_errors(rows, by_stretch, C, delta, mass_matrix(each, rows.q))
-        for each, delta in ((robot, nothing), (consistent, found))
+        acceleration_errors(rows, found.by_stretch, C, x, mass_matrix(each, rows.q))
+        for each, x in ((robot, nothing), (consistent, delta))
     )
-    better = _is_better(compared(lambda _: found), known)
+    better = _is_better(compared(lambda _: delta), known)
     return consistent if better and is_harmless(after, before) else None
+
+
+@dataclass(frozen=True)
+class _Regression:
+    """Unknowns by instrumental variables, with the noise `(nq,)` and the power κ that they leave."""
+
+    by_stretch: NormalEquations
+    judged: NormalEquations
+    mean: Tensor
+    noise: Tensor
+    power: float
+
+    def normal(self) -> tuple[Tensor, Tensor]:
+        return _normal(self.by_stretch.total(), self.noise, self.power)
+
+
+def _over_widths(rows: Rows, C: Tensor, M: Tensor) -> Iterator[_Regression]:
+    """Regressions on equations that are averaged over time, by the width of the average."""
+    inertial = (M @ rows.qdd[..., None])[..., 0]
+    for width in WIDTHS if rows.step else WIDTHS[:1]:
+        used, columns = averaged(rows, C, inertial, width) if rows.step else (rows, C)
+        if width and int(used.slides.sum(0).min()) < LEAST:
+            break
+        by_stretch = instrumental(used, columns)
+        every, mean, noise, power = by_stretch.total(), C.new_zeros(C.shape[-1]), C.new_ones(C.shape[1]), 1.0
+        for _ in range(PASSES):
+            left = used.residual - columns @ mean - (used.friction * every.friction(mean)).sum(-1)
+            left = used.slides * left
+            noise = (left.square().sum(0) / used.slides.sum(0).clamp(min=1)).sqrt().clamp(min=1e-300)
+            power = _power(used, left / noise)
+            mean = _estimate(every, noise, power)
+        yield _Regression(by_stretch, products(used, columns), mean, noise, power)
 
 
 def _power(rows: Rows, left: Tensor) -> float:
@@ -156,8 +185,8 @@ class Inertia:
     """Inertia that the log determines.
 
     Attributes:
-        robot: that of the file, with the inertia that was found.
-        identified: whether inertial parameters of links were, of which some uncertainty remains.
+        robot: that of the file, with the identified inertia.
+        identified: whether inertial parameters of links were identified, so that some uncertainty remains.
         doubts: warnings for the user.
     """
 
@@ -174,7 +203,7 @@ def inertia_of(
 
     Args:
         system: robot and contacts of the robot file.
-        friction: what the friction of a joint depends on.
+        friction: inputs of the friction of a joint.
         mean: prior mean of Q, with the motor torque.
         training: samples in motion, `LEAST` of them free.
     """

@@ -1,12 +1,12 @@
 """Inverse dynamics of a measured robot as a linear regression, with held-out stretches of the log.
 
-In free motion τ + Q_C + Q_G + Q_D − M₀ q̈ = C δ + Φ w + ε, with friction Φ w of each joint on its own. Each
+In free motion τ + Q_C + Q_G + Q_D − M₀ q̈ = C δ + Φ w + ε, with separate friction Φ w of each joint. Each
 column of C is the torque of one unknown: the inertia of a drive, or an inertial parameter of a link.
 
-Noise of the accelerations in C makes inertia look smaller than it is to least squares. So each sample has a
-partner, further away in time than noise is correlated: columns C′ of the partner serve as instruments,
-C′ᵀ(C δ + Φ w − r) = 0, and errors are judged by the product ε ε′, in which noise vanishes in expectation
-(Söderström and Stoica, *Instrumental Variable Methods for System Identification*, 1983).
+Because of the noise of the accelerations in C, least squares underestimates inertia. So each sample has a
+partner at a time lag beyond the correlation of the noise, and its columns C′ serve as instruments, C′ᵀ(C δ +
+Φ w − r) = 0, and errors are judged by the product ε ε′, in which noise vanishes in expectation (Söderström
+and Stoica, *Instrumental Variable Methods for System Identification*, 1983).
 """
 
 from __future__ import annotations
@@ -40,6 +40,8 @@ APART = 0.05
 """Time between a sample and its partner [s], where no filter of accelerations spans more."""
 DISTANCES = (0.01, 0.03, 0.1)
 """Distances over which friction with memory develops [rad, m]."""
+REACH = 3.0
+"""Standard deviations after which Gaussian weights end."""
 LEAST_SQUARE = 1e-300
 """Mean square of a joint that does not move in a stretch, which has no error."""
 TOLERATED = 0.02
@@ -54,14 +56,15 @@ class Rows:
 
     Attributes:
         q, qd, qdd: `(n, nq)`.
-        residual: torque that the robot of the file leaves `(n, nq)`.
+        residual: torque that the robot file does not explain `(n, nq)`.
         friction: Φ, features of the friction of each joint and its offset `(n, nq, f)`.
-        slides: `(n, nq)` bool, joints that move; the friction of one that sticks holds it, so its
-            torque is uninformative there.
+        slides: `(n, nq)` bool, joints that move; the torque of a joint that sticks is uninformative.
         group: stretch of each sample `(n,)`, from 0 without gaps.
         segment: `(n,)`.
-        partner: index of each sample's partner `(n,)`; its own where the log has none.
+        partner: index of each sample's partner `(n,)`; its own index if there is none.
         memory: friction with memory, further features `(n, nq, k)`.
+        step: time between neighbours [s]; 0 if they are not in order.
+        filter_variance: of the weights with which a filter averaged q̈ over time [s²].
     """
 
     q: Tensor
@@ -74,6 +77,8 @@ class Rows:
     segment: Tensor
     partner: Tensor
     memory: Tensor
+    step: float = 0.0
+    filter_variance: float = 0.0
 
     def with_memory(self) -> Rows:
         """The samples with all features of friction in Φ."""
@@ -118,7 +123,7 @@ class NormalEquations:
         )
 
     def friction(self, delta: Tensor) -> Tensor:
-        """w `(nq, f)` that explains what δ leaves."""
+        """Friction weights w `(nq, f)` that fit the residual at δ."""
         p = self.unknowns
         right = self.right[:, p:] - self.gram[:, p:, :p] @ delta
         return torch.linalg.solve(self._stiff(), right[..., None])[..., 0]
@@ -129,7 +134,7 @@ class NormalEquations:
         return self.gram[:, p:, p:] + RIDGE * self.count[:, None, None] * eye
 
     def quadratic(self, noise: Tensor) -> tuple[Tensor, Tensor]:
-        """H and h of H δ = h, with friction at its best; of Σ_j |ε_j|²/s_j² without instruments."""
+        """H and h of H δ = h, with optimal friction; of Σ_j |ε_j|²/s_j² without instruments."""
         # Friction eliminated, by Schur complement: H_j = G_δδ − G_δf (G_ff + D)⁻¹ G_fδ, H = Σ_j H_j/s_j²
         p = self.unknowns
         friction = torch.cat([self.gram[:, p:, :p], self.right[:, p:, None]], dim=-1)
@@ -153,7 +158,7 @@ Estimate = Callable[[NormalEquations], Tensor]
 def free_rows(
     system: ConstrainedSystem, prior: JointFrictionPrior, mean: ForceMean, training: Training
 ) -> Rows:
-    """Samples in free motion and their partners, of which there are `LEAST` or more in a measurement."""
+    """Samples in free motion and their partners, at least `LEAST` per measurement."""
     motions = (m for m in training.measurements if m.quantity == "qdd")
     free = ((m, (~m.active.any(-1)).nonzero()[:, 0]) for m in motions)
     m = next(m[rows] for m, rows in free if len(rows) >= LEAST)
@@ -168,7 +173,9 @@ def free_rows(
     if not paired:
         return _rows(system, prior, mean, m[first], memory[first], group, i)
     both, n = torch.cat([first, later[first]]), len(first)
-    return _rows(system, prior, mean, m[both], memory[both], group.repeat(2), torch.cat([i + n, i]))
+    rows = _rows(system, prior, mean, m[both], memory[both], group.repeat(2), torch.cat([i + n, i]))
+    step = max(0.0, float(m.t[first].diff().median()))
+    return dataclasses.replace(rows, step=step, filter_variance=training.filter_variance)
 
 
 def _in_time(m: Measurement | Dataset) -> Tensor:
@@ -181,7 +188,7 @@ def bristles(m: Measurement | Dataset) -> Tensor:
     """Friction with memory: z of Dahl's model dz/dt = q̇/δ − |q̇| z/δ for some distances δ, `(n, nq, k)`.
 
     Within δ of a reversal this friction is a spring, and its torque is about proportional to −q̈: without
-    these columns it passes for negative inertia.
+    these columns it resembles negative inertia.
     """
     order = _in_time(m)
     t, qd, segment = m.t[order], m.qd[order], m.segment[order]
@@ -203,10 +210,10 @@ def bristles(m: Measurement | Dataset) -> Tensor:
 
 
 def partners(m: Measurement, filter_span: float = 0.0) -> Tensor:
-    """The sample of the same trajectory that is later by `APART`, or −1, `(n,)`.
+    """Index of the sample of the same trajectory that is later by `APART`, or −1, `(n,)`.
 
-    By less where velocities would change too much meanwhile, but never by less than the span of a filter that
-    the log states [s]: noise within it is correlated, and instruments have that noise too.
+    The lag is shorter if velocities would change too much, but never shorter than the span of the log's
+    filter [s], within which noise is correlated.
     """
     later = torch.full((len(m.t),), -1, device=m.t.device)
     order = _in_time(m)
@@ -262,6 +269,56 @@ def _slides(moving: Tensor, Phi: Tensor, residual: Tensor) -> Tensor:
     return moving | ~sticks
 
 
+def averaged(rows: Rows, columns: Tensor, inertial: Tensor, width: float) -> tuple[Rows, Tensor]:
+    """Equations averaged over time with Gaussian weights; any sum of equations is one.
+
+    Noise of differentiated positions has high frequencies, the motion low ones. And a filter has averaged the
+    accelerations, so that the other terms are averaged by its variance more.
+
+    Args:
+        columns: C `(n, nq, p)`.
+        inertial: M₀ q̈ `(n, nq)`, a part of the residual.
+        width: standard deviation of the weights [s].
+
+    Returns:
+        Samples in motion around which all those of the average are of one stretch, and their columns.
+    """
+    stds = [x / rows.step for x in (width, math.hypot(width, math.sqrt(rows.filter_variance)))]
+    reach, stride = math.ceil(REACH * stds[1]), max(1, int(0.5 * stds[0]))
+    offset = torch.arange(-reach, reach + 1).to(columns)
+    narrow, wide = (torch.softmax(-0.5 * (offset / max(std, 1e-9)) ** 2, 0) for std in stds)
+    n = rows.leading
+    starts = range(0, len(rows.q), n)
+    count = len(range(reach, n - reach, stride))
+
+    def over(x: Tensor, weights: Tensor) -> Tensor:
+        total = x.new_zeros(len(starts), count, *x.shape[1:])
+        for k, w in enumerate(weights.tolist()):
+            for part, first in zip(total, starts, strict=True):
+                part += w * x[first + k : first + n - 2 * reach + k : stride]
+        return total.flatten(0, 1)
+
+    def shifted(x: Tensor, k: int) -> Tensor:
+        return torch.cat([x[first + k : first + n - 2 * reach + k : stride] for first in starts])
+
+    whole = torch.stack([shifted(x, 0) == shifted(x, 2 * reach) for x in (rows.group, rows.segment)]).all(0)
+    slides = (over(rows.slides.to(columns), torch.ones_like(offset)) > len(offset) - 0.5) & whole[:, None]
+    centre = {name: shifted(getattr(rows, name), reach) for name in ("q", "qd", "qdd", "group", "segment")}
+    i = torch.arange(count, device=columns.device)
+    result = dataclasses.replace(
+        rows,
+        **centre,
+        residual=over(rows.residual + inertial, wide) - over(inertial, narrow),
+        friction=over(rows.friction, wide),
+        memory=over(rows.memory, wide),
+        slides=slides,
+        partner=torch.cat([i + count, i]) if len(starts) == 2 else i,
+        step=stride * rows.step,
+        filter_variance=0.0,
+    )
+    return result, over(columns, narrow)
+
+
 def sums(rows: Rows, columns: Tensor) -> NormalEquations:
     """NormalEquations by stretch, with C `(n, nq, p)`."""
     X, r = _equations(rows, columns)
@@ -269,7 +326,7 @@ def sums(rows: Rows, columns: Tensor) -> NormalEquations:
 
 
 def instrumental(rows: Rows, columns: Tensor) -> NormalEquations:
-    """The same with the columns of partners as instruments; velocities, and so friction, are precise."""
+    """The same with the columns of partners as instruments; velocities and friction are taken as precise."""
     X, r = _equations(rows, columns, paired=True)
     p = columns.shape[-1]
     return _by_stretch(rows, torch.cat([X[rows.partner][..., :p], X[..., p:]], dim=-1), X, r, r)
@@ -304,12 +361,12 @@ def _by_stretch(rows: Rows, Z: Tensor, X: Tensor, s: Tensor, r: Tensor) -> Norma
 def held_out(
     by_stretch: NormalEquations, estimate: Estimate, judged: NormalEquations | None = None
 ) -> Tensor:
-    """Mean squares of torque errors on stretches that neither δ nor friction have seen, `(groups, nq)`.
+    """Mean squares of torque errors on stretches held out from δ and friction, `(groups, nq)`.
 
     Args:
-        by_stretch: what is estimated from.
+        by_stretch: the sums to estimate from.
         estimate: δ from all stretches but one.
-        judged: what errors are computed from, such as `products`; by default the same.
+        judged: the sums to compute errors from, such as `products`; by default the same.
     """
     errors = []
     for g in range(len(by_stretch.gram)):
@@ -322,7 +379,7 @@ def held_out(
 def acceleration_errors(
     rows: Rows, by_stretch: NormalEquations, columns: Tensor, delta: Tensor, M: Tensor
 ) -> Tensor:
-    """Mean squares of acceleration errors at δ on stretches that friction has not seen, `(groups, nq)`."""
+    """Mean squares of acceleration errors at δ on stretches held out from friction, `(groups, nq)`."""
     residual, errors = rows.residual - columns @ delta, []
     for g in range(len(by_stretch.gram)):
         inside = rows.group == g
@@ -333,12 +390,12 @@ def acceleration_errors(
 
 
 def log_ratio(after: Tensor, before: Tensor) -> Tensor:
-    """Of the roots of mean squares; zero for a joint that does not move in a stretch."""
+    """Logarithm of the ratio of root mean squares; zero for a joint that does not move in a stretch."""
     return 0.5 * (after.clamp(min=LEAST_SQUARE) / before.clamp(min=LEAST_SQUARE)).log()
 
 
 def is_harmless(after: Tensor, before: Tensor) -> bool:
-    """Whether the errors of no joint are larger by more than is tolerated."""
+    """Whether no joint's error grows beyond the tolerance."""
     return bool((log_ratio(after, before).mean(0) <= TOLERATED).all())
 
 

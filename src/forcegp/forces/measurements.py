@@ -1,8 +1,7 @@
-"""Measured quantities at states: from the columns of a log to all that a posterior is conditioned on.
+"""Measured quantities at states, from the columns of a log to the data of a posterior.
 
-In contact A q̈ = b. Where a measurement departs from it by far more than the usual noise (an impact, a wrong
-flag), the multiplier is not that of a contact that persists, and the other directions of q̈ are wrong with
-it.
+In contact A q̈ = b. If a measurement violates it by far more than the usual noise (an impact, a wrong flag),
+the contact does not persist, and the whole acceleration is unusable.
 """
 
 from __future__ import annotations
@@ -66,13 +65,13 @@ class Measurement:
         return (*self.states, self.values)
 
     def at(self, system: ConstrainedSystem) -> States:
-        """The equations of motion at the states, with the acceleration where it was measured."""
+        """The equations of motion at the states, with the measured acceleration if there is one."""
         time = torch.stack([self.t, self.segment.to(self.t)], dim=-1)
         return states(system, *self.states, qdd=self.values if self.quantity == "qdd" else None, time=time)
 
     @property
     def digests(self) -> Tensor:
-        """A number for each sample that no other one has, but by a rare chance `(n,)`."""
+        """A hash of each sample `(n,)`."""
         x = torch.cat([part.double() for part in self.tensors], dim=-1).contiguous().view(torch.int64)
         odd = torch.randint(2**62, x.shape[-1:], generator=torch.Generator().manual_seed(0)).to(x) * 2 + 1
         return ((x ^ (x >> 32)) * odd).sum(-1)
@@ -90,11 +89,11 @@ class Training:
         measurements: the values.
         noise_std: of each measurement, `(d,)` or `(n, d)`.
         scales: standardization of the inputs of each prior.
-        part_of: number of samples that are conditioned on, of which these are a part; 0 where these are all.
-        period: sampling period of the log that these are from [s]; 0 where its rows are not in order.
-        filter_span: of the filter that computed the accelerations [s]; 0 where the log does not state it.
-        weights: of the samples of each measurement `(n,)`, which their noise variance is divided by; `None`
-            for one.
+        part_of: number of all samples to condition on; 0 if these are all.
+        period: sampling period of the log [s]; 0 if its rows are not in order.
+        filter_span: of the filter that computed the accelerations [s]; 0 if unknown.
+        filter_variance: of its weights over time [s²], as in `DataHeader`.
+        weights: of the samples of each measurement `(n,)`, divisors of their noise variance; `None` for one.
         slopes: G = dz/d(q, q̇) `(n, d, 2 nq)` of each measurement with learned forces, `None` for a quantity
             without; `None` for those of the robot file (`forces/noise.py`).
     """
@@ -105,6 +104,7 @@ class Training:
     part_of: int = 0
     period: float = 0.0
     filter_span: float = 0.0
+    filter_variance: float = 0.0
     weights: tuple[Tensor, ...] | None = None
     slopes: tuple[Tensor | None, ...] | None = None
 
@@ -115,7 +115,7 @@ class Training:
 
     @property
     def all_samples(self) -> int:
-        """Number of samples that are conditioned on, of which these may be a part."""
+        """Number of all samples to condition on."""
         return self.part_of or self.samples
 
     def pieces(self, samples: int) -> Iterator[Training]:
@@ -137,16 +137,16 @@ class Training:
 
     @property
     def digests(self) -> Tensor:
-        """A number for each sample of all measurements."""
+        """A hash of each sample of all measurements."""
         return torch.cat([m.digests for m in self.measurements])
 
     def never_closed(self, system: ConstrainedSystem) -> tuple[str, ...]:
-        """Contacts that are closed at no sample."""
+        """Contacts that are never closed."""
         closed = torch.stack([m.active.any(0) for m in self.measurements]).any(0).tolist()
         return tuple(name for name, seen in zip(system.contact_names, closed, strict=True) if not seen)
 
     def thinned(self, samples: int) -> Training:
-        """About this many samples: the farthest points among the distinct states of each measurement."""
+        """Farthest points among the distinct states of each measurement, about this many samples."""
         share = samples / self.samples
         return self.of_rows([_spread(m, math.ceil(share * len(m.q))) for m in self.measurements])
 
@@ -241,7 +241,7 @@ DEFAULT_NOISE_STD = 0.1
 
 
 def plain(noise: NoiseStd | str | None) -> Any:
-    """A noise as what JSON can hold."""
+    """A noise as JSON-compatible values."""
     if noise is None or isinstance(noise, str):
         return noise
     values = torch.as_tensor(noise, dtype=torch.float64).tolist()
@@ -254,7 +254,7 @@ class Observation:
 
     Args:
         data: states, contacts and measured values.
-        quantity: what is measured: `qdd` (in contact or free), `multiplier`, `contact_force`,
+        quantity: the measured quantity: `qdd` (in contact or free), `multiplier`, `contact_force`,
             `constraint_force`, `joint_force`, `contact_friction` or `total_force`.
         noise_std: standard deviation of the measurement: one number, one per component, or `(n, d)`. For
             `qdd`, the default is that of the model, else the `qdd_std` of the log, else that of its header.
@@ -276,10 +276,10 @@ class Observation:
 
 
 def observations_of(data: Dataset | Sequence[Observation]) -> Sequence[Observation]:
-    """A data set as measurements of accelerations, or the measurements as given.
+    """A data set as measurements of accelerations, or the given measurements.
 
     Raises:
-        ModelError: there are none, or this is something else.
+        ModelError: there are none, or the argument has another type.
     """
     observations = [Observation(data)] if isinstance(data, Dataset) else data
     if not isinstance(observations, Sequence) or not all(isinstance(o, Observation) for o in observations):
@@ -305,7 +305,7 @@ def states_noise(observations: Sequence[Observation]) -> bool:
 
 @torch.no_grad()
 def unmeasured_forces(system: ConstrainedSystem, observations: Sequence[Observation]) -> dict[str, float]:
-    """Root mean square of M q̈ − Q_C − Q_G of the joints whose torque a log lacks, by name [N m, N]."""
+    """Root mean square of M q̈ − Q_C − Q_G of the joints without a logged torque, by name [N m, N]."""
     sizes: dict[str, float] = {}
     for data in (o.data for o in observations if o.data.header.unmeasured_torques):
         eom = system.equations(data.q, data.qd, contact_table(data, system.contact_names))
@@ -349,7 +349,7 @@ COLUMNS: Mapping[str, Callable[[Dataset, ConstrainedSystem], Tensor]] = {
 def measurement_of(
     observation: Observation, system: ConstrainedSystem, default_noise: NoiseStd | None = None
 ) -> tuple[Measurement, Tensor]:
-    """The measurement that an observation makes, and its noise `(d,)` or `(n, d)`.
+    """The measurement of an observation, and its noise `(d,)` or `(n, d)`.
 
     Raises:
         UnknownNameError: the quantity cannot be measured, or a contact is not logged.
@@ -413,9 +413,9 @@ def training_of(
     """Measurements with their noise and input scales.
 
     Args:
-        noise_std: of accelerations whose noise is not stated.
-        kept: scales of priors, by name, that keep earlier ones.
-        standardize: whether inputs of kernels are standardized, or enter in their units.
+        noise_std: of accelerations without a stated noise.
+        kept: earlier scales to keep, by name of the prior.
+        standardize: whether to standardize the inputs of kernels.
 
     Raises:
         ModelError, DataError: there are no data, or they do not fit the system.
@@ -428,6 +428,7 @@ def training_of(
         scales=(),
         period=_period(observations[0].data),
         filter_span=max(o.data.header.filter_span or 0.0 for o in observations),
+        filter_variance=max(o.data.header.filter_variance for o in observations),
     )
     return scaled(training, system, priors, kept, standardize)
 

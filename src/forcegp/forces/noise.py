@@ -1,8 +1,8 @@
-"""The noise of what a log measures: accelerations, motor torques, and the state.
+"""Measurement noise of a log: accelerations, motor torques, and the state.
 
 **Noise of the state**, to first order. At a measured state x + δ, with δ ~ N(0, Σ_x), the model predicts
-z(x + δ) ≈ z(x) + G δ, so a sample's rows have the noise G Σ_x Gᵀ more, with G = ∂z/∂(q, q̇) (McHutchon and
-Rasmussen, *Gaussian process training with input noise*, 2011). G is that of the robot file's equations of
+z(x + δ) ≈ z(x) + G δ, so a sample's rows have the additional noise G Σ_x Gᵀ, with G = ∂z/∂(q, q̇) (McHutchon
+and Rasmussen, *Gaussian process training with input noise*, 2011). G is that of the robot file's equations of
 motion under the measured torque, or, once forces have been learned, that of q̈ = L b + H F̄ with their
 posterior mean F̄ (`forces/noise_learning.py`).
 """
@@ -34,8 +34,8 @@ class Noise:
 
     Args:
         acceleration: standard deviation of measured accelerations [rad/s², m/s²], one or one per joint; by
-            default what the log states (`qdd_std` by sample, else its header), else 0.1.
-        learn: whether it is a hyperparameter, which starts there.
+            default the value in the log (`qdd_std` by sample, else its header), else 0.1.
+        learn: whether it is a hyperparameter, starting at this value.
         torque: standard deviation of the motor torque's white noise [N m, N], one or one per joint;
             `"learn"`, `None` for none, or `"auto"`: learned with the priors of measured robots.
         state: standard deviations of the white noise of measured q and q̇ [rad, rad/s], each one number or
@@ -43,8 +43,8 @@ class Noise:
         degrees_of_freedom: ν > 2 of a Student t distribution of each sample's noise, such as 4, for logs with
             impacts and other outliers; `None` for Gaussian noise (`forces/noise_learning.py`).
         external: standard deviation of an unknown force on some joints, by name [N m, N]: of a joint without
-            a torque sensor, or one that somebody moves by hand. Joints whose torque the log does not have
-            get the size of the force that moves them.
+            a torque sensor, or one that somebody moves by hand. Joints without a logged torque get the size
+            of the force that moves them.
 
     Example:
         >>> Noise(0.1, torque="learn").learns_torque
@@ -86,7 +86,7 @@ class Noise:
 
     @classmethod
     def of(cls, noise: NoiseStd | Noise | None) -> Noise:
-        """A noise as given, or that of accelerations alone."""
+        """The given `Noise`, or one of accelerations alone."""
         return noise if isinstance(noise, cls) else cls(noise)  # pyright: ignore[reportArgumentType]
 
     @property
@@ -95,7 +95,7 @@ class Noise:
         return self.torque == "learn" if isinstance(self.torque, str) else False
 
     def for_priors(self, priors: Sequence[ForcePrior]) -> Noise:
-        """The noise with that of the torque learned beside priors of measured robots, if it was left open."""
+        """The noise with `torque="auto"` resolved: learned with the priors of measured robots."""
         if not isinstance(self.torque, str) or self.torque != "auto":
             return self
         measured = any(isinstance(prior, JointFrictionPrior | InertialPrior) for prior in priors)
@@ -140,8 +140,8 @@ class SampleNoise:
 
     Attributes:
         std: σ of each component, `(d,)` or `(n, d)`.
-        force: Σ_τ, which reaches the values as the joint force does.
-        state: G Σ_x½ `(n, d, 2 nq)`, the factor of what noise of the state gives the values.
+        force: Σ_τ, the variance of the joint force.
+        state: G Σ_x½ `(n, d, 2 nq)`, factor of the noise of the state.
         weight: w of each sample `(n,)`; `None` for one.
     """
 

@@ -1,6 +1,6 @@
 """Noise that depends on the learned forces: slopes that carry noise of the state, and weights of samples.
 
-Both alternate with the hyperparameters.
+Both alternate with the hyperparameters (`solve` in `models/structured_learning.py`).
 
 **Slopes.** The first fit propagates the noise of the state through the equations of motion of the robot file
 (`noise.py`), which lack the unknown forces: a spring of 100 N m/rad turns noise of 1 mrad into 0.1 N m.
@@ -10,18 +10,17 @@ posterior mean F̄ at each sample and learn again with
     cov(y_i) = Σ_y + G_i Σ_x G_iᵀ,   G_i = ∂(L b + H F̄)/∂(q, q̇) + H ∂F̄/∂(q, q̇),
 
 where the first derivative is at fixed F̄; likewise for multipliers. The posterior mean can be worse than the
-robot file, for example far from other samples, so the slopes are kept only if the evidence of the training
+robot file, for example far from other samples, so new slopes are taken only if the evidence of the training
 data, with the weak priors, increases.
 
-**Weights.** Impacts, dropped packets and shocks of a gear break the equations of motion for a few samples,
-and under a Gaussian likelihood these decide what is learned. With y_i | w_i ~ N(E y_i, Σ_i/w_i) and
-w_i ~ Γ(ν/2, ν/2) the noise of sample i, d numbers that share one w_i, has a t distribution with ν degrees of
-freedom. Given the weights all is Gaussian, so inference stays exact. Expectation maximisation alternates
-learning with
+**Weights.** Impacts, dropped packets and gear shocks violate the equations of motion for a few samples, which
+would dominate a Gaussian likelihood. With y_i | w_i ~ N(E y_i, Σ_i/w_i) and w_i ~ Γ(ν/2, ν/2) the noise of
+sample i, d numbers that share one w_i, has a t distribution with ν degrees of freedom. Given the weights all
+is Gaussian, so inference stays exact. Expectation maximisation alternates learning with
 
     w_i = (ν + d) / (ν + E[r_iᵀ Σ_i⁻¹ r_i]),
 
-r_i the residual under the posterior: samples far outside the noise count for next to nothing (Lange, Little
+r_i the residual under the posterior: samples far outside the noise have almost no weight (Lange, Little
 and Taylor, *Robust statistical modeling using the t distribution*, 1989).
 """
 
@@ -41,10 +40,6 @@ from forcegp.forces.quantities import affine_map
 from forcegp.forces.search import Search
 from forcegp.gp.optimise import Learned, Progress
 
-ROUNDS = 3
-"""Most rounds of slopes, or of weights, and hyperparameters."""
-GROWTH = 1.0
-"""Increase of the log evidence below which the rounds end."""
 STEPS = 5
 """Steps of the weights at given hyperparameters; each needs one posterior."""
 CHUNK_STATES = 1024
@@ -56,54 +51,29 @@ IGNORED = 0.1
 def with_learned_slopes(
     problem: Problem, search: Search, learned: Learned, progress: Progress | None = None
 ) -> tuple[Problem, Learned, tuple[str, ...]]:
-    """The problem with the slopes of its learned forces, and what is learned with them.
+    """The problem with the slopes of its learned forces, what is learned with them, and warnings.
 
-    Nothing changes if a force is a function of time, or if the slopes cannot be computed or learned with, as
-    those of a force that is not made of tensors; a warning says so.
-
-    Args:
-        problem: exact, with noise of the state and the slopes of the robot file.
-
-    Returns:
-        The problem, what is learned, and warnings.
-    """
-    if any(prior.in_time for prior in problem.priors):
-        return problem, learned, ()
-    for _ in range(ROUNDS):
-        values = search.values(learned)
-        posterior, system = force_posterior(problem, values), problem.system_at(values)
-        try:
-            training = learned_slopes(problem.training, system, posterior)
-            updated = dataclasses.replace(problem, training=training)
-            relearned = search.solve(updated, progress, learned.tensors)
-        except (NumericalError, RuntimeError) as cause:
-            text = "the slopes of the learned forces, which noise of the state asks for, cannot be used"
-            return problem, learned, (f"{text}: {str(cause).splitlines()[0]}",)
-        growth = learned.value - relearned.value
-        if growth > 0.0:
-            problem, learned = updated, relearned
-        if not growth >= GROWTH:
-            break
-    return problem, learned, ()
-
-
-def with_learned_weights(
-    problem: Problem, search: Search, learned: Learned, degrees: float, progress: Progress | None = None
-) -> tuple[Problem, Learned]:
-    """The problem with the weights of its samples, and what is learned with them.
+    Nothing changes if the evidence does not increase, or if the slopes cannot be computed or learned with, as
+    those of a force that is not made of tensors.
 
     Args:
-        degrees: ν.
+        problem: exact, with noise of the state.
     """
-    for _ in range(ROUNDS):
-        problem = weighted(problem, search.values(learned), degrees)
-        learned = search.solve(problem, progress, learned.tensors)
-    return problem, learned
+    values = search.values(learned)
+    posterior, system = force_posterior(problem, values), problem.system_at(values)
+    try:
+        training = learned_slopes(problem.training, system, posterior)
+        updated = dataclasses.replace(problem, training=training)
+        relearned = search.solve(updated, progress, learned.tensors)
+    except (NumericalError, RuntimeError) as cause:
+        text = "the slopes of the learned forces, which noise of the state asks for, cannot be used"
+        return problem, learned, (f"{text}: {str(cause).splitlines()[0]}",)
+    return (updated, relearned, ()) if relearned.value < learned.value else (problem, learned, ())
 
 
 @torch.no_grad()
 def weighted(problem: Problem, values: Mapping[str, Tensor], degrees: float) -> Problem:
-    """The problem with the weights of its samples after `STEPS` steps, from those that it has.
+    """The problem with the weights of its samples after `STEPS` further steps.
 
     Args:
         degrees: ν.
@@ -121,7 +91,7 @@ def weighted(problem: Problem, values: Mapping[str, Tensor], degrees: float) -> 
 
 
 def left_out(problem: Problem) -> int:
-    """Number of samples that count for next to nothing."""
+    """Number of samples with almost no weight."""
     return sum(int((w < IGNORED).sum()) for w in problem.training.weights or ())
 
 

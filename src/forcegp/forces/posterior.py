@@ -1,18 +1,16 @@
 """The impressed forces before data, after them (eqs. 22 to 25), and as functions drawn from the posterior.
 
-Q̄ = m + Σ_p E_p f_p with f_p ~ GP(0, k_p), and Coulomb friction of contacts, which goes with the multiplier.
-Every quantity z = B_Q Q + B_z Q_z + o is an affine map of the latent forces f_p, so that their posterior
+Q̄ = m + Σ_p E_p f_p with f_p ~ GP(0, k_p), and Coulomb friction of contacts, proportional to the multiplier.
+Every quantity z = B_Q Q + B_z Q_z + o is an affine map of the latent forces f_p, so their posterior
 determines it. Each function drawn from it is a deterministic force field that can be integrated.
 
-Accelerations in contact depend on Q + Q_z alone (remark 3.3). The two are told apart by where they act (Q_z
-only in contact, along the tangent), by their inputs, and by measurements of either. Their posterior
-correlation measures the separation: at −1 only the sum is identifiable, at 0 each is known as well as the
-data allow.
+Accelerations in contact depend on Q + Q_z alone (remark 3.3). The two are distinguished by their directions
+(Q_z acts only in contact, along the tangent), by their inputs, and by measurements of either. Their posterior
+correlation measures the separation: at −1 only the sum is identifiable, at 0 they are separated.
 
-**Forces that are no function of the state.** Inside its static friction, the friction of a joint is whatever
-balances the other forces. A joint that hardly moves therefore has an unknown force of variance
-σ_s² e^{−(q̇/v_s)²} more. And noise learned where nothing moves says little about a jump: beyond the range of
-speeds and torques that a joint was trained on, its force has a standard deviation g D more, with D the
+**Forces that are no function of the state.** At rest, the friction of a joint balances the other forces. A
+joint that hardly moves therefore has an additional unknown force of variance σ_s² e^{−(q̇/v_s)²}. Beyond the
+trained range of speeds and torques of a joint, its force has an additional standard deviation g D, with D the
 distance from that range in training standard deviations. `calibration.growth` estimates g.
 """
 
@@ -56,7 +54,7 @@ FAR_BEYOND = 3.0
 
 @dataclass(frozen=True, eq=False)
 class ForceProcess:
-    """Priors on forces with what their operators have learned.
+    """Priors on forces with learned parameters of their operators.
 
     Attributes:
         priors, scales: the force priors and the standardization of their inputs.
@@ -110,7 +108,7 @@ LatentPosterior = ExactPosterior | SparsePosterior
 
 @dataclass(frozen=True, eq=False)
 class ForcePosterior:
-    """Latent forces conditioned on data; independent of the constraint under which it is read.
+    """Latent forces conditioned on data; independent of the constraint at prediction.
 
     Attributes:
         process: the forces before the data.
@@ -126,14 +124,14 @@ class ForcePosterior:
         return self.process.priors
 
     def shift(self, p: int, features: Features) -> Tensor | float:
-        """Shift of samples of the latent force of prior p that gives them the predicted mean."""
+        """Shift of samples of latent force p to the predicted mean."""
         if not self.process.pinned:
             return 0.0
         return self.means.latent_mean(p, features) - self.latent.latent_mean(p, features)
 
     @cached_property
     def means(self) -> LatentPosterior:
-        """The processes that means are read from: those given the forces that the robot contains."""
+        """The processes for means, given the forces that the robot contains."""
         means = self.latent
         for p, value in self.process.pinned.items():
             means = means.knowing(p, {"one": value.new_zeros(1, 1)}, value)
@@ -175,7 +173,7 @@ class ForcePosterior:
 
 
 def stick_variance(tensors: Mapping[str, Tensor], at: States) -> Tensor:
-    """Variance of the friction of joints that stick, `(n, nq)`; zero where it is not learned."""
+    """Variance of the friction of joints that stick, `(n, nq)`; zero if it is not learned."""
     if STICK_NOISE not in tensors:
         return torch.zeros_like(at.q)
     std, speed = tensors[STICK_NOISE].exp(), tensors[STICK_SPEED].exp()
@@ -187,9 +185,10 @@ def trained_region(qd: Tensor, tau: Tensor, load: Tensor, hidden: Tensor | None 
 
     Args:
         qd, tau: of samples in motion.
-        load: typical torque of each joint `(nq,)`, a fraction of which is the least spread of its torque.
-        hidden: `(nq,)` bool, joints whose torque has no effect on accelerations: rare torques are not learned
-            from, and their region is a standard deviation around the mean.
+        load: typical torque of each joint `(nq,)`, a fraction of which bounds the spread of its torque from
+            below.
+        hidden: `(nq,)` bool, joints without effect of the torque on accelerations; their region is one
+            standard deviation around the mean.
     """
     x = torch.stack([qd, tau], dim=1)
     low, high = x.quantile(torch.tensor([OUTERMOST, 1.0 - OUTERMOST]).to(x), dim=0)
@@ -202,8 +201,9 @@ def trained_region(qd: Tensor, tau: Tensor, load: Tensor, hidden: Tensor | None 
 
 
 def distance_beyond(tensors: Mapping[str, Tensor], qd: Tensor, tau: Tensor) -> Tensor:
-    """D of each joint `(*batch, nq)` in training standard deviations; zero inside the trained region, or
-    where none is known."""
+    """D of each joint `(*batch, nq)` in training standard deviations; zero inside the trained region, or if
+    it is unknown.
+    """
     if LOW not in tensors:
         return torch.zeros_like(qd)
     x = torch.stack([qd, tau], dim=-2)
@@ -212,7 +212,7 @@ def distance_beyond(tensors: Mapping[str, Tensor], qd: Tensor, tau: Tensor) -> T
 
 
 def warnings_beyond(distance: Tensor, joints: Sequence[str]) -> tuple[str, ...]:
-    """A warning where states lie far beyond the trained region.
+    """A warning if states lie far beyond the trained region.
 
     Args:
         distance: D `(*batch, nq)`.
@@ -230,15 +230,17 @@ def warnings_beyond(distance: Tensor, joints: Sequence[str]) -> tuple[str, ...]:
 
 
 def hidden_variance(tensors: Mapping[str, Tensor], at: States, external: Tensor | None) -> Tensor:
-    """Variance of forces that neither state nor torque sensor determines, `(n, nq)`: of joints that stick,
-    and unknown ones of stated size `(nq,)`."""
+    """Variance of forces determined by neither state nor torque sensor, `(n, nq)`: of joints that stick, and
+    of unknown forces of stated size `(nq,)`.
+    """
     variance = stick_variance(tensors, at)
     return variance if external is None else variance + external**2
 
 
 def unknown_variance(tensors: Mapping[str, Tensor], at: States, external: Tensor | None) -> Tensor:
-    """Variance of forces beside the learned ones in a prediction `(n, nq)`: hidden ones, and g² D² beyond the
-    trained region."""
+    """Additional variance of forces in a prediction `(n, nq)`: hidden forces, and g² D² beyond the trained
+    region.
+    """
     variance = hidden_variance(tensors, at, external)
     if GROWTH not in tensors:
         return variance
@@ -254,7 +256,7 @@ class ForceSamples:
     """Forces drawn from the posterior.
 
     Attributes:
-        posterior: what they are drawn from.
+        posterior: source of the samples.
         functions: the latent functions.
     """
 
@@ -311,7 +313,7 @@ def draw_samples(
 
     Args:
         generator: source of randomness, on the CPU.
-        features: random features per component; by default as many as the kind of posterior needs.
+        features: random features per component; by default a number that depends on the posterior.
     """
     size = () if features is None else (features,)
     return ForceSamples(posterior, posterior.latent.draw(count, generator, *size))
@@ -330,10 +332,10 @@ LARGE_JITTER = 0.01
 
 
 def force_correlation(posterior: ForcePosterior, system: ConstrainedSystem, at: States) -> Tensor:
-    """Posterior correlation of Q and Q_z at each state and joint, `(n, nq)`; 0 where one of them is certain.
+    """Posterior correlation of Q and Q_z at each state and joint, `(n, nq)`; 0 if one of them is certain.
 
-    corr_i = Cov(Q_i, Q_z,i) / √(Var Q_i Var Q_z,i). The part of Q along the constraint, which accelerations
-    never show, is left out.
+    corr_i = Cov(Q_i, Q_z,i) / √(Var Q_i Var Q_z,i). The part of Q along the constraint, which does not affect
+    accelerations, is excluded.
     """
     z = affine_map(system, at, ("joint_force", "contact_friction"))
     rows = posterior.rows(system, at, z)
@@ -351,7 +353,7 @@ def force_correlation(posterior: ForcePosterior, system: ConstrainedSystem, at: 
 def doubts_of(
     posterior: ForcePosterior, system: ConstrainedSystem, training: Training, power: float
 ) -> tuple[float | None, tuple[str, ...]]:
-    """Doubts about a posterior of rows to a power, at training states in contact and on the whole.
+    """Doubts about a posterior with a tempered likelihood, at training states in contact and overall.
 
     Returns:
         Mean correlation of Q and Q_z over some of these states, where both have priors; and warnings, each

@@ -64,15 +64,14 @@ class Problem:
     """Parts of the likelihood of force priors.
 
     Attributes:
-        system: robot and contacts, with the robot as it is where θ_A is not learned.
+        system: robot and contacts, with fixed parameters unless θ_A is learned.
         priors: the force priors.
         mean: prior mean of Q.
         training: measurements, noise and input scales.
-        parameters: module whose `forward()` gives the robot at θ_A, or `None`.
+        parameters: module with a `forward()` that returns the robot at θ_A, or `None`.
         torque_std: standard deviation of the white noise of the motor torque, `(nq,)`, unless it is learned.
-        power: κ, which the likelihood is raised to; below 1 where samples are correlated.
-        correlation: how long the noise of each torque is correlated, `(nq,)` [s]; `None` where that is not
-            known.
+        power: exponent κ of the likelihood; below 1 for correlated samples.
+        correlation: correlation time of the noise of each torque, `(nq,)` [s]; `None` if unknown.
         pinned: by prior, value `(components,)` of a latent force that the robot contains: its prior mean is
             minus this value, its posterior mean zero, and the others are conditioned on that.
         inducing: inducing inputs of each prior, for sparse inference; `None` for exact inference.
@@ -101,11 +100,11 @@ class Problem:
         return self.system.with_robot(torch.func.functional_call(self.parameters, own, ()))
 
     def priors_at(self, tensors: Mapping[str, Tensor]) -> tuple[ForcePrior, ...]:
-        """The priors with what their operators have learned."""
+        """The priors with learned parameters of their operators."""
         return tuple(prior.with_parameters(sub(tensors, prior.name)) for prior in self.priors)
 
     def noise_at(self, tensors: Mapping[str, Tensor], measurement: int) -> Tensor:
-        """Noise of a measurement, `(d,)` or `(n, d)`; a learned one scales what varies by sample."""
+        """Noise of a measurement, `(d,)` or `(n, d)`; learning scales noise that varies by sample."""
         std = self.training.noise_std[measurement]
         learned = tensors.get(noise_key(measurement))
         if learned is None:
@@ -113,18 +112,18 @@ class Problem:
         return learned.exp() if std.ndim == 1 else std * (learned.exp() / typical(std))
 
     def coulomb(self, tensors: Mapping[str, Tensor]) -> tuple[CoulombFriction, ...]:
-        """Coulomb friction of contacts, at its start where it is not among the tensors."""
+        """Coulomb friction of contacts, at its initial value if it is not among the tensors."""
         return coulomb_of(self.priors, tensors, self.system.robot.mass) if self.has_coulomb else ()
 
     @property
     def has_coulomb(self) -> bool:
-        """Whether a prior goes with Coulomb friction that is proportional to the multiplier."""
+        """Whether a prior is coupled with Coulomb friction proportional to the multiplier."""
         return any(prior.coupled for prior in self.priors)
 
     def with_coulomb_errors(self, tensors: Mapping[str, Tensor]) -> tuple[Problem, Tensors]:
-        """The problem with what is unknown of learned Coulomb friction as one more force, and its tensors.
+        """The problem with the error of learned Coulomb friction as a further force, and its tensors.
 
-        It is conditioned on, not learned with: there, the friction itself is what explains the data.
+        Used for conditioning, not for learning.
         """
         friction = self.coulomb(tensors)
         priors = tuple(CoulombErrorPrior(f.contact, friction) for f in friction)
@@ -148,7 +147,7 @@ class Problem:
         return lambda at: white + hidden_variance(tensors, at, self.external_std)
 
     def state_factor(self, system: ConstrainedSystem, measurement: int) -> Tensor | None:
-        """G Σ_x½ `(n, d, 2 nq)` of a measurement, or `None` where no noise of the state reaches it."""
+        """G Σ_x½ `(n, d, 2 nq)` of a measurement, or `None` without noise of the state."""
         if self.state_std is None:
             return None
         m, slopes = self.training.measurements[measurement], self.training.slopes
@@ -156,7 +155,7 @@ class Problem:
         return None if G is None else G * self.state_std
 
     def process_at(self, tensors: Mapping[str, Tensor]) -> ForceProcess:
-        """The forces a priori, with what operators and Coulomb friction have learned."""
+        """The forces a priori, with learned operators and Coulomb friction."""
         names = [prior.name for prior in self.priors]
         pinned = {names.index(name): value for name, value in self.pinned.items()}
         return ForceProcess(
@@ -187,7 +186,7 @@ class Problem:
 
     @cached_property
     def fixed_rows(self) -> WhitenedRows:
-        """The rows at the noise and robot as given."""
+        """The rows at the given noise and robot."""
         return self.rows({})
 
     @torch.no_grad()
@@ -209,13 +208,12 @@ class Problem:
     def hidden_torque(self) -> Tensor:
         """Standard deviation of torques with hardly any effect on accelerations, 0 for other joints `(nq,)`.
 
-        In contact, a force along the constraint changes no acceleration. A joint that pushes there has P_ii
-        near zero, and neither its noise nor its friction can be told from that of other joints. At most, it
-        explains all of the residual of its acceleration at such samples that unknown forces e of stated size
-        leave, s² = Σ (r_i² − Σ_k H_ik² Var e_k) / Σ H_ii². At least, it is `UNSHOWN` of the load of such
-        joints: friction goes with the size of a drive rather than with its load. That counts for joints with
-        P_ii below a half at most samples and above it at fewer than `SHOWN` independent ones, unless forces
-        were measured too.
+        In contact, a force along the constraint changes no acceleration. A joint that acts along the
+        constraint has P_ii near zero, and neither its noise nor its friction can be distinguished from those
+        of other joints. The upper bound is the residual of its acceleration at such samples beyond unknown
+        forces e of stated size, s² = Σ (r_i² − Σ_k H_ik² Var e_k) / Σ H_ii². The lower bound is `UNSHOWN` of
+        the load of such joints. It applies to joints with P_ii below one half at most samples and above it at
+        fewer than `SHOWN` independent ones, unless forces were measured too.
         """
         if set(self.training.quantities) != {"qdd"}:
             return torch.zeros_like(self.system.robot.mass)
@@ -246,13 +244,13 @@ class Problem:
         return torch.cat(squares).mean(0).sqrt()
 
     def negative_log_likelihood(self, params: Tensors, rows: WhitenedRows) -> Tensor:
-        """Of the rows, with their constant; of the weights of features where inference is sparse."""
+        """Negative log likelihood of the rows, or for sparse inference of the weights of features."""
         exact = self.inducing is None or not is_finite(self.priors)
         of = negative_log_likelihood if exact else negative_log_likelihood_of_weights
         return of(self.priors, params, rows.blocks) + rows.constant
 
     def rows_for(self, tensors: Tensors, held: Tensors) -> WhitenedRows:
-        """The rows at learned and held tensors; computed once where they are those as given."""
+        """The rows at learned and fixed tensors, cached if none of them changes the rows."""
         keys = [*tensors, *held]
         own = any(key.startswith(OWN) or key.endswith(MIXED) for key in keys)
         return self.rows({**held, **tensors}) if own else self.fixed_rows
@@ -273,9 +271,9 @@ class Totals:
 
     Attributes:
         sums: over the whitened rows.
-        constant: part of the negative log likelihood that no latent force changes `()`.
+        constant: part of the negative log likelihood independent of the latent forces `()`.
         samples: number of samples `()`.
-        pieces: how many pieces.
+        pieces: number of pieces.
     """
 
     sums: Sums
@@ -285,12 +283,12 @@ class Totals:
 
     @classmethod
     def zero(cls, problem: Problem, basis: LatentBasis) -> Totals:
-        """Of no samples."""
+        """Totals of no samples."""
         like = next(iter(basis.params.values()))
         return cls(Sums.zero(basis, like), like.new_zeros(()), like.new_zeros(()), 0)
 
     def over_processes(self) -> Totals:
-        """The totals of all processes of `torch.distributed` added, the same in each of them."""
+        """Add the totals of all processes of `torch.distributed`; each process gets the same result."""
         constant, samples = add_over_processes(torch.stack([self.constant, self.samples])).unbind()
         return Totals(reduce_sums(self.sums), constant, samples, self.pieces)
 
@@ -344,7 +342,7 @@ def posterior_of(
     """Forces conditioned on the samples of totals.
 
     Raises:
-        NumericalError: the sums are not finite, or the noise is rounding beside the prior.
+        NumericalError: the sums are not finite, or the noise is negligible beside the prior.
     """
     # A = I + Σ V S Vᵀ, w ~ N(A⁻¹v, A⁻¹)
     latent = SparsePosterior.of(basis, total.sums)
@@ -357,7 +355,7 @@ EXACT_SAMPLES = 1000
 
 
 def require_double(system: ConstrainedSystem) -> None:
-    """Refuse a robot in single precision, whose covariance matrices are not positive definite after rounding.
+    """Refuse a robot in single precision, since rounding makes its covariance matrices indefinite.
 
     Raises:
         ModelError: the robot is not float64.
@@ -399,7 +397,7 @@ def with_inducing(problem: Problem, hyperparameters: Mapping[str, Tensor], limit
     """The problem with inducing points chosen from its data by conditional variance.
 
     Args:
-        problem: with the samples that are conditioned on.
+        problem: with the samples to condition on.
         limit: maximum number of inducing points of one prior.
     """
     training = problem.training
@@ -435,7 +433,7 @@ def force_posterior(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> 
 def forces_and_constant(
     problem: Problem, hyperparameters: Mapping[str, Tensor]
 ) -> tuple[ForcePosterior, Tensor]:
-    """Forces conditioned on the data of a problem, and the part of the likelihood that they do not change.
+    """Forces conditioned on the data of a problem, and the part of the likelihood independent of them.
 
     Raises:
         ModelError: exact inference does not fit into memory.
@@ -453,10 +451,10 @@ def forces_and_constant(
 
 
 def lost_by_inducing(posterior: ForcePosterior) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Which inference a posterior has, and what a sparse one loses by its inducing points.
+    """The kind of inference of a posterior, and the information lost by inducing points.
 
     Returns:
-        The fields of `FitResult`, and a warning where the points miss much of the information in the data.
+        The fields of `FitResult`, and a warning if the points miss much of the information in the data.
     """
     if not isinstance(posterior.latent, SparsePosterior):
         return {"inference": "exact"}, ()

@@ -1,12 +1,11 @@
-"""Measurements as rows with unit white noise, with the directions that the constraint fixes projected out.
-
-Where q̈ is measured in contact, A q̈ = b fixes the part of q̈ in the range of Aᵀ: it is prior mean plus white
+"""Measurements as rows with unit white noise, with the directions fixed by the constraint projected out. If
+q̈ is measured in contact, A q̈ = b fixes the part of q̈ in the range of Aᵀ: it is prior mean plus white
 noise. With an orthonormal basis U of the null space of A (after scaling by the noise), Uᵀ q̈ carries the
 whole Gaussian process in nq − rank A rows per sample, and the likelihood splits exactly into the two parts.
 
-Noise of the motor torque is white noise on the joint force. It reaches a sample's rows through the same
+Noise of the motor torque is white noise on the joint force. It affects a sample's rows through the same
 operator as the force, so they have the covariance I + N Nᵀ with N = B Σ_τ½, whose Cholesky factor whitens
-them sample by sample. Noise of the state reaches them, to first order, through the Jacobian of the measured
+them sample by sample. Noise of the state affects them, to first order, through the Jacobian of the measured
 quantity.
 """
 
@@ -31,11 +30,11 @@ from forcegp.gp.features import Block, Features
 
 @dataclass(frozen=True, eq=False)
 class WhitenedRows:
-    """The rows of all measurements, and the part of the likelihood that no latent force changes.
+    """The rows of all measurements, and the part of the likelihood independent of the latent forces.
 
     Attributes:
         blocks: rows that the latent forces explain.
-        rest: computes the negative log likelihood of everything else, which an update does not ask for.
+        rest: computes the negative log likelihood of everything else; not needed for an update.
     """
 
     blocks: list[Block]
@@ -49,7 +48,7 @@ class WhitenedRows:
     def tempered(self, power: float) -> WhitenedRows:
         """The rows of the likelihood to a power κ: noise variances over κ, normalisations times κ.
 
-        Noise that is correlated over τ samples makes n of them worth n/τ; κ = 1/τ accounts for it.
+        With noise correlated over τ samples, n samples carry the evidence of n/τ; κ = 1/τ accounts for it.
         """
         if power == 1.0:
             return self
@@ -80,7 +79,7 @@ class _NullSpaceBasis(torch.autograd.Function):
 
 
 def null_space_basis(A: Tensor, rank: int) -> Tensor:
-    """Orthonormal basis U of the null space of matrices that share a rank, A U = 0, UᵀU = I.
+    """Orthonormal basis U of the null space of matrices of equal rank, A U = 0, UᵀU = I.
 
     The basis is defined up to a rotation U R, so only functions that do not depend on R have a
     derivative; for these dU = −A⁺ dA U.
@@ -147,7 +146,7 @@ class _Rows:
     def whitened(self, weight: Tensor | None) -> tuple[Block, Tensor]:
         """The rows divided by the factor of I + N Nᵀ, and the log determinant of the factors.
 
-        Samples with a weight have noise of less or more than unit variance.
+        Weighted samples have another noise variance.
         """
         signal = sum(self.widths) + 1
         rows, N = self.rows.tensor_split([signal], dim=-1)

@@ -1,11 +1,11 @@
-"""Every quantity as an affine map of the forces, z = B_Q Q + B_z Q_z + o; the home of λ's operator −Lᵀ.
+"""Every quantity as an affine map of the forces, z = B_Q Q + B_z Q_z + o.
 
 The operators follow from M q̈ = Q̄ + Aᵀλ and A q̈ = b (eqs. 19 to 25 with two corrections: the operator
 from force to λ is −Lᵀ, and λ depends on all impressed forces Q + Q_z).
 
-`linearize_field` differentiates q̈ and λ under a force field by state and torque. A system linearized at a
-fixed force (`constraints/gauss.py`) lacks how the force changes. With F = Q̄ − Q_C − Q_G − Q_D, the part of
-the impressed forces that is not in the robot file,
+`linearize_field` differentiates q̈ and λ under a force field with respect to state and torque. A system
+linearized at a fixed force (`constraints/gauss.py`) omits the change of the force. With F = Q̄ − Q_C − Q_G −
+Q_D, the part of the impressed forces that is not in the robot file,
 
     dq̈/dx = ∂q̈/∂x + H ∂F/∂x,   dλ/dx = ∂λ/∂x − Lᵀ ∂F/∂x   for x = q, q̇, τ.
 
@@ -34,10 +34,9 @@ class States:
         q, qd, tau: `(n, nq)`.
         active: `(n, n_contacts)` bool.
         eom: the equations of motion at these states.
-        qdd: `(n, nq)` measured acceleration, where one is known.
-        slip: `(n, nq)` direction in which each joint slides, in place of the smooth tanh(q̇/v₀) of dry
-            friction.
-        time: `(n, 2)` time [s] and number of the trajectory, for states of a log that is conditioned on.
+        qdd: `(n, nq)` measured acceleration, if known.
+        slip: `(n, nq)` sliding direction of each joint, in place of the smooth tanh(q̇/v₀) of dry friction.
+        time: `(n, 2)` time [s] and number of the trajectory, for states of a training log.
     """
 
     q: Tensor
@@ -231,7 +230,7 @@ QUANTITIES: dict[str, Callable[[ConstrainedSystem, States], AffineMap]] = {
 def affine_maps(
     system: ConstrainedSystem, at: States, quantity: str | Sequence[str]
 ) -> tuple[AffineMap, dict[str, slice]]:
-    """The affine map of a quantity, or of several one above the other, and the rows of each.
+    """The affine map of a quantity, or of several, stacked, and the rows of each.
 
     Raises:
         UnknownNameError: no such quantity.
@@ -268,8 +267,8 @@ class Hidden(NamedTuple):
     """Parts of quantities that motion does not determine.
 
     Attributes:
-        whole: `(n, d)` bool, components that are not determined at all.
-        shared: `(n, d, d)` C R Cᵀ, how contacts share their load, where R projects on Aᵀμ = 0.
+        whole: `(n, d)` bool, undetermined components.
+        shared: `(n, d, d)` C R Cᵀ, the load sharing of contacts, with R the projector on Aᵀμ = 0.
         seen: `(n,)` number of directions of the shared load that motion determines.
         doubts: the same in words.
     """
@@ -280,8 +279,9 @@ class Hidden(NamedTuple):
     doubts: tuple[str, ...]
 
     def applied(self, mean: Tensor, covariance: Tensor | None) -> tuple[Tensor, Tensor | None]:
-        """Mean `(n, d)` and covariance with NaN for what is not determined; a direction that motion does not
-        show has as prior variance the mean square of those that it shows."""
+        """Mean `(n, d)` and covariance, NaN for undetermined components; an undetermined direction has the
+        mean square of the determined ones as variance.
+        """
         if covariance is not None:
             square = mean.square() + covariance.diagonal(dim1=-2, dim2=-1)
             of_shared = square * (self.shared.diagonal(dim1=-2, dim2=-1) > 0.0)
@@ -301,7 +301,7 @@ def hidden_forces(
         never: contacts that were closed in no training sample.
 
     Raises:
-        ModelError: nothing is asked for but forces of such contacts.
+        ModelError: all requested quantities are forces of such contacts.
     """
     names = [c.name for c in system.contacts for _ in range(c.rows)]
     if not names or not {"multiplier", "contact_force", "constraint_force"} & set(parts):
@@ -339,7 +339,7 @@ def hidden_forces(
 
 
 def affine_map(system: ConstrainedSystem, at: States, quantity: str | Sequence[str]) -> AffineMap:
-    """The affine map of a quantity, or of several one above the other; errors as of `affine_maps`."""
+    """The affine map of a quantity, or of several, stacked; errors as in `affine_maps`."""
     return affine_maps(system, at, quantity)[0]
 
 

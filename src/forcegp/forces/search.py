@@ -2,9 +2,9 @@
 
 Inputs are standardized, so a length-scale of about the square root of their number relates typical samples. A
 log-normal prior around this start, with a different width on either side, keeps the length-scales of
-irrelevant inputs from drifting to infinity (four e-folds above), and asks for evidence before a force varies
-on a scale so short that it could follow the noise (one e-fold below). The standard deviation of a force
-starts at the root mean square of the force that explains the training residuals by least squares.
+irrelevant inputs from drifting to infinity (four e-folds above), and penalises length-scales so short that a
+force could fit the noise (one e-fold below). The standard deviation of a force starts at the root mean square
+of the force that explains the training residuals by least squares.
 """
 
 from __future__ import annotations
@@ -64,7 +64,7 @@ PARALLEL = 1e-9
 
 
 def initial(problem: Problem, learn_noise: bool, learn_torque_noise: bool = False) -> Tensors:
-    """Default start of everything that can be learned of a problem."""
+    """Default initial values of all learnable parameters of a problem."""
     few = problem
     if problem.training.samples > START_SAMPLES:
         few = dataclasses.replace(problem, training=problem.training.evenly(START_SAMPLES))
@@ -126,7 +126,7 @@ def initial_hyperparameters(
     """Initial log-hyperparameters, by `<prior>.<name>`.
 
     Args:
-        beyond_noise: whether the noise of the rows explains its share, as where unknown forces are stated.
+        beyond_noise: whether to subtract the share of the noise, for example if unknown forces are stated.
     """
     params: dict[str, Tensor] = {}
     # Some priors share the hyperparameters of another one.
@@ -175,7 +175,7 @@ def _first_parallel(operators: Sequence[Tensor]) -> Tensor:
 
 
 def limits_of(params: Parameters) -> dict[str, tuple[float, float]]:
-    """Bounds of the hyperparameters that have a scale of their own."""
+    """Bounds of hyperparameters with an absolute scale."""
     return {key: LIMITS[_kind(key)] for key in params if _kind(key) in LIMITS}
 
 
@@ -184,11 +184,11 @@ def box_around(
 ) -> dict[str, tuple[float | Tensor, float | Tensor]]:
     """Box of each hyperparameter, for the optimiser.
 
-    Far from the start, a likelihood in double precision is rounding: a force a million times as strong as its
-    noise leaves nothing of it.
+    Far from the start, double precision does not resolve the likelihood, for example for forces a million
+    times the noise.
 
     Args:
-        begin: where learning begins, if not there; the box contains it.
+        begin: another start of learning; the box contains it.
     """
     box: dict[str, tuple[float | Tensor, float | Tensor]] = {}
     for key, x in start.items():
@@ -199,10 +199,10 @@ def box_around(
 
 
 def doubts_at_bounds(tensors: Mapping[str, Tensor], box: Bounds) -> tuple[str, ...]:
-    """Warnings where learning ended at a bound that it should not need.
+    """Warnings if learning ended at a bound.
 
-    A force may vanish and an input may not matter; a noise at a bound, or a force at its upper one, is
-    in doubt.
+    A force may vanish and an input may be irrelevant; a noise at a bound, or a force at its upper bound, is
+    doubtful.
     """
     doubts = []
     for key, (low, high) in box.items():
@@ -236,7 +236,7 @@ def negative_log_prior(params: Parameters, start: Mapping[str, Tensor]) -> Tenso
 
 
 def checked_start(values: Mapping[str, Tensor], start: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Given values of what is learned, checked against the default start.
+    """Given initial values, checked against the default ones.
 
     Raises:
         ModelError: a value is missing, or has another shape.
@@ -254,7 +254,7 @@ def checked_start(values: Mapping[str, Tensor], start: Mapping[str, Tensor]) -> 
 
 
 def random_starts(start: Mapping[str, Tensor], restarts: int, seed: int) -> Iterator[dict[str, Tensor]]:
-    """The start, then as many random ones around its hyperparameters as there are restarts."""
+    """The start, then one random start around it per restart."""
     generator = torch.Generator().manual_seed(seed)
     yield dict(start)
     for _ in range(restarts):
@@ -267,7 +267,7 @@ def random_starts(start: Mapping[str, Tensor], restarts: int, seed: int) -> Iter
 
 
 def warm_start_sizes(samples: int, first: int | None) -> list[int]:
-    """Numbers of samples to learn on first, each twice the one before, up to half of all."""
+    """Numbers of samples of the warm start, doubling up to half of all samples."""
     sizes: list[int] = []
     size = first
     while size is not None and samples > 2 * size:
@@ -281,7 +281,7 @@ class Search:
     """Search of hyperparameters.
 
     Attributes:
-        start: default initial values of what is learned, and centre of the weak priors.
+        start: default initial values, and centre of the weak priors.
         held: values that are not learned.
         options: optimiser and its limits.
         recorded: wraps the objective, such as `Checkpoint.recorded`.
@@ -298,14 +298,14 @@ class Search:
         progress: Progress | None = None,
         begin: Mapping[str, Tensor] | None = None,
     ) -> Learned:
-        """Learn; on a part of the data first where there is much, and from several starts on request.
+        """Learn, first on a part of a large data set, and from several starts on request.
 
         Args:
             progress: called after each evaluation on all data.
-            begin: where to begin on all data, instead of warm starts and restarts.
+            begin: initial values on all data, instead of warm starts and restarts.
 
         Raises:
-            ModelError: `begin` does not fit what is learned.
+            ModelError: `begin` does not fit the learned parameters.
             NumericalError: the likelihood cannot be computed.
         """
         if begin is not None:

@@ -1,7 +1,7 @@
 """Basis functions of latent components: whitened covariances with inducing points, and exact features.
 
 A sum of linear kernels and of products of linear kernels is k(x, x′) = φ(x)ᵀφ(x′) exactly, with a few
-features φ. The rest, whatever contains a stationary factor, is approximated with inducing points Z: with
+features φ. The rest, every product with a stationary factor, is approximated with inducing points Z: with
 the truncated square root R of the inverse of their covariance, R Rᵀ = K_zz⁺, V(x) = Rᵀk(Z, x) are features
 with a standard normal prior on their weights, and V(x)ᵀV(x′) = k(x, Z) K_zz⁺ k(Z, x′).
 """
@@ -103,7 +103,7 @@ class ProcessBasis:
 
     @cached_property
     def roots(self) -> Tensor:
-        """R of each component, filled up with zero columns `(components, m, most kept)`."""
+        """R of each component, padded with zero columns `(components, m, most kept)`."""
         kept = [spectrum.root for spectrum in self.spectra]
         most = max(R.shape[1] for R in kept)
         return torch.stack([torch.nn.functional.pad(R, (0, most - R.shape[1])) for R in kept])
@@ -128,7 +128,7 @@ class ProcessBasis:
 
     @cached_property
     def used(self) -> Tensor:
-        """Which values are basis functions and no filling, `(components, width)`."""
+        """Mask of the values that are basis functions, not padding, `(components, width)`."""
         width = (self.roots.shape[-1] if self.spectra else 0) + self.finite_size
         used = torch.ones(self.components, width, dtype=torch.bool)
         for k, spectrum in enumerate(self.spectra):
@@ -142,7 +142,7 @@ class ProcessBasis:
         return self.used.reshape(-1).nonzero()[:, 0].to(device)
 
     def values(self, features: Features) -> tuple[Tensor, Tensor]:
-        """V(x) filled up with zeros `(components, n, width)`; |V|² of inducing points `(components, n)`."""
+        """V(x) padded with zeros `(components, n, width)`; |V|² of inducing points `(components, n)`."""
         if self.to_inducing is None:
             none = next(iter(features.values())).new_zeros(self.components, points(features), 0)
             return none if self.finite is None else self.finite.basis(features), none.sum(-1)
@@ -198,10 +198,10 @@ class ProcessBasis:
         return self.rest_variance(features) + torch.linalg.vecdot(exact, exact)
 
     def missed(self, variance: Tensor, explained: Tensor) -> Tensor:
-        """k(x, x) − |V(x)|² ≥ 0 of what inducing points approximate, `(components, n)`.
+        """k(x, x) − |V(x)|² ≥ 0 of the approximated part, `(components, n)`.
 
-        A projection is no longer than what is projected: what is below zero is rounding of the variance, and
-        less than `SMALLEST_FRACTION` of it where a posterior is resolved.
+        Negative values are rounding errors, and below `SMALLEST_FRACTION` of the variance if the posterior is
+        resolved.
         """
         return (variance - explained).clamp(min=0.0)
 
@@ -256,8 +256,7 @@ class LatentBasis:
     def tensors(self) -> dict[str, Tensor]:
         """Inducing points and eigenvectors, by name.
 
-        The eigenvectors are kept with sums: computed anew they may differ in sign or rotation, and the sums
-        belong to one choice.
+        The eigenvectors are stored with the sums, since recomputed ones may differ in sign or rotation.
         """
         tensors: dict[str, Tensor] = {}
         for p, part in enumerate(self.parts):
@@ -272,7 +271,7 @@ class LatentBasis:
     def of_tensors(
         cls, processes: Sequence[Process], params: Parameters, tensors: Mapping[str, Tensor]
     ) -> LatentBasis:
-        """The basis that `tensors` belong to.
+        """The basis restored from `tensors`.
 
         Raises:
             KeyError: a tensor is missing.
@@ -306,7 +305,7 @@ class LatentBasis:
 
         Returns:
             V `(n, size)`; by component `(n, components)` the prior variance of the kernels' rest, and
-            what is missed of it, k(x, x) − |V(x)|².
+            the part of it that is missed, k(x, x) − |V(x)|².
         """
         parts = [part.evaluate(x) for part, x in zip(self.parts, features, strict=True)]
         V, prior, missed = (torch.cat(columns, dim=-1) for columns in zip(*parts, strict=True))

@@ -14,18 +14,34 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from itertools import product
+from typing import NamedTuple
 
 import torch
 from torch import Tensor
 
 from forcegp.gp.basis import LatentBasis, ProcessBasis, split
-from forcegp.gp.features import Basis, Block, Features, stacked
+from forcegp.gp.features import Basis, Block, FeatureMap, Features, stacked
 from forcegp.gp.kernels import Kernel, Linear, Parameters, Process, Product, Stationary, Sum, sub
 
 FEATURES = 1024
 """Random features per component; the covariance of prior draws errs by about 1/√FEATURES of its scale."""
 UNMEASURED = 4
 """A process that no row depends on gets this many times fewer features: no data correct its draws."""
+
+
+class FoldedSamples(NamedTuple):
+    """Samples of one process as weights of k(x, Z), of exact features, and of random ones.
+
+    Attributes:
+        on_kernel: `(components, m, samples)`.
+        on_features: `(components, features, samples)`.
+        missed: random features of what the inducing points miss, if any, with weights `(components, features,
+            samples)`.
+    """
+
+    on_kernel: Tensor
+    on_features: Tensor
+    missed: tuple[FeatureMap, Tensor] | None
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,16 +51,20 @@ class FunctionSamples:
     Attributes:
         bases: of each process, functions of its standardized features.
         weights: of each process and basis, `(components, terms, samples)`.
+        folded: the same of each process by kernel and features, where they come from basis functions.
     """
 
     bases: tuple[tuple[Basis, ...], ...]
     weights: tuple[tuple[Tensor, ...], ...]
+    folded: tuple[FoldedSamples, ...] | None = None
 
     @classmethod
-    def of(cls, terms: Sequence[Sequence[tuple[Basis, Tensor]]]) -> FunctionSamples:
+    def of(
+        cls, terms: Sequence[Sequence[tuple[Basis, Tensor]]], folded: tuple[FoldedSamples, ...] | None = None
+    ) -> FunctionSamples:
         """From the terms of each process, functions with their weights."""
         bases = tuple(tuple(basis for basis, _ in process_terms) for process_terms in terms)
-        return cls(bases, tuple(tuple(w for _, w in process_terms) for process_terms in terms))
+        return cls(bases, tuple(tuple(w for _, w in process_terms) for process_terms in terms), folded)
 
     @property
     def count(self) -> int:
@@ -181,38 +201,46 @@ by about 1/√MISSED_FEATURES of its scale, and that of the rest not at all."""
 def draw_functions(
     basis: LatentBasis, weights: Tensor, generator: torch.Generator, features: int
 ) -> FunctionSamples:
-    """Functions with given weights of the basis functions, and what these miss drawn from the prior.
+    """Functions with given weights of the basis functions, and the missed part drawn from the prior.
 
     Args:
         weights: drawn from their posterior `(size, samples)`.
         generator: source of randomness, on the CPU.
         features: random features of each component's prior.
     """
-    parts = enumerate(basis.parts)
-    return FunctionSamples.of(
-        [_terms(part, weights[basis.of_process(p)], generator, features) for p, part in parts]
-    )
+    folded = [
+        _folded(part, weights[basis.of_process(p)], generator, features) for p, part in enumerate(basis.parts)
+    ]
+    terms = [_terms(part, each) for part, each in zip(basis.parts, folded, strict=True)]
+    return FunctionSamples.of(terms, tuple(folded))
 
 
-def _terms(
-    part: ProcessBasis, weights: Tensor, generator: torch.Generator, features: int
-) -> list[tuple[Basis, Tensor]]:
-    """The functions of one process that are summed, with their weights."""
+def _folded(part: ProcessBasis, weights: Tensor, generator: torch.Generator, features: int) -> FoldedSamples:
+    """Samples of one process with given weights of its basis functions."""
     on_kernel, on_features = part.fold(weights)
+    rest = part.split.rest
+    if rest is None:
+        return FoldedSamples(on_kernel, on_features, None)
+    # f_prior(Z) = φ(Z)ᵀ u with u ~ N(0, I)
+    draw = rest.kernel.draw(rest.params, part.inducing, features, generator)
+    at_points = draw.basis(part.inducing)
+    shape = (part.components, at_points.shape[-1], weights.shape[1])
+    u = torch.randn(shape, dtype=torch.float64, generator=generator).to(weights)
+    if part.to_inducing is not None:
+        # R Rᵀ f_prior(Z) are the weights of k(x, Z) that interpolate the prior function.
+        on_kernel = on_kernel - part.roots @ (part.roots.mT @ (at_points @ u))
+    return FoldedSamples(on_kernel, on_features, (draw, u))
+
+
+def _terms(part: ProcessBasis, samples: FoldedSamples) -> list[tuple[Basis, Tensor]]:
+    """The functions of one process that are summed, with their weights."""
     terms: list[tuple[Basis, Tensor]] = []
     rest = part.split.rest
-    if rest is not None:
-        # f_prior(Z) = φ(Z)ᵀ u with u ~ N(0, I)
-        draw = rest.kernel.draw(rest.params, part.inducing, features, generator)
-        count = draw.basis(part.inducing).shape[-1]
-        shape = (part.components, count, weights.shape[1])
-        u = torch.randn(shape, dtype=torch.float64, generator=generator).to(weights)
-        at_points = draw.basis(part.inducing) @ u
+    if samples.missed is not None:
+        draw, u = samples.missed
         terms += draw.weighted(u)
-        if part.to_inducing is not None:
-            # R Rᵀ f_prior(Z) are the weights of k(x, Z) that interpolate the prior function.
-            w = on_kernel - part.roots @ (part.roots.mT @ at_points)
-            terms += kernel_terms(rest.kernel, rest.params, part.inducing, w)
+    if rest is not None and part.to_inducing is not None:
+        terms += kernel_terms(rest.kernel, rest.params, part.inducing, samples.on_kernel)
     if part.finite is not None:
-        terms.append((part.finite.basis, on_features))
+        terms.append((part.finite.basis, samples.on_features))
     return terms

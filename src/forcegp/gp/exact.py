@@ -1,6 +1,6 @@
 """Exact posterior of latent processes given whitened rows (eqs. 11 and 22 to 24).
 
-It takes memory that grows with the square of the rows: what would not fit is refused beforehand.
+Memory grows with the square of the number of rows; fits that do not fit into memory are refused beforehand.
 """
 
 from __future__ import annotations
@@ -70,13 +70,13 @@ class ExactPosterior:
 
     @cached_property
     def conditioned(self) -> Conditioned:
-        """Factorisation of the covariance of the rows, computed when first needed after loading."""
+        """Factorisation of the covariance of the rows, computed on first use after loading."""
         require_exact_fits(self.blocks, learning=False)
         return condition(self.processes, self.params, self.blocks)
 
     @property
     def residual(self) -> float:
-        """Mean square of what the posterior mean leaves of the rows, in units of the noise."""
+        """Mean square residual of the rows in units of the noise."""
         # y − K α = α
         return float(self.alpha.square().mean()) if len(self.alpha) else 0.0
 
@@ -86,7 +86,7 @@ class ExactPosterior:
         return self.conditioned.jitter
 
     def updated(self, blocks: Sequence[Block]) -> ExactPosterior:
-        """Conditioned on further rows too: O(r n²) for r of them beside n, where a refit takes O((n + r)³).
+        """Condition on r further rows in O(r n²), compared with O((n + r)³) for a refit.
 
         Raises:
             ModelError: exact inference does not fit into memory.
@@ -117,7 +117,7 @@ class ExactPosterior:
 
     @cached_property
     def measured(self) -> tuple[bool, ...]:
-        """Whether any row depends on each process; the data change nothing about the others."""
+        """Whether any row depends on each process; the data do not affect the others."""
         return tuple(map(any, self._depends))
 
     @cached_property
@@ -174,7 +174,7 @@ class ExactPosterior:
         """Posterior covariance of the rows of each sample of a block, `(n, d, d)`, without noise.
 
         Raises:
-            NumericalError: a variance is rounding.
+            NumericalError: rounding errors dominate a variance.
         """
         n, d = block.target.shape
         if d == 0:  # such as the multiplier of a system without contacts
@@ -235,7 +235,7 @@ class ExactPosterior:
 
 
 def exact_bytes(blocks: Sequence[Block], learning: bool = True) -> int:
-    """Bytes of memory that exact inference on whitened rows takes at its peak.
+    """Peak memory of exact inference on whitened rows [bytes].
 
     Args:
         learning: whether hyperparameters are learned, or the rows conditioned on only.
@@ -249,13 +249,13 @@ def exact_bytes(blocks: Sequence[Block], learning: bool = True) -> int:
 
 
 def require_exact_fits(blocks: Sequence[Block], learning: bool = True, available: int | None = None) -> None:
-    """Refuse exact inference that would not fit into memory, and announce what takes most of it.
+    """Refuse exact inference that does not fit into memory, and announce it if it needs most of it.
 
     Args:
-        available: bytes that may be taken; by default `SHARE` of what is free.
+        available: usable memory [bytes]; by default `SHARE` of the free memory.
 
     Raises:
-        ModelError: it takes more.
+        ModelError: it needs more.
     """
     free = free_memory()
     allowed = (None if free is None else int(SHARE * free)) if available is None else available

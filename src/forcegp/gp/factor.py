@@ -1,4 +1,4 @@
-"""Cholesky factors, with counted jitter and after added rows, and spectra."""
+"""Cholesky factors with reported jitter and with added rows, and spectra."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def cholesky(K: Tensor) -> tuple[Tensor, float]:
         K: `(n, n)` symmetric; the lower triangle is read.
 
     Returns:
-        The factor `(n, n)` and the ε that was added, 0.0 where none was needed.
+        The factor `(n, n)` and the ε that was added, 0.0 if none was needed.
 
     Raises:
         NumericalError: K is not finite, or not positive definite within the largest jitter.
@@ -62,7 +62,7 @@ def cholesky(K: Tensor) -> tuple[Tensor, float]:
 def extended(L: Tensor, rows: Tensor) -> Tensor:
     """Lower factor of L Lᵀ + ΦᵀΦ, from the QR factorisation of Lᵀ above the rows Φ, in O(r n²).
 
-    A compiled kernel does it where there is a C++ compiler, three to four times as fast as LAPACK for a few
+    A compiled kernel does it if there is a C++ compiler, three to four times as fast as LAPACK for a few
     rows. LAPACK may make diagonal entries negative, which is harmless in solves.
 
     Args:
@@ -138,7 +138,7 @@ class Spectrum:
     Attributes:
         values: all eigenvalues, in ascending order `(m,)`.
         vectors: U `(m, m)`.
-        dropped: how many of the smallest are dropped.
+        dropped: number of dropped smallest eigenvalues.
     """
 
     values: Tensor

@@ -1,8 +1,8 @@
 """Inputs of kernels by name, rows of samples, and feature maps φ(x) of kernels and of random functions.
 
-The covariance K of whitened rows has entries that are off by about ε K_ii with ε = 2.2e-16, where the noise
-has unit variance. So standard deviations are off by some ε K_ii, and where data leave a fraction r of a prior
-variance, by some ε/r: 0.1 % at K_ii = 1e12 and 0.5 % at r = 1e-13 beside a posterior in 80-bit arithmetic.
+With unit noise variance, entries of the covariance K of whitened rows have errors of about ε K_ii with ε =
+2.2e-16. So standard deviations have relative errors of about ε K_ii, and ε/r if data reduce a prior variance
+to its fraction r: 0.1 % at K_ii = 1e12 and 0.5 % at r = 1e-13 beside a posterior in 80-bit arithmetic.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ Features = Mapping[str, Tensor]
 
 
 def stacked(x: Features, inputs: tuple[str, ...] | None) -> Tensor:
-    """The named features side by side, `(n, w)`, or `(k, n, w)` where components have inputs of their own.
+    """The named features side by side, `(n, w)`, or `(k, n, w)` if components have different inputs.
 
     Raises:
         UnknownNameError: a feature is not given.
@@ -50,10 +50,10 @@ def stacked(x: Features, inputs: tuple[str, ...] | None) -> Tensor:
 class Standardization:
     """Shift and scale of each named input, x ↦ (x − mean)/std, from training data.
 
-    A column that hardly varies says nothing of the scale on which a function varies along it. So no scale is
-    below `FLOOR` times the root mean square of the standard deviations of all columns of its input, and the
-    columns of a vector share that mean: neither turning its axes nor a step off a plane changes much.
-    Features whose zero means something, such as a joint at rest, are scaled but not shifted.
+    A column that hardly varies does not determine a scale. So no scale is below `FLOOR` times the root mean
+    square of the standard deviations of all columns of its input, and the columns of a vector share that
+    mean, so the result depends little on the orientation of the axes. Features with a meaningful zero, such
+    as velocities, are scaled but not shifted.
 
     Columns that are constant to rounding keep the scale 1, or that of their vector, and are listed in
     `constant`.
@@ -71,7 +71,7 @@ class Standardization:
 
         Args:
             features: named inputs `(n, w)`.
-            vectors: inputs whose columns are components of one vector.
+            vectors: inputs with columns that are components of one vector.
             centred: whether the mean is subtracted.
         """
         mean = {name: x.mean(0) if centred else torch.zeros_like(x[0]) for name, x in features.items()}
@@ -89,7 +89,7 @@ class Standardization:
 
     @classmethod
     def none(cls, features: Mapping[str, Tensor]) -> Standardization:
-        """Inputs as they are, in their units."""
+        """No standardization: inputs in their units."""
         zero = {name: torch.zeros_like(x[0]) for name, x in features.items()}
         return cls(zero, {name: torch.ones_like(x) for name, x in zero.items()})
 
@@ -129,7 +129,7 @@ def components_of(block: Block) -> list[int]:
 
 
 def chunked(blocks: Iterable[Block], samples: int) -> Iterator[Block]:
-    """The samples of blocks in blocks of at most so many."""
+    """Split blocks into blocks of a maximum number of samples."""
     for block in blocks:
         for first in range(0, len(block.target), samples):
             yield rows_of(block, slice(first, first + samples))
@@ -163,15 +163,17 @@ Basis = Callable[[Features], Tensor]
 
 @dataclass(frozen=True, eq=False)
 class FeatureTerm:
-    """Features a_kf φ_f(x) of k components, of which the functions φ are often the same.
+    """Features a_kf φ_f(x) of k components, often with common functions φ.
 
     Attributes:
         values: φ.
         scale: a `(k, f)`.
+        waves: inputs, frequencies and phases, if φ is cos(ωᵀx + φ) as of `fourier_features`.
     """
 
     values: Basis
     scale: Tensor
+    waves: tuple[tuple[str, ...] | None, Tensor, Tensor] | None = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -228,7 +230,7 @@ class FeatureMap:
 
 
 def require_resolved_noise(prior: Tensor) -> None:
-    """Refuse a prior so large that the noise is lost in rounding.
+    """Refuse a prior so large that double precision does not resolve the noise.
 
     Args:
         prior: variance of the prior of a row, in units of the noise variance `()`.
@@ -254,7 +256,7 @@ def require_resolved_variance(covariance: Tensor, prior: Tensor) -> Tensor:
         prior: variance of each row before the data `(n, d)`.
 
     Raises:
-        NumericalError: what is left of a prior variance is rounding.
+        NumericalError: rounding errors dominate a variance.
     """
     variance = covariance.diagonal(dim1=-2, dim2=-1)
     lost = variance < SMALLEST_FRACTION * prior
@@ -281,14 +283,15 @@ def fourier_features(inputs: tuple[str, ...] | None, omega: Tensor, phase: Tenso
     count = phase.shape[-1]
     scale = (math.sqrt(2.0 / count) * std)[:, None].expand(-1, count)
     turn, shift = omega.mT, phase[:, None, :]
-    return FeatureMap((FeatureTerm(lambda x: torch.cos(stacked(x, inputs) @ turn + shift), scale),))
+    waves = inputs, omega, phase
+    return FeatureMap((FeatureTerm(lambda x: torch.cos(stacked(x, inputs) @ turn + shift), scale, waves),))
 
 
 def linear_features(x: Features, inputs: tuple[str, ...] | None, slope: Tensor, bias: Tensor) -> FeatureMap:
     """Slopes and a bias: features of the linear kernel.
 
     Args:
-        x: kernel inputs, whose widths count.
+        x: kernel inputs; only their widths are used.
         inputs: names of the inputs; `None` for all.
         slope: standard deviation of each slope `(k, w)`, or of all `(k, 1)`.
         bias: that of the bias `(k,)`.

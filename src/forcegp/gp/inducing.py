@@ -1,8 +1,8 @@
 """Selection of inducing points from the data: greedy conditional variance.
 
-Each step adds the sample of which the points so far miss most, Σ_k S_kk Var(f_k(x) | f(Z)): what the trace
-term of the collapsed bound counts (pivoted partial Cholesky factorisation; Burt, Rasmussen & van der Wilk
-2020). Weights S = WᵀW put it in units of the noise variance.
+Each step adds the sample with the largest missed variance, Σ_k S_kk Var(f_k(x) | f(Z)), the trace term of the
+collapsed bound (pivoted partial Cholesky factorisation; Burt, Rasmussen & van der Wilk 2020). Weights S = WᵀW
+put it in units of the noise variance.
 """
 
 from __future__ import annotations
@@ -60,9 +60,10 @@ def select_inducing(
     A process without effect on any row, or with a finite number of features, gets none.
 
     Args:
-        rows: number of rows that will be conditioned on, of which these are a part; all by default.
-        limit: most points of one process.
-        share: missed variance of all rows, as a fraction of what the noise leaves of them, at which to stop.
+        rows: number of all rows to condition on; by default these.
+        limit: maximum number of points of one process.
+        share: missed variance of all rows at which to stop, as a fraction of the variance that the noise
+            leaves.
     """
     candidate_rows = sum(block.rows for block in blocks)
     tolerance = share / (candidate_rows if rows is None else rows)

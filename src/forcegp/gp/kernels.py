@@ -60,7 +60,7 @@ class Kernel(ABC):
 
     @abstractmethod
     def towards(self, params: Parameters, x2: Features) -> Callable[[Features], Tensor]:
-        """x ↦ k(x, x′) `(k, n, n')` for fixed x′, with what depends on x′ alone computed once."""
+        """x ↦ k(x, x′) `(k, n, n')` for fixed x′, with the terms of x′ computed once."""
 
     def covariance(self, params: Parameters, x1: Features, x2: Features) -> Tensor:
         """k(x, x′) `(k, n, n')`."""
@@ -68,7 +68,7 @@ class Kernel(ABC):
 
     @abstractmethod
     def variance(self, params: Parameters) -> Callable[[Features], Tensor]:
-        """x ↦ k(x, x) `(k, n)`, with what depends on the hyperparameters alone computed once."""
+        """x ↦ k(x, x) `(k, n)`, with the terms of the hyperparameters computed once."""
 
     def diagonal(self, params: Parameters, x: Features) -> Tensor:
         """k(x, x) `(k, n)`."""
@@ -76,13 +76,13 @@ class Kernel(ABC):
 
     @abstractmethod
     def draw(self, params: Parameters, x: Features, features: int, generator: torch.Generator) -> FeatureMap:
-        """Random functions from the prior, as `features` random features an output.
+        """Random functions from the prior, as `features` random features per output.
 
-        The features of linear kernels and constants are exact, whatever number is asked for.
+        Linear kernels and constants have exact features, whose number is fixed.
 
         Args:
             params: log-hyperparameters.
-            x: any inputs, whose widths count.
+            x: any inputs; only their widths are used.
             features: number of random features.
             generator: source of randomness, on the CPU.
         """
@@ -120,10 +120,10 @@ def width_of(inputs: tuple[str, ...] | None, widths: Mapping[str, int]) -> int:
 class Linear(Kernel):
     """k = s² Σ_d σ_d² x_d x′_d + σ_0²: functions that are linear in the inputs.
 
-    Fewer hyperparameters to overfit: with `ard=False` all inputs have one σ, and there is no slope that
-    learning takes for zero; with `shared=True` the σ_d are those of all outputs, each with its own s and σ_0.
+    Fewer hyperparameters to overfit: with `ard=False` all inputs have one σ, so learning cannot set single
+        slopes to zero; with `shared=True` all outputs share the σ_d, and each has its own s and σ_0.
     With an `offset` σ_0 is that fraction of the root mean square σ_d: a learned ratio, which starts there and
-    is the same for all outputs. One output alone does not show which σ_0 its one constant was drawn from.
+    is the same for all outputs. The constant of a single output does not determine σ_0.
     """
 
     inputs: tuple[str, ...] | None = None
@@ -146,7 +146,7 @@ class Linear(Kernel):
         return sizes | {"log_offset": share.new_tensor([math.log(self.offset)])}
 
     def slope_std(self, params: Parameters) -> Tensor:
-        """s σ_d `(k, w)`, or `(k, 1)` where all inputs have one."""
+        """s σ_d `(k, w)`, or `(k, 1)` if it is common to all inputs."""
         log = params["log_slope_std"]
         return torch.exp(log + params["log_std"][:, None] if self.shared else log)
 
@@ -201,8 +201,8 @@ class Constant(Kernel):
 class Stationary(Kernel):
     """σ² g(r) of the scaled distance r² = Σ_d (x_d − x′_d)² / ℓ_d² (automatic relevance determination).
 
-    With `shared=True` the length-scales are those of all outputs, each with its own σ: fewer hyperparameters
-    to overfit, and one distance to compute.
+    With `shared=True` all outputs share the length-scales, and each has its own σ: fewer hyperparameters to
+    overfit, and a single distance to compute.
     """
 
     inputs: tuple[str, ...] | None = None
@@ -311,7 +311,7 @@ class Sum(Kernel):
 
     @staticmethod
     def combined(left: Tensor, right: Tensor) -> Tensor:
-        """The covariance from those of the two sides."""
+        """The covariance computed from those of both sides."""
         return left + right
 
     @property
@@ -385,5 +385,5 @@ class Process(Protocol):
 
     @property
     def prefix(self) -> str:
-        """Prefix of the hyperparameters; another process's where they are shared."""
+        """Prefix of the hyperparameters; another process's if they are shared."""
         ...

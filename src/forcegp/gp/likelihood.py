@@ -54,7 +54,7 @@ def _chunks(n: int, size: int) -> Iterator[tuple[int, int]]:
 
 
 def add_rows(out: Tensor, W1: Tensor, k: Tensor, W2: Tensor, lower: bool = False) -> None:
-    """Add Σ_k W1 k W2ᵀ to `out`, chunk by chunk; only up to the diagonal where `lower`."""
+    """Add Σ_k W1 k W2ᵀ to `out`, chunk by chunk; only up to the diagonal if `lower`."""
     r = W1.shape[1]
     W2k = W2.permute(2, 0, 1)
     for i, j in _chunks(len(W1), W2.numel()):
@@ -89,7 +89,7 @@ def cross_gram(
 ) -> Tensor:
     """Covariance between the rows of two lists of blocks, `(rows1, rows2)` (eqs. 10, 13 and 19).
 
-    Without a second list it is that of the first with itself, of which the lower triangle is valid.
+    Without a second list, it is the covariance of the first with itself; only the lower triangle is valid.
     """
     lower, blocks2 = blocks2 is None, blocks1 if blocks2 is None else blocks2
     starts1, starts2 = offsets(blocks1), offsets(blocks2)
@@ -218,7 +218,7 @@ class Conditioned:
     Attributes:
         L: lower Cholesky factor of K + I `(rows, rows)`.
         alpha: (K + I)⁻¹ y `(rows,)`.
-        jitter: what was added to the diagonal, 0.0 as a rule.
+        jitter: addition to the diagonal, usually 0.0.
     """
 
     L: Tensor
@@ -251,7 +251,7 @@ def condition(priors: Sequence[Process], params: Parameters, blocks: Sequence[Bl
 
 
 def negative_log_likelihood(priors: Sequence[Process], params: Parameters, blocks: Sequence[Block]) -> Tensor:
-    """Negative log marginal likelihood of whitened rows, differentiable in all that it is made of.
+    """Negative log marginal likelihood of whitened rows, differentiable with respect to all its inputs.
 
     Value and gradient come from one factorisation.
 

@@ -35,15 +35,15 @@ class LearningOptions:
 
     Args:
         optimizer: `"lbfgs"` or `"adam"`.
-        max_evaluations: evaluations of the objective at most.
-        tolerance: relative change of the objective below which L-BFGS stops, and ADAM stops when it
-            has not improved by that much within `patience` evaluations.
+        max_evaluations: maximum number of evaluations of the objective.
+        tolerance: relative change of the objective below which L-BFGS stops, and ADAM stops if it does not
+            improve by that much within `patience` evaluations.
         learning_rate: of ADAM, for the hyperparameters θ_M.
         analytical_learning_rate: of ADAM, for the analytical parameters θ_A.
         patience: evaluations without improvement after which ADAM stops.
-        warm_start: where there are more than twice as many samples, learn on about so many first, then on
-            twice as many and so on, and at last on all; `None` learns on all from the start.
-        restarts: further random starts, of which the best end is kept.
+        warm_start: number of samples to learn on first, if there are more than twice as many; it doubles
+            until all are used. `None` learns on all from the start.
+        restarts: further random starts; the best result is kept.
         seed: of the random starts.
         hyperpriors: whether hyperparameters have weak log-normal priors around their start (maximum a
             posteriori), or none, as in the paper (maximum likelihood).
@@ -77,14 +77,14 @@ class Learned:
     """Result of learning.
 
     Attributes:
-        tensors: the best ones seen.
+        tensors: the best ones found.
         value: the objective there.
         converged: whether the tolerance was reached within the evaluations allowed.
-        evaluations: how many were made.
-        seconds: how long they took.
+        evaluations: their number.
+        seconds: their duration.
         message: why learning stopped.
         history: the objective at each evaluation.
-        doubts: about where learning ended, each with a remedy.
+        doubts: about the result, each with a remedy.
     """
 
     tensors: dict[str, Tensor]
@@ -98,7 +98,7 @@ class Learned:
 
     @property
     def outcome(self) -> dict[str, Any]:
-        """Course of learning, by the fields of `FitResult`."""
+        """The result of learning as fields of `FitResult`."""
         return {
             "converged": self.converged,
             "evaluations": self.evaluations,
@@ -110,7 +110,7 @@ class Learned:
 
 
 def reported(progress: FitProgress | None, most: int, before: int = 0) -> Progress | None:
-    """The progress of an optimisation of at most so many evaluations, after those `before`."""
+    """The progress of an optimisation with a maximum number of evaluations, after those `before`."""
     if progress is None:
         return None
     return lambda evaluations, value, _: progress(before + evaluations, most, value)
@@ -155,7 +155,7 @@ def minimise(
 
     Args:
         objective: maps the tensors to a scalar, differentiably.
-        analytical: names of the analytical parameters θ_A, which have an ADAM of their own.
+        analytical: names of the analytical parameters θ_A, which have a separate ADAM optimiser.
         bounds: box of each tensor, for L-BFGS.
         first_step: largest change of an entry in the first step of L-BFGS in a box.
 

@@ -1,4 +1,4 @@
-"""A process along time that is independent from one trajectory to the next."""
+"""A process in time, independent between trajectories."""
 
 from __future__ import annotations
 
@@ -19,10 +19,11 @@ TIME, SEGMENT = "time", "segment"
 
 @dataclass(frozen=True)
 class OrnsteinUhlenbeck(Kernel):
-    """k = σ² exp(−|t − t′|/T) within a trajectory, and 0 between two (Rasmussen and Williams, eq. B.28).
+    """k = σ² exp(−|t − t′|/T) within a trajectory, and 0 between trajectories (Rasmussen and Williams, eq.
+    B.28).
 
     Args:
-        time: T at which learning begins [s].
+        time: initial value of T [s].
 
     Example:
         >>> import torch

@@ -1,8 +1,8 @@
 """Sparse posterior over latent components, from two sums over samples.
 
 With A = I + Σ V_i S_i V_iᵀ and v = Σ V_i W_iᵀ y_i, the latent mean is V_*ᵀA⁻¹v and the latent covariance
-k_** − V_*ᵀV_* + V_*ᵀA⁻¹V_* (Titsias 2009; Hensman et al. 2013). A prediction costs the same after a
-hundred samples and after a million.
+k_** − V_*ᵀV_* + V_*ᵀA⁻¹V_* (Titsias 2009; Hensman et al. 2013). The cost of a prediction does not depend on
+the number of samples.
 
 Weights of basis functions may drift: some components change while the others stay. A drifting weight is an
 Ornstein–Uhlenbeck process with its prior as stationary distribution, w′ = ρ w + √(1 − ρ²) ξ, ξ ~ N(0, I). In
@@ -40,12 +40,12 @@ from forcegp.gp.sums import Moments, Sums, accumulate, add_rows
 
 
 def drifted(sums: Sums, weights: Tensor, factor: float) -> Sums:
-    """The sums after some weights have drifted; predictions of the others stay as they are.
+    """The sums after some weights have drifted; predictions of the others do not change.
 
     Args:
         sums: over the samples so far.
         weights: positions of the weights that drift `(k,)`.
-        factor: ρ, their correlation with what they were: 1 keeps them, 0 returns them to their prior.
+        factor: ρ, their correlation with the previous weights: 1 keeps them, 0 returns them to their prior.
 
     Raises:
         ModelError: the factor is not between 0 and 1.
@@ -82,9 +82,9 @@ class Diagnostics:
 
     Attributes:
         size: number of basis functions.
-        learned: how many basis functions the rows determine, tr A⁻¹G; in units of the noise variance this is
-            the variance that noise leaves in all rows together.
-        missed: the prior variance that the points miss in all rows together, in the same units.
+        learned: number of basis functions that the rows determine, tr A⁻¹G: the total posterior variance of
+            all rows in units of the noise variance.
+        missed: total prior variance of all rows that the points miss, in the same units.
     """
 
     size: int
@@ -112,9 +112,9 @@ class SparsePosterior:
 
     Attributes:
         basis: basis functions.
-        moments: sums over the samples but for G, which the factor holds.
+        moments: sums over the samples except for G, which follows from the factor.
         L: lower Cholesky factor of A = I + G.
-        jitter: what was added to the diagonal, 0.0 as a rule.
+        jitter: addition to the diagonal, usually 0.0.
     """
 
     basis: LatentBasis
@@ -127,7 +127,8 @@ class SparsePosterior:
         """Factorise A = I + G.
 
         Raises:
-            NumericalError: A is not positive definite, as after removing samples that were never added.
+            NumericalError: A is not positive definite, for example after removing samples that were never
+                added.
         """
         # A = I + G = L Lᵀ
         A = sums.G + torch.eye(len(sums.G), dtype=sums.G.dtype, device=sums.G.device)
@@ -137,7 +138,7 @@ class SparsePosterior:
         return result
 
     def tensors(self) -> dict[str, Tensor]:
-        """Everything but processes and hyperparameters, by name, to be saved."""
+        """All tensors to save except processes and hyperparameters, by name."""
         tensors = {f"moments.{name}": getattr(self.moments, name) for name in MOMENTS}
         tensors |= {"L": self.L, "jitter": torch.tensor(self.jitter, dtype=torch.float64)}
         tensors |= self.basis.tensors()
@@ -148,7 +149,7 @@ class SparsePosterior:
     def of_tensors(
         cls, processes: Sequence[Process], params: Parameters, tensors: Mapping[str, Tensor]
     ) -> SparsePosterior:
-        """The posterior that `tensors` belong to.
+        """The posterior restored from `tensors`.
 
         Raises:
             ModelError: a tensor is missing, or does not fit the processes.
@@ -173,7 +174,7 @@ class SparsePosterior:
 
     @cached_property
     def sums(self) -> Sums:
-        """All sums over the samples, G from the factor where samples were added to it."""
+        """All sums over the samples, with G from the factor if samples were added to it."""
         eye = torch.eye(len(self.L), dtype=self.L.dtype, device=self.L.device)
         return Sums(**vars(self.moments), G=self.L @ self.L.mT - (1.0 + self.jitter) * eye)
 
@@ -194,14 +195,14 @@ class SparsePosterior:
 
     @property
     def residual(self) -> float:
-        """Mean square of what the posterior mean leaves of the rows, in units of the noise."""
+        """Mean square residual of the rows in units of the noise."""
         # |y − Φ w|² = yᵀy − vᵀw − wᵀw with (I + ΦᵀΦ) w = v
         w, rows = self.weights, self.moments.rows.clamp(min=1.0)
         return max(0.0, float((self.moments.yy - self.moments.v @ w - w @ w) / rows))
 
     @cached_property
     def measured(self) -> tuple[bool, ...]:
-        """Of each process, whether it affects any row; the samples change nothing about the others."""
+        """Whether each process affects any row; the samples do not affect the others."""
         # The factor of A = I + G is that of the identity where G is zero.
         diagonal = self.L.diagonal().abs()
         slices = (self.basis.of_process(p) for p in range(len(self.basis.parts)))
@@ -232,7 +233,7 @@ class SparsePosterior:
     def knowing(self, p: int, features: Features, value: Tensor) -> SparsePosterior:
         """The posterior given that a constant process p, with finite features, has a value `(components,)`.
 
-        The mean of process p itself becomes zero, since what it explained is part of the prior mean now.
+        The mean of process p becomes zero, since its value is now part of the prior mean.
         """
         part, own = self.basis.parts[p], self.basis.of_process(p)
         eye = torch.eye(part.components, dtype=value.dtype, device=value.device)
@@ -280,7 +281,7 @@ class SparsePosterior:
             block: kernel inputs and operators of each process; the targets are not read.
 
         Raises:
-            NumericalError: a variance is rounding.
+            NumericalError: rounding errors dominate a variance.
         """
         d = block.target.shape[1]
         parts = [block.target.new_zeros(0, d, d)]
@@ -295,10 +296,10 @@ class SparsePosterior:
         return 0.5 * (covariance + covariance.mT)
 
     def require_resolved(self) -> None:
-        """Refuse a prior beside which the noise is rounding.
+        """Refuse a prior so large that double precision does not resolve the noise.
 
         Raises:
-            NumericalError: the prior of what inducing points approximate is too strong.
+            NumericalError: the prior of the approximated part is too large.
         """
         if float(self.moments.rows) > 0.0:
             require_resolved_noise(self.moments.prior.sum() / self.moments.rows)
@@ -327,7 +328,7 @@ class SparsePosterior:
         return draw_functions(self.basis, weights, generator, features)
 
     def updated(self, blocks: Sequence[Block]) -> SparsePosterior:
-        """Conditioned on further samples too, at a cost that does not depend on those before.
+        """Condition on further samples, at a cost that does not depend on the previous ones.
 
         Raises:
             NumericalError: the factorisation fails.
@@ -340,7 +341,7 @@ class SparsePosterior:
         return SparsePosterior(self.basis, moments, extended(self.L, Phi), self.jitter)
 
     def forgetting(self, factor: float) -> SparsePosterior:
-        """With every sample so far counting `factor` times; with 0 the prior is left.
+        """Scale the weight of all samples so far by `factor`; 0 restores the prior.
 
         Raises:
             ModelError: the factor is not between 0 and 1.
@@ -348,7 +349,7 @@ class SparsePosterior:
         return SparsePosterior.of(self.basis, self.sums.scaled(factor))
 
     def drifting(self, factor: float, processes: Sequence[int]) -> SparsePosterior:
-        """With the weights of some processes drifting towards their prior, the others as they are.
+        """Let the weights of some processes drift towards their prior; the others do not change.
 
         Raises:
             ModelError: the factor is not between 0 and 1.
@@ -358,7 +359,7 @@ class SparsePosterior:
         return SparsePosterior.of(self.basis, drifted(self.sums, weights, factor))
 
     def without(self, blocks: Sequence[Block]) -> SparsePosterior:
-        """Without samples that it was conditioned on.
+        """Remove samples that it was conditioned on.
 
         Raises:
             ModelError: there are more rows than it was conditioned on.

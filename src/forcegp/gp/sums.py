@@ -1,10 +1,10 @@
-"""The two sums over samples that a sparse posterior consists of; they stream, add and are forgotten.
+"""The two sums over samples of a sparse posterior, which can be streamed, added and discounted.
 
 Of whitened rows y_i = W_i f(x_i) + ε only S_i = W_iᵀW_i and c_i = W_iᵀy_i enter: G = Σ V_i S_i V_iᵀ and
 v = Σ V_i c_i, with V_i the basis functions of each component at sample i.
 
-Processes of `torch.distributed`, by gloo on processors or NCCL on GPUs, sum over samples of their own. The
-inducing points and hyperparameters must be those of all.
+Processes of `torch.distributed`, by gloo on processors or NCCL on GPUs, sum over separate samples, with
+common inducing points and hyperparameters.
 
     torchrun --standalone --nproc-per-node 2 script.py
 
@@ -38,9 +38,9 @@ class Moments:
     Attributes:
         v: Σ V Wᵀy `(size,)`.
         yy: Σ y² `()`.
-        rows: number of rows, less what is forgotten `()`.
+        rows: number of rows, reduced by forgetting `()`.
         prior: Σ tr W k Wᵀ of each process's part that inducing points approximate `(processes,)`.
-        missed: what of it the basis misses, Σ tr W (k − VᵀV) Wᵀ `(processes,)`.
+        missed: the part of it that the basis misses, Σ tr W (k − VᵀV) Wᵀ `(processes,)`.
     """
 
     v: Tensor
@@ -96,7 +96,7 @@ class Sums(Moments):
         return Sums(*(a - b for a, b in zip(self.tensors, other.tensors, strict=True)))
 
     def scaled(self, factor: float) -> Sums:
-        """Sums in which every sample counts `factor` times: exponential forgetting.
+        """Sums scaled by `factor`, for exponential forgetting.
 
         Raises:
             ModelError: the factor is not between 0 and 1.
@@ -121,7 +121,7 @@ def accumulate(basis: LatentBasis, blocks: Iterable[Block], chunk: int = CHUNK_S
 
     Args:
         blocks: whitened rows; may be a generator.
-        chunk: samples whose basis functions are held at a time.
+        chunk: number of samples per chunk.
     """
     total: Sums | None = None
     for block in chunked(blocks, chunk):
@@ -169,9 +169,9 @@ def _by_process(basis: LatentBasis, S_kk: Tensor, variance: Tensor) -> Tensor:
 
 @torch.no_grad()
 def add_rows(basis: LatentBasis, moments: Moments, blocks: Sequence[Block]) -> tuple[Moments, Tensor]:
-    """Moments with a few more samples, and the rows of these in terms of the basis functions.
+    """Moments with a few more samples, and their rows in terms of the basis functions.
 
-    The rows are formed as they stand, which is faster than `accumulate` for a few samples.
+    The rows are formed explicitly, which is faster than `accumulate` for a few samples.
 
     Returns:
         The new moments, and Φ with rows W_i V_iᵀ `(rows, size)`.
@@ -209,7 +209,7 @@ def _runs(columns: list[slice]) -> list[slice]:
 
 
 def shard(samples: int, rank: int, processes: int) -> slice:
-    """The samples of one process: equal runs of neighbouring ones, to within one.
+    """The samples of one process: contiguous runs of equal length to within one.
 
     Example:
         >>> [shard(7, rank, 3) for rank in range(3)]
@@ -226,7 +226,7 @@ def shard(samples: int, rank: int, processes: int) -> slice:
 
 
 def reduce_sums(sums: Sums) -> Sums:
-    """The sums of all processes added, the same in each of them.
+    """Add the sums of all processes; each process gets the same result.
 
     All must use the basis of `share_basis`: eigenvectors are defined up to sign and rotation.
 
@@ -239,7 +239,7 @@ def reduce_sums(sums: Sums) -> Sums:
 
 
 def add_over_processes(x: Tensor) -> Tensor:
-    """The tensors of all processes added, the same in each of them."""
+    """Add the tensors of all processes; each process gets the same result."""
     total = x.detach().clone()
     with _processes():
         dist.all_reduce(total, op=dist.ReduceOp.SUM)
@@ -247,7 +247,7 @@ def add_over_processes(x: Tensor) -> Tensor:
 
 
 def require_agreement(what: str, *values: int, hint: str | None = None) -> None:
-    """Check that some numbers are the same in all processes; it raises in all of them, or in none.
+    """Check that numbers agree in all processes; raises in all of them or in none.
 
     Raises:
         ModelError: they differ, or no group of processes has been initialised.
@@ -263,7 +263,7 @@ def require_agreement(what: str, *values: int, hint: str | None = None) -> None:
 
 
 def share_basis(basis: LatentBasis) -> LatentBasis:
-    """The basis of the first process in all of them, which must hold one of the same shapes.
+    """Distribute the basis of the first process to all others, which must have one of the same shapes.
 
     Raises:
         ModelError: no group of processes has been initialised.

@@ -43,7 +43,7 @@ NUMBERS = 16
 
 @dataclass(frozen=True)
 class Imported:
-    """A data set, what was found in the log and done to it, and the evidence for each detected contact."""
+    """A data set, the report of its import, and the evidence for each detected contact."""
 
     data: Dataset
     report: ImportReport
@@ -60,8 +60,8 @@ def read_log(
     Args:
         path: the log, a file or a folder.
         scene: a scene or its file, a system, or a robot.
-        mapping: what the columns mean: a mapping, its file, or the name of a bundled one. Without it, the
-            columns must be named as in a data set or as ROS names joint states.
+        mapping: a mapping of the columns, its file, or the name of a bundled one. Without it, the columns
+            must have the names of a data set or of ROS joint states.
 
     Returns:
         The log in SI units, in the robot's joint order.
@@ -98,7 +98,7 @@ def import_log(
     progress: Callable[[int, int], None] | None = None,
     displaced: bool = False,
 ) -> Imported:
-    """Read a log as `read_log` does, with a report; `displaced` lets a tip slide beside its surface."""
+    """Read a log like `read_log`, with a report; `displaced` accepts a tip that slides off its surface."""
     system = system_of(scene)
     robot = system.robot
     if mapping is None:
@@ -124,7 +124,7 @@ def import_log(
 
 
 def system_of(scene: Scene | ConstrainedSystem | RobotModel | str | Path) -> ConstrainedSystem:
-    """The robot with its contacts, however it is given."""
+    """The robot with its contacts, from any accepted form."""
     if isinstance(scene, ConstrainedSystem):
         return scene
     if isinstance(scene, RobotModel):

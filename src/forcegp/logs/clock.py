@@ -23,7 +23,7 @@ GAP_STEPS = 5.0
 
 
 def usual_step(t: Array) -> float:
-    """The median of the positive time steps [s]; `DataError` where time never increases."""
+    """The median of the positive time steps [s]; `DataError` if time never increases."""
     steps = np.diff(t)
     steps = steps[steps > 0.0]
     if not len(steps):
@@ -36,7 +36,7 @@ def usual_step(t: Array) -> float:
 
 
 def drop_repeated(signals: Signals, report: ImportReport) -> None:
-    """Drop rows that repeat the one before; `DataError` where only the stamp is the same."""
+    """Drop rows that repeat the previous one; `DataError` if only the stamp is the same."""
     same = np.concatenate([[False], np.diff(signals.t) == 0.0])
     if not same.any():
         return
@@ -57,8 +57,8 @@ def drop_repeated(signals: Signals, report: ImportReport) -> None:
 
 
 def split_trajectories(signals: Signals, gap: float | None, report: ImportReport) -> None:
-    """Number the trajectories: a new one where the log numbers another one, where the clock restarts, and
-    after a step longer than `gap` [s], by default `GAP_STEPS` usual ones.
+    """Number the trajectories: a new one begins at a new number in the log, at a restart of the clock, and
+    after a step longer than `gap` [s], by default `GAP_STEPS` usual steps.
 
     Raises:
         DataError: time steps back without restarting; the message has the rows.
@@ -91,7 +91,7 @@ def split_trajectories(signals: Signals, gap: float | None, report: ImportReport
 
 
 def find_held(signals: Signals, drop: bool, report: ImportReport) -> None:
-    """Find, and if asked drop, rows that repeat positions and torques, of a logger faster than its source."""
+    """Find, and on request drop, rows repeated because the logger is faster than its source."""
     held = np.zeros(len(signals), dtype=bool)
     held[1:] = signals.segment[1:] == signals.segment[:-1]
     for name in ("q", "tau"):
@@ -108,7 +108,7 @@ def find_held(signals: Signals, drop: bool, report: ImportReport) -> None:
 def join_stream(
     signals: Signals, name: str, t: Array, values: Array, gap: float | None, report: ImportReport
 ) -> None:
-    """Add a vector of a stream with stamps t `(k,)`, interpolated; rows it does not cover are dropped."""
+    """Add an interpolated vector of a stream with stamps t `(k,)`; rows outside its range are dropped."""
     back = np.flatnonzero(np.diff(t) <= 0.0)
     if len(back):
         raise DataError(
@@ -143,14 +143,14 @@ SMOOTH = ("q", "qd")
 
 
 def onto(t: Array, values: Array, at: Array, cubic: bool = False) -> Array:
-    """Values `(n, d)` of a stream with stamps t at other times, linearly or by a cubic spline."""
+    """Interpolate values `(n, d)` of a stream with stamps t at other times, linearly or by a cubic spline."""
     from scipy.interpolate import CubicSpline, make_interp_spline
 
     return CubicSpline(t, values)(at) if cubic and len(t) >= 4 else make_interp_spline(t, values, k=1)(at)
 
 
 def even_clock(signals: Signals, period: float | None, report: ImportReport) -> None:
-    """Put uneven trajectories on clocks of their own with the step `period` [s], by default the usual one."""
+    """Resample uneven trajectories with the step `period` [s], by default the usual one."""
     stretches = [rows for rows in signals.runs() if rows.stop - rows.start > 1]
     if not stretches:
         raise DataError("the log has no trajectory of two rows or more")

@@ -1,13 +1,13 @@
 """Intervals in which a contact is closed, from its distance, a measured force or λ.
 
 A force-torque sensor's reading becomes force and moment of the environment at the contact, in the world. The
-sensor sits in a frame of the robot, at p_S with rotation R. With f and m its reading as the environment and
-gravity act on the robot beyond it, the tool's weight m_T g at its centre of mass p_T is taken off and the
-moment carried to the contact point p_C:
+sensor sits in a frame of the robot, at p_S with rotation R. With f and m its reading of the action of
+environment and gravity on the robot, the tool's weight m_T g at its centre of mass p_T is subtracted, and the
+moment refers to the contact point p_C:
 
     F = R f − m_T g,   M = R m − (p_T − p_S) × m_T g − (p_C − p_S) × F.
 
-The tool's inertial force m_T p̈_T is not taken off: it is small for light tools and slow motion.
+The tool's inertial force m_T p̈_T is neglected: it is small for light tools and slow motion.
 """
 
 from __future__ import annotations
@@ -72,7 +72,7 @@ def _wrench(
 
 
 def per_contact(signals: Signals, system: ConstrainedSystem, mapping: Mapping) -> dict[str, dict[str, Array]]:
-    """`F_sensor` and `M_sensor` at each contact with a surface, or of a load cell the `multiplier`."""
+    """`F_sensor` and `M_sensor` at each contact with a surface, or the `multiplier` of a load cell."""
     touching = [contact for contact in system.contacts if isinstance(contact, SurfaceContact)]
     section = mapping.sections.wrench
     if section is not None and len(section.force) == 1:
@@ -91,7 +91,9 @@ def per_contact(signals: Signals, system: ConstrainedSystem, mapping: Mapping) -
 
 
 def multiplier(signals: Signals, system: ConstrainedSystem, contact: SurfaceContact) -> Array:
-    """λ = (A M⁻¹Aᵀ)⁺ A (q̈ − M⁻¹Q) `(n,)` of the rigid body at one contact [N], about zero in free motion."""
+    """λ = (A M⁻¹Aᵀ)⁺ A (q̈ − M⁻¹Q) `(n,)` at one contact according to the robot file [N], about zero in free
+    motion.
+    """
     alone = ConstrainedSystem(system.robot, [contact])
 
     def value(q: torch.Tensor, qd: torch.Tensor, qdd: torch.Tensor, tau: torch.Tensor) -> torch.Tensor:
@@ -139,9 +141,9 @@ BINS = 512
 
 @dataclass(frozen=True)
 class Evidence:
-    """What a contact's state was read from [N, m]: closed from `threshold` on, and then up to `release` on
-    either side; median and deviation in each state, NaN where it does not occur; first and last time of each
-    closed interval [s]; and how many intervals were too short and got their neighbours' state.
+    """Evidence for the state of a contact [N, m]: closed from `threshold` on, extended to `release` on either
+    side; median and deviation in each state, NaN if it does not occur; first and last time of each closed
+    interval [s]; and the number of short intervals merged with their neighbours.
     """
 
     contact: str
@@ -177,8 +179,8 @@ def detect(
 ) -> list[Evidence]:
     """Set `signals.contact` for every contact of the scene, and return the evidence for those detected.
 
-    Contacts found from λ need `qd` and `qdd`. A tip that slides beside its surface is an error, or with
-    `displaced` in contact with a surface that lies elsewhere.
+    Contacts found from λ need `qd` and `qdd`. A tip that slides off its surface is an error, unless
+    `displaced`.
     """
     sections = mapping.sections.contact
     for name in sections:
@@ -249,7 +251,7 @@ def _misplaced(
 
 
 def exchanged_joints(system: ConstrainedSystem, contact: SurfaceContact, q: Array) -> tuple[int, ...]:
-    """The two joints whose exchange puts the tip on its surface in some of the rows, if there are such."""
+    """The two joints that move the tip onto its surface in some of the rows when exchanged, if any."""
     q = q[:: max(1, len(q) // TRIED_ROWS)]
     for pair in combinations(range(q.shape[1]) if len(q) else (), 2):
         order = np.arange(q.shape[1])
@@ -281,8 +283,8 @@ def _detect(
 def touching(distance: Array) -> float:
     """Distance up to which a contact is closed [m], at most `TOUCHING`.
 
-    Most rows so near are those of the closed contact: the threshold, their median and `DISTANCE_STD` of their
-    deviations, parts them from those of the tip coming near and leaving.
+    Most rows within this distance belong to the closed contact: the threshold, their median plus
+        `DISTANCE_STD` deviations, separates them from approach and departure.
 
     >>> touching(np.array([0.0, 0.001, -0.001, 0.0, 0.002, 0.9, 30.0]) * 1e-3) < 1e-5
     True
@@ -295,10 +297,11 @@ def touching(distance: Array) -> float:
 
 
 def force_levels(values: Array, name: str, section: ContactStateSection) -> tuple[float, float]:
-    """Force from which a contact is closed, and the force up to which that interval then extends [N].
+    """Force threshold of a closed contact, and the lower force to which its interval extends [N].
 
-    The first parts the forces into the two groups with the least variance within them (Otsu 1979); the second
-    lies `RELEASE_STD` deviations above the median of the open group. `DataError` if the groups are not apart.
+    The first separates the forces into the two groups with the least variance (Otsu 1979); the second
+    lies `RELEASE_STD` deviations above the median of the open group. `DataError` if the groups are not
+    distinct.
     """
     if section.threshold is not None:
         return section.threshold, section.release if section.release is not None else 0.5 * section.threshold

@@ -2,8 +2,8 @@
 
 Motor side and joint side, currents and torques, signs and offsets are one factor per joint. A reading r is
 y = s k (r − o): o the reading at zero, in the unit of the column; s = ±1; and k the unit, times the
-torque constant K_t for a current. Through a gear of ratio N, a motor turns N times as fast as its joint and a
-joint bears N times the motor's torque: q = q_m / N, τ = N τ_m.
+torque constant K_t for a current. Through a gear of ratio N, a motor turns N times as fast as its joint, and
+the joint torque is N times the motor torque: q = q_m / N, τ = N τ_m.
 """
 
 from __future__ import annotations
@@ -16,13 +16,10 @@ import numpy as np
 from forcegp.errors import DataError
 from forcegp.logs import units
 from forcegp.logs.clock import drop_repeated, find_held, join_stream, split_trajectories
-from forcegp.logs.mapping import Mapping
+from forcegp.logs.mapping import SYMBOLS, Mapping
 from forcegp.logs.readers import read
 from forcegp.logs.table import Array, ImportReport, LogTable, Progress, Signals, Stream
 from forcegp.rows import describe, numbered
-
-SYMBOLS = {"position": "q", "velocity": "qd", "acceleration": "qdd", "torque": "tau"}
-"""Quantity of a mapping → name in a data set."""
 
 
 def gather(
@@ -33,7 +30,7 @@ def gather(
     progress: Progress | None = None,
     rows: int | None = None,
 ) -> Signals:
-    """Read the mapped columns of a log onto one clock, at most `rows` rows where the format allows it."""
+    """Read the mapped columns of a log onto one clock, at most `rows` rows if the format allows it."""
     sections = mapping.sections
     needed = {sections.time.column, sections.time.segment or sections.time.column}
     for name in SYMBOLS:

@@ -1,7 +1,7 @@
 """`--guess`: a mapping proposed from headings, magnitudes and the robot's own dynamics.
 
-Units and signs are tried: the logged velocity is compared with the derivative of the position, and the logged
-torque with the inverse dynamics of the scene's robot, gravity included. What is left open is marked CHECK.
+Units and signs are inferred by comparing the logged velocity with the derivative of the position, and the
+logged torque with the inverse dynamics of the scene's robot. Uncertain entries are marked CHECK.
 """
 
 from __future__ import annotations
@@ -35,18 +35,14 @@ ROWS, TRIED_ROWS = 100_000, 3000
 """Rows that are looked at; rows on which the inverse dynamics are evaluated."""
 LEAST_DEGREES = 3.2
 """Largest position [°] below which an arm in degrees would hardly move."""
-CLEARER = 1.5
-"""A unit is certain if the torque fits so much better than in the other one."""
-NEAR = 1.3
-"""A ratio is that of a unit if it is within this factor."""
-TRAJECTORY = 10
-"""Windows have at most one in so many samples of a trajectory."""
-LEAST_FORCE = 1.0
-"""A contact that is always closed presses with more than this [N]."""
+CLEARER, NEAR = 1.5, 1.3
+"""A unit is certain if the torque fits so much better in it; a ratio is that of a unit within this factor."""
+TRAJECTORY, LEAST_FORCE = 10, 1.0
+"""Windows have at most one in so many samples; a contact that is always closed presses with more [N]."""
 
 
 def guess_mapping(path: str | Path, system: ConstrainedSystem, progress: Progress | None = None) -> Draft:
-    """Propose a mapping for a log; `MappingError` where time, positions or torques are not recognised."""
+    """Propose a mapping for a log; `MappingError` if time, positions or torques are not recognised."""
     table = read(path, rows=ROWS, progress=progress)
     draft = Draft(str(path))
     with foreign(str(path), "a log that can be imported"):
@@ -188,7 +184,7 @@ def torque_slopes(trial: Signals, system: ConstrainedSystem) -> tuple[Array, Arr
     """Slope and partial correlation of the logged torque over the inverse dynamics, `(nq,)` each.
 
     τ_log = k τ_rigid + v q̇ + f sign(q̇) + Aᵀλ + const by least squares, joint by joint, with a constant λ of
-    each contact; the correlation is that of what the other terms leave of both sides.
+    each contact; the correlation is that of the residuals of both sides after the other terms.
     """
     nq = system.robot.nq
     rows = np.linspace(0, len(trial) - 1, min(TRIED_ROWS, len(trial))).astype(int)
@@ -211,7 +207,7 @@ def torque_slopes(trial: Signals, system: ConstrainedSystem) -> tuple[Array, Arr
 def propose_contacts(
     log: LogTable, draft: Draft, system: ConstrainedSystem, signals: Callable[[], Signals]
 ) -> None:
-    """Write into a draft how the state of each contact of the scene may be known; `signals` reads the log."""
+    """Propose in a draft a source for the state of each contact of the scene; `signals` reads the log."""
     named = [(c, x) for s in log.streams for c, x in s.columns.items() if "contact" in c.lower()]
     flags = [name for name, x in named if np.isin(x, (0.0, 1.0)).all()]
     in_order = flags if len(system.contacts) in (1, len(flags)) else []

@@ -19,31 +19,10 @@ from forcegp.logs.table import LogTable, Stream
 from forcegp.robot import RobotModel
 from forcegp.robust import robust_std
 
-WORDS = {
-    "acceleration": (
-        "qdd", "ddq", "acc", "accel", "acceleration", "accelerations", "qddot", "beschleunigung",
-    ),
-    "velocity": (
-        "qd", "dq", "vel", "velocity", "velocities", "speed", "omega", "qdot", "mdq", "w",
-        "geschwindigkeit", "drehzahl",
-    ),
-    "torque": (
-        "tau", "torque", "torques", "effort", "trq", "mtorque", "moment", "tq", "current", "currents",
-        "drehmoment",
-    ),
-    "position": (
-        "q", "pos", "position", "positions", "angle", "angles", "theta", "mq", "phi", "state", "joint",
-        "winkel",
-    ),
-}  # fmt: skip
+WORDS: dict[str, list[str]] = units.VOCABULARY["words"]
 """Words that name a quantity, by quantity, in the order in which they are looked for."""
-MEASURED = ("meas", "measured", "actual", "act", "msr", "sensor", "observation")
-"""Words of columns that were measured."""
-COMMANDED = (
-    "des", "desired", "target", "cmd", "command", "commanded", "ref", "reference", "con", "set", "goal",
-    "filt", "filtered", "fric", "err", "error", "action", "temperature", "temp", "voltage", "mode", "status",
-)  # fmt: skip
-"""Words of columns that are not what is looked for."""
+MEASURED, COMMANDED = (units.VOCABULARY["columns"][kind] for kind in ("measured", "commanded"))
+"""Words of columns that were measured, and of columns that are not what is looked for."""
 _TIME = re.compile(
     r"^(.*[ _./])?(t|mt|time|times|timestamp|stamp|clock|sec|secs|seconds|ms|millis|zeit)([ _./\[(].*)?$"
 )
@@ -68,7 +47,7 @@ def tokens(name: str) -> list[str]:
 
 
 def declared_unit(name: str, stream: Stream) -> str | None:
-    """The unit that a heading or the line below it declares, or `None`."""
+    """The unit declared by a heading or the line below it, or `None`."""
     if name in stream.units:
         return units.spelled(stream.units[name])
     for match in _DECLARED.finditer(name):
@@ -79,7 +58,7 @@ def declared_unit(name: str, stream: Stream) -> str | None:
 
 
 def find_time(table: LogTable, draft: Draft) -> Stream:
-    """The stream with the columns of the joints; its column of time goes into the draft."""
+    """The stream with the columns of the joints; its time column is added to the draft."""
     stream = max(table.streams, key=lambda s: (len(s.columns), len(s)))
     candidates = []
     for name, values in stream.columns.items():
@@ -117,7 +96,7 @@ def find_time(table: LogTable, draft: Draft) -> Stream:
 
 
 def find_families(stream: Stream, robot: RobotModel, draft: Draft) -> None:
-    """The columns of each quantity, and what the log calls each joint."""
+    """The columns of each quantity, and the log's names of the joints."""
     families = _families(stream, robot)
     if not any(re.search("[A-Za-z]", name) for name in stream.columns):
         find_by_values(stream, robot.joint_names, draft)
@@ -246,7 +225,7 @@ RELATED = 0.95
 
 
 def find_by_values(stream: Stream, joints: tuple[str, ...], draft: Draft) -> None:
-    """Propose families without headings: blocks of a column per joint, of which one is another's rate."""
+    """Propose families without headings: blocks with one column per joint, one the rate of another."""
     nq = len(joints)
     names = [name for name in stream.columns if name != draft.time["column"]]
     blocks = [names[k : k + nq] for k in range(0, len(names) - nq + 1, nq)]

@@ -1,8 +1,8 @@
-"""Mapping files: which column of a log is which quantity of which joint, in TOML (docs/import.md).
+"""Mapping files: the columns of a log for each quantity and joint, in TOML (docs/import.md).
 
-`[joints]` says what the log calls each joint of the robot, and a column such as `"q_{joint}"` is filled in
-with that name. A data set, and ROS joint states with the robot's names, need no file. A draft is a mapping
-that is proposed to the user: its tables, and a comment on each thing that is not certain.
+`[joints]` contains the log's name of each joint, which is inserted into columns such as `"q_{joint}"`. A data
+set, and ROS joint states with the robot's names, need no file. A draft is a proposed mapping: its tables, and
+comments on uncertain entries.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ CURRENT = {"side": "motor", "gear_ratio": 1.0, "torque_constant": 1.0}
 
 @dataclass
 class Family:
-    """Columns of one quantity by what stands for `{joint}` in the common pattern, or `by_joint` of the robot
-    where that does not name the joints as the positions do; `declared`, if the log says their unit.
+    """Columns of one quantity by the text in place of `{joint}` in their common pattern, or `by_joint` of the
+    robot if that text differs from that of the positions; `declared` if the log states their unit.
     """
 
     pattern: str
@@ -57,8 +57,9 @@ class Family:
 
 @dataclass
 class Draft:
-    """A proposed mapping: tables, in which a key that is `None` is left out, families of columns by quantity,
-    comments above each table, what the user must check, and the window of the derivatives."""
+    """A proposed mapping: tables (keys with `None` are omitted), families of columns by quantity, comments
+    above each table, entries for the user to check, and the window of the derivatives.
+    """
 
     source: str
     time: dict[str, Any] = field(default_factory=dict)
@@ -109,6 +110,8 @@ def _value(value: object) -> str:
     return json.dumps(value)
 
 
+SYMBOLS = {"position": "q", "velocity": "qd", "acceleration": "qdd", "torque": "tau"}
+"""Quantity of a mapping → name in a data set."""
 PerJoint = float | dict[str, float]
 """One number for all joints, or one for each by name."""
 
@@ -129,7 +132,7 @@ class TimeSection(Section):
 
 
 class QuantitySection(Section):
-    """`[position]`, `[velocity]`, `[acceleration]`: the columns of a joint vector, and how they are meant."""
+    """`[position]`, `[velocity]`, `[acceleration]`: the columns of a joint vector, with units and signs."""
 
     column: str | None = None
     columns: dict[str, str] = Field(default_factory=dict)
@@ -156,7 +159,7 @@ GROUND = "ground"
 class WrenchSection(Section):
     """`[wrench]`: a force-torque sensor, or a load cell with one column that measures along `axis`.
 
-    One that is fixed to the ground has its own `position` [m] and `rpy` [rad] in the world.
+    A sensor on the ground has `position` [m] and `rpy` [rad] in the world.
     """
 
     force: tuple[str, ...] = Field(min_length=1, max_length=3)
@@ -176,7 +179,7 @@ class WrenchSection(Section):
 
 
 class ContactStateSection(Section):
-    """`[contact.<name>]`: where it is known from whether a contact of the scene is closed."""
+    """`[contact.<name>]`: source of the state of a contact of the scene."""
 
     source: Literal["column", "wrench", "multiplier", "distance", "always", "never"]
     column: str | None = None
@@ -187,7 +190,7 @@ class ContactStateSection(Section):
 
 
 class DerivativesSection(Section):
-    """`[derivatives]`: how velocities and accelerations that the log lacks are computed."""
+    """`[derivatives]`: computation of missing velocities and accelerations."""
 
     method: Literal["savitzky_golay", "smoother"] = "savitzky_golay"
     source: Literal["position", "velocity"] | None = None
@@ -217,8 +220,7 @@ BUNDLED = ("double_pendulum_csv", "iiwa14_txt", "ros_joint_states", "ur3_bag", "
 
 @dataclass(frozen=True)
 class Mapping:
-    """A mapping file that has been read and checked: its tables, the document for messages, and the doubts
-    that `--guess` marked CHECK and nobody has removed."""
+    """A validated mapping file: its tables, the document for messages, and remaining CHECK marks."""
 
     sections: MappingSections
     document: Document
@@ -229,7 +231,7 @@ class Mapping:
         return getattr(self.sections, name)
 
     def measured(self, name: str, joints: Sequence[str]) -> list[str]:
-        """The joints of which the log has a quantity: all but those whose torque is `unmeasured`."""
+        """The joints with a logged quantity: all except those with `unmeasured` torque."""
         unmeasured = self.sections.torque.unmeasured if name == "torque" else ()
         self._check_joints((name, "unmeasured"), unmeasured, joints)
         return [joint for joint in joints if joint not in unmeasured]
@@ -256,7 +258,7 @@ class Mapping:
         return columns
 
     def per_joint(self, name: str, key: str, joints: Sequence[str]) -> NDArray[np.float64]:
-        """The numbers `(nq,)` of a key that holds one for all joints or one for each."""
+        """The numbers `(nq,)` of a key with one value for all joints or one per joint."""
         value: PerJoint = getattr(self.quantity(name), key)
         if not isinstance(value, dict):
             return np.full(len(joints), float(value))
@@ -285,7 +287,7 @@ class Mapping:
 
 
 def load_mapping(source: str | Path) -> Mapping:
-    """Read a mapping file by its path, or the name of one that comes with the library.
+    """Read a mapping file by its path, or a bundled one by name.
 
     Raises:
         MappingError: no such mapping, or it is not valid; the message names file, line and key.
@@ -372,11 +374,10 @@ def _check_quantity(mapping: Mapping, name: str, section: QuantitySection) -> No
 
 
 def default_mapping(path: str | Path, system: ConstrainedSystem) -> Mapping:
-    """The mapping of a log whose names leave no doubt; otherwise `MappingError`, with a hint."""
+    """The mapping of a log with unambiguous names; otherwise `MappingError`, with a hint."""
     table, robot = read(path, rows=1), system.robot
     names, joints = set(table.names), robot.joint_names
-    symbols = {"position": "q", "velocity": "qd", "acceleration": "qdd", "torque": "tau"}
-    logged = {n: s for n, s in symbols.items() if names >= {f"{s}.{joint}" for joint in joints}}
+    logged = {n: s for n, s in SYMBOLS.items() if names >= {f"{s}.{joint}" for joint in joints}}
     if {"position", "torque"} <= set(logged) and "t" in names:
         draft = Draft(str(path), {"column": "t", "segment": "segment" if "segment" in names else None})
         for name, symbol in logged.items():

@@ -1,8 +1,8 @@
-"""Velocities and accelerations that a log lacks, by trajectory and never across a contact switch.
+"""Computation of missing velocities and accelerations by trajectory, never across a contact switch.
 
 The Kalman smoother of a joint gives position, velocity and acceleration with error bars. Its model is a
-constant jerk disturbed by white snap of intensity s, seen in white noise of deviation σ: x = (q, q̇, q̈, q⃛),
-dx = F x dt + e₄ √s dw, y = q + ε. In the scaled state z = (q, h q̇, h² q̈, h³ q⃛), h the time step,
+constant jerk disturbed by white snap of intensity s, measured with white noise of deviation σ: x = (q, q̇,
+q̈, q⃛), dx = F x dt + e₄ √s dw, y = q + ε. In the scaled state z = (q, h q̇, h² q̈, h³ q⃛), h the time step,
 transition and noise are constant matrices: z⁺ = A z + w, A_ij = 1/(j−i)!, Cov(w)_ij = ρ σ² W_ij with ρ = s
 h⁷/σ² and W_ij = 1/((3−i)! (3−j)! (7−i−j)), i, j from 0. ρ is learned by evidence, σ in closed form (Rauch,
 Tung and Striebel 1965; Särkkä, Bayesian Filtering and Smoothing, 2013, ch. 8 and 12).
@@ -27,14 +27,10 @@ from forcegp.rows import runs
 
 STATES, SHORTEST = 4, 8
 """Size of the state, position to jerk, and rows that a piece needs."""
-LEARNED_ROWS = 2000
-"""Rows from which ρ is learned: the longest pieces, up to so many."""
-LOG_RHO = (-30.0, 8.0)
-"""Range of log ρ: from a parabola over any window to no smoothing at all."""
-DIFFUSE = 1e8
-"""Prior variance of the scaled state about the first row, in units of σ²: uninformative."""
-SETTLED = 1e-10
-"""Relative change of the covariance from row to row below which it counts as stationary."""
+LEARNED_ROWS, LOG_RHO = 2000, (-30.0, 8.0)
+"""Rows of the longest pieces that ρ is learned from, and range of log ρ: from a parabola to no smoothing."""
+DIFFUSE, SETTLED = 1e8, 1e-10
+"""Uninformative prior variance of the first scaled state [σ²]; change of a stationary covariance."""
 
 A = np.array([[1.0 / factorial(j - i) if j >= i else 0.0 for j in range(STATES)] for i in range(STATES)])
 TAYLOR = np.array([1.0 / factorial(3 - i) for i in range(STATES)])
@@ -58,7 +54,7 @@ def smooth(t: Array, q: Array, piece: NDArray[np.int64], also: Array | None = No
     """Smooth the positions q of one joint, piece by piece, with one ρ and σ for all pieces.
 
     All are `(n,)`: evenly spaced time within each piece [s], the number of each row's piece, of at least
-    `SHORTEST` rows, and `also`, another quantity to be passed through the same filter.
+    `SHORTEST` rows, and `also`, another quantity to filter in the same way.
 
     >>> t = np.arange(400) * 0.01
     >>> noise = 1e-3 * np.random.default_rng(0).standard_normal(400)
@@ -84,7 +80,9 @@ def smooth(t: Array, q: Array, piece: NDArray[np.int64], also: Array | None = No
 
 
 def learn(q: Array, stretches: list[slice]) -> tuple[float, float]:
-    """ρ and σ, in the unit of q, of greatest evidence on the longest pieces of measured positions `(n,)`."""
+    """ρ and σ, in the unit of q, with the largest evidence on the longest pieces of measured positions
+    `(n,)`.
+    """
     chosen, remaining = [], LEARNED_ROWS
     for rows in sorted(stretches, key=lambda s: s.start - s.stop):
         chosen.append(q[rows][:remaining])
@@ -161,8 +159,8 @@ def _run(y: Array, gain: Array, back: Array) -> Array:
 
 
 def add_derivatives(signals: Signals, settings: DerivativesSection, report: ImportReport) -> Array | None:
-    """Compute `qd` and `qdd` where the log has none, piece by piece between contact switches, and pass the
-    torque through the same filter; returns σ of the computed q̈ `(n, nq)`, or `None` where it is logged.
+    """Compute missing `qd` and `qdd`, piece by piece between contact switches, and filter the torque in the
+    same way; returns σ of the computed q̈ `(n, nq)`, or `None` if it is logged.
     """
     logged = [name for name in ("qd", "qdd") if name in signals.vectors]
     if len(logged) == 2:

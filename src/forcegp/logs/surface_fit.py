@@ -28,7 +28,7 @@ OUTLIER_STD = 4.0
 
 @dataclass(frozen=True)
 class Solution:
-    """Parameters, covariance, residuals of the rows used, how many of these are independent, and outliers."""
+    """Parameters, covariance, residuals of the rows used, the number of independent ones, and outliers."""
 
     x: Array
     covariance: Array
@@ -38,7 +38,7 @@ class Solution:
 
 
 def robust_least_squares(residual: Callable[[Array], Array], start: Array) -> Solution:
-    """Least squares of the residuals `(n,)` of parameters `(k,)`, without those that a robust fit rejects."""
+    """Least squares of the residuals `(n,)` of parameters `(k,)`, without outliers of a robust fit."""
     robust = start
     for _ in range(2):
         scale = max(float(robust_std(residual(robust))), ROUNDING)
@@ -78,7 +78,7 @@ class Tip:
         return float(x[-1]) if self.radius is None else self.radius
 
     def std(self, solution: Solution) -> dict[str, float]:
-        """Error bar of a fitted radius; `DataError` where the tip's orientation does not show it."""
+        """Error bar of a fitted radius; `DataError` if the tip's orientation does not determine it."""
         if self.radius is not None:
             return {}
         radius, std = self.of(solution.x), float(np.sqrt(solution.covariance[-1, -1]))
@@ -155,9 +155,9 @@ def fit_surface(
 ) -> SurfaceFit:
     """Fit a surface to the path of the touching point while a contact is closed.
 
-    Least squares of the signed distances, without the rows that a robust fit finds off the surface. The error
-    bars count residuals that are correlated in time as fewer independent ones. The ball that touches, of
-    `tip_radius` [m] or `"fit"`, ends at the scene's point; by default the tip is the scene's.
+    Least squares of the signed distances, without outliers of a robust fit. The error bars account for
+    residuals that are correlated in time. A ball of `tip_radius` [m] or `"fit"` ends at the scene's point; by
+    default the tip is the scene's.
 
     Raises:
         DataError: the scene has another tip, the contact is closed in too few rows, or the path is too

@@ -1,6 +1,5 @@
-"""What readers return, named columns of numbers by the clock that they share, and what the steps of an import
-hand on: quantities in SI units and in the robot's joint order on one clock, and a report of what was found
-and done.
+"""Named columns of numbers with a common clock, as returned by readers; quantities in SI units and in the
+robot's joint order on one clock, as used by the steps of an import; and the report of an import.
 """
 
 from __future__ import annotations
@@ -20,7 +19,7 @@ from forcegp.rows import numbered, runs
 
 
 def check_values(source: str, rows: int, columns: int) -> None:
-    """Raise `DataError` where a table is wider or larger than what is read; announce a large one."""
+    """Raise `DataError` if a table is wider or larger than the limits; announce a large one."""
     check_count(source, "columns", columns, limits.COLUMNS)
     check_count(source, f"numbers ({rows:,} rows × {columns} columns)", rows * columns, limits.LOG_VALUES)
     announce_memory(2 * 8 * rows * columns, f"reading {source}")  # as in the file, and as float64
@@ -35,7 +34,7 @@ Wanted = Callable[[str], bool]
 
 @dataclass(frozen=True, eq=False)
 class Stream:
-    """Columns `(n,)` with a common clock, NaN where a value is missing, and units that the log declares."""
+    """Columns `(n,)` with a common clock, NaN for missing values, and units declared by the log."""
 
     name: str
     columns: Mapping[str, Column]
@@ -48,7 +47,7 @@ class Stream:
 
 @dataclass(frozen=True, eq=False)
 class LogTable:
-    """A log as it was read, with remarks on what the reader left out or assumed, one sentence each."""
+    """A log as it was read, with remarks on omissions and assumptions of the reader, one sentence each."""
 
     source: str
     format: str
@@ -61,7 +60,7 @@ class LogTable:
         return [name for stream in self.streams for name in stream.columns]
 
     def stream_of(self, column: str, stream: str | None = None) -> Stream:
-        """The stream that holds a column; `DataError` where none does, or several and none is named."""
+        """The stream of a column; `DataError` without one, or with several if none is named."""
         among = [s for s in self.streams if stream is None or s.name == stream]
         if not among:
             raise missing(self.source, "stream", stream or "", [s.name for s in self.streams])
@@ -78,18 +77,18 @@ class LogTable:
 
 
 def joined(chunks: dict[str, list[Column]], rows: int | None) -> dict[str, Column]:
-    """Columns that were read piece by piece, cut to `rows`; memory holds one of them twice at a time."""
+    """Columns that were read piece by piece, truncated to `rows`; only one of them is copied at a time."""
     return {name: np.concatenate(chunks.pop(name))[:rows] for name in list(chunks)}
 
 
 def streams_by_length(groups: Mapping[int, Mapping[str, Column]], common: int) -> tuple[Stream, ...]:
-    """A stream for each number of rows, that with the common one first and without a name."""
+    """A stream for each number of rows, with the most common one first and unnamed."""
     ordered = sorted(groups, key=lambda rows: rows != common)
     return tuple(Stream("" if rows == common else f"{rows} rows", groups[rows]) for rows in ordered)
 
 
 def missing(source: str, kind: str, name: str, names: list[str]) -> DataError:
-    """The error for a stream or column that a log does not hold."""
+    """The error for a missing stream or column."""
     shown = ", ".join(repr(k) for k in names[:16]) + (f", … ({len(names)})" if len(names) > 16 else "")
     return DataError(
         f"{source}: the log has no {kind} {name!r}",
@@ -104,7 +103,7 @@ def table_of_arrays(
     """The log of the arrays of a file, a stream for each number of rows.
 
     A matrix `(n, d)` becomes the columns `name[0]` to `name[d-1]`. Rows run along the axis whose length
-    most arrays share; `(d, n)` is transposed. Arrays of another length are streams of their own. After the
+    most arrays share; `(d, n)` is transposed. Arrays of another length form separate streams. After the
     `remarks` of the reader comes one for each array that was transposed or left out.
     """
     usable, remarks, source = {}, list(remarks), str(path)
@@ -152,7 +151,7 @@ class Signals:
         return len(self.t)
 
     def keep(self, mask: NDArray[np.bool_], split: bool = False) -> None:
-        """Keep some rows `(n,)`, column by column to save memory; with `split`, gaps part trajectories."""
+        """Keep some rows `(n,)`, column by column to save memory; with `split`, gaps split trajectories."""
         if mask.all():
             return
         if split:
@@ -173,7 +172,9 @@ MOST_INTERVALS = 20
 
 @dataclass(frozen=True)
 class ImportFinding:
-    """A kind in a word and a sentence with what was done; `rows` has the first of the intervals concerned."""
+    """A finding of an import: its kind, and a sentence with the action taken; `rows` has the first intervals
+    concerned.
+    """
 
     kind: str
     message: str
@@ -183,7 +184,7 @@ class ImportFinding:
 
 @dataclass
 class ImportReport:
-    """What was found and done, in order; `rows_read` are those of the stream that sets the clock."""
+    """Findings and actions, in order; `rows_read` are those of the stream that defines the clock."""
 
     source: str
     format: str = ""

@@ -1,4 +1,4 @@
-"""Models of the forward dynamics: what they are made of, fitting, predicting, and reading them back."""
+"""Models of the forward dynamics: specification, fitting, prediction, and saved files."""
 
 from forcegp.models.load import register
 

@@ -52,8 +52,8 @@ class AnalyticalModel(Model["AnalyticalFit"]):
 
     Args:
         system: robot and contacts.
-        analytical_parameters: what is learned: joint names by quantity, as for `AnalyticalParameters`.
-        window: how far from the parameters of the file learning starts.
+        analytical_parameters: learned parameters: joint names by quantity, as for `AnalyticalParameters`.
+        window: size of the window around the parameters of the file in which learning starts.
         seed: of the start.
 
     Raises:
@@ -126,8 +126,8 @@ class AnalyticalFit(FittedModel):
     Attributes:
         system: robot and contacts.
         parameters: the learned coordinates.
-        window, seed: where learning started.
-        result: how the fit went.
+        window, seed: of the start of learning.
+        result: course of the fit.
     """
 
     system: ConstrainedSystem
@@ -140,7 +140,7 @@ class AnalyticalFit(FittedModel):
 
     @property
     def specified(self) -> ConstrainedSystem:
-        """The system with the robot that learning started from."""
+        """The system with the initial robot."""
         return self.system.with_robot(self.parameters.start)
 
     def described(self) -> list[tuple[str, object]]:

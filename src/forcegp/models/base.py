@@ -1,6 +1,6 @@
 """Models of the forward dynamics: a specification, and the fitted model that predicts.
 
-`AccelerationFit` is that of models of accelerations alone, which have neither contacts nor forces.
+`AccelerationFit` belongs to models of accelerations alone, which have neither contacts nor forces.
 """
 
 from __future__ import annotations
@@ -19,13 +19,16 @@ from forcegp.errors import ModelError
 from forcegp.files import Record
 from forcegp.forces.quantities import FlatStates
 from forcegp.gp.optimise import FitProgress
-from forcegp.models.fit_result import HasResult, fit_table, model_line
+from forcegp.models.fit_result import FitResult, fit_table, model_line
 from forcegp.models.prediction import Answer, Predictor, Query
 from forcegp.storage.model_file import ModelHeader, write_model
 
 
-class FittedModel(HasResult, Predictor):
+class FittedModel(Predictor):
     """A model with learned parameters; immutable."""
+
+    result: FitResult
+    """How the fit went."""
 
     def __repr__(self) -> str:
         """One line: robot, contacts, and how the fit went."""
@@ -44,11 +47,11 @@ class FittedModel(HasResult, Predictor):
     def restored(
         cls, header: ModelHeader, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
     ) -> FittedModel:
-        """The model that `save` wrote.
+        """Restore a saved model.
 
         Args:
-            header: of the file, with the settings that `record` gave.
-            tensors: as `record` gave them.
+            header: of the file, with the settings of `record`.
+            tensors: those of `record`.
             system: robot and contacts.
             source: name of the file, for messages.
 
@@ -58,7 +61,7 @@ class FittedModel(HasResult, Predictor):
 
     @abstractmethod
     def record(self) -> tuple[Record, dict[str, Tensor]]:
-        """Settings and tensors that the model can be restored from."""
+        """Settings and tensors from which the model can be restored."""
 
     def save(self, path: str | Path) -> None:
         write_model(path, self.kind, self.system, *self.record())
@@ -113,9 +116,9 @@ class Model(ABC, Generic[F]):
 
         Args:
             data: states and measurements.
-            progress: called now and then.
-            checkpoint: file that records a long fit; a fit that finds it resumes there, to the same bits.
-                Remove it once the fitted model is saved.
+            progress: called from time to time.
+            checkpoint: file that records a long fit; a fit that finds it resumes there, with the same result
+                to the bit. Remove it once the fitted model is saved.
 
         Returns:
             The fitted model. Fitting twice gives the same bits.
@@ -123,7 +126,7 @@ class Model(ABC, Generic[F]):
 
 
 class AccelerationFit(FittedModel):
-    """Predicts accelerations of the system that it was fitted on; it has neither forces nor contacts."""
+    """Predictor of accelerations of its own system, without forces or contacts."""
 
     def at(self, flat: FlatStates, query: Query) -> Answer:
         if query.quantity != "qdd":
@@ -144,4 +147,4 @@ class AccelerationFit(FittedModel):
 
     @abstractmethod
     def accelerations(self, at: FlatStates, variance: bool) -> tuple[Tensor, Tensor | None]:
-        """Mean `(n, nq)` at states and, on request and where the model has one, variance `(n, nq)`."""
+        """Mean `(n, nq)` at states and, on request and if the model has one, variance `(n, nq)`."""

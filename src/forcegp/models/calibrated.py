@@ -1,13 +1,13 @@
-"""The robot that a fit found, as figures that robot files hold, with samples of it.
+"""The robot identified by a fit, in the parameters of robot files, with samples.
 
 Links have the identified inertia. Robot files have joint friction as d q̇ + f sign q̇ only; d and f are those
 nearest to the learned friction Q_D(q̇) over the trained speeds, by least squares with an offset,
 
     min Σ_v (Q_D(v) + d v + f sign v − c)²,   d, f ≥ 0,
 
-averaged over poses where friction depends on the load. What is left, and the offset c, are losses. A
-log seldom separates an offset from the weight of links: if zero is within 2σ of an offset, all the rest is
-conditioned on c = 0. URDF has no armature a either: the links take its inertia as far as bodies can.
+averaged over poses where friction depends on the load. The residual and the offset c are losses. A log seldom
+separates an offset from the weight of links: if zero is within 2σ of an offset, all other parameters are
+conditioned on c = 0. URDF has no armature a: its inertia is added to the links as far as physically possible.
 Samples are the same for functions drawn from the posterior, with inertial parameters π + S δ
 (`forces/priors/inertial.py`).
 """
@@ -70,8 +70,8 @@ class Parameter:
     """One figure of the robot.
 
     Attributes:
-        element: joint whose figure it is; inertia is that of the link that it moves.
-        name: of the figure.
+        element: joint of the parameter; inertia refers to the link that it moves.
+        name: of the parameter.
         file, estimate, std: SI units.
         determined: whether the data determine it beyond the prior.
     """
@@ -89,12 +89,12 @@ class Calibration:
     """The robot that a fit found.
 
     Attributes:
-        robot: with identified inertia, and friction in the form that robot files have.
-        parameters: what changed, beside the file, with standard deviations.
+        robot: with identified inertia, and friction in the form of robot files.
+        parameters: changed parameters beside those of the file, with standard deviations.
         speeds, friction, friction_std: `(k, nq)` the learned friction of each joint over its trained speeds
             [rad/s, m/s], [N m, N].
-        left: `(nq,)` root mean square of the friction that d q̇ + f sign q̇ leaves [N m, N].
-        offset: `(nq,)` constant force beside it [N m, N].
+        left: `(nq,)` root mean square of the friction not explained by d q̇ + f sign q̇ [N m, N].
+        offset: `(nq,)` additional constant force [N m, N].
     """
 
     robot: RobotModel
@@ -107,7 +107,7 @@ class Calibration:
 
     @property
     def losses(self) -> tuple[str, ...]:
-        """Learned forces that the robot file cannot contain, one sentence for each joint."""
+        """Learned forces that a robot file cannot represent, one sentence for each joint."""
         joints = zip(self.robot.joint_names, self.left.tolist(), self.offset.tolist(), strict=True)
         return tuple(
             f"joint {joint!r}: friction beyond d q̇ + f sign q̇ of {left:.3g} (root mean square), and a "
@@ -119,15 +119,16 @@ class Calibration:
 
 @torch.no_grad()
 def calibrated(fit: StructuredFit, *, draws: int = DRAWS, seed: int = 0) -> Calibration:
-    """The robot with identified inertia, payload, and the part of the friction that robot files can hold.
+    """The robot with identified inertia, payload, and the part of the friction that robot files can
+    represent.
 
     Args:
         fit: around the analytical forces.
-        draws: function samples that standard deviations are taken from.
-        seed: of these samples, and of the poses that friction is averaged over.
+        draws: number of function samples for standard deviations.
+        seed: of these samples, and of the poses for averaging friction.
 
     Returns:
-        Robot, parameters with standard deviations, and what is lost.
+        Robot, parameters with standard deviations, and losses.
 
     Raises:
         ModelError: the fit has no analytical mean, so its forces are not those beyond the robot file's.
@@ -149,7 +150,7 @@ def sampled_robots(fit: StructuredFit, samples: int, *, seed: int = 0) -> list[R
     """Robots drawn from the joint posterior of inertia, drives' links, payload and friction; each is
     physically consistent.
 
-    Samples whose links no body could have are replaced by the nearest robot in the metric of the posterior
+    Samples with unphysical links are replaced by the nearest robot in the metric of the posterior
     (eigenvalues of pseudo-inertias over the identified ones are at least ε = 0.01).
 
     Args:
@@ -175,7 +176,7 @@ def write_calibrated(
     seed: int = 0,
     locked_joints: Mapping[str, float] | None = None,
 ) -> Calibration:
-    """Write a copy of the robot file with what a fit found, a report beside it, and sampled robots.
+    """Write a copy of the robot file with identified parameters, a report, and sampled robots.
 
     `calibrated.urdf` gets `calibrated.report.json`, with parameters, losses and friction in full, and
     `calibrated.sample_000.urdf` and so on.
@@ -186,7 +187,7 @@ def write_calibrated(
         out: the edited copy.
         samples: number of robots drawn from the posterior.
         seed: of the draws.
-        locked_joints: as they were given to `load_robot`.
+        locked_joints: as for `load_robot`.
 
     Raises:
         RobotFileError: the file does not fit the robot, or cannot take a change.
@@ -202,7 +203,10 @@ def write_calibrated(
         losses = losses or write_robot(holding, source, path, locked_joints=locked_joints).losses
     if drives:
         values = ", ".join(f"{x:.4g}" for x in found.robot.armature.tolist())
-        losses = (f"URDF has no armature ({values}): links have its inertia as far as they can", *losses)
+        losses = (
+            f"URDF has no armature ({values}): links have its inertia as far as physically possible",
+            *losses,
+        )
     report = {
         "parameters": [vars(parameter) for parameter in found.parameters],
         "losses": [*losses, *found.losses],
@@ -221,10 +225,10 @@ def write_calibrated(
 
 @torch.no_grad()
 def unknowns_after(fit: StructuredFit, unknowns: Unknowns, *, draws: int = DRAWS, seed: int = 0) -> Unknowns:
-    """What a fit leaves unknown before another motion, from the covariance of functions drawn from it.
+    """The unknowns before another motion, from the covariance of functions drawn from a fit.
 
-    Base parameters, payload and friction over speed have the posterior covariance; what the fit has no prior
-    for keeps that of `unknowns`. The noise is at least that of the torques of the fit.
+    Base parameters, payload and friction over speed have the posterior covariance; parameters without a prior
+    in the fit keep that of `unknowns`. The noise is at least that of the torques of the fit.
 
     Args:
         fit: around the analytical forces.
@@ -497,7 +501,7 @@ def _pseudo(pi: Tensor) -> Tensor:
 
 
 def without_armature(robot: RobotModel, fastest: Tensor) -> RobotModel:
-    """The robot whose links have the inertia of the drives as far as bodies can.
+    """The robot with the inertia of its drives added to the links as far as physically possible.
 
     Over n random states, it minimises the square of each joint's error of τ over the torque itself:
 

@@ -1,4 +1,4 @@
-"""Models from the table `[model]` of a scene or of a file of its own (docs/formats.md)."""
+"""Models from the table `[model]` of a scene or of a separate file (docs/formats.md)."""
 
 from __future__ import annotations
 
@@ -41,13 +41,13 @@ Options = LearningOptions | BatchOptions
 
 @dataclass(frozen=True, eq=False)
 class Configured:
-    """A model, and how it learns.
+    """A model with its options of learning.
 
     Attributes:
         name: of the model.
         model: the model.
-        options: how it learns; `None` for its default.
-        sensor_noise_std: where the log's force sensor is a second measurement, the noise of its force [N].
+        options: of learning; `None` for the default.
+        sensor_noise_std: noise of the log's force sensor if it is a second measurement [N].
     """
 
     name: str
@@ -56,7 +56,7 @@ class Configured:
     sensor_noise_std: float | None = None
 
     def fit(self, data: Dataset, *, progress: FitProgress | None = None, **settings: Any) -> FittedModel:
-        """Fit the model to data with its options, and to the force sensor if asked for."""
+        """Fit the model to data with its options, and to the force sensor if requested."""
         if self.options is not None:
             settings["options"] = self.options
         if self.sensor_noise_std is not None and isinstance(self.model, StructuredGP):

@@ -1,4 +1,4 @@
-"""The external wrench that a fitted model reads off a log, and the contacts that it detects."""
+"""Estimation of an external wrench from a log with a fitted model, and detection of contacts."""
 
 from __future__ import annotations
 
@@ -23,6 +23,7 @@ from forcegp.forces.external_wrench import (
     least_squares,
     momentum_force,
     observe,
+    over_levers,
 )
 from forcegp.forces.friction_memory import FrictionMemory
 from forcegp.forces.noise import external_std
@@ -43,8 +44,8 @@ THRESHOLD = 5.0
 class ExternalWrench(Prediction):
     """An external wrench at each sample of a log: `mean` `(n, k)` and `covariance` `(n, k, k)`.
 
-    The covariance counts the uncertainty of the learned forces, the noise of torques and of motion, and the
-    prior on the wrench; along directions that the arm cannot feel it is that of the prior.
+    The covariance contains the uncertainty of the learned forces, the noise of torques and of motion, and the
+    prior on the wrench; along directions without effect on the joints it is that of the prior.
 
     Attributes:
         frame: the frame, and the components that were estimated.
@@ -56,15 +57,15 @@ class ExternalWrench(Prediction):
         """Whether a wrench acts at each sample, `(n,)` bool.
 
         Without a wrench, d² = ŵᵀ C⁻¹ ŵ is at most a χ² variable with k degrees of freedom. A contact is
-        detected where d² exceeds the quantile of χ² that belongs to a Gaussian beyond ± `threshold` standard
-        deviations, at `hold` samples in a row.
+        detected if d² exceeds the χ² quantile with the probability of a Gaussian beyond ± `threshold`
+        standard deviations, at `hold` samples in a row.
 
         Args:
             threshold: [σ]; `false_alarm_rate(threshold)` is the probability of a false alarm at a sample.
-            hold: samples in a row, this one and those before it.
+            hold: number of consecutive samples, including the current one.
 
         Raises:
-            ParameterError: the threshold is not positive, or no sample is asked for.
+            ParameterError: the threshold is not positive, or `hold` is below one.
         """
         if not threshold > 0.0 or hold < 1:
             raise ParameterError(
@@ -100,7 +101,7 @@ def false_alarm_rate(threshold: float) -> float:
 
 @runtime_checkable
 class LearnedForces(Protocol):
-    """Forces of a fit: its posterior, the noise beside it, and the robot."""
+    """Forces of a fit: posterior, noise, and robot."""
 
     @property
     def system(self) -> ConstrainedSystem: ...
@@ -132,9 +133,13 @@ def external_wrench(
     else:
         mean, covariance = reading.from_momenta()
     k = len(frame.axes)
+    pairs = zip(mean[:, :k].split(CHUNK), covariance[:, :k, :k].split(CHUNK), strict=True)
+    prior, levers = frame.prior.to(mean), [lever.to(mean) for lever in frame.levers]
+    parts = (over_levers(m, C, prior, levers) for m, C in pairs)
+    mean, covariance = map(torch.cat, zip(*parts, strict=True))
     return ExternalWrench(
-        mean[:, :k],
-        covariance[:, :k, :k],
+        mean,
+        covariance,
         {"external_wrench": slice(0, k)},
         distance_beyond(fit.hyperparameters, data.qd, data.tau),
         fit.system.robot.joint_names,
@@ -155,10 +160,10 @@ class JointForces(NamedTuple):
 
 @dataclass(frozen=True)
 class Reading:
-    """A log in which a wrench is looked for.
+    """A log for the estimation of a wrench.
 
     Attributes:
-        fit, data, frame: the learned forces, the log, and what is estimated.
+        fit, data, frame: the learned forces, the log, and the estimated components.
         memory: friction with memory, for logs in order of time.
         remembered: its force `(n, nq)`, or zero.
         external: standard deviation of further unknown forces on the joints `(nq,)`, or `None`.
@@ -259,7 +264,7 @@ def velocity_noise(data: Dataset) -> Tensor:
     """`white_noise_std` of each joint's velocity in a log in order of time, evenly sampled, `(nq,)`.
 
     Raises:
-        DataError: no five samples follow each other.
+        DataError: there are no five consecutive samples.
     """
     whole = data.segment[4:] == data.segment[:-4]
     if not bool(whole.any()):
@@ -270,9 +275,9 @@ def velocity_noise(data: Dataset) -> Tensor:
 def white_noise_std(x: Tensor, whole: Tensor) -> Tensor:
     """Standard deviation σ of the white noise of each column of a smooth signal `(n, d)`, `(d,)`.
 
-    x_i − (−x_{i−2} + 4 x_{i−1} + 4 x_{i+1} − x_{i+2})/6, the departure from the cubic through the neighbours,
-    has the variance 35/18 σ²; its median absolute value does not see jumps. `whole` `(n − 4,)` bool are the
-    first of five samples that follow each other.
+    x_i − (−x_{i−2} + 4 x_{i−1} + 4 x_{i+1} − x_{i+2})/6, the deviation from the cubic through the neighbours,
+    has the variance 35/18 σ²; its median absolute value is robust to jumps. `whole` `(n − 4,)` bool marks the
+    first of five consecutive samples.
     """
     a, b, middle, c, d = (x[k : len(x) - 4 + k][whole] for k in range(5))
     departure = middle - (4.0 * (b + c) - a - d) / 6.0

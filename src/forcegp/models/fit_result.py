@@ -1,10 +1,9 @@
-"""The result of a fit, and how models are shown: one line, or a table in notebooks."""
+"""The result of a fit, and the display of models: one line, or a table in notebooks."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Generic, TypeVar
 
 from pydantic import NonNegativeFloat, NonNegativeInt
 from torch import Tensor
@@ -27,8 +26,8 @@ class Compared:
         behind: difference to the best set [nats per sample].
         standard_error: of that difference.
         chosen: whether the model has this set.
-        note: why a set was not tested, or not on all stretches.
-        coverage: share of held-out values within ±2σ, 0.95 where the error bars are right.
+        note: reason why a set was not tested, or not on all stretches.
+        coverage: share of held-out values within ±2σ, 0.95 for correct error bars.
     """
 
     name: str
@@ -41,7 +40,7 @@ class Compared:
 
     @property
     def doubt(self) -> str:
-        """The warning of a model that misses held-out data by far, or nothing."""
+        """A warning if the model misses held-out data by far, or nothing."""
         if self.coverage is None or self.coverage >= COVERED:
             return ""
         return (
@@ -67,10 +66,10 @@ class FitResult:
         seconds: duration of the fit.
         objective: final value (mean squared error, or negative log posterior of the hyperparameters).
         log_marginal_likelihood: of the training data, `None` for models without one.
-        jitter: added to the diagonal of the covariance to factorise it, relative to unit noise: the noise
-            that the model works with is √(1 + jitter) times the stated noise.
+        jitter: added to the diagonal of the covariance to factorise it, relative to unit noise: the effective
+            noise is √(1 + jitter) times the stated noise.
         constant_inputs: inputs that do not vary in the training data and were left unscaled.
-        message: why the optimiser stopped.
+        message: reason why the optimiser stopped.
         history: the objective at each evaluation.
         force_correlation: mean posterior correlation of the joint force Q and the contact's force Q_z at
             training states: near −1 only their sum is identifiable, near 0 both are. `None` without priors on
@@ -78,13 +77,13 @@ class FitResult:
         warnings: doubts about the fit, each with a remedy.
         inference: `"exact"` or `"sparse"`, for models that have both.
         samples: number of samples that the model is conditioned on.
-        learned_on: number of samples that hyperparameters were learned on.
+        learned_on: number of samples used to learn hyperparameters.
         basis_functions: size of a sparse posterior.
-        determined: how many basis functions the data determine.
-        missed: prior variance that the inducing points miss in all rows together, in units of the noise
-            variance; what noise leaves of all rows is `determined` in the same units.
+        determined: number of basis functions that the data determine.
+        missed: total prior variance of all rows that the inducing points miss, in units of the noise
+            variance; `determined` is the total posterior variance in the same units.
         more_points_would_help: whether `missed` is a tenth of `determined` or more.
-        comparison: the sets of force priors that the data chose between; empty if the caller named them.
+        comparison: the compared sets of force priors; empty if the caller named the priors.
         never_closed: contacts that are closed in no training sample; their forces are not determined.
     """
 
@@ -110,43 +109,8 @@ class FitResult:
     never_closed: tuple[str, ...] = ()
 
 
-T = TypeVar("T")
-
-
-class _OfResult(Generic[T]):
-    """A field of the result as an attribute of the fit."""
-
-    def __init__(self, doc: str) -> None:
-        self.__doc__ = doc
-
-    def __set_name__(self, owner: type, name: str) -> None:
-        self.name = name
-
-    def __get__(self, fit: HasResult | None, owner: type) -> T:
-        return self if fit is None else getattr(fit.result, self.name)  # pyright: ignore[reportReturnType]
-
-
-class HasResult:
-    """Has the result of a fit and gives access to its fields."""
-
-    result: FitResult
-
-    converged = _OfResult[bool]("Whether the optimiser reached its tolerance.")
-    evaluations = _OfResult[int]("Number of evaluations of the objective.")
-    seconds = _OfResult[float]("Duration of the fit.")
-    objective = _OfResult[float]("Final value of the objective.")
-    log_marginal_likelihood = _OfResult["float | None"](
-        "log p(y | X, θ) of the training data, `None` for models without one."
-    )
-    jitter = _OfResult[float]("Added to the diagonal of the covariance, relative to unit noise.")
-    constant_inputs = _OfResult[tuple[str, ...]]("Inputs that do not vary in the training data.")
-    message = _OfResult[str]("Why the optimiser stopped.")
-    history = _OfResult[tuple[float, ...]]("The objective at each evaluation.")
-    force_correlation = _OfResult["float | None"]("Mean posterior correlation of Q and Q_z.")
-
-
 def model_line(kind: str, system: ConstrainedSystem, result: FitResult | None) -> str:
-    """Robot, contacts, and how the fit went, of a model without one `None`."""
+    """Robot, contacts, and course of the fit, or `None` without one."""
     robot = system.robot
     contacts = f", contact {', '.join(system.contact_names)}" if system.contacts else ""
     outcome = "" if result is None else f"; {_outcome(result)}"

@@ -1,14 +1,14 @@
-"""Following forces that change at once, such as a payload that is picked up.
+"""Tracking of forces that change abruptly, such as a payload that is picked up.
 
-A memory that fades with time forgets a payload while the arm moves too little to show it, and takes time
-to notice a new one. So earlier samples are forgotten on evidence: with D the new samples, where
+A fading memory loses a payload while the arm rests, and is slow to detect a new one. So earlier samples are
+forgotten if, with D the new samples,
 
     p(D | payload anew from its prior) · p(change) > p(D | payload as it was).
 
-Both are marginal likelihoods, read off the posterior before and after the update.
+Both are marginal likelihoods, computed from the posterior before and after the update.
 
-The force of a payload is exact to first order in what it differs from the one that its prior knows. Once a
-change is found the prior knows the present estimate, as in an extended Kalman filter.
+The force of a payload is accurate to first order around the payload known to its prior. After a change, the
+prior uses the current estimate, as in an extended Kalman filter.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ class Followed:
     Attributes:
         fit: the fit with the new samples.
         changed: whether the forces were learned anew.
-        log_odds: of a change against none, after the new samples.
+        log_odds: of a change versus no change, after the new samples.
     """
 
     fit: StructuredFit
@@ -48,13 +48,13 @@ class Followed:
 def follow(
     fit: StructuredFit, data: Dataset, priors: Sequence[str], *, factor: float = 1.0, change: float = CHANGE
 ) -> Followed:
-    """Add samples to a fit, and learn the forces of some priors anew where these contradict it.
+    """Add samples to a fit, and relearn the forces of some priors if the samples contradict it.
 
     Args:
         fit: with sparse inference.
         data: a few new samples, such as those of 0.05 s.
-        priors: names of the priors whose forces may change, such as `payload`.
-        factor: correlation of these forces with what they were at the last call, for slow drift beside.
+        priors: names of the priors with forces that may change, such as `payload`.
+        factor: correlation of these forces with those at the last call, for additional slow drift.
         change: prior probability of a change between two calls.
 
     Raises:

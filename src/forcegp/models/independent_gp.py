@@ -1,4 +1,4 @@
-"""The Gaussian-process baseline: each joint acceleration has a process of its own, blind to mechanics.
+"""The Gaussian-process baseline: one process per joint acceleration, without mechanics.
 
 q̈_j ~ GP(0, k_j(x, x′)) with x = (q, q̇, τ) and squared-exponential k_j (section 5.4 of the paper).
 """
@@ -44,7 +44,7 @@ LEARNING = 6
 
 @dataclass(frozen=True)
 class IndependentTraining:
-    """Training data that a fitted model keeps.
+    """Training data of a fitted model.
 
     Attributes:
         features: inputs before standardization, `(n, nq)` by name.
@@ -59,9 +59,9 @@ class IndependentTraining:
     scale: Standardization
 
     def processes(self) -> list[tuple[JointForcePrior, Block, Tensor]]:
-        """Of each joint, its process, its accelerations in units of their noise, and Σ log of that noise.
+        """For each joint, its process, its accelerations in units of their noise, and Σ log of that noise.
 
-        The likelihood reads only name and kernel of a process.
+        The likelihood uses only name and kernel of a process.
         """
         inputs, noise = self.scale.apply(self.features), self.noise_std.expand_as(self.qdd)
         columns = enumerate(zip(self.qdd.split(1, dim=1), noise.split(1, dim=1), strict=True))
@@ -75,7 +75,7 @@ class IndependentTraining:
         ]
 
     def announce(self, copies: int) -> None:
-        """Announce the matrices of all joints, two each beside those that learning holds."""
+        """Announce the memory of the matrices of all joints."""
         n, nq = self.qdd.shape
         announce_memory(8 * (2 * nq + copies) * n**2, f"independent Gaussian processes on {n:,} samples")
 
@@ -94,8 +94,8 @@ class IndependentGP(Model["IndependentFit"]):
     Args:
         system: robot and contacts; the contacts serve to evaluate the model, not to learn it.
         noise: standard deviation of measured accelerations [rad/s², m/s²], one or one per joint; by
-            default what the log states, else 0.1.
-        standardize: whether inputs are standardized; otherwise they enter in their units, as in the paper.
+            default the value in the log, else 0.1.
+        standardize: whether to standardize the inputs; the paper does not.
 
     Raises:
         ModelError: the robot is not float64, or `noise` states more than that of accelerations.
@@ -216,11 +216,11 @@ class IndependentFit(AccelerationFit):
 
     Attributes:
         system: robot and contacts.
-        specification: what was fitted.
-        training: what the processes are conditioned on.
+        specification: of the fit.
+        training: data that the processes are conditioned on.
         hyperparameters: by process.
         posteriors: of each joint.
-        result: how the fit went.
+        result: course of the fit.
     """
 
     system: ConstrainedSystem

@@ -1,4 +1,4 @@
-"""Reading a saved model of any kind; process pools and `copy.deepcopy` send the bytes of the same form."""
+"""Reading a saved model of any kind; process pools and `copy.deepcopy` use the same format."""
 
 from __future__ import annotations
 
@@ -33,12 +33,12 @@ KINDS: dict[str, type[FittedModel]] = {
 
 
 def load_model(path: str | Path, *, system: ConstrainedSystem | None = None) -> FittedModel:
-    """Read a model that `save` wrote; it predicts the same, bit for bit.
+    """Read a saved model; its predictions are the same bit for bit.
 
     Args:
-        path: the file; `.safetensors` is added if it is left out.
-        system: where to take constraints from that only Python code describes (an `ImplicitSurface`);
-            robot and other constraints are those in the file.
+        path: the file; `.safetensors` is added if missing.
+        system: source of constraints defined in Python (an `ImplicitSurface`); robot and other constraints
+            are those in the file.
 
     Example:
         >>> import forcegp, torch
@@ -55,7 +55,7 @@ def load_model(path: str | Path, *, system: ConstrainedSystem | None = None) -> 
         'analytical'
 
     Raises:
-        ModelError: no model is there, it is damaged, or a constraint is to be given.
+        ModelError: there is no model, it is damaged, or a constraint must be passed.
         UnknownNameError: the model is of a kind unknown to this release.
     """
     return _restored(*read_model(path), str(model_path(path)), system)
@@ -87,7 +87,7 @@ def _restored(
 
 
 def register() -> None:
-    """Let the copying and sending of models go through their saved form."""
+    """Register the saved form for copying and pickling of models."""
     for kind in KINDS.values():
         copyreg.pickle(kind, _sent)  # pyright: ignore[reportArgumentType]
 

@@ -1,4 +1,6 @@
-"""Minimising a mean over samples: by ADAM on batches, with a held-out part to stop by, or on all of them."""
+"""Minimising a mean over samples: by ADAM on batches with early stopping on a held-out part, or on all
+samples.
+"""
 
 from __future__ import annotations
 
@@ -26,10 +28,11 @@ class BatchOptions:
     """Options of training on batches.
 
     Args:
-        epochs: passes over the data at most; the learning rate falls to 0 along a half cosine over them.
-        batch: samples a step.
+        epochs: maximum number of passes over the data; the learning rate falls to 0 along a half cosine over
+            them.
+        batch: samples per step.
         learning_rate: of ADAM, at the start.
-        held_out: share of the samples that is not trained on but watched.
+        held_out: share of the samples held out for early stopping.
         patience: epochs without improvement on the held-out samples after which training stops.
 
     Raises:
@@ -69,12 +72,12 @@ def train(
     Args:
         loss: mean squared error over rows, differentiable in the tensors.
         start: initial tensors by name.
-        samples: how many rows there are.
-        options: how to train: on batches, with the best epoch on the held-out samples as the result, or on
+        samples: number of rows.
+        options: of training: on batches, with the best epoch on the held-out samples as the result, or on
             all samples at once.
         generator: of the held-out part and the order of rows.
-        progress: called after each epoch or evaluation with its number, the most there will be, and the loss.
-        checkpoint: file where the state is kept now and then, and where training resumes.
+        progress: called after each epoch or evaluation with its number, their maximum number, and the loss.
+        checkpoint: file for the state of training, from which it resumes.
         key: identifies the loss, for the checkpoint.
 
     Returns:
@@ -164,7 +167,7 @@ class _State:
         return len(self.history) - 1 - self.history.index(self.value) if self.history else 0
 
     def note(self, held_out: float) -> None:
-        """Take down the end of an epoch.
+        """Record the end of an epoch.
 
         Raises:
             NumericalError: the loss is not finite.
@@ -188,7 +191,7 @@ class _State:
         return tensors
 
     def restore(self, tensors: Mapping[str, Tensor], source: Path) -> None:
-        """Go on where a state was saved.
+        """Continue from a saved state.
 
         Raises:
             ModelError: the state of the generator is damaged.

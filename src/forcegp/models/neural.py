@@ -1,4 +1,4 @@
-"""The neural-network baseline: sigmoid layers from (q, q̇, τ) to q̈, blind to mechanics (section 5.4)."""
+"""The neural-network baseline: sigmoid layers from (q, q̇, τ) to q̈, without mechanics (section 5.4)."""
 
 from __future__ import annotations
 
@@ -73,7 +73,7 @@ class NeuralNetwork(Model["NetworkFit"]):
 
         Args:
             data: states and measured accelerations.
-            options: how to train; `SHALLOW` or `DEEP` by default.
+            options: of training; `SHALLOW` or `DEEP` by default.
             progress: called after each epoch.
             checkpoint: see `Model.fit`.
 
@@ -111,10 +111,10 @@ class NetworkFit(AccelerationFit):
 
     Attributes:
         system: robot and contacts.
-        hidden, seed: what it was made from.
+        hidden, seed: of the specification.
         network: its layers.
         inputs, outputs: standardization of (q, q̇, τ) and of q̈.
-        result: how training went.
+        result: course of training.
     """
 
     system: ConstrainedSystem

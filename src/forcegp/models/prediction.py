@@ -1,4 +1,4 @@
-"""Predictors, and predicted quantities with their uncertainty; scores and plots beside what was measured."""
+"""Predictors, and predicted quantities with their uncertainty; scores, and plots with measured values."""
 
 from __future__ import annotations
 
@@ -47,14 +47,15 @@ class Prediction:
 
     Attributes:
         mean: `(*batch, d)`.
-        covariance: `(*batch, d, d)`, of the noise-free quantity unless noise was asked for; `None` where the
-            model gives none or it was not asked for.
-        parts: the slice of each quantity, where several were asked for.
-        beyond: `(*batch, nq)` how far the speed and torque of each joint lie beyond those of the training
-            data, in training standard deviations; `None` for models that do not know.
+        covariance: `(*batch, d, d)`, of the noise-free quantity unless noise was requested; `None` if the
+            model has none or it was not requested.
+        parts: the slice of each quantity, if several were requested.
+        beyond: `(*batch, nq)` distance of the speed and torque of each joint beyond the training data, in
+            training standard deviations; `None` for models without it.
         joint_names: the joints, in the order of `beyond`.
-        determined: `(*batch, d)` bool, what data and motion determine; the rest is NaN. `None` for all.
-        doubts: what is not determined, in words.
+        determined: `(*batch, d)` bool, components determined by data and motion; the others are NaN. `None`
+            for all.
+        doubts: descriptions of undetermined components.
     """
 
     mean: Tensor
@@ -105,7 +106,7 @@ class Prediction:
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Doubts about the prediction: what is not determined, states far beyond the training data."""
+        """Doubts about the prediction: undetermined components, states far beyond the training data."""
         beyond = () if self.beyond is None else warnings_beyond(self.beyond, self.joint_names)
         return (*self.doubts, *beyond)
 
@@ -138,7 +139,7 @@ class Prediction:
 
         Raises:
             ShapeError: the mean is not of shape `(n, d)`, or an argument does not fit it.
-            ParameterError: the number of axes is not that of the components.
+            ParameterError: the number of axes differs from that of the components.
         """
         from forcegp.plots import Timeline, axis_label, draw_panels
 
@@ -165,7 +166,7 @@ class Prediction:
         return axes
 
     def panel(self, i: int, name: str, label: str, true: Tensor | None) -> Panel:
-        """Component i, and what was measured of it, if anything was."""
+        """Component i with its measured values, if any."""
         from forcegp.plots import MEASURED, PREDICTED, Curve, Panel
 
         curves = [] if true is None else [Curve(true[:, i], "measured", MEASURED, width=0.7)]
@@ -174,7 +175,7 @@ class Prediction:
 
 
 class Query(NamedTuple):
-    """What `Predictor.predict` is asked for; no system stands for that of the fit."""
+    """Arguments of `Predictor.predict`; without a system, that of the fit is used."""
 
     quantity: str | Sequence[str]
     system: ConstrainedSystem | None
@@ -228,7 +229,7 @@ def component_names(system: ConstrainedSystem, quantity: str) -> list[str]:
 
 
 class Predictor(ForwardModel):
-    """A forward dynamics (q, q̇, τ) ↦ q̈ that predicts."""
+    """A predictor of the forward dynamics (q, q̇, τ) ↦ q̈."""
 
     has_noise: bool = False
     """Whether it can predict measurements, their noise included."""
@@ -246,16 +247,17 @@ class Predictor(ForwardModel):
         system: ConstrainedSystem | None = None,
         noise: bool = False,
     ) -> Prediction:
-        """Mean and covariance of a quantity, of a `StructuredGP` those of the posterior (eqs. 22 to 25).
+        """Mean and covariance of a quantity; for a `StructuredGP`, of its posterior (eqs. 22 to 25).
 
         Args:
             q, qd, tau: `(*batch, nq)` states.
-            quantity: a name of `QUANTITIES`, or of a model with forces several for their joint distribution.
+            quantity: a name of `QUANTITIES`, or, for models with forces, several for their joint
+                distribution.
             active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
             covariance: whether to compute the covariance, which costs more than the mean.
-            system: of a model with forces, read them on another system, such as another surface or none at
-                all; on that of the fit, contacts that the training data never close have no determined force.
-            noise: whether the covariance is that of a measurement, noise of torque and sensor included.
+            system: another system to predict on, such as another surface or none, for models with forces; on
+                that of the fit, contacts that are never closed in the training data have undetermined forces.
+            noise: whether the covariance is that of a measurement, including noise of torque and sensor.
 
         Returns:
             Mean `(*batch, d)` and, if the model has one, covariance `(*batch, d, d)`, without measurement
@@ -264,8 +266,8 @@ class Predictor(ForwardModel):
         Raises:
             UnknownNameError: no such quantity.
             ShapeError: a state or `active` does not fit the system.
-            ModelError: nothing but forces of contacts that were closed in no training sample; or a model of
-                accelerations alone is asked for another quantity, for another system, or for noise.
+            ModelError: only forces of contacts that are never closed in the training data; or another
+                quantity, another system or noise for a model of accelerations alone.
         """
         if noise and not self.has_noise:
             raise ModelError(f"a {self.kind!r} model has no noise of measurements", hint="use StructuredGP")
@@ -285,7 +287,7 @@ class Predictor(ForwardModel):
         return Prediction(mean, spread, parts, beyond, joints, determined=known, doubts=tuple(doubts))
 
     def at(self, flat: FlatStates, query: Query) -> Answer:
-        """The answer to a query at n states."""
+        """The result of a query at n states."""
         raise NotImplementedError
 
     @property
@@ -302,7 +304,7 @@ class Predictor(ForwardModel):
         active: Tensor | None = None,
         system: ConstrainedSystem | None = None,
     ) -> ForceLinearization:
-        """Mean acceleration and multiplier with their Jacobians by q, q̇ and τ, for control and filters.
+        """Mean acceleration and multiplier with their Jacobians with respect to q, q̇ and τ.
 
         Args:
             q, qd, tau: `(*batch, nq)` states.
@@ -335,7 +337,7 @@ class Predictor(ForwardModel):
         Args:
             q0, qd0: `(*batch, nq)` initial states.
             tau: motor torque over time: a log, or an array `(samples, nq)` or `(*batch, samples, nq)` with
-                its period in `options`; or a law of (t, q, q̇).
+                its period in `options`; or a feedback law of (t, q, q̇).
             duration: simulated time [s].
             samples: number of function samples to integrate besides the mean.
             **settings: `options`, `seed`, `active`, `system` and `progress` of `rollout_model`.
@@ -346,8 +348,8 @@ class Predictor(ForwardModel):
         """Coefficient of determination R² of the predicted mean on a data set, as in scikit-learn.
 
         R² = 1 − Σ(measured − predicted)² / Σ(measured − mean)², averaged over the components: 1 is perfect, 0
-        as good as the mean of the data, and negative worse. It ignores the uncertainty;
-        `forcegp.evaluate` does.
+        as good as the mean of the data, and negative worse. It ignores the uncertainty, unlike
+        `forcegp.evaluate`.
 
         Args:
             data: logged states and measured values.
@@ -422,16 +424,17 @@ class Predictor(ForwardModel):
         """Write the model to a file; `forcegp.load_model` reads it back exactly.
 
         Args:
-            path: the file; `.safetensors` is added if it is left out.
+            path: the file; `.safetensors` is added if missing.
 
         Raises:
             ModelError: a part of the model is Python code.
-            OSError: the place cannot be written.
+            OSError: the path cannot be written.
         """
 
 
 def require_semidefinite(covariance: Tensor) -> None:
-    """Refuse covariances with a clearly negative eigenvalue, of variables in units of their own deviation.
+    """Refuse covariances with a clearly negative eigenvalue, of variables in units of their standard
+    deviation.
 
     Args:
         covariance: `(*batch, d, d)`.

@@ -29,8 +29,8 @@ class Entry:
         made: class of the model.
         description: one line for help texts and the report.
         options: arguments of the class.
-        priors: force priors of a system with a mean and a kernel, if the set is not left to the class.
-        kernel: of these priors, if not their own.
+        priors: force priors of a system with a mean and a kernel, unless the class chooses them.
+        kernel: of these priors, if not the default.
     """
 
     made: type[Any]
@@ -95,7 +95,7 @@ def create(
     Args:
         name: a key of `MODELS`.
         system: robot and contacts.
-        noise: of measured accelerations, for models that have one; by default what the log states.
+        noise: of measured accelerations, for models that have one; by default the value in the log.
         seed: of random initial values, for models that have any.
         options: further arguments of the model's class.
 

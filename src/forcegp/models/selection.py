@@ -1,15 +1,15 @@
 """Selection of a set of force priors by a log.
 
-Each candidate, a set of `SETS` with or without the question whether the inertia differs from that of the
-robot file, is trained on one half of the log and tested on the other, both ways. A half consists of
-contiguous stretches, since neighbours in time would make any set look good. The score is the mean logarithm
-of the predictive density of what was measured, noise included,
+Each candidate, a set of `SETS` with or without identification of the inertia, is trained on one half of the
+log and tested on the other, both ways. A half consists of contiguous stretches, since neighbours in time
+would make any set look good. The score is the mean log predictive density of the measurements, including
+noise,
 
     S = 1/N Σ_i log N(y_i; E z(x_i), Var z(x_i) + Σ),
 
 and candidates are compared by differences of S over blocks of rows, which have a standard error. The simplest
-candidate within one standard error of the best is chosen. No candidate reads the motor torque: in closed loop
-a residual that does learns to cancel it, and its density looks best.
+candidate within one standard error of the best is chosen. No candidate depends on the motor torque: in closed
+loop such a residual learns to cancel it, and its density looks best.
 """
 
 from __future__ import annotations
@@ -87,7 +87,7 @@ def candidates_of(spec: Specification) -> list[Candidate]:
 
 
 def without_comparison(spec: Specification, note: str) -> tuple[Specification, tuple[Compared, ...]]:
-    """The specification with the set for few samples, and a table that says so."""
+    """The specification with the set for few samples, and a table with this choice."""
     spec = spec.with_options(inertia=spec.options.inertia or "auto")
     return spec.with_set(FEW), (Compared(FEW.name, chosen=True, note=note),)
 
@@ -98,12 +98,12 @@ def with_priors(
     learn: Sequence[str] | None = None,
     progress: FitProgress | None = None,
 ) -> tuple[Specification, tuple[Compared, ...]]:
-    """The specification with the priors that were left to the data, and the comparison.
+    """The specification with automatically selected priors, and the comparison.
 
     Args:
         spec: the model, with the noise for these data.
-        data: the log, or the rows of it that are held in memory.
-        learn: what is learned, if not all.
+        data: the log, or its rows in memory.
+        learn: learned parts, if not all.
         progress: called after each candidate with the number of candidates so far, of all, and NaN.
     """
     if learn is not None:
@@ -136,12 +136,12 @@ class Trial:
     """Scores of a candidate so far.
 
     Attributes:
-        candidate: what is tried.
+        candidate: the tested candidate.
         scores: on each half, by block.
         coverage: on each half, share of measured values within ±2σ.
-        begin: hyperparameters that the first half taught.
+        begin: hyperparameters learned on the first half.
         inertia_found: whether an inertia other than that of the robot file was found.
-        note: why the candidate is not tried any more.
+        note: reason why the candidate was dropped.
     """
 
     candidate: Candidate
@@ -220,8 +220,9 @@ def _result(spec: Specification, trials: Sequence[Trial]) -> tuple[Specification
 
 
 def halves_of(q: Tensor, qd: Tensor, in_order: bool) -> Tensor:
-    """Which half each row belongs to `(n,)`: alternating stretches in time, or else along the direction in
-    which the states vary most."""
+    """The half of each row `(n,)`: alternating stretches in time, or else along the direction in which the
+    states vary most.
+    """
     n = len(q)
     rank = torch.arange(n, device=q.device)
     if not in_order:

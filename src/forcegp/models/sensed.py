@@ -1,8 +1,8 @@
 """The force sensor of a log as a second measurement: the normal force λ beside the accelerations.
 
-A model is fitted to both, and at a state where the sensor was read, its reading is one more measurement of
-that state's λ: λ̂ = (λ_m/w² + s/σ²) / (1/w² + 1/σ²), with the model's λ_m ± w, in which w contains the noise
-of the motor torque, and the sensor's s ± σ. Both errors are independent.
+A model is fitted to both. At a state with a sensor reading, that reading is a further measurement of λ: λ̂ =
+(λ_m/w² + s/σ²) / (1/w² + 1/σ²), with the model's λ_m ± w, in which w contains the noise of the motor torque,
+and the sensor's s ± σ. Both errors are independent.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ TINY = 1e-12
 
 
 def with_sensor(data: Dataset, system: ConstrainedSystem, noise_std: float) -> list[Observation]:
-    """The accelerations of a log, and the normal force λ = n·F of its sensor where the contact is closed.
+    """The accelerations of a log, and the normal force λ = n·F of its sensor while the contact is closed.
 
     Args:
         data: a log with `F_sensor`.
         system: robot with a single contact with a surface.
-        noise_std: standard deviation of the normal force, that of the sensor and of what it does not measure,
-            such as the tool's inertial force [N].
+        noise_std: standard deviation of the normal force, of the sensor and of unmeasured forces, such as the
+            tool's inertial force [N].
 
     Raises:
         ModelError: there is no sensor, no row in contact, or more than one contact.
@@ -57,12 +57,12 @@ def with_sensor(data: Dataset, system: ConstrainedSystem, noise_std: float) -> l
 def with_sensed_forces(data: Dataset, system: ConstrainedSystem, force_std: float) -> list[Observation]:
     """The joint forces from a force sensor and the accelerations together, Q̄ = M q̈ − J_Eᵀ F.
 
-    Both contain the same errors of the torques, which two measurements would count twice. Learn from them
-    without the contact, `StructuredGP(ConstrainedSystem(system.robot), …)`: its force is measured. A joint
-    without a measured torque has an unknown force of the size of its Q̄ − Q_C − Q_G − Q_D.
+    Both contain the same errors of the torques, which two separate measurements would count twice. Learn from
+    them without the contact, `StructuredGP(ConstrainedSystem(system.robot), …)`: its force is measured. A
+    joint without a measured torque has an unknown force of the size of its Q̄ − Q_C − Q_G − Q_D.
 
     Args:
-        data: a log with `F_sensor`; where the contact is open, no force acts.
+        data: a log with `F_sensor`; no force acts while the contact is open.
         system: robot with a single contact with a surface.
         force_std: standard deviation of each component of the sensed force [N].
 
@@ -128,7 +128,7 @@ def sensor_noise_std(data: Dataset, system: ConstrainedSystem) -> float:
         system: robot with a single contact with a surface.
 
     Raises:
-        ModelError: no five rows follow each other in contact.
+        ModelError: there are no five consecutive rows in contact.
     """
     closed, force = data.active([_contact(system).name])[:, 0], sensed_force(data, system)
     steps = data.t.diff()

@@ -124,10 +124,10 @@ def pack(
     posterior: ForcePosterior,
     result: FitResult,
 ) -> tuple[StructuredSettings, dict[str, Tensor]]:
-    """A fit as settings and tensors; an exact posterior keeps its data, a sparse one its sums over them.
+    """A fit as settings and tensors.
 
     Args:
-        problem: what it is conditioned on.
+        problem: the data of the posterior.
 
     Raises:
         ModelError: a prior or kernel is Python code.
@@ -197,7 +197,7 @@ def _below(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
 def unpack(
     header: ModelHeader, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
 ) -> Parts:
-    """The fields of the fit that `pack` was given.
+    """The fields of the fit, restored from `pack`.
 
     Raises:
         ModelError: a tensor or setting is missing or not valid; names file and field.

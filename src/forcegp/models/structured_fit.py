@@ -1,4 +1,4 @@
-"""A fitted structured Gaussian process: forces conditioned on data, every quantity read off them."""
+"""A fitted structured Gaussian process: forces conditioned on data, which determine every quantity."""
 
 from __future__ import annotations
 
@@ -47,6 +47,7 @@ from forcegp.models.base import FittedModel
 from forcegp.models.export.folder import Export, write_export
 from forcegp.models.export.library import CompiledFit
 from forcegp.models.export.model import ExportedModel
+from forcegp.models.export.motion import CompiledMotion, compiled_motion
 from forcegp.models.external_wrench import ExternalWrench, external_wrench
 from forcegp.models.fit_result import FitResult
 from forcegp.models.prediction import Answer, Query, in_pieces
@@ -65,11 +66,11 @@ class StructuredFit(FittedModel):
     """Priors on forces conditioned on data, with learned hyperparameters.
 
     Attributes:
-        specification: what was fitted.
+        specification: of the fit.
         problem: the training data with the robot, priors and noise that explain them.
         hyperparameters: all learned tensors, by name.
         posterior: over latent forces.
-        result: how the fit went.
+        result: course of the fit.
         system: robot and contacts, with learned parameters.
         noise: standard deviation of a measurement of each measured quantity, `(d,)`.
         added: digests of the samples of a sparse posterior, which `forget` can remove.
@@ -104,7 +105,7 @@ class StructuredFit(FittedModel):
 
     @property
     def force_priors(self) -> tuple[ForcePrior, ...]:
-        """Priors on the unknown forces, those that were left to the data filled in."""
+        """Priors on the unknown forces, including those selected by the data."""
         return self.posterior.priors
 
     def at(self, flat: FlatStates, query: Query) -> Answer:
@@ -143,10 +144,10 @@ class StructuredFit(FittedModel):
         external: Mapping[str, float] | None = None,
         **components: Any,
     ) -> ExternalWrench:
-        """Wrench of the environment on a frame, beyond the learned forces and the contacts that are closed.
+        """Wrench of the environment on a frame, beyond the learned forces and the closed contacts.
 
         M q̈ = Q̄ + Aᵀλ + Jᵀ w (`forces/external_wrench.py`). With `method="acceleration"` each sample is
-        estimated by itself, by generalized least squares. With `method="momentum"` a causal Kalman filter
+        estimated separately by generalized least squares. With `method="momentum"` a causal Kalman filter
         runs over each trajectory and needs no accelerations. In logs in order of time, the learned forces
         include friction with memory.
 
@@ -154,8 +155,8 @@ class StructuredFit(FittedModel):
             data: a log; for the momentum filter in order of time.
             frame: frame of the robot.
             method: `"acceleration"` or `"momentum"`.
-            external: standard deviation of unknown forces on joints that the training log did not have, such
-                as a hand that pushes, by name [N m, N].
+            external: standard deviation of unknown forces on joints, absent in the training log, such as a
+                pushing hand, by name [N m, N].
             **components: `reference` (`"world"` or `"local"` axes), `axes` (some of `fx`, `fy`, `fz`, `mx`,
                 `my`, `mz`; the others are zero), `point`, `prior_std` and `change` of `WrenchFrame`.
 
@@ -175,6 +176,8 @@ class StructuredFit(FittedModel):
         return external_wrench(self, data, WrenchFrame(frame, **components), method, external)
 
     def _exported(self, functions: int | None) -> ExportedModel:
+        if functions is not None and functions < 1:
+            raise ModelError("a posterior has one function at least", expected="1 or more", got=functions)
         parts = self.system, self.posterior, self.hyperparameters, self.noise, self.torque_std
         learned, std = self.hyperparameters.get(TORQUE_NOISE), self.problem.torque_std
         std = learned.exp() if learned is not None else 0.0 if std is None else std
@@ -187,19 +190,20 @@ class StructuredFit(FittedModel):
     def export(
         self, path: str | Path, *, language: str = "c", name: str = "controller", functions: int | None = None
     ) -> Export:
-        """Write the fit as C99 that needs libm alone, with a test program, or its mean as a CasADi function.
+        """Write the fit as C99 code that needs only libm, with a test program, or its mean as a CasADi
+        function.
 
         The code maps (q, q̇, τ, closed contacts) to mean and covariance of every quantity, and to Jacobians of
-        the mean. The CasADi function gives the mean with exact derivatives of any order.
+        the mean. The CasADi function is the mean, with exact derivatives of any order.
 
         Args:
-            path: folder, which is made.
+            path: folder to create.
             language: `"c"` or `"casadi"`.
             name: of the files, and prefix of all names in them.
-            functions: number r that the covariance is reduced to; `None` for all.
+            functions: number r of functions of a reduced covariance; `None` for all.
 
         Returns:
-            The folder, and what a reduced covariance loses at training states.
+            The folder, and the growth of error bars by a reduced covariance at training states.
 
         Raises:
             ModelError: a prior, kernel or contact has no C form, or the posterior is too large; names it.
@@ -210,10 +214,10 @@ class StructuredFit(FittedModel):
         return write_export(self._exported(functions), self, self.training, path, language, name)
 
     def compiled(self, *, functions: int | None = None) -> CompiledFit:
-        """The fit as a fast predictor, by C code that the machine's compiler builds once.
+        """The fit as a fast predictor in C, compiled once by the machine's compiler.
 
         Args:
-            functions: number r that the covariance is reduced to, which only widens it; `None` for all.
+            functions: number r of functions of a reduced covariance, which can only widen; `None` for all.
 
         Raises:
             ModelError: a prior, kernel or contact has no C form, or the posterior is too large.
@@ -223,7 +227,7 @@ class StructuredFit(FittedModel):
 
     def beyond(self, qd: Tensor, tau: Tensor) -> Tensor | None:
         """Distance of the speed and torque of each joint beyond those of the training data, in training
-        standard deviations `(*batch, nq)`; `None` where no torque noise was learned."""
+        standard deviations `(*batch, nq)`; `None` if no torque noise was learned."""
         return distance_beyond(self.hyperparameters, qd, tau) if LOW in self.hyperparameters else None
 
     def force_field(self) -> ForceField:
@@ -234,14 +238,19 @@ class StructuredFit(FittedModel):
         """Force functions drawn from the posterior."""
         return draw_samples(self.posterior, samples, generator)
 
+    def compiled_motion(self, system: ConstrainedSystem, force: ForceField) -> CompiledMotion | None:
+        """The motion under the posterior mean, or under function samples of it, by C code."""
+        model = dataclasses.replace(self._exported(None), system=system, functions=0)
+        return compiled_motion(model, force, self.specified)
+
     def condition(
         self, data: Dataset | Sequence[Observation], hyperparameters: Mapping[str, Tensor] | None = None
     ) -> StructuredFit:
         """Condition on other data instead, with the same hyperparameters and input scales.
 
         Args:
-            data: what to condition on.
-            hyperparameters: use these instead.
+            data: data to condition on.
+            hyperparameters: other hyperparameters to use.
 
         Raises:
             ModelError: the data do not fit the model.
@@ -262,17 +271,16 @@ class StructuredFit(FittedModel):
         return conditioned(spec, problem, values, warnings=doubts)
 
     def update(self, data: Dataset | Sequence[Observation]) -> StructuredFit:
-        """The fit with more samples, as in a control loop.
+        """Add samples, for example in a control loop.
 
-        With sparse inference the cost does not depend on the number of samples seen before; with exact
-        inference it grows with their square. Hyperparameters, input scales and inducing points stay as they
-        are.
+        With sparse inference the cost does not depend on the number of previous samples; with exact inference
+        it grows with their square. Hyperparameters, input scales and inducing points do not change.
 
         Args:
             data: further measurements of the same quantities.
 
         Raises:
-            ModelError: the data measure something else.
+            ModelError: the data contain other quantities.
         """
         measurements, _ = training_for(self.specification, self.problem, data, learned=(), fewest=0)
         if measurements.quantities != tuple(self.noise):
@@ -312,13 +320,13 @@ class StructuredFit(FittedModel):
     def forget(
         self, what: float | Dataset | Sequence[Observation], priors: Sequence[str] | None = None
     ) -> StructuredFit:
-        """The fit without some samples, or with all of them partly forgotten so that later ones count more.
+        """Remove some samples, or discount all samples so far.
 
         Args:
-            what: a factor between 0 and 1, such as exp(−Δt/T) for a memory of T seconds, which the weight of
-                all samples so far is multiplied by; or samples of the fit, which are removed.
-            priors: forget the forces of these priors only, such as a payload: they
-                drift towards their prior, and the factor is the correlation with what they were.
+            what: a factor between 0 and 1 that multiplies the weight of all samples so far, such as
+                exp(−Δt/T) for a memory of T seconds; or samples of the fit to remove.
+            priors: forget the forces of these priors only, such as a payload: they drift towards their prior,
+                and the factor is the correlation with the previous forces.
 
         Raises:
             ModelError: inference is exact, the factor is out of range, or samples to remove were never added,
@@ -371,7 +379,7 @@ class StructuredFit(FittedModel):
 
     @property
     def torque_std(self) -> Tensor | None:
-        """Standard deviation of the motor torque's noise as it is predicted, `(nq,)`, or `None` for none."""
+        """Standard deviation of the predicted noise of the motor torque, `(nq,)`, or `None` for none."""
         learned = self.hyperparameters.get(TORQUE_NOISE)
         if self.problem.torque_std is not None:
             return self.problem.torque_std
@@ -420,14 +428,14 @@ class StructuredFit(FittedModel):
         *,
         sensor: bool = True,
     ) -> Tensor:
-        """Variance that a measurement of a quantity adds to its prediction, `(*batch, d)`.
+        """Additional variance of a measurement of a quantity, `(*batch, d)`.
 
         Args:
             q, qd, tau: `(*batch, nq)` states.
-            quantity: what is measured; the noise of the torque reaches every quantity, that of the sensor is
-                known for quantities that the model was fitted to.
+            quantity: the measured quantity; torque noise affects every quantity, and sensor noise is known
+                for quantities used for training.
             active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
-            sensor: whether the noise of the quantity's own sensor counts beside that of the torque.
+            sensor: whether to include the noise of the quantity's own sensor.
         """
 
         def read(flat: FlatStates) -> tuple[Tensor | None, ...]:
@@ -476,8 +484,8 @@ def conditioned(
     """Condition forces on the data of a problem at given hyperparameters.
 
     Args:
-        learned_on: number of samples that they were learned on.
-        forces: result of conditioning, where the data of the problem are only a part of the log.
+        learned_on: number of samples used to learn them.
+        forces: result of conditioning, if the data of the problem are only a part of the log.
 
     Raises:
         NumericalError: the covariance of the data is not positive definite.

@@ -42,24 +42,23 @@ class StructuredGP(Model[StructuredFit]):
         system: robot and contacts.
         mean: `"analytical"`, `"zero"`, or an `AnalyticalMean` with some terms left out.
         force_priors: priors on the unknown forces; the name of a set of `SETS` (`"sliding"`, `"friction"`,
-            `"friction+residual"`); or `"auto"`. Then, around the analytical forces, held-out stretches of the
-            training log choose the set (`models/selection.py`), and `fit.result.comparison` has the table.
-            Logs of fewer than 100 samples, and fits with `learn=`, get `"friction"`. Around a mean without
-            the motor torque, `"auto"` stands for `default_priors`: a `JointForcePrior`, and in contact its
-            `NormalForcePrior`, which changes no acceleration but keeps the uncertainty of multipliers honest.
-        noise: standard deviation of measured accelerations [rad/s², m/s²], one or one per joint, or a `Noise`
-            that also states that of torques and states; by default what the log states, else 0.1.
-        analytical_parameters: a module whose `forward()` gives the robot with its analytical parameters θ_A
-            as learned tensors; `None` keeps the robot as it is.
+            `"friction+residual"`); or `"auto"`. With `"auto"` and the analytical mean, the set is chosen on
+            held-out stretches of the training log (`models/selection.py`); `fit.result.comparison` contains
+            the scores. Logs of fewer than 100 samples, and fits with `learn=`, get `"friction"`. If the mean
+            lacks the motor torque, `"auto"` means `default_priors`: a `JointForcePrior`, and in contact its
+            `NormalForcePrior`, which only affects multipliers.
+        noise: standard deviation of measured accelerations [rad/s², m/s²], one or one per joint, or a
+            `Noise`, which includes the noise of torques and states; by default the value stated in the log,
+            else 0.1.
+        analytical_parameters: a module with a `forward()` that returns the robot with learned analytical
+            parameters θ_A; `None` keeps the robot unchanged.
         inference: `"exact"`, `"sparse"` or `"auto"`.
-        inducing_points: maximum number of inducing points of one prior; fewer are taken where they suffice,
-            and the result of the fit reports if more would help.
-        inertia: `"file"` keeps that of the robot; `"auto"` identifies links and drives if held-out
-            stretches of the log favour it (`forces/inertia.py`); `None` leaves that to the data if they
-            choose the priors, and is `"file"` elsewhere. It needs a `JointFrictionPrior` and a mean with the
-            motor torque.
-        standardize: whether the inputs of kernels are standardized; otherwise they enter in their units, as
-            in the paper.
+        inducing_points: maximum number of inducing points per prior; fewer are used if they suffice, and the
+            result of the fit reports if more would help.
+        inertia: `"file"` keeps the inertia of the robot; `"auto"` identifies links and drives if held-out
+            stretches of the log favour it (`forces/inertia.py`), which needs a `JointFrictionPrior` and a
+            mean with the motor torque. `None` is `"auto"` for automatically chosen priors, else `"file"`.
+        standardize: whether to standardize the inputs of kernels; the paper does not.
 
     Example:
         >>> import forcegp, torch
@@ -133,18 +132,17 @@ class StructuredGP(Model[StructuredFit]):
         Args:
             data: measured accelerations, any mixture of measurements, or a log that is read piece by piece,
                 in memory that does not grow with its length.
-            learn: what is learned: names of priors, `"noise"`, `"analytical_parameters"`. Everything else
-                keeps the values (and input scales) of the fit `after`, or else the initial ones. Default all;
-                an empty list conditions only.
-            after: an earlier fit of this model, such as one to other or less data. What `learn` does not name
-                keeps its values; without `learn` learning begins there, by default on fewer samples
-                (`options.warm_start`).
+            learn: parts to learn: names of priors, `"noise"`, `"analytical_parameters"`. All others keep the
+                values (and input scales) of the fit `after`, or else the initial ones. Default all; an empty
+                list only conditions.
+            after: an earlier fit of this model, for example to other or fewer data. It provides the values of
+                parts that are not learned, and without `learn` the start of learning.
             options: optimiser and its limits; L-BFGS by default, to a tolerance of 1e-9 where θ_A is learned.
             progress: called after each evaluation; for a streamed log also after each piece, with the samples
                 so far, the number of all, and NaN.
             checkpoint: file that records the evaluations of a long fit, and beside it the sums over a
-                streamed log; a fit that finds it resumes there, to the same bits as one without a break.
-                Remove it once the fitted model is saved.
+                streamed log; a fit that finds it resumes there, with the same result to the bit. Remove it
+                once the fitted model is saved.
 
         Returns:
             The fitted model. Fitting twice gives the same bits.

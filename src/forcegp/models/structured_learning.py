@@ -1,15 +1,14 @@
 """Parts of a structured Gaussian process, and the steps of learning it.
 
 1. Samples at rest only bound the friction, and impacts break the equations of motion;
-   robots that are measured learn from motion without impacts.
+   measured robots learn from motion without impacts.
 2. Hyperparameters are learned on a part of a long log, or on all of a short one.
-3. Residuals that are correlated in time temper the likelihood, and hyperparameters are learned once more;
-   unless a `DisturbancePrior` explains them.
+3. Residuals that are correlated in time temper the likelihood, unless a `DisturbancePrior` explains them;
+   they also determine slopes and weights (`forces/noise_learning.py`), and hyperparameters are learned again.
 4. Inertial parameters move to their posterior mean: one Gauss–Newton step, physically consistent.
-5. The noise of the torque is enlarged to that on held-out stretches of the training log, and how it
-   grows beyond the trained speeds and torques is learned from held-out regimes; dry friction with memory is
-   learned from what is left, for logs in order of time.
-6. The posterior is conditioned on all samples.
+5. Torque noise is increased to that on held-out stretches of the training log, and its growth beyond the
+trained speeds and torques is learned from held-out regimes; dry friction with memory is learned from the
+residuals of logs in order of time. 6. The posterior is conditioned on all samples.
 """
 
 from __future__ import annotations
@@ -41,7 +40,7 @@ from forcegp.forces.measurements import (
     without_impacts,
 )
 from forcegp.forces.noise import TORQUE_NOISE, Noise, external_std, state_std_of
-from forcegp.forces.noise_learning import left_out, weighted, with_learned_slopes, with_learned_weights
+from forcegp.forces.noise_learning import left_out, weighted, with_learned_slopes
 from forcegp.forces.posterior import REGION
 from forcegp.forces.priors.base import ANALYTICAL, COULOMB, NOISE, ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior
@@ -69,6 +68,9 @@ FEWEST_MOVING = 20
 FIRST_POWER = 0.25
 """Power of the likelihood before the correlation of its residuals is known."""
 
+ROUNDS = 2
+"""Times that hyperparameters are learned again with what the residuals determine."""
+
 
 @dataclass(frozen=True, eq=False)
 class Specification:
@@ -79,7 +81,7 @@ class Specification:
         mean: prior mean of Q.
         priors: on the unknown forces.
         noise: of measured accelerations, torques and states.
-        analytical_parameters: module whose `forward()` gives the robot at θ_A, or `None`.
+        analytical_parameters: module with a `forward()` that returns the robot at θ_A, or `None`.
         automatic: whether the data choose the priors among `SETS`.
         options: plain values.
     """
@@ -93,10 +95,10 @@ class Specification:
     options: StructuredOptions = field(default_factory=StructuredOptions)
 
     def for_data(self, data: Dataset | Sequence[Observation]) -> Specification:
-        """The specification with the noise that was left to the data.
+        """The specification with the noise resolved for given data.
 
-        The noise of accelerations is learned with that of the torque, or to compare sets of priors, if nobody
-        states it. Joints without a measured torque carry an unknown force.
+        Unless it is stated, the noise of accelerations is learned together with that of the torque, or to
+        compare sets of priors. Joints without a measured torque have an unknown force.
         """
         observations, noise = observations_of(data), self.noise
         learns = noise.learns_torque or self.automatic
@@ -112,14 +114,14 @@ class Specification:
         return dataclasses.replace(self, options=self.options.model_copy(update=changed))
 
     def with_set(self, chosen: PriorSet) -> Specification:
-        """The specification with a set of priors, and the noise of the torque that goes with it."""
+        """The specification with a set of priors and its torque noise."""
         priors, noise = chosen.priors(self.system), self.noise
         if isinstance(noise.torque, str) and noise.torque == "auto":
             noise = noise.for_priors(priors)
         return dataclasses.replace(self, priors=priors, noise=noise, automatic=False)
 
     def inertia_of(self, training: Training) -> Inertia:
-        """The robot identified from the training samples, if the model is to find it."""
+        """The robot identified from the training samples, if requested."""
         friction = next((prior for prior in self.priors if isinstance(prior, JointFrictionPrior)), None)
         asks = (
             self.options.inertia == "auto"
@@ -182,10 +184,10 @@ class Lesson:
 
     Attributes:
         problem: all samples, the updated robot, and the noise.
-        hyperparameters: learned and held.
-        learned: how the optimisation went.
-        learned_on: number of samples that were learned on.
-        warnings: doubts that came up.
+        hyperparameters: learned and fixed.
+        learned: course of the optimisation.
+        learned_on: number of samples used for learning.
+        warnings: doubts.
     """
 
     problem: Problem
@@ -243,8 +245,8 @@ def training_for(
 ) -> tuple[Training, tuple[str, ...]]:
     """Training data, with doubts about them.
 
-    Priors that are not learned (`None`: all are) keep the scales of their inputs. With fewer samples in
-    motion than `fewest`, those at rest are kept.
+    Priors that are not learned (`None`: all are) keep the scales of their inputs. If fewer than `fewest`
+    samples are in motion, those at rest are kept.
     """
     kept = {}
     if before is not None and learned is not None:
@@ -257,10 +259,10 @@ def training_for(
 
 
 def check_learned(spec: Specification, learn: Iterable[str]) -> None:
-    """Check the names of what is learned, the prefixes of its tensors.
+    """Check the names of learned parts, the prefixes of their tensors.
 
     Raises:
-        UnknownNameError: one is neither a prior nor something else that can be learned.
+        UnknownNameError: a name is neither a prior nor another learnable part.
     """
     names = (*(prior.name for prior in spec.priors), NOISE, ANALYTICAL, COULOMB)
     for name in learn:
@@ -333,10 +335,10 @@ def learned(
     begin: Mapping[str, Tensor] | None,
     neighbours: Training | None,
 ) -> Lesson:
-    """Learn what is free in a search, and record it; where nothing is free, prepare the problem alone.
+    """Learn the free parts of a search, and record the evaluations.
 
     Args:
-        file: records the evaluations; learning that finds it goes on from there, to the same bits.
+        file: record of the evaluations, from which learning resumes with the same result to the bit.
 
     Raises:
         ModelError: the file belongs to other learning.
@@ -396,10 +398,13 @@ def solve(
     begin: Mapping[str, Tensor] | None = None,
     neighbours: Training | None = None,
 ) -> Lesson:
-    """Learn what is free in a search, then prepare the problem that is conditioned on.
+    """Learn the free parts of a search, then prepare the problem for conditioning.
+
+    The residuals determine the power of the likelihood, slopes that carry noise of the state, and weights of
+    the samples; each time these change, hyperparameters are learned again, `ROUNDS` times at most.
 
     Args:
-        neighbours: samples as close in time as those of the log, where those of the problem are a part of it.
+        neighbours: samples at the rate of the log, if those of the problem are only a part of it.
     """
     part = subset(spec, problem)
     if part.inducing is None:
@@ -409,18 +414,22 @@ def solve(
     if correlated:
         part = dataclasses.replace(part, power=FIRST_POWER)
     learned, learned_on = search.solve(part, progress, begin), part.training.samples
+    sloped = part.state_std is not None and not any(prior.in_time for prior in part.priors)
+    sloped &= not is_sparse(spec.options.inference, part.priors, problem.training.all_samples)
     warnings: list[str] = []
-    if part.state_std is not None and not is_sparse(
-        spec.options.inference, part.priors, problem.training.all_samples
-    ):
-        part, learned, doubts = with_learned_slopes(part, search, learned, progress)
-        warnings += doubts
-    if spec.noise.degrees_of_freedom is not None:
-        part, learned = with_learned_weights(part, search, learned, spec.noise.degrees_of_freedom, progress)
-    if correlated:
-        power, _ = residual_times(part, search.values(learned), part.training)
-        part = dataclasses.replace(part, power=power)
-        learned = search.solve(part, progress, learned.tensors)
+    for number in range(ROUNDS):
+        before, values = part, search.values(learned)
+        if correlated and number == 0:
+            part = dataclasses.replace(part, power=residual_times(part, values, part.training)[0])
+        if spec.noise.degrees_of_freedom is not None:
+            part = weighted(part, values, spec.noise.degrees_of_freedom)
+        if part is not before:
+            learned = search.solve(part, progress, learned.tensors)
+        if sloped:
+            part, learned, doubts = with_learned_slopes(part, search, learned, progress)
+            warnings += doubts
+        if part is before:
+            break
     values = search.values(learned)
     if calibrated and any(isinstance(prior, InertialPrior) for prior in part.priors):
         part = with_updated_robot(part, values)
@@ -434,7 +443,7 @@ def solve(
     if spec.noise.degrees_of_freedom is not None and (count := left_out(whole)):
         samples = whole.training.samples
         warnings.append(f"{count} of {samples} samples lie far outside the noise and hardly count")
-    return Lesson(whole, values, learned, learned_on, tuple(warnings))
+    return Lesson(whole, values, learned, learned_on, tuple(dict.fromkeys(warnings)))
 
 
 def _at_the_rate_of_the_log(part: Problem, values: Mapping[str, Tensor], training: Training) -> Problem:

@@ -1,7 +1,7 @@
 """Fitting a structured Gaussian process to a log that is read piece by piece.
 
-A first pass takes a sample, from which input scales, hyperparameters and inducing points are chosen; a
-second one adds up the sums over all samples.
+A first pass draws a sample, which determines input scales, hyperparameters and inducing points; a second one
+computes the sums over all samples.
 """
 
 from __future__ import annotations
@@ -37,14 +37,14 @@ SAMPLE_ROWS = 20_000
 
 @dataclass(frozen=True)
 class Sample:
-    """Part of a log that one pass keeps; all of a log in memory.
+    """Part of a log kept by one pass; all of a log in memory.
 
     Attributes:
         data: the samples: evenly spaced ones of a log that is read piece by piece.
-        count: number of samples that are conditioned on, of which these may be a part; 0 where these are all.
+        count: number of samples to condition on, of which these may be a part; 0 if these are all.
         log: a log that is read piece by piece.
-        stretches: a few contiguous stretches of it, which show how long residuals are correlated.
-        moving: whether its samples at rest do not count.
+        stretches: a few contiguous stretches of it, used for the correlation time of residuals.
+        moving: whether samples at rest are ignored.
     """
 
     data: Dataset | Sequence[Observation]
@@ -57,10 +57,10 @@ class Sample:
         """Contiguous stretches of the log as training data.
 
         Args:
-            training: the sample, whose input scales are kept.
+            training: the sample, with the input scales to keep.
 
         Returns:
-            `None` where the sample is the whole log, or the model does not ask for it.
+            `None` if the sample is the whole log, or the model does not need it.
         """
         if self.stretches is None or not spec.noise.learns_torque or len(self.data) == self.count:
             return None
@@ -140,7 +140,7 @@ class Pass:
     Attributes:
         spec: the model.
         log: the log.
-        sample: what the model learned from.
+        sample: used for learning.
         checkpoint: file that records the sums, or `None`.
         progress: called with the samples so far, the number of all, and NaN.
     """
@@ -155,7 +155,7 @@ class Pass:
     def forces(
         self, problem: Problem, hyperparameters: Mapping[str, Tensor]
     ) -> tuple[ForcePosterior, Tensor]:
-        """Forces conditioned on the whole log, and the part of the likelihood that they do not change.
+        """Forces conditioned on the whole log, and the part of the likelihood independent of them.
 
         Raises:
             ModelError: the checkpoint belongs to another fit.

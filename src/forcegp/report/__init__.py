@@ -1,4 +1,4 @@
-"""HTML pages and their plots; other programs make their own pages from the names exported here."""
+"""HTML pages and their plots; other programs can build their own pages from the names exported here."""
 
 from forcegp.report.check import write_check
 from forcegp.report.page import (

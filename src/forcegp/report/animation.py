@@ -23,12 +23,12 @@ def animation(content: Mapping[str, object], label: str) -> Markup:
     """A canvas with a slider, a play button and a checkbox for each arm.
 
     Args:
-        content: what `templates/animation.js` draws: `times` of the frames [s]; `bodies`, points of an arm;
+        content: input of `templates/animation.js`: `times` of the frames [s]; `bodies`, points of an arm;
             `films`, arms with `label`, `colour`, `dash` and flat `points` (frames, bodies, 3) [m].
-            Optional: convex `solids` with `colour`, `opacity`, flat `points` [m] and `link`, the column of
-            `poses` (frames, links, 12) that moves them; `paths` with `colour`, `width` and `points`;
+            Optional: convex `solids` with `colour`, `opacity`, flat `points` [m] and `link`, their column in
+                `poses` (frames, links, 12); `paths` with `colour`, `width` and `points`;
             `forces` with `start`, `tip` and `bar` in each frame; `texts` of each frame.
-        label: of the canvas, for readers who cannot see it.
+        label: text alternative of the canvas.
     """
     # "</" would end the script element, even inside a string.
     text = json.dumps(content, allow_nan=False, separators=(",", ":")).replace("</", "<\\/")

@@ -41,7 +41,7 @@ def _axis(log: Log) -> tuple[Array, str]:
 
 
 def draw_overview(report: Report, log: Log) -> Picture:
-    """A lane per finding, with the time that it concerns."""
+    """Draw a lane per finding, with its intervals of time."""
     x, name = _axis(log)
 
     def paint(figure: Figure) -> None:
@@ -216,7 +216,7 @@ def _contact(finding: Finding, system: ConstrainedSystem, log: Log, rows: slice)
 
 
 def write_check(path: Path, title: str, report: Report, system: ConstrainedSystem, log: Log) -> Path:
-    """Write the page of a checked log, whose title is `title`: one HTML file that needs no other."""
+    """Write the page of a checked log with a title as one self-contained HTML file."""
     log, everything = of_robot(log, system.robot), ((0, report.samples),)
     sections = [
         {

@@ -44,8 +44,8 @@ def write_evaluation(
 ) -> Path:
     """Write the page on one model, with its plots and their data, and return its path.
 
-    `model`, `data` and `fitted_to` are files as the page names them; without the last, the trivial predictors
-    were fitted to halves of the data. `comparison` has the sets of force priors that the log chose between.
+    `model`, `data` and `fitted_to` are file names for the page; without the last, the trivial predictors were
+    fitted to halves of the data. `comparison` contains the compared sets of force priors.
     """
     drawn = {"Predictions": draw_predictions(window), "Errors": draw_errors(window)}
     pictures = [dataclasses.replace(picture, title=title) for title, picture in drawn.items()]
@@ -77,7 +77,9 @@ def write_evaluation(
 
 
 def _blocks(window: WindowData, pictures: list[Picture], force: Picture | None) -> list[PictureBlock]:
-    caption = "The normal force λ while the contact is closed, over the same seconds as below, with ±2σ."
+    caption = (
+        "The normal force λ of the closed contact, over the same seconds, with ±2σ if the model gives it."
+    )
     blocks = [PictureBlock("Contact force", caption, (force,), WINDOW, wide=True)] if force else []
     blocks += [
         PictureBlock(
@@ -99,7 +101,7 @@ def _blocks(window: WindowData, pictures: list[Picture], force: Picture | None) 
 
 
 def draw_calibration(evaluation: Evaluation) -> Picture:
-    """Coverage over nominal probability."""
+    """Draw the coverage over the nominal probability."""
     shares = evaluation.uncertainty.calibration if evaluation.uncertainty else {}
     levels = {float(level): share for level, share in shares.items()}
 
@@ -117,7 +119,7 @@ def draw_calibration(evaluation: Evaluation) -> Picture:
 
 
 def error_tables(evaluation: Evaluation) -> tuple[Table, ...]:
-    """Torque and acceleration errors by joint beside trivial predictors; red ones are worse."""
+    """Torque and acceleration errors by joint beside trivial predictors; worse values are red."""
     units = {"torque": "[N m, N]", "acceleration": "[rad/s², m/s²]"}
     tables = []
     for unit, names in units.items() if evaluation.predictors else ():
@@ -137,7 +139,7 @@ def error_tables(evaluation: Evaluation) -> tuple[Table, ...]:
 
 
 def uncertainty_tables(evaluation: Evaluation) -> tuple[Table, ...]:
-    """Coverage by joint, density beside the trivial predictors, and λ against its sensor."""
+    """Coverage by joint, density of the model and of trivial predictors, and λ compared with its sensor."""
     tables = []
     if evaluation.uncertainty is not None:
         shares = zip(evaluation.joint_names, evaluation.uncertainty.coverage_by_joint, strict=True)
@@ -168,7 +170,7 @@ def score_table(evaluation: Evaluation) -> Table:
 
 
 def comparison_tables(comparison: Sequence[Compared]) -> tuple[Table, ...]:
-    """The sets of force priors that the training log chose between; none if they were named."""
+    """The compared sets of force priors; none if the priors were named."""
     rows = tuple(
         tuple(cell(x, 3) for x in (each.name, each.log_density, each.behind, each.standard_error, note))
         for each in comparison

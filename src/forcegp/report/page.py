@@ -1,4 +1,4 @@
-"""How plots look: colours, names and sizes; pages as single HTML files, with plots as SVG text and tables."""
+"""Style of plots: colours, names and sizes; pages as single HTML files, with plots as SVG text and tables."""
 
 from __future__ import annotations
 
@@ -61,7 +61,7 @@ STYLE = Path(__file__).parent / "templates" / "forcegp.mplstyle"
 
 @dataclass(frozen=True)
 class Picture:
-    """A drawn plot as the text of an SVG file; `alt` describes it for readers who cannot see it."""
+    """A drawn plot as the text of an SVG file; `alt` is its text alternative."""
 
     svg: str
     alt: str
@@ -74,7 +74,7 @@ class Picture:
 
 
 def label(model: str) -> str:
-    """What a model is called."""
+    """The display name of a model."""
     return LABELS.get(model) or KINDS.get(model, model)
 
 
@@ -104,7 +104,7 @@ DIGITS = 7
 
 
 def series(values: Tensor) -> Series:
-    """A tensor `(n,)` as numbers for a file, rounded to what a plot can show."""
+    """A tensor `(n,)` as numbers for a file, rounded to the resolution of a plot."""
     return [float(f"{value:.{DIGITS}g}") for value in values.detach().cpu().tolist()]
 
 
@@ -123,31 +123,24 @@ NONE = "–"
 
 @dataclass(frozen=True)
 class Table:
-    """A table as text; the first column names the rows, `bad` holds `(row, column)` of cells in red."""
+    """A table as text; the first column names the rows, `bad` contains `(row, column)` of red cells."""
 
     caption: str
     head: tuple[str, ...]
     rows: tuple[tuple[str, ...], ...]
     bad: frozenset[tuple[int, int]] = frozenset()
 
-    def markdown(self) -> str:
-        """The table with its caption as Markdown."""
-
-        def line(cells: tuple[str, ...]) -> str:
-            return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"
-
-        rule = "|" + "---|" * len(self.head)
-        return "\n".join([f"{self.caption}:", "", line(self.head), rule, *map(line, self.rows)])
-
 
 def cell(value: object, digits: int = 4) -> str:
-    """One value as text: floats with significant digits, a dash for nothing."""
+    """One value as text: floats with significant digits, a dash for a missing value."""
     return NONE if value is None else text(value, digits)
 
 
 @dataclass(frozen=True)
 class PictureBlock:
-    """Pictures under one heading and caption, as wide as the page if `wide`; `source` has their data."""
+    """Pictures under one heading and caption, with the width of the page if `wide`; `source` is the file with
+    their data.
+    """
 
     heading: str
     caption: str
@@ -157,7 +150,7 @@ class PictureBlock:
 
 
 def render(template: str, package: str = "forcegp.report", **values: object) -> str:
-    """Fill in a template under `templates/` of the package, or of this one; a missing value is an error."""
+    """Render a template under `templates/` of the package, or of this one; a missing value is an error."""
     packages = dict.fromkeys((package, "forcegp.report"))
     environment = jinja2.Environment(
         loader=jinja2.ChoiceLoader([jinja2.PackageLoader(name) for name in packages]),

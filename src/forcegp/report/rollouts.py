@@ -41,7 +41,7 @@ class Band(Record):
 
 
 class ModelPath(Record):
-    """The first predicted trajectory of one model, up to where it diverged.
+    """The first predicted trajectory of one model, up to its divergence.
 
     Attributes:
         model: name.
@@ -51,11 +51,11 @@ class ModelPath(Record):
         drift: constraint error c(q) [m]; empty without contacts.
         multiplier: λ [N]; empty for models without forces.
         multiplier_band: over samples.
-        lost: probability that contact was lost by then, over samples; empty without samples.
+        lost: probability that contact was lost by each time, over samples; empty without samples.
         errors: tip error after each horizon, median over the starts [m]; `None` if over half diverged.
         coverage: share of logged tip coordinates within the band; `None` without samples.
         inflation: factor on the band, calibrated on another motion; `None` without one.
-        calibrated_coverage: coverage of the band widened by that factor.
+        calibrated_coverage: coverage of the band scaled by that factor.
         worst_drift: largest constraint error of mean and samples over all starts [m].
         diverged_at: time of the first divergence [s].
     """
@@ -115,7 +115,9 @@ class RolloutData(Header):
 
 
 def rollout_data(comparison: Comparison, calibration: Comparison | None = None) -> RolloutData:
-    """The data of the section, curves of the first start; `calibration`, on another motion, widens bands."""
+    """The data of the section, with curves of the first start; `calibration` on another motion scales the
+    bands.
+    """
     horizons = [h for h in HORIZONS if h <= float(comparison.t[-1]) * (1.0 + 1e-9)]
     stride = max(1, round(1.0 / (FRAMES_PER_SECOND * float(comparison.t[1] - comparison.t[0]))))
     tip = comparison.frame, comparison.point
@@ -183,7 +185,7 @@ def _bands(rolled, values: Tensor, n: int) -> list[Band]:
 
 
 def _sound(q: Tensor) -> int:
-    """How many leading times `(T, nq)` hold a finite state."""
+    """Number of leading times `(T, nq)` hold a finite state."""
     return int(torch.isfinite(q).all(-1).sum())
 
 
@@ -207,7 +209,7 @@ PAGE, DATA = "rollout.html", "rollout.json"
 
 
 def draw_tip(data: RolloutData) -> Picture:
-    """Position of the tip by axis, logged and predicted, for as long as there are bands over samples."""
+    """Draw the position of the tip by axis, logged and predicted, for the duration of the bands."""
 
     def paint(figure: Figure) -> None:
         for axis, axes in enumerate(figure.subplots(3, 1, sharex=True)):
@@ -280,7 +282,7 @@ def _curve(axes: Axes, data: RolloutData, path: ModelPath, values: Series, band:
 
 
 def rollout_pictures(data: RolloutData) -> tuple[Picture, ...]:
-    """The plots of the section for which there are data."""
+    """The plots of the section with data."""
     log = "logarithmic scale, one curve per model."
     errors = [(path, path.tip_error) for path in data.models]
     alt = f"Tip error over time, median over {data.starts} starts, {log}"
@@ -317,7 +319,9 @@ def rollout_table(data: RolloutData) -> Table:
 
 @dataclass(frozen=True)
 class RolloutSection:
-    """Plots, table and animation of trajectories; `script` is the hash for the page's security policy."""
+    """Plots, table and animation of trajectories; `script` is the hash of the script for the page's security
+    policy.
+    """
 
     block: PictureBlock
     table: Table

@@ -24,7 +24,7 @@ GREY = "#9a9a9a"
 
 
 class ForceWindow(Record):
-    """Normal force of a contact over the window [N]; `logged` and `std` may be unknown."""
+    """Normal force of a contact over the window [N]; `logged` and `std` are optional."""
 
     contact: str
     closed: list[bool]
@@ -34,9 +34,9 @@ class ForceWindow(Record):
 
 
 class WindowData(Header):
-    """Predictions of one model over a window of time, by joint [rad/s²]; `clean` and `std` may be unknown.
+    """Predictions of one model over a window of time, by joint [rad/s²]; `clean` and `std` are optional.
 
-    `forces` has the contacts that are closed, of models of forces; `noise_std` is that of the measured
+    `forces` contains the closed contacts, for models of forces; `noise_std` is that of the measured
     accelerations [rad/s²]; `t` is the time from the first sample [s].
     """
 
@@ -55,7 +55,7 @@ class WindowData(Header):
 
     @property
     def error(self) -> Tensor:
-        """Predicted less noise-free (or else measured) acceleration, `(nq, n)` [rad/s²]."""
+        """Predicted minus noise-free (or else measured) acceleration, `(nq, n)` [rad/s²]."""
         return as_tensor(self.mean) - as_tensor(self.clean or self.measured)
 
     @property
@@ -73,7 +73,7 @@ def opening(data: Dataset, seconds: float) -> Dataset:
 
 @torch.no_grad()
 def predicted_window(model: Predictor, data: Dataset, name: str) -> WindowData:
-    """Predictions at the samples of a window, sorted by time; the plots call the model `name`."""
+    """Predictions at the samples of a window, sorted by time; `name` is the label of the model."""
     predicted = model.predict(data.q, data.qd, data.tau, active=data.active(model.system.contact_names))
     clean, variance = data.extras.get("qdd_clean"), predicted.variance
     if variance is not None and isinstance(model, StructuredFit) and model.torque_std is not None:

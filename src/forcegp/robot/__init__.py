@@ -1,4 +1,4 @@
-"""The frozen robot model, its readers, and what can be learned of it."""
+"""The frozen robot model, its readers, and its learnable parameters."""
 
 from forcegp.robot.load import load_robot
 from forcegp.robot.model import RobotModel

@@ -1,7 +1,7 @@
-"""XML documents edited in place: attributes and elements change, and every other byte stays.
+"""XML documents edited in place: only the edited attributes and elements change.
 
-Writers of XML drop comments, the order of attributes or the indentation. Here the positions of start tags and
-of attribute values in the text are found, and only these spans are replaced.
+Writers of XML drop comments, the order of attributes or the indentation. This editor locates start tags and
+attribute values in the text, and replaces only these spans.
 """
 
 from __future__ import annotations
@@ -40,18 +40,18 @@ class Span:
         return next((child for child in self.children if child.tag == tag), None)
 
     def iter(self) -> Iterator[Span]:
-        """The element and all below, in the order of the document."""
+        """The element and all its descendants, in the order of the document."""
         yield self
         for child in self.children:
             yield from child.iter()
 
 
 class EditableXml:
-    """An XML document whose attributes can be changed in place.
+    """An XML document with attributes that can be changed in place.
 
     Args:
         data: the document.
-        label: names the file in messages.
+        label: name of the file in messages.
 
     Raises:
         RobotFileError: the document is not well-formed UTF-8, or is hostile (`safety.parse_xml`).
@@ -100,7 +100,7 @@ class EditableXml:
         )
 
     def set(self, element: Span, name: str, text: str) -> None:
-        """Give an attribute a value; one that the element lacks is added after the others."""
+        """Set an attribute; a new one is added after the others."""
         quoted = quoteattr(text).encode()
         if name in element.values:
             first, last, _ = element.values[name]
@@ -111,7 +111,7 @@ class EditableXml:
             self._edits.append((at, at, b" " + name.encode() + b"=" + quoted))
 
     def drop(self, element: Span, name: str) -> None:
-        """Take an attribute away."""
+        """Remove an attribute."""
         if name in element.values:
             _, last, before = element.values[name]
             self._edits.append((before, last, b""))

@@ -1,6 +1,6 @@
 """`load_robot`: a robot model from a bundled name, a URDF file or an MJCF file.
 
-The ordered tree of links and joints becomes the robot model, with fixed joints folded into the links.
+The ordered tree of links and joints becomes the robot model, with fixed joints merged into the links.
 """
 
 from __future__ import annotations
@@ -210,7 +210,7 @@ def load_robot(
 ) -> RobotModel:
     """A robot model from a bundled name, a URDF file or an MJCF file.
 
-    A file that is usable but doubtful gives a `RobotFileWarning`, whose text is also in `robot.remarks`.
+    A usable but doubtful file raises a `RobotFileWarning`; its text is also in `robot.remarks`.
 
     Args:
         source: `"kuka_iiwa"`, `"kuka_iiwa14"`, `"franka_panda"`, `"ur5"`, `"double_pendulum"`, or the path
@@ -223,7 +223,7 @@ def load_robot(
         device: device of all constants.
 
     Returns:
-        The robot; frozen, so that it can be shared.
+        The frozen robot.
 
     Example:
         >>> robot = load_robot("kuka_iiwa", gravity=(0.0, 0.0, -9.8))
@@ -233,7 +233,7 @@ def load_robot(
     Raises:
         UnknownNameError: no such bundled robot, or no such joint to lock.
         RobotFileError: the file cannot be read or is not a valid robot; the message names link or joint.
-        UnsupportedRobotError: a joint is floating, planar, ball or mimic; the hint names its position.
+        UnsupportedRobotError: a joint is floating, planar, ball or mimic; the hint suggests locking it.
         MissingDependencyError: the file is MJCF and MuJoCo is not installed.
         InertiaError: the inertia of a link is not physical.
         ShapeError: base_position, base_rpy or gravity is not a vector of three finite numbers.

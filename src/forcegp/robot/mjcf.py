@@ -31,7 +31,7 @@ _KINDS: dict[int, JointKind] = {
 def read_mjcf(root: Element, path: Path) -> Tree:
     """Links and joints of the `<mujoco>` document of a file: bodies are links, bodies and sites are frames,
     and massless links lie between several joints of a body. Typed errors quote MuJoCo's compiler, or name
-    what is not supported or not physical.
+    unsupported or unphysical elements.
     """
     document, coupled, remarks = reduce_mjcf(root, path)
     with _warnings_of_mujoco(str(path), remarks):

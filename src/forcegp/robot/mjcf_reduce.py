@@ -40,8 +40,8 @@ class Coupling(NamedTuple):
 
 
 def reduce_mjcf(root: Element, path: Path) -> tuple[Element, dict[str, Coupling], list[str]]:
-    """The reduced document of a file, with what it includes from its folder, coupling by name of the joint
-    that an equality constrains, and remarks; typed errors name what is not valid or not supported.
+    """The reduced document of a file, with included files of its folder, couplings by name of the constrained
+    joint, and remarks; typed errors name invalid or unsupported elements.
     """
     _expand_includes(root, path)
     document = Element("mujoco", model=root.get("model", path.stem))

@@ -2,7 +2,8 @@
 
 Joint `i` moves link `i`. Its frame sits at `placement` in the frame of its parent link; the link frame
 is the joint frame after the motion. All inertial parameters of link `i` are in the axes of link frame `i`,
-the inertia about the centre of mass. Fixed joints are folded into the links; their frames keep a name.
+the inertia about the centre of mass. Fixed joints are merged into the links; their frames remain available by
+name.
 """
 
 from __future__ import annotations
@@ -42,11 +43,11 @@ class RobotModel:
         damping: `(nq,)` viscous joint friction [N m s/rad, N s/m].
         friction: `(nq,)` Coulomb joint friction [N m, N].
         stribeck: `(nq,)` static friction above the Coulomb level [N m, N].
-        stribeck_velocity: `(nq,)` speed at which the static part has fallen off [rad/s, m/s].
+        stribeck_velocity: `(nq,)` decay speed of the static part [rad/s, m/s].
         friction_velocity: `(nq,)` speed over which Coulomb friction changes sign [rad/s, m/s].
         armature: `(nq,)` inertia of the drive, reflected to the joint [kg m², kg].
-        lower, upper: `(nq,)` joint limits [rad, m], infinite where there are none.
-        velocity_limit, effort_limit: `(nq,)` [rad/s, m/s], [N m, N], infinite where there are none.
+        lower, upper: `(nq,)` joint limits [rad, m], infinite if absent.
+        velocity_limit, effort_limit: `(nq,)` [rad/s, m/s], [N m, N], infinite if absent.
         frame_names: every link and fixed frame of the file.
         frame_parents: index of the joint that moves each frame, −1 for the base.
         frame_rotation, frame_position: `(nf, 3, 3)`, `(nf, 3)` pose in that joint's link frame.
@@ -127,7 +128,7 @@ class RobotModel:
 
     @cached_property
     def ancestors(self) -> Tensor:
-        """E `(nq, nq)`: E[i, j] = 1 where joint j moves link i."""
+        """E `(nq, nq)`: E[i, j] = 1 if joint j moves link i."""
         E = torch.eye(self.nq, dtype=self.dtype, device=self.device)
         for i, parent in enumerate(self.parents):
             if parent != BASE:
@@ -179,7 +180,7 @@ class RobotModel:
 
         Raises:
             UnknownNameError: a field does not exist.
-            ShapeError: a tensor has another shape than the one it replaces.
+            ShapeError: a tensor has another shape than the replaced one.
             ParameterError: gravity or a mass is not finite.
         """
         names = [field.name for field in dataclasses.fields(self)]

@@ -1,4 +1,4 @@
-"""Analytical parameters θ_A: the parameters of a robot that are learned. θ_A makes new, frozen robots.
+"""Analytical parameters θ_A: the learned parameters of a robot, which define new, frozen robots.
 
 | quantity            | coordinates of each joint j                                         | number |
 |---------------------|---------------------------------------------------------------------|--------|
@@ -33,10 +33,10 @@ SMALLEST = 1e-3
 
 
 class AnalyticalParameters(nn.Module):
-    """The learnable parameters of a robot; calling the module returns the robot that they describe.
+    """The learnable parameters of a robot; calling the module returns the robot with these parameters.
 
     The state dict has one tensor per quantity, `coordinates.<quantity>`, one row per joint. They are on the
-    robot's device and in its precision: to change these, start from `robot.to(...)`.
+    robot's device and in its precision: to change them, start from `robot.to(...)`.
 
     Args:
         robot: provides the initial values, and the parameters that are not learned.
@@ -54,7 +54,7 @@ class AnalyticalParameters(nn.Module):
     Raises:
         UnknownNameError: a quantity or a joint does not exist.
         ModelError: no parameter is selected, or the inertia of a link is selected twice.
-        InertiaError: `inertia` is learned for a link whose inertia is not physical.
+        InertiaError: `inertia` is learned for a link with unphysical inertia.
     """
 
     def __init__(self, robot: RobotModel, learn: Mapping[str, Sequence[str] | Literal["all"]]) -> None:

@@ -101,7 +101,7 @@ def parse_xml(data: bytes, label: str) -> Element:
 
 
 def xacro_error(label: str, got: str) -> RobotFileError:
-    """The error of a file whose xacro macros have not been expanded."""
+    """The error for a file with unexpanded xacro macros."""
     return RobotFileError(
         f"{label}: the file has xacro macros that are not expanded",
         expected="plain URDF",

@@ -58,7 +58,7 @@ def sphere(radius: float) -> Array:
 
 
 def turn_z(direction: Array) -> Array:
-    """A rotation that turns the z axis to a unit direction, `(3, 3)`."""
+    """The shortest rotation that turns the z axis to a unit direction, `(3, 3)`."""
     axis = np.cross([0.0, 0.0, 1.0], direction)
     sine, cosine = float(np.linalg.norm(axis)), float(direction[2])
     if sine < 1e-12:
@@ -71,8 +71,8 @@ def shapes_of(
 ) -> list[Shape]:
     """The parts of a robot, from its file or a bundled one; without a URDF file, rods between its joints.
 
-    By default a bundled robot of the same name and frames is recognised. Of `elements`, `"visual"` and
-    `"collision"`, the first is taken that the file has.
+    By default a bundled robot of the same name and frames is recognised. The first of `elements` (`"visual"`,
+    `"collision"`) in the file is used.
 
     Raises:
         RobotFileError: the shapes of the file are not valid.

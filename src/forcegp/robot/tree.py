@@ -1,4 +1,4 @@
-"""The tree of links and joints that URDF and MJCF files are read into, and its checks."""
+"""The common tree of links and joints of URDF and MJCF files, and its checks."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class Joint:
     """A joint between two links.
 
     Attributes:
-        refused: why the joint is not supported unless it is locked, or "".
+        refused: reason why the joint must be locked, or "".
         follows: the joint that this one mimics, with multiplier and offset.
     """
 
@@ -96,7 +96,7 @@ def joint_motion(kind: JointKind, axis: np.ndarray, q: float) -> np.ndarray:
 
 
 def lock_joints(tree: Tree, locked: Mapping[str, float]) -> Tree:
-    """The tree with joints, and those that follow them, fixed [rad, m]; typed errors for wrong ones."""
+    """The tree with joints and their followers locked [rad, m]; typed errors for invalid names."""
     names = [joint.name for joint in tree.joints if joint.kind != "fixed"]
     for name, q in locked.items():
         check_name(f"joint of {tree.label} to lock", name, names)
@@ -125,7 +125,7 @@ ROUNDING = 1e-6
 
 
 def checked(tree: Tree) -> Tree:
-    """The tree, joints depth first and siblings as in the file; typed errors name what is refused."""
+    """The tree, joints depth first and siblings as in the file; typed errors name refused elements."""
     _check_names(tree)
     root = _root(tree)
     children: dict[str, list[Joint]] = {}
@@ -176,7 +176,7 @@ def _check_inertia(tree: Tree, joints: list[Joint]) -> list[str]:
 
 
 def inertia_error(body: Inertial) -> str:
-    """Why no rigid body can have these parameters, or "" if one can (see also `inertia_doubt`)."""
+    """The reason why the parameters are unphysical, or "" (see also `inertia_doubt`)."""
     mass, com, inertia = body.mass, body.com, body.inertia
     if not (np.isfinite(mass) and np.isfinite(com).all() and np.isfinite(inertia).all()):
         return "a value is not finite"
@@ -189,7 +189,7 @@ def inertia_error(body: Inertial) -> str:
 
 
 def inertia_doubt(body: Inertial) -> str:
-    """Why a rigid body has these parameters only approximately, or ""; published files often round them."""
+    """The reason why the parameters are only approximately physical, such as rounding, or ""."""
     low, mid, high = np.linalg.eigvalsh(body.inertia)
     if body.mass == 0.0 and high > 0.0:
         return f"it has a rotational inertia of {high:.4g} kg m² but no mass"

@@ -1,4 +1,4 @@
-"""URDF files, with every element that is read checked; anything else in the file is ignored."""
+"""URDF files; every element that is read is checked, and all others are ignored."""
 
 from __future__ import annotations
 
@@ -40,7 +40,7 @@ WORLD = "world"
 
 
 def read_urdf(root: Element, label: str) -> Tree:
-    """Links and joints of a `<robot>` element; typed errors name what is not valid or not supported."""
+    """Links and joints of a `<robot>` element; typed errors name invalid or unsupported elements."""
     for element in root.iter():
         macros = [text for text in element.attrib.values() if "${" in text or "$(" in text]
         if macros or "xacro" in element.tag:

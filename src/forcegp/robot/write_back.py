@@ -1,8 +1,8 @@
-"""A robot's figures written back into the URDF or MJCF file that it came from.
+"""Parameters of a robot written back into its URDF or MJCF file.
 
-Only attributes of what changed are edited (`edit_xml.py`); meshes, comments, order and formatting stay. A
+Only changed attributes are edited (`edit_xml.py`); meshes, comments, order and formatting stay. A
 link of the robot may be several links of the file, fixed to each other. The heaviest of them that stays
-physically consistent takes the whole change J − J₀ of the pseudo-inertia; where none does, each changes by
+physically consistent takes the whole change J − J₀ of the pseudo-inertia; otherwise each changes by
 J_k ← E J_k Eᵀ with the E that gives E J₀ Eᵀ = J. The text is read back and compared before it is written.
 """
 
@@ -44,7 +44,7 @@ ORIENTATIONS = ("axisangle", "euler", "xyaxes", "zaxis")
 
 
 class Change(NamedTuple):
-    """A figure that changed, such as `mass` or `damping`, of a link or joint, with its values in SI units."""
+    """A changed parameter, such as `mass` or `damping`, of a link or joint, with its values in SI units."""
 
     element: str
     figure: str
@@ -54,7 +54,7 @@ class Change(NamedTuple):
 
 @dataclass(frozen=True)
 class WrittenRobot:
-    """Figures that changed, and sentences on figures of the robot that the format has no place for."""
+    """Changed parameters, and sentences on parameters that the format cannot represent."""
 
     changes: tuple[Change, ...]
     losses: tuple[str, ...]
@@ -70,17 +70,17 @@ def write_robot(
     """Write masses, inertias, damping, friction and armature of a robot into a copy of its file.
 
     Args:
-        robot: with the figures to write; links and joints are those of the file.
-        source: URDF or MJCF file that the robot was loaded from, or a bundled name.
-        out: where the edited copy goes; it may be `source` itself.
-        locked_joints: as they were given to `load_robot`.
+        robot: with the parameters to write; links and joints are those of the file.
+        source: URDF or MJCF file of the robot, or a bundled name.
+        out: path of the edited copy; it may be `source` itself.
+        locked_joints: as for `load_robot`.
 
     Returns:
-        What changed, and what the format cannot hold.
+        Changed parameters, and parameters that the format cannot represent.
 
     Raises:
         RobotFileError: the joints are not those of the file, an element to change lies in an included file,
-            no link of the file can take a change, or the written file would not give the robot.
+            no link of the file can take a change, or the written file would not describe the robot.
 
     Example:
         >>> import tempfile, forcegp
@@ -114,7 +114,7 @@ def write_robot(
 
 
 def is_mjcf(source: str | Path) -> bool:
-    """Whether a robot file is MJCF, whose joints have an armature; otherwise it is URDF."""
+    """Whether a robot file is MJCF (with armature of joints) rather than URDF."""
     path = robot_path(source)
     return parse_xml(read_bytes(path), str(path)).tag == "mujoco"
 

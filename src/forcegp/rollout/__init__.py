@@ -1,4 +1,4 @@
-"""Forward in time: trajectories that stay on the surface, with uncertainty, and contact that can be lost."""
+"""Forward simulation: trajectories on a surface with uncertainty, and contacts that open and close."""
 
 from forcegp.forces.quantities import ForceField
 from forcegp.rollout.comparison import Comparison, beside_log, compare, widening

@@ -1,6 +1,6 @@
 """Comparison of predicted and logged trajectories: tip error over time, drift, coverage of the bands.
 
-Split-conformal widening is the factor by which bands must grow to cover as much as they claim.
+Split-conformal widening is the factor that scales bands to their nominal coverage.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from forcegp.rollout.trajectory import Bands, Rollout
 
 
 def widening(values: Tensor, band: Bands, level: float) -> float:
-    """Factor on the half-widths of bands so that they cover a share `level` of trajectories like these.
+    """Factor on the half-widths of bands for a coverage `level` of exchangeable trajectories.
 
     The score of a trajectory is the factor that puts a share `level` of its values inside the band, from the
     ratios |value − median| / (half-width on that side); the factor is the ⌈(n + 1) level⌉-th smallest of n
@@ -33,12 +33,13 @@ def widening(values: Tensor, band: Bands, level: float) -> float:
     *Distribution-free predictive inference for regression*, JASA 113, 2018, section 2.2).
 
     Args:
-        values: `(n, …)` observed values of n trajectories, NaN where there is none.
+        values: `(n, …)` observed values of n trajectories, NaN if missing.
         band: the band of each value.
-        level: wanted coverage, between 0 and 1.
+        level: nominal coverage, between 0 and 1.
 
     Returns:
-        The factor; infinite if it takes more trajectories (9 for a level of 0.9) or samples of the model.
+        The factor; infinite with too few trajectories (at least 9 for a level of 0.9) or samples of the
+        model.
 
     Example:
         >>> bands = Bands(torch.tensor([-1.0]), torch.tensor([1.0]), torch.tensor([0.0]))
@@ -109,10 +110,11 @@ class Comparison:
         return float(self.tip_error(model)[:, step].median())
 
     def coverage(self, model: str, level: float = LEVEL, inflation: float = 1.0) -> float:
-        """Share of tip coordinates inside the band over samples, of all starts and all times but the first.
+        """Share of tip coordinates inside the band over samples, over all starts and all times except the
+        first.
 
         `level` is the share of samples inside the band, `inflation` a factor on its half-widths. On a surface
-        only the coordinates along it count, as the constraint fixes the one across it.
+        only the tangential coordinates count, as the constraint fixes the normal one.
         """
         logged, band = self._tip_along(model, level)
         band = band.widened(inflation)
@@ -120,7 +122,7 @@ class Comparison:
         return float(inside.to(self.q.dtype).mean())
 
     def inflation(self, model: str, level: float = LEVEL) -> float:
-        """Factor by which bands must grow to cover a share `level` of tip coordinates (`widening`)."""
+        """Factor that scales the bands to cover a share `level` of tip coordinates (`widening`)."""
         return widening(*self._tip_along(model, level), level)
 
     def _tip_along(self, model: str, level: float) -> tuple[Tensor, Bands]:
@@ -174,8 +176,8 @@ def compare(
         starts: the number of starts, spread evenly over the log, or the rows to start from.
         samples: number of function samples, for the models that have them.
         system: robot and contacts of the log; those of the first model by default.
-        options: how the rollouts are computed; by default a diverging one is kept up to its divergence.
-        progress: called as the models are rolled out.
+        options: of the rollouts; by default a diverging one is kept up to its divergence.
+        progress: called during the rollouts.
 
     Raises:
         DataError: the log is too short, or not in the order of time.
@@ -198,7 +200,7 @@ def compare(
 
 
 def beside_log(name: str, predicted: Rollout, log: Dataset, dt: float) -> Comparison:
-    """One trajectory, rolled out from the first row of a log, beside it; both have the period dt [s]."""
+    """A log and a rollout from its first row, both with the period dt [s]."""
     rows = torch.arange(len(log))[None]
     return _beside(predicted.system, log, rows, dt, {name: predicted[None]})
 

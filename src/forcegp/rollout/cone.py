@@ -1,9 +1,9 @@
-"""Contacts that stick in a rollout: the friction cone that ends sticking, and sliding that comes to rest.
+"""Contacts that stick in a rollout: the friction cone at which sticking ends, and the arrest of sliding.
 
-A contact that sticks holds with the tangential force λ_t that it takes, within its friction cone. The cone is
-that of the model: the contact slides away along d = −λ_t/|λ_t| if the friction that the model gives at a
-velocity v d does not stop it, dᵀ(A_t q̈ − b_t) > 0, with v above `stick_speed` and above the speeds over
-which the friction is smooth. Within a step, friction stops a contact that slides instead of turning it round.
+A contact sticks if the required tangential force λ_t is within its friction cone. The model defines the cone:
+the contact slides along d = −λ_t/|λ_t| if the friction of the model at a velocity v d does not stop it,
+dᵀ(A_t q̈ − b_t) > 0, with v above `stick_speed` and above the speeds over which the friction is smooth.
+Within a step, friction can stop a sliding contact but not reverse it.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from forcegp.forces.quantities import States
 
 
 def sticking_contacts(system: ConstrainedSystem, at: States, among: Container[str]) -> Tensor:
-    """Closed contacts that stick `(n, n_contacts)` bool, among those named."""
+    """Closed contacts that stick `(n, n_contacts)` bool, among the named ones."""
     sticks = torch.zeros_like(at.active)
     for k, contact, _ in system.may_stick:
         rests = at.eom.contact_points[contact.name].sticks
@@ -35,7 +35,7 @@ def sticking_contacts(system: ConstrainedSystem, at: States, among: Container[st
 def sliding_away(
     system: ConstrainedSystem, at: States, multiplier: Tensor, slides: Tensor, speeds: Mapping[str, float]
 ) -> States:
-    """The states where contacts that stick start to slide against the force that would hold them.
+    """The states at which sticking contacts start to slide.
 
     Args:
         multiplier: λ `(n, m)` of sticking.
@@ -59,7 +59,7 @@ def sliding_away(
 
 
 def accelerating(system: ConstrainedSystem, at: States, multiplier: Tensor, qdd: Tensor) -> Tensor:
-    """Contacts `(n, n_contacts)` bool that q̈ moves against the force that would hold them."""
+    """Contacts `(n, n_contacts)` bool that accelerate against the holding force."""
     away = torch.zeros_like(at.active)
     # −λ_tᵀ(A_t q̈ − b_t) > 0
     held = multiplier * ((at.eom.A @ qdd[..., None])[..., 0] - at.eom.b)
@@ -76,7 +76,7 @@ def arrested(
     closed: Tensor,
     qd: Tensor,
 ) -> Tensor:
-    """Velocity `(n, nq)` after a step, with contacts at rest that friction would have turned round within it.
+    """Velocity `(n, nq)` after a step, with contacts at rest that friction would otherwise reverse.
 
     The impulse is that of an impact on the tangential rows, q̇ ← q̇ − L A q̇.
 

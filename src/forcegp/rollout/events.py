@@ -1,6 +1,6 @@
-"""The instants at which contacts open and close, located within a step.
+"""Times at which contacts open and close, located within a step.
 
-A closed contact opens where λ falls to zero, an open one closes where c does; the mechanics are those of
+A closed contact opens when λ falls to zero, an open one closes when c does; the mechanics are those of
 `constraints/unilateral.py`. The probability that contact is lost at a state comes from the posterior over
 the multiplier.
 """
@@ -29,7 +29,7 @@ class ContactEvent(NamedTuple):
     """A contact that opened or closed.
 
     Attributes:
-        t: when [s].
+        t: time [s].
         row: index of the trajectory in the flattened batch.
         contact: name.
         closed: whether it is closed afterwards.
@@ -60,9 +60,9 @@ def switch(problem: RolloutProblem, state: State, crossed: Tensor) -> State:
 
 
 def settle(problem: RolloutProblem, state: State, end: Tensor) -> tuple[State, Instant, list[ContactEvent]]:
-    """The state at the start of a step, after contacts that pull have opened and those reached have closed.
+    """The state at the start of a step, after opening pulling contacts and closing reached ones.
 
-    The torque may jump there, and λ with it.
+    The torque may jump there, and so does λ.
     """
     now = problem.evaluate(state, end)
     events: list[ContactEvent] = []
@@ -79,7 +79,7 @@ def settle(problem: RolloutProblem, state: State, end: Tensor) -> tuple[State, I
 def advance(
     problem: RolloutProblem, step: Step, state: State, first: Instant, h: Tensor
 ) -> tuple[State, list[ContactEvent]]:
-    """One step of the batch of length h `(n, 1)` [s], stopping each trajectory at its events on the way."""
+    """One step of the batch of length h `(n, 1)` [s], stopping each trajectory at its events."""
     trial = step(problem, state, first, h)
     events: list[ContactEvent] = []
     for _ in range(MAX_EVENTS):
@@ -151,11 +151,11 @@ def contact_loss_probability(
 ) -> Tensor:
     """Probability `(*batch, m)` that λ < 0 at states `(*batch, nq)`, so that the contact opens.
 
-    P(λ < 0) = Φ(−μ/σ) of the multiplier's posterior N(μ, σ²); 1 for a contact that is open already. `active`
+    P(λ < 0) = Φ(−μ/σ) of the multiplier's posterior N(μ, σ²); 1 for an open contact. `active`
     `(*batch, n_contacts)` are the closed contacts; default all.
 
     Raises:
-        ModelError: the model gives no variance of the multiplier.
+        ModelError: the model has no variance of the multiplier.
     """
     prediction = model.predict(q, qd, tau, "multiplier", active=active, covariance=True)
     if prediction.std is None:

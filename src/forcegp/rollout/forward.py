@@ -41,23 +41,22 @@ class RolloutOptions:
     """Options of a rollout.
 
     Args:
-        dt: step, period of the output, and sampling period of torques passed as an array [s]. By default
-            the sampling period of the torques where they have one (a log, a controller), and 1/240 s for
-            a feedback law; an array has none, so it needs `dt`.
+        dt: step, period of the output, and sampling period of torques passed as an array [s]. By default the
+            sampling period of a log or controller, and 1/240 s for a feedback law; an array needs `dt`.
         method: `semi_implicit_euler` (the simulators' step), `rk4`, or, adaptive within each step,
             `rk45` and `dop853` of SciPy.
         stabilization: `none`, `baumgarte` (the system's own terms, or the default ones), other
             `Baumgarte` terms, or `projection` of q and q̇ onto the manifold after each step.
-        unilateral: whether contacts with a surface open where they would pull, and close again.
+        unilateral: whether contacts with a surface open when they would pull, and can close again.
         interpolation: of a torque array between its samples, `hold` or `linear`.
         speed_limit: a joint faster than this counts as diverged [rad/s, m/s].
-        torque_noise: whether function samples are driven by torques with noise drawn anew for each of them,
-            where the model has learned the noise of logged torques and its correlation in time, or where
-            the size of an unknown force on a joint is stated (constant over a trajectory).
+        torque_noise: whether each function sample has its own torque noise, if the model has learned the
+            noise of logged torques, and its own unknown forces, if their size is stated (constant over a
+            trajectory).
         sticking: whether dry friction of joints (of the robot file, or of a prior such as
-            `JointFrictionPrior`) holds a joint at rest while the net force is within its limit; otherwise it
-            is the smooth function of the velocity that models learn, which lets joints creep.
-        on_divergence: `raise` a `DivergedError` that holds the trajectories, or `keep` them.
+            `JointFrictionPrior`) holds a joint at rest while the net force is within its limit; otherwise
+            friction is a smooth function of the velocity, and joints creep.
+        on_divergence: `raise` a `DivergedError` that contains the trajectories, or `keep` them.
 
     Example:
         >>> RolloutOptions(method="rk4", stabilization="projection", dt=0.002).method
@@ -119,20 +118,20 @@ def rollout(
     torques and the parameters of the robot, as long as no contact opens or closes.
 
     Args:
-        law: gives the acceleration.
+        law: returns the acceleration.
         system: robot and contacts.
         q0, qd0: `(*batch, nq)` initial states.
         tau: motor torque Q_u over time (a log, or an array with its period in `options`), or a law of
             (t, q, q̇).
         duration: simulated time [s], rounded to whole steps.
-        active: `(*batch, n_contacts)` bool, contacts closed at the start; by default all, or, where
-            contacts can open, those that touch.
+        active: `(*batch, n_contacts)` bool, contacts closed at the start; by default all, or, if contacts can
+            open, those that touch.
         options: step, method, stabilization.
         progress: called after each step.
 
     Raises:
-        DivergedError: a trajectory diverged; the error holds what was computed.
-        ShapeError: an argument does not fit the robot.
+        DivergedError: a trajectory diverged; the error contains the result. ShapeError: an argument does not
+            fit the robot.
         ModelError: contacts can open but the law has no multiplier, or the period of the torques is missing.
     """
     options = options or DEFAULT
@@ -154,11 +153,11 @@ def rollout_model(
     options: RolloutOptions | None = None,
     progress: Progress | None = None,
 ) -> Rollout:
-    """The mean motion of a model, and the motions of functions drawn from its posterior.
+    """The mean motion of a model, and motions under functions drawn from its posterior.
 
     Each sample is one deterministic force function, so each of its trajectories obeys the constraint and
-    Newton's equation. Models of measured robots have learned that logged torques are noisy: each sample is
-    driven by the torques with its own noise (`RolloutOptions.torque_noise`).
+    Newton's equation. With learned torque noise, each sample has its own noise
+    (`RolloutOptions.torque_noise`).
 
     Args:
         model: a fitted model.
@@ -171,15 +170,15 @@ def rollout_model(
         The mean motion, with the trajectories of the samples, batch `(S, *batch)`, as `samples`.
 
     Raises:
-        DivergedError: a trajectory diverged; the error holds what was computed.
-        ModelError: the model has no function samples, or cannot leave its own system.
+        DivergedError: a trajectory diverged; the error contains the result. ModelError: the model has no
+            function samples, or cannot leave its own system.
     """
     options = options or DEFAULT
     batch = torch.broadcast_shapes(q0.shape[:-1], qd0.shape[:-1])
     law, system = law_of(model, system), system or model.system
     shares, start = (2 if samples else 1), (q0, qd0)
     report = share_of(progress, 0, shares)
-    rollout = _run(law, system, start, tau, duration, batch, active, options, report)
+    rollout = _run(law, system, start, tau, duration, batch, active, options, report, model=model)
     if samples:
         generator = torch.Generator().manual_seed(seed)
         force = ForceLaw(model.force_samples(samples, generator))
@@ -187,7 +186,7 @@ def rollout_model(
         disturbance = model.disturbance if options.torque_noise else None
         noise = None if disturbance is None else (disturbance, generator)
         given = force, system, start, tau, duration, whole, active, options, report
-        sampled = _run(*given, batch=batch, noise=noise)
+        sampled = _run(*given, batch=batch, noise=noise, model=model)
         rollout = dataclasses.replace(rollout, samples=sampled)
     return _checked(rollout, options)
 
@@ -204,7 +203,7 @@ def replayed(
 ) -> Rollout:
     """A model rolled out from the first state of a logged trajectory under its torques, at most to its end.
 
-    Batch, samples and options are those of `rollout_model`.
+    Batch, samples and options as in `rollout_model`.
     """
     duration = min(seconds, float(log.t[-1] - log.t[0]))
     active, how = log.active(model.system.contact_names)[0], {"options": options, "progress": progress}
@@ -224,6 +223,7 @@ def _run(
     *,
     batch: torch.Size | None = None,
     noise: tuple[Disturbance, torch.Generator] | None = None,
+    model: ForwardModel | None = None,
 ) -> Rollout:
     """Flatten the batch, integrate, and give the result the shape of the whole batch."""
     n, system = whole.numel(), options.stabilized(system)
@@ -240,8 +240,12 @@ def _run(
     if noise is not None:
         inputs = Disturbed.drawn(inputs, noise[0], n, steps, dt, noise[1])
     system.announce_states(n * (1 + steps // STEPS_PER_STATE), 1.0, f"{n:,} trajectories of {steps:,} steps")
-    mechanics = compiled_system(system) if steps >= COMPILED_STEPS else system
-    problem = RolloutProblem(mechanics, law, inputs, unilateral, options.sticking)
+    mechanics, motion = system, None
+    if steps >= COMPILED_STEPS:
+        mechanics = compiled_system(system)
+        if model is not None and isinstance(law, ForceLaw):
+            motion = model.compiled_motion(system, law.force)
+    problem = RolloutProblem(mechanics, law, inputs, unilateral, options.sticking, motion)
     with one_thread() if n <= FEW else nullcontext():
         trajectories = integrate(
             problem,
@@ -283,7 +287,7 @@ def _touching(system: ConstrainedSystem, q: Tensor, qd: Tensor) -> Tensor:
 
 
 def share_of(progress: Progress | None, part: int, parts: int) -> Progress | None:
-    """Progress of one of several runs of the same length, as part of the whole."""
+    """Progress of one of several runs of equal length, as a share of the total."""
     if progress is None:
         return None
     return lambda done, total: progress(part * total + done, parts * total)

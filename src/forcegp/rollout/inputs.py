@@ -5,7 +5,8 @@ from __future__ import annotations
 from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, NamedTuple
+from functools import cached_property
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import torch
 from torch import Tensor
@@ -24,8 +25,19 @@ EVEN = 0.02
 """Largest deviation of a step from the sampling period, relative to the period, in a log that is replayed."""
 
 
+@runtime_checkable
+class CompiledMotion(Protocol):
+    """The motion of trajectories, without gradients."""
+
+    def __call__(
+        self, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor, h: Tensor, sticking: bool
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
+        """q̈, λ, constraint error and its rate, and joints that friction holds over steps h `(n, 1)`."""
+        ...
+
+
 class ForwardModel(ABC):
-    """What a rollout asks of a model of the forward dynamics."""
+    """Interface that a rollout requires of a model of the forward dynamics."""
 
     kind: str
     """Name of the class of models in saved files."""
@@ -47,7 +59,7 @@ class ForwardModel(ABC):
             generator: source of the draws.
 
         Returns:
-            A force field on `(S * k, nq)` states, of which the s-th run of k belongs to function s.
+            A force field on `(S * k, nq)` states; the s-th run of k states belongs to function s.
 
         Raises:
             ModelError: the model has no posterior over force functions.
@@ -56,9 +68,13 @@ class ForwardModel(ABC):
             f"a {self.kind!r} model has no function samples", hint="use StructuredGP, or samples=0"
         )
 
+    def compiled_motion(self, system: ConstrainedSystem, force: ForceField) -> CompiledMotion | None:
+        """The motion of a system under the mean force or its samples by C code; `None` without such code."""
+        return None
+
     @property
     def disturbance(self) -> Disturbance | None:
-        """Forces beside the learned ones that disturb rollouts of function samples, `None` for none."""
+        """Additional forces that disturb rollouts of function samples, `None` for none."""
         return None
 
     @abstractmethod
@@ -76,7 +92,7 @@ class ForwardModel(ABC):
 
 
 class Disturbance(NamedTuple):
-    """Forces beside the learned ones, as function samples meet them.
+    """Additional forces on function samples.
 
     Attributes:
         density: root of the spectral density of the logged torques' noise `(nq,)` [N m √s, N √s].
@@ -88,19 +104,25 @@ class Disturbance(NamedTuple):
     constant: Tensor
 
 
-class Reached(NamedTuple):
-    """The states that a rollout has come to.
+@dataclass(frozen=True)
+class Reached:
+    """The current states of a rollout.
 
     Attributes:
         system: robot and contacts.
-        eom: their equations of motion.
         q, qd: `(n, nq)`.
+        active: `(n, n_contacts)` bool, closed contacts.
     """
 
     system: ConstrainedSystem
-    eom: Equations
     q: Tensor
     qd: Tensor
+    active: Tensor
+
+    @cached_property
+    def eom(self) -> Equations:
+        """The equations of motion there."""
+        return self.system.equations(self.q, self.qd, self.active)
 
 
 class Inputs(ABC):
@@ -117,9 +139,9 @@ class Inputs(ABC):
 
         Args:
             t: `(n, 1)` time [s].
-            end: `(n, 1)` end of the step that the torque is for; at t = end a torque that jumps has
-                the value before the jump.
-            at: the state, and the equations of motion there.
+            end: `(n, 1)` end of the current step; at t = end a torque that jumps has the value before the
+                jump.
+            at: the state with its equations of motion.
         """
 
 
@@ -224,11 +246,10 @@ class TaskSpaceControl(Inputs):
 def inputs_of(
     tau: Torque, batch: torch.Size, rows: int, dt: float | None, interpolation: str = "hold"
 ) -> Inputs:
-    """Inputs from what a caller passes, for `rows` trajectories, a multiple of the batch of initial states.
+    """Inputs from the argument `tau`, for `rows` trajectories, a multiple of the batch of initial states.
 
-    `tau` is `(*batch, samples, nq)` or `(samples, nq)` with a period dt [s], a log, which has its own period,
-    a law of (t, q, q̇), or inputs; a single sample is a constant torque. `interpolation` is `"hold"` or
-    `"linear"`.
+    `tau` is `(*batch, samples, nq)` or `(samples, nq)` with a period dt [s], a log, a feedback law of (t, q,
+    q̇), or inputs; a single sample is a constant torque. `interpolation` is `"hold"` or `"linear"`.
 
     Raises:
         UnknownNameError: unknown interpolation.

@@ -49,7 +49,7 @@ def runge_kutta_4(problem: RolloutProblem, state: State, first: Instant, h: Tens
 
 
 def adaptive(method: str) -> Step:
-    """A step made of as many steps of a method of `scipy.integrate` as its error control asks for.
+    """A step of an adaptive method of `scipy.integrate` with error control.
 
     The whole batch shares the steps; time runs from 0 to 1 within the step, whose length may differ by row.
     """
@@ -110,7 +110,7 @@ class _Record:
         self.motions.append(now)
 
     def note(self, events: list[ContactEvent], alive: Tensor) -> None:
-        """Keep the events of trajectories that are still followed."""
+        """Keep the events of trajectories that continue."""
         self.events += [event for event in events if bool(alive[event.row])]
 
 
@@ -128,7 +128,7 @@ def integrate(
     """Integrate n trajectories over steps of dt [s]; one that diverges is dropped while the others go on.
 
     `project` moves position and velocity onto the manifold after each step; a joint faster than `speed_limit`
-    [rad/s, m/s] counts as diverged. The result, batch `(n,)`, is shorter than asked for if all diverged.
+    [rad/s, m/s] counts as diverged. The result, batch `(n,)`, is shorter if all diverged.
     """
     record, state, step = _Record(), start, _stopping(step)
     alive = torch.ones(len(start.q), dtype=torch.bool, device=start.q.device)

@@ -1,23 +1,22 @@
 """The right-hand side of a rollout: states, the law that gives the acceleration, and joints that stick.
 
-Dry friction is a force within ±F where a joint is at rest and −F sign(q̇) where it slides. Equations of
-motion smooth it to −F tanh(q̇/v₀), so that it can be learned and differentiated; a rollout takes it as it is.
+Dry friction is a force within ±F if a joint is at rest and −F sign(q̇) if it slides. Equations of motion
+smooth it to −F tanh(q̇/v₀), so that it can be learned and differentiated; a rollout uses the original law.
 With Q(s) the force where each joint's dry friction has the direction s in place of tanh(q̇/v₀),
 
     Q = ½ (Q(1) + Q(−1)) − F s,   F = ½ (Q(−1) − Q(1)).
 
 Over a step h, dry friction p of the joints changes the velocity to q̇⁺ = q̇ + h (q̈₀ + G p), with q̈₀ the
-acceleration without it. It opposes motion as much as it can: |p_i| ≤ F_i, p_i = −F_i sign(q̇⁺_i) where the
-joint slides, and anything within the limit where it is at rest (Stewart and Trinkle, *An implicit
-time-stepping scheme for rigid body dynamics with inelastic collisions and Coulomb friction*, 1996). In
-contact G = H, so that the contact's force answers to that of joints that stick. Block principal pivoting
-solves this complementarity problem exactly (Júdice and Pires, *A block principal pivoting algorithm for
-large-scale strictly monotone linear complementarity problems*, 1994): guess which joints stick, solve for
-their friction, exchange those that contradict the guess.
+acceleration without it. It satisfies |p_i| ≤ F_i and p_i = −F_i sign(q̇⁺_i) if the joint slides (Stewart and
+Trinkle, *An implicit time-stepping scheme for rigid body dynamics with inelastic collisions and Coulomb
+friction*, 1996). In contact G = H, so that the contact force depends on that of sticking joints. Block
+principal pivoting solves this complementarity problem exactly (Júdice and Pires, *A block principal pivoting
+algorithm for large-scale strictly monotone linear complementarity problems*, 1994): guess the sticking
+joints, solve for their friction, and exchange those that contradict the guess.
 
-Where h G_ii D_i > 1 for a light joint with viscous friction D, an explicit step turns its motion round, and
-above 2 it grows without end. There viscous friction is that at the end of the step, q̈ = q̈₀ + G (p − h D
-q̈), as in MuJoCo's Euler integrator; elsewhere it is that of the start.
+If h G_ii D_i > 1 for a light joint with viscous friction D, an explicit step reverses its motion, and above 2
+it is unstable. Viscous friction is then evaluated at the end of the step, q̈ = q̈₀ + G (p − h D q̈), as in
+MuJoCo's Euler integrator; otherwise at its start.
 """
 
 from __future__ import annotations
@@ -40,7 +39,7 @@ from forcegp.forces.priors.contact import CoulombFriction, SurfaceForcePrior, co
 from forcegp.forces.priors.joint import AnalyticalMean
 from forcegp.forces.quantities import ForceField, States, affine_map
 from forcegp.rollout.cone import accelerating, arrested, sliding_away, sticking_contacts
-from forcegp.rollout.inputs import ForwardModel, Inputs, Reached
+from forcegp.rollout.inputs import CompiledMotion, ForwardModel, Inputs, Reached
 
 REGULARIZATION = 1e-10
 """Compliance of sticking, relative to that of a free joint. In contact more joints can stick than can move,
@@ -67,12 +66,12 @@ NUDGE = 1e-4
 
 @dataclass(frozen=True, eq=False)
 class DryFriction:
-    """An impressed force with the dry friction of joints apart.
+    """An impressed force separated from the dry friction of joints.
 
     Attributes:
         Q_bar: `(n, nq)` all impressed forces without it [N m, N].
         limit: `(n, nq)` its largest size F ≥ 0 [N m, N].
-        response: `(n, nq, nq)` ∂Q̄/∂Q where contacts have Coulomb friction; `None` for the identity.
+        response: `(n, nq, nq)` ∂Q̄/∂Q with Coulomb friction of contacts; `None` for the identity.
         damping: `(n, nq)` D = −∂Q_i/∂q̇_i ≥ 0 of the joints' other friction [N m s/rad, N s/m].
     """
 
@@ -89,7 +88,7 @@ def posterior_of(force: ForceField) -> ForcePosterior | None:
 
 
 def split(system: ConstrainedSystem, at: States, force: ForceField) -> DryFriction:
-    """A force field at states with the dry friction of joints apart.
+    """A force field at states, separated from the dry friction of joints.
 
     Args:
         force: posterior mean, samples, or a prior mean alone, Q̄.
@@ -135,7 +134,7 @@ class Stuck(NamedTuple):
     Attributes:
         force: p `(n, nq)` [N m, N].
         held: `(n, nq)` bool, joints at rest at the end of the step.
-        stopping: `(n, nq)` acceleration with which a joint comes to rest at the end of the step.
+        stopping: `(n, nq)` acceleration that brings a joint to rest at the end of the step.
     """
 
     force: Tensor
@@ -144,7 +143,7 @@ class Stuck(NamedTuple):
 
 
 def overshooting(G: Tensor, damping: Tensor, h: Tensor) -> Tensor | None:
-    """D `(n, nq)` of states where h G_ii D_i > 1 for a joint, 0 elsewhere; `None` where no state has one."""
+    """D `(n, nq)` at states with h G_ii D_i > 1 for a joint, 0 elsewhere; `None` without such states."""
     rows = (h * G.diagonal(dim1=-2, dim2=-1) * damping > 1.0).any(-1, keepdim=True)
     return torch.where(rows, damping, 0.0) if bool(rows.any()) else None
 
@@ -165,7 +164,7 @@ def at_the_end(qdd: Tensor, G: Tensor, damping: Tensor, h: Tensor) -> tuple[Tens
 
 
 def compliance_of(G: Tensor) -> Tensor:
-    """Acceleration of each joint per force of its own, G_ii `(n, nq)`, at least 1/1000 of the largest."""
+    """Acceleration of each joint per unit of its force, G_ii `(n, nq)`, at least 1/1000 of the largest."""
     diagonal = G.diagonal(dim1=-2, dim2=-1)
     return diagonal.clamp(min=1e-3 * diagonal.amax(-1, keepdim=True))
 
@@ -237,12 +236,11 @@ class Law(ABC):
 
     @property
     def rough(self) -> Mapping[str, float]:
-        """Contacts with friction, and the speed from which it is that of sliding [m/s]."""
+        """Contacts with friction, and the speed above which they slide [m/s]."""
         return {}
 
     def knows_friction(self, system: ConstrainedSystem, at: States) -> bool:
-        """Whether the contact friction at states that slide is known, so that sticking ends where it is
-        exceeded."""
+        """Whether the contact friction of sliding states is known, so that sticking can end."""
         return False
 
 
@@ -285,7 +283,7 @@ class ForceLaw(Law):
 
 @dataclass(frozen=True)
 class AccelerationLaw(Law):
-    """q̈ as a model predicts it, which need not obey the constraint."""
+    """q̈ predicted by a model; it need not obey the constraint."""
 
     model: ForwardModel
     has_multiplier: bool = False
@@ -299,7 +297,7 @@ def law_of(model: ForwardModel, system: ConstrainedSystem | None = None) -> Law:
     """The mean motion of a model: of its force field if it has one, otherwise of its accelerations.
 
     Raises:
-        ModelError: a model of accelerations alone is asked for the motion of another system.
+        ModelError: a model of accelerations alone cannot predict the motion of another system.
     """
     trained, force = model.system, model.force_field()
     if force is not None:
@@ -335,7 +333,7 @@ class State(NamedTuple):
     active: Tensor
 
     def where(self, rows: Tensor, other: State) -> State:
-        """This state in some rows `(n,)`, another one elsewhere."""
+        """This state in some rows `(n,)`, another state in the others."""
         return State(*(torch.where(rows[:, None], a, b) for a, b in zip(self, other, strict=True)))
 
 
@@ -360,8 +358,8 @@ class Instant(NamedTuple):
 class RolloutProblem:
     """q̈ = law(q, q̇, τ(t, q, q̇)) on a constrained system with the stabilization of the rollout.
 
-    `unilateral` lets contacts with a surface open and close, `sticking` dry friction hold joints. Whether the
-    friction of contacts is known is asked once, where a contact first sticks.
+    With `unilateral`, contacts with a surface can open and close; with `sticking`, dry friction can hold
+    joints. `compiled` is the same motion by C code, used if no gradient is required.
     """
 
     system: ConstrainedSystem
@@ -369,26 +367,31 @@ class RolloutProblem:
     inputs: Inputs
     unilateral: bool
     sticking: bool = False
+    compiled: CompiledMotion | None = None
 
     _known: list[bool] = field(default_factory=list, init=False)
 
     @cached_property
     def rough(self) -> Mapping[str, float]:
-        """Contacts that may stick and have friction, with the speed from which it is that of sliding."""
+        """Contacts that may stick and have friction, with the speed above which they slide."""
         speeds = {contact.name: contact.stick_speed or 0.0 for _, contact, _ in self.system.may_stick}
         known = self.law.rough if speeds else {}
         return {name: max(speeds[name], known[name]) for name in speeds if name in known}
 
     @cached_property
     def dry_friction(self) -> Callable[[States], DryFriction] | None:
-        """Dry friction that can hold joints at rest, told apart from other forces; `None` without any."""
+        """Dry friction that can hold joints at rest, separated from other forces; `None` without any."""
         return self.law.dry_friction(self.system) if self.sticking else None
 
     def evaluate(self, state: State, end: Tensor) -> Instant:
         """The motion at a state, within a step that ends at `end` `(n, 1)`."""
-        eom = self.system.equations(state.q, state.qd, state.active)
-        tau = self.inputs.torque(state.t, end, Reached(self.system, eom, state.q, state.qd))
-        at, h = States(state.q, state.qd, tau, state.active, eom), end - state.t
+        at, h = Reached(self.system, state.q, state.qd, state.active), end - state.t
+        tau = self.inputs.torque(state.t, end, at)
+        if self.compiled is not None and not any(x.requires_grad for x in (state.q, state.qd, tau)):
+            sticks = self.dry_friction is not None
+            qdd, multiplier, c, cd, held = self.compiled(state.q, state.qd, tau, state.active, h, sticks)
+            return Instant(tau, qdd, multiplier, c, cd, held if sticks else None)
+        at = States(state.q, state.qd, tau, state.active, at.eom)
         now, rough = self._instant(at, h), self.rough
         if not rough or not bool((sticks := sticking_contacts(self.system, at, rough)).any()):
             return now
@@ -403,7 +406,7 @@ class RolloutProblem:
         return self._instant(sliding_away(self.system, at, now.multiplier, slides, rough), h)
 
     def stopped(self, before: State, after: State) -> State:
-        """The state after a step, with contacts at rest that friction stops within it."""
+        """The state after a step, with contacts at rest that friction stops in this step."""
         if not self.rough:
             return after
         first, last = (self.system.equations(x.q, x.qd, x.active) for x in (before, after))

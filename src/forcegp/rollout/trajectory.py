@@ -34,7 +34,7 @@ class Divergence(NamedTuple):
         t: time of its last trustworthy state [s].
         row: index of the trajectory in the flattened batch.
         q, qd: that state.
-        reason: why the next one was rejected.
+        reason: reason for rejecting the next one.
     """
 
     t: float
@@ -45,7 +45,7 @@ class Divergence(NamedTuple):
 
 
 class DivergedError(NumericalError):
-    """A rollout in which a trajectory diverged; `rollout` holds all that was computed."""
+    """A rollout in which a trajectory diverged; `rollout` contains the result."""
 
     def __init__(self, diverged: Sequence[Divergence], rows: int, rollout: Rollout) -> None:
         self.rollout = rollout
@@ -72,7 +72,7 @@ class Bands(NamedTuple):
     median: Tensor
 
     def widened(self, inflation: float) -> Bands:
-        """The band with both halves longer by a factor, about the same median."""
+        """The band with half-widths scaled by a factor."""
         lower = self.median + inflation * (self.lower - self.median)
         return Bands(lower, self.median + inflation * (self.upper - self.median), self.median)
 
@@ -175,7 +175,7 @@ class Rollout:
 
     @property
     def drift(self) -> Tensor:
-        """`(*batch, T, m)` c(q) of closed contacts, 0 where open [m]."""
+        """`(*batch, T, m)` c(q) of closed contacts, 0 for open ones [m]."""
         rows = self.system.active_rows(self.active, self.active.shape[:-1])
         return torch.where(rows, self.c, 0.0)
 
@@ -187,7 +187,7 @@ class Rollout:
         """Central band of a quantity over function samples.
 
         Args:
-            values: `(S, …)`, such as `rollout.samples.multiplier`; NaN of diverged samples are left out.
+            values: `(S, …)`, such as `rollout.samples.multiplier`; NaN of diverged samples are ignored.
             level: share of the samples inside the band, between 0 and 1.
         """
         tail = 0.5 * (1.0 - level)
@@ -205,7 +205,7 @@ class Rollout:
         return self.samples
 
     def contact_lost(self) -> Tensor:
-        """`(*batch, T, n_contacts)` probability that a contact was open at a time or before, over samples.
+        """`(*batch, T, n_contacts)` probability that a contact has opened by each time, over samples.
 
         Raises:
             ModelError: the rollout was made without samples.

@@ -35,7 +35,7 @@ _TOKEN = re.compile(rf"({_NAME})|(\.)|[^\S\n]+|(.|\n)")
 
 
 class Document:
-    """A parsed TOML file that knows the line of each key; errors are of class `error` and name `source`."""
+    """A parsed TOML file with the line of each key; errors have the class `error` and name `source`."""
 
     def __init__(self, content: bytes, source: str, error: type[ForceGPError] = SceneError) -> None:
         self.source, self.error = source, error
@@ -70,7 +70,7 @@ class Document:
             raise self._error(schema, errors[0]) from error
 
     def at(self, key: Key, make: Callable[..., T], *args: object, **options: object) -> T:
-        """The result of `make(*args, **options)`, whose errors are reported at a key of this file."""
+        """The result of `make(*args, **options)`; its errors are reported at a key of this file."""
         with self.error.within(self.place(key)):
             return make(*args, **options)
 
@@ -175,7 +175,7 @@ def _tables_in(annotation: Any) -> list[type]:
 
 
 def dotted(key: Key) -> str:
-    """A key as people write it: `contact[0].surface`."""
+    """A key in dotted notation: `contact[0].surface`."""
     return "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in key).lstrip(".")
 
 

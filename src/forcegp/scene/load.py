@@ -1,4 +1,4 @@
-"""Scene files: a robot, its contacts and how to simulate them, in TOML (format in docs/formats.md)."""
+"""Scene files: a robot, its contacts and their simulation, in TOML (format in docs/formats.md)."""
 
 from __future__ import annotations
 
@@ -80,7 +80,7 @@ class Scene:
 def load_scene(source: str | Path) -> Scene:
     """Read a scene file: a path, or the name of a bundled scene, one of `BUNDLED`.
 
-    Nothing but the file is read yet.
+    Only this file is read.
 
     Example:
         >>> load_scene("kuka_plane").system().contact_names
@@ -105,12 +105,12 @@ def load_scene(source: str | Path) -> Scene:
 
 
 def default_model_table() -> ModelTable:
-    """The table `[model]` of a scene that has none."""
+    """The default table `[model]`."""
     return ModelTable(ModelSection(), Document(b"", "default model"))
 
 
 def load_model_table(path: str | Path) -> ModelTable:
-    """Read a TOML file with the table `[model]` alone; a `SceneError` names file, line and key."""
+    """Read a TOML file with only the table `[model]`; a `SceneError` names file, line and key."""
     if not is_file(Path(path)):
         raise SceneError(f"{path}: no such model file", expected="a TOML file with a table [model]")
     document = Document(Path(path).read_bytes(), str(path))

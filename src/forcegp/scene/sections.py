@@ -1,7 +1,7 @@
 """The tables of a scene file.
 
-A key is a parameter of the class that the table makes, or a field of saved models. A key that is left out of
-`[model]` has the default of the model.
+A key is a parameter of the class of the table, or a field of saved models. Missing keys of `[model]` have the
+default of the model.
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ State = NonNegativeFloat | tuple[NonNegativeFloat, ...]
 
 
 class LearningSection(Section):
-    """`[model.learning]`: fields of `LearningOptions`, or of `BatchOptions` for what learns on batches.
+    """`[model.learning]`: fields of `LearningOptions`, or of `BatchOptions` for models trained on batches.
 
     `warm_start = false` learns on all samples from the start.
     """
@@ -62,7 +62,7 @@ class NoiseSection(Section):
 
 
 class ModelSection(Section, StructuredOptions):
-    """`[model]`: the options of models, and what `forcegp.models.configured` reads."""
+    """`[model]`: the options of models, and further keys for `forcegp.models.configured`."""
 
     name: str | None = None
     noise: NoiseSection = NoiseSection()
@@ -90,7 +90,7 @@ def _tuples(value: Any) -> Any:
 
 
 class ModelFile(Section):
-    """A file with the table `[model]` alone."""
+    """A file with only the table `[model]`."""
 
     model: ModelSection
 

@@ -1,7 +1,7 @@
-"""Distances of a robot from itself, from the surfaces of its contacts and from boxes, by MuJoCo's geometry.
+"""Distances between the links of a robot, the surfaces of its contacts and boxes, by MuJoCo's geometry.
 
 The parts of the links (`robot/shapes.py`) and the surroundings are convex solids. Pairs that touch in most
-positions, as neighbouring links do at their joint, are left out.
+positions, such as neighbouring links, are ignored.
 """
 
 from __future__ import annotations
@@ -27,10 +27,10 @@ SURROUNDINGS = "surroundings"
 
 
 class Collisions:
-    """Where parts of a robot come closer than a clearance to each other or to their surroundings.
+    """Collisions of parts of a robot with each other or with their surroundings, at a clearance.
 
     Args:
-        system: robot, and contacts whose surfaces it must not touch.
+        system: robot, and contacts with surfaces that it must not touch.
         shapes: convex parts of the robot.
         boxes: `(k, 6)` centres and side lengths of boxes along the world's axes [m].
         clearance: [m].
@@ -91,7 +91,7 @@ class Collisions:
         return found
 
     def depth(self, q: Array) -> Array:
-        """By how much positions `(n, nq)` are closer than the clearance `(n,)` [m], 0 where none is."""
+        """Violation of the clearance `(n,)` at positions `(n, nq)` [m], 0 if there is none."""
         return np.array(
             [
                 max((self.clearance - self._data.contact.dist[k] for k, _ in self._near(x)), default=0.0)

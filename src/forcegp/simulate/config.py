@@ -1,4 +1,4 @@
-"""The settings of a simulation: those of the motion, and of the world that the robot moves in."""
+"""The settings of a simulation: of the motion, and of the simulated world."""
 
 from __future__ import annotations
 
@@ -20,8 +20,8 @@ class ContactSolver:
 
     Args:
         friction: Coulomb friction coefficient μ of tool and surface.
-        tip_radius: radius of the tip, a sphere that ends at the scene's contact point, where the contact has
-            no radius of its own [m].
+        tip_radius: radius of the tip, a sphere that ends at the scene's contact point, if the contact has no
+            radius [m].
         joint_friction: Coulomb friction of each joint, beyond the robot file; empty is none [N m].
         joint_damping: viscous friction of each joint, beyond the robot file; empty is none [N m s/rad].
         stiffness_time: time constant of the contact's restoring force [s]; shorter is stiffer.
@@ -62,7 +62,7 @@ class ContactSolver:
 
 @dataclass(frozen=True)
 class Sensors:
-    """Imperfect sensors; the controller and the log get their values. The defaults are perfect.
+    """Imperfect sensors; the controller and the log receive their values. The default is perfect sensors.
 
     Args:
         encoder_resolution: step of the measured joint positions [rad, m].
@@ -88,13 +88,13 @@ class Sensors:
 class SimulationConfig(MotionConfig):
     """Settings of a simulation; the defaults are the paper's task on the bundled arm.
 
-    The settings of the motion (`MotionConfig`) come first; these are added:
+    In addition to the settings of the motion (`MotionConfig`):
 
     Args:
         seed: of the waypoints, the postures and the noise.
         engine: `"pybullet"`, `"mujoco"` or `"auto"`.
-        contact: `"rigid"` takes contact forces from this library's own equations of motion; `"solver"`
-            leaves them to MuJoCo's contact solver, an independent truth.
+        contact: `"rigid"` computes contact forces by the library's equations of motion, `"solver"` by
+            MuJoCo's contact solver, an independent reference.
         viscous_friction: θ_v of F_z = −θ_v ṗ_E, tangential to the surface, with rigid contact [N s/m].
         noise_std: standard deviation of the noise on q̈ [rad/s²].
         solver: friction and geometry, with `contact="solver"`.

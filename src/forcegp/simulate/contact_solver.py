@@ -1,7 +1,8 @@
-"""MuJoCo with its own contact solver: contact and dry friction that this library did not compute."""
+"""MuJoCo with its own contact solver: contact and dry friction independent of this library."""
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -10,6 +11,7 @@ from scipy.spatial.transform import Rotation
 from forcegp.constraints import ConstrainedSystem, Cylinder, Plane, Sphere, SurfaceContact
 from forcegp.errors import ForceGPError, UnsupportedRobotError, optional_module
 from forcegp.robot.model import BASE, RobotModel
+from forcegp.robot.shapes import turn_z
 from forcegp.simulate.config import ContactSolver
 from forcegp.simulate.engines import NEEDS_MUJOCO, MuJoCoWorld
 from forcegp.simulate.urdf import link_name, write_urdf
@@ -74,11 +76,11 @@ class ContactSolverEngine(MuJoCoWorld):
         return f"{super().name}, contact solver"
 
     def forces(self, torque: np.ndarray) -> SolvedForces:
-        """Acceleration and forces at the present state under a motor torque `(nq,)` [N m].
+        """Acceleration and forces at the current state under a motor torque `(nq,)` [N m].
 
-        The engine's step takes viscous friction at its end, (M + h D) q̈ = Q(q, q̇), which for light joints
-        differs much from M⁻¹Q: q̈ and the friction are those of the step, so that the velocity changes by h
-        q̈.
+        The engine evaluates viscous friction at the end of the step, (M + h D) q̈ = Q(q, q̇), which for light
+        joints differs considerably from M⁻¹Q. q̈ and the friction are those of the step, so that the velocity
+        changes by h q̈.
         """
         data, dof = self._data, self._dof
         data.qfrc_applied[dof] = torque
@@ -94,7 +96,7 @@ class ContactSolverEngine(MuJoCoWorld):
         return SolvedForces(qdd[dof], others, Q_I, Q_z, np.linalg.norm(F_I, axis=-1), F_I, F_z)
 
     def step(self) -> None:
-        """Advance by the sampling period under the torque last given to `forces`."""
+        """Advance by the sampling period under the last torque of `forces`."""
         self._mujoco.mj_step(self.model, self._data, self._substeps)
 
     def _contact_force(self, surface: int, tip: int) -> tuple[np.ndarray, np.ndarray]:
@@ -157,7 +159,7 @@ def _per_joint(robot: RobotModel, solver: ContactSolver, name: str) -> np.ndarra
 def tip_of(robot: RobotModel, contact: SurfaceContact, radius: float) -> tuple[int, np.ndarray, float]:
     """The link that carries the tip, the centre of the tip in the link's coordinates, and its radius.
 
-    The tip is that of the contact. Where the contact is a point, the tip is a sphere that ends there, on the
+    The tip is that of the contact. If the contact is a point, the tip is a sphere that ends there, on the
     line from the frame's origin to that point.
     """
     index = robot.frame_index(contact.frame)
@@ -174,15 +176,20 @@ def tip_of(robot: RobotModel, contact: SurfaceContact, radius: float) -> tuple[i
 def geometry_of(mujoco: Any, contact: SurfaceContact) -> dict[str, Any]:
     """Type, size and pose of the geometry of a surface."""
     surface, geom = contact.surface, mujoco.mjtGeom
+
+    def along(axis: Sequence[float]) -> np.ndarray:
+        """Quaternion (w, x, y, z) of a rotation from z to an axis."""
+        return Rotation.from_matrix(turn_z(np.array(axis))).as_quat()[[3, 0, 1, 2]]
+
     if isinstance(surface, Plane):
-        normal = np.array(surface.normal)
-        pose = {"pos": surface.offset * normal, "quat": _turn_of_z(normal)}
+        position = surface.offset * np.array(surface.normal)
+        pose = {"pos": position, "quat": along(surface.normal)}
         return {"type": geom.mjGEOM_PLANE, "size": [0.0, 0.0, 1.0], **pose}
     if isinstance(surface, Sphere):
         return {"type": geom.mjGEOM_SPHERE, "size": [surface.radius, 0.0, 0.0], "pos": [*surface.center]}
     if isinstance(surface, Cylinder):
         size = [surface.radius, CYLINDER_LENGTH, 0.0]
-        pose = {"pos": [*surface.center], "quat": _turn_of_z(surface.axis)}
+        pose = {"pos": [*surface.center], "quat": along(surface.axis)}
         return {"type": geom.mjGEOM_CYLINDER, "size": size, **pose}
     raise ForceGPError(
         f"the contact solver has no geometry for the surface of {contact.name!r}",
@@ -190,9 +197,3 @@ def geometry_of(mujoco: Any, contact: SurfaceContact) -> dict[str, Any]:
         got=type(surface).__name__,
         hint='use contact = "rigid"',
     )
-
-
-def _turn_of_z(axis: Any) -> np.ndarray:
-    """Quaternion `(w, x, y, z)` of a rotation that takes the z axis to a unit vector."""
-    rotation = Rotation.align_vectors(np.reshape(axis, (1, 3)), [[0.0, 0.0, 1.0]])[0]
-    return rotation.as_quat()[[3, 0, 1, 2]]

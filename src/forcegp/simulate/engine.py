@@ -16,11 +16,11 @@ from forcegp.types import JointMatrix, JointVector
 
 @runtime_checkable
 class Engine(Protocol):
-    """A physics engine that holds one robot, moves it under gravity and adds no other force of its own.
+    """A physics engine with one robot under gravity and without any other force of its own.
 
     One step is semi-implicit Euler: q̇ₖ₊₁ = q̇ₖ + dt q̈(qₖ, q̇ₖ), qₖ₊₁ = qₖ + dt q̇ₖ₊₁, so the acceleration
     during a step is (q̇ₖ₊₁ − q̇ₖ)/dt. Contacts, collisions, joint limits, motors and damping are off; all
-    forces but gravity are given with `step`.
+    forces except gravity are passed to `step`.
     """
 
     @property
@@ -34,27 +34,27 @@ class Engine(Protocol):
         ...
 
     def reset(self, q: JointVector, qd: JointVector) -> None:
-        """Put the robot at q `(nq,)` moving at qd `(nq,)`."""
+        """Set position q and velocity qd, `(nq,)` each."""
         ...
 
     def state(self) -> tuple[JointVector, JointVector]:
-        """The present q and qd, `(nq,)` each [rad, rad/s]."""
+        """The current q and qd, `(nq,)` each [rad, rad/s]."""
         ...
 
     def step(self, force: JointVector) -> None:
-        """Advance by dt under the generalized force `(nq,)` [N m], all but gravity and bias forces."""
+        """Advance by dt under the generalized force `(nq,)` [N m], without gravity and bias forces."""
         ...
 
     def mass_matrix(self, q: JointVector) -> JointMatrix:
-        """The engine's own M(q) `(nq, nq)`, an oracle for ours."""
+        """M(q) `(nq, nq)` computed by the engine."""
         ...
 
     def inverse_dynamics(self, q: JointVector, qd: JointVector, qdd: JointVector) -> JointVector:
-        """The engine's own M q̈ − Q_C − Q_G `(nq,)`, an oracle for ours."""
+        """M q̈ − Q_C − Q_G `(nq,)` computed by the engine."""
         ...
 
     def close(self) -> None:
-        """Release the engine's resources; it is not used afterwards."""
+        """Release the engine's resources."""
         ...
 
 

@@ -1,4 +1,4 @@
-"""PyBullet and MuJoCo as physics engines, with everything off that would act beside the forces we apply."""
+"""PyBullet and MuJoCo as physics engines, without any forces other than the applied ones."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ MAX_JOINT_VELOCITY = 1e6
 
 
 class PyBulletEngine(Engine):
-    """A robot in a PyBullet world of its own, with a step dt [s].
+    """A robot in a separate PyBullet world with a step dt [s].
 
     Raises:
         MissingDependencyError: PyBullet is not installed.
-        UnsupportedRobotError: a drive has inertia of its own, which PyBullet has no place for.
+        UnsupportedRobotError: a drive has inertia, which PyBullet does not support.
     """
 
     def __init__(self, robot: RobotModel, dt: float) -> None:
@@ -133,11 +133,11 @@ class MuJoCoWorld:
         return f"mujoco {self._mujoco.__version__}"
 
     def reset(self, q: JointVector, qd: JointVector) -> None:
-        """Put the robot at q `(nq,)` moving at qd `(nq,)`."""
+        """Set position q and velocity qd, `(nq,)` each."""
         self._set(self._data, q, qd)
 
     def state(self) -> tuple[JointVector, JointVector]:
-        """The present q and qd, `(nq,)` each [rad, rad/s]."""
+        """The current q and qd, `(nq,)` each [rad, rad/s]."""
         return self._tensor(self._data.qpos[self._dof]), self._tensor(self._data.qvel[self._dof])
 
     def close(self) -> None:
@@ -159,7 +159,7 @@ class MuJoCoWorld:
 
 
 class MuJoCoEngine(MuJoCoWorld, Engine):
-    """A robot in a MuJoCo world of its own, with a step dt [s].
+    """A robot in a separate MuJoCo world with a step dt [s].
 
     Raises:
         MissingDependencyError: MuJoCo is not installed.
@@ -200,9 +200,9 @@ def make_engine(robot: RobotModel, dt: float, name: str = "auto") -> Engine:
     """An engine by name.
 
     Args:
-        robot: the robot it holds.
+        robot: the robot.
         dt: step [s].
-        name: `"pybullet"`, `"mujoco"`, or `"auto"` for PyBullet where it is installed, else MuJoCo.
+        name: `"pybullet"`, `"mujoco"`, or `"auto"` for PyBullet if it is installed, else MuJoCo.
 
     Example:
         >>> import torch, forcegp

@@ -1,11 +1,11 @@
-"""The motion that would identify the unknown forces best, within limits and free of collisions.
+"""Planning of the motion that identifies the unknown forces best, within limits and free of collisions.
 
-Joints follow uniform cubic B-splines that start and end at rest in the same position. Splines stay between
-their control points, so that bounds on these and on their differences hold the limits of position, velocity
-and acceleration at all times. L-BFGS minimises a criterion of the information (`control/information.py`)
-with squared hinges for all limits and the clearance, from random starts within all limits. The
-result is verified at 1 kHz; where it fails, these instants join the nodes of the hinges, and in the end the
-motion shrinks towards its start.
+Joints follow uniform cubic B-splines that start and end at rest in the same position. Splines stay in the
+convex hull of their control points, so bounds on these and on their differences guarantee the limits of
+position, velocity and acceleration at all times. L-BFGS minimises a criterion of the information
+(`control/information.py`) with squared hinges for all limits and the clearance, from random starts within all
+limits. The result is verified at 1 kHz; times of violations are added to the nodes of the hinges, and finally
+the motion is scaled towards its start.
 """
 
 from __future__ import annotations
@@ -79,13 +79,14 @@ class Limits:
         torque: Sequence[float] = (),
         share: float = 0.9,
     ) -> Limits:
-        """A share of the limits of a robot.
+        """Limits as a share of those of a robot.
 
         Args:
-            robot: its file's limits hold where no others are given.
+            robot: provides the limits that are not given.
             velocity, acceleration, torque: one number for all joints or one per joint. By default, the file's
                 velocity and torque, and accelerations that reach the velocity in a quarter of a second.
-            share: of the limits of velocity, acceleration and torque; the rest is left to the controller.
+            share: of the limits of velocity, acceleration and torque; the rest is reserved for the
+                controller.
 
         Raises:
             ParameterError: a limit is missing, or is not a positive number; the message names joint and
@@ -124,7 +125,7 @@ def _given(robot: RobotModel, name: str, values: Sequence[float], default: Tenso
 
 
 def random_states(robot: RobotModel, limits: Limits, count: int = REGION, seed: int = 0) -> States:
-    """Uniform states within the limits; those that need too much torque are slower."""
+    """Uniform states within the limits; those that need too much torque are slowed down."""
     share = torch.rand(3, count, robot.nq, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
     q = limits.low + share[0] * (limits.high - limits.low)
     qd, qdd = (
@@ -141,11 +142,11 @@ class Excitation:
     """A motion that excites a robot.
 
     Attributes:
-        motion: positions, velocities, accelerations, and the torque by the robot file.
-        limits: what it holds.
-        used: largest share of each limit that it uses at 1 kHz, by name; `clearance_m` is what it keeps.
-        before, after: what is unknown before its log, and expected after.
-        criterion: value of the objective, by random start; the first is the one that was taken.
+        motion: positions, velocities, accelerations, and the torque according to the robot file.
+        limits: of the motion.
+        used: largest used share of each limit at 1 kHz, by name; `clearance_m` is the smallest distance.
+        before, after: unknowns before its log, and expected unknowns after.
+        criterion: value of the objective, by random start; the first one was chosen.
     """
 
     motion: Dataset
@@ -160,7 +161,7 @@ class Excitation:
 
         Raises:
             DataError: the name ends in neither.
-            DestinationError: the place cannot be written.
+            DestinationError: the path cannot be written.
         """
         if Path(path).suffix.lower() != ".csv":
             return self.motion.write(path)
@@ -226,7 +227,7 @@ class Search:
 
     Args:
         spline, limits, collisions: of the motion.
-        unknowns: what it shall tell about.
+        unknowns: the unknown forces to identify.
         criterion: objective of the information.
     """
 
@@ -241,7 +242,7 @@ class Search:
         self.look(np.zeros(0))
 
     def look(self, times: Array) -> None:
-        """Let the hinges act at further times too."""
+        """Apply the hinges at further times."""
         self.extra = np.union1d(self.extra, times)
         self.matrices = [
             torch.from_numpy(m) for m in self.spline.at(np.concatenate([self.nodes, self.extra]))
@@ -292,7 +293,7 @@ class Search:
         return torch.linalg.solve(self.scale, torch.from_numpy(x).mT[..., None]).numpy().ravel()
 
     def minimised(self, x: Array, steps: int) -> tuple[Array, float]:
-        """Better control points, and the objective there."""
+        """Improved control points and their objective."""
         options = {"maxfun": steps, "maxiter": steps, "maxcor": 20}
         found = minimize(self, self.flat(x), jac=True, method="L-BFGS-B", options=options)
         w = torch.from_numpy(found.x.reshape(len(self.spline.start), -1))
@@ -300,7 +301,7 @@ class Search:
 
     @torch.no_grad()
     def used(self, x: Array, step: float) -> tuple[dict[str, float], Array]:
-        """Largest share of each limit at instants of a period `step`, the clearance lacking, and where."""
+        """Largest share of each limit at multiples of `step`, the missing clearance, and the times."""
         t = np.linspace(0.0, self.spline.seconds, round(self.spline.seconds / step) + 1)
         worst: dict[str, float] = {}
         where, limits, near = [], self.limits, self.collisions
@@ -322,10 +323,10 @@ class Search:
         return worst, np.concatenate(where)
 
     def shrunk(self, x: Array, step: float) -> tuple[Array, dict[str, float]]:
-        """The motion at the largest of `SHARES` at which it holds all limits.
+        """The motion at the largest of `SHARES` that satisfies all limits.
 
         Raises:
-            NumericalError: none does.
+            NumericalError: no share does.
         """
         used: dict[str, float] = {}
         for share in SHARES:
@@ -399,19 +400,19 @@ def excite(
     """The motion in free space that identifies the unknown forces best.
 
     Args:
-        system: robot, and contacts whose surfaces it keeps away from.
-        seconds: its length [s].
+        system: robot, and contacts with surfaces to avoid.
+        seconds: duration [s].
         limits: by default `Limits.of(robot)`.
-        unknowns: what is unknown before the motion; by default all, as in `Unknowns.of`.
+        unknowns: unknown forces before the motion; by default all, as in `Unknowns.of`.
         collisions: by default the robot's shapes and the surfaces of the contacts.
         start: `(nq,)` position at the start and the end; by default a free one near the middle.
         criterion: `"A"`, standard deviation of the torque in the region of `unknowns`, `"V"`, the same by
             links, viscous and dry friction alone, `"D"`, determinant of the covariance, or a function of the
             information.
-        rate: of the samples that are returned [Hz].
-        restarts: random starts that are optimised, the best of four times as many.
+        rate: of the returned samples [Hz].
+        restarts: number of optimised random starts, the best of four times as many.
         seed: of the random starts.
-        progress: called with the number of rounds done, and of all.
+        progress: called with the number of completed rounds and their total.
 
     Example:
         >>> import forcegp

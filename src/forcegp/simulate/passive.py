@@ -1,4 +1,4 @@
-"""Learned forces as MuJoCo's callback for passive forces, in simulations of one's own too."""
+"""Learned forces as MuJoCo's callback for passive forces, for any simulation."""
 
 from __future__ import annotations
 
@@ -19,9 +19,9 @@ class PassiveForces:
     """A force field as `mjcb_passive`: adds Q̄ − Q_C − Q_G − Q_u to `qfrc_passive`.
 
     With masses and drives of the fitted robot, `fit.system.robot` or a file with it, MuJoCo's acceleration
-    is M⁻¹Q̄, the prediction of the fit. Joint friction is part of Q̄: `installed` takes damping and
-    friction loss out of the model meanwhile, so that they do not act twice. Friction that contacts have
-    learned is not applied; the engine has its own. Q_u is `qfrc_applied` and the actuators' last forces.
+    is M⁻¹Q̄, the prediction of the fit. Joint friction is part of Q̄: `installed` removes damping and
+    friction loss from the model meanwhile, so that they do not act twice. Learned friction of contacts is not
+    applied, since the engine has its own. Q_u is `qfrc_applied` and the actuators' last forces.
 
     Args:
         system: the fitted robot.
@@ -29,7 +29,7 @@ class PassiveForces:
         joint_names: of the joints in the MuJoCo model; by default the robot's.
 
     Raises:
-        ModelError: there are not as many names as joints.
+        ModelError: the number of names differs from that of the joints.
 
     Example:
         `with PassiveForces(fit.system, fit.force_field()).installed(model): mujoco.mj_step(model, data)`
@@ -73,7 +73,7 @@ class PassiveForces:
 
     @contextmanager
     def installed(self, model: Any) -> Iterator[None]:
-        """The callback of all simulations within the block, with the model's joint friction taken out.
+        """Install the callback for all simulations within the block, without the model's joint friction.
 
         Raises:
             UnknownNameError: the model lacks a joint of the robot.

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 from dataclasses import dataclass, field
 
 import torch
@@ -27,8 +28,8 @@ class RunLog:
         q, qd, qdd, tau, Q, Q_I, Q_z: `(n, nq)`; qdd is the engine's acceleration, without noise.
         multiplier, c: `(n, m)`.
         contact, saturated: `(n, n_contacts)` and `(n,)` bool; whether a torque limit was hit.
-        contact_forces: `F_I`, `F_z` → contact → `(n, 3)`, where an engine of its own computed them [N].
-        measured: sensor values in place of `q`, `qd`, `tau`, where they are not perfect.
+        contact_forces: `F_I`, `F_z` → contact → `(n, 3)`, if the engine's solver computed them [N].
+        measured: sensor values of `q`, `qd`, `tau`, if the sensors are imperfect.
     """
 
     q: Tensor
@@ -47,7 +48,7 @@ class RunLog:
 
     @staticmethod
     def empty(steps: int, system: ConstrainedSystem) -> RunLog:
-        """Room for a number of steps."""
+        """An empty log for a number of steps."""
 
         def columns(width: int, dtype: torch.dtype = system.robot.dtype) -> Tensor:
             return torch.zeros(steps, width, dtype=dtype)
@@ -64,7 +65,7 @@ class RunLog:
 
 
 def noise(like: Tensor, generator: torch.Generator) -> Tensor:
-    """White noise of unit variance, drawn in double precision whatever the type."""
+    """White noise of unit variance, drawn in double precision for any type."""
     return torch.randn(like.shape, dtype=torch.float64, generator=generator).to(like.dtype)
 
 
@@ -95,7 +96,7 @@ class SimulationResult:
     engine: str
 
     def summary(self) -> dict[str, float | int | str]:
-        """Figures on the run, by name, with their units in the name."""
+        """Numbers describing the run, by name, with units in the names."""
         touching = torch.stack(list(self.data.contact.values()), dim=-1) if self.data.contact else None
         figures: dict[str, float | int | str] = {
             "engine": self.engine,
@@ -181,6 +182,12 @@ def _dataset(
         joint_names=robot.joint_names,
         contact_names=names,
     )
+    ends = itertools.accumulate(contact.rows for contact in system.contacts)
+    multipliers = {
+        contact.name: log.multiplier[:, end - contact.rows]
+        for contact, end in zip(system.contacts, ends, strict=True)
+        if isinstance(contact, SurfaceContact)
+    }
     clean = {f"{name}_clean": getattr(log, name) for name in ("qdd", *log.measured)}
     return Dataset(
         t=plan.reference.t,
@@ -191,16 +198,6 @@ def _dataset(
         joint_names=robot.joint_names,
         contact={name: log.contact[:, i] for i, name in enumerate(names)},
         extras={**clean, "Q": log.Q, "Q_z": log.Q_z, "Q_I": log.Q_I},
-        contact_extras=_multipliers(system, log) | log.contact_forces,
+        contact_extras=({"multiplier": multipliers} if multipliers else {}) | log.contact_forces,
         header=header,
     )
-
-
-def _multipliers(system: ConstrainedSystem, log: RunLog) -> dict[str, dict[str, Tensor]]:
-    """Normal force of each contact with a surface."""
-    if not system.contacts:
-        return {}
-    parts = log.multiplier.split([contact.rows for contact in system.contacts], dim=-1)
-    named = zip(system.contacts, parts, strict=True)
-    single = {contact.name: part[:, 0] for contact, part in named if isinstance(contact, SurfaceContact)}
-    return {"multiplier": single} if single else {}

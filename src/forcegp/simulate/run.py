@@ -1,7 +1,6 @@
-"""A simulated run: plan a motion, move the robot through it in a physics engine, log what a robot would.
+"""A simulated run: plan a motion, move the robot through it in a physics engine, and log it.
 
-Contacts are those of our own equations of motion, or made by MuJoCo's solver and seen through sensors. Every
-loop has torque limits, a bound on joint speeds, and progress.
+Contact forces follow from the library's equations of motion, or from MuJoCo's solver with simulated sensors.
 """
 
 from __future__ import annotations
@@ -84,7 +83,11 @@ def _follow_with_solver(
     for k in range(config.steps):
         true_q, true_qd = engine.state()
         _check_speed(k * config.dt, true_q, true_qd)
-        q, qd = _measured_state(true_q, true_qd, sensors, generator)
+        q, qd = true_q, true_qd
+        if sensors.encoder_resolution > 0.0:
+            q = (q / sensors.encoder_resolution).round() * sensors.encoder_resolution
+        if sensors.velocity_noise > 0.0:
+            qd = qd + sensors.velocity_noise * noise(qd, generator)
         measured["q"][k], measured["qd"][k] = q, qd
         command = plan.command(seen.equations(q, qd), q, qd, k, config.gains)
         Q_u = command.clamp(-limit, limit)
@@ -100,27 +103,11 @@ def _follow_with_solver(
         for name, F in (("F_I", F_I), ("F_z", F_z))
         if system.contacts
     }
-    measured["tau"] = _measured_torque(log.tau, config, generator)
+    # The torque is logged late by whole samples, the first one repeated, and noisy.
+    late = (torch.arange(len(log.tau)) - round(sensors.torque_delay / config.dt)).clamp(min=0)
+    measured["tau"] = log.tau[late] + sensors.torque_noise * noise(log.tau, generator)
     measured = {} if sensors == Sensors() else measured
     return dataclasses.replace(log, contact_forces=forces, measured=measured)
-
-
-def _measured_state(
-    q: Tensor, qd: Tensor, sensors: Sensors, generator: torch.Generator
-) -> tuple[Tensor, Tensor]:
-    """Joint positions at the resolution of the encoders, and noisy velocities."""
-    if sensors.encoder_resolution > 0.0:
-        q = (q / sensors.encoder_resolution).round() * sensors.encoder_resolution
-    if sensors.velocity_noise > 0.0:
-        qd = qd + sensors.velocity_noise * noise(qd, generator)
-    return q, qd
-
-
-def _measured_torque(tau: Tensor, config: SimulationConfig, generator: torch.Generator) -> Tensor:
-    """The torque as it is logged: late by whole samples, the first one repeated, and noisy."""
-    late = round(config.sensors.torque_delay / config.dt)
-    rows = (torch.arange(len(tau)) - late).clamp(min=0)
-    return tau[rows] + config.sensors.torque_noise * noise(tau, generator)
 
 
 ON_SURFACE = 1e-8
@@ -139,12 +126,12 @@ def simulate(
 
     The engine moves the robot under Q_u + Q_D + Q_I + Q_z: the motor torque of a task-space controller, joint
     friction, the normal force of the constrained equations of motion with their Baumgarte terms, and viscous
-    friction at the contact (section 5 of the paper). A contact opens when its multiplier would turn negative,
-    and closes with an inelastic impact. The run is computed on the CPU, where the data stay.
+    friction at the contact (section 5 of the paper). A contact opens when its multiplier would become
+    negative, and closes with an inelastic impact. The run is computed on the CPU.
 
     Args:
         system: robot and contacts; without contacts the motion is free.
-        config: what is simulated.
+        config: settings of the simulation.
         motion: joints to follow instead of the tool's random motion, as long as the configuration says.
         forces: learned forces of joints, in place of the robot's friction; for `contact = "solver"`.
         progress: called every few steps, and after the last.
@@ -168,7 +155,12 @@ def simulate(
     system.announce_states(config.steps, 1.0, f"a simulation of {config.steps:,} steps")
     generator = torch.Generator().manual_seed(config.seed)
     with torch.no_grad(), one_thread():
-        plan = _plan(system, config, motion, generator)
+        if motion is None:
+            plan = make_plan(system, config, generator)
+        else:
+            followed = motion.select(system.robot.joint_names)
+            joints = JointTarget(followed.q, followed.qd, followed.qdd)
+            plan = joint_plan(system, config, followed.t, joints)
         if config.contact == "solver":
             engine = ContactSolverEngine(system, config.dt, config.solver)
             with nullcontext() if forces is None else forces.installed(engine.model):
@@ -182,15 +174,6 @@ def simulate(
         with closing(make_engine(system.robot, config.dt, config.engine)) as engine:
             log = _follow(system, config, plan, engine, progress)
             return make_result(system, config, plan, log, engine.name, generator)
-
-
-def _plan(
-    system: ConstrainedSystem, config: SimulationConfig, motion: Dataset | None, generator: torch.Generator
-) -> Plan:
-    if motion is None:
-        return make_plan(system, config, generator)
-    motion = motion.select(system.robot.joint_names)
-    return joint_plan(system, config, motion.t, JointTarget(motion.q, motion.qd, motion.qdd))
 
 
 def _follow(

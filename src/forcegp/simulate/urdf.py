@@ -1,25 +1,24 @@
-"""A robot model written as URDF, so that every physics engine is given the same parameters."""
+"""A robot model written as URDF, so that all physics engines have the same parameters."""
 
 from __future__ import annotations
 
-import math
+import warnings
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 import torch
+from scipy.spatial.transform import Rotation as ScipyRotation
 from torch import Tensor
 
 from forcegp.robot.model import BASE, RobotModel
 
 WORLD = "world"
-GIMBAL = 1e-12
-"""Below this cosine of the pitch, roll and yaw turn about the same axis and the roll is set to zero."""
 
 
 def write_urdf(robot: RobotModel) -> str:
     """The robot as URDF text: inertial parameters and joints only, mounted in the world at its base pose.
 
-    Shapes, joint limits, damping and friction are left out: an engine that reads the file adds no force
-    of its own.
+    Shapes, joint limits, damping and friction are left out: an engine that loads the file adds no further
+        force.
     """
     root = Element("robot", name=robot.name)
     _link(root, WORLD, 1.0, torch.zeros(3), torch.eye(3), torch.ones(3))
@@ -64,12 +63,9 @@ def _joint(root: Element, robot: RobotModel, i: int, name: str) -> None:
 
 def _roll_pitch_yaw(rotation: Tensor) -> list[float]:
     """Angles about the fixed axes x, y, z, as URDF has them."""
-    (r00, r01, _), (r10, r11, _), (r20, r21, r22) = rotation.tolist()
-    cosine = math.hypot(r00, r10)
-    pitch = math.atan2(-r20, cosine)
-    if cosine < GIMBAL:
-        return [0.0, pitch, math.atan2(-r01, r11)]
-    return [math.atan2(r21, r22), pitch, math.atan2(r10, r00)]
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # at a pitch of 90° roll and yaw turn about one axis, and one is zero
+        return ScipyRotation.from_matrix(rotation.numpy()).as_euler("xyz").tolist()
 
 
 def _numbers(values: Tensor | list[float]) -> str:

@@ -1,4 +1,4 @@
-"""The state of a long fit on disk, so that an interrupted fit is resumed to the same bits."""
+"""The state of a long fit on disk, so that an interrupted fit resumes with the same result to the bit."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def beside(checkpoint: str | Path) -> Path:
 
 @dataclass
 class Checkpoint:
-    """A safetensors file from which a long fit goes on; `key` (`key_of`) says what is learned."""
+    """A safetensors file from which a long fit resumes; `key` (`key_of`) identifies the fit."""
 
     path: Path
     key: str
@@ -60,8 +60,8 @@ class Checkpoint:
         """The tensors in the file; none if there is no file.
 
         Args:
-            like: tensors of the names, types and shapes that the file holds.
-            growing: names of those whose length may differ.
+            like: tensors with the names, types and shapes of those in the file.
+            growing: names of tensors of variable length.
 
         Raises:
             ModelError: the file is damaged, not finite, or belongs to another fit.
@@ -86,12 +86,12 @@ class Checkpoint:
         return {name: tensors[name] for name in like}
 
     def write_now_and_then(self, tensors: Callable[[], Mapping[str, Tensor]]) -> None:
-        """Write tensors if the last writing is long ago."""
+        """Write tensors if the last write was long ago."""
         if time.monotonic() - self._written >= INTERVAL:
             self.write(tensors())
 
     def write(self, tensors: Mapping[str, Tensor]) -> None:
-        """Write tensors, whole or not at all; `DestinationError` where the place cannot be written."""
+        """Write tensors, whole or not at all; `DestinationError` if the path cannot be written."""
         copies = {name: x.detach().to("cpu", copy=True).contiguous() for name, x in tensors.items()}
         with atomic_file(self.path) as temporary:
             temporary.write_bytes(safetensors.torch.save(copies, {"key": self.key}))
@@ -102,12 +102,12 @@ class Checkpoint:
 class Evaluations:
     """Every evaluation of an objective: position, value and gradient, kept in a checkpoint.
 
-    A resumed fit runs the optimiser again from the start on the recorded values, which takes no time, and so
-    ends with the same bits as a fit that was not interrupted. If the optimiser requests another point (on
-    another machine or release of a library), the rest of the record is dropped and evaluated anew.
+    A resumed fit replays the optimiser on the recorded values, and so ends with the same bits as an
+    uninterrupted fit. If the optimiser requests another point (on another machine or release of a library),
+    the rest of the record is discarded and recomputed.
 
     Args:
-        checkpoint: where they are kept; `None` to keep nothing.
+        checkpoint: file of the record; `None` for none.
     """
 
     checkpoint: Checkpoint | None
@@ -116,7 +116,7 @@ class Evaluations:
 
     @classmethod
     def resumed(cls, path: str | Path | None, start: Mapping[str, Tensor], *key: object) -> Evaluations:
-        """The evaluations in a file, if any; `key` identifies what is learned from `start`."""
+        """The evaluations in a file, if any; `key` identifies the fit from `start`."""
         if path is None:
             return cls(None)
         result = cls(Checkpoint(Path(path), Checkpoint.key_of(*key)))
@@ -124,7 +124,7 @@ class Evaluations:
         return result
 
     def read(self, start: Mapping[str, Tensor]) -> int:
-        """Take up the evaluations in the file, if there is one; returns how many will not be repeated."""
+        """Load the evaluations in the file, if there is one; returns their number."""
         assert self.checkpoint is not None
         size = sum(value.numel() for value in start.values())
         rows = torch.zeros(0, size, dtype=torch.float64)
@@ -144,7 +144,7 @@ class Evaluations:
         return lengths.pop()
 
     def recorded(self, objective: Objective) -> Objective:
-        """The same objective, with its evaluations read from the record as far as it goes, then recorded."""
+        """The same objective, with evaluations from the record, and new ones recorded."""
         checkpoint = self.checkpoint
         if checkpoint is None:
             return objective

@@ -23,7 +23,7 @@ _CHECK = ConfigDict(arbitrary_types_allowed=True, strict=True, allow_inf_nan=Fal
 
 
 def encode(value: Any, classes: Classes) -> Any:
-    """A description as what JSON can hold; `ModelError` for a class that has no JSON form."""
+    """A description as JSON-compatible values; `ModelError` for a class without a JSON form."""
     names = {kind: name for name, kind in classes.items()}
     if type(value) in names:
         members = {field.name: encode(getattr(value, field.name), classes) for field in _written(value)}
@@ -38,7 +38,8 @@ def encode(value: Any, classes: Classes) -> Any:
 
 
 def decode(json: Any, classes: Classes, place: str, depth: int = 0, *, whole: bool = True) -> Any:
-    """The description that `encode` wrote, with all fields if `whole`, else with defaults for those left out.
+    """The description restored from `encode`, with all fields if `whole`, else with defaults for missing
+    ones.
 
     Raises:
         ForceGPError: a field is missing, unknown or of another type, or a class is unknown; names the place.

@@ -1,8 +1,8 @@
-"""A saved model: one safetensors file whose metadata hold a versioned header, all of it under one hash.
+"""A saved model: one safetensors file with a versioned header in its metadata and a hash of all its content.
 
-The hash is the SHA-256 of the file with 64 zeros in the place of the hash, so that no bit of header or
-tensors changes unnoticed. The file is put in its place by one `os.replace`: a reader sees the old model or
-the new one. What every tensor must be is checked once, when the file is read.
+The hash is the SHA-256 of the file with 64 zeros in place of the hash, so any changed bit of header or
+tensors is detected. The file is replaced by one `os.replace`: a reader sees the old model or the new one.
+Tensors are checked once, when the file is read.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _POSITIVE = re.compile(r"(data\.\d+|training)\.noise_std|std\.[^.]+|scale\..+\.s
 
 
 def check_tensors(tensors: Mapping[str, Tensor], source: str) -> None:
-    """Check number, types and values of tensors; deviations are positive. The loader checks shapes."""
+    """Check number, types and values of tensors, such as positive standard deviations, but not shapes."""
     if len(tensors) > TENSORS:
         raise ModelError(f"{source}: too many tensors", expected=f"at most {TENSORS}", got=len(tensors))
     for name, value in tensors.items():
@@ -64,7 +64,7 @@ COPIES = 3
 
 
 class ModelHeader(Header):
-    """Header of a saved model: `Model.kind`, its settings, and its system as `pack_system` wrote it."""
+    """Header of a saved model: `Model.kind`, its settings, and its system in the form of `pack_system`."""
 
     FORMAT: ClassVar[str] = "forcegp-model"
     VERSION: ClassVar[int] = 3
@@ -79,7 +79,7 @@ class ModelHeader(Header):
 
 
 def model_path(path: str | Path) -> Path:
-    """The file of a model: the path, with the ending `.safetensors` if it has another or none."""
+    """The file of a model: the path with the ending `.safetensors`."""
     path = Path(path)
     if not path.name:
         raise ModelError("the path of a model has no name", expected="a file", got=repr(str(path)))
@@ -104,7 +104,7 @@ def write_model(
     settings: Record,
     tensors: Mapping[str, Tensor],
 ) -> None:
-    """Write the file of a model, whole or not at all; `DestinationError` where it cannot be written."""
+    """Write the file of a model, whole or not at all; `DestinationError` if it cannot be written."""
     data = model_bytes(kind, system, settings, tensors)
     with atomic_file(model_path(path)) as temporary:
         temporary.write_bytes(data)

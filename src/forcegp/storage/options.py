@@ -1,4 +1,4 @@
-"""Options of models: one table each for the constructor, the table `[model]` of scenes and saved files."""
+"""Options of models, shared by the constructor, the table `[model]` of scenes and saved files."""
 
 from __future__ import annotations
 
@@ -35,8 +35,7 @@ class KernelOptions(Record):
     """Options of models with kernels on the states.
 
     Attributes:
-        standardize: whether the inputs of kernels are standardized; otherwise they enter in their units, as
-            in the paper.
+        standardize: whether to standardize the inputs of kernels; the paper does not.
     """
 
     standardize: bool = True
@@ -46,7 +45,7 @@ class KernelOptions(Record):
         """The fields that are among named values, with their types checked.
 
         Raises:
-            UnknownNameError: a value is not one of the names that the field takes.
+            UnknownNameError: a value is not one of the valid names of the field.
             ModelError: a value is not valid.
         """
         known = {name: values[name] for name in cls.model_fields if name in values}
@@ -68,10 +67,10 @@ class StructuredOptions(KernelOptions):
     signature of the constructor repeats it.
 
     Attributes:
-        inference: how to condition; `"auto"` by the number of samples.
+        inference: kind of conditioning; `"auto"` depends on the number of samples.
         inducing_points: maximum number of inducing points of one prior.
-        inertia: `"file"`, or `"auto"` if the log may determine another one; `None` leaves that to the data if
-            they choose the priors, and is `"file"` elsewhere.
+        inertia: `"file"`, or `"auto"` to identify it if the log favours that; `None` is `"auto"` for
+            automatically chosen priors, else `"file"`.
     """
 
     inference: Literal["auto", "exact", "sparse"] = "auto"

@@ -1,8 +1,8 @@
 """A constrained system as JSON and tensors, so that a saved model needs no other file.
 
 The robot is saved as the tensors of `RobotModel`, bit for bit. Constraints that the user defines in Python
-(an `ImplicitSurface`, a subclass of `Constraint`) cannot be saved: the file has a placeholder, and reading
-takes them from a system that the caller passes.
+(an `ImplicitSurface`, a subclass of `Constraint`) cannot be saved: the file has a placeholder, and the caller
+passes a system with them when reading.
 """
 
 from __future__ import annotations
@@ -162,7 +162,7 @@ def unpack_system(
     source: str,
     fallback: ConstrainedSystem | None = None,
 ) -> ConstrainedSystem:
-    """The system that `pack_system` wrote; constraints that cannot be saved are those of `fallback`.
+    """The system restored from `pack_system`; constraints that cannot be saved are those of `fallback`.
 
     Raises:
         ModelError: a field or tensor is missing or not valid, or a constraint that was not saved is needed.
@@ -243,7 +243,7 @@ def robot_tensors(robot: RobotModel) -> list[str]:
 
 
 def take_robot(tensors: Mapping[str, Tensor], prefix: str, like: RobotModel, source: str) -> RobotModel:
-    """A robot with tensors named `<prefix><field>`, checked by `take`, and all else as in another one."""
+    """A robot with tensors named `<prefix><field>`, checked by `take`, and other fields like another one."""
     fields = {}
     for name in robot_tensors(like):
         value, finite = getattr(like, name), name not in MAY_BE_INFINITE

@@ -1,4 +1,4 @@
-"""The page of a motion that excites a robot: in three dimensions, its limits, and what its log would tell."""
+"""The page of an exciting motion: in three dimensions, its limits, and the expected information."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ MOST = 1500
 
 
 def draw_limits(result: Excitation) -> Picture:
-    """Position, velocity, acceleration and torque of each joint as shares of their limits over time."""
+    """Draw position, velocity, acceleration and torque of each joint as shares of their limits over time."""
     limits, motion = result.limits, result.motion[:: -(-len(result.motion) // MOST)]
     middle, half = 0.5 * (limits.low + limits.high), 0.5 * (limits.high - limits.low)
     curves = {
@@ -72,7 +72,7 @@ def write_excitation(
     boxes: Array = np.zeros((0, 6)),  # noqa: B008
     title: str = "forcegp",
 ) -> Path:
-    """Write the page of a motion as one HTML file that needs no other and no network."""
+    """Write the page of a motion as one self-contained HTML file."""
     motion = result.motion
     rows = pictures(motion.t)
     paths = [Path3D(MEAN, tip_path(system, motion.q[rows]))]

@@ -1,4 +1,4 @@
-"""A motion to look at: joint positions over time, forces of contacts, and paths of the tip."""
+"""A motion to display: joint positions over time, forces of contacts, and paths of the tip."""
 
 from __future__ import annotations
 
@@ -28,9 +28,9 @@ LOGGED, MEAN, SAMPLE = "logged", "predicted", "sampled"
 
 @dataclass(frozen=True)
 class Force:
-    """The normal force of a contact in each picture, where it acts `(k, 3)` and the normal there [m].
+    """The normal force of a contact in each picture, its point of application `(k, 3)` and the normal [m].
 
-    `value` `(k,)` [N] is NaN where the contact is open; `std` is 0 where it is not known.
+    `value` `(k,)` [N] is NaN if the contact is open; `std` is 0 if unknown.
     """
 
     contact: str
@@ -78,7 +78,7 @@ def of_log(system: ConstrainedSystem, data: Dataset, model: Predictor | None = N
 
 
 def with_rollout(motion: Motion, path: Rollout) -> Motion:
-    """The motion with the paths of a rollout: the mean, and one of each function sample."""
+    """The motion with the paths of a rollout: the mean, and one per function sample."""
     paths = [Path3D(MEAN, tip_path(motion.system, path.q.reshape(-1, path.q.shape[-1])))]
     if path.samples is not None:
         sampled = path.samples.q.reshape(-1, *path.samples.q.shape[-2:])
@@ -93,14 +93,14 @@ def sampled_rollout(model: Predictor, data: Dataset, samples: int, seconds: floa
 
 
 def tip_path(system: ConstrainedSystem, q: Tensor) -> Array:
-    """Positions of the tip `(n, 3)`, up to where a trajectory diverged [m]."""
+    """Positions of the tip `(n, 3)`, up to the divergence of a trajectory [m]."""
     sound = int(torch.isfinite(q).all(-1).long().cumprod(0).sum())
     frame, point = tip_of(system)
     return as_array(kinematics.point_position(system.robot, q[:sound], frame, tuple(point)))
 
 
 def pictures(t: Tensor) -> Tensor:
-    """The rows that are shown: the last one before each picture's time."""
+    """The displayed rows: the last one before the time of each picture."""
     period = 1.0 / FRAMES_PER_SECOND
     times = torch.arange(float(t[0]), float(t[-1]) + 0.5 * period, period, dtype=t.dtype)
     return torch.unique((torch.searchsorted(t.contiguous(), times, right=True) - 1).clamp(0, len(t) - 1))

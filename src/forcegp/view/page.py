@@ -119,23 +119,22 @@ def force_text(force: Force, k: int) -> str:
 
 
 def view_page(motion: Motion, shapes: Sequence[Shape], title: str) -> str:
-    """The HTML of a motion, which needs no other file and no network."""
+    """The self-contained HTML of a motion."""
     label = "The robot moving, with its surfaces, contact forces and paths of the tip"
     drawn = animation(content_of(motion, shapes), label)
     return render("view.html.j2", title=title, animation=drawn, script=animation_source())
 
 
 def write_view(path: str | Path, motion: Motion, shapes: Sequence[Shape], title: str = "forcegp") -> Path:
-    """Write a motion as one HTML file that needs no other and no network."""
+    """Write a motion as one self-contained HTML file."""
     write_text(path, view_page(motion, shapes, title))
     return Path(path)
 
 
 def serve(page: str, port: int = PORT, say: Callable[[str], None] = print) -> None:
-    """Show a page in a browser on this computer until interrupted; `say` gets its address.
+    """Show a page in a browser on this computer until interrupted; `say` receives its address.
 
-    Other users of the computer do not know the address, and other pages in the browser, which may reach the
-    server by a name of theirs, are refused.
+    Other users of the computer do not know the address, and requests under another host name are refused.
     """
     path = f"/{secrets.token_urlsafe(16)}"
 

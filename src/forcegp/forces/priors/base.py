@@ -1,6 +1,6 @@
-"""Gaussian-process priors on unknown forces: where a force acts, on what it depends, and how it varies.
+"""Gaussian-process priors on unknown forces: direction, inputs and kernel of each force.
 
-`OperatorForcePrior` is a prior on any force, carried by an operator of the user.
+`OperatorForcePrior` is a prior on any force, with a user-defined operator.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ class ForcePrior(ABC):
 
     @property
     def prefix(self) -> str:
-        """Prefix of the hyperparameters; another prior's name where they are shared."""
+        """Prefix of the hyperparameters; another prior's name if they are shared."""
         return self.name
 
     @abstractmethod
@@ -81,19 +81,19 @@ class ForcePrior(ABC):
         return {}
 
     def with_parameters(self, params: Mapping[str, Tensor]) -> ForcePrior:
-        """The prior with learned parameters of its operator, of those in `initial_parameters`."""
+        """The prior with learned parameters of its operator (see `initial_parameters`)."""
         return self
 
     def check(self, system: ConstrainedSystem) -> None:  # noqa: B027  (most priors fit every system)
-        """Raise a typed error where the prior does not fit the system."""
+        """Raise a typed error if the prior does not fit the system."""
 
 
 def check_inputs(name: str, inputs: tuple[str, ...], valid: tuple[str, ...]) -> None:
-    """Check what a force depends on.
+    """Check the inputs of a force.
 
     Raises:
-        ModelError: on nothing.
-        UnknownNameError: on something that is not known.
+        ModelError: there is no input.
+        UnknownNameError: an input is unknown.
     """
     if not inputs:
         raise ModelError(f"force prior {name!r} depends on nothing", expected="one input at least")
@@ -102,7 +102,7 @@ def check_inputs(name: str, inputs: tuple[str, ...], valid: tuple[str, ...]) -> 
 
 
 def check_priors(priors: tuple[ForcePrior, ...], system: ConstrainedSystem) -> None:
-    """Check that priors fit a system and have names of their own, which prefix their hyperparameters.
+    """Check that priors fit a system and have distinct names, the prefixes of their hyperparameters.
 
     Raises:
         ModelError: no prior is given, two share a name, a name is not one word, or a prior shares the

@@ -1,9 +1,9 @@
 """Forces at a contact with a surface: along it, against it, and Coulomb friction from the multiplier.
 
-Contact has no world axes: vectors along the surface have two coordinates in a tangent frame that turns
-with the surface. The frame at normal n is (R e_x, R e_y), with the smallest rotation R that takes e_z to n.
-So what is learned on one surface holds on one that is raised, tilted or curved. A force against the surface
-changes no acceleration.
+Contact forces do not depend on world axes: vectors along the surface have two coordinates in a tangent frame
+that turns with the surface. The frame at normal n is (R e_x, R e_y), with the smallest rotation R that takes
+e_z to n. So forces learned on one surface carry over to one that is raised, tilted or curved. A force normal
+to the surface changes no acceleration.
 
 Friction proportional to the normal force couples force and multiplier. With one contact, u = −J_Eᵀ s(v) and
 g = Lᵀ u, the equations λ = λ_K − Lᵀ Q_z and Q_z = μ λ u have the solution λ = λ_K / (1 + μ g), where λ_K is
@@ -57,7 +57,7 @@ LOADED = ("coulomb", "stribeck", "torsion")
 
 @dataclass(frozen=True)
 class SurfaceForcePrior(ForcePrior):
-    """A force at a contact with a surface, where it is closed and slides."""
+    """A force at a closed, sliding contact with a surface."""
 
     contact: str
     kernel: Kernel = field(default_factory=SquaredExponential)
@@ -95,7 +95,7 @@ class SurfaceForcePrior(ForcePrior):
 
     @abstractmethod
     def directions(self, system: ConstrainedSystem, at: States) -> Tensor:
-        """E(x) `(n, nq, outputs)` where the contact is closed and slides."""
+        """E(x) `(n, nq, outputs)` while the contact is closed and slides."""
 
     def _touching(self, system: ConstrainedSystem, at: States) -> ContactPoint:
         """The touching point; errors as of `check` where the contact has none."""
@@ -116,7 +116,7 @@ def _along(point: ContactPoint, name: str) -> Tensor:
 class ContactForcePrior(SurfaceForcePrior):
     """A prior on the dissipative force F_z at a contact, F_z = t_1 f_1 + t_2 f_2 along the surface.
 
-    E = J_Eᵀ (t_1, t_2) where the contact is closed and 0 elsewhere, as in a system without contacts; t_1 and
+    E = J_Eᵀ (t_1, t_2) while the contact is closed, else 0; t_1 and
     t_2 span the surface at the touching point and turn with it (`tangent_frame`).
 
     Args:
@@ -149,14 +149,14 @@ class SlidingFrictionPrior(SurfaceForcePrior):
     F_z = −θ_v v − (θ_d + λ (μ + μ_s e^{−|v|²/v_s²})) s(v), and the moment −θ_t λ s(ω_n) n about the normal.
 
     The unknowns are the scalar functions named in `terms`: `viscous` θ_v [N s/m], `dry` θ_d [N], `coulomb` μ,
-    `stribeck` μ_s, `torsion` θ_t [m]. They take fewer points than the components of a force. They depend on
-    the sliding speed by default, so they hold on surfaces of any place, tilt and shape.
+    `stribeck` μ_s, `torsion` θ_t [m]. They need fewer samples than the components of a force. By default they
+    depend on the sliding speed, so they carry over to surfaces of any position, tilt and shape.
 
     λ = max(λ_K, 0) / (1 + μ̂ g) with the multiplier λ_K of the analytical forces Q_K + τ without friction and
-    g = −Lᵀ J_Eᵀ s(v). This is exact for one contact whose friction is −μ̂ λ s(v). Otherwise it misses terms
+    g = −Lᵀ J_Eᵀ s(v). This is exact for one contact whose friction is −μ̂ λ s(v). Otherwise it neglects terms
     of second order: μ (μ − μ̂), μ times any other friction of the contact, and μ times unknown joint forces
-    or the friction of other contacts. Where unknown joint forces are large, prefer `dry`, or learn them as
-    analytical parameters, which λ_K follows.
+    or the friction of other contacts. If unknown joint forces are large, prefer `dry`, or learn them as
+    analytical parameters.
 
     Args:
         contact: name of a surface contact of the system.
@@ -167,12 +167,12 @@ class SlidingFrictionPrior(SurfaceForcePrior):
         terms: kinds of friction.
         friction_coefficient: μ̂.
         stribeck_speed: v_s [m/s].
-        torsion_smoothing: rate of turning about the normal below which torsional friction is smooth [rad/s].
+        torsion_smoothing: angular velocity about the normal below which torsional friction is smooth [rad/s].
         coupled: whether Coulomb friction −μ λ s(v) with a constant μ, which is learned together with its ε,
             is part of the mechanics beside the functions in `terms` (`forces/priors/contact.py`).
 
     Raises:
-        UnknownNameError: an input or a kind of friction is not known.
+        UnknownNameError: an input or a kind of friction is unknown.
         ModelError: a speed is not positive, or the friction coefficient is negative.
 
     Example:
@@ -265,10 +265,10 @@ class NormalForcePrior(ForcePrior):
 
     H Aᵀ = 0, so a force Aᵀ g(x) changes the multiplier by −g(x) and no acceleration. A joint force prior
     alone is overconfident along the normal. This independent process, with the hyperparameters of the joint
-    force prior, keeps the uncertainty of that part until a force sensor or the like reduces it.
+    force prior, keeps the uncertainty of that part unless, for example, a force sensor reduces it.
 
     Args:
-        like: the joint force prior whose kernel, inputs and hyperparameters it shares.
+        like: the joint force prior that provides kernel, inputs and hyperparameters.
 
     Example:
         >>> from forcegp import JointForcePrior
@@ -342,7 +342,7 @@ def initial_coulomb(priors: Iterable[ForcePrior], like: Tensor) -> dict[str, Ten
 def coulomb_of(
     priors: Sequence[ForcePrior], tensors: Mapping[str, Tensor], like: Tensor
 ) -> tuple[CoulombFriction, ...]:
-    """Friction at learned tensors, or where its learning begins if it is not among them."""
+    """Friction at learned tensors, or its initial value if it is not among them."""
     values = initial_coulomb(priors, like) | dict(tensors)
     return tuple(
         CoulombFriction(prior.contact, *(values[key].exp() for key in coulomb_keys(prior.contact)))
@@ -356,13 +356,13 @@ def _coupled_priors(priors: Iterable[ForcePrior]) -> list[SlidingFrictionPrior]:
 
 @dataclass(frozen=True, eq=False)
 class CoulombErrorPrior(ForcePrior):
-    """Q_z = λ̂ ∂(μ u)/∂(log μ, log ε) δ, δ ~ N(0, 1): what learning leaves unknown of a contact's friction.
+    """Q_z = λ̂ ∂(μ u)/∂(log μ, log ε) δ, δ ~ N(0, 1): remaining uncertainty of a contact's friction.
 
     λ̂ is the multiplier of the analytical forces with the learned friction. One e-fold is about the width of
     the weak priors that μ and ε are learned with (`forces/search.py`).
 
     Attributes:
-        contact: whose friction is uncertain.
+        contact: the contact with uncertain friction.
         friction: learned friction of all contacts, on which λ̂ depends.
     """
 
@@ -409,10 +409,10 @@ def against_sliding(at: States, contact: str, smoothing: Tensor | float) -> Tens
 def coupled(
     system: ConstrainedSystem, at: States, z: AffineMap, friction: Sequence[CoulombFriction]
 ) -> AffineMap:
-    """The affine map of a quantity where contacts have Coulomb friction.
+    """The affine map of a quantity with Coulomb friction of contacts.
 
     Args:
-        system: robot and contacts; friction of contacts that it does not have is left out.
+        system: robot and contacts; friction of other contacts is ignored.
         z: the quantity without this friction.
         friction: of each contact that has one.
     """
@@ -454,7 +454,7 @@ def below_jamming(
     priors: Iterable[ForcePrior],
     bounds: Mapping[str, tuple[float, float]],
 ) -> dict[str, tuple[float, float]]:
-    """Bounds with which no contact jams, 1 + μ Lᵀu > 0, in a state in which it was seen to slide."""
+    """Bounds that exclude jamming, 1 + μ Lᵀu > 0, at all training states with sliding."""
     changed = dict(bounds)
     for prior in _coupled_priors(priors):
         key, row = coulomb_keys(prior.contact)[0], _row(system, prior.contact)

@@ -3,7 +3,7 @@
 Inverse dynamics is linear in the inertial parameters π: with π = π₀ + δ, M₀ q̈ − Q_C,0 − Q_G,0 + Y(q, q̇,
 q̈) δ = Q is an identity at the measured acceleration. So δ acts like a joint force −Y δ with a constant
 latent δ ~ N(0, S²), and least-squares identification with a ridge towards the file is a special case. A
-prediction takes the robot with the updated parameters; what remains uncertain acts through Y at the
+prediction uses the robot with the updated parameters; the remaining uncertainty acts through Y at the
 predicted acceleration. An unknown mass that is attached to a link is the same with the columns Y_k of that
 link for its mass and first moment (Atkeson, An, Hollerbach 1986).
 """
@@ -71,14 +71,15 @@ class InertialPrior(ForcePrior):
     drives: tuple[float, ...] = ()
 
     def around(self, robot: RobotModel) -> InertialPrior:
-        """The prior with the scale of this robot, whatever robot it is read on."""
+        """The prior with the scale of this robot, for any robot."""
         return dataclasses.replace(self, scales=tuple(self.scale(robot)[: PER_LINK * robot.nq].tolist()))
 
     def with_drives(self, std: Tensor) -> InertialPrior:
-        """The prior with unknown inertia of drives of some standard deviation `(nq,)` too.
+        """The prior with additional unknown inertia of drives, standard deviation `(nq,)`.
 
-        Motion hardly tells the inertia of a drive from that of the links that it turns. With the drives taken
-        as known, any error of theirs would be one of the links, with too small a standard deviation.
+        Motion hardly distinguishes the inertia of a drive from that of the links that it moves. If the drives
+        were treated as known, their errors would be attributed to the links, with too small a standard
+        deviation.
         """
         return dataclasses.replace(self, drives=tuple(std.tolist()), kernel=Constant())
 
@@ -128,7 +129,7 @@ class InertialPrior(ForcePrior):
             robot: with π₀.
             mean: of δ, `(10 nq,)`.
             precision: of δ, `(10 nq, 10 nq)`.
-            log_volume: V, what turns the density of a torque into that of an acceleration.
+            log_volume: V, converts the density of a torque to that of an acceleration.
 
         Returns:
             The robot, and the δ that it contains `(10 nq,)`. Links that are not physically consistent in the
@@ -191,19 +192,18 @@ class PayloadPrior(ForcePrior):
     """Q = −Y_k(q, q̇, q̈) S δ, δ ~ N(0, s² I): a point mass on the link that a joint moves.
 
     q̈ is the acceleration of the arm with the payload `known`, none at first. So the force is exact for that
-    payload, and to first order in what it differs by; `around` moves to the present estimate.
+    payload, and accurate to first order for others; `around` moves to the current estimate.
 
-    With `update` and `forget` it follows a payload that is picked up or put down. A log without payload says
-    that there is none, so leave its scale as it is while other priors learn:
-    `model.fit(data, learn=["joint"])`.
+    With `update` and `forget` it tracks a payload that is picked up or put down. A log without payload would
+    set its scale to zero, so keep the scale while other priors learn: `model.fit(data, learn=["joint"])`.
 
     Args:
-        joint: whose link carries it; the last joint by default.
+        joint: joint of the link with the payload; the last one by default.
         mass: standard deviation of the mass [kg].
         length: standard deviation of the first moment over that of the mass [m].
         kernel: covariance of the constants.
         name: prefix of the hyperparameters.
-        known: mass [kg] and first moment [kg m] of the payload that the acceleration is taken with.
+        known: mass [kg] and first moment [kg m] of the payload at which the acceleration is computed.
         measured: take the measured acceleration where there is one: exact for any payload, but its noise
             makes the payload too small where the arm hardly accelerates.
 
@@ -249,8 +249,8 @@ class PayloadPrior(ForcePrior):
         """The prior with the acceleration of the arm with the estimated payload.
 
         Args:
-            mean: of the latent constants `(4,)`; where it is not a point mass near the link, the arm is taken
-                without payload.
+            mean: of the latent constants `(4,)`; if it is not a point mass near the link, no payload is
+                assumed.
         """
         mass, *moment = (mean * self.units(mean)).tolist()
         near = mass > 0.0 and math.hypot(*moment) <= FARTHEST * self.length * mass
@@ -261,7 +261,7 @@ class PayloadPrior(ForcePrior):
         return like.new_tensor([self.mass, *3 * [self.mass * self.length]])
 
     def loaded(self, robot: RobotModel) -> RobotModel:
-        """The robot with the known payload, a point mass; as it is if none is known."""
+        """The robot with the known payload, a point mass, if any."""
         if not self.known:
             return robot
         J = pseudo_inertia(robot.mass, robot.com, robot.inertia)
@@ -276,7 +276,7 @@ class PayloadPrior(ForcePrior):
         self.link(system.robot)
 
     def link(self, robot: RobotModel) -> int:
-        """Number of the joint whose link carries it."""
+        """Index of the joint of the link with the payload."""
         if self.joint is None:
             return robot.nq - 1
         check_name("joint that carries a payload", self.joint, robot.joint_names)

@@ -3,11 +3,11 @@
 - `JointForcePrior`: any force, one process per joint.
 - `JointFrictionPrior`: friction that no robot file declares (viscous, Coulomb, a transition between the two,
   a part that grows with the load) and the offset of the torque sensor. Each joint reads only its own
-  velocity, so the prior extrapolates to motions in which other joints do something new. It never reads τ: in
-  a closed loop the likeliest force would be the one that cancels the noise of the torque sensor.
-- `DisturbancePrior`: torques that last for a while and are another time different (temperature, hysteresis).
-  A function of the state would take them for signal, white noise for more evidence than there is.
-- `CoregionalPrior`: one cause that moves several joints, such as a cable or a contact that the scene lacks;
+  velocity, so the prior extrapolates to new motions of other joints. It does not depend on τ: in closed loop
+      the most likely force would cancel the noise of the torque sensor.
+- `DisturbancePrior`: slowly varying torques (temperature, hysteresis). As a function of the state they would
+be overfitted, and as white noise they would be underestimated.
+- `CoregionalPrior`: common causes of several joint forces, such as a cable or a contact that the scene lacks;
   independent processes must learn such a force once per joint.
 """
 
@@ -66,10 +66,10 @@ class AnalyticalMean:
 
 
 def mean_of(mean: str | AnalyticalMean) -> AnalyticalMean:
-    """`"zero"`, `"analytical"` or a mean of one's own.
+    """The mean named `"zero"` or `"analytical"`, or a given mean.
 
     Raises:
-        UnknownNameError: a name that is neither.
+        UnknownNameError: no such mean.
     """
     if isinstance(mean, AnalyticalMean):
         return mean
@@ -142,13 +142,13 @@ OFFSET = 0.3
 class JointFrictionPrior(PerJointPrior):
     """Q_i = w_i·φ(q̇_i) + c_i with φ = (q̇_i, tanh(q̇_i/v_1), tanh(q̇_i/v_2), …, |Q_G,i| tanh(q̇_i/v_1)).
 
-    The weights w_i and the offset c_i are Gaussian and marginalised. Three things are learned: how large the
-    friction of each joint is, which features matter, and how large offsets are beside friction; the last two
-    are the same for all joints. A joint that moved in one direction only does not tell its offset from its
-    friction, but the other joints show which is likely. With a standard deviation for each weight alone,
-    learning takes most of them for zero, and the joint is overconfident where it does something new. A kernel
-    with a smooth part, such as `Linear(shared=True, offset=0.3) + SquaredExponential(("velocity",))`, adds a
-    smooth remainder.
+    The weights w_i and the offset c_i are Gaussian and marginalised. Three scales are learned: the friction
+        of each joint, the relevance of each feature, and the offsets relative to friction; the last two are
+        shared by all joints. A joint that moved in one direction only does not separate offset and
+    friction, but the other joints indicate which is likely. With a separate standard deviation for each
+    weight, learning would set most of them to zero, and be overconfident on new motions. A kernel with a
+    smooth part, such as `Linear(shared=True, offset=0.3) + SquaredExponential(("velocity",))`, adds a smooth
+    remainder.
 
     Args:
         kernel: covariance of each component; linear in the features by default.
@@ -206,11 +206,11 @@ NEW_MOTION = -1.0
 
 @dataclass(frozen=True)
 class DisturbancePrior(PerJointPrior):
-    """Q_i = d_i(t), an Ornstein–Uhlenbeck process of each joint, independent from one trajectory to the next.
+    """Q_i = d_i(t), an Ornstein–Uhlenbeck process of each joint, independent between trajectories.
 
     Its standard deviation σ_i and correlation time T_i are learned. It cannot be predicted on new
     motions, so it adds σ_i² to the variance of the joint force there, and zero to the mean. Inference is
-    exact: sums over samples, as in sparse inference, take samples to be independent.
+    exact, since sparse inference assumes independent samples.
 
     Args:
         kernel: covariance over time.

@@ -1,4 +1,4 @@
-"""Named sets of force priors: those that the data choose between, and those of the paper."""
+"""Named sets of force priors: the candidates of automatic selection, and those of the paper."""
 
 from __future__ import annotations
 
@@ -29,15 +29,16 @@ learns to cancel it."""
 def default_priors(
     system: ConstrainedSystem, mean: str | AnalyticalMean = "analytical", kernel: Kernel | None = None
 ) -> tuple[ForcePrior, ...]:
-    """A joint force prior, with what accelerations do not show left open where there are contacts.
+    """A joint force prior; with contacts also a prior on the part that accelerations do not determine.
 
-    Where the mean includes the motor torque, each contact with a surface also has a `SlidingFrictionPrior`:
-    without one the joints are blamed for its friction, and what is read in free motion is overconfident.
+    If the mean includes the motor torque, each contact with a surface also has a `SlidingFrictionPrior`;
+    without it, its friction would be attributed to the joints, and predictions in free motion would be
+    overconfident.
 
     Args:
-        mean: the model's prior mean, which decides what is left to the prior.
+        mean: the model's prior mean, which determines the default kernel.
         kernel: covariance of each joint force, without a prior on the contact's friction; by default
-            `REMAINING` where the mean includes the motor torque, `WHOLE` elsewhere.
+            `REMAINING` if the mean includes the motor torque, else `WHOLE`.
 
     Example:
         >>> import torch, forcegp
@@ -56,7 +57,7 @@ def default_priors(
 def friction_priors(system: ConstrainedSystem) -> tuple[ForcePrior, ...]:
     """Friction of each joint, and Coulomb friction of each contact with a surface.
 
-    None of the priors reads the motor torque.
+    None of the priors depends on the motor torque.
 
     Args:
         system: robot and contacts.
@@ -86,8 +87,8 @@ class PriorSet:
         name: of the set.
         description: the forces that it models.
         priors: the priors for a system.
-        has_joint_friction: whether the friction of the joints is modelled, and with it noise of the motor
-            torque; the inertia can only be identified then.
+        has_joint_friction: whether joint friction and torque noise are modelled, which identification of
+            inertia requires.
         needs_surface: whether the set is for systems with a contact with a surface.
     """
 
@@ -103,7 +104,7 @@ class PriorSet:
 
 
 def contact_priors(system: ConstrainedSystem, kernel: Kernel | None = None) -> tuple[ForcePrior, ...]:
-    """A prior on the friction of each contact with a surface; a joint force prior where there is none.
+    """A prior on the friction of each contact with a surface; a joint force prior without such contacts.
 
     Args:
         kernel: covariance of each Cartesian component of any tangential force; by default the force is
@@ -146,7 +147,7 @@ FEW = SETS["friction"]
 def priors_of(
     system: ConstrainedSystem, mean: AnalyticalMean, force_priors: str | Sequence[ForcePrior]
 ) -> tuple[ForcePrior, ...]:
-    """Force priors as given, or those of a named set; those for few samples where the data are to choose.
+    """The given force priors, or those of a named set; for `"auto"` those for few samples.
 
     Raises:
         UnknownNameError: no such set.

@@ -1,4 +1,6 @@
-"""Which format a log has, by its first bytes and then by its name; formats that can run code are refused."""
+"""Detection of the format of a log by its first bytes, then by its name; formats that can run code are
+refused.
+"""
 
 from __future__ import annotations
 
@@ -47,13 +49,13 @@ def read(
     rows: int | None = None,
     progress: Progress | None = None,
 ) -> LogTable:
-    """Read a log, a file or a folder, of any format that is known.
+    """Read a log, a file or a folder, of any supported format.
 
-    Columns are read if `wanted`, rows up to `rows` where the format allows it; `progress` gets done and
-    total.
+    Columns are read if `wanted`, and rows up to `rows` if the format allows it; `progress` receives the done
+    and total counts.
 
     Raises:
-        DataError: no such file, a format that is not read or not safe, damage, or a size beyond the limits.
+        DataError: no such file, an unsupported or unsafe format, damage, or a size beyond the limits.
         MissingDependencyError: the format's reader is not installed.
 
     >>> import tempfile

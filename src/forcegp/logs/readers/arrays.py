@@ -1,6 +1,6 @@
 """Files of named arrays: NumPy archives without pickled objects, HDF5 and MATLAB.
 
-MATLAB files of version 7.3 are read as the HDF5 files that they are, version 4 by SciPy. Of versions 5 to 7
+MATLAB files of version 7.3 are read as HDF5 files, version 4 by SciPy. Of versions 5 to 7
 every tag is checked before it is followed, as SciPy's reader crashes the process on some damaged files; the
 layout is that of "MAT-File Format" (MathWorks), chapter 1. Links out of an HDF5 file are not followed.
 """
@@ -74,7 +74,7 @@ def _array(source: str, name: str, file: Any, size: int) -> Arrays:
 
 
 def read_hdf5(path: Path, **_: object) -> LogTable:
-    """Read the numeric data sets of an HDF5 file; one in a group is `group/name`."""
+    """Read the numeric data sets of an HDF5 file; those in groups are named `group/name`."""
     remarks: list[str] = []
     return table.table_of_arrays(path, "hdf5", _hdf5_arrays(path, "/", remarks), remarks)
 
@@ -136,10 +136,10 @@ COMPLEX = 0x08
 
 
 class Variable(NamedTuple):
-    """A named value: an array, the fields of a struct, or why there is neither."""
+    """A named array (`struct.field` in a struct), or the reason why it cannot be read."""
 
     name: str
-    value: NDArray[np.generic] | tuple[Variable, ...] | str
+    value: NDArray[np.generic] | str
 
 
 class _Element(NamedTuple):
@@ -148,7 +148,7 @@ class _Element(NamedTuple):
 
 
 def variables(content: bytes, source: str) -> Iterator[Variable]:
-    """The variables of a file with that content, in their order; `source` names it in messages."""
+    """The variables of a file from its content, in order; `source` is its name in messages."""
     order = {b"IM": "<", b"MI": ">"}.get(content[126:128])
     if order is None:
         raise DataError(f"{source}: not a MATLAB file of versions 5 to 7", got=content[:20])
@@ -166,7 +166,7 @@ class _Reader:
                 element = self.next(self.elements(self.inflated(element.body)))
             if element.kind != MATRIX:
                 raise self.damaged("a variable", f"an element of type {element.kind}")
-            yield self.matrix(element.body, 0)
+            yield from self.matrix(element.body)
 
     def inflated(self, body: memoryview) -> memoryview:
         stream = zlib.decompressobj()
@@ -204,45 +204,45 @@ class _Reader:
             raise self.damaged("a further element", "the end of the variable")
         return element
 
-    def matrix(self, body: memoryview, depth: int) -> Variable:
-        """A variable, or a field of a struct."""
+    def matrix(self, body: memoryview, field: str = "", depth: int = 0) -> Iterator[Variable]:
+        """A variable, or the field of a struct; of a struct its fields."""
         if depth > limits.GROUP_DEPTH:
             raise DataError(f"{self.source}: structs are nested more than {limits.GROUP_DEPTH} levels deep")
         self.count += 1
         guards.check_count(self.source, "variables and fields", self.count, limits.COLUMNS)
         if not len(body):
-            return Variable("", "holds nothing")
+            yield Variable(field, "holds nothing")
+            return
         parts = self.elements(body)
         flags = self.numbers(self.next(parts))
         if not len(flags):
             raise self.damaged("the class of an array", "nothing")
         kind, flag = int(flags[0]) & 0xFF, int(flags[0]) >> 8 & 0xFF
         if kind in (16, 17):  # functions and classes have a layout of their own
-            return Variable("", f"is of class {OTHER_CLASSES[kind]}")
+            yield Variable(field, f"is of class {OTHER_CLASSES[kind]}")
+            return
         shape = tuple(int(x) for x in self.numbers(self.next(parts)))
         name = self.text(self.next(parts))
-        if kind in NUMERIC and flag & COMPLEX:
-            return Variable(name, "is complex")
-        if kind in NUMERIC:
-            return Variable(name, self.array(self.next(parts), shape))
+        name = field or name
         if kind == STRUCT and math.prod(shape) == 1:
-            return Variable(name, self.fields(parts, depth))
-        return Variable(name, f"is of class {OTHER_CLASSES.get(kind, 'struct')}")
+            yield from self.fields(parts, name, depth)
+        elif kind in NUMERIC:
+            yield Variable(name, "is complex" if flag & COMPLEX else self.array(self.next(parts), shape))
+        else:
+            yield Variable(name, f"is of class {OTHER_CLASSES.get(kind, 'struct')}")
 
-    def fields(self, parts: Iterator[_Element], depth: int) -> tuple[Variable, ...]:
+    def fields(self, parts: Iterator[_Element], struct: str, depth: int) -> Iterator[Variable]:
         lengths = self.numbers(self.next(parts))
         names = bytes(self.next(parts).body)
         length = int(lengths[0]) if len(lengths) else 0
         if length <= 0 or len(names) % length or len(names) // length > limits.COLUMNS:
             raise self.damaged("the names of a struct's fields", f"{len(names)} bytes in steps of {length}")
-        variables = []
         for start in range(0, len(names), length):
             element = self.next(parts)
             if element.kind != MATRIX:
                 raise self.damaged("a field of a struct", f"an element of type {element.kind}")
             field = names[start : start + length].split(b"\0")[0].decode("utf-8", "replace")
-            variables.append(Variable(field, self.matrix(element.body, depth + 1).value))
-        return tuple(variables)
+            yield from self.matrix(element.body, f"{struct}.{field}", depth + 1)
 
     def array(self, element: _Element, shape: tuple[int, ...]) -> NDArray[np.generic]:
         values = self.numbers(element)
@@ -281,8 +281,12 @@ def read_matlab(path: Path, **_: object) -> LogTable:
         arrays = {name: array.T for name, array in _hdf5_arrays(path, ".", remarks).items()}
     else:
         with guards.foreign(str(path), "a MATLAB file"):
-            for variable in _version4(path) if 0 in head[:4] else variables(path.read_bytes(), str(path)):
-                _collect(variable, arrays, remarks)
+            for name, value in _version4(path) if 0 in head[:4] else variables(path.read_bytes(), str(path)):
+                if isinstance(value, np.ndarray) and value.dtype.kind in "fiub":
+                    arrays[name] = value
+                else:
+                    reason = value if isinstance(value, str) else "holds no numbers"
+                    remarks.append(f"{name!r} {reason} and was left out")
     guards.check_count(str(path), "arrays", len(arrays), limits.COLUMNS)
     return table.table_of_arrays(path, "matlab", arrays, remarks)
 
@@ -298,16 +302,3 @@ def _version4(path: Path) -> Iterator[Variable]:
     for name, value in loadmat(path).items():
         if not name.startswith("__"):
             yield Variable(name, value if isinstance(value, np.ndarray) else "is sparse")
-
-
-def _collect(variable: Variable, arrays: Arrays, remarks: list[str]) -> None:
-    """Numeric arrays of a variable, going into structs."""
-    name, value = variable
-    if isinstance(value, tuple):
-        for field in value:
-            _collect(Variable(f"{name}.{field.name}", field.value), arrays, remarks)
-    elif isinstance(value, np.ndarray) and value.dtype.kind in "fiub":
-        arrays[name] = value
-    else:
-        reason = value if isinstance(value, str) else "holds no numbers"
-        remarks.append(f"{name!r} {reason} and was left out")

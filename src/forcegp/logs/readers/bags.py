@@ -1,8 +1,8 @@
 """ROS 1 and ROS 2 bags and MCAP files: joint states and wrenches as columns, without a ROS installation.
 
-Columns of a joint state: `position.<joint>`, `velocity.<joint>`, `effort.<joint>`. Of a wrench:
-`force.x` to `torque.z`. Of both: `header`, the stamp that the driver gave [s], and `receive`, the time of
-recording [s], each counted from the earliest one in the log, as float64 has no nanoseconds since 1970.
+Columns of a joint state: `position.<joint>`, `velocity.<joint>`, `effort.<joint>`. Columns of a wrench:
+`force.x` to `torque.z`. Both have `header`, the stamp of the driver [s], and `receive`, the time of recording
+[s], each counted from the earliest one in the log, as float64 has no nanoseconds since 1970.
 
 The layouts are those of the ROS distributions; definitions that a bag carries are not compiled.
 """
@@ -27,8 +27,7 @@ from forcegp.logs.table import Column, LogTable, Progress, Stream, Wanted
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 WRENCH = "geometry_msgs/msg/WrenchStamped"
-KINDS = (JOINT_STATE, WRENCH)
-"""Message types that are read."""
+KINDS = (JOINT_STATE, WRENCH)  # that are read
 UNITS = {"position": "rad", "velocity": "rad/s", "effort": "Nm", "force": "N", "torque": "Nm"}
 """Units of the quantities of a joint state, by REP 103, and of a wrench."""
 CLOCKS = ("header", "receive")
@@ -69,7 +68,7 @@ class Messages:
     stamps: list[tuple[int, int]] = field(default_factory=list)
 
     def stream(self, name: str, origin: np.ndarray, wanted: Wanted) -> Stream:
-        """The columns that are wanted and hold numbers, with times from `origin` [ns]."""
+        """The requested numeric columns, with times from `origin` [ns]."""
         stamps = (np.array(self.stamps, dtype=np.int64) - origin) * 1e-9
         order = np.argsort(stamps[:, 1], kind="stable")
         columns: dict[str, Column] = dict(zip(CLOCKS, np.ascontiguousarray(stamps[order].T), strict=True))
@@ -92,7 +91,7 @@ class Collector:
     def take(
         self, messages: Iterable[Found], rows: int | None, progress: Progress | None, total: int
     ) -> None:
-        """Take the messages of types that are read, until a stream has `rows` of them."""
+        """Take messages of supported types, until a stream has `rows` of them."""
         for topic, kind, encoding, receive_ns, raw, done in messages:
             if kind in KINDS and encoding in ("cdr", "ros1"):
                 self._add(topic, kind, receive_ns, raw, decoder(kind, encoding))
@@ -124,7 +123,7 @@ class Collector:
         return max((len(stream.rows) for stream in self._streams.values()), default=0)
 
     def table(self, format_: str, topics: dict[str, str], wanted: Wanted) -> LogTable:
-        """The log, with the columns that are wanted; `topics` are all topics of the bag with their types."""
+        """The log with the requested columns; `topics` are all topics of the bag with their types."""
         if not self._streams:
             listing = ", ".join(f"{topic} ({kind})" for topic, kind in topics.items())
             raise DataError(

@@ -36,7 +36,7 @@ def read_parquet(path: Path, *, wanted: Wanted, rows: int | None, progress: Prog
 def read_columns(
     paths: list[Path], wanted: Wanted, rows: int | None, remarks: list[str], progress: Progress | None
 ) -> dict[str, Column]:
-    """Columns of files one after another, of lists by name or `name[i]`; `remarks` gets what is left out."""
+    """Concatenated columns of files, lists by name or `name[i]`; omitted columns are added to `remarks`."""
     import pyarrow.parquet as pq
 
     chunks: dict[str, list[Column]] = {}

@@ -1,6 +1,6 @@
 """CSV and text columns with any separator, decimal mark and heading, read in blocks; folders of such files.
 
-How a table is written is found from its first lines. In a folder each file holds one quantity: `q.txt`, …
+The format of a table is inferred from its first lines. In a folder each file holds one quantity: `q.txt`, …
 """
 
 from __future__ import annotations
@@ -23,10 +23,8 @@ if TYPE_CHECKING:
     import pyarrow as pa
 
 
-SAMPLE_BYTES = 1 << 18
-"""Size of the part of a file that is inspected."""
-SAMPLE_LINES = 200
-"""Number of lines of numbers that must agree."""
+SAMPLE_BYTES, SAMPLE_LINES = 1 << 18, 200
+"""Size of the part of a file that is inspected, and lines of numbers that must agree."""
 
 SEPARATORS = (";", "\t", ",", "|", " ")
 """Candidates; a space stands for any run of blanks."""
@@ -41,7 +39,7 @@ _UNIT = re.compile(r"^[\[(]?\s*([A-Za-zµ°%][\w°²^/*·. -]{0,15}|-|1)?\s*[\])
 
 @dataclass(frozen=True)
 class Dialect:
-    """How a text table is written from `first_line` on: columns are `number`, `bool`, `date`, `text` or
+    """Format of a text table from `first_line` on: columns are `number`, `bool`, `date`, `text` or
     `empty`."""
 
     encoding: str
@@ -54,7 +52,7 @@ class Dialect:
 
 
 def sniff(path: Path) -> Dialect:
-    """Find out how a text table is written, from its first lines."""
+    """Infer the format of a text table from its first lines."""
     with path.open("rb") as file:
         head = file.read(SAMPLE_BYTES)
     text, encoding = _decode(path, head)
@@ -275,7 +273,7 @@ ENDINGS = (".txt", ".csv", ".tsv", ".dat", ".asc")
 
 
 def read_folder(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read the tables of a folder as `file[i]` or `file.heading`; those of as many rows make one stream."""
+    """Read the tables of a folder as `file[i]` or `file.heading`; tables of equal length form one stream."""
 
     def in_file(file: Path, column: str) -> str:
         return f"{file.stem}[{column}]" if column.isdigit() else f"{file.stem}.{column}"

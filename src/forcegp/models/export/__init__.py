@@ -1,1 +1,3 @@
-"""A fitted model as plain C: its numbers, the source text, the folder that is written, the same in Python."""
+"""A fitted model as plain C: its numbers, the source text, the written folder, and the compiled predictor in
+Python.
+"""

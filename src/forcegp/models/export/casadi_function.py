@@ -27,11 +27,11 @@ OPERATORS = {
 def casadi_function(model: ExportedModel, name: str = "forcegp") -> Any:
     """A `casadi.Function` from (q, q̇, τ, closed) to the mean of each of `DIFFERENTIATED`.
 
-    `closed` has a 1 for each contact that is closed, and a 0 for one that is open. The closed contacts must
+    `closed` is 1 for each closed contact, and 0 for an open one. The closed contacts must
     be independent of each other.
 
     Raises:
-        ModelError: a part of the model has no such form; names it.
+        ModelError: a part of the model cannot be exported; names it.
         MissingDependencyError: CasADi is not installed.
     """
     ca: Any = optional_module("casadi", "a CasADi function")
@@ -62,7 +62,7 @@ def _vector(ca: Any, graph: Graph, given: Mapping[str, Any], outputs: Iterable[S
 
 
 def write_casadi(model: ExportedModel, path: Path, name: str) -> None:
-    """Write the function to a folder, with a README; errors as of `casadi_function`."""
+    """Write the function to a folder, with a README; errors as in `casadi_function`."""
     function = casadi_function(model, name)
     names = {"joints": model.system.robot.joint_names, "contacts": model.system.contact_names or ("none",)}
     fields: dict[str, object] = {"name": name, "robot": model.system.robot.name}

@@ -31,7 +31,7 @@ typedef struct {
   double normal[3], tangent[2][3];                  /* of the surface there */
   double sliding[3], sliding_jacobian[3][NQ];       /* velocity and Jacobian along the surface */
   double turning[NQ];                               /* n^T J_omega */
-  double A[NQ], b;                                  /* A qdd = b while it is closed */
+  double A[NQ], b, c;                               /* A qdd = b while it is closed; c is its error */
 } touching;
 
 typedef struct {
@@ -293,6 +293,7 @@ typedef struct {
   double E[COMPONENTS][NQ];                   /* generalized force of each f */
   double T[COMPONENTS][RANK];                 /* the covariance is D + T T^T or, with SIGN -1, D - T T^T */
   const forcegp_learned *learned;             /* what was learned online, if anything */
+  const double *folded;                       /* weights of kernels and features, if not those of the mean */
   double *functions;                          /* where whitened functions go, if nothing else is asked for */
 } latent;
 
@@ -309,9 +310,7 @@ static void component(const double *restrict V, int m, int features, double vari
                       int k, latent *restrict f) {
   const double more = dot(V + m, V + m, features), *functions = V;
   double white[MOST_FUNCTIONS];
-#if ONLINE
-  if (f->learned) weights = f->learned->folded + FOLDED[k];
-#endif
+  if (f->folded) weights = f->folded + FOLDED[k];
   f->mean[k] = dot(V, weights, m + features);
   f->prior[k] = variance + more;
   f->rest[k] = SIGN > 0.0 ? variance : variance + more;
@@ -560,7 +559,10 @@ static int predict(const forcegp_learned *learned, const double *q, const double
   distance(qd, tau, far);
   if (beyond) memcpy(beyond, far, sizeof far);
   expected_force(&e, tau, prior_mean);
-  f.learned = learned, f.functions = NULL;
+  f.learned = learned, f.folded = NULL, f.functions = NULL;
+#if ONLINE
+  if (learned) f.folded = learned->folded;
+#endif
   if ((status = latent_forces(q, qd, tau, &e, gain, covariance != NULL, &f)) != 0) return status;
 #ifdef PAYLOAD
   inertial(q, qd, e.qdd, PAYLOAD, PAYLOAD_COLUMN, 4, PAYLOAD_UNITS, &f);
@@ -588,53 +590,6 @@ static int predict(const forcegp_learned *learned, const double *q, const double
       for (int i = 0; quantities >> bit & 1u && i < SIZES[bit]; ++i, ++row)
         covariance[row * size + row] += SENSOR_VARIANCE[bit] ? SENSOR_VARIANCE[bit][i] : 0.0;
   return status;
-}
-
-/* ---- Jacobians of the mean ---- */
-
-/* whether the closed contacts are independent: the trace of the projector A L is their number */
-static int independent(const equations *restrict e) {
-  double missing = 0.0;
-  for (int r = 0; r < ROWS; ++r) {
-    missing += e->closed[r];
-    for (int i = 0; i < NQ; ++i) missing -= e->A[r][i] * e->L[i][r];
-  }
-  return missing < 0.5;
-}
-
-int forcegp_jacobian(const double *q, const double *qd, const double *tau, const unsigned char *closed,
-                     unsigned quantities, double *mean, double *jacobian) {
-  double sine[NQ], cosine[NQ], shut[SOME(ROWS)], f[SOME(SUPPORTED)], slope[SOME(SLOPES)], out[SIZE_OF_ALL * 3 * NQ];
-  const double *row = out;
-  equations e;
-  const int status = forcegp_predict(q, qd, tau, closed, quantities, 0, mean, NULL, NULL);
-  if (status) return status;
-  if (quantities & ~DIFFERENTIATED) return FORCEGP_NO_JACOBIAN;
-  assemble(q, qd, tau, closed, &e);
-  if (!independent(&e)) return FORCEGP_NO_JACOBIAN;
-  for (int i = 0; i < NQ; ++i) sine[i] = sin(q[i]), cosine[i] = cos(q[i]);
-  for (int r = 0; r < ROWS; ++r) shut[r] = e.closed[r];
-  all_slopes(&e, f, slope);
-  slopes_of_mean(q, qd, tau, shut, f, slope, sine, cosine, out);
-  for (int bit = 0; bit < QUANTITIES; ++bit) {
-    const long size = 3 * NQ * SIZES[bit];
-    if (quantities >> bit & 1u) memcpy(jacobian, row, sizeof(double) * size), jacobian += size;
-    if (DIFFERENTIATED >> bit & 1u) row += size;
-  }
-  return 0;
-}
-
-int forcegp_jacobian_many(long count, const double *q, const double *qd, const double *tau, const unsigned char *closed,
-                          unsigned quantities, double *mean, double *jacobian) {
-  const int d = forcegp_size(quantities);
-  int worst = 0;
-  for (long i = 0; i < count; ++i) {
-    const int status =
-        forcegp_jacobian(q + i * NQ, qd + i * NQ, tau + i * NQ, closed ? closed + i * CONTACTS : NULL, quantities,
-                         mean + i * d, jacobian + i * d * 3 * NQ);
-    worst = worst ? worst : status;
-  }
-  return worst;
 }
 
 int forcegp_equations(const double *q, const double *qd, double *M, double *A) {

@@ -32,10 +32,10 @@ class Export:
     """Files of an export.
 
     Attributes:
-        folder: where.
-        functions: functions of the covariance.
+        folder: its path.
+        functions: number of functions of the covariance.
         widest, wider: growth of σ of q̈ and λ by a reduced covariance, the largest and the median one, as
-            fractions, at training states or, where a saved fit has kept none, at random ones.
+            fractions, at training states or, if a saved fit has none, at random ones.
     """
 
     folder: Path
@@ -47,7 +47,7 @@ class Export:
 def write_export(
     model: ExportedModel, fit: Predictor, training: Training, path: str | Path, language: str, name: str
 ) -> Export:
-    """Write a model to a folder; arguments and errors as of `StructuredFit.export`."""
+    """Write a model to a folder; arguments and errors as in `StructuredFit.export`."""
     check_name("language of an export", language, LANGUAGES)
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,40}", name):
         raise ParameterError(

@@ -1,4 +1,6 @@
-"""A fitted model that predicts by its own C code, compiled by the machine's compiler and kept on disk."""
+"""A fitted model that predicts with its exported C code, compiled by the machine's compiler and cached on
+disk.
+"""
 
 from __future__ import annotations
 
@@ -46,7 +48,7 @@ FUNCTIONS = {
 
 
 class CompiledFit(Predictor):
-    """A fit whose predictions come from its C code: the numbers of `StructuredFit.predict`, in microseconds.
+    """A fit that predicts with its C code: the results of `StructuredFit.predict`, in microseconds.
 
     Made by `StructuredFit.compiled`; `library` has the functions of the C header, named `forcegp_…`."""
 
@@ -66,7 +68,7 @@ class CompiledFit(Predictor):
         self._known: dict[str | tuple[str, ...], _Rows] = {}
 
     def save(self, path: str | Path) -> None:
-        """A compiled fit has no file of its own.
+        """Not available: save the fit itself.
 
         Raises:
             ModelError: always.
@@ -90,12 +92,12 @@ class CompiledFit(Predictor):
         active: Tensor | None = None,
         noise_std: Tensor | None = None,
     ) -> CompiledFit:
-        """The fit with more samples, one after the other, as `StructuredFit.update` gives it.
+        """Add samples one after the other, as in `StructuredFit.update`.
 
         Args:
             q, qd, tau: `(*batch, nq)` states.
             measured: `(*batch, d)` values at these states.
-            quantity: that was measured.
+            quantity: the measured quantity.
             active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
             noise_std: of the values `(d,)`; by default that of the fit.
 
@@ -122,14 +124,14 @@ class CompiledFit(Predictor):
     def forget(
         self, factor: float, priors: Sequence[str] | None = None, *, budget: int = 2**30
     ) -> CompiledFit:
-        """The fit with all samples partly forgotten, as `StructuredFit.forget` gives it.
+        """Discount all samples so far, as in `StructuredFit.forget`.
 
         Args:
-            factor: what the weight of all samples so far is multiplied by, or, with `priors`, the correlation
-                of their forces with what they were.
-            priors: whose forces drift towards their prior, instead of forgetting samples.
-            budget: how many weights have their prior renewed, at the cost of a row each; the prior of others
-                waits for the next calls. All of them by default.
+            factor: multiplies the weight of all samples so far; with `priors`, the correlation of their
+                forces with the previous ones.
+            priors: names of the priors; their forces drift towards the prior, and no samples are discounted.
+            budget: number of weights with renewed prior, at the cost of a row each; the others wait for the
+                next calls. Default all.
 
         Raises:
             ModelError: the model cannot learn in C, or the factor is out of range.
@@ -156,7 +158,7 @@ class CompiledFit(Predictor):
 
     @cached_property
     def _begun(self) -> Tensor:
-        """What the fit has learned, as the numbers of a `forcegp_learned`."""
+        """The learned state of the fit, as the numbers of a `forcegp_learned`."""
         if not self.model.online:
             raise ModelError(
                 "this fit cannot learn online in C",
@@ -181,13 +183,13 @@ class CompiledFit(Predictor):
         system: ConstrainedSystem | None = None,
         noise: bool = False,
     ) -> Prediction:
-        """Posterior mean and covariance of a quantity, as `StructuredFit.predict` gives them.
+        """Posterior mean and covariance of a quantity, as in `StructuredFit.predict`.
 
         Arguments and errors are those of that method. `quantity` may also be `"joint_friction"`, the friction
-        of the joints, that of the robot file included [N m, N].
+        of the joints, including that of the robot file [N m, N].
 
         Raises:
-            ModelError: another `system` than that of the fit, or friction with which a contact jams.
+            ModelError: another `system` than that of the fit, or a contact that jams by friction.
         """
         if system is not None and system is not self.system:
             raise ModelError("a compiled fit predicts on its own system", hint="use the predict of the fit")
@@ -214,7 +216,7 @@ class CompiledFit(Predictor):
         *,
         active: Tensor | None = None,
     ) -> MeanJacobian:
-        """Posterior mean of quantities and its Jacobian by q, q̇ and τ.
+        """Posterior mean of quantities and its Jacobian with respect to q, q̇ and τ.
 
         Args:
             q, qd, tau: `(*batch, nq)` states.
@@ -223,7 +225,7 @@ class CompiledFit(Predictor):
 
         Raises:
             UnknownNameError: no such quantity.
-            ModelError: friction with which a contact jams, or a fit that has learned in C.
+            ModelError: a contact that jams by friction, or a fit updated in C.
             NumericalError: closed contacts are not independent.
         """
         if self._learned is not None:
@@ -253,7 +255,7 @@ class CompiledFit(Predictor):
         active: Tensor | None = None,
         system: ConstrainedSystem | None = None,
     ) -> ForceLinearization:
-        """Mean acceleration and multiplier with their Jacobians, as `StructuredFit.linearize` gives them."""
+        """Mean acceleration and multiplier with their Jacobians, as in `StructuredFit.linearize`."""
         if system is not None and system is not self.system:
             raise ModelError("a compiled fit predicts on its own system", hint="use that of the fit")
         found = self.jacobian(q, qd, tau, ["qdd", "multiplier"], active=active)
@@ -272,7 +274,7 @@ class CompiledFit(Predictor):
         return tuple(x.contiguous() for x in given), batch
 
     def _error(self, status: int, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor | None) -> ForceGPError:
-        """What the C code reports; raises at once if a state is not finite, and says which."""
+        """The error that the C code reports; raises at once and names the state if it is not finite."""
         flat_states(self.system, q, qd, tau, active)
         return KINDS.get(status, NumericalError)(MESSAGES[status])
 
@@ -311,7 +313,7 @@ class MeanJacobian(NamedTuple):
 
     Attributes:
         mean: `(*batch, d)`.
-        dq, dqd, dtau: `(*batch, d, nq)` derivatives by q, q̇ and τ.
+        dq, dqd, dtau: `(*batch, d, nq)` derivatives with respect to q, q̇ and τ.
         parts: the slice of each quantity.
     """
 

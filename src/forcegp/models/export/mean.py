@@ -1,9 +1,9 @@
 """The posterior mean of a fit in scalars, the source of its C code, its Jacobians and its CasADi function.
 
-What depends on the state alone is a straight-line program: mechanics, touching points, inputs and features of
+All terms of the state alone form a straight-line program: mechanics, touching points, inputs and features of
 the priors. The functions of the priors that have support points are loops, and enter as inputs f with their
-slopes ∂f/∂x. A motion M q̈ = Q + (A + U)ᵀ λ, A q̈ = b with friction U λ that goes with the multiplier is
-differentiated as the solution that it is: at fixed q̈ and λ the equations change by dR and dg, and
+slopes ∂f/∂x. A motion M q̈ = Q + (A + U)ᵀ λ, A q̈ = b with friction U λ proportional to the multiplier is
+differentiated implicitly: at fixed q̈ and λ the equations change by dR and dg, and
 
     (I + LᵀU) dλ = (A M⁻¹ Aᵀ)⁻¹ dg − Lᵀ dR,   dq̈ = M⁻¹ (dR + (Aᵀ + U) dλ),
 
@@ -80,6 +80,7 @@ class Touching(NamedTuple):
     turning: Scalars
     A: Scalars
     b: Scalars
+    c: Scalars
 
 
 class Mean:
@@ -88,7 +89,7 @@ class Mean:
     Attributes:
         M, Q_C, Q_G, Q_D: mass matrix, bias, gravity and damping force.
         touching: each contact, as if it were closed.
-        A, b: rows of the contacts, zero for those that are open.
+        A, b: rows of the contacts, zero for open contacts.
         x: standardized inputs of each prior, `(1 or components, width)`.
         phi: features of each component of each prior.
     """
@@ -99,7 +100,7 @@ class Mean:
         self.graph, n = self.links.graph, self.robot.nq
         self.q, self.qd, self.tau = (np.array(self.links.vector(x), dtype=object) for x in ARGUMENTS[:3])
         self.M, self.Q_C, self.Q_G = _forces(self.links)
-        self.Q_D = self._damping()
+        self.Q_D = self._damping(None)
         on = [x for x in model.system.contacts if isinstance(x, SurfaceContact)]
         self.names = [x.name for x in on]
         self.touching = [self._contact(x) for x in on]
@@ -107,14 +108,11 @@ class Mean:
         rows = [at.A * closed for at, closed in zip(self.touching, self.closed, strict=True)]
         self.A = np.array(rows, dtype=object).reshape(len(on), n)
         self.b = np.array([at.b[0] for at in self.touching], dtype=object) * self.closed
-        self.x = [self._inputs(p, part) for p, part in enumerate(parts)]
-        self.phi = [
-            [[] if part.finite is None else self._features(p, part.finite, k) for k in range(part.components)]
-            for p, part in enumerate(parts)
-        ]
+        self.x = [self._inputs(p, None) for p in range(len(parts))]
+        self.phi = [self._all_features(p, x) for p, x in enumerate(self.x)]
 
     def program(self, outputs: Iterable[Scalar], arguments: Sequence[str]) -> Program:
-        """A program of these arguments."""
+        """A program with these arguments."""
         outputs = list(outputs)
         return Program(tuple(arguments), (len(outputs),), self.graph, outputs)
 
@@ -122,16 +120,34 @@ class Mean:
         """Zeros."""
         return self.graph.constants(np.zeros(shape))
 
-    def _damping(self) -> Scalars:
-        """Q_D of the robot file: viscous, Coulomb and Stribeck friction."""
+    def sliding(self) -> tuple[list[int], list[Scalar]]:
+        """The priors whose joints can stick; and of joints that slide in the directions `slip`, Q_D and their
+        inputs and features."""
+        slip = [self.graph.input("slip", i) for i in range(self.robot.nq)]
+        priors = [p for p, part in enumerate(self.parts) if part.prior.sticks]
+        x = [self._inputs(p, slip) for p in priors]
+        outputs = [*self._damping(slip), *(each for rows in x for each in rows.flat)]
+        for p, rows in zip(priors, x, strict=True):
+            outputs += [each for phi in self._all_features(p, rows) for each in phi]
+        return priors, outputs
+
+    def _all_features(self, p: int, x: Scalars) -> list[list[Scalar]]:
+        """φ of each component of a prior at its inputs."""
+        part = self.parts[p]
+        return [
+            [] if part.finite is None else self._features(p, part.finite, k, x[k if len(x) > 1 else 0])
+            for k in range(part.components)
+        ]
+
+    def _damping(self, slip: Sequence[Scalar] | None) -> Scalars:
+        """Q_D of the robot file: viscous, Coulomb and Stribeck friction; `slip` in place of tanh(q̇/v₀)."""
         names = ("damping", "friction", "friction_velocity", "stribeck", "stribeck_velocity")
-        force = []
-        for v, d, c, v_c, s, v_s in zip(
-            self.qd, *(numbers(getattr(self.robot, x)) for x in names), strict=True
-        ):
+        force, columns = [], (numbers(getattr(self.robot, x)) for x in names)
+        for i, (v, d, c, v_c, s, v_s) in enumerate(zip(self.qd, *columns, strict=True)):
             fast = v / v_s if s else v * 0.0
             dry = (-(fast * fast)).exp() * s + c
-            force.append(-(v * d) - (dry * (v / v_c).tanh() if c or s else 0.0))
+            direction = (v / v_c).tanh() if slip is None else slip[i]
+            force.append(-(v * d) - (dry * direction if c or s else 0.0))
         return np.array(force, dtype=object)
 
     def _contact(self, contact: SurfaceContact) -> Touching:
@@ -157,6 +173,7 @@ class Mean:
             normal @ J[:3],
             A,
             np.array([b], dtype=object),
+            np.array([c], dtype=object),
         )
 
     def _surface(self, surface: object, p: Scalars, v: Scalars) -> tuple[Scalars, Scalar, Scalar]:
@@ -182,14 +199,12 @@ class Mean:
         x, y, both = 1.0 - n[0] * n[0] * share, up * 2.0 - 1.0 - n[1] * n[1] * share, -(n[0] * n[1] * share)
         return np.array([[x, both, -n[0]], [both, y, -n[1]]], dtype=object)
 
-    def _inputs(self, p: int, part: Functions) -> Scalars:
+    def _inputs(self, p: int, slip: Sequence[Scalar] | None) -> Scalars:
         """Standardized inputs x, one row for all components if they share them."""
-        scales, shared = (
-            self.model.posterior.process.scales[p],
-            all(x.ndim == 2 for x in part.support.values()),
-        )
+        part, scales = self.parts[p], self.model.posterior.process.scales[p]
+        shared = all(x.ndim == 2 for x in part.support.values())
         rows: list[list[Scalar]] = []
-        raw = self._raw_inputs(part.prior)
+        raw = self._raw_inputs(part.prior, slip)
         for k in range(1 if shared else part.components):
             row = []
             for name, columns in raw.items():
@@ -199,14 +214,16 @@ class Mean:
             rows.append(row)
         return np.array(rows, dtype=object)
 
-    def _raw_inputs(self, prior: ForcePrior) -> dict[str, list[Scalar]]:
+    def _raw_inputs(self, prior: ForcePrior, slip: Sequence[Scalar] | None) -> dict[str, list[Scalar]]:
         """Inputs by name; of joint friction, one for each joint."""
         if isinstance(prior, contact.NormalForcePrior):
-            return self._raw_inputs(prior.like)
+            return self._raw_inputs(prior.like, slip)
         if isinstance(prior, JointFrictionPrior):
             raw = {"velocity": list(self.qd)}
             for n, speed in enumerate(prior.speeds):
                 raw[f"coulomb_{n}"] = [(v / float(speed)).tanh() for v in self.qd]
+            if slip is not None:
+                raw[f"coulomb_{prior.sharpest}"] = list(slip)
             if prior.load:
                 signs = [(x.step() * 2.0 - 1.0) * x for x in self.Q_G]
                 raw["load"] = [x * c for x, c in zip(signs, raw["coulomb_0"], strict=True)]
@@ -227,9 +244,9 @@ class Mean:
             raw["q"] += [x for i, x in enumerate(self.q) if i not in turns]
         return raw
 
-    def _features(self, p: int, part: KernelPart, k: int) -> list[Scalar]:
+    def _features(self, p: int, part: KernelPart, k: int, x: Scalars) -> list[Scalar]:
         """φ(x) of component k."""
-        kernel, params, x = part.kernel, part.params, self.x[p][k if len(self.x[p]) > 1 else 0]
+        kernel, params = part.kernel, part.params
         if isinstance(kernel, kernels.Linear):
             columns = self.parts[p].columns(kernel.inputs)
             slopes = row_of(kernel.slope_std(params), k).expand(len(columns)).tolist()
@@ -238,7 +255,7 @@ class Mean:
         if isinstance(kernel, kernels.Constant):
             return [self.graph.constant(float(row_of(kernel.std(params), k)))]
         assert isinstance(kernel, kernels.Sum)
-        left, right = (self._features(p, KernelPart(*side), k) for side in kernel.parts(params))
+        left, right = (self._features(p, KernelPart(*side), k, x) for side in kernel.parts(params))
         product = isinstance(kernel, kernels.Product)
         return [a * b for a in left for b in right] if product else left + right
 

@@ -5,8 +5,8 @@ component. V are its functions: covariances k(x, X) with support points, and the
 part of its kernel. For a posterior over basis functions with weights of precision A = L Lᵀ, C = L⁻ᵀ and D is
 what the points miss; V is whitened then. For an exact one with Σ = L Lᵀ, C = Wᵀ L⁻ᵀ, D = k(x, x), with the
 sign −. A posterior reduced to r functions has D = k(x, x) and the sign − too: A⁻¹ = I − U (1 − Λ⁻¹) Uᵀ with
-the r largest eigenvalues Λ of A, or Σ⁻¹ = U Λ⁻¹ Uᵀ with those of Σ. These are the directions that the rows
-of the training states determine most. What is left out only widens the error bars; the mean keeps all.
+the r largest eigenvalues Λ of A, or Σ⁻¹ = U Λ⁻¹ Uᵀ with those of Σ. These are the directions that the rows of
+the training states determine best. The reduction only widens the error bars and does not change the mean.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ class Functions:
         rest, finite: the part of its kernel that has support points, and that with features, if any.
         support: standardized inputs of the m support points.
         weights: of k(x, X) and φ, whose sum is the posterior mean `(components, m + features)`.
-        whitening: what k(x, X) is multiplied by in T, a matrix `(m, kept)` for each component, or `None`.
+        whitening: factor of k(x, X) in T, a matrix `(m, kept)` for each component, or `None`.
         roots: C of each component, `(functions, rank − first)`.
         first: first column that is not zero, by component.
     """
@@ -95,7 +95,7 @@ class ExportedModel:
         tensors: all hyperparameters.
         noise: standard deviation of a measurement of each measured quantity.
         torque_std, external_std: of the motor torques' noise and of unknown forces on joints, or `None`.
-        functions: number r that the covariance is reduced to; `None` for all.
+        functions: number r of functions of a reduced covariance; `None` for all, 0 for the mean alone.
         sampling: of a sample learned online, the variance of the motor torques' noise `(nq,)`, the power κ of
             its likelihood, and whether it must be in motion; `None` for a model that cannot.
     """
@@ -111,7 +111,7 @@ class ExportedModel:
 
     @property
     def online(self) -> bool:
-        """Whether it learns online: it is over basis functions, and all of its covariance is kept."""
+        """Whether it can learn online: it has basis functions and its full covariance."""
         return self.sign > 0 and not self.posterior.process.pinned and self.sampling is not None
 
     def check(self) -> None:
@@ -136,10 +136,6 @@ class ExportedModel:
         for kind, what in ((InertialPrior, "the inertia"), (PayloadPrior, "a payload")):
             if sum(isinstance(prior, kind) for prior in self.posterior.priors) > 1:
                 raise ModelError(f"a fit with two priors on {what} is not exported", expected="one at most")
-        if self.functions is not None and self.functions < 1:
-            raise ModelError(
-                "a posterior has one function at least", expected="1 or more", got=self.functions
-            )
         latent = self.posterior.latent
         size = latent.basis.size if isinstance(latent, SparsePosterior) else len(latent.alpha)
         if self.functions is None and size > LARGEST:
@@ -167,6 +163,8 @@ class ExportedModel:
             eye = torch.eye(len(latent.L), dtype=latent.L.dtype)
             # C = L⁻ᵀ, upper triangular
             C = torch.linalg.solve_triangular(latent.L, eye, upper=False).mT
+        elif not self.functions:
+            C = latent.L.new_zeros(len(latent.L), 1)
         else:
             # C = U √(1 − Λ⁻¹)
             values, vectors = torch.linalg.eigh(latent.L @ latent.L.mT)
@@ -193,6 +191,8 @@ class ExportedModel:
         assert isinstance(means, ExactPosterior)
         if self.functions is None:
             rows = torch.linalg.solve_triangular(L, torch.eye(len(L), dtype=L.dtype), upper=False).mT
+        elif not self.functions:
+            rows = L.new_zeros(len(L), 1)
         else:
             values, vectors = torch.linalg.eigh(L @ L.mT)
             rows = vectors[:, -self.functions :] * values[-self.functions :].rsqrt()
@@ -216,7 +216,7 @@ class ExportedModel:
 
 
 def row_of(x: Tensor, k: int) -> Tensor:
-    """The row of component k, or the one that all share."""
+    """The row of component k, or the common one."""
     return x[k if len(x) > 1 else 0]
 
 

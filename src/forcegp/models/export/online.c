@@ -83,7 +83,7 @@ int forcegp_update(forcegp_learned *s, const double *q, const double *qd, const 
   }
   if ((status = prepare(q, qd, tau, closed, &e, gain)) != 0) return status;
   if (fastest <= REST_SPEED) return FORCEGP_AT_REST;
-  f.learned = s, f.functions = V;
+  f.learned = s, f.folded = s->folded, f.functions = V;
   if ((status = latent_forces(q, qd, tau, &e, gain, 1, &f)) != 0) return status;
 #ifdef PAYLOAD
   inertial(q, qd, e.qdd, PAYLOAD, PAYLOAD_COLUMN, 4, PAYLOAD_UNITS, &f);

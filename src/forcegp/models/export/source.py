@@ -1,6 +1,6 @@
 """C99 source text of a fitted model: its numbers, its straight-line mechanics, and the code of its priors.
 
-What does not depend on the model, from the equations of motion to reading a quantity, is in `controller.c`.
+Code that does not depend on the model is in `controller.c`.
 """
 
 from __future__ import annotations
@@ -27,12 +27,26 @@ from forcegp.forces.priors.joint import TERMS, JointFrictionPrior
 from forcegp.forces.quantities import QUANTITIES
 from forcegp.gp import kernels
 from forcegp.gp.basis import KernelPart
+from forcegp.gp.draws import MISSED_FEATURES
 from forcegp.gp.features import SMALLEST_FRACTION, stacked
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.export.mean import ARGUMENTS, DIFFERENTIATED, LearnedMotion
 from forcegp.models.export.model import ExportedModel, Functions, row_of
 from forcegp.models.structured_learning import REST_SPEED
+from forcegp.rollout import law
 
+NO_FRICTION = 9
+"""What C code returns if no dry friction solves the problem of `rollout/law.py`."""
+LAW = (
+    "REGULARIZATION",
+    "CONTRADICTION",
+    "BLOCK_TRIALS",
+    "MAX_EXCHANGES",
+    "INSTANT",
+    "STILL",
+    "SMOOTH",
+    "NUDGE",
+)
 READ = (*QUANTITIES, "joint_friction")
 """The quantities of the C code, in the order of its bits; the last one is not in `QUANTITIES`."""
 TARGETS = (JOINT, CONTACT, CONSTRAINT)
@@ -41,8 +55,8 @@ GIVEN = """const double *restrict q, const double *restrict qd, const double *re
 SLOPES = "const equations *restrict e, double *restrict f, double *restrict slope"
 
 
-def c_source(model: ExportedModel, name: str) -> tuple[str, str]:
-    """Header and source text.
+def c_source(model: ExportedModel, name: str, rollout: bool = False) -> tuple[str, str]:
+    """Header and source text, with Jacobians or, for a rollout, with the motions of trajectories.
 
     Raises:
         ModelError: a part of the model has no C form; names it.
@@ -50,14 +64,15 @@ def c_source(model: ExportedModel, name: str) -> tuple[str, str]:
     model.check()
     before, _, rest = template("controller.c").partition("/* HELPERS")
     helpers, after = rest.split("/* PRIORS */\n")
-    writer = Writer(model)
+    writer = Writer(model, rollout)
     priors = writer.priors()
     used = (
         text for text in helpers.strip().split("\n\n")[1:] if any(f" {_called(text)}(" in x for x in priors)
     )
     head = '#include <math.h>\n#include <string.h>\n#include "forcegp.h"\n'
     head += "#ifdef __cplusplus\n#define restrict __restrict__\n#endif\n"
-    blocks = [head, "\n".join(writer.lines), *_programs(writer.mean), before, *used, *priors, after]
+    blocks = [head, "\n".join(writer.lines), *_programs(writer.mean, rollout), before, *used, *priors, after]
+    blocks += [template("motion.c", writer.sticking()) if rollout else template("jacobian.c")]
     blocks += [template("online.c")] if model.online else []
     robot, contacts = model.system.robot, model.system.contact_names
     fields = {
@@ -77,7 +92,7 @@ def c_source(model: ExportedModel, name: str) -> tuple[str, str]:
 
 
 def template(name: str, fields: dict[str, object] | None = None) -> str:
-    """A file beside this one, each `@field@` filled in."""
+    """A template file with each `@field@` filled in."""
     text = files("forcegp.models.export").joinpath(name).read_text(encoding="utf-8")
     for field, value in (fields or {}).items():
         text = text.replace(f"@{field}@", str(value))
@@ -94,9 +109,10 @@ def _called(text: str) -> str:
     return text.partition("static ")[2].partition("(")[0].split()[-1]
 
 
-def _programs(mean: LearnedMotion) -> list[str]:
-    """Mechanics, touching points and what priors read of the state; forward dynamics; Y; Jacobians."""
-    robot, quantities = mean.robot, mean.quantities()
+def _programs(mean: LearnedMotion, rollout: bool) -> list[str]:
+    """Mechanics, touching points and what priors read of the state; forward dynamics; Y; Jacobians, or the
+    friction of joints that slide."""
+    robot = mean.robot
     blocks = [mean.M, mean.Q_C, mean.Q_G, mean.Q_D, *(x for at in mean.touching for x in at), *mean.x]
     outputs = [x for block in blocks for x in block.flat]
     outputs += [x for features in mean.phi for phi in features for x in phi]
@@ -106,16 +122,20 @@ def _programs(mean: LearnedMotion) -> list[str]:
     }
     if any(isinstance(part.prior, InertialPrior | PayloadPrior) for part in mean.parts):
         programs["regressor"] = regressor_program(Links(robot))
-    values = np.concatenate([quantities[x] for x in DIFFERENTIATED])
-    programs["slopes_of_mean"] = mean.program(mean.tangents(values).flat, (*ARGUMENTS, "f", "slope"))
+    if rollout:
+        programs["sliding"] = mean.program(mean.sliding()[1], (*ARGUMENTS[:3], "slip"))
+    else:
+        quantities = mean.quantities()
+        values = np.concatenate([quantities[x] for x in DIFFERENTIATED])
+        programs["slopes_of_mean"] = mean.program(mean.tangents(values).flat, (*ARGUMENTS, "f", "slope"))
     return [f"#define MECHANICS {len(outputs)}", *(c_function(*item) for item in programs.items())]
 
 
 class Writer:
     """Writes the code of priors, and in `lines` the tables that it reads."""
 
-    def __init__(self, model: ExportedModel) -> None:
-        self.model, self.parts, self.lines = model, model.parts(), list[str]()
+    def __init__(self, model: ExportedModel, rollout: bool) -> None:
+        self.model, self.parts, self.lines, self.rollout = model, model.parts(), list[str](), rollout
         self.mean, self._tables = LearnedMotion(model, self.parts, differentiate=True), dict[str, str]()
         self.starts = list(accumulate((part.components for part in self.parts), initial=0))
         self.tables: list[list[str]] = []
@@ -169,6 +189,7 @@ class Writer:
         self.lines += [f"#define {name} {value}" for name, value in defined.items()]
         self.lines.append("enum { JOINT, CONTACT, CONSTRAINT, JOINT_FRICTION };")
         self.array(sizes, "SIZES", "int")
+        self.array(accumulate((len(w) for x in self.parts for w in x.weights), initial=0), "FOLDED", "int")
         owners = [part.prior for part in self.parts for _ in range(part.components)]
         self.array([TARGETS.index(prior.target) for prior in owners], "TARGET", "int")
         self.array([float(isinstance(prior, JointFrictionPrior)) for prior in owners], "IS_FRICTION", "int")
@@ -205,7 +226,7 @@ class Writer:
         self.lines.append(f"static const double *const SENSOR_VARIANCE[] = {{{', '.join(sensors)}}};")
 
     def _online(self) -> None:
-        """Where the functions of each component lie in what is learned online, and the noise of samples."""
+        """Add the positions of each component's functions in the online state, and the noise of samples."""
         self.lines.append(f"#define ONLINE {int(self.model.online)}")
         if not self.model.online or self.model.sampling is None:
             return
@@ -214,7 +235,6 @@ class Writer:
         assert isinstance(latent, SparsePosterior)
         self.array(latent.weights, "WEIGHTS")
         self.array(accumulate((len(C) for part in parts for C in part.roots), initial=0), "FUNCTION", "int")
-        self.array(accumulate((len(w) for part in parts for w in part.weights), initial=0), "FOLDED", "int")
         self.array([part.size for part in parts for _ in range(part.components)], "POINTS", "int")
         self.array(self.starts, "FIRST_COMPONENT", "int")
         self.array(variance, "LEARNED_TORQUE_VARIANCE")
@@ -232,7 +252,7 @@ class Writer:
         return template("online.h", fields) if self.model.online else ""
 
     def priors(self) -> list[str]:
-        """A function for each prior, and the one that calls them all."""
+        """A function for each prior, and one that calls all of them."""
         texts, calls = [], []
         for p, part in enumerate(self.parts):
             body = [*self._operator(part, self.starts[p]), *self._functions(p, part)]
@@ -245,7 +265,37 @@ class Writer:
             column = ", ".join(tables[i] for tables in self.tables)
             self.lines.append(f"static const double *const {name}[] = {{{column}}};")
         texts.append(f"static int latent_forces({GIVEN}) {{\n{''.join(calls)}  return 0;\n}}\n")
-        return [*texts, *self._slopes()]
+        if not self.rollout:
+            return [*texts, *self._slopes()]
+        chosen = "".join(calls[p] for p in self.mean.sliding()[0])
+        unread = "  (void)q, (void)qd, (void)tau, (void)e, (void)gain, (void)spread, (void)f;\n"
+        return [*texts, f"static int sticking_forces({GIVEN}) {{\n{unread}{chosen}  return 0;\n}}\n"]
+
+    def sticking(self) -> dict[str, object]:
+        """Numbers of `motion.c`: which components are friction of joints that stick, where their inputs and
+        features lie, and of each prior where its inputs and components do."""
+        (priors, outputs), x, phi = self.mean.sliding(), self.mean.x, self.mean.phi
+        sizes = [sum(map(len, features)) for features in phi]
+        places = [("x", sum(each.size for each in x[:p]), x[p].size) for p in priors]
+        places += [("phi", sum(sizes[:p]), sizes[p]) for p in priors]
+        copies, first = "", self.mean.robot.nq
+        for name, start, size in places:
+            copies += f"  memcpy(e->{name} + {start}, out + {first}, sizeof(double) * {size});\n"
+            first += size
+        sticks = [int(part.prior.sticks) for part in self.parts for _ in range(part.components)]
+        starts = accumulate((each.size for each in x), initial=0)
+        rows = [(start, *each.shape) for start, each in zip(starts, x, strict=False)]
+        laws: dict[str, object] = {name.lower(): repr(getattr(law, name)) for name in LAW}
+        return laws | {
+            "outputs": len(outputs),
+            "copies": copies,
+            "priors": len(self.parts),
+            "waves": MISSED_FEATURES,
+            "no_friction": NO_FRICTION,
+            "sticks": ", ".join(map(str, sticks)),
+            "first": ", ".join(map(str, self.starts)),
+            "inputs": ", ".join(f"{{{a}, {b}, {c}}}" for a, b, c in rows),
+        }
 
     def _operator(self, part: Functions, start: int) -> list[str]:
         """Code of E(x), from f to generalized forces; that of inertial errors is in `controller.c`."""
@@ -313,8 +363,9 @@ class Writer:
 
 
 class Leaf(NamedTuple):
-    """A kernel of support points in C: its array `u`, their table, its inputs with their factors, and what
-    the array is multiplied by and added to."""
+    """A kernel of support points in C: its array `u`, their table, its inputs with their factors, its factor,
+    and the array that it is added to.
+    """
 
     u: str
     table: str
@@ -325,7 +376,7 @@ class Leaf(NamedTuple):
 
 
 class KernelCode:
-    """C code of the kernel of one prior; what a leaf needs is computed once in front of its use."""
+    """C code of the kernel of one prior; terms of a leaf are computed once before use."""
 
     def __init__(self, writer: Writer, p: int, lines: list[str], x: str, differentiate: bool = False) -> None:
         self.writer, self.part, self.lines = writer, writer.parts[p], lines

@@ -1,0 +1,370 @@
+"""Twenty faults in raw logs, by somebody who did not write the check: what its first line names.
+
+Each fault is planted in the columns of a raw log, or in the robot or scene of the user, before `import`;
+what counts as naming it was written down before the first run. Run from the repository root:
+`python benchmarks/check_planted.py --out planted.json`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import tempfile
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from real_contact import FORCE, HEIGHT, columns
+from scipy.signal import lfilter
+
+import forcegp
+from forcegp.checks import check, log_of
+from forcegp.constraints import ConstrainedSystem
+from forcegp.errors import ForceGPError
+from forcegp.logs import import_log, parse_mapping
+from forcegp.scene import load_scene
+from forcegp.simulate import simulate
+
+HERE = Path(__file__).resolve().parents[1]
+REAL = HERE / "../shared/real"
+Table = dict[str, NDArray[Any]]
+Log = tuple[ConstrainedSystem, Table]
+Plant = Callable[[Log], Log]
+
+
+@dataclass(frozen=True)
+class Fault:
+    """A fault; kinds and joint (by index) of a finding that names it, or a word of the import's error."""
+
+    log: str
+    name: str
+    plant: Plant
+    kinds: tuple[str, ...]
+    joint: int | None = None
+    word: str = "?"
+
+
+def simulated(scene: str, **settings: Any) -> Log:
+    """A bundled scene by MuJoCo's solver, without friction beyond the robot file."""
+    loaded = load_scene(scene)
+    system = loaded.system()
+    solver = replace(loaded.simulation.solver, joint_friction=(), joint_damping=())
+    config = replace(loaded.simulation, engine="mujoco", contact="solver", solver=solver, **settings)
+    data = simulate(system, config).data
+    return system, {"t": data.t.numpy(), "q": data.q.numpy(), "qd": data.qd.numpy(), "tau": data.tau.numpy()}
+
+
+def wiping() -> Log:
+    """The log of the examples; friction of its joints is a true finding."""
+    table = np.loadtxt(HERE / "examples/data/ur5_wiping.csv", delimiter=",", skiprows=1)
+    of = {name: table[:, 6 * k + 1 : 6 * k + 7] for k, name in enumerate(("q", "qd", "tau"))}
+    return load_scene("ur5_wiping").system(), {"t": table[:, 0], **of}
+
+
+def iiwa() -> Log:
+    """A published log of four segments; its torque has the other sign."""
+    folder = REAL / "kuka_iiwa14/motion_b"
+    t = np.loadtxt(folder / "cur_traj_time_s.txt")
+    q, qd, tau = (
+        np.loadtxt(folder / f"joint_{name}_measured.txt") for name in ("position", "velocity", "torque")
+    )
+    robot = forcegp.load_robot(REAL / "kuka_iiwa14/iiwa14.urdf")
+    return ConstrainedSystem(robot), {"t": t, "q": q, "qd": qd, "tau": -tau}
+
+
+def hopper() -> Log:
+    """The real leg on its slider."""
+    robot = forcegp.load_robot(REAL / "hopper/teststand.urdf")
+    signals = ("joint_positions", "joint_velocities", "joint_torques", HEIGHT, FORCE)
+    raw = columns(REAL / "hopper/hopping", signals)
+    q = np.hstack([raw[HEIGHT], raw["joint_positions"]])
+    speed = np.gradient(lfilter(np.ones(31) / 31, 1.0, raw[HEIGHT], axis=0), 1e-3, axis=0)
+    qd = np.hstack([speed, raw["joint_velocities"]])
+    foot = forcegp.kinematics.frame_pose(robot, torch.from_numpy(q), "contact")[1][:1400, 2]
+    ground = forcegp.SurfaceContact(
+        name="ground",
+        frame="contact",
+        point=(0.0, 0.0, 0.0),
+        surface=forcegp.Plane(normal=(0.0, 0.0, 1.0), offset=float(foot.median())),
+    )
+    tau = np.hstack([np.zeros((len(q), 1)), raw["joint_torques"]])
+    return ConstrainedSystem(robot, [ground]), {"t": np.arange(len(q)) * 1e-3, "q": q, "qd": qd, "tau": tau}
+
+
+LOGS: dict[str, Callable[[], Log]] = {
+    "kuka_plane": lambda: simulated("kuka_plane", seed=71, duration=16.0, lift_probability=0.2),
+    "panda_tilted": lambda: simulated("panda_tilted", seed=72, duration=16.0, lift_probability=0.3),
+    "ur5_wiping": wiping,
+    "real iiwa": iiwa,
+    "hopper": hopper,
+}
+
+
+def change(column: str, of: Callable[[NDArray[np.float64]], NDArray[np.float64]]) -> Plant:
+    """A fault of one column of the log."""
+    return lambda log: (log[0], {**log[1], column: of(log[1][column].copy())})
+
+
+def at(joint: int, of: Callable[[NDArray[np.float64]], Any]) -> Callable[..., NDArray[np.float64]]:
+    """A change of the column of one joint."""
+
+    def changed(x: NDArray[np.float64]) -> NDArray[np.float64]:
+        x[:, joint] = of(x[:, joint])
+        return x
+
+    return changed
+
+
+def swapped(i: int, j: int, *names: str) -> Plant:
+    """Columns of two joints exchanged."""
+
+    def plant(log: Log) -> Log:
+        order = list(range(log[0].robot.nq))
+        order[i], order[j] = order[j], order[i]
+        return log[0], {name: x[:, order] if name in names else x for name, x in log[1].items()}
+
+    return plant
+
+
+def late(x: NDArray[np.float64], rows: int) -> NDArray[np.float64]:
+    """A signal that arrives some rows late."""
+    return np.concatenate([np.repeat(x[:1], rows, axis=0), x[:-rows]])
+
+
+def robot(of: Callable[[forcegp.RobotModel], forcegp.RobotModel]) -> Plant:
+    """A robot that is not the one of the log."""
+    return lambda log: (log[0].with_robot(of(log[0].robot)), log[1])
+
+
+def heavier(link: int, factor: float) -> Plant:
+    """A link whose mass and inertia the robot file states too large."""
+
+    def of(model: forcegp.RobotModel) -> forcegp.RobotModel:
+        mass, inertia = model.mass.clone(), model.inertia.clone()
+        mass[link], inertia[link] = factor * mass[link], factor * inertia[link]
+        return dataclasses.replace(model, mass=mass, inertia=inertia)
+
+    return robot(of)
+
+
+def lean(degrees: float) -> Plant:
+    """A base that leans about y; the scene says upright."""
+
+    def of(model: forcegp.RobotModel) -> forcegp.RobotModel:
+        a = np.radians(degrees)
+        down = 9.81 * torch.tensor([np.sin(a), 0.0, -np.cos(a)], dtype=torch.float64)
+        return dataclasses.replace(model, gravity=down)
+
+    return robot(of)
+
+
+def lowered(log: Log) -> Log:
+    """The table of the scene lies 4 mm too low."""
+    (contact,) = log[0].contacts
+    surface = dataclasses.replace(contact.surface, offset=contact.surface.offset - 0.004)  # type: ignore[attr-defined]
+    moved = dataclasses.replace(contact, surface=surface)  # type: ignore[type-var]
+    return dataclasses.replace(log[0], contacts=[moved]), log[1]
+
+
+def dropped(log: Log) -> Log:
+    """60 rows are lost while the arm moves, and the clock was made up afterwards."""
+    speed = np.abs(log[1]["qd"]).sum(axis=1)
+    middle = 60 + int(np.argmax(speed[60:-60]))
+    keep = np.ones(len(speed), bool)
+    keep[middle - 30 : middle + 30] = False
+    t = log[1]["t"].copy()
+    restarts = np.append(np.flatnonzero(np.diff(t) <= 0.0) + 1, len(t))
+    t[middle + 30 : restarts[restarts > middle][0]] -= t[middle + 30] - t[middle - 30]
+    return log[0], {name: x[keep] for name, x in {**log[1], "t": t}.items()}
+
+
+def stuck(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """An encoder that keeps its value for 120 rows where it turns fastest."""
+    step = np.convolve(np.abs(np.diff(x)), np.ones(120), "valid")
+    k = int(np.argmax(step))
+    x[k : k + 120] = x[k]
+    return x
+
+
+def clipped(x: NDArray[np.float64]) -> NDArray[np.float64]:
+    """A drive that saturates at 92 % of the values."""
+    limit = np.quantile(np.abs(x), 0.92)
+    return np.clip(x, -limit, limit)
+
+
+MASSES = ("masses-mismatch", "payload-missing")
+FAULTS = (
+    Fault(
+        "kuka_plane",
+        "torque columns of joints 2 and 4 exchanged",
+        swapped(1, 3, "tau"),
+        ("torque-order", "joint-order"),
+        1,
+    ),
+    Fault("kuka_plane", "table 4 mm too low", lowered, ("surface-offset",), word="mm"),
+    Fault(
+        "kuka_plane",
+        "encoder of joint 4 off by 0.05 rad",
+        change("q", at(3, lambda x: x + 0.05)),
+        ("encoder-offset",),
+        3,
+    ),
+    Fault("kuka_plane", "link 4 twice as heavy in the file", heavier(3, 2.0), MASSES),
+    Fault(
+        "panda_tilted",
+        "tool of 1 kg more in the file than on the arm",
+        robot(lambda r: dataclasses.replace(r, mass=torch.cat([r.mass[:-1], r.mass[-1:] + 1.0]))),
+        MASSES,
+    ),
+    Fault(
+        "panda_tilted",
+        "base leans by 8 degrees",
+        lean(8.0),
+        ("base-tilted", "gravity-direction"),
+    ),
+    Fault(
+        "panda_tilted",
+        "velocity of joint 6 filtered over 0.2 s",
+        change("qd", at(5, lambda x: lfilter(np.ones(48) / 48, 1.0, x))),
+        ("velocity-mismatch", "velocity-delay"),
+        5,
+    ),
+    Fault(
+        "panda_tilted",
+        "torque of joint 2 clipped",
+        change("tau", at(1, clipped)),
+        ("torque-saturated",),
+        1,
+    ),
+    Fault("ur5_wiping", "positions in degrees", change("q", np.degrees), ("degrees",), word="degree"),
+    Fault(
+        "ur5_wiping",
+        "torque of joint 2 a third too large",
+        change("tau", at(1, lambda x: x * 4.0 / 3.0)),
+        ("torque-gain",),
+        1,
+    ),
+    Fault(
+        "ur5_wiping",
+        "joint 4 counts the other way",
+        lambda log: change("qd", at(3, np.negative))(change("q", at(3, np.negative))(log)),
+        ("joint-sign",),
+        3,
+    ),
+    Fault(
+        "ur5_wiping",
+        "torques 120 ms late",
+        change("tau", lambda x: late(x, 30)),
+        ("torque-delay",),
+    ),
+    Fault("real iiwa", "torques of the other sign", change("tau", np.negative), ("torque-sign",)),
+    Fault(
+        "real iiwa",
+        "torque of joint 4 late by 0.25 s",
+        change("tau", at(3, lambda x: late(x, 50))),
+        ("torque-delay",),
+        3,
+    ),
+    Fault(
+        "real iiwa",
+        "60 rows lost without a trace in the clock",
+        dropped,
+        ("position-jump",),
+    ),
+    Fault(
+        "real iiwa",
+        "encoder of joint 4 stuck for 0.6 s",
+        change("q", at(3, stuck)),
+        ("channel-stuck", "velocity-mismatch"),
+        3,
+    ),
+    Fault(
+        "real iiwa",
+        "torque of joint 2 off by 8 N m",
+        change("tau", at(1, lambda x: x + 8.0)),
+        ("torque-offset",),
+        1,
+    ),
+    Fault(
+        "hopper",
+        "hip and knee exchanged",
+        swapped(1, 2, "q", "qd", "tau"),
+        ("joint-order",),
+        1,
+        word="KFE",
+    ),
+    Fault("hopper", "time stamps in milliseconds", change("t", lambda t: t * 1e3), ("time-unit",), word="ms"),
+    Fault(
+        "hopper",
+        "velocity of the knee of the other sign",
+        change("qd", at(2, np.negative)),
+        ("velocity-sign",),
+        2,
+    ),
+)
+
+
+def first_line(system: ConstrainedSystem, table: Table, folder: Path) -> dict[str, Any]:
+    """Import a raw log as a user does, and check it: the first line that names something."""
+    names = system.robot.joint_names
+    keys = ("q", "qd", "tau")
+    head = ",".join(["t", *(f"{key}.{name}" for key in keys for name in names)])
+    rows = np.column_stack([table["t"], *(table[key] for key in keys)])
+    np.savetxt(folder / "log.csv", rows, delimiter=",", header=head, comments="")
+    # The height of the real leg is known to 9 mm (notes/contacts.md).
+    far = "threshold = 0.009\n" if "joint_z" in names else ""
+    contacts = "".join(f'[contact.{c.name}]\nsource = "distance"\n{far}' for c in system.contacts)
+    unmeasured = 'unmeasured = ["joint_z"]\n' if "joint_z" in names else ""
+    columns_of = (("position", "q", "rad"), ("velocity", "qd", "rad/s"), ("torque", "tau", "Nm"))
+    mapping = "\n".join(
+        [
+            '[time]\ncolumn = "t"\nunit = "s"\n[joints]',
+            *(f'{name} = "{name}"' for name in names),
+            *(f'[{x}]\ncolumn = "{key}.{{joint}}"\nunit = "{unit}"' for x, key, unit in columns_of),
+            f"{unmeasured}[derivatives]\nwindow = 21\n{contacts}",
+        ]
+    )
+    try:
+        data = import_log(folder / "log.csv", system, parse_mapping(mapping.encode(), "mapping")).data
+    except ForceGPError as error:
+        return {"kinds": [], "joints": [], "line": f"import: {error}"}
+    report = check(system, log_of(data))
+    if not report.findings:
+        return {"kinds": [], "joints": [], "line": report.verdict}
+    first = report.findings[0]
+    return {
+        "kinds": list(first.kinds),
+        "joints": list(first.joints),
+        "line": first.message,
+        "all": [f.kind for f in report.findings],
+    }
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__)
+    parser.add_argument("--out", type=Path, required=True)
+    options = parser.parse_args()
+    logs, result = {name: make() for name, make in LOGS.items()}, []
+    with tempfile.TemporaryDirectory() as folder:
+        for name, log in logs.items():
+            print(f"{name}, nothing planted:", first_line(*log, Path(folder)), flush=True)
+        for fault in FAULTS:
+            planted = fault.plant(logs[fault.log])
+            line = first_line(*planted, Path(folder))
+            joint = None if fault.joint is None else logs[fault.log][0].robot.joint_names[fault.joint]
+            kind = bool({*line["kinds"]} & {*fault.kinds}) and (joint is None or joint in line["joints"])
+            named = kind or (not line["kinds"] and fault.word in line["line"])
+            result.append({"log": fault.log, "fault": fault.name, "named": named, **line})
+            print("named " if named else "MISSED", fault.log, "-", fault.name, ":", line, flush=True)
+    print(f"{sum(row['named'] for row in result)} of {len(result)} named by the first line")
+    options.out.write_text(json.dumps(result, indent=2, ensure_ascii=False) + "\n")
+
+
+if __name__ == "__main__":
+    main()

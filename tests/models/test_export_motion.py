@@ -1,0 +1,88 @@
+"""Rollouts by C code: the trajectories of the law in PyTorch, of means and of function samples."""
+
+from __future__ import annotations
+
+import pytest
+import torch
+from torch import Tensor
+
+from forcegp import dynamics
+from forcegp.models.export.motion import CompiledMotion
+from forcegp.rollout import RolloutOptions, forward
+from forcegp.rollout.trajectory import Rollout
+from models.test_export import fitted, states
+from slow import slow_except
+
+SAME = 1e-9  # of the largest value: sums in another order, carried over twenty steps
+FIELDS = ("q", "qd", "qdd", "multiplier", "c", "cd")
+SMOOTH = ("exact", "every_friction", "zero_mean")  # function samples are made in PyTorch
+CASES = [
+    "one_contact",
+    "free_friction",
+    "sparse",
+    "exact",
+    "every_friction",
+    "contained_inertia",
+    "zero_mean",
+]
+
+
+def both(
+    monkeypatch: pytest.MonkeyPatch, name: str, samples: int, still: bool = False, **options
+) -> list[Rollout]:
+    """A rollout by the law in PyTorch, and by C code."""
+    fit, paths = fitted(name), []
+    state, active = states(fit)
+    q, qd, tau, active = (x[1:4] for x in (*state, active))
+    if still:
+        qd, tau = 1e-3 * qd, -dynamics.gravity_force(fit.system.robot, q)
+        tau[:, 3] += torch.tensor([0.1, 1.0, 8.0])
+    how = RolloutOptions(dt=1e-3, on_divergence="keep", **options)
+    calls, motion = list[int](), CompiledMotion.__call__
+
+    def counted(self: CompiledMotion, q: Tensor, *others) -> tuple[Tensor, ...]:
+        calls.append(len(q))
+        return motion(self, q, *others)
+
+    monkeypatch.setattr(CompiledMotion, "__call__", counted)
+    for steps in (10**9, 1):
+        assert not calls
+        monkeypatch.setattr(forward, "COMPILED_STEPS", steps)
+        paths.append(fit.rollout(q, qd, tau[:, None], 0.02, samples, active=active, options=how))
+    assert {3, 3 * samples} - {0} == set(calls), "means and samples come from C code"
+    return paths
+
+
+def agree(torch_path: Rollout, compiled: Rollout) -> None:
+    for field in FIELDS:
+        expected, got = getattr(torch_path, field), getattr(compiled, field)
+        if expected.numel():
+            scale = float(expected.abs().nan_to_num(0.0).max()) + 1e-12
+            torch.testing.assert_close(got, expected, rtol=0.0, atol=SAME * scale, equal_nan=True, msg=field)
+
+
+@pytest.mark.parametrize("name", slow_except(CASES, "one_contact", "sparse"))
+def test_trajectories_are_those_of_the_law_in_pytorch(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    first, second = both(monkeypatch, name, 0 if name in SMOOTH else 3)
+    agree(first, second)
+    if first.samples is not None and second.samples is not None:
+        agree(first.samples, second.samples)
+
+
+@pytest.mark.parametrize("options", [{"method": "rk4"}, {"sticking": False}, {"stabilization": "projection"}])
+def test_so_they_are_with_other_options(options: dict, monkeypatch: pytest.MonkeyPatch) -> None:
+    agree(*both(monkeypatch, "one_contact", 0, **options))
+
+
+def test_joints_stick_and_start_to_slide_at_the_same_time(monkeypatch: pytest.MonkeyPatch) -> None:
+    first, second = both(monkeypatch, "free_friction", 0, still=True)
+    assert 0 < int((first.qd[:, -1] == 0.0).sum()) < 21, "some joints stick"
+    agree(first, second)
+
+
+def test_the_law_in_pytorch_gives_gradients(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(forward, "COMPILED_STEPS", 1)
+    fit = fitted("free_friction")
+    q, qd, tau = (x[1].clone() for x in states(fit)[0])
+    fit.rollout(q, qd.requires_grad_(), tau[None], 0.005, options=RolloutOptions(dt=1e-3)).q.sum().backward()
+    assert qd.grad is not None and bool((qd.grad != 0.0).any())
