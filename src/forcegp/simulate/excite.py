@@ -406,18 +406,11 @@ def excite(
         unknowns: unknown forces before the motion; by default all, as in `Unknowns.of`.
         collisions: by default the robot's shapes and the surfaces of the contacts.
         start: `(nq,)` position at the start and the end; by default a free one near the middle.
-<<<<<<< HEAD
         criterion: `"A"`, standard deviation of the torque in the region of `unknowns`, `"V"`, the same by
             links, viscous and dry friction alone, `"D"`, determinant of the covariance, or a function of the
             information.
-        rate: of the samples that are returned [Hz].
-        restarts: random starts that are optimised, the best of four times as many.
-=======
-        criterion: `"A"`, standard deviation of the torque in the region of `unknowns`, `"D"`, determinant of
-            the covariance, or a function of the information.
         rate: of the returned samples [Hz].
         restarts: number of optimised random starts, the best of four times as many.
->>>>>>> main
         seed: of the random starts.
         progress: called with the number of completed rounds and their total.
 

@@ -203,13 +203,9 @@ class PayloadPrior(ForcePrior):
         length: standard deviation of the first moment over that of the mass [m].
         kernel: covariance of the constants.
         name: prefix of the hyperparameters.
-<<<<<<< HEAD
-        known: mass [kg] and first moment [kg m] of the payload that the acceleration is taken with.
+        known: mass [kg] and first moment [kg m] of the payload at which the acceleration is computed.
         measured: take the measured acceleration where there is one: exact for any payload, but its noise
             makes the payload too small where the arm hardly accelerates.
-=======
-        known: mass [kg] and first moment [kg m] of the payload at which the acceleration is computed.
->>>>>>> main
 
     Raises:
         ModelError: the known payload is not a mass and a moment.
