@@ -106,12 +106,11 @@ def test_mpc_with_learned_friction(tmp_path: Path) -> None:
     for package in ("mujoco", "casadi"):
         pytest.importorskip(package)
     text = example("mpc_with_learned_friction", tmp_path)
-    (file, _), (learned, solve) = (
+    (file, _), (learned, _) = (
         numbers(rf"{name}: tracking error ([\d.]+) mrad, solve ([\d.]+) ms", text)
         for name in ("robot file", "learned")
     )
     assert learned < 0.5 * file
-    assert solve < 20.0
 
 
 @pytest.mark.slow
@@ -119,12 +118,11 @@ def test_mpc_holds_a_force(tmp_path: Path) -> None:
     for package in ("mujoco", "casadi"):
         pytest.importorskip(package)
     text = example("mpc_holds_a_force", tmp_path)
-    (file, _), (learned, solve) = (
+    (file, _), (learned, _) = (
         numbers(rf"{name}: outside 10 ± 3 N in ([\d.]+)% of the steps, solve ([\d.]+) ms", text)
         for name in ("robot file", "learned")
     )
     assert learned <= 5.0 < file
-    assert solve < 20.0
 
 
 def test_force_observer(tmp_path: Path) -> None:
