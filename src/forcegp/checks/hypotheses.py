@@ -150,8 +150,8 @@ def delays(log: Log) -> Iterator[Hypothesis]:
 
 
 def joint_delays(log: Log, rows: np.ndarray, problem: TorqueProblem) -> Iterator[Hypothesis]:
-    """The torque of one joint, logged before or after the motion: its best delay beside friction."""
-    shifts = [sign * lag for lag in (LAGS if log.stretches else ()) for sign in (1, -1)]
+    """The torque of one joint, logged after the motion, as sensors lag: its best delay beside friction."""
+    shifts = list(LAGS) if log.stretches else []
     needed = problem.r + log.tau[rows]
     for j in range(log.nq if log.nq > 1 and shifts else 0):
         x = log.qd[rows, j]
