@@ -130,7 +130,7 @@ def writable(target: Path) -> Iterator[None]:
 
 
 def check_kind(target: Path, *, folder: bool) -> None:
-    """Check that only a folder, or only a regular file, would be replaced.
+    """Check that an existing target is a folder if `folder` is true, else a regular file.
 
     The path is inspected once, since another writer could change it between `exists` and `is_dir`.
     """

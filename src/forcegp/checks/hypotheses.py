@@ -150,7 +150,7 @@ def delays(log: Log) -> Iterator[Hypothesis]:
 
 
 def joint_delays(log: Log, rows: np.ndarray, problem: TorqueProblem) -> Iterator[Hypothesis]:
-    """The torque of one joint, logged after the motion, as sensors lag: its best delay beside friction."""
+    """For each joint, the hypothesis that its torque lags the motion, with its best delay beside friction."""
     shifts = list(LAGS) if log.stretches else []
     needed = problem.r + log.tau[rows]
     for j in range(log.nq if log.nq > 1 and shifts else 0):

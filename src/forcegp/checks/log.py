@@ -32,7 +32,7 @@ Array = NDArray[Any]
 
 
 def evenly(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
-    """Up to `most` of some rows, evenly spread."""
+    """Select up to `most` of the given rows, evenly spaced."""
     return rows[np.unique(np.linspace(0, len(rows) - 1, min(most, len(rows))).astype(np.int64))]
 
 

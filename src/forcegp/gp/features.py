@@ -308,7 +308,7 @@ def linear_features(x: Features, inputs: tuple[str, ...] | None, slope: Tensor, 
 
 
 def constant_features(std: Tensor) -> FeatureMap:
-    """A constant per component, of standard deviation `(k,)`."""
+    """One constant feature per component, with standard deviations `(k,)`."""
     return FeatureMap((FeatureTerm(lambda x: std.new_ones(1, stacked(x, None).shape[-2], 1), std[:, None]),))
 
 

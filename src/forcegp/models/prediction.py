@@ -191,7 +191,7 @@ determined `(n, d)`; the slice of each quantity; what is not determined, in word
 def in_pieces(
     at: FlatStates, read: Callable[[FlatStates], tuple[Tensor | None, ...]]
 ) -> tuple[Tensor | None, ...]:
-    """Results of `read` at states, `CHUNK` at a time; memory holds the result and one piece."""
+    """Evaluate `read` on `CHUNK` states at a time; memory holds the result and one piece."""
     whole, n = list[Tensor | None](), len(at.q)
     for first in range(0, max(n, 1), CHUNK):
         piece = read(at.rows(slice(first, first + CHUNK)))

@@ -125,7 +125,7 @@ ROUNDING = 1e-6
 
 
 def checked(tree: Tree) -> Tree:
-    """The tree, joints depth first and siblings as in the file; typed errors name refused elements."""
+    """Validate a tree and sort its joints depth first, siblings in the order of the file."""
     _check_names(tree)
     root = _root(tree)
     children: dict[str, list[Joint]] = {}

@@ -59,7 +59,7 @@ def sliding_away(
 
 
 def accelerating(system: ConstrainedSystem, at: States, multiplier: Tensor, qdd: Tensor) -> Tensor:
-    """Contacts `(n, n_contacts)` bool that accelerate against the holding force."""
+    """Boolean mask `(n, n_contacts)` of the contacts that accelerate against the holding force."""
     away = torch.zeros_like(at.active)
     # −λ_tᵀ(A_t q̈ − b_t) > 0
     held = multiplier * ((at.eom.A @ qdd[..., None])[..., 0] - at.eom.b)

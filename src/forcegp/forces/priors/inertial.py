@@ -276,7 +276,7 @@ class PayloadPrior(ForcePrior):
         self.link(system.robot)
 
     def link(self, robot: RobotModel) -> int:
-        """Index of the joint of the link with the payload."""
+        """Index of the joint that carries the payload."""
         if self.joint is None:
             return robot.nq - 1
         check_name("joint that carries a payload", self.joint, robot.joint_names)
