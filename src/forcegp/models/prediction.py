@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
@@ -80,9 +81,11 @@ class Prediction:
                 both = self.determined[..., None] & self.determined[..., None, :]
                 covariance = covariance.where(both, 0.0)
         for name, value in (("mean", mean), ("covariance", covariance)):
-            pieces = () if value is None else value.reshape(-1).split(1 << 20)
-            wrong = sum(int((~torch.isfinite(piece)).sum()) for piece in pieces)
-            if value is not None and wrong:
+            # A sum is finite only if all numbers are.
+            if value is None or math.isfinite(float(value.sum())):
+                continue
+            wrong = sum(int((~torch.isfinite(piece)).sum()) for piece in value.reshape(-1).split(1 << 20))
+            if wrong:
                 raise NumericalError(
                     f"the {name} of a prediction is not finite",
                     got=f"{wrong} of {value.numel()} numbers",
