@@ -38,7 +38,7 @@ def reproduce(
 ) -> None:
     """Simulate the paper's task, select data, fit all models, and write a page with the results.
 
-    Stages that are done and whose inputs have not changed are not run again.
+    Finished stages with unchanged inputs are not run again.
 
     [bold]Examples[/bold]
 

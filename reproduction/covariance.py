@@ -1,4 +1,4 @@
-"""Figure 1: the structured covariance H k_Q Hᵀ of accelerations, block by block, at real states."""
+"""Figure 1: the structured covariance H k_Q Hᵀ of accelerations, block by block, at states of the log."""
 
 from __future__ import annotations
 
@@ -25,25 +25,25 @@ from reproduction.stages import write_data
 from reproduction.task import Task
 
 STATES = 6
-"""States of the figure: the first training points."""
+"""Number of states in the figure, the first training points."""
 RANK_TOLERANCE = 1e-9
 """Eigenvalues below this share of the largest count as zero."""
 WIDTH = 4.1
 DECADES = 3.5
-"""The colour scale spans this many powers of ten below the largest entry."""
+"""Number of powers of ten that the colour scale spans below the largest entry."""
 
 
 class CovarianceData(Header):
     """Blocks of the structured covariance H k_Q Hᵀ at some states.
 
     Attributes:
-        model: whose learned force prior it is.
+        model: name of the model with the learned force prior.
         t: times of the states [s].
         nq: number of joints.
         operators: H of each state, `nq × nq` each.
         force: k_Q, `(n nq) × (n nq)`.
         acceleration: H k_Q Hᵀ, of the same size.
-        rank: of the acceleration covariance.
+        rank: rank of the acceleration covariance.
     """
 
     FORMAT: ClassVar[str] = "forcegp-covariance"
@@ -68,12 +68,12 @@ def make_covariance(folder: Path, run: Path, rows: Path, fit: Path, *, model: st
 
 @torch.no_grad()
 def covariance_blocks(model: StructuredFit, data: Dataset, name: str) -> CovarianceData:
-    """H, k_Q and H k_Q Hᵀ (eq. 32) with the learned hyperparameters, at the states of a data set.
+    """Return H, k_Q and H k_Q Hᵀ (eq. 32) with the learned hyperparameters, at the states of a data set.
 
     Args:
         model: a fitted model with priors on joint forces.
-        data: the states, a few of them.
-        name: of the model, for the plot.
+        data: a few states.
+        name: name of the model, for the plot.
     """
     system, fitted = model.system, model.posterior
     at = states(system, data.q, data.qd, data.tau, data.active(system.contact_names))
@@ -102,7 +102,7 @@ def covariance_blocks(model: StructuredFit, data: Dataset, name: str) -> Covaria
 
 
 def covariance_block(data: CovarianceData) -> report.PictureBlock:
-    """Figure 1 under its caption."""
+    """Return figure 1 with its caption."""
     n, rows = len(data.t), len(data.acceleration)
     panels = (
         ("Operators H(xᵢ)", torch.block_diag(*map(report.as_tensor, data.operators)),
@@ -139,7 +139,7 @@ def _draw(values: Tensor, data: CovarianceData, title: str, alt: str) -> report.
 
 
 def _grid(axes: Axes, states: int, nq: int) -> None:
-    """Lines between the blocks, and the number of each state."""
+    """Draw lines between the blocks, and the number of each state."""
     axes.grid(visible=False)
     for edge in range(1, states):
         axes.axhline(edge * nq - 0.5, color="#777777", linewidth=0.6)

@@ -26,9 +26,9 @@ from reproduction.task import Task
 MODEL, SCORE = "model", "score.json"
 MEASURES = ("noisy_mae", "clean_mae", "coverage_noisy", "coverage_clean", "nlpd", "residual")
 NETWORKS = {"nn-30-20": (30, 20), "nn-200x4": (200, 200, 200, 200)}
-"""Hidden layers of the paper's other networks."""
+"""Hidden layer widths of the paper's other networks."""
 LARGE = 400
-"""From this many points on, the fit to the next size starts from the hyperparameters of the last."""
+"""Number of points from which a fit starts from the hyperparameters of the previous size."""
 EXACT_MODELS = ("gp", "sgp-zero", "sgp-mean")
 """The paper's Gaussian processes."""
 EXACT_LEARNING = LearningOptions(
@@ -39,7 +39,7 @@ EXACT_LEARNING = LearningOptions(
     warm_start=None,
     hyperpriors=False,
 )
-"""How the paper learns them; it says "until convergence", and states neither the start nor a tolerance."""
+"""The paper's learning options; it states "until convergence", without initial values or a tolerance."""
 
 
 @dataclass(frozen=True)
@@ -47,11 +47,11 @@ class Fit:
     """A model on the training points of a split.
 
     Attributes:
-        name: of the model.
+        name: name of the model.
         points: training points.
-        split: where they come from.
-        seed: of the simulated run.
-        stage: fits and scores it.
+        split: name of the split.
+        seed: seed for the simulated run.
+        stage: the stage that fits and scores the model.
     """
 
     name: str
@@ -61,12 +61,12 @@ class Fit:
     stage: Stage
 
     def score(self) -> Score:
-        """Its score on test samples of the split."""
+        """Return the its score on test samples of the split."""
         return Score.model_validate_json((self.stage.folder / SCORE).read_bytes())
 
 
 def models_of(sizes: Profile, split: str) -> list[tuple[str, int]]:
-    """Name and number of points of every fit on a split; of each model, smaller ones first."""
+    """Return the model name and number of points of every fit on a split, smaller fits of a model first."""
     baselines = split == "stretches" or sizes.paper_split_baselines
     found = [(name, sizes.baseline_points) for name in ("analytical", *sizes.networks) if baselines]
     for points in sizes.sizes:
@@ -80,13 +80,13 @@ def models_of(sizes: Profile, split: str) -> list[tuple[str, int]]:
 
 
 def fits_of(sizes: Profile, task: tuple[Stage, Stage], split: str, seed: int) -> list[Fit]:
-    """Every model on a split, the smaller ones of each first; from `LARGE` on, each starts from the last.
+    """Return the fits of every model on a split, smaller ones first, each from `LARGE` on after the previous.
 
     Args:
-        sizes: which models.
+        sizes: profile that selects the models.
         task: the two stages of the simulated run.
-        split: where training and test samples come from.
-        seed: of the run.
+        split: name of the split.
+        seed: seed for the run.
     """
     fits: list[Fit] = []
     for name, points in models_of(sizes, split):
@@ -120,14 +120,14 @@ def fit_and_score(
     """Write a model fitted to the first training points of a split, and its score on the test samples.
 
     Args:
-        folder: where they go.
+        folder: output folder.
         run, rows: the task.
-        before: the same model on fewer points, whose hyperparameters a structured GP starts from.
-        name: of the model.
-        split: where the samples come from.
+        before: fit of the same model to fewer points, which provides initial hyperparameters.
+        name: name of the model.
+        split: name of the split.
         points: number of training points.
-        exact: whether a Gaussian process is the paper's in every respect that it states.
-        test_samples: how many at most.
+        exact: whether to follow the paper's settings wherever it states them.
+        test_samples: maximum number of test samples.
     """
     task = Task.read(run, rows)
     model = exact_model(name, task) if exact else make_model(name, task)
@@ -158,14 +158,14 @@ def fit_and_score(
 
 
 def make_model(name: str, task: Task) -> Model:
-    """An unfitted model by its registry name, or one of the paper's other networks."""
+    """Return an unfitted model by registry name, or one of the paper's other networks."""
     if name in NETWORKS:
         return NeuralNetwork(task.system, NETWORKS[name], task.seed)
     return create(name, task.system, noise=task.noise_std, seed=task.seed)
 
 
 def exact_model(name: str, task: Task) -> Model:
-    """An unfitted model of the paper: squared exponential kernels alone (eq. 31), inputs in their units."""
+    """Return the paper's unfitted model, with squared exponential kernels only (eq. 31) and raw inputs."""
     if name == "gp":
         return IndependentGP(task.system, task.noise_std, standardize=False)
     mean = {"sgp-zero": "zero", "sgp-mean": "analytical"}[name]
@@ -183,6 +183,6 @@ def reset_peak() -> bool:
 
 
 def peak_memory() -> int:
-    """Peak resident memory of the process since the last reset [byte]."""
+    """Return the peak resident memory of the process since the last reset [byte]."""
     lines = Path("/proc/self/status").read_text().splitlines()
     return next(int(line.split()[1]) * 1024 for line in lines if line.startswith("VmHWM:"))

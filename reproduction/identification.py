@@ -31,7 +31,7 @@ WRONG_MASS = 2.5
 WRONG_OFFSET = 0.05
 """Initial error of the last joint's position along each axis [m]."""
 MASS_RANGE = 1.0
-"""How far from the truth a mass is shown [kg]; the optimiser's first steps go further."""
+"""Range of masses shown around the truth [kg]; the first steps of the optimiser exceed it."""
 MASS_TOLERANCE, OFFSET_TOLERANCE = 0.02, 1e-3
 WIDTH = 4.6
 
@@ -39,7 +39,7 @@ WIDTH = 4.6
 class LastLink(nn.Module):
     """θ_A = (log mass of the last link, shift of the last joint).
 
-    The shift is learned in centimetres, so that the optimiser's steps are small changes of posture.
+    The shift is learned in centimetres, which keeps the optimiser's steps small in terms of posture.
     """
 
     def __init__(self, start: RobotModel) -> None:
@@ -58,7 +58,7 @@ class LastLink(nn.Module):
 
 
 def wrong_parameters(robot: RobotModel) -> LastLink:
-    """θ_A of a robot whose last link is too heavy and whose last joint is misplaced."""
+    """Return θ_A of a robot with a last link that is too heavy and a misplaced last joint."""
     mass, position = robot.mass.clone(), robot.placement_position.clone()
     mass[-1] = WRONG_MASS
     position[-1] += WRONG_OFFSET
@@ -70,8 +70,8 @@ class IdentificationRun(Record):
 
     Attributes:
         model: name of the model.
-        seed: of the data.
-        mass: of the last link [kg].
+        seed: seed for the data.
+        mass: mass of the last link [kg].
         offset: error of the last joint's position, by axis [m].
     """
 
@@ -81,7 +81,7 @@ class IdentificationRun(Record):
     offset: list[report.Series]
 
     def off(self, i: int, true_mass: float) -> tuple[float, float]:
-        """Errors of mass [kg] and offset (largest axis) [m] at an evaluation."""
+        """Return the errors of mass [kg] and offset (largest axis) [m] at an evaluation."""
         return abs(self.mass[i] - true_mass), max(abs(axis[i]) for axis in self.offset)
 
 
@@ -105,8 +105,8 @@ class IdentificationData(Header):
 class Trace:
     """θ_A at the best evaluation so far, one entry per evaluation.
 
-    An evaluation may call the module several times with the same parameters, so an entry is made when the
-    evaluation is reported, from the last call before.
+    An evaluation may call the module several times with the same parameters, so an entry is only made when
+    the evaluation is reported.
     """
 
     def __init__(self, theta: LastLink) -> None:
@@ -124,7 +124,7 @@ class Trace:
         self.least = min(self.least, objective)
 
     def run(self, truth: RobotModel, model: str, seed: int) -> IdentificationRun:
-        """The parameters over the evaluations, beside the truth."""
+        """Return the parameters over the evaluations, with the true values."""
         mass, position = (torch.stack(values) for values in zip(*self.best, strict=True))
         offset = report.columns(position - truth.placement_position[-1])
         return IdentificationRun(model=model, seed=seed, mass=report.series(mass), offset=offset)
@@ -161,10 +161,10 @@ def identify_structured(
         system: the true system.
         data: training samples.
         force_priors: on the unknown forces.
-        name: of the model, for the plot.
-        noise_std: of the accelerations [rad/s²].
-        seed: of the data, for the plot.
-        evaluations: of the objective.
+        name: name of the model, for the plot.
+        noise_std: standard deviation of the accelerations [rad/s²].
+        seed: seed for the data, for the plot.
+        evaluations: number of evaluations of the objective.
     """
     theta = wrong_parameters(system.robot)
     trace = Trace(theta)
@@ -184,7 +184,7 @@ def identify_structured(
 def identify_alone(
     system: ConstrainedSystem, data: Dataset, *, seed: int, evaluations: int
 ) -> IdentificationRun:
-    """θ_A of the analytical model alone, without a model of the friction, by least squares."""
+    """Return θ_A of the analytical model alone, without a model of the friction, by least squares."""
     theta = wrong_parameters(system.robot)
     trace, active = Trace(theta), data.active(system.contact_names)
 
@@ -203,7 +203,7 @@ def _options(evaluations: int) -> LearningOptions:
 
 
 def identification_block(data: IdentificationData) -> report.PictureBlock:
-    """The figure under its caption."""
+    """Return the figure with its caption."""
     return report.PictureBlock(
         "Identification (main paper)",
         f"Mass of the last link, started at {WRONG_MASS} kg, and error of the last joint's position, "
@@ -217,7 +217,7 @@ def identification_block(data: IdentificationData) -> report.PictureBlock:
 
 
 def draw_mass(data: IdentificationData) -> report.Picture:
-    """The last link's mass over the evaluations."""
+    """Return the last link's mass over the evaluations."""
 
     def paint(figure: Figure) -> None:
         axes = figure.subplots()
@@ -235,7 +235,7 @@ def draw_mass(data: IdentificationData) -> report.Picture:
 
 
 def draw_offset(data: IdentificationData) -> report.Picture:
-    """The error of the last joint's offset over the evaluations, by axis."""
+    """Return the error of the last joint's offset over the evaluations, by axis."""
     names = list(dict.fromkeys(run.model for run in data.runs))
 
     def paint(figure: Figure) -> None:
@@ -262,7 +262,7 @@ def _legend(figure: Figure, axes: Axes, columns: int) -> None:
 
 
 def identification_finding(data: IdentificationData) -> Statement | None:
-    """Whether mass and offset are found."""
+    """Return whether mass and offset are found."""
     words, good = [], []
     for model in dict.fromkeys(run.model for run in data.runs):
         runs = [run for run in data.runs if run.model == model]
@@ -278,7 +278,7 @@ def identification_finding(data: IdentificationData) -> Statement | None:
 
 
 def _settled(run: IdentificationRun, data: IdentificationData) -> int:
-    """The evaluation from which on mass and offset stay within tolerance."""
+    """Return the evaluation from which on mass and offset stay within tolerance."""
     errors = [run.off(i, data.true_mass) for i in range(len(run.mass))]
     outside = [i for i, (m, o) in enumerate(errors) if m > MASS_TOLERANCE or o > OFFSET_TOLERANCE]
     return max(outside, default=-1) + 1

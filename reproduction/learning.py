@@ -1,7 +1,7 @@
-"""Learning curves (main paper, error over N): drawing, tables and findings, ours beside the paper's.
+"""Learning curves (main paper, error over N): plots, tables and findings, compared with the paper's.
 
-The paper's curves are drawn beside the models with the paper's kernel alone, which is the like-for-like
-comparison; the default kernels are a different model.
+The paper's curves are compared with models that use only the paper's kernel; the default kernels define a
+different model.
 """
 
 from __future__ import annotations
@@ -28,14 +28,14 @@ ERROR_WORDS = ("lower (task differs)", "higher (task differs)")
 POINTS_WORDS = ("fewer (task differs)", "more (task differs)")
 """Verdicts of comparisons with the paper's errors and numbers of points: the task is not the same."""
 WIDE = 5000
-"""Training points from which they are drawn on a logarithmic axis."""
+"""Number of training points from which the axis is logarithmic."""
 TASK = (
     "The paper does not state its rectangle, travel times, pressing force or test window, so the two tasks "
     "are not identical: slower or smaller motion than the paper's lowers our errors, faster or wider "
     "motion raises them. Like is compared with like: the paper's curves with its own kernel, not with our "
     "default kernels."
 )
-"""What `UNKNOWN` means, said once on every page."""
+"""Explanation of `UNKNOWN`, shown once on every page."""
 
 
 EXACT = (
@@ -44,16 +44,16 @@ EXACT = (
     "not state where learning starts or when it counts as converged; here length-scales start at the square "
     "root of the number of inputs, and learning stops after 50 evaluations without improvement, or 500."
 )
-"""What the profile `paper-exact` takes from the paper, and what it had to choose."""
+"""Settings that the profile `paper-exact` takes from the paper, and those that it had to choose."""
 
 
 def about_task(results: Results) -> str:
-    """What is not known of the paper's task, and of its models where these are compared."""
+    """Return what is not known of the paper's task, and of its models where these are compared."""
     return f"{TASK} {EXACT}" if results.exact else TASK
 
 
 def learning_block(results: Results, paper: PaperNumbers) -> report.PictureBlock:
-    """The learning curves under their caption."""
+    """Return the learning curves with their caption."""
     pictures = [
         draw_learning_curve(results, paper, split, kind) for kind in ("noisy", "clean") for split in SPLITS
     ]
@@ -73,11 +73,11 @@ def learning_block(results: Results, paper: PaperNumbers) -> report.PictureBlock
 
 
 def draw_learning_curve(results: Results, paper: PaperNumbers, split: str, kind: str) -> report.Picture:
-    """Error against training points.
+    """Return the error against training points.
 
     Args:
         results: the scores.
-        paper: the paper's curves, drawn where they are comparable.
+        paper: the paper's curves, drawn if they are comparable.
         split: a name of `SPLITS`.
         kind: `"noisy"` or `"clean"`, the accelerations compared with.
     """
@@ -102,7 +102,7 @@ def draw_learning_curve(results: Results, paper: PaperNumbers, split: str, kind:
 
 
 def draw_residual(results: Results, paper: PaperNumbers, split: str) -> report.Picture:
-    """Mean |A q̈ − b| of the predicted accelerations against training points."""
+    """Return the mean |A q̈ − b| of the predicted accelerations against training points."""
 
     def paint(figure: Figure) -> None:
         axes = figure.subplots()
@@ -118,7 +118,7 @@ def draw_residual(results: Results, paper: PaperNumbers, split: str) -> report.P
 
 
 def _curves(axes: Axes, results: Results, split: str, measure: str) -> None:
-    """Mean and range over seeds of every GP model, with the paper's kernel dashed in the same colour."""
+    """Draw mean and range over seeds of every GP model, with the paper's kernel dashed in the same colour."""
     for model in GP_MODELS:
         style = {
             "color": report.colour(model),
@@ -158,7 +158,7 @@ def _finish(figure: Figure, axes: Axes, name: str) -> None:
 
 
 def _ends(results: Results, split: str, measure: str) -> str:
-    """The last point of every curve, in words."""
+    """Return the last point of every curve, in words."""
     last = {m: (max(results.sizes(m), default=0), results.mean(m, split, None, measure)) for m in GP_MODELS}
     return (
         "; ".join(f"{report.label(m)} {v:.2g} at N = {n}" for m, (n, v) in last.items() if v is not None)
@@ -167,7 +167,7 @@ def _ends(results: Results, split: str, measure: str) -> str:
 
 
 def curve_table(results: Results, paper: PaperNumbers, kind: str) -> report.Table:
-    """Error over training points: ours on both splits, and the paper's for noisy accelerations."""
+    """Return the error over training points on both splits, with the paper's for noisy accelerations."""
     sizes = sorted({n for model in GP_MODELS for n in results.sizes(model)})
     rows = []
     for model in (m for m in (*GP_MODELS, *PAPER_KERNELS.values()) if m in results.models):
@@ -182,13 +182,13 @@ def curve_table(results: Results, paper: PaperNumbers, kind: str) -> report.Tabl
 
 
 def paper_value(paper: PaperNumbers, model: str | None, points: int) -> str:
-    """The paper's error for a model, if it gives one for that many points."""
+    """Return the paper's error for a model, if it reports one for this number of points."""
     value = None if model is None else paper.error(model, points)
     return report.NONE if value is None else f"{value:g}"
 
 
 def residual_table(results: Results, paper: PaperNumbers) -> report.Table:
-    """Constraint residual at the fewest and most training points, beside the paper's."""
+    """Return the constraint residual at the fewest and most training points, with the paper's values."""
     rows = []
     for model in (m for m in GP_MODELS if m in results.models):
         ends = results.sizes(model)[0], results.sizes(model)[-1]
@@ -203,7 +203,7 @@ def residual_table(results: Results, paper: PaperNumbers) -> report.Table:
 
 
 def against_paper(results: Results, paper: PaperNumbers, model: str) -> Statement | None:
-    """Our error on the paper's split against the paper's at every N, with the paper's kernel first."""
+    """Return our error on the paper's split against the paper's at every N, with the paper's kernel first."""
     same = like(results, model)
     pairs = {
         n: (ours, theirs)
@@ -228,7 +228,7 @@ def against_paper(results: Results, paper: PaperNumbers, model: str) -> Statemen
 
 
 def efficiency(results: Results, paper: PaperNumbers) -> Statement | None:
-    """How many points the zero-mean structured model needs to reach the paper's best error."""
+    """Return how many points the zero-mean structured model needs to reach the paper's best error."""
     target, words, reached = paper.noisy_mae["sgp-zero"][-1], [], []
     for model in (m for m in (PAPER_KERNELS["sgp-zero"], "sgp-zero") if m in results.models):
         sizes = results.sizes(model)

@@ -18,16 +18,16 @@ from reproduction.statements import Statement
 from reproduction.task import Task, motion_of
 
 STEP = 4
-"""Every fourth sample is predicted."""
+"""Stride of the predicted samples."""
 BAND = 2.0
 """Standard deviations on either side."""
 INSIDE = 0.90
-"""Coverage from which the claim about the multiplier counts as confirmed."""
+"""Coverage above which the claim about the multiplier counts as confirmed."""
 WIDTH = 4.6
 
 
 class MultiplierBand(Record):
-    """The multiplier as one model predicts it.
+    """The multiplier predicted by one model.
 
     Attributes:
         model: registry name.
@@ -50,7 +50,7 @@ class MultiplierBand(Record):
     def of(
         cls, model: str, mean: Tensor, std: Tensor, simulated: Tensor, judged: Tensor, held_out: Tensor
     ) -> MultiplierBand:
-        """The band of a prediction `(n,)`, judged by the simulator's value on the samples marked."""
+        """Return the band of a prediction `(n,)`, scored against the simulator on the marked samples."""
         error = (mean - simulated).abs()
         inside = (error <= BAND * std).double()
         return cls(
@@ -72,7 +72,7 @@ class MultiplierData(Header):
         c: constraint error [m].
         simulated: the simulator's multiplier [N].
         held_out: intervals of time without training points [s].
-        bands: one per model.
+        bands: one band per model.
     """
 
     FORMAT: ClassVar[str] = "forcegp-multiplier"
@@ -116,7 +116,7 @@ def make_multiplier(
 
 
 def spans(t: Tensor, marked: Tensor) -> list[tuple[float, float]]:
-    """The times at which runs of marked samples begin and end."""
+    """Return the start and end times of runs of marked samples."""
     zero = marked.new_zeros(1).int()
     edges = torch.diff(marked.int(), prepend=zero, append=zero)
     begins, ends = (edges == 1).nonzero()[:, 0], (edges == -1).nonzero()[:, 0] - 1
@@ -124,7 +124,7 @@ def spans(t: Tensor, marked: Tensor) -> list[tuple[float, float]]:
 
 
 def multiplier_block(data: MultiplierData) -> report.PictureBlock:
-    """Figure 2 under its caption."""
+    """Return figure 2 with its caption."""
     return report.PictureBlock(
         "Figure 2: surface error and multiplier",
         "The error of the surface equation in simulation, and the Lagrange multiplier λ (the normal force) "
@@ -137,7 +137,7 @@ def multiplier_block(data: MultiplierData) -> report.PictureBlock:
 
 
 def draw_constraint(data: MultiplierData) -> report.Picture:
-    """Constraint error in simulation (top)."""
+    """Return the constraint error in simulation (top)."""
     error = report.as_tensor(data.c)
 
     def paint(figure: Figure) -> None:
@@ -153,7 +153,7 @@ def draw_constraint(data: MultiplierData) -> report.Picture:
 
 
 def draw_multiplier(data: MultiplierData, band: MultiplierBand) -> report.Picture:
-    """The predicted multiplier beside the simulator's (bottom)."""
+    """Return the predicted multiplier and the simulator's (bottom)."""
     mean, simulated = report.as_tensor(band.mean), report.as_tensor(data.simulated)
     spread, shown = BAND * report.as_tensor(band.std), report.colour(band.model)
 
@@ -183,7 +183,7 @@ def draw_multiplier(data: MultiplierData, band: MultiplierBand) -> report.Pictur
 
 
 def multiplier_finding(data: MultiplierData) -> Statement | None:
-    """Whether the multiplier is positive and within its band."""
+    """Return whether the multiplier is positive and within its band."""
     listed = "; ".join(
         f"{report.label(b.model)}: ±2σ coverage {100 * b.inside:.0f} %"
         + ("" if b.inside_held_out is None else f" ({100 * b.inside_held_out:.0f} % of held-out samples)")

@@ -1,4 +1,4 @@
-"""The page of a reproduction and its `results.md`: every figure and table, ours beside the paper's."""
+"""The page of a reproduction and its `results.md`: all figures and tables, compared with the paper's."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ from reproduction.task_space import TaskSpaceData, task_space_block
 from reproduction.trajectories import bands, tip_error
 
 ROLLOUTS, WINDOWS = "stages/figures/rollouts/", "stages/figures/window/"
-"""Where a reproduction keeps the data of its trajectories and of figures 4 and 5."""
+"""Folders for the data of trajectories and of figures 4 and 5."""
 OPENING = "sgp-mean"
-"""The model whose multiplier opens the page."""
+"""The model with the multiplier shown at the top of the page."""
 
 
 @dataclasses.dataclass(frozen=True)
 class FigureData:
-    """What the figures of a reproduction are drawn from."""
+    """Data of the figures of a reproduction."""
 
     covariance: CovarianceData
     multiplier: MultiplierData
@@ -34,7 +34,7 @@ class FigureData:
 
 
 def common_limit(windows: Sequence[report.WindowData]) -> float:
-    """A half height [rad/s²] that fits the noise and the errors of the better half of the models."""
+    """Return an axis limit [rad/s²] that fits the noise and the errors of the better half of the models."""
     if not windows:
         return 0.5
     largest = sorted(float(window.error.abs().quantile(0.995)) for window in windows)
@@ -42,7 +42,7 @@ def common_limit(windows: Sequence[report.WindowData]) -> float:
 
 
 def findings(results: Results, paper: PaperNumbers, figures: FigureData) -> list[Statement]:
-    """All findings that the results allow."""
+    """Return all findings that can be derived from the results."""
     found = [learning.against_paper(results, paper, model) for model in paper.noisy_mae]
     found += [
         scores.order(results),
@@ -57,7 +57,7 @@ def findings(results: Results, paper: PaperNumbers, figures: FigureData) -> list
 
 
 def render_page(results: Results, figures: FigureData, view: str | None = None) -> str:
-    """The page of a reproduction as HTML; `view` is the file with the motion in three dimensions."""
+    """Return the page of a reproduction as HTML; `view` is the file with the motion in three dimensions."""
     paper = paper_numbers()
     return report.render(
         "page.html.j2",
@@ -82,7 +82,7 @@ def render_page(results: Results, figures: FigureData, view: str | None = None) 
 
 
 def _opening(results: Results, paper: PaperNumbers, figures: FigureData) -> report.PictureBlock:
-    """What the page shows first: how error falls with data, and the contact force with its band."""
+    """Return what the page shows first: how error falls with data, and the contact force with its band."""
     drawn = {"Error over training points": learning.draw_learning_curve(results, paper, "stretches", "clean")}
     band = next((b for b in figures.multiplier.bands if b.model == OPENING), None)
     if band is not None:
@@ -111,7 +111,7 @@ def _tables(results: Results, paper: PaperNumbers) -> dict[str, report.Table]:
 def prediction_blocks(
     windows: Sequence[report.WindowData],
 ) -> tuple[report.PictureBlock, report.PictureBlock]:
-    """Both figures under their captions."""
+    """Return both figures with their captions."""
     seconds, limit = f"{windows[0].seconds:.1f} s" if windows else "", common_limit(windows)
     predictions = report.PictureBlock(
         "Figure 4: predictions",
@@ -132,7 +132,7 @@ def prediction_blocks(
 
 
 def simulation_table(results: Results) -> report.Table:
-    """Numbers on each simulated run, with the comparison of the physics engine and our equations."""
+    """Return statistics of each simulated run, including the comparison of engine and library."""
     seeds = list(results.simulations)
     names = dict.fromkeys(name for run in results.simulations.values() for name in run)
     runs = results.simulations.values()
@@ -141,7 +141,7 @@ def simulation_table(results: Results) -> report.Table:
 
 
 def settings_table(results: Results) -> report.Table:
-    """Settings and versions."""
+    """Return the settings and versions."""
     rows = [(name.replace("_", " "), value) for name, value in results.settings.items()]
     rows += [("seeds", ", ".join(str(s) for s in results.seeds))]
     rows += [(f"version of {name}", value) for name, value in results.versions.items()]
@@ -150,7 +150,7 @@ def settings_table(results: Results) -> report.Table:
 
 
 def render_markdown(results: Results, figures: FigureData) -> str:
-    """The numbers of a reproduction beside the paper's, as Markdown."""
+    """Return the results of a reproduction and those of the paper as Markdown."""
     paper = paper_numbers()
     tables = {name: markdown(table) for name, table in _tables(results, paper).items()}
     said = findings(results, paper, figures)

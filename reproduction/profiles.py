@@ -1,4 +1,4 @@
-"""Sizes of a reproduction: a few minutes, those of the paper, or all samples of the log; and the models."""
+"""Profiles of a reproduction, from a few minutes to the sizes of the paper or all samples of the log."""
 
 from __future__ import annotations
 
@@ -12,29 +12,29 @@ class Profile:
     """Sizes of a reproduction.
 
     Attributes:
-        name: of the profile.
+        name: name of the profile.
         duration: simulated motion [s].
         seeds: number of simulated runs, each with its own split.
         sizes: training points of the GP models.
-        paper_kernels_up_to: largest size at which the paper's kernel alone is fitted too.
+        paper_kernels_up_to: largest size at which models with only the paper's kernel are also fitted.
         main: training points of the GP models in the figures over time.
         baseline_points: training points of the analytical model and the neural networks.
-        networks: which networks are trained.
-        paper_split_seeds: simulated runs that are scored on the paper's split too.
-        paper_split_baselines: whether analytical model and networks are scored on the paper's split too.
+        networks: names of the networks to train.
+        paper_split_seeds: number of simulated runs that are also scored on the paper's split.
+        paper_split_baselines: whether analytical model and networks are also scored on the paper's split.
         stretch: duration of a held-out stretch, and of the window of figures 4 and 5 [s].
         test_samples: maximum number of test samples that are predicted for the scores.
         multiplier_seconds: length of figure 2 [s].
         identification_points: training points of the identification.
         identification_evaluations: iterations of the identification.
-        rollout_seconds: length of the trajectories that are predicted in open loop [s].
-        rollout_starts: states of a further simulated run that they start from.
-        rollout_samples: function samples of their bands.
-        sparse_sizes: training points of the structured models beyond those of the other GP models: rows
-            evenly spaced over all that are not held out.
-        exact: whether the GP models are the paper's in every respect that it states: its kernel alone, inputs
-            in their units, the marginal likelihood without priors on hyperparameters, and ADAM with the
-            learning rate 0.2; otherwise ours, with the paper's kernel beside them.
+        rollout_seconds: length of the open-loop trajectories [s].
+        rollout_starts: number of initial states, from an additional simulated run.
+        rollout_samples: number of function samples for their bands.
+        sparse_sizes: additional training set sizes for the structured models, with evenly spaced rows that
+            are not held out.
+        exact: whether the GP models follow the paper's settings wherever it states them: only its kernel,
+            inputs in their units, the marginal likelihood without priors on hyperparameters, and ADAM with
+            learning rate 0.2. Otherwise, the default models and models with the paper's kernel are fitted.
     """
 
     name: str
@@ -91,7 +91,7 @@ PROFILES = {profile.name: profile for profile in (QUICK, PAPER, EXACT, LARGE)}
 
 
 def profile_of(name: str) -> Profile:
-    """A profile by name.
+    """Return a profile by name.
 
     Raises:
         UnknownNameError: no such profile.

@@ -1,7 +1,7 @@
-"""From a foreign log to a contact force: the whole line on scenes whose contact MuJoCo's solver makes.
+"""From an external log to a contact force: the full pipeline on scenes simulated with MuJoCo's solver.
 
-Simulate, export as CSV in degrees and milliseconds, import, check, select, fit, evaluate: each step as a user
-takes it on the command line. Models never see the simulator's forces, which only judge them.
+Simulate, export as CSV in degrees and milliseconds, import, check, select, fit and evaluate, as a user would
+on the command line. The simulator's forces are only used to score the models.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ from reproduction.stages import Stage
 
 SCENES = ("ur5_wiping", "panda_sphere")
 SOURCES = ("distance", "wrench")
-"""What contact is detected from; the first is what the models are fitted with."""
+"""Sources of contact detection; the models are fitted with the first."""
 RUN, LOG, IMPORTED, EVALUATED = "run.parquet", "log.parquet", "import.json", "evaluation.json"
 VARIANTS = ("file", "torques", "sensor")
-"""The robot file alone; fitted to accelerations; and to the wrist sensor's force too, which is then also a
-measurement at the states that are predicted."""
+"""The robot file alone, a fit to accelerations, and a fit to accelerations and the force of a wrist sensor,
+which then also serves as a measurement at the predicted states."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class Line:
     """The stages of one scene.
 
     Attributes:
-        scene: its name.
+        scene: name of the scene.
         run: the simulated log.
         log: the log exported as CSV and imported, with the check's page.
         fits: a model and its scores on held-out stretches, by variant.
@@ -61,7 +61,7 @@ class Line:
 
 
 def line_of(root: Path, scene: str, duration: float, seed: int) -> Line:
-    """The stages of a scene, for a run of some seconds."""
+    """Return the stages of a scene for a run of given duration."""
     settings: dict[str, Any] = {"scene": scene}
     run = Stage(root, f"{scene}/simulate", make_run, settings | {"duration": duration, "seed": seed})
     log = Stage(root, f"{scene}/import", make_log, settings, (run,))
@@ -124,7 +124,7 @@ def _model(variant: str, system: ConstrainedSystem, train: Dataset) -> FittedMod
 
 
 def force_of(stage: Stage, test: Dataset) -> tuple[torch.Tensor, torch.Tensor]:
-    """Mean and standard deviation of the normal force of a fitted model at states, `(n,)` each [N]."""
+    """Return mean and standard deviation of a model's normal force at states, `(n,)` each [N]."""
     fit = load_model(stage.folder / "model")
     assert isinstance(fit, StructuredFit)
     active = test.active(fit.system.contact_names)
@@ -137,5 +137,5 @@ def force_of(stage: Stage, test: Dataset) -> tuple[torch.Tensor, torch.Tensor]:
 
 
 def numbers_of(stage: Stage, name: str) -> dict[str, Any]:
-    """The numbers that a stage wrote."""
+    """Return the numbers written by a stage."""
     return json.loads((stage.folder / name).read_text(encoding="utf-8"))

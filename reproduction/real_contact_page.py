@@ -1,4 +1,4 @@
-"""`python -m reproduction --profile real-contact`: runs the line on its scenes and writes the page."""
+"""`python -m reproduction --profile real-contact`: runs the pipeline on its scenes and writes the page."""
 
 from __future__ import annotations
 
@@ -22,18 +22,18 @@ PROFILE, PAGE, RESULTS, MARKDOWN = "real-contact", "report.html", "results.json"
 DURATION = 60.0
 """Simulated time of each scene [s]."""
 SHOWN = 1500
-"""Rows of the force that the page shows."""
+"""Number of rows of the force that the page shows."""
 GAP = 0.5
-"""Time between two stretches at least [s]."""
+"""Minimum time between two stretches [s]."""
 NAMES = {
     "file": "robot file",
     "torques": "sgp",
     "sensor": "sgp with wrist sensor",
 }
 ROWS_RIGHT, OFFSET_MM, TILT_DEGREES = 0.99, 0.2, 0.2
-"""What contact detection and the surface fit are asked for."""
+"""Requirements for contact detection and the surface fit."""
 BIAS, SPREAD, CORRELATION, COVERAGE = 0.4, 1.2, 0.95, (0.90, 0.98)
-"""What the normal force is asked for: at most this bias and spread [N], correlation, ±2σ coverage."""
+"""Requirements for the normal force: maximum bias and spread [N], correlation, ±2σ coverage."""
 
 
 def run_real_contact(
@@ -45,14 +45,14 @@ def run_real_contact(
     processes: int = 1,
     say: Say = lambda *_: None,
 ) -> dict[str, object]:
-    """From a foreign log to a contact force on MuJoCo's scenes; finished stages are not run again.
+    """Run the pipeline from log to contact force on MuJoCo's scenes; finished stages are not run again.
 
     Args:
         out: folder for the page and everything it is made from.
-        seed: of the simulated runs.
-        duration: of each [s].
-        scenes: which of them.
-        processes: how many stages are run at the same time.
+        seed: seed for the simulated runs.
+        duration: duration of each run [s].
+        scenes: names of the scenes.
+        processes: number of stages to run in parallel.
         say: called when a stage ends.
 
     Returns:
@@ -92,7 +92,7 @@ def run_real_contact(
 
 
 def _force_score(stage: Stage) -> dict[str, Any]:
-    """λ against the simulator's force, and the coverage of accelerations."""
+    """Return λ against the simulator's force, and the coverage of accelerations."""
     found = real_contact.numbers_of(stage, real_contact.EVALUATED)
     coverage = (found["uncertainty"] or {}).get("coverage_noisy")
     force = (found["sensed"] or found["multipliers"])[0]
@@ -100,7 +100,7 @@ def _force_score(stage: Stage) -> dict[str, Any]:
 
 
 def tables(results: dict[str, dict[str, Any]]) -> tuple[report.Table, report.Table]:
-    """Contact and surface; normal force by model."""
+    """Return two tables: contact and surface, and normal force by model."""
     found = [
         (
             scene,
@@ -132,7 +132,7 @@ def tables(results: dict[str, dict[str, Any]]) -> tuple[report.Table, report.Tab
 
 
 def findings(results: dict[str, dict[str, Any]]) -> list[Statement]:
-    """What was asked, and whether it holds."""
+    """Return the requirements, and whether they are met."""
     shares = [share for numbers in results.values() for share in numbers["rows_right"].values()]
     text = f"At least {100 * min(shares):.2f} % of rows are right; asked: {100 * ROWS_RIGHT:.0f} %."
     said = [Statement("Contact detection", min(shares) >= ROWS_RIGHT, text)]
@@ -164,7 +164,7 @@ def _force_finding(topic: str, score: dict[str, Any]) -> Statement:
 
 @torch.no_grad()
 def _block(line: real_contact.Line) -> report.PictureBlock:
-    """λ over the first held-out stretch, by the fitted models."""
+    """Return λ over the first held-out stretch, by the fitted models."""
     system = load_scene(line.scene).system()
     data, truth = (
         Dataset.read(line.log.folder / real_contact.LOG),
@@ -193,6 +193,6 @@ def _block(line: real_contact.Line) -> report.PictureBlock:
 
 
 def _first_stretch(t: torch.Tensor) -> int:
-    """Number of samples up to the first gap; impacts are left out, which makes shorter ones."""
+    """Return the number of samples up to the first gap, ignoring the short gaps left by impacts."""
     gaps = (t.diff() > GAP).nonzero()[:, 0]
     return int(gaps[0]) + 1 if len(gaps) else len(t)

@@ -10,16 +10,16 @@ from reproduction.results import GP_MODELS, SPLITS, PaperNumbers, Results, like
 from reproduction.statements import Statement, number
 
 RESIDUAL = 1e-11
-"""Mean constraint residual below which only rounding is left [m/s²]."""
+"""Mean constraint residual attributed to rounding [m/s²]."""
 COVERAGE = (0.93, 0.98)
 """±2σ coverage that counts as calibrated; 0.954 for a normal distribution."""
 CLOSE = 0.15
-"""Relative difference up to which two errors count as about the same."""
+"""Relative difference up to which two errors count as equal."""
 MEGABYTE = 1e6
 
 
 def error_table(results: Results, paper: PaperNumbers) -> report.Table:
-    """Errors of every model with its most training points, on both splits, beside the paper's."""
+    """Return the errors of every model at its largest size, on both splits, with the paper's errors."""
     rows = []
     for model in results.models:
         points = results.sizes(model)[-1]
@@ -36,7 +36,7 @@ def error_table(results: Results, paper: PaperNumbers) -> report.Table:
 
 
 def overview_table(results: Results) -> report.Table:
-    """The few numbers that the page opens with."""
+    """Return the summary table at the top of the page."""
     rows = []
     for model in (m for m in results.models if m not in ("nn-30-20", "nn-200x4") and not m.endswith("-se")):
         points = results.sizes(model)[-1]
@@ -51,7 +51,7 @@ def overview_table(results: Results) -> report.Table:
 
 
 def quality_table(results: Results) -> report.Table:
-    """Coverage, density, constraint residual and cost of every model on held-out stretches."""
+    """Return the coverage, density, constraint residual and cost of every model on held-out stretches."""
     rows = []
     for model in results.models:
         points = results.sizes(model)[-1]
@@ -72,10 +72,10 @@ def quality_table(results: Results) -> report.Table:
 
 
 def order(results: Results) -> Statement | None:
-    """The order of the models by their error on held-out stretches, pair by pair as the paper has it.
+    """Return the order of the models by held-out error, in the pairs that the paper compares.
 
     Structured models and the GP are compared at their largest common number of training points, with the
-    paper's kernel; the analytical model and the networks, with all their points, against the GP with all its.
+        paper's kernel; the analytical model and the networks are compared with the GP at the largest sizes.
     """
     chain = [like(results, m) for m in ("gp", "sgp-zero", "sgp-mean") if m in results.models]
     sizes = [{n for n in results.sizes(m) if results.values(m, "stretches", n, "noisy_mae")} for m in chain]
@@ -102,7 +102,7 @@ def order(results: Results) -> Statement | None:
 def _pair(
     results: Results, first: tuple[str, int], second: tuple[str, int], close: bool = False
 ) -> tuple[bool, str]:
-    """Whether the first model is worse than the second, or about as good (`close`), and a sentence on it."""
+    """Return whether the first model is worse than the second or about equal, with a sentence on it."""
     (a, n), (b, m) = first, second
     one, two = results.mean(a, "stretches", n, "noisy_mae"), results.mean(b, "stretches", m, "noisy_mae")
     assert one is not None and two is not None
@@ -116,7 +116,7 @@ def _pair(
 
 
 def splits(results: Results) -> Statement | None:
-    """How much the paper's split flatters."""
+    """Return a statement on how much the paper's split underestimates errors."""
     rows = []
     for model in (m for m in GP_MODELS if m in results.models):
         held, papers = (results.mean(model, split, None, "clean_mae") for split in SPLITS)
@@ -129,7 +129,7 @@ def splits(results: Results) -> Statement | None:
 
 
 def calibration(results: Results) -> Statement | None:
-    """Whether the ±2σ bands have the right coverage."""
+    """Return whether the ±2σ bands have the right coverage."""
     models = (m for m in GP_MODELS if m in results.models)
     found = {m: results.mean(m, "stretches", None, "coverage_noisy") for m in models}
     shares = {m: share for m, share in found.items() if share is not None}
@@ -141,7 +141,7 @@ def calibration(results: Results) -> Statement | None:
 
 
 def constraint(results: Results) -> Statement | None:
-    """Whether predictions obey the constraint."""
+    """Return whether predictions obey the constraint."""
     found = {m: [s.residual for s in results.scores if s.model == m and s.residual] for m in GP_MODELS}
     worst = {m: max(values) for m, values in found.items() if values}
     listed = ", ".join(f"{report.label(m)} {value:.1e}" for m, value in worst.items())

@@ -1,12 +1,12 @@
-"""Stages that run once: each leaves a folder with the key of everything that went into it.
+"""Stages that run once: each writes a folder with a key computed from all its inputs.
 
 The key is a hash of the stage's name, its settings, the keys of its inputs, and the code: the sources of the
-library and of the study, and the versions of the libraries that compute. A folder whose key still matches is
-used as it is. The key is written last, so an interrupted study resumes with its unfinished stages. One study
-at a time may write to a folder.
+library and of the study, and the versions of the numerical libraries. A folder with a matching key is reused.
+The key is written last, so an interrupted study resumes with its unfinished stages. Only one study at a time
+may write to a folder.
 
-`joblib` would not be shorter: its `Memory` pickles results, and its `Parallel` knows no order of stages, so
-all workers would wait for the slowest stage of each level.
+`joblib` would not be shorter: its `Memory` pickles results, and its `Parallel` does not support dependencies,
+so all workers would wait for the slowest stage of each level.
 """
 
 from __future__ import annotations
@@ -38,25 +38,25 @@ from forcegp.files import Header, write_text
 STAGE_FILE, DATA = "stage.json", "data.json"
 STUDY = Path(__file__).parent
 SOURCES = (Path(str(forcegp.__file__)).parent, STUDY, STUDY.parent / "benchmarks" / "foreign_log.py")
-"""Folders and files whose code decides results."""
+"""Folders and files with code that affects results."""
 LIBRARIES = ("torch", "numpy", "scipy", "pybullet", "mujoco")
-"""Libraries whose versions go into the keys."""
+"""Libraries with versions that are part of the keys."""
 PRESENTATION = ("cli/", "report/templates/", "templates/", "page.py", "real_contact_page.py", "__main__.py")
-"""Sources that only show what stages have computed."""
+"""Sources that only present results."""
 MOST_PROCESSES = 8
-"""Default limit on the number of processes: each holds the libraries and a log in memory."""
+"""Default limit on the number of processes, each of which holds the libraries and a log in memory."""
 H = TypeVar("H", bound=Header)
 Say = Callable[[str, int, int], None]
-"""Called when a stage has ended, with a line about it, the number of stages that ended, and of all to run."""
+"""Called when a stage ends, with a message, the number of finished stages, and the total."""
 
 
 class StageHeader(Header):
-    """What the folder of a finished stage says of it.
+    """Header in the folder of a finished stage.
 
     Attributes:
-        name: of the stage.
-        key: hash of everything that went into it.
-        seconds: how long it took.
+        name: name of the stage.
+        key: hash of all inputs of the stage.
+        seconds: duration of the stage.
     """
 
     FORMAT: ClassVar[str] = "forcegp-stage"
@@ -73,14 +73,14 @@ class StageError(ForceGPError, RuntimeError):
 
 @dataclass(frozen=True)
 class Stage:
-    """A step of a study, done or not.
+    """A step of a study, finished or not.
 
     Attributes:
         root: folder of all stages.
         name: path of its folder below the root, such as `"fit/seed-0/gp-200"`.
         make: function of a module, called as `make(folder, *input_folders, **settings)`; writes files.
-        settings: everything besides inputs and code that decides the result, as JSON.
-        inputs: stages whose files are read.
+        settings: all other settings that affect the result, as JSON.
+        inputs: stages that provide input files.
     """
 
     root: Path
@@ -91,12 +91,12 @@ class Stage:
 
     @property
     def folder(self) -> Path:
-        """Where its files are."""
+        """Output folder of the stage."""
         return self.root / self.name
 
     @cached_property
     def key(self) -> str:
-        """Hash of everything that decides the result."""
+        """Hash of everything that affects the result."""
         parts = {
             "code": [code_digest(folder) for folder in SOURCES],
             "libraries": {library: version_of(library) for library in LIBRARIES},
@@ -108,7 +108,7 @@ class Stage:
         return hashlib.sha256(text.encode()).hexdigest()
 
     def found(self) -> StageHeader | None:
-        """The header of its files, if it was run and nothing that went into it has changed."""
+        """Return the header of the finished stage if none of its inputs has changed."""
         path = self.folder / STAGE_FILE
         try:
             header = StageHeader.from_json(path.read_bytes(), str(path), DataError)
@@ -117,10 +117,10 @@ class Stage:
         return header if header.key == self.key else None
 
     def run(self) -> float:
-        """Write its files, in place of older ones.
+        """Write the files of the stage, replacing older ones.
 
         Returns:
-            How long it took [s].
+                Duration [s].
         """
         began = time.perf_counter()
         # The header goes first: what is left of an interrupted removal is not taken for a finished stage.
@@ -135,33 +135,33 @@ class Stage:
         return seconds
 
     def data(self, kind: type[H]) -> H:
-        """The header that a stage wrote with `write_data`."""
+        """Return the header written by `write_data`."""
         path = self.folder / DATA
         return kind.from_json(path.read_bytes(), str(path), DataError)
 
 
 def write_data(folder: Path, data: Header) -> None:
-    """Write the result of a stage that is one header."""
+    """Write the result of a stage as a header."""
     write_text(folder / DATA, data.to_json())
 
 
 def run_stages(stages: Sequence[Stage], processes: int = 1, say: Say = lambda *_: None) -> set[str]:
-    """Run stages, and those that they need, unless they are done.
+    """Run unfinished stages and the stages that they depend on.
 
-    A stage starts once its inputs are there, and of those that can start, the first in the list. When one
-    fails, those that run are waited for and no further one starts.
+    A stage starts when its inputs are available; if several can start, the first in the list does. If a stage
+        fails, running stages are completed and no further stage starts.
 
     Args:
-        stages: the first ones first, where the order is free.
-        processes: how many stages are run at the same time, each in one thread; one runs in this process.
-        say: called with one line for every stage that ends.
+            stages: the stages, by priority.
+            processes: number of stages to run in parallel, each in one thread; 1 uses this process.
+            say: called with a message whenever a stage ends.
 
-    Returns:
-        Names of the stages that were run.
+        Returns:
+            Names of the stages that were run.
 
-    Raises:
-        StageError: two stages with one name.
-        Exception: whatever a stage raised.
+        Raises:
+            StageError: two stages have the same name.
+            Exception: any exception raised by a stage.
     """
     missing = {name: stage for name, stage in _by_name(stages).items() if stage.found() is None}
     order = TopologicalSorter(
@@ -184,7 +184,7 @@ def run_stages(stages: Sequence[Stage], processes: int = 1, say: Say = lambda *_
 
 
 def _by_name(stages: Sequence[Stage]) -> dict[str, Stage]:
-    """The stages, each after those that it needs."""
+    """Return the stages sorted so that each follows its dependencies."""
     found: dict[str, Stage] = {}
     for stage in stages:
         for name, other in (_by_name(stage.inputs) | {stage.name: stage}).items():
@@ -195,7 +195,7 @@ def _by_name(stages: Sequence[Stage]) -> dict[str, Stage]:
 
 @contextmanager
 def _start(processes: int) -> Iterator[Callable[[Callable[[], float]], Future[float]]]:
-    """Starts calls in other processes, or makes them at once; an interrupt ends the processes."""
+    """Yield a function that runs calls in worker processes, which an interrupt ends, or in this one."""
     if processes == 1:
         yield _at_once
         return
@@ -220,7 +220,7 @@ def _at_once(call: Callable[[], float]) -> Future[float]:
 
 
 def _begin() -> None:
-    """Set up a worker: one thread, deaf to interrupts, which its parent handles; it ends with its parent."""
+    """Set up a worker with one thread that ignores interrupts and ends with its parent."""
     torch.set_num_threads(1)
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     parent = multiprocessing.parent_process()
@@ -236,7 +236,7 @@ def _begin() -> None:
 
 @cache
 def code_digest(package: Path) -> str:
-    """Hash of the sources and data files below a folder, without those that only present results.
+    """Return a hash of the sources and data files in a folder, except those that only present results.
 
     Args:
         package: folder of a package, or a single file.
@@ -255,7 +255,7 @@ def code_digest(package: Path) -> str:
 
 
 def version_of(package: str) -> str | None:
-    """The installed version of a package, `None` if it is not installed."""
+    """Return the installed version of a package, `None` if it is not installed."""
     try:
         return version(package)
     except PackageNotFoundError:
@@ -263,7 +263,7 @@ def version_of(package: str) -> str | None:
 
 
 def available_processors() -> int:
-    """Number of processors that this process may use."""
+    """Return the number of processors that this process may use."""
     if hasattr(os, "sched_getaffinity"):
         return len(os.sched_getaffinity(0))
     return os.cpu_count() or 1

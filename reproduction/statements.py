@@ -9,7 +9,7 @@ from forcegp.report import NONE, Table
 
 
 def number(values: Sequence[float | int | None], digits: int = 3) -> str:
-    """The mean of values over seeds, with half their range if there are several."""
+    """Return the mean over seeds, with half the range if there are several."""
     present = [float(v) for v in values if v is not None]
     if not present:
         return NONE
@@ -26,9 +26,9 @@ class Statement:
 
     Attributes:
         topic: a few words.
-        agrees: whether the claim holds; `None` if none is made.
+        agrees: whether the claim holds; `None` if no claim is made.
         text: the sentence, with its numbers.
-        words: verdict on a claim that holds, and on one that does not.
+        words: verdicts for a claim that holds and for one that does not.
     """
 
     topic: str
@@ -43,7 +43,7 @@ class Statement:
 
 
 def markdown(table: Table) -> str:
-    """A table with its caption as Markdown."""
+    """Return a table with its caption as Markdown."""
 
     def line(cells: Sequence[str]) -> str:
         return "| " + " | ".join(cell.replace("|", "\\|") for cell in cells) + " |"

@@ -34,9 +34,9 @@ from reproduction.trajectories import make_rollouts, together
 PAGE, RESULTS, MARKDOWN, VIEW = "report.html", "results.json", "results.md", "view.html"
 PACKAGES = ("forcegp", "torch", "numpy", "scipy", "pybullet", "mujoco", "matplotlib")
 OTHER_MOTION = 1000
-"""Added to the first seed for the motion that no model has seen."""
+"""Offset from the first seed for the motion that is not used for training."""
 VIEW_SAMPLES, VIEW_AHEAD, VIEW_SECONDS = 8, 1.0, 5.0
-"""Function samples of the paths in the view, how far these reach, and the length of the motion [s]."""
+"""Number of function samples in the view, their duration [s], and the duration of the motion [s]."""
 
 
 @dataclass(frozen=True)
@@ -45,7 +45,7 @@ class Reproduction:
 
     Attributes:
         page: the page to open.
-        results: its numbers.
+        results: results of the reproduction.
         reused: number of stages taken from an earlier run.
         stages: number of all stages.
     """
@@ -56,7 +56,7 @@ class Reproduction:
     stages: int
 
     def summary(self) -> dict[str, object]:
-        """The main numbers by name, the page last."""
+        """Return the main numbers by name, the page last."""
         numbers: dict[str, object] = {
             "profile": self.results.profile,
             "stages": f"{self.stages} ({self.reused} done before)",
@@ -74,14 +74,14 @@ class Plan:
     """The stages of a reproduction.
 
     Attributes:
-        tasks: two for each simulated run.
-        identification: one for each simulated run.
-        fits: every model on its splits.
+        tasks: two stages for each simulated run.
+        identification: one stage for each simulated run.
+        fits: fits of every model on its splits.
         covariance, multiplier, task_space: data of figures 1 to 3.
-        windows: of figures 4 and 5, one for each model.
+        windows: windows of figures 4 and 5, one for each model.
         unseen: a run with other waypoints.
-        rollouts: trajectories on it, one for each model.
-        view: the motion in three dimensions, or nothing.
+        rollouts: trajectories on that run, one stage for each model.
+        view: the motion in 3D, or `None`.
     """
 
     tasks: list[tuple[Stage, Stage]]
@@ -96,14 +96,14 @@ class Plan:
     view: list[Stage]
 
     def stages(self) -> list[Stage]:
-        """All of them, the longest first where the order is free."""
+        """Return all stages, the longest first."""
         fits = [fit.stage for fit in sorted(self.fits, key=lambda fit: -fit.points)]
         figures = [self.covariance, self.multiplier, self.task_space, *self.windows, *self.view]
         tasks = [stage for task in self.tasks for stage in task]
         return [*tasks, self.unseen, *self.identification, *fits, *self.rollouts, *figures]
 
     def figures(self) -> FigureData:
-        """The data of all figures, once the stages are done."""
+        """Return the data of all figures, available once the stages are finished."""
         runs = [stage.data(IdentificationData) for stage in self.identification]
         together_of = runs[0].model_copy(update={"runs": [run for part in runs for run in part.runs]})
         return FigureData(
@@ -127,10 +127,10 @@ def run(
     """Reproduce the paper's experiments; finished stages in `out` that have not changed are not run again.
 
     Args:
-        profile: `"quick"`, `"paper"`, or your own sizes.
-        out: folder for the page and everything it is made from.
-        seed: of the first simulated run; the others follow.
-        processes: how many stages are run at the same time, as far as memory allows; see `run_stages`.
+        profile: `"quick"`, `"paper"`, or a custom profile.
+        out: folder for the page and all data.
+        seed: seed for the first simulated run; the others follow.
+        processes: maximum number of stages to run in parallel, limited by memory; see `run_stages`.
         say: called when a stage ends.
 
     Returns:
@@ -158,7 +158,7 @@ def run(
 
 
 def _fits_at_once(sizes: Profile) -> int:
-    """How many of the largest fits memory allows; announced before anything is computed."""
+    """Return how many of the largest fits fit into memory, with a warning before any computation."""
     system, points = load_scene(SCENE).system(), max(sizes.sizes)
     needed = int(MATRICES_TO_LEARN * 8 * (points * system.robot.nq) ** 2)
     announce_memory(needed, f"the largest fit, to {points} samples,")
@@ -166,12 +166,12 @@ def _fits_at_once(sizes: Profile) -> int:
 
 
 def plan_of(root: Path, sizes: Profile, seed: int) -> Plan:
-    """The stages of a reproduction.
+    """Return the stages of a reproduction.
 
     Args:
-        root: their folder.
-        sizes: of the reproduction.
-        seed: of its first simulated run.
+        root: folder of the stages.
+        sizes: sizes of the reproduction.
+        seed: seed for its first simulated run.
     """
     tasks, fits, identified = [], [], []
     most = max(sizes.baseline_points, *sizes.sizes)
@@ -225,7 +225,7 @@ def plan_of(root: Path, sizes: Profile, seed: int) -> Plan:
 
 
 def shown(sizes: Profile, fits: Sequence[Fit]) -> list[Fit]:
-    """The fits that the figures over time show: each model at its main size."""
+    """Return the fits for the figures over time: each model at its main size."""
     return [
         fit
         for fit in fits
@@ -234,7 +234,7 @@ def shown(sizes: Profile, fits: Sequence[Fit]) -> list[Fit]:
 
 
 def viewed(fits: Sequence[Fit]) -> list[Fit]:
-    """The fit that the view shows: the largest structured one."""
+    """Return the fit for the view: the largest structured one."""
     fits = [fit for fit in fits if fit.name.startswith("sgp") and fit.name not in PAPER_KERNELS.values()]
     return sorted(fits, key=lambda fit: (fit.points, fit.name == "sgp-mean"))[-1:]
 

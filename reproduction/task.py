@@ -42,7 +42,7 @@ class Task:
     """A simulated run with the training and test rows of both splits.
 
     Attributes:
-        seed: of the run.
+        seed: seed for the run.
         system: robot and contacts.
         data: the log.
         splits: by name, see `SPLITS`.
@@ -55,7 +55,7 @@ class Task:
 
     @classmethod
     def read(cls, run: Path, rows: Path) -> Task:
-        """The task from the folders of its two stages."""
+        """Return the task from the folders of its two stages."""
         chosen = RowsFile.from_json((rows / DATA).read_bytes(), str(rows / DATA), DataError)
         splits = {
             name: Split(
@@ -69,13 +69,15 @@ class Task:
 
     @property
     def noise_std(self) -> float:
-        """The noise on the accelerations that models are given [rad/s²]."""
+        """Standard deviation of the acceleration noise given to the models [rad/s²]."""
         noise = self.data.header.noise_std
         assert noise is not None
         return noise
 
     def train(self, split: str, points: int) -> Dataset:
-        """The first `points` training samples of a split; of more than were selected, evenly spaced ones."""
+        """Return the first `points` training samples of a split, or evenly spaced ones if fewer were
+        selected.
+        """
         chosen = self.splits[split]
         if points <= len(chosen.train):
             return self.data[chosen.train[:points]]
@@ -84,9 +86,9 @@ class Task:
         return self.data[rows[torch.linspace(0, len(rows) - 1, most).round().long()]]
 
     def test(self, split: str, most: int) -> Dataset:
-        """At most `most` test samples of a split, spread evenly over all of them.
+        """Return at most `most` evenly spaced test samples of a split.
 
-        The header does not name the logged robot, as models with learned parameters are tested on them.
+        The header does not name the logged robot, since models with learned parameters are tested.
         """
         rows = self.splits[split].test
         if len(rows) > most:
@@ -95,15 +97,15 @@ class Task:
         return test.replace(header=test.header.model_copy(update={"robot_fingerprint": None}))
 
     def stretches(self) -> list[tuple[int, int]]:
-        """The held-out stretches as (first row, one past the last)."""
+        """Return the held-out stretches as (first row, last row + 1)."""
         return list(self.splits["stretches"].stretches)
 
     def held_out(self) -> Dataset:
-        """The samples of the first held-out stretch."""
+        """Return the samples of the first held-out stretch."""
         return self.data[slice(*self.stretches()[0])]
 
     def around(self, seconds: float, step: int) -> Tensor:
-        """The rows of some seconds around the first held-out stretch, thinned."""
+        """Return the rows of some seconds around the first held-out stretch, thinned."""
         dt = self.data.header.dt
         assert dt is not None
         (start, stop), wanted = self.stretches()[0], round(seconds / dt)
@@ -112,13 +114,13 @@ class Task:
 
 
 def task_stages(root: Path, duration: float, seed: int, points: int, stretch: float) -> tuple[Stage, Stage]:
-    """The two stages of a task: the simulated run, and its training and test rows.
+    """Return the two stages of a task: the simulated run, and its training and test rows.
 
     Args:
         root: folder of the stages.
-        duration: of the run [s].
-        seed: of both.
-        points: how many training points are selected, at most.
+        duration: duration of the run [s].
+        seed: seed for both stages.
+        points: maximum number of training points.
         stretch: duration of a held-out stretch [s].
     """
     run = Stage(root, f"simulate/seed-{seed}", simulate_task, {"duration": duration, "seed": seed})
@@ -127,7 +129,7 @@ def task_stages(root: Path, duration: float, seed: int, points: int, stretch: fl
 
 
 def simulate_task(folder: Path, *, duration: float, seed: int) -> None:
-    """Write the log, the motion of the tool beside its plan, and numbers on the run."""
+    """Write the log, the planned and executed motion of the tool, and statistics of the run."""
     scene = load_scene(SCENE)
     system = scene.system()
     config = dataclasses.replace(scene.simulation, duration=duration, seed=seed)
@@ -163,10 +165,10 @@ def select_rows(folder: Path, run: Path, *, points: int, stretch: float, seed: i
 
 
 def motion_of(run: Path) -> dict[str, Tensor]:
-    """Planned and executed motion of the tool, and the constraint error, by name."""
+    """Return the planned and executed motion of the tool, and the constraint error, by name."""
     return load_file(str(run / MOTION))
 
 
 def summary_of(run: Path) -> dict[str, float | int | str]:
-    """Numbers on the simulated run, by name."""
+    """Return statistics of the simulated run, by name."""
     return json.loads((run / SUMMARY).read_text(encoding="utf-8"))

@@ -17,7 +17,7 @@ from reproduction.stages import write_data
 from reproduction.task import Task, motion_of
 
 STEP = 2
-"""Every other sample is drawn."""
+"""Stride of the plotted samples."""
 WIDTH = 4.6
 UNITS = {"position": "m", "velocity": "m/s", "acceleration": "m/s²"}
 PLANNED: dict[str, Any] = {"linewidth": 0.9, "linestyle": (0, (4, 1.5))}
@@ -47,12 +47,12 @@ def make_task_space(folder: Path, run: Path, rows: Path, *, seconds: float) -> N
 
 
 def task_space_motion(t: Tensor, motion: Mapping[str, Tensor], rows: Tensor) -> TaskSpaceData:
-    """The motion of the tool at some samples, with the waypoints that it passes.
+    """Return the motion of the tool at some samples, with the waypoints passed.
 
     Args:
         t: `(n,)` times of the log [s].
         motion: as saved by a simulation.
-        rows: which samples.
+        rows: rows of the samples.
     """
     first, last = int(motion["segment"][rows].min()), int(motion["segment"][rows].max())
     vectors = [prefix + name for prefix in ("planned_", "") for name in UNITS]
@@ -64,7 +64,7 @@ def task_space_motion(t: Tensor, motion: Mapping[str, Tensor], rows: Tensor) -> 
 
 
 def task_space_block(data: TaskSpaceData) -> report.PictureBlock:
-    """Figure 3 under its caption."""
+    """Return figure 3 with its caption."""
     return report.PictureBlock(
         "Figure 3: task-space motion",
         "The tool moves along straight lines between random points on the surface, with a trapezoidal "
@@ -76,7 +76,7 @@ def task_space_block(data: TaskSpaceData) -> report.PictureBlock:
 
 
 def draw_motion(data: TaskSpaceData) -> report.Picture:
-    """Planned and executed position, velocity and acceleration of the tool by axis."""
+    """Return the planned and executed position, velocity and acceleration of the tool by axis."""
 
     def paint(figure: Figure) -> None:
         for axes, (name, unit) in zip(figure.subplots(3, 1, sharex=True), UNITS.items(), strict=True):
@@ -102,7 +102,7 @@ def draw_motion(data: TaskSpaceData) -> report.Picture:
 
 
 def draw_path(data: TaskSpaceData) -> report.Picture:
-    """The path of the tool over the surface, seen from above, with its waypoints."""
+    """Return the path of the tool over the surface, seen from above, with its waypoints."""
 
     def paint(figure: Figure) -> None:
         axes = figure.subplots()

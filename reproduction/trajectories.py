@@ -1,4 +1,4 @@
-"""Trajectories in open loop (section 4): every model, from states of a motion that none of them has seen."""
+"""Open-loop trajectories (section 4) of every model, from states of a motion not used for training."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from reproduction.statements import Statement
 from reproduction.task import LOG, Task
 
 OTHER_MOTION = 1000
-"""Added to the task's seed for the motion that no model has seen."""
+"""Offset from the task's seed for the motion that is not used for training."""
 BAND_SECONDS = 2.0
-"""Maximum duration of function samples [s]: each costs one more trajectory from every start."""
+"""Maximum duration of function samples [s]; each requires another trajectory from every start."""
 CALIBRATION_STARTS = 2
-"""Trajectories to calibrate bands on, per trajectory to test them on, as far as the stretches suffice."""
+"""Number of calibration trajectories per test trajectory, as far as the stretches suffice."""
 HORIZON = 1.0
 """Time at which tip errors are compared [s]."""
 FIFTH = 0.2
@@ -48,14 +48,14 @@ def make_rollouts(
     """Write trajectories of one model: means over the whole time, bands over the first part of it.
 
     Args:
-        folder: where they go.
-        unseen: a run with other waypoints, long enough for starts whose trajectories do not overlap.
+        folder: output folder.
+        unseen: a run with other waypoints, long enough for trajectories that do not overlap.
         run, rows: the task.
         fit: the fitted model.
-        model: its name.
+        model: name of the model.
         seconds: length of the trajectories.
-        starts: how many.
-        samples: function samples of their bands.
+        starts: number of initial states.
+        samples: number of function samples for the bands.
         stretch: duration of the held-out stretches that bands are calibrated on [s].
     """
     models, task, data = {model: load_model(fit / MODEL)}, Task.read(run, rows), Dataset.read(unseen / LOG)
@@ -71,7 +71,7 @@ def make_rollouts(
 
 
 def _calibration_starts(task: Task, seconds: float, most: int) -> torch.Tensor:
-    """Starts in held-out stretches, spread over the log and over the phases of a line of the motion."""
+    """Return starts in held-out stretches, spread over the log and the phases of a line of the motion."""
     stretches, dt = task.stretches(), task.data.header.dt
     assert dt is not None
     chosen = torch.linspace(0, len(stretches) - 1, min(most, len(stretches))).round().long().tolist()
@@ -85,13 +85,13 @@ def _calibration_starts(task: Task, seconds: float, most: int) -> torch.Tensor:
 
 
 def with_bands(paths: report.RolloutData, bands: report.RolloutData) -> report.RolloutData:
-    """Trajectories of mean functions with the bands of another, cheaper comparison of the same models.
+    """Combine trajectories of mean functions with the bands of another comparison of the same models.
 
     Bands cost one trajectory per sample, so they may cover fewer starts and a shorter time.
 
     Args:
         paths: tip errors, drift and multiplier over the whole time.
-        bands: of the models that have function samples, from the same first start.
+        bands: bands of the models that have function samples, from the same first start.
     """
     sampled = {band.model: band for band in bands.models}
     models = [_with_bands(p, sampled[p.model]) if p.model in sampled else p for p in paths.models]
@@ -100,10 +100,10 @@ def with_bands(paths: report.RolloutData, bands: report.RolloutData) -> report.R
 
 
 def together(parts: Sequence[report.RolloutData]) -> report.RolloutData:
-    """Trajectories of several models, from one comparison each with the same log.
+    """Combine the trajectories of several models from separate comparisons on the same log.
 
     Args:
-        parts: at least one; each from the same starts.
+            parts: one or more comparisons from the same starts.
     """
     # Models without function samples have no bands, whose duration is then that of the trajectories.
     whole = min(parts, key=lambda part: part.band_seconds)
@@ -121,7 +121,7 @@ def _with_bands(path: report.ModelPath, band: report.ModelPath) -> report.ModelP
 
 
 def tip_error(data: report.RolloutData) -> Statement | None:
-    """The S-GP with analytical mean against models that do not learn forces, one second ahead."""
+    """Return a comparison of S-GP with analytical mean and models without learned forces after one second."""
     if HORIZON not in data.horizons:
         return None
     at = data.horizons.index(HORIZON)
@@ -144,7 +144,7 @@ def tip_error(data: report.RolloutData) -> Statement | None:
 
 
 def bands(data: report.RolloutData) -> Statement | None:
-    """Whether bands over function samples have the right coverage of the simulated motion."""
+    """Return whether bands over function samples have the right coverage of the simulated motion."""
     sampled = [path for path in data.models if path.coverage is not None]
     if not sampled:
         return None

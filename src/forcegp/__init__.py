@@ -1,7 +1,7 @@
 """Forward dynamics of robot arms, free or in contact, with Gaussian-process priors on the unknown forces.
 
-Public names, listed in `__init__.pyi`, are imported when they are first used: `import forcegp` alone does not
-load PyTorch, so that the command line starts quickly.
+The public names in `__init__.pyi` are imported on first use: `import forcegp` alone does not load PyTorch, so
+the command line starts quickly.
 """
 
 import lazy_loader

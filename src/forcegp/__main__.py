@@ -1,4 +1,4 @@
-"""`python -m forcegp`: the command line, if the script `forcegp` is not on the path."""
+"""`python -m forcegp` runs the command line even if the script `forcegp` is not on the path."""
 
 from forcegp.cli import main
 

@@ -16,23 +16,23 @@ from torch import Tensor
 from forcegp.errors import MassMatrixError
 
 _SMALL = 4096
-"""Below so many elements the number of operations counts, above it the time each one takes."""
+"""Number of elements below which the overhead of operations dominates their run time."""
 
 
 def batch_last(x: Tensor, tail: int) -> Tensor:
-    """`(*batch, *tail)` as `(*tail, B)`, laid out in that order in memory."""
+    """Return `(*batch, *tail)` as `(*tail, B)`, contiguous in memory."""
     shape = x.shape[x.ndim - tail :]
     flat = x.reshape((math.prod(x.shape[: x.ndim - tail]), *shape))
     return flat.movedim(0, -1).contiguous()
 
 
 def batch_first(x: Tensor, batch: torch.Size) -> Tensor:
-    """`(*tail, B)` as a view `(*batch, *tail)`."""
+    """Return `(*tail, B)` as a view `(*batch, *tail)`."""
     return x.movedim(-1, 0).reshape((*batch, *x.shape[:-1]))
 
 
 def cross(a: Tensor, b: Tensor) -> Tensor:
-    """Vector product over the first dimension, broadcasting over the others."""
+    """Return the vector product over the first dimension, broadcasting over the others."""
     if a.numel() < _SMALL:
         return torch.linalg.cross(*torch.broadcast_tensors(a, b), dim=0)
     (ax, ay, az), (bx, by, bz) = a, b
@@ -46,14 +46,14 @@ def cross(a: Tensor, b: Tensor) -> Tensor:
 
 
 def skew(v: Tensor) -> Tensor:
-    """`(3, 3, …)` matrices [v]× with [v]× w = v × w."""
+    """Return `(3, 3, …)` matrices [v]× with [v]× w = v × w."""
     x, y, z = v
     zero = torch.zeros_like(x)
     return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).unflatten(0, (3, 3))
 
 
 def dot(a: Tensor, b: Tensor) -> Tensor:
-    """Σ_k a_k b_k over the first dimension, broadcasting over the others."""
+    """Return Σ_k a_k b_k over the first dimension, broadcasting over the others."""
     if a.numel() < _SMALL and b.numel() < _SMALL:
         return (a * b).sum(0)
     total = a[0] * b[0]
@@ -63,22 +63,22 @@ def dot(a: Tensor, b: Tensor) -> Tensor:
 
 
 def apply(A: Tensor, v: Tensor) -> Tensor:
-    """A v for matrices `(r, k, …)` and vectors `(k, …)`."""
+    """Return a v for matrices `(r, k, …)` and vectors `(k, …)`."""
     return dot(A.transpose(0, 1), v.unsqueeze(1))
 
 
 def product(A: Tensor, X: Tensor) -> Tensor:
-    """A X for matrices `(r, k, …)` and `(k, c, …)`."""
+    """Return a X for matrices `(r, k, …)` and `(k, c, …)`."""
     return dot(A.transpose(0, 1).unsqueeze(2), X.unsqueeze(1))
 
 
 def sum_over(E: Tensor, x: Tensor) -> Tensor:
-    """Σ_j E_ij x_j over the joint dimension, the last but one, of `(…, nq, B)`."""
+    """Return Σ_j E_ij x_j over the joint dimension of `(…, nq, B)`."""
     return E @ x
 
 
 def take(x: Tensor, joints: Sequence[int]) -> Tensor:
-    """The entries of some joints of `(…, nq, B)`; a view if they are evenly spaced."""
+    """Return the entries of some joints of `(…, nq, B)`, as a view if they are evenly spaced."""
     first, last, count = joints[0], joints[-1], len(joints)
     step = (last - first) // (count - 1) if count > 1 else 1
     if step > 0 and list(joints) == list(range(first, last + 1, step)):
@@ -87,7 +87,7 @@ def take(x: Tensor, joints: Sequence[int]) -> Tensor:
 
 
 def solve_spd(M: Tensor, rhs: Tensor) -> Tensor:
-    """M⁻¹ rhs for symmetric positive definite `(n, n, B)` and `(n, k, B)`.
+    """Return M⁻¹ rhs for symmetric positive definite `(n, n, B)` and `(n, k, B)`.
 
     Large batches use elimination without pivoting (stable for such M), vectorized over the samples.
     """

@@ -37,14 +37,14 @@ class ForwardDynamicsDerivatives(NamedTuple):
 
 
 def _pairs(robot: RobotModel, up: Tensor, down: Tensor) -> Tensor:
-    """D with D_ij = up_ij where joint j moves link i, and down_ij where joint i moves link j."""
+    """Return D with D_ij = up_ij if joint j moves link i, and down_ij if joint i moves link j."""
     E = robot.ancestors[..., None]
     strictly = torch.tril(robot.ancestors, -1).mT[..., None]
     return up * E + down * strictly
 
 
 def _gyration(links: dynamics.LinkInertia, omega: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-    """N = 2 ω×I − tr(I) ω× − 2 h×v× and the linear momentum l of each link."""
+    """Return N = 2 ω×I − tr(I) ω× − 2 h×v× and the linear momentum l of each link."""
     w = batchlast.skew(omega)
     trace = links.inertia.diagonal(dim1=0, dim2=1).sum(-1)
     N = 2.0 * batchlast.product(w, links.inertia) - trace * w
@@ -55,13 +55,13 @@ def _gyration(links: dynamics.LinkInertia, omega: Tensor, v: Tensor) -> tuple[Te
 def _inverse_derivatives(
     robot: RobotModel, poses: LinkPoses, links: dynamics.LinkInertia, motion: LinkMotion, qdd: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """∂ID/∂q and ∂ID/∂q̇ with the batch last, `(nq, nq, B)`.
+    """Return ∂ID/∂q and ∂ID/∂q̇ with the batch last, `(nq, nq, B)`.
 
     With the composite inertia I and the composite 2B = [[N, 0], [−2 l×, 0]] of the subtree of joint i,
     N = 2 ω×I − tr(I) ω× − 2 h×v×, l its linear momentum, F its force, and for each joint Ṡ = V×S,
     S̈ = a×S + V×Ṡ:
-    ∂τ_i/∂q_j = S_i·(2B Ṡ_j + I S̈_j) for j that moves i, S_i·(2B Ṡ_j + I S̈_j + S_j ×* F) of subtree j
-    for i that moves j; ∂τ/∂q̇ has S and 2 Ṡ in place of Ṡ and S̈, and no F.
+    ∂τ_i/∂q_j = S_i·(2B Ṡ_j + I S̈_j) if j moves i, and S_i·(2B Ṡ_j + I S̈_j + S_j ×* F) of subtree j if i
+    moves j; ∂τ/∂q̇ has S and 2 Ṡ instead of Ṡ and S̈, and no F.
     """
     Et, z, l, omega, v = robot.ancestors.mT, poses.angular, poses.linear, motion.omega, motion.velocity
     alpha, a = dynamics.accelerations(robot, poses, motion, qdd)
@@ -103,7 +103,7 @@ def _inverse_derivatives(
 def inverse_dynamics_derivatives(
     robot: RobotModel, q: JointVector, qd: JointVector, qdd: JointVector
 ) -> InverseDynamicsDerivatives:
-    """Jacobians of `inverse_dynamics` with respect to q, q̇ and q̈ at states `(*batch, nq)`.
+    """Return Jacobians of `inverse_dynamics` with respect to q, q̇ and q̈ at states `(*batch, nq)`.
 
     Raises:
         ShapeError: an argument does not fit the robot.
@@ -119,8 +119,8 @@ def inverse_dynamics_derivatives(
 def forward_dynamics_derivatives(
     robot: RobotModel, q: JointVector, qd: JointVector, force: JointVector
 ) -> ForwardDynamicsDerivatives:
-    """Jacobians of `forward_dynamics` with respect to q, q̇ and force: −M⁻¹ ∂ID/∂q, −M⁻¹ ∂ID/∂q̇ and M⁻¹, at
-    its q̈.
+    """Return Jacobians of `forward_dynamics` with respect to q, q̇ and force: −M⁻¹ ∂ID/∂q, −M⁻¹ ∂ID/∂q̇ and
+    M⁻¹, at its q̈.
 
     Raises:
         ShapeError: an argument does not fit the robot.

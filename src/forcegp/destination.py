@@ -1,4 +1,4 @@
-"""Checks, before the work starts, that a result can be written; and a fallback path if writing fails."""
+"""Checks before the work starts that a result can be written, and a fallback path if writing fails."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from forcegp.errors import DestinationError, ForceGPError
 from forcegp.files import check_kind, writable
 
 PROBE_BYTES = 1 << 16
-"""Written and removed again to see whether there is room, and whether a quota allows it."""
+"""Bytes written and removed again to test for free space and quotas."""
 
 
 def check_destination(path: str | Path, *, folder: bool = False, own_files: Iterable[str] = ()) -> None:
     """Check, before long work, that a file or folder can be written, without leaving anything behind.
 
-    A folder may replace an empty folder or one that contains only `own_files` (patterns; any folder without
-    patterns).
+    A folder may replace an empty folder or one that contains only `own_files` (patterns). Without patterns,
+    it may replace any folder.
 
     Raises:
         DestinationError: a file would replace a folder or the reverse, the folder contains other files, or
@@ -40,7 +40,7 @@ def check_destination(path: str | Path, *, folder: bool = False, own_files: Iter
 
 
 def write_or_keep(write: Callable[[Path], object], path: str | Path) -> None:
-    """Write a result by `write(path)`, or else to another path named in the `DestinationError`."""
+    """Write a result with `write(path)` or, if that fails, to a path named in the `DestinationError`."""
     target = Path(path)
     try:
         write(target)
@@ -59,7 +59,7 @@ def write_or_keep(write: Callable[[Path], object], path: str | Path) -> None:
 
 
 def _kept(write: Callable[[Path], object], name: str) -> Path | None:
-    """A private place where the result could be written, or `None`."""
+    """Write the result to a private location and return its path, or `None`."""
     for parent in (tempfile.gettempdir(), os.getcwd(), str(Path.home())):
         with contextlib.suppress(OSError, ForceGPError):
             place = Path(tempfile.mkdtemp(prefix="forcegp-kept-", dir=parent))

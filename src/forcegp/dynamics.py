@@ -1,6 +1,6 @@
 """Mass matrix, bias and gravity forces, inverse and forward dynamics of a tree of rigid links.
 
-All forces stand on the right-hand side: M q̈ = Q_C + Q_G + Q_D + Q_u. The algorithms are the composite
+All forces are on the right-hand side: M q̈ = Q_C + Q_G + Q_D + Q_u. The algorithms are the composite
 rigid-body and the recursive Newton-Euler algorithm (Featherstone, *Rigid Body Dynamics Algorithms*,
 ch. 5 and 6), written in world axes so that sums over subtrees are products with the ancestor matrix.
 """
@@ -35,7 +35,7 @@ class LinkInertia:
 
 
 def link_inertia(robot: RobotModel, poses: LinkPoses) -> LinkInertia:
-    """Inertia of each link, moved to the base origin: I_o = R I_c Rᵀ + m(cᵀc 1 − c cᵀ)."""
+    """Return the inertia of each link, moved to the base origin: I_o = R I_c Rᵀ + m(cᵀc 1 − c cᵀ)."""
     R, mass = poses.R, robot.mass[:, None]
     c = poses.p + apply(R, robot.com.T[..., None])
     moment = mass * c
@@ -47,7 +47,7 @@ def link_inertia(robot: RobotModel, poses: LinkPoses) -> LinkInertia:
 
 
 def mass_matrix_of(robot: RobotModel, poses: LinkPoses, links: LinkInertia) -> Tensor:
-    """M_ij = s_iᵀ I^c_j s_j for i an ancestor of j, composite I^c = Eᵀ I, plus the drives, `(nq, nq, B)`."""
+    """Return M_ij = s_iᵀ I^c_j s_j, i an ancestor of j, composite I^c = Eᵀ I, plus drives, `(nq, nq, B)`."""
     E, S, L = robot.ancestors, poses.angular, poses.linear
     whole = LinkInertia(E.mT @ links.mass, sum_over(E.mT, links.moment), sum_over(E.mT, links.inertia))
     angular, linear = momentum(whole, S, L)
@@ -58,21 +58,21 @@ def mass_matrix_of(robot: RobotModel, poses: LinkPoses, links: LinkInertia) -> T
 
 
 def _gravity_force(robot: RobotModel, poses: LinkPoses, links: LinkInertia) -> Tensor:
-    """Q_G = sᵀ Eᵀ [m c × g; m g] with the batch last, `(nq, B)`."""
+    """Return Q_G = sᵀ Eᵀ [m c × g; m g] with the batch last, `(nq, B)`."""
     Et, g = robot.ancestors.mT, robot.gravity[:, None, None]
     torque = cross(sum_over(Et, links.moment), g)
     return dot(poses.angular, torque) + dot(poses.linear, (Et @ links.mass) * g)
 
 
 def momentum(links: LinkInertia, w: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-    """Inertia times a motion vector [w; v], `(3, nq, B)` each: [I w + h × v; m v − h × w]."""
+    """Return the inertia times a motion vector [w; v], `(3, nq, B)` each: [I w + h × v; m v − h × w]."""
     return apply(links.inertia, w) + cross(links.moment, v), links.mass * v - cross(links.moment, w)
 
 
 def link_force(
     links: LinkInertia, motion: LinkMotion, alpha: Tensor, acceleration: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Torque and force I a + V ×* I V, `(3, nq, B)`, of links with velocity V and acceleration a."""
+    """Return torque and force I a + V ×* I V, `(3, nq, B)`, of links with velocity V and acceleration a."""
     n, l = momentum(links, motion.omega, motion.velocity)
     torque, force = momentum(links, alpha, acceleration)
     torque = torque + cross(motion.omega, n) + cross(motion.velocity, l)
@@ -80,20 +80,20 @@ def link_force(
 
 
 def _joint_force(robot: RobotModel, poses: LinkPoses, torque: Tensor, force: Tensor) -> Tensor:
-    """Joint forces sᵀ Eᵀ [torque; force], `(nq, B)`, that hold forces on the links."""
+    """Return the joint forces sᵀ Eᵀ [torque; force], `(nq, B)`, that balance forces on the links."""
     Et = robot.ancestors.mT
     return dot(poses.angular, sum_over(Et, torque)) + dot(poses.linear, sum_over(Et, force))
 
 
 def _bias_force(robot: RobotModel, poses: LinkPoses, links: LinkInertia, motion: LinkMotion) -> Tensor:
-    """Q_C with the batch last, `(nq, B)`."""
+    """Return Q_C with the batch last, `(nq, B)`."""
     return -_joint_force(robot, poses, *link_force(links, motion, motion.alpha, motion.acceleration))
 
 
 def known_terms(
     robot: RobotModel, poses: LinkPoses, motion: LinkMotion, qd: JointVector
 ) -> tuple[JointMatrix, JointVector, JointVector, JointVector]:
-    """M, Q_C, Q_G and Q_D, all forces of the robot file, from the motion of the links."""
+    """Return M, Q_C, Q_G and Q_D, all forces of the robot file, from the motion of the links."""
     links, Q_D = link_inertia(robot, poses), damping_force(robot, qd)
     M, Q_C = mass_matrix_of(robot, poses, links), _bias_force(robot, poses, links, motion)
     Q_G = _gravity_force(robot, poses, links)
@@ -103,8 +103,8 @@ def known_terms(
 def accelerations(
     robot: RobotModel, poses: LinkPoses, motion: LinkMotion, qdd: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Spatial accelerations `(3, nq, B)` of the links at q̈ `(nq, B)`; gravity enters as an acceleration of
-    the base.
+    """Return the spatial accelerations `(3, nq, B)` of the links at q̈ `(nq, B)`; gravity enters as an
+    acceleration of the base.
     """
     E = robot.ancestors
     linear = motion.acceleration + sum_over(E, poses.linear * qdd) - robot.gravity[:, None, None]
@@ -114,7 +114,7 @@ def accelerations(
 def equation_of_motion(
     robot: RobotModel, poses: LinkPoses, links: LinkInertia, motion: LinkMotion
 ) -> tuple[Tensor, Tensor]:
-    """M `(nq, nq, B)` and −(Q_C + Q_G) `(nq, B)` of M q̈ − Q_C − Q_G = force."""
+    """Return M `(nq, nq, B)` and −(Q_C + Q_G) `(nq, B)` of M q̈ − Q_C − Q_G = force."""
     # Gravity enters as an acceleration of the base, so one pass gives both forces.
     lifted = motion.acceleration - robot.gravity[:, None, None]
     torque, force = link_force(links, motion, motion.alpha, lifted)
@@ -122,7 +122,7 @@ def equation_of_motion(
 
 
 def mass_matrix(robot: RobotModel, q: JointVector) -> JointMatrix:
-    """Generalized mass matrix M(q) `(*batch, nq, nq)`, symmetric positive definite [kg m², kg m, kg].
+    """Return the mass matrix M(q) `(*batch, nq, nq)`, symmetric positive definite [kg m², kg m, kg].
 
     Example:
         >>> import torch, forcegp
@@ -139,7 +139,7 @@ def mass_matrix(robot: RobotModel, q: JointVector) -> JointMatrix:
 
 
 def gravity_force(robot: RobotModel, q: JointVector) -> JointVector:
-    """Generalized gravity force Q_G(q), `(*batch, nq)` [N m, N].
+    """Return the generalized gravity force Q_G(q), `(*batch, nq)` [N m, N].
 
     Raises:
         ShapeError: q does not fit the robot.
@@ -149,7 +149,7 @@ def gravity_force(robot: RobotModel, q: JointVector) -> JointVector:
 
 
 def bias_force(robot: RobotModel, q: JointVector, qd: JointVector) -> JointVector:
-    """Generalized Coriolis and centrifugal force Q_C(q, q̇) on the right-hand side, `(*batch, nq)` [N m, N].
+    """Return the Coriolis and centrifugal force Q_C(q, q̇) on the right-hand side, `(*batch, nq)` [N m, N].
 
     Raises:
         ShapeError: q or qd does not fit the robot.
@@ -161,7 +161,7 @@ def bias_force(robot: RobotModel, q: JointVector, qd: JointVector) -> JointVecto
 
 
 def damping_force(robot: RobotModel, qd: JointVector, slip: JointVector | None = None) -> JointVector:
-    """Joint friction of the robot: viscous, Coulomb (smoothed at zero speed) and the Stribeck effect.
+    """Return the joint friction of the robot: viscous, Coulomb (smoothed at zero speed) and Stribeck.
 
     Q_D = −d q̇ − (f_c + f_s e^{−(q̇/v_s)²}) tanh(q̇/v_0), `(*batch, nq)` [N m, N]; `slip` `(*batch, nq)` is a
     direction of sliding in place of tanh(q̇/v_0). See Armstrong-Hélouvry, Dupont, Canudas de Wit, *A survey
@@ -197,7 +197,7 @@ def inverse_dynamics(robot: RobotModel, q: JointVector, qd: JointVector, qdd: Jo
 
 
 def forward_dynamics(robot: RobotModel, q: JointVector, qd: JointVector, force: JointVector) -> JointVector:
-    """Acceleration of free motion `(*batch, nq)`, q̈ = M⁻¹(force + Q_C + Q_G) (eq. 1) [rad/s², m/s²].
+    """Return q̈ = M⁻¹(force + Q_C + Q_G) of free motion (eq. 1), `(*batch, nq)` [rad/s², m/s²].
 
     Args:
         robot: the robot.

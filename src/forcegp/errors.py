@@ -12,7 +12,7 @@ from typing import Any, TypeVar
 from forcegp.limits import NAME_COMPARED, NAMES_COMPARED
 
 LONGEST_VALUE = 2000
-"""Characters of a wrong value that a message shows."""
+"""Maximum number of characters of a wrong value in a message."""
 
 E = TypeVar("E", bound="ForceGPError")
 
@@ -39,7 +39,7 @@ class ForceGPError(Exception):
 
     @classmethod
     def at(cls: type[E], place: str, cause: ForceGPError) -> E:
-        """An error of this class that adds the location (a file, a line) to another error."""
+        """Return an error of this class that adds the location (a file, a line) to another error."""
         message = f"{place}: {cause.message}"
         error = cls.__new__(cls)
         ForceGPError.__init__(error, message, expected=cause.expected, got=cause.got, hint=cause.hint)
@@ -55,18 +55,18 @@ class ForceGPError(Exception):
             raise cls.at(place, cause) from cause
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Recipe to copy the error, or to send it to another process: its text and plain values."""
+        """Return text and plain values, from which the error can be copied or sent to another process."""
         state = {name: _plain(value) for name, value in self.__dict__.items()}
         return _rebuilt, (type(self), tuple(map(_plain, self.args)), state)
 
 
 def _plain(value: object) -> object:
-    """The value itself where every process can hold it, else the text that the message shows."""
+    """Return a value that every process can unpickle, and the text of the message for any other."""
     return value if isinstance(value, str | int | float | None) else str(value)
 
 
 def _rebuilt(kind: type[E], args: tuple[object, ...], state: dict[str, object]) -> E:
-    """The error that `ForceGPError.__reduce__` took apart; no constructor runs a second time."""
+    """Rebuild an error from `ForceGPError.__reduce__` without calling its constructor again."""
     error = kind.__new__(kind, *args)
     error.args = args
     error.__dict__.update(state)
@@ -74,7 +74,7 @@ def _rebuilt(kind: type[E], args: tuple[object, ...], state: dict[str, object]) 
 
 
 def near_names(name: object, valid: Iterable[str], cutoff: float = 0.6) -> list[str]:
-    """The valid name nearest to a misspelt one, if any; long names and long lists are not compared."""
+    """Return the valid name nearest to a misspelt one, if any; long names and long lists are not compared."""
     text = str(name)
     if len(text) > NAME_COMPARED:
         return []
@@ -83,13 +83,13 @@ def near_names(name: object, valid: Iterable[str], cutoff: float = 0.6) -> list[
 
 
 def did_you_mean(name: object, valid: Iterable[str], cutoff: float = 0.6) -> str | None:
-    """A hint that names the valid name nearest to a misspelt one, if there is one."""
+    """Return a hint that names the valid name nearest to a misspelt one, if there is one."""
     near = near_names(name, valid, cutoff)
     return f"did you mean {near[0]!r}?" if near else None
 
 
 class RobotFileError(ForceGPError, ValueError):
-    """A robot file that cannot be read, or that describes no valid robot."""
+    """A robot file that cannot be read or does not describe a valid robot."""
 
 
 class UnsupportedRobotError(RobotFileError):
@@ -97,7 +97,7 @@ class UnsupportedRobotError(RobotFileError):
 
 
 class InertiaError(RobotFileError):
-    """Inertial parameters that no rigid body can have (the message names the link and the reason)."""
+    """Inertial parameters that are physically impossible (the message names the link and the reason)."""
 
 
 class RobotFileWarning(UserWarning):
@@ -141,15 +141,15 @@ class DataError(ForceGPError, ValueError):
 
 
 class SceneError(ForceGPError, ValueError):
-    """A scene file that is not valid (the message names file, line and key)."""
+    """An invalid scene file (the message names file, line and key)."""
 
 
 class MappingError(ForceGPError, ValueError):
-    """A mapping of log columns that is not valid, or does not fit the log (names file, line and key)."""
+    """A mapping of log columns that is invalid or does not match the log (names file, line and key)."""
 
 
 class ModelError(ForceGPError, ValueError):
-    """A model without the requested ability, or a saved model that cannot be read."""
+    """A model that does not support the request, or a saved model that cannot be read."""
 
 
 class NumericalError(ForceGPError, ArithmeticError):
@@ -157,7 +157,7 @@ class NumericalError(ForceGPError, ArithmeticError):
 
 
 class MassMatrixError(NumericalError):
-    """A mass matrix that is not positive definite, as of a robot with negative masses."""
+    """A mass matrix that is not positive definite, for example due to negative masses."""
 
     def __init__(self, cause: Exception) -> None:
         text, hint = "a mass matrix is not positive definite", "check the robot's masses and inertias"
@@ -169,15 +169,15 @@ class MissingDependencyError(ForceGPError, ImportError):
 
 
 class DestinationError(ForceGPError, OSError):
-    """A path that cannot be written; the message names where the results were kept, if they exist."""
+    """A path that cannot be written; the message names the location of any results that were kept."""
 
 
 class MemoryLimitError(ForceGPError, RuntimeError):
-    """Work that needs more memory than is free; it was not started."""
+    """A computation that was not started since it needs more than the free memory."""
 
 
 def optional_module(name: str, purpose: str, extra: str | None = None) -> Any:
-    """An optional package.
+    """Import an optional package.
 
     Args:
         name: the module to import.

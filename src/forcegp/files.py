@@ -1,8 +1,8 @@
 """Files that are written atomically, and JSON headers with format and version.
 
-A file under construction is hidden, locked while its writer lives, and deleted after a crash. Its name is
+Temporary files are hidden, locked while their writer runs, and deleted after a crash. Their name is
 `.forcegp-new-<12 hex digits>-<name of the target>`. The lock (flock) ends with the process; without flock
-(Windows, some network file systems) such files remain.
+(Windows, some network file systems), such files remain after a crash.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ M = TypeVar("M", bound=BaseModel)
 
 
 LONGEST = 200
-"""Bytes of a target's name that its hidden names repeat; file systems allow 255 in all."""
+"""Maximum bytes of a target's name in temporary names; file systems allow 255 in total."""
 NEW = ".forcegp-new-"
-"""Prefix of what is under construction."""
+"""Prefix of temporary names."""
 
 
 def _short(target: Path) -> str:
-    """The name of a target, or for a long one a digest with the same ending, which some writers go by."""
+    """Return the name of a target, or for a long name a digest with its suffix (needed by some writers)."""
     name = os.fsencode(target.name)
     if len(name) <= LONGEST:
         return target.name
@@ -49,7 +49,7 @@ def _short(target: Path) -> str:
 
 
 class Temporary:
-    """An empty file or folder under construction beside an existing target, locked until `close`."""
+    """An empty temporary file or folder next to an existing target, locked until `close`."""
 
     def __init__(self, target: Path, *, folder: bool, mode: int) -> None:
         while True:
@@ -98,7 +98,7 @@ def discard(path: Path) -> None:
 
 
 def _lock(path: Path) -> tuple[bool, int | None]:
-    """Whether we hold the lock of a path that still exists (or need none), and the descriptor."""
+    """Return whether we hold the lock of a path that still exists (or need none), and the descriptor."""
     if fcntl is None:
         return True, None
     try:
@@ -116,7 +116,7 @@ def _lock(path: Path) -> tuple[bool, int | None]:
 
 @contextmanager
 def writable(target: Path) -> Iterator[None]:
-    """Errors of the system in the block, which writes to `target`, as `DestinationError`."""
+    """Convert operating system errors in the block, which writes to `target`, to `DestinationError`."""
     try:
         yield
     except DestinationError:
@@ -130,7 +130,7 @@ def writable(target: Path) -> Iterator[None]:
 
 
 def check_kind(target: Path, *, folder: bool) -> None:
-    """Check that an existing target is a folder if `folder` is true, else a regular file.
+    """Check that an existing target is a folder if `folder` is true, and otherwise a regular file.
 
     The path is inspected once, since another writer could change it between `exists` and `is_dir`.
     """
@@ -148,7 +148,7 @@ def check_kind(target: Path, *, folder: bool) -> None:
 
 
 def _sync(path: Path) -> None:
-    """Force a file or folder to disk, so that a rename never outruns the data that it names."""
+    """Flush a file or folder to disk, so that a rename never precedes its data."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -158,7 +158,7 @@ def _sync(path: Path) -> None:
 
 @contextmanager
 def _temporary(target: Path, *, folder: bool, mode: int) -> Iterator[Path]:
-    """Temporary file of a target; gone when the block ends, unless it was moved."""
+    """Yield a temporary file for a target, which is deleted when the block ends unless it was moved."""
     with writable(target):
         check_kind(target, folder=folder)
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -172,16 +172,16 @@ def _temporary(target: Path, *, folder: bool, mode: int) -> Iterator[Path]:
 
 @contextmanager
 def atomic_file(path: str | Path, mode: int = 0o666) -> Iterator[Path]:
-    """A temporary path that replaces `path` when the block ends without an error.
+    """Yield a temporary path that replaces `path` if the block ends without an error.
 
     Temporary files of crashed writers of the same file are removed.
 
     Args:
-        path: the file to write; missing parent folders are made.
-        mode: permissions of the new file, less the umask.
+        path: the file to write; missing parent folders are created.
+        mode: permissions of the new file before the umask.
 
     Yields:
-        Where to write. A reader of `path` sees the old file or the whole new one.
+        The path to write to. Readers of `path` see the old file or the complete new one.
 
     Raises:
         DestinationError: the path cannot be written, or is a folder, a pipe or a device.
@@ -206,10 +206,10 @@ def atomic_file(path: str | Path, mode: int = 0o666) -> Iterator[Path]:
 
 @contextmanager
 def written_folder(path: str | Path) -> Iterator[Path]:
-    """A temporary folder; its files move into the target folder when the block ends without an error.
+    """Yield a temporary folder, which is moved into the target folder if the block ends without an error.
 
-    Each file replaces its namesake in one step, in the order of writing, so that the last one exists only
-    with the others; then all other files of the folder are removed. Symbolic links are followed.
+    Each file replaces its namesake in one step, in the order of writing, so the last one exists only
+    together with the others. Then all other files in the folder are removed. Symbolic links are followed.
 
     Yields:
         The folder to write the files to.
@@ -268,7 +268,7 @@ class Header(Record):
     MAX_BYTES: ClassVar[int] = HEADER_BYTES
 
     def to_json(self) -> str:
-        """The header as JSON text, format and version first."""
+        """Return the header as JSON text, format and version first."""
         head = {"format": self.FORMAT, "version": self.VERSION}
         return json.dumps(head | self.model_dump(mode="json"), indent=2, allow_nan=False)
 
@@ -323,7 +323,7 @@ def _json_object(text: str | bytes, source: str, error: type[ForceGPError], most
 
 
 def depth(value: object) -> int:
-    """Largest depth of nested mappings and lists, found without recursion."""
+    """Return the largest depth of nested mappings and lists, found without recursion."""
     level, levels = [value], 0
     while level := [part for part in level if isinstance(part, dict | list)]:
         levels += 1

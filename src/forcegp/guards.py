@@ -1,6 +1,6 @@
-"""Guards of readers: the claimed size of a file is checked before it is read, and errors are typed.
+"""Guards for readers, which check the declared size of a file before reading it, and convert errors.
 
-A small compressed file can claim to contain more than fits into memory. The bounds are in `forcegp.limits`.
+A small compressed file may declare more content than fits into memory. The bounds are in `forcegp.limits`.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from forcegp.errors import DataError, ForceGPError, optional_module
 
 
 def check_count(source: str, what: str, count: int, most: int) -> None:
-    """Raise `DataError` if a log claims more than `most` items, named in the plural.
+    """Raise `DataError` if a log declares more than `most` items (a plural noun).
 
     >>> check_count("run.csv", "columns", 12, limits.COLUMNS)
     """
@@ -36,7 +36,7 @@ def check_count(source: str, what: str, count: int, most: int) -> None:
 
 
 def check_expansion(source: str, size: int, file: int, free: int | None = None) -> None:
-    """Raise `DataError` if a small file, of `file` bytes, claims to contain far more, `size` bytes."""
+    """Raise `DataError` if a file of `file` bytes declares a far larger content of `size` bytes."""
     allowed = allowed_bytes(file, free)
     if size > allowed:
         raise DataError(
@@ -48,13 +48,13 @@ def check_expansion(source: str, size: int, file: int, free: int | None = None) 
 
 
 def allowed_bytes(file: int, free: int | None = None) -> int:
-    """Number of bytes that a file of `file` bytes may unpack to, at least `free`."""
+    """Return the number of bytes that a file of `file` bytes may unpack to, at least `free`."""
     return max(free or limits.FREE_TABLE_BYTES, limits.TABLE_EXPANSION * file)
 
 
 @dataclass
 class Unpacking:
-    """Bytes and records that a log of `file` bytes has unpacked to so far, in bounds by its size."""
+    """Counter of the bytes and records unpacked from a log of `file` bytes, bounded by its size."""
 
     source: str
     file: int
@@ -69,7 +69,7 @@ class Unpacking:
         return content
 
     def read(self, size: int) -> None:
-        """Count bytes that were read from the log, perhaps for the second time."""
+        """Count bytes that were read from the log, including repeated reads."""
         self.size += size
         check_expansion(self.source, self.size, self.file, limits.FREE_BAG_BYTES)
 
@@ -81,7 +81,7 @@ class Unpacking:
 
 
 def _opened(packed: bytes, compression: str) -> Any:
-    """A compressed part as a file that is unpacked as it is read."""
+    """Return a compressed part as a file that is unpacked as it is read."""
     stream = io.BytesIO(packed)
     if compression in ("", "none"):
         return stream
@@ -96,7 +96,7 @@ def _opened(packed: bytes, compression: str) -> Any:
 
 
 def bounded(reader: Any, unpacking: Unpacking) -> Any:
-    """The reader of ROS 1 bags with bounds on unpacked chunks and on the index."""
+    """Return the reader of ROS 1 bags with bounds on unpacked chunks and on the index."""
 
     class Bounded(reader):
         indexed = 0
@@ -117,7 +117,7 @@ def bounded(reader: Any, unpacking: Unpacking) -> Any:
 
 
 def check_tables(file: Path) -> None:
-    """Check that a bag in SQLite computes no rows and lists no topic twice; other files pass."""
+    """Check that an SQLite bag has no computed rows or duplicate topics; other files pass."""
     if not starts_with(file, b"SQLite format 3"):
         return
     with closing(sqlite3.connect(f"{file.absolute().as_uri()}?immutable=1", uri=True)) as bag:
@@ -129,7 +129,7 @@ def check_tables(file: Path) -> None:
 
 
 def is_file(path: Path) -> bool:
-    """Whether a file exists; false for invalid names."""
+    """Return whether a file exists; false for invalid names."""
     try:
         return path.is_file()
     except (OSError, ValueError):
@@ -137,19 +137,19 @@ def is_file(path: Path) -> bool:
 
 
 def starts_with(file: Path, magic: bytes) -> bool:
-    """Whether a file begins with some bytes."""
+    """Return whether a file begins with some bytes."""
     with file.open("rb") as opened:
         return opened.read(len(magic)) == magic
 
 
 DEFLATE, SHUFFLE, FLETCHER32, LZF = 1, 2, 3, 32000
 DEFLATE_RATIO = 1032
-"""Bytes that one byte of deflated data unpacks to at most."""
+"""Maximum number of bytes that one byte of deflated data unpacks to."""
 
 
 def check_chunks(dataset: Any, file: int) -> None:
-    """Check that no chunk of an h5py data set exceeds its declared size, which HDF5 does not check; a
-    chunk of another compression is a `DataError` too.
+    """Check that no chunk of an h5py data set exceeds its declared size, which HDF5 does not check.
+    Unsupported compression also raises `DataError`.
     """
     source, properties = f"{dataset.file.filename}: {dataset.name!r}", dataset.id.get_create_plist()
     filters = [properties.get_filter(i)[0] for i in range(properties.get_nfilters())]
@@ -173,7 +173,7 @@ def check_chunks(dataset: Any, file: int) -> None:
 
 
 def within(folder: Path, files: Iterable[Path]) -> list[Path]:
-    """Files of a folder that is read as one log; `DataError` names a link that leads out of it."""
+    """Return the files of a folder that is read as one log; `DataError` for links to paths outside it."""
     files, root = list(files), folder.resolve()
     for file in files:
         if not file.resolve().is_relative_to(root):
@@ -199,7 +199,7 @@ def foreign(source: str, kind: str) -> Iterator[None]:
 
 
 def damaged(source: str, kind: str, cause: BaseException) -> DataError:
-    """The error for a file that cannot be parsed."""
+    """Return the error for a file that cannot be parsed."""
     lines = str(cause).splitlines()
     return DataError(
         f"{source}: the file is damaged, truncated or not {kind}",

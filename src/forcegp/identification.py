@@ -2,7 +2,7 @@
 
 Sources: Atkeson, An, Hollerbach, *Estimation of inertial parameters of manipulator loads and links*
 (IJRR 1986); Gautier, *Numerical calculation of the base inertial parameters of robots* (J. Robotic
-Systems 1991). Only the base parameters β = B π, r of them, act on the motion and can be identified.
+Systems 1991). Only the r base parameters β = B π affect the motion and can be identified.
 """
 
 from __future__ import annotations
@@ -26,19 +26,20 @@ from forcegp.types import JointVector
 
 Regressor = Float[Tensor, "*batch nq p"]
 RANK = 1e-9
-"""Share of the largest pivot of the scaled regressor below which a direction does not act on the motion."""
+"""Fraction of the largest pivot of the scaled regressor below which a direction does not affect the motion.
+"""
 STATES = 100
-"""Random states at which the rank is found."""
+"""Number of random states for determining the rank."""
 MASS_SHARE, MOMENT_ARM = 0.3, 0.1
-"""Tolerance of a robot file: of the mass m of a link, as a share, and its centre of mass [m]: the standard
+"""Tolerance of a robot file, for the mass m of a link (relative) and its centre of mass [m]. The standard
 deviations of its parameters are 30 % of m, m · 0.1 m and m · (0.1 m)²."""
 PARAMETER_NAMES = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
 
 
 def regressor(robot: RobotModel, q: JointVector, qd: JointVector, qdd: JointVector) -> Regressor:
-    """Y `(*batch, nq, 10 nq)` with Y π = M q̈ − Q_C − Q_G without drives, π as in `parameter_vector`.
+    """Return Y `(*batch, nq, 10 nq)` with Y π = M q̈ − Q_C − Q_G without drives, π as in `parameter_vector`.
 
-    Inverse dynamics is linear in π, so column k of link i contains the forces of that link with unit π_k.
+    Inverse dynamics is linear in π, so column k of link i contains the forces due to that link with unit π_k.
     Only kinematics and gravity of the robot are used.
 
     Example:
@@ -67,7 +68,7 @@ def regressor(robot: RobotModel, q: JointVector, qd: JointVector, qdd: JointVect
 
 
 def _links_of(poses: LinkPoses, parameters: Tensor) -> LinkInertia:
-    """All links with the same π `(10,)` about the link origin, moved to the base origin."""
+    """Return the inertias of links that all have the same π `(10,)`, moved to the base origin."""
     rows = torch.tensor([[4, 5, 6], [5, 7, 8], [6, 8, 9]], device=parameters.device)
     R, p, mass = poses.R, poses.p, parameters[0].expand(poses.p.shape[1], 1)
     # I_o = R I Rᵀ + (2 p·h + m p·p) 1 − p hᵀ − h pᵀ − m p pᵀ with h = R m c
@@ -79,18 +80,18 @@ def _links_of(poses: LinkPoses, parameters: Tensor) -> LinkInertia:
 
 
 def parameter_vector(robot: RobotModel) -> Float[Tensor, " p"]:
-    """π `(10 nq,)`: m, m c and the inertia about the link origin of each link in turn."""
+    """Return π `(10 nq,)`: m, m c and the inertia about the link origin of each link in turn."""
     return inertial_parameters(robot.mass, robot.com, robot.inertia).flatten()
 
 
 @dataclass(frozen=True)
 class BaseParameters:
-    """The combinations β = B π that act on the motion.
+    """The combinations β = B π that affect the motion.
 
     Attributes:
         columns: indices in π of the r independent parameters, one per combination.
-        combination: B `(r, 10 nq)`, the identity in these columns.
-        names: of the combinations, such as `"Izz[joint_1] + 3 more"`.
+        combination: B `(r, 10 nq)`, with the identity in these columns.
+        names: names of the combinations, such as `"Izz[joint_1] + 3 more"`.
     """
 
     columns: tuple[int, ...]
@@ -103,12 +104,12 @@ class BaseParameters:
         return len(self.columns)
 
     def of(self, robot: RobotModel) -> np.ndarray:
-        """β of a robot with the same kinematics, `(r,)`."""
+        """Return β `(r,)` of a robot with the same kinematics."""
         return self.combination @ parameter_vector(robot).detach().cpu().numpy()
 
 
 def base_parameters(robot: RobotModel) -> BaseParameters:
-    """Base parameters by rank-revealing QR of the regressor at random states (Gautier 1991).
+    """Compute the base parameters by rank-revealing QR of the regressor at random states (Gautier 1991).
 
     Runs in double precision on the CPU. Only kinematics and gravity of the robot are used.
 
@@ -159,7 +160,7 @@ class Identification:
         covariance: `(r, r)` covariance of the estimate.
         damping, friction: `(nq,)` viscous and Coulomb friction if requested, else None.
         noise_std: `(nq,)` standard deviation of the torque residual [N m, N].
-        condition: condition number of the scaled problem; beyond about 100 the motion excites too little.
+        condition: condition number of the scaled problem; above about 100, the motion is not exciting enough.
     """
 
     base: BaseParameters
@@ -187,10 +188,10 @@ def identify(
     joint weighted by its residual noise. The accelerations are treated as exact.
 
     Args:
-        robot: its kinematics, gravity, drive inertia and v_0 are used, its inertial parameters are not.
-        q, qd, qdd: `(n, nq)` the motion.
-        tau: `(n, nq)` measured joint force, without the dissipative part unless `friction` [N m, N].
-        friction: identify viscous and Coulomb friction with the inertial parameters.
+        robot: robot that provides kinematics, gravity, drive inertia and v_0.
+        q, qd, qdd: `(n, nq)` positions, velocities and accelerations.
+        tau: `(n, nq)` measured joint force, excluding friction unless `friction` is true [N m, N].
+        friction: whether to identify viscous and Coulomb friction as well.
 
     Example:
         >>> import forcegp, torch
@@ -202,7 +203,7 @@ def identify(
 
     Raises:
         ShapeError: an argument does not fit the robot.
-        DataError: a value is not finite, there are too few samples, or the motion does not excite all.
+        DataError: a value is not finite, there are too few samples, or the motion is not exciting enough.
     """
     robot.check_state(q=q, qd=qd, qdd=qdd, tau=tau)
     if not all(bool(torch.isfinite(x).all()) for x in (q, qd, qdd, tau)):
@@ -235,7 +236,7 @@ def identify(
 
 
 def _least_squares(W: np.ndarray, y: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Weighted solution, its covariance, and the condition of the problem with columns of unit length."""
+    """Return the weighted solution, its covariance, and the condition number with unit columns."""
     A = (W * weights[:, None]).reshape(-1, W.shape[-1])
     b = (y * weights).ravel()
     scale = np.linalg.norm(A, axis=0)

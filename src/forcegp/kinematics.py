@@ -2,7 +2,7 @@
 
 Spatial vectors are `[angular, linear]`, in world axes, about the origin of the base. With joint screws s_j in
 this form and the ancestor matrix E, the twist of link i is V_i = Σ_j E_ij s_j q̇_j, so only the poses need a
-recursion, over the depth of the tree.
+recursion over the depth of the tree.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from forcegp.robot.model import BASE, RobotModel
 from forcegp.types import FrameJacobian, JointVector, PointJacobian, Rotation, Vector3
 
 Anchor = tuple[str, Sequence[float]]
-"""A frame, and a point in its coordinates [m]."""
+"""A frame and a point in its coordinates [m]."""
 
 
 @dataclass(frozen=True)
@@ -87,18 +87,18 @@ class PointMotion(NamedTuple):
 
     @classmethod
     def of(cls, blocks: Sequence[Tensor], qd: Tensor) -> PointMotion:
-        """From rotation, position, J and J̇ q̇ of a compiled kernel, and q̇."""
+        """Construct from rotation, position, J and J̇ q̇ of a compiled kernel, and q̇."""
         rotation, position, J, bias = blocks
         return cls(rotation, position, vecdot(J, qd[..., None, :]), J, bias)
 
 
 def skew(v: Vector3) -> Rotation:
-    """The matrix [v]× with [v]× w = v × w."""
+    """Return the matrix [v]× with [v]× w = v × w."""
     return batchlast.skew(v.movedim(-1, 0)).movedim((0, 1), (-2, -1))
 
 
 def common_states(robot: RobotModel, **states: Tensor) -> tuple[Tensor, ...]:
-    """Joint-space arguments, checked and broadcast to one batch; ShapeError if one does not fit."""
+    """Return joint-space arguments, checked and broadcast to one batch; `ShapeError` if one does not fit."""
     robot.check_state(**states)
     if len({value.shape for value in states.values()}) == 1:
         return tuple(states.values())
@@ -114,9 +114,9 @@ def common_states(robot: RobotModel, **states: Tensor) -> tuple[Tensor, ...]:
 
 
 def _local_poses(robot: RobotModel, q: Tensor) -> Tensor:
-    """Pose [R p] of each link in its parent link, `(3, 4, nq, B)`: Rodrigues about a constant axis a.
+    """Return the pose [R p] of each link in its parent link, `(3, 4, nq, B)`, by Rodrigues' formula.
 
-    With K = [a]× and the placement P: R = P a aᵀ + sin(q) P K + cos(q) (P − P a aᵀ).
+    With a constant axis a, K = [a]× and the placement P: R = P a aᵀ + sin(q) P K + cos(q) (P − P a aᵀ).
     """
     q, P, a = batch_last(q, 1), robot.placement_rotation, robot.axis[:, None, :]
     slide = (P * a).sum(-1)
@@ -136,7 +136,7 @@ def _local_poses(robot: RobotModel, q: Tensor) -> Tensor:
 
 
 def _chain(robot: RobotModel, levels: Sequence[Sequence[int]], q: JointVector) -> Tensor:
-    """R_parent [R p]_local of every link, `(3, 4, nq, B)`, level by level of the tree."""
+    """Return R_parent [R p]_local of every link, `(3, 4, nq, B)`, level by level of the tree."""
     local = _local_poses(robot, q)
     turned, parents = robot.base_rotation[..., None, None], [BASE]
     blocks, order = [], []
@@ -151,7 +151,7 @@ def _chain(robot: RobotModel, levels: Sequence[Sequence[int]], q: JointVector) -
 
 
 def link_poses(robot: RobotModel, q: JointVector) -> LinkPoses:
-    """Poses of all links, R_i = R_parent R_i^local, and the joint screws in world axes, at q `(*batch, nq)`.
+    """Return the poses R_i = R_parent R_i^local of all links and the joint screws (world axes) at q.
 
     Raises:
         ShapeError: q does not fit the robot.
@@ -167,7 +167,7 @@ def link_poses(robot: RobotModel, q: JointVector) -> LinkPoses:
 
 
 def link_motion(robot: RobotModel, poses: LinkPoses, qd: JointVector) -> LinkMotion:
-    """Twists V = E(s q̇) and the accelerations E(ṡ q̇) that remain at q̈ = 0, with ṡ_j = V_j × s_j."""
+    """Return the twists V = E(s q̇) and the accelerations E(ṡ q̇) at q̈ = 0, with ṡ_j = V_j × s_j."""
     rate, E = batch_last(qd.expand(*poses.batch, robot.nq), 1), robot.ancestors
     turning, sliding = poses.angular * rate, poses.linear * rate
     omega, velocity = sum_over(E, turning), sum_over(E, sliding)
@@ -177,7 +177,7 @@ def link_motion(robot: RobotModel, poses: LinkPoses, qd: JointVector) -> LinkMot
 
 
 def _frame_in_base(robot: RobotModel, poses: LinkPoses, index: int) -> tuple[Tensor, Tensor]:
-    """Rotation `(3, 3, B)` and position `(3, B)` of a frame relative to the base origin, world axes."""
+    """Return rotation `(3, 3, B)` and position `(3, B)` of a frame relative to the base, world axes."""
     parent, R, p = robot.frame_parents[index], robot.frame_rotation[index], robot.frame_position[index]
     if parent == BASE:
         B, base = poses.p.shape[-1], robot.base_rotation
@@ -187,18 +187,18 @@ def _frame_in_base(robot: RobotModel, poses: LinkPoses, index: int) -> tuple[Ten
 
 
 def pose_of_frame(robot: RobotModel, poses: LinkPoses, index: int) -> tuple[Rotation, Vector3]:
-    """Axes of a frame `(*batch, 3, 3)` and its position relative to the base origin `(*batch, 3)` [m]."""
+    """Return axes `(*batch, 3, 3)` and position `(*batch, 3)` [m] of a frame relative to the base origin."""
     rotation, position = _frame_in_base(robot, poses, index)
     return batch_first(rotation, poses.batch), batch_first(position, poses.batch)
 
 
 def as_point(robot: RobotModel, point: object) -> Vector3:
-    """A point `(3,)` given as a tuple or tensor, in the robot's precision and on its device."""
+    """Return a point `(3,)` given as a tuple or tensor, in the robot's precision and on its device."""
     return torch.as_tensor(point, dtype=robot.dtype, device=robot.device)
 
 
 def frame_pose(robot: RobotModel, q: JointVector, frame: str) -> tuple[Rotation, Vector3]:
-    """Rotation `(*batch, 3, 3)` and position `(*batch, 3)` [m] of a named frame in the world.
+    """Return the rotation `(*batch, 3, 3)` and position `(*batch, 3)` [m] of a named frame in the world.
 
     Example:
         >>> import torch, forcegp
@@ -217,7 +217,7 @@ def frame_pose(robot: RobotModel, q: JointVector, frame: str) -> tuple[Rotation,
 
 
 def point_position(robot: RobotModel, q: JointVector, frame: str, point: object = (0.0, 0.0, 0.0)) -> Vector3:
-    """World position `(*batch, 3)` [m] of a point fixed in a frame (coordinates in that frame)."""
+    """Return the world position `(*batch, 3)` [m] of a point fixed in a frame (coordinates in that frame)."""
     R, p = frame_pose(robot, q, frame)
     return p + (R @ as_point(robot, point)[..., None])[..., 0]
 
@@ -225,14 +225,14 @@ def point_position(robot: RobotModel, q: JointVector, frame: str, point: object 
 def point_jacobian(
     robot: RobotModel, q: JointVector, frame: str, point: object = (0.0, 0.0, 0.0)
 ) -> PointJacobian:
-    """J with ṗ = J q̇ for a point fixed in a frame, `(*batch, 3, nq)`, world axes; see `frame_jacobian`."""
+    """Return J with ṗ = J q̇ for a point in a frame, `(*batch, 3, nq)`, world axes; see `frame_jacobian`."""
     return frame_jacobian(robot, q, frame, point)[..., 3:, :]
 
 
 def frame_jacobian(
     robot: RobotModel, q: JointVector, frame: str, point: object = (0.0, 0.0, 0.0)
 ) -> FrameJacobian:
-    """J with [ω; ṗ] = J q̇ for a frame and a point fixed in it, `(*batch, 6, nq)`, world axes.
+    """Return J with [ω; ṗ] = J q̇ for a frame and a point fixed in it, `(*batch, 6, nq)`, world axes.
 
     Raises:
         UnknownNameError: no such frame.
@@ -250,7 +250,7 @@ def point_motion(
     frame: str,
     point: object = (0.0, 0.0, 0.0),
 ) -> PointMotion:
-    """The motion of a point fixed in a frame, from links with known motion.
+    """Return the motion of a point fixed in a frame, from links with known motion.
 
     Raises:
         UnknownNameError: no such frame.
@@ -264,14 +264,14 @@ def point_motion(
 
 
 def jacobian_of_poses(robot: RobotModel, poses: LinkPoses, index: int, point: Tensor) -> FrameJacobian:
-    """`frame_jacobian` from known poses."""
+    """Return `frame_jacobian` from known poses."""
     rotation, origin = _frame_in_base(robot, poses, index)
     x = origin + batchlast.apply(rotation, point[:, None])
     return batch_first(_jacobian(robot, poses, index, x), poses.batch)
 
 
 def _jacobian(robot: RobotModel, poses: LinkPoses, index: int, x: Tensor) -> Tensor:
-    """J `(6, nq, B)` of the point of a frame that is at x `(3, B)`."""
+    """Return J `(6, nq, B)` of the point of a frame that is at x `(3, B)`."""
     linear = poses.linear + batchlast.cross(poses.angular, x[:, None])
     parent = robot.frame_parents[index]
     moving = torch.zeros_like(robot.revolute) if parent == BASE else robot.ancestors[parent]
@@ -281,12 +281,12 @@ def _jacobian(robot: RobotModel, poses: LinkPoses, index: int, x: Tensor) -> Ten
 def point_velocity(
     robot: RobotModel, q: JointVector, qd: JointVector, frame: str, point: object = (0.0, 0.0, 0.0)
 ) -> Vector3:
-    """ṗ = J q̇ of a point fixed in a frame, `(*batch, 3)` [m/s], world axes."""
+    """Return ṗ = J q̇ of a point fixed in a frame, `(*batch, 3)` [m/s], world axes."""
     return (point_jacobian(robot, q, frame, point) @ qd[..., None])[..., 0]
 
 
 def _bias(robot: RobotModel, poses: LinkPoses, motion: LinkMotion, index: int, x: Tensor) -> Tensor:
-    """[α; a + α × x + ω × (v + ω × x)] `(6, B)` of the point of a frame that is at x `(3, B)`."""
+    """Return [α; a + α × x + ω × (v + ω × x)] `(6, B)` of the point of a frame that is at x `(3, B)`."""
     parent = robot.frame_parents[index]
     if parent == BASE:
         return poses.p.new_zeros(6, poses.p.shape[-1])

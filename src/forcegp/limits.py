@@ -1,7 +1,7 @@
 """Bounds on the content of files, each checked before the corresponding work.
 
-They admit every robot, log and model that we know of, and prevent a file of a few kilobytes from using more
-than about 1 GiB of memory or a few seconds.
+They accept every robot, log and model known to us, and prevent a file of a few kilobytes from using more than
+about 1 GiB of memory or more than a few seconds.
 """
 
 from __future__ import annotations
@@ -9,16 +9,16 @@ from __future__ import annotations
 KIB, MIB, GIB = 1 << 10, 1 << 20, 1 << 30
 
 HEADER_BYTES = MIB
-"""A JSON header."""
+"""Size of a JSON header."""
 HEADER_DEPTH = 64
-"""Objects and lists inside each other in a header."""
+"""Nesting depth of objects and lists in a header."""
 
 TABLE_BYTES = 8 * GIB
-"""A table in memory, in bytes of float64."""
+"""Size of a table in memory, in bytes of float64."""
 FREE_TABLE_BYTES = 128 * MIB
-"""A table in memory, whatever the size of its file: columns that do not change compress without limit."""
+"""Size of a table allowed for a file of any size, since constant columns compress without limit."""
 TABLE_EXPANSION = 64
-"""A larger table has at most so many times the bytes of its file."""
+"""Maximum ratio of the size of a larger table to that of its file."""
 COLUMNS = 4096
 """Columns of a log."""
 JOINTS = 512
@@ -26,12 +26,12 @@ JOINTS = 512
 COLUMN_NAME = 1024
 """Characters of a column's name."""
 SEGMENT_NUMBER = 2**53
-"""The number of a trajectory: the largest range in which float64 holds every integer."""
+"""Largest number of a trajectory; float64 represents all integers up to it."""
 
 LOG_VALUES = 1 << 28
-"""Numbers read from the log of another program: 2 GiB of float64."""
+"""Numbers read from an imported log: 2 GiB of float64."""
 FREE_ROWS = 100_000
-"""Rows that a log is resampled to, whatever its own; more are at most `TABLE_EXPANSION` for each row."""
+"""Resampled rows allowed for any log; beyond that, at most `TABLE_EXPANSION` per original row."""
 LOG_STREAMS = 1024
 """Topics, groups or arrays of different length in a log."""
 LOG_FILES = 20_000
@@ -39,42 +39,42 @@ LOG_FILES = 20_000
 LOG_MESSAGES = 20_000_000
 """Messages of a bag."""
 LOG_NAME = 200
-"""Characters of a column's name, beyond which it is cut."""
+"""Characters after which a column name is truncated."""
 MESSAGE_BYTES = MIB
-"""A message of a bag: a joint state takes less than a kilobyte."""
+"""Size of a message in a bag; a joint state takes less than a kilobyte."""
 FREE_BAG_BYTES = 16 * MIB
-"""A bag unpacked, whatever the size of its file; beyond that, `TABLE_EXPANSION` times its bytes."""
+"""Unpacked size allowed for any bag; beyond that, at most `TABLE_EXPANSION` times its file size."""
 FREE_MESSAGES, MESSAGE_PACKED = 100_000, 2
-"""Messages of a bag whatever its size, and the fewest bytes of the file that one of more takes."""
+"""Messages allowed for any bag, and the minimum file size per message beyond that [bytes]."""
 RECORD_BYTES = 256 * MIB
-"""A record of an MCAP file, packed."""
+"""Compressed size of a record in an MCAP file."""
 LISTING_BYTES = MIB
-"""The description of a bag of several files."""
+"""Size of the description of a multi-file bag."""
 LINE_BYTES = MIB
-"""A line of a text table."""
+"""Length of a line in a text table."""
 GROUP_DEPTH = 16
-"""Groups or structs inside each other in a log."""
+"""Nesting depth of groups or structs in a log."""
 
 SCENE_BYTES = MIB
-"""A scene file."""
+"""Size of a scene file."""
 KEY_PARTS = 16
 """Parts of a dotted key of a scene."""
 SCENE_KEYS = 2000
 """Keys and tables of a scene."""
 
 MODEL_BYTES = 16 * GIB
-"""The tensors of a saved model."""
+"""Size of the tensors of a saved model."""
 TENSORS = 10_000
 """Tensors of a saved model or checkpoint."""
 CHECKPOINT_BYTES = GIB
-"""A checkpoint: the tensors that are learned, without the data."""
+"""Size of a checkpoint: the learned tensors, without the data."""
 CHECKPOINT_VALUE = 1e12
-"""A value in a checkpoint: hyperparameters are logarithms, and analytical parameters are in SI units."""
+"""Largest value in a checkpoint; hyperparameters are logarithms, analytical parameters in SI units."""
 
 LOGGED_VALUE = 1e100
-"""A number in a log or a state: its square, and the square of that, are finite."""
+"""Largest number in a log or a state; its fourth power is finite."""
 
 NAMES_COMPARED = 500
-"""Names that a misspelt one is compared with."""
+"""Maximum number of names that a misspelt one is compared with."""
 NAME_COMPARED = 100
-"""Characters of a name up to which it is compared."""
+"""Maximum length of a name in this comparison."""

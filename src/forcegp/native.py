@@ -1,8 +1,8 @@
-"""From C++ source text to a shared library: the system's compiler, and a cache on disk.
+"""Compilation of C++ source text to a shared library, with a cache on disk.
 
-Compiled kernels are code: they are stored in a folder that only their owner can write to, and checked before
-they run. A kernel is named `<key>-<SHA-256 of the file>.so`; the key identifies the source, and the digest a
-complete file. The folder is private (0700) and so are the files (0600), whatever the umask.
+Compiled kernels are code, so they are stored in a folder that only their owner can write to, and checked
+before they run. A kernel is named `<key>-<SHA-256 of the file>.so`; the key identifies the source, and the
+digest a complete file. The folder (0700) and the files (0600) are private regardless of the umask.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ PROC = Path("/proc/self/fd")
 
 
 def find_compiler() -> str:
-    """Path of the C++ compiler: `$CXX` or one on the PATH; `MissingDependencyError` if there is none."""
+    """Return the path of the C++ compiler, `$CXX` or on the PATH, or raise `MissingDependencyError`."""
     wanted = [os.environ["CXX"]] if os.environ.get("CXX") else ["c++", "g++", "clang++"]
     for name in wanted:
         if path := shutil.which(name):
@@ -42,7 +42,7 @@ def find_compiler() -> str:
 
 
 def _machine() -> str:
-    """Processor features that `-march=native` depends on."""
+    """Return the processor features that `-march=native` depends on."""
     try:
         text = Path("/proc/cpuinfo").read_text(encoding="utf-8", errors="replace")
     except OSError:
@@ -52,7 +52,7 @@ def _machine() -> str:
 
 
 def load_library(source: str, level: str = "-O2") -> ctypes.CDLL:
-    """The library of a C++ text, compiled unless it is cached; `MissingDependencyError` if that fails."""
+    """Return the library of a C++ source, compiled unless cached; `MissingDependencyError` if that fails."""
     compiler = find_compiler()
     try:
         version = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=False).stdout
@@ -82,7 +82,7 @@ def load_library(source: str, level: str = "-O2") -> ctypes.CDLL:
 
 
 def _compiled(compiler: Sequence[str], source: str, folder: Path) -> bytes:
-    """The content of the shared library; what a killed compiler left in the folder is removed."""
+    """Return the content of the shared library, and remove files left by killed compilers."""
     target = folder / "build"
     sweep(target)
     build = Temporary(target, folder=True, mode=0o700)
@@ -94,7 +94,7 @@ def _compiled(compiler: Sequence[str], source: str, folder: Path) -> bytes:
 
 
 def _built(compiler: Sequence[str], source: str, folder: Path) -> bytes:
-    """Output of the compiler in a private folder, which is held open: its name may change hands."""
+    """Return the compiler output from a private folder, which is held open in case its path is replaced."""
     if not PROC.is_dir():  # no folder has a name by its descriptor here
         _run_compiler(compiler, source, folder)
         return (folder / LIBRARY).read_bytes()
@@ -122,7 +122,7 @@ def _run_compiler(compiler: Sequence[str], source: str, folder: Path) -> None:
 
 
 def cache_directory() -> Path:
-    """Folder of compiled kernels: `$FORCEGP_CACHE`, or `forcegp` in the user's cache folder."""
+    """Return the folder of compiled kernels: `$FORCEGP_CACHE`, or `forcegp` in the user's cache folder."""
     chosen = os.environ.get("FORCEGP_CACHE")
     if chosen:
         return Path(chosen)
@@ -130,7 +130,7 @@ def cache_directory() -> Path:
 
 
 def private_folder(folder: Path) -> Path:
-    """A folder that is private to its owner; `MissingDependencyError` if others can replace it."""
+    """Return a folder private to its owner; `MissingDependencyError` if others can replace it."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     with contextlib.suppress(FileExistsError):
         folder.mkdir(mode=0o700)
@@ -154,7 +154,7 @@ def _check_owner(folder: Path) -> None:
 
 
 def _is_alone_in(group: int) -> bool:
-    """Whether nobody but the user and root is in a group, as far as the system lists its members."""
+    """Return whether a group contains only the user and root, as far as the system lists its members."""
     import grp
     import pwd
 
@@ -176,7 +176,7 @@ def _untrusted(folder: Path, place: Path, got: str) -> MissingDependencyError:
 
 
 def find(folder: Path, key: str) -> Path | None:
-    """The kernel of a key, if the folder has a complete one of this user; others are removed."""
+    """Return the kernel with a key if it is complete and owned by this user; others are removed."""
     for path in sorted(folder.glob(f"{key}-*.so")):
         if _trusted(path):
             return path

@@ -15,11 +15,11 @@ _FIRST = "text-align:left;padding:.15em .7em"
 def html_table(
     title: str, head: Sequence[str] = (), rows: Sequence[Sequence[object]] = (), notes: Sequence[str] = ()
 ) -> str:
-    """A titled table as HTML without scripts; numbers are shown with four significant digits.
+    """Return a titled table as HTML without scripts, with numbers to four significant digits.
 
     Args:
-        title, notes: lines above and below.
-        head: names of the columns; the first column names the rows.
+        title, notes: lines above and below the table.
+        head: column names; the first column names the rows.
         rows: cells.
 
     Example:
@@ -36,7 +36,7 @@ def html_table(
 
 
 def text(value: object, digits: int = 4) -> str:
-    """A value as text: floats with significant digits."""
+    """Format a value as text, floats with significant digits."""
     return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
 
 
@@ -61,7 +61,7 @@ class FitBar:
         self._shown: Any = None
 
     def __call__(self, done: int, total: int, objective: float) -> None:
-        """Show how many evaluations are done, of at most `total`, and the objective."""
+        """Show the number of evaluations, out of at most `total`, and the objective."""
         self.done, self.total, self.objective = done, total, objective
         interactive = sys.modules.get("IPython")
         if interactive is None or interactive.get_ipython() is None:
@@ -73,7 +73,7 @@ class FitBar:
             self._shown.update(content, raw=True)
 
     def html(self) -> str:
-        """The bar, and its numbers."""
+        """Return the bar and its numbers."""
         bar = f'<progress value="{self.done}" max="{self.total}"></progress>'
         most = f" of at most {self.total}" if self.done < self.total else ""
         return f"{bar} {self.done}{most} evaluations, objective {text(self.objective)}"

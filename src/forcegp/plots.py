@@ -1,7 +1,7 @@
 """Plots over time of data sets, predictions, models and rollouts with matplotlib.
 
-Panels share a time axis and show curves, bands of ±2 standard deviations, and contact. Segments are placed
-one after the other, with gaps between them.
+Panels share a time axis and contain curves, bands of ±2 standard deviations, and shading for contact.
+Segments are placed one after the other, with gaps between them.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ from forcegp.errors import ParameterError, check_name
 MEASURED = "#222222"
 PREDICTED = "#0072b2"
 CONTACT = "#f5eed6"
-"""Shade of the time in contact."""
+"""Shading for contact."""
 CYCLE = ("#0072b2", "#d55e00", "#007a5e", "#c4488c", "#6a3d9a", "#d08c00", "#555555")
-"""One colour per joint; joints beyond the last share them again."""
+"""One colour per joint; further joints reuse the colours."""
 SYMBOLS = {
     "q": "q",
     "qd": r"\dot{q}",
@@ -39,15 +39,15 @@ SYMBOLS = {
     "c": "c",
     "cd": r"\dot{c}",
 }
-"""Quantities in the notation of the library, as mathematics."""
+"""Quantities in the library's notation, as mathematical text."""
 POWERS = {"q": "", "qd": "/s", "qdd": "/s²", "qdd_free": "/s²"}
 CARTESIAN = {"multiplier": "N", "contact_force": "N", "c": "m", "cd": "m/s"}
 
 
 def unit(quantity: str, kinds: Sequence[str] = ()) -> str:
-    """The unit of a quantity of `SYMBOLS`, without brackets; empty for an unknown quantity.
+    """Return the unit of a quantity in `SYMBOLS`, without brackets; empty for an unknown quantity.
 
-    Without the kinds of the joints on the axis (`"revolute"` or `"prismatic"`) both units are returned.
+    Without the types of the joints on the axis (`"revolute"` or `"prismatic"`), both units are returned.
 
     Example:
         >>> unit("qdd", ["revolute"]), unit("tau"), unit("multiplier")
@@ -64,7 +64,7 @@ def unit(quantity: str, kinds: Sequence[str] = ()) -> str:
 
 
 def axis_label(quantity: str, kinds: Sequence[str] = (), symbol: str | None = None) -> str:
-    """Symbol and unit of a quantity, for an axis; `symbol` replaces that of the library."""
+    """Return the axis label of a quantity; `symbol` replaces the symbol of the library."""
     label = symbol or (f"${SYMBOLS[quantity]}$" if quantity in SYMBOLS else quantity)
     units = unit(quantity, kinds)
     return f"{label} [{units}]" if units else label
@@ -72,7 +72,7 @@ def axis_label(quantity: str, kinds: Sequence[str] = (), symbol: str | None = No
 
 Array = NDArray[np.float64]
 GAP = 3.0
-"""A step longer than so many median steps interrupts a curve."""
+"""Number of median steps beyond which a time step interrupts a curve."""
 
 
 @dataclass(frozen=True)
@@ -80,10 +80,10 @@ class Timeline:
     """Positions of samples on the time axis.
 
     Attributes:
-        x, order: `(n,)` increasing time [s], and the row of each position.
+        x, order: `(n,)` increasing time [s], and the row at each position.
         breaks: positions before which a curve is interrupted.
         ordered: whether the samples are a time series, drawn as a curve.
-        label: of the axis.
+        label: label of the axis.
     """
 
     x: Array
@@ -98,8 +98,8 @@ class Timeline:
 
         Args:
             t: `(n,)` [s].
-            segment: `(n,)` trajectory of each sample; default one.
-            ordered: whether the rows are in order of time within each segment.
+            segment: `(n,)` trajectory of each sample; by default a single one.
+            ordered: whether the rows are in time order within each segment.
         """
         x, segments = as_array(t), np.zeros(len(t)) if segment is None else as_array(segment)
         order = np.arange(len(x)) if ordered else np.lexsort((x, segments))
@@ -115,15 +115,17 @@ class Timeline:
         return cls(x, order, breaks, ordered, label)
 
     def place(self, values: Tensor) -> Array:
-        """Values `(n, …)` in the order of the axis."""
+        """Return the values `(n, …)` in axis order."""
         return as_array(values)[self.order]
 
     def open(self, values: Array) -> Array:
-        """Placed values `(n,)` with NaN at interruptions of the curve."""
+        """Return the values `(n,)` in axis order, with NaN at interruptions of the curve."""
         return np.insert(values, self.breaks, np.nan)
 
     def spans(self, closed: Tensor) -> list[tuple[float, float]]:
-        """Intervals of time in which a flag `(n,)` is true; none if the samples are not a time series."""
+        """Return the time intervals in which a flag `(n,)` is true; empty unless the samples are a time
+        series.
+        """
         flags = as_array(closed)[self.order] > 0
         if not self.ordered or not len(flags):
             return []
@@ -133,12 +135,12 @@ class Timeline:
 
 
 def as_array(values: Any) -> Array:
-    """A tensor on any device as an array of double precision."""
+    """Convert a tensor on any device to a double-precision array."""
     return torch.as_tensor(values).detach().to("cpu", torch.float64).numpy()
 
 
 Target = Axes | Iterable[Axes] | None
-"""Axes to draw on: of the caller, one per panel, or `None` for a new figure."""
+"""Axes to draw on, one per panel, or `None` for a new figure."""
 WIDTH, ROW, MARGIN = 7.0, 1.25, 0.9
 """Size of a new figure [inch]."""
 
@@ -156,7 +158,7 @@ class Curve:
 
 @dataclass(frozen=True)
 class Panel:
-    """One plot: its title, the name and unit of its values, and its curves."""
+    """A plot with its title, axis label and curves."""
 
     title: str
     ylabel: str
@@ -224,7 +226,7 @@ def _draw(axes: Axes, curve: Curve, time: Timeline) -> None:
 
 
 def chosen(wanted: Sequence[str] | None, names: Sequence[str], kind: str) -> list[int]:
-    """Indices of the selected names, by default all; an unknown name raises `UnknownNameError`."""
+    """Return the indices of the selected names, by default all; `UnknownNameError` for unknown names."""
     for name in wanted or ():
         check_name(kind, name, names)
     return [list(names).index(name) for name in (names if wanted is None else wanted)]

@@ -1,4 +1,4 @@
-"""Memory and threads: a large allocation is announced, or refused, before it is made.
+"""Memory and threads: large allocations cause a warning or an error before they are made.
 
 Operations on small tensors run on one thread, and SciPy uses as many threads as PyTorch.
 """
@@ -18,27 +18,27 @@ from threadpoolctl import ThreadpoolController
 from forcegp.errors import MemoryLimitError
 
 LARGE = 0.5
-"""Share of the free memory above which a need is announced."""
+"""Fraction of the free memory above which a warning is issued."""
 
 _CGROUP = Path("/sys/fs/cgroup")
 _TURN = RLock()
 
 
 class MemoryNeedWarning(UserWarning):
-    """Work that needs more than half of the free memory."""
+    """Warning about a computation that needs more than half of the free memory."""
 
 
 def free_memory() -> int | None:
-    """Memory that can be allocated without swapping, within the container's limit [bytes], if known."""
+    """Return the memory available without swapping, within the container's limit [bytes], if known."""
     limits = [value for value in (_available(), _container_memory()) if value is not None]
     return min(limits) if limits else None
 
 
 def announce_memory(needed: int, what: str, *, certain: int | None = None) -> None:
-    """Announce work that needs more than half of the free memory; `MemoryLimitError` if more than all of it.
+    """Warn if work needs more than half of the free memory; `MemoryLimitError` if it needs more than all.
 
-    Call it before the allocation, with an upper bound [bytes], and a `certain` lower bound if the upper one
-    is rough; `what` is the subject of a sentence: "the covariance of 20,000 points".
+    Call this before the allocation, with an upper bound [bytes], and a `certain` lower bound if the upper one
+    is rough; `what` is the subject of the message, such as "the covariance of 20,000 points".
     """
     free = free_memory()
     if free is None or needed <= LARGE * free:
@@ -69,7 +69,7 @@ def _available() -> int | None:
 
 
 def _container_memory() -> int | None:
-    """Memory that the limit of the control group leaves (version 2, then 1)."""
+    """Return the memory available within the limit of the control group (version 2, then 1)."""
     for most, used in (
         ("memory.max", "memory.current"),
         ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"),
@@ -113,12 +113,12 @@ def threads_of_pytorch() -> Iterator[None]:
 
 @cache
 def _openblas() -> ThreadpoolController:
-    """The BLAS libraries of NumPy and SciPy."""
+    """Return the BLAS libraries of NumPy and SciPy."""
     return ThreadpoolController().select(internal_api="openblas")
 
 
 @cache
 def _openmp() -> ThreadpoolController:
-    """The OpenMP libraries of the process; found once, which takes milliseconds."""
+    """Return the OpenMP libraries of the process; found once, which takes milliseconds."""
     torch.get_num_threads()
     return ThreadpoolController().select(user_api="openmp")

@@ -1,4 +1,4 @@
-"""Levels and standard deviations that are robust to outliers."""
+"""Estimates of levels and standard deviations that are robust to outliers."""
 
 from __future__ import annotations
 
@@ -8,16 +8,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 MAD_TO_STD = 1.4826
-"""Standard deviation over median absolute deviation of a normal distribution."""
+"""Ratio of standard deviation to median absolute deviation of a normal distribution."""
 
 
 def robust_std(x: NDArray[Any]) -> NDArray[Any]:
-    """Standard deviation of a normal distribution with the same median absolute deviation."""
+    """Return the standard deviation of a normal distribution with the same median absolute deviation."""
     return np.asarray(MAD_TO_STD * np.median(np.abs(x - np.median(x, axis=0)), axis=0))
 
 
 def level_of(x: NDArray[Any], width: float, share: float) -> float | None:
-    """Median of the values within `width` of the mode of a histogram, if they exceed a share of all values.
+    """Return the median within `width` of the mode of a histogram, if it contains a share of all values.
 
     >>> level_of(np.array([5.0, 5.1, 4.9, 40.0, -7.0]), 1.0, 0.5)
     5.0
@@ -30,7 +30,7 @@ def level_of(x: NDArray[Any], width: float, share: float) -> float | None:
 
 
 def resolution(x: NDArray[Any]) -> NDArray[Any]:
-    """Step between the values of a column with few values, else zero."""
+    """Return the step between the values of a column with few distinct values, and zero for other columns."""
     steps = np.zeros(x.shape[1])
     for j, levels in enumerate(map(np.unique, x.T)):
         if 2 < len(levels) < 0.75 * len(x):

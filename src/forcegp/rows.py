@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 Intervals = tuple[tuple[int, int], ...]
-"""Half-open and increasing."""
+"""Half-open, increasing intervals."""
 
 
 def runs(*keys: NDArray[Any]) -> list[slice]:
-    """Stretches of rows with constant keys.
+    """Return the stretches of rows with constant keys.
 
     >>> runs(np.array([0, 0, 1, 1]), np.array([True, True, True, False]))
     [slice(0, 2, None), slice(2, 3, None), slice(3, 4, None)]
@@ -27,7 +27,7 @@ def runs(*keys: NDArray[Any]) -> list[slice]:
 
 
 def intervals(mask: NDArray[np.bool_], join: int = 0) -> Intervals:
-    """Runs of true rows; runs at most `join` rows apart are merged.
+    """Return the runs of true rows, merging runs at most `join` rows apart.
 
     >>> intervals(np.array([True, True, False, True]))
     ((0, 2), (3, 4))
@@ -42,7 +42,7 @@ def intervals(mask: NDArray[np.bool_], join: int = 0) -> Intervals:
 
 
 def numbered(rows: NDArray[np.int64]) -> Intervals:
-    """Intervals of increasing row numbers.
+    """Return the intervals of consecutive row numbers.
 
     >>> numbered(np.array([3, 4, 5, 9]))
     ((3, 6), (9, 10))
@@ -53,7 +53,7 @@ def numbered(rows: NDArray[np.int64]) -> Intervals:
 
 
 def describe(spans: Intervals, most: int = 3) -> str:
-    """Rows in words, such as `row 4` or `rows 4 to 9, 20 to 31 and 5 more`."""
+    """Describe rows in words, such as `row 4` or `rows 4 to 9, 20 to 31 and 5 more`."""
     texts = [f"{a}" if b - a == 1 else f"{a} to {b - 1}" for a, b in spans[:most]]
     many = len(spans) > 1 or any(b - a > 1 for a, b in spans)
     rest = f" and {len(spans) - most} more" if len(spans) > most else ""

@@ -1,6 +1,6 @@
-"""Fits of several models to several robots and seeds, on the workers of a Dask cluster.
+"""Fits of several models for several robots and seeds, on the workers of a Dask cluster.
 
-Each fit is one task that writes a folder, so an interrupted sweep continues with the missing fits.
+Each fit is a task that writes a folder, so an interrupted sweep resumes with the missing fits.
 """
 
 from __future__ import annotations
@@ -29,9 +29,9 @@ SCORE, MODEL = "score.json", "model"
 
 @dataclass(frozen=True)
 class SweptFit:
-    """One fit of a sweep: a scene with its simulated motion, a model, and a seed.
+    """A fit of a sweep: a scene with its simulated motion, a model, and a seed.
 
-    `duration` is the simulated time [s]; `None` for the scene's.
+    `duration` is the simulated time [s]; `None` uses that of the scene.
     """
 
     scene: str
@@ -48,7 +48,7 @@ class SweptFit:
 def fits_of(
     scenes: Sequence[str], models: Sequence[str], seeds: Sequence[int], duration: float | None = None
 ) -> list[SweptFit]:
-    """All fits of the given models, robots and seeds.
+    """Return all fits of the given models, robots and seeds.
 
     Example:
         >>> [fit.name for fit in fits_of(["kuka_plane"], ["sgp-mean", "gp"], [0])]
@@ -58,7 +58,7 @@ def fits_of(
 
 
 def run_fit(fit: SweptFit, out: str) -> dict[str, Any]:
-    """Simulate, fit and score, unless already done; runs on a worker in one thread."""
+    """Simulate, fit and score, unless already done, on a worker in one thread."""
     folder = Path(out) / fit.name
     if (folder / SCORE).is_file():
         return json.loads((folder / SCORE).read_text(encoding="utf-8"))
@@ -93,17 +93,17 @@ def sweep(
     address: str | None = None,
     say: Callable[[int, dict[str, Any]], None] = lambda _, __: None,
 ) -> list[dict[str, Any]]:
-    """Run fits on a Dask cluster: a new one on this machine, or a running one.
+    """Run fits on a Dask cluster, either a new one on this machine or a running one.
 
     Args:
         fits: the fits to run.
         out: folder for the fits, accessible to all workers.
-        processes: workers of one thread each on this machine.
-        address: of the scheduler of a running cluster, such as `tcp://host:8786`.
+        processes: number of single-threaded workers on this machine.
+        address: address of the scheduler of a running cluster, such as `tcp://host:8786`.
         say: called with the number of finished fits and the score of the last one.
 
     Returns:
-        The scores, in the order of the fits.
+        The scores in the order of the fits.
     """
     dask = optional_module("distributed", "A sweep", "sweep")
     root, scores = str(Path(out).resolve()), {}

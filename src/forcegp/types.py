@@ -1,7 +1,7 @@
 """Shape aliases: every batched quantity has its batch dimensions first, `(*batch, …)`.
 
-The batches of joint vectors broadcast against each other (`*#batch`). `nq` joints, `nf` frames, `m`
-constraint rows, `n` samples, `d` components. The aliases document shapes in signatures; the test suite
+The batches of joint vectors broadcast against each other (`*#batch`). Sizes are `nq` joints, `nf` frames, `m`
+constraint rows, `n` samples and `d` components. The aliases document shapes in signatures; the test suite
 enforces them at run time.
 """
 

@@ -24,11 +24,11 @@ from forcegp.cli.view import view
 from forcegp.errors import ForceGPError
 
 USER_ERROR = 2
-"""Exit code where the input is at fault, the same as for a wrong option."""
+"""Exit code for invalid input, the same as for an invalid option."""
 INTERRUPTED = 130
-"""Exit code after an interrupt (SIGINT), as of a shell."""
+"""Exit code after an interrupt (SIGINT), as in a shell."""
 GRACE = 0.6
-"""Time to end in an orderly way after an interrupt [s]."""
+"""Time for an orderly exit after an interrupt [s]."""
 
 app = typer.Typer(
     name="forcegp",
@@ -58,13 +58,13 @@ def _options(
         False, "--version", callback=_version, is_eager=True, help="Say which version."
     ),
 ) -> None:
-    """Options of the program as a whole."""
+    """Handle global options."""
 
 
 def main(program: typer.Typer = app) -> None:
-    """Run a command line; user errors exit with one message and code 2, an interrupt with 130.
+    """Run a command line; user errors exit with one message and code 2, interrupts with code 130.
 
-    Temporary files that an interrupt leaves are removed by the next run, as after a crash.
+    Temporary files left by an interrupt are removed by the next run, as after a crash.
     """
     _end_when_interrupted()
     with warnings.catch_warnings():
@@ -83,10 +83,10 @@ def main(program: typer.Typer = app) -> None:
 
 
 def _end_when_interrupted() -> None:
-    """End at an interrupt, or `GRACE` later if that is held up.
+    """Exit on an interrupt, at the latest after `GRACE`.
 
-    Python handles a signal between two of its own operations, so not within a long one of another library,
-    and loses the exception within a destructor. The descriptor gets the signal at once.
+    Python handles signals only between its operations, not within long operations of other libraries, and
+    loses exceptions in destructors. The file descriptor receives the signal immediately.
     """
     if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
         return  # ignored, as in a background job, or in the hands of the caller

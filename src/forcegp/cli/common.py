@@ -1,4 +1,4 @@
-"""Shared by commands: progress bars, results, and reading data for a robot."""
+"""Functions shared by commands: progress bars, results, and reading data for a robot."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Advance(Protocol):
 
 
 def printable(text: object) -> str:
-    """Text with control characters escaped: names in files may contain terminal commands.
+    """Escape control characters, since names in files may contain terminal commands.
 
     >>> printable("a\\x1b[2Jb")
     'a\\\\x1b[2Jb'
@@ -45,7 +45,7 @@ def warn(text: object) -> None:
 
 @contextmanager
 def progress_bar(description: str, total: int) -> Iterator[Advance]:
-    """A progress bar on stderr; its function takes the steps done, their total if it changed, a note."""
+    """Yield a function that updates a progress bar on stderr with completed steps, new total, and note."""
     from rich.console import Console
     from rich.markup import escape
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -60,7 +60,7 @@ def progress_bar(description: str, total: int) -> Iterator[Advance]:
 
 
 def show(result: Mapping[str, object], as_json: bool) -> None:
-    """Print the result of a command, one value per line without those that are empty, or all as JSON."""
+    """Print the nonempty values of a result, one per line, or all as JSON."""
     if as_json:
         typer.echo(json.dumps(dict(result), default=str))
         return
@@ -73,7 +73,7 @@ def show(result: Mapping[str, object], as_json: bool) -> None:
 
 
 def check_output(out: Path, *inputs: Path) -> None:
-    """Check, before long work, that a file can be written and is not an input of the result."""
+    """Check, before long work, that a file can be written and is not an input."""
     from forcegp.destination import check_destination
 
     check_destination(out)
@@ -82,7 +82,7 @@ def check_output(out: Path, *inputs: Path) -> None:
 
 
 def save(write: Callable[[Path], object], out: Path) -> None:
-    """Write a result by `write(out)`; if that fails, to another path named in the error."""
+    """Write a result with `write(out)` or, if that fails, to a path named in the error."""
     from forcegp.destination import write_or_keep
 
     write_or_keep(write, out)
@@ -97,14 +97,14 @@ def check_data_destination(path: Path, *inputs: Path) -> None:
 
 
 def derivatives(window: int | None) -> forcegp.SavitzkyGolay | None:
-    """The filter of a window, if there is one."""
+    """Return the filter for a window, if there is one."""
     return None if window is None else forcegp.SavitzkyGolay(window=window)
 
 
 def read_data(
     path: Path, robot: forcegp.RobotModel | None = None, differentiate: int | None = None
 ) -> forcegp.Dataset:
-    """Read a data set with the joints of a robot in its order, computing derivatives if a window is given."""
+    """Read a data set with the joints of a robot in order, computing derivatives if a window is given."""
     data = forcegp.Dataset.read(path, differentiate=derivatives(differentiate))
     if robot is not None and set(robot.joint_names) <= set(data.joint_names):
         data = data.select(robot.joint_names)
@@ -114,7 +114,7 @@ def read_data(
 
 
 def trajectory_from(data: forcegp.Dataset, start: int, purpose: str) -> forcegp.Dataset:
-    """The rows from `start` to the end of their trajectory."""
+    """Return the rows from `start` to the end of their trajectory."""
     if not data.header.ordered:
         raise DataError(
             f"a {purpose} needs a log in order of time",
@@ -128,7 +128,7 @@ def trajectory_from(data: forcegp.Dataset, start: int, purpose: str) -> forcegp.
 
 
 def fitted(model: Configured, data: Any, **options: Any) -> FittedModel:
-    """A model fitted under a progress bar that notes the objective."""
+    """Fit a model with a progress bar that displays the objective."""
 
     with progress_bar(f"fitting {model.name}", 1) as advance:
 
@@ -146,7 +146,7 @@ def check_robot_named(scene: str | None, robot: str | None) -> None:
 
 
 def system_of(scene: str | None, robot: str | None) -> forcegp.ConstrainedSystem:
-    """The robot of a scene with its contacts, or a robot without contacts."""
+    """Return the robot of a scene with its contacts, or a robot without contacts."""
     check_robot_named(scene, robot)
     if scene is not None:
         return forcegp.load_scene(scene).system()
@@ -154,7 +154,7 @@ def system_of(scene: str | None, robot: str | None) -> forcegp.ConstrainedSystem
 
 
 def model_table(config: Path | None, scene: str | None) -> ModelTable:
-    """The table [model] of a separate file if one is given, else that of the scene, if any."""
+    """Return the table [model] from a separate file if given, otherwise from the scene, if any."""
     from forcegp.scene import default_model_table, load_model_table
 
     if config is not None:
@@ -163,7 +163,7 @@ def model_table(config: Path | None, scene: str | None) -> ModelTable:
 
 
 def warn_beyond(model: Predictor, data: forcegp.Dataset, doubts: Iterable[str] = ()) -> None:
-    """Print doubts about predictions, and whether states are far from the training data."""
+    """Print doubts about predictions, and warn about states far from the training data."""
     from forcegp.forces.posterior import warnings_beyond
     from forcegp.models.structured_fit import StructuredFit
 

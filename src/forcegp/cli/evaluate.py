@@ -40,14 +40,14 @@ def evaluate(
 ) -> None:
     """Compare a model's predictions with a data set and with trivial predictors.
 
-    The trivial predictors are the mean, the robot file alone, and least squares of inertial parameters,
-    viscous and Coulomb friction and offsets. The verdict states the share of the torque beyond gravity that
-    the model explains, its error of motion in open loop, and its contact force, if one is logged;
-    the next line compares it with each predictor in torque and in acceleration. Errors are in rad/s² (m/s²
-    for sliding joints); coverage is the share of samples within two standard deviations.
+    The trivial predictors are the mean, the robot file alone, and least squares for inertial parameters,
+    viscous and Coulomb friction and offsets. The verdict states the fraction of the torque beyond gravity
+    that the model explains, the error of open-loop motion, and the error of the contact force, if logged.
+    The next line compares the model with each predictor in torque and acceleration. Errors are in rad/s²
+    (m/s² for sliding joints); coverage is the fraction of samples within two standard deviations.
 
-    With --out, prints the path of a page with the verdict, the errors by joint, the calibration and the
-    predictions over the first seconds, and writes all scores to evaluation.json.
+    With --out, the command writes a page with the verdict, the errors by joint, the calibration and the
+    predictions over the first seconds, prints its path, and writes all scores to evaluation.json.
 
     [bold]Examples[/bold]
 
@@ -85,7 +85,7 @@ def _written(
     test: forcegp.Dataset,
     names: tuple[str, str, str | None],
 ) -> dict[str, object]:
-    """Write the page and its data, and say where they are; `names` are of the files in the title."""
+    """Write the page and its data, and print their paths; `names` are the file names in the title."""
     from forcegp.files import write_json, written_folder
     from forcegp.report.evaluation import PAGE, write_evaluation
     from forcegp.report.window import opening, predicted_window
@@ -103,7 +103,7 @@ def _written(
 
 
 def _model(model: Path | None, scene: str | None, config: Path | None, train: Path | None) -> Predictor:
-    """The fitted model in a file, or one that is fitted to the training data now."""
+    """Load a fitted model from a file, or fit one to the training data."""
     from forcegp.models.configured import configured
 
     if model is not None:

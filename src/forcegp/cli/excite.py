@@ -51,11 +51,12 @@ def excite(
     seed: Annotated[int, typer.Option(help="Seed of the random starts.")] = 0,
     as_json: AsJson = False,
 ) -> None:
-    """Plan the motion in free space that identifies inertia and friction best.
+    """Plan the motion in free space that best identifies inertia and friction.
 
-    It starts and ends at rest, respects the limits of the robot file or the given ones, and avoids collisions
-    with the robot, the surfaces of the scene, and boxes. A page of the same name shows the motion, its
-    limits, and the expected standard deviation of the torque before and after its log.
+    The motion starts and ends at rest, respects the limits in the robot file or the given ones, and avoids
+    collisions of the robot with itself, the surfaces of the scene, and boxes. A page of the same name
+    displays the motion, its limits, and the expected standard deviation of the torque before and after
+    recording.
 
     [bold]Examples[/bold]
 

@@ -1,4 +1,4 @@
-"""`forcegp export`: a fitted model as code for a controller, or as parameters in a robot file."""
+"""`forcegp export`: convert a fitted model to controller code or to parameters in a robot file."""
 
 from __future__ import annotations
 
@@ -40,16 +40,16 @@ def export(
     seed: Annotated[int, typer.Option(help="Of these samples.")] = 0,
     as_json: AsJson = False,
 ) -> None:
-    """Write a structured Gaussian process as C99 or for CasADi, or into the file of its robot.
+    """Export a structured Gaussian process as C99 or CasADi code, or into a copy of its robot file.
 
-    C: one .h and one .c file: state and closed contacts to accelerations, multipliers and forces, each with
-    mean and covariance, and Jacobians of the mean. It needs only libm. A test program with reference values,
-    CMakeLists.txt and a README are included.
+    C: one .h and one .c file that map state and closed contacts to mean and covariance of accelerations,
+    multipliers and forces, and to Jacobians of the mean. They need only libm. A test program with reference
+    values, CMakeLists.txt and a README are included.
 
     CasADi: the mean as a function with exact derivatives, in a file for `casadi.Function.load`.
 
-    URDF, MJCF: a copy of the robot's file with identified inertia, damping and friction, and no other change;
-    a report with standard deviations and losses; and robots drawn from the posterior.
+    URDF, MJCF: a copy of the robot file in which only inertia, damping and friction are changed to identified
+    values; a report with standard deviations and losses; and robots drawn from the posterior.
 
     [bold]Examples[/bold]
 
@@ -78,7 +78,7 @@ def export(
 def _written_back(
     fit: StructuredFit, to: str, robot: str | None, out: Path, samples: int, seed: int
 ) -> dict[str, object]:
-    """Write the robot file, and say what changed."""
+    """Write the robot file and print the changes."""
     from forcegp.models.calibrated import write_calibrated
     from forcegp.robot.write_back import is_mjcf
 

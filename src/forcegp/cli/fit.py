@@ -1,4 +1,4 @@
-"""`forcegp fit` trains a model on a log; `forcegp sweep` trains many on the workers of a cluster."""
+"""`forcegp fit` trains a model on a log; `forcegp sweep` trains many models on a cluster."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from forcegp.models.fit_result import FitResult
 
 STREAM_ROWS = 100_000
-"""Rows of a log from which it is read piece by piece."""
+"""Number of rows from which a log is read piece by piece."""
 
 
 def fit(
@@ -49,8 +49,8 @@ def fit(
 ) -> None:
     """Fit a model of the forward dynamics to logged motion.
 
-    The table \\[model] of the scene, or of --config, defines priors, kernels, noise, robot parameters and
-    learning; the options override it.
+    The table \\[model] in the scene or in --config defines priors, kernels, noise, robot parameters and
+    learning; options override it.
 
     Structured models read Parquet logs of more than 100,000 rows, and several files, piece by piece.
 
@@ -87,7 +87,7 @@ def fit(
 
 
 def _figures(result: FitResult, as_json: bool) -> dict[str, object]:
-    """The result by name; for a reader without the warnings, which were printed, and without empty fields."""
+    """Return the result by name; as text, without empty fields and the warnings already printed."""
     figures = {name: value for name, value in asdict(result).items() if name != "history"}
     if as_json:
         return figures
@@ -98,7 +98,7 @@ def _figures(result: FitResult, as_json: bool) -> dict[str, object]:
 def _training(
     regression: Model, files: list[Path], differentiate: int | None, robot: forcegp.RobotModel
 ) -> forcegp.Dataset | forcegp.StreamedDataset:
-    """The data that a model is fitted to: read piece by piece where they are long and the model can."""
+    """Return the training data, streamed if they are long and the model supports it."""
     parquet = all(file.suffix.lower() == ".parquet" for file in files)
     if parquet and isinstance(regression, forcegp.StructuredGP):
         log = forcegp.StreamedDataset(tuple(files), common.derivatives(differentiate), robot.joint_names)
@@ -120,9 +120,9 @@ def sweep(
     ] = None,
     as_json: options.AsJson = False,
 ) -> None:
-    """Simulate, fit and score several models on several robots, with several seeds.
+    """Simulate, fit and score several models on several robots with several seeds.
 
-    Finished fits are not run again. Needs the extra `sweep` (Dask).
+    Finished fits are not run again. This command needs the extra `sweep` (Dask).
 
     [bold]Examples[/bold]
 

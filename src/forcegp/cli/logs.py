@@ -1,4 +1,4 @@
-"""`forcegp import`, `check` and `select`: a log of any program as a data set, its faults, its points."""
+"""`forcegp import`, `check` and `select`: convert a log to a data set, find its faults, select points."""
 
 from __future__ import annotations
 
@@ -45,9 +45,9 @@ def import_(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Import a log: CSV, text, Parquet, NumPy, MATLAB, HDF5, ROS bags, MCAP or LeRobot.
+    """Import a log from CSV, text, Parquet, NumPy, MATLAB, HDF5, ROS bags, MCAP or LeRobot.
 
-    A mapping in TOML assigns columns to joints, with units, signs and frames; --guess writes one.
+    A mapping in TOML assigns columns to joints, with units, signs and frames; --guess proposes one.
 
     [bold]Examples[/bold]
 
@@ -89,7 +89,7 @@ def _guess(log: Path, system: forcegp.ConstrainedSystem, out: Path) -> dict[str,
 
 
 def _summary(imported: Imported) -> dict[str, object]:
-    """Rows, trajectories and period, then what was found and done."""
+    """Return rows, trajectories and period, followed by findings and processing steps."""
     data, report = imported.data, imported.report
     rows, segments = f"{len(data)} from {report.rows_read} logged", int(data.segment[-1]) + 1
     result: dict[str, object] = {"rows": rows, "segments": segments, "period_s": data.header.dt}
@@ -98,7 +98,7 @@ def _summary(imported: Imported) -> dict[str, object]:
 
 
 def _tip_radius(text: str | None) -> float | Literal["fit"] | None:
-    """The radius of the tip as it was given."""
+    """Parse the radius of the tip."""
     if text is None or text == "fit":
         return text
     with suppress(ValueError):
@@ -113,7 +113,7 @@ def _surfaces(
     kind: Literal["plane", "sphere"],
     tip_radius: float | Literal["fit"] | None,
 ) -> dict[str, object]:
-    """The surface of each contact that was closed, as a line for the scene."""
+    """Return the surface of each contact that was closed, as a line for the scene file."""
     from forcegp.logs.surface_fit import fit_surface
 
     touched = [name for name, closed in imported.data.contact.items() if bool(closed.any())]
@@ -139,7 +139,7 @@ def _json(imported: Imported) -> dict[str, object]:
 
 
 NOT_USABLE = 1
-"""Exit code where a finding makes a fit worthless."""
+"""Exit code if a finding makes a fit worthless."""
 COLOURS = {"error": "bold red", "warning": "yellow", "note": "cyan"}
 
 
@@ -192,7 +192,7 @@ def check(
 
 
 def _print(report: Report) -> None:
-    """The findings as a table."""
+    """Print the findings as a table."""
     from rich.console import Console
     from rich.table import Table
     from rich.text import Text
@@ -241,8 +241,8 @@ def select(
 ) -> None:
     """Select training points that cover a log, and keep the rest for testing.
 
-    Farthest point sampling on standardized positions, velocities and torques: exact, deterministic, and
-    in the order of selection, so that the first k rows are the selection of k points.
+    Points are selected by exact farthest-point sampling on standardized positions, velocities and torques.
+    They are deterministic and in selection order: the first k rows are the selection of k points.
 
     [bold]Examples[/bold]
 
@@ -273,7 +273,7 @@ def select(
 def _written(
     data: forcegp.Dataset, parts: Split, how: str, out: Path, rest: Path | None
 ) -> dict[str, object]:
-    """Write training and test points, and say what was written."""
+    """Write training and test points, and print a summary."""
     result: dict[str, object] = {}
     files = ("selected", "training", parts.train, out), ("kept", "test", parts.test, rest)
     for done, kind, rows, path in files:

@@ -1,4 +1,4 @@
-"""`forcegp predict`: a quantity at logged states, with its standard deviation."""
+"""`forcegp predict`: predict a quantity at logged states, with its standard deviation."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 PER_CONTACT = ("multiplier", "contact_force")
 """Quantities with one value or one vector per contact; the others have one component per joint."""
 WRENCH = "external_wrench"
-"""The wrench on a frame, saved as force and moment of a contact with the name of the frame."""
+"""Wrench on a frame, saved as force and moment of a contact named after the frame."""
 
 
 def predict(
@@ -64,9 +64,9 @@ def predict(
 ) -> None:
     """Predict a quantity at the states of a data set.
 
-    The output is the data set with the columns predicted_<quantity> and, for models with an
-    uncertainty, predicted_<quantity>_std: that of a measurement, with the noise of the motor torque and of
-    the sensor; --no-noise leaves these out, as predict in Python does.
+    The output is the data set with the additional column predicted_<quantity> and, for models with
+    uncertainty, predicted_<quantity>_std. The standard deviation includes the noise of the motor torque and
+    of the sensor, except with --no-noise, the default in Python.
 
     [bold]Examples[/bold]
 
@@ -104,7 +104,7 @@ def predict(
 def _predicted(
     model: Predictor, doubts: dict[str, None], part: forcegp.Dataset, quantity: str, noise: bool, sensor: bool
 ) -> Moments:
-    """Mean and standard deviation of a quantity at some states; `doubts` gets what is not determined."""
+    """Return mean and standard deviation of a quantity; undetermined components are added to `doubts`."""
     from forcegp.models.sensed import force_from_sensor
     from forcegp.models.structured_fit import StructuredFit
 
@@ -125,8 +125,10 @@ def _predicted(
 def _with_wrench(
     model: Predictor, test: forcegp.Dataset, frame: str | None, reference: str, momentum: bool
 ) -> tuple[forcegp.Dataset, dict[str, object]]:
-    """The data set with the external wrench on a frame and whether a contact is detected, as if the frame
-    were a contact; the share of the samples with a contact."""
+    """Add the external wrench on a frame and detected contact, with the frame as a contact.
+
+    Return the data set and the fraction of samples in contact.
+    """
     from forcegp.models.structured_fit import StructuredFit
 
     if not isinstance(model, StructuredFit):
@@ -149,7 +151,7 @@ def _with_wrench(
 def _with_columns(
     data: forcegp.Dataset, system: forcegp.ConstrainedSystem, quantity: str, name: str, values: Tensor
 ) -> forcegp.Dataset:
-    """The data set with a predicted quantity among its logged ones."""
+    """Add a predicted quantity to the logged ones."""
     if quantity not in PER_CONTACT:
         return data.replace(extras={**data.extras, name: values})
     if quantity == "multiplier":

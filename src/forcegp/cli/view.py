@@ -1,4 +1,4 @@
-"""`forcegp view`: robot, surface, contact force and predicted paths in three dimensions."""
+"""`forcegp view`: display robot, surface, contact force and predicted paths in 3D."""
 
 from __future__ import annotations
 
@@ -42,13 +42,13 @@ def view(
     port: Annotated[int, typer.Option(min=1024, max=65535, help="Port of the page.")] = 8080,
     as_json: AsJson = False,
 ) -> None:
-    """Look at a robot, its surfaces, contact forces and predicted paths in three dimensions.
+    """View a robot, its surfaces, contact forces and predicted paths in 3D.
 
-    With a model and a log: the logged motion, the predicted contact force as an arrow with ±2 standard
-    deviations at its tip, and the paths of the tip that the model predicts from the first state. With a scene
-    and a log, the force is the logged one. Without a log the robot stands still.
+    With a model and a log, the view contains the logged motion, the predicted contact force as an arrow with
+    ±2 standard deviations at its tip, and the paths of the tip predicted from the first state. With a scene
+    and a log, it contains the logged force. Without a log, the robot does not move.
 
-    The page is served to this computer only. With --out, one HTML file is written that needs no network.
+    The page is served to this computer only. With --out, it is written as one HTML file that works offline.
 
     [bold]Examples[/bold]
 
@@ -87,7 +87,7 @@ def view(
 
 
 def _target(target: str) -> tuple[forcegp.ConstrainedSystem, FittedModel | None, list[Shape]]:
-    """The system, the model if the target is one, and what the robot looks like."""
+    """Return the system, the model if the target is one, and the shapes of the robot."""
     from forcegp.robot.load import BUNDLED
     from forcegp.robot.shapes import shapes_of
     from forcegp.storage.model_file import model_path
@@ -101,7 +101,7 @@ def _target(target: str) -> tuple[forcegp.ConstrainedSystem, FittedModel | None,
 
 
 def _stretch(log: Path, system: forcegp.ConstrainedSystem, start: int, seconds: float) -> forcegp.Dataset:
-    """The rows of one trajectory from `start` on, up to its first gap, and as long as asked for."""
+    """Return the rows of a trajectory from `start` to its first gap or the requested duration."""
     stretch = trajectory_from(read_data(log, system.robot), start, "view")
     steps = stretch.t.diff()
     gaps = (steps > 1.5 * steps.median()).nonzero() if len(steps) > 0 else steps  # left by `forcegp select`

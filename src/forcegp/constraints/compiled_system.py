@@ -1,7 +1,7 @@
-"""The equations of motion of one system, with the mechanics of its robot from a compiled kernel.
+"""Equations of motion with the robot's mechanics from a compiled kernel.
 
-At a few states the overhead of tensor operations is many times the work on them. The kernel is built by the
-machine's C++ compiler and kept on disk.
+For a few states, the overhead of tensor operations exceeds the computation many times. The kernel is built by
+the local C++ compiler and cached on disk.
 """
 
 from __future__ import annotations
@@ -29,14 +29,14 @@ _KERNELS: WeakKeyDictionary[RobotModel, dict[tuple[Anchor, ...], CompiledMechani
     WeakKeyDictionary()
 )
 _SYSTEMS: WeakKeyDictionary[ConstrainedSystem, ConstrainedSystem] = WeakKeyDictionary()
-"""The compiled form of systems, kept as long as these."""
+"""Compiled systems, kept as long as the original ones."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class CompiledSystem(ConstrainedSystem):
     """A constrained system whose equations of motion use a compiled kernel if no gradient is required.
 
-    Made by `compiled_system`; the kernel also has the motion of further `points`.
+    Created by `compiled_system`; the kernel also computes the motion of additional `points`.
     """
 
     points: tuple[Anchor, ...] = ()
@@ -50,7 +50,7 @@ class CompiledSystem(ConstrainedSystem):
         return _kernel(self.robot, self._anchors)
 
     def with_robot(self, robot: RobotModel) -> ConstrainedSystem:
-        """The same constraints on a robot with other parameters, without the kernel."""
+        """Return the same constraints on a robot with other parameters, without the kernel."""
         return ConstrainedSystem(robot, self.contacts, self.baumgarte)
 
     def equations(self, q: JointVector, qd: JointVector, active: Tensor | None = None) -> Equations:
@@ -71,11 +71,11 @@ class CompiledSystem(ConstrainedSystem):
 
 
 def compiled_system(system: ConstrainedSystem, *points: Anchor) -> ConstrainedSystem:
-    """The system with compiled equations of motion, for many evaluations of one robot.
+    """Return the system with compiled equations of motion, for many evaluations of one robot.
 
-    The first call for a robot takes some seconds to compile; later ones, in any process, read the cache. It
-    is returned unchanged without a compiler, or if the robot's parameters require gradients or lie on a GPU.
-    `points` are further points for `Equations.point_motion`.
+    The first call for a robot takes some seconds to compile; later calls in any process read the cache. The
+    system is returned unchanged if there is no compiler, or if the robot's parameters require gradients or
+    are on a GPU. `points` are additional points for `Equations.point_motion`.
 
     Example:
         >>> import torch, forcegp
@@ -92,7 +92,7 @@ def compiled_system(system: ConstrainedSystem, *points: Anchor) -> ConstrainedSy
 
 
 def _anchors_of(system: ConstrainedSystem, points: Sequence[Anchor]) -> tuple[Anchor, ...]:
-    """The points that constraints read, and further ones, each once."""
+    """Return the points used by constraints, and additional ones, without duplicates."""
     read = (anchor for contact in system.contacts for anchor in contact.anchors)
     return tuple(dict.fromkeys(map(_key, (*read, *points))))
 
@@ -103,7 +103,7 @@ def _key(anchor: Anchor) -> Anchor:
 
 
 def _kernel(robot: RobotModel, anchors: tuple[Anchor, ...]) -> CompiledMechanics | None:
-    """The kernel of a robot, `None` where there can be none; kept as long as the robot."""
+    """Return the kernel of a robot, cached as long as the robot; `None` if it cannot be compiled."""
     kept = _KERNELS.setdefault(robot, {})
     if anchors not in kept:
         known = robot.device.type == "cpu" and robot.dtype in (torch.float64, torch.float32)
@@ -115,7 +115,7 @@ def _kernel(robot: RobotModel, anchors: tuple[Anchor, ...]) -> CompiledMechanics
 
 
 def _traced(x: Tensor) -> bool:
-    """Whether derivatives by x may be asked for: by autograd, or by a transform of `torch.func`."""
+    """Return whether x may be differentiated, by autograd or by a transform of `torch.func`."""
     if x.requires_grad and torch.is_grad_enabled():
         return True
     try:

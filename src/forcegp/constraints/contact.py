@@ -1,4 +1,4 @@
-"""Holonomic constraints c(q) = 0 of a robot: a point that touches a surface, two points that coincide.
+"""Holonomic constraints c(q) = 0: a point in contact with a surface, and two coincident points.
 
 Differentiating twice gives A q̈ = b with A = ∂c/∂q and b = −Ȧ q̇ (eq. 3).
 """
@@ -29,8 +29,8 @@ class ConstraintTerms(NamedTuple):
         c: `(*batch, rows)` position-level error.
         A: `(*batch, rows, nq)` Jacobian of c.
         b: `(*batch, rows)` with A q̈ = b, no stabilization.
-        point: the touching point, for a contact with a surface.
-        holds: `(*batch, rows)` bool, rows that hold at this state; all where `None`.
+        point: the contact point, for a contact with a surface.
+        holds: `(*batch, rows)` bool, rows that apply at this state; `None` for all.
     """
 
     c: Tensor
@@ -49,18 +49,18 @@ class Constraint(ABC):
     @property
     @abstractmethod
     def anchors(self) -> tuple[Anchor, ...]:
-        """The points of the robot on which the constraint depends, each with its frame."""
+        """Points of the robot that the constraint depends on, each with its frame."""
 
     @abstractmethod
     def terms_of(self, points: Sequence[PointMotion]) -> ConstraintTerms:
-        """c, A and b from the motion of the anchors."""
+        """Return c, A and b from the motion of the anchors."""
 
     @abstractmethod
     def check(self, robot: RobotModel) -> None:
-        """Check that the constraint fits a robot.
+        """Check that the constraint matches a robot.
 
         Raises:
-            UnknownNameError: the robot has no such frame.
+            UnknownNameError: the robot does not have the frame.
             ParameterError: a point does not have three finite coordinates.
         """
 
@@ -70,22 +70,22 @@ class SurfaceContact(Constraint):
     """A point or a ball of the robot that slides on a surface, c(q) = c_surface(p(q)) − r.
 
     A = ∇cᵀ J_p and b = −(∇cᵀ J̇_p q̇ + ṗᵀ ∇²c ṗ); the multiplier is the normal force if |∇c| = 1. A rounded
-    tip is a ball of radius r around p. It touches at p − r n, whose material velocity is ṗ + ω × (−r n), so
-    J_E = J_p + r [n]ₓ J_ω: friction at a rounded tip has the lever arm −r n, the normal force has none.
+    tip is a ball of radius r around p. The contact point p − r n has the material velocity ṗ + ω × (−r n), so
+    J_E = J_p + r [n]ₓ J_ω. Friction at a rounded tip has the lever arm −r n; the normal force has none.
 
-    A contact that may stick has two more rows, (t_1, t_2)ᵀ J_E q̇ = 0 with the tangent frame of the surface,
-    which hold while the touching point moves along it by less than `stick_speed`. Their multipliers are the
-    components of the tangential force. In a rollout, sticking ends when that force exceeds the friction
-    predicted by the model (`rollout/cone.py`).
+    A contact that may stick has two additional rows, (t_1, t_2)ᵀ J_E q̇ = 0 in the tangent frame of the
+    surface, which apply while the tangential speed of the contact point is below `stick_speed`. Their
+    multipliers are the components of the tangential force. In a rollout, sticking ends when this force
+    exceeds the friction predicted by the model (`rollout/cone.py`).
 
     Args:
         name: name of the contact, as in `contact.<name>` of a data set.
-        frame: link or frame that carries the point.
+        frame: link or frame of the contact point.
         point: coordinates in that frame [m]; for a rounded tip, those of its centre.
-        surface: the surface, in the world.
-        radius: r of a rounded tip; 0 is a sharp one [m].
-        stick_speed: speed along the surface below which the touching point sticks [m/s]; `None` for a contact
-            that always slides.
+        surface: the surface in the world frame.
+        radius: radius r of a rounded tip [m]; 0 for a sharp tip.
+        stick_speed: tangential speed below which the contact point sticks [m/s]; `None` for a contact that
+            always slides.
 
     Raises:
         ParameterError: the radius is negative, the surface is not a signed distance, or the speed is not
@@ -125,7 +125,7 @@ class SurfaceContact(Constraint):
 
     @property
     def center_surface(self) -> Surface:
-        """The surface on which `point` moves: that of the contact, raised by the radius of the tip."""
+        """Surface on which `point` moves: that of the contact, raised by the radius of the tip."""
         return self.surface.raised(self.radius) if self.radius else self.surface
 
     def check(self, robot: RobotModel) -> None:
@@ -172,12 +172,12 @@ class SurfaceContact(Constraint):
 
 @dataclass(frozen=True)
 class PointConnection(Constraint):
-    """Two points that coincide, c(q) = p_1(q) − p_2(q): closes a kinematic loop.
+    """Two coincident points, c(q) = p_1(q) − p_2(q), which close a kinematic loop.
 
     Args:
         name: name of the constraint.
-        frame, point: first frame, and the point in its coordinates [m].
-        other_frame, other_point: the second; `None` fixes the first point in the world.
+        frame, point: first frame, and point in its coordinates [m].
+        other_frame, other_point: second frame and point; `None` fixes the first point in the world.
     """
 
     name: str

@@ -1,15 +1,15 @@
 """Equations of motion under implicit constraints (Gauss; Udwadia and Kalaba): A, b → L, T, P, H, λ.
 
-From M q̈ = Q̄ + Aᵀλ and A q̈ = b follow q̈ = L b + H Q̄ and λ = (A M⁻¹ Aᵀ)⁺(b − A M⁻¹ Q̄). With the
-Cholesky factor M = G Gᵀ and W = A G⁻ᵀ these are L = G⁻ᵀ W⁺ and (A M⁻¹ Aᵀ)⁺ = W⁺ᵀ W⁺. The rank is decided on
-the singular values of W: those of A M⁻¹ Aᵀ are their squares, which in single precision leaves no room
-between redundant constraints and rounding.
+M q̈ = Q̄ + Aᵀλ and A q̈ = b imply q̈ = L b + H Q̄ and λ = (A M⁻¹ Aᵀ)⁺(b − A M⁻¹ Q̄). With the Cholesky factor
+M = G Gᵀ and W = A G⁻ᵀ, L = G⁻ᵀ W⁺ and (A M⁻¹ Aᵀ)⁺ = W⁺ᵀ W⁺. The rank is determined from the singular values
+of W, since those of A M⁻¹ Aᵀ are their squares, which in single precision do not separate redundant
+constraints from rounding.
 
 At fixed q̈ and λ, the derivatives of M q̈ − Q_C − Q_G − Q_D − Aᵀλ = Q and A q̈ = b leave the residuals
-r_f = ∂Q − ∂ID + ∂Q_D + ∂(Aᵀ)λ and r_c = ∂b − ∂A q̈, from which ∂q̈ = H r_f + L r_c and
+r_f = ∂Q − ∂ID + ∂Q_D + ∂(Aᵀ)λ and r_c = ∂b − ∂A q̈, so ∂q̈ = H r_f + L r_c and
 ∂λ = (A M⁻¹ Aᵀ)⁺(r_c − A M⁻¹ r_f). The derivatives of inverse dynamics are in closed form; those of the few
 constraint rows come from autograd. The pseudo-inverse itself is not differentiated, so redundant constraints
-of constant rank do no harm.
+of constant rank are handled correctly.
 """
 
 from __future__ import annotations
@@ -32,29 +32,28 @@ from forcegp.robot.model import RobotModel
 from forcegp.types import ConstraintInverse, ConstraintMatrix, ConstraintVector, JointMatrix, JointVector
 
 RANK_TOLERANCE = 1e-5
-"""Singular values of A G⁻ᵀ, M = G Gᵀ, below this fraction of the largest count as redundant constraints."""
+"""Fraction of the largest singular value of A G⁻ᵀ, M = G Gᵀ, below which constraints are redundant."""
 ROUNDING = 1e3
-"""The same fraction in units of the precision's ε, where that is larger: in single precision, 1.2e-4.
-
-Redundant contacts of the bundled arms leave 2 ε; closed loops and ill-conditioned M leave more."""
+"""The same fraction in units of the precision's ε, used if larger: 1.2e-4 in single precision. Redundant
+    contacts of the bundled arms leave 2 ε; closed loops and ill-conditioned M leave more."""
 
 
 def rank_tolerance(dtype: torch.dtype) -> float:
-    """Smallest ratio of singular values of A G⁻ᵀ that counts as an independent constraint."""
+    """Return the smallest ratio of singular values of A G⁻ᵀ that counts as an independent constraint."""
     return max(RANK_TOLERANCE, ROUNDING * torch.finfo(dtype).eps)
 
 
 def nothing(dtype: torch.dtype) -> float:
-    """Size below which a row of A G⁻ᵀ counts as zero [1/√kg]: its point cannot move."""
+    """Return the size below which a row of A G⁻ᵀ counts as zero [1/√kg], since its point cannot move."""
     return ROUNDING * torch.finfo(dtype).eps
 
 
 FACING_DOWN = 1e-6
-"""A normal is −e_z where 1 + n_z is below this; the smallest rotation has no direction there."""
+"""Value of 1 + n_z below which a normal counts as −e_z, for which the smallest rotation is not unique."""
 
 
 def tangent_frame(n: Tensor) -> Tensor:
-    """Two unit vectors along the surface at unit normals n `(*batch, 3)`, `(*batch, 3, 2)`.
+    """Return two unit vectors along the surface at unit normals n `(*batch, 3)`, `(*batch, 3, 2)`.
 
     The columns are R e_x and R e_y with R e_z = n and the smallest rotation R = 1 + [w]ₓ + [w]ₓ²/(1 + n_z),
     w = e_z × n; at n = −e_z, half a turn about e_x.
@@ -69,13 +68,13 @@ def tangent_frame(n: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class ContactPoint:
-    """The point of the robot that touches a surface; for a rounded tip, the current material point.
+    """The point of the robot in contact with a surface; for a rounded tip, the current material point.
 
     Attributes:
         position, velocity: `(*batch, 3)` in the world [m], [m/s].
         jacobian: J_E `(*batch, 3, nq)`, world axes.
         normal: ∇c `(*batch, 3)` at the point.
-        sticks: `(*batch,)` bool, whether it rests on the surface; `None` if the contact always slides.
+        sticks: `(*batch,)` bool, true if the point rests on the surface; `None` if the contact always slides.
     """
 
     position: Tensor
@@ -86,7 +85,7 @@ class ContactPoint:
 
     @cached_property
     def unit_normal(self) -> Tensor:
-        """n `(*batch, 3)`, the direction of ∇c."""
+        """Unit normal n `(*batch, 3)`, the direction of ∇c."""
         return normalize(self.normal, dim=-1)
 
     @cached_property
@@ -97,8 +96,9 @@ class ContactPoint:
         return J - n[..., None] * (n[..., None, :] @ J), v - n * vecdot(n, v)[..., None]
 
     def directions(self, rows: int) -> Tensor:
-        """Directions of the multipliers `(*batch, 3, rows)`: ∇c, and the tangent frame of a contact that may
-        stick."""
+        """Return the directions of the multipliers `(*batch, 3, rows)`: ∇c, and the tangent frame if it may
+        stick.
+        """
         normal = self.normal[..., None]
         return normal if rows == 1 else torch.cat([normal, tangent_frame(self.unit_normal)], dim=-1)
 
@@ -111,13 +111,13 @@ class Equations:
         M: `(*batch, nq, nq)` mass matrix.
         A: `(*batch, m, nq)`; rows of inactive contacts are zero.
         b: `(*batch, m)` with A q̈ = b, Baumgarte terms included.
-        c, cd: `(*batch, m)` constraint error and its rate, of all contacts, active or not.
+        c, cd: `(*batch, m)` constraint error and its rate for all contacts, active or not.
         Q_C, Q_G, Q_D: `(*batch, nq)` bias, gravity and dissipative joint force.
-        contact_points: the touching point of each surface contact, by name.
-        point_motion: computes the motion of a point `(frame, point)` of the robot at the states.
+        contact_points: contact point of each surface contact, by name.
+        point_motion: function that returns the motion of a point `(frame, point)` at the states.
         links: function that returns the poses and the motion of the links at the states.
-        holds: `(*batch, m)` bool, rows of A that hold: those of closed contacts, including tangential rows if
-            they stick.
+        holds: `(*batch, m)` bool, rows of A that apply: those of closed contacts, including tangential rows
+            if they stick.
     """
 
     M: JointMatrix
@@ -199,8 +199,9 @@ class Equations:
 
     @cached_property
     def hidden(self) -> Tensor:
-        """Projector on multipliers of rows that hold and change no motion, Aᵀμ = 0 `(*batch, m, m)`: one for
-        points that cannot move, fractions for contacts that share their load.
+        """Projector onto multipliers that do not affect the motion, Aᵀμ = 0 `(*batch, m, m)`: 1 for points
+            that
+        cannot move, fractions for contacts that share their load.
         """
         # R = 1 − W W⁺
         return torch.diag_embed(self.holds.to(self.M)) - self.scaled_jacobian @ self.scaled_inverse
@@ -222,24 +223,24 @@ class Equations:
 
     @cached_property
     def H(self) -> JointMatrix:
-        """H = M⁻¹P = T M⁻¹ = M⁻¹ − L A M⁻¹, symmetric, from force to constrained acceleration."""
+        """Symmetric map H = M⁻¹P = T M⁻¹ = M⁻¹ − L A M⁻¹ from force to constrained acceleration."""
         return self.M_inv - self.L @ self.M_inv_At.mT
 
     @property
     def Q_K(self) -> JointVector:
-        """Q_C + Q_G + Q_D, the force of the robot file without actuation."""
+        """Force Q_C + Q_G + Q_D computed from the robot file, without actuation."""
         return self.Q_C + self.Q_G + self.Q_D
 
     def free_acceleration(self, Q: JointVector) -> JointVector:
-        """q̈′ = M⁻¹ Q, the acceleration without contact (eq. 1)."""
+        """Return q̈′ = M⁻¹ Q, the acceleration without contact (eq. 1)."""
         return torch.cholesky_solve(Q[..., None], self.M_cholesky)[..., 0]
 
     def _gap(self, free: JointVector) -> ConstraintVector:
-        """b − A q̈′, the constrained acceleration that free motion lacks, `(*batch, m)`."""
+        """Return b − A q̈′ `(*batch, m)`, the violation of the constraint by free motion."""
         return self.b - (self.A @ free[..., None])[..., 0]
 
     def acceleration(self, Q_bar: JointVector) -> JointVector:
-        """q̈ = L b + H Q̄ (eq. 4), as the correction q̈′ + L(b − A q̈′) of the free acceleration.
+        """Return q̈ = L b + H Q̄ (eq. 4), as the correction q̈′ + L(b − A q̈′) of the free acceleration.
 
         Args:
             Q_bar: `(*batch, nq)` all impressed generalized forces Q + Q_z [N m, N].
@@ -248,17 +249,17 @@ class Equations:
         return free + (self.L @ self._gap(free)[..., None])[..., 0]
 
     def motion_under(self, Q_bar: JointVector) -> tuple[JointVector, ConstraintVector]:
-        """q̈ = q̈′ + M⁻¹Aᵀ λ and λ together, for a step of a rollout."""
+        """Return q̈ = q̈′ + M⁻¹Aᵀ λ and λ together, for a step of a rollout."""
         free = self.free_acceleration(Q_bar)
         multiplier = (self.constraint_inertia @ self._gap(free)[..., None])[..., 0]
         return free + (self.M_inv_At @ multiplier[..., None])[..., 0], multiplier
 
     def multiplier(self, Q_bar: JointVector) -> ConstraintVector:
-        """λ = (A M⁻¹ Aᵀ)⁺(b − A M⁻¹ Q̄) (eq. 16, with all impressed forces), `(*batch, m)`."""
+        """Return λ = (A M⁻¹ Aᵀ)⁺(b − A M⁻¹ Q̄) (eq. 16, with all impressed forces), `(*batch, m)`."""
         return (self.constraint_inertia @ self._gap(self.free_acceleration(Q_bar))[..., None])[..., 0]
 
     def constraint_force(self, Q_bar: JointVector) -> JointVector:
-        """Q_I = Aᵀ λ (eq. 17), `(*batch, nq)` [N m, N]."""
+        """Return Q_I = Aᵀ λ (eq. 17), `(*batch, nq)` [N m, N]."""
         return (self.A.mT @ self.multiplier(Q_bar)[..., None])[..., 0]
 
 
@@ -269,8 +270,8 @@ class Linearization(NamedTuple):
         qdd: `(*batch, nq)` constrained acceleration.
         dq, dqd, dforce: `(*batch, nq, nq)` ∂q̈/∂q, ∂q̈/∂q̇ and ∂q̈/∂Q = H.
         multiplier: `(*batch, m)` λ.
-        multiplier_dq, multiplier_dqd, multiplier_dforce: `(*batch, m, nq)`. For redundant constraints, which
-            determine only Aᵀλ, these are the Jacobians of least norm.
+        multiplier_dq, multiplier_dqd, multiplier_dforce: `(*batch, m, nq)`; for redundant constraints, which
+            determine only Aᵀλ, the Jacobians of least norm.
     """
 
     qdd: JointVector
@@ -291,7 +292,7 @@ def linearize(
     qd: JointVector,
     force: JointVector,
 ) -> Linearization:
-    """The linearization at states (q, q̇) with known equations of motion; `rows` gives A and b at states."""
+    """Linearize at states (q, q̇) with known equations of motion; `rows` returns A and b at states."""
     with torch.no_grad():
         Q_bar = eom.Q_K + force
         qdd, multiplier = eom.acceleration(Q_bar), eom.multiplier(Q_bar)
@@ -312,7 +313,7 @@ def _residuals(
     qdd: Tensor,
     multiplier: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Jacobians of b − A q̈ `(*batch, m, 2 nq)` and of Aᵀλ + Q_D by (q, q̇), at fixed q̈ and λ."""
+    """Return Jacobians of b − A q̈ `(*batch, m, 2 nq)` and of Aᵀλ + Q_D by (q, q̇), at fixed q̈ and λ."""
     with torch.enable_grad():
         state = state.detach().clone().requires_grad_()
         q, qd = state.chunk(2, -1)

@@ -1,10 +1,10 @@
-"""Rigid surfaces as implicit functions c(p) of a point: zero on the surface, positive outside the solid.
+"""Rigid surfaces as implicit functions c(p) of a point, zero on the surface and positive outside the solid.
 
-The gradient points out of the solid, so a contact that presses has a multiplier λ ≥ 0. Except for
-`ImplicitSurface`, c is the signed distance and the gradient the unit normal.
+The gradient points out of the solid, so a contact under pressure has a multiplier λ ≥ 0. Except for
+`ImplicitSurface`, c is the signed distance and the gradient is the unit normal.
 
-`SurfaceSchema` is the one description of surfaces in files: scene files and saved models are validated
-against these classes, selected by a field `type`.
+`SurfaceSchema` describes surfaces in files: scene files and saved models are validated against these classes,
+selected by the field `type`.
 """
 
 from __future__ import annotations
@@ -24,28 +24,28 @@ from forcegp.types import Scalars, Vector3
 
 
 class Surface(ABC):
-    """A surface with the derivatives that a contact needs, batched over points in the world."""
+    """A surface with the derivatives needed for a contact, batched over points in the world."""
 
     @abstractmethod
     def value(self, p: Vector3) -> Scalars:
-        """c(p), `(*batch,)`; metres for signed distances."""
+        """Return c(p), `(*batch,)`, in metres for signed distances."""
 
     @abstractmethod
     def gradient(self, p: Vector3) -> Vector3:
-        """∇c(p), `(*batch, 3)`."""
+        """Return ∇c(p), `(*batch, 3)`."""
 
     @abstractmethod
     def curvature(self, p: Vector3, v: Vector3) -> Scalars:
-        """vᵀ ∇²c(p) v, `(*batch,)`."""
+        """Return vᵀ ∇²c(p) v, `(*batch,)`."""
 
     def raised(self, distance: float) -> Surface:
-        """The surface at a distance above this one, c(p) − distance, if c is a signed distance.
+        """Return the offset surface c(p) − distance, if c is a signed distance.
 
         Args:
-            distance: along the normal [m].
+            distance: offset along the normal [m].
 
         Raises:
-            ParameterError: the surface has no signed distance.
+            ParameterError: the surface is not a signed distance.
         """
         raise ParameterError(
             f"{type(self).__name__} cannot be raised by {distance} m",
@@ -117,7 +117,7 @@ class Plane(Surface):
 
 
 class _Round(Surface):
-    """c(p) = |r| − radius with r the part of p − center that `_across` leaves, touched from outside."""
+    """c(p) = |r| − radius, with r computed from p − center by `_across`, for contact from outside."""
 
     center: Sequence[float]
     radius: float
@@ -156,11 +156,11 @@ class _Round(Surface):
 
 @dataclass(frozen=True)
 class Sphere(_Round):
-    """The sphere c(p) = |p − center| − radius, touched from outside.
+    """The sphere c(p) = |p − center| − radius, for contact from outside.
 
     Args:
-        center: [m].
-        radius: [m].
+        center: centre of the sphere [m].
+        radius: radius [m].
 
     Example:
         >>> import torch
@@ -178,12 +178,12 @@ class Sphere(_Round):
 
 @dataclass(frozen=True)
 class Cylinder(_Round):
-    """The infinite cylinder c(p) = |p − center − a aᵀ(p − center)| − radius, touched from outside.
+    """The infinite cylinder c(p) = |p − center − a aᵀ(p − center)| − radius, for contact from outside.
 
     Args:
-        center: a point of the axis [m].
+        center: a point on the axis [m].
         axis: direction a of the axis; scaled to unit length.
-        radius: [m].
+        radius: radius [m].
 
     Example:
         >>> import torch
@@ -209,16 +209,16 @@ class Cylinder(_Round):
 
 
 SurfaceSchema = Annotated[Plane | Sphere | Cylinder, Field(discriminator="type")]
-"""The surfaces that a file can describe, with `type = "plane"`, `"sphere"` or `"cylinder"`."""
+"""Surfaces in files, with `type = "plane"`, `"sphere"` or `"cylinder"`."""
 
 
 @dataclass(frozen=True)
 class ImplicitSurface(Surface):
-    """Any smooth c(p), differentiated automatically.
+    """Any smooth surface c(p), differentiated automatically.
 
     Args:
-        function: maps one point `(3,)` to a scalar tensor, positive outside the solid, twice differentiable
-            by PyTorch. The multiplier is in newtons if |∇c| = 1.
+        function: function that maps one point `(3,)` to a scalar tensor, positive outside the solid and twice
+            differentiable by PyTorch. The multiplier is in newtons if |∇c| = 1.
 
     Example:
         >>> import torch

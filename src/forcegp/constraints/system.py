@@ -1,4 +1,4 @@
-"""A robot with its constraints and their stabilization, and the equations of motion at a state."""
+"""Constrained systems: a robot with constraints, their stabilization, and the equations of motion."""
 
 from __future__ import annotations
 
@@ -23,21 +23,21 @@ from forcegp.robot.model import RobotModel
 from forcegp.types import ConstraintVector, JointVector
 
 SQUARE, LINEAR = 20, 60
-"""Matrices and vectors over joints and constraint rows that one state takes at the peak; measured."""
+"""Measured peak number of matrices and vectors over joints and constraint rows per state."""
 CERTAIN = 0.25
-"""Part of the bound below which no measured work stays."""
+"""Fraction of the bound that all measured computations exceed."""
 
 
 @dataclass(frozen=True)
 class Baumgarte:
-    """Makes the constraint error a damped oscillator, c̈ + 2ωξ ċ + ω² c = 0 (eq. 29).
+    """Baumgarte stabilization, which damps the constraint error by c̈ + 2ωξ ċ + ω² c = 0 (eq. 29).
 
-    The right-hand side becomes b̃ = b − 2ωξ A q̇ − ω² c; eq. (30) of the paper has the opposite signs, with
-    which the error grows.
+    The right-hand side becomes b̃ = b − 2ωξ A q̇ − ω² c. Equation (30) of the paper has the opposite signs,
+    with which the error grows.
 
     Args:
-        natural_frequency: ω > 0 [rad/s].
-        damping_ratio: ξ > 0; 1 is critical damping.
+        natural_frequency: natural frequency ω > 0 [rad/s].
+        damping_ratio: damping ratio ξ > 0; 1 is critical damping.
 
     Raises:
         ParameterError: a parameter is not positive.
@@ -58,7 +58,7 @@ class Baumgarte:
                 )
 
     def stabilized(self, b: ConstraintVector, c: ConstraintVector, cd: ConstraintVector) -> ConstraintVector:
-        """b̃ = b − 2ωξ ċ − ω² c, `(*batch, m)` (eq. 30, with its signs corrected)."""
+        """Return b̃ = b − 2ωξ ċ − ω² c, `(*batch, m)` (eq. 30, with its signs corrected)."""
         omega = self.natural_frequency
         return b - 2.0 * omega * self.damping_ratio * cd - omega**2 * c
 
@@ -69,7 +69,7 @@ class ConstrainedSystem:
 
     Args:
         robot: the robot.
-        contacts: the constraints; an empty sequence is free motion.
+        contacts: the constraints; an empty sequence describes free motion.
         baumgarte: stabilization of the constraint error, or `None`.
 
     Example:
@@ -82,7 +82,7 @@ class ConstrainedSystem:
 
     Raises:
         UnknownNameError: a contact is attached to an unknown frame.
-        ParameterError: two contacts have the same name, or a point is not valid.
+        ParameterError: two contacts have the same name, or a point is invalid.
     """
 
     robot: RobotModel
@@ -100,13 +100,13 @@ class ConstrainedSystem:
             contact.check(self.robot)
 
     def __repr__(self) -> str:
-        """One line with robot and contacts, without the numbers."""
+        """Return a one-line summary of robot and contacts, without numbers."""
         contacts = ", ".join(f"{type(contact).__name__} {contact.name!r}" for contact in self.contacts)
         rule = f"; {self.baumgarte}" if self.baumgarte is not None else ""
         return f"<ConstrainedSystem: {self.robot!r}; {contacts or 'no contacts'}{rule}>"
 
     def _repr_html_(self) -> str:
-        """A table of the constraints for notebooks."""
+        """Return a table of the constraints for notebooks."""
         rows = [
             (c.name, type(c).__name__, ", ".join(dict(c.anchors)), str(getattr(c, "surface", "–")))
             for c in self.contacts
@@ -128,15 +128,15 @@ class ConstrainedSystem:
 
     @property
     def row_names(self) -> list[str]:
-        """A name for each constraint row: that of the constraint, numbered where it has several."""
+        """Name of each constraint row: that of the constraint, numbered if it has several rows."""
         rows = ((c.name, c.rows, row + 1) for c in self.contacts for row in range(c.rows))
         return [name if count == 1 else f"{name} {row}" for name, count, row in rows]
 
     def contact(self, name: str) -> Constraint:
-        """A constraint by name.
+        """Return a constraint by name.
 
         Raises:
-            UnknownNameError: no such contact.
+           UnknownNameError: the contact does not exist.
         """
         if name not in self.contact_names:
             raise UnknownNameError("contact", name, self.contact_names)
@@ -165,9 +165,9 @@ class ConstrainedSystem:
         return 8 * (SQUARE * width**2 + LINEAR * width)
 
     def announce_states(self, states: int, copies: float, what: str) -> None:
-        """Announce, or refuse, work on many states at once; see `announce_memory`.
+        """Warn about or reject work on many states at once; see `announce_memory`.
 
-        `copies` is the peak in units of the memory of one state's equations of motion; `what` is the work.
+        `copies` is the peak memory in units of that of the equations of motion; `what` describes the work.
 
         Raises:
             MemoryLimitError: the work needs more memory than is free.
@@ -176,14 +176,14 @@ class ConstrainedSystem:
         announce_memory(needed, what, certain=int(CERTAIN * needed))
 
     def with_robot(self, robot: RobotModel) -> ConstrainedSystem:
-        """The same constraints on a robot with other parameters."""
+        """Return the same constraints on a robot with other parameters."""
         return dataclasses.replace(self, robot=robot)
 
     def active_rows(self, active: Tensor | None, batch: torch.Size) -> Tensor:
-        """`(*batch, m)` bool from `(*batch, n_contacts)` bool, all active for `None`.
+        """Expand active contacts `(*batch, n_contacts)` bool to rows `(*batch, m)`; `None` activates all.
 
         Raises:
-            ShapeError: not boolean, or a shape that does not fit the contacts and the batch.
+            ShapeError: the argument is not boolean, or does not match the contacts and the batch.
         """
         n = len(self.contacts)
         if active is None:
@@ -203,11 +203,11 @@ class ConstrainedSystem:
         return active[..., self._contact_of_row].expand(*batch, self.m)
 
     def equations(self, q: JointVector, qd: JointVector, active: Tensor | None = None) -> Equations:
-        """The equations of motion at states (q, q̇).
+        """Return the equations of motion at states (q, q̇).
 
         Args:
             q, qd: `(*batch, nq)` joint positions and velocities.
-            active: `(*batch, n_contacts)` bool, which contacts are closed in each sample; default all.
+            active: `(*batch, n_contacts)` bool, the closed contacts of each sample; by default all.
 
         Example:
             >>> import torch, forcegp
@@ -218,7 +218,7 @@ class ConstrainedSystem:
             (torch.Size([1, 7]), torch.Size([1]))
 
         Raises:
-            ShapeError: an argument does not fit.
+            ShapeError: an argument has the wrong shape, dtype or device.
         """
         robot = self.robot
         robot.check_state(q=q, qd=qd)
@@ -237,7 +237,7 @@ class ConstrainedSystem:
         point_motion: Callable[[str, Sequence[float]], PointMotion],
         links: Callable[[], tuple[LinkPoses, LinkMotion]],
     ) -> Equations:
-        """The equations of motion from M, Q_C, Q_G and Q_D of the robot and the motion of its points."""
+        """Return the equations of motion from M, Q_C, Q_G, Q_D and the motion of the points."""
         terms = self._terms(point_motion)
         c, cd, A, b, holds = self._rows(q, qd, terms, active)
         touching = zip(self.contact_names, (term.point for term in terms), strict=True)
@@ -248,8 +248,8 @@ class ConstrainedSystem:
     def linearize(
         self, q: JointVector, qd: JointVector, force: JointVector, active: Tensor | None = None
     ) -> Linearization:
-        """The constrained acceleration and the multiplier with their Jacobians with respect to q, q̇ and
-        force.
+        """Return the constrained acceleration and the multiplier, with Jacobians with respect to q, q̇
+        and force.
 
         q̈(q, q̇, Q) = L b + H (Q_C + Q_G + Q_D + Q) with its exact derivatives, detached from the graph.
         If Q depends on the state, as learned forces do, add `dforce` times the derivative of Q.
@@ -257,10 +257,10 @@ class ConstrainedSystem:
         Args:
             q, qd: `(*batch, nq)` joint positions and velocities.
             force: `(*batch, nq)` Q, the motor torques and all other forces beyond the robot file.
-            active: `(*batch, n_contacts)` bool, which contacts are closed in each sample; default all.
+            active: `(*batch, n_contacts)` bool, the closed contacts of each sample; by default all.
 
         Raises:
-            ShapeError: an argument does not fit.
+            ShapeError: an argument has the wrong shape, dtype or device.
 
         Example:
             >>> import torch, forcegp
@@ -282,26 +282,26 @@ class ConstrainedSystem:
 
     @cached_property
     def _contact_of_row(self) -> Tensor:
-        """The contact that each constraint row belongs to, `(m,)`."""
+        """Index of the contact of each constraint row, `(m,)`."""
         rows = [i for i, contact in enumerate(self.contacts) for _ in range(contact.rows)]
         return torch.tensor(rows, dtype=torch.int64, device=self.robot.device)
 
     def _moving(
         self, q: Tensor, qd: Tensor
     ) -> tuple[LinkPoses, LinkMotion, Callable[[str, Sequence[float]], PointMotion]]:
-        """Poses and velocities of the links, and the motion of points of them."""
+        """Return the poses and velocities of the links, and the motion of their points."""
         poses = kinematics.link_poses(self.robot, q)
         motion = kinematics.link_motion(self.robot, poses, qd)
         return poses, motion, partial(kinematics.point_motion, self.robot, poses, motion, qd)
 
     def _terms(self, point_motion: Callable[[str, Sequence[float]], PointMotion]) -> list[ConstraintTerms]:
-        """The constraints where their points are."""
+        """Evaluate the constraints at their points."""
         return [c.terms_of([point_motion(*anchor) for anchor in c.anchors]) for c in self.contacts]
 
     def _rows(
         self, q: Tensor, qd: Tensor, terms: Sequence[ConstraintTerms], active: Tensor | None
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """c and ċ of all contacts, the stabilized A and b of the active ones, and which rows hold."""
+        """Return c and ċ of all contacts, the stabilized A and b of the active ones, and which rows hold."""
         if len(terms) == 1:
             c, A, b = terms[0].c, terms[0].A, terms[0].b
         else:

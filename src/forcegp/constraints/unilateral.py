@@ -17,22 +17,22 @@ from forcegp.errors import NumericalError
 from forcegp.types import ActiveContacts, JointVector
 
 PULL = 1e-9
-"""A contact pulls if λ is below minus this [N]; rounding must not open a contact that carries no load."""
+"""A contact pulls if −λ exceeds this [N]; rounding must not open a contact without load."""
 APPROACH = 1e-9
-"""A contact is approached if ċ is below minus this [m/s]; after an impact ċ is zero up to rounding."""
+"""A contact is approached if −ċ exceeds this [m/s]; after an impact, ċ is zero up to rounding."""
 
 POSITION_TOLERANCE = 1e-12
-"""Largest constraint error that counts as none [m]; rounding of the kinematics of an arm leaves 1e-15."""
+"""Largest constraint error that counts as zero [m]; rounding in the kinematics of an arm leaves 1e-15."""
 ROUNDING = 100.0
-"""Constraint error, in units of the precision's ε, that rounding may leave; it counts in float32 only."""
+"""Constraint error due to rounding, in units of the precision's ε; only relevant in float32."""
 MAX_ITERATIONS = 30
-"""Newton doubles the digits in each iteration; a state off by a centimetre needs four."""
+"""Maximum number of Newton iterations; a state off by a centimetre needs four."""
 MAX_STEP = 0.2
-"""Largest move of a joint in one iteration [rad, m]; light wrist joints are asked for more than they give."""
+"""Largest change of a joint in one iteration [rad, m], mainly for light wrist joints."""
 
 
 class Landing(NamedTuple):
-    """The contacts at the start of a step, before any force is known.
+    """State of the contacts at the start of a step, before forces are computed.
 
     Attributes:
         closed: `(n_contacts,)` bool.
@@ -48,7 +48,7 @@ class Landing(NamedTuple):
 
 
 class ContactForces(NamedTuple):
-    """The contacts and the forces during a step.
+    """Contacts and forces during a step.
 
     Attributes:
         closed: `(n_contacts,)` bool.
@@ -68,13 +68,13 @@ class ContactForces(NamedTuple):
 
 
 def rows_of(system: ConstrainedSystem, active: Tensor) -> Tensor:
-    """The rows of the active contacts, `(*batch, m)` bool."""
+    """Return the rows of the active contacts, `(*batch, m)` bool."""
     repeats = torch.tensor([contact.rows for contact in system.contacts], device=active.device)
     return active.repeat_interleave(repeats, dim=-1)
 
 
 def any_row(system: ConstrainedSystem, rows: Tensor) -> Tensor:
-    """Whether any row of each constraint is set: `(*batch, n_contacts)` bool from `(*batch, m)` bool."""
+    """Reduce rows `(*batch, m)` bool to constraints `(*batch, n_contacts)` with any row set."""
     if system.m == len(system.contacts):
         return rows
     parts = rows.split([contact.rows for contact in system.contacts], dim=-1)
@@ -82,7 +82,7 @@ def any_row(system: ConstrainedSystem, rows: Tensor) -> Tensor:
 
 
 def normal_rows(system: ConstrainedSystem, rows: Tensor) -> Tensor:
-    """The first row of each contact, that of its normal: `(*batch, n_contacts)` from `(*batch, m)`."""
+    """Select the first (normal) row of each contact: `(*batch, n_contacts)` from `(*batch, m)`."""
     if system.m == len(system.contacts):
         return rows
     first = [sum(contact.rows for contact in system.contacts[:i]) for i in range(len(system.contacts))]
@@ -90,17 +90,17 @@ def normal_rows(system: ConstrainedSystem, rows: Tensor) -> Tensor:
 
 
 def pulling(system: ConstrainedSystem, active: Tensor, multiplier: Tensor) -> Tensor:
-    """Closed contacts `(*batch, n_contacts)` that open since they would pull, λ `(*batch, m)` < 0."""
+    """Return the closed contacts `(*batch, n_contacts)` that would pull, λ `(*batch, m)` < 0, and open."""
     return normal_rows(system, multiplier < -PULL) & system.can_open & active
 
 
 def reached(system: ConstrainedSystem, active: Tensor, c: Tensor, cd: Tensor) -> Tensor:
-    """Open contacts `(*batch, n_contacts)` that close: c ≤ 0 and ċ < 0."""
+    """Return the open contacts `(*batch, n_contacts)` that close, c ≤ 0 and ċ < 0."""
     return normal_rows(system, (c <= 0.0) & (cd < -APPROACH)) & system.can_open & ~active
 
 
 def project_velocity(eom: Equations, qd: Tensor) -> Tensor:
-    """Velocity `(*batch, nq)` after an inelastic impact without friction on the active constraints.
+    """Return the velocity `(*batch, nq)` after a frictionless inelastic impact on active constraints.
 
     M (q̇⁺ − q̇⁻) = Aᵀ Λ with A q̇⁺ = 0, so q̇⁺ = T q̇⁻ = q̇⁻ − L A q̇⁻.
     """
@@ -112,10 +112,10 @@ def project_state(
 ) -> tuple[JointVector, JointVector]:
     """Project (q, q̇) `(*batch, nq)` onto the constraint manifold, in the metric of M.
 
-    Newton's iteration q ← q − M⁻¹Aᵀ(A M⁻¹ Aᵀ)⁺ c moves along the directions in which constraint forces push;
-    q̇ ← q̇ − L A q̇ is the nearest velocity on the manifold in the metric of the kinetic energy. For the
-    contacts that are `active` `(*batch, n_contacts)`, by default all, |c(q)| ≤ 1e−12 m (1e−5 m in float32)
-    and A q̇ = 0.
+    Newton's iteration q ← q − M⁻¹Aᵀ(A M⁻¹ Aᵀ)⁺ c moves along the directions of the constraint forces;
+    q̇ ← q̇ − L A q̇ is the nearest velocity on the manifold in the metric of the kinetic energy. The result
+    satisfies |c(q)| ≤ 1e−12 m (1e−5 m in float32) and A q̇ = 0 for the `active` contacts
+    `(*batch, n_contacts)`, by default all.
 
     Raises:
         NumericalError: the iteration does not converge, for example if the surface is out of reach.
@@ -142,7 +142,7 @@ def project_state(
 def sliding_friction(
     system: ConstrainedSystem, eom: Equations, active: Tensor, viscous_friction: float
 ) -> Tensor:
-    """Friction of the active contacts `(*batch, nq)`: Q_z = Σ J_Eᵀ F_z, F_z = −θ_v (I − n nᵀ) ṗ_E [N m, N].
+    """Return the friction of active contacts `(*batch, nq)`, Q_z = Σ J_Eᵀ F_z, F_z = −θ_v (I − n nᵀ) ṗ_E.
 
     `active` is `(*batch, n_contacts)` bool, `viscous_friction` θ_v [N s/m].
     """
@@ -177,8 +177,8 @@ def contact_forces(
     Q_u: Tensor,
     viscous_friction: float,
 ) -> ContactForces:
-    """Normal and friction force at a state `(nq,)` under the torque Q_u [N m], after opening contacts that
-    would pull.
+    """Return the normal and friction force at a state `(nq,)` under the torque Q_u [N m], after opening
+    contacts that would pull.
 
     `landing` holds the closed contacts and their equations of motion, `viscous_friction` is θ_v [N s/m].
     """

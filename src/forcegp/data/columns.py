@@ -21,7 +21,7 @@ Arrays = dict[str, Any]
 
 
 def unparse(data: Fields) -> tuple[Columns, DataHeader]:
-    """Columns and header of a data set in the form of the file."""
+    """Return the columns and header of a data set in file format."""
     columns: dict[str, Tensor] = {"t": data.t, "segment": data.segment}
     columns |= {f"contact.{name}": value for name, value in data.contact.items()}
     for name, value in named_columns(data).items():
@@ -33,7 +33,7 @@ def unparse(data: Fields) -> tuple[Columns, DataHeader]:
 
 
 def parse(source: str, raw: Columns, header: DataHeader, method: SavitzkyGolay | None) -> Arrays:
-    """Arrays of a data set from a file's columns; a `DataError` names the nearest existing column."""
+    """Return the arrays of a data set from file columns; a `DataError` names the nearest existing column."""
     joints = header.joint_names or tuple(name[2:] for name in raw if name.startswith("q."))
     if not joints:
         raise DataError(f"{source}: no column 'q.<joint>'", expected="one per joint", got=_listing(raw))
@@ -63,7 +63,7 @@ def parse(source: str, raw: Columns, header: DataHeader, method: SavitzkyGolay |
 
 
 def as_tensors(fields: Arrays, dtype: torch.dtype, device: torch.device) -> Arrays:
-    """The arrays of `parse` as tensors, real numbers in the requested precision."""
+    """Convert the arrays of `parse` to tensors, with real numbers in the requested precision."""
 
     def convert(value: Any) -> Any:
         if isinstance(value, dict):
@@ -130,7 +130,7 @@ def _segment(source: str, unread: Columns, n: int) -> NDArray[np.int64]:
 def _extras(
     source: str, unread: Columns, joints: Sequence[str], contacts: Sequence[str]
 ) -> tuple[dict[str, NDArray[np.float64]], dict[str, dict[str, NDArray[np.float64]]]]:
-    """Joint vectors and contact quantities among the columns that are left; takes them out."""
+    """Remove joint vectors and contact quantities from the remaining columns and return them."""
     extras: dict[str, NDArray[np.float64]] = {}
     contact_extras: dict[str, dict[str, NDArray[np.float64]]] = {}
     names = dict.fromkeys(column.split(".", 1)[0] for column in unread if "." in column)
@@ -150,7 +150,7 @@ def _extras(
 def _fill_in(
     source: str, fields: Arrays, absent: set[str], method: SavitzkyGolay, header: DataHeader
 ) -> DataHeader:
-    """Compute the absent `qd` and `qdd`, and log how uncertain the computed q̈ is."""
+    """Compute missing `qd` and `qdd`, and add the standard deviation of the computed q̈."""
     of, order = ("q", 2) if "qd" in absent else ("qd", 1)
 
     def derive(name: str, degree: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

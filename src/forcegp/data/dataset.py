@@ -48,11 +48,11 @@ class Dataset(Fields):
         t: `(n,)` time [s], strictly increasing within a segment unless `header.ordered` is false.
         q, qd, qdd: `(n, nq)` joint positions, velocities, accelerations.
         tau: `(n, nq)` motor torque Q_u [N m, N].
-        joint_names: the joints, in the order of the columns.
+        joint_names: the joints in column order.
         contact: name → `(n,)` bool, whether the contact is closed.
-        extras: name → `(n, nq)` further logged joint vectors: `qdd_clean`, `Q`, `Q_z`, `Q_I`, …
+        extras: name → `(n, nq)` additional joint vectors: `qdd_clean`, `Q`, `Q_z`, `Q_I`, …
         contact_extras: name → contact → `(n,)` or `(n, 3)`: `multiplier`, `F_I`, …
-        segment: `(n,)` number of the trajectory of each row; default one trajectory.
+        segment: `(n,)` trajectory number of each row; by default a single trajectory.
         header: noise, sampling period, robot, seed and provenance.
 
     Extras are attributes too: `data.Q_z`, `data.multiplier["table"]`.
@@ -68,7 +68,7 @@ class Dataset(Fields):
         (2, 10, 40)
 
     Raises:
-        DataError: a shape, type, value or time does not fit; the message names column and row.
+        DataError: a shape, type, value or time is invalid; the message names column and row.
     """
 
     def __post_init__(self) -> None:
@@ -81,7 +81,7 @@ class Dataset(Fields):
         fields.check_values(self)
 
     def __repr__(self) -> str:
-        """Summary of the columns without their numbers: samples, joints, duration, contacts, further
+        """Return a summary of the columns without their numbers: samples, joints, duration, contacts, further
         quantities.
         """
         robot = f" of {self.header.robot!r}" if self.header.robot else ""
@@ -108,12 +108,12 @@ class Dataset(Fields):
         )
 
     def __getitem__(self, rows: object) -> Dataset:
-        """The data set of some rows, given as a slice, a mask `(n,)` or indices in any order.
+        """Return the data set of some rows, given as a slice, a mask `(n,)` or indices in any order.
 
-        Rows that no longer follow time have `header.ordered` false: they cannot be split into stretches.
+        For rows that are not in time order, `header.ordered` is false; they cannot be split into stretches.
 
         Raises:
-            DataError: a mask of another length, or an index that does not exist.
+            DataError: a mask has the wrong length, or an index does not exist.
         """
         index = fields.row_indices(rows, len(self), self.t.device)
         ordered = self.header.ordered and bool((index[1:] > index[:-1]).all())
@@ -137,11 +137,11 @@ class Dataset(Fields):
 
     @property
     def contact_names(self) -> tuple[str, ...]:
-        """The contacts, in order."""
+        """Names of the contacts, in order."""
         return tuple(self.contact)
 
     def active(self, contacts: Sequence[str]) -> Tensor:
-        """`(n, len(contacts))` bool: which of the named contacts are closed.
+        """Return the state of the named contacts, `(n, len(contacts))` bool, true if closed.
 
         Raises:
             DataError: the state of a contact is not logged.
@@ -149,22 +149,22 @@ class Dataset(Fields):
         return fields.contact_table(self, contacts)
 
     def replace(self, **fields: object) -> Dataset:
-        """A data set with some fields changed."""
+        """Return a data set with some fields changed."""
         return dataclasses.replace(self, **fields)  # pyright: ignore[reportArgumentType]
 
     def with_step(self, step: str) -> Dataset:
-        """The same data with one more line of provenance in the header."""
+        """Return the same data with one more line of provenance in the header."""
         return self.replace(header=self.header.with_step(step))
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Dataset:
-        """The same data on another device or in another precision."""
+        """Return the same data on another device or in another precision."""
         return self._map(lambda x: x.to(device=device, dtype=dtype if x.is_floating_point() else None))
 
     def select(self, joints: Sequence[str]) -> Dataset:
-        """The data set with its joints reordered, or only some of them, such as `robot.joint_names`.
+        """Return the data set with only the given joints, in this order, such as `robot.joint_names`.
 
         Raises:
-            UnknownNameError: a joint is not in the data set; the message has the nearest name.
+            UnknownNameError: a joint is not in the data set; the message suggests the nearest name.
         """
         for joint in joints:
             check_name("joint of the data set", joint, self.joint_names)
@@ -175,36 +175,36 @@ class Dataset(Fields):
         return self.replace(**fields, extras=extras, joint_names=tuple(joints), header=header)
 
     def check_robot(self, robot: RobotModel) -> None:
-        """Check that the columns are the robot's joints, in its order.
+        """Check that the joints match those of the robot, in the same order.
 
         Warns:
-            RobotMismatchWarning: the parameters of the robot differ from those of the logged one.
+            RobotMismatchWarning: the robot's parameters differ from those of the logged robot.
 
         Raises:
-            DataError: joints are missing, unknown or in another order; the hint names the remedy.
+            DataError: joints are missing, unknown or in another order; the hint suggests a remedy.
         """
         fields.check_robot(self, robot)
 
     def plot(
         self, quantity: str | None = None, *, joints: Sequence[str] | None = None, ax: Target = None
     ) -> list[Axes]:
-        """Draw the log over time, with the time in contact shaded, and return the axes.
+        """Plot the log over time, with shading for contact, and return the axes.
 
         Args:
             quantity: a logged quantity, such as `"tau"` or `"multiplier"`, with one panel per joint or
                 contact; by default q, qd, tau and qdd, one panel each with all joints.
-            joints: which joints; default all.
-            ax: matplotlib axes to draw on, one per panel; default a new figure.
+            joints: names of the joints; by default all.
+            ax: matplotlib axes to draw on, one per panel; by default a new figure.
 
         Raises:
-            ForceGPError: no such quantity or joint, or the number of axes differs from that of the panels.
+            ForceGPError: the quantity or joint does not exist, or the number of axes is wrong.
         """
         from forcegp.data.plot import plot
 
         return plot(self, quantity, joints, ax)
 
     def _repr_html_(self) -> str:
-        """A table for notebooks, with the range of each joint's motion."""
+        """Return a table for notebooks with the range of motion of each joint."""
         names = {"q": "rad, m", "qd": "rad/s, m/s", "tau": "N m, N", "qdd": "rad/s², m/s²"}
         head = ("joint", *(f"{name} [{unit}]" for name, unit in names.items()))
         rows: list[tuple[object, ...]] = []
@@ -214,7 +214,7 @@ class Dataset(Fields):
         return html_table(repr(self).strip("<>"), head, rows, self.header.provenance)
 
     def _map(self, change: Callable[[Tensor], Tensor], **fields: object) -> Dataset:
-        """The data set with every column changed alike."""
+        """Apply the same change to every column."""
         return self.replace(**mapped([self], lambda values: change(values[0])), **fields)
 
     @staticmethod
@@ -222,7 +222,7 @@ class Dataset(Fields):
         """Concatenate data sets, with separate segments.
 
         Raises:
-            DataError: no parts, or their joints, contacts, extras, precision or device differ.
+            DataError: there are no parts, or their joints, contacts, extras, precision or device differ.
         """
         fields.check_alike(parts)
         segments, start = [], 0
@@ -247,11 +247,11 @@ class Dataset(Fields):
 
         Args:
             path: the file.
-            differentiate: how to compute the columns `qd` and `qdd` if the log lacks them.
-            dtype, device: of the tensors.
+            differentiate: method for computing `qd` and `qdd` if they are missing.
+            dtype, device: data type and device of the tensors.
 
         Raises:
-            DataError: the file is damaged, or not a valid log; names file, column and row.
+            DataError: the file is damaged or not a valid log; the message names file, column and row.
         """
         raw, header = read_table(path)
         fields = parse(str(path), raw, header, differentiate)
@@ -259,7 +259,7 @@ class Dataset(Fields):
             return cls(**as_tensors(fields, dtype, torch.device(device)))
 
     def write(self, path: str | Path) -> None:
-        """Write to a Parquet file, whole or not at all.
+        """Write to a Parquet file atomically.
 
         Raises:
             DataError: the name does not end in `.parquet`.

@@ -13,17 +13,17 @@ from forcegp.robust import MAD_TO_STD
 from forcegp.rows import runs
 
 WINDOWS = (5, 7, 9, 11, 15, 21, 31, 41, 61, 81, 101, 121, 151, 201)
-"""Windows that cross-validation tries, in samples."""
+"""Windows tried by cross-validation, in samples."""
 UNIFORM_TOLERANCE = 0.02
-"""Largest departure of a time step from the median step, as a fraction: clocks jitter, gaps do not pass."""
+"""Largest relative deviation of a time step from the median, which allows for jitter but not for gaps."""
 
 
 @dataclass(frozen=True)
 class SavitzkyGolay:
     """Differentiation of the polynomial fitted by least squares to a moving window.
 
-    A wider window means less noise and more bias; a higher order the reverse. The noise of neighbouring
-    results is correlated over about one window, which a likelihood with white noise ignores.
+    A wider window reduces noise and increases bias; a higher order has the opposite effect. The noise of
+    neighbouring results is correlated over about one window, which a likelihood with white noise ignores.
 
     Args:
         window: number of samples, odd.
@@ -48,11 +48,11 @@ class SavitzkyGolay:
 def cross_validated_window(
     signals: Sequence[NDArray[np.float64]], order: int = 3, most: int | None = None
 ) -> int:
-    """The window that best predicts each sample of the noisiest signal from the others in the window.
+    """Return the window that best predicts each sample of the noisiest signal from the others in the window.
 
-    With h the weight of a sample in its own fit, its leave-one-out error is (x − x̂)/(1 − h). Each column has
-    the window with the least mean square error, and the widest of these windows is returned, so that all
-    signals have the same bandwidth.
+    If a sample has weight h in its own fit, its leave-one-out error is (x − x̂)/(1 − h). For each column, the
+    window with the least mean square error is determined, and the widest of these windows is returned, so
+    all signals have the same bandwidth.
 
     Args:
         signals: logged values, `(n, d)` each, evenly spaced in time.
@@ -94,12 +94,13 @@ def differentiate(
     method: SavitzkyGolay,
     degree: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """The `degree`-th time derivative of x, and the standard deviation of its noise, `(n, d)` each.
+    """Return the `degree`-th time derivative of x, and the standard deviation of its noise, `(n, d)` each.
 
-    The derivative is Σ_k w_k x_{i+k}, so white noise of standard deviation σ on x becomes σ |w|. The median
-    absolute residual of the fit gives σ of each column: residuals scatter by σ √(1 − h), with h the weight of
-    a sample in its own fit. The outermost fits are used at the ends of each segment, with larger noise. Time
-    t `(n,)` [s] is evenly spaced within each segment, and no window reaches across two.
+    The derivative is Σ_k w_k x_{i+k}, so white noise of standard deviation σ on x becomes σ |w|. σ is
+    estimated for each column from the median absolute residual of the fit; residuals have the standard
+    deviation σ √(1 − h) if a sample has weight h in its own fit. The outermost fits are used at the ends of
+    each segment, with larger noise. Time t `(n,)` [s] must be evenly spaced within each segment. Windows do
+    not cross segments.
 
     Raises:
         DataError: a segment is shorter than the window, or its time steps are uneven.

@@ -1,4 +1,4 @@
-"""Header and columns of a data set, and whether they are valid and fit a robot, contacts and each other."""
+"""Header and columns of a data set, with checks of their validity and consistency."""
 
 from __future__ import annotations
 
@@ -18,23 +18,23 @@ from forcegp.robot.model import RobotModel
 
 
 class DataHeader(Header):
-    """Header of a data set; every field is optional, so that a foreign log can be read.
+    """Header of a data set. Every field is optional, so logs from other programs can be read.
 
     Attributes:
         dt: sampling period [s].
         noise_std: standard deviation of the noise on q̈ [rad/s²].
-        filtered: q̈ was computed by a filter, so its noise is correlated in time; otherwise `noise_std`
+        filtered: whether a filter computed q̈, so its noise is correlated in time; otherwise `noise_std`
             refers to white noise.
-        filter_span: of the filter that computed q̈ [s]: its noise is uncorrelated further apart in time.
+        filter_span: time span of the filter that computed q̈ [s]; noise further apart is uncorrelated.
         robot: name of the robot.
         robot_fingerprint: `RobotModel.fingerprint` of the robot that moved.
-        seed: seed of the random numbers that went into the data.
-        ordered: rows are in order of time within each segment (false for points in order of selection).
+        seed: random seed used for the data.
+        ordered: whether rows are in time order within each segment (false for selected points).
         provenance: processing steps of the data, oldest first.
         derived: joint vectors computed by a filter.
-        imported: kind and sentence of each finding of the import, including doubts about its mapping.
+        imported: kind and message of each finding of the import, including doubts about the mapping.
         unmeasured_torques: joints whose motor torque was not measured; the column is 0.
-        joint_names, contact_names: in the order of the columns; empty if not logged.
+        joint_names, contact_names: names in column order; empty if not logged.
     """
 
     FORMAT: ClassVar[str] = "forcegp-dataset"
@@ -59,25 +59,25 @@ class DataHeader(Header):
     def filter_variance(self) -> float:
         """Second moment of the weights with which the filter averages q̈ over time [s²]; 0 if unknown.
 
-        The second derivative of cubics fitted to positions over a span T is q̈ + T²/56 d²q̈/dt² + …, as is an
-        average with the variance T²/28; the first derivative of cubics fitted to q̇ has no such term.
+        The second derivative of cubics fitted to positions over a span T is q̈ + T²/56 d²q̈/dt² + …, like an
+        average with variance T²/28; the first derivative of cubics fitted to q̇ has no such term.
         """
         return (self.filter_span or 0.0) ** 2 / 28.0 if {"qd", "qdd"} <= set(self.derived) else 0.0
 
     def with_step(self, step: str, **fields: object) -> DataHeader:
-        """The header with fields changed and one more line of provenance."""
+        """Return the header with changed fields and another line of provenance."""
         return self.model_copy(update={"provenance": (*self.provenance, step), **fields})
 
 
 JOINT_VECTORS = ("q", "qd", "tau", "qdd")
-"""The joint vectors that every data set holds."""
+"""Joint vectors in every data set."""
 AXES = ("x", "y", "z")
-"""Components of a Cartesian vector logged of a contact."""
+"""Components of a Cartesian vector logged for a contact."""
 
 
 @dataclass(frozen=True, eq=False)
 class Fields:
-    """Fields of a data set; `Dataset` documents them."""
+    """Fields of a data set, documented in `Dataset`."""
 
     t: Tensor
     q: Tensor
@@ -92,19 +92,19 @@ class Fields:
     header: DataHeader = field(default_factory=DataHeader)
 
     def __len__(self) -> int:
-        """Number of samples."""
+        """Return the number of samples."""
         return self.t.shape[0]
 
 
 def component_names(name: str, value: Tensor, joint_names: Sequence[str]) -> list[str]:
-    """Names on disk of the columns of a joint vector, a contact's scalar or its Cartesian vector."""
+    """Return the column names of a joint vector, or of a contact's scalar or Cartesian vector."""
     if value.ndim == 1:
         return [name]
     return [f"{name}.{part}" for part in (AXES if "." in name else joint_names)]
 
 
 def named_columns(data: Fields) -> dict[str, Tensor]:
-    """Every floating-point column except time, by its name on disk; vectors are not split."""
+    """Return all floating-point columns except time, by their name on disk; vectors are not split."""
     named = {name: getattr(data, name) for name in JOINT_VECTORS} | dict(data.extras)
     for name, group in data.contact_extras.items():
         named |= {f"{name}.{contact}": value for contact, value in group.items()}
@@ -112,7 +112,7 @@ def named_columns(data: Fields) -> dict[str, Tensor]:
 
 
 def mapped(parts: Sequence[Fields], change: Callable[[list[Tensor]], Tensor]) -> dict[str, Any]:
-    """Columns of data sets of one layout; `change` gets the tensors of each column in all parts."""
+    """Combine data sets of equal layout by applying `change` to the tensors of each column."""
     first = parts[0]
     return {
         **{name: change([getattr(p, name) for p in parts]) for name in ("t", "segment", *JOINT_VECTORS)},
@@ -126,7 +126,7 @@ def mapped(parts: Sequence[Fields], change: Callable[[list[Tensor]], Tensor]) ->
 
 
 def check_tensors(data: Fields) -> None:
-    """Check that every column is a tensor, and every group of columns a mapping, before they are used."""
+    """Check that every column is a tensor and every group of columns a mapping."""
     for name in ("contact", "extras", "contact_extras"):
         _check_kind(name, getattr(data, name), Mapping, "a mapping of names to tensors")
     for name, group in data.contact_extras.items():
@@ -184,7 +184,7 @@ def check_layout(data: Fields) -> None:
 
 
 def _check_names(data: Fields) -> None:
-    """Extras must not hide a field, nor each other, and a dot in their name would cut it on disk."""
+    """Check that extras do not hide a field or each other, and have no dot in their name."""
     taken = set(vars(data))
     for name in (*data.extras, *data.contact_extras):
         if name in taken or "." in name or not name:
@@ -214,7 +214,7 @@ def _check_shape(name: str, value: Tensor, shape: tuple[int, ...], meaning: str)
 
 
 def check_values(data: Fields) -> None:
-    """Check that numbers are finite, except for undetermined predictions, and that time increases."""
+    """Check that values are finite, except for undetermined predictions, and that time increases."""
     for name, value in (("t", data.t), *named_columns(data).items()):
         wrong = ~(value.abs() <= LOGGED_VALUE)
         if name.startswith("predicted_"):
@@ -258,7 +258,7 @@ def check_time(data: Fields) -> None:
 
 
 def row_indices(rows: object, n: int, device: torch.device) -> Tensor:
-    """Row numbers `(k,)` of a slice, mask or list; negative ones count from the end."""
+    """Return the row numbers `(k,)` of a slice, mask or list; negative numbers count from the end."""
     if isinstance(rows, slice):
         return torch.tensor(range(n)[rows], dtype=torch.int64, device=device)
     rule = "rows are selected by a slice, a mask or a list of row numbers"
@@ -279,11 +279,11 @@ def row_indices(rows: object, n: int, device: torch.device) -> Tensor:
 
 
 TURN, MOST_RADIANS = 6.3, 60.0
-"""Angles beyond which a joint has turned once, and at most, if it has no limit [rad]."""
+"""Angle of one turn, and the largest plausible angle of a joint without limits [rad]."""
 
 
 class RobotMismatchWarning(UserWarning):
-    """The data were logged on a robot with other parameters than the current robot."""
+    """Warning that the data were logged on a robot with different parameters."""
 
 
 def check_joints(have: Sequence[str], want: Sequence[str], robot: str) -> None:
@@ -303,14 +303,14 @@ def check_joints(have: Sequence[str], want: Sequence[str], robot: str) -> None:
 
 
 def lock_hint(joints: Sequence[str]) -> str:
-    """Hint to treat joints that a log lacks, such as those of a gripper, as fixed."""
+    """Return a hint to lock joints that are missing from a log, such as those of a gripper."""
     positions = ", ".join(f"{joint} = 0.0" for joint in joints)
     return f"if they did not move, lock them: locked_joints = {{ {positions} }} under [robot] in a scene file"
 
 
 def check_robot(data: Fields, robot: RobotModel) -> None:
-    """Check that a log has the robot's joints, in its order; warn of other robot parameters and of angles
-    that look like degrees.
+    """Check that a log has the robot's joints in order; warn about different robot parameters and about
+    angles that may be in degrees.
     """
     check_joints(data.joint_names, robot.joint_names, robot.name)
     q, free = data.q.to(robot.lower) * robot.revolute, torch.full_like(robot.lower, MOST_RADIANS)
@@ -337,7 +337,7 @@ def check_robot(data: Fields, robot: RobotModel) -> None:
 
 
 def contact_table(data: Fields, contacts: Sequence[str]) -> Tensor:
-    """`(n, len(contacts))` bool: which of the named contacts are closed."""
+    """Return `(n, len(contacts))` bool, true if the named contact is closed."""
     for name in contacts:
         if name not in data.contact:
             raise DataError(
@@ -350,7 +350,7 @@ def contact_table(data: Fields, contacts: Sequence[str]) -> Tensor:
 
 
 def check_alike(parts: Sequence[Fields]) -> None:
-    """Check that data sets have the same columns, so that they can be concatenated."""
+    """Check that data sets have the same columns and can be concatenated."""
     if not parts:
         raise DataError("no data sets to concatenate", expected="one or more data sets")
 
@@ -375,7 +375,7 @@ def check_alike(parts: Sequence[Fields]) -> None:
 
 
 def common_header(headers: Sequence[DataHeader]) -> DataHeader:
-    """The fields on which headers agree; the others get their default."""
+    """Return a header with the fields that agree; the others have their default values."""
     first = headers[0].model_dump()
     agreed = {name: v for name, v in first.items() if all(getattr(h, name) == v for h in headers)}
     steps = tuple(dict.fromkeys(step for header in headers for step in header.provenance))

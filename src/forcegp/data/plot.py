@@ -65,11 +65,11 @@ def _by_contact(data: Fields, quantity: str) -> list[Panel]:
 
 
 ALIASES = {"Q": "total_force", "Q_z": "contact_friction", "Q_I": "constraint_force", "F_I": "contact_force"}
-"""Quantities that logged columns name by their symbol."""
+"""Quantities by the symbol of their logged column."""
 
 
 def _named(column: str) -> str:
-    """Symbol and unit of a logged column."""
+    """Return the symbol and unit of a logged column."""
     base = column.removesuffix("_clean").removesuffix("_std").removesuffix("_logged")
     quantity = ALIASES.get(base, "contact_force" if base == "F_z" else base)
     return axis_label(quantity, (), None if column == quantity else column)

@@ -1,7 +1,7 @@
-"""Preparation of a log for learning: points selected, stretches held out, impacts left out, noise added.
+"""Preparation of a log for learning: selection of points, held-out stretches, impacts, and noise.
 
-Farthest point sampling selects few points that cover the inputs of a log (section 5.3 of the paper). If
-training points come from the same stretch as the test rows, as in the paper, the test error measures
+Farthest-point sampling selects a few points that cover the inputs of a log (section 5.3 of the paper). If
+training points come from the same stretches as the test rows, as in the paper, the test error measures
 interpolation; held-out stretches measure prediction of unseen motion.
 """
 
@@ -19,16 +19,16 @@ from forcegp.data.dataset import Dataset
 from forcegp.errors import DataError, check_name
 
 INPUTS = ("q", "qd", "tau")
-"""Inputs of a regression model."""
+"""Names of the inputs of a regression model."""
 
 
 def standardized_inputs(data: Dataset) -> Float[Tensor, "n d"]:
-    """(q, q̇, τ) of each sample with zero mean and unit variance per column; constant columns become zero."""
+    """Return (q, q̇, τ) of each sample, standardized per column; constant columns become zero."""
     return standardized(torch.cat([getattr(data, name) for name in INPUTS], dim=-1))
 
 
 def standardized(x: Float[Tensor, "n d"]) -> Float[Tensor, "n d"]:
-    """Columns with zero mean and unit variance; constant columns become zero."""
+    """Scale columns to zero mean and unit variance; constant columns become zero."""
     centred = x - x.mean(0)
     # Rounding leaves a constant column a spread of some units in the last place.
     noise = x.abs().amax(0) * torch.finfo(x.dtype).eps * 16.0
@@ -43,19 +43,20 @@ def farthest_points(
     start: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Int[Tensor, " count"]:
-    """Indices of points, each the farthest from its predecessors, by exact Euclidean distance.
+    """Return the indices of points, each the farthest from its predecessors in Euclidean distance.
 
-    i_{k+1} = argmax_i min_{j ≤ k} |x_i − x_{i_j}|; ties go to the lowest index, so the result is
-    deterministic, and its first k entries are the result for k points. O(n d) per point, O(n) memory.
+    i_{k+1} = argmax_i min_{j ≤ k} |x_i − x_{i_j}|. Ties go to the lowest index, so the result is
+    deterministic, and its first k entries are the result for k points. The cost is O(n d) per point and
+    O(n) memory.
 
     Args:
         x: `(n, d)` points.
-        count: how many to choose.
-        start: the first point; default the one closest to the mean.
-        progress: called after each point with the number chosen so far.
+        count: number of points to select.
+        start: the first point; by default the one closest to the mean.
+        progress: called after each point with the number selected so far.
 
     Raises:
-        DataError: there are fewer than `count` distinct points, or no point `start`.
+        DataError: there are fewer than `count` distinct points, or `start` is out of range.
     """
     n = x.shape[0]
     _check_count(count, n)
@@ -81,7 +82,7 @@ def _check_count(count: int, n: int) -> None:
 
 
 def _distance(x: Tensor, point: Tensor) -> Tensor:
-    """|x_i − point| by differences: the form by products loses the digits of close points."""
+    """Return |x_i − point| from differences, which are accurate for close points, unlike products."""
     return torch.cdist(x, point[None], compute_mode="donot_use_mm_for_euclid_dist")[:, 0]
 
 
@@ -94,19 +95,19 @@ def select_points(
     candidates: Tensor | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Int[Tensor, " count"]:
-    """Row numbers of training points, in the order of selection.
+    """Return the row numbers of training points, in the order of selection.
 
     Args:
         data: the log.
-        count: how many points.
-        method: `"farthest"` (on standardized q, q̇, τ), `"even"` (evenly spaced rows, in their order), or
-            `"random"` for comparison. Farthest points favour the outliers of measured logs.
-        seed: of the random choice.
-        candidates: row numbers to choose from; default all.
-        progress: called with the number of points chosen so far.
+        count: number of points.
+        method: `"farthest"` (on standardized q, q̇, τ), `"even"` (evenly spaced rows, in order), or
+            `"random"` for comparison. Farthest points favour outliers in measured logs.
+        seed: seed for random selection.
+        candidates: row numbers to select from; by default all.
+        progress: called with the number of points selected so far.
 
     Raises:
-        ForceGPError: no such method, or fewer distinct points.
+        ForceGPError: the method is unknown, or there are too few distinct points.
     """
     rows = torch.arange(len(data), device=data.device) if candidates is None else candidates
     if method == "farthest":
@@ -122,8 +123,8 @@ def select_points(
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """Training rows in the order of selection, test rows in increasing order, and the held-out stretches as
-    (first row, one past the last).
+    """Training rows in selection order, test rows in increasing order, and held-out stretches as half-open
+    row ranges.
     """
 
     train: Int[Tensor, " count"]
@@ -132,7 +133,7 @@ class Split:
 
 
 def complement(rows: Tensor, n: int) -> Tensor:
-    """The row numbers below n that are not among `rows`, increasing."""
+    """Return the row numbers below n that are not in `rows`, in increasing order."""
     keep = torch.ones(n, dtype=torch.bool, device=rows.device)
     keep[rows] = False
     return torch.nonzero(keep)[:, 0]
@@ -146,7 +147,7 @@ def split_by_selection(
     seed: int = 0,
     progress: Callable[[int], None] | None = None,
 ) -> Split:
-    """The paper's split: training points selected from the whole log, the rest for testing."""
+    """Split a log as in the paper: select training points from the whole log and test on the rest."""
     train = select_points(data, count, method=method, seed=seed, progress=progress)
     return Split(train, complement(train, len(data)))
 
@@ -165,21 +166,21 @@ def split_by_stretches(
     """Hold out stretches of motion drawn at random, and select training points from the rest only.
 
     Args:
-        data: a log in order of time.
-        count: how many training points.
-        stretch: approximate duration of the equal stretches that each trajectory is cut into [s].
-        fraction: part of the stretches that is held out.
+        data: a log in time order.
+        count: number of training points.
+        stretch: approximate duration of the equal stretches that each trajectory is divided into [s].
+        fraction: fraction of the stretches to hold out.
         margin: time around each held-out stretch without training points [s].
         method: see `select_points`.
-        seed: of the draw of stretches (and of a random selection).
-        progress: called with the number of points chosen so far.
+        seed: seed for the held-out stretches and for random selection.
+        progress: called with the number of points selected so far.
 
     Returns:
-        Training rows, all rows of the held-out stretches, and the stretches. Rows in a margin, and rows
-        outside the stretches that were not selected, are in neither.
+        Training rows, all rows of the held-out stretches, and the stretches. Rows in a margin and unselected
+        rows outside the stretches belong to neither.
 
     Raises:
-        DataError: the log is not in order of time, is too short to be cut, or leaves too few points.
+        DataError: the log is not in time order, is too short, or leaves too few points.
     """
     blocks = _stretches(data, stretch)
     held_count = max(1, round(fraction * len(blocks)))
@@ -204,7 +205,7 @@ def split_by_stretches(
 
 
 def _stretches(data: Dataset, stretch: float) -> list[tuple[int, int]]:
-    """Row ranges of the trajectories cut into parts of equal duration."""
+    """Return the row ranges of trajectories divided into parts of equal duration."""
     if not data.header.ordered:
         raise DataError(
             "held-out stretches need a log in order of time",
@@ -227,11 +228,11 @@ def _stretches(data: Dataset, stretch: float) -> list[tuple[int, int]]:
 
 
 IMPACT = "impact"
-"""Mask by contact, 1 near a switch, as `forcegp import` writes it."""
+"""Name of the mask by contact, 1 near a switch, written by `forcegp import`."""
 
 
 def without_marked_impacts(data: Dataset) -> Dataset:
-    """The rows not marked by any mask `impact.<contact>`; all rows of a log without masks."""
+    """Return the rows not marked in any mask `impact.<contact>`; all rows if there are no masks."""
     marked = torch.zeros(len(data), dtype=torch.bool, device=data.t.device)
     for mask in data.contact_extras.get(IMPACT, {}).values():
         marked |= mask > 0.0
@@ -244,7 +245,7 @@ def without_marked_impacts(data: Dataset) -> Dataset:
 def with_noise(data: Dataset, std: float, generator: torch.Generator) -> Dataset:
     """Add Gaussian noise to q̈ and keep the noise-free value: q̈ = q̈_clean + std ε, ε ~ N(0, I).
 
-    If the data contain `qdd_clean`, the noise is added to that, so that repeated calls do not accumulate.
+    If the data contain `qdd_clean`, the noise is added to it, so repeated calls do not accumulate.
 
     Args:
         data: the log.

@@ -1,4 +1,4 @@
-"""A long log in Parquet files, read piece by piece; filter windows overlap neighbouring pieces."""
+"""Long logs in Parquet files, read piece by piece; filter windows overlap neighbouring pieces."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Piece:
-    """Neighbouring rows of a file from row `first`; `columns` has `before` more rows in front of them."""
+    """Consecutive rows of a file from row `first`; `columns` starts `before` rows earlier."""
 
     columns: Columns
     header: DataHeader
@@ -40,7 +40,7 @@ class Piece:
 
 
 def shape_of(path: Path) -> tuple[int, DataHeader]:
-    """Number of rows and header of a Parquet file."""
+    """Return the number of rows and header of a Parquet file."""
     file = existing(path)
     if file.suffix.lower() != ".parquet":
         hint = "write the log as Parquet: Dataset.read(path).write('run.parquet')"
@@ -52,8 +52,10 @@ def shape_of(path: Path) -> tuple[int, DataHeader]:
 
 
 def pieces_of(path: Path, size: int, window: int, number: int) -> Iterator[Piece]:
-    """The pieces of a file, `size` rows each, with `window` rows around them within their trajectories, which
-    are numbered from `number`; `DataError` if it is damaged, or rows of a trajectory are not together.
+    """Yield the pieces of a file, `size` rows each, with `window` rows around them within their trajectories.
+
+    Trajectories are numbered from `number`. `DataError` if the file is damaged or a trajectory is not
+    contiguous.
     """
     import pyarrow as pa
 
@@ -82,7 +84,7 @@ def _columns(file: Path, table: pa.Table) -> Columns:
 
 
 def _with_context(before: Columns, columns: Columns, after: Columns) -> tuple[Columns, int]:
-    """A piece with the rows around it of its first and last trajectory, and the number of those before it."""
+    """Return a piece with context rows from its first and last trajectory, and the number before it."""
     own = columns["segment"]
     parts = [
         {name: values[part["segment"] == number] for name, values in part.items()}
@@ -94,14 +96,14 @@ def _with_context(before: Columns, columns: Columns, after: Columns) -> tuple[Co
 
 
 class _Trajectories:
-    """Numbers trajectories throughout, and checks that each is in one run and in order of time."""
+    """Numbers trajectories consecutively, and checks that each is contiguous and in time order."""
 
     def __init__(self, source: str, number: int) -> None:
         self.source, self.last_number = source, number - 1
         self.raw, self.time, self.segments = np.nan, -np.inf, set[float]()
 
     def number(self, columns: Columns, ordered: bool) -> None:
-        """Replace the segments of the next rows by numbers that go on from those before."""
+        """Renumber the segments of the next rows, continuing from the previous ones."""
         raw, t = columns["segment"], columns.get("t")
         if ordered and t is not None and raw[0] == self.raw and t[0] <= self.time:
             raise DataError(
@@ -126,7 +128,7 @@ class _Trajectories:
         self.time = -np.inf if t is None else float(t[-1])
 
     def peek(self, columns: Columns) -> None:
-        """Number the next rows without advancing."""
+        """Renumber the segments of the next rows without advancing."""
         columns["segment"] = self.last_number + np.cumsum(self._starts(columns["segment"]))
 
     def _starts(self, raw: NDArray[np.generic]) -> NDArray[np.bool_]:
@@ -134,9 +136,9 @@ class _Trajectories:
 
 
 PIECE_ROWS = 8192
-"""Rows that are read at a time."""
+"""Number of rows read at a time."""
 Keep = Callable[[Dataset], Tensor]
-"""Row numbers of a piece that count."""
+"""Row numbers of a piece to keep."""
 
 
 @dataclass(frozen=True)
@@ -146,12 +148,12 @@ class StreamedDataset:
     Missing columns are computed as in `Dataset.read`; their noise is estimated piece by piece.
 
     Args:
-        paths: the files; their joints, contacts and further columns must agree.
-        differentiate: how to compute the columns `qd` and `qdd` if the log lacks them.
-        joints: the joints wanted, in this order; by default those of the files.
-        dtype, device: of the tensors.
-        distributed: whether the processes of `torch.distributed` share the pieces in a fit. Each of them
-            makes the same call and gets the same fit.
+        paths: the files; their joints, contacts and additional columns must agree.
+        differentiate: method for computing `qd` and `qdd` if they are missing.
+        joints: joints to read, in this order; by default those of the files.
+        dtype, device: data type and device of the tensors.
+        distributed: whether the processes of `torch.distributed` share the pieces in a fit. Each process
+            makes the same call and obtains the same fit.
 
     Example:
         >>> import tempfile, torch
@@ -184,7 +186,7 @@ class StreamedDataset:
 
     @property
     def digest(self) -> int:
-        """A hash of the bytes of all files."""
+        """Hash of the contents of all files."""
         digest = hashlib.sha256()
         for path in self.files:
             with path.open("rb") as file:
@@ -198,7 +200,7 @@ class StreamedDataset:
         return tuple(map(shape_of, self.files))
 
     def __len__(self) -> int:
-        """Number of samples."""
+        """Return the number of samples."""
         return sum(rows for rows, _ in self._shapes)
 
     @property
@@ -213,18 +215,18 @@ class StreamedDataset:
         return headers[0] if len(headers) == 1 else common_header(headers)
 
     def select(self, joints: Sequence[str]) -> StreamedDataset:
-        """The log with its joints reordered, or only some of them."""
+        """Return the log with only the given joints, in this order."""
         return dataclasses.replace(self, joints=tuple(joints))
 
     def pieces(self, start: int = 0, share: tuple[int, int] = (0, 1)) -> Iterator[Dataset]:
-        """The log in order, `PIECE_ROWS` rows at a time; segments are numbered throughout.
+        """Yield the log in order, `PIECE_ROWS` rows at a time, with consecutive segment numbers.
 
         Args:
             start: number of pieces to skip.
             share: (r, k) yields data only for piece r of every k; the others belong to other processes.
 
         Raises:
-            DataError: a file is damaged or not a valid log, or differs from the first one in its columns.
+            DataError: a file is damaged, is not a valid log, or has other columns than the first file.
         """
         first, number, count = None, 0, 0
         window = self.differentiate.window if self.differentiate is not None else 0
@@ -240,7 +242,7 @@ class StreamedDataset:
             number += 1
 
     def _dataset(self, path: Path, piece: Piece, first: Dataset | None) -> Dataset:
-        """A piece as a data set of the same columns as the first one."""
+        """Return a piece as a data set with the same columns as the first one."""
         source = str(path) if piece.first == 0 else f"{path} (rows counted from {piece.first - piece.before})"
         with warnings.catch_warnings():
             if piece.first:  # One warning per file is enough.
@@ -259,8 +261,8 @@ class StreamedDataset:
 
 
 def spaced_sample(pieces: Iterable[Dataset], count: int, keep: Keep | None = None) -> tuple[Dataset, int]:
-    """Evenly spaced rows of a log of unknown length, `count` to twice as many if available, in one pass, and
-    the number of all rows kept by `keep`; `DataError` without any piece.
+    """Return evenly spaced rows of a log of unknown length in one pass, `count` to twice as many if
+    available, and the number of all rows kept by `keep`; `DataError` without any piece.
     """
     kept: list[tuple[Tensor, Dataset]] = []
     step, total = 1, 0

@@ -28,24 +28,24 @@ Columns = dict[str, NDArray[np.generic]]
 
 HEADER_KEY = b"forcegp"
 COPIES = 4
-"""A table is in memory as the reader's columns, as arrays, side by side, and as tensors."""
+"""Number of copies of a table in memory: the reader's columns, arrays, joined arrays, and tensors."""
 
 GROUP_ROWS = 1 << 18
-"""Rows that are written at a time, so that memory holds one copy of a long log and not two."""
+"""Number of rows written at a time, which avoids a second copy of a long log in memory."""
 
 
 class IgnoredColumnsWarning(UserWarning):
-    """Columns of a log with unknown names were left out."""
+    """Warning that columns with unknown names were ignored."""
 
 
 def check_ending(path: str | Path) -> None:
-    """Raise `DataError` unless the name of a file to write ends in `.parquet`."""
+    """Raise `DataError` unless the name of an output file ends in `.parquet`."""
     if Path(path).suffix.lower() != ".parquet":
         raise DataError(f"{path}: data sets are written as Parquet", hint="end the name in .parquet")
 
 
 def write_parquet(path: str | Path, columns: Columns, header: DataHeader) -> None:
-    """Write columns and header to a Parquet file, whole or not at all; `OSError` if that fails."""
+    """Write columns and header to a Parquet file atomically; `OSError` if that fails."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -64,8 +64,10 @@ def write_parquet(path: str | Path, columns: Columns, header: DataHeader) -> Non
 def read_table(
     path: str | Path, *, missing: Literal["refuse", "nan"] = "refuse"
 ) -> tuple[Columns, DataHeader]:
-    """Numeric columns of a Parquet or CSV file, and its header (defaults if there is none); an empty value is
-    an error, or NaN if `missing` is `"nan"`. A `DataError` states why a file cannot be read.
+    """Return the numeric columns and the header (or its defaults) of a Parquet or CSV file.
+
+    An empty value is an error, or NaN if `missing` is `"nan"`. A `DataError` states why a file cannot be
+    read.
     """
     file = existing(path)
     readers = {".parquet": _read_parquet, ".csv": _read_csv}
@@ -77,7 +79,7 @@ def read_table(
 
 
 def existing(path: str | Path) -> Path:
-    """The path of a file that exists, else a `DataError` with the nearest name as hint."""
+    """Return the path of an existing file; `DataError` with the nearest name as hint if it does not exist."""
     file = Path(path)
     with foreign(str(path), "a path"):
         if file.is_file():
@@ -91,7 +93,7 @@ def existing(path: str | Path) -> Path:
 
 
 def _read_parquet(file: Path) -> tuple[pa.Table, DataHeader]:
-    """The columns, whose size in memory is checked before: a small file can claim to hold more than fits."""
+    """Return the columns, after a check of their size in memory, which may exceed that of the file by far."""
     with opened_parquet(file) as (parquet, usable, header):
         rows, columns = parquet.metadata.num_rows, len(usable)
         allowed = min(allowed_bytes(file.stat().st_size), limits.TABLE_BYTES)
@@ -108,7 +110,7 @@ def _read_parquet(file: Path) -> tuple[pa.Table, DataHeader]:
 
 @contextmanager
 def opened_parquet(file: Path) -> Iterator[tuple[pq.ParquetFile, list[str], DataHeader]]:
-    """A Parquet file, its numeric columns and its header; `DataError` if it is damaged or not a log."""
+    """Open a Parquet file; yield it with its numeric columns and header; `DataError` if it is no log."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -133,7 +135,7 @@ def _check_count(file: Path, columns: int) -> None:
 
 
 def _check_flat(file: Path, usable: list[str], paths: list[str]) -> None:
-    """Check that no list or struct lies inside a column of numbers: a name also selects what is inside it."""
+    """Check that numeric columns contain no lists or structs, which their name would select as well."""
     names = set(usable)
     for path in (path for path in paths if path not in names):
         prefixes = accumulate(path.split("."), "{}.{}".format)
@@ -167,7 +169,7 @@ def _read_csv(file: Path) -> tuple[pa.Table, DataHeader]:
 
 
 def _usable(file: Path, schema: pa.Schema) -> list[str]:
-    """Names of the numeric columns; the others are reported, a name that occurs twice is an error."""
+    """Return the names of the numeric columns; others cause a warning, and duplicate names an error."""
     import pyarrow.types as kinds
 
     names = schema.names
@@ -190,7 +192,7 @@ def _usable(file: Path, schema: pa.Schema) -> list[str]:
 
 
 def numeric(file: Path, name: str, column: pa.ChunkedArray, missing: str) -> NDArray[np.generic]:
-    """The values of a column; a missing one is a `DataError`, or a NaN."""
+    """Return the values of a column; a missing value is a `DataError`, or NaN."""
     if column.null_count and missing == "refuse":
         row = int(np.flatnonzero(column.is_null().to_numpy())[0])
         raise DataError(

@@ -1,7 +1,7 @@
 """Basis functions of latent components: whitened covariances with inducing points, and exact features.
 
-A sum of linear kernels and of products of linear kernels is k(x, x′) = φ(x)ᵀφ(x′) exactly, with a few
-features φ. The rest, every product with a stationary factor, is approximated with inducing points Z: with
+A sum of linear kernels and of products of linear kernels is exactly k(x, x′) = φ(x)ᵀφ(x′), with a few
+features φ. The rest, every product with a stationary factor, is approximated with inducing points Z. With
 the truncated square root R of the inverse of their covariance, R Rᵀ = K_zz⁺, V(x) = Rᵀk(Z, x) are features
 with a standard normal prior on their weights, and V(x)ᵀV(x′) = k(x, Z) K_zz⁺ k(Z, x′).
 """
@@ -21,18 +21,18 @@ from forcegp.gp.features import Block, FeatureMap, Features, points
 from forcegp.gp.kernels import Constant, Kernel, Linear, Parameters, Process, Product, Sum, sides, sub
 
 EXACT: tuple[type[Kernel], ...] = (Linear, Constant)
-"""Kernels without factors whose `draw` holds all their features, whatever number it is asked for."""
+"""Kernels without factors for which `draw` returns all features, regardless of the requested number."""
 
 
 @dataclass(frozen=True)
 class KernelPart:
-    """A kernel made of factors of another one, with their log-hyperparameters."""
+    """A kernel composed of factors of another kernel, with their log-hyperparameters."""
 
     kernel: Kernel
     params: Parameters
 
     def features(self, x: Features) -> FeatureMap:
-        """φ of a finite part: features whose products are the kernel exactly."""
+        """Return the features φ of a finite part, with which φ(x)ᵀφ(x′) equals the kernel exactly."""
         # Such a draw takes no random number, so any generator does.
         return self.kernel.draw(self.params, x, 1, torch.Generator())
 
@@ -46,13 +46,13 @@ class KernelSplit:
 
 
 def split(kernel: Kernel, params: Parameters) -> KernelSplit:
-    """The finite part of a kernel and the rest; products of sums are multiplied out where needed."""
+    """Split a kernel into its finite part and the rest, expanding products of sums where needed."""
     finite, rest = _terms(KernelPart(kernel, params))
     return KernelSplit(_sum(finite), _sum(rest))
 
 
 def _terms(part: KernelPart) -> tuple[list[KernelPart], list[KernelPart]]:
-    """Terms with and without a finite number of features."""
+    """Return the terms with and without a finite number of features."""
     kernel = part.kernel
     if isinstance(kernel, EXACT):
         return [part], []
@@ -84,10 +84,10 @@ class ProcessBasis:
 
     Attributes:
         kernel: covariance of a component.
-        params: its log-hyperparameters.
+        params: log-hyperparameters of the kernel.
         components: number of components.
-        inducing: kernel inputs of the inducing points, none where only the finite part has features.
-        spectra: of K_zz of each component.
+        inducing: kernel inputs of the inducing points, empty if only the finite part has features.
+        spectra: eigendecomposition of K_zz for each component.
     """
 
     kernel: Kernel
@@ -137,12 +137,12 @@ class ProcessBasis:
 
     @cached_property
     def columns(self) -> Tensor:
-        """Positions of the basis functions among the values of all components."""
+        """Positions of the basis functions in the values of all components."""
         device = next(iter(self.inducing.values())).device
         return self.used.reshape(-1).nonzero()[:, 0].to(device)
 
     def values(self, features: Features) -> tuple[Tensor, Tensor]:
-        """V(x) padded with zeros `(components, n, width)`; |V|² of inducing points `(components, n)`."""
+        """Return V(x) padded with zeros `(components, n, width)`, and |V|² by inducing points."""
         if self.to_inducing is None:
             none = next(iter(features.values())).new_zeros(self.components, points(features), 0)
             return none if self.finite is None else self.finite.basis(features), none.sum(-1)
@@ -154,11 +154,11 @@ class ProcessBasis:
         return torch.cat([whitened, self.finite.basis(features)], dim=-1), explained
 
     def rows(self, W: Tensor, values: Tensor) -> Tensor:
-        """Rows W_i V_iᵀ of n samples in terms of the basis functions, `(n d, Σ sizes)`.
+        """Return the rows W_i V_iᵀ of n samples in terms of the basis functions, `(n d, Σ sizes)`.
 
         Args:
             W: operators `(n, d, components)`.
-            values: V of the samples, as `values` gives it.
+            values: V at the samples, from `values`.
         """
         # Φ_i = W_i V_iᵀ
         whole = W[..., None] * values.transpose(0, 1)[:, None]
@@ -171,10 +171,10 @@ class ProcessBasis:
         return bool(self.used.all())
 
     def fold(self, weights: Tensor) -> tuple[Tensor, Tensor]:
-        """Weights of basis functions as those of k(x, Z) and of the exact features.
+        """Convert weights of basis functions to weights of k(x, Z) and of the exact features.
 
         Args:
-            weights: of the process's basis functions `(Σ sizes, s)`.
+            weights: weights of the process's basis functions `(Σ sizes, s)`.
 
         Returns:
             `(components, m, s)` and `(components, features, s)`.
@@ -188,17 +188,17 @@ class ProcessBasis:
         return on_kernel, filled[:, width:]
 
     def prior_variance(self, features: Features, values: Tensor) -> Tensor:
-        """k(x, x) of the whole kernel `(components, n)`.
+        """Return k(x, x) of the whole kernel `(components, n)`.
 
         Args:
-            values: V(x), as `values` gives it.
+            values: V(x), from `values`.
         """
         # k(x, x) = k_rest(x, x) + |φ(x)|²
         exact = values[..., values.shape[-1] - self.finite_size :]
         return self.rest_variance(features) + torch.linalg.vecdot(exact, exact)
 
     def missed(self, variance: Tensor, explained: Tensor) -> Tensor:
-        """k(x, x) − |V(x)|² ≥ 0 of the approximated part, `(components, n)`.
+        """Return k(x, x) − |V(x)|² ≥ 0 of the approximated part, `(components, n)`.
 
         Negative values are rounding errors, and below `SMALLEST_FRACTION` of the variance if the posterior is
         resolved.
@@ -214,7 +214,7 @@ class ProcessBasis:
         return rest.kernel.variance(rest.params)
 
     def evaluate(self, features: Features) -> tuple[Tensor, Tensor, Tensor]:
-        """The basis functions at n samples `(n, Σ sizes)`, and their share in `LatentBasis.evaluate`."""
+        """Return basis functions at n samples `(n, Σ sizes)`, and their part of `LatentBasis.evaluate`."""
         values, explained = self.values(features)
         V = values.transpose(0, 1).reshape(points(features), -1).index_select(1, self.columns)
         prior = self.rest_variance(features)
@@ -228,7 +228,7 @@ class LatentBasis:
     Attributes:
         processes: the processes.
         params: all log-hyperparameters.
-        parts: basis of each process.
+        parts: basis for each process.
     """
 
     processes: tuple[Process, ...]
@@ -237,7 +237,7 @@ class LatentBasis:
 
     @cached_property
     def columns(self) -> tuple[slice, ...]:
-        """The basis functions of each component, the components of all processes in order."""
+        """Basis functions of each component, for the components of all processes in order."""
         sizes = [size for part in self.parts for size in part.used.sum(-1).tolist()]
         ends = torch.tensor([0, *sizes]).cumsum(0).tolist()
         return tuple(slice(a, b) for a, b in pairwise(ends))
@@ -250,13 +250,13 @@ class LatentBasis:
 
     @cached_property
     def size(self) -> int:
-        """Number of basis functions in all."""
+        """Total number of basis functions."""
         return self.columns[-1].stop
 
     def tensors(self) -> dict[str, Tensor]:
-        """Inducing points and eigenvectors, by name.
+        """Return the inducing points and eigenvectors, by name.
 
-        The eigenvectors are stored with the sums, since recomputed ones may differ in sign or rotation.
+        Eigenvectors are stored with the sums, since recomputed ones may differ in sign or rotation.
         """
         tensors: dict[str, Tensor] = {}
         for p, part in enumerate(self.parts):
@@ -271,7 +271,7 @@ class LatentBasis:
     def of_tensors(
         cls, processes: Sequence[Process], params: Parameters, tensors: Mapping[str, Tensor]
     ) -> LatentBasis:
-        """The basis restored from `tensors`.
+        """Restore a basis from `tensors`.
 
         Raises:
             KeyError: a tensor is missing.
@@ -288,17 +288,17 @@ class LatentBasis:
         return cls(tuple(processes), dict(params), tuple(parts))
 
     def of_process(self, p: int) -> slice:
-        """The basis functions of process p."""
+        """Return the basis functions of process p."""
         slices = self.columns[self.components[p]]
         return slice(slices[0].start, slices[-1].stop)
 
     def rows(self, block: Block) -> Tensor:
-        """The rows of samples in terms of the basis functions, Φ `(n r, size)`."""
+        """Return the rows of samples in terms of the basis functions, Φ `(n r, size)`."""
         each = zip(self.parts, block.operators, block.features, strict=True)
         return torch.cat([part.rows(W, part.values(x)[0]) for part, W, x in each], dim=-1)
 
     def evaluate(self, features: Sequence[Features]) -> tuple[Tensor, Tensor, Tensor]:
-        """Basis functions at n samples.
+        """Return the basis functions at n samples.
 
         Args:
             features: kernel inputs of each process.
@@ -318,10 +318,10 @@ def latent_basis(
     inducing: Sequence[Features],
     components: Sequence[int],
 ) -> LatentBasis:
-    """Basis functions of processes with given inducing points.
+    """Return the basis functions of processes with given inducing points.
 
     Args:
-        inducing: kernel inputs of the inducing points of each process, of any number, none included.
+        inducing: kernel inputs of the inducing points of each process, of any number including zero.
         components: number of components of each process.
     """
     parts = []

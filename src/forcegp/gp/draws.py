@@ -1,7 +1,7 @@
 """Functions drawn from a posterior, cheap to evaluate anywhere (pathwise conditioning, Wilson et al. 2020).
 
-A function from the prior, made of random features, is corrected by the data. Each sample is one deterministic
-function, so a trajectory integrated under it obeys Newton's equation and the constraint.
+A function from the prior, composed of random features, is corrected by the data. Each sample is a
+deterministic function, so a trajectory integrated under it obeys Newton's equations and the constraint.
 
 A sparse posterior applies Matheron's rule to the inducing points, at a cost that does not depend on the
 number of samples: f(x) = f_prior(x) + V(x)ᵀ(w − Rᵀf_prior(Z)) with weights w ~ N(A⁻¹v, A⁻¹), and φ(x)ᵀw for
@@ -24,9 +24,9 @@ from forcegp.gp.features import Basis, Block, FeatureMap, Features, stacked
 from forcegp.gp.kernels import Kernel, Linear, Parameters, Process, Product, Stationary, Sum, sub
 
 FEATURES = 1024
-"""Random features per component; the covariance of prior draws errs by about 1/√FEATURES of its scale."""
+"""Random features per component; the error in the covariance of prior draws is about 1/√FEATURES."""
 UNMEASURED = 4
-"""A process that no row depends on gets this many times fewer features: no data correct its draws."""
+"""Factor by which a process has fewer features if no row depends on it and no data correct its draws."""
 
 
 class FoldedSamples(NamedTuple):
@@ -49,9 +49,9 @@ class FunctionSamples:
     """Samples of latent processes, f_s(x) = Σ_t φ_t(x) w_ts.
 
     Attributes:
-        bases: of each process, functions of its standardized features.
-        weights: of each process and basis, `(components, terms, samples)`.
-        folded: the same of each process by kernel and features, where they come from basis functions.
+        bases: bases of each process, functions of its standardized features.
+        weights: weights for each process and basis, `(components, terms, samples)`.
+        folded: the same for each process by kernel and features, if they come from basis functions.
     """
 
     bases: tuple[tuple[Basis, ...], ...]
@@ -62,7 +62,7 @@ class FunctionSamples:
     def of(
         cls, terms: Sequence[Sequence[tuple[Basis, Tensor]]], folded: tuple[FoldedSamples, ...] | None = None
     ) -> FunctionSamples:
-        """From the terms of each process, functions with their weights."""
+        """Construct from the terms of each process, functions with their weights."""
         bases = tuple(tuple(basis for basis, _ in process_terms) for process_terms in terms)
         return cls(bases, tuple(tuple(w for _, w in process_terms) for process_terms in terms), folded)
 
@@ -72,7 +72,7 @@ class FunctionSamples:
         return self.weights[0][0].shape[-1]
 
     def latent(self, p: int, features: Features) -> Tensor:
-        """Values of process p at its standardized inputs at n states, `(samples, n, components)`."""
+        """Return process p at its standardized inputs at n states, `(samples, n, components)`."""
         # f_s(x) = Σ_t φ_t(x) w_ts
         terms = zip(self.bases[p], self.weights[p], strict=True)
         return torch.stack([basis(features) @ w for basis, w in terms]).sum(0).permute(2, 1, 0)
@@ -83,8 +83,8 @@ class FunctionSamples:
         return [[w.permute(2, 0, 1).contiguous() for w in weights] for weights in self.weights]
 
     def by_runs(self, p: int, features: Features, samples: range, runs: int) -> Tensor:
-        """Values of process p from some samples, each at its own runs of states: `(samples · runs,
-        components)`."""
+        """Return the values of process p from some samples, each at separate runs of states: `(samples ·
+        runs, components)`."""
         parts = []
         for basis, w in zip(self.bases[p], self._weights_by_sample[p], strict=True):
             phi, w_runs = basis(features).unflatten(1, (len(samples), runs)), w[samples.start : samples.stop]
@@ -113,7 +113,7 @@ def draw_priors(
         features: random features per component.
 
     Returns:
-        Of each process, the functions with their weights, and W f(X) at the rows `(rows, samples)`.
+        The functions of each process with their weights, and W f(X) at the rows `(rows, samples)`.
     """
     like, terms = blocks[0].target, []
     at_rows = like.new_zeros(sum(block.rows for block in blocks), count)
@@ -135,10 +135,10 @@ def draw_priors(
 
 
 def kernel_terms(kernel: Kernel, params: Parameters, X: Features, w: Tensor) -> list[tuple[Basis, Tensor]]:
-    """k(x, X) w as a sum of functions of x, each with its weights.
+    """Return k(x, X) w as a sum of functions of x, each with weights.
 
-    Terms with a finite number of features are folded into weights of these. A stationary term whose
-    length-scales all components share is evaluated once for all of them, and so is a product of such terms.
+    Terms with a finite number of features are folded into weights of these. A stationary term with
+    length-scales shared by all components is evaluated once for all of them, as is a product of such terms.
 
     Args:
         X: n points.
@@ -165,8 +165,9 @@ def kernel_terms(kernel: Kernel, params: Parameters, X: Features, w: Tensor) -> 
 def _common(
     kernel: Kernel, params: Parameters, X: Features
 ) -> tuple[Callable[[Features], list[Tensor]], list[Tensor]] | None:
-    """A kernel as Σ_t a_t g_t: functions g_t(x, X) `(1, ·, n)` that all components have in common, and sizes
-    a_t `(k,)`; `None` where components differ by more than factors."""
+    """Return a kernel as Σ_t a_t g_t, with functions g_t(x, X) `(1, ·, n)` common to all components and
+    factors a_t `(k,)`; `None` if components differ by more than factors.
+    """
     if isinstance(kernel, Stationary) and len(params["log_lengthscale"]) == 1:
         g = kernel.towards({**params, "log_std": torch.zeros_like(params["log_std"][:1])}, X)
         return lambda x: [g(x)], [torch.exp(2.0 * params["log_std"])]
@@ -194,14 +195,15 @@ def _common(
 
 
 MISSED_FEATURES = 256
-"""Random features per component. Only what the inducing points miss is drawn from them: its covariance errs
-by about 1/√MISSED_FEATURES of its scale, and that of the rest not at all."""
+"""Random features per component. Only the part missed by the inducing points is drawn from them; its
+covariance about 1/√MISSED_FEATURES of its scale, and that of the rest not at all.
+"""
 
 
 def draw_functions(
     basis: LatentBasis, weights: Tensor, generator: torch.Generator, features: int
 ) -> FunctionSamples:
-    """Functions with given weights of the basis functions, and the missed part drawn from the prior.
+    """Return functions with given weights of the basis functions, drawing the missed part from the prior.
 
     Args:
         weights: drawn from their posterior `(size, samples)`.
@@ -216,7 +218,7 @@ def draw_functions(
 
 
 def _folded(part: ProcessBasis, weights: Tensor, generator: torch.Generator, features: int) -> FoldedSamples:
-    """Samples of one process with given weights of its basis functions."""
+    """Return the samples of one process with given weights of its basis functions."""
     on_kernel, on_features = part.fold(weights)
     rest = part.split.rest
     if rest is None:
@@ -233,7 +235,7 @@ def _folded(part: ProcessBasis, weights: Tensor, generator: torch.Generator, fea
 
 
 def _terms(part: ProcessBasis, samples: FoldedSamples) -> list[tuple[Basis, Tensor]]:
-    """The functions of one process that are summed, with their weights."""
+    """Return the functions of a process to be summed, with their weights."""
     terms: list[tuple[Basis, Tensor]] = []
     rest = part.split.rest
     if samples.missed is not None:

@@ -1,6 +1,6 @@
 """Exact posterior of latent processes given whitened rows (eqs. 11 and 22 to 24).
 
-Memory grows with the square of the number of rows; fits that do not fit into memory are refused beforehand.
+Memory grows with the square of the number of rows; fits that exceed memory are rejected in advance.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from forcegp.gp.likelihood import Conditioned, add_rows, condition, cross_gram, 
 from forcegp.resources import announce_memory, free_memory
 
 MATRICES_TO_LEARN = 3.0
-"""Square matrices of all rows that learning holds at once: the covariance, its factor and a copy."""
+"""Number of square matrices over all rows in memory during learning: the covariance, its factor, a copy."""
 MATRICES_TO_CONDITION = 2.0
-"""Those that conditioning holds: the covariance and its factor."""
+"""The same during conditioning: the covariance and its factor."""
 SHARE = 0.8
-"""Fraction of the free memory that exact inference may take."""
+"""Fraction of the free memory that exact inference may use."""
 CHUNK_COLUMNS = 700
-"""Columns of the triangular solve that are held at a time."""
+"""Number of columns of the triangular solve in memory at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,7 +58,8 @@ class ExactPosterior:
         """Condition on rows.
 
         Raises:
-            NumericalError: the covariance of the rows is not positive definite, or its noise is rounding.
+            NumericalError: the covariance of the rows is not positive definite, or its noise is below
+                rounding.
         """
         fitted = condition(processes, params, blocks)
         if len(fitted.L):
@@ -82,11 +83,11 @@ class ExactPosterior:
 
     @property
     def jitter(self) -> float:
-        """Added to the diagonal to factorise, relative to unit noise."""
+        """Jitter added to the diagonal, relative to unit noise."""
         return self.conditioned.jitter
 
     def updated(self, blocks: Sequence[Block]) -> ExactPosterior:
-        """Condition on r further rows in O(r n²), compared with O((n + r)³) for a refit.
+        """Condition on r additional rows in O(r n²), compared with O((n + r)³) for a refit.
 
         Raises:
             ModelError: exact inference does not fit into memory.
@@ -103,7 +104,9 @@ class ExactPosterior:
         return result
 
     def knowing(self, p: int, features: Features, value: Tensor) -> ExactPosterior:
-        """The posterior given that a constant process p has a value `(components,)`, its mean zero."""
+        """Return the posterior given the value `(components,)` of a constant process p, with its mean set to
+        zero.
+        """
         # y ← y − W_p f_p, with W_p ← 0
         blocks = [
             Block(
@@ -136,7 +139,7 @@ class ExactPosterior:
         return self.weights_of(self.alpha[:, None])
 
     def weights_of(self, rows: Tensor) -> list[list[Tensor]]:
-        """Wᵀ applied to vectors over the rows `(rows, s)`, by process and block `(components, n, s)`."""
+        """Apply Wᵀ to vectors over the rows `(rows, s)`, by process and block `(components, n, s)`."""
         weights: list[list[Tensor]] = [[] for _ in self.processes]
         first = 0
         for block in self.blocks:
@@ -155,7 +158,7 @@ class ExactPosterior:
         ]
 
     def latent_mean(self, p: int, features: Features) -> Tensor:
-        """Posterior mean of process p at standardized features, `(n, components)`."""
+        """Return the posterior mean of process p at standardized features, `(n, components)`."""
         if not self.measured[p]:
             x, components = next(iter(features.values())), self.blocks[0].operators[p].shape[-1]
             return x.new_zeros(len(x), components)
@@ -167,11 +170,11 @@ class ExactPosterior:
         return sum(parts[1:], start=parts[0]).mT
 
     def mean(self, block: Block) -> Tensor:
-        """Posterior mean Σ W f of the rows of each sample of a block, `(n, d)`."""
+        """Return the posterior mean Σ W f of the rows of each sample of a block, `(n, d)`."""
         return rows_mean(self.latent_mean, block)
 
     def covariance(self, block: Block) -> Tensor:
-        """Posterior covariance of the rows of each sample of a block, `(n, d, d)`, without noise.
+        """Return the posterior covariance of the rows of each sample of a block, `(n, d, d)`, without noise.
 
         Raises:
             NumericalError: rounding errors dominate a variance.
@@ -196,7 +199,7 @@ class ExactPosterior:
         return 0.5 * (covariance + covariance.mT)
 
     def _cross(self, new: Block) -> Tensor:
-        """Covariance of the rows of another block with those of the data, `(new, rows)` (eqs. 10 and 19)."""
+        """Return the covariance between the rows of a block and the data, `(new, rows)` (eqs. 10 and 19)."""
         starts = offsets(self.blocks)
         cross = new.target.new_zeros(new.rows, starts[-1])
         for p, W in enumerate(new.operators):
@@ -213,7 +216,8 @@ class ExactPosterior:
         return -float(self.conditioned.negative_log_likelihood(target_of(self.blocks)))
 
     def draw(self, count: int, generator: torch.Generator, features: int = FEATURES) -> FunctionSamples:
-        """Functions from the posterior by Matheron's rule: f(x) + k(x, X) WᵀΣ⁻¹(y − W f(X) − ε), Σ = K + I.
+        """Draw functions from the posterior by Matheron's rule: f(x) + k(x, X) WᵀΣ⁻¹(y − W f(X) − ε), Σ = K +
+        I.
 
         Args:
             generator: source of randomness, on the CPU.
@@ -235,10 +239,10 @@ class ExactPosterior:
 
 
 def exact_bytes(blocks: Sequence[Block], learning: bool = True) -> int:
-    """Peak memory of exact inference on whitened rows [bytes].
+    """Return the peak memory of exact inference on whitened rows [bytes].
 
     Args:
-        learning: whether hyperparameters are learned, or the rows conditioned on only.
+        learning: whether hyperparameters are learned.
     """
     rows = sum(block.target.numel() for block in blocks)
     components = sum(W.shape[-1] for W in blocks[0].operators) if blocks else 0
@@ -249,13 +253,13 @@ def exact_bytes(blocks: Sequence[Block], learning: bool = True) -> int:
 
 
 def require_exact_fits(blocks: Sequence[Block], learning: bool = True, available: int | None = None) -> None:
-    """Refuse exact inference that does not fit into memory, and announce it if it needs most of it.
+    """Reject exact inference that does not fit into memory, and warn if it needs most of the memory.
 
     Args:
         available: usable memory [bytes]; by default `SHARE` of the free memory.
 
     Raises:
-        ModelError: it needs more.
+        ModelError: inference needs more memory.
     """
     free = free_memory()
     allowed = (None if free is None else int(SHARE * free)) if available is None else available

@@ -1,4 +1,4 @@
-"""Cholesky factors with reported jitter and with added rows, and spectra."""
+"""Cholesky factors with reported jitter, their updates for added rows, and spectra."""
 
 from __future__ import annotations
 
@@ -18,28 +18,27 @@ from forcegp.native import load_library
 from forcegp.resources import threads_of_pytorch
 
 JITTER_STEPS = (0.0, 1e-14, 1e-12, 1e-10, 1e-8)
-"""Fractions of the mean diagonal that are tried, in order, until the factorisation succeeds."""
+"""Fractions of the mean diagonal, tried in order until the factorisation succeeds."""
 PANEL = 24
-"""Columns that LAPACK's triangular-pentagonal QR takes at a time."""
+"""Block size of LAPACK's triangular-pentagonal QR."""
 TRUNCATION = 1e-12
-"""Eigenvalues of the inducing points' covariance below this fraction of the largest are dropped.
-
-Kernels are accurate to about 10⁻¹⁵ of their scale, so an eigenvalue at the threshold is to 10⁻³. Where the
-prior is a million times as strong as the noise, a threshold of 10⁻¹⁰ loses information in the data.
+"""Eigenvalues of the inducing point covariance below this fraction of the largest are dropped. Kernels are
+accurate to about 10⁻¹⁵ of their scale, so an eigenvalue at the threshold is to 10⁻³. Where the prior is a
+million times as strong as the noise, a threshold of 10⁻¹⁰ loses information in the data.
 """
 
 
 def cholesky(K: Tensor) -> tuple[Tensor, float]:
-    """Lower Cholesky factor of K + ε I, with the smallest ε of `JITTER_STEPS` that succeeds.
+    """Return the lower Cholesky factor of K + ε I, with the smallest ε of `JITTER_STEPS` that succeeds.
 
     Args:
-        K: `(n, n)` symmetric; the lower triangle is read.
+        K: `(n, n)` symmetric matrix; the lower triangle is read.
 
     Returns:
-        The factor `(n, n)` and the ε that was added, 0.0 if none was needed.
+        The factor `(n, n)` and the added ε, 0.0 if none was needed.
 
     Raises:
-        NumericalError: K is not finite, or not positive definite within the largest jitter.
+        NumericalError: K is not finite, or not positive definite even with the largest jitter.
     """
     scale = float(K.diagonal().mean()) if K.shape[-1] else 1.0
     if not torch.isfinite(K.diagonal()).all():
@@ -60,17 +59,17 @@ def cholesky(K: Tensor) -> tuple[Tensor, float]:
 
 
 def extended(L: Tensor, rows: Tensor) -> Tensor:
-    """Lower factor of L Lᵀ + ΦᵀΦ, from the QR factorisation of Lᵀ above the rows Φ, in O(r n²).
+    """Return the lower factor of L Lᵀ + ΦᵀΦ, from the QR factorisation of Lᵀ above the rows Φ, in O(r n²).
 
-    A compiled kernel does it if there is a C++ compiler, three to four times as fast as LAPACK for a few
-    rows. LAPACK may make diagonal entries negative, which is harmless in solves.
+    If there is a C++ compiler, a compiled kernel is used, which is three to four times as fast as LAPACK for
+    a few rows. LAPACK may return negative diagonal entries, which are harmless in solves.
 
     Args:
         L: lower factor on the CPU `(n, n)`; fastest if its columns are contiguous.
         rows: Φ `(r, n)`.
 
     Raises:
-        NumericalError: LAPACK refuses the arguments.
+        NumericalError: LAPACK rejects the arguments.
     """
     plain = all(x.dtype == torch.float64 and x.device.type == "cpu" for x in (L, rows))
     fits = L.shape[0] == L.shape[1] == rows.shape[1] and len(rows) > 0
@@ -85,7 +84,7 @@ def extended(L: Tensor, rows: Tensor) -> Tensor:
 
 @cache
 def _kernel() -> Callable[[int, int, int, int, int], None] | None:
-    """`extend` of factor_rows.cpp; `None` without a compiler."""
+    """Return `extend` of factor_rows.cpp; `None` without a compiler."""
     source = files("forcegp.gp").joinpath("factor_rows.cpp").read_text(encoding="utf-8")
     try:
         function = load_library(source, level="-O3").extend
@@ -107,7 +106,7 @@ def _extended_by_lapack(L: Tensor, rows: Tensor) -> Tensor:
 
 
 def bordered(L: Tensor, cross: Tensor, corner: Tensor) -> tuple[Tensor, float]:
-    """Lower factor of [[L Lᵀ, C], [Cᵀ, K]], in O(r n²) for r new rows.
+    """Return the lower factor of [[L Lᵀ, C], [Cᵀ, K]], in O(r n²) for r new rows.
 
     Args:
         L: lower factor `(n, n)`.
@@ -115,7 +114,7 @@ def bordered(L: Tensor, cross: Tensor, corner: Tensor) -> tuple[Tensor, float]:
         corner: K `(r, r)`, whose lower triangle is read.
 
     Returns:
-        The factor `(n + r, n + r)`, and the jitter that the new rows needed.
+        The factor `(n + r, n + r)`, and the jitter for the new rows.
 
     Raises:
         NumericalError: the matrix is not positive definite.
@@ -133,7 +132,7 @@ def bordered(L: Tensor, cross: Tensor, corner: Tensor) -> tuple[Tensor, float]:
 
 @dataclass(frozen=True)
 class Spectrum:
-    """Eigendecomposition of one component's K_zz, U Λ Uᵀ.
+    """Eigendecomposition U Λ Uᵀ of K_zz for one component.
 
     Attributes:
         values: all eigenvalues, in ascending order `(m,)`.
@@ -147,7 +146,7 @@ class Spectrum:
 
     @classmethod
     def of(cls, K: Tensor) -> Spectrum:
-        """Of a symmetric matrix `(m, m)`."""
+        """Decompose a symmetric matrix `(m, m)`."""
         values, vectors = torch.linalg.eigh(K)
         kept = values > TRUNCATION * values[-1] if len(values) else values > 0.0
         return cls(values, vectors, int((~kept).sum()))

@@ -1,8 +1,8 @@
-"""Inputs of kernels by name, rows of samples, and feature maps φ(x) of kernels and of random functions.
+"""Named kernel inputs, rows of samples, and feature maps φ(x) of kernels and random functions.
 
 With unit noise variance, entries of the covariance K of whitened rows have errors of about ε K_ii with ε =
-2.2e-16. So standard deviations have relative errors of about ε K_ii, and ε/r if data reduce a prior variance
-to its fraction r: 0.1 % at K_ii = 1e12 and 0.5 % at r = 1e-13 beside a posterior in 80-bit arithmetic.
+2.2e-16. The relative errors of standard deviations are therefore about ε K_ii, or ε/r if data reduce a prior
+variance to a fraction r: 0.1 % at K_ii = 1e12 and 0.5 % at r = 1e-13, compared with 80-bit arithmetic.
 """
 
 from __future__ import annotations
@@ -17,22 +17,22 @@ from torch import Tensor
 from forcegp.errors import NumericalError, UnknownNameError
 
 FLOOR = 0.01
-"""Smallest scale of a column, in units of the typical one of its input. It is below what a motion through the
-workspace gives (0.034 for the torque of an arm's joint 5), and above what drift gives."""
+"""Smallest scale of a column, relative to the typical one of its input. It is below that of a motion through
+the workspace gives (0.034 for the torque of an arm's joint 5), and above what drift gives."""
 PRIOR_TO_NOISE = 1e6
 """Largest standard deviation of the prior of a row, in units of its noise."""
 SMALLEST_FRACTION = 1e-13
-"""Smallest fraction of a prior variance that a posterior variance is resolved to."""
+"""Smallest ratio of posterior to prior variance that is resolved."""
 
 Features = Mapping[str, Tensor]
 """Named kernel inputs: `(n, w)`, shared by all components, or `(n, k, w)`, one row for each component."""
 
 
 def stacked(x: Features, inputs: tuple[str, ...] | None) -> Tensor:
-    """The named features side by side, `(n, w)`, or `(k, n, w)` if components have different inputs.
+    """Concatenate the named features, `(n, w)`, or `(k, n, w)` if components have different inputs.
 
     Raises:
-        UnknownNameError: a feature is not given.
+        UnknownNameError: a feature is missing.
     """
     names = tuple(x) if inputs is None else inputs
     for name in names:
@@ -50,12 +50,12 @@ def stacked(x: Features, inputs: tuple[str, ...] | None) -> Tensor:
 class Standardization:
     """Shift and scale of each named input, x ↦ (x − mean)/std, from training data.
 
-    A column that hardly varies does not determine a scale. So no scale is below `FLOOR` times the root mean
-    square of the standard deviations of all columns of its input, and the columns of a vector share that
-    mean, so the result depends little on the orientation of the axes. Features with a meaningful zero, such
-    as velocities, are scaled but not shifted.
+    A column that hardly varies does not determine a scale. Scales are therefore at least `FLOOR` times the
+    root mean square of the standard deviations of all columns of the input. The columns of a vector share
+    this mean, so the result depends little on the orientation of the axes. Features with a meaningful zero,
+    such as velocities, are scaled but not shifted.
 
-    Columns that are constant to rounding keep the scale 1, or that of their vector, and are listed in
+    Columns that are constant up to rounding keep the scale 1, or that of their vector, and are listed in
     `constant`.
     """
 
@@ -67,12 +67,12 @@ class Standardization:
     def of(
         cls, features: Mapping[str, Tensor], vectors: Collection[str] = (), centred: bool = True
     ) -> Standardization:
-        """Mean and standard deviation of each column, or zero and its root mean square.
+        """Compute the mean and standard deviation of each column, or zero and its root mean square.
 
         Args:
             features: named inputs `(n, w)`.
-            vectors: inputs with columns that are components of one vector.
-            centred: whether the mean is subtracted.
+            vectors: inputs that are vectors, with columns as components.
+            centred: whether to subtract the mean.
         """
         mean = {name: x.mean(0) if centred else torch.zeros_like(x[0]) for name, x in features.items()}
         std, constant = {}, []
@@ -89,22 +89,22 @@ class Standardization:
 
     @classmethod
     def none(cls, features: Mapping[str, Tensor]) -> Standardization:
-        """No standardization: inputs in their units."""
+        """Return a standardization that leaves the inputs unchanged."""
         zero = {name: torch.zeros_like(x[0]) for name, x in features.items()}
         return cls(zero, {name: torch.ones_like(x) for name, x in zero.items()})
 
     def apply(self, features: Mapping[str, Tensor]) -> dict[str, Tensor]:
-        """The standardized features."""
+        """Return the standardized features."""
         return {name: (x - self.mean[name]) / self.std[name] for name, x in features.items()}
 
 
 @dataclass(frozen=True)
 class Block:
-    """Samples that share a number of rows.
+    """Samples with the same number of rows.
 
     Attributes:
         features: standardized kernel inputs of each prior, `(n, w)` by name.
-        operators: W of each prior, `(n, r, components)`.
+        operators: W for each prior, `(n, r, components)`.
         target: whitened residual `(n, r)`.
     """
 
@@ -119,24 +119,24 @@ class Block:
 
 
 def points(features: Features) -> int:
-    """Number of inputs in a dictionary of features."""
+    """Return the number of inputs in a dictionary of features."""
     return len(next(iter(features.values())))
 
 
 def components_of(block: Block) -> list[int]:
-    """Number of components of each process."""
+    """Return the number of components of each process."""
     return [W.shape[-1] for W in block.operators]
 
 
 def chunked(blocks: Iterable[Block], samples: int) -> Iterator[Block]:
-    """Split blocks into blocks of a maximum number of samples."""
+    """Split blocks into blocks with a maximum number of samples."""
     for block in blocks:
         for first in range(0, len(block.target), samples):
             yield rows_of(block, slice(first, first + samples))
 
 
 def rows_of(block: Block, index: slice | Tensor) -> Block:
-    """Some of the samples of a block."""
+    """Return some of the samples of a block."""
     return Block(
         tuple({name: x[index] for name, x in f.items()} for f in block.features),
         tuple(W[index] for W in block.operators),
@@ -145,7 +145,7 @@ def rows_of(block: Block, index: slice | Tensor) -> Block:
 
 
 def rows_mean(latent_mean: Callable[[int, Features], Tensor], block: Block) -> Tensor:
-    """Mean Σ_p W_p μ_p of the rows of each sample of a block, `(n, d)` (eq. 23).
+    """Return the mean Σ_p W_p μ_p of the rows of each sample of a block, `(n, d)` (eq. 23).
 
     Args:
         latent_mean: μ_p of process p at kernel inputs, `(n, components)`.
@@ -158,7 +158,7 @@ def rows_mean(latent_mean: Callable[[int, Features], Tensor], block: Block) -> T
 
 
 Basis = Callable[[Features], Tensor]
-"""x ↦ φ(x) `(k, n, f)`, or `(1, n, f)` where all components have the same."""
+"""x ↦ φ(x) `(k, n, f)`, or `(1, n, f)` if they are common to all components."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,7 +168,7 @@ class FeatureTerm:
     Attributes:
         values: φ.
         scale: a `(k, f)`.
-        waves: inputs, frequencies and phases, if φ is cos(ωᵀx + φ) as of `fourier_features`.
+        waves: inputs, frequencies and phases, if φ is cos(ωᵀx + φ) as in `fourier_features`.
     """
 
     values: Basis
@@ -178,7 +178,7 @@ class FeatureTerm:
 
 @dataclass(frozen=True, eq=False)
 class FeatureMap:
-    """φ(x) with E[φ(x)ᵀφ(x′)] = k(x, x′), as terms side by side: f(x) = φ(x)ᵀw with w ~ N(0, I).
+    """Concatenated terms φ(x) with E[φ(x)ᵀφ(x′)] = k(x, x′): f(x) = φ(x)ᵀw with w ~ N(0, I).
 
     Attributes:
         terms: groups of features.
@@ -187,18 +187,18 @@ class FeatureMap:
     terms: tuple[FeatureTerm, ...]
 
     def basis(self, x: Features) -> Tensor:
-        """φ(x) `(k, n, features)`."""
+        """Return φ(x) `(k, n, features)`."""
         parts = [term.scale[:, None] * term.values(x) for term in self.terms]
         return parts[0] if len(parts) == 1 else torch.cat(parts, dim=-1)
 
     def weighted(self, weights: Tensor) -> list[tuple[Basis, Tensor]]:
-        """φ(x)ᵀw as functions with weights, for `w` of shape `(k, features, samples)`."""
+        """Return φ(x)ᵀw as functions with weights, for `w` of shape `(k, features, samples)`."""
         parts = weights.split([term.scale.shape[-1] for term in self.terms], dim=1)
         pairs = zip(self.terms, parts, strict=True)
         return [(term.values, term.scale[..., None] * w) for term, w in pairs]
 
     def joined(self) -> FeatureTerm:
-        """All features as one term."""
+        """Join all features into one term."""
         if len(self.terms) == 1:
             return self.terms[0]
 
@@ -210,17 +210,17 @@ class FeatureMap:
         return FeatureTerm(values, torch.cat([term.scale for term in self.terms], dim=-1))
 
     def __add__(self, other: FeatureMap) -> FeatureMap:
-        """The features of both, for the sum of two kernels."""
+        """Return the features of both, for the sum of two kernels."""
         return FeatureMap((*self.terms, *other.terms))
 
     def __mul__(self, other: FeatureMap) -> FeatureMap:
-        """All pairs of features, for the product of two kernels."""
+        """Return all pairs of features, for the product of two kernels."""
         a, b = self.joined(), other.joined()
         scale = (a.scale[:, :, None] * b.scale[:, None, :]).flatten(-2)
         return FeatureMap((FeatureTerm(lambda x: _all_pairs(a.values(x), b.values(x)), scale),))
 
     def paired(self, other: FeatureMap, count: int, generator: torch.Generator) -> FeatureMap:
-        """`count` random pairs of features, for the product of two kernels with many features each."""
+        """Return `count` random pairs of features, for the product of two kernels with many features each."""
         a, b = self.joined(), other.joined()
         sizes = a.scale.shape[-1], b.scale.shape[-1]
         pairs = torch.Generator().manual_seed(int(torch.randint(2**31, (1,), generator=generator)))
@@ -230,13 +230,13 @@ class FeatureMap:
 
 
 def require_resolved_noise(prior: Tensor) -> None:
-    """Refuse a prior so large that double precision does not resolve the noise.
+    """Reject a prior so large that double precision does not resolve the noise.
 
     Args:
-        prior: variance of the prior of a row, in units of the noise variance `()`.
+        prior: prior variance of a row, in units of the noise variance `()`.
 
     Raises:
-        NumericalError: it is more than `PRIOR_TO_NOISE` squared.
+        NumericalError: the prior exceeds `PRIOR_TO_NOISE` squared.
     """
     ratio = math.sqrt(float(prior))
     if ratio > PRIOR_TO_NOISE:
@@ -249,11 +249,11 @@ def require_resolved_noise(prior: Tensor) -> None:
 
 
 def require_resolved_variance(covariance: Tensor, prior: Tensor) -> Tensor:
-    """Return a posterior covariance `(n, d, d)` if all of its variances are resolved.
+    """Return a posterior covariance `(n, d, d)` if all its variances are resolved.
 
     Args:
-        covariance: of the rows of each sample.
-        prior: variance of each row before the data `(n, d)`.
+        covariance: covariance of the rows of each sample.
+        prior: prior variance of each row `(n, d)`.
 
     Raises:
         NumericalError: rounding errors dominate a variance.
@@ -272,11 +272,11 @@ def require_resolved_variance(covariance: Tensor, prior: Tensor) -> Tensor:
 
 
 def fourier_features(inputs: tuple[str, ...] | None, omega: Tensor, phase: Tensor, std: Tensor) -> FeatureMap:
-    """σ √(2/F) cos(ωᵀx + φ): random Fourier features of a stationary kernel.
+    """Return σ √(2/F) cos(ωᵀx + φ): random Fourier features of a stationary kernel.
 
     Args:
         inputs: names of the inputs; `None` for all.
-        omega: frequencies `(k, F, w)`, or `(1, F, w)` where all components have the same.
+        omega: frequencies `(k, F, w)`, or `(1, F, w)` if they are common to all components.
         phase: `(k, F)` or `(1, F)`.
         std: σ `(k,)`.
     """
@@ -288,13 +288,13 @@ def fourier_features(inputs: tuple[str, ...] | None, omega: Tensor, phase: Tenso
 
 
 def linear_features(x: Features, inputs: tuple[str, ...] | None, slope: Tensor, bias: Tensor) -> FeatureMap:
-    """Slopes and a bias: features of the linear kernel.
+    """Return the features of the linear kernel, slopes and a bias.
 
     Args:
         x: kernel inputs; only their widths are used.
         inputs: names of the inputs; `None` for all.
-        slope: standard deviation of each slope `(k, w)`, or of all `(k, 1)`.
-        bias: that of the bias `(k,)`.
+        slope: standard deviation of each slope `(k, w)`, or of all slopes `(k, 1)`.
+        bias: standard deviation of the bias `(k,)`.
     """
 
     def values(x: Features) -> Tensor:
@@ -308,10 +308,10 @@ def linear_features(x: Features, inputs: tuple[str, ...] | None, slope: Tensor, 
 
 
 def constant_features(std: Tensor) -> FeatureMap:
-    """One constant feature per component, with standard deviations `(k,)`."""
+    """Return one constant feature per component, with standard deviations `(k,)`."""
     return FeatureMap((FeatureTerm(lambda x: std.new_ones(1, stacked(x, None).shape[-2], 1), std[:, None]),))
 
 
 def _all_pairs(a: Tensor, b: Tensor) -> Tensor:
-    """a_i b_j of features `(k, n, f)` and `(k, n, g)`, `(k, n, f g)`."""
+    """Return all products a_i b_j of features `(k, n, f)` and `(k, n, g)`, `(k, n, f g)`."""
     return (a[..., :, None] * b[..., None, :]).flatten(-2)

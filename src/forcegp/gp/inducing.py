@@ -1,8 +1,8 @@
-"""Selection of inducing points from the data: greedy conditional variance.
+"""Selection of inducing points from the data by greedy conditional variance.
 
 Each step adds the sample with the largest missed variance, Σ_k S_kk Var(f_k(x) | f(Z)), the trace term of the
 collapsed bound (pivoted partial Cholesky factorisation; Burt, Rasmussen & van der Wilk 2020). Weights S = WᵀW
-put it in units of the noise variance.
+convert it to units of the noise variance.
 """
 
 from __future__ import annotations
@@ -19,27 +19,26 @@ from forcegp.gp.features import Block, Features, points
 from forcegp.gp.kernels import Parameters, Process, sub
 
 CANDIDATES = 4000
-"""Samples among which points are chosen."""
+"""Number of samples from which points are selected."""
 
 LIMIT = 100
-"""Most inducing points of one process."""
+"""Maximum number of inducing points of a process."""
 
 SHARE = 0.02
-"""Missed variance of all rows, as a fraction of what the noise leaves of them, at which to stop.
-
-In units of the noise variance, M basis functions learned from noisy rows leave a variance of at most M in
-all rows together; what the points miss should be small beside it.
+"""Missed variance of all rows at which selection stops, as a fraction of their posterior variance. In units
+    of the noise variance, M basis functions learned from noisy rows have a total posterior variance of at
+    most M over all rows; the missed variance should be small compared with it.
 """
 
 
 @dataclass(frozen=True)
 class Selection:
-    """Chosen inducing points of one process.
+    """Selected inducing points of a process.
 
     Attributes:
-        points: their kernel inputs.
-        missed: by number of points, from none on, the missed prior variance of a row on average over the
-            candidates, in units of the noise variance `(points + 1,)`.
+        points: kernel inputs of the points.
+        missed: missed prior variance of a row for 0, 1, … points, on average over the candidates, in units
+            of the noise variance `(points + 1,)`.
     """
 
     points: dict[str, Tensor]
@@ -55,15 +54,14 @@ def select_inducing(
     limit: int = LIMIT,
     share: float = SHARE,
 ) -> list[Selection]:
-    """Choose inducing points of each process among the samples of blocks.
+    """Select inducing points for each process from the samples of blocks.
 
-    A process without effect on any row, or with a finite number of features, gets none.
+    A process that affects no row, or that has a finite number of features, has no inducing points.
 
     Args:
-        rows: number of all rows to condition on; by default these.
-        limit: maximum number of points of one process.
-        share: missed variance of all rows at which to stop, as a fraction of the variance that the noise
-            leaves.
+        rows: total number of rows to condition on; by default those of the blocks.
+        limit: maximum number of points of a process.
+        share: missed variance of all rows at which to stop, as a fraction of their posterior variance.
     """
     candidate_rows = sum(block.rows for block in blocks)
     tolerance = share / (candidate_rows if rows is None else rows)
@@ -78,7 +76,7 @@ def select_inducing(
 
 
 def _greedy(rest: KernelPart | None, x: Features, weight: Tensor, limit: int, tolerance: float) -> Selection:
-    """Pivoted partial Cholesky factorisation of every component with common pivots."""
+    """Compute the pivoted partial Cholesky factorisation of every component with common pivots."""
     none = Selection({name: value[:0] for name, value in x.items()}, weight.new_zeros(1))
     if rest is None or not bool(weight.any()):
         return none

@@ -1,8 +1,8 @@
-"""Covariance functions of independent latent outputs, as frozen descriptions on a dictionary of parameters.
+"""Covariance functions of independent latent outputs, as frozen descriptions with a dictionary of parameters.
 
-A kernel serves `k` independent outputs at once: its covariance is `(k, n, n')`. Inputs are named
-features, `{"q": (n, w), "qd": (n, w), …}`, already standardized; a kernel reads those named in `inputs`,
-or all. Hyperparameters are logarithms, in a flat dictionary, so that one optimiser serves every kernel.
+A kernel describes `k` independent outputs at once; its covariance is `(k, n, n')`. Inputs are standardized
+named features, `{"q": (n, w), "qd": (n, w), …}`; a kernel reads those listed in `inputs`, or all.
+Hyperparameters are logarithms in a flat dictionary, so one optimiser handles every kernel.
 """
 
 from __future__ import annotations
@@ -32,51 +32,51 @@ Parameters = Mapping[str, Tensor]
 Initial = dict[str, Tensor]
 
 LARGEST_EXPONENT = 300.0
-"""exp(−300) is far below rounding and far above the denormal numbers that slow processors down."""
+"""Bound on exponents; exp(−300) is far below rounding and far above denormal numbers, which are slow."""
 LINEAR_PAIRS = 8
-"""Divisor of the random features of a factor of a product for each linear factor of the other one."""
+"""Divisor of the number of random features of a factor for each linear factor of the other one."""
 
 
 def sub(params: Parameters, prefix: str) -> dict[str, Tensor]:
-    """The entries `prefix.*`, without the prefix."""
+    """Return the entries `prefix.*`, without the prefix."""
     return {key[len(prefix) + 1 :]: value for key, value in params.items() if key.startswith(prefix + ".")}
 
 
 class Kernel(ABC):
-    """A covariance function of `k` independent outputs."""
+    """Covariance function of `k` independent outputs."""
 
     is_finite: bool = False
     """Whether k(x, x′) = φ(x)ᵀφ(x′) with a finite number of features φ."""
 
     @abstractmethod
     def initial(self, outputs: int, widths: Mapping[str, int], log_std: Tensor | float = 0.0) -> Initial:
-        """Initial log-hyperparameters.
+        """Return the initial log-hyperparameters.
 
         Args:
             outputs: number of outputs.
             widths: columns of each feature.
-            log_std: logarithm of the standard deviation of the functions, one, or one per output.
+            log_std: logarithm of the standard deviation of the functions, one value or one per output.
         """
 
     @abstractmethod
     def towards(self, params: Parameters, x2: Features) -> Callable[[Features], Tensor]:
-        """x ↦ k(x, x′) `(k, n, n')` for fixed x′, with the terms of x′ computed once."""
+        """Return the function x ↦ k(x, x′) `(k, n, n')` for fixed x′, precomputing the terms of x′."""
 
     def covariance(self, params: Parameters, x1: Features, x2: Features) -> Tensor:
-        """k(x, x′) `(k, n, n')`."""
+        """Return k(x, x′) `(k, n, n')`."""
         return self.towards(params, x2)(x1)
 
     @abstractmethod
     def variance(self, params: Parameters) -> Callable[[Features], Tensor]:
-        """x ↦ k(x, x) `(k, n)`, with the terms of the hyperparameters computed once."""
+        """Return the function x ↦ k(x, x) `(k, n)`, precomputing the terms of the hyperparameters."""
 
     def diagonal(self, params: Parameters, x: Features) -> Tensor:
-        """k(x, x) `(k, n)`."""
+        """Return k(x, x) `(k, n)`."""
         return self.variance(params)(x)
 
     @abstractmethod
     def draw(self, params: Parameters, x: Features, features: int, generator: torch.Generator) -> FeatureMap:
-        """Random functions from the prior, as `features` random features per output.
+        """Draw functions from the prior as `features` random features per output.
 
         Linear kernels and constants have exact features, whose number is fixed.
 
@@ -95,16 +95,16 @@ class Kernel(ABC):
 
 
 def sides(left: Parameters, right: Parameters) -> Initial:
-    """The hyperparameters of two kernels in one dictionary."""
+    """Merge the hyperparameters of two kernels into one dictionary."""
     parts = (("left", left), ("right", right))
     return {f"{side}.{key}": value for side, part in parts for key, value in part.items()}
 
 
 def width_of(inputs: tuple[str, ...] | None, widths: Mapping[str, int]) -> int:
-    """Number of columns that a kernel reads.
+    """Return the number of columns that a kernel reads.
 
     Raises:
-        UnknownNameError: an input is not given.
+        UnknownNameError: an input is missing.
         ModelError: there is no input.
     """
     names = tuple(widths) if inputs is None else inputs
@@ -120,10 +120,10 @@ def width_of(inputs: tuple[str, ...] | None, widths: Mapping[str, int]) -> int:
 class Linear(Kernel):
     """k = s² Σ_d σ_d² x_d x′_d + σ_0²: functions that are linear in the inputs.
 
-    Fewer hyperparameters to overfit: with `ard=False` all inputs have one σ, so learning cannot set single
-    slopes to zero; with `shared=True` all outputs share the σ_d, and each has its own s and σ_0.
-    With an `offset` σ_0 is that fraction of the root mean square σ_d: a learned ratio, which starts there and
-    is the same for all outputs. The constant of a single output does not determine σ_0.
+    Two options reduce the number of hyperparameters. With `ard=False`, all inputs have the same σ, so
+    learning cannot set single slopes to zero. With `shared=True`, all outputs share the σ_d, with separate s
+    and σ_0. With `offset`, σ_0 is a learned fraction of the root mean square σ_d, with this initial value,
+    shared by all outputs, since the constant of a single output does not determine σ_0.
     """
 
     inputs: tuple[str, ...] | None = None
@@ -146,12 +146,12 @@ class Linear(Kernel):
         return sizes | {"log_offset": share.new_tensor([math.log(self.offset)])}
 
     def slope_std(self, params: Parameters) -> Tensor:
-        """s σ_d `(k, w)`, or `(k, 1)` if it is common to all inputs."""
+        """Return s σ_d `(k, w)`, or `(k, 1)` if it is common to all inputs."""
         log = params["log_slope_std"]
         return torch.exp(log + params["log_std"][:, None] if self.shared else log)
 
     def bias_std(self, params: Parameters) -> Tensor:
-        """σ_0 `(k,)`."""
+        """Return σ_0 `(k,)`."""
         if self.offset is None:
             return torch.exp(params["log_bias_std"])
         return torch.exp(params["log_offset"]) * self.slope_std(params).square().mean(-1).sqrt()
@@ -172,7 +172,7 @@ class Linear(Kernel):
 
 @dataclass(frozen=True)
 class Constant(Kernel):
-    """k = s²: constants, with one standard deviation s for each `group` of outputs, 1 at the start."""
+    """k = s²: constants, with one standard deviation s (initially 1) for each `group` of outputs."""
 
     group: int = 1
 
@@ -182,7 +182,7 @@ class Constant(Kernel):
         return {"log_scale": torch.zeros(outputs // self.group, dtype=torch.float64)}
 
     def std(self, params: Parameters) -> Tensor:
-        """s `(k,)`."""
+        """Return s `(k,)`."""
         return params["log_scale"].exp().repeat_interleave(self.group)
 
     def towards(self, params: Parameters, x2: Features) -> Callable[[Features], Tensor]:
@@ -201,8 +201,8 @@ class Constant(Kernel):
 class Stationary(Kernel):
     """σ² g(r) of the scaled distance r² = Σ_d (x_d − x′_d)² / ℓ_d² (automatic relevance determination).
 
-    With `shared=True` all outputs share the length-scales, and each has its own σ: fewer hyperparameters to
-    overfit, and a single distance to compute.
+    With `shared=True`, all outputs share the length-scales but not σ, which leaves fewer hyperparameters and
+    a single distance to compute.
     """
 
     inputs: tuple[str, ...] | None = None
@@ -218,7 +218,7 @@ class Stationary(Kernel):
 
     @abstractmethod
     def profile(self, r2: Tensor) -> Tensor:
-        """g as a function of r²."""
+        """Return g as a function of r²."""
 
     def towards(self, params: Parameters, x2: Features) -> Callable[[Features], Tensor]:
         inverse = torch.exp(-params["log_lengthscale"])[:, None, :]
@@ -240,7 +240,7 @@ class Stationary(Kernel):
 
     @abstractmethod
     def frequencies(self, shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
-        """Draws from the spectral density of g at unit length-scales."""
+        """Sample from the spectral density of g at unit length-scales."""
 
     def draw(self, params: Parameters, x: Features, features: int, generator: torch.Generator) -> FeatureMap:
         lengthscale = params["log_lengthscale"].exp()
@@ -253,7 +253,7 @@ class Stationary(Kernel):
 
 @dataclass(frozen=True)
 class SquaredExponential(Stationary):
-    """k = σ² exp(−r²/2), a length-scale for each input and, unless shared, output (eq. 31)."""
+    """k = σ² exp(−r²/2), with a length-scale for each input and, unless shared, each output (eq. 31)."""
 
     def profile(self, r2: Tensor) -> Tensor:
         return torch.exp((-0.5 * r2).clamp(-LARGEST_EXPONENT, 0.0))
@@ -311,7 +311,7 @@ class Sum(Kernel):
 
     @staticmethod
     def combined(left: Tensor, right: Tensor) -> Tensor:
-        """The covariance computed from those of both sides."""
+        """Combine the covariances of both sides."""
         return left + right
 
     @property
@@ -319,7 +319,7 @@ class Sum(Kernel):
         return self.left.is_finite and self.right.is_finite
 
     def parts(self, params: Parameters) -> tuple[tuple[Kernel, Initial], tuple[Kernel, Initial]]:
-        """Both kernels, with their hyperparameters."""
+        """Return both kernels, with their hyperparameters."""
         return (self.left, sub(params, "left")), (self.right, sub(params, "right"))
 
     def towards(self, params: Parameters, x2: Features) -> Callable[[Features], Tensor]:
@@ -337,7 +337,7 @@ class Sum(Kernel):
 
 @dataclass(frozen=True)
 class Product(Sum):
-    """k = k_1 k_2; the second factor starts at unit size."""
+    """k = k_1 k_2; the second factor initially has unit size."""
 
     def initial(self, outputs: int, widths: Mapping[str, int], log_std: Tensor | float = 0.0) -> Initial:
         return sides(self.left.initial(outputs, widths, log_std), self.right.initial(outputs, widths))
@@ -367,7 +367,7 @@ class Product(Sum):
 
 
 def _linear_factors(kernel: Kernel) -> int:
-    """Number of factors of a kernel that is linear, or a product of linear ones; 0 for any other."""
+    """Return the number of factors of a linear kernel or product of linear kernels; 0 for any other."""
     if isinstance(kernel, Product):
         left, right = _linear_factors(kernel.left), _linear_factors(kernel.right)
         return left + right if left and right else 0
@@ -376,7 +376,7 @@ def _linear_factors(kernel: Kernel) -> int:
 
 @runtime_checkable
 class Process(Protocol):
-    """A Gaussian process by its kernel and the prefix of its hyperparameters."""
+    """A Gaussian process defined by its kernel and the prefix of its hyperparameters."""
 
     @property
     def kernel(self) -> Kernel:
@@ -385,12 +385,12 @@ class Process(Protocol):
 
     @property
     def prefix(self) -> str:
-        """Prefix of the hyperparameters; another process's if they are shared."""
+        """Prefix of the hyperparameters; that of another process if they are shared."""
         ...
 
 
 TIME, SEGMENT = "time", "segment"
-"""Names of its inputs: time [s], and the number of the trajectory, each `(n, 1)`."""
+"""Names of the inputs of `OrnsteinUhlenbeck`: time [s] and trajectory number, each `(n, 1)`."""
 
 
 @dataclass(frozen=True)

@@ -1,11 +1,11 @@
-"""The covariance of whitened rows (eq. 10) and their likelihood, with closed gradients.
+"""The covariance of whitened rows (eq. 10) and their likelihood, with closed-form gradients.
 
 A block holds `n` samples with `r` rows each. Between two samples the covariance of their rows is
 Σ_k W[i,:,k] k_k(x_i, x_j) W[j,:,k]ᵀ, summed over the components k of every prior: the block-by-block
 form of H k_Q Hᵀ (eq. 32, figure 1) for any operator W. Rows are ordered by block, sample, row.
 
-Processes with a finite number of features have few weights and many rows, and their likelihood is that of the
-weights (Rasmussen and Williams, *Gaussian Processes for Machine Learning*, section 2.1).
+Processes with a finite number of features have few weights and many rows, so their likelihood is computed
+from the weights (Rasmussen and Williams, *Gaussian Processes for Machine Learning*, section 2.1).
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ from forcegp.gp.kernels import Parameters, Process, sub
 from forcegp.resources import threads_of_pytorch
 
 CHUNK_ELEMENTS = 400_000
-"""Size of the intermediate arrays of one chunk of samples; they should stay in the processor's cache."""
+"""Size of the intermediate arrays for a chunk of samples, which should fit into the processor cache."""
 
 
 Place = tuple[Any, ...]
@@ -40,7 +40,7 @@ Gradient = dict[Place, Tensor]
 
 
 def offsets(blocks: Sequence[Block]) -> list[int]:
-    """First row of each block, and the number of rows."""
+    """Return the first row of each block, and the number of rows."""
     starts = [0]
     for block in blocks:
         starts.append(starts[-1] + block.rows)
@@ -71,7 +71,7 @@ def _pairs(
     blocks2: Sequence[Block],
     lower: bool,
 ) -> Iterator[tuple[int, dict[str, Tensor], int, int]]:
-    """Each prior with its hyperparameters, and the pairs of blocks between which it contributes."""
+    """Yield each prior with its hyperparameters and the pairs of blocks to which it contributes."""
     for p, prior in enumerate(priors):
         depends1, depends2 = ([bool(b.operators[p].any()) for b in blocks] for blocks in (blocks1, blocks2))
         process_params = sub(params, prior.prefix)
@@ -87,9 +87,9 @@ def cross_gram(
     blocks1: Sequence[Block],
     blocks2: Sequence[Block] | None = None,
 ) -> Tensor:
-    """Covariance between the rows of two lists of blocks, `(rows1, rows2)` (eqs. 10, 13 and 19).
+    """Return the covariance between the rows of two lists of blocks, `(rows1, rows2)` (eqs. 10, 13 and 19).
 
-    Without a second list, it is the covariance of the first with itself; only the lower triangle is valid.
+    Without a second list, return the covariance of the first with itself; only the lower triangle is valid.
     """
     lower, blocks2 = blocks2 is None, blocks1 if blocks2 is None else blocks2
     starts1, starts2 = offsets(blocks1), offsets(blocks2)
@@ -105,7 +105,7 @@ def cross_gram(
 
 
 def gram(priors: Sequence[Process], params: Parameters, blocks: Sequence[Block]) -> Tensor:
-    """Covariance of the rows of blocks with unit white noise, `(rows, rows)`; the lower triangle is valid."""
+    """Return the covariance of the rows with unit white noise, `(rows, rows)`; lower triangle only."""
     # Σ = K + I (eq. 10)
     K = cross_gram(priors, params, blocks)
     K.diagonal().add_(1.0)
@@ -120,16 +120,16 @@ def gram_gradient(
     alpha: Tensor,
     deep: bool,
 ) -> Gradient:
-    """Derivatives of F = ½ log|Σ| + ½ yᵀΣ⁻¹y with Σ = K + I, from ∂F/∂Σ = ½(Σ⁻¹ − ααᵀ) in closed form.
+    """Return the derivatives of F = ½ log|Σ| + ½ yᵀΣ⁻¹y, Σ = K + I, in closed form.
 
-    With G = Σ⁻¹ − ααᵀ the derivative for the kernel between samples i and j is ½ W_iᵀ G_ij W_j; only
-    the kernels themselves are differentiated automatically.
+    With G = Σ⁻¹ − ααᵀ, ∂F/∂Σ = ½ G, and the derivative with respect to the kernel between samples i and j is
+    ½ W_iᵀ G_ij W_j; only the kernels themselves are differentiated automatically.
 
     Args:
-        priors, params, blocks: as given to `gram`.
-        K_inv: Σ⁻¹ `(rows, rows)`, the lower triangle is read.
+        priors, params, blocks: as for `gram`.
+        K_inv: Σ⁻¹ `(rows, rows)`; the lower triangle is read.
         alpha: Σ⁻¹ y `(rows,)`.
-        deep: whether to compute derivatives for targets, operators and features too.
+        deep: whether to differentiate also with respect to targets, operators and features.
     """
     rows = [slice(*pair) for pair in pairwise(offsets(blocks))]
     total: Gradient = {}
@@ -163,7 +163,7 @@ def gram_gradient(
 def _kernel_with_leaves(
     prior: Process, process_params: Parameters, f1: Features, f2: Features, with_features: bool
 ) -> tuple[dict[tuple[str, str], Tensor], Tensor]:
-    """The kernel matrix with a graph to fresh leaves of its parameters and, on request, its inputs."""
+    """Return the kernel matrix with a graph to new leaves for its parameters and optionally its inputs."""
     leaves = {("param", key): value.detach().requires_grad_() for key, value in process_params.items()}
     one: Mapping[str, Tensor] = f1
     two: Mapping[str, Tensor] = f2
@@ -184,9 +184,9 @@ def _kernel_gradient(
     lower: bool,
     into: tuple[Tensor, Tensor] | None,
 ) -> Tensor:
-    """Derivative for the kernel matrix `(components, n, n')`; adds those for the operators to `into`.
+    """Return the derivative by the kernel matrix `(components, n, n')`; add those by the operators to `into`.
 
-    On a diagonal block the lower triangle carries the weight of both.
+    On a diagonal block, the lower triangle has the weight of both triangles.
     """
     W1, W2 = operators
     r, s = W1.shape[1], W2.shape[1]
@@ -218,7 +218,7 @@ class Conditioned:
     Attributes:
         L: lower Cholesky factor of K + I `(rows, rows)`.
         alpha: (K + I)⁻¹ y `(rows,)`.
-        jitter: addition to the diagonal, usually 0.0.
+        jitter: jitter added to the diagonal, usually 0.0.
     """
 
     L: Tensor
@@ -226,13 +226,13 @@ class Conditioned:
     jitter: float
 
     def negative_log_likelihood(self, y: Tensor) -> Tensor:
-        """−log p(y) = ½ yᵀ(K + I)⁻¹y + ½ log|K + I| + ½ n log 2π."""
+        """Return −log p(y) = ½ yᵀ(K + I)⁻¹y + ½ log|K + I| + ½ n log 2π."""
         # = ½ yᵀα + Σ log L_ii + ½ n log 2π
         return 0.5 * (y @ self.alpha) + self.L.diagonal().log().sum() + 0.5 * len(y) * math.log(2 * math.pi)
 
 
 def target_of(blocks: Sequence[Block]) -> Tensor:
-    """All whitened residuals `(rows,)`."""
+    """Return all whitened residuals `(rows,)`."""
     return torch.cat([block.target.reshape(-1) for block in blocks])
 
 
@@ -251,9 +251,9 @@ def condition(priors: Sequence[Process], params: Parameters, blocks: Sequence[Bl
 
 
 def negative_log_likelihood(priors: Sequence[Process], params: Parameters, blocks: Sequence[Block]) -> Tensor:
-    """Negative log marginal likelihood of whitened rows, differentiable with respect to all its inputs.
+    """Return the negative log marginal likelihood of whitened rows, differentiable in all its inputs.
 
-    Value and gradient come from one factorisation.
+    Value and gradient are computed from one factorisation.
 
     Returns:
         The scalar.
@@ -272,7 +272,7 @@ def negative_log_likelihood(priors: Sequence[Process], params: Parameters, block
 
 
 class _OfRows(torch.autograd.Function):
-    """Computes the gradient beside the value, while what both need is at hand."""
+    """Computes the gradient together with the value, from shared intermediate results."""
 
     @staticmethod
     def forward(ctx: Any, rows: tuple[Any, Any, Any], places: list[Place], *tensors: Tensor) -> Tensor:
@@ -297,7 +297,7 @@ class _OfRows(torch.autograd.Function):
 
 
 def cholesky_inverse_(L: Tensor) -> Tensor:
-    """Lower triangle of (L Lᵀ)⁻¹, written over the factor L (LAPACK potri); the upper one is undefined."""
+    """Return (L Lᵀ)⁻¹ in place of the factor L (LAPACK potri); only the lower triangle is defined."""
     if L.device.type != "cpu":
         return torch.cholesky_inverse(L)
     if L.shape[0] == 0:
@@ -315,7 +315,7 @@ def cholesky_inverse_(L: Tensor) -> Tensor:
 
 
 class _OfWeights(torch.autograd.Function):
-    """−log N(y; 0, I + Φ Φᵀ) with its derivatives beside it."""
+    """−log N(y; 0, I + Φ Φᵀ) with its derivatives."""
 
     @staticmethod
     def forward(ctx: Any, Phi: Tensor, y: Tensor) -> Tensor:
@@ -336,7 +336,7 @@ class _OfWeights(torch.autograd.Function):
 def negative_log_likelihood_of_weights(
     processes: Sequence[Process], params: Parameters, blocks: Sequence[Block]
 ) -> Tensor:
-    """`negative_log_likelihood` of processes with a finite number of features, at a cost linear in the rows.
+    """Return `negative_log_likelihood` for finitely many features, at a cost linear in the rows.
 
     The rows are Φ w + ε with w ~ N(0, I), and Φ_i = W_i φ(x_i)ᵀ.
 

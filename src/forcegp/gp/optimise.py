@@ -1,4 +1,4 @@
-"""Minimising a differentiable objective over named tensors: L-BFGS, or ADAM as in the paper."""
+"""Minimisation of a differentiable objective over named tensors, by L-BFGS or by ADAM as in the paper."""
 
 from __future__ import annotations
 
@@ -17,36 +17,36 @@ from forcegp.errors import ModelError, NumericalError, check_name
 
 Objective = Callable[[dict[str, Tensor]], Tensor]
 Progress = Callable[[int, float, dict[str, Tensor]], None]
-"""Called after each evaluation with their number, the objective, and the best tensors so far."""
+"""Called after each evaluation with the number of evaluations, the objective, and the best tensors so far."""
 FitProgress = Callable[[int, int, float], None]
-"""Called with the number of evaluations, their maximum, and the objective."""
+"""Called with the number of evaluations, its maximum, and the objective."""
 Bounds = Mapping[str, tuple[float | Tensor, float | Tensor]]
-"""Box of each tensor: a lower and an upper bound of all its entries, or of each."""
+"""Box for each tensor: a lower and an upper bound for all its entries, or for each entry."""
 
 OPTIMIZERS = ("lbfgs", "adam")
 FIRST_STEP = 2.0
-"""Largest change of an entry in the first step of L-BFGS in a box; of logarithms, two e-folds."""
+"""Largest change of an entry in the first step of L-BFGS in a box; two e-folds for logarithms."""
 STOPPED = ("converged", "stopped at the limit of iterations", "the line search found no smaller objective")
 
 
 @dataclass(frozen=True)
 class LearningOptions:
-    """Options of learning.
+    """Options for learning.
 
     Args:
         optimizer: `"lbfgs"` or `"adam"`.
         max_evaluations: maximum number of evaluations of the objective.
-        tolerance: relative change of the objective below which L-BFGS stops, and ADAM stops if it does not
-            improve by that much within `patience` evaluations.
-        learning_rate: of ADAM, for the hyperparameters θ_M.
-        analytical_learning_rate: of ADAM, for the analytical parameters θ_A.
-        patience: evaluations without improvement after which ADAM stops.
-        warm_start: number of samples to learn on first, if there are more than twice as many; it doubles
-            until all are used. `None` learns on all from the start.
-        restarts: further random starts; the best result is kept.
-        seed: of the random starts.
-        hyperpriors: whether hyperparameters have weak log-normal priors around their start (maximum a
-            posteriori), or none, as in the paper (maximum likelihood).
+        tolerance: relative change of the objective below which L-BFGS stops. ADAM stops if it does not
+            improve by this much within `patience` evaluations.
+        learning_rate: learning rate of ADAM for the hyperparameters θ_M.
+        analytical_learning_rate: learning rate of ADAM for the analytical parameters θ_A.
+        patience: number of evaluations without improvement after which ADAM stops.
+        warm_start: number of samples to learn from first, if there are more than twice as many; it is
+            doubled until all are used. `None` learns from all samples from the start.
+        restarts: number of additional random starts; the best result is kept.
+        seed: seed for the random starts.
+        hyperpriors: whether hyperparameters have weak log-normal priors around their initial values
+            (maximum a posteriori), or none, as in the paper (maximum likelihood).
 
     Example:
         >>> LearningOptions(max_evaluations=50).optimizer
@@ -77,14 +77,14 @@ class Learned:
     """Result of learning.
 
     Attributes:
-        tensors: the best ones found.
-        value: the objective there.
-        converged: whether the tolerance was reached within the evaluations allowed.
-        evaluations: their number.
-        seconds: their duration.
-        message: why learning stopped.
-        history: the objective at each evaluation.
-        doubts: about the result, each with a remedy.
+        tensors: the best tensors found.
+        value: objective at these tensors.
+        converged: whether the tolerance was reached within the allowed evaluations.
+        evaluations: number of evaluations.
+        seconds: duration of learning.
+        message: reason for stopping.
+        history: objective at each evaluation.
+        doubts: doubts about the result, each with a remedy.
     """
 
     tensors: dict[str, Tensor]
@@ -110,18 +110,18 @@ class Learned:
 
 
 def reported(progress: FitProgress | None, most: int, before: int = 0) -> Progress | None:
-    """The progress of an optimisation with a maximum number of evaluations, after those `before`."""
+    """Adapt a progress function to an optimisation that follows `before` evaluations."""
     if progress is None:
         return None
     return lambda evaluations, value, _: progress(before + evaluations, most, value)
 
 
 class _SpentError(Exception):
-    """The evaluations allowed are spent."""
+    """Raised when the allowed evaluations are used up."""
 
 
 class _Recorder:
-    """Evaluates the objective with its gradient, and remembers the best point."""
+    """Evaluates the objective and its gradient, and stores the best point."""
 
     def __init__(self, objective: Objective, start: Mapping[str, Tensor], progress: Progress | None) -> None:
         self.objective, self.progress = objective, progress
@@ -156,7 +156,7 @@ def minimise(
     Args:
         objective: maps the tensors to a scalar, differentiably.
         analytical: names of the analytical parameters θ_A, which have a separate ADAM optimiser.
-        bounds: box of each tensor, for L-BFGS.
+        bounds: box for each tensor, used by L-BFGS.
         first_step: largest change of an entry in the first step of L-BFGS in a box.
 
     Raises:
@@ -222,12 +222,12 @@ def _lbfgs(
 
 
 def _flattened(tensors: Iterable[Tensor]) -> np.ndarray:
-    """All entries in one vector."""
+    """Concatenate all entries into one vector."""
     return torch.cat([x.detach().reshape(-1) for x in tensors]).cpu().double().numpy()
 
 
 def _unflattened(x: np.ndarray, like: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Tensors from a vector of all their entries, with the names, shapes and type of others."""
+    """Split a vector into tensors with the names, shapes and types of others."""
     first, tensors = next(iter(like.values())), {}
     flat = torch.as_tensor(x, dtype=first.dtype, device=first.device)
     for key, value in like.items():
@@ -236,7 +236,7 @@ def _unflattened(x: np.ndarray, like: Mapping[str, Tensor]) -> dict[str, Tensor]
 
 
 def _flat_bounds(start: Mapping[str, Tensor], bounds: Bounds, side: int) -> np.ndarray:
-    """The lower or upper bound of every entry."""
+    """Return the lower or upper bounds of all entries."""
     free = (-math.inf, math.inf)
     return _flattened(torch.zeros_like(value) + bounds.get(key, free)[side] for key, value in start.items())
 

@@ -1,12 +1,12 @@
-"""Sparse posterior over latent components, from two sums over samples.
+"""Sparse posterior over latent components, computed from two sums over samples.
 
 With A = I + Σ V_i S_i V_iᵀ and v = Σ V_i W_iᵀ y_i, the latent mean is V_*ᵀA⁻¹v and the latent covariance
 k_** − V_*ᵀV_* + V_*ᵀA⁻¹V_* (Titsias 2009; Hensman et al. 2013). The cost of a prediction does not depend on
 the number of samples.
 
-Weights of basis functions may drift: some components change while the others stay. A drifting weight is an
+Weights of basis functions may drift, so some components change while others do not. A drifting weight is an
 Ornstein–Uhlenbeck process with its prior as stationary distribution, w′ = ρ w + √(1 − ρ²) ξ, ξ ~ N(0, I). In
-information form, with A = I + G, v, the drifting weights p and the others o,
+information form, with A = I + G, v, drifting weights p and other weights o,
 
     S = A_pp + ρ²a I,  a = 1/(1 − ρ²),
     A′_oo = A_oo − A_op S⁻¹ A_po,  A′_op = ρa A_op S⁻¹,  A′_pp = a I − ρ²a² S⁻¹,
@@ -40,12 +40,12 @@ from forcegp.gp.sums import Moments, Sums, accumulate, add_rows
 
 
 def drifted(sums: Sums, weights: Tensor, factor: float) -> Sums:
-    """The sums after some weights have drifted; predictions of the others do not change.
+    """Return the sums after some weights have drifted; predictions of the others do not change.
 
     Args:
-        sums: over the samples so far.
-        weights: positions of the weights that drift `(k,)`.
-        factor: ρ, their correlation with the previous weights: 1 keeps them, 0 returns them to their prior.
+        sums: sums over the samples so far.
+        weights: positions of the drifting weights `(k,)`.
+        factor: correlation ρ with the previous weights: 1 keeps them, 0 resets them to their prior.
 
     Raises:
         ModelError: the factor is not between 0 and 1.
@@ -73,12 +73,12 @@ def drifted(sums: Sums, weights: Tensor, factor: float) -> Sums:
 
 
 MISSED = 0.1
-"""Missed variance, as a fraction of what the noise leaves, above which more points would help."""
+"""Missed variance, as a fraction of the posterior variance, above which more points would help."""
 
 
 @dataclass(frozen=True)
 class Diagnostics:
-    """Loss of a sparse posterior by its inducing points.
+    """Variance that a sparse posterior misses due to its inducing points.
 
     Attributes:
         size: number of basis functions.
@@ -93,17 +93,17 @@ class Diagnostics:
 
     @property
     def more_points_would_help(self) -> bool:
-        """Whether the points miss a tenth or more of the variance that the noise leaves."""
+        """Whether the points miss at least a tenth of the posterior variance."""
         return self.missed > MISSED * self.learned
 
 
 MOMENTS = tuple(field.name for field in fields(Moments))
 """Names of the sums in saved posteriors."""
 CHUNK_PREDICTIONS = 256
-"""Samples whose covariance is computed at a time."""
+"""Number of samples for which covariances are computed at a time."""
 
 UPDATE_FRACTION = 0.25
-"""New rows, as a fraction of the basis functions, above which a factor is computed afresh."""
+"""Number of new rows, relative to the basis functions, above which the factor is recomputed."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -114,7 +114,7 @@ class SparsePosterior:
         basis: basis functions.
         moments: sums over the samples except for G, which follows from the factor.
         L: lower Cholesky factor of A = I + G.
-        jitter: addition to the diagonal, usually 0.0.
+        jitter: jitter added to the diagonal, usually 0.0.
     """
 
     basis: LatentBasis
@@ -138,7 +138,7 @@ class SparsePosterior:
         return result
 
     def tensors(self) -> dict[str, Tensor]:
-        """All tensors to save except processes and hyperparameters, by name."""
+        """Return all tensors to save, by name, except processes and hyperparameters."""
         tensors = {f"moments.{name}": getattr(self.moments, name) for name in MOMENTS}
         tensors |= {"L": self.L, "jitter": torch.tensor(self.jitter, dtype=torch.float64)}
         tensors |= self.basis.tensors()
@@ -149,7 +149,7 @@ class SparsePosterior:
     def of_tensors(
         cls, processes: Sequence[Process], params: Parameters, tensors: Mapping[str, Tensor]
     ) -> SparsePosterior:
-        """The posterior restored from `tensors`.
+        """Restore a posterior from `tensors`.
 
         Raises:
             ModelError: a tensor is missing, or does not fit the processes.
@@ -185,7 +185,7 @@ class SparsePosterior:
 
     @property
     def log_likelihood(self) -> float:
-        """The collapsed bound of log p(y), no larger than that of exact inference (Titsias 2009)."""
+        """Collapsed lower bound on log p(y), at most that of exact inference (Titsias 2009)."""
         # F = −½ [Σ y² − vᵀA⁻¹v + log|A| + rows log 2π + Σ tr W(k − VᵀV)Wᵀ], log|A| = 2 Σ log L_ii
         moments = self.moments
         fit = moments.yy - moments.v @ self.weights
@@ -215,7 +215,7 @@ class SparsePosterior:
         return [part.fold(weights[basis.of_process(p)]) for p, part in enumerate(basis.parts)]
 
     def latent_mean(self, p: int, features: Features) -> Tensor:
-        """Posterior mean of process p, `(n, components)`."""
+        """Return the posterior mean of process p, `(n, components)`."""
         # μ(x) = V(x)ᵀ A⁻¹v = k(x, Z) (R m) + φ(x)ᵀ m (eq. 23)
         part, (on_kernel, on_features) = self.basis.parts[p], self.folded[p]
         x = next(iter(features.values()))
@@ -227,11 +227,11 @@ class SparsePosterior:
         return mean[..., 0].mT
 
     def mean(self, block: Block) -> Tensor:
-        """Posterior mean Σ W f of the rows of each sample of a block, `(n, d)`."""
+        """Return the posterior mean Σ W f of the rows of each sample of a block, `(n, d)`."""
         return rows_mean(self.latent_mean, block)
 
     def knowing(self, p: int, features: Features, value: Tensor) -> SparsePosterior:
-        """The posterior given that a constant process p, with finite features, has a value `(components,)`.
+        """Return the posterior given the value `(components,)` of a constant process p with finite features.
 
         The mean of process p becomes zero, since its value is now part of the prior mean.
         """
@@ -248,10 +248,10 @@ class SparsePosterior:
 
     @cached_property
     def _inverse_factor(self) -> list[Tensor]:
-        """L⁻ᵀ by process, a block of rows for each component `(components, width, size)`.
+        """L⁻ᵀ by process, with a block of rows for each component `(components, width, size)`.
 
-        A component's basis functions meet their own rows only; with L⁻ᵀ at hand the other ones cost
-        nothing, which a triangular solve could not leave out.
+        The basis functions of a component involve only its rows. With L⁻ᵀ available, the other rows can be
+        skipped, unlike in a triangular solve.
         """
         eye = torch.eye(len(self.L), dtype=self.L.dtype, device=self.L.device)
         inverse = torch.linalg.solve_triangular(self.L, eye, upper=False).mT
@@ -263,7 +263,7 @@ class SparsePosterior:
         return blocks
 
     def _latent(self, features: Sequence[Features]) -> tuple[Tensor, Tensor, Tensor]:
-        """Of all components at each sample: T with the covariance T Tᵀ of what the basis explains
+        """Return, for all components at each sample, T with the covariance T Tᵀ explained by the basis
         `(n, components, size)`; the variance that it misses and that of the prior `(n, components)`."""
         T, missed, prior = [], [], []
         for part, inverse, x in zip(self.basis.parts, self._inverse_factor, features, strict=True):
@@ -275,7 +275,7 @@ class SparsePosterior:
         return torch.cat(T).transpose(0, 1), torch.cat(missed).mT, torch.cat(prior).mT
 
     def covariance(self, block: Block) -> Tensor:
-        """Posterior covariance of rows at each sample, without noise, `(n, d, d)`.
+        """Return the posterior covariance `(n, d, d)` of the rows of each sample, without noise.
 
         Args:
             block: kernel inputs and operators of each process; the targets are not read.
@@ -296,7 +296,7 @@ class SparsePosterior:
         return 0.5 * (covariance + covariance.mT)
 
     def require_resolved(self) -> None:
-        """Refuse a prior so large that double precision does not resolve the noise.
+        """Reject a prior so large that double precision does not resolve the noise.
 
         Raises:
             NumericalError: the prior of the approximated part is too large.
@@ -306,7 +306,7 @@ class SparsePosterior:
 
     @cached_property
     def diagnostics(self) -> Diagnostics:
-        """Variance that the samples determine and the inducing points miss."""
+        """Variance determined by the samples, and variance missed by the inducing points."""
         # tr A⁻¹G = size − tr A⁻¹ = size − |L⁻ᵀ|²
         inverse = sum((block**2).sum() for block in self._inverse_factor)
         size = self.basis.size
@@ -315,7 +315,7 @@ class SparsePosterior:
     def draw(
         self, count: int, generator: torch.Generator, features: int = MISSED_FEATURES
     ) -> FunctionSamples:
-        """Functions from the posterior.
+        """Draw functions from the posterior.
 
         Args:
             generator: source of randomness, on the CPU.
@@ -328,7 +328,7 @@ class SparsePosterior:
         return draw_functions(self.basis, weights, generator, features)
 
     def updated(self, blocks: Sequence[Block]) -> SparsePosterior:
-        """Condition on further samples, at a cost that does not depend on the previous ones.
+        """Condition on additional samples, at a cost that does not depend on the number of previous ones.
 
         Raises:
             NumericalError: the factorisation fails.
@@ -349,7 +349,7 @@ class SparsePosterior:
         return SparsePosterior.of(self.basis, self.sums.scaled(factor))
 
     def drifting(self, factor: float, processes: Sequence[int]) -> SparsePosterior:
-        """Let the weights of some processes drift towards their prior; the others do not change.
+        """Let the weights of some processes drift towards their prior; others do not change.
 
         Raises:
             ModelError: the factor is not between 0 and 1.
@@ -359,10 +359,10 @@ class SparsePosterior:
         return SparsePosterior.of(self.basis, drifted(self.sums, weights, factor))
 
     def without(self, blocks: Sequence[Block]) -> SparsePosterior:
-        """Remove samples that it was conditioned on.
+        """Remove samples that the posterior was conditioned on.
 
         Raises:
-            ModelError: there are more rows than it was conditioned on.
-            NumericalError: the samples were not among them.
+            ModelError: there are more rows than the posterior was conditioned on.
+            NumericalError: the posterior was not conditioned on these samples.
         """
         return SparsePosterior.of(self.basis, self.sums - accumulate(self.basis, blocks))

@@ -1,10 +1,10 @@
 """The two sums over samples of a sparse posterior, which can be streamed, added and discounted.
 
-Of whitened rows y_i = W_i f(x_i) + ε only S_i = W_iᵀW_i and c_i = W_iᵀy_i enter: G = Σ V_i S_i V_iᵀ and
-v = Σ V_i c_i, with V_i the basis functions of each component at sample i.
+Whitened rows y_i = W_i f(x_i) + ε enter only through S_i = W_iᵀW_i and c_i = W_iᵀy_i: G = Σ V_i S_i V_iᵀ and
+v = Σ V_i c_i, where V_i contains the basis functions of each component at sample i.
 
-Processes of `torch.distributed`, by gloo on processors or NCCL on GPUs, sum over separate samples, with
-common inducing points and hyperparameters.
+Processes of `torch.distributed` (gloo on CPUs, NCCL on GPUs) sum over separate samples with common inducing
+points and hyperparameters.
 
     torchrun --standalone --nproc-per-node 2 script.py
 
@@ -28,19 +28,19 @@ from forcegp.gp.features import Block, Features, chunked
 from forcegp.gp.kernels import Parameters
 
 CHUNK_SAMPLES = 1024
-"""Samples whose basis functions are held at a time."""
+"""Number of samples for which basis functions are in memory at a time."""
 
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """Sums over samples that are cheap to hold.
+    """Sums over samples that need little memory.
 
     Attributes:
         v: Σ V Wᵀy `(size,)`.
         yy: Σ y² `()`.
         rows: number of rows, reduced by forgetting `()`.
-        prior: Σ tr W k Wᵀ of each process's part that inducing points approximate `(processes,)`.
-        missed: the part of it that the basis misses, Σ tr W (k − VᵀV) Wᵀ `(processes,)`.
+        prior: Σ tr W k Wᵀ for the part of each process approximated by inducing points `(processes,)`.
+        missed: the part of it missed by the basis, Σ tr W (k − VᵀV) Wᵀ `(processes,)`.
     """
 
     v: Tensor
@@ -67,24 +67,24 @@ class Sums(Moments):
 
     @classmethod
     def zero(cls, basis: LatentBasis, like: Tensor) -> Sums:
-        """Sums over no samples."""
+        """Return the sums over no samples."""
         n, p = basis.size, len(basis.parts)
         return cls(*(like.new_zeros(shape) for shape in ((n,), (), (), (p,), (p,), (n, n))))
 
     def __add__(self, other: Sums) -> Sums:
-        """Sums over the samples of both.
+        """Return the sums over the samples of both.
 
         Raises:
-            ModelError: they belong to bases of different sizes.
+            ModelError: the sums belong to bases of different sizes.
         """
         self._check(other)
         return Sums(*(a + b for a, b in zip(self.tensors, other.tensors, strict=True)))
 
     def __sub__(self, other: Sums) -> Sums:
-        """Sums without the samples of the other, which must be among those of this one.
+        """Return the sums without the samples of the other, which must be a subset.
 
         Raises:
-            ModelError: they belong to bases of different sizes, or the other has more rows.
+            ModelError: the sums belong to bases of different sizes, or the other has more rows.
         """
         self._check(other)
         if float(other.rows) > float(self.rows):
@@ -96,7 +96,7 @@ class Sums(Moments):
         return Sums(*(a - b for a, b in zip(self.tensors, other.tensors, strict=True)))
 
     def scaled(self, factor: float) -> Sums:
-        """Sums scaled by `factor`, for exponential forgetting.
+        """Return the sums scaled by `factor`, for exponential forgetting.
 
         Raises:
             ModelError: the factor is not between 0 and 1.
@@ -136,7 +136,7 @@ def accumulate(basis: LatentBasis, blocks: Iterable[Block], chunk: int = CHUNK_S
 
 
 def _add(basis: LatentBasis, block: Block, into: Sums) -> None:
-    """Add a block in place; only the upper triangle of G."""
+    """Add a block in place, to the upper triangle of G only."""
     V, prior, missed = basis.evaluate(block.features)
     # S = WᵀW `(k, k, n)` and c = Wᵀy `(n, k)` of each sample
     W = torch.cat(block.operators, dim=-1)
@@ -162,14 +162,14 @@ def _add(basis: LatentBasis, block: Block, into: Sums) -> None:
 
 
 def _by_process(basis: LatentBasis, S_kk: Tensor, variance: Tensor) -> Tensor:
-    """Σ S_kk var_k of each process, `(processes,)`, with S_kk and variances `(n, k)`."""
+    """Return Σ S_kk var_k of each process, `(processes,)`, with S_kk and variances `(n, k)`."""
     traces = (S_kk * variance).sum(0)
     return torch.stack([traces[components].sum() for components in basis.components])
 
 
 @torch.no_grad()
 def add_rows(basis: LatentBasis, moments: Moments, blocks: Sequence[Block]) -> tuple[Moments, Tensor]:
-    """Moments with a few more samples, and their rows in terms of the basis functions.
+    """Return the moments with a few more samples, and the new rows in terms of the basis functions.
 
     The rows are formed explicitly, which is faster than `accumulate` for a few samples.
 
@@ -198,7 +198,7 @@ def add_rows(basis: LatentBasis, moments: Moments, blocks: Sequence[Block]) -> t
 
 
 def _runs(columns: list[slice]) -> list[slice]:
-    """Neighbouring slices joined."""
+    """Join neighbouring slices."""
     runs: list[slice] = []
     for part in columns:
         if runs and runs[-1].stop == part.start:
@@ -209,14 +209,14 @@ def _runs(columns: list[slice]) -> list[slice]:
 
 
 def shard(samples: int, rank: int, processes: int) -> slice:
-    """The samples of one process: contiguous runs of equal length to within one.
+    """Return the samples of one process; all processes have contiguous runs of equal length to within one.
 
     Example:
         >>> [shard(7, rank, 3) for rank in range(3)]
         [slice(0, 3, None), slice(3, 5, None), slice(5, 7, None)]
 
     Raises:
-        ModelError: there is no such process.
+        ModelError: the process does not exist.
     """
     if not 0 <= rank < processes:
         raise ModelError("no such process", expected=f"a rank from 0 to {processes - 1}", got=rank)
@@ -226,9 +226,9 @@ def shard(samples: int, rank: int, processes: int) -> slice:
 
 
 def reduce_sums(sums: Sums) -> Sums:
-    """Add the sums of all processes; each process gets the same result.
+    """Add the sums of all processes; each process obtains the same result.
 
-    All must use the basis of `share_basis`: eigenvectors are defined up to sign and rotation.
+    All must use the basis from `share_basis`, since eigenvectors are defined only up to sign and rotation.
 
     Raises:
         ModelError: no group of processes has been initialised.
@@ -239,7 +239,7 @@ def reduce_sums(sums: Sums) -> Sums:
 
 
 def add_over_processes(x: Tensor) -> Tensor:
-    """Add the tensors of all processes; each process gets the same result."""
+    """Add the tensors of all processes; each process obtains the same result."""
     total = x.detach().clone()
     with _processes():
         dist.all_reduce(total, op=dist.ReduceOp.SUM)
@@ -247,10 +247,10 @@ def add_over_processes(x: Tensor) -> Tensor:
 
 
 def require_agreement(what: str, *values: int, hint: str | None = None) -> None:
-    """Check that numbers agree in all processes; raises in all of them or in none.
+    """Check that numbers agree in all processes; an error is raised in all of them or in none.
 
     Raises:
-        ModelError: they differ, or no group of processes has been initialised.
+        ModelError: the numbers differ, or no group of processes has been initialised.
     """
     own = torch.tensor(values, dtype=torch.int64)
     with _processes():
@@ -263,7 +263,7 @@ def require_agreement(what: str, *values: int, hint: str | None = None) -> None:
 
 
 def share_basis(basis: LatentBasis) -> LatentBasis:
-    """Distribute the basis of the first process to all others, which must have one of the same shapes.
+    """Send the basis of the first process to all others, which must have a basis of the same shapes.
 
     Raises:
         ModelError: no group of processes has been initialised.
@@ -293,7 +293,7 @@ def _broadcast(x: Tensor) -> Tensor:
 
 @contextmanager
 def _processes() -> Iterator[None]:
-    """Exchange with the other processes; `ModelError` without them, or if one is lost."""
+    """Exchange data with the other processes; `ModelError` without them, or if one is lost."""
     if not (dist.is_available() and dist.is_initialized()):
         raise ModelError(
             "no group of processes has been initialised",

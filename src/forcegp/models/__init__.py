@@ -1,4 +1,4 @@
-"""Models of the forward dynamics: specification, fitting, prediction, and saved files."""
+"""Models of forward dynamics: specification, fitting, prediction, and saved files."""
 
 from forcegp.models.load import register
 

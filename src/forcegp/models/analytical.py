@@ -38,26 +38,26 @@ ADAM = BatchOptions(epochs=30, batch=128, learning_rate=0.05, patience=10)
 
 
 class AnalyticalSettings(Window):
-    """Saved settings of an analytical model besides its tensors; the robot is the learned one."""
+    """Saved settings of an analytical model; the robot is the learned one."""
 
     analytical_parameters: dict[str, tuple[str, ...]]
     seed: int
 
 
 class AnalyticalModel(Model["AnalyticalFit"]):
-    """The constrained equations of motion, with the robot parameters θ_A learned from accelerations.
+    """The constrained equations of motion with robot parameters θ_A learned from accelerations.
 
-    `nominal()` predicts with the parameters of the robot file. Learned parameters stay physically consistent,
-    since θ_A are coordinates of physical bodies only.
+    `nominal()` predicts with the parameters from the robot file. Learned parameters stay physically
+    consistent, since θ_A are coordinates of physical bodies only.
 
     Args:
         system: robot and contacts.
-        analytical_parameters: learned parameters: joint names by quantity, as for `AnalyticalParameters`.
-        window: size of the window around the parameters of the file in which learning starts.
-        seed: of the start.
+        analytical_parameters: parameters to learn, as joint names by quantity (see `AnalyticalParameters`).
+        window: window of initial values around the parameters in the file.
+        seed: seed for the initial values.
 
     Raises:
-        UnknownNameError, ModelError, InertiaError: `analytical_parameters` do not fit the robot.
+        UnknownNameError, ModelError, InertiaError: `analytical_parameters` do not match the robot.
     """
 
     kind = KIND
@@ -87,13 +87,13 @@ class AnalyticalModel(Model["AnalyticalFit"]):
 
         Args:
             data: states and measured accelerations.
-            options: ADAM on batches with early stopping by default; `LearningOptions` minimise over all
-                samples at once, by L-BFGS or ADAM.
-            progress: called after each epoch, or evaluation.
+            options: by default, ADAM on batches with early stopping; `LearningOptions` minimise over all
+                samples at once by L-BFGS or ADAM.
+            progress: called after each epoch or evaluation.
             checkpoint: see `Model.fit`.
 
         Raises:
-            ModelError, DataError: the data do not fit the model.
+            ModelError, DataError: the data do not match the model.
         """
         measured, _ = measurement_of(Observation(data, noise_std=1.0), self.system)
         generator = torch.Generator().manual_seed(self.seed)
@@ -114,20 +114,20 @@ class AnalyticalModel(Model["AnalyticalFit"]):
         return AnalyticalFit(system, theta, self.window, self.seed, FitResult(**learned.outcome))
 
     def nominal(self) -> AnalyticalFit:
-        """The equations of motion with the parameters of the robot file; nothing is learned."""
+        """Return the equations of motion with the parameters from the robot file, without learning."""
         result = FitResult(True, 0, 0.0, 0.0, message="parameters of the robot file, nothing learned")
         return AnalyticalFit(self.system, self.parameters, self.window, self.seed, result)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class AnalyticalFit(FittedModel):
-    """The equations of motion of a robot with learned parameters.
+    """Equations of motion of a robot with learned parameters.
 
     Attributes:
         system: robot and contacts.
-        parameters: the learned coordinates.
-        window, seed: of the start of learning.
-        result: course of the fit.
+        parameters: learned coordinates.
+        window, seed: window and seed of the initial values.
+        result: result of the fit.
     """
 
     system: ConstrainedSystem
@@ -140,7 +140,7 @@ class AnalyticalFit(FittedModel):
 
     @property
     def specified(self) -> ConstrainedSystem:
-        """The system with the initial robot."""
+        """System with the initial robot."""
         return self.system.with_robot(self.parameters.start)
 
     def described(self) -> list[tuple[str, object]]:
@@ -157,7 +157,7 @@ class AnalyticalFit(FittedModel):
         return (hidden.applied(mean, None)[0], None, None, ~hidden.whole), parts, hidden.doubts
 
     def force_field(self) -> ForceField:
-        """Q_C + Q_G + Q_D + Q_u at states."""
+        """Return Q_C + Q_G + Q_D + Q_u at states."""
         return AnalyticalMean()
 
     @classmethod

@@ -1,6 +1,6 @@
-"""Models of the forward dynamics: a specification, and the fitted model that predicts.
+"""Models of forward dynamics: specifications, and fitted models for prediction.
 
-`AccelerationFit` belongs to models of accelerations alone, which have neither contacts nor forces.
+`AccelerationFit` is the base of models of accelerations only, which have no contacts or forces.
 """
 
 from __future__ import annotations
@@ -25,21 +25,21 @@ from forcegp.storage.model_file import ModelHeader, write_model
 
 
 class FittedModel(Predictor):
-    """A model with learned parameters; immutable."""
+    """Immutable model with learned parameters."""
 
     result: FitResult
-    """How the fit went."""
+    """Result of the fit."""
 
     def __repr__(self) -> str:
-        """One line: robot, contacts, and how the fit went."""
+        """Return a one-line summary of robot, contacts and fit."""
         return model_line(type(self).__name__, self.system, self.result)
 
     def _repr_html_(self) -> str:
-        """A table for notebooks."""
+        """Return a table for notebooks."""
         return fit_table(repr(self), self.result, self.described())
 
     def described(self) -> list[tuple[str, object]]:
-        """Learned values, by name, for tables."""
+        """Return the learned values, by name, for tables."""
         return []
 
     @classmethod
@@ -50,18 +50,18 @@ class FittedModel(Predictor):
         """Restore a saved model.
 
         Args:
-            header: of the file, with the settings of `record`.
-            tensors: those of `record`.
+            header: header of the file, with settings from `record`.
+            tensors: tensors from `record`.
             system: robot and contacts.
             source: name of the file, for messages.
 
         Raises:
-            ModelError: a tensor or setting is missing or not valid; names file and field.
+            ModelError: a tensor or setting is missing or invalid; the message names file and field.
         """
 
     @abstractmethod
     def record(self) -> tuple[Record, dict[str, Tensor]]:
-        """Settings and tensors from which the model can be restored."""
+        """Return the settings and tensors from which the model can be restored."""
 
     def save(self, path: str | Path) -> None:
         write_model(path, self.kind, self.system, *self.record())
@@ -71,17 +71,17 @@ F = TypeVar("F", bound=FittedModel)
 
 
 class Model(ABC, Generic[F]):
-    """A specification, which never changes: `fit` learns from data and returns a fitted model."""
+    """Immutable specification of a model; `fit` learns from data and returns a fitted model."""
 
     kind: str
-    """Name of the class of models in saved files."""
+    """Name of the model class in saved files."""
     system: ConstrainedSystem
     """Robot and contacts."""
 
     _params: dict[str, Any]
 
     def _keep(self, arguments: Mapping[str, Any]) -> None:
-        """Keep the arguments of the constructor: its `locals()`."""
+        """Store the arguments of the constructor, passed as its `locals()`."""
         self._params = {name: x for name, x in arguments.items() if name not in ("self", "__class__")}
 
     if not TYPE_CHECKING:
@@ -92,16 +92,15 @@ class Model(ABC, Generic[F]):
             raise AttributeError(f"a {type(self).__name__} has no attribute {name!r}{hint}")
 
     def __repr__(self) -> str:
-        """One line: robot and contacts."""
+        """Return a one-line summary of robot and contacts."""
         return model_line(type(self).__name__, self.system, None)
 
     def _repr_html_(self) -> str:
-        """A table for notebooks."""
+        """Return a table for notebooks."""
         return fit_table(repr(self), None, list(self.get_params().items()))
 
     def get_params(self) -> dict[str, Any]:
-        """Arguments of the constructor as the caller passed them: `type(model)(**model.get_params())` is a
-        copy."""
+        """Return the arguments of the constructor; `type(model)(**model.get_params())` is a copy."""
         return dict(self._params)
 
     @abstractmethod
@@ -116,17 +115,17 @@ class Model(ABC, Generic[F]):
 
         Args:
             data: states and measurements.
-            progress: called from time to time.
-            checkpoint: file that records a long fit; a fit that finds it resumes there, with the same result
-                to the bit. Remove it once the fitted model is saved.
+            progress: called during the fit.
+            checkpoint: file that records a long fit. With an existing file, the fit resumes and produces a
+                bit-identical result. Remove the file once the fitted model is saved.
 
         Returns:
-            The fitted model. Fitting twice gives the same bits.
+            The fitted model. Repeated fits are bit-identical.
         """
 
 
 class AccelerationFit(FittedModel):
-    """Predictor of accelerations of its own system, without forces or contacts."""
+    """Predictor of the accelerations of one system, without forces or contacts."""
 
     def at(self, flat: FlatStates, query: Query) -> Answer:
         if query.quantity != "qdd":
@@ -147,4 +146,4 @@ class AccelerationFit(FittedModel):
 
     @abstractmethod
     def accelerations(self, at: FlatStates, variance: bool) -> tuple[Tensor, Tensor | None]:
-        """Mean `(n, nq)` at states and, on request and if the model has one, variance `(n, nq)`."""
+        """Return mean `(n, nq)` at states and, if requested and available, variance `(n, nq)`."""

@@ -1,15 +1,15 @@
-"""The robot identified by a fit, in the parameters of robot files, with samples.
+"""The robot identified by a fit, expressed in parameters of robot files, with samples.
 
-Links have the identified inertia. Robot files have joint friction as d q̇ + f sign q̇ only; d and f are those
-nearest to the learned friction Q_D(q̇) over the trained speeds, by least squares with an offset,
+Links have the identified inertia. Robot files only support joint friction d q̇ + f sign q̇; d and f are
+fitted to the learned friction Q_D(q̇) over the trained speeds by least squares with an offset,
 
     min Σ_v (Q_D(v) + d v + f sign v − c)²,   d, f ≥ 0,
 
-averaged over poses where friction depends on the load. The residual and the offset c are losses. A log seldom
-separates an offset from the weight of links: if zero is within 2σ of an offset, all other parameters are
-conditioned on c = 0. URDF has no armature a: its inertia is added to the links as far as physically possible.
-Samples are the same for functions drawn from the posterior, with inertial parameters π + S δ
-(`forces/priors/inertial.py`).
+averaged over poses if friction depends on the load. The residual and the offset c are losses. Logs seldom
+separate an offset from the weight of links, so if zero is within 2σ of an offset, all other parameters are
+conditioned on c = 0. URDF does not support armature a, so drive inertia is added to the links as far as
+physically possible. Samples are computed in the same way from functions drawn from the posterior, with
+inertial parameters π + S δ (`forces/priors/inertial.py`).
 """
 
 from __future__ import annotations
@@ -40,40 +40,40 @@ from forcegp.robot.model import RobotModel
 from forcegp.robot.write_back import is_mjcf, write_robot
 
 SPEEDS, POSES = 20, 20
-"""Speeds in each direction, and poses, at which friction is read."""
+"""Number of speeds in each direction, and of poses, at which friction is evaluated."""
 SLOWEST = 0.05
-"""Least of these speeds, over the largest trained one: below it, dry friction is smooth in the fit."""
+"""Smallest of these speeds relative to the largest trained one; dry friction is smooth below it."""
 UNTRAINED = 1.0
-"""Largest speed if the fit does not contain its trained speeds [rad/s, m/s]."""
+"""Largest speed if the trained speeds are unknown [rad/s, m/s]."""
 DRAWS = 400
-"""Function samples from which standard deviations are taken."""
+"""Number of function samples for computing standard deviations."""
 OPEN = 2.0
-"""Standard deviations from zero up to which an offset is left open by the data."""
+"""Number of standard deviations from zero up to which an offset is undetermined."""
 DETERMINED = 0.5
-"""A parameter is determined from this fraction of its prior standard deviation, or of its own size, on."""
+"""Fraction of the prior standard deviation, or of its magnitude, below which a parameter is determined."""
 SMALLEST = 1e-2
 """ε, the smallest eigenvalue of a link's pseudo-inertia in units of the identified one."""
 ROUNDS, RELAXATION = 300, 1.6
-"""Of the search for the nearest bodies."""
+"""Parameters of the search for the nearest physical bodies."""
 STATES, RATE = 400, 4.0
-"""Random states at which links take the inertia of drives, and accelerations over speeds there [1/s]."""
+"""Number of random states for adding drive inertia to links, and ratio of acceleration to speed [1/s]."""
 WANTED = 0.01
-"""ε, the wanted error of a torque over its size."""
+"""Target relative torque error ε."""
 MOMENTS = ("mass", "mass·x", "mass·y", "mass·z", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
 """The inertial parameters of a link, about its origin [kg, kg m, kg m²]."""
 FIGURES = ("damping", "friction", *MOMENTS, "armature")
-"""Names of the figures of a joint."""
+"""Names of the parameters of a joint."""
 
 
 @dataclass(frozen=True)
 class Parameter:
-    """One figure of the robot.
+    """A parameter of the robot.
 
     Attributes:
         element: joint of the parameter; inertia refers to the link that it moves.
-        name: of the parameter.
-        file, estimate, std: SI units.
-        determined: whether the data determine it beyond the prior.
+        name: name of the parameter.
+        file, estimate, std: value in the file, estimate and standard deviation, in SI units.
+        determined: whether the data determine the parameter beyond the prior.
     """
 
     element: str
@@ -86,11 +86,11 @@ class Parameter:
 
 @dataclass(frozen=True, eq=False)
 class Calibration:
-    """The robot that a fit found.
+    """The robot identified by a fit.
 
     Attributes:
-        robot: with identified inertia, and friction in the form of robot files.
-        parameters: changed parameters beside those of the file, with standard deviations.
+        robot: robot with identified inertia, and friction in the form of robot files.
+        parameters: changed parameters and their values in the file, with standard deviations.
         speeds, friction, friction_std: `(k, nq)` the learned friction of each joint over its trained speeds
             [rad/s, m/s], [N m, N].
         left: `(nq,)` root mean square of the friction not explained by d q̇ + f sign q̇ [N m, N].
@@ -107,7 +107,7 @@ class Calibration:
 
     @property
     def losses(self) -> tuple[str, ...]:
-        """Learned forces that a robot file cannot represent, one sentence for each joint."""
+        """Learned forces that a robot file cannot represent, one sentence per joint."""
         joints = zip(self.robot.joint_names, self.left.tolist(), self.offset.tolist(), strict=True)
         return tuple(
             f"joint {joint!r}: friction beyond d q̇ + f sign q̇ of {left:.3g} (root mean square), and a "
@@ -119,19 +119,18 @@ class Calibration:
 
 @torch.no_grad()
 def calibrated(fit: StructuredFit, *, draws: int = DRAWS, seed: int = 0) -> Calibration:
-    """The robot with identified inertia, payload, and the part of the friction that robot files can
-    represent.
+    """Return the robot with identified inertia, payload, and friction in the form of robot files.
 
     Args:
-        fit: around the analytical forces.
+        fit: fit with an analytical mean.
         draws: number of function samples for standard deviations.
-        seed: of these samples, and of the poses for averaging friction.
+        seed: seed for these samples and for the poses over which friction is averaged.
 
     Returns:
         Robot, parameters with standard deviations, and losses.
 
     Raises:
-        ModelError: the fit has no analytical mean, so its forces are not those beyond the robot file's.
+        ModelError: the fit has no analytical mean.
 
     Example:
         `write_robot(calibrated(fit).robot, "my.urdf", "calibrated.urdf")`
@@ -147,20 +146,19 @@ def calibrated(fit: StructuredFit, *, draws: int = DRAWS, seed: int = 0) -> Cali
 
 @torch.no_grad()
 def sampled_robots(fit: StructuredFit, samples: int, *, seed: int = 0) -> list[RobotModel]:
-    """Robots drawn from the joint posterior of inertia, drives' links, payload and friction; each is
-    physically consistent.
+    """Draw physically consistent robots from the joint posterior of inertia, drives, payload and friction.
 
     Samples with unphysical links are replaced by the nearest robot in the metric of the posterior
-    (eigenvalues of pseudo-inertias over the identified ones are at least ε = 0.01).
+    (eigenvalues of pseudo-inertias relative to the identified ones are at least ε = 0.01).
 
     Args:
-        fit: around the analytical forces.
-        samples: how many.
-        seed: of the draws.
+        fit: fit with an analytical mean.
+        samples: number of robots.
+        seed: random seed.
 
     Raises:
         ModelError: see `calibrated`.
-        ParameterError: fewer than one sample.
+        ParameterError: `samples` is below one.
     """
     if samples < 1:
         raise ParameterError("no such number of samples", expected="1 or more", got=samples)
@@ -178,19 +176,19 @@ def write_calibrated(
 ) -> Calibration:
     """Write a copy of the robot file with identified parameters, a report, and sampled robots.
 
-    `calibrated.urdf` gets `calibrated.report.json`, with parameters, losses and friction in full, and
-    `calibrated.sample_000.urdf` and so on.
+    In addition to `calibrated.urdf`, it writes `calibrated.report.json`, with parameters, losses and full
+    friction curves, and `calibrated.sample_000.urdf` and so on.
 
     Args:
-        fit: around the analytical forces.
-        source: the file that the robot was loaded from, or a bundled name.
-        out: the edited copy.
+        fit: fit with an analytical mean.
+        source: robot file, or name of a bundled robot.
+        out: path of the edited copy.
         samples: number of robots drawn from the posterior.
-        seed: of the draws.
+        seed: random seed.
         locked_joints: as for `load_robot`.
 
     Raises:
-        RobotFileError: the file does not fit the robot, or cannot take a change.
+        RobotFileError: the file does not match the robot, or cannot represent a change.
         ModelError: see `calibrated`.
     """
     found, out = calibrated(fit, seed=seed), Path(out)
@@ -225,16 +223,16 @@ def write_calibrated(
 
 @torch.no_grad()
 def unknowns_after(fit: StructuredFit, unknowns: Unknowns, *, draws: int = DRAWS, seed: int = 0) -> Unknowns:
-    """The unknowns before another motion, from the covariance of functions drawn from a fit.
+    """Return the unknowns for planning another motion, from the covariance of functions drawn from a fit.
 
     Base parameters, payload and friction over speed have the posterior covariance; parameters without a prior
-    in the fit keep that of `unknowns`. The noise is at least that of the torques of the fit.
+    in the fit keep that of `unknowns`. The noise is at least the torque noise of the fit.
 
     Args:
-        fit: around the analytical forces.
-        unknowns: of its robot, without data.
-        draws: function samples.
-        seed: of these samples.
+        fit: fit with an analytical mean.
+        unknowns: unknowns of the robot without data.
+        draws: number of function samples.
+        seed: seed for these samples.
 
     Raises:
         ModelError: see `calibrated`.
@@ -275,20 +273,20 @@ def unknowns_after(fit: StructuredFit, unknowns: Unknowns, *, draws: int = DRAWS
 
 
 JITTER = 1e-6
-"""Of that covariance, over the prior variances."""
+"""Jitter of the covariance relative to the prior variances."""
 Curve = tuple[Tensor, Tensor, Tensor]
-"""Friction over speeds `(k, nq)`, what d q̇ + f sign q̇ leaves of it, and the offset `(nq,)`."""
+"""Friction over speeds `(k, nq)`, its residual after fitting d q̇ + f sign q̇, and the offset `(nq,)`."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Reader:
-    """Reads robots off the posterior of a fit.
+    """Computes robots from the posterior of a fit.
 
     Attributes:
-        fit: what is read.
-        speeds: `(k, nq)`.
-        at: the states of all poses at these speeds.
-        seed: of the draws.
+        fit: the fit.
+        speeds: `(k, nq)` speeds at which friction is evaluated.
+        at: states of all poses at these speeds.
+        seed: random seed.
     """
 
     fit: StructuredFit
@@ -324,7 +322,7 @@ class _Reader:
 
     @property
     def scale(self) -> Tensor | None:
-        """Prior standard deviations of links and drives `(nq, 11)`; `None` where all was kept."""
+        """Prior standard deviations of links and drives `(nq, 11)`; `None` if inertia was not identified."""
         robot = self.fit.system.robot
         for prior in self.fit.force_priors:
             if isinstance(prior, InertialPrior):
@@ -334,7 +332,7 @@ class _Reader:
         return None
 
     def robots(self, draws: int) -> list[tuple[RobotModel, Curve]]:
-        """The robot of the posterior mean, and of function samples, each with its friction."""
+        """Return the robots of the posterior mean and of function samples, each with its friction."""
         drawn = self.fit.force_samples(draws, torch.Generator().manual_seed(self.seed))
         assert isinstance(drawn, ForceSamples)
         curves = torch.stack(list(self._curves(drawn)))
@@ -350,11 +348,11 @@ class _Reader:
         return [self._robot(curve.view_as(self.speeds), delta, load) for curve, delta, load in rows]
 
     def _consistent(self, values: Tensor, first: int) -> Tensor:
-        """Mean and samples `(1 + samples, d)` with the most probable links that are bodies.
+        """Return mean and samples `(1 + samples, d)` with the most probable physically consistent links.
 
-        min_x ½ (x − x₀)ᵀ Σ⁻¹ (x − x₀) with the samples' covariance Σ, over the entries x of J₀^-½ ΔJ J₀^-½ of
-        each link from −1 + ε on, by ADMM; links are in the columns from `first` on. Other columns follow by
-        their covariance with the links, and a link of the file that no body could be stays as it is.
+        Solves min_x ½ (x − x₀)ᵀ Σ⁻¹ (x − x₀) with the sample covariance Σ over the entries x ≥ −1 + ε of
+        J₀^-½ ΔJ J₀^-½ of each link by ADMM; links are in the columns from `first` on. Other columns follow
+        from their covariance with the links. A link that is unphysical in the file does not change.
         Source: Boyd et al., *Distributed optimization and statistical learning via ADMM* (2011), section 5.
         """
         if self.scale is None:
@@ -392,12 +390,12 @@ class _Reader:
         return moved
 
     def _offsets(self, curves: Tensor) -> Tensor:
-        """The offset of each curve by least squares `(1 + samples, nq)`."""
+        """Return the offset of each curve by least squares `(1 + samples, nq)`."""
         columns = torch.stack([self.speeds, self.speeds.sign(), torch.ones_like(self.speeds)], dim=-1)
         return (torch.linalg.pinv(columns.movedim(1, 0)) @ curves.movedim(-1, 1)[..., None])[..., 2, 0]
 
     def _kept(self) -> Tensor:
-        """Friction at the identified inertia, less the friction of the posterior mean of both."""
+        """Return the friction at the identified inertia, relative to that of the posterior mean of both."""
         fit, at, force = self.fit, self.at, torch.zeros_like(self.at.q)
         for p, prior in enumerate(fit.force_priors):
             if isinstance(prior, JointFrictionPrior) and fit.posterior.process.pinned:
@@ -406,7 +404,7 @@ class _Reader:
         return self._over_poses(force)
 
     def _curves(self, drawn: ForceSamples) -> Iterator[Tensor]:
-        """The friction Q_D over speeds `(k, nq)` of the posterior mean and of samples, mean over poses."""
+        """Yield the friction Q_D over speeds `(k, nq)` of posterior mean and samples, averaged over poses."""
         fit, at = self.fit, self.at
         priors = [p for p, prior in enumerate(fit.force_priors) if isinstance(prior, JointFrictionPrior)]
         known = dynamics.damping_force(fit.system.robot, at.qd)
@@ -424,7 +422,7 @@ class _Reader:
         return force.unflatten(0, (POSES, len(self.speeds))).mean(0)
 
     def _constants(self, drawn: ForceSamples, kind: type) -> Tensor:
-        """Mean and samples of the constants of the first prior of a kind `(1 + samples, components)`."""
+        """Return mean and samples of the constants `(1 + samples, components)` of the first such prior."""
         for p, prior in enumerate(self.fit.force_priors):
             if isinstance(prior, kind):
                 one = {name: x[:1] for name, x in self._features(p).items()}
@@ -438,7 +436,7 @@ class _Reader:
         return self.fit.posterior.process.features(p, self.fit.system, self.at)
 
     def _robot(self, curve: Tensor, delta: Tensor, load: Tensor) -> tuple[RobotModel, Curve]:
-        """The robot with a friction curve, a deviation δ of its inertial parameters and a payload."""
+        """Return the robot with a friction curve, deviations δ of inertial parameters, and a payload."""
         robot = self.fit.system.robot
         damping, friction, left, offset = _projected(self.speeds, curve)
         robot = robot.replace(damping=damping, friction=friction, stribeck=0.0 * friction)
@@ -455,15 +453,14 @@ class _Reader:
 
 
 def _without_offsets(offset: Tensor, mean: Tensor, values: Tensor) -> Tensor:
-    """The mean and samples of values `(1 + samples, d)` given that offsets `(1 + samples, nq)` are zero where
-    the data leave that open.
+    """Return mean and samples of values `(1 + samples, d)`, conditioned on zero for undetermined offsets.
 
-    With the samples' covariances, E[z | c = 0] = z − Cov(z, c) Cov(c)⁻¹ c.
+    With sample covariances, E[z | c = 0] = z − Cov(z, c) Cov(c)⁻¹ c.
 
     Args:
-        offset: at the identified inertia, and of samples around it.
-        mean: `(nq,)` of the posterior of offset and inertia, by which zero is open or not.
-        values: to be conditioned.
+        offset: offsets at the identified inertia and of samples around it, `(1 + samples, nq)`.
+        mean: `(nq,)` posterior mean of the offsets, which is compared with zero.
+        values: values to condition.
     """
     c = offset[:, mean.abs() <= OPEN * offset[1:].std(0)]
     around = c[1:] - c[1:].mean(0)
@@ -474,7 +471,7 @@ def _without_offsets(offset: Tensor, mean: Tensor, values: Tensor) -> Tensor:
 
 
 def _projected(speeds: Tensor, curve: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-    """Damping d, dry friction f, what they leave, and the offset c of each joint, `(nq,)`."""
+    """Return damping d, dry friction f, residual, and offset c of each joint, `(nq,)`."""
     found: list[NDArray[np.float64]] = []
     for v, force in zip(speeds.T.cpu().numpy(), curve.T.cpu().numpy(), strict=True):
         # −Q_D = d v + f sign v − c
@@ -486,14 +483,14 @@ def _projected(speeds: Tensor, curve: Tensor) -> tuple[Tensor, Tensor, Tensor, T
 
 
 def _moved(robot: RobotModel, change: Tensor) -> RobotModel:
-    """The robot with inertial parameters π + change `(nq, 10)`."""
+    """Return the robot with inertial parameters π + change `(nq, 10)`."""
     J = pseudo_inertia(robot.mass, robot.com, robot.inertia)
     mass, com, inertia = from_pseudo_inertia(J + _pseudo(change))
     return robot.replace(mass=mass, com=com, inertia=inertia)
 
 
 def _pseudo(pi: Tensor) -> Tensor:
-    """J of inertial parameters `(nq, 10)`, linear in them: Σ = ½ tr(I_o) 1 − I_o."""
+    """Return J of inertial parameters `(nq, 10)`, linear in them: Σ = ½ tr(I_o) 1 − I_o."""
     I = pi[:, [4, 5, 6, 5, 7, 8, 6, 8, 9]].unflatten(-1, (3, 3))
     Sigma = 0.5 * I.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None] * torch.eye(3).to(I) - I
     top = torch.cat([Sigma, pi[:, 1:4, None]], dim=-1)
@@ -501,7 +498,7 @@ def _pseudo(pi: Tensor) -> Tensor:
 
 
 def without_armature(robot: RobotModel, fastest: Tensor) -> RobotModel:
-    """The robot with the inertia of its drives added to the links as far as physically possible.
+    """Return the robot with the inertia of its drives added to the links as far as physically possible.
 
     Over n random states, it minimises the square of each joint's error of τ over the torque itself:
 
@@ -526,7 +523,7 @@ def without_armature(robot: RobotModel, fastest: Tensor) -> RobotModel:
 
 
 def _figures(robot: RobotModel) -> Tensor:
-    """The figures of each joint that a fit may change `(nq, 13)`, in the order of `FIGURES`."""
+    """Return the parameters of each joint that a fit may change `(nq, 13)`, in the order of `FIGURES`."""
     friction = torch.stack([robot.damping, robot.friction], dim=-1)
     links = inertial_parameters(robot.mass, robot.com, robot.inertia)
     return torch.cat([friction, links, robot.armature[:, None]], dim=-1)
@@ -535,7 +532,7 @@ def _figures(robot: RobotModel) -> Tensor:
 def _parameters(
     file: RobotModel, robot: RobotModel, samples: list[RobotModel], scale: Tensor | None
 ) -> tuple[Parameter, ...]:
-    """All figures that the fit may change, with standard deviations over samples."""
+    """Return all parameters that a fit may change, with standard deviations over samples."""
     before, after = _figures(file), _figures(robot)
     std, prior = torch.stack([_figures(each) for each in samples]).std(0), after.abs()
     if scale is not None:

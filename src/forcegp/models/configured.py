@@ -1,4 +1,4 @@
-"""Models from the table `[model]` of a scene or of a separate file (docs/formats.md)."""
+"""Models defined by the table `[model]` of a scene or of a separate file (docs/formats.md)."""
 
 from __future__ import annotations
 
@@ -31,23 +31,23 @@ from forcegp.scene.sections import NoiseSection
 from forcegp.storage.descriptions import decode
 
 DEFAULT = "sgp"
-"""The model where none is named."""
+"""Name of the default model."""
 COMMON = ("name", "noise", "seed", "learning")
-"""Keys of `[model]` that every model takes; one without noise or a random start ignores these."""
+"""Keys of `[model]` accepted for every model, even if the model ignores them."""
 ARGUMENTS = {"priors": "force_priors"}
-"""Keys that have another name than the argument of the model's class."""
+"""Keys named differently from the argument of the model class."""
 Options = LearningOptions | BatchOptions
 
 
 @dataclass(frozen=True, eq=False)
 class Configured:
-    """A model with its options of learning.
+    """A model with its learning options.
 
     Attributes:
-        name: of the model.
+        name: name of the model.
         model: the model.
-        options: of learning; `None` for the default.
-        sensor_noise_std: noise of the log's force sensor if it is a second measurement [N].
+        options: learning options; `None` for the default.
+        sensor_noise_std: standard deviation of the force sensor, if it is an additional measurement [N].
     """
 
     name: str
@@ -73,15 +73,15 @@ def configured(
     noise_std: NoiseStd | None = None,
     seed: int | None = None,
 ) -> Configured:
-    """The model that a table `[model]` describes.
+    """Create the model defined by a table `[model]`.
 
     Args:
-        table: of a scene, or from `load_model_table`.
+        table: table of a scene, or from `load_model_table`.
         system: robot and contacts.
-        name, noise_std, seed: in place of those in the table.
+        name, noise_std, seed: values that override those in the table.
 
     Raises:
-        SceneError: a value does not fit the model or the system; the message names file, line and key.
+        SceneError: a value is invalid for the model or the system; the message names file, line and key.
         UnknownNameError: `name` is not a model.
 
     Example:
@@ -103,14 +103,14 @@ def configured(
 
 
 def keys_of(kind: type[Model[Any]]) -> tuple[str, ...]:
-    """The keys of `[model]` for a class of models: the arguments of its constructor, and those of all."""
+    """Return the keys of `[model]` for a model class: its constructor arguments and the common keys."""
     keys = {argument: key for key, argument in ARGUMENTS.items()}
     own = [keys.get(name, name) for name in signature(kind).parameters if name not in ("system", *COMMON)]
     return (*COMMON, *own, *(("sensor_noise_std",) if kind is StructuredGP else ()))
 
 
 def _arguments(table: ModelTable, system: ConstrainedSystem, name: str) -> dict[str, Any]:
-    """Arguments of the model's class from the keys in the file."""
+    """Return the arguments of the model's class from the keys in the file."""
     made, at = MODELS[name].made, table.document.at
     given, arguments = table.section.given(), dict[str, Any]()
     for key, value in given.items():
@@ -128,7 +128,7 @@ def _arguments(table: ModelTable, system: ConstrainedSystem, name: str) -> dict[
 
 
 def _noise(section: NoiseSection, acceleration: NoiseStd | None) -> NoiseStd | Noise | None:
-    """The noise of `[model]`, a number or a table; `acceleration` replaces that of accelerations."""
+    """Return the noise in `[model]`, a number or a table; `acceleration` overrides the acceleration noise."""
     given = section.given() | ({} if acceleration is None else {"acceleration": acceleration})
     if set(given) <= {"acceleration"}:
         return given.get("acceleration")
@@ -138,7 +138,7 @@ def _noise(section: NoiseSection, acceleration: NoiseStd | None) -> NoiseStd | N
 
 
 def _priors(table: ModelTable, written: Sequence[dict[str, Any]]) -> tuple[ForcePrior, ...]:
-    """The priors of `[[model.priors]]`."""
+    """Return the priors of `[[model.priors]]`."""
     priors = []
     for i, described in enumerate(written):
         key = ("model", "priors", i)
@@ -155,7 +155,7 @@ def _priors(table: ModelTable, written: Sequence[dict[str, Any]]) -> tuple[Force
 
 
 def _learning(table: ModelTable, model: Model[Any]) -> Options | None:
-    """The options of `[model.learning]`, over the defaults of the model."""
+    """Return the options in `[model.learning]`, with the defaults of the model."""
     given: dict[str, Any] = table.section.learning.given()
     if not given:
         return None
@@ -170,7 +170,7 @@ def _learning(table: ModelTable, model: Model[Any]) -> Options | None:
 
 
 def _default(model: Model[Any], given: Mapping[str, Any]) -> Options:
-    """The options of a model where nothing is given; an analytical model takes both classes."""
+    """Return the default options of a model; an analytical model accepts both classes."""
     if isinstance(model, NeuralNetwork):
         return DEEP if len(model.hidden) > 2 else SHALLOW
     if isinstance(model, AnalyticalModel) and not {"optimizer", "max_evaluations"} & set(given):

@@ -1,4 +1,4 @@
-"""Estimation of an external wrench from a log with a fitted model, and detection of contacts."""
+"""Estimation of external wrenches from a log with a fitted model, and contact detection."""
 
 from __future__ import annotations
 
@@ -35,33 +35,33 @@ from forcegp.robust import MAD_TO_STD
 
 METHODS = ("acceleration", "momentum")
 LEAST_NOISE = 1e-9
-"""Smallest noise of a velocity, beyond rounding [rad/s, m/s]."""
+"""Minimum velocity noise, above rounding [rad/s, m/s]."""
 THRESHOLD = 5.0
-"""σ beyond which a contact is detected."""
+"""Number of standard deviations beyond which a contact is detected."""
 
 
 @dataclass(frozen=True, repr=False)
 class ExternalWrench(Prediction):
-    """An external wrench at each sample of a log: `mean` `(n, k)` and `covariance` `(n, k, k)`.
+    """External wrench at each sample of a log, with `mean` `(n, k)` and `covariance` `(n, k, k)`.
 
-    The covariance contains the uncertainty of the learned forces, the noise of torques and of motion, and the
-    prior on the wrench; along directions without effect on the joints it is that of the prior.
+    The covariance includes the uncertainty of the learned forces, the noise of torques and motion, and the
+    prior on the wrench. In directions without effect on the joints, it equals that of the prior.
 
     Attributes:
-        frame: the frame, and the components that were estimated.
+        frame: frame and estimated components.
     """
 
     frame: WrenchFrame | None = None
 
     def detect(self, threshold: float = THRESHOLD, hold: int = 1) -> Tensor:
-        """Whether a wrench acts at each sample, `(n,)` bool.
+        """Return whether a wrench acts at each sample, `(n,)` bool.
 
         Without a wrench, d² = ŵᵀ C⁻¹ ŵ is at most a χ² variable with k degrees of freedom. A contact is
-        detected if d² exceeds the χ² quantile with the probability of a Gaussian beyond ± `threshold`
-        standard deviations, at `hold` samples in a row.
+        detected if d² exceeds the χ² quantile that corresponds to a Gaussian beyond ± `threshold` standard
+        deviations in `hold` consecutive samples.
 
         Args:
-            threshold: [σ]; `false_alarm_rate(threshold)` is the probability of a false alarm at a sample.
+            threshold: threshold [σ]; `false_alarm_rate(threshold)` is the false alarm probability per sample.
             hold: number of consecutive samples, including the current one.
 
         Raises:
@@ -81,7 +81,7 @@ class ExternalWrench(Prediction):
 
     @property
     def distance_squared(self) -> Tensor:
-        """d² = ŵᵀ C⁻¹ ŵ, the squared Mahalanobis distance from no wrench `(n,)`."""
+        """Squared Mahalanobis distance from zero, d² = ŵᵀ C⁻¹ ŵ, `(n,)`."""
         assert self.covariance is not None
         scale = self.covariance.diagonal(dim1=-2, dim2=-1).sqrt()
         correlation = self.covariance / (scale[..., :, None] * scale[..., None, :])
@@ -90,7 +90,7 @@ class ExternalWrench(Prediction):
 
 
 def false_alarm_rate(threshold: float) -> float:
-    """Probability that a Gaussian variable lies beyond ± `threshold` standard deviations.
+    """Return the probability that a Gaussian variable is beyond ± `threshold` standard deviations.
 
     Example:
         >>> round(false_alarm_rate(2.0), 4)
@@ -101,7 +101,7 @@ def false_alarm_rate(threshold: float) -> float:
 
 @runtime_checkable
 class LearnedForces(Protocol):
-    """Forces of a fit: posterior, noise, and robot."""
+    """Learned forces of a fit: posterior, noise, and robot."""
 
     @property
     def system(self) -> ConstrainedSystem: ...
@@ -125,7 +125,7 @@ def external_wrench(
     method: str,
     external: Mapping[str, float] | None = None,
 ) -> ExternalWrench:
-    """The external wrench at the samples of a log; see `StructuredFit.external_wrench`."""
+    """Return the external wrench at the samples of a log; see `StructuredFit.external_wrench`."""
     check_name("method of estimating a wrench", method, METHODS)
     reading = Reading.of(fit, data, frame, external)
     if method == "acceleration":
@@ -148,8 +148,8 @@ def external_wrench(
 
 
 class JointForces(NamedTuple):
-    """At n states: mean of Q̄ `(n, nq)`, its covariance with noise of the torques `(n, nq, nq)`, the
-    equations of motion, J `(n, k, nq)` of the wrench and of multipliers, and their priors `(k,)`."""
+    """Mean of Q̄ `(n, nq)` at n states, its covariance with torque noise `(n, nq, nq)`, the equations of
+    motion, J `(n, k, nq)` for the wrench and multipliers, and their prior `(k,)`."""
 
     mean: Tensor
     covariance: Tensor
@@ -160,13 +160,13 @@ class JointForces(NamedTuple):
 
 @dataclass(frozen=True)
 class Reading:
-    """A log for the estimation of a wrench.
+    """A log prepared for wrench estimation.
 
     Attributes:
-        fit, data, frame: the learned forces, the log, and the estimated components.
-        memory: friction with memory, for logs in order of time.
-        remembered: its force `(n, nq)`, or zero.
-        external: standard deviation of further unknown forces on the joints `(nq,)`, or `None`.
+        fit, data, frame: learned forces, log, and estimated components.
+        memory: friction with memory, for logs in time order.
+        remembered: force of this friction `(n, nq)`, or zero.
+        external: standard deviation of other unknown forces on the joints `(nq,)`, or `None`.
     """
 
     fit: LearnedForces
@@ -180,13 +180,13 @@ class Reading:
     def of(
         cls, fit: LearnedForces, data: Dataset, frame: WrenchFrame, external: Mapping[str, float] | None
     ) -> Reading:
-        """A log, with the friction with memory of the fit's training log."""
+        """Prepare a log, with friction with memory learned from the training log."""
         memory = FrictionMemory.of(fit.hyperparameters) if data.header.ordered else None
         force = torch.zeros_like(data.q) if memory is None else memory.force(fit.system.robot, data)
         return cls(fit, data, frame, memory, force, external_std(external, fit.system.robot))
 
     def forces(self, rows: Tensor, qdd: Tensor) -> JointForces:
-        """Forces at some rows, with errors of the inertia at given accelerations `(n, nq)`."""
+        """Return the forces at some rows, including inertia errors at given accelerations `(n, nq)`."""
         data, fit, system = self.data[rows], self.fit, self.fit.system
         active = data.active(system.contact_names)
         at, _ = states_at(system, data.q, data.qd, data.tau, active)
@@ -208,7 +208,7 @@ class Reading:
         return JointForces(mean + self.remembered[rows], S, at.eom, J, prior)
 
     def from_accelerations(self) -> tuple[Tensor, Tensor]:
-        """Mean and covariance by generalized least squares."""
+        """Estimate mean and covariance by generalized least squares."""
         stated, parts = self.data.extras.get("qdd_std"), []
         learned = self.fit.noise.get("qdd", self.data.q.new_zeros(self.data.nq))
         for rows in torch.arange(len(self.data)).split(CHUNK):
@@ -222,7 +222,7 @@ class Reading:
         return torch.cat(mean), torch.cat(covariance)
 
     def from_momenta(self) -> tuple[Tensor, Tensor]:
-        """Mean and covariance by the momentum filter, trajectory by trajectory."""
+        """Estimate mean and covariance with the momentum filter, for each trajectory."""
         if not self.data.header.ordered:
             raise DataError("the momentum filter needs a log in order of time", got="points in another order")
         correlation = self.fit.problem.correlation if self.memory is None else self.memory.correlation
@@ -241,7 +241,7 @@ class Reading:
         return mean, covariance
 
     def momenta(self, trajectory: Tensor, noise: Tensor, correlation: Tensor) -> MomentumLog:
-        """Inputs of the momentum filter for one trajectory, given by its rows."""
+        """Return the inputs to the momentum filter for the rows of one trajectory."""
         robot, columns, prior = self.fit.system.robot, [], self.frame.prior
         for rows in trajectory.split(CHUNK):
             q, qd = self.data.q[rows], self.data.qd[rows]
@@ -261,7 +261,7 @@ class Reading:
 
 
 def velocity_noise(data: Dataset) -> Tensor:
-    """`white_noise_std` of each joint's velocity in a log in order of time, evenly sampled, `(nq,)`.
+    """Return `white_noise_std` of the joint velocities `(nq,)` in an evenly sampled log in time order.
 
     Raises:
         DataError: there are no five consecutive samples.
@@ -273,9 +273,9 @@ def velocity_noise(data: Dataset) -> Tensor:
 
 
 def white_noise_std(x: Tensor, whole: Tensor) -> Tensor:
-    """Standard deviation σ of the white noise of each column of a smooth signal `(n, d)`, `(d,)`.
+    """Return the standard deviation σ `(d,)` of the white noise in each column of a smooth signal `(n, d)`.
 
-    x_i − (−x_{i−2} + 4 x_{i−1} + 4 x_{i+1} − x_{i+2})/6, the deviation from the cubic through the neighbours,
+    The deviation from the cubic through the neighbours, x_i − (−x_{i−2} + 4 x_{i−1} + 4 x_{i+1} − x_{i+2})/6,
     has the variance 35/18 σ²; its median absolute value is robust to jumps. `whole` `(n − 4,)` bool marks the
     first of five consecutive samples.
     """

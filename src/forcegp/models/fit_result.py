@@ -1,4 +1,4 @@
-"""The result of a fit, and the display of models: one line, or a table in notebooks."""
+"""Result of a fit, and display of models as one line or as a table in notebooks."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.notebook import html_table
 
 COVERED = 0.8
-"""Share of held-out values within ±2σ below which a fit warns: less than with half the right deviation."""
+"""Held-out ±2σ coverage below which a fit warns, lower than with half the correct standard deviation."""
 
 
 @dataclass(frozen=True)
@@ -20,14 +20,14 @@ class Compared:
     """A set of force priors in the comparison on held-out stretches of the training log.
 
     Attributes:
-        name: of the set.
+        name: name of the set.
         log_density: mean log predictive density of held-out samples [nats per sample]; `None` if it was not
             computed.
         behind: difference to the best set [nats per sample].
-        standard_error: of that difference.
-        chosen: whether the model has this set.
+        standard_error: standard error of this difference.
+        chosen: whether this set was selected.
         note: reason why a set was not tested, or not on all stretches.
-        coverage: share of held-out values within ±2σ, 0.95 for correct error bars.
+        coverage: fraction of held-out values within ±2σ, 0.95 for correct error bars.
     """
 
     name: str
@@ -40,7 +40,7 @@ class Compared:
 
     @property
     def doubt(self) -> str:
-        """A warning if the model misses held-out data by far, or nothing."""
+        """Warning if held-out coverage is far too low, otherwise empty."""
         if self.coverage is None or self.coverage >= COVERED:
             return ""
         return (
@@ -58,33 +58,33 @@ class Compared:
 
 @dataclass(frozen=True)
 class FitResult:
-    """Course of a fit; saved files contain all but the history.
+    """Result of a fit; saved files contain everything but the history.
 
     Attributes:
         converged: whether the optimiser reached its tolerance.
         evaluations: number of evaluations of the objective.
         seconds: duration of the fit.
         objective: final value (mean squared error, or negative log posterior of the hyperparameters).
-        log_marginal_likelihood: of the training data, `None` for models without one.
-        jitter: added to the diagonal of the covariance to factorise it, relative to unit noise: the effective
-            noise is √(1 + jitter) times the stated noise.
-        constant_inputs: inputs that do not vary in the training data and were left unscaled.
+        log_marginal_likelihood: log marginal likelihood of the training data, `None` for models without one.
+        jitter: jitter added to the diagonal of the covariance, relative to unit noise; the effective noise is
+            √(1 + jitter) times the given noise.
+        constant_inputs: inputs that do not vary in the training data and were not scaled.
         message: reason why the optimiser stopped.
         history: the objective at each evaluation.
-        force_correlation: mean posterior correlation of the joint force Q and the contact's force Q_z at
-            training states: near −1 only their sum is identifiable, near 0 both are. `None` without priors on
-            both.
+        force_correlation: mean posterior correlation of the joint force Q and the contact force Q_z at
+            training states. Near −1, only their sum is identifiable; near 0, both are. `None` without priors
+            on both.
         warnings: doubts about the fit, each with a remedy.
-        inference: `"exact"` or `"sparse"`, for models that have both.
+        inference: `"exact"` or `"sparse"`, for models that support both.
         samples: number of samples that the model is conditioned on.
         learned_on: number of samples used to learn hyperparameters.
         basis_functions: size of a sparse posterior.
         determined: number of basis functions that the data determine.
-        missed: total prior variance of all rows that the inducing points miss, in units of the noise
+        missed: total prior variance of all rows missed by the inducing points, in units of the noise
             variance; `determined` is the total posterior variance in the same units.
-        more_points_would_help: whether `missed` is a tenth of `determined` or more.
-        comparison: the compared sets of force priors; empty if the caller named the priors.
-        never_closed: contacts that are closed in no training sample; their forces are not determined.
+        more_points_would_help: whether `missed` is at least a tenth of `determined`.
+        comparison: the compared sets of force priors; empty if the priors were given.
+        never_closed: contacts that are never closed in the training data; their forces are undetermined.
     """
 
     converged: bool
@@ -110,7 +110,7 @@ class FitResult:
 
 
 def model_line(kind: str, system: ConstrainedSystem, result: FitResult | None) -> str:
-    """Robot, contacts, and course of the fit, or `None` without one."""
+    """Return a line with robot, contacts and the result of the fit, if any."""
     robot = system.robot
     contacts = f", contact {', '.join(system.contact_names)}" if system.contacts else ""
     outcome = "" if result is None else f"; {_outcome(result)}"
@@ -125,7 +125,7 @@ def _outcome(result: FitResult) -> str:
 
 
 def fit_table(title: str, result: FitResult | None, learned: Sequence[tuple[str, object]]) -> str:
-    """Course and result of a fit, as HTML."""
+    """Return the result of a fit as HTML."""
     rows: list[tuple[object, ...]] = []
     notes: Sequence[str] = ()
     if result is not None:
@@ -139,7 +139,7 @@ def fit_table(title: str, result: FitResult | None, learned: Sequence[tuple[str,
 
 
 def _number(value: object) -> object:
-    """Tensors and long sequences as a few numbers."""
+    """Format tensors and long sequences as a few numbers."""
     if value is None:
         return "–"
     if isinstance(value, Tensor):

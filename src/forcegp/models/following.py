@@ -1,14 +1,14 @@
 """Tracking of forces that change abruptly, such as a payload that is picked up.
 
-A fading memory loses a payload while the arm rests, and is slow to detect a new one. So earlier samples are
-forgotten if, with D the new samples,
+A fading memory loses a payload while the arm rests, and is slow to detect a new one. Earlier samples are
+therefore forgotten if, for new samples D,
 
-    p(D | payload anew from its prior) · p(change) > p(D | payload as it was).
+    p(D | payload drawn again from its prior) · p(change) > p(D | payload unchanged).
 
 Both are marginal likelihoods, computed from the posterior before and after the update.
 
-The force of a payload is accurate to first order around the payload known to its prior. After a change, the
-prior uses the current estimate, as in an extended Kalman filter.
+The force of a payload is accurate to first order around the known payload of its prior. After a change, the
+prior is linearized around the current estimate, as in an extended Kalman filter.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ CHANGE = 1e-3
 
 @dataclass(frozen=True)
 class Followed:
-    """The result of `follow`.
+    """Result of `follow`.
 
     Attributes:
         fit: the fit with the new samples.
-        changed: whether the forces were learned anew.
-        log_odds: of a change versus no change, after the new samples.
+        changed: whether the forces were relearned.
+        log_odds: log odds of a change versus no change, after the new samples.
     """
 
     fit: StructuredFit
@@ -48,18 +48,18 @@ class Followed:
 def follow(
     fit: StructuredFit, data: Dataset, priors: Sequence[str], *, factor: float = 1.0, change: float = CHANGE
 ) -> Followed:
-    """Add samples to a fit, and relearn the forces of some priors if the samples contradict it.
+    """Add samples to a fit, and relearn the forces of some priors if the samples contradict them.
 
     Args:
-        fit: with sparse inference.
-        data: a few new samples, such as those of 0.05 s.
-        priors: names of the priors with forces that may change, such as `payload`.
-        factor: correlation of these forces with those at the last call, for additional slow drift.
+        fit: fit with sparse inference.
+        data: a few new samples, such as 0.05 s of data.
+        priors: names of the priors on forces that may change, such as `payload`.
+        factor: correlation of these forces with those at the previous call, for additional slow drift.
         change: prior probability of a change between two calls.
 
     Raises:
         ModelError: inference is exact, or a number is out of range.
-        UnknownNameError: no such prior.
+        UnknownNameError: a prior does not exist.
     """
     if not 0.0 < change < 1.0:
         raise ModelError("invalid probability of a change", expected="between 0 and 1", got=change)
@@ -82,13 +82,13 @@ def follow(
 def _knowing(
     fit: StructuredFit, estimate: StructuredFit, priors: Sequence[str], begin: bool = True
 ) -> StructuredFit:
-    """The fit with payload priors around an estimate.
+    """Linearize payload priors around an estimate.
 
     Args:
-        fit: whose priors are replaced.
-        estimate: fit that shows the payloads.
-        priors: names of the priors that are followed.
-        begin: whether priors without known payload are replaced too.
+        fit: fit with the priors to replace.
+        estimate: fit with the estimated payloads.
+        priors: names of the tracked priors.
+        begin: whether to replace also priors without a known payload.
     """
     one = {"one": torch.zeros(1, 1, dtype=torch.float64)}
     updated_priors = tuple(

@@ -1,4 +1,4 @@
-"""The Gaussian-process baseline: one process per joint acceleration, without mechanics.
+"""Gaussian-process baseline with one process per joint acceleration and without mechanics.
 
 q̈_j ~ GP(0, k_j(x, x′)) with x = (q, q̇, τ) and squared-exponential k_j (section 5.4 of the paper).
 """
@@ -39,7 +39,7 @@ from forcegp.storage.system import take
 
 KIND = "independent_gp"
 LEARNING = 6
-"""Matrices over the samples that learning one joint holds besides the factors of all joints; measured."""
+"""Measured number of matrices over the samples for learning a joint, besides the factors of all joints."""
 
 
 @dataclass(frozen=True)
@@ -48,8 +48,8 @@ class IndependentTraining:
 
     Attributes:
         features: inputs before standardization, `(n, nq)` by name.
-        qdd: `(n, nq)` [rad/s², m/s²].
-        noise_std: `(nq,)` or `(n, nq)`.
+        qdd: `(n, nq)` accelerations [rad/s², m/s²].
+        noise_std: `(nq,)` or `(n, nq)` standard deviation of the acceleration noise.
         scale: standardization of the inputs.
     """
 
@@ -59,7 +59,8 @@ class IndependentTraining:
     scale: Standardization
 
     def processes(self) -> list[tuple[JointForcePrior, Block, Tensor]]:
-        """For each joint, its process, its accelerations in units of their noise, and Σ log of that noise.
+        """Return, for each joint, its process, its accelerations in units of the noise, and Σ log of the
+        noise.
 
         The likelihood uses only name and kernel of a process.
         """
@@ -75,13 +76,13 @@ class IndependentTraining:
         ]
 
     def announce(self, copies: int) -> None:
-        """Announce the memory of the matrices of all joints."""
+        """Warn about the memory of the matrices of all joints."""
         n, nq = self.qdd.shape
         announce_memory(8 * (2 * nq + copies) * n**2, f"independent Gaussian processes on {n:,} samples")
 
 
 class IndependentSettings(KernelOptions):
-    """Saved settings of independent Gaussian processes besides their tensors."""
+    """Saved settings of independent Gaussian processes."""
 
     noise_std: PositiveFloat | tuple[PositiveFloat, ...] | None
 
@@ -89,16 +90,16 @@ class IndependentSettings(KernelOptions):
 class IndependentGP(Model["IndependentFit"]):
     """Independent zero-mean Gaussian processes, one per joint acceleration, on standardized (q, q̇, τ).
 
-    Contacts are not an input: inputs are states and torques only.
+    The inputs are states and torques only, not contacts.
 
     Args:
-        system: robot and contacts; the contacts serve to evaluate the model, not to learn it.
+        system: robot and contacts; contacts are used for evaluation only, not for learning.
         noise: standard deviation of measured accelerations [rad/s², m/s²], one or one per joint; by
-            default the value in the log, else 0.1.
-        standardize: whether to standardize the inputs; the paper does not.
+            default the value in the log, or 0.1.
+        standardize: whether to standardize the inputs, which the paper does not.
 
     Raises:
-        ModelError: the robot is not float64, or `noise` states more than that of accelerations.
+        ModelError: the robot is not float64, or `noise` specifies more than acceleration noise.
     """
 
     kind = KIND
@@ -127,12 +128,12 @@ class IndependentGP(Model["IndependentFit"]):
         progress: FitProgress | None = None,
         checkpoint: str | Path | None = None,
     ) -> IndependentFit:
-        """Learn the hyperparameters of each joint by maximum a posteriori, one joint after the other.
+        """Learn the hyperparameters by maximum a posteriori estimation, one joint after the other.
 
         Args:
             data: states and measured accelerations.
             options: optimiser and its limits, for each joint.
-            progress: called after each evaluation, with those of all joints.
+            progress: called after each evaluation, counting those of all joints.
             checkpoint: see `Model.fit`.
 
         Raises:
@@ -162,7 +163,7 @@ class IndependentGP(Model["IndependentFit"]):
         return fitted(self, training, hyperparameters, parts)
 
     def training(self, features: dict[str, Tensor], qdd: Tensor, noise_std: Tensor) -> IndependentTraining:
-        """Training data with their standardization."""
+        """Return the training data with their standardization."""
         scaled = Standardization.of if self.options.standardize else Standardization.none
         return IndependentTraining(features, qdd, noise_std, scaled(features))
 
@@ -174,7 +175,7 @@ def _objective(
     centre: Mapping[str, Tensor],
     theta: dict[str, Tensor],
 ) -> Tensor:
-    """Negative log posterior of the hyperparameters of a joint, with weak priors around a centre if any."""
+    """Return the negative log posterior of a joint's hyperparameters, with weak priors if any."""
     value = negative_log_likelihood([prior], theta, [block]) + constant
     return value + negative_log_prior(theta, centre) if centre else value
 
@@ -212,15 +213,15 @@ def fitted(
 
 @dataclass(frozen=True, eq=False, repr=False)
 class IndependentFit(AccelerationFit):
-    """Conditioned processes.
+    """Fitted independent Gaussian processes.
 
     Attributes:
         system: robot and contacts.
-        specification: of the fit.
+        specification: specification of the model.
         training: data that the processes are conditioned on.
-        hyperparameters: by process.
-        posteriors: of each joint.
-        result: course of the fit.
+        hyperparameters: log-hyperparameters of all processes.
+        posteriors: posterior for each joint.
+        result: result of the fit.
     """
 
     system: ConstrainedSystem

@@ -1,4 +1,4 @@
-"""Reading a saved model of any kind; process pools and `copy.deepcopy` use the same format."""
+"""Loading of saved models of any kind; pickling and copying use the same format."""
 
 from __future__ import annotations
 
@@ -29,16 +29,16 @@ from forcegp.storage.system import unpack_system
 KINDS: dict[str, type[FittedModel]] = {
     kind.kind: kind for kind in (AnalyticalFit, NetworkFit, IndependentFit, StructuredFit)
 }
-"""Fitted models by the name in the file."""
+"""Fitted models by their name in files."""
 
 
 def load_model(path: str | Path, *, system: ConstrainedSystem | None = None) -> FittedModel:
-    """Read a saved model; its predictions are the same bit for bit.
+    """Load a saved model, which reproduces predictions bit for bit.
 
     Args:
         path: the file; `.safetensors` is added if missing.
-        system: source of constraints defined in Python (an `ImplicitSurface`); robot and other constraints
-            are those in the file.
+        system: system with constraints defined in Python (such as an `ImplicitSurface`); robot and other
+            constraints are read from the file.
 
     Example:
         >>> import forcegp, torch
@@ -56,13 +56,13 @@ def load_model(path: str | Path, *, system: ConstrainedSystem | None = None) -> 
 
     Raises:
         ModelError: there is no model, it is damaged, or a constraint must be passed.
-        UnknownNameError: the model is of a kind unknown to this release.
+        UnknownNameError: this release does not know the kind of model.
     """
     return _restored(*read_model(path), str(model_path(path)), system)
 
 
 def model_of_bytes(data: bytes) -> FittedModel:
-    """Read a model from the content of its file.
+    """Load a model from the content of its file.
 
     Raises:
         ModelError, UnknownNameError: see `load_model`.
@@ -74,7 +74,7 @@ def model_of_bytes(data: bytes) -> FittedModel:
 def _restored(
     header: ModelHeader, tensors: Mapping[str, Tensor], source: str, system: ConstrainedSystem | None = None
 ) -> FittedModel:
-    """The model of a header and tensors."""
+    """Restore a model from header and tensors."""
     check_name(f"kind of models in {source}", header.kind, KINDS)
     try:
         model_system = unpack_system(header.system, tensors, source, system)
@@ -87,15 +87,15 @@ def _restored(
 
 
 def register() -> None:
-    """Register the saved form for copying and pickling of models."""
+    """Register the file format for copying and pickling models."""
     for kind in KINDS.values():
         copyreg.pickle(kind, _sent)  # pyright: ignore[reportArgumentType]
 
 
 def _sent(model: FittedModel) -> tuple[Any, ...]:
-    """Recipe to restore a model from the content of its file.
+    """Return a function and arguments that restore a model from the content of its file.
 
     Raises:
-        ModelError: a part of the model is Python code.
+        ModelError: a part of the model is defined in Python.
     """
     return model_of_bytes, (model_bytes(model.kind, model.system, *model.record()),)

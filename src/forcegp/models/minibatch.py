@@ -1,6 +1,4 @@
-"""Minimising a mean over samples: by ADAM on batches with early stopping on a held-out part, or on all
-samples.
-"""
+"""Minimisation of a mean over samples, by ADAM on batches with early stopping or over all samples."""
 
 from __future__ import annotations
 
@@ -18,22 +16,21 @@ from forcegp.gp.optimise import FitProgress, Learned, LearningOptions, minimise,
 from forcegp.storage.checkpoint import Checkpoint, Evaluations
 
 HISTORY = "history"
-"""Name of the tensor with one entry per epoch, the only one whose length changes."""
+"""Name of the tensor with one entry per epoch, the only one of variable length."""
 Loss = Callable[[Mapping[str, Tensor], Tensor], Tensor]
-"""Maps tensors and row numbers `(k,)` to the mean squared error of these rows."""
+"""Function that maps tensors and row numbers `(k,)` to the mean squared error of these rows."""
 
 
 @dataclass(frozen=True)
 class BatchOptions:
-    """Options of training on batches.
+    """Options for training on batches.
 
     Args:
-        epochs: maximum number of passes over the data; the learning rate falls to 0 along a half cosine over
-            them.
-        batch: samples per step.
-        learning_rate: of ADAM, at the start.
-        held_out: share of the samples held out for early stopping.
-        patience: epochs without improvement on the held-out samples after which training stops.
+        epochs: maximum number of passes over the data, with a half-cosine decay of the learning rate to 0.
+        batch: number of samples per step.
+        learning_rate: initial learning rate of ADAM.
+        held_out: fraction of the samples held out for early stopping.
+        patience: number of epochs without held-out improvement after which training stops.
 
     Raises:
         ModelError: a value is out of range.
@@ -73,12 +70,12 @@ def train(
         loss: mean squared error over rows, differentiable in the tensors.
         start: initial tensors by name.
         samples: number of rows.
-        options: of training: on batches, with the best epoch on the held-out samples as the result, or on
-            all samples at once.
-        generator: of the held-out part and the order of rows.
+        options: training on batches, which returns the best epoch on the held-out samples, or on all samples
+            at once.
+        generator: source of randomness for the held-out part and the order of rows.
         progress: called after each epoch or evaluation with its number, their maximum number, and the loss.
         checkpoint: file for the state of training, from which it resumes.
-        key: identifies the loss, for the checkpoint.
+        key: identifier of the loss for the checkpoint.
 
     Returns:
         The tensors, their loss, and one entry per epoch or evaluation as history.
@@ -138,7 +135,7 @@ def _on_batches(
 
 @dataclass
 class _State:
-    """Everything that decides how training goes on."""
+    """Complete state of training."""
 
     weights: dict[str, Tensor]
     optimizer: torch.optim.Adam
@@ -148,7 +145,7 @@ class _State:
 
     @classmethod
     def at(cls, start: Mapping[str, Tensor], learning_rate: float, generator: torch.Generator) -> _State:
-        """The state before the first epoch."""
+        """Return the state before the first epoch."""
         weights = {name: value.detach().clone().requires_grad_() for name, value in start.items()}
         optimizer = torch.optim.Adam(weights.values(), lr=learning_rate)
         for x in weights.values():
@@ -158,12 +155,12 @@ class _State:
 
     @property
     def value(self) -> float:
-        """The least held-out loss so far."""
+        """Smallest held-out loss so far."""
         return min(self.history, default=math.inf)
 
     @property
     def since(self) -> int:
-        """Epochs since the first one with the least held-out loss."""
+        """Number of epochs since the smallest held-out loss."""
         return len(self.history) - 1 - self.history.index(self.value) if self.history else 0
 
     def note(self, held_out: float) -> None:
@@ -182,7 +179,7 @@ class _State:
         self.history.append(held_out)
 
     def tensors(self) -> dict[str, Tensor]:
-        """The state by name."""
+        """Return the state by name."""
         tensors = {HISTORY: torch.tensor(self.history, dtype=torch.float64)}
         tensors["generator"] = self.generator.get_state()
         for name, x in self.weights.items():
@@ -207,7 +204,7 @@ class _State:
 
 
 FLAT = 0.05
-"""Relative change of the held-out loss over the last tenth of the epochs that counts as none."""
+"""Relative change of the held-out loss over the last tenth of the epochs that counts as zero."""
 
 
 def _flat(history: list[float]) -> bool:

@@ -1,4 +1,4 @@
-"""The neural-network baseline: sigmoid layers from (q, q̇, τ) to q̈, without mechanics (section 5.4)."""
+"""Neural-network baseline: sigmoid layers from (q, q̇, τ) to q̈, without mechanics (section 5.4)."""
 
 from __future__ import annotations
 
@@ -26,11 +26,11 @@ from forcegp.storage.system import take
 KIND = "neural_network"
 SHALLOW = BatchOptions(epochs=3000, batch=1024, learning_rate=0.03, patience=300)
 DEEP = BatchOptions(epochs=300, batch=256, learning_rate=0.003)
-"""For networks of more than two hidden layers, whose epochs take longer and whose steps must be smaller."""
+"""Options for more than two hidden layers, which need smaller steps and take longer per epoch."""
 
 
 class NetworkSettings(Record):
-    """Saved settings of a neural network besides its tensors."""
+    """Saved settings of a neural network."""
 
     hidden: tuple[int, ...]
     seed: int
@@ -40,12 +40,12 @@ class NetworkSettings(Record):
 class NeuralNetwork(Model["NetworkFit"]):
     """A feed-forward network with sigmoid layers on standardized (q, q̇, τ), trained by mean squared error.
 
-    Contacts are not an input, and there is no covariance.
+    The network does not use contacts as inputs and does not predict covariances.
 
     Args:
-        system: robot and contacts; the contacts serve to evaluate the model, not to learn it.
+        system: robot and contacts; contacts are used for evaluation only, not for learning.
         hidden: widths of the hidden layers.
-        seed: of the initial weights, the held-out samples and the order of the batches.
+        seed: seed for the initial weights, the held-out samples and the order of the batches.
 
     Raises:
         ModelError: a width is not positive.
@@ -69,16 +69,17 @@ class NeuralNetwork(Model["NetworkFit"]):
         progress: FitProgress | None = None,
         checkpoint: str | Path | None = None,
     ) -> NetworkFit:
-        """Train with ADAM on batches; the weights of the best epoch on held-out samples are kept.
+        """Train with ADAM on batches, keeping the weights of the best epoch on held-out samples.
 
         Args:
             data: states and measured accelerations.
-            options: of training; `SHALLOW` or `DEEP` by default.
+            options: training options; by default `SHALLOW` or `DEEP`.
             progress: called after each epoch.
             checkpoint: see `Model.fit`.
 
         Returns:
-            The epochs as `evaluations`, and the held-out error of standardized accelerations.
+            The fitted network, with the number of epochs as `evaluations` and the held-out error of
+            standardized accelerations as `objective`.
 
         Raises:
             ModelError, DataError: the data do not fit the model.
@@ -111,10 +112,10 @@ class NetworkFit(AccelerationFit):
 
     Attributes:
         system: robot and contacts.
-        hidden, seed: of the specification.
-        network: its layers.
+        hidden, seed: layer widths and seed of the specification.
+        network: layers of the network.
         inputs, outputs: standardization of (q, q̇, τ) and of q̈.
-        result: course of training.
+        result: result of training.
     """
 
     system: ConstrainedSystem
@@ -167,7 +168,7 @@ class NetworkFit(AccelerationFit):
 
 
 def _network(system: ConstrainedSystem, hidden: tuple[int, ...]) -> nn.Sequential:
-    """The layers, with weights that are not drawn yet."""
+    """Return the layers with uninitialised weights."""
     robot = system.robot
     widths = [3 * robot.nq, *hidden]
     layers: list[nn.Module] = []
@@ -178,11 +179,11 @@ def _network(system: ConstrainedSystem, hidden: tuple[int, ...]) -> nn.Sequentia
 
 
 SIGMOID_GAIN = 4.0
-"""Inverse slope of the sigmoid at 0: with it the signal keeps its variance from layer to layer."""
+"""Inverse slope of the sigmoid at 0, which preserves the variance of the signal between layers."""
 
 
 def _initialise(network: nn.Sequential, generator: torch.Generator) -> None:
-    """Glorot-normal weights, scaled for sigmoid layers, and biases of 0."""
+    """Initialise Glorot-normal weights, scaled for sigmoid layers, and zero biases."""
     for layer in network:
         if isinstance(layer, nn.Linear):
             std = (2.0 / (layer.in_features + layer.out_features)) ** 0.5
@@ -194,5 +195,5 @@ def _initialise(network: nn.Sequential, generator: torch.Generator) -> None:
 
 
 def _stacked(scale: Standardization, states: dict[str, Tensor]) -> Tensor:
-    """The standardized inputs side by side, `(n, 3 nq)`."""
+    """Concatenate the standardized inputs, `(n, 3 nq)`."""
     return torch.cat(list(scale.apply(states).values()), dim=-1)

@@ -1,4 +1,4 @@
-"""Predictors, and predicted quantities with their uncertainty; scores, and plots with measured values."""
+"""Predictors and predicted quantities with uncertainty, with scores and plots."""
 
 from __future__ import annotations
 
@@ -29,17 +29,17 @@ if TYPE_CHECKING:
     from forcegp.plots import Panel, Target
 
 CHUNK = 2000
-"""States that are predicted at once, to bound the memory."""
+"""Number of states predicted at a time, to bound memory."""
 CHECKED = 1 << 16
-"""Covariances that are checked at once."""
+"""Number of covariances checked at a time."""
 MOST_SAMPLES = 2000
-"""Samples that are predicted and drawn: more are indistinguishable."""
+"""Maximum number of samples in a plot; more are indistinguishable."""
 
 
 NEGATIVE = 0.01
-"""An eigenvalue below minus this fraction of the variances is no rounding of zero."""
+"""Fraction of the variances below which a negative eigenvalue counts as rounding."""
 ROUNDING = 1e-12
-"""Variances below this fraction of the largest of a sample are compared with this fraction of it."""
+"""Smallest variance used for scaling, as a fraction of the largest variance of a sample."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -47,15 +47,15 @@ class Prediction:
     """A predicted quantity at a batch of states.
 
     Attributes:
-        mean: `(*batch, d)`.
-        covariance: `(*batch, d, d)`, of the noise-free quantity unless noise was requested; `None` if the
-            model has none or it was not requested.
-        parts: the slice of each quantity, if several were requested.
+        mean: `(*batch, d)` mean.
+        covariance: `(*batch, d, d)` covariance of the noise-free quantity, unless noise was requested; `None`
+            if the model does not provide it or it was not requested.
+        parts: slice of each quantity, if several were requested.
         beyond: `(*batch, nq)` distance of the speed and torque of each joint beyond the training data, in
-            training standard deviations; `None` for models without it.
-        joint_names: the joints, in the order of `beyond`.
+            training standard deviations; `None` if the model does not provide it.
+        joint_names: joints in the order of `beyond`.
         determined: `(*batch, d)` bool, components determined by data and motion; the others are NaN. `None`
-            for all.
+            if all are determined.
         doubts: descriptions of undetermined components.
     """
 
@@ -68,11 +68,11 @@ class Prediction:
     doubts: tuple[str, ...] = field(default=(), kw_only=True)
 
     def __post_init__(self) -> None:
-        """Refuse numbers that are not finite, and covariances that are none.
+        """Reject non-finite numbers and invalid covariances.
 
         Raises:
-            NumericalError: the mean or the covariance is not finite where it is determined, or an eigenvalue
-                is clearly negative.
+            NumericalError: a determined mean or covariance is not finite, or an eigenvalue is clearly
+                negative.
         """
         mean, covariance = self.mean, self.covariance
         if self.determined is not None:
@@ -98,23 +98,23 @@ class Prediction:
 
     @property
     def variance(self) -> Tensor | None:
-        """`(*batch, d)`, the diagonal of the covariance."""
+        """Variance `(*batch, d)`, the diagonal of the covariance."""
         return None if self.covariance is None else self.covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0)
 
     @property
     def std(self) -> Tensor | None:
-        """`(*batch, d)` standard deviation."""
+        """Standard deviation `(*batch, d)`."""
         variance = self.variance
         return None if variance is None else variance.sqrt()
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Doubts about the prediction: undetermined components, states far beyond the training data."""
+        """Doubts about the prediction: undetermined components, and states far beyond the training data."""
         beyond = () if self.beyond is None else warnings_beyond(self.beyond, self.joint_names)
         return (*self.doubts, *beyond)
 
     def __repr__(self) -> str:
-        """One line with shapes, without the numbers."""
+        """Return a one-line summary with shapes, without numbers."""
         what = ", ".join(self.parts) or "values"
         bars = "no uncertainty" if self.covariance is None else "with covariance"
         return f"<Prediction of {what}: mean {tuple(self.mean.shape)}, {bars}>"
@@ -127,22 +127,22 @@ class Prediction:
         names: Sequence[str] | None = None,
         ax: Target = None,
     ) -> list[Axes]:
-        """Draw the mean with its band of ±2 standard deviations, one panel per component.
+        """Plot the mean with a band of ±2 standard deviations, one panel per component.
 
-        `model.plot(data)` does the same with the names, the time and the measurements of a data set.
+        `model.plot(data)` does the same with the names, times and measurements of a data set.
 
         Args:
-            t: `(n,)` time of each sample [s]; by default samples are numbered.
-            measured: `(n, d)` values to compare with.
-            names: one per component.
-            ax: matplotlib axes to draw on, one per panel; default a new figure.
+            t: `(n,)` time of each sample [s]; by default, samples are numbered.
+            measured: `(n, d)` measured values for comparison.
+            names: names of the components.
+            ax: matplotlib axes to draw on, one per panel; by default a new figure.
 
         Returns:
             The axes, one per panel.
 
         Raises:
-            ShapeError: the mean is not of shape `(n, d)`, or an argument does not fit it.
-            ParameterError: the number of axes differs from that of the components.
+            ShapeError: the mean does not have shape `(n, d)`, or an argument does not match it.
+            ParameterError: the number of axes differs from the number of components.
         """
         from forcegp.plots import Timeline, axis_label, draw_panels
 
@@ -169,7 +169,7 @@ class Prediction:
         return axes
 
     def panel(self, i: int, name: str, label: str, true: Tensor | None) -> Panel:
-        """Component i with its measured values, if any."""
+        """Return a panel for component i with its measured values, if any."""
         from forcegp.plots import MEASURED, PREDICTED, Curve, Panel
 
         curves = [] if true is None else [Curve(true[:, i], "measured", MEASURED, width=0.7)]
@@ -178,7 +178,7 @@ class Prediction:
 
 
 class Query(NamedTuple):
-    """Arguments of `Predictor.predict`; without a system, that of the fit is used."""
+    """Arguments of `Predictor.predict`; the default system is that of the fit."""
 
     quantity: str | Sequence[str]
     system: ConstrainedSystem | None
@@ -187,14 +187,14 @@ class Query(NamedTuple):
 
 
 Answer = tuple[tuple[Tensor | None, ...], dict[str, slice], tuple[str, ...]]
-"""Mean `(n, d)`, covariance `(n, d, d)`, distance beyond the trained region `(n, nq)` and components that are
-determined `(n, d)`; the slice of each quantity; what is not determined, in words."""
+"""Mean `(n, d)`, covariance `(n, d, d)`, distance beyond the trained region `(n, nq)`, determined components
+    `(n, d)`, the slice of each quantity, and descriptions of undetermined components."""
 
 
 def in_pieces(
     at: FlatStates, read: Callable[[FlatStates], tuple[Tensor | None, ...]]
 ) -> tuple[Tensor | None, ...]:
-    """Evaluate `read` on `CHUNK` states at a time; memory holds the result and one piece."""
+    """Evaluate `read` on `CHUNK` states at a time, with memory for the result and one piece."""
     whole, n = list[Tensor | None](), len(at.q)
     for first in range(0, max(n, 1), CHUNK):
         piece = read(at.rows(slice(first, first + CHUNK)))
@@ -206,18 +206,18 @@ def in_pieces(
 
 
 def measured(system: ConstrainedSystem, data: Dataset, quantity: str) -> Tensor:
-    """Logged values `(n, d)` of a quantity.
+    """Return the logged values `(n, d)` of a quantity.
 
     Raises:
         UnknownNameError: the quantity cannot be measured, or a contact of the system is not logged.
-        NotLoggedError: it is not logged.
+        NotLoggedError: the quantity is not logged.
     """
     check_name("measured quantity", quantity, COLUMNS)
     return COLUMNS[quantity](data, system)
 
 
 def component_names(system: ConstrainedSystem, quantity: str) -> list[str]:
-    """Owners of the components of a quantity: joints, contacts, or axes of a contact's force."""
+    """Return the names of the components of a quantity: joints, contacts, or axes of a contact force."""
     if quantity == "contact_force":
         contacts = [c.name for c in system.contacts if isinstance(c, SurfaceContact)]
         return [f"{name} {axis}" for name in contacts for axis in AXES]
@@ -228,7 +228,7 @@ class Predictor(ForwardModel):
     """A predictor of the forward dynamics (q, q̇, τ) ↦ q̈."""
 
     has_noise: bool = False
-    """Whether it can predict measurements, their noise included."""
+    """Whether the predictor can predict measurements including their noise."""
 
     @torch.no_grad()
     def predict(
@@ -243,27 +243,28 @@ class Predictor(ForwardModel):
         system: ConstrainedSystem | None = None,
         noise: bool = False,
     ) -> Prediction:
-        """Mean and covariance of a quantity; for a `StructuredGP`, of its posterior (eqs. 22 to 25).
+        """Predict mean and covariance of a quantity, for a `StructuredGP` from its posterior (eqs. 22 to 25).
 
         Args:
             q, qd, tau: `(*batch, nq)` states.
-            quantity: a name of `QUANTITIES`, or, for models with forces, several for their joint
+            quantity: a name in `QUANTITIES` or, for models with forces, several names for their joint
                 distribution.
-            active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
+            active: `(*batch, n_contacts)` bool, the closed contacts; by default all.
             covariance: whether to compute the covariance, which costs more than the mean.
-            system: another system to predict on, such as another surface or none, for models with forces; on
-                that of the fit, contacts that are never closed in the training data have undetermined forces.
-            noise: whether the covariance is that of a measurement, including noise of torque and sensor.
+            system: another system, such as one with another surface or none, for models with forces. On the
+                system of the fit, contacts that are never closed in the training data have undetermined
+                forces.
+            noise: whether the covariance includes the noise of torque and sensor.
 
         Returns:
             Mean `(*batch, d)` and, if the model has one, covariance `(*batch, d, d)`, without measurement
             noise by default.
 
         Raises:
-            UnknownNameError: no such quantity.
-            ShapeError: a state or `active` does not fit the system.
-            ModelError: only forces of contacts that are never closed in the training data; or another
-                quantity, another system or noise for a model of accelerations alone.
+            UnknownNameError: the quantity does not exist.
+            ShapeError: a state or `active` does not match the system.
+            ModelError: all requested forces belong to contacts that are never closed in the training data, or
+                a model of accelerations only does not support the quantity, system or noise.
         """
         if noise and not self.has_noise:
             raise ModelError(f"a {self.kind!r} model has no noise of measurements", hint="use StructuredGP")
@@ -283,12 +284,12 @@ class Predictor(ForwardModel):
         return Prediction(mean, spread, parts, beyond, joints, determined=known, doubts=tuple(doubts))
 
     def at(self, flat: FlatStates, query: Query) -> Answer:
-        """The result of a query at n states."""
+        """Evaluate a query at n states."""
         raise NotImplementedError
 
     @property
     def specified(self) -> ConstrainedSystem:
-        """The system before the fit, with the robot of the file if the fit keeps it."""
+        """System before the fit, with the robot from the file if the fit keeps it."""
         return self.system
 
     def linearize(
@@ -300,16 +301,16 @@ class Predictor(ForwardModel):
         active: Tensor | None = None,
         system: ConstrainedSystem | None = None,
     ) -> ForceLinearization:
-        """Mean acceleration and multiplier with their Jacobians with respect to q, q̇ and τ.
+        """Return the mean acceleration and multiplier with their Jacobians with respect to q, q̇ and τ.
 
         Args:
             q, qd, tau: `(*batch, nq)` states.
-            active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
-            system: another system to predict on.
+            active: `(*batch, n_contacts)` bool, the closed contacts; by default all.
+            system: another system for the prediction.
 
         Raises:
             ModelError: the model has no forces.
-            ShapeError: an argument does not fit the system.
+            ShapeError: an argument does not match the system.
         """
         force = self.force_field()
         if force is None:
@@ -332,28 +333,28 @@ class Predictor(ForwardModel):
 
         Args:
             q0, qd0: `(*batch, nq)` initial states.
-            tau: motor torque over time: a log, or an array `(samples, nq)` or `(*batch, samples, nq)` with
-                its period in `options`; or a feedback law of (t, q, q̇).
+            tau: motor torque over time: a log, an array `(samples, nq)` or `(*batch, samples, nq)` with
+                its period in `options`, or a feedback law of (t, q, q̇).
             duration: simulated time [s].
-            samples: number of function samples to integrate besides the mean.
-            **settings: `options`, `seed`, `active`, `system` and `progress` of `rollout_model`.
+            samples: number of function samples to integrate in addition to the mean.
+            **settings: `options`, `seed`, `active`, `system` and `progress` for `rollout_model`.
         """
         return rollout_model(self, q0, qd0, tau, duration, samples, **settings)
 
     def score(self, data: Dataset, quantity: str = "qdd") -> float:
-        """Coefficient of determination R² of the predicted mean on a data set, as in scikit-learn.
+        """Return the coefficient of determination R² of the predicted mean on a data set, as in scikit-learn.
 
         R² = 1 − Σ(measured − predicted)² / Σ(measured − mean)², averaged over the components: 1 is perfect, 0
-        as good as the mean of the data, and negative worse. It ignores the uncertainty, unlike
-        `forcegp.evaluate`.
+        is as good as the mean of the data, and negative values are worse. Unlike `forcegp.evaluate`, it
+        ignores the uncertainty.
 
         Args:
             data: logged states and measured values.
-            quantity: what to predict; the data set must contain it.
+            quantity: quantity to predict, which the data set must contain.
 
         Raises:
             UnknownNameError, NotLoggedError: the quantity is unknown or not logged.
-            DataError: the joints are not those of the robot, or the quantity does not vary.
+            DataError: the joints differ from those of the robot, or the quantity does not vary.
         """
         data.check_robot(self.specified.robot)
         if len(data) < 2:
@@ -375,21 +376,21 @@ class Predictor(ForwardModel):
         ax: Target = None,
         **settings: Any,
     ) -> list[Axes]:
-        """Draw a predicted quantity with ±2 standard deviations beside the measured one, if it is logged.
+        """Plot a predicted quantity with ±2 standard deviations and the measured one, if it is logged.
 
         Args:
-            data: logged states; of a long log, every k-th row is predicted and drawn.
-            quantity: what to predict.
-            joints: which joints or contacts, of a quantity with several; default all.
-            ax: matplotlib axes to draw on, one per panel; default a new figure.
-            **settings: further arguments of `predict`, such as `noise=True` for the band of a measurement.
+            data: logged states; for a long log, every k-th row is predicted and plotted.
+            quantity: quantity to predict.
+            joints: names of joints or contacts to plot; by default all.
+            ax: matplotlib axes to draw on, one per panel; by default a new figure.
+            **settings: other arguments of `predict`, such as `noise=True` for a band that includes noise.
 
         Returns:
             The axes, one per panel.
 
         Raises:
-            UnknownNameError: no such quantity or joint.
-            ParameterError: the number of axes is not that of the panels.
+            UnknownNameError: the quantity or joint does not exist.
+            ParameterError: the number of axes differs from the number of panels.
         """
         from forcegp.plots import Timeline, axis_label, chosen, draw_panels
 
@@ -411,29 +412,29 @@ class Predictor(ForwardModel):
         return draw_panels(panels, time, [data.contact[c] for c in system.contact_names], ax)
 
     def _at_logged(self, data: Dataset, quantity: str, **settings: Any) -> Prediction:
-        """The prediction at logged states; contacts are closed as logged."""
+        """Predict at logged states, with contacts closed as logged."""
         active = data.active((settings.get("system") or self.system).contact_names)
         return self.predict(data.q, data.qd, data.tau, quantity, active=active, **settings)
 
     @abstractmethod
     def save(self, path: str | Path) -> None:
-        """Write the model to a file; `forcegp.load_model` reads it back exactly.
+        """Save the model to a file, which `forcegp.load_model` restores exactly.
 
         Args:
             path: the file; `.safetensors` is added if missing.
 
         Raises:
-            ModelError: a part of the model is Python code.
+            ModelError: a part of the model is defined in Python.
             OSError: the path cannot be written.
         """
 
 
 def require_semidefinite(covariance: Tensor) -> None:
-    """Refuse covariances with a clearly negative eigenvalue, of variables in units of their standard
+    """Reject covariances with a clearly negative eigenvalue, for variables scaled by their standard
     deviation.
 
     Args:
-        covariance: `(*batch, d, d)`.
+        covariance: `(*batch, d, d)` covariances.
 
     Raises:
         NumericalError: a variance or an eigenvalue is below −`NEGATIVE`.

@@ -1,4 +1,4 @@
-"""The models by the short names of the command line and the report."""
+"""Models by the short names used on the command line and in reports."""
 
 from __future__ import annotations
 
@@ -27,10 +27,11 @@ class Entry:
 
     Attributes:
         made: class of the model.
-        description: one line for help texts and the report.
-        options: arguments of the class.
-        priors: force priors of a system with a mean and a kernel, unless the class chooses them.
-        kernel: of these priors, if not the default.
+        description: one-line description for help texts and the report.
+        options: arguments for the class.
+        priors: function that returns force priors for a system, mean and kernel, unless the class selects
+            them.
+        kernel: kernel of these priors, if not the default.
     """
 
     made: type[Any]
@@ -41,12 +42,12 @@ class Entry:
 
     @property
     def kind(self) -> str:
-        """As in saved models."""
+        """Kind of the model as in saved files."""
         return self.made.kind
 
 
 def _contact(system: ConstrainedSystem, mean: Any, kernel: Kernel | None) -> Sequence[ForcePrior]:
-    """Priors on the contact's friction alone, whatever the mean."""
+    """Return priors on contact friction only, for any mean."""
     return contact_priors(system, kernel)
 
 
@@ -79,7 +80,7 @@ MODELS: dict[str, Entry] = {
         StructuredGP, "the same with any tangential force and the paper's kernel", ANALYTICAL, _contact, PAPER
     ),
 }
-"""The models, simplest first."""
+"""Models by name, simplest first."""
 
 
 def create(
@@ -90,17 +91,17 @@ def create(
     seed: int = 0,
     **options: Any,
 ) -> Model:
-    """A model by its short name.
+    """Create a model by its short name.
 
     Args:
         name: a key of `MODELS`.
         system: robot and contacts.
-        noise: of measured accelerations, for models that have one; by default the value in the log.
-        seed: of random initial values, for models that have any.
-        options: further arguments of the model's class.
+        noise: noise of measured accelerations, if the model uses it; by default the value in the log.
+        seed: seed for random initial values, if the model uses them.
+        options: other arguments of the model class.
 
     Raises:
-        UnknownNameError: no such model.
+        UnknownNameError: the model does not exist.
     """
     check_name("model", name, MODELS)
     entry = MODELS[name]

@@ -1,15 +1,15 @@
-"""Selection of a set of force priors by a log.
+"""Selection of a set of force priors on a log.
 
-Each candidate, a set of `SETS` with or without identification of the inertia, is trained on one half of the
-log and tested on the other, both ways. A half consists of contiguous stretches, since neighbours in time
-would make any set look good. The score is the mean log predictive density of the measurements, including
-noise,
+Each candidate, a set in `SETS` with or without identification of the inertia, is trained on one half of the
+log and tested on the other, and vice versa. Each half consists of contiguous stretches, since with
+neighbouring samples any set would look good. The score is the mean log predictive density of the
+measurements, including noise,
 
     S = 1/N Σ_i log N(y_i; E z(x_i), Var z(x_i) + Σ),
 
 and candidates are compared by differences of S over blocks of rows, which have a standard error. The simplest
-candidate within one standard error of the best is chosen. No candidate depends on the motor torque: in closed
-loop such a residual learns to cancel it, and its density looks best.
+candidate within one standard error of the best is selected. No candidate depends on the motor torque, since
+in closed loop such a residual learns to cancel it and appears to have the best density.
 """
 
 from __future__ import annotations
@@ -42,35 +42,34 @@ from forcegp.models.structured_learning import (
 )
 
 FEWEST = 100
-"""Samples below which the set `FEW` is taken."""
+"""Number of samples below which the set `FEW` is used."""
 HALVES, STRETCHES, BLOCKS = 2, 4, 8
-"""Halves of the log, stretches that they alternate between, and blocks of rows that a half is compared on."""
+"""Number of halves of the log, of alternating stretches, and of blocks of rows for comparison in a half."""
 ROWS = 400
-"""Evenly spaced rows of a half that a candidate is conditioned on, and tested on."""
+"""Number of evenly spaced rows of a half for conditioning and for testing a candidate."""
 LEARN_ROWS = 150
-"""Rows that hyperparameters are learned on if a prior is not a finite number of features."""
+"""Number of rows for learning hyperparameters if a prior does not have finitely many features."""
 QUICK = LearningOptions(tolerance=1e-5, max_evaluations=150)
-"""Options of learning candidates: their scores differ by more than the last digits of a likelihood."""
+"""Learning options for candidates, with a loose tolerance since their scores differ clearly."""
 DROPPED = 2.0
-"""Standard errors behind the best after which a candidate is not tried on the second half."""
+"""Number of standard errors behind the best from which a candidate is not tried on the second half."""
 
 
 @dataclass(frozen=True)
 class Candidate:
-    """A set of priors, and whether the inertia is identified with it."""
+    """A set of priors, with or without identification of the inertia."""
 
     set: PriorSet
     inertia: bool = False
 
     @property
     def name(self) -> str:
-        """As in the table of the comparison."""
+        """Name in the table of the comparison."""
         return f"{self.set.name}, inertia identified" if self.inertia else self.set.name
 
 
 def candidates_of(spec: Specification) -> list[Candidate]:
-    """The candidates for a model, simplest first; with unknown forces on joints, those with noise of the
-    torque."""
+    """Return the candidates, simplest first; with unknown joint forces, only those with torque noise."""
     candidates = []
     sets = [each for each in SETS.values() if each.fits(spec.system)]
     for chosen in sets if not spec.noise.external else [each for each in sets if each.has_joint_friction]:
@@ -87,7 +86,7 @@ def candidates_of(spec: Specification) -> list[Candidate]:
 
 
 def without_comparison(spec: Specification, note: str) -> tuple[Specification, tuple[Compared, ...]]:
-    """The specification with the set for few samples, and a table with this choice."""
+    """Return the specification with the set for few samples, and a comparison table with this choice."""
     spec = spec.with_options(inertia=spec.options.inertia or "auto")
     return spec.with_set(FEW), (Compared(FEW.name, chosen=True, note=note),)
 
@@ -98,13 +97,13 @@ def with_priors(
     learn: Sequence[str] | None = None,
     progress: FitProgress | None = None,
 ) -> tuple[Specification, tuple[Compared, ...]]:
-    """The specification with automatically selected priors, and the comparison.
+    """Return the specification with automatically selected priors, and the comparison.
 
     Args:
         spec: the model, with the noise for these data.
         data: the log, or its rows in memory.
-        learn: learned parts, if not all.
-        progress: called after each candidate with the number of candidates so far, of all, and NaN.
+        learn: parts to learn, if not all.
+        progress: called after each candidate with the number of completed candidates, their total, and NaN.
     """
     if learn is not None:
         return without_comparison(spec, "not everything is learned")
@@ -137,8 +136,8 @@ class Trial:
 
     Attributes:
         candidate: the tested candidate.
-        scores: on each half, by block.
-        coverage: on each half, share of measured values within ±2σ.
+        scores: scores on each half, by block.
+        coverage: fraction of measured values within ±2σ on each half.
         begin: hyperparameters learned on the first half.
         inertia_found: whether an inertia other than that of the robot file was found.
         note: reason why the candidate was dropped.
@@ -152,7 +151,7 @@ class Trial:
     note: str = ""
 
     def row(self, best: Tensor, chosen: bool) -> Compared:
-        """The row of the table."""
+        """Return the row of the comparison table."""
         if not self.scores:
             return Compared(self.candidate.name, note=self.note)
         own = torch.cat(self.scores)
@@ -193,7 +192,7 @@ def _score(
 
 
 def _drop(trials: Sequence[Trial]) -> None:
-    """Leave out the candidates that are far behind the best."""
+    """Drop candidates far behind the best."""
     blocks = [(trial, torch.cat(trial.scores)) for trial in trials if not trial.note]
     best = max((own for _, own in blocks), key=lambda x: float(x.mean()), default=torch.empty(0))
     for trial, own in blocks:
@@ -203,7 +202,7 @@ def _drop(trials: Sequence[Trial]) -> None:
 
 
 def _result(spec: Specification, trials: Sequence[Trial]) -> tuple[Specification, tuple[Compared, ...]]:
-    """The specification with the chosen set, and the table."""
+    """Return the specification with the selected set, and the comparison table."""
     found = any(trial.inertia_found for trial in trials)
     # Without another inertia, a candidate with the question about it is the one without.
     shown = [t for t in trials if not t.candidate.inertia or spec.options.inertia == "auto" or found]
@@ -220,8 +219,8 @@ def _result(spec: Specification, trials: Sequence[Trial]) -> tuple[Specification
 
 
 def halves_of(q: Tensor, qd: Tensor, in_order: bool) -> Tensor:
-    """The half of each row `(n,)`: alternating stretches in time, or else along the direction in which the
-    states vary most.
+    """Return the half of each row `(n,)`: alternating stretches in time, or along the direction of largest
+    variation of the states.
     """
     n = len(q)
     rank = torch.arange(n, device=q.device)
@@ -237,11 +236,11 @@ def halves_of(q: Tensor, qd: Tensor, in_order: bool) -> Tensor:
 def trained(
     spec: Specification, inertia: Inertia, train: Training, begin: Mapping[str, Tensor] | None
 ) -> StructuredFit:
-    """A candidate, conditioned on `ROWS` rows of a half.
+    """Return a candidate conditioned on `ROWS` rows of a half.
 
     Args:
-        spec: with the priors of the candidate.
-        inertia: of the robot to learn with.
+        spec: specification with the priors of the candidate.
+        inertia: inertia of the robot to learn with.
     """
     spec, pinned = identified(spec, train) if inertia.identified else (spec, {})
     rows = scaled(train.evenly(ROWS), spec.system, spec.priors, {}, spec.options.standardize)
@@ -258,8 +257,8 @@ def trained(
 
 @torch.no_grad()
 def log_density(fit: StructuredFit, test: Training) -> tuple[Tensor, float]:
-    """log N(y_i; E z, Var z + Σ) of each sample `(n,)`: of accelerations, or else of all measured values; and
-    the share of these within ±2σ.
+    """Return log N(y_i; E z, Var z + Σ) of each sample `(n,)`, for accelerations or else all measured values,
+    and the fraction within ±2σ.
 
     Raises:
         NumericalError: a covariance is not positive definite.
@@ -280,11 +279,11 @@ def log_density(fit: StructuredFit, test: Training) -> tuple[Tensor, float]:
 
 
 def blocks_of(density: Tensor) -> Tensor:
-    """Means over contiguous blocks of rows `(BLOCKS,)`."""
+    """Return means over contiguous blocks of rows `(BLOCKS,)`."""
     return torch.stack([part.mean() for part in density.tensor_split(BLOCKS)])
 
 
 def difference(best: Tensor, own: Tensor) -> tuple[float, float]:
-    """Distance of a score from the best, and its standard error, from blocks `(k,)` of each."""
+    """Return the difference of a score to the best, with its standard error, from blocks `(k,)` of each."""
     behind = best - own
     return float(behind.mean()), float(behind.std() / math.sqrt(len(behind)))

@@ -1,8 +1,8 @@
-"""The force sensor of a log as a second measurement: the normal force λ beside the accelerations.
+"""The force sensor of a log as a measurement of the normal force λ in addition to accelerations.
 
-A model is fitted to both. At a state with a sensor reading, that reading is a further measurement of λ: λ̂ =
-(λ_m/w² + s/σ²) / (1/w² + 1/σ²), with the model's λ_m ± w, in which w contains the noise of the motor torque,
-and the sensor's s ± σ. Both errors are independent.
+A model is fitted to both. At a state with a sensor reading, the reading is an additional measurement of λ: λ̂
+= (λ_m/w² + s/σ²) / (1/w² + 1/σ²), with the model's λ_m ± w, in which w includes motor torque noise, and the
+sensor's s ± σ. The two errors are independent.
 """
 
 from __future__ import annotations
@@ -20,21 +20,21 @@ from forcegp.models.external_wrench import white_noise_std
 from forcegp.models.structured_fit import StructuredFit
 
 SENSOR = "F_sensor"
-"""Force on the robot at a contact, as `forcegp import` writes it [N]."""
+"""Name of the force on the robot at a contact [N], as written by `forcegp import`."""
 LEAST_FORCE = 1e-3
-"""Smallest noise of a sensed joint force, relative to its size."""
+"""Minimum noise of a sensed joint force, relative to its magnitude."""
 TINY = 1e-12
 """Smallest variance of a predicted force [N²]."""
 
 
 def with_sensor(data: Dataset, system: ConstrainedSystem, noise_std: float) -> list[Observation]:
-    """The accelerations of a log, and the normal force λ = n·F of its sensor while the contact is closed.
+    """Return the accelerations of a log, and the sensor's normal force λ = n·F while the contact is closed.
 
     Args:
         data: a log with `F_sensor`.
-        system: robot with a single contact with a surface.
-        noise_std: standard deviation of the normal force, of the sensor and of unmeasured forces, such as the
-            tool's inertial force [N].
+        system: robot with a single surface contact.
+        noise_std: standard deviation of the normal force due to the sensor and unmeasured forces, such as the
+            inertial force of the tool [N].
 
     Raises:
         ModelError: there is no sensor, no row in contact, or more than one contact.
@@ -55,19 +55,19 @@ def with_sensor(data: Dataset, system: ConstrainedSystem, noise_std: float) -> l
 
 @torch.no_grad()
 def with_sensed_forces(data: Dataset, system: ConstrainedSystem, force_std: float) -> list[Observation]:
-    """The joint forces from a force sensor and the accelerations together, Q̄ = M q̈ − J_Eᵀ F.
+    """Return joint forces computed from a force sensor and the accelerations, Q̄ = M q̈ − J_Eᵀ F.
 
-    Both contain the same errors of the torques, which two separate measurements would count twice. Learn from
-    them without the contact, `StructuredGP(ConstrainedSystem(system.robot), …)`: its force is measured. A
-    joint without a measured torque has an unknown force of the size of its Q̄ − Q_C − Q_G − Q_D.
+    Both contain the same torque errors, which two separate measurements would count twice. Fit these forces
+    without the contact, `StructuredGP(ConstrainedSystem(system.robot), …)`, since its force is measured. A
+    joint without a measured torque has an unknown force of the magnitude of Q̄ − Q_C − Q_G − Q_D.
 
     Args:
         data: a log with `F_sensor`; no force acts while the contact is open.
-        system: robot with a single contact with a surface.
-        force_std: standard deviation of each component of the sensed force [N].
+        system: robot with a single surface contact.
+        force_std: standard deviation of each force component [N].
 
     Raises:
-        ModelError: the log has no sensor's force, or the system another number of contacts.
+        ModelError: the log has no sensor force, or the system does not have exactly one contact.
     """
     contact = _contact(system)
     if not has_sensor(data, system):
@@ -92,7 +92,7 @@ def with_sensed_forces(data: Dataset, system: ConstrainedSystem, force_std: floa
 
 
 def _contact(system: ConstrainedSystem) -> SurfaceContact:
-    """The contact that a sensor measures."""
+    """Return the contact that a sensor measures."""
     contact = system.contacts[0] if len(system.contacts) == 1 else None
     if not isinstance(contact, SurfaceContact):
         raise ModelError(
@@ -104,12 +104,12 @@ def _contact(system: ConstrainedSystem) -> SurfaceContact:
 
 
 def has_sensor(data: Dataset, system: ConstrainedSystem) -> bool:
-    """Whether the log holds a sensor's force at the system's contact."""
+    """Return whether the log contains a sensor force at the system's contact."""
     return any(name in data.contact_extras.get(SENSOR, {}) for name in system.contact_names)
 
 
 def sensed_force(data: Dataset, system: ConstrainedSystem) -> Tensor:
-    """The normal force n·F of the sensor `(n,)` [N].
+    """Return the normal force n·F of the sensor `(n,)` [N].
 
     Raises:
         ModelError: the system has more than one contact, or none with a surface.
@@ -121,11 +121,11 @@ def sensed_force(data: Dataset, system: ConstrainedSystem) -> Tensor:
 
 
 def sensor_noise_std(data: Dataset, system: ConstrainedSystem) -> float:
-    """Standard deviation of the white noise of the sensor's normal force, from the log itself [N].
+    """Estimate the standard deviation of the white noise of the sensor's normal force from the log [N].
 
     Args:
-        data: a log in order of time, with `F_sensor`.
-        system: robot with a single contact with a surface.
+        data: a log in time order, with `F_sensor`.
+        system: robot with a single surface contact.
 
     Raises:
         ModelError: there are no five consecutive rows in contact.
@@ -142,14 +142,14 @@ def sensor_noise_std(data: Dataset, system: ConstrainedSystem) -> float:
 
 @torch.no_grad()
 def force_from_sensor(fit: StructuredFit, data: Dataset) -> tuple[Tensor, Tensor]:
-    """λ of the contact with the sensor's reading as a measurement, mean and standard deviation `(n,)` [N].
+    """Return mean and standard deviation `(n,)` [N] of λ, with the sensor reading as a measurement.
 
     Args:
-        fit: fitted to the accelerations and the sensor (`with_sensor`).
+        fit: model fitted to the accelerations and the sensor (`with_sensor`).
         data: states with `F_sensor`.
 
     Raises:
-        ModelError: the fit has no noise of the sensor, or the log has no sensor.
+        ModelError: the fit has no sensor noise, or the log has no sensor.
     """
     if "multiplier" not in fit.noise or not has_sensor(data, fit.system):
         raise ModelError(

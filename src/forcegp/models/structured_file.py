@@ -1,6 +1,6 @@
 """Structured Gaussian processes in saved files.
 
-An exact posterior keeps its data, a sparse one its sums over them. The options are those of
+An exact posterior is saved with its data, a sparse one with its sums over them. The options are those of
 `StructuredOptions`, and priors are written field by field.
 """
 
@@ -47,7 +47,7 @@ from forcegp.storage.options import StructuredOptions
 from forcegp.storage.system import robot_tensors, take_robot
 
 Stated = NonNegativeFloat | tuple[NonNegativeFloat, ...]
-"""A noise that may be zero, as one number or one per joint."""
+"""Noise that may be zero, as one number or one per joint."""
 CLASSES: dict[str, type] = {
     "squared_exponential": kernels.SquaredExponential,
     "matern32": kernels.Matern32,
@@ -69,16 +69,16 @@ CLASSES: dict[str, type] = {
     "contact": ContactForcePrior,
     "sliding_friction": SlidingFrictionPrior,
 }
-"""Classes that can be saved, by the name in the file."""
+"""Classes that can be saved, by their name in the file."""
 COLUMNS = ("q", "qd", "tau", "active", "values")
 """Saved parts of each measurement."""
 IN_TIME = ("segment", "t")
-"""Saved beside it if a prior depends on time or recording."""
+"""Additional saved parts if a prior depends on time or recording."""
 NOT_REAL = (
     (re.compile(r"data\.\d+\.active"), torch.bool),
     (re.compile(r"added|data\.\d+\.segment|sparse\..*\.(components|dropped)"), torch.int64),
 )
-"""Names of the tensors that are not of real numbers, with their type."""
+"""Names of the tensors that do not contain real numbers, with their type."""
 Parts = tuple[
     Specification, Problem, dict[str, Tensor], ForcePosterior, FitResult, ConstrainedSystem, dict[str, Tensor]
 ]
@@ -97,7 +97,7 @@ class NoiseSettings(Record):
 
 
 class StructuredSettings(StructuredOptions):
-    """Saved settings of a structured Gaussian process besides its tensors."""
+    """Saved settings of a structured Gaussian process."""
 
     mean: tuple[str, ...]
     noise: NoiseSettings
@@ -111,7 +111,7 @@ class StructuredSettings(StructuredOptions):
 
     @field_serializer("result")
     def _saved(self, result: FitResult) -> dict[str, Any]:
-        """All but the history, which is long, and the constant inputs, which the scales name."""
+        """Return the result without the long history and the constant inputs, which are in the scales."""
         left_out = ("history", "constant_inputs")
         return {name: x for name, x in dataclasses.asdict(result).items() if name not in left_out}
 
@@ -123,13 +123,13 @@ def pack(
     posterior: ForcePosterior,
     result: FitResult,
 ) -> tuple[StructuredSettings, dict[str, Tensor]]:
-    """A fit as settings and tensors.
+    """Convert a fit to settings and tensors.
 
     Args:
-        problem: the data of the posterior.
+        problem: problem with the data of the posterior.
 
     Raises:
-        ModelError: a prior or kernel is Python code.
+        ModelError: a prior or kernel is defined in Python.
     """
     own = spec.analytical_parameters if isinstance(spec.analytical_parameters, AnalyticalParameters) else None
     tensors = {f"hyper.{key}": value for key, value in _kept(hyperparameters, own).items()}
@@ -162,7 +162,7 @@ def pack(
 
 
 def _conditioned_on(spec: Specification, training: Training, posterior: ForcePosterior) -> dict[str, Tensor]:
-    """The data of an exact posterior, or the sums over them of a sparse one."""
+    """Return the data of an exact posterior, or the sums over them of a sparse one."""
     latent = posterior.latent
     if not isinstance(latent, ExactPosterior):
         return {f"sparse.{name}": value for name, value in latent.tensors().items()}
@@ -178,13 +178,13 @@ def _conditioned_on(spec: Specification, training: Training, posterior: ForcePos
 
 
 def _columns(spec: Specification) -> tuple[str, ...]:
-    """Saved parts of each measurement."""
+    """Return the saved parts of each measurement."""
     dated = any(prior.in_time or isinstance(prior, PerRecording) for prior in spec.priors)
     return COLUMNS + (IN_TIME if dated else ())
 
 
 def _kept(hyper: Mapping[str, Tensor], own: AnalyticalParameters | None) -> dict[str, Tensor]:
-    """The hyperparameters without θ_A of a module that cannot be saved, which the robot contains."""
+    """Return the hyperparameters without θ_A of a module that cannot be saved; the robot contains them."""
     left_out = analytical_parameters(hyper) if own is None else {}
     return {k: v for k, v in hyper.items() if k.removeprefix(f"{ANALYTICAL}.") not in left_out}
 
@@ -196,10 +196,10 @@ def _below(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
 def unpack(
     header: ModelHeader, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
 ) -> Parts:
-    """The fields of the fit, restored from `pack`.
+    """Restore the fields of a fit from `pack`.
 
     Raises:
-        ModelError: a tensor or setting is missing or not valid; names file and field.
+        ModelError: a tensor or setting is missing or invalid; the message names file and field.
     """
     settings = header.settings_as(StructuredSettings, source)
     spec = _specification(settings, tensors, system, source)
@@ -238,7 +238,7 @@ def _specification(
 
 
 def _check_types(tensors: Mapping[str, Tensor]) -> None:
-    """Raise `ValueError` where a tensor is not of real numbers, or contacts are not flags."""
+    """Raise `ValueError` if a tensor does not contain real numbers, or contacts are not flags."""
     for name, value in tensors.items():
         dtype = next((dtype for names, dtype in NOT_REAL if names.fullmatch(name)), None)
         if not value.is_floating_point() if dtype is None else value.dtype != dtype:
@@ -276,7 +276,7 @@ def _training(settings: StructuredSettings, spec: Specification, tensors: Mappin
 
 
 def _check_hyperparameters(spec: Specification, training: Training, hyper: Mapping[str, Tensor]) -> None:
-    """Raise `ValueError` or `KeyError` where hyperparameters are not those of the kernels."""
+    """Raise `ValueError` or `KeyError` if hyperparameters do not match the kernels."""
     for prior, scale in zip(spec.priors, training.scales, strict=True):
         widths = {name: x.shape[-1] for name, x in scale.mean.items()}
         expected = prior.kernel.initial(prior.outputs(spec.system.robot), widths)
@@ -295,7 +295,7 @@ def _restored(
     settings: StructuredSettings,
     system: ConstrainedSystem,
 ) -> Parts:
-    """The fit with its weights as they were; the factorisation waits until a covariance is asked for."""
+    """Restore the fit with its weights; factorisation is deferred until a covariance is needed."""
     correlation = tensors.get("torque_correlation")
     if correlation is None and settings.correlation_time > 0.0:  # older models have one for all joints
         correlation = torch.full_like(system.robot.mass, settings.correlation_time)
@@ -313,9 +313,9 @@ def _restored(
 
 
 def _in_order(problem: Problem, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The tensors with the inputs of each kernel in the order in which its prior names them.
+    """Return the tensors with the inputs of each kernel in the order defined by its prior.
 
-    A kernel that reads all inputs takes them in their order, which a file does not keep.
+    A kernel that reads all inputs uses their order, which files do not preserve.
     """
     system = problem.system
     rest = torch.zeros(1, system.robot.nq, dtype=system.robot.dtype, device=system.robot.device)
@@ -327,7 +327,7 @@ def _in_order(problem: Problem, tensors: Mapping[str, Tensor]) -> dict[str, Tens
 
 
 def _posterior(problem: Problem, hyper: dict[str, Tensor], tensors: Mapping[str, Tensor]) -> ForcePosterior:
-    """The posterior with its weights or sums as they were."""
+    """Restore the posterior with its weights or sums."""
     params, process = kernel_parameters(hyper), problem.process_at(hyper)
     if "alpha" not in tensors:
         kept = _in_order(problem, _below(tensors, "sparse."))

@@ -1,4 +1,4 @@
-"""A fitted structured Gaussian process: forces conditioned on data, which determine every quantity."""
+"""Fitted structured Gaussian processes: forces conditioned on data, which determine every quantity."""
 
 from __future__ import annotations
 
@@ -58,22 +58,22 @@ from forcegp.storage.model_file import ModelHeader
 
 KIND = "structured_gp"
 JOINED = 256
-"""Updates after which the digests of their samples become one tensor."""
+"""Number of updates after which the digests of their samples are joined."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class StructuredFit(FittedModel):
-    """Priors on forces conditioned on data, with learned hyperparameters.
+    """Force priors conditioned on data, with learned hyperparameters.
 
     Attributes:
-        specification: of the fit.
-        problem: the training data with the robot, priors and noise that explain them.
+        specification: specification of the model.
+        problem: training data with robot, priors and noise.
         hyperparameters: all learned tensors, by name.
-        posterior: over latent forces.
-        result: course of the fit.
+        posterior: posterior over latent forces.
+        result: result of the fit.
         system: robot and contacts, with learned parameters.
-        noise: standard deviation of a measurement of each measured quantity, `(d,)`.
-        added: digests of the samples of a sparse posterior, which `forget` can remove.
+        noise: standard deviation of a measurement for each measured quantity, `(d,)`.
+        added: digests of samples of a sparse posterior that `forget` can remove.
     """
 
     specification: Specification
@@ -105,7 +105,7 @@ class StructuredFit(FittedModel):
 
     @property
     def force_priors(self) -> tuple[ForcePrior, ...]:
-        """Priors on the unknown forces, including those selected by the data."""
+        """Priors on the unknown forces, including those selected on the data."""
         return self.posterior.priors
 
     def at(self, flat: FlatStates, query: Query) -> Answer:
@@ -129,7 +129,7 @@ class StructuredFit(FittedModel):
     def _read(
         self, system: ConstrainedSystem, at: States, z: AffineMap, parts: Mapping[str, slice], noise: bool
     ) -> tuple[Tensor, Tensor]:
-        """Mean and covariance of quantities, unknown forces and, if asked for, noise included."""
+        """Return mean and covariance of quantities, including unknown forces and, if requested, noise."""
         mean, spread = self.posterior.read(system, at, z)
         z = self.posterior.process.coupled(system, at, z)
         spread = spread + _carried(z, unknown_variance(self.hyperparameters, at, self.problem.external_std))
@@ -144,30 +144,31 @@ class StructuredFit(FittedModel):
         external: Mapping[str, float] | None = None,
         **components: Any,
     ) -> ExternalWrench:
-        """Wrench of the environment on a frame, beyond the learned forces and the closed contacts.
+        """Estimate the wrench of the environment on a frame, beyond the learned forces and the closed
+        contacts.
 
-        M q̈ = Q̄ + Aᵀλ + Jᵀ w (`forces/external_wrench.py`). With `method="acceleration"` each sample is
-        estimated separately by generalized least squares. With `method="momentum"` a causal Kalman filter
-        runs over each trajectory and needs no accelerations. In logs in order of time, the learned forces
+        M q̈ = Q̄ + Aᵀλ + Jᵀ w (`forces/external_wrench.py`). With `method="acceleration"`, each sample is
+        estimated separately by generalized least squares. With `method="momentum"`, a causal Kalman filter
+        runs over each trajectory and needs no accelerations. For logs in time order, the learned forces
         include friction with memory.
 
         Args:
-            data: a log; for the momentum filter in order of time.
+            data: a log, in time order for the momentum filter.
             frame: frame of the robot.
             method: `"acceleration"` or `"momentum"`.
-            external: standard deviation of unknown forces on joints, absent in the training log, such as a
-                pushing hand, by name [N m, N].
+            external: standard deviation of unknown joint forces that are absent from the training log, such
+                as a pushing hand, by joint name [N m, N].
             **components: `reference` (`"world"` or `"local"` axes), `axes` (some of `fx`, `fy`, `fz`, `mx`,
-                `my`, `mz`; the others are zero), `point`, `prior_std` and `change` of `WrenchFrame`.
+                `my`, `mz`; the others are zero), `point`, `prior_std` and `change` for `WrenchFrame`.
 
         Returns:
             Mean `(n, k)` and covariance `(n, k, k)` [N, N m], with `detect` for contacts.
 
         Raises:
-            UnknownNameError: no such frame, reference, component or method.
+            UnknownNameError: the frame, reference, component or method does not exist.
             ParameterError: a number is out of range.
-            DataError: the log does not fit the robot, or is not in order of time.
-            ModelError: the fit lacks the noise of the torques, which the momentum filter needs.
+            DataError: the log does not match the robot, or is not in time order.
+            ModelError: the fit has no torque noise, which the momentum filter needs.
 
         Example:
             `wrench = fit.external_wrench(log, "tool", axes=("fx", "fy", "fz"), method="momentum")`
@@ -190,63 +191,65 @@ class StructuredFit(FittedModel):
     def export(
         self, path: str | Path, *, language: str = "c", name: str = "controller", functions: int | None = None
     ) -> Export:
-        """Write the fit as C99 code that needs only libm, with a test program, or its mean as a CasADi
+        """Export the fit as C99 code that needs only libm, with a test program, or its mean as a CasADi
         function.
 
-        The code maps (q, q̇, τ, closed contacts) to mean and covariance of every quantity, and to Jacobians of
-        the mean. The CasADi function is the mean, with exact derivatives of any order.
+        The code maps (q, q̇, τ, closed contacts) to mean and covariance of every quantity, and to Jacobians
+        of the mean. The CasADi function returns the mean, with exact derivatives of any order.
 
         Args:
             path: folder to create.
             language: `"c"` or `"casadi"`.
-            name: of the files, and prefix of all names in them.
-            functions: number r of functions of a reduced covariance; `None` for all.
+            name: name of the files, and prefix of all names in them.
+            functions: number r of basis functions for a reduced covariance; `None` for all.
 
         Returns:
             The folder, and the growth of error bars by a reduced covariance at training states.
 
         Raises:
-            ModelError: a prior, kernel or contact has no C form, or the posterior is too large; names it.
-            UnknownNameError, ParameterError: no such language, or a name that is no C identifier.
-            DestinationError: the folder cannot be written, or holds other files.
+            ModelError: a prior, kernel or contact cannot be exported to C, or the posterior is too large.
+            UnknownNameError, ParameterError: the language does not exist, or the name is not a C identifier.
+            DestinationError: the folder cannot be written, or contains other files.
             MissingDependencyError: CasADi is not installed.
         """
         return write_export(self._exported(functions), self, self.training, path, language, name)
 
     def compiled(self, *, functions: int | None = None) -> CompiledFit:
-        """The fit as a fast predictor in C, compiled once by the machine's compiler.
+        """Compile the fit to a fast predictor in C with the local compiler.
 
         Args:
-            functions: number r of functions of a reduced covariance, which can only widen; `None` for all.
+            functions: number r of basis functions for a reduced covariance, which can only be wider; `None`
+                for all.
 
         Raises:
-            ModelError: a prior, kernel or contact has no C form, or the posterior is too large.
+            ModelError: a prior, kernel or contact cannot be exported to C, or the posterior is too large.
             MissingDependencyError: there is no C++ compiler.
         """
         return CompiledFit(self._exported(functions))
 
     def beyond(self, qd: Tensor, tau: Tensor) -> Tensor | None:
-        """Distance of the speed and torque of each joint beyond those of the training data, in training
-        standard deviations `(*batch, nq)`; `None` if no torque noise was learned."""
+        """Return the distance of the speed and torque of each joint beyond the training data, in training
+        standard deviations `(*batch, nq)`; `None` if no torque noise was learned.
+        """
         return distance_beyond(self.hyperparameters, qd, tau) if LOW in self.hyperparameters else None
 
     def force_field(self) -> ForceField:
-        """Posterior mean of Q̄ = Q + Q_z, `(n, nq)` at states."""
+        """Return the posterior mean of Q̄ = Q + Q_z, `(n, nq)` at states."""
         return self.posterior
 
     def force_samples(self, samples: int, generator: torch.Generator) -> ForceField:
-        """Force functions drawn from the posterior."""
+        """Return a force field of functions drawn from the posterior."""
         return draw_samples(self.posterior, samples, generator)
 
     def compiled_motion(self, system: ConstrainedSystem, force: ForceField) -> CompiledMotion | None:
-        """The motion under the posterior mean, or under function samples of it, by C code."""
+        """Return C code for the motion under the posterior mean or function samples."""
         model = dataclasses.replace(self._exported(None), system=system, functions=0)
         return compiled_motion(model, force, self.specified)
 
     def condition(
         self, data: Dataset | Sequence[Observation], hyperparameters: Mapping[str, Tensor] | None = None
     ) -> StructuredFit:
-        """Condition on other data instead, with the same hyperparameters and input scales.
+        """Condition on other data, with the same hyperparameters and input scales.
 
         Args:
             data: data to condition on.
@@ -273,11 +276,11 @@ class StructuredFit(FittedModel):
     def update(self, data: Dataset | Sequence[Observation]) -> StructuredFit:
         """Add samples, for example in a control loop.
 
-        With sparse inference the cost does not depend on the number of previous samples; with exact inference
-        it grows with their square. Hyperparameters, input scales and inducing points do not change.
+        With sparse inference, the cost does not depend on the number of previous samples; with exact
+        inference, it grows quadratically. Hyperparameters, input scales and inducing points do not change.
 
         Args:
-            data: further measurements of the same quantities.
+            data: additional measurements of the same quantities.
 
         Raises:
             ModelError: the data contain other quantities.
@@ -306,13 +309,13 @@ class StructuredFit(FittedModel):
         return dataclasses.replace(updated, problem=whole)
 
     def _with_slopes(self, measurements: Training) -> Training:
-        """Other measurements, with the slopes of the learned forces where the fit has them."""
+        """Return other measurements with the slopes of the learned forces, if the fit has them."""
         if self.training.slopes is None:
             return measurements
         return learned_slopes(measurements, self.system, self.posterior)
 
     def _problem_of(self, measurements: Training) -> Problem:
-        """The problem with other measurements and the learned robot, whose mechanics are compiled."""
+        """Return the problem with other measurements and the learned robot with compiled mechanics."""
         system = compiled_system(self.system)
         problem = dataclasses.replace(self.problem, training=measurements, system=system, parameters=None)
         return problem.with_coulomb_errors(self.hyperparameters)[0]
@@ -324,14 +327,14 @@ class StructuredFit(FittedModel):
 
         Args:
             what: a factor between 0 and 1 that multiplies the weight of all samples so far, such as
-                exp(−Δt/T) for a memory of T seconds; or samples of the fit to remove.
-            priors: forget the forces of these priors only, such as a payload: they drift towards their prior,
-                and the factor is the correlation with the previous forces.
+                exp(−Δt/T) for a memory of T seconds, or samples of the fit to remove.
+            priors: names of priors, such as a payload, to which forgetting is limited: their forces drift
+                towards the prior, with the factor as correlation with the previous forces.
 
         Raises:
             ModelError: inference is exact, the factor is out of range, or samples to remove were never added,
-                are partly forgotten, or belong to a log that was read piece by piece.
-            UnknownNameError: no such prior.
+                are partly forgotten, or belong to a streamed log.
+            UnknownNameError: a prior does not exist.
         """
         latent = self.posterior.latent
         if not isinstance(latent, SparsePosterior):
@@ -359,7 +362,7 @@ class StructuredFit(FittedModel):
     def _with(
         self, latent: ExactPosterior | SparsePosterior, added: tuple[Tensor, ...] = ()
     ) -> StructuredFit:
-        """The fit with another posterior of the latent processes, which can forget the samples `added`."""
+        """Return the fit with another posterior, which can forget the samples `added`."""
         posterior = dataclasses.replace(self.posterior, latent=latent)
         return dataclasses.replace(self, posterior=posterior, added=added)
 
@@ -379,7 +382,7 @@ class StructuredFit(FittedModel):
 
     @property
     def torque_std(self) -> Tensor | None:
-        """Standard deviation of the predicted noise of the motor torque, `(nq,)`, or `None` for none."""
+        """Standard deviation of the motor torque noise `(nq,)`, or `None` without noise."""
         learned = self.hyperparameters.get(TORQUE_NOISE)
         if self.problem.torque_std is not None:
             return self.problem.torque_std
@@ -387,15 +390,14 @@ class StructuredFit(FittedModel):
 
     @property
     def specified(self) -> ConstrainedSystem:
-        """The system before the fit, with the robot of the file."""
+        """System before the fit, with the robot from the file."""
         return self.specification.system
 
     @property
     def disturbance(self) -> Disturbance | None:
-        """s √T of torque noise with standard deviation s that is correlated for a time T, and unknown forces
-        of stated size.
+        """Torque noise as s √T (standard deviation s, correlation time T), and unknown forces of given size.
 
-        Over times longer than T the noise acts like white noise with this root of a spectral density.
+        Over times longer than T, the noise acts like white noise with this root of a spectral density.
         """
         none, density = torch.zeros_like(self.system.robot.mass[:1]).expand(self.system.robot.nq), None
         if self.torque_std is not None and self.problem.correlation is not None:
@@ -406,7 +408,7 @@ class StructuredFit(FittedModel):
         return Disturbance(none if density is None else density, none if external is None else external)
 
     def _noise_covariance(self, z: AffineMap, parts: Mapping[str, slice]) -> Tensor:
-        """B Σ_τ Bᵀ + Σ_q̈ of a measurement of the quantities, `(n, d, d)`."""
+        """Return the noise covariance B Σ_τ Bᵀ + Σ_q̈ of measured quantities, `(n, d, d)`."""
         noise = z.o.new_zeros(*z.o.shape, z.o.shape[-1])
         if self.torque_std is not None:
             noise = noise + _carried(z, self.torque_std**2)
@@ -428,14 +430,14 @@ class StructuredFit(FittedModel):
         *,
         sensor: bool = True,
     ) -> Tensor:
-        """Additional variance of a measurement of a quantity, `(*batch, d)`.
+        """Return the additional variance of a measurement of a quantity, `(*batch, d)`.
 
         Args:
             q, qd, tau: `(*batch, nq)` states.
             quantity: the measured quantity; torque noise affects every quantity, and sensor noise is known
-                for quantities used for training.
+                for quantities used in training.
             active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
-            sensor: whether to include the noise of the quantity's own sensor.
+            sensor: whether to include sensor noise.
         """
 
         def read(flat: FlatStates) -> tuple[Tensor | None, ...]:
@@ -450,10 +452,10 @@ class StructuredFit(FittedModel):
 
 
 def _without(added: tuple[Tensor, ...], removed: Tensor) -> tuple[Tensor, ...]:
-    """Digests of samples without some of them.
+    """Return the digests of samples without some of them.
 
     Raises:
-        ModelError: one to remove is not among them.
+        ModelError: a sample to remove is not among them.
     """
     values, counts = torch.cat([*added, removed]).unique(return_counts=True)
     _, own = torch.cat([values, removed]).unique(return_counts=True)
@@ -467,7 +469,7 @@ def _without(added: tuple[Tensor, ...], removed: Tensor) -> tuple[Tensor, ...]:
 
 
 def _carried(z: AffineMap, variance: Tensor) -> Tensor:
-    """B Σ Bᵀ of white noise on the joint force, `(n, d, d)`."""
+    """Return B Σ Bᵀ of white noise on the joint force, `(n, d, d)`."""
     return (z.B_Q * variance[..., None, :]) @ z.B_Q.mT
 
 
@@ -484,7 +486,7 @@ def conditioned(
     """Condition forces on the data of a problem at given hyperparameters.
 
     Args:
-        learned_on: number of samples used to learn them.
+        learned_on: number of samples used for learning.
         forces: result of conditioning, if the data of the problem are only a part of the log.
 
     Raises:

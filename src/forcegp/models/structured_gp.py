@@ -1,8 +1,8 @@
-"""Gaussian-process priors on forces, carried to accelerations and multipliers by the known mechanics.
+"""Gaussian-process priors on forces, mapped to accelerations and multipliers by known mechanics.
 
 q̈ ~ GP(L b + H m_Q, H k_Q Hᵀ) (eq. 15), and likewise for every other quantity (eqs. 19 to 25). `fit` learns
-(`structured_learning.solve`) and conditions (`structured_fit.conditioned`); the posterior covariance of
-equation 10 is made of `gram` in `gp/likelihood.py`.
+(`structured_learning.solve`) and conditions (`structured_fit.conditioned`); the covariance in equation 10 is
+computed by `gram` in `gp/likelihood.py`.
 """
 
 from __future__ import annotations
@@ -32,33 +32,33 @@ from forcegp.models.structured_stream import Pass, Sample, sample_of
 from forcegp.storage.options import StructuredOptions
 
 FIT_COPIES = 3.0
-"""Memory of a fit besides the matrices of its inference, in that of the equations of motion."""
+"""Memory of a fit besides its inference matrices, in units of that of the equations of motion."""
 
 
 class StructuredGP(Model[StructuredFit]):
-    """A structured Gaussian process (S-GP): priors on the unknown forces of a constrained system.
+    """A structured Gaussian process (S-GP) with priors on the unknown forces of a constrained system.
 
     Args:
         system: robot and contacts.
-        mean: `"analytical"`, `"zero"`, or an `AnalyticalMean` with some terms left out.
-        force_priors: priors on the unknown forces; the name of a set of `SETS` (`"sliding"`, `"friction"`,
-            `"friction+residual"`); or `"auto"`. With `"auto"` and the analytical mean, the set is chosen on
+        mean: `"analytical"`, `"zero"`, or an `AnalyticalMean` with some of its terms.
+        force_priors: priors on the unknown forces, the name of a set in `SETS` (`"sliding"`, `"friction"`,
+            `"friction+residual"`), or `"auto"`. With `"auto"` and the analytical mean, the set is selected on
             held-out stretches of the training log (`models/selection.py`); `fit.result.comparison` contains
-            the scores. Logs of fewer than 100 samples, and fits with `learn=`, get `"friction"`. If the mean
-            lacks the motor torque, `"auto"` means `default_priors`: a `JointForcePrior`, and in contact its
-            `NormalForcePrior`, which only affects multipliers.
+            the scores. Logs of fewer than 100 samples, and fits with `learn=`, use `"friction"`. If the mean
+            does not include the motor torque, `"auto"` means `default_priors`: a `JointForcePrior` and, in
+            contact, its `NormalForcePrior`, which only affects multipliers.
         noise: standard deviation of measured accelerations [rad/s², m/s²], one or one per joint, or a
-            `Noise`, which includes the noise of torques and states; by default the value stated in the log,
-            else 0.1.
-        analytical_parameters: a module with a `forward()` that returns the robot with learned analytical
-            parameters θ_A; `None` keeps the robot unchanged.
+            `Noise`, which includes the noise of torques and states; by default the value in the log, or 0.1.
+        analytical_parameters: a module with a `forward()` method that returns the robot with learned
+            analytical parameters θ_A; `None` keeps the robot unchanged.
         inference: `"exact"`, `"sparse"` or `"auto"`.
         inducing_points: maximum number of inducing points per prior; fewer are used if they suffice, and the
             result of the fit reports if more would help.
         inertia: `"file"` keeps the inertia of the robot; `"auto"` identifies links and drives if held-out
-            stretches of the log favour it (`forces/inertia.py`), which needs a `JointFrictionPrior` and a
-            mean with the motor torque. `None` is `"auto"` for automatically chosen priors, else `"file"`.
-        standardize: whether to standardize the inputs of kernels; the paper does not.
+            stretches of the log favour it (`forces/inertia.py`), which requires a `JointFrictionPrior` and a
+            mean with the motor torque. `None` is `"auto"` for automatically selected priors, and otherwise
+            `"file"`.
+        standardize: whether to standardize kernel inputs, which the paper does not.
 
     Example:
         >>> import forcegp, torch
@@ -72,7 +72,7 @@ class StructuredGP(Model[StructuredFit]):
         torch.Size([20, 2])
 
     Raises:
-        ModelError, UnknownNameError: the priors do not fit the system, or the robot is not float64.
+        ModelError, UnknownNameError: the priors do not match the system, or the robot is not float64.
     """
 
     kind = KIND
@@ -127,28 +127,29 @@ class StructuredGP(Model[StructuredFit]):
         progress: FitProgress | None = None,
         checkpoint: str | Path | None = None,
     ) -> StructuredFit:
-        """Learn hyperparameters (and analytical parameters) by maximum a posteriori, then condition.
+        """Learn hyperparameters (and analytical parameters) by maximum a posteriori, then condition on the
+        data.
 
         Args:
-            data: measured accelerations, any mixture of measurements, or a log that is read piece by piece,
-                in memory that does not grow with its length.
-            learn: parts to learn: names of priors, `"noise"`, `"analytical_parameters"`. All others keep the
-                values (and input scales) of the fit `after`, or else the initial ones. Default all; an empty
+            data: measured accelerations, any mixture of measurements, or a streamed log, which needs a
+                constant amount of memory.
+            learn: parts to learn: names of priors, `"noise"`, `"analytical_parameters"`. Other parts keep the
+                values (and input scales) of the fit `after`, or the initial values. By default all; an empty
                 list only conditions.
             after: an earlier fit of this model, for example to other or fewer data. It provides the values of
-                parts that are not learned, and without `learn` the start of learning.
-            options: optimiser and its limits; L-BFGS by default, to a tolerance of 1e-9 where θ_A is learned.
-            progress: called after each evaluation; for a streamed log also after each piece, with the samples
-                so far, the number of all, and NaN.
-            checkpoint: file that records the evaluations of a long fit, and beside it the sums over a
-                streamed log; a fit that finds it resumes there, with the same result to the bit. Remove it
-                once the fitted model is saved.
+                parts that are not learned and, without `learn`, the initial values.
+            options: optimiser and its limits; by default L-BFGS, with a tolerance of 1e-9 if θ_A is learned.
+            progress: called after each evaluation; for a streamed log also after each piece, with the number
+                of samples so far, their total, and NaN.
+            checkpoint: file that records the evaluations of a long fit, with a second file for the sums over
+                a streamed log. With existing files, the fit resumes and produces a bit-identical result.
+                Remove them once the fitted model is saved.
 
         Returns:
-            The fitted model. Fitting twice gives the same bits.
+            The fitted model. Repeated fits are bit-identical.
 
         Raises:
-            ModelError, DataError, UnknownNameError: data, earlier fit, or checkpoint do not fit the model.
+            ModelError, DataError, UnknownNameError: data, earlier fit, or checkpoint do not match the model.
             NumericalError: the likelihood cannot be computed.
         """
         spec = self.specification if after is None else self._continued(after)
@@ -184,7 +185,7 @@ class StructuredGP(Model[StructuredFit]):
         return dataclasses.replace(fit, result=result)
 
     def _without_effect(self, fit: StructuredFit) -> Iterator[str]:
-        """Options that were given and had no effect on a fit."""
+        """Yield the given options that had no effect on a fit."""
         points = [x for Z in fit.problem.inducing or () for x in Z.values()]
         if self._params["inducing_points"] != LIMIT and not any(map(len, points)):
             how = "exact inference" if fit.problem.inducing is None else "priors of finite features"
@@ -195,10 +196,10 @@ class StructuredGP(Model[StructuredFit]):
             yield f'inertia="auto" has no effect: the model lacks {lacks}'
 
     def _continued(self, after: StructuredFit) -> Specification:
-        """This model with the priors of an earlier fit, which those that were left to its data belong to.
+        """Return this model with the priors of an earlier fit, including automatically selected ones.
 
         Raises:
-            ModelError: the fit is of a model with other priors or contacts.
+            ModelError: the fit belongs to a model with other priors or contacts.
         """
         spec = self.specification
         own = () if self.specification.automatic else tuple(prior.name for prior in self.force_priors)

@@ -1,11 +1,11 @@
-"""Parts of a structured Gaussian process, and the steps of learning it.
+"""Parts of a structured Gaussian process, and the steps of learning.
 
-1. Samples at rest only bound the friction, and impacts break the equations of motion;
-   measured robots learn from motion without impacts.
-2. Hyperparameters are learned on a part of a long log, or on all of a short one.
+1. Samples at rest only bound the friction, and impacts violate the equations of motion, so measured robots
+   learn from motion without impacts.
+2. Hyperparameters are learned from a part of a long log, or from all of a short one.
 3. Residuals that are correlated in time temper the likelihood, unless a `DisturbancePrior` explains them;
    they also determine slopes and weights (`forces/noise_learning.py`), and hyperparameters are learned again.
-4. Inertial parameters move to their posterior mean: one Gauss–Newton step, physically consistent.
+4. Inertial parameters move to their posterior mean in one physically consistent Gauss–Newton step.
 5. Torque noise is increased to that on held-out stretches of the training log, and its growth beyond the
 trained speeds and torques is learned from held-out regimes; dry friction with memory is learned from the
 residuals of logs in order of time. 6. The posterior is conditioned on all samples.
@@ -56,20 +56,20 @@ from forcegp.storage.options import StructuredOptions
 from forcegp.storage.system import pack_system
 
 OPTIONS, WITH_PARAMETERS = LearningOptions(), LearningOptions(tolerance=1e-9)
-"""Default options, also where θ_A is learned too: L-BFGS then stalls on its way for a step or two."""
+"""Default options, and those for learning θ_A, in which L-BFGS stalls for a step or two."""
 LEARN_SAMPLES = 800
-"""Samples that hyperparameters are learned on where priors are finite features."""
+"""Number of samples for learning hyperparameters if priors have finitely many features."""
 LEARN_SAMPLES_INDUCING = 400
-"""Samples that hyperparameters are learned on, exactly, where a longer log is conditioned on sparsely."""
+"""Number of samples for exact learning of hyperparameters if a longer log needs sparse inference."""
 REST_SPEED = 0.01
-"""A sample is at rest where no joint moves faster [rad/s, m/s]."""
+"""Largest joint speed of a sample at rest [rad/s, m/s]."""
 FEWEST_MOVING = 20
-"""With fewer samples in motion, samples at rest are kept."""
+"""Number of samples in motion below which samples at rest are kept."""
 FIRST_POWER = 0.25
-"""Power of the likelihood before the correlation of its residuals is known."""
+"""Power of the likelihood before the correlation of the residuals is known."""
 
 ROUNDS = 3
-"""Times that hyperparameters are learned again with what the residuals determine."""
+"""Number of times that hyperparameters are relearned after updates from the residuals."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,11 +79,11 @@ class Specification:
     Attributes:
         system: robot and contacts.
         mean: prior mean of Q.
-        priors: on the unknown forces.
-        noise: of measured accelerations, torques and states.
+        priors: priors on the unknown forces.
+        noise: noise of measured accelerations, torques and states.
         analytical_parameters: module with a `forward()` that returns the robot at θ_A, or `None`.
-        automatic: whether the data choose the priors among `SETS`.
-        options: plain values.
+        automatic: whether the priors are selected from `SETS` on the data.
+        options: options with plain values.
     """
 
     system: ConstrainedSystem
@@ -95,10 +95,10 @@ class Specification:
     options: StructuredOptions = field(default_factory=StructuredOptions)
 
     def for_data(self, data: Dataset | Sequence[Observation]) -> Specification:
-        """The specification with the noise resolved for given data.
+        """Return the specification with the noise resolved for given data.
 
-        Unless it is stated, the noise of accelerations is learned together with that of the torque, or to
-        compare sets of priors. Joints without a measured torque have an unknown force.
+        Unless it is given, acceleration noise is learned together with torque noise, or to compare sets of
+        priors. Joints without a measured torque have an unknown force.
         """
         observations, noise = observations_of(data), self.noise
         learns = noise.learns_torque or self.automatic
@@ -110,18 +110,18 @@ class Specification:
         return dataclasses.replace(self, noise=noise)
 
     def with_options(self, **changed: Any) -> Specification:
-        """The specification with other options."""
+        """Return the specification with other options."""
         return dataclasses.replace(self, options=self.options.model_copy(update=changed))
 
     def with_set(self, chosen: PriorSet) -> Specification:
-        """The specification with a set of priors and its torque noise."""
+        """Return the specification with a set of priors and its torque noise."""
         priors, noise = chosen.priors(self.system), self.noise
         if isinstance(noise.torque, str) and noise.torque == "auto":
             noise = noise.for_priors(priors)
         return dataclasses.replace(self, priors=priors, noise=noise, automatic=False)
 
     def inertia_of(self, training: Training) -> Inertia:
-        """The robot identified from the training samples, if requested."""
+        """Return the robot identified from the training samples, if requested."""
         friction = next((prior for prior in self.priors if isinstance(prior, JointFrictionPrior)), None)
         asks = (
             self.options.inertia == "auto"
@@ -137,11 +137,11 @@ class Specification:
     def problem(
         self, training: Training, robot: RobotModel | None = None, pinned: Mapping[str, Tensor] | None = None
     ) -> Problem:
-        """The learning problem of training data.
+        """Return the learning problem of training data.
 
         Args:
-            robot: to learn with, if it is another one than that of the file.
-            pinned: values of forces that it contains, by prior.
+            robot: robot used for learning, if different from that of the file.
+            pinned: values of forces that this robot contains, by prior.
         """
         system = self.system if robot in (None, self.system.robot) else self.system.with_robot(robot)
         noise, robot, std = self.noise, self.system.robot, None
@@ -161,7 +161,7 @@ class Specification:
 
 
 def _unchecked_masses(training: Training) -> tuple[str, ...]:
-    """The warning for a log in contact with neither free motion nor a measured force."""
+    """Return a warning for a log in contact without free motion or a measured force."""
     closed = sum(int(m.active.any(-1).sum()) for m in training.measurements)
     if not closed or set(training.quantities) != {"qdd"}:
         return ()
@@ -173,21 +173,21 @@ def _unchecked_masses(training: Training) -> tuple[str, ...]:
 
 
 def constant_inputs(problem: Problem) -> tuple[str, ...]:
-    """Inputs of priors that do not vary in the training data."""
+    """Return the inputs of priors that do not vary in the training data."""
     pairs = zip(problem.priors, problem.training.scales, strict=True)
     return tuple(f"{prior.name}.{name}" for prior, scale in pairs for name in scale.constant)
 
 
 @dataclass(frozen=True)
 class Lesson:
-    """Result of learning, and the problem that the posterior is conditioned on.
+    """Result of learning, and the problem for conditioning the posterior.
 
     Attributes:
         problem: all samples, the updated robot, and the noise.
-        hyperparameters: learned and fixed.
-        learned: course of the optimisation.
+        hyperparameters: learned and fixed hyperparameters.
+        learned: result of the optimisation.
         learned_on: number of samples used for learning.
-        warnings: doubts.
+        warnings: doubts about the result.
     """
 
     problem: Problem
@@ -204,14 +204,14 @@ def problem_for(
     chosen: Sequence[str] | None,
     part_of: int = 0,
 ) -> tuple[Specification, Problem, tuple[str, ...]]:
-    """The learning problem of a fit to data, after the problem of an earlier fit or as the first.
+    """Return the learning problem of a first fit to data, or of one after an earlier fit.
 
     Args:
-        part_of: number of samples that are conditioned on, if the data are a part of them.
+        part_of: number of samples to condition on, if the data are only a part of them.
 
     Returns:
-        The model, to which a first fit that identifies the robot adds a prior on errors that remain; the
-        problem; and doubts about the samples and the robot.
+        The model, with a prior on remaining errors if a first fit identifies the robot; the problem; and
+        doubts about the samples and the robot.
     """
     training, doubts = training_for(spec, before, data, chosen)
     robot, pinned = spec.system.robot, dict[str, Tensor]()
@@ -227,7 +227,7 @@ def problem_for(
 
 
 def identified(spec: Specification, training: Training) -> tuple[Specification, dict[str, Tensor]]:
-    """The model of a robot with identified inertia: errors of links and drives remain, with mean zero."""
+    """Return the model of a robot with identified inertia and zero-mean remaining errors."""
     robot = spec.system.robot
     q = torch.cat([m.q for m in training.evenly(VOLUME_STATES).measurements])
     size = mass_matrix(robot, q).diagonal(dim1=-2, dim2=-1).mean(0)
@@ -243,10 +243,10 @@ def training_for(
     learned: Sequence[str] | None,
     fewest: int = FEWEST_MOVING,
 ) -> tuple[Training, tuple[str, ...]]:
-    """Training data, with doubts about them.
+    """Return the training data, with doubts about them.
 
-    Priors that are not learned (`None`: all are) keep the scales of their inputs. If fewer than `fewest`
-    samples are in motion, those at rest are kept.
+    Priors that are not learned (`None`: all are) keep the scales of their inputs. Samples at rest are kept if
+    fewer than `fewest` samples are in motion.
     """
     kept = {}
     if before is not None and learned is not None:
@@ -259,10 +259,10 @@ def training_for(
 
 
 def check_learned(spec: Specification, learn: Iterable[str]) -> None:
-    """Check the names of learned parts, the prefixes of their tensors.
+    """Check the names of learned parts, which are prefixes of their tensors.
 
     Raises:
-        UnknownNameError: a name is neither a prior nor another learnable part.
+        UnknownNameError: a name is not a prior or another learnable part.
     """
     names = (*(prior.name for prior in spec.priors), NOISE, ANALYTICAL, COULOMB)
     for name in learn:
@@ -276,9 +276,9 @@ def search_of(
     chosen: Sequence[str] | None,
     options: LearningOptions | None,
 ) -> Search:
-    """Learned parts of a problem, their start, and parts with a known value.
+    """Return the learned parts of a problem, their initial values, and parts with a known value.
 
-    The scale of a force that the robot contains is not learned.
+    The scale of a force contained in the robot is not learned.
     """
     options = options or (OPTIONS if spec.analytical_parameters is None else WITH_PARAMETERS)
     start = initial(problem, spec.noise.learn, spec.noise.learns_torque)
@@ -298,7 +298,7 @@ def search_of(
 def in_motion(
     system: ConstrainedSystem, training: Training, fewest: int = FEWEST_MOVING
 ) -> tuple[Training, tuple[str, ...]]:
-    """The samples in motion, without impacts, and doubts about them."""
+    """Return the samples in motion, without impacts, and doubts about them."""
     moving = training.moving(REST_SPEED)
     if moving.samples < fewest:
         return training, (
@@ -313,7 +313,7 @@ def in_motion(
 
 
 def subset(spec: Specification, problem: Problem) -> Problem:
-    """The problem on the samples that hyperparameters are learned on."""
+    """Return the problem restricted to the samples for learning hyperparameters."""
     training = problem.training
     if not is_sparse(spec.options.inference, problem.priors, training.all_samples):
         return problem
@@ -338,10 +338,10 @@ def learned(
     """Learn the free parts of a search, and record the evaluations.
 
     Args:
-        file: record of the evaluations, from which learning resumes with the same result to the bit.
+        file: record of the evaluations, from which learning resumes with a bit-identical result.
 
     Raises:
-        ModelError: the file belongs to other learning.
+        ModelError: the file belongs to another fit.
     """
     if not search.start:
         return Lesson(prepared(spec, problem, search.held), search.held)
@@ -359,7 +359,7 @@ def learned(
 
 
 def _with_memory(lesson: Lesson, neighbours: Training | None) -> Lesson:
-    """The lesson with friction with memory, where the log has free motion."""
+    """Add friction with memory to the result, if the log has free motion."""
     training = neighbours or lesson.problem.training
     if training.free_motions < LEAST:
         return lesson
@@ -368,7 +368,7 @@ def _with_memory(lesson: Lesson, neighbours: Training | None) -> Lesson:
 
 
 def identity(problem: Problem) -> tuple[object, ...]:
-    """The mean, priors, data, noise and system of a problem, for the keys of checkpoints."""
+    """Return the mean, priors, data, noise and system of a problem, for the keys of checkpoints."""
     training, (record, robot) = problem.training, pack_system(problem.system)
     data = (value for m in training.measurements for value in m.tensors)
     priors = [(type(prior).__name__, prior) for prior in problem.priors]
@@ -378,7 +378,7 @@ def identity(problem: Problem) -> tuple[object, ...]:
 def _key(
     spec: Specification, problem: Problem, search: Search, begin: Mapping[str, Tensor] | None
 ) -> tuple[object, ...]:
-    """Identifies the learning of some tensors of a problem, with these options."""
+    """Return an identifier for learning some tensors of a problem with these options."""
     named = [pair for group in (search.start, search.held, begin or {}) for pair in group.items()]
     sides = [side for scale in problem.training.scales for side in (scale.mean, scale.std)]
     stated = problem.state_std, problem.torque_std, problem.external_std
@@ -400,11 +400,11 @@ def solve(
 ) -> Lesson:
     """Learn the free parts of a search, then prepare the problem for conditioning.
 
-    The residuals determine the power of the likelihood, slopes that carry noise of the state, and weights of
-    the samples; each time these change, hyperparameters are learned again, `ROUNDS` times at most.
+    The residuals determine the power of the likelihood, slopes that propagate state noise, and weights of the
+    samples. Whenever these change, hyperparameters are relearned, at most `ROUNDS` times.
 
     Args:
-        neighbours: samples at the rate of the log, if those of the problem are only a part of it.
+        neighbours: samples at the rate of the log, if the problem contains only a part of it.
     """
     part = subset(spec, problem)
     if part.inducing is None:
@@ -448,10 +448,10 @@ def solve(
 
 
 def _at_the_rate_of_the_log(part: Problem, values: Mapping[str, Tensor], training: Training) -> Problem:
-    """The problem with the correlation of its residuals among all samples.
+    """Return the problem with the correlation of its residuals among all samples.
 
-    Neighbours in the whole log are closer in time than in the part that was learned on. Of a log that is read
-    piece by piece, a few contiguous stretches are looked at.
+    Neighbours in the whole log are closer in time than in the part used for learning. For a streamed log, a
+    few contiguous stretches are used.
     """
     power, correlation = residual_times(part, values, training)
     if part.training.measurements is training.measurements:
@@ -461,7 +461,7 @@ def _at_the_rate_of_the_log(part: Problem, values: Mapping[str, Tensor], trainin
 
 
 def prepared(spec: Specification, problem: Problem, values: Mapping[str, Tensor]) -> Problem:
-    """The problem with the inference for its samples, and their weights under heavy-tailed noise."""
+    """Return the problem with its inference and sample weights for heavy-tailed noise."""
     if is_sparse(spec.options.inference, problem.priors, problem.training.all_samples):
         # Sums over samples have the slopes of the robot file.
         problem = dataclasses.replace(problem, training=dataclasses.replace(problem.training, slopes=None))

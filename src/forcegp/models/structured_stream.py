@@ -1,6 +1,6 @@
-"""Fitting a structured Gaussian process to a log that is read piece by piece.
+"""Fitting of a structured Gaussian process to a streamed log.
 
-A first pass draws a sample, which determines input scales, hyperparameters and inducing points; a second one
+A first pass draws a sample, which determines input scales, hyperparameters and inducing points; a second pass
 computes the sums over all samples.
 """
 
@@ -32,17 +32,17 @@ from forcegp.models.structured_learning import FEWEST_MOVING, REST_SPEED, Specif
 from forcegp.storage.checkpoint import Checkpoint, beside
 
 SAMPLE_ROWS = 20_000
-"""Rows, evenly spaced over the log, that are learned from; fewer than twice as many are held."""
+"""Number of evenly spaced rows for learning; fewer than twice as many are in memory."""
 
 
 @dataclass(frozen=True)
 class Sample:
-    """Part of a log kept by one pass; all of a log in memory.
+    """Part of a streamed log kept by one pass, or all of a log in memory.
 
     Attributes:
-        data: the samples: evenly spaced ones of a log that is read piece by piece.
-        count: number of samples to condition on, of which these may be a part; 0 if these are all.
-        log: a log that is read piece by piece.
+        data: the samples, evenly spaced for a streamed log.
+        count: total number of samples to condition on; 0 if these are all.
+        log: streamed log, if any.
         stretches: a few contiguous stretches of it, used for the correlation time of residuals.
         moving: whether samples at rest are ignored.
     """
@@ -54,13 +54,13 @@ class Sample:
     moving: bool = False
 
     def neighbours(self, spec: Specification, training: Training) -> Training | None:
-        """Contiguous stretches of the log as training data.
+        """Return the contiguous stretches of the log as training data.
 
         Args:
             training: the sample, with the input scales to keep.
 
         Returns:
-            `None` if the sample is the whole log, or the model does not need it.
+            The training data, or `None` if the sample is the whole log or the model does not need them.
         """
         if self.stretches is None or not spec.noise.learns_torque or len(self.data) == self.count:
             return None
@@ -70,12 +70,11 @@ class Sample:
 
 @torch.no_grad()
 def sample_of(spec: Specification, data: StreamedDataset) -> Sample:
-    """Training sample: evenly spaced samples of a log, in motion if the model requires it.
+    """Return the training sample: evenly spaced samples of a log, in motion if the model requires it.
 
     Raises:
-        DataError: a file is damaged, or holds no samples.
-        ModelError: processes read different logs, or exact inference on more samples than are
-            read at once.
+        DataError: a file is damaged or contains no samples.
+        ModelError: processes read different logs, or exact inference is requested for a streamed log.
     """
     if data.distributed:
         require_agreement("the log", data.digest, len(data), hint="give each the same files")
@@ -89,14 +88,14 @@ def sample_of(spec: Specification, data: StreamedDataset) -> Sample:
 
 
 def _rows_of(log: StreamedDataset, keep: Keep | None) -> tuple[Dataset, Dataset, int]:
-    """Evenly spaced rows that count, contiguous stretches of them, and the number of all of them."""
+    """Return evenly spaced relevant rows, contiguous stretches of them, and their total number."""
     stretches: list[Dataset] = []
     rows, count = spaced_sample(_with_stretches(log, stretches, keep), SAMPLE_ROWS, keep)
     return rows, Dataset.concatenate(stretches), count
 
 
 def _with_stretches(stream: StreamedDataset, parts: list[Dataset], keep: Keep | None) -> Iterator[Dataset]:
-    """The pieces of a log; the first rows of some of them are appended to `parts`."""
+    """Yield the pieces of a log, appending the first rows of some pieces to `parts`."""
     last, length = stream.piece_count - 1, MOST_RESIDUALS // STRETCHES
     wanted = {round(last * i / (STRETCHES - 1)) for i in range(STRETCHES)}
     for number, piece in enumerate(stream.pieces()):
@@ -106,7 +105,7 @@ def _with_stretches(stream: StreamedDataset, parts: list[Dataset], keep: Keep | 
 
 
 def _check_inference(spec: Specification, count: int, held: int) -> None:
-    """Raise `ModelError` where exact inference is needed on more samples than are held at once."""
+    """Raise `ModelError` if exact inference is needed for more samples than are in memory."""
     if spec.noise.degrees_of_freedom is not None and count > held:
         raise ModelError(
             "noise with heavy tails weighs every sample, also of a log that is read piece by piece",
@@ -124,25 +123,25 @@ def _check_inference(spec: Specification, count: int, held: int) -> None:
 
 
 def kept_scales(priors: Sequence[ForcePrior], training: Training) -> dict[str, Standardization]:
-    """The input scales of training data by prior."""
+    """Return the input scales of training data by prior."""
     return {prior.name: scale for prior, scale in zip(priors, training.scales, strict=True)}
 
 
 def moving_rows(data: Dataset) -> Tensor:
-    """Rows in which a joint moves."""
+    """Return the rows in which a joint moves."""
     return (data.qd.abs().amax(-1) > REST_SPEED).nonzero()[:, 0]
 
 
 @dataclass(frozen=True)
 class Pass:
-    """A pass over a streamed log, in one or several processes, that can be resumed.
+    """A resumable pass over a streamed log in one or several processes.
 
     Attributes:
         spec: the model.
         log: the log.
-        sample: used for learning.
+        sample: sample used for learning.
         checkpoint: file that records the sums, or `None`.
-        progress: called with the samples so far, the number of all, and NaN.
+        progress: called with the number of samples so far, their total, and NaN.
     """
 
     spec: Specification
@@ -155,7 +154,7 @@ class Pass:
     def forces(
         self, problem: Problem, hyperparameters: Mapping[str, Tensor]
     ) -> tuple[ForcePosterior, Tensor]:
-        """Forces conditioned on the whole log, and the part of the likelihood independent of them.
+        """Return the forces conditioned on the whole log, and the part of the likelihood independent of them.
 
         Raises:
             ModelError: the checkpoint belongs to another fit.
@@ -197,7 +196,7 @@ class Pass:
         return posterior_of(problem, hyperparameters, basis, total), total.constant
 
     def _pieces(self, problem: Problem, start: int) -> Iterator[Training]:
-        """The samples of this process, a piece at a time; a piece of another process has none."""
+        """Yield the samples of this process by piece; pieces of other processes are empty."""
         rank, processes = (dist.get_rank(), dist.get_world_size()) if self.log.distributed else (0, 1)
         kept = kept_scales(problem.priors, problem.training)
         for piece in self.log.pieces(start, (rank, processes)):
@@ -214,7 +213,7 @@ class Pass:
         return path.with_name(f"{path.name}.{dist.get_rank()}") if self.log.distributed else path
 
     def _key(self, problem: Problem, hyperparameters: Mapping[str, Tensor]) -> str:
-        """Identifies the sums over a log, with a basis, a system and a noise."""
+        """Return an identifier for the sums over a log with a basis, a system and noise."""
         files = [(path.name, path.stat().st_size) for path in self.log.files]
         points = [x for Z in problem.inducing or () for x in Z.values()]
         named = [part for pair in sorted(hyperparameters.items()) for part in pair]
@@ -224,7 +223,7 @@ class Pass:
 
 
 def _tensors(basis: LatentBasis, total: Totals) -> dict[str, Tensor]:
-    """Results of a pass so far, by name."""
+    """Return the results of a pass so far, by name."""
     tensors = {f"basis.{name}": value for name, value in basis.tensors().items()}
     tensors |= {f"sums.{i}": value for i, value in enumerate(total.sums.tensors)}
     counts = {"constant": total.constant, "samples": total.samples, "pieces": torch.tensor(total.pieces)}
@@ -232,7 +231,7 @@ def _tensors(basis: LatentBasis, total: Totals) -> dict[str, Tensor]:
 
 
 def _restored(basis: LatentBasis, tensors: Mapping[str, Tensor]) -> tuple[LatentBasis, Totals]:
-    """The basis and totals that `_tensors` was given; kernel inputs are in the order of the prior."""
+    """Restore basis and totals from `_tensors`, with kernel inputs in the order of the prior."""
     own = LatentBasis.of_tensors(basis.processes, basis.params, sub(tensors, "basis"))
     sums = Sums(*(tensors[f"sums.{i}"] for i in range(len(fields(Sums)))))
     return own, Totals(sums, tensors["constant"], tensors["samples"], int(tensors["pieces"]))

@@ -1,4 +1,4 @@
-"""HTML pages and their plots; other programs can build their own pages from the names exported here."""
+"""HTML pages and their plots, with functions for building custom pages."""
 
 from forcegp.report.check import write_check
 from forcegp.report.page import (

@@ -1,4 +1,4 @@
-"""The arm in motion: an animation in a page, drawn by the page's own script."""
+"""Animations of the arm, drawn by a script in the page."""
 
 from __future__ import annotations
 
@@ -20,14 +20,14 @@ FRAMES_PER_SECOND = 20
 
 
 def animation(content: Mapping[str, object], label: str) -> Markup:
-    """A canvas with a slider, a play button and a checkbox for each arm.
+    """Return a canvas with a slider, a play button and a checkbox for each arm.
 
     Args:
-        content: input of `templates/animation.js`: `times` of the frames [s]; `bodies`, points of an arm;
+        content: input for `templates/animation.js`: `times` of the frames [s]; `bodies`, points of an arm;
             `films`, arms with `label`, `colour`, `dash` and flat `points` (frames, bodies, 3) [m].
             Optional: convex `solids` with `colour`, `opacity`, flat `points` [m] and `link`, their column in
             `poses` (frames, links, 12); `paths` with `colour`, `width` and `points`;
-            `forces` with `start`, `tip` and `bar` in each frame; `texts` of each frame.
+            `forces` with `start`, `tip` and `bar` in each frame; `texts` for each frame.
         label: text alternative of the canvas.
     """
     # "</" would end the script element, even inside a string.
@@ -42,7 +42,7 @@ def animation(content: Mapping[str, object], label: str) -> Markup:
 
 
 def animation_source() -> str:
-    """Hash of the animation's script for a content security policy."""
+    """Return the hash of the animation script for a content security policy."""
     digest = hashlib.sha256(_script().encode()).digest()
     return "sha256-" + base64.b64encode(digest).decode()
 
@@ -52,7 +52,7 @@ def _script() -> str:
 
 
 def arm_points(robot: RobotModel, q: Tensor, frame: str, point: Sequence[float]) -> Tensor:
-    """Base, link origins on the way to the tip, and the tip: `(frames, points, 3)` in the world [m]."""
+    """Return base, link origins along the chain, and tip in the world, `(frames, points, 3)` [m]."""
     poses = kinematics.link_poses(robot, q)
     joint = robot.frame_parents[robot.frame_index(frame)]
     chain: list[int] = []
@@ -66,5 +66,5 @@ def arm_points(robot: RobotModel, q: Tensor, frame: str, point: Sequence[float])
 
 
 def rounded(points: Tensor) -> list[float]:
-    """Points as flat coordinates, to 10 µm [m]."""
+    """Return points as flat coordinates [m], rounded to 10 µm."""
     return [round(x, 5) for x in points.detach().flatten().tolist()]

@@ -1,4 +1,4 @@
-"""The page of a checked log: the verdict, and each finding with a picture of its columns and rows."""
+"""Page of a checked log: the verdict, and each finding with a plot of its columns and rows."""
 
 from __future__ import annotations
 
@@ -22,26 +22,26 @@ from forcegp.rows import describe
 
 COLOURS = {"error": "#a1121f", "warning": "#d08c00", "note": "#0072b2"}
 POINTS = 1500
-"""Points of a curve: more are indistinguishable on a page."""
+"""Maximum number of points in a curve; more are indistinguishable on a page."""
 CONTEXT = 3.0
-"""Rows shown, in lengths of the interval."""
+"""Number of rows shown, relative to the length of the interval."""
 LEAST_ROWS = 200
 JOINTS, FEW = 7, 3
-"""Joints shown of a finding that names them, and of one that names none."""
+"""Number of joints shown for a finding that names joints, and for one that does not."""
 SIZE = (12.0, 1.35)
-"""Width of a picture and height of a panel [inch]."""
+"""Width of a plot and height of a panel [inch]."""
 
 Paint = Callable[[Axes, Log, slice, int], None]
 
 
 def _axis(log: Log) -> tuple[Array, str]:
-    """Time from the first row [s] where it runs forward, else row numbers, and the label of the axis."""
+    """Return the time from the first row [s], or row numbers if it is not monotonic, and the axis label."""
     runs = bool(log.header.ordered and np.isfinite(log.t).all() and (np.diff(log.t) >= 0.0).all())
     return (log.t - log.t[0], "time [s]") if runs and len(log) else (np.arange(float(len(log))), "row")
 
 
 def draw_overview(report: Report, log: Log) -> Picture:
-    """Draw a lane per finding, with its intervals of time."""
+    """Draw a lane for each finding with its time intervals."""
     x, name = _axis(log)
 
     def paint(figure: Figure) -> None:
@@ -61,7 +61,7 @@ def draw_overview(report: Report, log: Log) -> Picture:
 
 
 def picture_of(finding: Finding, system: ConstrainedSystem, log: Log) -> Picture | None:
-    """Picture of a finding, by its family; none for findings of an import."""
+    """Return the plot of a finding, by its family; `None` for findings of an import."""
     rows, family = _window(finding, log), KINDS[finding.kind].family
     if family == "import":
         return None
@@ -91,14 +91,14 @@ def picture_of(finding: Finding, system: ConstrainedSystem, log: Log) -> Picture
 
 
 def _window(finding: Finding, log: Log) -> slice:
-    """The first interval with some context, or the whole log."""
+    """Return the first interval with some context, or the whole log."""
     start, stop = finding.intervals[0] if finding.intervals else (0, len(log))
     margin = max(LEAST_ROWS, round(CONTEXT * (stop - start))) // 2
     return slice(max(start - margin, 0), min(stop + margin, len(log)))
 
 
 def _largest(log: Log) -> list[int]:
-    """The joints with the largest torques."""
+    """Return the joints with the largest torques."""
     size = np.nan_to_num(np.nanmean(log.tau**2, axis=0))
     return sorted(np.argsort(-size)[:FEW].tolist())
 
@@ -112,7 +112,7 @@ def _panels(
     paint: Paint,
     quantity: str,
 ) -> Picture:
-    """One panel per joint, with the rows of the finding shaded."""
+    """Return one panel per joint, with the rows of the finding shaded."""
 
     def fill(figure: Figure) -> None:
         panels = figure.subplots(len(joints), 1, sharex=True, squeeze=False)[:, 0]
@@ -142,7 +142,7 @@ def _shade(axes: Axes, finding: Finding, rows: slice, log: Log) -> None:
 
 
 def _line(axes: Axes, log: Log, rows: slice, y: Array, colour: str = INK, name: str | None = None) -> None:
-    """A curve over time, thinned to what can be seen by the extremes of each bin."""
+    """Draw a curve over time, thinned to the extremes of each bin."""
     x = _axis(log)[0][rows]
     if len(y) > POINTS:
         width = -(-len(y) // (POINTS // 2))
@@ -168,7 +168,7 @@ def _acceleration(axes: Axes, log: Log, rows: slice, j: int) -> None:
 
 
 def _rates(value: str, rate: str) -> Paint:
-    """A logged rate beside the rate of change of its value."""
+    """Return panels with a logged rate and the rate of change of its value."""
 
     def rates(axes: Axes, log: Log, rows: slice, j: int) -> None:
         with np.errstate(all="ignore"):
@@ -181,7 +181,7 @@ def _rates(value: str, rate: str) -> Paint:
 
 
 def _torque(system: ConstrainedSystem, log: Log, rows: slice) -> Paint:
-    """Logged torque beside the one that the robot file needs for the motion."""
+    """Return panels with the logged torque and the torque computed from the robot file."""
     q, qd, qdd = (torch.from_numpy(np.ascontiguousarray(x[rows])) for x in (log.q, log.qd, log.qdd))
     robot = system.robot.to("cpu", torch.float64)
     with torch.no_grad():
@@ -196,7 +196,7 @@ def _torque(system: ConstrainedSystem, log: Log, rows: slice) -> Paint:
 
 
 def _contact(finding: Finding, system: ConstrainedSystem, log: Log, rows: slice) -> Picture:
-    """Distance of the tip from the surface, with the label."""
+    """Return a panel with the distance of the tip from the surface and the contact label."""
     contact = system.contact(finding.contact or "")
     c = tip_path(system, contact, log).c if isinstance(contact, SurfaceContact) else np.full(len(log), np.nan)
 
@@ -216,7 +216,7 @@ def _contact(finding: Finding, system: ConstrainedSystem, log: Log, rows: slice)
 
 
 def write_check(path: Path, title: str, report: Report, system: ConstrainedSystem, log: Log) -> Path:
-    """Write the page of a checked log with a title as one self-contained HTML file."""
+    """Write the page of a checked log as a self-contained HTML file with a title."""
     log, everything = of_robot(log, system.robot), ((0, report.samples),)
     sections = [
         {

@@ -1,4 +1,4 @@
-"""The page of one evaluated model: verdict, errors by joint, calibration, and predictions over time."""
+"""Page of an evaluated model: verdict, errors by joint, calibration, and predictions over time."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ def write_evaluation(
     window: WindowData,
     comparison: Sequence[Compared] = (),
 ) -> Path:
-    """Write the page on one model, with its plots and their data, and return its path.
+    """Write the page of a model, with its plots and their data, and return its path.
 
-    `model`, `data` and `fitted_to` are file names for the page; without the last, the trivial predictors were
-    fitted to halves of the data. `comparison` contains the compared sets of force priors.
+    `model`, `data` and `fitted_to` are file names shown on the page; without the last, the trivial predictors
+    were fitted to halves of the data. `comparison` contains the compared sets of force priors.
     """
     drawn = {"Predictions": draw_predictions(window), "Errors": draw_errors(window)}
     pictures = [dataclasses.replace(picture, title=title) for title, picture in drawn.items()]
@@ -87,7 +87,7 @@ def _blocks(window: WindowData, pictures: list[Picture], force: Picture | None) 
 
 
 def draw_calibration(evaluation: Evaluation) -> Picture:
-    """Draw the coverage over the nominal probability."""
+    """Plot the coverage over the nominal probability."""
     shares = evaluation.uncertainty.calibration if evaluation.uncertainty else {}
     levels = {float(level): share for level, share in shares.items()}
 
@@ -105,7 +105,7 @@ def draw_calibration(evaluation: Evaluation) -> Picture:
 
 
 def error_tables(evaluation: Evaluation) -> tuple[Table, ...]:
-    """Torque and acceleration errors by joint beside trivial predictors; worse values are red."""
+    """Return the torque and acceleration errors by joint with trivial predictors; worse values are red."""
     units = {"torque": "[N m, N]", "acceleration": "[rad/s², m/s²]"}
     tables = []
     for unit, names in units.items() if evaluation.predictors else ():
@@ -125,7 +125,7 @@ def error_tables(evaluation: Evaluation) -> tuple[Table, ...]:
 
 
 def uncertainty_tables(evaluation: Evaluation) -> tuple[Table, ...]:
-    """Coverage by joint, density of the model and of trivial predictors, and λ compared with its sensor."""
+    """Return coverage by joint, densities of model and trivial predictors, and λ against the sensor."""
     tables = []
     if evaluation.uncertainty is not None:
         shares = zip(evaluation.joint_names, evaluation.uncertainty.coverage_by_joint, strict=True)
@@ -149,7 +149,7 @@ def uncertainty_tables(evaluation: Evaluation) -> tuple[Table, ...]:
 
 
 def score_table(evaluation: Evaluation) -> Table:
-    """The scores over all joints, with units."""
+    """Return the scores over all joints, with units."""
     scores = evaluation.summary()
     rows = tuple(
         (name, cell(scores[key])) for key, name in NAMES["scores"].items() if scores[key] is not None
@@ -158,7 +158,7 @@ def score_table(evaluation: Evaluation) -> Table:
 
 
 def comparison_tables(comparison: Sequence[Compared]) -> tuple[Table, ...]:
-    """The compared sets of force priors; none if the priors were named."""
+    """Return the compared sets of force priors; none if the priors were given."""
     rows = tuple(
         tuple(cell(x, 3) for x in (each.name, each.log_density, each.behind, each.standard_error, note))
         for each in comparison

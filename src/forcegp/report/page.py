@@ -1,4 +1,4 @@
-"""Style of plots: colours, names and sizes; pages as single HTML files, with plots as SVG text and tables."""
+"""Style of plots (colours, names and sizes), and pages as single HTML files with SVG plots and tables."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ STYLE = TEMPLATES / "forcegp.mplstyle"
 """Fonts, sizes and lines of plots."""
 NAMES = tomllib.loads((TEMPLATES / "names.toml").read_text(encoding="utf-8"))
 COLOURS, DASHES, KINDS, LABELS = (NAMES[table] for table in ("colours", "dashes", "kinds", "labels"))
-"""Looks of models, what kinds of saved models are called, and what models are called in plots and tables."""
+"""Line colours and dashes of models, and labels of saved model kinds and of models."""
 OTHER = "#0072b2"
-"""Colour of a model without one of its own; not black, as measurements are."""
+"""Colour of other models; not black, which is used for measurements."""
 INK = "#222222"
 AXES = ("#0072b2", "#d55e00", "#007a5e")
 """Colours of the Cartesian axes x, y, z."""
@@ -32,7 +32,7 @@ AXES = ("#0072b2", "#d55e00", "#007a5e")
 
 @dataclass(frozen=True)
 class Picture:
-    """A drawn plot as the text of an SVG file; `alt` is its text alternative."""
+    """A plot as SVG text; `alt` is its text alternative."""
 
     svg: str
     alt: str
@@ -45,22 +45,22 @@ class Picture:
 
 
 def label(model: str) -> str:
-    """The display name of a model."""
+    """Return the display name of a model."""
     return LABELS.get(model) or KINDS.get(model, model)
 
 
 def colour(model: str) -> str:
-    """The colour of a model."""
+    """Return the colour of a model."""
     return COLOURS.get(model, COLOURS["nn"] if model.startswith("nn") else OTHER)
 
 
 def line(model: str) -> str | tuple[float, tuple[float, ...]]:
-    """The line style of a model, for curves of several models in one panel."""
+    """Return the line style of a model, for curves of several models in one panel."""
     return (0.0, DASHES[model]) if model in DASHES else "-"
 
 
 def draw(paint: Callable[[Figure], None], size: tuple[float, float], alt: str, title: str = "") -> Picture:
-    """Draw a plot of a size [inch] as SVG in the style of this project, without changing global settings."""
+    """Draw a plot of given size [inch] as SVG in the project style, without changing global settings."""
     buffer = io.StringIO()
     with matplotlib.rc_context({"svg.hashsalt": "forcegp"}, fname=STYLE):
         figure = Figure(figsize=size)
@@ -71,21 +71,21 @@ def draw(paint: Callable[[Figure], None], size: tuple[float, float], alt: str, t
 
 Series = list[float]
 DIGITS = 7
-"""Significant digits kept in series that are only drawn."""
+"""Significant digits in series that are only plotted."""
 
 
 def series(values: Tensor) -> Series:
-    """A tensor `(n,)` as numbers for a file, rounded to the resolution of a plot."""
+    """Convert a tensor `(n,)` to numbers rounded to the resolution of a plot."""
     return [float(f"{value:.{DIGITS}g}") for value in values.detach().cpu().tolist()]
 
 
 def columns(values: Tensor) -> list[Series]:
-    """A tensor `(n, d)` as d series."""
+    """Convert a tensor `(n, d)` to d series."""
     return [series(column) for column in values.unbind(-1)]
 
 
 def as_tensor(values: Series | list[Series]) -> Tensor:
-    """Series `(n,)` or `(d, n)` as a tensor."""
+    """Convert series `(n,)` or `(d, n)` to a tensor."""
     return torch.tensor(values, dtype=torch.float64)
 
 
@@ -94,7 +94,7 @@ NONE = "–"
 
 @dataclass(frozen=True)
 class Table:
-    """A table as text; the first column names the rows, `bad` contains `(row, column)` of red cells."""
+    """A table as text; the first column names the rows, and `bad` lists `(row, column)` of red cells."""
 
     caption: str
     head: tuple[str, ...]
@@ -103,14 +103,14 @@ class Table:
 
 
 def cell(value: object, digits: int = 4) -> str:
-    """One value as text: floats with significant digits, a dash for a missing value."""
+    """Format a value as text: floats with significant digits, a dash for a missing value."""
     return NONE if value is None else text(value, digits)
 
 
 @dataclass(frozen=True)
 class PictureBlock:
-    """Pictures under one heading and caption, with the width of the page if `wide`; `source` is the file with
-    their data.
+    """Plots with a common heading and caption, across the page if `wide`; `source` is the file with their
+    data.
     """
 
     heading: str
@@ -121,7 +121,7 @@ class PictureBlock:
 
 
 def render(template: str, package: str = "forcegp.report", **values: object) -> str:
-    """Render a template under `templates/` of the package, or of this one; a missing value is an error."""
+    """Render a template from `templates/` of the package or of this one; a missing value is an error."""
     packages = dict.fromkeys((package, "forcegp.report"))
     environment = jinja2.Environment(
         loader=jinja2.ChoiceLoader([jinja2.PackageLoader(name) for name in packages]),

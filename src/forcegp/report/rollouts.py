@@ -1,4 +1,4 @@
-"""Predicted trajectories beside the logged one: their data, plots, table and animation."""
+"""Predicted trajectories compared with the logged one: data, plots, table and animation."""
 
 from __future__ import annotations
 
@@ -41,21 +41,21 @@ class Band(Record):
 
 
 class ModelPath(Record):
-    """The first predicted trajectory of one model, up to its divergence.
+    """First predicted trajectory of a model, up to its divergence.
 
     Attributes:
-        model: name.
+        model: name of the model.
         tip: x, y and z of the tip [m].
-        tip_bands: of x, y and z over samples; empty without samples.
+        tip_bands: bands of x, y and z over samples; empty without samples.
         tip_error: distance from the logged tip, median over the starts [m].
         drift: constraint error c(q) [m]; empty without contacts.
         multiplier: λ [N]; empty for models without forces.
-        multiplier_band: over samples.
-        lost: probability that contact was lost by each time, over samples; empty without samples.
+        multiplier_band: band of λ over samples.
+        lost: fraction of samples that have lost contact by each time; empty without samples.
         errors: tip error after each horizon, median over the starts [m]; `None` if over half diverged.
-        coverage: share of logged tip coordinates within the band; `None` without samples.
+        coverage: fraction of logged tip coordinates within the band; `None` without samples.
         inflation: factor on the band, calibrated on another motion; `None` without one.
-        calibrated_coverage: coverage of the band scaled by that factor.
+        calibrated_coverage: coverage of the band scaled by this factor.
         worst_drift: largest constraint error of mean and samples over all starts [m].
         diverged_at: time of the first divergence [s].
     """
@@ -77,23 +77,23 @@ class ModelPath(Record):
 
 
 class Film(Record):
-    """Points of an arm for an animation: frames × points × 3, flat [m]; `label` names the model."""
+    """Points of an arm for an animation, frames × points × 3, flattened [m]; `label` names the model."""
 
     label: str
     points: Series
 
 
 class RolloutData(Header):
-    """Trajectories predicted in open loop beside the logged one.
+    """Open-loop trajectories compared with the logged one.
 
     Attributes:
         t: time since the start [s].
         tip, multiplier: logged x, y, z of the tip [m]; λ of the first contact [N], empty if not logged.
-        starts: number of starts of the medians.
+        starts: number of starts for the medians.
         band_starts, band_seconds, level: starts, duration and nominal coverage of the bands.
         horizons: times of `ModelPath.errors` [s].
-        models: one per model.
-        frame_times, bodies, films: animation times [s], points of the arm, and arms, the logged one first.
+        models: trajectories by model.
+        frame_times, bodies, films: animation times [s], points of the arm, and arms (the logged one first).
     """
 
     FORMAT: ClassVar[str] = "forcegp-rollout"
@@ -115,8 +115,8 @@ class RolloutData(Header):
 
 
 def rollout_data(comparison: Comparison, calibration: Comparison | None = None) -> RolloutData:
-    """The data of the section, with curves of the first start; `calibration` on another motion scales the
-    bands.
+    """Return the data of the section, with curves from the first start; `calibration` on another motion
+    scales the bands.
     """
     horizons = [h for h in HORIZONS if h <= float(comparison.t[-1]) * (1.0 + 1e-9)]
     stride = max(1, round(1.0 / (FRAMES_PER_SECOND * float(comparison.t[1] - comparison.t[0]))))
@@ -177,7 +177,7 @@ def _model_path(
 
 
 def _bands(rolled, values: Tensor, n: int) -> list[Band]:
-    """Bands `(S, T, d)` of each component over the first n times, as far as any sample goes."""
+    """Return bands of each component of samples `(S, T, d)` over the first n times, up to divergence."""
     band = rolled.bands(values[:, :n], LEVEL)
     last = _sound(band.lower)
     pairs = zip(band.lower[:last].T, band.upper[:last].T, strict=True)
@@ -185,12 +185,12 @@ def _bands(rolled, values: Tensor, n: int) -> list[Band]:
 
 
 def _sound(q: Tensor) -> int:
-    """Number of leading times `(T, nq)` hold a finite state."""
+    """Return the number of leading times with a finite state `(T, nq)`."""
     return int(torch.isfinite(q).all(-1).sum())
 
 
 def _animation(data: RolloutData) -> Markup:
-    """The logged arm and the predicted ones in motion."""
+    """Return an animation of the logged and predicted arms."""
     films = [
         {
             "label": film.label if film.label == "logged" else label(film.label),
@@ -209,7 +209,7 @@ PAGE, DATA = "rollout.html", "rollout.json"
 
 
 def draw_tip(data: RolloutData) -> Picture:
-    """Draw the position of the tip by axis, logged and predicted, for the duration of the bands."""
+    """Plot the position of the tip by axis, logged and predicted, for the duration of the bands."""
 
     def paint(figure: Figure) -> None:
         for axis, axes in enumerate(figure.subplots(3, 1, sharex=True)):
@@ -231,7 +231,7 @@ def draw_tip(data: RolloutData) -> Picture:
 def _draw_logarithmic(
     data: RolloutData, curves: list[tuple[ModelPath, Series]], least: float, name: str, alt: str, title: str
 ) -> Picture:
-    """Magnitudes on a logarithmic scale; the first, at the logged start, is zero and left out."""
+    """Plot magnitudes on a logarithmic scale, without the first one, which is zero."""
 
     def paint(figure: Figure) -> None:
         axes = figure.subplots()
@@ -247,7 +247,7 @@ def _draw_logarithmic(
 
 
 def draw_contact_force(data: RolloutData) -> Picture:
-    """The multiplier along predicted trajectories with its band, and the probability of lost contact."""
+    """Plot the multiplier along predicted trajectories with its band, and the probability of lost contact."""
     paths = [path for path in data.models if path.multiplier]
     losing = [path for path in paths if any(path.lost)]
 
@@ -273,7 +273,7 @@ def draw_contact_force(data: RolloutData) -> Picture:
 
 
 def _curve(axes: Axes, data: RolloutData, path: ModelPath, values: Series, band: Band | None = None) -> None:
-    """Values of a model over time in its style, with their band as far as it goes."""
+    """Draw values of a model over time in its style, with their band."""
     style = {"color": colour(path.model), "linestyle": line(path.model)}
     if band is not None:
         t = data.t[: len(band.lower)]
@@ -286,7 +286,7 @@ def _starts(number: int) -> str:
 
 
 def rollout_pictures(data: RolloutData) -> tuple[Picture, ...]:
-    """The plots of the section with data."""
+    """Return the plots of the section that have data."""
     log = "logarithmic scale, one curve per model."
     errors = [(path, path.tip_error) for path in data.models]
     alt = f"Tip error over time, median over {_starts(data.starts)}, {log}"
@@ -300,7 +300,7 @@ def rollout_pictures(data: RolloutData) -> tuple[Picture, ...]:
 
 
 def rollout_table(data: RolloutData) -> Table:
-    """Tip errors at the horizons, coverage of the bands and largest drift."""
+    """Return the tip errors at the horizons, coverage of the bands and largest drift."""
     after = (f"after {h:g} s [mm]" for h in data.horizons)
     head = ("model", *after, "in band", "in widened band", "largest |c(q)| [m]")
     rows = []
@@ -323,9 +323,7 @@ def rollout_table(data: RolloutData) -> Table:
 
 @dataclass(frozen=True)
 class RolloutSection:
-    """Plots, table and animation of trajectories; `script` is the hash of the script for the page's security
-    policy.
-    """
+    """Plots, table and animation of trajectories; `script` is the script hash for the security policy."""
 
     block: PictureBlock
     table: Table
@@ -334,7 +332,7 @@ class RolloutSection:
 
 
 def rollout_section(data: RolloutData, source: str = DATA) -> RolloutSection:
-    """The section on trajectories; `source` is the file with the data, beside the page."""
+    """Return the section on trajectories; `source` is the data file next to the page."""
     band = f" with the band that holds {data.level:.0%} of the function samples"
     sampled = any(path.tip_bands for path in data.models)
     why = (
@@ -351,7 +349,7 @@ def rollout_section(data: RolloutData, source: str = DATA) -> RolloutSection:
 
 
 def write_rollouts(folder: Path, title: str, data: RolloutData) -> Path:
-    """Write the page on trajectories, its plots and their data to a folder; returns the path of the page."""
+    """Write the page on trajectories, its plots and their data to a folder; return the path of the page."""
     section = rollout_section(data)
     for i, picture in enumerate(section.block.pictures):
         write_text(folder / f"rollout-{i + 1}.svg", picture.svg)

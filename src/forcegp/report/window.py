@@ -17,14 +17,14 @@ from forcegp.models.structured_fit import StructuredFit
 from forcegp.report.page import INK, Picture, Series, as_tensor, colour, columns, draw, label, series
 
 WIDTH, WIDE, ROW, MARGIN = 4.1, 12.0, 0.92, 0.75
-"""Widths of a plot by joint and of one across the page, height of a row and of the rest [inch]."""
+"""Width of a plot by joint and of a plot across the page, height of a row and of the margins [inch]."""
 OUTSIDE, ROOM = 0.005, 0.25
-"""Share of the values on either side that axes may cut off, and room around the others as a share of them."""
+"""Fraction of outer values that axes may clip on either side, and relative margin around the others."""
 GREY = "#9a9a9a"
 
 
 class ForceWindow(Record):
-    """Normal force of a contact over the window [N]; `logged` and `std` are optional."""
+    """Normal force of a contact over a window [N]; `logged` and `std` are optional."""
 
     contact: str
     closed: list[bool]
@@ -34,10 +34,10 @@ class ForceWindow(Record):
 
 
 class WindowData(Header):
-    """Predictions of one model over a window of time, by joint [rad/s²]; `clean` and `std` are optional.
+    """Predictions of a model over a time window, by joint [rad/s²]; `clean` and `std` are optional.
 
-    `forces` contains the closed contacts, for models of forces; `noise_std` is that of the measured
-    accelerations [rad/s²]; `t` is the time from the first sample [s].
+    `forces` contains the closed contacts, for models of forces; `noise_std` is the standard deviation of the
+    noise on the accelerations [rad/s²]; `t` is the time from the first sample [s].
     """
 
     FORMAT: ClassVar[str] = "forcegp-window"
@@ -55,7 +55,7 @@ class WindowData(Header):
 
     @property
     def error(self) -> Tensor:
-        """Predicted minus noise-free (or else measured) acceleration, `(nq, n)` [rad/s²]."""
+        """Predicted minus noise-free (or measured) acceleration, `(nq, n)` [rad/s²]."""
         return as_tensor(self.mean) - as_tensor(self.clean or self.measured)
 
     @property
@@ -65,7 +65,7 @@ class WindowData(Header):
 
 
 def opening(data: Dataset, seconds: float) -> Dataset:
-    """The first seconds of the first trajectory of a data set, sorted by time."""
+    """Return the first seconds of the first trajectory of a data set, sorted by time."""
     rows = (data.segment == data.segment[0]).nonzero()[:, 0]
     rows = rows[data.t[rows].argsort()]
     return data[rows[data.t[rows] <= data.t[rows[0]] + seconds]]
@@ -73,7 +73,7 @@ def opening(data: Dataset, seconds: float) -> Dataset:
 
 @torch.no_grad()
 def predicted_window(model: Predictor, data: Dataset, name: str) -> WindowData:
-    """Predictions at the samples of a window, sorted by time; `name` is the label of the model."""
+    """Return the predictions at the samples of a window, sorted by time; `name` labels the model."""
     predicted = model.predict(data.q, data.qd, data.tau, active=data.active(model.system.contact_names))
     clean, variance = data.extras.get("qdd_clean"), predicted.variance
     if variance is not None and isinstance(model, StructuredFit) and model.torque_std is not None:
@@ -113,7 +113,7 @@ def _forces(model: Predictor, data: Dataset) -> tuple[ForceWindow, ...]:
 
 
 def draw_forces(window: WindowData) -> Picture:
-    """Predicted normal force of each contact while it is closed, with ±2σ, and the logged one."""
+    """Plot the predicted normal force of each closed contact with ±2σ, and the logged one."""
 
     def paint(figure: Figure) -> None:
         panels = figure.subplots(len(window.forces), 1, sharex=True, squeeze=False)[:, 0]
@@ -139,7 +139,7 @@ def draw_forces(window: WindowData) -> Picture:
 
 
 def _robust_limits(axes: Axes, values: Tensor) -> None:
-    """Limits that hold all but the outermost `OUTSIDE` of the values, with some room around them."""
+    """Set axis limits that contain all but the outermost `OUTSIDE` of the values, with a margin."""
     values = values[values.isfinite()]
     if len(values):
         low, high = values.quantile(torch.tensor([OUTSIDE, 1.0 - OUTSIDE], dtype=values.dtype)).tolist()
@@ -148,14 +148,14 @@ def _robust_limits(axes: Axes, values: Tensor) -> None:
 
 
 def draw_predictions(window: WindowData) -> Picture:
-    """Measured and predicted accelerations, one row per joint, with a band of ±2 standard deviations."""
+    """Plot measured and predicted accelerations, one row per joint, with bands of ±2 standard deviations."""
     band = ", with the ±2σ band," if window.std else ""
     alt = f"accelerations of {{}}; measured in black, predicted{band} in colour."
     return _draw(window, torch.zeros(len(window.t), dtype=torch.float64), alt)
 
 
 def draw_errors(window: WindowData, limit: float | None = None) -> Picture:
-    """Errors of the predictions by joint, within ±`limit` [rad/s²], or each row at its own scale."""
+    """Plot prediction errors by joint within ±`limit` [rad/s²], or with a separate scale for each row."""
     error = window.error.abs()
     alt = (
         f"error of the predicted accelerations of {{}}, mean magnitude {error.mean():.2g}, "
@@ -172,7 +172,7 @@ def _draw(window: WindowData, centre: Tensor, alt: str, limit: float | None = No
 
 
 def _rows(figure: Figure, window: WindowData, centre: Tensor, limit: float | None = None) -> None:
-    """One row per joint, everything drawn relative to `centre`."""
+    """Draw one row per joint relative to `centre`."""
     rows = figure.subplots(len(window.joint_names), 1, sharex=True, squeeze=False)[:, 0]
     measured, mean = as_tensor(window.measured) - centre, as_tensor(window.mean) - centre
     relative, model_colour = centre.dim() > 1, colour(window.model)

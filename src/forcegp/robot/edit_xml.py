@@ -1,7 +1,7 @@
-"""XML documents edited in place: only the edited attributes and elements change.
+"""In-place editing of XML documents, which changes only the edited attributes and elements.
 
-Writers of XML drop comments, the order of attributes or the indentation. This editor locates start tags and
-attribute values in the text, and replaces only these spans.
+XML writers drop comments, attribute order or indentation. This editor locates start tags and attribute values
+in the text, and replaces only these spans.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ _TAG_NAME = re.compile(rb"<[^\s/>]+")
 @dataclass(eq=False)
 class Span:
     """An element of the text: the end of its name (`head`) and of its start tag (`close`), whether it is
-    `<tag/>`, the white space at the start of its line, and of each attribute the start and end of its value
-    with quotes and the start of the whole with the space before it.
+    `<tag/>`, the indentation of its line, and for each attribute the start and end of its quoted value and
+    the start of the attribute including the preceding space.
     """
 
     tag: str
@@ -36,11 +36,11 @@ class Span:
     children: list[Span] = field(default_factory=list)
 
     def find(self, tag: str) -> Span | None:
-        """The first child with a tag."""
+        """Return the first child with a tag."""
         return next((child for child in self.children if child.tag == tag), None)
 
     def iter(self) -> Iterator[Span]:
-        """The element and all its descendants, in the order of the document."""
+        """Yield the element and all its descendants in document order."""
         yield self
         for child in self.children:
             yield from child.iter()
@@ -54,7 +54,7 @@ class EditableXml:
         label: name of the file in messages.
 
     Raises:
-        RobotFileError: the document is not well-formed UTF-8, or is hostile (`safety.parse_xml`).
+        RobotFileError: the document is not well-formed UTF-8, or is rejected by `safety.parse_xml`.
 
     Example:
         >>> document = EditableXml(b"<robot> <!-- mine --> <mass value='1'/></robot>", "my.urdf")
@@ -100,7 +100,7 @@ class EditableXml:
         )
 
     def set(self, element: Span, name: str, text: str) -> None:
-        """Set an attribute; a new one is added after the others."""
+        """Set an attribute; a new attribute is added after the others."""
         quoted = quoteattr(text).encode()
         if name in element.values:
             first, last, _ = element.values[name]
@@ -117,7 +117,7 @@ class EditableXml:
             self._edits.append((before, last, b""))
 
     def add_child(self, element: Span, tag: str, attributes: dict[str, str], inside: str = "") -> None:
-        """Insert an element as the first child; `inside` is its own content, empty tags."""
+        """Insert an element as the first child; `inside` is its content, as empty tags."""
         text = "".join(f" {name}={quoteattr(value)}" for name, value in attributes.items())
         child = f"<{tag}{text}>{inside}</{tag}>" if inside else f"<{tag}{text}/>"
         step = element.children[0].indent if element.children else element.indent + b"  "
@@ -130,7 +130,7 @@ class EditableXml:
             self._edits.append((element.close, element.close, added))
 
     def written(self) -> bytes:
-        """The document with all changes."""
+        """Return the document with all changes."""
         parts, at = [], 0
         for first, last, text in sorted(self._edits, key=lambda edit: edit[:2]):
             parts += [self._data[at:first], text]

@@ -29,19 +29,19 @@ from forcegp.robot.tree import Inertial, Joint, Tree, checked, joint_motion, loc
 from forcegp.robot.urdf import read_urdf
 
 FRICTION_VELOCITY = 0.1
-"""Default speed over which Coulomb friction changes sign [rad/s, m/s]; robot files do not specify it."""
+"""Default speed scale of Coulomb friction [rad/s, m/s], which robot files do not specify."""
 SINGULAR = 1e-12
-"""Smallest eigenvalue of the scaled mass matrix below which it counts as singular in double precision."""
+"""Eigenvalue of the scaled mass matrix below which it counts as singular in double precision."""
 LIMB_JOINTS, WALKING_JOINTS, BODY_MASS = 2, 6, 1.0
-"""Joints from which a chain counts as a limb; those of all limbs and mass of the base [kg] from which a robot
+"""Number of joints from which a chain counts as a limb, and joints and base mass [kg] from which a robot
 may walk: a hand is lighter."""
 OF_JOINTS = ("axis", "damping", "friction", "armature", "lower", "upper", "velocity_limit", "effort_limit")
-"""Joint attributes that the robot takes unchanged from the file."""
+"""Joint attributes copied unchanged from the file."""
 
 
 @dataclass(frozen=True)
 class _Placed:
-    """The moving joints, and for each link of the file the joint that moves it and its pose in that link."""
+    """Moving joints, and for each link of the file its moving joint and the pose in that joint's link."""
 
     moving: list[Joint]
     parents: list[int]
@@ -50,7 +50,7 @@ class _Placed:
 
 
 def robot_of(tree: Tree, world: Mapping[str, np.ndarray]) -> RobotModel:
-    """The robot of a tree in a world; typed errors for ambiguous frames and motion without inertia."""
+    """Build the robot from a tree; typed errors for ambiguous frames and motion without inertia."""
     remarks, placed = list(tree.remarks), _place(tree.joints)
     bodies = _merge(tree, placed)
     remarks += _held_base(tree, placed)
@@ -99,7 +99,7 @@ def _place(joints: tuple[Joint, ...]) -> _Placed:
 
 
 def _held_base(tree: Tree, placed: _Placed) -> list[str]:
-    """A remark where a base with mass carries several limbs, as of a walking robot, and no joint moves it."""
+    """Return a remark if a fixed base with mass carries several limbs, like that of a walking robot."""
     limb: list[int] = []
     for i, parent in enumerate(placed.parents):
         limb.append(i if parent == BASE else limb[parent])
@@ -115,7 +115,7 @@ def _held_base(tree: Tree, placed: _Placed) -> list[str]:
 
 
 def _merge(tree: Tree, placed: _Placed) -> list[Inertial]:
-    """Mass, centre of mass and inertia of each moving link, including the links fixed to it."""
+    """Return the mass, centre of mass and inertia of each moving link, including the links fixed to it."""
     parts: list[list[Inertial]] = [[] for _ in placed.moving]
     for link in tree.links:
         index, T = placed.links[link.name]
@@ -136,7 +136,7 @@ def _sum(bodies: list[Inertial]) -> Inertial:
 
 
 def _check_mass_matrix(tree: Tree, placed: _Placed, bodies: list[Inertial]) -> None:
-    """Refuse a robot that can move without kinetic energy, tested at a generic configuration."""
+    """Reject a robot that can move without kinetic energy, tested in a generic configuration."""
     M = _mass_matrix(placed, bodies) + np.diag([joint.armature for joint in placed.moving])
     scale = np.sqrt(np.diag(M))
     if scale.min() > 0.0:
@@ -208,16 +208,16 @@ def load_robot(
     dtype: torch.dtype = torch.float64,
     device: torch.device | str = "cpu",
 ) -> RobotModel:
-    """A robot model from a bundled name, a URDF file or an MJCF file.
+    """Load a robot model by bundled name, or from a URDF or MJCF file.
 
-    A usable but doubtful file raises a `RobotFileWarning`; its text is also in `robot.remarks`.
+    A usable but doubtful file causes a `RobotFileWarning`, which is also listed in `robot.remarks`.
 
     Args:
         source: `"kuka_iiwa"`, `"kuka_iiwa14"`, `"franka_panda"`, `"ur5"`, `"double_pendulum"`, or the path
             of a file.
         base_position: position of the root link in the world [m].
-        base_rpy: its roll, pitch and yaw about the world's axes [rad].
-        gravity: gravitational acceleration in the world [m/s²]; that of an MJCF file is ignored.
+        base_rpy: roll, pitch and yaw of the root link about the world axes [rad].
+        gravity: gravitational acceleration in the world [m/s²]; that in an MJCF file is ignored.
         locked_joints: positions [rad, m] of joints to treat as fixed, such as those of a gripper.
         dtype: floating-point type of all constants.
         device: device of all constants.
@@ -231,9 +231,9 @@ def load_robot(
         (7, 'lbr_iiwa_joint_1')
 
     Raises:
-        UnknownNameError: no such bundled robot, or no such joint to lock.
+        UnknownNameError: the bundled robot or a joint to lock does not exist.
         RobotFileError: the file cannot be read or is not a valid robot; the message names link or joint.
-        UnsupportedRobotError: a joint is floating, planar, ball or mimic; the hint suggests locking it.
+        UnsupportedRobotError: a joint is a floating, planar, ball or mimic joint; the hint is to lock it.
         MissingDependencyError: the file is MJCF and MuJoCo is not installed.
         InertiaError: the inertia of a link is not physical.
         ShapeError: base_position, base_rpy or gravity is not a vector of three finite numbers.
@@ -248,7 +248,7 @@ def load_robot(
 
 
 def robot_path(source: str | Path) -> Path:
-    """The file of a bundled name or a path; `UnknownNameError` if it is neither."""
+    """Return the file of a bundled robot or a path; `UnknownNameError` if there is neither."""
     path = Path(os.path.expanduser(source))  # an unknown user is left as it is
     if str(source) in BUNDLED:
         return Path(__file__).parent / "bundled" / f"{source}.urdf"
@@ -263,7 +263,7 @@ def _read(source: str | Path) -> Tree:
 
 
 def read_tree(data: bytes, path: Path) -> Tree:
-    """Links and joints of a URDF or MJCF document of a `path`; `RobotFileError` if it is not valid."""
+    """Return links and joints of a URDF or MJCF document from `path`; `RobotFileError` if it is invalid."""
     root = parse_xml(data, str(path))
     if root.tag == "robot":
         return read_urdf(root, str(path))

@@ -1,6 +1,6 @@
-"""MJCF files: reduced to the mechanics, compiled by MuJoCo, and read from its compiled model.
+"""Reading of MJCF files, which are reduced to the mechanics and compiled by MuJoCo.
 
-Imported only when an MJCF file is read, since it needs the optional package `mujoco`.
+This module is imported only to read MJCF files, since it needs the optional package `mujoco`.
 """
 
 from __future__ import annotations
@@ -29,9 +29,10 @@ _KINDS: dict[int, JointKind] = {
 
 
 def read_mjcf(root: Element, path: Path) -> Tree:
-    """Links and joints of the `<mujoco>` document of a file: bodies are links, bodies and sites are frames,
-    and massless links lie between several joints of a body. Typed errors quote MuJoCo's compiler, or name
-    unsupported or unphysical elements.
+    """Return the links and joints of a `<mujoco>` document.
+
+    Bodies become links, bodies and sites become frames, and massless links separate several joints of a body.
+    Typed errors quote MuJoCo's compiler, or name unsupported or unphysical elements.
     """
     document, coupled, remarks = reduce_mjcf(root, path)
     with _warnings_of_mujoco(str(path), remarks):
@@ -57,15 +58,15 @@ def read_mjcf(root: Element, path: Path) -> Tree:
 
 
 _HANDLER = threading.RLock()
-"""Held while MuJoCo's handler of warnings is ours."""
+"""Lock held while MuJoCo's warning handler is replaced."""
 
 
 @contextmanager
 def _warnings_of_mujoco(label: str, remarks: list[str]) -> Iterator[None]:
     """Collect MuJoCo's warnings, which would otherwise go to a log file in the working folder.
 
-    The handler belongs to the process: one reader at a time replaces it and puts it back, and warnings of
-    other threads go on to theirs.
+    The handler is global to the process. One reader at a time replaces and restores it, and warnings of other
+    threads are passed on.
     """
     thread = threading.get_ident()
     with _HANDLER:
@@ -110,7 +111,7 @@ def _inertial(model: Any, b: int) -> Inertial | None:
 def _chain(
     model: Any, b: int, names: list[str], joint_names: list[str], coupled: dict[str, Coupling], label: str
 ) -> list[Joint]:
-    """The joints of body b in order, each about its own anchor, and the fixed joint that ends at the body."""
+    """Return the joints of body b in order, each at its anchor, and the fixed joint to the body frame."""
     parent, placement = names[model.body_parentid[b]], _pose(model.body_pos[b], model.body_quat[b])
     chain: list[Joint] = []
     anchor = np.zeros(3)
@@ -125,7 +126,7 @@ def _chain(
 
 
 def _joint(model: Any, j: int, name: str, body: str, follows: Coupling | None, label: str) -> Joint:
-    """A joint of a body, placed where its position is zero; its links are not known yet."""
+    """Return a joint of a body, placed at zero position, before its links are assigned."""
     kind, dof = _KINDS.get(int(model.jnt_type[j])), model.jnt_dofadr[j]
     if kind is None:
         word = "free (floating)" if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE else "ball"
@@ -161,7 +162,7 @@ def _joint(model: Any, j: int, name: str, body: str, follows: Coupling | None, l
 
 
 def _effort(model: Any, j: int) -> float:
-    """Largest force that the joint and its actuators allow; the control range of a motor limits it too."""
+    """Return the largest force allowed by the joint, its actuators, and the control range of a motor."""
     effort = float(np.abs(model.jnt_actfrcrange[j]).max()) if model.jnt_actfrclimited[j] else np.inf
     of_joint = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
     efforts = []

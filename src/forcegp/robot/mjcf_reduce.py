@@ -1,7 +1,7 @@
 """MJCF documents reduced to their mechanics, before MuJoCo's compiler reads them.
 
-Bodies, joints, sites, inertias and defaults are kept. Elements for drawing, sensing, driving or colliding are
-dropped, so meshes and textures are never opened. Elements that affect the motion but are not supported are
+Bodies, joints, sites, inertias and defaults are kept. Elements for visuals, sensors, actuation or collisions
+are dropped, so meshes and textures are never opened. Unsupported elements that affect the motion raise
 errors.
 """
 
@@ -32,7 +32,7 @@ _WORDS = ("name", "class", "childclass", "user", "joint1", "joint2")
 
 
 class Coupling(NamedTuple):
-    """The joint that a coupled joint follows, and the linear part of the relation."""
+    """Joint followed by a coupled joint, and the linear part of the relation."""
 
     leader: str
     multiplier: float
@@ -40,8 +40,8 @@ class Coupling(NamedTuple):
 
 
 def reduce_mjcf(root: Element, path: Path) -> tuple[Element, dict[str, Coupling], list[str]]:
-    """The reduced document of a file, with included files of its folder, couplings by name of the constrained
-    joint, and remarks; typed errors name invalid or unsupported elements.
+    """Return the reduced document of a file with included files from its folder, couplings by name of the
+    constrained joint, and remarks; typed errors name invalid or unsupported elements.
     """
     _expand_includes(root, path)
     document = Element("mujoco", model=root.get("model", path.stem))
@@ -74,7 +74,7 @@ def reduce_mjcf(root: Element, path: Path) -> tuple[Element, dict[str, Coupling]
 
 
 def _expand_includes(root: Element, path: Path) -> None:
-    """Insert included files, each at most once, and only from the folder of the robot file or below."""
+    """Insert included files, each at most once, and only from within the folder of the robot file."""
     folder = path.resolve().parent
     included = {path.resolve()}
     stack = [root]
@@ -137,7 +137,7 @@ def _without(element: Element, names: tuple[str, ...]) -> dict[str, str]:
 
 
 def _copy_actuators(section: Element) -> Element:
-    """Actuators of joints, reduced to their limits; the name states whether the control is the force."""
+    """Copy the limits of joint actuators; the name states whether the control is the force."""
     copy = Element("actuator")
     for i, actuator in enumerate(section):
         if actuator.tag in _ACTUATORS and actuator.get("joint"):
@@ -148,7 +148,7 @@ def _copy_actuators(section: Element) -> Element:
 
 
 def _parts(body: Element) -> Iterator[Element]:
-    """The elements of a body itself, including those within frames but not those of child bodies."""
+    """Yield the elements of a body, including those within frames but not those of child bodies."""
     for child in body:
         yield child
         if child.tag == "frame":
@@ -216,7 +216,7 @@ def _couplings(equality: Element, path: Path) -> dict[str, Coupling]:
 
 
 def _check_numbers(document: Element, path: Path) -> None:
-    """Refuse NaN, infinite and absurd numbers, which MuJoCo's compiler accepts."""
+    """Reject NaN, infinite and implausibly large numbers, which MuJoCo's compiler accepts."""
     for element in document.iter():
         for attribute, text in element.attrib.items():
             if attribute in _WORDS or element.tag == "mujoco":

@@ -1,8 +1,8 @@
-"""The frozen description of a robot: a tree of one-degree-of-freedom joints with rigid links.
+"""The frozen description of a robot as a tree of one-degree-of-freedom joints with rigid links.
 
-Joint `i` moves link `i`. Its frame sits at `placement` in the frame of its parent link; the link frame
-is the joint frame after the motion. All inertial parameters of link `i` are in the axes of link frame `i`,
-the inertia about the centre of mass. Fixed joints are merged into the links; their frames remain available by
+Joint `i` moves link `i`. Its frame is at `placement` in the frame of its parent link; the link frame is the
+joint frame after the motion. All inertial parameters of link `i` are in the axes of link frame `i`, with the
+inertia about the centre of mass. Links connected by fixed joints are merged; their frames remain available by
 name.
 """
 
@@ -22,12 +22,12 @@ from forcegp.notebook import html_table
 
 JointType = Literal["revolute", "prismatic"]
 BASE = -1
-"""Index of the fixed base where a joint index is expected."""
+"""Joint index that stands for the fixed base."""
 
 
 @dataclass(frozen=True, eq=False)
 class RobotModel:
-    """A robot arm with `nq` joints and `nf` named frames, as constants (SI units, radians).
+    """A robot arm with `nq` joints and `nf` named frames (constants in SI units and radians).
 
     Args:
         name: name of the robot.
@@ -44,16 +44,16 @@ class RobotModel:
         friction: `(nq,)` Coulomb joint friction [N m, N].
         stribeck: `(nq,)` static friction above the Coulomb level [N m, N].
         stribeck_velocity: `(nq,)` decay speed of the static part [rad/s, m/s].
-        friction_velocity: `(nq,)` speed over which Coulomb friction changes sign [rad/s, m/s].
+        friction_velocity: `(nq,)` speed scale on which Coulomb friction changes sign [rad/s, m/s].
         armature: `(nq,)` inertia of the drive, reflected to the joint [kg m², kg].
         lower, upper: `(nq,)` joint limits [rad, m], infinite if absent.
         velocity_limit, effort_limit: `(nq,)` [rad/s, m/s], [N m, N], infinite if absent.
         frame_names: every link and fixed frame of the file.
         frame_parents: index of the joint that moves each frame, −1 for the base.
-        frame_rotation, frame_position: `(nf, 3, 3)`, `(nf, 3)` pose in that joint's link frame.
+        frame_rotation, frame_position: `(nf, 3, 3)`, `(nf, 3)` pose in the link frame of that joint.
         base_rotation, base_position: pose of the base in the world `(3, 3)`, `(3,)` [m].
         gravity: `(3,)` gravitational acceleration in the world [m/s²].
-        remarks: doubtful properties of the file that the loader accepted, one sentence each.
+        remarks: doubtful properties of the file, one sentence each.
     """
 
     name: str
@@ -86,7 +86,7 @@ class RobotModel:
     remarks: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
-        """One line that names the robot, without the numbers."""
+        """Return a one-line summary without numbers."""
         moving = self.joint_types.count("prismatic")
         kinds = f", {moving} of them prismatic" if moving else ""
         mass = float(self.mass.detach().sum())
@@ -94,7 +94,7 @@ class RobotModel:
         return f"<RobotModel {self.name!r}: {self.nq} joints{kinds}; {mass:.4g} kg; {kind} on {self.device}>"
 
     def _repr_html_(self) -> str:
-        """A table of the joints for notebooks."""
+        """Return a table of the joints for notebooks."""
         head = ("joint", "type", "parent", "lower", "upper", "mass [kg]", "damping", "friction")
         numbers = torch.stack([self.lower, self.upper, self.mass, self.damping, self.friction], dim=1)
         parents = ["base" if parent == BASE else self.joint_names[parent] for parent in self.parents]
@@ -162,25 +162,25 @@ class RobotModel:
         return {name: value for name, value in values if isinstance(value, Tensor)}
 
     def frame_index(self, frame: str) -> int:
-        """Index of a named frame; an `UnknownNameError` lists the frames and the nearest one."""
+        """Return the index of a named frame; an `UnknownNameError` lists the frames and the nearest one."""
         check_name(f"frame of robot {self.name!r}", frame, self.frame_names)
         return self.frame_names.index(frame)
 
     def joint_index(self, joint: str) -> int:
-        """Index of a named joint; an `UnknownNameError` lists the joints and the nearest one."""
+        """Return the index of a named joint; an `UnknownNameError` lists the joints and the nearest one."""
         check_name(f"joint of robot {self.name!r}", joint, self.joint_names)
         return self.joint_names.index(joint)
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> RobotModel:
-        """The same robot with its constants on another device or in another precision."""
+        """Return the same robot with its constants on another device or in another precision."""
         return self.replace(**{name: x.to(device=device, dtype=dtype) for name, x in self._tensors.items()})
 
     def replace(self, **fields: object) -> RobotModel:
-        """A robot with some fields changed, such as `robot.replace(mass=mass)`.
+        """Return a robot with some fields changed, such as `robot.replace(mass=mass)`.
 
         Raises:
             UnknownNameError: a field does not exist.
-            ShapeError: a tensor has another shape than the replaced one.
+            ShapeError: a tensor has a different shape than the one it replaces.
             ParameterError: gravity or a mass is not finite.
         """
         names = [field.name for field in dataclasses.fields(self)]
@@ -195,7 +195,7 @@ class RobotModel:
         return dataclasses.replace(self, **fields)  # pyright: ignore[reportArgumentType]
 
     def check_state(self, **states: Tensor) -> None:
-        """Check that arguments end in `nq` and share the robot's dtype and device; `ShapeError` names one."""
+        """Raise `ShapeError` unless arguments end in `nq` and have the robot's dtype and device."""
         for name, value in states.items():
             if not isinstance(value, Tensor):
                 raise ShapeError(

@@ -1,14 +1,14 @@
-"""Analytical parameters θ_A: the learned parameters of a robot, which define new, frozen robots.
+"""Analytical parameters θ_A: the learnable parameters of a robot.
 
 | quantity            | coordinates of each joint j                                         | number |
 |---------------------|---------------------------------------------------------------------|--------|
 | `inertia`           | log-Cholesky form of the pseudo-inertia of the link that j moves    | 10     |
 | `mass`              | log m of that link                                                  | 1      |
 | `com`               | centre of mass of that link [m]                                     | 3      |
-| `offset`            | turn (rotation vector) and shift [m] of j's placement               | 6      |
+| `offset`            | rotation vector and translation [m] of j's placement                | 6      |
 | `damping`, `friction`, `stribeck`, `stribeck_velocity`, `friction_velocity`, `armature` | log | 1 each |
 
-Every value of the coordinates is a physical robot if the initial robot is physical.
+All values of the coordinates describe a physical robot if the initial robot is physical.
 """
 
 from __future__ import annotations
@@ -29,19 +29,20 @@ POSITIVE = (
 )  # fmt: skip
 QUANTITIES = ("inertia", "com", "offset", *POSITIVE)
 SMALLEST = 1e-3
-"""Initial value of a friction or drive parameter that is zero in the robot, as its logarithm is learned."""
+"""Initial value of a friction or drive parameter that is zero in the robot, since its logarithm is learned.
+"""
 
 
 class AnalyticalParameters(nn.Module):
     """The learnable parameters of a robot; calling the module returns the robot with these parameters.
 
-    The state dict has one tensor per quantity, `coordinates.<quantity>`, one row per joint. They are on the
-    robot's device and in its precision: to change them, start from `robot.to(...)`.
+    The state dict has one tensor per quantity, `coordinates.<quantity>`, with one row per joint. The tensors
+    have the robot's device and precision; to change these, start from `robot.to(...)`.
 
     Args:
-        robot: provides the initial values, and the parameters that are not learned.
-        learn: joint names by quantity, or `"all"` joints, such as `{"mass": ["joint_7"], "damping": "all"}`.
-            The inertia, mass and centre of mass named by a joint are those of the link that it moves.
+        robot: robot with the initial values and the parameters that are not learned.
+        learn: joint names by quantity, or `"all"`, such as `{"mass": ["joint_7"], "damping": "all"}`. For
+            inertia, mass and centre of mass, a joint name refers to the link that the joint moves.
 
     Example:
         >>> import torch, forcegp
@@ -69,7 +70,7 @@ class AnalyticalParameters(nn.Module):
         self.coordinates = nn.ParameterDict({name: self._initial(name) for name in self.joints})
 
     def forward(self) -> RobotModel:
-        """The robot with the learned parameters, differentiable in the coordinates."""
+        """Return the robot with the learned parameters, differentiable in the coordinates."""
         fields: dict[str, Tensor] = {}
         for quantity, x in self.coordinates.items():
             for name, rows in self._fields(quantity, x).items():
@@ -87,8 +88,8 @@ class AnalyticalParameters(nn.Module):
     ) -> None:
         """Draw all coordinates uniformly from a window around the initial robot.
 
-        `relative` is the half width of logarithms, a factor of up to e^{±relative}; `length` of centres of
-        mass, shifts and lengths [m]; `angle` that of rotations [rad].
+        The half widths are `relative` for logarithms (a factor of up to e^{±relative}), `length` for centres
+        of mass and translations [m], and `angle` for rotations [rad].
         """
         for quantity, x in self.coordinates.items():
             half = torch.full_like(x, relative)

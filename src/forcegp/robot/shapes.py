@@ -1,4 +1,4 @@
-"""Appearance of a robot: the shapes of its URDF file, or else rods between its joints, as convex solids."""
+"""Convex shapes of a robot for display and collisions, from its URDF file or as rods between its joints."""
 
 from __future__ import annotations
 
@@ -19,32 +19,32 @@ from forcegp.robot.safety import parse_numbers, parse_xml, read_bytes
 
 Array = NDArray[np.float64]
 MESHES = (".stl", ".obj", ".ply", ".glb")
-"""Formats of meshes that are read; parts in another format are left out."""
+"""Supported mesh formats; parts in other formats are omitted."""
 MESH_BYTES = 1 << 25
 MESH_CORNERS = 200
-"""Corners of the convex hull of a mesh that are kept at most."""
+"""Maximum number of corners of the convex hull of a mesh."""
 LEAST = 1e-3
-"""Rods shorter than this are left out [m]."""
+"""Minimum length of a rod [m]."""
 SIZES = {"box": {"size": 3}, "cylinder": {"radius": 1, "length": 1}, "sphere": {"radius": 1}}
-"""Attributes of the shapes of a URDF file, with the count of their numbers."""
+"""Attributes of shapes in a URDF file, with the number of their values."""
 
 
 @dataclass(frozen=True)
 class Shape:
-    """A convex part of the link that joint `link` moves (−1: base): corners `(k, 3)` in its frame [m]."""
+    """A convex part of the link moved by joint `link` (−1: base), with corners `(k, 3)` in its frame [m]."""
 
     link: int
     points: Array
 
 
 def box(x: float, y: float, z: float) -> Array:
-    """Corners of a box about the origin, `(8, 3)`, from its sides [m]."""
+    """Return the corners `(8, 3)` of a box centred at the origin from its side lengths [m]."""
     signs = np.stack(np.meshgrid(*3 * [[-0.5, 0.5]], indexing="ij"), axis=-1)
     return signs.reshape(-1, 3) * [x, y, z]
 
 
 def cylinder(radius: float, length: float, corners: int = 24) -> Array:
-    """Corners of a cylinder along z about the origin, `(2 corners, 3)` [m]."""
+    """Return the corners `(2 corners, 3)` of a cylinder along z centred at the origin [m]."""
     angle = np.linspace(0.0, 2.0 * np.pi, corners, endpoint=False)
     ring = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0.0 * angle], axis=-1)
     half = np.array([0.0, 0.0, 0.5 * length])
@@ -52,13 +52,13 @@ def cylinder(radius: float, length: float, corners: int = 24) -> Array:
 
 
 def sphere(radius: float) -> Array:
-    """Corners of a sphere about the origin, `(k, 3)` [m]."""
+    """Return the corners `(k, 3)` of a sphere centred at the origin [m]."""
     angles = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 13)
     return np.concatenate([cylinder(radius * np.cos(a), 2.0 * radius * np.sin(a), 24)[:24] for a in angles])
 
 
 def turn_z(direction: Array) -> Array:
-    """The shortest rotation that turns the z axis to a unit direction, `(3, 3)`."""
+    """Return the shortest rotation `(3, 3)` from the z axis to a unit direction."""
     axis = np.cross([0.0, 0.0, 1.0], direction)
     sine, cosine = float(np.linalg.norm(axis)), float(direction[2])
     if sine < 1e-12:
@@ -69,13 +69,13 @@ def turn_z(direction: Array) -> Array:
 def shapes_of(
     robot: RobotModel, source: str | Path | None = None, elements: Sequence[str] = ("visual",)
 ) -> list[Shape]:
-    """The parts of a robot, from its file or a bundled one; without a URDF file, rods between its joints.
+    """Return the parts of a robot from its file or a bundled one, or rods between its joints without URDF.
 
-    By default a bundled robot of the same name and frames is recognised. The first of `elements` (`"visual"`,
-    `"collision"`) in the file is used.
+    By default, the file of a bundled robot with the same name and frames is used. The first of `elements`
+    (`"visual"`, `"collision"`) that the file contains is used.
 
     Raises:
-        RobotFileError: the shapes of the file are not valid.
+        RobotFileError: the shapes in the file are invalid.
     """
     name = str(source) if source is not None else robot.name
     if name in BUNDLED:
@@ -90,7 +90,7 @@ def shapes_of(
 
 
 def rods(robot: RobotModel) -> list[Shape]:
-    """A rod to each joint and to the last frame of each link."""
+    """Return rods to each joint and to the last frame of each link."""
     place, at = robot.placement_position.detach().cpu().numpy(), robot.frame_position.detach().cpu().numpy()
     ends = list(zip(robot.parents, place, strict=True))
     for link in range(robot.nq):
@@ -106,7 +106,7 @@ def rods(robot: RobotModel) -> list[Shape]:
 
 
 def _parts(root: Element, path: Path, robot: RobotModel, element: str) -> list[Shape]:
-    """The visual or collision elements of the links of a URDF document that are frames of the robot."""
+    """Return the visual or collision elements of those links of a URDF document that are robot frames."""
     parts = []
     for link in root.findall("link"):
         name = link.get("name", "")
@@ -123,7 +123,7 @@ def _parts(root: Element, path: Path, robot: RobotModel, element: str) -> list[S
 
 
 def _corners(part: Element, where: str, folder: Path) -> Array | None:
-    """Corners of one part, in the frame of its link; `None` for what cannot be shown."""
+    """Return the corners of a part in the frame of its link; `None` if it cannot be displayed."""
     origin, geometry = part.find("origin"), part.find("geometry")
     if geometry is None or not len(geometry):
         return None
@@ -147,7 +147,7 @@ def _corners(part: Element, where: str, folder: Path) -> Array | None:
 
 
 def _hull(file: Path) -> Array:
-    """Corners of the convex hull of a mesh, thinned to `MESH_CORNERS`."""
+    """Return the corners of the convex hull of a mesh, thinned to `MESH_CORNERS`."""
     import trimesh
 
     points = np.asarray(trimesh.load(str(file), force="mesh").vertices, dtype=np.float64)  # pyright: ignore
@@ -159,7 +159,7 @@ def _hull(file: Path) -> Array:
 
 
 def _mesh_file(name: str, folder: Path) -> Path | None:
-    """A mesh that a robot file names, never outside of its folder or the package; `None` if none is found."""
+    """Return a mesh named in a robot file, only from its folder or the package; `None` if not found."""
     package, _, rest = name.removeprefix("package://").partition("/")
     if name.startswith("package://"):
         roots = [parent / package for parent in (folder, *folder.resolve().parents)] + [folder]

@@ -1,4 +1,4 @@
-"""The common tree of links and joints of URDF and MJCF files, and its checks."""
+"""Common tree of links and joints for URDF and MJCF files, and its checks."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Inertial:
 
 @dataclass(frozen=True)
 class Link:
-    """A rigid link; the robot keeps its frame if `frame` is true."""
+    """A rigid link, which becomes a frame of the robot if `frame` is true."""
 
     name: str
     inertial: Inertial | None = None
@@ -40,7 +40,7 @@ class Joint:
 
     Attributes:
         refused: reason why the joint must be locked, or "".
-        follows: the joint that this one mimics, with multiplier and offset.
+        follows: the joint mimicked by this one, with multiplier and offset.
     """
 
     name: str
@@ -82,21 +82,21 @@ class Tree:
 
 
 def transform(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
-    """Homogeneous matrix `(4, 4)` of a pose."""
+    """Return the homogeneous matrix `(4, 4)` of a pose."""
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = rotation, position
     return T
 
 
 def joint_motion(kind: JointKind, axis: np.ndarray, q: float) -> np.ndarray:
-    """Pose of a link in its joint frame at joint position q."""
+    """Return the pose of a link in its joint frame at joint position q."""
     if kind == "prismatic":
         return transform(np.eye(3), q * axis)
     return transform(scipy.spatial.transform.Rotation.from_rotvec(q * axis).as_matrix(), np.zeros(3))
 
 
 def lock_joints(tree: Tree, locked: Mapping[str, float]) -> Tree:
-    """The tree with joints and their followers locked [rad, m]; typed errors for invalid names."""
+    """Return the tree with joints and their followers locked [rad, m]; typed errors for invalid names."""
     names = [joint.name for joint in tree.joints if joint.kind != "fixed"]
     for name, q in locked.items():
         check_name(f"joint of {tree.label} to lock", name, names)
@@ -121,11 +121,11 @@ def lock_joints(tree: Tree, locked: Mapping[str, float]) -> Tree:
 
 MAX_JOINTS = 500
 ROUNDING = 1e-6
-"""Relative error of principal moments that are printed with a few digits only."""
+"""Relative error of principal moments due to rounding in files."""
 
 
 def checked(tree: Tree) -> Tree:
-    """Validate a tree and sort its joints depth first, siblings in the order of the file."""
+    """Validate a tree and sort its joints depth first, with siblings in file order."""
     _check_names(tree)
     root = _root(tree)
     children: dict[str, list[Joint]] = {}
@@ -152,7 +152,7 @@ def checked(tree: Tree) -> Tree:
 
 
 def _check_inertia(tree: Tree, joints: list[Joint]) -> list[str]:
-    """Check the inertia of each link; one that never moves has no effect and gets a remark only."""
+    """Check the inertia of each link; invalid inertia of a link that never moves only causes a remark."""
     moving: set[str] = set()
     for joint in joints:
         if joint.kind != "fixed" or joint.parent in moving:
@@ -176,7 +176,7 @@ def _check_inertia(tree: Tree, joints: list[Joint]) -> list[str]:
 
 
 def inertia_error(body: Inertial) -> str:
-    """The reason why the parameters are unphysical, or "" (see also `inertia_doubt`)."""
+    """Return the reason why the parameters are unphysical, or "" (see also `inertia_doubt`)."""
     mass, com, inertia = body.mass, body.com, body.inertia
     if not (np.isfinite(mass) and np.isfinite(com).all() and np.isfinite(inertia).all()):
         return "a value is not finite"
@@ -189,7 +189,7 @@ def inertia_error(body: Inertial) -> str:
 
 
 def inertia_doubt(body: Inertial) -> str:
-    """The reason why the parameters are only approximately physical, such as rounding, or ""."""
+    """Return the reason why the parameters are only approximately physical, such as rounding, or ""."""
     low, mid, high = np.linalg.eigvalsh(body.inertia)
     if body.mass == 0.0 and high > 0.0:
         return f"it has a rotational inertia of {high:.4g} kg m² but no mass"
@@ -271,7 +271,7 @@ def _check_kinds(tree: Tree) -> None:
 
 
 def _lock(tree: Tree, refused: list[Joint]) -> dict[str, float]:
-    """Positions at which refused joints, and the joints that they follow, can be locked."""
+    """Return positions for locking the refused joints and the joints that they follow."""
     joints = {joint.name: joint for joint in tree.joints if joint.kind != "fixed"}
     lock: dict[str, float] = {}
     for joint in refused:

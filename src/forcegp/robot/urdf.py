@@ -1,4 +1,4 @@
-"""URDF files; every element that is read is checked, and all others are ignored."""
+"""Reading of URDF files, which checks all elements used and ignores all others."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ _INSTEAD = {
 """Remedies for unsupported joint types."""
 _KINDS = ("revolute", "continuous", "prismatic", "fixed")
 WORLD = "world"
-"""Name of the fixed surroundings, which some files use as a link without declaring it."""
+"""Name of the fixed world, which some files use as a link without declaring it."""
 
 
 def read_urdf(root: Element, label: str) -> Tree:
-    """Links and joints of a `<robot>` element; typed errors name invalid or unsupported elements."""
+    """Return links and joints of a `<robot>` element; typed errors name invalid or unsupported elements."""
     for element in root.iter():
         macros = [text for text in element.attrib.values() if "${" in text or "$(" in text]
         if macros or "xacro" in element.tag:
@@ -68,7 +68,7 @@ def _name(element: Element, label: str) -> str:
 
 
 def _part(element: Element, tag: str, where: str) -> dict[str, Any]:
-    """Attributes of the only part with a tag, with their numbers read; empty if there is none."""
+    """Return the parsed attributes of the only part with a tag; empty if there is none."""
     parts = element.findall(tag)
     if len(parts) > 1:
         raise RobotFileError(f"{where} has several <{tag}>", expected="one", got=len(parts))
@@ -160,7 +160,7 @@ def _unit(axis: np.ndarray, where: str) -> np.ndarray:
 
 
 def _limits(limit: dict[str, Any], kind: str, where: str) -> dict[str, float]:
-    """Position, effort and velocity limits; a limit of effort or velocity that is 0 or missing is none."""
+    """Return position, effort and velocity limits; infinite for effort and velocity that are 0 or missing."""
     effort, velocity = (limit.get(name) or np.inf for name in ("effort", "velocity"))
     if min(effort, velocity) < 0.0:
         raise RobotFileError(

@@ -1,9 +1,9 @@
-"""Parameters of a robot written back into its URDF or MJCF file.
+"""Writing of robot parameters into a copy of the URDF or MJCF file.
 
-Only changed attributes are edited (`edit_xml.py`); meshes, comments, order and formatting stay. A
-link of the robot may be several links of the file, fixed to each other. The heaviest of them that stays
-physically consistent takes the whole change J − J₀ of the pseudo-inertia; otherwise each changes by
-J_k ← E J_k Eᵀ with the E that gives E J₀ Eᵀ = J. The text is read back and compared before it is written.
+Only changed attributes are edited (`edit_xml.py`); meshes, comments, order and formatting are preserved. A
+link of the robot may consist of several links in the file that are fixed to each other. The heaviest of them
+that stays physically consistent takes the whole change J − J₀ of the pseudo-inertia. Otherwise, each changes
+by J_k ← E J_k Eᵀ, where E satisfies E J₀ Eᵀ = J. The text is read back and compared before it is written.
 """
 
 from __future__ import annotations
@@ -36,11 +36,11 @@ from forcegp.robot.tree import (
 )
 
 CHANGED = 1e-6
-"""Relative change of a figure below which the file keeps its own text."""
+"""Relative change of a parameter below which the text in the file is preserved."""
 SAME = 1e-6
-"""Relative difference that the text of a written file may leave."""
+"""Relative tolerance for the parameters read back from a written file."""
 ORIENTATIONS = ("axisangle", "euler", "xyaxes", "zaxis")
-"""Orientations of an inertial frame that MJCF has beside a quaternion."""
+"""Orientation attributes of an inertial frame in MJCF other than a quaternion."""
 
 
 class Change(NamedTuple):
@@ -54,7 +54,7 @@ class Change(NamedTuple):
 
 @dataclass(frozen=True)
 class WrittenRobot:
-    """Changed parameters, and sentences on parameters that the format cannot represent."""
+    """Changed parameters, and descriptions of parameters that the format cannot represent."""
 
     changes: tuple[Change, ...]
     losses: tuple[str, ...]
@@ -70,7 +70,7 @@ def write_robot(
     """Write masses, inertias, damping, friction and armature of a robot into a copy of its file.
 
     Args:
-        robot: with the parameters to write; links and joints are those of the file.
+        robot: robot with the parameters to write, and the links and joints of the file.
         source: URDF or MJCF file of the robot, or a bundled name.
         out: path of the edited copy; it may be `source` itself.
         locked_joints: as for `load_robot`.
@@ -79,8 +79,8 @@ def write_robot(
         Changed parameters, and parameters that the format cannot represent.
 
     Raises:
-        RobotFileError: the joints are not those of the file, an element to change lies in an included file,
-            no link of the file can take a change, or the written file would not describe the robot.
+        RobotFileError: the joints differ from those in the file, an element to change is in an included file,
+            no link can take a change, or the written file would not describe the robot.
 
     Example:
         >>> import tempfile, forcegp
@@ -114,7 +114,7 @@ def write_robot(
 
 
 def is_mjcf(source: str | Path) -> bool:
-    """Whether a robot file is MJCF (with armature of joints) rather than URDF."""
+    """Return whether a robot file is MJCF (which supports armature) rather than URDF."""
     path = robot_path(source)
     return parse_xml(read_bytes(path), str(path)).tag == "mujoco"
 
@@ -124,7 +124,7 @@ def _world(robot: RobotModel) -> dict[str, np.ndarray]:
 
 
 def _joint_changes(writer: _Urdf | _Mjcf, robot: RobotModel, file: RobotModel) -> list[Change]:
-    """Write the figures of joints that changed."""
+    """Write the changed parameters of joints."""
     changes = []
     for i, joint in enumerate(robot.joint_names):
         values = {}
@@ -139,7 +139,7 @@ def _joint_changes(writer: _Urdf | _Mjcf, robot: RobotModel, file: RobotModel) -
 
 
 def _link_changes(writer: _Urdf | _Mjcf, tree: Tree, robot: RobotModel, file: RobotModel) -> list[Change]:
-    """Write the inertia of links that changed."""
+    """Write the changed inertia of links."""
     old = {link.name: link.inertial for link in tree.links}
     J_old = pseudo_inertia(file.mass, file.com, file.inertia)
     J_new = pseudo_inertia(robot.mass, robot.com, robot.inertia)
@@ -160,14 +160,14 @@ def _link_changes(writer: _Urdf | _Mjcf, tree: Tree, robot: RobotModel, file: Ro
 
 
 NOTHING = Inertial(0.0, np.zeros(3), np.zeros((3, 3)))
-"""The inertia of a link that has none."""
+"""Inertia of a link without mass."""
 _MOMENTS = ("xx", "yy", "zz", "xy", "xz", "yz")
 _PLACES = (0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)
 
 
 class _Part(NamedTuple):
-    """A link of the file that is fixed to a link of the robot: pose T and pseudo-inertia J `(4, 4)` of it
-    there, and whether some body has its figures.
+    """A link of the file that is part of a link of the robot: pose T and pseudo-inertia J `(4, 4)` in that
+    link, and whether a body in the file defines them.
     """
 
     name: str
@@ -177,7 +177,7 @@ class _Part(NamedTuple):
 
 
 def _parts(file: RobotModel, i: int, old: Mapping[str, Inertial | None]) -> list[_Part]:
-    """The links of the file that make up link i, the heaviest first."""
+    """Return the links of the file that make up link i, the heaviest first."""
     frames = zip(file.frame_names, file.frame_parents, file.frame_rotation, file.frame_position, strict=True)
     parts = []
     for name, parent, R, p in frames:
@@ -192,7 +192,7 @@ def _parts(file: RobotModel, i: int, old: Mapping[str, Inertial | None]) -> list
 
 
 def _shared(parts: list[_Part], J_old: Tensor, J_new: Tensor, joint: str) -> dict[str, Inertial]:
-    """New inertia of links that are fixed to each other, of which one takes the change, or all a share."""
+    """Return the new inertias of links fixed to each other: one takes the change, or all take a share."""
     for part in parts:
         body = _body(part.pose, part.J + J_new - J_old)
         if body is not None and not inertia_error(body) and not (part.sound and inertia_doubt(body)):
@@ -216,7 +216,7 @@ def _shared(parts: list[_Part], J_old: Tensor, J_new: Tensor, joint: str) -> dic
 
 
 def _body(pose: Tensor, J: Tensor) -> Inertial | None:
-    """Mass, centre of mass and inertia in the axes of a link; `None` without mass."""
+    """Return mass, centre of mass and inertia in the axes of a link; `None` without mass."""
     back = torch.linalg.inv(pose)
     if float(J[3, 3]) <= 0.0:
         return None
@@ -225,7 +225,7 @@ def _body(pose: Tensor, J: Tensor) -> Inertial | None:
 
 
 def _losses(robot: RobotModel, figures: Mapping[str, str]) -> tuple[str, ...]:
-    """Parameters without a place in the format."""
+    """Describe the parameters that the format cannot represent."""
     losses = []
     for figure in ("damping", "friction", "stribeck", "armature"):
         values = getattr(robot, figure)
@@ -236,7 +236,7 @@ def _losses(robot: RobotModel, figures: Mapping[str, str]) -> tuple[str, ...]:
 
 
 def _check(robot: RobotModel, read: RobotModel, writer: _Urdf | _Mjcf) -> None:
-    """Compare a robot with what the written text gives; `RobotFileError` where they differ."""
+    """Compare a robot with the one read from the written text; `RobotFileError` if they differ."""
     for figure in ("mass", "com", "inertia", *writer.figures):
         wanted, got = getattr(robot, figure), getattr(read, figure)
         error = (wanted - got).abs().flatten(1).amax(-1) if wanted.ndim > 1 else (wanted - got).abs()
@@ -354,7 +354,7 @@ class _Mjcf:
 
 
 def _principal(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Principal moments and axes of an inertia, a right-handed frame."""
+    """Return the principal moments and right-handed principal axes of an inertia."""
     moments, axes = np.linalg.eigh(inertia)
     moments, axes = moments[::-1], axes[:, ::-1]
     if np.linalg.det(axes) < 0.0:

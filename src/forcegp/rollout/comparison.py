@@ -1,6 +1,6 @@
 """Comparison of predicted and logged trajectories: tip error over time, drift, coverage of the bands.
 
-Split-conformal widening is the factor that scales bands to their nominal coverage.
+Split-conformal widening scales bands to their nominal coverage.
 """
 
 from __future__ import annotations
@@ -24,13 +24,14 @@ from forcegp.rollout.trajectory import Bands, Rollout
 
 
 def widening(values: Tensor, band: Bands, level: float) -> float:
-    """Factor on the half-widths of bands for a coverage `level` of exchangeable trajectories.
+    """Return the factor on the half-widths of bands for a coverage `level` of exchangeable trajectories.
 
-    The score of a trajectory is the factor that puts a share `level` of its values inside the band, from the
-    ratios |value − median| / (half-width on that side); the factor is the ⌈(n + 1) level⌉-th smallest of n
-    scores. A further exchangeable trajectory then has a share `level` of its values inside with probability
-    `level` or more, however wrong the model is (Lei, G'Sell, Rinaldo, Tibshirani, Wasserman,
-    *Distribution-free predictive inference for regression*, JASA 113, 2018, section 2.2).
+    The score of a trajectory is the factor for which a fraction `level` of its values is inside the band,
+    computed from the ratios |value − median| / (half-width on that side). The result is the ⌈(n + 1)
+    level⌉-th smallest of n scores. For another exchangeable trajectory, a fraction `level` of the values is
+    then inside with probability at least `level`, however wrong the model is (Lei, G'Sell, Rinaldo,
+    Tibshirani, Wasserman, *Distribution-free predictive inference for regression*, JASA 113, 2018, section
+    2.2).
 
     Args:
         values: `(n, …)` observed values of n trajectories, NaN if missing.
@@ -57,7 +58,7 @@ def widening(values: Tensor, band: Bands, level: float) -> float:
 HORIZONS = (0.5, 1.0, 2.0, 5.0, 10.0)
 """Times at which tip errors are reported [s]."""
 LEVEL = 0.9
-"""Share of the samples inside a band."""
+"""Fraction of the samples inside a band."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,7 +67,7 @@ class Comparison:
 
     Attributes:
         system: robot and contacts as logged.
-        frame, point: the tip.
+        frame, point: frame and coordinates of the tip.
         t: `(T,)` time since the start [s].
         q: `(k, T, nq)` logged joint positions.
         multiplier: `(k, T, n_contacts)` logged λ [N], or `None`.
@@ -83,26 +84,26 @@ class Comparison:
 
     @property
     def tip(self) -> Tensor:
-        """Logged world position of the tip, `(k, T, 3)` [m]."""
+        """Logged position of the tip in the world, `(k, T, 3)` [m]."""
         return kinematics.point_position(self.system.robot, self.q, self.frame, tuple(self.point))
 
     def predicted_tip(self, model: str) -> Tensor:
-        """Predicted position of the tip `(k, T, 3)` [m], by the model's own kinematics; NaN once diverged."""
+        """Return the predicted position of the tip `(k, T, 3)` [m]; NaN after a divergence."""
         return self._whole(self.predicted[model].tip(self.frame, self.point))
 
     def sampled_tip(self, model: str) -> Tensor:
-        """Tip of each function sample, `(S, k, T, 3)` [m]."""
+        """Return the tip of each function sample, `(S, k, T, 3)` [m]."""
         return self._whole(self.predicted[model].need_samples().tip(self.frame, self.point))
 
     def tip_error(self, model: str) -> Tensor:
-        """Distance between predicted and logged tip, `(k, T)` [m]; infinite once diverged."""
+        """Return the distance between predicted and logged tip, `(k, T)` [m]; infinite after a divergence."""
         return (self.predicted_tip(model) - self.tip).norm(dim=-1).nan_to_num(torch.inf)
 
     def error_at(self, model: str, horizon: float) -> float:
-        """Median over the starts of the tip error after a time [m].
+        """Return the median over the starts of the tip error after a time [m].
 
         Raises:
-            DataError: the comparison is shorter.
+            DataError: the comparison is shorter than this time.
         """
         if horizon > float(self.t[-1]) * (1.0 + 1e-9):
             raise DataError("the comparison ends earlier", expected=f"{horizon} s", got=float(self.t[-1]))
@@ -110,11 +111,11 @@ class Comparison:
         return float(self.tip_error(model)[:, step].median())
 
     def coverage(self, model: str, level: float = LEVEL, inflation: float = 1.0) -> float:
-        """Share of tip coordinates inside the band over samples, over all starts and all times except the
+        """Return the fraction of tip coordinates inside the band, over all starts and all times except the
         first.
 
-        `level` is the share of samples inside the band, `inflation` a factor on its half-widths. On a surface
-        only the tangential coordinates count, as the constraint fixes the normal one.
+        `level` is the fraction of samples inside the band, and `inflation` a factor on its half-widths. On a
+        surface, only tangential coordinates count, since the constraint fixes the normal one.
         """
         logged, band = self._tip_along(model, level)
         band = band.widened(inflation)
@@ -122,18 +123,18 @@ class Comparison:
         return float(inside.to(self.q.dtype).mean())
 
     def inflation(self, model: str, level: float = LEVEL) -> float:
-        """Factor that scales the bands to cover a share `level` of tip coordinates (`widening`)."""
+        """Return the factor on the bands that covers a fraction `level` of tip coordinates (`widening`)."""
         return widening(*self._tip_along(model, level), level)
 
     def _tip_along(self, model: str, level: float) -> tuple[Tensor, Bands]:
-        """Logged tip coordinates `(k, T − 1, d)`, along the surface if there is one, and the band of each."""
+        """Return the logged tip coordinates `(k, T − 1, d)`, along the surface if any, and their bands."""
         along = self._tangents()
         sampled = (self.sampled_tip(model)[..., None, :] @ along)[..., 0, :]
         logged = (self.tip[..., None, :] @ along)[..., 0, :]
         return logged[:, 1:], self.predicted[model].bands(sampled[:, :, 1:], level)
 
     def _tangents(self) -> Tensor:
-        """Orthonormal directions along the surface under the logged tip `(k, T, 3, 2)`, or all axes."""
+        """Return orthonormal directions along the surface at the logged tip `(k, T, 3, 2)`, or all axes."""
         contact = _tip_contact(self.system)
         if contact is None or contact.frame != self.frame:
             return torch.eye(3, dtype=self.q.dtype).expand(*self.q.shape[:-1], 3, 3)
@@ -141,7 +142,7 @@ class Comparison:
         return torch.linalg.svd(normal[..., None, :]).Vh.mT[..., 1:]
 
     def _whole(self, values: Tensor) -> Tensor:
-        """Values over the whole time, NaN after all trajectories had diverged."""
+        """Extend values to the full duration, with NaN after all trajectories have diverged."""
         missing = len(self.t) - values.shape[-2]
         return torch.nn.functional.pad(values, (0, 0, 0, missing), value=torch.nan)
 
@@ -151,7 +152,7 @@ def _tip_contact(system: ConstrainedSystem) -> SurfaceContact | None:
 
 
 def tip_of(system: ConstrainedSystem) -> tuple[str, Sequence[float]]:
-    """Frame and point of the first contact with a surface, or the origin of the last frame."""
+    """Return frame and point of the first surface contact, or the origin of the last frame."""
     contact = _tip_contact(system)
     return (contact.frame, contact.point) if contact else (system.robot.frame_names[-1], (0.0, 0.0, 0.0))
 
@@ -167,20 +168,20 @@ def compare(
     options: RolloutOptions | None = None,
     progress: Progress | None = None,
 ) -> Comparison:
-    """Roll models forward from logged states under the logged torques, in open loop.
+    """Simulate models in open loop from logged states under the logged torques.
 
     Args:
         models: fitted models by name.
-        data: a log in the order of time.
-        duration: of each trajectory [s].
-        starts: the number of starts, spread evenly over the log, or the rows to start from.
-        samples: number of function samples, for the models that have them.
-        system: robot and contacts of the log; those of the first model by default.
-        options: of the rollouts; by default a diverging one is kept up to its divergence.
+        data: a log in time order.
+        duration: duration of each trajectory [s].
+        starts: number of evenly spaced starts, or the rows to start from.
+        samples: number of function samples, for models that support them.
+        system: robot and contacts of the log; by default those of the first model.
+        options: options for the rollouts; by default, diverging rollouts are kept up to their divergence.
         progress: called during the rollouts.
 
     Raises:
-        DataError: the log is too short, or not in the order of time.
+        DataError: the log is too short or not in time order.
     """
     system = system or next(iter(models.values())).system
     dt = _period(data)
@@ -200,7 +201,7 @@ def compare(
 
 
 def beside_log(name: str, predicted: Rollout, log: Dataset, dt: float) -> Comparison:
-    """A log and a rollout from its first row, both with the period dt [s]."""
+    """Return a log and a rollout from its first row, both with the period dt [s]."""
     rows = torch.arange(len(log))[None]
     return _beside(predicted.system, log, rows, dt, {name: predicted[None]})
 
@@ -221,7 +222,7 @@ def _period(data: Dataset) -> float:
 
 
 def _starts(data: Dataset, steps: int, starts: int | Tensor) -> Tensor:
-    """Rows `(count,)` that `steps` more rows of their trajectory follow: those given, or spread evenly."""
+    """Return start rows `(count,)`, given or evenly spaced, that are followed by `steps` rows."""
     count = starts if isinstance(starts, int) else len(starts)
     fits = torch.arange(max(len(data) - steps, 0))
     fits = fits[data.segment[fits] == data.segment[fits + steps]]

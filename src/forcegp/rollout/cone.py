@@ -1,8 +1,8 @@
-"""Contacts that stick in a rollout: the friction cone at which sticking ends, and the arrest of sliding.
+"""Sticking contacts in a rollout: the friction cone that ends sticking, and the arrest of sliding.
 
 A contact sticks if the required tangential force λ_t is within its friction cone. The model defines the cone:
-the contact slides along d = −λ_t/|λ_t| if the friction of the model at a velocity v d does not stop it,
-dᵀ(A_t q̈ − b_t) > 0, with v above `stick_speed` and above the speeds over which the friction is smooth.
+the contact slides along d = −λ_t/|λ_t| if the model's friction at a velocity v d does not stop it,
+dᵀ(A_t q̈ − b_t) > 0, with v above `stick_speed` and above the speed scale of smoothed friction.
 Within a step, friction can stop a sliding contact but not reverse it.
 """
 
@@ -23,7 +23,7 @@ from forcegp.forces.quantities import States
 
 
 def sticking_contacts(system: ConstrainedSystem, at: States, among: Container[str]) -> Tensor:
-    """Closed contacts that stick `(n, n_contacts)` bool, among the named ones."""
+    """Return which of the named contacts are closed and stick, `(n, n_contacts)` bool."""
     sticks = torch.zeros_like(at.active)
     for k, contact, _ in system.may_stick:
         rests = at.eom.contact_points[contact.name].sticks
@@ -35,12 +35,12 @@ def sticking_contacts(system: ConstrainedSystem, at: States, among: Container[st
 def sliding_away(
     system: ConstrainedSystem, at: States, multiplier: Tensor, slides: Tensor, speeds: Mapping[str, float]
 ) -> States:
-    """The states at which sticking contacts start to slide.
+    """Return the states at which sticking contacts start to slide.
 
     Args:
-        multiplier: λ `(n, m)` of sticking.
-        slides: `(n, n_contacts)` bool, which contacts slide.
-        speeds: at which, by name [m/s].
+        multiplier: multipliers λ `(n, m)` for sticking.
+        slides: `(n, n_contacts)` bool, true for sliding contacts.
+        speeds: sliding speed of each contact, by name [m/s].
     """
     eom, points = at.eom, dict(at.eom.contact_points)
     free = torch.zeros_like(eom.b, dtype=torch.bool)
@@ -59,7 +59,7 @@ def sliding_away(
 
 
 def accelerating(system: ConstrainedSystem, at: States, multiplier: Tensor, qdd: Tensor) -> Tensor:
-    """Boolean mask `(n, n_contacts)` of the contacts that accelerate against the holding force."""
+    """Return a mask `(n, n_contacts)` of the contacts that accelerate against the holding force."""
     away = torch.zeros_like(at.active)
     # −λ_tᵀ(A_t q̈ − b_t) > 0
     held = multiplier * ((at.eom.A @ qdd[..., None])[..., 0] - at.eom.b)
@@ -76,7 +76,7 @@ def arrested(
     closed: Tensor,
     qd: Tensor,
 ) -> Tensor:
-    """Velocity `(n, nq)` after a step, with contacts at rest that friction would otherwise reverse.
+    """Return the velocity `(n, nq)` after a step, stopping contacts that friction would otherwise reverse.
 
     The impulse is that of an impact on the tangential rows, q̇ ← q̇ − L A q̇.
 

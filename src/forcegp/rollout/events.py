@@ -1,8 +1,8 @@
 """Times at which contacts open and close, located within a step.
 
-A closed contact opens when λ falls to zero, an open one closes when c does; the mechanics are those of
-`constraints/unilateral.py`. The probability that contact is lost at a state comes from the posterior over
-the multiplier.
+A closed contact opens when λ falls to zero, and an open contact closes when c does; the mechanics are those
+of `constraints/unilateral.py`. The probability of losing contact at a state is computed from the posterior
+over the multiplier.
 """
 
 from __future__ import annotations
@@ -18,11 +18,11 @@ from forcegp.rollout.inputs import ForwardModel
 from forcegp.rollout.law import Instant, RolloutProblem, State, Step
 
 MAX_EVENTS = 8
-"""Events within one step; a contact that bounces to rest within a step has infinitely many."""
+"""Maximum number of events within a step; a contact that bounces to rest has infinitely many."""
 LOCATION = 1e-9
-"""An event is located where λ [N] or c [m] is this small relative to its value at the start of the step."""
+"""Value of λ [N] or c [m], relative to the start of the step, at which an event counts as located."""
 MAX_TRIALS = 40
-"""Trials to locate an event; regula falsi with halving (Illinois) needs about eight."""
+"""Maximum number of trials to locate an event; regula falsi with halving (Illinois) needs about eight."""
 
 
 class ContactEvent(NamedTuple):
@@ -31,8 +31,8 @@ class ContactEvent(NamedTuple):
     Attributes:
         t: time [s].
         row: index of the trajectory in the flattened batch.
-        contact: name.
-        closed: whether it is closed afterwards.
+        contact: name of the contact.
+        closed: whether the contact is closed afterwards.
     """
 
     t: float
@@ -42,7 +42,7 @@ class ContactEvent(NamedTuple):
 
 
 def _signal(problem: RolloutProblem, state: State, now: Instant) -> tuple[Tensor, Tensor]:
-    """`(n, n_contacts)`: what crosses zero at the next event, and whether it has."""
+    """Return the signals that cross zero at the next event, and whether they have, `(n, n_contacts)`."""
     system, active = problem.system, state.active
     crossed = pulling(system, active, now.multiplier) | reached(system, active, now.c, now.cd)
     signal = torch.where(rows_of(system, active), now.multiplier, now.c)
@@ -50,7 +50,7 @@ def _signal(problem: RolloutProblem, state: State, now: Instant) -> tuple[Tensor
 
 
 def switch(problem: RolloutProblem, state: State, crossed: Tensor) -> State:
-    """Open and close the contacts that crossed `(n, n_contacts)`, with the impacts of those that close."""
+    """Open and close contacts with crossed signals `(n, n_contacts)`, with impacts for those that close."""
     active = state.active ^ crossed
     landing = (crossed & active).any(-1)
     if not bool(landing.any()):
@@ -60,9 +60,9 @@ def switch(problem: RolloutProblem, state: State, crossed: Tensor) -> State:
 
 
 def settle(problem: RolloutProblem, state: State, end: Tensor) -> tuple[State, Instant, list[ContactEvent]]:
-    """The state at the start of a step, after opening pulling contacts and closing reached ones.
+    """Return the state at the start of a step, after opening pulling contacts and closing reached ones.
 
-    The torque may jump there, and so does λ.
+    The torque may jump at the start of a step, and λ with it.
     """
     now = problem.evaluate(state, end)
     events: list[ContactEvent] = []
@@ -79,7 +79,7 @@ def settle(problem: RolloutProblem, state: State, end: Tensor) -> tuple[State, I
 def advance(
     problem: RolloutProblem, step: Step, state: State, first: Instant, h: Tensor
 ) -> tuple[State, list[ContactEvent]]:
-    """One step of the batch of length h `(n, 1)` [s], stopping each trajectory at its events."""
+    """Advance the batch by one step of length h `(n, 1)` [s], stopping each trajectory at its events."""
     trial = step(problem, state, first, h)
     events: list[ContactEvent] = []
     for _ in range(MAX_EVENTS):
@@ -111,7 +111,7 @@ def _locate(
     signal: Tensor,
     crossed: Tensor,
 ) -> Tensor:
-    """Fraction `(n, 1)` of the step after which the first of the crossing signals is zero; 1 for no event."""
+    """Return the fraction `(n, 1)` of the step until the first signal crosses zero; 1 without events."""
 
     def smallest(values: Tensor) -> Tensor:
         return torch.where(crossed, values, torch.inf).amin(-1, keepdim=True)
@@ -149,13 +149,13 @@ def _listed(problem: RolloutProblem, state: State, crossed: Tensor) -> list[Cont
 def contact_loss_probability(
     model: ForwardModel, q: Tensor, qd: Tensor, tau: Tensor, *, active: Tensor | None = None
 ) -> Tensor:
-    """Probability `(*batch, m)` that λ < 0 at states `(*batch, nq)`, so that the contact opens.
+    """Return the probability `(*batch, m)` that λ < 0 at states `(*batch, nq)` and the contact opens.
 
-    P(λ < 0) = Φ(−μ/σ) of the multiplier's posterior N(μ, σ²); 1 for an open contact. `active`
-    `(*batch, n_contacts)` are the closed contacts; default all.
+    P(λ < 0) = Φ(−μ/σ) for the multiplier's posterior N(μ, σ²), and 1 for an open contact. `active`
+    `(*batch, n_contacts)` are the closed contacts, by default all.
 
     Raises:
-        ModelError: the model has no variance of the multiplier.
+        ModelError: the model does not predict the variance of the multiplier.
     """
     prediction = model.predict(q, qd, tau, "multiplier", active=active, covariance=True)
     if prediction.std is None:

@@ -1,4 +1,4 @@
-"""Long-term predictions: roll a model, or any force law, forward from initial states (section 4)."""
+"""Long-term predictions: integrate a model, or any force law, from initial states (section 4)."""
 
 from __future__ import annotations
 
@@ -23,37 +23,38 @@ from forcegp.rollout.trajectory import FIELDS, DivergedError, Rollout
 STEP = 1.0 / 240.0
 """Step of a rollout under a feedback law in continuous time [s]."""
 CLOSED = 5e-4
-"""A contact that can open is closed at the start if its error is below this [m]: more than the drift of a
-logged contact, less than a distance that would count as off the surface."""
+"""A contact that can open is initially closed if its error is below this [m]: more than the drift of a logged
+contact, less than a distance that would count as off the surface.
+"""
 STEPS_PER_STATE = 4
-"""Recorded steps that take as much memory as the equations of motion of one state; measured, rounded down."""
+"""Number of recorded steps that need as much memory as the equations of motion of one state (measured)."""
 FEW = 8
-"""Up to this number of trajectories one thread is used, as more only slow down work on small tensors."""
+"""Number of trajectories up to which one thread is used, since more are slower on small tensors."""
 
 COMPILED_STEPS = 1000
-"""Steps from which compiled mechanics save more time than compiling takes."""
+"""Number of steps from which compiled mechanics save more time than compilation takes."""
 STABILIZATIONS = ("none", "baumgarte", "projection")
 ON_DIVERGENCE = ("raise", "keep")
 
 
 @dataclass(frozen=True)
 class RolloutOptions:
-    """Options of a rollout.
+    """Options for a rollout.
 
     Args:
-        dt: step, period of the output, and sampling period of torques passed as an array [s]. By default the
-            sampling period of a log or controller, and 1/240 s for a feedback law; an array needs `dt`.
-        method: `semi_implicit_euler` (the simulators' step), `rk4`, or, adaptive within each step,
-            `rk45` and `dop853` of SciPy.
-        stabilization: `none`, `baumgarte` (the system's own terms, or the default ones), other
+        dt: step size, output period, and sampling period of torques passed as an array [s]. By default the
+            sampling period of a log or controller, and 1/240 s for a feedback law; an array requires `dt`.
+        method: `semi_implicit_euler` (the step of the simulators), `rk4`, or SciPy's `rk45` and `dop853`,
+            which are adaptive within each step.
+        stabilization: `none`, `baumgarte` (the terms of the system, or the default ones), custom
             `Baumgarte` terms, or `projection` of q and q̇ onto the manifold after each step.
         unilateral: whether contacts with a surface open when they would pull, and can close again.
-        interpolation: of a torque array between its samples, `hold` or `linear`.
-        speed_limit: a joint faster than this counts as diverged [rad/s, m/s].
-        torque_noise: whether each function sample has its own torque noise, if the model has learned the
-            noise of logged torques, and its own unknown forces, if their size is stated (constant over a
+        interpolation: interpolation of a torque array between samples, `hold` or `linear`.
+        speed_limit: joint speed above which a trajectory counts as diverged [rad/s, m/s].
+        torque_noise: whether each function sample has independent torque noise, if the model has learned the
+            noise of logged torques, and independent unknown forces, if their size is given (constant over a
             trajectory).
-        sticking: whether dry friction of joints (of the robot file, or of a prior such as
+        sticking: whether dry joint friction (from the robot file, or from a prior such as
             `JointFrictionPrior`) holds a joint at rest while the net force is within its limit; otherwise
             friction is a smooth function of the velocity, and joints creep.
         on_divergence: `raise` a `DivergedError` that contains the trajectories, or `keep` them.
@@ -64,7 +65,7 @@ class RolloutOptions:
 
     Raises:
         ForceGPError: a value is out of range.
-        UnknownNameError: unknown method, stabilization or `on_divergence`.
+        UnknownNameError: the method, stabilization or `on_divergence` is unknown.
     """
 
     dt: float | None = None
@@ -90,7 +91,7 @@ class RolloutOptions:
             check_name("stabilization", self.stabilization, STABILIZATIONS)
 
     def stabilized(self, system: ConstrainedSystem) -> ConstrainedSystem:
-        """The system with the stabilization terms of the rollout in its right-hand side."""
+        """Return the system with the stabilization of the rollout on the right-hand side."""
         terms = self.stabilization if isinstance(self.stabilization, Baumgarte) else None
         if self.stabilization == "baumgarte":
             terms = system.baumgarte or Baumgarte()
@@ -114,24 +115,24 @@ def rollout(
 ) -> Rollout:
     """Integrate q̈ = law(q, q̇, τ) from initial states.
 
-    With the fixed-step methods the result is differentiable with respect to the initial state, the
-    torques and the parameters of the robot, as long as no contact opens or closes.
+    With fixed-step methods, the result is differentiable with respect to the initial state, the torques and
+    the parameters of the robot, as long as no contact opens or closes.
 
     Args:
-        law: returns the acceleration.
+        law: function that returns the acceleration.
         system: robot and contacts.
         q0, qd0: `(*batch, nq)` initial states.
-        tau: motor torque Q_u over time (a log, or an array with its period in `options`), or a law of
+        tau: motor torque Q_u over time (a log, or an array with its period in `options`), or a function of
             (t, q, q̇).
         duration: simulated time [s], rounded to whole steps.
-        active: `(*batch, n_contacts)` bool, contacts closed at the start; by default all, or, if contacts can
-            open, those that touch.
+        active: `(*batch, n_contacts)` bool, initially closed contacts; by default all or, if contacts can
+            open, those on a surface.
         options: step, method, stabilization.
         progress: called after each step.
 
     Raises:
-        DivergedError: a trajectory diverged; the error contains the result. ShapeError: an argument does not
-            fit the robot.
+        DivergedError: a trajectory diverged; the error contains the result.
+        ShapeError: an argument does not match the robot.
         ModelError: contacts can open but the law has no multiplier, or the period of the torques is missing.
     """
     options = options or DEFAULT
@@ -153,25 +154,24 @@ def rollout_model(
     options: RolloutOptions | None = None,
     progress: Progress | None = None,
 ) -> Rollout:
-    """The mean motion of a model, and motions under functions drawn from its posterior.
+    """Return the mean motion of a model, and motions under functions drawn from its posterior.
 
-    Each sample is one deterministic force function, so each of its trajectories obeys the constraint and
-    Newton's equation. With learned torque noise, each sample has its own noise
-    (`RolloutOptions.torque_noise`).
+    Each sample is a deterministic force function, so its trajectories obey the constraint and Newton's
+    equations. With learned torque noise, samples have independent noise (`RolloutOptions.torque_noise`).
 
     Args:
         model: a fitted model.
         q0, qd0, tau, duration, active, options, progress: see `rollout`.
         samples: number S of function samples; all are integrated together.
-        seed: of the samples.
-        system: roll out on another system, such as another surface, or a robot with other parameters.
+        seed: seed for the samples.
+        system: another system, for example with another surface or other robot parameters.
 
     Returns:
         The mean motion, with the trajectories of the samples, batch `(S, *batch)`, as `samples`.
 
     Raises:
-        DivergedError: a trajectory diverged; the error contains the result. ModelError: the model has no
-            function samples, or cannot leave its own system.
+        DivergedError: a trajectory diverged; the error contains the result.
+        ModelError: the model does not support function samples or other systems.
     """
     options = options or DEFAULT
     batch = torch.broadcast_shapes(q0.shape[:-1], qd0.shape[:-1])
@@ -201,9 +201,9 @@ def replayed(
     options: RolloutOptions,
     progress: Progress | None = None,
 ) -> Rollout:
-    """A model rolled out from the first state of a logged trajectory under its torques, at most to its end.
+    """Simulate a model from the first state of a logged trajectory under its torques, up to its end.
 
-    Batch, samples and options as in `rollout_model`.
+    Batch, samples and options are as in `rollout_model`.
     """
     duration = min(seconds, float(log.t[-1] - log.t[0]))
     active, how = log.active(model.system.contact_names)[0], {"options": options, "progress": progress}
@@ -225,7 +225,7 @@ def _run(
     noise: tuple[Disturbance, torch.Generator] | None = None,
     model: ForwardModel | None = None,
 ) -> Rollout:
-    """Flatten the batch, integrate, and give the result the shape of the whole batch."""
+    """Flatten the batch, integrate, and restore the shape of the batch."""
     n, system = whole.numel(), options.stabilized(system)
     system.robot.check_state(q0=start[0], qd0=start[1])
     unilateral = options.unilateral and len(system.contacts) > 0
@@ -267,7 +267,7 @@ def _run(
 def _initial(
     problem: RolloutProblem, start: tuple[Tensor, Tensor], whole: torch.Size, active: Tensor | None
 ) -> State:
-    """The initial states of all trajectories, and the contacts that are closed there."""
+    """Return the initial states of all trajectories, and the initially closed contacts."""
     n, contacts = whole.numel(), len(problem.system.contacts)
     q, qd = (x.expand(*whole, x.shape[-1]).reshape(n, -1) for x in start)
     if active is not None:
@@ -280,14 +280,14 @@ def _initial(
 
 
 def _touching(system: ConstrainedSystem, q: Tensor, qd: Tensor) -> Tensor:
-    """Contacts that touch, or cannot open `(n, n_contacts)`."""
+    """Return the contacts that are on their surface or cannot open, `(n, n_contacts)`."""
     with torch.no_grad():
         is_open = any_row(system, system.equations(q, qd).c.abs() > CLOSED)
     return ~(is_open & system.can_open)
 
 
 def share_of(progress: Progress | None, part: int, parts: int) -> Progress | None:
-    """Progress of one of several runs of equal length, as a share of the total."""
+    """Adapt a progress function to one of several runs of equal length."""
     if progress is None:
         return None
     return lambda done, total: progress(part * total + done, parts * total)

@@ -1,4 +1,4 @@
-"""Inputs of a rollout: a model, and motor torques as an array, a log, a feedback law or a controller."""
+"""Inputs to a rollout: a model, and motor torques as an array, a log, a feedback law or a controller."""
 
 from __future__ import annotations
 
@@ -20,27 +20,27 @@ from forcegp.forces.quantities import ForceField
 
 INTERPOLATIONS = ("hold", "linear")
 EDGE = 1e-6
-"""Part of a sampling period within which a time counts as a sampling time, against rounding."""
+"""Fraction of a sampling period within which a time counts as a sampling time, to allow for rounding."""
 EVEN = 0.02
-"""Largest deviation of a step from the sampling period, relative to the period, in a log that is replayed."""
+"""Largest relative deviation of a step from the sampling period in a replayed log."""
 
 
 @runtime_checkable
 class CompiledMotion(Protocol):
-    """The motion of trajectories, without gradients."""
+    """Function that computes the motion of trajectories, without gradients."""
 
     def __call__(
         self, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor, h: Tensor, sticking: bool
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """q̈, λ, constraint error and its rate, and joints that friction holds over steps h `(n, 1)`."""
+        """Return q̈, λ, constraint error and rate, and joints held by friction over steps h `(n, 1)`."""
         ...
 
 
 class ForwardModel(ABC):
-    """Interface that a rollout requires of a model of the forward dynamics."""
+    """Interface of forward dynamics models for rollouts."""
 
     kind: str
-    """Name of the class of models in saved files."""
+    """Name of the model class in saved files."""
     has_function_samples: bool = False
     """Whether `force_samples` draws functions from a posterior over forces."""
 
@@ -48,15 +48,15 @@ class ForwardModel(ABC):
     """Robot and contacts that predictions refer to."""
 
     def force_field(self) -> ForceField | None:
-        """The mean impressed force Q̄ `(n, nq)` at states, or `None` for a model of accelerations alone."""
+        """Return the mean impressed force Q̄ `(n, nq)` at states; `None` for models of accelerations only."""
         return None
 
     def force_samples(self, samples: int, generator: torch.Generator) -> ForceField:
-        """Force functions drawn from the posterior, all evaluated at once.
+        """Return a force field of functions drawn from the posterior, all evaluated at once.
 
         Args:
             samples: number S of functions.
-            generator: source of the draws.
+            generator: source of randomness.
 
         Returns:
             A force field on `(S * k, nq)` states; the s-th run of k states belongs to function s.
@@ -69,12 +69,12 @@ class ForwardModel(ABC):
         )
 
     def compiled_motion(self, system: ConstrainedSystem, force: ForceField) -> CompiledMotion | None:
-        """The motion of a system under the mean force or its samples by C code; `None` without such code."""
+        """Return C code for the motion under the mean force or its samples; `None` if unavailable."""
         return None
 
     @property
     def disturbance(self) -> Disturbance | None:
-        """Additional forces that disturb rollouts of function samples, `None` for none."""
+        """Additional random forces in rollouts of function samples, or `None`."""
         return None
 
     @abstractmethod
@@ -88,15 +88,15 @@ class ForwardModel(ABC):
         active: Tensor | None = None,
         covariance: bool = True,
     ) -> Any:
-        """`mean` and `std` `(*batch, d)` of a quantity at states `(*batch, nq)`; `std` may be `None`."""
+        """Return `mean` and `std` (or `None`) `(*batch, d)` of a quantity at states `(*batch, nq)`."""
 
 
 class Disturbance(NamedTuple):
-    """Additional forces on function samples.
+    """Additional random forces in rollouts of function samples.
 
     Attributes:
-        density: root of the spectral density of the logged torques' noise `(nq,)` [N m √s, N √s].
-        constant: standard deviation of an unknown force on each joint `(nq,)` [N m, N], kept for the whole
+        density: square root of the spectral density of the torque noise `(nq,)` [N m √s, N √s].
+        constant: standard deviation of an unknown force on each joint `(nq,)` [N m, N], constant over the
             trajectory, since its variation is unknown.
     """
 
@@ -121,32 +121,33 @@ class Reached:
 
     @cached_property
     def eom(self) -> Equations:
-        """The equations of motion there."""
+        """Equations of motion at the current states."""
         return self.system.equations(self.q, self.qd, self.active)
 
 
 class Inputs(ABC):
-    """Motor torque as a function of time and state."""
+    """Motor torques as a function of time and state."""
 
     @property
     def period(self) -> float | None:
-        """Sampling period [s]; `None` for a law in continuous time."""
+        """Sampling period [s]; `None` for a continuous-time law."""
         return None
 
     @abstractmethod
     def torque(self, t: Tensor, end: Tensor, at: Reached) -> Tensor:
-        """Q_u `(n, nq)` [N m].
+        """Return Q_u `(n, nq)` [N m].
 
         Args:
             t: `(n, 1)` time [s].
-            end: `(n, 1)` end of the current step; at t = end a torque that jumps has the value before the
+            end: `(n, 1)` end of the current step; at t = end, a torque that jumps has the value before the
                 jump.
-            at: the state with its equations of motion.
+            at: state with its equations of motion.
         """
 
 
 Torque = Tensor | Dataset | Inputs | Callable[[Tensor, Tensor, Tensor], Tensor]
-"""An array over time `(samples, nq)` or `(*batch, samples, nq)`, a log, inputs, or a law of (t, q, q̇)."""
+"""An array over time `(samples, nq)` or `(*batch, samples, nq)`, a log, inputs, or a function of (t, q, q̇).
+"""
 
 
 @dataclass(frozen=True)
@@ -207,7 +208,7 @@ class Disturbed(Inputs):
     def drawn(
         cls, inputs: Inputs, by: Disturbance, rows: int, steps: int, dt: float, generator: torch.Generator
     ) -> Disturbed:
-        """White noise and a constant force, drawn for each of n trajectories."""
+        """Draw white noise and a constant force for each of n trajectories."""
         density, constant = by
         white = torch.randn(rows, steps, len(density), generator=generator, dtype=density.dtype)
         kept = torch.randn(rows, 1, len(density), generator=generator, dtype=density.dtype)
@@ -217,10 +218,10 @@ class Disturbed(Inputs):
 
 @dataclass(frozen=True)
 class TaskSpaceControl(Inputs):
-    """The simulator's task-space controller following a plan of period dt [s].
+    """The simulator's task-space controller, which tracks a plan with period dt [s].
 
-    It assumes the analytical mechanics of `system`; `limit` `(nq,)` are torque limits [N m], by default those
-    of the robot.
+    The controller uses the analytical mechanics of `system`; `limit` `(nq,)` contains torque limits [N m], by
+    default those of the robot.
     """
 
     system: ConstrainedSystem
@@ -246,14 +247,14 @@ class TaskSpaceControl(Inputs):
 def inputs_of(
     tau: Torque, batch: torch.Size, rows: int, dt: float | None, interpolation: str = "hold"
 ) -> Inputs:
-    """Inputs from the argument `tau`, for `rows` trajectories, a multiple of the batch of initial states.
+    """Return the inputs defined by `tau` for `rows` trajectories, a multiple of the batch of initial states.
 
     `tau` is `(*batch, samples, nq)` or `(samples, nq)` with a period dt [s], a log, a feedback law of (t, q,
     q̇), or inputs; a single sample is a constant torque. `interpolation` is `"hold"` or `"linear"`.
 
     Raises:
-        UnknownNameError: unknown interpolation.
-        ShapeError: the array does not fit the initial states.
+        UnknownNameError: the interpolation is unknown.
+        ShapeError: the array does not match the initial states.
         ModelError: the sampling period of an array is missing.
         DataError: the log is not one trajectory with a constant sampling period.
     """
@@ -287,7 +288,7 @@ def inputs_of(
 
 
 def sampling_period(log: Dataset) -> float:
-    """Sampling period of a log of one trajectory [s], from its time column.
+    """Return the sampling period of a log of one trajectory [s], from its time column.
 
     Raises:
         DataError: rows are out of order or selected, or the log has several trajectories or gaps.

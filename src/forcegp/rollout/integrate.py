@@ -1,6 +1,7 @@
 """Integration of a rollout over time: the methods for one step, and the loop over all steps.
 
-The methods are semi-implicit Euler, Runge-Kutta of order four, and SciPy's adaptive ones with error control.
+The methods are semi-implicit Euler, fourth-order Runge-Kutta, and SciPy's adaptive methods with error
+control.
 """
 
 from __future__ import annotations
@@ -20,21 +21,21 @@ from forcegp.rollout.law import REGULARIZATION, STILL, Instant, RolloutProblem, 
 from forcegp.rollout.trajectory import Divergence, Rollout
 
 Progress = Callable[[int, int], None]
-"""Called with the number of steps done and the total number."""
+"""Called with the number of completed steps and their total number."""
 
 RELATIVE_TOLERANCE = 1e-9
 ABSOLUTE_TOLERANCE = 1e-11
-"""Error of an adaptive step in position [rad] and velocity [rad/s]: well below any model's own error."""
+"""Error of an adaptive step in position [rad] and velocity [rad/s], well below the error of any model."""
 
 
 def semi_implicit_euler(problem: RolloutProblem, state: State, first: Instant, h: Tensor) -> State:
-    """q̇⁺ = q̇ + h q̈, q⁺ = q + h q̇⁺, the step of the simulators; of first order."""
+    """Return the first-order step of the simulators, q̇⁺ = q̇ + h q̈, q⁺ = q + h q̇⁺."""
     qd = state.qd + h * first.qdd
     return State(state.t + h, state.q + h * qd, qd, state.active)
 
 
 def runge_kutta_4(problem: RolloutProblem, state: State, first: Instant, h: Tensor) -> State:
-    """The classical Runge-Kutta method, of fourth order."""
+    """Return a step of the classical fourth-order Runge-Kutta method."""
     t, q, qd, active = state
     end, half = t + h, 0.5 * h
     qd2 = qd + half * first.qdd
@@ -49,9 +50,10 @@ def runge_kutta_4(problem: RolloutProblem, state: State, first: Instant, h: Tens
 
 
 def adaptive(method: str) -> Step:
-    """A step of an adaptive method of `scipy.integrate` with error control.
+    """Return a step of an adaptive method of `scipy.integrate` with error control.
 
-    The whole batch shares the steps; time runs from 0 to 1 within the step, whose length may differ by row.
+    All rows share the internal steps; time runs from 0 to 1 within the step, which may differ in length by
+    row.
     """
 
     def step(problem: RolloutProblem, state: State, first: Instant, h: Tensor) -> State:
@@ -87,12 +89,12 @@ METHODS: dict[str, Step] = {
     "rk45": adaptive("RK45"),
     "dop853": adaptive("DOP853"),
 }
-"""The methods of integration, by name."""
+"""Integration methods by name."""
 
 
 @dataclass
 class _Record:
-    """States at output times, as they are reached."""
+    """Recorded states at output times."""
 
     states: list[State] = field(default_factory=list)
     motions: list[Instant] = field(default_factory=list)
@@ -100,7 +102,7 @@ class _Record:
     diverged: list[Divergence] = field(default_factory=list)
 
     def write(self, state: State, now: Instant, alive: Tensor) -> None:
-        """Keep a state; NaN in the rows `(n,)` that were dropped."""
+        """Record a state, with NaN in the dropped rows `(n,)`."""
         if not bool(alive.all()):
             rows = alive[:, None]
             now = Instant(*(torch.where(rows, x, torch.nan) for x in now[:-1]))  # pyright: ignore[reportArgumentType]
@@ -110,7 +112,7 @@ class _Record:
         self.motions.append(now)
 
     def note(self, events: list[ContactEvent], alive: Tensor) -> None:
-        """Keep the events of trajectories that continue."""
+        """Record the events of trajectories that continue."""
         self.events += [event for event in events if bool(alive[event.row])]
 
 
@@ -125,10 +127,10 @@ def integrate(
     speed_limit: float,
     progress: Progress | None = None,
 ) -> Rollout:
-    """Integrate n trajectories over steps of dt [s]; one that diverges is dropped while the others go on.
+    """Integrate n trajectories over steps of dt [s], dropping those that diverge.
 
     `project` moves position and velocity onto the manifold after each step; a joint faster than `speed_limit`
-    [rad/s, m/s] counts as diverged. The result, batch `(n,)`, is shorter if all diverged.
+    [rad/s, m/s] counts as diverged. The result, batch `(n,)`, is shorter if all trajectories diverge.
     """
     record, state, step = _Record(), start, _stopping(step)
     alive = torch.ones(len(start.q), dtype=torch.bool, device=start.q.device)
@@ -166,7 +168,7 @@ def integrate(
 
 
 def _stopping(step: Step) -> Step:
-    """The method, with contacts and joints at rest that friction stops within the step, up to its error."""
+    """Wrap a method so that contacts and joints stopped by friction are at rest after the step."""
 
     def stopped(problem: RolloutProblem, state: State, first: Instant, h: Tensor) -> State:
         reached = problem.stopped(state, step(problem, state, first, h))
@@ -182,9 +184,9 @@ def _stopping(step: Step) -> Step:
 
 
 def _braked(problem: RolloutProblem, state: State, held: Tensor) -> State:
-    """The state after the impulse of friction that stops joints.
+    """Return the state after the friction impulse that stops joints.
 
-    It changes the speed of the others too. Without that, stopping a joint alone can add kinetic energy.
+    The impulse also changes the speed of other joints; stopping a joint alone could add kinetic energy.
     """
     G = problem.system.equations(state.q, state.qd, state.active).H
     eye = torch.eye(G.shape[-1], dtype=G.dtype, device=G.device)
@@ -196,7 +198,7 @@ def _braked(problem: RolloutProblem, state: State, held: Tensor) -> State:
 def _survivors(
     record: _Record, before: State, after: State, alive: Tensor, speed_limit: float
 ) -> tuple[State, Tensor]:
-    """The state after a step, with trajectories that diverged held where they were."""
+    """Return the state after a step, with diverged trajectories kept at their previous state."""
     sound = torch.isfinite(after.q).all(-1) & (after.qd.abs().amax(-1) < speed_limit)
     if bool(sound.all()):
         return after, alive

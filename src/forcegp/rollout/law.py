@@ -1,22 +1,22 @@
-"""The right-hand side of a rollout: states, the law that gives the acceleration, and joints that stick.
+"""The right-hand side of a rollout: states, laws for the acceleration, and sticking joints.
 
-Dry friction is a force within ±F if a joint is at rest and −F sign(q̇) if it slides. Equations of motion
-smooth it to −F tanh(q̇/v₀), so that it can be learned and differentiated; a rollout uses the original law.
-With Q(s) the force where each joint's dry friction has the direction s in place of tanh(q̇/v₀),
+Dry friction is within ±F if a joint is at rest, and −F sign(q̇) if it slides. Equations of motion smooth it
+to −F tanh(q̇/v₀) for learning and differentiation; a rollout uses the original law. Let Q(s) be the force
+with the direction s of dry friction instead of tanh(q̇/v₀) for each joint. Then
 
     Q = ½ (Q(1) + Q(−1)) − F s,   F = ½ (Q(−1) − Q(1)).
 
-Over a step h, dry friction p of the joints changes the velocity to q̇⁺ = q̇ + h (q̈₀ + G p), with q̈₀ the
-acceleration without it. It satisfies |p_i| ≤ F_i and p_i = −F_i sign(q̇⁺_i) if the joint slides (Stewart and
-Trinkle, *An implicit time-stepping scheme for rigid body dynamics with inelastic collisions and Coulomb
-friction*, 1996). In contact G = H, so that the contact force depends on that of sticking joints. Block
+Over a step h, dry joint friction p changes the velocity to q̇⁺ = q̇ + h (q̈₀ + G p), where q̈₀ is the
+frictionless acceleration. It satisfies |p_i| ≤ F_i, and p_i = −F_i sign(q̇⁺_i) if the joint slides (Stewart
+and Trinkle, *An implicit time-stepping scheme for rigid body dynamics with inelastic collisions and Coulomb
+friction*, 1996). In contact G = H, so the contact force depends on the friction of sticking joints. Block
 principal pivoting solves this complementarity problem exactly (Júdice and Pires, *A block principal pivoting
 algorithm for large-scale strictly monotone linear complementarity problems*, 1994): guess the sticking
 joints, solve for their friction, and exchange those that contradict the guess.
 
 If h G_ii D_i > 1 for a light joint with viscous friction D, an explicit step reverses its motion, and above 2
 it is unstable. Viscous friction is then evaluated at the end of the step, q̈ = q̈₀ + G (p − h D q̈), as in
-MuJoCo's Euler integrator; otherwise at its start.
+MuJoCo's Euler integrator, and otherwise at the start.
 """
 
 from __future__ import annotations
@@ -42,37 +42,37 @@ from forcegp.rollout.cone import accelerating, arrested, sliding_away, sticking_
 from forcegp.rollout.inputs import CompiledMotion, ForwardModel, Inputs, Reached
 
 REGULARIZATION = 1e-10
-"""Compliance of sticking, relative to that of a free joint. In contact more joints can stick than can move,
-and only with it is their friction unique; it lets them creep by this part of the motion without friction."""
+"""Compliance of sticking, relative to that of a free joint. It makes friction unique even if more joints
+    stick than can move in contact; joints creep by this fraction of the frictionless motion."""
 CONTRADICTION = 1e-9
-"""A force beyond its limit, or a velocity against its direction, counts from this on, relative to its
-scale."""
+"""Relative threshold for forces beyond their limit and velocities against the direction of friction.
+"""
 BLOCK_TRIALS = 5
-"""Exchanges of several joints at once that may fail to improve the guess, before single ones."""
+"""Number of block exchanges without improvement before single exchanges."""
 MAX_EXCHANGES = 300
-"""Exchanges in all; arms need fewer than ten."""
+"""Maximum number of exchanges; arms need fewer than ten."""
 INSTANT = 1e-12
-"""Shortest step, at which a joint that moves slides [s]."""
+"""Shortest step [s], over which every moving joint slides."""
 STILL = 1e-8
-"""Speed up to which a joint is at rest: joints that stick creep by rounding [rad/s, m/s]."""
+"""Speed up to which a joint is at rest [rad/s, m/s]; sticking joints creep by rounding."""
 SMOOTH = 0.02
-"""Speed over which friction that would drive a joint changes sign; it is no friction and cannot stick
-[rad/s, m/s]."""
+"""Speed scale of learned "friction" that drives a joint, which cannot stick [rad/s, m/s].
+"""
 SATURATED = 10.0
-"""Speed, over that at which Coulomb friction is smooth, from which it counts as that of sliding."""
+"""Speed, relative to the speed scale of smoothed Coulomb friction, from which a contact slides."""
 NUDGE = 1e-4
-"""Change of speed over which the slope of friction is taken [rad/s, m/s]."""
+"""Change of speed for computing the slope of friction [rad/s, m/s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class DryFriction:
-    """An impressed force separated from the dry friction of joints.
+    """An impressed force separated into dry joint friction and other forces.
 
     Attributes:
-        Q_bar: `(n, nq)` all impressed forces without it [N m, N].
-        limit: `(n, nq)` its largest size F ≥ 0 [N m, N].
+        Q_bar: `(n, nq)` all other impressed forces [N m, N].
+        limit: `(n, nq)` largest magnitude F ≥ 0 of dry friction [N m, N].
         response: `(n, nq, nq)` ∂Q̄/∂Q with Coulomb friction of contacts; `None` for the identity.
-        damping: `(n, nq)` D = −∂Q_i/∂q̇_i ≥ 0 of the joints' other friction [N m s/rad, N s/m].
+        damping: `(n, nq)` damping D = −∂Q_i/∂q̇_i ≥ 0 of the other joint friction [N m s/rad, N s/m].
     """
 
     Q_bar: Tensor
@@ -82,16 +82,16 @@ class DryFriction:
 
 
 def posterior_of(force: ForceField) -> ForcePosterior | None:
-    """The posterior that a force field is the mean or a sample of, if any."""
+    """Return the posterior of a force field that is its mean or a sample, if any."""
     force = force.posterior if isinstance(force, ForceSamples) else force
     return force if isinstance(force, ForcePosterior) else None
 
 
 def split(system: ConstrainedSystem, at: States, force: ForceField) -> DryFriction:
-    """A force field at states, separated from the dry friction of joints.
+    """Evaluate a force field at states, separating the dry friction of joints.
 
     Args:
-        force: posterior mean, samples, or a prior mean alone, Q̄.
+        force: force field Q̄: a posterior mean, samples, or a prior mean.
 
     Example:
         >>> import torch, forcegp
@@ -143,13 +143,13 @@ class Stuck(NamedTuple):
 
 
 def overshooting(G: Tensor, damping: Tensor, h: Tensor) -> Tensor | None:
-    """D `(n, nq)` at states with h G_ii D_i > 1 for a joint, 0 elsewhere; `None` without such states."""
+    """Return D `(n, nq)` at states with h G_ii D_i > 1 for a joint, otherwise 0; `None` if there are none."""
     rows = (h * G.diagonal(dim1=-2, dim2=-1) * damping > 1.0).any(-1, keepdim=True)
     return torch.where(rows, damping, 0.0) if bool(rows.any()) else None
 
 
 def at_the_end(qdd: Tensor, G: Tensor, damping: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
-    """(1 + h G D)⁻¹ q̈₀ and (1 + h G D)⁻¹ G: acceleration and response with D at the end of the step.
+    """Return (1 + h G D)⁻¹ q̈₀ and (1 + h G D)⁻¹ G, acceleration and response with D at the end of the step.
 
     Example:
         >>> import torch
@@ -164,19 +164,19 @@ def at_the_end(qdd: Tensor, G: Tensor, damping: Tensor, h: Tensor) -> tuple[Tens
 
 
 def compliance_of(G: Tensor) -> Tensor:
-    """Acceleration of each joint per unit of its force, G_ii `(n, nq)`, at least 1/1000 of the largest."""
+    """Return the acceleration per force of each joint, G_ii `(n, nq)`, at least 1/1000 of the largest."""
     diagonal = G.diagonal(dim1=-2, dim2=-1)
     return diagonal.clamp(min=1e-3 * diagonal.amax(-1, keepdim=True))
 
 
 def dry_friction_force(qdd: Tensor, G: Tensor, limit: Tensor, qd: Tensor, h: Tensor) -> Stuck:
-    """The dry friction of joints over a step h `(n, 1)` [s] from velocities q̇ `(n, nq)`; 0 for an instant.
+    """Return the dry friction of joints over a step h `(n, 1)` [s], 0 for an instant, from q̇ `(n, nq)`.
 
-    `qdd` is the acceleration without it, `G` `(n, nq, nq)` acceleration per friction, H or M⁻¹, and `limit`
-    `(n, nq)` the largest size F ≥ 0 [N m, N].
+    `qdd` is the frictionless acceleration, `G` `(n, nq, nq)` the acceleration per friction (H or M⁻¹), and
+    `limit` `(n, nq)` the largest magnitude F ≥ 0 [N m, N].
 
     Raises:
-        NumericalError: no friction solves the problem, since G is not positive definite.
+        NumericalError: there is no solution, since G is not positive definite.
 
     Example:
         >>> import torch
@@ -222,31 +222,31 @@ def dry_friction_force(qdd: Tensor, G: Tensor, limit: Tensor, qd: Tensor, h: Ten
 
 
 class Law(ABC):
-    """A deterministic acceleration of a constrained system."""
+    """Deterministic law for the acceleration of a constrained system."""
 
     has_multiplier: bool
 
     @abstractmethod
     def motion(self, system: ConstrainedSystem, at: States) -> tuple[Tensor, Tensor]:
-        """q̈ `(n, nq)` and λ `(n, m)` at states; NaN if the law has no forces."""
+        """Return q̈ `(n, nq)` and λ `(n, m)` at states; NaN if the law has no forces."""
 
     def dry_friction(self, system: ConstrainedSystem) -> Callable[[States], DryFriction] | None:
-        """Dry friction of the joints at states, separated from other forces; `None` without such friction."""
+        """Return the force at states with dry joint friction separated; `None` without such friction."""
         return None
 
     @property
     def rough(self) -> Mapping[str, float]:
-        """Contacts with friction, and the speed above which they slide [m/s]."""
+        """Contacts with friction, and the speed above which each slides [m/s]."""
         return {}
 
     def knows_friction(self, system: ConstrainedSystem, at: States) -> bool:
-        """Whether the contact friction of sliding states is known, so that sticking can end."""
+        """Return whether the contact friction at sliding states is determined, so sticking can end."""
         return False
 
 
 @dataclass(frozen=True)
 class ForceLaw(Law):
-    """q̈ = L b + H Q̄ and λ = (A M⁻¹ Aᵀ)⁺(b − A M⁻¹ Q̄) of a force field (eqs. 4 and 16)."""
+    """Law q̈ = L b + H Q̄ and λ = (A M⁻¹ Aᵀ)⁺(b − A M⁻¹ Q̄) for a force field (eqs. 4 and 16)."""
 
     force: ForceField
     has_multiplier: bool = True
@@ -283,7 +283,7 @@ class ForceLaw(Law):
 
 @dataclass(frozen=True)
 class AccelerationLaw(Law):
-    """q̈ predicted by a model; it need not obey the constraint."""
+    """Law with q̈ predicted by a model, which need not obey the constraint."""
 
     model: ForwardModel
     has_multiplier: bool = False
@@ -294,10 +294,10 @@ class AccelerationLaw(Law):
 
 
 def law_of(model: ForwardModel, system: ConstrainedSystem | None = None) -> Law:
-    """The mean motion of a model: of its force field if it has one, otherwise of its accelerations.
+    """Return the law of a model's mean motion, from its force field if any, otherwise from its accelerations.
 
     Raises:
-        ModelError: a model of accelerations alone cannot predict the motion of another system.
+        ModelError: a model of accelerations only cannot predict the motion of another system.
     """
     trained, force = model.system, model.force_field()
     if force is not None:
@@ -319,11 +319,11 @@ def _described(system: ConstrainedSystem) -> str:
 
 
 class State(NamedTuple):
-    """The states of n trajectories; events within a step let their times differ.
+    """States of n trajectories, with times that may differ due to events within a step.
 
     Attributes:
-        t: `(n, 1)` [s].
-        q, qd: `(n, nq)`.
+        t: `(n, 1)` time [s].
+        q, qd: `(n, nq)` positions and velocities.
         active: `(n, n_contacts)` bool, closed contacts.
     """
 
@@ -333,12 +333,12 @@ class State(NamedTuple):
     active: Tensor
 
     def where(self, rows: Tensor, other: State) -> State:
-        """This state in some rows `(n,)`, another state in the others."""
+        """Return this state in the given rows `(n,)`, and another state in the others."""
         return State(*(torch.where(rows[:, None], a, b) for a, b in zip(self, other, strict=True)))
 
 
 class Instant(NamedTuple):
-    """The motion at a state.
+    """Motion at a state.
 
     Attributes:
         tau, qdd: `(n, nq)` motor torque and acceleration.
@@ -359,7 +359,7 @@ class RolloutProblem:
     """q̈ = law(q, q̇, τ(t, q, q̇)) on a constrained system with the stabilization of the rollout.
 
     With `unilateral`, contacts with a surface can open and close; with `sticking`, dry friction can hold
-    joints. `compiled` is the same motion by C code, used if no gradient is required.
+    joints. `compiled` computes the same motion in C, used if no gradient is required.
     """
 
     system: ConstrainedSystem
@@ -373,18 +373,18 @@ class RolloutProblem:
 
     @cached_property
     def rough(self) -> Mapping[str, float]:
-        """Contacts that may stick and have friction, with the speed above which they slide."""
+        """Contacts with friction that may stick, with the speed above which each slides."""
         speeds = {contact.name: contact.stick_speed or 0.0 for _, contact, _ in self.system.may_stick}
         known = self.law.rough if speeds else {}
         return {name: max(speeds[name], known[name]) for name in speeds if name in known}
 
     @cached_property
     def dry_friction(self) -> Callable[[States], DryFriction] | None:
-        """Dry friction that can hold joints at rest, separated from other forces; `None` without any."""
+        """Force at a state with dry joint friction separated; `None` without dry friction."""
         return self.law.dry_friction(self.system) if self.sticking else None
 
     def evaluate(self, state: State, end: Tensor) -> Instant:
-        """The motion at a state, within a step that ends at `end` `(n, 1)`."""
+        """Return the motion at a state within a step that ends at `end` `(n, 1)`."""
         at, h = Reached(self.system, state.q, state.qd, state.active), end - state.t
         tau = self.inputs.torque(state.t, end, at)
         if self.compiled is not None and not any(x.requires_grad for x in (state.q, state.qd, tau)):
@@ -406,7 +406,7 @@ class RolloutProblem:
         return self._instant(sliding_away(self.system, at, now.multiplier, slides, rough), h)
 
     def stopped(self, before: State, after: State) -> State:
-        """The state after a step, with contacts at rest that friction stops in this step."""
+        """Return the state after a step, with contacts stopped by friction in this step at rest."""
         if not self.rough:
             return after
         first, last = (self.system.equations(x.q, x.qd, x.active) for x in (before, after))
@@ -414,7 +414,7 @@ class RolloutProblem:
         return after._replace(qd=arrested(self.system, self.rough, first, last, closed, after.qd))
 
     def _instant(self, at: States, h: Tensor) -> Instant:
-        """The motion at states, over a step h `(n, 1)` [s]."""
+        """Return the motion at states, over a step h `(n, 1)` [s]."""
         eom, tau = at.eom, at.tau
         if self.dry_friction is None:
             qdd, multiplier = self.law.motion(self.system, at)
@@ -435,4 +435,4 @@ class RolloutProblem:
 
 
 Step = Callable[[RolloutProblem, State, Instant, Tensor], State]
-"""Advance a state, whose motion is known, by steps h `(n, 1)` [s]."""
+"""Function that advances a state with known motion by steps h `(n, 1)` [s]."""

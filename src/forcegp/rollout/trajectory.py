@@ -22,7 +22,7 @@ if TYPE_CHECKING:
     from forcegp.plots import Target
 
 FIELDS = ("q", "qd", "qdd", "tau", "multiplier", "c", "cd", "active")
-"""Attributes of a rollout that have the shape of its batch."""
+"""Attributes of a rollout with batch dimensions."""
 JOINT_QUANTITIES = ("q", "qd", "qdd", "tau")
 QUANTITIES = (*JOINT_QUANTITIES, "multiplier", "c", "cd")
 
@@ -33,8 +33,8 @@ class Divergence(NamedTuple):
     Attributes:
         t: time of its last trustworthy state [s].
         row: index of the trajectory in the flattened batch.
-        q, qd: that state.
-        reason: reason for rejecting the next one.
+        q, qd: state at that time.
+        reason: reason for rejecting the next state.
     """
 
     t: float
@@ -45,7 +45,7 @@ class Divergence(NamedTuple):
 
 
 class DivergedError(NumericalError):
-    """A rollout in which a trajectory diverged; `rollout` contains the result."""
+    """Error of a rollout with a diverged trajectory; `rollout` contains the result."""
 
     def __init__(self, diverged: Sequence[Divergence], rows: int, rollout: Rollout) -> None:
         self.rollout = rollout
@@ -64,7 +64,7 @@ class Bands(NamedTuple):
 
     Attributes:
         lower, upper: bounds of the central band.
-        median: the middle.
+        median: median.
     """
 
     lower: Tensor
@@ -72,24 +72,24 @@ class Bands(NamedTuple):
     median: Tensor
 
     def widened(self, inflation: float) -> Bands:
-        """The band with half-widths scaled by a factor."""
+        """Return the band with half-widths scaled by a factor."""
         lower = self.median + inflation * (self.lower - self.median)
         return Bands(lower, self.median + inflation * (self.upper - self.median), self.median)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Rollout:
-    """Trajectories of a batch of initial states at T times; NaN after a trajectory diverged.
+    """Trajectories from a batch of initial states at T times, with NaN after a divergence.
 
     Attributes:
         system: robot and contacts, with the stabilization of the rollout.
-        t: `(T,)` [s].
-        q, qd, qdd, tau: `(*batch, T, nq)`.
+        t: `(T,)` time [s].
+        q, qd, qdd, tau: `(*batch, T, nq)` positions, velocities, accelerations and motor torques.
         multiplier: λ `(*batch, T, m)` [N]; NaN if the model has no forces.
-        c, cd: `(*batch, T, m)` constraint error and its rate, of all contacts, open or closed [m], [m/s].
+        c, cd: `(*batch, T, m)` constraint error and its rate for all contacts, open or closed [m], [m/s].
         active: `(*batch, T, n_contacts)` bool, closed contacts.
-        events: contacts that opened and closed.
-        diverged: trajectories that diverged and were dropped.
+        events: openings and closings of contacts.
+        diverged: dropped trajectories.
         samples: trajectories of function samples, batch `(S, *batch)`.
     """
 
@@ -108,7 +108,7 @@ class Rollout:
     samples: Rollout | None = None
 
     def __repr__(self) -> str:
-        """One line: length, batch, samples and what happened, without the numbers."""
+        """Return a one-line summary of length, batch, samples and events, without numbers."""
         n = self.rows
         what = "one trajectory" if n == 1 else f"{n} trajectories"
         span = float(self.t[-1] - self.t[0]) if len(self.t) else 0.0
@@ -126,17 +126,18 @@ class Rollout:
         joints: Sequence[str] | None = None,
         ax: Target = None,
     ) -> list[Axes]:
-        """Draw the predicted motion over time, with the band of ±2 standard deviations over function samples.
+        """Plot the predicted motion over time, with bands of ±2 standard deviations over function samples.
 
         Args:
             quantity: `q`, `qd`, `qdd`, `tau`, `multiplier`, `c` or `cd`.
-            log: the logged motion from the same start, to compare with.
-            joints: which joints or contacts; default all.
-            ax: matplotlib axes to draw on, one per panel; default a new figure.
+            log: logged motion from the same start, for comparison.
+            joints: names of joints or contacts; by default all.
+            ax: matplotlib axes to draw on, one per panel; by default a new figure.
 
         Raises:
-            UnknownNameError: no such quantity or joint.
-            ParameterError: several trajectories (choose one: `rollout[0].plot()`), or a wrong number of axes.
+            UnknownNameError: the quantity or joint does not exist.
+            ParameterError: there are several trajectories (select one: `rollout[0].plot()`), or the number of
+                axes is wrong.
         """
         from forcegp.plots import MEASURED, PREDICTED, Curve, Panel, Timeline, axis_label, chosen, draw_panels
 
@@ -180,41 +181,44 @@ class Rollout:
         return torch.where(rows, self.c, 0.0)
 
     def tip(self, frame: str, point: Sequence[float] = (0.0, 0.0, 0.0)) -> Tensor:
-        """World position `(*batch, T, 3)` of a point fixed in a frame [m]; NaN after a divergence."""
+        """Return the position `(*batch, T, 3)` of a point in a frame, in the world [m]; NaN after a
+        divergence.
+        """
         return kinematics.point_position(self.system.robot, self.q, frame, tuple(point))
 
     def bands(self, values: Tensor, level: float = 0.9) -> Bands:
-        """Central band of a quantity over function samples.
+        """Return the central band of a quantity over function samples.
 
         Args:
-            values: `(S, …)`, such as `rollout.samples.multiplier`; NaN of diverged samples are ignored.
-            level: share of the samples inside the band, between 0 and 1.
+            values: `(S, …)` values such as `rollout.samples.multiplier`; NaN in diverged samples is ignored.
+            level: fraction of the samples inside the band, between 0 and 1.
         """
         tail = 0.5 * (1.0 - level)
         quantiles = torch.tensor([tail, 1.0 - tail, 0.5], dtype=values.dtype, device=values.device)
         return Bands(*torch.nanquantile(values, quantiles, dim=0))
 
     def need_samples(self) -> Rollout:
-        """The sampled trajectories.
+        """Return the sampled trajectories.
 
         Raises:
-            ModelError: the rollout was made without samples.
+            ModelError: the rollout has no samples.
         """
         if self.samples is None:
             raise ModelError("the rollout has no samples", hint="pass samples=100 to rollout")
         return self.samples
 
     def contact_lost(self) -> Tensor:
-        """`(*batch, T, n_contacts)` probability that a contact has opened by each time, over samples.
+        """Return the fraction of samples in which a contact has opened by each time, `(*batch, T,
+        n_contacts)`.
 
         Raises:
-            ModelError: the rollout was made without samples.
+            ModelError: the rollout has no samples.
         """
         lost = (~self.need_samples().active).cumsum(-2) > 0
         return lost.to(self.q.dtype).mean(0)
 
     def __getitem__(self, index: object) -> Rollout:
-        """The trajectories of some members of the batch; events keep their row of the whole batch."""
+        """Return the trajectories of some members of the batch; events keep their row in the full batch."""
         chosen = {name: getattr(self, name)[index] for name in FIELDS}
         places = index if isinstance(index, tuple) else (index,)
         samples = None if self.samples is None else self.samples[(slice(None), *places)]
@@ -222,7 +226,7 @@ class Rollout:
 
 
 def _spread(path: Rollout, quantity: str) -> Tensor | None:
-    """Standard deviation `(T, d)` over the function samples, of which a finite one is needed at each time."""
+    """Return the standard deviation `(T, d)` over function samples, at least one of them finite."""
     if path.samples is None:
         return None
     values = getattr(path.samples, quantity).reshape(-1, len(path.t), getattr(path, quantity).shape[-1])
@@ -233,7 +237,7 @@ def _spread(path: Rollout, quantity: str) -> Tensor | None:
 
 
 def _logged(path: Rollout, log: Dataset, quantity: str) -> Tensor | None:
-    """Logged values `(T, d)` at the times of the rollout, or `None` where they are not logged."""
+    """Return the logged values `(T, d)` at the times of the rollout, or `None` if they are not logged."""
     if len(log) < len(path.t):
         raise ParameterError(
             "the log is shorter than the rollout", expected=f"{len(path.t)} rows or more", got=len(log)

@@ -1,4 +1,4 @@
-"""TOML files validated against a schema: every error names the file, the line and the key."""
+"""Validation of TOML files against a schema, with errors that name the file, the line and the key."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _TOKEN = re.compile(rf"({_NAME})|(\.)|[^\S\n]+|(.|\n)")
 
 
 class Document:
-    """A parsed TOML file with the line of each key; errors have the class `error` and name `source`."""
+    """A parsed TOML file with the line of each key; errors are of class `error` and name `source`."""
 
     def __init__(self, content: bytes, source: str, error: type[ForceGPError] = SceneError) -> None:
         self.source, self.error = source, error
@@ -58,7 +58,7 @@ class Document:
         self._lines = _lines_of_keys(text)
 
     def validated(self, schema: type[Schema]) -> Schema:
-        """The content as an instance of a pydantic model; the first error is raised with its line and key."""
+        """Convert the content to a pydantic model; the first error is raised with its line and key."""
         # In JSON mode, strict validation accepts a list for a tuple and an integer for a float.
         try:
             return schema.model_validate_json(json.dumps(self.data, default=str))
@@ -70,12 +70,12 @@ class Document:
             raise self._error(schema, errors[0]) from error
 
     def at(self, key: Key, make: Callable[..., T], *args: object, **options: object) -> T:
-        """The result of `make(*args, **options)`; its errors are reported at a key of this file."""
+        """Return `make(*args, **options)`, reporting errors at a key of this file."""
         with self.error.within(self.place(key)):
             return make(*args, **options)
 
     def place(self, key: Key) -> str:
-        """`file:line: key` of a key, or of the nearest enclosing key that is in the file."""
+        """Return `file:line: key` of a key, or of the nearest enclosing key in the file."""
         prefix: Key = ()
         value: Any = self.data
         for part in key:
@@ -88,7 +88,7 @@ class Document:
         return f"{where}: {dotted(prefix)}" if prefix else where
 
     def _error(self, schema: type[BaseModel], error: ErrorDetails) -> ForceGPError:
-        """The message of a validation error."""
+        """Return the message of a validation error."""
         key, kind, context = error["loc"], error["type"], error.get("ctx", {})
         place, last = self.place(key), str(key[-1]) if key else ""
         if isinstance(cause := context.get("error"), ForceGPError):
@@ -115,7 +115,7 @@ class Document:
         return self.error(f"{place}: {error['msg'][0].lower()}{error['msg'][1:]}", got=repr(error["input"]))
 
     def _named(self, key: Key, message: str) -> Key:
-        """The key within a table that a message names, or the table."""
+        """Return the key within a table that is named in a message, or the table."""
         table: Any = self.data
         for part in key:
             members: Any = dict(enumerate(table)) if isinstance(table, list) else table
@@ -126,7 +126,7 @@ class Document:
 
 
 def _check_keys(text: str, source: str, error: type[ForceGPError]) -> None:
-    """Check the number of keys and of the parts of each: a parser takes quadratic time for either."""
+    """Check the number of keys and of the parts of each, for which parsers take quadratic time."""
     keys = text.count("=") + len(_BRACKET.findall(text))
     if keys > SCENE_KEYS:
         raise error(f"{source}: too many keys and tables", expected=f"at most {SCENE_KEYS}", got=keys)
@@ -149,7 +149,7 @@ def _one_of(names: list[str]) -> str:
 
 
 def _tables_at(schema: type, key: Key) -> list[type]:
-    """The classes that may describe the table at a key."""
+    """Return the classes that may describe the table at a key."""
     tables = [schema]
     for part in key:
         members = [_hints(table)[str(part)] for table in tables if str(part) in _hints(table)]
@@ -161,7 +161,7 @@ def _tables_at(schema: type, key: Key) -> list[type]:
 
 
 def _hints(table: type) -> dict[str, Any]:
-    """Annotation of each key of a table."""
+    """Return the annotation of each key of a table."""
     if issubclass(table, BaseModel):
         return {name: field.annotation for name, field in table.model_fields.items()}
     hints = get_type_hints(table)
@@ -175,7 +175,7 @@ def _tables_in(annotation: Any) -> list[type]:
 
 
 def dotted(key: Key) -> str:
-    """A key in dotted notation: `contact[0].surface`."""
+    """Return a key in dotted notation: `contact[0].surface`."""
     return "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in key).lstrip(".")
 
 
@@ -184,7 +184,7 @@ def _split(name: str) -> Key:
 
 
 def _lines_of_keys(text: str) -> dict[Key, int]:
-    """Line of each table and key; of keys in an inline table, only the line of the table."""
+    """Return the line of each table and key; keys in an inline table have the line of the table."""
     lines: dict[Key, int] = {}
     counts: dict[Key, int] = {}
     table: Key = ()

@@ -1,7 +1,7 @@
-"""The tables of a scene file.
+"""Tables of a scene file.
 
-A key is a parameter of the class of the table, or a field of saved models. Missing keys of `[model]` have the
-default of the model.
+Keys are parameters of the class of the table, or fields of saved models. Missing keys of `[model]` have the
+default values of the model.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ class Section(Record, strict=True):
     """A table of a TOML file."""
 
     def given(self) -> dict[str, Any]:
-        """The keys that are in the file, with their values."""
+        """Return the keys present in the file with their values."""
         return {name: getattr(self, name) for name in self.model_fields_set}
 
 
@@ -32,7 +32,7 @@ State = NonNegativeFloat | tuple[NonNegativeFloat, ...]
 class LearningSection(Section):
     """`[model.learning]`: fields of `LearningOptions`, or of `BatchOptions` for models trained on batches.
 
-    `warm_start = false` learns on all samples from the start.
+    `warm_start = false` learns from all samples from the start.
     """
 
     optimizer: Literal["lbfgs", "adam"] = "lbfgs"
@@ -51,7 +51,7 @@ class LearningSection(Section):
 
 
 class NoiseSection(Section):
-    """`[model.noise]`: fields of `Noise`; `torque = "none"` for none."""
+    """`[model.noise]`: fields of `Noise`; `torque = "none"` for exact torques."""
 
     acceleration: NonNegativeFloat | tuple[NonNegativeFloat, ...] | None = None
     learn: bool = False
@@ -62,7 +62,7 @@ class NoiseSection(Section):
 
 
 class ModelSection(Section, StructuredOptions):
-    """`[model]`: the options of models, and further keys for `forcegp.models.configured`."""
+    """`[model]`: options of models, and additional keys for `forcegp.models.configured`."""
 
     name: str | None = None
     noise: NoiseSection = NoiseSection()
@@ -78,19 +78,19 @@ class ModelSection(Section, StructuredOptions):
     @field_validator("noise", mode="before")
     @classmethod
     def _of_accelerations(cls, value: object) -> object:
-        """A number, or a list of them, is the noise of accelerations."""
+        """Interpret a number or a list of numbers as the noise of accelerations."""
         return _tuples({"acceleration": value} if isinstance(value, int | float | list) else value)
 
 
 def _tuples(value: Any) -> Any:
-    """Lists as tuples, which strict validation asks for after a validator in Python."""
+    """Convert lists to tuples, as required by strict validation after a Python validator."""
     if isinstance(value, dict):
         return {key: _tuples(part) for key, part in value.items()}
     return tuple(map(_tuples, value)) if isinstance(value, list) else value
 
 
 class ModelFile(Section):
-    """A file with only the table `[model]`."""
+    """A file that contains only the table `[model]`."""
 
     model: ModelSection
 
@@ -106,15 +106,15 @@ class RobotSection(Section):
 
 
 class ContactSection(ContactFields, strict=True):
-    """`[[contact]]`: a point of the robot that may touch a surface, or a ball of some `radius` around it."""
+    """`[[contact]]`: a point of the robot, or a ball of given `radius` around it, and a surface."""
 
 
 class ConnectionSection(ConnectionFields, strict=True):
-    """`[[connection]]`: two points that coincide; without `other_frame`, the second is fixed in the world."""
+    """`[[connection]]`: two coincident points; without `other_frame`, the second is fixed in the world."""
 
 
 class SceneSections(Section):
-    """All tables of a scene file; constraints are stabilized only if there is a table `[baumgarte]`."""
+    """All tables of a scene file; constraints are stabilized only if there is a `[baumgarte]` table."""
 
     robot: RobotSection
     contact: tuple[ContactSection, ...] = ()

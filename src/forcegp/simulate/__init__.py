@@ -1,4 +1,4 @@
-"""Simulation of a robot, free or in contact, in a physics engine."""
+"""Simulation of a robot in free motion or contact with a physics engine."""
 
 from forcegp.control.task_space import Gains
 from forcegp.control.trajectory import Reference

@@ -1,6 +1,6 @@
-"""Distances between the links of a robot, the surfaces of its contacts and boxes, by MuJoCo's geometry.
+"""Distances between robot links, contact surfaces and boxes, computed by MuJoCo.
 
-The parts of the links (`robot/shapes.py`) and the surroundings are convex solids. Pairs that touch in most
+The parts of the links (`robot/shapes.py`) and the surroundings are convex solids. Pairs that overlap in most
 positions, such as neighbouring links, are ignored.
 """
 
@@ -20,20 +20,20 @@ from forcegp.simulate.urdf import link_name, write_urdf
 from forcegp.types import Array
 
 POSITIONS, MOST = 200, 0.5
-"""Random positions, and the share of them from which on a pair that touches is left out."""
+"""Number of random positions, and the fraction of overlaps above which a pair is ignored."""
 TIP = 0.005
-"""Radius of the tip of a contact that is a point [m]."""
+"""Tip radius for point contacts [m]."""
 SURROUNDINGS = "surroundings"
 
 
 class Collisions:
-    """Collisions of parts of a robot with each other or with their surroundings, at a clearance.
+    """Collisions of parts of a robot with each other or with their surroundings, with a clearance.
 
     Args:
-        system: robot, and contacts with surfaces that it must not touch.
+        system: robot, and contacts with surfaces to avoid.
         shapes: convex parts of the robot.
-        boxes: `(k, 6)` centres and side lengths of boxes along the world's axes [m].
-        clearance: [m].
+        boxes: `(k, 6)` centres and side lengths of boxes aligned with the world axes [m].
+        clearance: minimum distance [m].
 
     Raises:
         ParameterError: a box is not six finite numbers with positive sides.
@@ -83,7 +83,7 @@ class Collisions:
         self._left_out |= self._always_touching(robot)
 
     def pairs(self, q: Array) -> dict[str, float]:
-        """Pairs of bodies closer than the clearance at a position `(nq,)`, and their distance [m]."""
+        """Return pairs of bodies closer than the clearance at a position `(nq,)`, with their distance [m]."""
         found: dict[str, float] = {}
         for k, pair in self._near(q):
             name = f"{self._names[pair[0]]} and {self._names[pair[1]]}"
@@ -91,7 +91,7 @@ class Collisions:
         return found
 
     def depth(self, q: Array) -> Array:
-        """Violation of the clearance `(n,)` at positions `(n, nq)` [m], 0 if there is none."""
+        """Return the violation `(n,)` of the clearance at positions `(n, nq)` [m], 0 if there is none."""
         return np.array(
             [
                 max((self.clearance - self._data.contact.dist[k] for k, _ in self._near(x)), default=0.0)
@@ -100,7 +100,7 @@ class Collisions:
         )
 
     def penalty(self, q: Array, margin: float) -> tuple[float, Array]:
-        """Σ (1 − distance/margin)² over positions `(n, nq)` and nearer pairs, and its gradient."""
+        """Return Σ (1 − distance/margin)² over positions `(n, nq)` and closer pairs, and its gradient."""
         self._model.geom_margin[:] = margin
         value, gradient, model, data = 0.0, np.zeros_like(q), self._model, self._data
         jacobian = np.zeros((2, 3, model.nv))
@@ -118,7 +118,7 @@ class Collisions:
         return value, gradient
 
     def _near(self, q: Array, distance: float | None = None, jacobians: bool = False) -> list[Any]:
-        """Number of each contact that is nearer than a distance, and its bodies in MuJoCo's order."""
+        """Return the index of each contact closer than a distance, and its bodies in MuJoCo's order."""
         data, model = self._data, self._model
         data.qpos[self._dof] = q
         self._mujoco.mj_kinematics(model, data)
@@ -155,7 +155,7 @@ def _checked(boxes: Sequence[Sequence[float]]) -> Array:
 
 
 def _placed(robot: RobotModel, shape: Shape) -> Array:
-    """Corners of a part in the coordinates of its MuJoCo body."""
+    """Return the corners of a part in the coordinates of its MuJoCo body."""
     if shape.link != BASE:
         return shape.points
     return shape.points @ robot.base_rotation.cpu().numpy().T + robot.base_position.cpu().numpy()

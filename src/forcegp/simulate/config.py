@@ -1,4 +1,4 @@
-"""The settings of a simulation: of the motion, and of the simulated world."""
+"""Settings of a simulation: motion and simulated world."""
 
 from __future__ import annotations
 
@@ -9,23 +9,22 @@ from forcegp.control.plan import NOT_NEGATIVE, MotionConfig, check_setting
 
 CONTACTS = ("rigid", "solver")
 LONGEST_STEP = 5e-4
-"""Of the contact solver [s]; a contact of the default stiffness takes eight such steps."""
+"""Longest step of the contact solver [s]; a contact of the default stiffness takes eight such steps."""
 WHOLE = 1e-6
-"""Rounding of a ratio that is meant to be whole."""
+"""Tolerance for a ratio that should be an integer."""
 
 
 @dataclass(frozen=True)
 class ContactSolver:
-    """The world of MuJoCo's contact solver: dry friction in joints and contact, and a rounded tip.
+    """Settings for MuJoCo's contact solver: dry friction in joints and contact, and a rounded tip.
 
     Args:
-        friction: Coulomb friction coefficient μ of tool and surface.
-        tip_radius: radius of the tip, a sphere that ends at the scene's contact point, if the contact has no
-            radius [m].
-        joint_friction: Coulomb friction of each joint, beyond the robot file; empty is none [N m].
-        joint_damping: viscous friction of each joint, beyond the robot file; empty is none [N m s/rad].
+        friction: Coulomb friction coefficient μ between tool and surface.
+        tip_radius: radius [m] of a spherical tip ending at the contact point, if the contact has no radius.
+        joint_friction: additional Coulomb friction of each joint [N m]; empty for none.
+        joint_damping: additional viscous friction of each joint [N m s/rad]; empty for none.
         stiffness_time: time constant of the contact's restoring force [s]; shorter is stiffer.
-        step: step of the engine, a whole part of the sampling period [s]; by default the longest one up to
+        step: engine step, which must divide the sampling period [s]; by default the longest step up to
             `LONGEST_STEP`.
 
     Raises:
@@ -51,7 +50,7 @@ class ContactSolver:
         check_setting("friction", 0.0 <= self.friction < float("inf"), NOT_NEGATIVE, self.friction)
 
     def substeps(self, dt: float) -> int:
-        """Steps of the engine in a sampling period dt [s]; ParameterError unless a multiple of `step`."""
+        """Return the engine steps per period dt [s]; `ParameterError` unless it is a multiple of `step`."""
         if self.step is None:
             return math.ceil(dt / LONGEST_STEP - WHOLE)
         steps = dt / self.step
@@ -62,13 +61,13 @@ class ContactSolver:
 
 @dataclass(frozen=True)
 class Sensors:
-    """Imperfect sensors; the controller and the log receive their values. The default is perfect sensors.
+    """Imperfect sensors, which provide values for controller and log. By default, sensors are perfect.
 
     Args:
-        encoder_resolution: step of the measured joint positions [rad, m].
+        encoder_resolution: resolution of the measured joint positions [rad, m].
         velocity_noise: standard deviation of the noise on q̇ [rad/s, m/s].
         torque_noise: standard deviation of the noise on the logged torque [N m, N].
-        torque_delay: time by which the logged torque lags behind the motion [s], rounded to whole samples.
+        torque_delay: delay of the logged torque relative to the motion [s], rounded to whole samples.
 
     Raises:
         ParameterError: a value is out of range; the message names it.
@@ -91,14 +90,14 @@ class SimulationConfig(MotionConfig):
     In addition to the settings of the motion (`MotionConfig`):
 
     Args:
-        seed: of the waypoints, the postures and the noise.
+        seed: seed for the waypoints, the postures and the noise.
         engine: `"pybullet"`, `"mujoco"` or `"auto"`.
-        contact: `"rigid"` computes contact forces by the library's equations of motion, `"solver"` by
+        contact: `"rigid"` computes contact forces with the library's equations of motion, `"solver"` with
             MuJoCo's contact solver, an independent reference.
-        viscous_friction: θ_v of F_z = −θ_v ṗ_E, tangential to the surface, with rigid contact [N s/m].
+        viscous_friction: θ_v in F_z = −θ_v ṗ_E, tangential to the surface, for rigid contact [N s/m].
         noise_std: standard deviation of the noise on q̈ [rad/s²].
-        solver: friction and geometry, with `contact="solver"`.
-        sensors: resolution, noise and delay of the measurements, with `contact="solver"`.
+        solver: friction and geometry for `contact="solver"`.
+        sensors: resolution, noise and delay of the measurements for `contact="solver"`.
 
     Example:
         >>> SimulationConfig(duration=2.0).steps

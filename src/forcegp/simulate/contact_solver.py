@@ -1,4 +1,4 @@
-"""MuJoCo with its own contact solver: contact and dry friction independent of this library."""
+"""MuJoCo with its contact solver, which models contact and dry friction independently of this library."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ from forcegp.simulate.engines import NEEDS_MUJOCO, MuJoCoWorld
 from forcegp.simulate.urdf import link_name, write_urdf
 
 CYLINDER_LENGTH = 100.0
-"""Half length of the cylinder that stands for an infinite one [m]."""
+"""Half length of the cylinder that represents an infinite one [m]."""
 IMPEDANCE = [0.01, 0.95, 0.0002, 0.5, 2.0]
-"""MuJoCo's impedance: it grows from almost nothing within 0.2 mm, so that the force has no jump."""
+"""MuJoCo's impedance, which grows from almost zero within 0.2 mm to avoid force jumps."""
 SOLVED = 1e-15
-"""Tolerance of the solver, so tight that forces and acceleration obey Newton's equation to rounding."""
+"""Solver tolerance at which forces and acceleration obey Newton's equation up to rounding."""
 NO_FORCE = 1e-9
-"""A contact that presses with less counts as open [N]."""
+"""Normal force below which a contact counts as open [N]."""
 
 
 class SolvedForces(NamedTuple):
@@ -47,13 +47,13 @@ class SolvedForces(NamedTuple):
 
 
 class ContactSolverEngine(MuJoCoWorld):
-    """A robot in a MuJoCo world with solid surfaces and rounded tips, moved by motor torques alone.
+    """A robot in a MuJoCo world with solid surfaces and rounded tips, driven by motor torques only.
 
-    Each contact needs a plane, a sphere or a cylinder; a torque is held for the sampling period dt [s].
+    Each contact needs a plane, a sphere or a cylinder; torques are held for the sampling period dt [s].
 
     Raises:
         MissingDependencyError: MuJoCo is not installed.
-        ForceGPError: a constraint without a geometry, or friction for another number of joints.
+        ForceGPError: a constraint has no geometry, or friction is given for a wrong number of joints.
         UnsupportedRobotError: the robot file declares Stribeck friction, which MuJoCo does not model.
     """
 
@@ -76,11 +76,11 @@ class ContactSolverEngine(MuJoCoWorld):
         return f"{super().name}, contact solver"
 
     def forces(self, torque: np.ndarray) -> SolvedForces:
-        """Acceleration and forces at the current state under a motor torque `(nq,)` [N m].
+        """Return the acceleration and forces at the current state under a motor torque `(nq,)` [N m].
 
-        The engine evaluates viscous friction at the end of the step, (M + h D) q̈ = Q(q, q̇), which for light
-        joints differs considerably from M⁻¹Q. q̈ and the friction are those of the step, so that the velocity
-        changes by h q̈.
+        The engine evaluates viscous friction at the end of the step, (M + h D) q̈ = Q(q, q̇), which differs
+        considerably from M⁻¹Q for light joints. q̈ and the friction are those of the step, in which the
+        velocity changes by h q̈.
         """
         data, dof = self._data, self._dof
         data.qfrc_applied[dof] = torque
@@ -96,11 +96,11 @@ class ContactSolverEngine(MuJoCoWorld):
         return SolvedForces(qdd[dof], others, Q_I, Q_z, np.linalg.norm(F_I, axis=-1), F_I, F_z)
 
     def step(self) -> None:
-        """Advance by the sampling period under the last torque of `forces`."""
+        """Advance by the sampling period under the torque last passed to `forces`."""
         self._mujoco.mj_step(self.model, self._data, self._substeps)
 
     def _contact_force(self, surface: int, tip: int) -> tuple[np.ndarray, np.ndarray]:
-        """Normal and friction force of a surface on a tip, generalized `(2, nq)` and Cartesian `(2, 3)`."""
+        """Return normal and friction force on a tip, generalized `(2, nq)` and Cartesian `(2, 3)`."""
         model, data = self.model, self._data
         Q, F = np.zeros((2, len(self._dof))), np.zeros((2, 3))
         wrench, jacobian = np.zeros(6), np.zeros((3, model.nv))
@@ -120,7 +120,7 @@ class ContactSolverEngine(MuJoCoWorld):
 
 
 def _compile(mujoco: Any, system: ConstrainedSystem, solver: ContactSolver) -> Any:
-    """The robot with a tip and a surface for each contact; only these pairs can touch."""
+    """Compile the robot with a tip and a surface for each contact; only these pairs can collide."""
     robot = system.robot
     spec = mujoco.MjSpec.from_string(write_urdf(robot))
     for i, contact in enumerate(system.contacts):
@@ -157,10 +157,9 @@ def _per_joint(robot: RobotModel, solver: ContactSolver, name: str) -> np.ndarra
 
 
 def tip_of(robot: RobotModel, contact: SurfaceContact, radius: float) -> tuple[int, np.ndarray, float]:
-    """The link that carries the tip, the centre of the tip in the link's coordinates, and its radius.
+    """Return the link of the tip, the centre of the tip in link coordinates, and its radius.
 
-    The tip is that of the contact. If the contact is a point, the tip is a sphere that ends there, on the
-    line from the frame's origin to that point.
+    For a point contact, the tip is a sphere that ends at the point, on the line from the origin of the frame.
     """
     index = robot.frame_index(contact.frame)
     center = np.array(contact.point, dtype=float)
@@ -174,11 +173,11 @@ def tip_of(robot: RobotModel, contact: SurfaceContact, radius: float) -> tuple[i
 
 
 def geometry_of(mujoco: Any, contact: SurfaceContact) -> dict[str, Any]:
-    """Type, size and pose of the geometry of a surface."""
+    """Return the type, size and pose of the geometry of a surface."""
     surface, geom = contact.surface, mujoco.mjtGeom
 
     def along(axis: Sequence[float]) -> np.ndarray:
-        """Quaternion (w, x, y, z) of a rotation from z to an axis."""
+        """Return the quaternion (w, x, y, z) of a rotation from z to an axis."""
         return Rotation.from_matrix(turn_z(np.array(axis))).as_quat()[[3, 0, 1, 2]]
 
     if isinstance(surface, Plane):

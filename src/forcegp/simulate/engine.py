@@ -1,4 +1,4 @@
-"""Protocol of a physics engine, and its comparison with our equations of motion."""
+"""Protocol for physics engines, and their comparison with the library's equations of motion."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from forcegp.types import JointMatrix, JointVector
 
 @runtime_checkable
 class Engine(Protocol):
-    """A physics engine with one robot under gravity and without any other force of its own.
+    """A physics engine with one robot under gravity and no other forces.
 
     One step is semi-implicit Euler: q̇ₖ₊₁ = q̇ₖ + dt q̈(qₖ, q̇ₖ), qₖ₊₁ = qₖ + dt q̇ₖ₊₁, so the acceleration
     during a step is (q̇ₖ₊₁ − q̇ₖ)/dt. Contacts, collisions, joint limits, motors and damping are off; all
@@ -25,12 +25,12 @@ class Engine(Protocol):
 
     @property
     def name(self) -> str:
-        """Name and version, for the record."""
+        """Name and version of the engine."""
         ...
 
     @property
     def dt(self) -> float:
-        """Step [s]."""
+        """Step size [s]."""
         ...
 
     def reset(self, q: JointVector, qd: JointVector) -> None:
@@ -38,7 +38,7 @@ class Engine(Protocol):
         ...
 
     def state(self) -> tuple[JointVector, JointVector]:
-        """The current q and qd, `(nq,)` each [rad, rad/s]."""
+        """Return the current q and qd, `(nq,)` each [rad, rad/s]."""
         ...
 
     def step(self, force: JointVector) -> None:
@@ -46,11 +46,11 @@ class Engine(Protocol):
         ...
 
     def mass_matrix(self, q: JointVector) -> JointMatrix:
-        """M(q) `(nq, nq)` computed by the engine."""
+        """Return M(q) `(nq, nq)` computed by the engine."""
         ...
 
     def inverse_dynamics(self, q: JointVector, qd: JointVector, qdd: JointVector) -> JointVector:
-        """M q̈ − Q_C − Q_G `(nq,)` computed by the engine."""
+        """Return M q̈ − Q_C − Q_G `(nq,)` computed by the engine."""
         ...
 
     def close(self) -> None:
@@ -60,16 +60,16 @@ class Engine(Protocol):
 
 @dataclass(frozen=True)
 class EngineCheck:
-    """Largest differences between an engine and our library on random states.
+    """Largest differences between an engine and the library at random states.
 
     Attributes:
         engine: name and version.
         states: number of states compared.
-        mass_matrix: [kg m²].
-        inverse_dynamics: [N m].
-        free_acceleration: of one step under a random force [rad/s²].
-        constrained_acceleration: of one step with the constraint force and joint friction applied [rad/s²].
-        largest_acceleration: largest acceleration of all these steps, for scale [rad/s²].
+        mass_matrix: difference in the mass matrix [kg m²].
+        inverse_dynamics: difference in inverse dynamics [N m].
+        free_acceleration: difference over one step under a random force [rad/s²].
+        constrained_acceleration: difference over one step with constraint force and joint friction [rad/s²].
+        largest_acceleration: largest acceleration in all steps, for scale [rad/s²].
     """
 
     engine: str
@@ -93,9 +93,9 @@ class EngineCheck:
 def check_engine(
     system: ConstrainedSystem, engine: Engine, generator: torch.Generator, states: int = 50
 ) -> EngineCheck:
-    """Largest differences between an engine and our library on random states of a system.
+    """Return the largest differences between an engine and the library at random states of a system.
 
-    Angles are in ±π, speeds and accelerations of some rad/s and rad/s².
+    Angles are within ±π, and speeds and accelerations are a few rad/s and rad/s².
     """
     robot = system.robot
 
@@ -125,7 +125,7 @@ def check_engine(
 
 
 def _step(engine: Engine, q: Tensor, qd: Tensor, force: Tensor) -> Tensor:
-    """Accelerations of one step from each state."""
+    """Return the accelerations of one step from each state."""
     accelerations = []
     for state in zip(q, qd, force, strict=True):
         engine.reset(state[0], state[1])

@@ -20,7 +20,7 @@ from forcegp.types import JointMatrix, JointVector
 
 NEEDS_MUJOCO = "the engine 'mujoco'"
 MAX_JOINT_VELOCITY = 1e6
-"""Bullet clamps joint velocities at 100 rad/s unless told otherwise; a clamp is a force nobody applied."""
+"""Joint velocity limit for Bullet, which by default clamps at 100 rad/s, an unwanted force."""
 
 
 class PyBulletEngine(Engine):
@@ -117,7 +117,7 @@ class PyBulletEngine(Engine):
 
 
 class MuJoCoWorld:
-    """A robot in a compiled MuJoCo model with its joint names; gravity and drive inertia are the robot's."""
+    """A robot in a compiled MuJoCo model with its joint names, gravity and drive inertia."""
 
     def __init__(self, robot: RobotModel, model: Any, dt: float) -> None:
         self._mujoco, self._robot, self.model = optional_module("mujoco", NEEDS_MUJOCO), robot, model
@@ -129,7 +129,7 @@ class MuJoCoWorld:
 
     @property
     def name(self) -> str:
-        """Name and version, for the record."""
+        """Name and version of the engine."""
         return f"mujoco {self._mujoco.__version__}"
 
     def reset(self, q: JointVector, qd: JointVector) -> None:
@@ -137,11 +137,11 @@ class MuJoCoWorld:
         self._set(self._data, q, qd)
 
     def state(self) -> tuple[JointVector, JointVector]:
-        """The current q and qd, `(nq,)` each [rad, rad/s]."""
+        """Return the current q and qd, `(nq,)` each [rad, rad/s]."""
         return self._tensor(self._data.qpos[self._dof]), self._tensor(self._data.qvel[self._dof])
 
     def close(self) -> None:
-        """Release the engine's resources: MuJoCo holds none."""
+        """Release the engine's resources; MuJoCo holds none."""
 
     def _set(self, data: Any, q: JointVector, qd: JointVector) -> None:
         data.qpos[self._dof] = q.numpy()
@@ -151,7 +151,7 @@ class MuJoCoWorld:
         return torch.tensor(values, dtype=self._robot.dtype)
 
     def _mass_matrix(self, data: Any) -> np.ndarray:
-        """M `(nv, nv)` of a state whose positions are up to date; `mj_fullM` differs between versions."""
+        """Return M `(nv, nv)` at a state with updated positions; `mj_fullM` differs between versions."""
         M = np.zeros((self.model.nv, self.model.nv))
         for column, unit in zip(M, np.eye(self.model.nv), strict=True):
             self._mujoco.mj_mulM(self.model, data, column, unit)
@@ -197,7 +197,7 @@ MAKERS = {"pybullet": PyBulletEngine, "mujoco": MuJoCoEngine}
 
 
 def make_engine(robot: RobotModel, dt: float, name: str = "auto") -> Engine:
-    """An engine by name.
+    """Return an engine by name.
 
     Args:
         robot: the robot.
@@ -212,7 +212,7 @@ def make_engine(robot: RobotModel, dt: float, name: str = "auto") -> Engine:
         torch.Size([2, 2])
 
     Raises:
-        UnknownNameError: no such engine.
+        UnknownNameError: the engine does not exist.
         MissingDependencyError: the engine's package is not installed.
     """
     check_name("engine", name, ["auto", *MAKERS])

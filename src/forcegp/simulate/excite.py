@@ -1,8 +1,8 @@
-"""Planning of the motion that identifies the unknown forces best, within limits and free of collisions.
+"""Planning of collision-free motions within limits that best identify the unknown forces.
 
 Joints follow uniform cubic B-splines that start and end at rest in the same position. Splines stay in the
-convex hull of their control points, so bounds on these and on their differences guarantee the limits of
-position, velocity and acceleration at all times. L-BFGS minimises a criterion of the information
+convex hull of their control points, so bounds on the control points and their differences guarantee the
+limits on position, velocity and acceleration at all times. L-BFGS minimises an information criterion
 (`control/information.py`) with squared hinges for all limits and the clearance, from random starts within all
 limits. The result is verified at 1 kHz; times of violations are added to the nodes of the hinges, and finally
 the motion is scaled towards its start.
@@ -33,21 +33,21 @@ from forcegp.simulate.collisions import Collisions
 from forcegp.types import Array
 
 KNOT, NODE, FINE = 0.5, 0.1, 0.001
-"""Time between control points, between nodes of the objective, and between instants that are verified [s]."""
+"""Time between control points, between nodes of the objective, and between verified instants [s]."""
 SINES, SLOWEST, QUICKEST = 6, 0.05, 0.6
-"""Sines of a random start, and their frequencies [Hz]."""
+"""Number of sines in a random start, and the range of their frequencies [Hz]."""
 STEEP = 5.0
-"""Weight of the squared hinges at first; each round that fails doubles it."""
+"""Initial weight of the squared hinges, doubled in each failed round."""
 INSIDE = 0.97
-"""Share of a limit, and over the clearance its inverse, from which on a hinge acts."""
+"""Fraction of a limit above which a hinge is active; for the clearance, its inverse."""
 KEEP = 1.5
-"""Distance from which on a hinge acts, over the clearance."""
+"""Distance below which a hinge is active, relative to the clearance."""
 ROUNDS, STEPS, REPAIRS = 4, 150, 30
-"""Rounds of verification, and evaluations of the criterion in the first and in later ones."""
+"""Number of verification rounds, and of evaluations in the first round and in later ones."""
 SHARES = (1.0, 0.98, 0.95, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1, 0.05)
-"""Sizes of a motion that are tried until it holds all limits."""
+"""Scales of a motion, tried until all limits are satisfied."""
 REGION = 300
-"""States of the default region."""
+"""Number of states in the default region."""
 CHUNK = 3000
 TOLERANCE = 1e-9
 
@@ -56,11 +56,11 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """Limits of a motion, `(nq,)` each; positions without a limit end at ± π.
+    """Limits of a motion, `(nq,)` each; positions without a limit are limited to ±π.
 
     Attributes:
-        low, high: positions [rad, m].
-        velocity, acceleration, torque: largest magnitudes.
+        low, high: position limits [rad, m].
+        velocity, acceleration, torque: maximum magnitudes.
     """
 
     low: Tensor
@@ -79,18 +79,17 @@ class Limits:
         torque: Sequence[float] = (),
         share: float = 0.9,
     ) -> Limits:
-        """Limits as a share of those of a robot.
+        """Return a fraction of the limits of a robot.
 
         Args:
-            robot: provides the limits that are not given.
-            velocity, acceleration, torque: one number for all joints or one per joint. By default, the file's
-                velocity and torque, and accelerations that reach the velocity in a quarter of a second.
-            share: of the limits of velocity, acceleration and torque; the rest is reserved for the
+            robot: robot with the limits that are not given.
+            velocity, acceleration, torque: one number for all joints or one per joint. By default, velocity
+                and torque from the file, and accelerations that reach the velocity in a quarter of a second.
+            share: fraction of the velocity, acceleration and torque limits; the rest is reserved for the
                 controller.
 
         Raises:
-            ParameterError: a limit is missing, or is not a positive number; the message names joint and
-                option.
+            ParameterError: a limit is missing or not positive; the message names joint and option.
         """
         if not 0.0 < share <= 1.0:
             raise ParameterError(
@@ -104,7 +103,7 @@ class Limits:
 
 
 def _given(robot: RobotModel, name: str, values: Sequence[float], default: Tensor) -> Tensor:
-    """Limits of all joints from those given, or else the robot's own."""
+    """Return the limits of all joints, given or from the robot."""
     option = f"give --{name}, as one number or one per joint"
     if len(values) not in (0, 1, robot.nq):
         raise ParameterError(
@@ -125,7 +124,7 @@ def _given(robot: RobotModel, name: str, values: Sequence[float], default: Tenso
 
 
 def random_states(robot: RobotModel, limits: Limits, count: int = REGION, seed: int = 0) -> States:
-    """Uniform states within the limits; those that need too much torque are slowed down."""
+    """Draw states uniformly within the limits; those that need too much torque are slowed down."""
     share = torch.rand(3, count, robot.nq, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
     q = limits.low + share[0] * (limits.high - limits.low)
     qd, qdd = (
@@ -143,10 +142,10 @@ class Excitation:
 
     Attributes:
         motion: positions, velocities, accelerations, and the torque according to the robot file.
-        limits: of the motion.
-        used: largest used share of each limit at 1 kHz, by name; `clearance_m` is the smallest distance.
-        before, after: unknowns before its log, and expected unknowns after.
-        criterion: value of the objective, by random start; the first one was chosen.
+        limits: limits of the motion.
+        used: largest used fraction of each limit at 1 kHz, by name; `clearance_m` is the smallest distance.
+        before, after: unknowns before recording the motion, and expected unknowns afterwards.
+        criterion: objective for each random start; the first one was selected.
     """
 
     motion: Dataset
@@ -157,10 +156,10 @@ class Excitation:
     criterion: tuple[float, ...]
 
     def write(self, path: str | Path) -> None:
-        """Write the motion as a data set: CSV with columns t, q.<joint>, qd., qdd. and tau., or Parquet.
+        """Write the motion as CSV with columns t, q.<joint>, qd., qdd. and tau., or as a Parquet data set.
 
         Raises:
-            DataError: the name ends in neither.
+            DataError: the name does not end in `.csv` or `.parquet`.
             DestinationError: the path cannot be written.
         """
         if Path(path).suffix.lower() != ".csv":
@@ -174,7 +173,7 @@ class Excitation:
 
 
 class Spline:
-    """Motions of some seconds that start and end at rest at `start` `(nq,)`, by free control points."""
+    """Motions that start and end at rest at `start` `(nq,)`, defined by free control points."""
 
     def __init__(self, start: Array, seconds: float) -> None:
         self.start, self.seconds = start, seconds
@@ -182,7 +181,7 @@ class Spline:
         self.h, self.free = seconds / self.spans, self.spans - 3
 
     def at(self, t: Array) -> tuple[Array, Array, Array]:
-        """Matrices `(n, free)` from control points, relative to the start, to q, q̇ and q̈ at times `(n,)`."""
+        """Return matrices `(n, free)` from control points (relative to the start) to q, q̇, q̈ at times."""
         s = np.clip(np.floor(t / self.h).astype(int), 0, self.spans - 1)
         u, h = t / self.h - s, self.h
         v = 1.0 - u
@@ -198,13 +197,13 @@ class Spline:
         return found[0][:, 3:-3], found[1][:, 3:-3], found[2][:, 3:-3]
 
     def differences(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Control points of the velocity and of the acceleration."""
+        """Return the control points of velocity and acceleration."""
         zero = x.new_zeros(3, x.shape[1])
         first = torch.cat([zero, x, zero]).diff(dim=0) / self.h
         return first, first.diff(dim=0) / self.h
 
     def random(self, limits: Limits, random: np.random.Generator) -> Array:
-        """Control points `(free, nq)` of a sum of sines within the limits of the kinematics."""
+        """Draw control points `(free, nq)` of a sum of sines within the kinematic limits."""
         t = np.arange(1, self.free + 1)[:, None, None] * self.h
         shape = (1, len(self.start), SINES)
         w, phase = (
@@ -223,10 +222,10 @@ class Spline:
 
 
 class Search:
-    """The objective of a motion over its control points.
+    """Objective of a motion as a function of its control points.
 
     Args:
-        spline, limits, collisions: of the motion.
+        spline, limits, collisions: spline, limits and collisions of the motion.
         unknowns: the unknown forces to identify.
         criterion: objective of the information.
     """
@@ -242,21 +241,21 @@ class Search:
         self.look(np.zeros(0))
 
     def look(self, times: Array) -> None:
-        """Apply the hinges at further times."""
+        """Apply the hinges at additional times."""
         self.extra = np.union1d(self.extra, times)
         self.matrices = [
             torch.from_numpy(m) for m in self.spline.at(np.concatenate([self.nodes, self.extra]))
         ]
 
     def states(self, x: Tensor) -> States:
-        """Positions, velocities and accelerations at the nodes and the further times."""
+        """Return positions, velocities and accelerations at the nodes and the additional times."""
         q, qd, qdd = (matrix @ x for matrix in self.matrices)
         return torch.from_numpy(self.spline.start) + q, qd, qdd
 
     def scaled(self) -> Tensor:
-        """C `(nq, free, free)`: control points of joint j are C_j w_j, with hinges of even curvature in w.
+        """Return scales C `(nq, free, free)` of control points C_j w_j, with similar hinge curvatures in w.
 
-        C Cᵀ = (4/r² + D₁ᵀD₁/v² + D₂ᵀD₂/a²)⁻¹ with the differences D, the range r and the limits v and a.
+        C Cᵀ = (4/r² + D₁ᵀD₁/v² + D₂ᵀD₂/a²)⁻¹ with differences D, range r and limits v and a.
         """
         limits, eye = self.limits, torch.eye(self.spline.free, dtype=torch.float64)
         D1, D2 = self.spline.differences(eye)
@@ -268,7 +267,7 @@ class Search:
         return torch.linalg.solve_triangular(L, eye.expand_as(L), upper=False).mT
 
     def __call__(self, flat: Array) -> tuple[float, Array]:
-        """Criterion and hinges, and their gradient, at scaled control points w."""
+        """Return the sum of criterion and hinges, and its gradient, at scaled control points w."""
         limits, n = self.limits, len(self.nodes)
         w = torch.tensor(flat.reshape(len(self.spline.start), -1), requires_grad=True)
         x = (self.scale @ w[..., None])[..., 0].mT
@@ -289,11 +288,11 @@ class Search:
         return float(objective.detach()), w.grad.numpy().ravel()  # pyright: ignore[reportOptionalMemberAccess]
 
     def flat(self, x: Array) -> Array:
-        """Scaled control points of control points `(free, nq)`."""
+        """Convert control points `(free, nq)` to scaled control points."""
         return torch.linalg.solve(self.scale, torch.from_numpy(x).mT[..., None]).numpy().ravel()
 
     def minimised(self, x: Array, steps: int) -> tuple[Array, float]:
-        """Improved control points and their objective."""
+        """Minimise the objective, and return the control points and the objective."""
         options = {"maxfun": steps, "maxiter": steps, "maxcor": 20}
         found = minimize(self, self.flat(x), jac=True, method="L-BFGS-B", options=options)
         w = torch.from_numpy(found.x.reshape(len(self.spline.start), -1))
@@ -301,7 +300,9 @@ class Search:
 
     @torch.no_grad()
     def used(self, x: Array, step: float) -> tuple[dict[str, float], Array]:
-        """Largest share of each limit at multiples of `step`, the missing clearance, and the times."""
+        """Return the largest fraction of each limit at multiples of `step`, the missing clearance, and the
+        times.
+        """
         t = np.linspace(0.0, self.spline.seconds, round(self.spline.seconds / step) + 1)
         worst: dict[str, float] = {}
         where, limits, near = [], self.limits, self.collisions
@@ -323,10 +324,10 @@ class Search:
         return worst, np.concatenate(where)
 
     def shrunk(self, x: Array, step: float) -> tuple[Array, dict[str, float]]:
-        """The motion at the largest of `SHARES` that satisfies all limits.
+        """Return the motion scaled by the largest of `SHARES` that satisfies all limits.
 
         Raises:
-            NumericalError: no share does.
+            NumericalError: no scale satisfies all limits.
         """
         used: dict[str, float] = {}
         for share in SHARES:
@@ -345,10 +346,10 @@ class Search:
 def _start_of(
     start: Sequence[float] | None, robot: RobotModel, limits: Limits, collisions: Collisions
 ) -> Array:
-    """The position that was given, or the free one next to the middle of the limits.
+    """Return the given position, or the collision-free one closest to the middle of the limits.
 
     Raises:
-        ParameterError: the start does not fit the robot, its limits, or its surroundings.
+        ParameterError: the start does not match the robot, exceeds its limits, or is in collision.
     """
     low, high = limits.low.numpy(), limits.high.numpy()
     if start is None:
@@ -397,21 +398,21 @@ def excite(
     seed: int = 0,
     progress: Progress | None = None,
 ) -> Excitation:
-    """The motion in free space that identifies the unknown forces best.
+    """Plan the motion in free space that best identifies the unknown forces.
 
     Args:
         system: robot, and contacts with surfaces to avoid.
         seconds: duration [s].
-        limits: by default `Limits.of(robot)`.
+        limits: limits of the motion; by default `Limits.of(robot)`.
         unknowns: unknown forces before the motion; by default all, as in `Unknowns.of`.
-        collisions: by default the robot's shapes and the surfaces of the contacts.
-        start: `(nq,)` position at the start and the end; by default a free one near the middle.
-        criterion: `"A"`, standard deviation of the torque in the region of `unknowns`, `"V"`, the same by
-            links, viscous and dry friction alone, `"D"`, determinant of the covariance, or a function of the
-            information.
-        rate: of the returned samples [Hz].
+        collisions: collisions to avoid; by default the robot's shapes and the surfaces of the contacts.
+        start: `(nq,)` initial and final position; by default a collision-free one near the middle.
+        criterion: `"A"`, standard deviation of the torque in the region of `unknowns`; `"V"`, the same with
+            only link inertia, viscous and dry friction unknown; `"D"`, determinant of the covariance; or a
+            function of the information.
+        rate: sampling rate of the result [Hz].
         restarts: number of optimised random starts, the best of four times as many.
-        seed: of the random starts.
+        seed: seed for the random starts.
         progress: called with the number of completed rounds and their total.
 
     Example:
@@ -424,7 +425,7 @@ def excite(
     Raises:
         ParameterError: limits are missing, the start is in collision or beyond limits, or an option is out of
             range.
-        NumericalError: no motion from the start fits the limits.
+        NumericalError: no motion from the start satisfies the limits.
         MissingDependencyError: MuJoCo is not installed.
     """
     if not (2.0 <= seconds <= 600.0 and 0.0 < rate <= 1e5 and restarts >= 1):
@@ -450,7 +451,7 @@ def excite(
 def _searched(
     search: Search, restarts: int, random: np.random.Generator, progress: Progress
 ) -> tuple[tuple[float, ...], Array, dict[str, float]]:
-    """Objectives of the random starts, the best first, the control points there, and what they use."""
+    """Optimise the random starts; return objectives (best first), control points, and used limits."""
     rounds = restarts + ROUNDS
     drawn = (search.spline.random(search.limits, random) for _ in range(4 * restarts))
     starts = [search.shrunk(x, NODE)[0] for x in drawn]

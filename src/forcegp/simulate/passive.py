@@ -1,4 +1,4 @@
-"""Learned forces as MuJoCo's callback for passive forces, for any simulation."""
+"""Learned forces as a MuJoCo callback for passive forces in any simulation."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from forcegp.resources import one_thread
 
 
 class PassiveForces:
-    """A force field as `mjcb_passive`: adds Q̄ − Q_C − Q_G − Q_u to `qfrc_passive`.
+    """A force field as `mjcb_passive`, which adds Q̄ − Q_C − Q_G − Q_u to `qfrc_passive`.
 
-    With masses and drives of the fitted robot, `fit.system.robot` or a file with it, MuJoCo's acceleration
-    is M⁻¹Q̄, the prediction of the fit. Joint friction is part of Q̄: `installed` removes damping and
-    friction loss from the model meanwhile, so that they do not act twice. Learned friction of contacts is not
-    applied, since the engine has its own. Q_u is `qfrc_applied` and the actuators' last forces.
+    If the MuJoCo model has the masses and drives of the fitted robot (`fit.system.robot`), its acceleration
+    is M⁻¹Q̄, the prediction of the fit. Q̄ includes joint friction, so `installed` temporarily removes
+    damping and friction loss from the model. Learned contact friction is not applied, since the engine models
+    it. Q_u consists of `qfrc_applied` and the last actuator forces.
 
     Args:
-        system: the fitted robot.
-        field: `fit.force_field()`, or one function of the posterior, `fit.force_samples(1, generator)`.
-        joint_names: of the joints in the MuJoCo model; by default the robot's.
+        system: system with the fitted robot.
+        field: `fit.force_field()`, or a posterior sample, `fit.force_samples(1, generator)`.
+        joint_names: names of the joints in the MuJoCo model; by default the robot's.
 
     Raises:
-        ModelError: the number of names differs from that of the joints.
+        ModelError: the number of names differs from the number of joints.
 
     Example:
         `with PassiveForces(fit.system, fit.force_field()).installed(model): mujoco.mj_step(model, data)`
@@ -48,14 +48,14 @@ class PassiveForces:
             )
 
     def __call__(self, model: Any, data: Any) -> None:
-        """Add the forces at the present state of `data`."""
+        """Add the forces at the current state of `data`."""
         dof, qpos = self._places(model)
         tau = data.qfrc_applied[dof] + data.qfrc_actuator[dof]
         data.qfrc_passive[dof] += self.force(data.qpos[qpos], data.qvel[dof], tau)
 
     @torch.no_grad()
     def force(self, q: np.ndarray, qd: np.ndarray, tau: np.ndarray) -> np.ndarray:
-        """The force `(nq,)` at a state `(nq,)` [N m, N]."""
+        """Return the force `(nq,)` at a state `(nq,)` [N m, N]."""
         q_, qd_, tau_ = (torch.tensor(x, dtype=self.system.robot.dtype)[None] for x in (q, qd, tau))
         open_ = torch.zeros(1, len(self.system.contacts), dtype=torch.bool)
         with one_thread():
@@ -64,7 +64,7 @@ class PassiveForces:
         return force[0].double().numpy()
 
     def _places(self, model: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Degrees of freedom and positions of the joints in a model."""
+        """Return the indices of the joints' degrees of freedom and positions in a model."""
         known = [model.joint(k).name for k in range(model.njnt)]
         for name in self.joint_names:
             check_name("joint of the MuJoCo model", name, known)
@@ -73,7 +73,7 @@ class PassiveForces:
 
     @contextmanager
     def installed(self, model: Any) -> Iterator[None]:
-        """Install the callback for all simulations within the block, without the model's joint friction.
+        """Install the callback for all simulations within the block, and disable the model's joint friction.
 
         Raises:
             UnknownNameError: the model lacks a joint of the robot.

@@ -17,7 +17,7 @@ from forcegp.data.fields import DataHeader
 from forcegp.simulate.config import SimulationConfig
 
 CHUNK = 8192
-"""States whose equations are held in memory at once."""
+"""Number of states with equations of motion in memory at a time."""
 
 
 @dataclass(frozen=True)
@@ -25,9 +25,9 @@ class RunLog:
     """Quantities recorded at every step.
 
     Attributes:
-        q, qd, qdd, tau, Q, Q_I, Q_z: `(n, nq)`; qdd is the engine's acceleration, without noise.
-        multiplier, c: `(n, m)`.
-        contact, saturated: `(n, n_contacts)` and `(n,)` bool; whether a torque limit was hit.
+        q, qd, qdd, tau, Q, Q_I, Q_z: `(n, nq)`; qdd is the noise-free acceleration of the engine.
+        multiplier, c: `(n, m)` multipliers and constraint errors.
+        contact, saturated: closed contacts `(n, n_contacts)` and reached torque limits `(n,)`, bool.
         contact_forces: `F_I`, `F_z` → contact → `(n, 3)`, if the engine's solver computed them [N].
         measured: sensor values of `q`, `qd`, `tau`, if the sensors are imperfect.
     """
@@ -48,7 +48,7 @@ class RunLog:
 
     @staticmethod
     def empty(steps: int, system: ConstrainedSystem) -> RunLog:
-        """An empty log for a number of steps."""
+        """Return an empty log for a number of steps."""
 
         def columns(width: int, dtype: torch.dtype = system.robot.dtype) -> Tensor:
             return torch.zeros(steps, width, dtype=dtype)
@@ -65,7 +65,7 @@ class RunLog:
 
 
 def noise(like: Tensor, generator: torch.Generator) -> Tensor:
-    """White noise of unit variance, drawn in double precision for any type."""
+    """Draw white noise of unit variance, in double precision for any type."""
     return torch.randn(like.shape, dtype=torch.float64, generator=generator).to(like.dtype)
 
 
@@ -75,12 +75,12 @@ class SimulationResult:
 
     Attributes:
         data: the log as a data set.
-        reference: the planned motion of the tool point.
-        position, velocity, acceleration: `(n, 3)` its actual motion in the world [m], [m/s], [m/s²].
+        reference: planned motion of the tool point.
+        position, velocity, acceleration: `(n, 3)` actual motion of the point in the world [m], [m/s], [m/s²].
         c: `(n, m)` constraint error [m].
-        saturated: samples in which a torque limit was hit.
-        beyond_limits: samples in which a joint was outside its limits.
-        acceleration_mismatch: largest difference between the engine's accelerations and ours [rad/s²].
+        saturated: number of samples at a torque limit.
+        beyond_limits: number of samples with a joint outside its limits.
+        acceleration_mismatch: largest difference between the accelerations of engine and library [rad/s²].
         engine: name and version of the engine.
     """
 
@@ -96,7 +96,7 @@ class SimulationResult:
     engine: str
 
     def summary(self) -> dict[str, float | int | str]:
-        """Numbers describing the run, by name, with units in the names."""
+        """Return statistics of the run, by name with units."""
         touching = torch.stack(list(self.data.contact.values()), dim=-1) if self.data.contact else None
         figures: dict[str, float | int | str] = {
             "engine": self.engine,
@@ -128,7 +128,7 @@ def make_result(
     engine: str,
     generator: torch.Generator,
 ) -> SimulationResult:
-    """The result of a run from its log."""
+    """Build the result of a run from its log."""
     robot = system.robot
     poses = kinematics.link_poses(robot, log.q)
     motion = kinematics.link_motion(robot, poses, log.qd)
@@ -149,9 +149,9 @@ def make_result(
 
 
 def _mismatch(system: ConstrainedSystem, config: SimulationConfig, log: RunLog) -> float:
-    """Largest difference between the engine's accelerations and L b + H Q̄ of our equations [rad/s²].
+    """Return the largest difference between the engine's accelerations and L b + H Q̄ [rad/s²].
 
-    Where the engine has contact forces of its own, they are impressed forces of free motion.
+    Contact forces computed by the engine are treated as impressed forces in free motion.
     """
     Q_bar, active = log.Q + log.Q_z, log.contact
     if config.contact == "solver":

@@ -1,6 +1,7 @@
-"""A simulated run: plan a motion, move the robot through it in a physics engine, and log it.
+"""Simulated runs: plan a motion, execute it in a physics engine, and log it.
 
-Contact forces follow from the library's equations of motion, or from MuJoCo's solver with simulated sensors.
+Contact forces are computed with the library's equations of motion, or by MuJoCo's solver with simulated
+sensors.
 """
 
 from __future__ import annotations
@@ -28,16 +29,16 @@ from forcegp.simulate.passive import PassiveForces
 from forcegp.simulate.result import RunLog, SimulationResult, make_result, noise
 
 RUNAWAY_SPEED = 50.0
-"""A joint faster than this [rad/s] has left any planned motion."""
+"""Joint speed [rad/s] beyond that of any planned motion."""
 PROGRESS_STRIDE = 24
-"""Steps between two calls of the progress function, a tenth of a second at 240 Hz."""
+"""Number of steps between calls of the progress function, a tenth of a second at 240 Hz."""
 
 Progress = Callable[[int, int], None]
-"""Called with the number of steps done and the number in all."""
+"""Called with the number of completed steps and their total number."""
 
 
 def _torque_limit(system: ConstrainedSystem, config: MotionConfig) -> Tensor:
-    """Torque limits `(nq,)` [N m]: those of the settings, or else the robot's own."""
+    """Return the torque limits `(nq,)` [N m] from the settings or the robot."""
     robot = system.robot
     if config.torque_limit is None:
         return robot.effort_limit
@@ -50,7 +51,7 @@ def _check_speed(t: float, q: Tensor, qd: Tensor) -> None:
     """Stop a run that diverges.
 
     Raises:
-        NumericalError: a joint is too fast, or the state is not finite; names time and state.
+        NumericalError: a joint is too fast, or the state is not finite; the message names time and state.
     """
     if not (bool(q.isfinite().all()) and float(qd.abs().max()) < RUNAWAY_SPEED):
         raise NumericalError(
@@ -74,7 +75,7 @@ def _follow_with_solver(
     generator: torch.Generator,
     progress: Progress | None,
 ) -> RunLog:
-    """Step the engine through the plan; the controller sees what the sensors measure."""
+    """Step the engine through the plan, controlled by sensor values."""
     log, sensors, limit = RunLog.empty(config.steps, system), config.sensors, _torque_limit(system, config)
     seen = compiled_system(system, (plan.frame, plan.point))
     measured = {"q": torch.zeros_like(log.q), "qd": torch.zeros_like(log.qd)}
@@ -111,7 +112,7 @@ def _follow_with_solver(
 
 
 ON_SURFACE = 1e-8
-"""A contact is closed at the start where the error is below this [m]; placement leaves less."""
+"""Constraint error below which a contact is initially closed [m]."""
 
 
 def simulate(
@@ -125,16 +126,16 @@ def simulate(
     """Simulate a motion of the robot, in contact or free, and log it.
 
     The engine moves the robot under Q_u + Q_D + Q_I + Q_z: the motor torque of a task-space controller, joint
-    friction, the normal force of the constrained equations of motion with their Baumgarte terms, and viscous
-    friction at the contact (section 5 of the paper). A contact opens when its multiplier would become
-    negative, and closes with an inelastic impact. The run is computed on the CPU.
+    friction, the normal force from the constrained equations of motion with Baumgarte terms, and viscous
+    contact friction (section 5 of the paper). A contact opens when its multiplier would become negative, and
+    closes with an inelastic impact. The run is computed on the CPU.
 
     Args:
-        system: robot and contacts; without contacts the motion is free.
+        system: robot and contacts; without contacts, the motion is free.
         config: settings of the simulation.
-        motion: joints to follow instead of the tool's random motion, as long as the configuration says.
-        forces: learned forces of joints, in place of the robot's friction; for `contact = "solver"`.
-        progress: called every few steps, and after the last.
+        motion: joint motion to follow instead of a random tool motion, for the configured duration.
+        forces: learned joint forces that replace the robot's friction, for `contact = "solver"`.
+        progress: called every few steps and after the last one.
 
     Returns:
         The data set with the reference, the actual motion of the tool and statistics of the run.
@@ -147,7 +148,7 @@ def simulate(
         24
 
     Raises:
-        NumericalError: the motion cannot be reached, or the run diverges (names time and state).
+        NumericalError: the motion cannot be reached, or the run diverges (the message names time and state).
         MissingDependencyError: the engine is not installed.
         MemoryLimitError: the log needs more memory than is free.
     """

@@ -1,4 +1,4 @@
-"""A robot model written as URDF, so that all physics engines have the same parameters."""
+"""Conversion of a robot model to URDF, which gives all physics engines the same parameters."""
 
 from __future__ import annotations
 
@@ -15,10 +15,9 @@ WORLD = "world"
 
 
 def write_urdf(robot: RobotModel) -> str:
-    """The robot as URDF text: inertial parameters and joints only, mounted in the world at its base pose.
+    """Return the robot as URDF text with inertial parameters and joints, mounted at its base pose.
 
-    Shapes, joint limits, damping and friction are left out: an engine that loads the file adds no further
-    force.
+    Shapes, joint limits, damping and friction are omitted, so engines add no other forces.
     """
     root = Element("robot", name=robot.name)
     _link(root, WORLD, 1.0, torch.zeros(3), torch.eye(3), torch.ones(3))
@@ -32,12 +31,12 @@ def write_urdf(robot: RobotModel) -> str:
 
 
 def link_name(robot: RobotModel, index: int) -> str:
-    """Name of a link in the written file."""
+    """Return the name of a link in the written file."""
     return WORLD if index == BASE else f"link_of_{robot.joint_names[index]}"
 
 
 def _link(root: Element, name: str, mass: float, com: Tensor, axes: Tensor, moments: Tensor) -> None:
-    """A link whose inertia is written in principal axes, so that no engine has to diagonalize it."""
+    """Write a link with its inertia in principal axes, which engines need not diagonalize."""
     inertial = SubElement(SubElement(root, "link", name=name), "inertial")
     SubElement(inertial, "origin", xyz=_numbers(com), rpy=_numbers(_roll_pitch_yaw(axes)))
     SubElement(inertial, "mass", value=repr(mass))
@@ -62,7 +61,7 @@ def _joint(root: Element, robot: RobotModel, i: int, name: str) -> None:
 
 
 def _roll_pitch_yaw(rotation: Tensor) -> list[float]:
-    """Angles about the fixed axes x, y, z, as URDF has them."""
+    """Return the angles about the fixed axes x, y and z, as in URDF."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # at a pitch of 90° roll and yaw turn about one axis, and one is zero
         return ScipyRotation.from_matrix(rotation.numpy()).as_euler("xyz").tolist()

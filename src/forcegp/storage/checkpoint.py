@@ -1,4 +1,4 @@
-"""The state of a long fit on disk, so that an interrupted fit resumes with the same result to the bit."""
+"""The state of a long fit on disk, from which an interrupted fit resumes with a bit-identical result."""
 
 from __future__ import annotations
 
@@ -22,14 +22,14 @@ from forcegp.gp.optimise import Objective
 from forcegp.limits import CHECKPOINT_BYTES, CHECKPOINT_VALUE, LOGGED_VALUE
 
 INTERVAL = 10.0
-"""Least time between two writings [s]."""
+"""Minimum time between two writes [s]."""
 NAMES = ("positions", "objectives", "gradients")
 SUFFIX = ".sums"
-"""Suffix added to the name of the checkpoint of learning."""
+"""Suffix added to the name of the learning checkpoint."""
 
 
 def beside(checkpoint: str | Path) -> Path:
-    """The file of sums that belongs to the checkpoint of learning."""
+    """Return the file of sums that belongs to a learning checkpoint."""
     path = Path(checkpoint)
     return path.with_name(path.name + SUFFIX)
 
@@ -44,7 +44,7 @@ class Checkpoint:
 
     @staticmethod
     def key_of(*values: object) -> str:
-        """A short digest of settings and tensors, and of the release of this library."""
+        """Return a short digest of settings, tensors, and the release of this library."""
         digest = hashlib.sha256(version("forcegp").encode())
         for value in values:
             if isinstance(value, Tensor):
@@ -57,7 +57,7 @@ class Checkpoint:
         return digest.hexdigest()[:16]
 
     def read(self, like: Mapping[str, Tensor], growing: Container[str] = ()) -> dict[str, Tensor]:
-        """The tensors in the file; none if there is no file.
+        """Return the tensors in the file, empty if there is no file.
 
         Args:
             like: tensors with the names, types and shapes of those in the file.
@@ -91,7 +91,7 @@ class Checkpoint:
             self.write(tensors())
 
     def write(self, tensors: Mapping[str, Tensor]) -> None:
-        """Write tensors, whole or not at all; `DestinationError` if the path cannot be written."""
+        """Write tensors atomically; `DestinationError` if the path cannot be written."""
         copies = {name: x.detach().to("cpu", copy=True).contiguous() for name, x in tensors.items()}
         with atomic_file(self.path) as temporary:
             temporary.write_bytes(safetensors.torch.save(copies, {"key": self.key}))
@@ -100,14 +100,14 @@ class Checkpoint:
 
 @dataclass
 class Evaluations:
-    """Every evaluation of an objective: position, value and gradient, kept in a checkpoint.
+    """Record of all evaluations of an objective (position, value and gradient) in a checkpoint.
 
-    A resumed fit replays the optimiser on the recorded values, and so ends with the same bits as an
-    uninterrupted fit. If the optimiser requests another point (on another machine or release of a library),
-    the rest of the record is discarded and recomputed.
+    A resumed fit replays the optimiser on the recorded values and is therefore bit-identical to an
+    uninterrupted fit. If the optimiser requests another point (on another machine or library release), the
+    rest of the record is discarded and recomputed.
 
     Args:
-        checkpoint: file of the record; `None` for none.
+        checkpoint: file of the record, or `None`.
     """
 
     checkpoint: Checkpoint | None
@@ -116,7 +116,7 @@ class Evaluations:
 
     @classmethod
     def resumed(cls, path: str | Path | None, start: Mapping[str, Tensor], *key: object) -> Evaluations:
-        """The evaluations in a file, if any; `key` identifies the fit from `start`."""
+        """Return the evaluations in a file, if any; `key` identifies the fit from `start`."""
         if path is None:
             return cls(None)
         result = cls(Checkpoint(Path(path), Checkpoint.key_of(*key)))
@@ -124,7 +124,7 @@ class Evaluations:
         return result
 
     def read(self, start: Mapping[str, Tensor]) -> int:
-        """Load the evaluations in the file, if there is one; returns their number."""
+        """Load the evaluations in the file, if there is one, and return their number."""
         assert self.checkpoint is not None
         size = sum(value.numel() for value in start.values())
         rows = torch.zeros(0, size, dtype=torch.float64)
@@ -144,7 +144,7 @@ class Evaluations:
         return lengths.pop()
 
     def recorded(self, objective: Objective) -> Objective:
-        """The same objective, with evaluations from the record, and new ones recorded."""
+        """Wrap an objective to use recorded evaluations and to record new ones."""
         checkpoint = self.checkpoint
         if checkpoint is None:
             return objective
@@ -168,12 +168,12 @@ class Evaluations:
         return again
 
     def write(self) -> None:
-        """Write all evaluations so far, up to the first that is not finite."""
+        """Write all evaluations so far, up to the first non-finite one."""
         if self.checkpoint is not None and self._finite():
             self.checkpoint.write(self._tensors())
 
     def _finite(self) -> list[tuple[Tensor, Tensor, Tensor]]:
-        """The evaluations before the first that is not finite."""
+        """Return the evaluations before the first non-finite one."""
         limits = ([bool((x.abs() <= LOGGED_VALUE).all()) for x in entry] for entry in self._record)
         return self._record[: next((i for i, finite in enumerate(limits) if not all(finite)), None)]
 
@@ -183,7 +183,7 @@ class Evaluations:
 
 
 def _layout(tensors: Mapping[str, Tensor], growing: Container[str]) -> dict[str, tuple[object, ...]]:
-    """Type and shape of tensors by name, without the length of those that grow."""
+    """Return type and shape of tensors by name, without the length of growing ones."""
     return {name: (x.dtype, x.ndim, *x.shape[1 if name in growing else 0 :]) for name, x in tensors.items()}
 
 
@@ -194,7 +194,7 @@ def _flat(tensors: Sequence[Tensor]) -> Tensor:
 def _evaluated(
     objective: Objective, tensors: Mapping[str, Tensor], names: list[str]
 ) -> tuple[Tensor, Tensor]:
-    """Value and gradient of an objective, on the CPU in float64."""
+    """Return the value and gradient of an objective, on the CPU in float64."""
     leaves = {name: value.detach().requires_grad_() for name, value in tensors.items()}
     with torch.enable_grad():
         value = objective(leaves)
@@ -204,7 +204,7 @@ def _evaluated(
 
 
 class _StoredGradient(torch.autograd.Function):
-    """A value whose gradient is known."""
+    """Value with a known gradient."""
 
     @staticmethod
     def forward(ctx: Any, value: Tensor, gradient: Tensor, *tensors: Tensor) -> Tensor:
@@ -218,7 +218,7 @@ class _StoredGradient(torch.autograd.Function):
 
 
 def _read(path: Path) -> tuple[dict[str, Tensor], str | None]:
-    """The tensors of a checkpoint, and the key of what it was written for."""
+    """Return the tensors of a checkpoint and the key of its fit."""
     if not path.is_file():
         raise ModelError(f"{path} is not a file", expected="the file of a checkpoint")
     try:

@@ -1,7 +1,8 @@
-"""Frozen descriptions, such as kernels and force priors, as JSON and back.
+"""Conversion of frozen descriptions, such as kernels and force priors, to JSON and back.
 
-Only classes of a given table are written and read, field by field; a description that holds Python code (an
-operator, a function) has no JSON form and is refused. Reading checks names and types and runs nothing.
+Only classes in a given table are written and read, field by field. A description that contains Python code
+(an operator, a function) has no JSON form and is rejected. Reading checks names and types and does not run
+code.
 """
 
 from __future__ import annotations
@@ -15,15 +16,15 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from forcegp.errors import ModelError, check_name, near_names
 
 Classes = Mapping[str, type]
-"""The classes that may be written and read, by the name in the file."""
+"""Classes that may be written and read, by their name in the file."""
 
 MAX_DEPTH = 40
-"""Levels of nesting; a sum of many kernels has one level per term."""
+"""Maximum nesting depth; a sum of many kernels has one level per term."""
 _CHECK = ConfigDict(arbitrary_types_allowed=True, strict=True, allow_inf_nan=False)
 
 
 def encode(value: Any, classes: Classes) -> Any:
-    """A description as JSON-compatible values; `ModelError` for a class without a JSON form."""
+    """Return a description as JSON-compatible values; `ModelError` for a class without a JSON form."""
     names = {kind: name for name, kind in classes.items()}
     if type(value) in names:
         members = {field.name: encode(getattr(value, field.name), classes) for field in _written(value)}
@@ -38,11 +39,11 @@ def encode(value: Any, classes: Classes) -> Any:
 
 
 def decode(json: Any, classes: Classes, place: str, depth: int = 0, *, whole: bool = True) -> Any:
-    """The description restored from `encode`, with all fields if `whole`, else with defaults for missing
-    ones.
+    """Restore a description from `encode`, with defaults for missing fields unless `whole`.
 
     Raises:
-        ForceGPError: a field is missing, unknown or of another type, or a class is unknown; names the place.
+        ForceGPError: a field is missing, unknown or of the wrong type, or a class is unknown; the message
+            names the location.
     """
     if depth > MAX_DEPTH:
         raise ModelError(f"{place}: nested too deeply", expected=f"at most {MAX_DEPTH} levels")
@@ -67,12 +68,12 @@ def decode(json: Any, classes: Classes, place: str, depth: int = 0, *, whole: bo
 
 
 def _written(kind: Any) -> list[Field[Any]]:
-    """The fields that a description is made from; others hold what learning adds."""
+    """Return the fields that define a description, without those added by learning."""
     return [field for field in fields(kind) if field.init]
 
 
 def _check_fields(kind: type, name: str, members: Mapping[str, Any], place: str, whole: bool) -> None:
-    """Raise `ModelError` where a field is unknown or missing."""
+    """Raise `ModelError` if a field is unknown or missing."""
     assert is_dataclass(kind)
     names = {field.name for field in _written(kind)}
     without = {f.name for f in _written(kind) if f.default is MISSING and f.default_factory is MISSING}
@@ -89,7 +90,7 @@ def _check_fields(kind: type, name: str, members: Mapping[str, Any], place: str,
 
 
 def _checked(value: Any, hint: Any, place: str) -> Any:
-    """The value, of the type that its field declares."""
+    """Check and convert a value to the declared type of its field."""
     if isinstance(hint, type) and is_dataclass(hint):
         if not isinstance(value, hint):
             raise ModelError(f"{place} is not valid", expected=hint.__name__, got=type(value).__name__)

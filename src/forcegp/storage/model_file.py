@@ -1,7 +1,7 @@
-"""A saved model: one safetensors file with a versioned header in its metadata and a hash of all its content.
+"""Saved models: one safetensors file with a versioned header in its metadata and a hash of all its content.
 
-The hash is the SHA-256 of the file with 64 zeros in place of the hash, so any changed bit of header or
-tensors is detected. The file is replaced by one `os.replace`: a reader sees the old model or the new one.
+The hash is the SHA-256 of the file with 64 zeros in place of the hash, so any changed bit in header or
+tensors is detected. A single `os.replace` replaces the file, so a reader sees the old model or the new one.
 Tensors are checked once, when the file is read.
 """
 
@@ -27,15 +27,15 @@ from forcegp.resources import announce_memory
 from forcegp.storage.system import MAY_BE_INFINITE, PREFIX, pack_system
 
 TYPES = (torch.float64, torch.float32, torch.int64, torch.bool)
-"""Types of tensors that a model holds."""
+"""Data types of tensors in a model."""
 
 _MAY_BE_INFINITE = re.compile(rf"(system|start)\.({'|'.join(MAY_BE_INFINITE)})")
 _POSITIVE = re.compile(r"(data\.\d+|training)\.noise_std|std\.[^.]+|scale\..+\.std\.[^.]+")
-"""Standard deviations: of the noise, and those that inputs are divided by."""
+"""Names of positive tensors: standard deviations of the noise and scales of inputs."""
 
 
 def check_tensors(tensors: Mapping[str, Tensor], source: str) -> None:
-    """Check number, types and values of tensors, such as positive standard deviations, but not shapes."""
+    """Check number, types and values of tensors (such as positive standard deviations), but not shapes."""
     if len(tensors) > TENSORS:
         raise ModelError(f"{source}: too many tensors", expected=f"at most {TENSORS}", got=len(tensors))
     for name, value in tensors.items():
@@ -57,14 +57,14 @@ def check_tensors(tensors: Mapping[str, Tensor], source: str) -> None:
 
 SUFFIX = ".safetensors"
 HEADER = "forcegp"
-"""Key of the file's metadata: the hash, then the header in JSON."""
+"""Metadata key for the hash and the JSON header."""
 NO_HASH = "0" * 64
 COPIES = 3
-"""A model is in memory as the bytes of its file, and as tensors before and after they are aligned."""
+"""Number of copies of a model in memory: the bytes of its file, and tensors before and after alignment."""
 
 
 class ModelHeader(Header):
-    """Header of a saved model: `Model.kind`, its settings, and its system in the form of `pack_system`."""
+    """Header of a saved model: `Model.kind`, its settings, and its system as returned by `pack_system`."""
 
     FORMAT: ClassVar[str] = "forcegp-model"
     VERSION: ClassVar[int] = 3
@@ -74,12 +74,12 @@ class ModelHeader(Header):
     system: dict[str, Any]
 
     def settings_as(self, kind: type[M], source: str) -> M:
-        """The settings of a saved model, checked; a `ModelError` names file and field."""
+        """Validate the settings of a saved model; a `ModelError` names file and field."""
         return validated(kind, self.settings, source, ModelError, ("settings",))
 
 
 def model_path(path: str | Path) -> Path:
-    """The file of a model: the path with the ending `.safetensors`."""
+    """Return the path of a model with the suffix `.safetensors`."""
     path = Path(path)
     if not path.name:
         raise ModelError("the path of a model has no name", expected="a file", got=repr(str(path)))
@@ -89,7 +89,7 @@ def model_path(path: str | Path) -> Path:
 def model_bytes(
     kind: str, system: ConstrainedSystem, settings: Record, tensors: Mapping[str, Tensor]
 ) -> bytes:
-    """The content of the file of a model; no tensor has a name that begins with `system.`."""
+    """Return the content of a model file; tensor names must not begin with `system.`."""
     record, robot = pack_system(system)
     copies = {name: value.detach().to("cpu", copy=True).contiguous() for name, value in tensors.items()}
     header = ModelHeader(kind=kind, settings=settings.model_dump(mode="json"), system=record)
@@ -104,14 +104,14 @@ def write_model(
     settings: Record,
     tensors: Mapping[str, Tensor],
 ) -> None:
-    """Write the file of a model, whole or not at all; `DestinationError` if it cannot be written."""
+    """Write a model file atomically; `DestinationError` if it cannot be written."""
     data = model_bytes(kind, system, settings, tensors)
     with atomic_file(model_path(path)) as temporary:
         temporary.write_bytes(data)
 
 
 def read_model(path: str | Path) -> tuple[ModelHeader, dict[str, Tensor]]:
-    """Header and tensors of a saved model, its system's too; `ModelError` if it is missing or damaged."""
+    """Return header and tensors of a saved model and its system; `ModelError` if damaged or missing."""
     file = model_path(path)
     try:
         if not file.is_file():
@@ -130,7 +130,7 @@ def read_model(path: str | Path) -> tuple[ModelHeader, dict[str, Tensor]]:
 
 
 def parse_model(data: bytes, source: str) -> tuple[ModelHeader, dict[str, Tensor]]:
-    """Header and tensors of the content of a model's file; `ModelError` if it is damaged, or not a model."""
+    """Return header and tensors from the content of a model file; `ModelError` if it is no valid model."""
     stated, _, text = _metadata(data, source).partition("\n")
     digest = _digest(data, stated)
     if digest != stated:
@@ -151,7 +151,7 @@ def parse_model(data: bytes, source: str) -> tuple[ModelHeader, dict[str, Tensor
 
 
 def _metadata(data: bytes, source: str) -> str:
-    """Hash and header of a model in the metadata of a safetensors file."""
+    """Return hash and header of a model from the metadata of a safetensors file."""
     size = int.from_bytes(data[:8], "little")
     try:
         if not 0 < size <= min(len(data) - 8, HEADER_BYTES):
@@ -167,7 +167,7 @@ def _metadata(data: bytes, source: str) -> str:
 
 
 def _digest(data: bytes, stated: str) -> str:
-    """SHA-256 of the file with zeros in the place of the stated hash."""
+    """Return the SHA-256 of the file with zeros in place of the stored hash."""
     is_hash = len(stated) == len(NO_HASH) and stated.isascii()
     start = data.find(_entry(stated), 0, 8 + int.from_bytes(data[:8], "little")) if is_hash else -1
     if start < 0:
@@ -179,10 +179,10 @@ def _digest(data: bytes, stated: str) -> str:
 
 
 def _entry(digest: str) -> bytes:
-    """The hash in the header; within the text of another entry its quotes would be escaped."""
+    """Return the hash entry in the header, which is unique since quotes in other entries are escaped."""
     return f'"{HEADER}":"{digest}'.encode()
 
 
 def model_tensors(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """The tensors of the model itself, without its system's."""
+    """Return the tensors of the model without those of its system."""
     return {name: value for name, value in tensors.items() if not name.startswith(PREFIX)}

@@ -1,4 +1,4 @@
-"""Options of models, shared by the constructor, the table `[model]` of scenes and saved files."""
+"""Options of models, shared by constructors, the table `[model]` of scenes, and saved files."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ O = TypeVar("O", bound="KernelOptions")
 
 
 class Window(Record):
-    """Window around the parameters of the robot file in which learning starts.
+    """Window of initial values around the parameters in the robot file.
 
     Attributes:
-        relative: half width for logarithms of masses, moments and friction; 0.5 is a factor of 0.37 to
-            2.7 for the mass of a link, and of 0.61 to 1.65 for friction.
+        relative: half width for logarithms of masses, moments and friction; 0.5 corresponds to a factor of
+            0.37 to 2.7 for the mass of a link, and of 0.61 to 1.65 for friction.
         length: half width for centres of mass and other lengths [m].
-        angle: half width for turns [rad].
+        angle: half width for rotations [rad].
     """
 
     relative: Width = 0.5
@@ -35,18 +35,18 @@ class KernelOptions(Record):
     """Options of models with kernels on the states.
 
     Attributes:
-        standardize: whether to standardize the inputs of kernels; the paper does not.
+        standardize: whether to standardize kernel inputs, which the paper does not.
     """
 
     standardize: bool = True
 
     @classmethod
     def of(cls: type[O], values: Mapping[str, Any]) -> O:
-        """The fields that are among named values, with their types checked.
+        """Select the fields from named values and check their types.
 
         Raises:
-            UnknownNameError: a value is not one of the valid names of the field.
-            ModelError: a value is not valid.
+            UnknownNameError: a value is not one of the valid names for the field.
+            ModelError: a value is invalid.
         """
         known = {name: values[name] for name in cls.model_fields if name in values}
         try:
@@ -63,14 +63,14 @@ class KernelOptions(Record):
 class StructuredOptions(KernelOptions):
     """Options of `StructuredGP` that are plain values.
 
-    A field is an argument of the constructor, a key of `[model]` and a setting of saved models. Only the
-    signature of the constructor repeats it.
+    Each field is also an argument of the constructor, a key of `[model]` and a setting of saved models. Only
+    the signature of the constructor repeats the fields.
 
     Attributes:
-        inference: kind of conditioning; `"auto"` depends on the number of samples.
-        inducing_points: maximum number of inducing points of one prior.
-        inertia: `"file"`, or `"auto"` to identify it if the log favours that; `None` is `"auto"` for
-            automatically chosen priors, else `"file"`.
+        inference: type of inference; `"auto"` depends on the number of samples.
+        inducing_points: maximum number of inducing points per prior.
+        inertia: `"file"`, or `"auto"` to identify the inertia if the log supports it; `None` is `"auto"` for
+            automatically selected priors, and otherwise `"file"`.
     """
 
     inference: Literal["auto", "exact", "sparse"] = "auto"

@@ -1,8 +1,8 @@
-"""A constrained system as JSON and tensors, so that a saved model needs no other file.
+"""Storage of a constrained system as JSON and tensors, which makes a saved model self-contained.
 
 The robot is saved as the tensors of `RobotModel`, bit for bit. Constraints that the user defines in Python
-(an `ImplicitSurface`, a subclass of `Constraint`) cannot be saved: the file has a placeholder, and the caller
-passes a system with them when reading.
+(an `ImplicitSurface`, a subclass of `Constraint`) cannot be saved. The file contains placeholders, and the
+caller passes a system with these constraints when reading.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ from forcegp.files import Record, validated
 from forcegp.robot.model import RobotModel
 
 SURFACES = get_args(get_args(SurfaceSchema)[0])
-"""The surfaces that can be saved."""
+"""Surfaces that can be saved."""
 
 
 def _floats(value: object) -> object:
-    """Elements of arrays and tensors as numbers."""
+    """Convert the elements of arrays and tensors to numbers."""
     if isinstance(value, str) or not isinstance(value, Iterable):
         return value
     return tuple(x.item() if hasattr(x, "item") else x for x in value)
@@ -54,7 +54,7 @@ class RobotRecord(Record):
 
 
 class ContactFields(Record):
-    """A point of the robot that may touch a surface, or a ball of some `radius` around it."""
+    """A point of the robot, or a ball of given `radius` around it, that may be in contact with a surface."""
 
     name: str
     frame: str
@@ -64,13 +64,13 @@ class ContactFields(Record):
     stick_speed: float | None = None
 
     def build(self) -> Constraint:
-        """The constraint."""
+        """Return the constraint."""
         further = {"radius": self.radius, "stick_speed": self.stick_speed}
         return SurfaceContact(self.name, self.frame, self.point, self.surface, **further)
 
 
 class ConnectionFields(Record):
-    """Two points that coincide; without `other_frame`, the second is fixed in the world."""
+    """Two coincident points; without `other_frame`, the second is fixed in the world."""
 
     name: str
     frame: str
@@ -79,7 +79,7 @@ class ConnectionFields(Record):
     other_point: Point = (0.0, 0.0, 0.0)
 
     def build(self) -> Constraint:
-        """The constraint."""
+        """Return the constraint."""
         return PointConnection(self.name, self.frame, self.point, self.other_frame, self.other_point)
 
 
@@ -96,7 +96,7 @@ class PointConnectionRecord(ConnectionFields):
 
 
 class UnsavedRecord(Record):
-    """Placeholder of a constraint that is defined in Python code."""
+    """Placeholder for a constraint defined in Python code."""
 
     type: Literal["unsaved"] = "unsaved"
     name: str
@@ -115,7 +115,7 @@ class SystemRecord(Record):
 
 
 def _record(contact: Constraint) -> ConstraintRecord:
-    """The record of a constraint, or a placeholder if it is defined in Python code."""
+    """Return the record of a constraint, or a placeholder if it is defined in Python code."""
     if type(contact) is PointConnection:
         return PointConnectionRecord.model_validate(contact)
     described = contact.surface if type(contact) is SurfaceContact else contact
@@ -125,7 +125,7 @@ def _record(contact: Constraint) -> ConstraintRecord:
 
 
 PREFIX = "system."
-"""Prefix of the names of the robot's tensors."""
+"""Name prefix of the robot's tensors."""
 SHAPES: dict[str, tuple[str | int, ...]] = {
     "placement_rotation": ("nq", 3, 3),
     "placement_position": ("nq", 3),
@@ -138,12 +138,12 @@ SHAPES: dict[str, tuple[str | int, ...]] = {
     "base_position": (3,),
     "gravity": (3,),
 }
-"""Shape of each tensor of a robot; one number per joint for all others."""
+"""Shapes of a robot's tensors that do not have one number per joint."""
 MAY_BE_INFINITE = ("lower", "upper", "velocity_limit", "effort_limit")
 
 
 def pack_system(system: ConstrainedSystem) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """A system as a JSON object, and copies of the tensors of its robot on the CPU (`system.<field>`)."""
+    """Return a system as a JSON object, and CPU copies of the tensors of its robot (`system.<field>`)."""
     record = SystemRecord(
         robot=RobotRecord.model_validate(system.robot),
         contacts=tuple(map(_record, system.contacts)),
@@ -162,10 +162,10 @@ def unpack_system(
     source: str,
     fallback: ConstrainedSystem | None = None,
 ) -> ConstrainedSystem:
-    """The system restored from `pack_system`; constraints that cannot be saved are those of `fallback`.
+    """Restore a system from `pack_system`, with constraints that cannot be saved taken from `fallback`.
 
     Raises:
-        ModelError: a field or tensor is missing or not valid, or a constraint that was not saved is needed.
+        ModelError: a field or tensor is missing or invalid, or an unsaved constraint is missing.
     """
     record = validated(SystemRecord, dict(json), source, ModelError, ("system",))
     robot = _robot(record.robot, tensors, source)
@@ -221,7 +221,7 @@ def take(
     *,
     finite: bool = True,
 ) -> Tensor:
-    """A named tensor of a saved model, of any shape for `None`; `ModelError` unless it fits and is finite."""
+    """Return a tensor of a saved model; `ModelError` unless it is finite and has the shape (`None`: any)."""
     if name not in tensors:
         raise ModelError(f"{source}: tensor {name!r} is missing")
     value = tensors[name]
@@ -237,13 +237,13 @@ def take(
 
 
 def robot_tensors(robot: RobotModel) -> list[str]:
-    """Names of the fields of a robot that are tensors."""
+    """Return the names of the fields of a robot that are tensors."""
     names = [field.name for field in dataclasses.fields(robot)]
     return [name for name in names if isinstance(getattr(robot, name), Tensor)]
 
 
 def take_robot(tensors: Mapping[str, Tensor], prefix: str, like: RobotModel, source: str) -> RobotModel:
-    """A robot with tensors named `<prefix><field>`, checked by `take`, and other fields like another one."""
+    """Return a robot with tensors named `<prefix><field>`, checked by `take`, and other fields copied."""
     fields = {}
     for name in robot_tensors(like):
         value, finite = getattr(like, name), name not in MAY_BE_INFINITE

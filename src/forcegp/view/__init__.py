@@ -1,1 +1,1 @@
-"""A robot, its surfaces, contact forces and predicted paths in three dimensions, in the browser."""
+"""3D view of a robot, its surfaces, contact forces and predicted paths in the browser."""

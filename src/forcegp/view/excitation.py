@@ -1,4 +1,4 @@
-"""The page of an exciting motion: in three dimensions, its limits, and the expected information."""
+"""Page of an exciting motion with a 3D view, its limits, and the expected information."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from forcegp.view.motion import MEAN, Motion, Path3D, pictures, tip_path
 from forcegp.view.page import SURFACE, content_of, solid
 
 MOST = 1500
-"""Instants that curves are drawn through."""
+"""Number of instants in a curve."""
 
 
 def draw_limits(result: Excitation) -> Picture:
-    """Draw position, velocity, acceleration and torque of each joint as shares of their limits over time."""
+    """Plot position, velocity, acceleration and torque of each joint as fractions of their limits."""
     limits, motion = result.limits, result.motion[:: -(-len(result.motion) // MOST)]
     middle, half = 0.5 * (limits.low + limits.high), 0.5 * (limits.high - limits.low)
     curves = {
@@ -50,7 +50,7 @@ def draw_limits(result: Excitation) -> Picture:
 
 
 def expected_table(result: Excitation) -> Table:
-    """Standard deviation of the torque in the region, before and after the log."""
+    """Return a table of the standard deviation of the torque in the region, before and after the log."""
     head = ["joint"]
     columns: list[list[float]] = []
     for part in ("all", "links", "friction"):

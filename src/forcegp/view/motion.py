@@ -1,4 +1,4 @@
-"""A motion to display: joint positions over time, forces of contacts, and paths of the tip."""
+"""Motions to display: joint positions over time, contact forces, and paths of the tip."""
 
 from __future__ import annotations
 
@@ -28,7 +28,7 @@ LOGGED, MEAN, SAMPLE = "logged", "predicted", "sampled"
 
 @dataclass(frozen=True)
 class Force:
-    """The normal force of a contact in each picture, its point of application `(k, 3)` and the normal [m].
+    """Normal force of a contact in each frame, with its point of application `(k, 3)` [m] and normal.
 
     `value` `(k,)` [N] is NaN if the contact is open; `std` is 0 if unknown.
     """
@@ -42,7 +42,7 @@ class Force:
 
 @dataclass(frozen=True)
 class Path3D:
-    """The path of the tip, `(n, 3)` [m]; its kind is `logged`, `predicted` or `sampled`."""
+    """Path of the tip `(n, 3)` [m]; its kind is `logged`, `predicted` or `sampled`."""
 
     kind: str
     points: Array
@@ -50,7 +50,7 @@ class Path3D:
 
 @dataclass(frozen=True)
 class Motion:
-    """A motion: joint positions `(k, nq)` at times `(k,)` [s], forces of contacts, paths of the tip."""
+    """Joint positions `(k, nq)` at times `(k,)` [s], contact forces, and paths of the tip."""
 
     system: ConstrainedSystem
     t: Array
@@ -60,14 +60,14 @@ class Motion:
 
 
 def at_rest(system: ConstrainedSystem) -> Motion:
-    """The robot at q = 0, or the nearest position within its limits."""
+    """Return a motionless robot at q = 0, or at the nearest position within its limits."""
     robot = system.robot
     q = torch.zeros(1, robot.nq, dtype=robot.dtype).clamp(robot.lower.cpu(), robot.upper.cpu())
     return Motion(system, np.zeros(1), q)
 
 
 def of_log(system: ConstrainedSystem, data: Dataset, model: Predictor | None = None) -> Motion:
-    """The logged motion, with a model's force or the logged one; `DataError` unless it fits the robot."""
+    """Return the logged motion, with a predicted or logged force; `DataError` if joints do not match."""
     data = data.select(system.robot.joint_names)
     if not len(data):
         raise DataError("there is no motion to look at", expected="one row or more", got="none")
@@ -78,7 +78,7 @@ def of_log(system: ConstrainedSystem, data: Dataset, model: Predictor | None = N
 
 
 def with_rollout(motion: Motion, path: Rollout) -> Motion:
-    """The motion with the paths of a rollout: the mean, and one per function sample."""
+    """Add the paths of a rollout to a motion: the mean and one per function sample."""
     paths = [Path3D(MEAN, tip_path(motion.system, path.q.reshape(-1, path.q.shape[-1])))]
     if path.samples is not None:
         sampled = path.samples.q.reshape(-1, *path.samples.q.shape[-2:])
@@ -87,27 +87,27 @@ def with_rollout(motion: Motion, path: Rollout) -> Motion:
 
 
 def sampled_rollout(model: Predictor, data: Dataset, samples: int, seconds: float) -> Rollout:
-    """A model rolled out under the logged torques from the first state of a trajectory."""
+    """Simulate a model under the logged torques from the first state of a trajectory."""
     options = RolloutOptions(sampling_period(data), on_divergence="keep")
     return replayed(model, data, samples if model.has_function_samples else 0, seconds, options=options)
 
 
 def tip_path(system: ConstrainedSystem, q: Tensor) -> Array:
-    """Positions of the tip `(n, 3)`, up to the divergence of a trajectory [m]."""
+    """Return the positions of the tip `(n, 3)`, up to the divergence of a trajectory [m]."""
     sound = int(torch.isfinite(q).all(-1).long().cumprod(0).sum())
     frame, point = tip_of(system)
     return as_array(kinematics.point_position(system.robot, q[:sound], frame, tuple(point)))
 
 
 def pictures(t: Tensor) -> Tensor:
-    """The displayed rows: the last one before the time of each picture."""
+    """Return the displayed rows: the last row before the time of each frame."""
     period = 1.0 / FRAMES_PER_SECOND
     times = torch.arange(float(t[0]), float(t[-1]) + 0.5 * period, period, dtype=t.dtype)
     return torch.unique((torch.searchsorted(t.contiguous(), times, right=True) - 1).clamp(0, len(t) - 1))
 
 
 def _forces(system: ConstrainedSystem, data: Dataset, model: Predictor | None) -> list[Force]:
-    """The normal force of each contact with a surface."""
+    """Return the normal force of each contact with a surface."""
     if not system.contacts:
         return []
     active = data.active(system.contact_names)

@@ -1,4 +1,4 @@
-"""The view as one self-contained HTML file, or served to a browser on this computer."""
+"""The 3D view as a self-contained HTML file, or served to a browser on this computer."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ from forcegp.view.motion import LOGGED, MEAN, Force, Motion
 
 ROBOT, BASE_COLOUR, SURFACE = "#607d96", "#464e56", "#e2cd96"
 OPACITY = 0.45
-"""Of the solids, so that a force inside the tool is seen."""
+"""Opacity of the solids, which keeps a force inside the tool visible."""
 PATHS = {LOGGED: ("#222222", 2.0), MEAN: ("#0072b2", 2.0)}
 SAMPLED = ("#82b9dc", 1.0)
 ARROW = 0.3
 """Length of the longest arrow [m]."""
 MARGIN = 0.15
-"""By how much a surface is drawn beyond the path of the tip [m]."""
+"""Margin of a surface around the path of the tip [m]."""
 LOCAL, PORT = "127.0.0.1", 8080
-"""The view is served to this computer only."""
+"""Address of the server, accessible from this computer only."""
 
 
 def content_of(motion: Motion, shapes: Sequence[Shape]) -> dict[str, Any]:
-    """Drawing of a motion for `report.animation`: robot, surfaces, paths, forces and their texts."""
+    """Return a motion as input for `report.animation`: robot, surfaces, paths, and forces with labels."""
     system, frames = motion.system, range(len(motion.t))
     robot, poses = system.robot, kinematics.link_poses(system.robot, motion.q)
     R = torch.cat([robot.base_rotation.expand(len(frames), 1, 3, 3), poses.rotation], dim=1)
@@ -65,20 +65,20 @@ def content_of(motion: Motion, shapes: Sequence[Shape]) -> dict[str, Any]:
 
 
 def solid(points: Array, colour: str, link: int | None) -> dict[str, Any]:
-    """A convex solid of an animation: corners in the frame of a link, or in the world."""
+    """Return a convex solid for an animation, with corners in the frame of a link or the world."""
     style = {"colour": colour, "opacity": OPACITY, "link": link}
     return {"points": rounded(torch.from_numpy(points)), **style}
 
 
 def _around(motion: Motion, contact: str, tip: Array) -> Array:
-    """Points that a surface is drawn around."""
+    """Return the points that a drawn surface must cover."""
     positions = [force.point for force in motion.forces if force.contact == contact]
     points = np.concatenate(positions or [path.points for path in motion.paths] or [tip])
     return points if len(points) else tip
 
 
 def _patch(surface: Surface, points: Array) -> Array:
-    """Corners of a patch of a plane below the points, of a sphere, or of a cylinder along the points."""
+    """Return the corners of a plane patch below the points, a sphere, or a cylinder along the points."""
     if isinstance(surface, Plane):
         R = turn_z(np.asarray(surface.normal))
         local = points @ R
@@ -98,7 +98,7 @@ def _patch(surface: Surface, points: Array) -> Array:
 
 
 def _arrow(force: Force, scale: float) -> dict[str, Any]:
-    """The arrow of a force in each frame, and the segment of ±2σ about its tip; `None` where it is open."""
+    """Return the arrow of a force in each frame and its ±2σ segment; `None` while the contact is open."""
     along = scale * force.normal
     tip, bar = force.point + force.value[:, None] * along, 2.0 * force.std[:, None] * along
     closed = np.isfinite(force.value)
@@ -111,7 +111,7 @@ def _arrow(force: Force, scale: float) -> dict[str, Any]:
 
 
 def force_text(force: Force, k: int) -> str:
-    """A force in words."""
+    """Describe a force in words."""
     value, std = force.value[k], force.std[k]
     if not np.isfinite(value):
         return f"{force.contact}: open"
@@ -119,7 +119,7 @@ def force_text(force: Force, k: int) -> str:
 
 
 def view_page(motion: Motion, shapes: Sequence[Shape], title: str) -> str:
-    """The self-contained HTML of a motion."""
+    """Return the self-contained HTML of a motion."""
     label = "The robot moving, with its surfaces, contact forces and paths of the tip"
     drawn = animation(content_of(motion, shapes), label)
     return render("view.html.j2", title=title, animation=drawn, script=animation_source())
@@ -132,9 +132,9 @@ def write_view(path: str | Path, motion: Motion, shapes: Sequence[Shape], title:
 
 
 def serve(page: str, port: int = PORT, say: Callable[[str], None] = print) -> None:
-    """Show a page in a browser on this computer until interrupted; `say` receives its address.
+    """Serve a page to a browser on this computer until interrupted; `say` receives its address.
 
-    Other users of the computer do not know the address, and requests under another host name are refused.
+    Other users of the computer cannot guess the address, and requests for other host names are rejected.
     """
     path = f"/{secrets.token_urlsafe(16)}"
 
