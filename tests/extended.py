@@ -129,7 +129,7 @@ def deviation_errors(fit: StructuredFit, at: Dataset, quantity: str = "qdd") -> 
     """Largest relative error of a standard deviation of a fit where the prior has one.
 
     Args:
-        fit: with exact inference, or priors of finite features.
+        fit: with exact inference, or priors with finitely many features.
         at: states.
         quantity: what is predicted.
     """

@@ -52,9 +52,9 @@ def write_or_keep(write: Callable[[Path], object], path: str | Path) -> None:
         raise cause
     reason = cause.message if isinstance(cause, ForceGPError) else (cause.strerror or str(cause))
     raise DestinationError(
-        f"{target}: the result could not be written there",
+        f"{target}: the result could not be written",
         got=reason,
-        hint=f"it was kept in {kept}; move it to where it belongs",
+        hint=f"it was saved to {kept}; move it to its destination",
     ) from cause
 
 
@@ -77,8 +77,8 @@ def _check_replaceable(folder: Path, own_files: tuple[str, ...]) -> None:
     foreign = [name for name in names if not any(fnmatchcase(name, pattern) for pattern in own_files)]
     if own_files and foreign:
         raise DestinationError(
-            f"{folder} holds other files than a result of this command, which would be lost",
-            expected="a folder that is new, empty, or holds nothing but " + ", ".join(own_files),
+            f"{folder} contains other files, which would be lost",
+            expected="a folder that is new, empty, or contains only " + ", ".join(own_files),
             got=", ".join(foreign[:5]),
-            hint="name another folder, or move these files",
+            hint="choose another folder, or move these files",
         )

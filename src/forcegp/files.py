@@ -125,7 +125,7 @@ def writable(target: Path) -> Iterator[None]:
         raise DestinationError(
             f"{target}: cannot be written",
             got=cause.strerror or str(cause),
-            hint="name a place that exists, is not full and can be written",
+            hint="choose an existing, writable location with free space",
         ) from cause
 
 
@@ -135,16 +135,16 @@ def check_kind(target: Path, *, folder: bool) -> None:
     The path is inspected once, since another writer could change it between `exists` and `is_dir`.
     """
     if "\0" in str(target):
-        raise DestinationError("a path holds a null byte", got=repr(str(target)))
+        raise DestinationError("a path contains a null byte", got=repr(str(target)))
     try:
         mode = os.stat(target).st_mode
     except (FileNotFoundError, NotADirectoryError):
         return
     if folder and not stat.S_ISDIR(mode):
-        raise DestinationError(f"{target} is a file, and a folder is to be written there")
+        raise DestinationError(f"{target} is a file, but a folder is to be written there")
     if not folder and not stat.S_ISREG(mode):
         kind = "a folder" if stat.S_ISDIR(mode) else "not a regular file"
-        raise DestinationError(f"{target} is {kind}, and a file is to be written there")
+        raise DestinationError(f"{target} is {kind}, but a file is to be written there")
 
 
 def _sync(path: Path) -> None:
@@ -278,7 +278,7 @@ class Header(Record):
         fields = _json_object(text, source, error, cls.MAX_BYTES)
         name, version = fields.pop("format", None), fields.pop("version", None)
         if name != cls.FORMAT:
-            raise error(f"{source} is of another format", expected=cls.FORMAT, got=repr(name))
+            raise error(f"{source} has another format", expected=cls.FORMAT, got=repr(name))
         if version != cls.VERSION:
             raise error(
                 f"{source} has a version of the {cls.FORMAT} format that this release cannot read",

@@ -28,7 +28,7 @@ def check_count(source: str, what: str, count: int, most: int) -> None:
     """
     if count > most:
         raise DataError(
-            f"{source}: the log claims too many {what}",
+            f"{source}: the log declares too many {what}",
             expected=f"at most {most:,}",
             got=f"{count:,}",
             hint="split the log, or export only the columns that are needed",
@@ -40,7 +40,7 @@ def check_expansion(source: str, size: int, file: int, free: int | None = None) 
     allowed = allowed_bytes(file, free)
     if size > allowed:
         raise DataError(
-            f"{source}: the file claims to be larger than what is read at once",
+            f"{source}: the declared size of the file exceeds the limit",
             expected=f"at most {allowed:,} bytes in a file of this size",
             got=f"{size:,}",
             hint="split the log into several files",
@@ -157,7 +157,7 @@ def check_chunks(dataset: Any, file: int) -> None:
         return
     if len(set(filters)) < len(filters) or not set(filters) <= {DEFLATE, SHUFFLE, FLETCHER32, LZF}:
         hint = "repack it: h5repack -f GZIP=4"
-        raise DataError(f"{source} is packed by filters that are not read", got=str(filters)[:200], hint=hint)
+        raise DataError(f"{source} uses unsupported compression filters", got=str(filters)[:200], hint=hint)
     chunk, stored = math.prod(dataset.chunks) * dataset.dtype.itemsize, dataset.id.get_storage_size()
     check_expansion(source, chunk, file)
     check_count(source, "bytes in chunks", stored, file)
@@ -178,8 +178,8 @@ def within(folder: Path, files: Iterable[Path]) -> list[Path]:
     for file in files:
         if not file.resolve().is_relative_to(root):
             raise DataError(
-                f"{file}: a link that leads out of {folder} is not followed",
-                hint="copy the folder with the files that its links name: cp -rL",
+                f"{file}: a link to a path outside {folder} is not followed",
+                hint="copy the folder with the linked files: cp -rL",
             )
     return files
 
@@ -204,5 +204,5 @@ def damaged(source: str, kind: str, cause: BaseException) -> DataError:
     return DataError(
         f"{source}: the file is damaged, truncated or not {kind}",
         got=lines[0][:300] if lines else type(cause).__name__,
-        hint="write it again from its source; an interrupted copy is the usual cause",
+        hint="create it again from its source; the usual cause is an interrupted copy",
     )

@@ -59,7 +59,7 @@ def load_library(source: str, level: str = "-O2") -> ctypes.CDLL:
         place = cache_directory()
     except (OSError, RuntimeError) as cause:
         raise MissingDependencyError(
-            "the C++ compiler or the folder of its results cannot be used",
+            "the C++ compiler or its output folder cannot be used",
             got=str(cause),
             hint="set CXX to a C++ compiler, and FORCEGP_CACHE to a folder that can be written",
         ) from cause
@@ -102,7 +102,7 @@ def _built(compiler: Sequence[str], source: str, folder: Path) -> bytes:
     try:
         status = os.fstat(held)
         if status.st_uid != os.geteuid() or stat.S_IMODE(status.st_mode) != 0o700:
-            raise OSError(errno.EPERM, "another folder was put in the place of the build folder", str(folder))
+            raise OSError(errno.EPERM, "the build folder was replaced", str(folder))
         _run_compiler(compiler, source, PROC / str(held))
         with os.fdopen(os.open(LIBRARY, os.O_RDONLY | os.O_NOFOLLOW, dir_fd=held), "rb") as file:
             return file.read()
@@ -168,10 +168,10 @@ def _is_alone_in(group: int) -> bool:
 
 def _untrusted(folder: Path, place: Path, got: str) -> MissingDependencyError:
     return MissingDependencyError(
-        f"compiled kernels are not kept in {folder}, since others could put code there",
-        expected=f"{place} to belong to you, and nobody else to write to it",
+        f"compiled kernels are not stored in {folder}, since other users could place code there",
+        expected=f"{place} owned by you and not writable by others",
         got=got,
-        hint="set FORCEGP_CACHE to a folder of your own, or call chmod 700 on it",
+        hint="set FORCEGP_CACHE to a private folder, or call chmod 700 on it",
     )
 
 

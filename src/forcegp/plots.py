@@ -203,7 +203,7 @@ def _axes(count: int, ax: Target) -> list[Axes]:
     axes = [ax] if isinstance(ax, Axes) else list(np.asarray(ax, dtype=object).ravel())
     if len(axes) != count:
         raise ParameterError(
-            "the number of axes is not that of the panels",
+            "the number of axes differs from the number of panels",
             expected=f"{count} axes, one per panel",
             got=len(axes),
             hint="pass ax=None for a new figure, or choose joints",

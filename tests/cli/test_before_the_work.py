@@ -130,7 +130,7 @@ def test_a_result_whose_place_fails_later_is_kept(
     spare.mkdir()
     monkeypatch.setattr("tempfile.tempdir", str(spare))
     fails_in(place, monkeypatch)
-    with pytest.raises(DestinationError, match="it was kept in"):
+    with pytest.raises(DestinationError, match="it was saved to"):
         run(*arguments(command, made, place / "result.parquet"))
     [kept] = spare.iterdir()
     assert (kept / "result.parquet").exists()

@@ -88,13 +88,13 @@ def test_folder_and_files_are_private_whatever_the_umask(
 @pytest.mark.parametrize("mode", [0o770, 0o707, 0o777])
 def test_a_folder_that_others_write_is_refused(mode: int, folder: Path) -> None:
     folder.chmod(mode)
-    with pytest.raises(MissingDependencyError, match=rf"others could put code there(.|\n)*{mode:04o}"):
+    with pytest.raises(MissingDependencyError, match=rf"other users could place code there(.|\n)*{mode:04o}"):
         compiled()
 
 
 def test_a_folder_below_one_that_others_write_is_refused(tmp_path: Path, folder: Path) -> None:
     tmp_path.chmod(0o777)
-    with pytest.raises(MissingDependencyError, match="others could put code there"):
+    with pytest.raises(MissingDependencyError, match="other users could place code there"):
         compiled()
     tmp_path.chmod(0o1777)
     compiled()
@@ -104,7 +104,7 @@ def test_a_folder_below_one_that_others_write_is_refused(tmp_path: Path, folder:
 def test_a_folder_below_one_that_a_foreign_group_writes_is_refused(tmp_path: Path, folder: Path) -> None:
     os.chown(tmp_path, os.geteuid(), OTHER)
     tmp_path.chmod(0o775)
-    with pytest.raises(MissingDependencyError, match=r"others could put code there(.|\n)*0775"):
+    with pytest.raises(MissingDependencyError, match=r"other users could place code there(.|\n)*0775"):
         compiled()
     tmp_path.chmod(0o755)
     compiled()
@@ -117,7 +117,7 @@ def test_a_private_group_may_write_above(
     monkeypatch.setattr(native, "_is_alone_in", lambda group: group == tmp_path.stat().st_gid)
     compiled()
     monkeypatch.setattr(native, "_is_alone_in", lambda group: False)
-    with pytest.raises(MissingDependencyError, match="others could put code there"):
+    with pytest.raises(MissingDependencyError, match="other users could place code there"):
         compiled()
 
 

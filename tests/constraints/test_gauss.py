@@ -301,11 +301,11 @@ def test_function_transforms(kind: str) -> None:
 def test_arguments_that_do_not_fit_are_refused() -> None:
     system = system_of("two", 0)
     q, qd, _ = random_state(system, 3)
-    with pytest.raises(ShapeError, match=r"active does not fit the contacts plane, ball[\s\S]*\(3, 2\)"):
+    with pytest.raises(ShapeError, match=r"active does not match the contacts plane, ball[\s\S]*\(3, 2\)"):
         system.equations(q, qd, torch.ones(3, 1, dtype=torch.bool))
     with pytest.raises(ShapeError, match=r"expected: bool of shape \(3, 2\)[\s\S]*got: float64"):
         system.equations(q, qd, torch.ones(3, 2, dtype=torch.float64))
-    with pytest.raises(ShapeError, match="active does not fit"):
+    with pytest.raises(ShapeError, match="active does not match"):
         system.equations(q, qd, torch.ones(4, 2, dtype=torch.bool))
     with pytest.raises(UnknownNameError, match=r"unknown contact 'plan'[\s\S]*did you mean 'plane'"):
         system.contact("plan")

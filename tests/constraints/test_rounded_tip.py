@@ -100,7 +100,7 @@ def test_a_surface_is_raised_along_its_normal() -> None:
 
 def test_what_cannot_be_a_ball_is_refused() -> None:
     (contact,) = CONSTRAINTS["rounded"]
-    with pytest.raises(ParameterError, match="the tip of contact 'round' has no such radius"):
+    with pytest.raises(ParameterError, match="the tip of contact 'round' has an invalid radius"):
         dataclasses.replace(contact, radius=-0.1)
     with pytest.raises(ParameterError, match="ImplicitSurface cannot be raised"):
         SurfaceContact("hill", "tool", (0.0, 0.0, 0.1), ImplicitSurface(lambda p: p[2]), radius=0.1)

@@ -92,5 +92,5 @@ def test_friction_of_sliding_is_no_force_of_a_point_that_rests() -> None:
 
 
 def test_a_speed_that_is_not_positive_is_refused() -> None:
-    with pytest.raises(ParameterError, match="cannot stick below such a speed"):
+    with pytest.raises(ParameterError, match="has an invalid stick speed"):
         sticking(SURFACES[0], 0.0, 0.0)

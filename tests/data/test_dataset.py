@@ -73,7 +73,7 @@ def test_rows_by_slice_mask_and_indices() -> None:
 @pytest.mark.parametrize(
     ("rows", "message"),
     [
-        (torch.ones(3, dtype=torch.bool), "mask has another length"),
+        (torch.ones(3, dtype=torch.bool), "mask and the data set differ in length"),
         ([0, 10], "no such row\n  expected: 0 to 9\n  got: 10"),
         ([-11], "no such row"),
         ([0.5], "a slice, a mask or a list"),
@@ -156,14 +156,14 @@ def replaced(name: str, row: int, value: float) -> Callable[[], Dataset]:
         (replaced("qdd", 7, float("nan")), r"column 'qdd.elbow' holds nan in row 7"),
         (replaced("tau", 0, float("inf")), r"column 'tau.elbow' holds inf in row 0"),
         (replaced("t", 9, 0.0), r"column 't' does not increase in row 9\n  expected: more than 0.0333"),
-        (lambda: random_log().replace(segment=torch.arange(60) % 2), "rows of segment 0 are not together"),
+        (lambda: random_log().replace(segment=torch.arange(60) % 2), "rows of segment 0 are not contiguous"),
         (lambda: random_log().replace(q=torch.zeros(60, 2, dtype=torch.float64)), r"'q' has the wrong shape"),
         (lambda: random_log().replace(qd=torch.zeros(60, 3)), "'qd' is of another type"),
         (
             lambda: random_log().replace(contact={"table": torch.zeros(60)}),
             "'contact.table' has the wrong type",
         ),
-        (lambda: random_log().replace(contact={}), "'multiplier' is logged of contact 'table'"),
+        (lambda: random_log().replace(contact={}), "'multiplier' is logged for contact 'table'"),
         (lambda: random_log().replace(extras={"qd": torch.zeros(60, 3).double()}), "'qd' cannot be the name"),
         (lambda: random_log().replace(extras={"a.b": torch.zeros(60, 3).double()}), "'a.b' cannot be"),
         (lambda: random_log().replace(extras={"F_I": torch.zeros(60, 3).double()}), "'F_I' cannot be"),
@@ -262,7 +262,7 @@ def test_missing_files_and_other_kinds(tmp_path: Path) -> None:
     with pytest.raises(DataError, match=r"no such file\n  hint: did you mean .*log.parquet"):
         Dataset.read(tmp_path / "lgo.parquet")
     (tmp_path / "log.pkl").write_bytes(b"")
-    with pytest.raises(DataError, match="not a kind of data file"):
+    with pytest.raises(DataError, match="this type of data file is not supported"):
         Dataset.read(tmp_path / "log.pkl")
     with pytest.raises(DataError, match=r"end the name in .parquet"):
         random_log().write(tmp_path / "log.csv")

@@ -79,5 +79,5 @@ def test_noise_is_added_to_the_clean_value_once() -> None:
         assert float((data.qdd - log.qdd).std()) == pytest.approx(0.1, rel=0.03)
     assert torch.equal(with_noise(log, 0.1, torch.Generator().manual_seed(3)).qdd, noisy.qdd)
     assert noisy.header.noise_std == 0.1 and "seed 3" in noisy.header.provenance[-1]
-    with pytest.raises(DataError, match="noise is not valid"):
+    with pytest.raises(DataError, match="noise is invalid"):
         with_noise(log, float("nan"), torch.Generator())

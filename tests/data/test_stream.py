@@ -144,5 +144,5 @@ def test_time_that_jumps_back_between_pieces(tmp_path: Path) -> None:
     again = log.replace(segment=(torch.arange(80) // 20) % 2, header=points.header)
     again.write(path)
     pq.write_table(pq.read_table(path).replace_schema_metadata({}), path)
-    with pytest.raises(DataError, match="not together"):
+    with pytest.raises(DataError, match="not contiguous"):
         list(StreamedDataset((path,)).pieces())

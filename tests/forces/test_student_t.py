@@ -86,7 +86,7 @@ def test_planted_impacts_hardly_count(tmp_path: Path) -> None:
     weights = model.training.weights[0]
     assert float(weights[::EVERY].max()) < 0.1
     assert float(weights.median()) > 0.8
-    assert any("hardly count" in warning for warning in model.result.warnings)
+    assert any("little weight" in warning for warning in model.result.warnings)
     model.save(tmp_path / "model")
     again = forcegp.load_model(tmp_path / "model")
     q, qd, tau = torch.randn(3, 5, 2, dtype=torch.float64)

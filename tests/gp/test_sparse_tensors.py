@@ -32,5 +32,5 @@ def test_what_does_not_fit_is_refused() -> None:
     tensors = condition_sparse(PROCESSES, params, [block], first(block, 8)).tensors()
     with pytest.raises(ModelError, match=r"not complete[\s\S]*L"):
         SparsePosterior.of_tensors(PROCESSES, params, {k: x for k, x in tensors.items() if k != "L"})
-    with pytest.raises(ModelError, match="does not fit its processes"):
+    with pytest.raises(ModelError, match="does not match its processes"):
         SparsePosterior.of_tensors(PROCESSES, params, tensors | {"L": tensors["L"][:-1, :-1]})

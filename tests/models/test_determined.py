@@ -197,7 +197,7 @@ def test_options_without_effect_are_said(data: forcegp.Dataset) -> None:
     )
     friction = [forcegp.JointFrictionPrior()]
     finite = {"force_priors": friction, "inference": "sparse", "inducing_points": 50}
-    assert "priors of finite features" in doubts_of(data, **finite)
+    assert "priors with finitely many features" in doubts_of(data, **finite)
     used = {"force_priors": joint, "inference": "sparse", "inducing_points": 20}
     for settings in (exact, used, {"force_priors": "friction", "inertia": "auto"}):
         assert "no effect" not in doubts_of(data, **settings)

@@ -444,15 +444,15 @@ def test_what_else_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         fit.compiled(functions=0)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "main.c").write_text("")
-    with pytest.raises(DestinationError, match="holds other files"):
+    with pytest.raises(DestinationError, match="contains other files"):
         fit.export(tmp_path / "mine")
     monkeypatch.setattr("forcegp.models.export.model.LARGEST", 20)
     with pytest.raises(ModelError, match=r"(?s)48 functions is too large.*functions=200"):
         fit.export(tmp_path / "c")
     (q, qd, tau), _ = states(fit)
-    with pytest.raises(ShapeError, match="qd holds values that are not finite"):
+    with pytest.raises(ShapeError, match="qd contains values that are not finite"):
         fast.predict(q, qd * float("nan"), tau)
-    with pytest.raises(ShapeError, match="qd holds values that are not finite"):
+    with pytest.raises(ShapeError, match="qd contains values that are not finite"):
         fast.predict(q, qd * float("nan"), tau, active=mixed_contacts(len(q))[:, :1])
     with pytest.raises(ShapeError, match="q is not in the precision"):
         fast.predict(q.float(), qd.float(), tau.float())

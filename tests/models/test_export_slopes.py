@@ -137,7 +137,7 @@ def test_what_has_no_jacobian_is_refused() -> None:
     fast, (state, active) = compiled("one_contact"), states(fitted("one_contact"))
     with pytest.raises(UnknownNameError, match="unknown quantity with a Jacobian 'total_force'"):
         fast.jacobian(*state, "total_force")
-    with pytest.raises(ShapeError, match="qd holds values that are not finite"):
+    with pytest.raises(ShapeError, match="qd contains values that are not finite"):
         fast.jacobian(state[0], state[1] * float("nan"), state[2], active=active)
     swapped = fast.jacobian(*state, ["multiplier", "qdd"], active=active)
     plain = fast.jacobian(*state, ["qdd", "multiplier"], active=active)

@@ -64,5 +64,5 @@ def test_a_worker_fits_a_model_to_the_same_bits(pool: ProcessPoolExecutor) -> No
 def test_a_fit_of_python_code_says_so_before_it_is_sent(pool: ProcessPoolExecutor) -> None:
     hill = forcegp.OperatorForcePrior("own", 7, identity)
     fit = forcegp.StructuredGP(table_system(), "zero", force_priors=[hill], noise=0.1).fit(DATA, learn=[])
-    with pytest.raises(ModelError, match="holds Python code"):
+    with pytest.raises(ModelError, match="contains Python code"):
         pool.submit(predicted, fit, "qdd").result(timeout=120)

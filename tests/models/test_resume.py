@@ -112,8 +112,8 @@ def test_a_checkpoint_of_another_objective_is_refused(other: dict[str, Any], tmp
 @pytest.mark.parametrize(
     ("name", "value", "message"),
     [
-        ("weights.0.weight", float("nan"), "holds a value that no fit reaches"),
-        ("history", float("inf"), "holds a value that no fit reaches"),
+        ("weights.0.weight", float("nan"), "contains an implausible value"),
+        ("history", float("inf"), "contains an implausible value"),
         ("exp_avg.0.weight", None, "belongs to another fit"),
         ("generator", 7, "damaged"),
     ],

@@ -79,7 +79,7 @@ def test_an_acceleration_of_1e8_is_refused(scene: str, mean: str) -> None:
     qdd = train.qdd.clone()
     qdd[7, 1] = OUTLIER
     model = forcegp.StructuredGP(system, mean, default_priors(system, mean))
-    with pytest.raises(NumericalError, match="does not resolve the noise beside the prior"):
+    with pytest.raises(NumericalError, match="does not resolve the noise relative to the prior"):
         model.fit(dataclasses.replace(train, qdd=qdd), options=FEW)
 
 

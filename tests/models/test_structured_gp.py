@@ -126,7 +126,7 @@ def test_little_noise(std: float) -> None:
 
 def test_contradicting_duplicates_without_noise_are_refused() -> None:
     rows = data[torch.tensor([0] * 6 + [1] * 6)]
-    with pytest.raises(NumericalError, match="does not resolve the noise beside the prior"):
+    with pytest.raises(NumericalError, match="does not resolve the noise relative to the prior"):
         StructuredGP(table, "zero", both, noise=1e-7).fit(rows, options=SHORT)
 
 
@@ -300,7 +300,7 @@ def test_models_of_python_code_are_not_saved(tmp_path: Path) -> None:
     own = OperatorForcePrior(
         "own", 7, lambda system, at: torch.eye(7, dtype=torch.float64).expand(len(at.q), 7, 7)
     )
-    with pytest.raises(ModelError, match=r"OperatorForcePrior holds Python code"):
+    with pytest.raises(ModelError, match=r"OperatorForcePrior contains Python code"):
         fitted(force_priors=[own]).save(tmp_path / "model")
     assert not any(tmp_path.iterdir())
 
@@ -445,12 +445,12 @@ def test_states_that_do_not_fit_are_refused(model: StructuredFit) -> None:
         model.predict(q[:, :6], qd, tau)
     with pytest.raises(ShapeError, match=r"q, qd and tau do not broadcast[\s\S]*'qd': \(3, 7\)"):
         model.predict(q, qd[:3], tau)
-    with pytest.raises(ShapeError, match="tau holds values that are not finite"):
+    with pytest.raises(ShapeError, match="tau contains values that are not finite"):
         model.predict(q, qd, tau * float("nan"))
     with pytest.raises(ShapeError, match=r"torch.float64 on cpu[\s\S]*hint: convert q"):
         model.predict(q.float(), qd, tau)
     with pytest.raises(
-        ShapeError, match=r"active does not fit the contacts table[\s\S]*bool of shape \(20, 1\)"
+        ShapeError, match=r"active does not match the contacts table[\s\S]*bool of shape \(20, 1\)"
     ):
         model.predict(q, qd, tau, active=torch.ones(20, 2, dtype=torch.bool))
     with pytest.raises(UnknownNameError, match=r"unknown quantity 'qddd'[\s\S]*did you mean 'qdd'"):

@@ -110,7 +110,7 @@ def test_sensor_and_accelerations_show_the_joint_forces(logs: dict[str, Dataset]
     (hidden,) = with_sensed_forces(lacking, SYSTEM, FORCE_NOISE)
     unknown = measurement_of(hidden, SYSTEM)[1]
     assert bool((unknown[:, 0] > noise[:, 0]).all()) and torch.equal(unknown[:, 1:], noise[:, 1:])
-    with pytest.raises(ModelError, match="no sensor's force"):
+    with pytest.raises(ModelError, match="no sensor force"):
         with_sensed_forces(logs["truth"], SYSTEM, FORCE_NOISE)
 
 
@@ -150,7 +150,7 @@ def test_with_the_sensor_at_each_state_the_force_is_better_than_either(logs: dic
 
 
 def test_a_sensor_needs_one_contact_and_its_columns(logs: dict[str, Dataset]) -> None:
-    with pytest.raises(ModelError, match=r"no sensor's force at contact 'ball'"):
+    with pytest.raises(ModelError, match=r"no sensor force at contact 'ball'"):
         with_sensor(logs["truth"], SYSTEM, 0.5)
     with pytest.raises(ModelError, match="a force sensor measures one contact"):
         with_sensor(logs["wrench"], ConstrainedSystem(SYSTEM.robot), 0.5)

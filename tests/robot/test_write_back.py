@@ -151,13 +151,13 @@ def test_fixed_links_share_a_change_that_none_can_take(tmp_path: Path) -> None:
 
 def test_refusals_leave_no_file(tmp_path: Path) -> None:
     robot, out = forcegp.load_robot("kuka_iiwa14"), tmp_path / "out.urdf"
-    with pytest.raises(RobotFileError, match="joints are not those of the robot"):
+    with pytest.raises(RobotFileError, match="joints differ from those of the robot"):
         write_robot(robot, "ur5", out)
     path = tmp_path / "arm.xml"
     path.write_text(CLASSES)
     (tmp_path / "outer.xml").write_text('<mujoco><include file="arm.xml"/></mujoco>')
     outer = forcegp.load_robot(tmp_path / "outer.xml")
-    with pytest.raises(RobotFileError, match="does not stand in this file"):
+    with pytest.raises(RobotFileError, match="is not in this file"):
         write_robot(outer.replace(damping=outer.damping + 1.0), tmp_path / "outer.xml", out)
     path.write_text(CLASSES.replace('angle="radian"', 'angle="radian" boundmass="0.15"'))
     bounded = forcegp.load_robot(path)

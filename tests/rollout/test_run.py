@@ -143,7 +143,7 @@ def test_a_singular_law_stops_the_run_with_its_reason(tmp_path) -> None:
 @pytest.mark.parametrize("shape", [(7,), (3, 10, 7), (0, 7)])
 def test_torques_of_the_wrong_shape_are_refused(shape: tuple[int, ...]) -> None:
     data = simulated().data
-    with pytest.raises(ShapeError, match="torques do not fit"):
+    with pytest.raises(ShapeError, match="torques do not match"):
         rollout(ANALYTICAL, arm(), data.q[0], data.qd[0], torch.zeros(shape, dtype=torch.float64), 0.1)
 
 

@@ -156,7 +156,7 @@ def test_a_learned_model_loses_no_contact_while_it_slides() -> None:
 
 def test_models_without_a_posterior_say_so() -> None:
     data, plain = log(), AnalyticalModel(arm(Baumgarte())).nominal()
-    with pytest.raises(ModelError, match="no uncertainty of the multiplier"):
+    with pytest.raises(ModelError, match="does not predict the uncertainty of the multiplier"):
         contact_loss_probability(plain, data.q[0], data.qd[0], data.tau[0])
     with pytest.raises(ModelError, match="no function samples"):
         plain.rollout(data.q[0], data.qd[0], data, 0.02, samples=2)

@@ -182,10 +182,10 @@ def test_starts_in_collision_and_limits_without_room_are_refused() -> None:
         short(start=[9.0] * 6)
     weak = Limits.of(ROBOT, acceleration=[6.0], torque=[1.0])
     with pytest.raises(
-        NumericalError, match=r"no motion from the start fits the limits of torque(?s:.*)--start"
+        NumericalError, match=r"no motion from the start satisfies the limits of torque(?s:.*)--start"
     ):
         short(limits=weak)
-    with pytest.raises(ParameterError, match="no position was found"):
+    with pytest.raises(ParameterError, match="no collision-free position"):
         short(limits=Limits.of(ROBOT, torque=[0.01]), start=None)
     with pytest.raises(UnknownNameError, match="criterion"):
         short(criterion="B")

@@ -112,7 +112,9 @@ def test_a_standard_deviation_that_is_not_positive_is_named(
         value = value.clone()
         value[0] = wrong
         place = repaired(saved[name], tmp_path / str(number), {tensor: value})
-        with pytest.raises(ModelError, match=rf"'{tensor}' holds a standard deviation that is not positive"):
+        with pytest.raises(
+            ModelError, match=rf"'{tensor}' contains a standard deviation that is not positive"
+        ):
             forcegp.load_model(place)
 
 

@@ -157,4 +157,4 @@ def test_one_motion_at_a_time(tmp_path: Path) -> None:
     both = ["--data", "a.parquet", "--rollout", "b.parquet"]
     done = CliRunner().invoke(app, ["view", "kuka_plane", *both])
     assert done.exit_code != 0
-    assert "exclude each other" in str(done.exception)
+    assert "cannot be combined" in str(done.exception)

@@ -78,7 +78,7 @@ def check_output(out: Path, *inputs: Path) -> None:
 
     check_destination(out)
     if out.resolve() in (path.resolve() for path in inputs):
-        raise DestinationError(f"{out} would be overwritten", hint="name another file for the result")
+        raise DestinationError(f"{out} would be overwritten", hint="choose another file for the result")
 
 
 def save(write: Callable[[Path], object], out: Path) -> None:
@@ -117,9 +117,9 @@ def trajectory_from(data: forcegp.Dataset, start: int, purpose: str) -> forcegp.
     """Return the rows from `start` to the end of their trajectory."""
     if not data.header.ordered:
         raise DataError(
-            f"a {purpose} needs a log in order of time",
+            f"a {purpose} needs a log in time order",
             got="points in order of selection",
-            hint="pass the log that they were selected from",
+            hint="pass the log from which they were selected",
         )
     if start >= len(data):
         raise DataError("there is no such row to start from", expected=f"0 to {len(data) - 1}", got=start)
@@ -141,8 +141,8 @@ def fitted(model: Configured, data: Any, **options: Any) -> FittedModel:
 def check_robot_named(scene: str | None, robot: str | None) -> None:
     """Check that either a scene or a robot was given."""
     if (scene is None) == (robot is None):
-        problems = "the robot is not named", "both --scene and --robot name a robot"
-        raise ForceGPError(problems[scene is not None], hint="give either --scene or --robot")
+        problems = "no robot was given", "both --scene and --robot were given"
+        raise ForceGPError(problems[scene is not None], hint="pass either --scene or --robot")
 
 
 def system_of(scene: str | None, robot: str | None) -> forcegp.ConstrainedSystem:

@@ -22,7 +22,8 @@ WINDOW_SECONDS = 3.0
 def evaluate(
     data: DataFile,
     model: Annotated[
-        Path | None, typer.Option("--model", "-m", help="File of a fitted model; left out, one is fitted.")
+        Path | None,
+        typer.Option("--model", "-m", help="File of a fitted model; by default, a model is fitted."),
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for the page and its data.")] = None,
     train: Annotated[
@@ -108,11 +109,11 @@ def _model(model: Path | None, scene: str | None, config: Path | None, train: Pa
 
     if model is not None:
         if scene is not None or config is not None:
-            raise ForceGPError("a fitted model has its scene and settings", hint="give --model alone")
+            raise ForceGPError("a fitted model contains its scene and settings", hint="pass only --model")
         return forcegp.load_model(model)
     if scene is None or train is None:
         raise ForceGPError(
-            "the model to evaluate is not named",
+            "no model to evaluate was given",
             expected="--model FOLDER, or --scene and --train to fit one",
         )
     system = forcegp.load_scene(scene).system()

@@ -14,40 +14,42 @@ if TYPE_CHECKING:
     from forcegp.simulate.excite import Excitation
 
 Numbers = Annotated[
-    str | None, typer.Option(metavar="X[,X...]", help="Largest one; one number or one per joint.")
+    str | None, typer.Option(metavar="X[,X...]", help="Maximum; one number or one per joint.")
 ]
 
 
 def excite(
     scene: SceneName,
-    out: Annotated[Path, typer.Option("--out", "-o", help="The motion, .csv or .parquet.")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Path of the motion (.csv or .parquet).")],
     seconds: Annotated[float, typer.Option(help="Length of the motion.")] = 30.0,
     model: Annotated[
-        Path | None, typer.Option("--model", "-m", help="Fitted model: continue from what it knows.")
+        Path | None, typer.Option("--model", "-m", help="Fitted model to start from, with its posterior.")
     ] = None,
     region: Annotated[
         Path | None,
-        typer.Option(
-            help="Data set with the states at which the torque shall be known; default: all states."
-        ),
+        typer.Option(help="Data set with the states at which to predict the torque; default: all states."),
     ] = None,
     start: Annotated[
-        str | None, typer.Option(metavar="Q,Q...", help="Position at start and end; default: a free one.")
+        str | None,
+        typer.Option(metavar="Q,Q...", help="Initial and final position; default: a collision-free one."),
     ] = None,
     velocity: Numbers = None,
     acceleration: Numbers = None,
     torque: Numbers = None,
-    share: Annotated[float, typer.Option(help="Share of the limits that the motion may use.")] = 0.9,
+    share: Annotated[float, typer.Option(help="Fraction of the limits that the motion may use.")] = 0.9,
     box: Annotated[
         list[str] | None,
-        typer.Option(metavar="X,Y,Z,A,B,C", help="Box to stay away from: centre and sides [m]; repeatable."),
+        typer.Option(metavar="X,Y,Z,A,B,C", help="Box to avoid: centre and side lengths [m]; repeatable."),
     ] = None,
-    clearance: Annotated[float, typer.Option(min=1e-4, help="Distance of all parts from others [m].")] = 0.01,
+    clearance: Annotated[float, typer.Option(min=1e-4, help="Minimum distance between parts [m].")] = 0.01,
     criterion: Annotated[
-        str, typer.Option(help="A: spread of the torque; V: by links and friction alone; D: determinant.")
+        str,
+        typer.Option(
+            help="A: deviation of the torque; V: with only links and friction unknown; D: determinant."
+        ),
     ] = "A",
     rate: Annotated[float, typer.Option(help="Samples per second.")] = 1000.0,
-    restarts: Annotated[int, typer.Option(min=1, help="Random starts that are optimised.")] = 2,
+    restarts: Annotated[int, typer.Option(min=1, help="Number of optimised random starts.")] = 2,
     seed: Annotated[int, typer.Option(help="Seed of the random starts.")] = 0,
     as_json: AsJson = False,
 ) -> None:
@@ -133,7 +135,7 @@ def _numbers(option: str, text: str | None) -> list[float]:
         return [float(word) for word in (text or "").split(",") if word.strip()]
     except ValueError:
         raise ParameterError(
-            f"--{option} is not a list of numbers", expected="numbers with commas between", got=text
+            f"--{option} is not a list of numbers", expected="comma-separated numbers", got=text
         ) from None
 
 

@@ -25,19 +25,21 @@ def export(
     ],
     to: Annotated[str, typer.Option("--to", help="c, casadi, urdf or mjcf.")] = "c",
     name: Annotated[
-        str, typer.Option(help="Of C code: name of the files, and prefix of the functions.")
+        str, typer.Option(help="C code: name of the files, and prefix of the functions.")
     ] = "controller",
     functions: Annotated[
         int | None,
-        typer.Option(min=1, help="Of C code: reduce the covariance to so many functions, which widens it."),
+        typer.Option(
+            min=1, help="C code: number of basis functions of a reduced covariance, which is wider."
+        ),
     ] = None,
     robot: Annotated[
-        str | None, typer.Option(help="The URDF or MJCF file that the robot was loaded from, or its name.")
+        str | None, typer.Option(help="URDF or MJCF file of the robot, or name of a bundled robot.")
     ] = None,
     samples: Annotated[
-        int, typer.Option(min=0, help="Of a robot file: robots drawn from the posterior, a file each.")
+        int, typer.Option(min=0, help="Robot file: number of robots to draw from the posterior.")
     ] = 0,
-    seed: Annotated[int, typer.Option(help="Of these samples.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed of these samples.")] = 0,
     as_json: AsJson = False,
 ) -> None:
     """Export a structured Gaussian process as C99 or CasADi code, or into a copy of its robot file.
@@ -84,12 +86,12 @@ def _written_back(
 
     if robot is None:
         raise ModelError(
-            "no robot file is named that figures could be written into",
+            "no robot file was given",
             expected="--robot my.urdf, the file that the robot was loaded from",
         )
     if is_mjcf(robot) != (to == "mjcf"):
         raise RobotFileError(
-            f"{robot} is of another format", expected=to, got="mjcf" if to == "urdf" else "urdf"
+            f"{robot} has another format", expected=to, got="mjcf" if to == "urdf" else "urdf"
         )
     found = write_calibrated(fit, robot, out, samples=samples, seed=seed)
     determined = sum(parameter.determined for parameter in found.parameters)

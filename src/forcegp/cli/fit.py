@@ -30,19 +30,19 @@ def fit(
         typer.Option(
             "--model",
             "-m",
-            help="analytical, nn, gp, sgp or sgp-zero; of the paper: sgp-mean, sgp-contact, and with its "
-            "kernel sgp-zero-se, sgp-mean-se or sgp-contact-se. Default: the file's, else sgp.",
+            help="analytical, nn, gp, sgp or sgp-zero; from the paper: sgp-mean, sgp-contact, and with its "
+            "kernel sgp-zero-se, sgp-mean-se or sgp-contact-se. Default: from the file, or sgp.",
         ),
     ] = None,
     config: options.Config = None,
     noise_std: Annotated[
         float | None,
-        typer.Option(help="Noise on accelerations in rad/s²; default: the file's or the data's."),
+        typer.Option(help="Noise of accelerations in rad/s²; default: from the file or the data."),
     ] = None,
     differentiate: options.Differentiate = None,
     checkpoint: Annotated[
         Path | None,
-        typer.Option(help="File that records a long fit; a fit that finds it resumes there."),
+        typer.Option(help="File that records a long fit, which resumes from it if it exists."),
     ] = None,
     seed: Annotated[int | None, typer.Option(help="Seed of random initial values.")] = None,
     as_json: options.AsJson = False,
@@ -112,11 +112,13 @@ def sweep(
     scene: Annotated[list[str], typer.Option("--scene", "-s", help="Scene; may be given several times.")],
     model: Annotated[list[str], typer.Option("--model", "-m", help="Model; may be given several times.")],
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the fits.")],
-    seeds: Annotated[int, typer.Option(min=1, help="Number of seeds, from 0 on.")] = 1,
+    seeds: Annotated[int, typer.Option(min=1, help="Number of seeds, starting from 0.")] = 1,
     duration: options.SimulatedTime = None,
-    processes: Annotated[int, typer.Option(min=1, help="Workers on this machine, of one thread each.")] = 2,
+    processes: Annotated[
+        int, typer.Option(min=1, help="Number of single-threaded workers on this machine.")
+    ] = 2,
     address: Annotated[
-        str | None, typer.Option(help="Scheduler of a running cluster, in place of workers here.")
+        str | None, typer.Option(help="Scheduler of a running cluster, instead of local workers.")
     ] = None,
     as_json: options.AsJson = False,
 ) -> None:

@@ -30,7 +30,7 @@ def import_(
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Path of the data set (.parquet).")] = None,
     guess: Annotated[
-        Path | None, typer.Option(help="Write a mapping to this file for you to check, and import nothing.")
+        Path | None, typer.Option(help="Write a proposed mapping to this file, without importing.")
     ] = None,
     fit_surface: Annotated[
         Literal["plane", "sphere"] | None,
@@ -62,7 +62,7 @@ def import_(
     common.check_robot_named(scene, robot)
     place = guess or out
     if place is None or (guess is None and place.suffix.lower() != ".parquet"):
-        raise ForceGPError("the data set has no place to go", expected="--out log.parquet", got=out)
+        raise ForceGPError("no output path was given", expected="--out log.parquet", got=out)
     common.check_output(place, log)
     system = common.system_of(scene, robot)
     if guess is not None:
@@ -81,7 +81,7 @@ def _guess(log: Path, system: forcegp.ConstrainedSystem, out: Path) -> dict[str,
     from forcegp.files import write_text
     from forcegp.logs.guess import guess_mapping
 
-    with progress_bar(f"looking at {log.name}", 1) as advance:
+    with progress_bar(f"reading {log.name}", 1) as advance:
         guessed = guess_mapping(log, system, progress=advance)
     save(lambda path: write_text(path, guessed.toml()), out)
     doubts = {f"doubt_{i + 1}": text for i, text in enumerate(guessed.doubts)}
@@ -104,7 +104,7 @@ def _tip_radius(text: str | None) -> float | Literal["fit"] | None:
     with suppress(ValueError):
         if 0.0 <= float(text) < float("inf"):
             return float(text)
-    raise ForceGPError("no such radius of the tip", expected="a length in metres, or fit", got=text)
+    raise ForceGPError("invalid tip radius", expected="a length in metres, or fit", got=text)
 
 
 def _surfaces(
@@ -150,7 +150,7 @@ def check(
     scene: SceneOrNone = None,
     robot: RobotName = None,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="HTML page with a picture of each finding.")
+        Path | None, typer.Option("--out", "-o", help="HTML page with a plot of each finding.")
     ] = None,
     as_json: AsJson = False,
 ) -> None:
@@ -224,19 +224,21 @@ def select(
     rest: Annotated[Path | None, typer.Option(help="Path of the test points (.parquet).")] = None,
     split: Annotated[
         Literal["selection", "stretches"],
-        typer.Option(help="Test on all points not selected (the paper), or on held-out stretches of motion."),
+        typer.Option(help="Test on all unselected points (as in the paper) or on held-out stretches."),
     ] = "selection",
     stretch: Annotated[float, typer.Option(help="Duration of a held-out stretch in seconds.")] = 3.0,
-    fraction: Annotated[float, typer.Option(help="Part of the motion that is held out.")] = 0.2,
-    margin: Annotated[float, typer.Option(help="Time kept free beside held-out stretches in seconds.")] = 0.0,
+    fraction: Annotated[float, typer.Option(help="Fraction of the motion to hold out.")] = 0.2,
+    margin: Annotated[
+        float, typer.Option(help="Time without training points around held-out stretches in seconds.")
+    ] = 0.0,
     method: Annotated[
-        Literal["farthest", "even", "random"], typer.Option(help="Selection of training points.")
+        Literal["farthest", "even", "random"], typer.Option(help="Method for selecting training points.")
     ] = "farthest",
     keep_impacts: Annotated[
-        bool, typer.Option("--keep-impacts", help="Keep rows that the log marks as near an impact.")
+        bool, typer.Option("--keep-impacts", help="Keep rows marked as near an impact.")
     ] = False,
     differentiate: Differentiate = None,
-    seed: Annotated[int, typer.Option(help="Seed of the held-out stretches and of a random choice.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed for held-out stretches and random selection.")] = 0,
     as_json: AsJson = False,
 ) -> None:
     """Select training points that cover a log, and keep the rest for testing.

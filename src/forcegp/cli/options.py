@@ -18,18 +18,16 @@ SceneName = Annotated[str, _SCENE]
 SceneOrNone = Annotated[str | None, _SCENE]
 RobotName = Annotated[
     str | None,
-    typer.Option(
-        "--robot", help="In place of a scene without contacts: URDF or MJCF file, or a bundled robot."
-    ),
+    typer.Option("--robot", help="URDF or MJCF file, or bundled robot, instead of a scene."),
 ]
 ModelFile = Annotated[Path, typer.Option("--model", "-m", help="File of a fitted model.")]
 DataFile = Annotated[Path, typer.Option("--data", "-d", help="Data set, .parquet or .csv.")]
 SimulatedTime = Annotated[
-    float | None, typer.Option("--duration", help="Simulated time in seconds; default: the scene's.")
+    float | None, typer.Option("--duration", help="Simulated time in seconds; default: from the scene.")
 ]
 Config = Annotated[
     Path | None,
-    typer.Option(help="TOML file with a table \\[model], in place of the scene's: priors, learning."),
+    typer.Option(help="TOML file with a table \\[model], which replaces that of the scene."),
 ]
 DataFiles = Annotated[
     list[Path],

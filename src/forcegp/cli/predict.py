@@ -44,7 +44,9 @@ def predict(
     reference: Annotated[str, typer.Option(help="Axes of an external_wrench: world or local.")] = "world",
     momentum: Annotated[
         bool,
-        typer.Option("--momentum", help="external_wrench by a causal filter that reads no accelerations."),
+        typer.Option(
+            "--momentum", help="Estimate external_wrench with a causal filter, without accelerations."
+        ),
     ] = False,
     noise: Annotated[
         bool,

@@ -26,15 +26,15 @@ def rollout(
     out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the trajectories and the page.")],
     start: Annotated[int, typer.Option(min=0, help="Row of the data to start from.")] = 0,
     duration: Annotated[
-        float | None, typer.Option(help="Time to roll out in seconds; default: to the end of the trajectory.")
+        float | None, typer.Option(help="Simulated time in seconds; default: to the end of the trajectory.")
     ] = None,
-    samples: Annotated[int, typer.Option(min=0, help="Functions to draw from the model's posterior.")] = 0,
+    samples: Annotated[int, typer.Option(min=0, help="Number of functions to draw from the posterior.")] = 0,
     stabilization: Annotated[str, typer.Option(help="none, baumgarte or projection.")] = "baumgarte",
     method: Annotated[
         str, typer.Option(help="semi_implicit_euler, rk4, rk45 or dop853.")
     ] = "semi_implicit_euler",
     unilateral: Annotated[
-        bool, typer.Option("--unilateral", help="Let contacts open where they would pull, and close again.")
+        bool, typer.Option("--unilateral", help="Let contacts open when they would pull, and close again.")
     ] = False,
     seed: Annotated[int, typer.Option(help="Seed of the samples.")] = 0,
     as_json: AsJson = False,
@@ -123,8 +123,8 @@ def _stretch(data: forcegp.Dataset, start: int, duration: float | None) -> force
     steps = stretch.t.diff()
     if len(stretch) < 2 or bool(((steps - steps.median()).abs() > UNIFORM_TOLERANCE * steps.median()).any()):
         raise DataError(
-            "a rollout needs two rows or more at an even sampling period",
-            hint="start in a trajectory without gaps; rows that are left over from a selection have them",
+            "a rollout needs two rows or more at a constant sampling period",
+            hint="start in a trajectory without gaps; rows left over from a selection have gaps",
         )
     return stretch
 
@@ -167,7 +167,7 @@ def _learned(path: Path, sample: bool, seed: int) -> PassiveForces:
     fit = load_model(path)
     field = fit.force_field()
     if field is None or (sample and not fit.has_function_samples):
-        raise ModelError(f"{path} has no forces to simulate with", expected="a structured GP", got=fit.kind)
+        raise ModelError(f"{path} contains no forces to simulate", expected="a structured GP", got=fit.kind)
     if sample:
         field = fit.force_samples(1, torch.Generator().manual_seed(seed))
     return PassiveForces(fit.system, field)
@@ -177,23 +177,24 @@ def simulate(
     scene: SceneName,
     out: Annotated[Path, typer.Option("--out", "-o", help="Path of the log (.parquet).")],
     duration: SimulatedTime = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of motion and noise; default: the scene's.")] = None,
-    engine: Annotated[str | None, typer.Option(help="pybullet, mujoco or auto; default: scene's.")] = None,
+    seed: Annotated[
+        int | None, typer.Option(help="Seed of motion and noise; default: from the scene.")
+    ] = None,
+    engine: Annotated[str | None, typer.Option(help="pybullet, mujoco or auto; default: from scene.")] = None,
     contact: Annotated[
         str | None,
-        typer.Option(help="rigid, or solver for MuJoCo's own contact and friction; default: the scene's."),
+        typer.Option(help="rigid, or solver for MuJoCo's own contact and friction; default: from the scene."),
     ] = None,
     motion: Annotated[
-        Path | None, typer.Option(help="Data set whose joints are followed, as of `forcegp excite`.")
+        Path | None, typer.Option(help="Data set with joints to follow, such as from `forcegp excite`.")
     ] = None,
     model: Annotated[
         Path | None,
-        typer.Option(
-            "--model", "-m", help="Fitted model: its robot in MuJoCo, with the learned joint forces."
-        ),
+        typer.Option("--model", "-m", help="Fitted model: simulate its robot with the learned joint forces."),
     ] = None,
     sample: Annotated[
-        bool, typer.Option("--sample", help="One function of the posterior, by seed, in place of its mean.")
+        bool,
+        typer.Option("--sample", help="Use a posterior sample, drawn with the seed, instead of the mean."),
     ] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -217,7 +218,7 @@ def simulate(
 
     check_data_destination(out, *(path for path in (motion, model) if path is not None))
     if sample and model is None:
-        raise ParameterError("--sample has no posterior to draw from", hint="give --model")
+        raise ParameterError("--sample needs a model to draw from", hint="give --model")
     read = forcegp.load_scene(scene)
     system = read.system()
     path = None if motion is None else read_data(motion, system.robot)

@@ -21,11 +21,11 @@ def view(
     target: Annotated[
         str, typer.Argument(help="Scene file, name of a bundled scene, or file of a fitted model.")
     ],
-    data: Annotated[Path | None, typer.Option("--data", "-d", help="Log whose motion is shown.")] = None,
+    data: Annotated[Path | None, typer.Option("--data", "-d", help="Log with the motion to display.")] = None,
     rollout: Annotated[
         Path | None,
         typer.Option(
-            "--rollout", "-r", help="The rollout.parquet of `forcegp rollout`, shown as it predicts."
+            "--rollout", "-r", help="rollout.parquet from `forcegp rollout`, to display its motion."
         ),
     ] = None,
     out: Annotated[
@@ -33,12 +33,14 @@ def view(
         typer.Option("--out", "-o", help="HTML file that works offline; default: serve the page."),
     ] = None,
     start: Annotated[int, typer.Option(min=0, help="Row of the log to start from.")] = 0,
-    seconds: Annotated[float, typer.Option(min=0.05, help="Length of the motion in seconds.")] = 10.0,
+    seconds: Annotated[float, typer.Option(min=0.05, help="Duration of the motion in seconds.")] = 10.0,
     samples: Annotated[
         int,
-        typer.Option(min=0, help="Function samples whose paths of the tip are drawn, of a structured model."),
+        typer.Option(min=0, help="Number of sampled tip paths to draw, for a structured model."),
     ] = 8,
-    horizon: Annotated[float, typer.Option(min=0.01, help="Length of the predicted paths in seconds.")] = 1.0,
+    horizon: Annotated[
+        float, typer.Option(min=0.01, help="Duration of the predicted paths in seconds.")
+    ] = 1.0,
     port: Annotated[int, typer.Option(min=1024, max=65535, help="Port of the page.")] = 8080,
     as_json: AsJson = False,
 ) -> None:
@@ -65,7 +67,7 @@ def view(
     if out is not None:
         check_destination(out)
     if data is not None and rollout is not None:
-        raise ParameterError("--data and --rollout exclude each other", hint="name one motion to look at")
+        raise ParameterError("--data and --rollout cannot be combined", hint="choose one motion to display")
     system, model, shapes = _target(target)
     log = data or rollout
     motion = at_rest(system)

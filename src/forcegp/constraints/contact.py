@@ -110,14 +110,14 @@ class SurfaceContact(Constraint):
         if self.stick_speed is not None:
             if not 0.0 < self.stick_speed < float("inf"):
                 raise ParameterError(
-                    f"contact {self.name!r} cannot stick below such a speed",
+                    f"contact {self.name!r} has an invalid stick speed",
                     expected="a positive finite speed [m/s], or None for a contact that always slides",
                     got=self.stick_speed,
                 )
             object.__setattr__(self, "rows", 3)
         if not 0.0 <= self.radius < float("inf"):
             raise ParameterError(
-                f"the tip of contact {self.name!r} has no such radius",
+                f"the tip of contact {self.name!r} has an invalid radius",
                 expected="a finite length, 0 or above [m]",
                 got=self.radius,
             )

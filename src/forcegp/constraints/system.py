@@ -94,7 +94,7 @@ class ConstrainedSystem:
         for name in names:
             if names.count(name) > 1:
                 raise ParameterError(
-                    f"two contacts are named {name!r}", hint="give each contact its own name"
+                    f"two contacts are named {name!r}", hint="give each contact a unique name"
                 )
         for contact in self.contacts:
             contact.check(self.robot)
@@ -196,7 +196,7 @@ class ConstrainedSystem:
         )
         if not fits or active.dtype != torch.bool:
             raise ShapeError(
-                f"active does not fit the contacts {', '.join(self.contact_names) or '(none)'}",
+                f"active does not match the contacts {', '.join(self.contact_names) or '(none)'}",
                 expected=f"bool of shape {(*batch, n)}",
                 got=f"{str(active.dtype).removeprefix('torch.')} of shape {tuple(active.shape)}",
             )

@@ -132,10 +132,10 @@ def project_state(
         move = (eom.L @ c[..., None])[..., 0]
         q = q - move * (MAX_STEP / move.detach().abs().amax(-1, keepdim=True).clamp(min=MAX_STEP))
     raise NumericalError(
-        "no state on the constraint manifold is found",
+        "no state on the constraint manifold was found",
         expected=f"a constraint error of at most {tolerance:g} m after {MAX_ITERATIONS} iterations",
         got=f"{error:.3g} m",
-        hint="start nearer to the surface, and check that the arm can reach it",
+        hint="start closer to the surface, and check that the arm can reach it",
     )
 
 

@@ -51,7 +51,7 @@ def parse(source: str, raw: Columns, header: DataHeader, method: SavitzkyGolay |
     fields["extras"], fields["contact_extras"] = _extras(source, unread, joints, contacts)
     if unread:
         warnings.warn(
-            f"{source}: columns of unknown meaning are left out: {', '.join(unread)}",
+            f"{source}: columns of unknown meaning are ignored: {', '.join(unread)}",
             IgnoredColumnsWarning,
             stacklevel=4,
         )
@@ -90,7 +90,7 @@ def _take(source: str, unread: Columns, name: str, remedy: str | None = None) ->
         f"{source}: column {name!r} is missing",
         expected=name,
         got=_listing(unread),
-        hint=remedy or (f"is {near[0]!r} the column that is meant?" if near else None),
+        hint=remedy or (f"did you mean column {near[0]!r}?" if near else None),
     )
 
 

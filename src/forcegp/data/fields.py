@@ -171,7 +171,7 @@ def check_layout(data: Fields) -> None:
         for contact, value in group.items():
             if contact not in data.contact:
                 raise DataError(
-                    f"{name!r} is logged of contact {contact!r}, whose state is not logged",
+                    f"{name!r} is logged for contact {contact!r}, but the state of this contact is not",
                     expected=f"a contact column for one of {', '.join(data.contact) or 'no contacts'}",
                 )
             if value.shape != (n, 3):
@@ -189,8 +189,8 @@ def _check_names(data: Fields) -> None:
     for name in (*data.extras, *data.contact_extras):
         if name in taken or "." in name or not name:
             raise DataError(
-                f"{name!r} cannot be the name of a further logged quantity",
-                expected="a name of its own without a dot",
+                f"{name!r} cannot be the name of an additional quantity",
+                expected="a unique name without a dot",
                 hint=f"{', '.join(sorted(taken))} are taken",
             )
         taken.add(name)
@@ -253,7 +253,7 @@ def check_time(data: Fields) -> None:
         seen, values = set(), runs.tolist()
         twice = next(value for value in values if value in seen or seen.add(value))
         raise DataError(
-            f"the rows of segment {twice} are not together", hint="sort the log by 'segment' and 't'"
+            f"the rows of segment {twice} are not contiguous", hint="sort the log by 'segment' and 't'"
         )
 
 
@@ -270,7 +270,7 @@ def row_indices(rows: object, n: int, device: torch.device) -> Tensor:
         raise DataError(rule, got=f"a tensor of shape {tuple(index.shape)} and type {index.dtype}")
     if index.dtype == torch.bool:
         if len(index) != n:
-            raise DataError("the mask has another length than the data set", expected=n, got=len(index))
+            raise DataError("the mask and the data set differ in length", expected=n, got=len(index))
         return torch.nonzero(index)[:, 0]
     outside = (index < -n) | (index >= n)
     if bool(outside.any()):

@@ -213,7 +213,7 @@ def _stretches(data: Dataset, stretch: float) -> list[tuple[int, int]]:
             hint="split the log before selecting points from it",
         )
     if not 0.0 < stretch < float("inf"):
-        raise DataError("the duration of a stretch is not valid", expected="a positive time [s]", got=stretch)
+        raise DataError("the duration of a stretch is invalid", expected="a positive time [s]", got=stretch)
     _, counts = torch.unique_consecutive(data.segment, return_counts=True)
     blocks, first = [], 0
     for rows in counts.tolist():
@@ -239,7 +239,7 @@ def without_marked_impacts(data: Dataset) -> Dataset:
     count = int(marked.sum())
     if count == 0:
         return data
-    return data[torch.nonzero(~marked)[:, 0]].with_step(f"left out {count} rows at impacts")
+    return data[torch.nonzero(~marked)[:, 0]].with_step(f"excluded {count} rows at impacts")
 
 
 def with_noise(data: Dataset, std: float, generator: torch.Generator) -> Dataset:
@@ -256,7 +256,7 @@ def with_noise(data: Dataset, std: float, generator: torch.Generator) -> Dataset
         DataError: the standard deviation is negative or not finite.
     """
     if not 0.0 <= std < float("inf"):
-        raise DataError("the noise is not valid", expected="a finite standard deviation ≥ 0", got=std)
+        raise DataError("the noise is invalid", expected="a finite standard deviation ≥ 0", got=std)
     clean = data.extras.get("qdd_clean", data.qdd)
     noise = torch.randn(clean.shape, dtype=clean.dtype, device=generator.device, generator=generator)
     step = f"noise of standard deviation {std:g} on qdd, seed {generator.initial_seed()}"

@@ -118,7 +118,7 @@ class _Trajectories:
         if ordered and (repeated or len(fresh) < int(starts.sum())):
             which = next(iter(repeated), None)
             raise DataError(
-                f"{self.source}: the rows of a segment are not together",
+                f"{self.source}: the rows of a segment are not contiguous",
                 got=None if which is None else f"segment {which:g} again",
                 hint="sort the log by 'segment' and 't'",
             )

@@ -72,7 +72,7 @@ def read_table(
     file = existing(path)
     readers = {".parquet": _read_parquet, ".csv": _read_csv}
     if file.suffix.lower() not in readers:
-        kinds, text = " or ".join(readers), f"{file}: not a kind of data file that is read"
+        kinds, text = " or ".join(readers), f"{file}: this type of data file is not supported"
         raise DataError(text, expected=kinds, got=file.suffix)
     table, header = readers[file.suffix.lower()](file)
     return {name: numeric(file, name, table[name], missing) for name in table.column_names}, header
@@ -99,7 +99,7 @@ def _read_parquet(file: Path) -> tuple[pa.Table, DataHeader]:
         allowed = min(allowed_bytes(file.stat().st_size), limits.TABLE_BYTES)
         if 8 * rows * columns > allowed:
             raise DataError(
-                f"{file}: the file claims to be larger than what is read at once",
+                f"{file}: the declared size of the file exceeds the limit",
                 expected=f"at most {allowed // 8:,} numbers in a file of this size",
                 got=f"{rows:,} rows × {columns} columns",
                 hint="split the log into several files",
@@ -177,14 +177,14 @@ def _usable(file: Path, schema: pa.Schema) -> list[str]:
     if twice:
         raise DataError(f"{file}: column {twice[0]!r} occurs more than once")
     if any(len(name) > limits.COLUMN_NAME for name in names):
-        raise DataError(f"{file}: a column's name is longer than {limits.COLUMN_NAME} characters")
+        raise DataError(f"{file}: a column name is longer than {limits.COLUMN_NAME} characters")
     kept = (kinds.is_floating, kinds.is_integer, kinds.is_boolean)
     numeric = [field.name for field in schema if any(kind(field.type) for kind in kept)]
     ignored = sorted(set(names) - set(numeric), key=names.index)
     # A text column that should be numbers is reported by name once it is missed; the rest is harmless.
     if ignored:
         warnings.warn(
-            f"{file}: columns that hold no numbers are left out: {', '.join(ignored)}",
+            f"{file}: non-numeric columns are ignored: {', '.join(ignored)}",
             IgnoredColumnsWarning,
             stacklevel=5,
         )

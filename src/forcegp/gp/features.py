@@ -241,10 +241,10 @@ def require_resolved_noise(prior: Tensor) -> None:
     ratio = math.sqrt(float(prior))
     if ratio > PRIOR_TO_NOISE:
         raise NumericalError(
-            "double precision does not resolve the noise beside the prior",
+            "double precision does not resolve the noise relative to the prior",
             expected=f"a prior standard deviation at most {PRIOR_TO_NOISE:g} times that of the noise",
             got=f"{ratio:.3g} times",
-            hint=f"leave out outliers, or state a noise at least {ratio / PRIOR_TO_NOISE:.2g} times as large",
+            hint=f"remove outliers, or specify a noise at least {ratio / PRIOR_TO_NOISE:.2g} times as large",
         )
 
 
@@ -266,7 +266,7 @@ def require_resolved_variance(covariance: Tensor, prior: Tensor) -> Tensor:
             f"double precision does not resolve {int(lost.sum())} of {lost.numel()} predicted variances",
             expected=f"at least {SMALLEST_FRACTION:g} of the variance before the data",
             got=f"{least:.2g} of it",
-            hint="state a larger noise, or leave out outliers, which make the prior large",
+            hint="specify a larger noise, or remove outliers, which make the prior large",
         )
     return covariance
 

@@ -26,7 +26,7 @@ Bounds = Mapping[str, tuple[float | Tensor, float | Tensor]]
 OPTIMIZERS = ("lbfgs", "adam")
 FIRST_STEP = 2.0
 """Largest change of an entry in the first step of L-BFGS in a box; two e-folds for logarithms."""
-STOPPED = ("converged", "stopped at the limit of iterations", "the line search found no smaller objective")
+STOPPED = ("converged", "stopped at the iteration limit", "the line search found no smaller objective")
 
 
 @dataclass(frozen=True)
@@ -68,7 +68,9 @@ class LearningOptions:
         check_name("optimizer", self.optimizer, OPTIMIZERS)
         if self.max_evaluations < 1:
             raise ModelError(
-                "learning takes an evaluation", expected="max_evaluations ≥ 1", got=self.max_evaluations
+                "learning needs at least one evaluation",
+                expected="max_evaluations ≥ 1",
+                got=self.max_evaluations,
             )
 
 

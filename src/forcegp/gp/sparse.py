@@ -159,13 +159,11 @@ class SparsePosterior:
             moments = Moments(*(tensors[f"moments.{name}"] for name in MOMENTS))
             L, jitter = tensors["L"], float(tensors["jitter"])
         except KeyError as error:
-            raise ModelError(
-                "a saved sparse posterior is not complete", expected=f"a tensor {error}"
-            ) from None
+            raise ModelError("a saved sparse posterior is incomplete", expected=f"a tensor {error}") from None
         size = (basis.size, basis.size)
         if L.shape != size or moments.v.shape != size[:1] or moments.prior.shape != (len(processes),):
             raise ModelError(
-                "a saved sparse posterior does not fit its processes",
+                "a saved sparse posterior does not match its processes",
                 expected=f"{basis.size} basis functions of {len(processes)} processes",
                 got=f"{len(moments.v)} of {len(moments.prior)}",
             )

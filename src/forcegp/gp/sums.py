@@ -302,5 +302,5 @@ def _processes() -> Iterator[None]:
     try:
         yield
     except RuntimeError as cause:
-        hint = "start all of them again; a fit with a checkpoint resumes"
+        hint = "restart all processes; a fit with a checkpoint resumes"
         raise ModelError("another process of the fit was lost", got=str(cause)[:300], hint=hint) from cause

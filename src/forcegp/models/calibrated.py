@@ -161,7 +161,7 @@ def sampled_robots(fit: StructuredFit, samples: int, *, seed: int = 0) -> list[R
         ParameterError: `samples` is below one.
     """
     if samples < 1:
-        raise ParameterError("no such number of samples", expected="1 or more", got=samples)
+        raise ParameterError("invalid number of samples", expected="1 or more", got=samples)
     return [robot for robot, _ in _Reader.of(fit, seed).robots(max(samples, DRAWS))[1 : 1 + samples]]
 
 
@@ -299,7 +299,7 @@ class _Reader:
         mean = fit.problem.mean
         if not isinstance(mean, AnalyticalMean) or "actuation" not in mean.terms:
             raise ModelError(
-                "the forces of this fit are not those that the robot file lacks",
+                "the forces of this fit are not relative to the robot file",
                 expected='a model with mean="analytical"',
                 hint='fit StructuredGP(system, "analytical")',
             )

@@ -224,12 +224,12 @@ class Reading:
     def from_momenta(self) -> tuple[Tensor, Tensor]:
         """Estimate mean and covariance with the momentum filter, for each trajectory."""
         if not self.data.header.ordered:
-            raise DataError("the momentum filter needs a log in order of time", got="points in another order")
+            raise DataError("the momentum filter needs a log in time order", got="points in another order")
         correlation = self.fit.problem.correlation if self.memory is None else self.memory.correlation
         if self.fit.torque_std is None or correlation is None:
             raise ModelError(
-                "this fit has not learned the noise of the torques, which the momentum filter needs",
-                hint='fit with force_priors="friction" to more samples in order of time',
+                "this fit has no learned torque noise, which the momentum filter needs",
+                hint='fit with force_priors="friction" to more samples in time order',
             )
         noise, segment = velocity_noise(self.data), self.data.segment
         logs = [

@@ -89,7 +89,7 @@ class Prediction:
                 raise NumericalError(
                     f"the {name} of a prediction is not finite",
                     got=f"{wrong} of {value.numel()} numbers",
-                    hint="states beyond what a robot can do overflow; check q, qd and tau",
+                    hint="implausible states cause overflow; check q, qd and tau",
                 )
         if covariance is not None:
             d = covariance.shape[-1]
@@ -160,7 +160,7 @@ class Prediction:
             ("names", (len(names),), (d,)),
         ):
             if value is not None and value != expected:
-                raise ShapeError(f"{what} does not fit the prediction", expected=expected, got=value)
+                raise ShapeError(f"{what} does not match the prediction", expected=expected, got=value)
         label = axis_label(next(iter(self.parts)) if len(self.parts) == 1 else "")
         panels = [self.panel(i, names[i], label, measured) for i in range(d)]
         axes = draw_panels(panels, Timeline.of(torch.arange(n) if t is None else t), (), ax)
@@ -364,7 +364,7 @@ class Predictor(ForwardModel):
         unexplained = (true - mean).square().sum(0)
         spread = (true - true.mean(0)).square().sum(0)
         if not bool((spread > 0.0).any()):
-            raise DataError(f"{quantity} is constant in the data, so that a score is not defined")
+            raise DataError(f"{quantity} is constant in the data, so a score is not defined")
         return float((1.0 - unexplained / spread)[spread > 0.0].mean())
 
     def plot(
@@ -454,5 +454,5 @@ def require_semidefinite(covariance: Tensor) -> None:
             f"{int(negative.sum())} of {negative.numel()} covariances of a prediction are not positive "
             "semidefinite",
             got=f"an eigenvalue of {worst:.2g}",
-            hint="the posterior is rounding: state a larger noise, or leave out outliers",
+            hint="the posterior is dominated by rounding: specify a larger noise, or remove outliers",
         )

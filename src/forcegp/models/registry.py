@@ -57,22 +57,20 @@ MODELS: dict[str, Entry] = {
     "nn": Entry(NeuralNetwork, "neural network with sigmoid layers on (q, qd, tau)"),
     "gp": Entry(IndependentGP, "one Gaussian process per joint acceleration on (q, qd, tau)"),
     "sgp-zero": Entry(StructuredGP, "structured GP, all joint forces unknown", ZERO, default_priors),
-    "sgp": Entry(
-        StructuredGP, "structured GP around the analytical forces, priors chosen by the data", ANALYTICAL
-    ),
+    "sgp": Entry(StructuredGP, "structured GP with analytical mean, priors selected on the data", ANALYTICAL),
     "sgp-mean": Entry(
         StructuredGP,
-        "structured GP around the analytical forces, any joint force",
+        "structured GP with analytical mean, any joint force unknown",
         ANALYTICAL,
         default_priors,
     ),
-    "sgp-zero-se": Entry(StructuredGP, "sgp-zero with the paper's kernel alone", ZERO, default_priors, PAPER),
+    "sgp-zero-se": Entry(StructuredGP, "sgp-zero with only the paper's kernel", ZERO, default_priors, PAPER),
     "sgp-mean-se": Entry(
-        StructuredGP, "sgp-mean with the paper's kernel alone", ANALYTICAL, default_priors, PAPER
+        StructuredGP, "sgp-mean with only the paper's kernel", ANALYTICAL, default_priors, PAPER
     ),
     "sgp-contact": Entry(
         StructuredGP,
-        "structured GP with mean and a prior on the contact's friction alone",
+        "structured GP with analytical mean, only contact friction unknown",
         ANALYTICAL,
         _contact,
     ),

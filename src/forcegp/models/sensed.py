@@ -43,7 +43,7 @@ def with_sensor(data: Dataset, system: ConstrainedSystem, noise_std: float) -> l
     closed = data.active([contact.name])[:, 0]
     if not has_sensor(data, system) or not bool(closed.any()):
         raise ModelError(
-            f"the log has no sensor's force at contact {contact.name!r}",
+            f"the log has no sensor force at contact {contact.name!r}",
             expected=f"columns {SENSOR}.{contact.name}.x, .y, .z and rows in contact",
             hint="import the log with a table [wrench], or leave out sensor_noise_std",
         )
@@ -72,7 +72,7 @@ def with_sensed_forces(data: Dataset, system: ConstrainedSystem, force_std: floa
     contact = _contact(system)
     if not has_sensor(data, system):
         raise ModelError(
-            f"the log has no sensor's force at contact {contact.name!r}",
+            f"the log has no sensor force at contact {contact.name!r}",
             expected=f"columns {SENSOR}.{contact.name}.x, .y, .z",
         )
     closed = data.active([contact.name])
@@ -136,7 +136,9 @@ def sensor_noise_std(data: Dataset, system: ConstrainedSystem) -> float:
     inner = torch.stack([follows[k : len(closed) - 4 + k] for k in range(4)]).all(0)
     inner &= torch.stack([closed[k : len(closed) - 4 + k] for k in range(5)]).all(0)
     if not bool(inner.any()):
-        raise ModelError("the sensor's noise cannot be estimated", expected="five rows in contact in a row")
+        raise ModelError(
+            "the sensor's noise cannot be estimated", expected="five consecutive rows in contact"
+        )
     return float(white_noise_std(force[:, None], inner))
 
 

@@ -210,7 +210,9 @@ def unpack(
         _check_hyperparameters(spec, training, hyper)
         return _restored(spec, training, hyper, tensors, settings, system)
     except (KeyError, RuntimeError, ValueError, IndexError) as cause:
-        raise ModelError(f"{source}: the model's tensors do not fit its settings", got=str(cause)) from cause
+        raise ModelError(
+            f"{source}: the tensors of the model do not match its settings", got=str(cause)
+        ) from cause
 
 
 def _specification(

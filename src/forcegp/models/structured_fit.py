@@ -265,7 +265,7 @@ class StructuredFit(FittedModel):
                 "the learned noise belongs to other measurements",
                 expected=", ".join(self.training.quantities),
                 got=", ".join(training.quantities),
-                hint='call model.fit(data, learn=["noise"], after=fit), which learns the noise alone',
+                hint='call model.fit(data, learn=["noise"], after=fit), which learns only the noise',
             )
         values = self.hyperparameters if hyperparameters is None else hyperparameters
         if not is_sparse(spec.options.inference, self.problem.priors, training.all_samples):
@@ -288,7 +288,7 @@ class StructuredFit(FittedModel):
         measurements, _ = training_for(self.specification, self.problem, data, learned=(), fewest=0)
         if measurements.quantities != tuple(self.noise):
             raise ModelError(
-                "an update measures other quantities than the fit",
+                "the update contains other quantities than the fit",
                 expected=", ".join(self.noise),
                 got=", ".join(measurements.quantities),
             )
@@ -340,7 +340,7 @@ class StructuredFit(FittedModel):
         if not isinstance(latent, SparsePosterior):
             raise ModelError(
                 "a fit with exact inference cannot forget",
-                hint='make the model with inference="sparse", or condition it on the data that count',
+                hint='create the model with inference="sparse", or condition it on the relevant data',
             )
         if not isinstance(what, int | float):
             without, _ = training_for(self.specification, self.problem, what, learned=(), fewest=0)
@@ -463,7 +463,7 @@ def _without(added: tuple[Tensor, ...], removed: Tensor) -> tuple[Tensor, ...]:
     if bool((left < 0).any()):
         raise ModelError(
             f"{int(-left.clamp(max=0).sum())} of {len(removed)} samples to forget were never added",
-            expected="samples of this fit, not of a log that is read piece by piece, with their full weight",
+            expected="samples of this fit with their full weight, not from a streamed log",
         )
     return (values.repeat_interleave(left),)
 

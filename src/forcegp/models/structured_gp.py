@@ -188,7 +188,7 @@ class StructuredGP(Model[StructuredFit]):
         """Yield the given options that had no effect on a fit."""
         points = [x for Z in fit.problem.inducing or () for x in Z.values()]
         if self._params["inducing_points"] != LIMIT and not any(map(len, points)):
-            how = "exact inference" if fit.problem.inducing is None else "priors of finite features"
+            how = "exact inference" if fit.problem.inducing is None else "priors with finitely many features"
             yield f"inducing_points={self._params['inducing_points']} has no effect: the fit has {how}"
         friction = any(isinstance(prior, JointFrictionPrior) for prior in fit.force_priors)
         if self._params["inertia"] == "auto" and not (friction and "actuation" in self.mean.terms):

@@ -168,7 +168,7 @@ def _unchecked_masses(training: Training) -> tuple[str, ...]:
     return (
         f"{training.free_motions} samples in free motion are too few to check the masses of the robot file "
         f"(expected: {LEAST} or more), and any error of the masses biases the multiplier: train on "
-        "more samples if the log has free motion, else add a few seconds of it, or measure the contact force",
+        "more samples if the log has free motion, otherwise add some seconds, or measure the contact force",
     )
 
 
@@ -308,7 +308,7 @@ def in_motion(
     if not impacts:
         return moving, ()
     return moving, (
-        f"{impacts} samples in contact were left out as impacts: they accelerate off the surface or into it",
+        f"{impacts} samples in contact were excluded as impacts: they accelerate off the surface or into it",
     )
 
 
@@ -443,7 +443,7 @@ def solve(
     whole = prepared(spec, whole, values)
     if spec.noise.degrees_of_freedom is not None and (count := left_out(whole)):
         samples = whole.training.samples
-        warnings.append(f"{count} of {samples} samples lie far outside the noise and hardly count")
+        warnings.append(f"{count} of {samples} samples are far outside the noise and have little weight")
     return Lesson(whole, values, learned, learned_on, tuple(dict.fromkeys(warnings)))
 
 

@@ -77,7 +77,7 @@ def sample_of(spec: Specification, data: StreamedDataset) -> Sample:
         ModelError: processes read different logs, or exact inference is requested for a streamed log.
     """
     if data.distributed:
-        require_agreement("the log", data.digest, len(data), hint="give each the same files")
+        require_agreement("the log", data.digest, len(data), hint="pass the same files to each")
     moving = spec.automatic or spec.noise.learns_torque
     rows, stretches, count = _rows_of(data, moving_rows if moving else None)
     if moving and count < FEWEST_MOVING:
@@ -108,15 +108,15 @@ def _check_inference(spec: Specification, count: int, held: int) -> None:
     """Raise `ModelError` if exact inference is needed for more samples than are in memory."""
     if spec.noise.degrees_of_freedom is not None and count > held:
         raise ModelError(
-            "noise with heavy tails weighs every sample, also of a log that is read piece by piece",
+            "heavy-tailed noise needs a weight for every sample, which a streamed log does not have",
             expected=f"at most {2 * SAMPLE_ROWS - 1:,} samples",
             got=f"{count:,}",
-            hint="select rows, or leave degrees_of_freedom out",
+            hint="select rows, or omit degrees_of_freedom",
         )
     coupled = any(prior.in_time for prior in spec.priors)
     if (spec.options.inference == "exact" or coupled) and count > held:
         raise ModelError(
-            f"exact inference on a log of {count:,} samples that is read piece by piece",
+            f"exact inference on a log of {count:,} samples that is streamed",
             expected=f"at most {2 * SAMPLE_ROWS - 1:,} samples",
             hint="select rows" if coupled else 'use inference="sparse"',
         )
@@ -172,7 +172,7 @@ class Pass:
                 refused = cause
             if self.log.distributed:
                 # Where one process stops, the others must not wait for it.
-                hint = "resume with as many processes as began, or remove all parts of the checkpoint"
+                hint = "resume with the original number of processes, or remove all parts of the checkpoint"
                 require_agreement("their parts of the checkpoint", 2 if refused else bool(kept), hint=hint)
             if refused is not None:
                 raise refused

@@ -72,15 +72,15 @@ def _blocks(window: WindowData, pictures: list[Picture], force: Picture | None) 
             "Predictions and errors",
             f"The first {window.seconds:.2g} s. Predictions: accelerations by joint, measured in black, "
             "predicted in colour, with the ±2σ band if the model gives one. Errors: measured (grey) and, if "
-            "logged, noise-free (black) acceleration less the prediction.",
+            "logged, noise-free (black) acceleration minus the prediction.",
             tuple(pictures[:2]),
             WINDOW,
         )
     ]
     if len(pictures) > 2:
         caption = (
-            "Share of measured accelerations inside the central interval of each probability. On the "
-            "diagonal the uncertainty is right; below it the model is overconfident, above it underconfident."
+            "Fraction of measured accelerations inside the central interval of each probability. On the "
+            "diagonal, the uncertainty is correct; below, the model is overconfident, above, underconfident."
         )
         blocks.append(PictureBlock("Calibration", caption, tuple(pictures[2:]), "evaluation.json"))
     return blocks
@@ -138,8 +138,8 @@ def uncertainty_tables(evaluation: Evaluation) -> tuple[Table, ...]:
         tables.append(Table(caption, ("predictor", "log density"), rows))
     head = ("contact", "samples", "bias [N]", "standard deviation [N]", "correlation", "±2σ coverage")
     titles = (
-        "Multiplier λ: predicted less logged",
-        "Multiplier λ: predicted less logged, with the force sensor",
+        "Multiplier λ: predicted minus logged",
+        "Multiplier λ: predicted minus logged, with the force sensor",
     )
     for title, scores in zip(titles, (evaluation.multipliers, evaluation.sensed), strict=True):
         values = [(m.contact, m.samples, m.bias, m.spread, m.correlation, m.coverage) for m in scores]

@@ -268,8 +268,8 @@ def draw_contact_force(data: RolloutData) -> Picture:
         panels[-1].set_xlim(0.0, data.band_seconds)
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=2)
 
-    alt = "Multiplier along the predicted trajectories, with bands over samples, beside the logged one."
-    return draw(paint, (WIDTH, 3.8 if losing else 2.8), alt, "Contact force along the way")
+    alt = "Multiplier along the predicted trajectories, with bands over samples, and the logged one."
+    return draw(paint, (WIDTH, 3.8 if losing else 2.8), alt, "Contact force over time")
 
 
 def _curve(axes: Axes, data: RolloutData, path: ModelPath, values: Series, band: Band | None = None) -> None:
@@ -314,7 +314,7 @@ def rollout_table(data: RolloutData) -> Table:
     caption = f"Tip error in open loop (median over {_starts(data.starts)})"
     if any(path.coverage is not None for path in data.models):
         caption += (
-            f"; share of logged tip positions inside the {data.level:.0%} bands over function samples "
+            f"; fraction of logged tip positions inside the {data.level:.0%} bands over function samples "
             f"({_starts(data.band_starts)}, {data.band_seconds:.3g} s), and inside the bands widened by the "
             "factor calibrated on held-out stretches of the training run"
         )
@@ -333,11 +333,9 @@ class RolloutSection:
 
 def rollout_section(data: RolloutData, source: str = DATA) -> RolloutSection:
     """Return the section on trajectories; `source` is the data file next to the page."""
-    band = f" with the band that holds {data.level:.0%} of the function samples"
+    band = f" with the band that contains {data.level:.0%} of the function samples"
     sampled = any(path.tip_bands for path in data.models)
-    why = (
-        " The curve follows the mean force. It may leave the band, as the motion is not linear in the force."
-    )
+    why = " The curve follows the mean force. It may leave the band, since motion is nonlinear in the force."
     caption = (
         f"Open loop from a logged state under the logged torques, {data.t[-1]:.3g} s ahead: logged in "
         f"black, predicted in colour{band if sampled else ''}. Position and contact force are shown for the "

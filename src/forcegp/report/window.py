@@ -194,7 +194,7 @@ def _rows(figure: Figure, window: WindowData, centre: Tensor, limit: float | Non
             axes.set_ylim(-limit, limit)
         else:
             _robust_limits(axes, torch.stack([measured[i], mean[i]]))
-    rows[0].set_title(f"acceleration{' less prediction' if relative else ''} [rad/s²]", loc="left")
+    rows[0].set_title(f"acceleration{' minus prediction' if relative else ''} [rad/s²]", loc="left")
     rows[-1].set_xlabel("time from the first sample [s]")
     handles, names = rows[0].get_legend_handles_labels()
     legend = figure.legend(handles, names, loc="outside upper center", ncols=len(names))

@@ -110,7 +110,7 @@ def _held_base(tree: Tree, placed: _Placed) -> list[str]:
         return []
     return [
         f"{tree.label}: no joint connects the base {root!r} ({mass:.3g} kg, with {len(limbs)} limbs) to the "
-        "world, so that it is held fixed; a robot that walks needs a floating base, which is not supported"
+        "world, so it is fixed; a walking robot needs a floating base, which is not supported"
     ]
 
 
@@ -149,7 +149,7 @@ def _check_mass_matrix(tree: Tree, placed: _Placed, bodies: list[Inertial]) -> N
     joint, mass = placed.moving[index], bodies[index].mass
     raise InertiaError(
         f"{tree.label}: link {joint.child!r} of joint {joint.name!r} moves without inertia",
-        expected="mass beyond every moving joint, so that the mass matrix is positive definite",
+        expected="mass beyond every moving joint, for a positive definite mass matrix",
         got=f"link mass {mass:g} kg, and no link beyond it that resists the motion",
         hint="give the link an <inertial>, or lock the joint with locked_joints",
     )

@@ -78,10 +78,10 @@ def parse_xml(data: bytes, label: str) -> Element:
         return parser.close()
     except DefusedXmlException as error:
         raise RobotFileError(
-            f"{label}: document types and entities are refused",
+            f"{label}: document types and entities are not allowed",
             expected="plain XML without <!DOCTYPE> and <!ENTITY>",
             got=type(error).__name__,
-            hint="write the text out instead of using entities",
+            hint="replace entities by their text",
         ) from error
     except ParseError as error:
         if b"<xacro:" in data:
@@ -90,7 +90,7 @@ def parse_xml(data: bytes, label: str) -> Element:
             f"{label}: not well-formed XML",
             expected="a complete URDF or MJCF document",
             got=str(error),
-            hint="delete what stands before <?xml"
+            hint="delete everything before <?xml"
             if "not at start" in str(error)
             else "the file may be truncated, or may not be XML",
         ) from error

@@ -97,10 +97,10 @@ def write_robot(
     file = robot_of(tree, _world(robot))
     if file.joint_names != robot.joint_names:
         raise RobotFileError(
-            f"{path}: the joints are not those of the robot",
+            f"{path}: the joints differ from those of the robot",
             expected=", ".join(robot.joint_names),
             got=", ".join(file.joint_names),
-            hint="give the file that the robot was loaded from, with the same locked_joints",
+            hint="pass the file from which the robot was loaded, with the same locked_joints",
         )
     document = EditableXml(data, str(path))
     writer = (_Urdf if document.root.tag == "robot" else _Mjcf)(document, str(path))
@@ -211,7 +211,7 @@ def _shared(parts: list[_Part], J_old: Tensor, J_new: Tensor, joint: str) -> dic
         f"no link of the file can take the change of inertia beyond joint {joint!r}",
         expected="links that stay physically consistent",
         got=", ".join(part.name for part in parts) or "no link with a name",
-        hint="correct the <inertial> of these links, which no body has",
+        hint="correct the <inertial> of these links, which is unphysical",
     )
 
 
@@ -231,7 +231,7 @@ def _losses(robot: RobotModel, figures: Mapping[str, str]) -> tuple[str, ...]:
         values = getattr(robot, figure)
         if figure not in figures and bool((values != 0.0).any()):
             listed = ", ".join(f"{x:.4g}" for x in values.tolist())
-            losses.append(f"the format has no place for {figure} ({listed})")
+            losses.append(f"the format does not support {figure} ({listed})")
     return tuple(losses)
 
 
@@ -318,9 +318,9 @@ class _Mjcf:
     def _element(self, kind: str, name: str, among: Mapping[str, Span]) -> Span:
         if name not in among:
             raise RobotFileError(
-                f"{self.label}: the {kind} {name!r} does not stand in this file",
+                f"{self.label}: the {kind} {name!r} is not in this file",
                 expected=f"one of {', '.join(among) or 'none'}",
-                hint="write to the file that it is included from, or expand the includes first",
+                hint="write to the included file, or expand the includes first",
             )
         return among[name]
 

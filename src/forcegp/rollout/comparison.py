@@ -229,7 +229,7 @@ def _starts(data: Dataset, steps: int, starts: int | Tensor) -> Tensor:
     sound = len(fits) >= count if isinstance(starts, int) else bool(torch.isin(starts, fits).all())
     if not sound or not data.header.ordered:
         raise DataError(
-            "the log is too short for the rollouts, or not in the order of time",
+            "the log is too short for the rollouts, or not in time order",
             expected=f"{count} starts with {steps} further samples in the same trajectory",
             got=f"{len(data)} samples, {len(fits)} such starts",
             hint="a shorter duration, or a log that was not selected from",

@@ -160,7 +160,7 @@ def contact_loss_probability(
     prediction = model.predict(q, qd, tau, "multiplier", active=active, covariance=True)
     if prediction.std is None:
         raise ModelError(
-            f"a {model.kind!r} model gives no uncertainty of the multiplier",
+            f"a {model.kind!r} model does not predict the uncertainty of the multiplier",
             hint="use StructuredGP, or compare the predicted multiplier with zero",
         )
     certain = prediction.std == 0.0

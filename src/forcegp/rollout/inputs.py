@@ -268,7 +268,7 @@ def inputs_of(
         return Feedback(tau)
     if tau.ndim < 2 or tau.shape[-2] == 0 or tau.shape[:-2] not in (torch.Size(), batch):
         raise ShapeError(
-            "the torques do not fit the initial states",
+            "the torques do not match the initial states",
             expected=f"shape (samples, nq) or {(*batch, 'samples', 'nq')}",
             got=tuple(tau.shape),
         )
@@ -299,8 +299,8 @@ def sampling_period(log: Dataset) -> float:
     if not one or bool(((steps - period).abs() > EVEN * period).any()):
         raise DataError(
             "the torques of this log cannot be replayed",
-            expected="one trajectory of two or more rows in the order of time, at a constant sampling period",
-            got=f"{len(log.t)} rows" + ("" if log.header.ordered else " in the order of their selection"),
+            expected="one trajectory of two or more rows in time order, at a constant sampling period",
+            got=f"{len(log.t)} rows" + ("" if log.header.ordered else " in selection order"),
             hint="pass the rows of one trajectory, without gaps",
         )
     return period

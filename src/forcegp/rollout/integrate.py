@@ -76,7 +76,7 @@ def adaptive(method: str) -> Step:
                 rate, (0.0, 1.0), start, method=method, rtol=RELATIVE_TOLERANCE, atol=ABSOLUTE_TOLERANCE
             )
         if not solved.success:
-            raise NumericalError(f"{method} finds no step that is accurate enough", got=solved.message)
+            raise NumericalError(f"{method} found no sufficiently accurate step", got=solved.message)
         q, qd = torch.from_numpy(solved.y[:, -1].copy()).to(state.q).reshape(shape)
         return State(end, q, qd, state.active)
 

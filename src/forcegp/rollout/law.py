@@ -215,7 +215,7 @@ def dry_friction_force(qdd: Tensor, G: Tensor, limit: Tensor, qd: Tensor, h: Ten
         exchanged = torch.where((trials >= 0)[:, None], wrong, last)
         direction = torch.where(exchanged, over, direction)
     raise NumericalError(
-        "the dry friction of the joints cannot be found",
+        "the dry friction of the joints cannot be computed",
         got=f"{int(count.count_nonzero())} of {len(G)} states without a solution",
         hint="a smaller step, or RolloutOptions(sticking=False)",
     )
@@ -309,7 +309,7 @@ def law_of(model: ForwardModel, system: ConstrainedSystem | None = None) -> Law:
             f"this model ({model.kind}) predicts accelerations of the system that it was fitted on only",
             expected=_described(trained),
             got=f"another system: {_described(system)}",
-            hint="leave `system` out, or use a model of forces such as StructuredGP",
+            hint="omit `system`, or use a model of forces such as StructuredGP",
         )
     return AccelerationLaw(model)
 

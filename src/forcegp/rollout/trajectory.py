@@ -144,7 +144,7 @@ class Rollout:
         check_name("quantity of a rollout", quantity, QUANTITIES)
         if self.rows != 1:
             raise ParameterError(
-                "several trajectories cannot be drawn on one axis",
+                "several trajectories cannot be plotted together",
                 expected="one trajectory",
                 got=self.rows,
                 hint="choose one, such as rollout[0].plot()",

@@ -55,7 +55,7 @@ class ContactSolver:
             return math.ceil(dt / LONGEST_STEP - WHOLE)
         steps = dt / self.step
         whole = steps > 0.5 and abs(steps - round(steps)) < WHOLE
-        check_setting("step", whole, f"a whole part of dt = {dt} s", self.step)
+        check_setting("step", whole, f"a divisor of dt = {dt} s", self.step)
         return round(steps)
 
 

@@ -44,7 +44,7 @@ class PyBulletEngine(Engine):
             if armature != 0.0:
                 raise UnsupportedRobotError(
                     f"joint {joint!r} of robot {robot.name!r} has a drive with inertia",
-                    expected="armature 0, as PyBullet has no place for it",
+                    expected="armature 0, since PyBullet does not support it",
                     got=armature,
                     hint='use the engine "mujoco"',
                 )

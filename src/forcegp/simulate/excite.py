@@ -107,7 +107,7 @@ def _given(robot: RobotModel, name: str, values: Sequence[float], default: Tenso
     option = f"give --{name}, as one number or one per joint"
     if len(values) not in (0, 1, robot.nq):
         raise ParameterError(
-            f"limits of {name} do not fit the robot", expected=f"1 or {robot.nq} numbers", got=values
+            f"limits of {name} do not match the robot", expected=f"1 or {robot.nq} numbers", got=values
         )
     limit = default.new_tensor(values).expand(robot.nq) if len(values) else default
     missing = [
@@ -336,7 +336,7 @@ class Search:
                 return share * x, used
         broken = ", ".join(name for name, value in used.items() if value > 1.0 + TOLERANCE)
         raise NumericalError(
-            f"no motion from the start fits the limits of {broken}",
+            f"no motion from the start satisfies the limits of {broken}",
             expected="room for a small motion around the start, at rest and in motion",
             got={name: round(value, 3) for name, value in used.items()},
             hint="give another --start, wider limits, or less --clearance",
@@ -360,7 +360,7 @@ def _start_of(
         free = (collisions.depth(tried) == 0.0) & (torque.abs() < INSIDE * limits.torque).all(-1).numpy()
         if not free.any():
             raise ParameterError(
-                "no position was found that is free of collisions and that the torques can hold",
+                "no collision-free position within the torque limits was found",
                 expected=f"one of {len(tried)} positions within the limits",
                 hint="give --start, smaller boxes, or less --clearance",
             )

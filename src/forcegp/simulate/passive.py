@@ -42,7 +42,7 @@ class PassiveForces:
         self.joint_names = tuple(joint_names or system.robot.joint_names)
         if len(self.joint_names) != system.robot.nq:
             raise ModelError(
-                "the joint names do not fit the robot",
+                "the joint names do not match the robot",
                 expected=f"{system.robot.nq} names in the order of {', '.join(system.robot.joint_names)}",
                 got=", ".join(self.joint_names),
             )

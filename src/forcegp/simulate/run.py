@@ -58,7 +58,7 @@ def _check_speed(t: float, q: Tensor, qd: Tensor) -> None:
             f"the simulation diverges at t = {t:.4f} s",
             expected=f"joint speeds below {RUNAWAY_SPEED:g} rad/s",
             got=f"q = {q.tolist()}, qd = {qd.tolist()}",
-            hint="smaller gains, a longer travel time, or a rectangle further from the edge of the workspace",
+            hint="use smaller gains, a longer travel time, or a rectangle farther inside the workspace",
         )
 
 

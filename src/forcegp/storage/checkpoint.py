@@ -79,9 +79,9 @@ class Checkpoint:
         for name, value in tensors.items():
             if value.is_floating_point() and not bool((value.abs() <= LOGGED_VALUE).all()):
                 raise ModelError(
-                    f"{self.path}: {name!r} holds a value that no fit reaches",
+                    f"{self.path}: {name!r} contains an implausible value",
                     expected=f"finite numbers up to ±{LOGGED_VALUE:g}",
-                    hint="remove the checkpoint to start anew",
+                    hint="remove the checkpoint to start again",
                 )
         return {name: tensors[name] for name in like}
 
@@ -137,7 +137,7 @@ class Evaluations:
                 f"{self.checkpoint.path}: the checkpoint is damaged: 'positions' that no fit reaches, or of "
                 "another length than the objectives",
                 expected=f"finite numbers up to ±{CHECKPOINT_VALUE:g}",
-                hint="remove the checkpoint to start anew",
+                hint="remove the checkpoint to start again",
             )
         self._record = list(zip(*(record[name] for name in NAMES), strict=True))
         self._next = 0
@@ -234,5 +234,5 @@ def _read(path: Path) -> tuple[dict[str, Tensor], str | None]:
         if isinstance(cause, ModelError):
             raise
         raise ModelError(
-            f"{path}: the checkpoint is damaged", got=str(cause), hint="remove it to start anew"
+            f"{path}: the checkpoint is damaged", got=str(cause), hint="remove it to start again"
         ) from cause

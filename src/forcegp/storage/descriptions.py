@@ -34,7 +34,8 @@ def encode(value: Any, classes: Classes) -> Any:
     if value is None or isinstance(value, str | int | float | bool):
         return value
     raise ModelError(
-        f"a {type(value).__name__} holds Python code and cannot be saved", expected=", ".join(sorted(classes))
+        f"a {type(value).__name__} contains Python code and cannot be saved",
+        expected=", ".join(sorted(classes)),
     )
 
 

@@ -41,16 +41,16 @@ def check_tensors(tensors: Mapping[str, Tensor], source: str) -> None:
     for name, value in tensors.items():
         if value.dtype not in TYPES:
             raise ModelError(
-                f"{source}: tensor {name!r} has a type that no model has",
+                f"{source}: tensor {name!r} has an unsupported type",
                 expected=", ".join(str(dtype) for dtype in TYPES),
                 got=value.dtype,
             )
         infinite = _MAY_BE_INFINITE.fullmatch(name) is not None
         if bool(value.isnan().any()) or not (infinite or bool(torch.isfinite(value).all())):
-            raise ModelError(f"{source}: tensor {name!r} holds values that are not finite")
+            raise ModelError(f"{source}: tensor {name!r} contains values that are not finite")
         if _POSITIVE.fullmatch(name) and not bool((value > 0.0).all()):
             raise ModelError(
-                f"{source}: tensor {name!r} holds a standard deviation that is not positive",
+                f"{source}: tensor {name!r} contains a standard deviation that is not positive",
                 got=value.min().item(),
             )
 
@@ -118,7 +118,7 @@ def read_model(path: str | Path) -> tuple[ModelHeader, dict[str, Tensor]]:
             hint = None
             if Path(path).is_dir():
                 hint = "models were folders before version 3: fit the model again with this release"
-            raise ModelError(f"{file} is not a saved model", expected="a file that Fit.save wrote", hint=hint)
+            raise ModelError(f"{file} is not a saved model", expected="a file written by `save`", hint=hint)
         size = file.stat().st_size
         if size > MODEL_BYTES:
             raise ModelError(f"{file}: too large", expected=f"at most {MODEL_BYTES:,} bytes", got=f"{size:,}")
@@ -138,7 +138,7 @@ def parse_model(data: bytes, source: str) -> tuple[ModelHeader, dict[str, Tensor
             f"{source}: the file is damaged or truncated",
             expected=f"SHA-256 {stated[:12]!a}…",
             got=f"{digest[:12]}…",
-            hint="copy the file again from where it was written",
+            hint="copy the file again from its source",
         )
     header = ModelHeader.from_json(text, source, ModelError)
     try:

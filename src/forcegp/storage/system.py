@@ -180,7 +180,7 @@ def _constraint(record: ConstraintRecord, fallback: ConstrainedSystem | None) ->
     if fallback is None:
         raise ModelError(
             f"contact {record.name!r} is a {record.described_by} defined in Python, which is not saved",
-            hint="pass the system that the model was made with: load_model(path, system=…)",
+            hint="pass the original system: load_model(path, system=…)",
         )
     return fallback.contact(record.name)
 
@@ -200,7 +200,9 @@ def _robot(record: RobotRecord, tensors: Mapping[str, Tensor], source: str) -> R
     for name, limit in limits.items():
         for i, (parent, below) in enumerate(zip(getattr(record, name), limit, strict=True)):
             if not -1 <= parent < below:
-                raise ModelError(f"{source}: field 'system.robot.{name}.{i}' names no joint", got=parent)
+                raise ModelError(
+                    f"{source}: field 'system.robot.{name}.{i}' does not name a joint", got=parent
+                )
     axis = tensors.get(PREFIX + "axis")
     dtype = axis.dtype if axis is not None and axis.is_floating_point() else torch.float64
     arrays = {}
@@ -232,7 +234,7 @@ def take(
             got=f"{value.dtype} of shape {tuple(value.shape)}",
         )
     if bool(value.isnan().any()) or (finite and not bool(torch.isfinite(value).all())):
-        raise ModelError(f"{source}: tensor {name!r} holds values that are not finite")
+        raise ModelError(f"{source}: tensor {name!r} contains values that are not finite")
     return value
 
 

@@ -45,7 +45,7 @@ def draw_limits(result: Excitation) -> Picture:
         figure.axes[-1].set_xlabel("time [s]")
         figure.legend(*figure.axes[0].get_legend_handles_labels(), loc="outside upper center", ncols=4)
 
-    alt = "Position, velocity, acceleration and torque of each joint over time, as shares of their limits."
+    alt = "Position, velocity, acceleration and torque of each joint over time, as fractions of their limits."
     return draw(paint, (12.0, 7.0), alt)
 
 
@@ -81,7 +81,8 @@ def write_excitation(
     used = ", ".join(f"{name} {value:.0%}" for name, value in result.used.items() if name != "clearance_m")
     limits = PictureBlock(
         "Limits",
-        f"Largest shares at 1 kHz: {used}. All parts stay {1e3 * result.used['clearance_m']:.3g} mm apart.",
+        f"Largest fractions of the limits at 1 kHz: {used}. "
+        f"All parts stay {1e3 * result.used['clearance_m']:.3g} mm apart.",
         (draw_limits(result),),
         "the motion's file",
         wide=True,

@@ -70,7 +70,7 @@ def of_log(system: ConstrainedSystem, data: Dataset, model: Predictor | None = N
     """Return the logged motion, with a predicted or logged force; `DataError` if joints do not match."""
     data = data.select(system.robot.joint_names)
     if not len(data):
-        raise DataError("there is no motion to look at", expected="one row or more", got="none")
+        raise DataError("there is no motion to display", expected="one row or more", got="none")
     rows = pictures(data.t)
     frames = data[rows]
     path = Path3D(LOGGED, tip_path(system, data.q))

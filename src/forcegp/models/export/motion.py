@@ -84,7 +84,7 @@ class CompiledMotion:
         )
         if status == NO_FRICTION:
             raise NumericalError(
-                "the dry friction of the joints cannot be found",
+                "the dry friction of the joints cannot be computed",
                 hint="a smaller step, or RolloutOptions(sticking=False)",
             )
         if status:
