@@ -1,4 +1,4 @@
-"""Checks of a log against a scene before a model is fitted to it: all checks in order, and their report."""
+"""Checks of a log against a scene before fitting a model: all checks in order, and their report."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from forcegp.resources import announce_memory
 __all__ = ["KINDS", "Finding", "Log", "Report", "check", "clipped_torques", "log_of", "read_log"]
 
 NUMBERS = 24
-"""Upper bound on the numbers of one joint in one row that are held at a time; twenty were measured."""
+"""Upper bound on the numbers in memory per joint and row; twenty were measured."""
 OF_CONTACTS = frozenset({"contact", "contact force"})
-"""Checks of contacts, which a scene without any does without."""
+"""Checks of contacts, which are skipped without contacts."""
 OF_TIME = frozenset({"order of time", "held rows", "gaps", "jitter", "sampling period", "standing channels"})
-"""Checks that need rows in the order of time."""
+"""Checks that need rows in time order."""
 Check = Callable[[ConstrainedSystem, Log], Outcome]
 Progress = Callable[[int, int], None]
 
@@ -39,7 +39,7 @@ def check_robot(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_import(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Findings of the import, without those on contacts, which are checked here."""
+    """Return the findings of the import, except those on contacts, which are checked here."""
     doubts = [text for kind, text in log.header.imported if kind == "doubt"]
     others = [text for kind, text in log.header.imported if kind not in ("doubt", "contact")]
     pairs = ("import-doubt", doubts), ("import-found", others)
@@ -75,29 +75,29 @@ CHECKS: tuple[tuple[str, Check], ...] = (
     ("contact force", contact.check_forces),
     ("excitation", excitation.check_excitation),
 )
-"""Every check in the order in which they run; each sees the log as those before it have corrected it."""
+"""All checks in the order in which they run, each on the log corrected by the previous ones."""
 
 _MOTION = frozenset({"velocity-mismatch"})
 _ROBOT = frozenset(
     {"gravity-direction", "base-tilted", "payload-missing", "masses-mismatch", "torque-unexplained"}
 )
 VOIDS = {"dynamics": _MOTION, "contact force": _MOTION | _ROBOT, "excitation": _MOTION}
-"""Findings after which a check cannot judge."""
+"""Findings that invalidate a check."""
 
 
 def check(system: ConstrainedSystem, data: Dataset | Log, *, progress: Progress | None = None) -> Report:
-    """Check a log against a scene before a model is fitted to it.
+    """Check a log against a scene before fitting a model.
 
-    Checks return no findings for a valid log. A fault is corrected before the next check, so that it is
-    reported once; the log itself is not changed.
+    Checks return no findings for a valid log. A fault is corrected before the next check, so it is reported
+    only once; the log itself is not changed.
 
     Args:
         system: robot and contacts.
-        data: the log; `forcegp.checks.read_log` reads one that `Dataset` refuses.
+        data: the log; `forcegp.checks.read_log` reads logs that `Dataset` rejects.
         progress: called with the number of completed checks and their total number.
 
     Returns:
-        The findings, the most severe first; `report.usable` is true if a model can be fitted.
+        The findings, sorted by severity; `report.usable` is true if a model can be fitted.
 
     Raises:
         DataError: a joint of the robot is not in the log, or the log is empty.

@@ -22,33 +22,33 @@ from forcegp.robust import level_of, robust_std
 from forcegp.rows import Intervals, describe, intervals
 
 OFFSET, TILT = 5e-4, np.radians(0.2)
-"""Displacement [m] and tilt [rad] of a surface that are reported."""
+"""Displacement [m] and tilt [rad] from which a surface is reported."""
 FAR = 0.01
-"""Displacement of all contact rows that no calibration explains: another surface, point or label [m]."""
+"""Displacement of all contact rows from which surface, point or label must be wrong [m]."""
 TOUCH, ROUGH = 2e-4, 8.0
-"""A tip touches within this distance [m], as surfaces and arms are no stiffer, or within so many robust
-standard deviations of the distance in contact."""
+"""Distance within which a tip is in contact, given the stiffness of surfaces and arms [m], and the same in
+    robust standard deviations of the distance in contact."""
 CREEP = 1e-3
-"""Speed along the normal that a touching tip may have, at least [m/s]."""
+"""Minimum speed along the normal that is allowed in contact [m/s]."""
 LANDING, STOPS = 5, 2.0
-"""Rows within which a tip that lands stops, and the factor by which it is faster than one that rests."""
+"""Number of rows within which a landing tip stops, and ratio of its speed to that of a resting tip."""
 DRIFT, RUN_SECONDS = 2e-3, 0.02
 """Distance that a tip may gain and lose while it touches [m]: soft ground, a bent arm, a drift; shortest run
 of rows that a wrong label is reported for [s]."""
 MISSED_SECONDS, MISSED_DISTANCE = 0.1, 2e-3
-"""Shortest time [s] and way [m] along the surface that count as a contact that was not labelled."""
+"""Shortest time [s] and distance [m] along the surface that count as an unlabelled contact."""
 LEAST_ROWS = 20
 OFF = {
     "contact-early": "labelled closed before the tip touches",
     "contact-late": "labelled closed after the tip has left",
     "contact-far": "labelled closed while the tip is off the surface",
 }
-"""Rows that are labelled closed off the surface, by kind of finding."""
+"""Rows labelled closed while off the surface, by kind of finding."""
 
 
 @dataclass(frozen=True)
 class Path:
-    """Distance `(n,)` of a touching point from the surface of the scene [m]; its position and velocity in the
+    """Distance `(n,)` of a contact point from the surface in the scene [m]; its position and velocity in the
     world and the normal out of the solid, `(n, 3)` each [m], [m/s]."""
 
     c: Array
@@ -70,7 +70,7 @@ class Path:
 def tip_path(
     system: ConstrainedSystem, contact: SurfaceContact, log: Log, rows: np.ndarray | None = None
 ) -> Path:
-    """Position of the touching point at some or all rows, NaN for rows that are not finite."""
+    """Return the position of the contact point at some or all rows, NaN for non-finite rows."""
     parts = np.array_split(np.arange(len(log)) if rows is None else rows, -(-len(log) // CHUNK))
     paths = []
     with torch.no_grad():
@@ -86,7 +86,7 @@ def tip_path(
 
 
 def touching(system: ConstrainedSystem, log: Log) -> Iterator[tuple[SurfaceContact, np.ndarray]]:
-    """The contacts with surfaces that are labelled as closed in enough rows, and these rows."""
+    """Yield surface contacts that are labelled as closed in enough rows, and these rows."""
     for contact in labelled_contacts(system, log):
         rows = np.flatnonzero(log.contact[contact.name] & log.usable)
         if isinstance(contact, SurfaceContact) and len(rows) >= LEAST_ROWS:
@@ -115,7 +115,7 @@ def check_contacts(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def _beside(contact: SurfaceContact, path: Path, usable: np.ndarray) -> list[Finding]:
-    """A tip that keeps one distance from the surface of a contact that is closed in no row."""
+    """Return a tip that keeps a constant distance from the surface of a contact that is never closed."""
     rows = usable & (np.linalg.norm(path.along, axis=1) > SLIDING_SLOW)
     level = level_of(path.c[rows], TOUCHING, LEVEL)
     if level is None or abs(level) <= TOUCHING:
@@ -134,7 +134,7 @@ def _beside(contact: SurfaceContact, path: Path, usable: np.ndarray) -> list[Fin
 def _placement(
     contact: SurfaceContact, path: Path, closed: np.ndarray, log: Log
 ) -> tuple[list[Finding], Array]:
-    """Displacement and tilt of the surface, and the distance from it once they are undone."""
+    """Return displacement and tilt of the surface, and the distance from it after correction."""
     offset, tilt, shift = fit_surface(contact, path, closed)
     name, evidence = contact.name, {"offset_m": offset, "tilt_deg": float(np.degrees(np.linalg.norm(tilt)))}
     finding = partial(Finding, intervals=intervals(closed), contact=name)
@@ -180,7 +180,7 @@ def fit_surface(contact: SurfaceContact, path: Path, closed: np.ndarray) -> tupl
 def _labels(
     contact: SurfaceContact, path: Path, closed: np.ndarray, usable: np.ndarray, c: Array, log: Log
 ) -> list[Finding]:
-    """Rows labelled closed off the surface, by their place in the interval, and open ones that slide."""
+    """Return rows labelled closed off the surface, by position in the interval, and open ones that slide."""
     touch = max(TOUCH, ROUGH * float(robust_std(c[closed])))
     moving = closed & (np.linalg.norm(path.v, axis=1) > CREEP)
     slow = max(CREEP, ROUGH * float(robust_std(path.approach[moving])) if moving.any() else 0.0)
@@ -199,7 +199,7 @@ def _labels(
 def _runs_off(
     approach: Array, closed: np.ndarray, c: Array, touch: float, slow: float, log: Log
 ) -> dict[str, list[tuple[int, int]]]:
-    """Runs of rows labelled closed off the surface, by kind of finding, up to where the tip settles."""
+    """Return runs labelled closed off the surface, by kind of finding, extended until the tip settles."""
     settled = approach <= slow
     least = max(2, round(RUN_SECONDS / log.dt)) if np.isfinite(log.dt) else 2
     off = closed & (np.abs(c) > touch)
@@ -220,7 +220,7 @@ def _runs_off(
 
 
 def _until_settled(a: int, b: int, settled: np.ndarray) -> tuple[int, int]:
-    """A run at the start or the end of an interval, extended to where the tip settles."""
+    """Extend a run at the start or the end of an interval until the tip settles."""
     if a == 0:
         return a, b + int(np.argmax(settled[b:])) if settled[b:].any() else b
     return (a - int(np.argmax(settled[:a][::-1])) if settled[:a].any() else a), b
@@ -229,7 +229,7 @@ def _until_settled(a: int, b: int, settled: np.ndarray) -> tuple[int, int]:
 def _missed(
     contact: SurfaceContact, path: Path, open_: np.ndarray, c: Array, touch: float, log: Log
 ) -> list[Finding]:
-    """Rows labelled open in which the tip slides on the surface, longer than when it takes off gently."""
+    """Return rows labelled open in which the tip slides on the surface, longer than at a gentle lift-off."""
     if not np.isfinite(log.dt):
         return []
     near, speed = open_ & (np.abs(c) <= touch), np.linalg.norm(path.along, axis=1)
@@ -246,13 +246,15 @@ def _missed(
 
 
 FORCE_ROWS = 4000
-"""Contact rows whose force is computed."""
+"""Maximum number of contact rows for computing forces."""
 PULLS = 0.5
-"""Share of contact rows with a pulling force from which the normal must be the wrong way round."""
+"""Fraction of contact rows with a pulling force from which the normal must be reversed."""
 SIGNIFICANT, LARGEST_FRICTION = 4.0, 2.0
-"""Standard errors over blocks from which friction is there, and coefficients of hardly any materials."""
+"""Number of standard errors over blocks from which friction is significant, and largest plausible
+coefficient.
+"""
 SLIDING_SLOW, NARROW = 0.01, 0.05
-"""Speed below which the direction of sliding is unknown [m/s]; least share of the second direction."""
+"""Speed below which the sliding direction is unknown [m/s], and minimum share of the second direction."""
 
 
 def check_forces(system: ConstrainedSystem, log: Log) -> Outcome:
@@ -269,7 +271,7 @@ def check_forces(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def _force(system: ConstrainedSystem, log: Log, rows: np.ndarray, path: Path) -> Array:
-    """Force `(n, 3)` that explains the torque best, r = Jᵀ F; along the normal for up to three torques."""
+    """Return the force `(n, 3)` that best explains the torque, r = Jᵀ F; normal for up to three torques."""
     r, J = residual(system, log, rows)
     if log.nq <= 3:
         A = J[:, 0] * ~np.isin(np.arange(log.nq), unmeasured(log))
@@ -290,7 +292,7 @@ def _pulls(finding: partial[Finding], path: Path, force: Array) -> list[Finding]
 
 
 def _friction(finding: partial[Finding], path: Path, force: Array) -> list[Finding]:
-    """Friction coefficient from the force against the direction of sliding."""
+    """Return the friction coefficient from the force against the direction of sliding."""
     speed = np.linalg.norm(path.along, axis=1)
     sliding = speed > SLIDING_SLOW
     if sliding.sum() < LEAST_ROWS:
@@ -311,7 +313,7 @@ def _friction(finding: partial[Finding], path: Path, force: Array) -> list[Findi
 
 
 def _directions(finding: partial[Finding], v: Array) -> list[Finding]:
-    """Sliding along one line only leaves friction across it unknown."""
+    """Report sliding along a single line, which leaves friction across it unknown."""
     size = np.linalg.svd(v.T @ v / len(v), compute_uv=False)
     if size[1] > NARROW**2 * size[0]:
         return []

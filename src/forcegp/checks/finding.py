@@ -1,4 +1,4 @@
-"""Findings with rows, severity and remedy, their report, and `KINDS` of them with meaning and remedy."""
+"""Findings with rows, severity and remedy, their report, and all `KINDS` with meaning and remedy."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Severity = Literal["note", "warning", "error"]
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of finding: its part of the log, usual severity, title and remedy."""
+    """A kind of finding, with its part of the log, default severity, title and remedy."""
 
     family: str
     severity: Severity
@@ -29,13 +29,13 @@ class Kind:
 
 _FAMILIES = tomllib.loads((files("forcegp.checks") / "kinds.toml").read_text(encoding="utf-8"))
 TESTS: dict[str, str] = _FAMILIES.pop("tests")
-"""A test for each kind of fault, in order of preference."""
+"""Tests for each kind of fault, in order of preference."""
 KINDS = {name: Kind(family, *row) for family, rows in _FAMILIES.items() for name, row in rows.items()}
 """Every kind of finding by name, family by family."""
 
 
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
-"""From the gravest to the lightest."""
+"""Severities in decreasing order."""
 
 
 @dataclass(frozen=True)
@@ -44,17 +44,17 @@ class Finding:
 
     Args:
         kind: one of `KINDS`.
-        message: one sentence with the numbers.
-        intervals: rows concerned, half-open and increasing, counted from 0.
-        joints: the joints concerned.
-        contact: the contact concerned, if any.
-        evidence: the numbers behind the message, by name.
+        message: a sentence with numbers.
+        intervals: affected rows as half-open, increasing intervals, counted from 0.
+        joints: affected joints.
+        contact: affected contact, if any.
+        evidence: numbers behind the message, by name.
         weight: severity, if it differs from that of the kind.
         alternatives: other explanations that fit the log equally well.
         told_apart_by: a test that distinguishes them.
 
     Raises:
-        UnknownNameError: no such kind.
+        UnknownNameError: the kind does not exist.
     """
 
     kind: str
@@ -82,12 +82,12 @@ class Finding:
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """Its kind and those of its alternatives, each once."""
+        """Kinds of the finding and its alternatives, without duplicates."""
         return tuple(dict.fromkeys((self.kind, *(other.kind for other in self.alternatives))))
 
     @property
     def remedy(self) -> str:
-        """The remedy; with alternatives, the test that distinguishes them and the remedy of each."""
+        """Remedy; with alternatives, a test that distinguishes them and the remedy for each."""
         if not self.alternatives:
             return KINDS[self.kind].remedy
         each = "; ".join(f"{kind}: {KINDS[kind].remedy}" for kind in self.kinds)
@@ -95,11 +95,11 @@ class Finding:
 
     @property
     def rows(self) -> int:
-        """Number of rows concerned."""
+        """Number of affected rows."""
         return sum(stop - start for start, stop in self.intervals)
 
     def to_dict(self) -> dict[str, Any]:
-        """The finding as JSON-compatible values."""
+        """Return the finding as JSON-compatible values."""
         plain = ("kind", "severity", "message", "remedy", "contact", "told_apart_by")
         return {name: getattr(self, name) for name in plain} | {
             "kinds": list(self.kinds),
@@ -113,18 +113,18 @@ class Finding:
 def at_rows(
     mask: NDArray[np.bool_], kind: str, text: str, joints: tuple[str, ...] = (), **evidence: SupportsFloat
 ) -> list[Finding]:
-    """A finding on the rows of a mask, appended to its text; empty if the mask has no row."""
+    """Return a finding on the rows of a mask, described in its text; empty for an empty mask."""
     rows = intervals(mask)
     return [Finding(kind, f"{text} {describe(rows)}", rows, joints, evidence=evidence)] if rows else []
 
 
 class NotJudgedError(Exception):
-    """A check that cannot be made on this log; `Report.skipped` contains the message."""
+    """Raised if a check cannot be applied to a log; `Report.skipped` contains the message."""
 
 
 @dataclass(frozen=True)
 class Report:
-    """All findings on a log, the most severe first, and the checks that were skipped, with the reason."""
+    """All findings on a log, sorted by severity, and skipped checks with the reason."""
 
     findings: tuple[Finding, ...]
     samples: int
@@ -132,7 +132,7 @@ class Report:
     skipped: Mapping[str, str] = field(default_factory=dict)
 
     def count(self, severity: Severity) -> int:
-        """Number of findings of a severity."""
+        """Return the number of findings of a severity."""
         return sum(finding.severity == severity for finding in self.findings)
 
     @property
@@ -142,7 +142,7 @@ class Report:
 
     @property
     def verdict(self) -> str:
-        """One line on whether a model can be fitted."""
+        """One-line verdict on whether a model can be fitted."""
         errors, warnings = self.count("error"), self.count("warning")
         if errors:
             return f"verdict: stop; repair {errors} error{'s' * (errors > 1)} before fitting a model"
@@ -151,7 +151,7 @@ class Report:
         return "verdict: go on"
 
     def to_dict(self) -> dict[str, Any]:
-        """The report as JSON-compatible values."""
+        """Return the report as JSON-compatible values."""
         return {
             "samples": self.samples,
             "joint_names": list(self.joint_names),

@@ -1,4 +1,4 @@
-"""Fit of a hypothesis to the torque: least squares on all blocks of a log but one.
+"""Fit of a hypothesis to the torque by least squares on all blocks of a log except one.
 
 The residual torque of the robot file is explained, without possible contributions of a labelled contact: r =
 M q̈ − Q_C − Q_G − Q_D − Q_u is Aᵀλ + Q_z = Jᵀ F in contact, and zero elsewhere. Projecting r on the null
@@ -18,16 +18,16 @@ from forcegp.checks.log import Array, Log
 from forcegp.constraints import ConstrainedSystem, Constraint, SurfaceContact
 
 CHUNK = 8192
-"""Rows whose dynamics are in memory at once."""
+"""Number of rows with dynamics in memory at a time."""
 
 
 def tensors(log: Log, rows: np.ndarray, *names: str) -> list[Tensor]:
-    """Selected rows of columns, as tensors."""
+    """Return selected rows of columns as tensors."""
     return [torch.from_numpy(np.ascontiguousarray(getattr(log, name)[rows])) for name in names]
 
 
 def residual(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> tuple[Array, Array]:
-    """Unexplained torque r `(n, nq)` [N m, N], and J `(n, k, nq)` of the points, 0 without contact."""
+    """Return the unexplained torque r `(n, nq)` [N m, N], and J `(n, k, nq)` of the points, 0 if open."""
     robot, r, J = system.robot, [], []
     with torch.no_grad():
         for part in np.array_split(rows, max(1, -(-len(rows) // CHUNK))):
@@ -39,24 +39,25 @@ def residual(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> tuple[Arr
 
 
 def labelled_contacts(system: ConstrainedSystem, log: Log) -> list[Constraint]:
-    """The contacts with a logged state."""
+    """Return the contacts with a logged state."""
     return [c for c in system.contacts if c.name in log.contact]
 
 
 def takes_friction_out(system: ConstrainedSystem, log: Log) -> bool:
-    """Whether enough torques remain after removing any force at the contacts, not only the normal force."""
+    """Return whether enough torques remain after removing all contact forces, not only the normal force."""
     return 3 * len(labelled_contacts(system, log)) < log.nq
 
 
 def unmeasured(log: Log) -> list[int]:
-    """Joints whose torque the header says is not logged."""
+    """Return the joints without a logged torque, according to the header."""
     return [j for j, name in enumerate(log.joint_names) if name in log.header.unmeasured_torques]
 
 
 def _contact_jacobian(system: ConstrainedSystem, log: Log, rows: np.ndarray, q: Tensor, qd: Tensor) -> Array:
-    """Rows of J of all contacts, those of the surface normal alone where all of J would leave no torque.
+    """Return the rows of J of all contacts, or only those of the surface normals if all would leave no
+    torque.
 
-    Torques that are not logged follow as rows of their own: they may be anything.
+    Unlogged torques follow as additional rows, since they may have any value.
     """
     contacts, whole = labelled_contacts(system, log), takes_friction_out(system, log)
     free = np.broadcast_to(np.eye(log.nq)[unmeasured(log)], (len(rows), len(unmeasured(log)), log.nq))
@@ -73,7 +74,7 @@ def _contact_jacobian(system: ConstrainedSystem, log: Log, rows: np.ndarray, q: 
 
 
 def projector(J: Array, scale: Array) -> Array:
-    """Projector `(n, nq, nq)` on torques r/scale that no force at the touching points can produce."""
+    """Return the projector `(n, nq, nq)` onto torques r/scale that no force at contact points can produce."""
     J = J * (1.0 / scale)
     eye = np.broadcast_to(np.eye(J.shape[-1]), (len(J), *2 * (J.shape[-1],))).copy()
     touching = (J != 0.0).any(axis=(1, 2))
@@ -86,16 +87,16 @@ def projector(J: Array, scale: Array) -> Array:
 
 
 BLOCKS, REWEIGHTED = 8, 10
-"""Contiguous parts of the log, each held out once; rounds of a robust fit."""
+"""Number of contiguous blocks of the log, each held out once, and of rounds of a robust fit."""
 FLOOR = 0.03
-"""Errors below this share of a joint's torque do not matter: robot files are no better."""
+"""Negligible error relative to a joint's torque, the accuracy of robot files."""
 
 
 @dataclass(frozen=True)
 class TorqueProblem:
-    """Unexplained torque r `(n, nq)` [N m, N], Jacobian J of the touching points `(n, k, nq)`, columns that
-    every hypothesis may use `(n, nq, p)`, size of the logged torque, and scale of its noise, which weights
-    the joints.
+    """Unexplained torque r `(n, nq)` [N m, N], Jacobian J of the contact points `(n, k, nq)`, columns common
+    to all hypotheses `(n, nq, p)`, magnitude of the logged torque, and scale of its noise, which weights the
+    joints.
     """
 
     r: Array
@@ -105,17 +106,17 @@ class TorqueProblem:
     scale: Array
 
     def without_contact(self, x: Array) -> Array:
-        """P x/scale of columns x `(n, nq, p)`."""
+        """Return P x/scale of columns x `(n, nq, p)`."""
         x = x / self.scale[:, None]
         return projector(self.J, self.scale) @ x if self.J.any() else x
 
 
 @dataclass(frozen=True)
 class TorqueFit:
-    """A hypothesis fitted to a log, and tested on its blocks.
+    """A hypothesis fitted to a log and tested on its blocks.
 
-    `error` and `shares` `(blocks, nq)` are the root mean square of the held-out residual over `scale` and
-    over `size`; `theta` and `nuisance` `(p,)` are parameters, with deviations by the jackknife over blocks.
+    `error` and `shares` `(blocks, nq)` are the root mean square held-out residual relative to `scale` and to
+    `size`; `theta` and `nuisance` `(p,)` are parameters, with jackknife deviations over blocks.
     """
 
     error: Array
@@ -128,7 +129,7 @@ class TorqueFit:
 
 
 def blocks_of(n: int) -> Array:
-    """Number of the block of each row."""
+    """Return the number of the block of each row."""
     return np.minimum(np.arange(n) * BLOCKS // max(n, 1), BLOCKS - 1)
 
 
@@ -141,10 +142,10 @@ def cross_validate(
 ) -> TorqueFit:
     """Fit the nuisance and the columns of a hypothesis, and test them on held-out blocks.
 
-    Minimises |P(r − N η − Φ θ)/σ|² + |θ/s|², with P the projector that removes contact forces. Φ are the
-    columns `(n, nq, p)`, none by default; the prior s `(p,)` bounds the parameters; the first
-    parameters scale the torque of the joints `gains`. Instruments Z replace least squares by
-    Zᵀ P (r − N η − Φ θ) = 0, for columns with errors (Wooldridge, *Introductory Econometrics*, ch. 15).
+    Minimises |P(r − N η − Φ θ)/σ|² + |θ/s|², where P removes contact forces. Φ contains the columns
+    `(n, nq, p)`, by default none; the prior s `(p,)` bounds the parameters; the first parameters scale the
+    torque of the joints `gains`. Instruments Z replace least squares by Zᵀ P (r − N η − Φ θ) = 0, for columns
+    with errors (Wooldridge, *Introductory Econometrics*, ch. 15).
     """
     p = columns.shape[-1] if columns is not None else 0
     A, y, unit, weight = _equations(problem, columns, prior)
@@ -169,7 +170,7 @@ def cross_validate(
 def _equations(
     problem: TorqueProblem, columns: Array | None, prior: Array | None
 ) -> tuple[Array, Array, Array, Array]:
-    """Columns of size one and right-hand side without contact forces, unit and weight of the columns."""
+    """Return normalised columns and right-hand side without contact forces, and units and weights."""
     extra = columns if columns is not None else np.zeros((*problem.r.shape, 0))
     p = extra.shape[-1]
     every = problem.without_contact(np.concatenate([problem.r[..., None], extra, problem.nuisance], axis=-1))
@@ -185,7 +186,7 @@ def _equations(
 
 
 def robust_parameters(problem: TorqueProblem, columns: Array, prior: Array) -> Array:
-    """Parameters by Huber's weights min(1, k/|r|), k twice the median (*Robust Statistics*, 1981, ch. 7)."""
+    """Fit with Huber's weights min(1, k/|r|), k twice the median (*Robust Statistics*, 1981, ch. 7)."""
     A, y, unit, weight = _equations(problem, columns, prior)
     w, theta = np.ones(len(y)), np.zeros(A.shape[-1])
     for _ in range(REWEIGHTED):
@@ -197,7 +198,7 @@ def robust_parameters(problem: TorqueProblem, columns: Array, prior: Array) -> A
 
 
 def _held_out(A: Array, y: Array, weight: Array, Z: Array | None = None) -> tuple[Array, Array, Array]:
-    """Residual of each block under the parameters of the others, these parameters, and those of all."""
+    """Return the residual of each block for parameters of the others, these parameters, and those of all."""
     block, rest, symmetric = blocks_of(len(y)), np.zeros_like(y), Z is None
     Z = A if Z is None else Z
     grams, sides, thetas = [], [], []
@@ -213,7 +214,7 @@ def _held_out(A: Array, y: Array, weight: Array, Z: Array | None = None) -> tupl
 
 
 def held_out(problem: TorqueProblem, columns: Array, prior: Array) -> Array:
-    """Held-out residual of each row as a share of the torque `(n, nq)`; it is linear in `problem.r`."""
+    """Return the held-out residual of each row relative to the torque `(n, nq)`, linear in `problem.r`."""
     A, y, _, weight = _equations(problem, columns, prior)
     return _held_out(A, y, weight)[0] * problem.scale / problem.size
 
@@ -227,20 +228,20 @@ def _solve(gram: Array, side: Array, weight: Array, symmetric: bool = True) -> A
 
 
 def score_of(shares: Array) -> Array:
-    """`(blocks,)` Σ_j log error_j of errors `(blocks, nq)`, with a floor for negligible errors."""
+    """Return `(blocks,)` Σ_j log error_j of errors `(blocks, nq)`, with a floor for negligible errors."""
     return 0.5 * np.log(shares**2 + FLOOR**2).sum(axis=1)
 
 
 def gain_of(better: Array, worse: Array) -> tuple[float, float]:
-    """Mean decrease of a score by block, and its standard error."""
+    """Return the mean decrease of a score by block, and its standard error."""
     drop = worse - better
     return float(drop.mean()), float(drop.std(ddof=1) / np.sqrt(len(drop)))
 
 
 def pooled_gain_of(better: Array, worse: Array) -> tuple[float, float]:
-    """Decrease of Σ_j log of errors `(blocks, nq)` over all blocks, and its standard error by the jackknife.
+    """Return the decrease of Σ_j log errors `(blocks, nq)` over all blocks, and its jackknife standard error.
 
-    Unlike the mean over blocks, it does not depend on the excitation of single blocks (Cochran, *Sampling
+    Unlike the mean over blocks, this does not depend on the excitation of single blocks (Cochran, *Sampling
     Techniques*, ch. 6).
     """
 

@@ -1,8 +1,9 @@
-"""A log as it was recorded, valid or not, and the filter of the torque checks.
+"""Recorded logs, valid or not, and the filter for the torque checks.
 
-Noise ε on q̈ enters the explained torque as M ε, and a fit gains by shrinking the inertia, as any regression
-on noisy columns does. The same filter of a tenth of a second on positions, velocities, accelerations and
-torques removes the noise and preserves M q̈ = Q, up to changes of M and of the bias force within its window.
+Noise ε on q̈ enters the explained torque as M ε, and a fit gains by shrinking the inertia, like any
+regression on noisy columns. The same filter of a tenth of a second on positions, velocities, accelerations
+and torques removes the noise and preserves M q̈ = Q, up to changes of M and of the bias force within its
+window.
 """
 
 from __future__ import annotations
@@ -37,14 +38,15 @@ def evenly(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
 
 
 DEPARTURE = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0
-"""Weights of the departure of a value from the cubic through its four neighbours."""
+"""Weights of the deviation of a value from the cubic through its four neighbours."""
 OUTER, SPREAD = np.array([3.0, -10.0, 10.0, 0.0, -5.0, 2.0, 0.0]) / 3.0, 3.7
 """Weights of the departure at x = −3 from the cubic through x = −2, −1, 1, 2, and the standard deviation of
 that contrast over the one of the middle value, for white noise."""
 
 
 def spikes(x: Array) -> tuple[Array, Array]:
-    """Deviation of each value from the cubic through its four neighbours, and that of its neighbours.
+    """Return the deviation of each value from the cubic through its four neighbours, and that of the
+    neighbours.
 
     e_i = x_i − (−x_{i−2} + 4 x_{i−1} + 4 x_{i+1} − x_{i+2})/6. The second result is the same deviation for
     the neighbours alone, without x_i: a kink of the motion increases both, a spike only the first. Values are
@@ -60,17 +62,17 @@ def spikes(x: Array) -> tuple[Array, Array]:
 
 
 def position_unit(robot: RobotModel, j: int | np.integer) -> str:
-    """Unit of the position of joint j."""
+    """Return the unit of the position of joint j."""
     return "rad" if robot.joint_types[j] == "revolute" else "m"
 
 
 def force_unit(robot: RobotModel, j: int | np.integer) -> str:
-    """Unit of the force of joint j."""
+    """Return the unit of the force of joint j."""
     return "N m" if robot.joint_types[j] == "revolute" else "N"
 
 
 def displacement(robot: RobotModel, j: int | np.integer, offset: float) -> str:
-    """An offset of the position of joint j in words, with angles also in degrees."""
+    """Return an offset of the position of joint j in words, with angles also in degrees."""
     degrees = f" ({np.degrees(offset):+.2f}°)" if robot.joint_types[j] == "revolute" else ""
     return f"{offset:+.4f} {position_unit(robot, j)}{degrees}"
 
@@ -79,13 +81,13 @@ GAP, CLOCK_SPREAD = 1.5, 10.0
 """A gap is longer than this multiple of the median step, as half a sample is missing, and this many robust
 standard deviations of the steps longer than it, as clocks jitter."""
 SHORTEST, SMOOTHING = 8, 0.1
-"""Rows of the shortest stretch that is looked at; length of the filter of missing accelerations [s]."""
+"""Minimum number of rows in a stretch, and length of the filter for missing accelerations [s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """Columns of a log, named as in a `Dataset`, unchecked; `qd` and `qdd` may be `derived` here, and a check
-    has rows `masked` `(n,)` for those after it.
+    """Unchecked columns of a log, named as in a `Dataset`; `qd` and `qdd` may be `derived`, and rows may be
+    `masked` `(n,)` for subsequent checks.
     """
 
     t: Array
@@ -101,7 +103,7 @@ class Log:
     masked: NDArray[np.bool_] | None = None
 
     def __len__(self) -> int:
-        """Number of rows."""
+        """Return the number of rows."""
         return len(self.t)
 
     @property
@@ -115,24 +117,24 @@ class Log:
         return ((0, len(self)),)
 
     def finding(self, kind: str, text: str, joints: tuple[str, ...] = (), **evidence: Any) -> Finding:
-        """A finding on the whole log."""
+        """Return a finding on the whole log."""
         return Finding(kind, text, self.all_rows, joints, evidence=evidence)
 
     def on_joints(self, kind: str, mask: Array, text: str, **evidence: Any) -> list[Finding]:
-        """A finding on the joints of a mask, inserted at the `{}` of its text; empty without a joint."""
+        """Return a finding on the joints of a mask, named at `{}` in its text; empty without joints."""
         joints = self.named(mask)
         return [self.finding(kind, text.format(", ".join(joints)), joints, **evidence)] if joints else []
 
     def named(self, joints: Array | np.bool_) -> tuple[str, ...]:
-        """Names of the joints of a mask."""
+        """Return the names of the joints of a mask."""
         return tuple(self.joint_names[j] for j in np.flatnonzero(joints))
 
     def replace(self, **fields: Any) -> Log:
-        """The log with some fields changed."""
+        """Return the log with some fields changed."""
         return dataclasses.replace(self, **fields)
 
     def mask(self, rows: NDArray[np.bool_]) -> Log:
-        """The log with more rows masked."""
+        """Return the log with more rows masked."""
         return self.replace(masked=rows if self.masked is None else self.masked | rows)
 
     @cached_property
@@ -147,7 +149,7 @@ class Log:
         return self.finite if self.masked is None else self.finite & ~self.masked
 
     def reach(self, name: str) -> Array:
-        """`(nq,)` range of a column without its outermost values."""
+        """Return `(nq,)` range of a column without its outermost values."""
         return np.ptp(np.percentile(getattr(self, name)[self.usable], (0.5, 99.5), axis=0), axis=0)
 
     @cached_property
@@ -177,7 +179,7 @@ class Log:
         return [slice(a, b + 1) for a, b in runs if b + 1 - a >= SHORTEST]
 
     def rows(self, most: int, margin: int = 0) -> NDArray[np.int64]:
-        """Up to `most` usable rows, evenly spread, at least `margin` rows from the end of a stretch."""
+        """Return up to `most` evenly spaced usable rows, at least `margin` rows from the end of a stretch."""
         inner = [np.arange(s.start + margin, s.stop - margin) for s in self.stretches]
         index = np.concatenate([np.empty(0, np.int64), *inner])
         index = index if self.header.ordered else np.flatnonzero(self.usable)
@@ -189,7 +191,7 @@ Outcome = tuple[list[Finding], Log]
 
 
 def log_of(data: Dataset) -> Log:
-    """The log of a data set."""
+    """Return the log of a data set."""
     return Log(
         **{n: getattr(data, n).detach().cpu().numpy().astype(float) for n in ("t", *JOINT_VECTORS)},
         segment=data.segment.cpu().numpy(),
@@ -200,7 +202,7 @@ def log_of(data: Dataset) -> Log:
 
 
 def read_log(path: str | Path) -> Log:
-    """Read a log from Parquet or CSV without refusing NaN, empty values or time that runs backward.
+    """Read a log from Parquet or CSV, accepting NaN, empty values and time stamps that run backward.
 
     The columns are those of docs/formats.md; missing q̇ and q̈ are computed by a Savitzky-Golay filter.
 
@@ -218,7 +220,7 @@ def read_log(path: str | Path) -> Log:
 
 
 def derive(log: Log, absent: list[str]) -> Log:
-    """The log with missing derivatives computed on each contiguous stretch, NaN elsewhere."""
+    """Return the log with missing derivatives computed on each contiguous stretch, NaN elsewhere."""
     logged = [name for name in JOINT_VECTORS if name not in absent]
     filled = log.replace(**{name: np.zeros_like(log.q) for name in absent})
     values = {name: np.full_like(log.q, np.nan) for name in absent}
@@ -236,7 +238,7 @@ def derive(log: Log, absent: list[str]) -> Log:
 
 
 def of_robot(log: Log, robot: RobotModel) -> Log:
-    """The log with the robot's joints in its order; `DataError` if one is missing or the log is empty."""
+    """Return the log with the robot's joints in order; `DataError` if one is missing or the log is empty."""
     if len(log) == 0:
         raise DataError("the log holds no rows", expected="one or more samples")
     if not set(robot.joint_names) <= set(log.joint_names):
@@ -247,11 +249,11 @@ def of_robot(log: Log, robot: RobotModel) -> Log:
 
 
 SMOOTHED_SECONDS, SMOOTHED_ORDER = 0.1, 3
-"""Length of the filter [s], and degree of its polynomial: bends of the motion within the window are kept."""
+"""Length of the filter [s], and degree of its polynomial, which preserves curvature within the window."""
 
 
 def smoothed(log: Log) -> Log:
-    """The log, if valid, after a Savitzky-Golay filter between contact switches, with masked ends."""
+    """Apply a Savitzky-Golay filter to a valid log between contact switches, masking the ends."""
     from scipy.signal import savgol_filter
 
     half = round(SMOOTHED_SECONDS / log.dt / 2.0) if np.isfinite(log.dt) and log.header.ordered else 0

@@ -1,7 +1,7 @@
-"""Do the joint angles place the tip on the surface in rows labelled as contact?
+"""Check that the joint angles place the tip on the surface in rows labelled as contact.
 
-If the surface is displaced, the distance of the tip is a plane over the path; if the angles are wrong, one
-change of them moves the tip onto the surface in all rows.
+If the surface is displaced, the distance of the tip is a plane over the path. If the angles are wrong, a
+single correction moves the tip onto the surface in all rows.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from forcegp.robot.model import RobotModel
 from forcegp.robust import level_of, robust_std
 
 ROWS = 2000
-"""Contact rows that are looked at."""
+"""Maximum number of contact rows."""
 BETTER = 0.25
-"""Share of what a displaced surface leaves that changed angles may leave."""
+"""Largest accepted residual of corrected angles, relative to that of a displaced surface."""
 STEPS = 6
-"""Gauss-Newton steps that find an encoder offset."""
+"""Number of Gauss-Newton steps for an encoder offset."""
 
 
 def check_placement(system: ConstrainedSystem, log: Log) -> Outcome:
@@ -66,7 +66,7 @@ def check_placement(system: ConstrainedSystem, log: Log) -> Outcome:
 def _never_closed(
     system: ConstrainedSystem, contact: SurfaceContact, log: Log, rows: np.ndarray
 ) -> Outcome | None:
-    """The one change of angles that takes a tip that never touches to the surface, if there is one."""
+    """Return the single correction that moves a tip that is never in contact to the surface, if any."""
     signs = ((h, h.change(log)) for h in discrete(log) if h.name == "joint-sign")
     tried = []
     for h, other in (*signs, *_offsets(system, contact, log, rows, LEVEL)):
@@ -90,7 +90,7 @@ def _chosen(
     near: list[tuple[Hypothesis, Log]],
     where: str,
 ) -> Outcome:
-    """Changes that place the tip alike, as those of two joints in one plane; the torque chooses one."""
+    """Return corrections that place the tip equally well, such as two joints in a plane, ranked by torque."""
     rows = evenly(np.flatnonzero(log.usable), TRIED_ROWS)
     scores = [cross_validate(hypotheses.problem_of(system, other, rows)).score.mean() for _, other in near]
     best, repaired = near[int(np.argmin(scores))]
@@ -99,7 +99,7 @@ def _chosen(
 
 
 def leaves_surface(system: ConstrainedSystem, before: Log, after: Log) -> bool:
-    """Whether changed angles move a tip off the surface in rows labelled as contact."""
+    """Return whether a correction moves the tip off the surface in rows labelled as contact."""
     if after.q is before.q:
         return False
     for contact, rows in touching(system, before):
@@ -112,7 +112,7 @@ def leaves_surface(system: ConstrainedSystem, before: Log, after: Log) -> bool:
 def _explanation(
     system: ConstrainedSystem, contact: SurfaceContact, log: Log, rows: np.ndarray, most: float
 ) -> Outcome | None:
-    """The change of angles that leaves the tip on the surface, if there is one."""
+    """Return the correction of angles that places the tip on the surface, if any."""
     angles = ((h, h.change(log)) for h in discrete(log) if h.name in ("joint-sign", "joint-order"))
     for candidates in (angles, _offsets(system, contact, log, rows)):
         near = [(h, other) for h, other in candidates if _off(system, contact, other, rows) <= most]
@@ -123,16 +123,16 @@ def _explanation(
 
 
 def _off(system: ConstrainedSystem, contact: SurfaceContact, log: Log, rows: np.ndarray) -> float:
-    """Median distance of the tip from the surface [m]."""
+    """Return the median distance of the tip from the surface [m]."""
     return float(np.median(np.abs(tip_path(system, contact, log, rows).c)))
 
 
 def _offsets(
     system: ConstrainedSystem, contact: SurfaceContact, log: Log, rows: np.ndarray, share: float | None = None
 ) -> Iterator[tuple[Hypothesis, Log]]:
-    """Each encoder with the offset that takes the tip to the surface, by Gauss-Newton steps.
+    """Yield each encoder with the offset that moves the tip to the surface, by Gauss-Newton steps.
 
-    With a share, rows have offsets of their own, and one that this share of them agrees on is taken.
+    With a share, offsets are computed per row, and one on which this share of them agrees is used.
     """
     few = log.replace(q=log.q[rows], qd=log.qd[rows])
     for j in range(log.nq):

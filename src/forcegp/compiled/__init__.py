@@ -1,7 +1,7 @@
-"""Opt-in compiled dynamics: one fused kernel per robot and quantity, cached on disk.
+"""Opt-in compiled dynamics with one fused kernel per robot and quantity, cached on disk.
 
-The robot's parameters are folded into the kernel. The eager functions of `forcegp.dynamics` need no compiler
-and accept learned robots; these are for many evaluations of one robot.
+The robot's parameters are folded into the kernel. Use compiled functions for many evaluations of one robot;
+the eager functions in `forcegp.dynamics` need no compiler and accept learned robots.
 """
 
 from __future__ import annotations
@@ -28,11 +28,10 @@ def _stacked_derivatives(robot: RobotModel, q: Tensor, qd: Tensor, force: Tensor
 
 
 class CompiledDynamics:
-    """One quantity of one robot as a compiled function of the joint-space arguments.
+    """A quantity of a robot as a compiled function of joint-space arguments.
 
-    Call it like the eager function of the same name, without the robot. Its derivatives are those of the
-    eager function, of any order; the first derivatives of the forward dynamics have a separate kernel,
-    built on first use.
+    Call it like the eager function of the same name, without the robot. Derivatives of any order are those of
+    the eager function; the first derivatives of forward dynamics have a separate kernel, built on first use.
     """
 
     def __init__(self, robot: RobotModel, quantity: str) -> None:
@@ -53,10 +52,10 @@ class CompiledDynamics:
         return CompiledDynamics(self.robot, "forward_dynamics_derivatives")
 
     def __call__(self, *states: Tensor) -> Tensor:
-        """The quantity at states `(*batch, nq)`.
+        """Return the quantity at states `(*batch, nq)`.
 
         Raises:
-            ShapeError: an argument is missing or does not fit the robot.
+            ShapeError: an argument is missing or does not match the robot.
         """
         if len(states) != len(self._arguments):
             raise ShapeError(
@@ -72,14 +71,14 @@ class CompiledDynamics:
         return self._eager(self.robot, *states)
 
     def pull(self, gradient: Tensor, *states: Tensor) -> tuple[Tensor, ...]:
-        """gradientᵀ times the Jacobian with respect to each state."""
+        """Return gradientᵀ times the Jacobian with respect to each state."""
         if self.quantity == "forward_dynamics" and not torch.is_grad_enabled():
             jacobians = self._jacobians.run(*states)
             return (gradient[..., None, None, :] @ jacobians)[..., 0, :].unbind(-2)
         return torch.func.vjp(self.eager, *states)[1](gradient)
 
     def run(self, *states: Tensor) -> Tensor:
-        """Call the kernel on states of one shape, outside of autograd."""
+        """Call the kernel on states of equal shape, without autograd."""
         batch = states[0].shape[:-1]
         values = {
             name: x.reshape((math.prod(batch), self.robot.nq)).contiguous()
@@ -131,18 +130,18 @@ class _Kernel(torch.autograd.Function):
 def compile_dynamics(robot: RobotModel, quantity: str = "forward_dynamics") -> CompiledDynamics:
     """Compile a function of `forcegp.dynamics` (or its derivatives) for one robot.
 
-    The first call on a machine runs its C++ compiler (about a second for an arm, ten for a hand, minutes for
-    a hundred joints); later ones, in any process, read the kernel from the cache (`$FORCEGP_CACHE`, or
-    `forcegp` in the user's cache folder). On a CUDA robot NVRTC compiles the kernel in each process.
+    The first call runs the local C++ compiler (about a second for an arm, ten for a hand, minutes for a
+    hundred joints); later calls in any process read the kernel from the cache (`$FORCEGP_CACHE`, or `forcegp`
+    in the user's cache folder). For a robot on a CUDA device, NVRTC compiles the kernel in each process.
 
     Args:
-        robot: the robot; its parameters become constants.
+        robot: the robot, with parameters that become constants.
         quantity: `forward_dynamics`, `forward_dynamics_derivatives`, `inverse_dynamics`, `mass_matrix`,
             `bias_force` or `gravity_force`.
 
     Returns:
-        A function of the states that the eager function takes. The derivatives come as one tensor
-        `(*batch, 3, nq, nq)`: with respect to q, q̇ and force.
+        A function of the states accepted by the eager function. Derivatives are returned as one tensor
+        `(*batch, 3, nq, nq)`, with respect to q, q̇ and force.
 
     Example:
         >>> import torch, forcegp
@@ -152,8 +151,8 @@ def compile_dynamics(robot: RobotModel, quantity: str = "forward_dynamics") -> C
         >>> fast(q, 0 * q, 0 * q).shape  # doctest: +SKIP
 
     Raises:
-        UnknownNameError: no such quantity.
-        ModelError: a parameter of the robot is being learned, or its precision has no kernel.
+        UnknownNameError: the quantity does not exist.
+        ModelError: a parameter of the robot is being learned, or its precision is not supported.
         MissingDependencyError: there is no compiler.
     """
     check_name("quantity to compile", quantity, QUANTITIES)

@@ -1,7 +1,7 @@
 """Scalar expressions that fold constants and share equal subexpressions as they are built.
 
-Written for numpy object arrays: an algorithm on arrays of `Scalar` reads as the same algorithm on numbers
-and records a straight-line program.
+They work in numpy object arrays: an algorithm on arrays of `Scalar` has the same code as on numbers, and
+records a straight-line program.
 """
 
 from __future__ import annotations
@@ -15,43 +15,41 @@ import numpy as np
 Node = tuple[str, object, object]
 """Operation and operands: ("const", value, None), ("input", name, index), (op, left, right) by position."""
 UNARY = ("exp", "tanh", "sqrt", "step")
-"""Functions of one operand; step is 1 above 0, and 0 elsewhere."""
+"""Functions of one operand; step is 1 above 0 and otherwise 0."""
 Tangents = dict[int, "Scalar"]
-"""Derivatives of a scalar by direction; those that are not there are zero."""
+"""Derivatives of a scalar by direction; missing ones are zero."""
 
 
 @dataclass
 class Graph:
-    """The nodes of a program without duplicates, operands before their use."""
+    """Nodes of a program without duplicates, with operands before their use."""
 
     nodes: list[Node] = field(default_factory=list)
     _positions: dict[Node, int] = field(default_factory=dict)
 
     def scalar(self, node: Node) -> Scalar:
-        """The scalar computed by a node; an equal node is reused."""
+        """Return the scalar computed by a node, reusing an equal node."""
         position = self._positions.setdefault(node, len(self.nodes))
         if position == len(self.nodes):
             self.nodes.append(node)
         return Scalar(self, position)
 
     def constant(self, value: float) -> Scalar:
-        """A number."""
+        """Return a number."""
         # −0.0 and 0.0 are one key; the sign of a zero never matters here.
         return self.scalar(("const", float(value) + 0.0, None))
 
     def constants(self, values: object) -> np.ndarray:
-        """An array of numbers."""
+        """Return an array of numbers."""
         array = np.asarray(values, dtype=float)
         return np.array([self.constant(x) for x in array.flat], dtype=object).reshape(array.shape)
 
     def input(self, name: str, index: int) -> Scalar:
-        """Entry of an argument of the program."""
+        """Return the entry of an argument of the program."""
         return self.scalar(("input", name, index))
 
     def live(self, outputs: list[Scalar], known: Container[int] = ()) -> list[int]:
-        """Positions of the nodes that the outputs depend on, in order of computation, stopping at known
-        nodes.
-        """
+        """Return the nodes that the outputs depend on, in order of computation, stopping at known nodes."""
         needed, open_ = set(), [x.position for x in outputs]
         while open_:
             position = open_.pop()
@@ -63,10 +61,10 @@ class Graph:
         return sorted(needed)
 
     def tangents(self, outputs: list[Scalar], seeds: dict[int, Tangents]) -> list[Tangents]:
-        """Derivatives of the outputs by forward mode, from those of `seeds` by position.
+        """Return the derivatives of the outputs by forward mode, from those of `seeds` by position.
 
-        A seed need not be an input: the solution of an equation can be seeded with its derivative. A scalar
-        without directions counts as a constant.
+        A seed need not be an input; for example, the solution of an equation can be seeded with its
+        derivative. A scalar without directions is treated as a constant.
         """
         found = dict(seeds)
         for position in self.live(outputs, seeds):
@@ -75,7 +73,7 @@ class Graph:
         return [found[x.position] for x in outputs]
 
     def _tangents(self, position: int, found: dict[int, Tangents]) -> Tangents:
-        """The derivatives of one node from those of its operands."""
+        """Return the derivatives of one node from those of its operands."""
         op, i, j = self.nodes[position]
         if op in ("const", "input", "step"):
             return {}
@@ -99,20 +97,20 @@ class Graph:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scalar:
-    """One number of a program: a position in its graph, with the arithmetic of numbers."""
+    """A number in a program, represented by a position in its graph, with arithmetic operations."""
 
     graph: Graph
     position: int
 
     @property
     def value(self) -> float | None:
-        """The number, if it is a constant."""
+        """Value if the scalar is a constant."""
         op, value, _ = self.graph.nodes[self.position]
         return value if op == "const" else None  # pyright: ignore[reportReturnType]
 
     @property
     def negated(self) -> Scalar | None:
-        """x, if this is −x."""
+        """x if this is −x."""
         op, operand, _ = self.graph.nodes[self.position]
         return Scalar(self.graph, operand) if op == "neg" else None  # pyright: ignore[reportArgumentType]
 
@@ -123,19 +121,19 @@ class Scalar:
         return self.graph.scalar((op, self.position, other.position))
 
     def exp(self) -> Scalar:
-        """e^x."""
+        """Return e^x."""
         return self._function("exp")
 
     def tanh(self) -> Scalar:
-        """Hyperbolic tangent."""
+        """Return the hyperbolic tangent."""
         return self._function("tanh")
 
     def sqrt(self) -> Scalar:
-        """Square root."""
+        """Return the square root."""
         return self._function("sqrt")
 
     def step(self) -> Scalar:
-        """1 above 0, and 0 elsewhere."""
+        """Return 1 above 0 and otherwise 0."""
         return self._function("step")
 
     def _function(self, name: str) -> Scalar:

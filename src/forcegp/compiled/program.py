@@ -1,4 +1,4 @@
-"""The dynamics of one robot written out on scalars: the algorithms of `forcegp.dynamics`, link by link.
+"""The dynamics of a robot expanded to scalars: the algorithms of `forcegp.dynamics`, link by link.
 
 The robot's parameters are numbers, so products with the zeros and ones of joint axes and placements vanish
 while the program is built. Poses, joint screws and inertias of the links are in world axes about the
@@ -19,12 +19,12 @@ from forcegp.robot.model import BASE, RobotModel
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """a × b of expressions."""
+    """Return a × b of expressions."""
     return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
 def skew(v: np.ndarray) -> np.ndarray:
-    """Cross-product matrix [v]× of expressions."""
+    """Return the cross-product matrix [v]× of expressions."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
@@ -34,8 +34,8 @@ class Links:
     Attributes:
         R, p: rotation and origin of each link.
         z, l: angular and linear part of each joint screw.
-        c, mass: centre and mass of each link; moment = m c.
-        I: inertia about the centre, inertia about the base origin in `inertia`.
+        c, mass: centre of mass and mass of each link; moment = m c.
+        I: inertia about the centre of mass; `inertia` is about the base origin.
     """
 
     def __init__(self, robot: RobotModel) -> None:
@@ -60,7 +60,7 @@ class Links:
         self.inertia = [I + _shift(*x) for I, *x in zip(self.I, self.c, self.moment, strict=True)]
 
     def _joint(self, robot: RobotModel, i: int) -> tuple[np.ndarray, np.ndarray]:
-        """Pose of a link in its parent link (Rodrigues' formula about a constant axis)."""
+        """Return the pose of a link in its parent link (Rodrigues' formula about a constant axis)."""
         graph, a, P = self.graph, numbers(robot.axis[i]), numbers(robot.placement_rotation[i])
         shift = graph.constants(numbers(robot.placement_position[i]))
         if robot.joint_types[i] == "prismatic":
@@ -70,11 +70,11 @@ class Links:
         return turn + graph.constants(P - along) * graph.input("cos", i), shift
 
     def vector(self, name: str) -> list[Scalar]:
-        """A joint-space argument of the program."""
+        """Return a joint-space argument of the program."""
         return [self.graph.input(name, i) for i in range(len(self.parents))]
 
     def composite(self, values: list) -> list:
-        """Sums over the subtree of each link, including the link."""
+        """Sum over the subtree of each link, including the link."""
         total = list(values)
         for i in reversed(range(len(total))):
             if (parent := self.parents[i]) != BASE:
@@ -82,7 +82,7 @@ class Links:
         return total
 
     def ancestors(self, i: int) -> list[int]:
-        """The joints that move link i, itself first."""
+        """Return the joints that move link i, starting with joint i."""
         chain = [i]
         while self.parents[chain[-1]] != BASE:
             chain.append(self.parents[chain[-1]])
@@ -90,19 +90,19 @@ class Links:
 
 
 def numbers(x: Tensor) -> np.ndarray:
-    """A tensor as constants of the expressions."""
+    """Convert a tensor to constant expressions."""
     return x.detach().cpu().double().numpy()
 
 
 def congruent(R: np.ndarray, inertia: np.ndarray) -> np.ndarray:
-    """R I Rᵀ, computing each of its six distinct entries once."""
+    """Return R I Rᵀ, computing each of its six distinct entries once."""
     turned = R @ inertia
     upper = {(r, c): turned[r] @ R[c] for r in range(3) for c in range(r, 3)}
     return np.array([[upper[min(r, c), max(r, c)] for c in range(3)] for r in range(3)], dtype=object)
 
 
 def _shift(c: np.ndarray, h: np.ndarray) -> np.ndarray:
-    """cᵀh 1 − c hᵀ with its six different entries computed once (h = m c)."""
+    """Return cᵀh 1 − c hᵀ with its six different entries computed once (h = m c)."""
     diagonal = [c[1] * h[1] + c[2] * h[2], c[0] * h[0] + c[2] * h[2], c[0] * h[0] + c[1] * h[1]]
     rows = [[diagonal[r] if r == s else -(c[min(r, s)] * h[max(r, s)]) for s in range(3)] for r in range(3)]
     return np.array(rows, dtype=object)
@@ -110,7 +110,7 @@ def _shift(c: np.ndarray, h: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Program:
-    """A straight-line program: its arguments as in the eager function, and its result in row-major order."""
+    """A straight-line program with the arguments of the eager function and its result in row-major order."""
 
     arguments: tuple[str, ...]
     shape: tuple[int, ...]
@@ -134,7 +134,7 @@ class _Motion(NamedTuple):
 
 
 def _mass_matrix(links: Links) -> np.ndarray:
-    """M_ij = s_iᵀ I^c_j s_j with the composite inertias (composite rigid-body algorithm)."""
+    """Return M_ij = s_iᵀ I^c_j s_j with the composite inertias (composite rigid-body algorithm)."""
     n = len(links.parents)
     M = links.graph.constants(np.zeros((n, n)))
     for j, composite in enumerate(_composites(links)):
@@ -146,18 +146,18 @@ def _mass_matrix(links: Links) -> np.ndarray:
 
 
 def _momentum(mass: float, moment: np.ndarray, inertia: np.ndarray, w: np.ndarray, v: np.ndarray) -> tuple:
-    """[I w + h × v; m v − h × w]."""
+    """Return [I w + h × v; m v − h × w]."""
     return inertia @ w + cross(moment, v), v * mass - cross(moment, w)
 
 
 def _composites(links: Links) -> list[_Inertia]:
-    """Mass, first moment and inertia of each subtree."""
+    """Return the mass, first moment and inertia of each subtree."""
     parts = (links.mass, links.moment, links.inertia)
     return list(zip(*(links.composite(list(x)) for x in parts), strict=True))
 
 
 def _motion(links: Links, qd: list | None, qdd: list | None, gravity: bool) -> list[_Motion]:
-    """Motion of all links; gravity enters as an acceleration of the base."""
+    """Return the motion of all links; gravity enters as an acceleration of the base."""
     zero, motion = links.graph.constants(np.zeros(3)), []
     rest = _Motion(zero, zero, zero, -links.gravity if gravity else zero)
     for i, parent in enumerate(links.parents):
@@ -174,7 +174,7 @@ def _motion(links: Links, qd: list | None, qdd: list | None, gravity: bool) -> l
 
 
 def _link_forces(links: Links, motion: list[_Motion]) -> tuple[list, list]:
-    """Torque and force on the subtree of each joint, by Newton and Euler about the centres of mass."""
+    """Return torque and force on the subtree of each joint, by Newton-Euler about the centres of mass."""
     torques, forces = [], []
     for (omega, v, alpha, a), c, I, mass in zip(motion, links.c, links.I, links.mass, strict=True):
         force = (a + cross(alpha, c) + cross(omega, v + cross(omega, c))) * mass
@@ -184,7 +184,7 @@ def _link_forces(links: Links, motion: list[_Motion]) -> tuple[list, list]:
 
 
 def _joint_force(links: Links, qd: list | None, qdd: list | None, gravity: bool) -> np.ndarray:
-    """M q̈ − Q_C − Q_G, each term where its argument is given (recursive Newton-Euler)."""
+    """Return the terms of M q̈ − Q_C − Q_G with given arguments (recursive Newton-Euler)."""
     torques, forces = _link_forces(links, _motion(links, qd, qdd, gravity))
     result = [z @ t + l @ f for z, l, t, f in zip(links.z, links.l, torques, forces, strict=True)]
     if qdd is not None:
@@ -193,7 +193,7 @@ def _joint_force(links: Links, qd: list | None, qdd: list | None, gravity: bool)
 
 
 def _solve(M: np.ndarray, rhs: np.ndarray) -> np.ndarray:
-    """M⁻¹ rhs, eliminated from the leaves so that the zeros of branched trees stay (Featherstone, §6.5)."""
+    """Return M⁻¹ rhs by elimination from the leaves, which preserves branch sparsity (Featherstone, §6.5)."""
     M, x, n = M.copy(), rhs.copy(), len(rhs)
     inverse = [1.0 / M[0, 0]] * n
     for k in reversed(range(n)):
@@ -211,7 +211,7 @@ def _solve(M: np.ndarray, rhs: np.ndarray) -> np.ndarray:
 
 
 def _forward_dynamics(links: Links) -> np.ndarray:
-    """M⁻¹(force + Q_C + Q_G)."""
+    """Return M⁻¹(force + Q_C + Q_G)."""
     needed = _joint_force(links, links.vector("qd"), None, gravity=True)
     return _solve(_mass_matrix(links), np.array(links.vector("force"), dtype=object) - needed)
 
@@ -219,7 +219,7 @@ def _forward_dynamics(links: Links) -> np.ndarray:
 def _inverse_dynamics_derivatives(
     links: Links, qd: list | None, qdd: list, gravity: bool = True
 ) -> tuple[np.ndarray, np.ndarray]:
-    """∂ID/∂q and ∂ID/∂q̇ of the terms that are given; the formulas are those of `forcegp.derivatives`."""
+    """Return ∂ID/∂q and ∂ID/∂q̇ of the given terms, with the formulas of `forcegp.derivatives`."""
     motion = _motion(links, qd, qdd, gravity)
     torques, forces = _link_forces(links, motion)
     spin, momenta = [], []
@@ -253,7 +253,7 @@ def _inverse_dynamics_derivatives(
 
 
 def _bend(motion: _Motion, screw: tuple, rate: tuple) -> tuple[np.ndarray, np.ndarray]:
-    """S̈ = a × S + V × Ṡ of one joint."""
+    """Return S̈ = a × S + V × Ṡ of one joint."""
     (omega, v, alpha, a), (z, l) = motion, screw
     return (
         cross(alpha, z) + cross(omega, rate[0]),
@@ -264,7 +264,7 @@ def _bend(motion: _Motion, screw: tuple, rate: tuple) -> tuple[np.ndarray, np.nd
 def _columns(
     motion: _Motion, screw: tuple, rate: tuple, spin, momentum, composite: _Inertia
 ) -> tuple[tuple, tuple]:
-    """2B Ṡ + I S̈ and 2B S + 2 I Ṡ of one joint and its subtree."""
+    """Return 2B Ṡ + I S̈ and 2B S + 2 I Ṡ of one joint and its subtree."""
     bent, turned = _momentum(*composite, *_bend(motion, screw, rate)), _momentum(*composite, *rate)
     return (
         (spin @ rate[0] + bent[0], cross(rate[0], momentum) * 2.0 + bent[1]),
@@ -273,7 +273,7 @@ def _columns(
 
 
 def _forward_dynamics_derivatives(links: Links) -> np.ndarray:
-    """∂q̈/∂q, ∂q̈/∂q̇ and M⁻¹, `(3, nq, nq)`."""
+    """Return ∂q̈/∂q, ∂q̈/∂q̇ and M⁻¹, `(3, nq, nq)`."""
     qd, n = links.vector("qd"), len(links.parents)
     inverse = _solve(_mass_matrix(links), links.graph.constants(np.eye(n)))
     needed = _joint_force(links, qd, None, gravity=True)
@@ -283,7 +283,7 @@ def _forward_dynamics_derivatives(links: Links) -> np.ndarray:
 
 
 def regressor_program(links: Links) -> Program:
-    """Y `(10 nq, nq)`, the transpose of `identification.regressor`, from the motion of each link's origin."""
+    """Return Y `(10 nq, nq)`, transpose of `identification.regressor`, from the motion of link origins."""
     n = len(links.parents)
     Y = links.graph.constants(np.zeros((PARAMETERS * n, n)))
     motion = _motion(links, links.vector("qd"), links.vector("qdd"), gravity=True)
@@ -316,11 +316,11 @@ QUANTITIES: dict[str, tuple[tuple[str, ...], Callable[[Links], np.ndarray]]] = {
     "bias_force": (("q", "qd"), lambda links: -_joint_force(links, links.vector("qd"), None, gravity=False)),
     "gravity_force": (("q",), lambda links: -_joint_force(links, None, None, gravity=True)),
 }
-"""Arguments and algorithm of each quantity that can be compiled."""
+"""Arguments and algorithm of each supported quantity."""
 
 
 def trace(robot: RobotModel, quantity: str) -> Program:
-    """The program of one quantity of `QUANTITIES` for one robot."""
+    """Record the program for one quantity in `QUANTITIES` and one robot."""
     arguments, algorithm = QUANTITIES[quantity]
     links = Links(robot)
     result = algorithm(links)

@@ -18,7 +18,7 @@ from forcegp.errors import MissingDependencyError
 from forcegp.native import load_library
 
 LANES_BYTES = 64
-"""Width of the vectors of a CPU kernel; the compiler splits them where the machine's are narrower."""
+"""Vector width of a CPU kernel, which the compiler splits if the machine's vectors are narrower."""
 CUDA_THREADS = 128
 
 _CPU = """\
@@ -71,14 +71,14 @@ extern "C" __global__ void kernel({parameters}, T* out, int batch) {{
 
 @dataclass(frozen=True)
 class Source:
-    """Source text, and the arrays that its kernel reads: arguments of the quantity, "sin" or "cos" of q."""
+    """Source text, and the arrays read by its kernel: arguments of the quantity, "sin" or "cos" of q."""
 
     text: str
     arrays: tuple[str, ...]
 
 
 def statements(program: Program, load: dict[tuple[str, int], str], store: str) -> str:
-    """One statement per live node, then the stores, on vectors `V` of numbers `T`."""
+    """Return one statement per live node, followed by stores, on vectors `V` of numbers `T`."""
     nodes, lines = program.graph.nodes, []
     name: dict[int, str] = {}
     for position in program.graph.live(program.outputs):
@@ -99,14 +99,14 @@ def statements(program: Program, load: dict[tuple[str, int], str], store: str) -
 
 
 def _operation(op: str, left: str, right: str = "") -> str:
-    """The text of an operation; `step` and other functions exist in C alone."""
+    """Return the text of an operation; `step` and other functions exist in C only."""
     if op in UNARY:
         return f"{left} > 0.0" if op == "step" else f"{op}({left})"
     return f"{left} {op} {right}" if right else f"-{left}"
 
 
 def inputs_of(program: Program) -> tuple[tuple[str, ...], list[tuple[str, int]]]:
-    """The arrays that are read, and the entries in use."""
+    """Return the arrays to read, and the entries in use."""
     nodes = (program.graph.nodes[i] for i in program.graph.live(program.outputs))
     entries = sorted((str(name), int(index)) for op, name, index in nodes if op == "input")  # pyright: ignore[reportArgumentType]
     return tuple(sorted({name for name, _ in entries})), entries
@@ -117,7 +117,7 @@ def _type(dtype: torch.dtype) -> str:
 
 
 def cpu_source(program: Program, nq: int, dtype: torch.dtype) -> Source:
-    """C++ that computes a vector of samples at a time and distributes the batch over threads."""
+    """Return C++ that computes a vector of samples at a time and distributes the batch over threads."""
     arrays, entries = inputs_of(program)
     load = "\n".join(
         f"    entry[{k}][lane] = in[{arrays.index(name)}][row * {nq} + {index}];"
@@ -140,11 +140,12 @@ def cpu_source(program: Program, nq: int, dtype: torch.dtype) -> Source:
 
 
 STATEMENTS = 500
-"""Statements of a C function; the time that compilers take grows faster than their number."""
+"""Number of statements per C function; compile time grows faster than linearly with it."""
 
 
 def c_function(name: str, program: Program) -> str:
-    """A static C99 function of one state: the arguments, sin q and cos q, then the result.
+    """Return a static C99 function of one state with the arguments, sin q, cos q and the result as
+    parameters.
 
     A long program becomes several functions that pass intermediate values in an array.
     """
@@ -202,7 +203,7 @@ def c_function(name: str, program: Program) -> str:
 
 
 def cuda_source(program: Program, nq: int, dtype: torch.dtype) -> Source:
-    """CUDA C++ that computes one sample per thread."""
+    """Return CUDA C++ that computes one sample per thread."""
     arrays, entries = inputs_of(program)
     text = _CUDA.format(
         type=_type(dtype),
@@ -217,14 +218,14 @@ def cuda_source(program: Program, nq: int, dtype: torch.dtype) -> Source:
 
 
 Kernel = Callable[[Sequence[Tensor], Tensor], None]
-"""Reads contiguous arrays `(B, nq)` and fills the contiguous result `(B, …)`."""
+"""Function that reads contiguous arrays `(B, nq)` and fills the contiguous result `(B, …)`."""
 
 SAMPLES_PER_THREAD = 512
 """Minimum number of samples per thread, to amortise its start-up."""
 
 
 def cpu_kernel(text: str) -> Kernel:
-    """The kernel of a `cpu_source`, run on as many threads as `torch.get_num_threads()`."""
+    """Return the kernel of a `cpu_source`, run on as many threads as `torch.get_num_threads()`."""
     function = load_library(text).kernel
     function.restype = None
     function.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_long, ctypes.c_long]
@@ -239,7 +240,7 @@ def cpu_kernel(text: str) -> Kernel:
 
 
 def cuda_kernel(text: str) -> Kernel:
-    """The kernel of a `cuda_source`, compiled by NVRTC.
+    """Return the kernel of a `cuda_source`, compiled by NVRTC.
 
     Raises:
         MissingDependencyError: this PyTorch cannot compile a CUDA kernel at run time.

@@ -1,1 +1,1 @@
-"""Motions to follow and the task-space controller that follows them."""
+"""Reference motions and the task-space controller that tracks them."""

@@ -1,8 +1,8 @@
 """Information of a motion about the unknown forces of a robot.
 
-The torque is linear in the unknowns, τ = τ₀ + Φ(q, q̇, q̈) θ with θ ~ N(0, U Uᵀ): base parameters of
-the links; for each joint a function of its speed and one of its position, as viscous and dry friction and
-Gaussian bumps; inertia of the drives, after a fit has learned it. After a motion x with noise Σ
+The torque is linear in the unknowns, τ = τ₀ + Φ(q, q̇, q̈) θ with θ ~ N(0, U Uᵀ). These are base parameters
+of the links; for each joint a function of its speed (viscous and dry friction and Gaussian bumps) and one of
+its position (bumps); and the inertia of drives, if a fit has learned it. After a motion x with noise Σ
 
     Cov θ = U (1 + Uᵀ G U)⁻¹ Uᵀ,    G = Σ_i Φ(x_i)ᵀ Σ⁻¹ Φ(x_i),
 
@@ -27,20 +27,20 @@ from forcegp.identification import BaseParameters, base_parameters, parameter_ve
 from forcegp.robot.model import RobotModel
 
 LOOK = 0.1
-"""Time after which a torque is independent of the one before [s]."""
+"""Time after which torque errors are independent [s]."""
 NOISE = 0.01
-"""Standard deviation of the noise of a torque, over the root mean square of the torques of the region."""
+"""Standard deviation of torque noise, relative to the root mean square torque in the region."""
 FRICTION, BUMP = 0.1, 0.03
-"""Prior standard deviations of friction and of each bump, over the same."""
+"""Prior standard deviations of friction and of each bump, relative to the same."""
 SPEEDS, PLACES = 7, 5
-"""Bumps over the range of speeds, and of positions, of a joint."""
+"""Number of bumps over the range of speeds and of positions of a joint."""
 DRY = 0.02
-"""Share of a joint's largest speed over which dry friction changes its sign."""
+"""Speed scale on which dry friction changes sign, relative to the largest speed of a joint."""
 
 States = tuple[Tensor, Tensor, Tensor]
 """Positions, velocities and accelerations `(n, nq)`."""
 Criterion = Callable[[Tensor, "Unknowns"], Tensor]
-"""An objective to minimise, of the information G `(p, p)` of a motion."""
+"""An objective to minimise, as a function of the information G `(p, p)` of a motion."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,10 +48,10 @@ class Unknowns:
     """Unknown forces of a robot before a motion.
 
     Attributes:
-        robot: its kinematics, gravity and drives are used, its links as prior mean.
-        base: combinations of the inertial parameters that act on the motion.
-        low, high, fastest: `(nq,)` the range of positions and speeds that the functions span.
-        region: states `(m, nq)` at which the torque is to be predicted.
+        robot: robot with kinematics, gravity and drives, and links as prior mean.
+        base: combinations of the inertial parameters that affect the motion.
+        low, high, fastest: `(nq,)` range of positions and speeds spanned by the functions.
+        region: states `(m, nq)` at which to predict the torque.
         noise: `(nq,)` standard deviation of a torque sample [N m, N].
         root: U `(p, p)`: the covariance of θ before the motion is U Uᵀ.
     """
@@ -75,12 +75,13 @@ class Unknowns:
         region: States,
         noise: Tensor | None = None,
     ) -> Unknowns:
-        """Unknown forces of a robot without data.
+        """Return the unknown forces of a robot without data.
 
         Args:
-            robot: as in its file.
-            low, high, fastest, region: see the class.
-            noise: by default 1 % of each joint's torques in the region, and 0.1 % of the largest.
+            robot: robot from the file.
+            low, high, fastest, region: as for the class.
+            noise: torque noise; by default 1 % of each joint's torques in the region plus 0.1 % of the
+                largest.
 
         Raises:
             ParameterError: the region is empty.
@@ -107,7 +108,9 @@ class Unknowns:
         return {"links": slice(0, links), "friction": slice(links, drives), "drives": slice(drives, None)}
 
     def basis(self, q: Tensor, qd: Tensor) -> Tensor:
-        """Functions of each joint `(n, nq, k)`: q̇ and tanh q̇ in units, bumps over q̇, bumps over q."""
+        """Return the functions of each joint `(n, nq, k)`: scaled q̇ and tanh q̇, bumps over q̇, bumps over
+        q.
+        """
         u, place = qd / self.fastest, 2.0 * (q - self.low) / (self.high - self.low) - 1.0
         bumps = [
             torch.exp(-0.5 * ((x[..., None] - torch.linspace(-1.0, 1.0, k).to(x)) * (k - 1) / 2.0) ** 2)
@@ -116,44 +119,44 @@ class Unknowns:
         return torch.cat([u[..., None], torch.tanh(u / DRY)[..., None], *bumps], dim=-1)
 
     def columns(self, q: Tensor, qd: Tensor, qdd: Tensor) -> tuple[Tensor, Tensor]:
-        """Regressor Y of the links and Φ `(n, nq, p)` of all parameters at states `(n, nq)`."""
+        """Return the regressor Y of the links and Φ `(n, nq, p)` of all parameters at states `(n, nq)`."""
         Y = regressor(self.robot, q, qd, qdd)
         functions = torch.diag_embed(self.basis(q, qd).movedim(-1, 1)).movedim(1, -1)
         parts = [Y[..., list(self.base.columns)], functions.flatten(-2), torch.diag_embed(qdd)]
         return Y, torch.cat(parts, dim=-1)
 
     def information(self, Phi: Tensor, seconds: float) -> Tensor:
-        """G `(p, p)` of a motion of given duration, from Φ at its states."""
+        """Return G `(p, p)` of a motion of given duration, from Φ at its states."""
         A = (Phi / self.noise[:, None]).flatten(0, 1)
         return A.mT @ A * (seconds / LOOK / len(Phi))
 
     @cached_property
     def wanted(self) -> Tensor:
-        """Mean of φᵀ φ over the region for the row φ of each joint `(nq, p, p)`."""
+        """Mean of φᵀφ over the region for the row φ of each joint `(nq, p, p)`."""
         Phi = self.columns(*self.region)[1].movedim(1, 0)
         return Phi.mT @ Phi / Phi.shape[1]
 
     def covariance_root(self, G: Tensor) -> Tensor:
-        """R with R Rᵀ = Cov θ after a motion."""
+        """Return R with R Rᵀ = Cov θ after a motion."""
         eye = torch.eye(self.root.shape[1], dtype=G.dtype)
         L = torch.linalg.cholesky(eye + self.root.mT @ G @ self.root)
         return torch.linalg.solve_triangular(L, self.root.mT, upper=False).mT
 
     def without_bumps(self) -> Unknowns:
-        """The unknowns with viscous and dry friction as the only functions."""
+        """Return the unknowns with viscous and dry friction as the only functions."""
         known = torch.ones_like(self.root[:, 0])
         functions = known[self.parts["friction"]].view(self.robot.nq, -1)
         functions[:, 2:] = 0.0
         return replace(self, root=known[:, None] * self.root)
 
     def after(self, G: Tensor) -> Unknowns:
-        """The unknowns after a motion with information G."""
+        """Return the unknowns after a motion with information G."""
         return replace(self, root=self.covariance_root(G))
 
     def torque_std(self) -> Mapping[str, Tensor]:
-        """Root mean square over the region of the standard deviation of the torque `(nq,)` [N m, N].
+        """Return the root mean square of the torque standard deviation over the region, `(nq,)` [N m, N].
 
-        By `all` parameters, and by the links or the friction alone.
+        The keys are `all` parameters, and the links or the friction alone.
         """
         Phi = self.columns(*self.region)[1]
         parts = {"all": slice(None), **self.parts}
@@ -166,18 +169,18 @@ def _squared(X: Tensor) -> Tensor:
 
 
 def rigid_torque(robot: RobotModel, q: Tensor, qd: Tensor, qdd: Tensor, Y: Tensor | None = None) -> Tensor:
-    """Torque of a motion `(n, nq)` according to the robot file: Y π + armature q̈ − Q_D [N m, N]."""
+    """Return the torque of a motion `(n, nq)` from the robot file, Y π + armature q̈ − Q_D [N m, N]."""
     Y = regressor(robot, q, qd, qdd) if Y is None else Y
     return Y @ parameter_vector(robot) + robot.armature * qdd - damping_force(robot, qd)
 
 
 def a_optimal(G: Tensor, unknowns: Unknowns) -> Tensor:
-    """Mean over joints of the log standard deviation of the torque, root mean square over the region."""
+    """Return the mean over joints of the log torque deviation (root mean square over the region)."""
     return _log_std(unknowns.covariance_root(G), unknowns)
 
 
 def v_optimal(G: Tensor, unknowns: Unknowns) -> Tensor:
-    """The same by links, viscous and dry friction, which are all that least squares identify."""
+    """Return `a_optimal` for links, viscous and dry friction only, which least squares can identify."""
     return _log_std(unknowns.without_bumps().covariance_root(G), unknowns)
 
 
@@ -186,7 +189,7 @@ def _log_std(R: Tensor, unknowns: Unknowns) -> Tensor:
 
 
 def d_optimal(G: Tensor, unknowns: Unknowns) -> Tensor:
-    """½ log of det Cov θ relative to its prior, per parameter."""
+    """Return ½ log of det Cov θ relative to its prior, per parameter."""
     eye = torch.eye(unknowns.root.shape[1], dtype=G.dtype)
     return -0.5 * torch.logdet(eye + unknowns.root.mT @ G @ unknowns.root) / len(eye)
 

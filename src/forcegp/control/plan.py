@@ -1,7 +1,7 @@
-"""The plan of a motion: reference, posture, orientation and start, drawn before anything moves.
+"""The plan of a motion: reference, posture, orientation and initial state, drawn before the simulation.
 
-`MotionConfig` defines path, speed, pressing force and control of the tool. Inverse
-kinematics finds the joint positions that put the tool at a pose.
+`MotionConfig` defines path, speed, pressing force and control of the tool. Inverse kinematics finds the joint
+positions for a pose of the tool.
 """
 
 from __future__ import annotations
@@ -42,23 +42,23 @@ def check_setting(name: str, valid: bool, expected: str, got: object) -> None:
 
 @dataclass(frozen=True)
 class MotionConfig:
-    """A random motion of the tool over a surface, or in free space; the defaults are the paper's task.
+    """A random motion of the tool over a surface or in free space, by default the paper's task.
 
     Args:
-        duration: length of the motion [s].
+        duration: duration of the motion [s].
         dt: sampling period of the motion and of the controller [s].
         center: centre of the rectangle, moved onto the surface if there is a contact [m].
         size: side lengths of the rectangle, ahead and across [m].
         travel_time: time between two waypoints [s].
-        max_acceleration: of the end-effector along a line [m/s²].
+        max_acceleration: maximum acceleration of the end-effector along a line [m/s²].
         lift_probability: probability that a waypoint lies above the surface; 0 stays in contact.
         lift_height: range of heights of such a waypoint [m].
         pressing_force: range of the force on the surface, drawn for each line [N].
-        elbow_swing: how far the posture in the null space varies from line to line [rad].
-        tool_turn: rotation of the tool about the surface's normal, for better reach [rad].
+        elbow_swing: variation of the null-space posture between lines [rad].
+        tool_turn: rotation of the tool about the surface normal, for better reach [rad].
         gains: gains of the controller.
-        torque_limit: one per joint, or `None` for the robot's own limits [N m].
-        frame, point: the tool without contact; by default the last frame of the robot.
+        torque_limit: torque limits, one per joint [N m], or `None` for the limits of the robot.
+        frame, point: tool frame and point without contact; by default the last frame of the robot.
 
     Raises:
         ParameterError: a value is out of range; the message names it.
@@ -102,15 +102,15 @@ class MotionConfig:
 
 
 POSE_TOLERANCE = 1e-10
-"""A pose is reached when no component is off by more (metres, or the sine of an angle)."""
+"""Largest error of a component of a reached pose (metres, or the sine of an angle)."""
 ITERATIONS = 150
-"""Steps from each start; those that reach the pose at all do so in about thirty."""
+"""Maximum number of steps from each start; successful ones need about thirty."""
 MAX_STEP = 0.3
-"""Largest turn of a joint in one step [rad]; the linear model of the pose is not good for more."""
+"""Largest rotation of a joint in one step [rad], within the range of the linear model of the pose."""
 DAMPING = 0.1
-"""Damping of the squares in proportion to the squared error, so that it fades as the pose is reached."""
+"""Damping of least squares relative to the squared error; it vanishes as the pose is reached."""
 LEANING = 0.1
-"""Share of the way to the preferred joint positions that a step takes in the null space of the pose."""
+"""Fraction of the way to the preferred joint positions per step in the null space of the pose."""
 
 
 def inverse_kinematics(
@@ -122,11 +122,11 @@ def inverse_kinematics(
     starts: Tensor,
     near: JointVector,
 ) -> JointVector:
-    """Joint positions `(nq,)` that put a point of a frame at a pose, by damped least squares from `starts`.
+    """Return joint positions `(nq,)` at which a point of a frame has a pose, by damped least squares.
 
     Each step is Jᵀ(J Jᵀ + μ I)⁻¹ e; the first half of the steps also move towards `near` `(nq,)` in the null
-    space of J, and the solution from `starts` `(k, nq)` closest to it is returned. The pose in the world is
-    `(3,)` [m] and `(3, 3)`; for an arm with fewer than six joints only the position is matched.
+    space of J, and the solution closest to `near` from all `starts` `(k, nq)` is returned. The pose in the
+    world is `(3,)` [m] and `(3, 3)`; with fewer than six joints, only the position is matched.
 
     Raises:
         NumericalError: no start leads to the pose within the joint limits.
@@ -154,10 +154,10 @@ def inverse_kinematics(
 def _pose_error(
     robot: RobotModel, q: Tensor, index: int, x: Tensor, position: Tensor, rotation: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Pose error `(k, 6)`, or of the position `(k, 3)`, its Jacobian, and whether the axes agree.
+    """Return the error of pose `(k, 6)` or position `(k, 3)`, its Jacobian, and whether the axes agree.
 
-    The sine in the orientation error also vanishes half a turn away, where the trace of the relative
-    rotation is −1 and not 3.
+    The sine in the orientation error also vanishes after half a turn, for which the trace of the relative
+    rotation is −1 instead of 3.
     """
     poses = kinematics.link_poses(robot, q)
     reached, origin = kinematics.pose_of_frame(robot, poses, index)
@@ -170,7 +170,7 @@ def _pose_error(
 
 
 def _damped_step(J: Tensor, error: Tensor, leaning: Tensor) -> Tensor:
-    """Jᵀ(J Jᵀ + μ I)⁻¹(e − J l) + l."""
+    """Return Jᵀ(J Jᵀ + μ I)⁻¹(e − J l) + l."""
     damping = DAMPING * (error * error).sum(-1) + torch.finfo(error.dtype).eps
     missing = (error - (J @ leaning[..., None])[..., 0])[..., None]
     damped = damping[..., None, None] * torch.eye(min(J.shape[-2:]), dtype=J.dtype)
@@ -180,7 +180,8 @@ def _damped_step(J: Tensor, error: Tensor, leaning: Tensor) -> Tensor:
 
 
 def tool_rotation(normal: Vector3, ahead: Vector3, tool_axis: Vector3) -> Rotation:
-    """Axes `(3, 3)` of a frame with its `tool_axis` into the surface, rotated by π about the side axis.
+    """Return the axes `(3, 3)` of a frame with `tool_axis` into the surface, after half a turn about the side
+    axis.
 
     `normal` and `ahead` are the unit normal out of the surface and a unit tangent, `(3,)` each.
     """
@@ -189,7 +190,7 @@ def tool_rotation(normal: Vector3, ahead: Vector3, tool_axis: Vector3) -> Rotati
 
 
 STARTS = 64
-"""Random joint positions that inverse kinematics starts from, around the middle of the limits."""
+"""Number of random initial joint positions for inverse kinematics, around the middle of the limits."""
 
 
 @dataclass(frozen=True)
@@ -197,10 +198,10 @@ class Plan:
     """Reference of the controller.
 
     Attributes:
-        contacts: names of the tool's contacts, none in free space.
-        frame, point: the tool point.
-        reference: the motion of the tool point.
-        targets: the controller's targets, `(n, …)`, one per sample.
+        contacts: names of the tool's contacts, empty in free space.
+        frame, point: frame and point of the tool.
+        reference: motion of the tool point.
+        targets: targets of the controller, `(n, …)`, one per sample.
         start: `(nq,)` joint positions at the first waypoint.
     """
 
@@ -212,7 +213,7 @@ class Plan:
     start: Tensor
 
     def command(self, eom: Equations, q: Tensor, qd: Tensor, k: int | Tensor, gains: Gains) -> Tensor:
-        """Motor torque `(*batch, nq)` towards the targets of samples `(*batch,)`, not limited [N m]."""
+        """Return the unlimited motor torque `(*batch, nq)` for the targets of samples `(*batch,)` [N m]."""
         target = type(self.targets)(*(values[k] for values in self.targets))
         if isinstance(target, JointTarget):
             return joint_torque(eom, q, qd, target, gains)
@@ -220,7 +221,7 @@ class Plan:
         return control_torque(tool, eom, q, qd, target, self.press(eom), gains)
 
     def press(self, eom: Equations) -> Tensor:
-        """Generalized unit normal force on each of the tool's contacts, summed, Σ Jᵀn/|n| `(*batch, nq)`."""
+        """Return the sum of generalized unit normal forces on the tool, Σ Jᵀn/|n| `(*batch, nq)`."""
         total = 0.0 * eom.Q_C
         for name in self.contacts:
             at = eom.contact_points[name]
@@ -231,11 +232,11 @@ class Plan:
 def make_plan(system: ConstrainedSystem, config: MotionConfig, generator: torch.Generator) -> Plan:
     """Draw a motion of the tool over the surface of the system's first contact, or in free space.
 
-    The tool's axis points from the origin of its frame to the middle of the contacts that the frame carries.
-    An arm with fewer than six joints follows the position alone.
+    The tool axis points from the origin of its frame to the centre of the frame's contacts. An arm with fewer
+    than six joints follows only the position.
 
     Raises:
-        NumericalError: the rectangle's centre or the first waypoint is out of reach.
+        NumericalError: the centre of the rectangle or the first waypoint is out of reach.
     """
     robot = system.robot
     touching = [c for c in system.contacts if isinstance(c, SurfaceContact)]
@@ -278,7 +279,7 @@ def make_plan(system: ConstrainedSystem, config: MotionConfig, generator: torch.
 
 
 def joint_plan(system: ConstrainedSystem, config: MotionConfig, t: Tensor, motion: JointTarget) -> Plan:
-    """The plan that follows a motion of the joints `(n, nq)` at times t `(n,)`, interpolated linearly."""
+    """Return a plan that follows a joint motion `(n, nq)` at times t `(n,)` with linear interpolation."""
     robot = system.robot
     touching = [c for c in system.contacts if isinstance(c, SurfaceContact)]
     frame, point = (touching[0].frame, touching[0].point) if touching else (config.frame, config.point)
@@ -298,14 +299,14 @@ def joint_plan(system: ConstrainedSystem, config: MotionConfig, t: Tensor, motio
 
 
 def _tool_axis(point: Tensor) -> Tensor:
-    """The direction of the tool point in its frame, or the frame's z axis for a point at its origin."""
+    """Return the direction of the tool point in its frame, or the z axis for a point at the origin."""
     if float(torch.linalg.vector_norm(point)) == 0.0:
         return torch.tensor([0.0, 0.0, 1.0], dtype=point.dtype)
     return torch.nn.functional.normalize(point, dim=-1)
 
 
 def _draw_push(reference: Reference, config: MotionConfig, generator: torch.Generator) -> Tensor:
-    """`(n,)` force into the surface, one draw per line, zero on lines off the surface."""
+    """Draw the force into the surface `(n,)`, one value per line, zero on lines off the surface."""
     low, high = config.pressing_force
     draws = torch.rand(len(reference.travel_time), dtype=torch.float64, generator=generator)
     return (low + (high - low) * draws).to(reference.t.dtype)[reference.segment] * reference.on_surface

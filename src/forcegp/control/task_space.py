@@ -1,7 +1,7 @@
-"""Task-space inverse dynamics control with null-space control of the redundant degrees of freedom.
+"""Task-space inverse dynamics control with null-space control of redundant degrees of freedom.
 
-The task is the pose of the tool, or its position alone for an arm with fewer than six joints. A redundant arm
-moves its elbow in the null space of the task's Jacobian, which does not affect the task's error dynamics
+The task is the pose of the tool, or only its position for an arm with fewer than six joints. A redundant arm
+moves its elbow in the null space of the task Jacobian, which does not affect the error dynamics of the task
 (Siciliano et al., *Robotics: Modelling, Planning and Control*, p. 347 and section 3.5.1).
 """
 
@@ -18,19 +18,19 @@ from forcegp.kinematics import PointMotion
 
 POSE_ROWS, POSITION_ROWS = 6, 3
 SINGULAR = 1e-3
-"""Below this smallest pivot of √(J Jᵀ) the task asks for joint speeds a thousand times its own."""
+"""Smallest pivot of √(J Jᵀ), below which joint speeds exceed task speeds a thousandfold."""
 
 
 @dataclass(frozen=True)
 class Gains:
-    """Feedback gains of the controller, as stiffness k_P [1/s²] and damping k_D [1/s] of each error.
+    """Feedback gains of the controller, with stiffness k_P [1/s²] and damping k_D [1/s] for each error.
 
     Critical damping is k_D = 2 √k_P.
 
     Args:
-        position_stiffness, position_damping: of the tool's position.
-        orientation_stiffness, orientation_damping: of the tool's orientation.
-        posture_stiffness, posture_damping: of the joints, in the null space of the task.
+        position_stiffness, position_damping: gains for the tool position.
+        orientation_stiffness, orientation_damping: gains for the tool orientation.
+        posture_stiffness, posture_damping: gains for the joints in the null space of the task.
     """
 
     position_stiffness: float = 100.0
@@ -45,8 +45,8 @@ class Target(NamedTuple):
     """Target of the controller at an instant.
 
     Attributes:
-        position, velocity, acceleration: `(*batch, 3)` of the tool point [m], [m/s], [m/s²].
-        rotation: `(*batch, 3, 3)` constant axes of the tool's frame.
+        position, velocity, acceleration: `(*batch, 3)` motion of the tool point [m], [m/s], [m/s²].
+        rotation: `(*batch, 3, 3)` constant axes of the tool frame.
         posture: `(*batch, nq)` preferred joint positions in the null space [rad].
         push: `(*batch,)` desired normal force of the tool on the surface [N].
     """
@@ -68,12 +68,12 @@ class JointTarget(NamedTuple):
 
 
 def task_rows(nq: int) -> slice:
-    """The rows of [ω; ṗ] that an arm of nq joints can follow: all for six joints, ṗ for fewer."""
+    """Return the rows of [ω; ṗ] that an arm with nq joints can follow: all for six joints, ṗ for fewer."""
     return slice(0 if nq >= POSE_ROWS else POSITION_ROWS, POSE_ROWS)
 
 
 def orientation_error(rotation: Tensor, target: Tensor) -> Tensor:
-    """e_O = ½ Σᵢ rᵢ × rᵢᵈ of axes `(*batch, 3, 3)`: sin(angle) times the axis of the turn, `(*batch, 3)`.
+    """Return e_O = ½ Σᵢ rᵢ × rᵢᵈ of axes `(*batch, 3, 3)`: sin(angle) times the rotation axis, `(*batch, 3)`.
 
     The sum is the vector of the skew part of R_d Rᵀ, in world axes (Siciliano et al., eq. 3.98).
     """
@@ -83,7 +83,7 @@ def orientation_error(rotation: Tensor, target: Tensor) -> Tensor:
 
 
 def task_acceleration(tool: PointMotion, target: Target, gains: Gains) -> Tensor:
-    """[ω̇; p̈] `(*batch, 6)` that makes both errors damped oscillators, ë + k_D ė + k_P e = 0."""
+    """Return [ω̇; p̈] `(*batch, 6)` for which both errors obey ë + k_D ė + k_P e = 0."""
     omega, velocity = tool.twist[..., :3], tool.twist[..., 3:]
     turning = (
         gains.orientation_stiffness * orientation_error(tool.rotation, target.rotation)
@@ -98,13 +98,14 @@ def task_acceleration(tool: PointMotion, target: Target, gains: Gains) -> Tensor
 
 
 def joint_acceleration(tool: PointMotion, task: Tensor, posture: Tensor) -> Tensor:
-    """y = J⁺(a − J̇q̇) + (I − J⁺J) y₀: the task's acceleration, and the posture's in its null space.
+    """Return y = J⁺(a − J̇q̇) + (I − J⁺J) y₀, with the posture acceleration in the null space of the task.
 
-    a `(*batch, 6)` is the task's and y₀ `(*batch, nq)` the posture's. J are the rows of the tool's Jacobian
-    that the arm can follow (`task_rows`); an arm with fewer joints follows in the least-squares sense.
+    a `(*batch, 6)` is the task acceleration and y₀ `(*batch, nq)` the posture acceleration. J contains the
+    rows of the tool Jacobian that the arm can follow (`task_rows`), in the least-squares sense with fewer
+    joints.
 
     Raises:
-        NumericalError: the arm is in a singular pose, so the task cannot be reached.
+        NumericalError: the arm is in a singular pose.
     """
     nq = tool.jacobian.shape[-1]
     rows = task_rows(nq)
@@ -131,19 +132,19 @@ def control_torque(
     press: Tensor,
     gains: Gains,
 ) -> Tensor:
-    """Motor torque Q_u = M y − Q_K − Q_n F `(*batch, nq)` of inverse dynamics control, not limited [N m].
+    """Return the unlimited motor torque Q_u = M y − Q_K − Q_n F of inverse dynamics control [N m].
 
     Args:
         tool: the tool at the state.
         eom: the equations of motion at the state; M and Q_K = Q_C + Q_G + Q_D are used.
-        q, qd: `(*batch, nq)` the state.
-        target: desired motion; F is its `push`.
-        press: Q_n `(*batch, nq)`, Jᵀn of unit normal forces at the actual tool position, summed over its
-            contacts; along the normal of the reference, the force would push the tool off a convex surface.
+        q, qd: `(*batch, nq)` positions and velocities.
+        target: desired motion, with `push` as F.
+        press: Q_n `(*batch, nq)`, Jᵀn for unit normal forces at the actual tool position, summed over its
+            contacts; a force along the normal of the reference would push the tool off a convex surface.
         gains: feedback gains.
 
     Raises:
-        NumericalError: the arm is singular.
+        NumericalError: the arm is in a singular pose.
     """
     posture = gains.posture_stiffness * (target.posture - q) - gains.posture_damping * qd
     y = joint_acceleration(tool, task_acceleration(tool, target, gains), posture)
@@ -151,6 +152,6 @@ def control_torque(
 
 
 def joint_torque(eom: Any, q: Tensor, qd: Tensor, target: JointTarget, gains: Gains) -> Tensor:
-    """Motor torque M (q̈_d + k_D ė + k_P e) − Q_K `(*batch, nq)` of joints, with the gains of positions."""
+    """Return the motor torque M (q̈_d + k_D ė + k_P e) − Q_K `(*batch, nq)`, with the position gains."""
     y = target.qdd + gains.position_damping * (target.qd - qd) + gains.position_stiffness * (target.q - q)
     return (eom.M @ y[..., None])[..., 0] - eom.Q_K

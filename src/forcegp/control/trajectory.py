@@ -1,8 +1,8 @@
 """Reference motions of the end-effector: random points joined by straight lines (section 5.2 of the paper).
 
-Points are drawn in a chart (u, v, h): u and v along the sides of a rectangle that touches the surface at its
-centre, h the height above the surface. A line of the chart is traversed with a trapezoidal velocity profile
-(Siciliano et al., *Robotics*, section 4.2.1) and then mapped onto the surface.
+Points are drawn in a chart (u, v, h), with u and v along the sides of a rectangle that touches the surface at
+its centre, and the height h above the surface. A line in the chart is traversed with a trapezoidal velocity
+profile (Siciliano et al., *Robotics*, section 4.2.1) and then mapped onto the surface.
 """
 
 from __future__ import annotations
@@ -17,7 +17,7 @@ from forcegp.constraints.surface import Plane, Surface
 from forcegp.errors import ForceGPError
 
 PROJECTION_STEPS = 8
-"""Newton steps onto a surface; one is exact for a signed distance, each further one doubles the digits."""
+"""Number of Newton steps onto a surface; one is exact for a signed distance, each more doubles the digits."""
 
 
 class Trapezoid(NamedTuple):
@@ -25,9 +25,9 @@ class Trapezoid(NamedTuple):
 
     Attributes:
         length: `(*batch,)` distance travelled [m].
-        travel_time: `(*batch,)` [s].
+        travel_time: `(*batch,)` travel time [s].
         blend_time: `(*batch,)` duration of acceleration and of deceleration [s].
-        acceleration: `(*batch,)` during the blends [m/s²].
+        acceleration: `(*batch,)` acceleration during the blends [m/s²].
     """
 
     length: Tensor
@@ -36,7 +36,9 @@ class Trapezoid(NamedTuple):
     acceleration: Tensor
 
     def at(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Distance, speed and acceleration at time t since the start of the segment, held after its end."""
+        """Return distance, speed and acceleration at time t from the start of the segment, held after its
+        end.
+        """
         t = torch.minimum(t.clamp(min=0.0), self.travel_time)
         remaining = self.travel_time - t
         a, blend = self.acceleration, self.blend_time
@@ -53,7 +55,7 @@ class Trapezoid(NamedTuple):
 
 
 def trapezoid(length: Tensor, travel_time: float, max_acceleration: float) -> Trapezoid:
-    """Profiles of lengths d `(*batch,)` [m] and travel time T that accelerate with the maximum, a.
+    """Return the profiles for lengths d `(*batch,)` [m] and travel time T with the maximum acceleration a.
 
     The blend time is t_c = T/2 − ½ √(T² − 4 d/a). If the acceleration a is too small to cover d in T, the
     `travel_time` of the result is 2 √(d/a). Source: Siciliano et al., eqs. 4.7 and 4.8.
@@ -86,9 +88,9 @@ class Chart:
 
     @staticmethod
     def about(center: Tensor, surface: Surface | None) -> Chart:
-        """The chart about the point of the surface closest to `center`; u points along the world's x axis.
+        """Return the chart about the surface point closest to `center`, with u along the world x axis.
 
-        In free space the normal is the world's z axis.
+        In free space, the normal is the world z axis.
         """
         normal = torch.eye(3, dtype=center.dtype)[2]
         if surface is not None:
@@ -100,7 +102,7 @@ class Chart:
         return Chart(center, axes, None if isinstance(surface, Plane) else surface)
 
     def point(self, w: Tensor) -> Tensor:
-        """World position `(*batch, 3)` of chart coordinates w `(*batch, 3)`."""
+        """Return the world position `(*batch, 3)` of chart coordinates w `(*batch, 3)`."""
         if self.surface is None:
             return self.center + w @ self.axes
         foot = project(self.surface, self.center + w[..., :2] @ self.axes[:2])
@@ -108,7 +110,7 @@ class Chart:
         return foot + w[..., 2:] * normal
 
     def motion(self, w: Tensor, wd: Tensor, wdd: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Position, velocity and acceleration in the world of a motion of the chart, `(n, 3)` each."""
+        """Return position, velocity and acceleration in the world of a motion in the chart, `(n, 3)` each."""
         if self.surface is None:
             return self.point(w), wd @ self.axes, wdd @ self.axes
 
@@ -125,7 +127,7 @@ class Chart:
 
 
 def project(surface: Surface, p: Tensor) -> Tensor:
-    """The point of a surface reached from p `(*batch, 3)` along the gradient, p ← p − c ∇c/|∇c|²."""
+    """Return the point of a surface reached from p `(*batch, 3)` along the gradient, p ← p − c ∇c/|∇c|²."""
     for _ in range(PROJECTION_STEPS):
         gradient = surface.gradient(p)
         p = p - (surface.value(p) / (gradient * gradient).sum(-1))[..., None] * gradient
@@ -137,12 +139,12 @@ class Reference:
     """A sampled reference motion of the end-effector.
 
     Attributes:
-        t: `(n,)` [s].
-        position, velocity, acceleration: `(n, 3)` in the world [m], [m/s], [m/s²].
+        t: `(n,)` time [s].
+        position, velocity, acceleration: `(n, 3)` motion in the world [m], [m/s], [m/s²].
         segment: `(n,)` index of the current line.
-        on_surface: `(n,)` bool, whether that line lies on the surface.
+        on_surface: `(n,)` bool, true if the line is on the surface.
         waypoints: `(segments + 1, 3)` end points of the lines, in the world [m].
-        travel_time: `(segments,)` [s].
+        travel_time: `(segments,)` travel time of each line [s].
         lengthened: number of segments slowed down to respect the maximum acceleration.
     """
 
@@ -164,7 +166,7 @@ def draw_waypoints(
     lift_probability: float,
     generator: torch.Generator,
 ) -> Tensor:
-    """Chart coordinates `(count, 3)` [m]: uniform in a rectangle, some lifted to a uniform height."""
+    """Draw chart coordinates `(count, 3)` [m] uniformly in a rectangle, some lifted to a uniform height."""
     draws = torch.rand(count, 4, dtype=torch.float64, generator=generator)
     across = (draws[:, :2] - 0.5) * torch.tensor(size, dtype=torch.float64)
     low, high = lift_height
@@ -175,10 +177,10 @@ def draw_waypoints(
 def straight_lines(
     chart: Chart, waypoints: Tensor, t: Tensor, travel_time: float, max_acceleration: float
 ) -> Reference:
-    """Lines between waypoints `(k, 3)` of a chart, with trapezoidal velocity profiles, at times t `(n,)` ≥ 0.
+    """Return lines between waypoints `(k, 3)` of a chart with trapezoidal velocity, at times t `(n,)` ≥ 0.
 
-    Speed and acceleration are those of the chart; on a plane and in free space, of the end-effector too. The
-    last waypoint is held after the end; travel time and acceleration are those of `trapezoid`.
+    Speed and acceleration refer to the chart and, on a plane or in free space, also to the end-effector. The
+    last waypoint is held after the end; travel time and acceleration are as in `trapezoid`.
     """
     lines = waypoints.diff(dim=0)
     length = torch.linalg.vector_norm(lines, dim=-1)

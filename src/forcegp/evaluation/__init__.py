@@ -1,4 +1,4 @@
-"""Quality of a model: errors and uncertainty by joint, trivial predictors beside it, and a verdict."""
+"""Quality of a model: errors and uncertainty by joint, comparison with trivial predictors, and a verdict."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from forcegp.models.base import FittedModel, Predictor
 __all__ = ["Evaluation", "evaluate"]
 
 GRAVITY_ALONE, LEAST_RESPONSE = 0.99, 0.5
-"""Gravity's share of the torque from which data test little more; least share of an added torque to act."""
+"""Fraction of torque due to gravity above which data test little else; least fraction of an added torque."""
 
 
 @dataclass(frozen=True)
@@ -45,25 +45,25 @@ class Evaluation:
     """Scores of a model's predictions on a data set.
 
     Attributes:
-        kind: of the model.
+        kind: kind of the model.
         samples: number of predictions.
-        joint_names: the joints, in the order of all scores by joint.
-        noisy: errors against the measured accelerations.
-        clean: errors against the noise-free ones, `None` if they are not logged.
+        joint_names: joints in the order of the scores by joint.
+        noisy: errors against measured accelerations.
+        clean: errors against noise-free accelerations, `None` if they are not logged.
         uncertainty: coverage and density, `None` without a covariance or with unknown noise.
         residual, residual_max: mean and largest |A q̈ − b| of the predicted mean over closed contacts
             [m/s²], `None` without contacts.
-        noise_std: assumed for the measured accelerations, one per joint.
-        seconds_per_state: time to predict, including the covariance if there is one.
+        noise_std: assumed noise of the measured accelerations, one per joint.
+        seconds_per_state: prediction time, including the covariance if there is one.
         predictors: errors by joint of the model and of the trivial predictors.
-        verdicts: the model against each trivial predictor; empty if there are too few samples.
-        multipliers: λ against the logged one, for models of forces and logs that contain it.
+        verdicts: comparison of the model with each trivial predictor; empty if there are too few samples.
+        multipliers: comparison of λ with logged values, for models of forces and logs that contain it.
         sensed: the same with the log's force sensor as a measurement at each state, for models fitted to it.
-        gravity: share R² of the torque explained by gravity alone; if it is close to 1, the log hardly tests
-            a model.
-        response: share by joint of an added torque that acts: 1 for a rigid robot, 0 for a model that has
-            learned the controller; `None` without free motion.
-        motion: in open loop, for models of forces and data in the order of time.
+        gravity: fraction R² of the torque explained by gravity alone; close to 1, the log hardly tests a
+            model.
+        response: fraction by joint of an added torque that takes effect: 1 for a rigid robot, 0 for a model
+            that has learned the controller; `None` without free motion.
+        motion: open-loop motion, for models of forces and data in time order.
     """
 
     kind: str
@@ -86,7 +86,7 @@ class Evaluation:
 
     @property
     def verdict(self) -> str:
-        """Torque explained beyond gravity, motion in open loop and force in contact, in one sentence."""
+        """Verdict in one sentence: explained torque beyond gravity, open-loop motion and contact force."""
         parts, shares = [], {p.name: p.beyond_gravity for p in self.predictors}
         if (share := shares.pop("model", None)) is not None:
             others = [
@@ -111,7 +111,7 @@ class Evaluation:
 
     @property
     def poor(self) -> bool:
-        """Whether there are doubts, or the model explains no torque, or less than the robot file."""
+        """Whether there are doubts, or the model explains no torque or less than the robot file."""
         shares = {p.name: x for p in self.predictors if (x := p.beyond_gravity) is not None}
         model = shares.get("model", 1.0)
         return bool(self.doubts) or model <= 0.0 or model < shares.get("robot file", 0.0)
@@ -123,7 +123,7 @@ class Evaluation:
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """Reasons not to trust the numbers."""
+        """Reasons to doubt the scores."""
         found = []
         if self.gravity is not None and self.gravity > GRAVITY_ALONE:
             share = f"{100.0 * self.gravity:.1f} %"
@@ -139,13 +139,13 @@ class Evaluation:
         return tuple(found)
 
     def to_dict(self) -> dict[str, Any]:
-        """All scores as JSON-compatible values."""
+        """Return all scores as JSON-compatible values."""
         texts = [verdict.text() for verdict in self.verdicts]
         said = {"verdict": self.verdict, "comparison": self.comparison, "doubts": self.doubts}
         return asdict(self) | said | {"verdict_texts": texts}
 
     def summary(self) -> dict[str, float | int | str | None]:
-        """The scores over all joints, by name."""
+        """Return the scores over all joints, by name."""
         clean, spread = self.clean, self.uncertainty
         return {
             "kind": self.kind,
@@ -177,15 +177,15 @@ def evaluate(
     Args:
         model: a fitted model.
         data: states and measured accelerations, and noise-free ones as `qdd_clean` if known.
-        train: data to fit the trivial predictors to; by default each half of `data` (in order of its rows) is
+        train: data for fitting the trivial predictors; by default, each half of `data` (in row order) is
             predicted by those fitted to the other half.
-        compare: whether to fit the trivial predictors at all.
+        compare: whether to fit the trivial predictors.
         system: robot and contacts for the constraint residual, the torque errors and the trivial
             predictors; by default those of the model before learning.
         progress: called with the number of states predicted and their total number.
 
     Raises:
-        ForceGPError: the data are empty, their joints are not the robot's, or they lack a contact.
+        ForceGPError: the data are empty, have other joints than the robot, or lack a contact.
     """
     if len(data) == 0:
         raise DataError("there is nothing to evaluate on", expected="at least one sample", got="none")
@@ -235,7 +235,7 @@ def _predictors(
     train: Dataset | None,
     rest: Tensor,
 ) -> tuple[PredictorScores, ...]:
-    """Errors by joint of the model and of the trivial predictors, in torque and in acceleration."""
+    """Return torque and acceleration errors by joint of the model and of the trivial predictors."""
     moving = moving_joints(data.qd)
 
     def score(name: str, error: Tensor, torque: Tensor, density: float | None) -> PredictorScores:
@@ -256,7 +256,7 @@ def _predictors(
 def _trivial(
     system: ConstrainedSystem, data: Dataset, train: Dataset | None
 ) -> dict[str, tuple[Tensor, Tensor, Tensor]]:
-    """Errors, errors as torques and standard deviations, `(n, nq)`, never on their own training data."""
+    """Return errors, torque errors and standard deviations, `(n, nq)`, on data not used for training."""
     half = len(data) // 2
     parts = [(train, data)] if train is not None else [(data[half:], data[:half]), (data[:half], data[half:])]
     errors: dict[str, list[tuple[Tensor, Tensor, Tensor]]] = {}

@@ -1,8 +1,8 @@
-"""Criteria of a good model: torque explained beyond gravity, motion in open loop, response to a torque.
+"""Criteria for a good model: explained torque beyond gravity, open-loop motion, response to a torque.
 
-A torque error is that of the inverse dynamics, M(q)(predicted − measured q̈) with the mass matrix of the
-predictor's robot. Of the torque beyond gravity, a predictor of forces explains R² = 1 − Σ (N M Δq̈)² / Σ (N
-(τ − τ_g))². Gravity and constant τ_g are fitted to the torques, and N = 1 − A⁺A removes the constraint force.
+The torque error is that of inverse dynamics, M(q)(predicted − measured q̈), with the mass matrix of the
+predictor's robot. The explained fraction of the torque beyond gravity is R² = 1 − Σ (N M Δq̈)² / Σ (N (τ −
+τ_g))². Gravity and constant τ_g are fitted to the torques, and N = 1 − A⁺A removes the constraint force.
 """
 
 from __future__ import annotations
@@ -24,26 +24,26 @@ from forcegp.rollout.comparison import Comparison, compare
 from forcegp.rollout.forward import RolloutOptions
 
 HORIZONS = (0.1, 0.3, 1.0)
-"""Times at which motions in open loop are compared [s]."""
+"""Times at which open-loop motions are compared [s]."""
 STARTS, FEWEST_STARTS = 12, 3
-"""Starts of these motions, spread evenly over the data, at most and at least."""
+"""Maximum and minimum number of evenly spaced starts of these motions."""
 FAINT = 0.1
-"""A joint counts if its torque beyond gravity, or its motion, is this share of that of the largest."""
+"""Smallest torque beyond gravity, or motion, of a scored joint, relative to the largest."""
 RESPONSE_SAMPLES, FEWEST_FREE = 500, 20
-"""States at which a torque is added, at most and at least."""
+"""Maximum and minimum number of states at which a torque is added."""
 GRAVITY_SAMPLES, RIDGE = 4000, 1e-9
-"""Samples that gravity is fitted to, and the relative ridge that holds what they do not determine."""
+"""Number of samples for fitting gravity, and relative ridge for undetermined directions."""
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Motion in open loop from logged states under the logged torques.
+    """Open-loop motion from logged states under the logged torques.
 
     Attributes:
         horizons: times after the start [s].
         starts: number of starts.
-        model, robot_file: root mean square error of the joint positions over that of their change since the
-            start, median over the joints that move; `None` once a motion diverged.
+        model, robot_file: root mean square error of the joint positions, relative to their change since the
+            start, median over the moving joints; `None` after a divergence.
     """
 
     horizons: tuple[float, ...]
@@ -54,7 +54,7 @@ class Motion:
 
 @torch.no_grad()
 def beyond_gravity(system: ConstrainedSystem, data: Dataset) -> tuple[Tensor, float]:
-    """N (τ − τ_g) `(n, nq)`, and the share R² of the variance of the torques explained by gravity alone."""
+    """Return N (τ − τ_g) `(n, nq)`, and the fraction R² of torque variance explained by gravity alone."""
     scale = data.tau.std(0).clamp(min=1e-9)
 
     def rows(part: Dataset) -> tuple[Tensor, Tensor]:
@@ -77,8 +77,8 @@ def beyond_gravity(system: ConstrainedSystem, data: Dataset) -> tuple[Tensor, fl
 
 
 def explained(error: Tensor, rest: Tensor) -> tuple[float | None, ...]:
-    """R² by joint of torque errors relative to the torque beyond gravity, `(n, nq)` each; `None` if that is
-    `FAINT`.
+    """Return R² by joint of torque errors relative to the torque beyond gravity, `(n, nq)` each; `None` if
+    the latter is `FAINT`.
     """
     left, whole = (error**2).sum(0), (rest**2).sum(0)
     shares, seen = (1.0 - left / whole).tolist(), (whole > FAINT**2 * whole.max()).tolist()
@@ -87,10 +87,11 @@ def explained(error: Tensor, rest: Tensor) -> tuple[float | None, ...]:
 
 @torch.no_grad()
 def torque_response(model: FittedModel, data: Dataset) -> tuple[float, ...] | None:
-    """Share of an added torque that acts, by joint: 1 for a rigid robot, 0 for a model that cancels it.
+    """Return the effective fraction of an added torque by joint: 1 for a rigid robot, 0 if the model cancels
+    it.
 
-    Random torques of a tenth of the logged spread are added in free motion; the acting torque is M(q) times
-    the change of the predicted acceleration. `None` without free motion.
+    Random torques of a tenth of the logged standard deviation are added in free motion; the effective torque
+    is M(q) times the change of the predicted acceleration. `None` without free motion.
     """
     closed = data.active(model.system.contact_names)
     free = (~closed.any(-1)).nonzero()[:, 0]
@@ -110,7 +111,7 @@ def torque_response(model: FittedModel, data: Dataset) -> tuple[float, ...] | No
 
 @torch.no_grad()
 def open_loop(model: FittedModel, system: ConstrainedSystem, data: Dataset) -> Motion | None:
-    """The motion of a model of forces and that of the robot file; `None` if the data are too short."""
+    """Simulate a model of forces and the robot file in open loop; `None` if the data are too short."""
     if model.force_field() is None or not data.header.ordered or len(data) < 2:
         return None
     dt = data.header.dt or float((data.t[1:] - data.t[:-1]).median())
@@ -134,7 +135,7 @@ def open_loop(model: FittedModel, system: ConstrainedSystem, data: Dataset) -> M
 
 
 def _shares(found: Comparison, name: str, horizons: tuple[float, ...]) -> tuple[float | None, ...]:
-    """Error over change of the joint positions at each horizon."""
+    """Return the error relative to the change of the joint positions at each horizon."""
     shares: list[float | None] = []
     for horizon in horizons:
         step = int((found.t - horizon).abs().argmin())

@@ -1,10 +1,10 @@
-"""Predictors that any model should beat: the mean, the robot file alone, and least squares.
+"""Baseline predictors that any model should beat: the mean, the robot file alone, and least squares.
 
 Least squares identifies a rigid robot with physically consistent inertial parameters,
 τ = M q̈ − Q_C − Q_G − Q_D + Y(q, q̇, q̈) δπ + d q̇ + f tanh(q̇/v₀) + o + noise, where δπ corrects the
 inertial parameters of every link, and d, f, o are viscous friction, Coulomb friction and offset of every
 joint. A ridge keeps all unknowns near the robot file. Log-Cholesky coordinates keep every link physical
-(Rucker and Wensing 2022), so that the mass matrix stays positive definite. In contact the equations are
+(Rucker and Wensing 2022) and therefore the mass matrix positive definite. In contact, the equations are
 projected onto the directions without constraint force.
 """
 
@@ -33,39 +33,39 @@ from forcegp.robot.inertia import pseudo_inertia as pseudo_inertia_of
 from forcegp.robot.model import RobotModel
 
 CHUNK_STATES = 1000
-"""States handled at a time."""
+"""Number of states processed at a time."""
 MOST = 4000
-"""Samples used at most, evenly spaced: some hundred times the number of unknowns in equations."""
+"""Maximum number of evenly spaced samples, some hundred equations per unknown."""
 WIDE = 10.0
 """Prior standard deviation of friction and offset, relative to the largest torque of the joint."""
 NOISE_PASSES, STEPS = 3, 30
-"""Re-estimations of the noise of every joint, and steps of least squares in each."""
+"""Number of noise re-estimations, and of least-squares steps in each."""
 POINT = 1e-4
-"""Share of the largest mass, at 0.1 m, that spreads a link whose parameters no extended body has."""
+"""Fraction of the largest mass, placed at 0.1 m to make a link without extent physical."""
 
 
 @dataclass(frozen=True)
 class LeastSquares:
-    """An identified robot; `friction` `(3 nq,)`: viscous, Coulomb and offsets beyond the file, by joint."""
+    """An identified robot with additional `friction` `(3 nq,)`: viscous, Coulomb and offsets, by joint."""
 
     system: ConstrainedSystem
     friction: Tensor
 
     @torch.no_grad()
     def predict(self, data: Dataset) -> Tensor:
-        """Accelerations `(n, nq)` under the logged torques, on the constraint."""
+        """Return the accelerations `(n, nq)` under the logged torques, on the constraint."""
         if len(data) > CHUNK_STATES:
             return torch.cat([self.predict(part) for part in data_chunks(data)])
         eom = self.system.equations(data.q, data.qd, data.active(self.system.contact_names))
         return eom.acceleration(eom.Q_K + data.tau - self.losses(data.qd))
 
     def losses(self, qd: Tensor) -> Tensor:
-        """Torque of the identified friction and offsets `(n, nq)` at velocities `(n, nq)`."""
+        """Return the torque of the identified friction and offsets `(n, nq)` at velocities `(n, nq)`."""
         return (_friction_columns(self.system.robot, qd) @ self.friction[:, None])[..., 0]
 
 
 def data_chunks(data: Dataset) -> Iterator[Dataset]:
-    """Parts of a data set of `CHUNK_STATES`, which bound the memory."""
+    """Yield a data set in chunks of `CHUNK_STATES`, to bound memory."""
     return (data[i : i + CHUNK_STATES] for i in range(0, len(data), CHUNK_STATES))
 
 
@@ -92,13 +92,13 @@ def identify_rigid(system: ConstrainedSystem, train: Dataset) -> LeastSquares:
 
 
 def _friction_columns(robot: RobotModel, qd: Tensor) -> Tensor:
-    """(diag q̇, diag tanh(q̇/v₀), 1), `(n, nq, 3 nq)`."""
+    """Return (diag q̇, diag tanh(q̇/v₀), 1), `(n, nq, 3 nq)`."""
     dry = torch.tanh(qd / robot.friction_velocity)
     return torch.cat([torch.diag_embed(x) for x in (qd, dry, torch.ones_like(qd))], dim=-1)
 
 
 def _prior_std(robot: RobotModel, train: Dataset) -> Tensor:
-    """Prior standard deviation of every unknown, `(13 nq,)`."""
+    """Return the prior standard deviation of every unknown, `(13 nq,)`."""
     mass = robot.mass.clamp(min=1e-3 * float(robot.mass.max()))
     shares = torch.tensor([MASS_SHARE, *[MOMENT_ARM] * 3, *[MOMENT_ARM**2] * 6]).to(mass)
     torque = WIDE * train.tau.abs().amax(0).clamp(min=1e-6)
@@ -110,7 +110,7 @@ def _prior_std(robot: RobotModel, train: Dataset) -> Tensor:
 def _normal_equations(
     system: ConstrainedSystem, train: Dataset, prior: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """WᵀW `(nq, p, p)`, Wᵀy `(nq, p)` and yᵀy `(nq,)` by joint, with unknowns scaled by the prior."""
+    """Return WᵀW `(nq, p, p)`, Wᵀy `(nq, p)`, yᵀy `(nq,)` by joint, with unknowns scaled by the prior."""
     p, nq = len(prior), train.nq
     G, g, y2 = prior.new_zeros(nq, p, p), prior.new_zeros(nq, p), prior.new_zeros(nq)
     for part in data_chunks(train):
@@ -123,7 +123,7 @@ def _normal_equations(
 
 
 def _rows(system: ConstrainedSystem, data: Dataset) -> tuple[Tensor, Tensor]:
-    """Regressor `(n, nq, 13 nq)` and torque that the robot file leaves `(n, nq)`."""
+    """Return the regressor `(n, nq, 13 nq)` and the torque not explained by the robot file `(n, nq)`."""
     eom = system.equations(data.q, data.qd, data.active(system.contact_names))
     Y = regressor(system.robot, data.q, data.qd, data.qdd)
     W = torch.cat([Y, _friction_columns(system.robot, data.qd)], dim=-1)
@@ -135,13 +135,13 @@ def _rows(system: ConstrainedSystem, data: Dataset) -> tuple[Tensor, Tensor]:
 
 
 def without_constraint(system: ConstrainedSystem, data: Dataset, torque: Tensor) -> Tensor:
-    """N torque `(n, nq)`, part by part."""
+    """Return N torque `(n, nq)`, computed in chunks."""
     parts = zip(data_chunks(data), torque.split(CHUNK_STATES), strict=True)
     return torch.cat([(free_directions(system, part) @ x[..., None])[..., 0] for part, x in parts])
 
 
 def free_directions(system: ConstrainedSystem, data: Dataset) -> Tensor:
-    """N = 1 − A⁺A `(n, nq, nq)` or `(nq, nq)`, which removes the constraint force, in the range of Aᵀ."""
+    """Return N = 1 − A⁺A `(n, nq, nq)` or `(nq, nq)`, which removes forces in the range of Aᵀ."""
     one = torch.eye(data.nq).to(data.q)
     if not system.m:
         return one
@@ -150,7 +150,7 @@ def free_directions(system: ConstrainedSystem, data: Dataset) -> Tensor:
 
 
 def _start(robot: RobotModel) -> Tensor:
-    """Log-Cholesky coordinates of the robot file `(nq, 10)`; bodies without extent get a little of it."""
+    """Return the log-Cholesky coordinates of the robot file `(nq, 10)`, giving all bodies some extent."""
     J = pseudo_inertia_of(robot.mass, robot.com, robot.inertia)
     least = POINT * float(robot.mass.max()) * torch.tensor([MOMENT_ARM**2] * 3 + [1.0]).to(J)
     bad = torch.linalg.cholesky_ex(J - 1e-2 * torch.diag(least)).info != 0
@@ -160,7 +160,7 @@ def _start(robot: RobotModel) -> Tensor:
 def _minimise(
     robot: RobotModel, gram: Tensor, right: Tensor, prior: Tensor, theta: Tensor, friction: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Least of ½ xᵀ gram x − rightᵀ x over x = ((π(θ) − π₀)/S, friction), as ½ |Cᵀx − C⁻¹ right|²."""
+    """Minimise ½ xᵀ gram x − rightᵀ x over x = ((π(θ) − π₀)/S, friction), as ½ |Cᵀx − C⁻¹ right|²."""
     like, n = friction, theta.numel()
     gram, right, prior, theta, friction = (x.double() for x in (gram, right, prior, theta, friction))
     centre, links = parameter_vector(robot).detach().double().reshape(-1, 10), prior.reshape(-1, 10)
@@ -186,12 +186,12 @@ def _minimise(
 
 
 def _parameters(theta: Tensor) -> Tensor:
-    """π `(..., 10)` of log-Cholesky coordinates `(..., 10)`."""
+    """Return π `(..., 10)` of log-Cholesky coordinates `(..., 10)`."""
     return inertial_parameters(*from_pseudo_inertia(from_log_cholesky(theta)))
 
 
 FEWEST_TRAINING = 20
-"""Minimum number of samples to fit a baseline to."""
+"""Minimum number of samples for fitting a baseline."""
 
 
 @dataclass(frozen=True)
@@ -199,8 +199,9 @@ class Baseline:
     """A trivial predictor of accelerations.
 
     Attributes:
-        name, system: its name, and the robot with the mass matrix that converts its errors to torques.
-        predict: accelerations `(n, nq)` of a data set.
+        name, system: name of the predictor, and robot with the mass matrix that converts its errors to
+            torques.
+        predict: function that returns the accelerations `(n, nq)` of a data set.
         std: `(nq,)` root-mean-square error on its training data, used as its uncertainty.
     """
 
@@ -211,7 +212,7 @@ class Baseline:
 
 
 def baselines(system: ConstrainedSystem, train: Dataset) -> list[Baseline]:
-    """Mean, robot file and least squares, fitted to at least `FEWEST_TRAINING` samples."""
+    """Return the mean, robot file and least squares, fitted to at least `FEWEST_TRAINING` samples."""
     mean, nothing = train.qdd.mean(0), train.qdd.new_zeros(3 * train.nq)
     identified = identify_rigid(system, train)
 
@@ -226,7 +227,7 @@ def baselines(system: ConstrainedSystem, train: Dataset) -> list[Baseline]:
 
 
 def as_torque(system: ConstrainedSystem, q: Tensor, error: Tensor) -> Tensor:
-    """Errors of acceleration as torques M(q)(predicted − measured q̈), `(n, nq)` [N m, N]."""
+    """Return the errors of acceleration as torques M(q)(predicted − measured q̈), `(n, nq)` [N m, N]."""
     pairs = zip(q.split(CHUNK_STATES), error.split(CHUNK_STATES), strict=True)
     with torch.no_grad():
         parts = [dynamics.mass_matrix(system.robot, at) @ e[..., None] for at, e in pairs]

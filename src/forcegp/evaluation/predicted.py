@@ -1,4 +1,4 @@
-"""Predictions at all samples of a data set, in chunks that bound the memory; scores of the multiplier."""
+"""Predictions at all samples of a data set, in chunks to bound memory, and scores of the multiplier."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from forcegp.models.sensed import force_from_sensor, has_sensor, sensed_force
 from forcegp.models.structured_fit import StructuredFit
 
 CHUNK_STATES = 2000
-"""States predicted at a time."""
+"""Number of states predicted at a time."""
 Progress = Callable[[int, int], None]
 
 
@@ -28,10 +28,10 @@ class Predicted:
     """The predictions of a model at all samples of a data set.
 
     Attributes:
-        mean, variance: `(n, nq)`; no variance for a model without a covariance.
-        noise_std: `(n, nq)` assumed for measured accelerations, if known, including torque noise.
-        residual: `(k,)` |A q̈ − b| of all rows of closed contacts.
-        seconds: time taken.
+        mean, variance: `(n, nq)`; no variance for models without a covariance.
+        noise_std: `(n, nq)` assumed noise of measured accelerations, including torque noise, if known.
+        residual: `(k,)` |A q̈ − b| for all rows of closed contacts.
+        seconds: computation time.
     """
 
     mean: Tensor
@@ -42,13 +42,13 @@ class Predicted:
 
 
 Moments = tuple[Tensor, Tensor | None]
-"""Mean, and variance or standard deviation if the model gives one."""
+"""Mean, and variance or standard deviation if available."""
 
 
 def in_chunks(
     predict: Callable[[Dataset], Moments], data: Dataset, progress: Progress | None = None
 ) -> Moments:
-    """Results of `predict` for all samples, `CHUNK_STATES` at a time."""
+    """Call `predict` for all samples, `CHUNK_STATES` at a time, and join the results."""
     parts = []
     for first in range(0, len(data), CHUNK_STATES):
         parts.append(predict(data[first : first + CHUNK_STATES]))
@@ -80,7 +80,7 @@ def predict_all(
 
 
 def _noise_std(model: Predictor, data: Dataset) -> Tensor | None:
-    """The noise that the model assumes for measured accelerations, or the data's, `(n, nq)`."""
+    """Return the acceleration noise `(n, nq)` assumed by the model, or that of the data."""
     if isinstance(model, StructuredFit):
         active = data.active(model.system.contact_names)
         return model.noise_variance(data.q, data.qd, data.tau, active=active).sqrt()
@@ -96,11 +96,11 @@ class MultiplierScore:
     """The predicted multiplier λ of one contact against a logged one, over samples in contact.
 
     Attributes:
-        contact: name.
-        samples: in contact.
-        bias, spread, level: mean and standard deviation of predicted less logged λ, and mean logged λ [N].
-        correlation: of predicted and logged λ, `None` if either is constant.
-        coverage: share of logged values within ±2σ, including torque noise; `None` without a covariance.
+        contact: name of the contact.
+        samples: number of samples in contact.
+        bias, spread, level: mean and standard deviation of predicted minus logged λ, and mean logged λ [N].
+        correlation: correlation of predicted and logged λ, `None` if either is constant.
+        coverage: fraction of logged values within ±2σ, including torque noise; `None` without a covariance.
     """
 
     contact: str
@@ -112,7 +112,7 @@ class MultiplierScore:
     level: float
 
     def text(self) -> str:
-        """The comparison in words."""
+        """Describe the comparison in words."""
         held = "" if self.coverage is None else f", ±2σ holds {100.0 * self.coverage:.0f} %"
         error = math.hypot(self.bias, self.spread)
         return f"the force at {self.contact!r} is off by {error:.2g} N of {self.level:.3g} N{held}"
@@ -128,7 +128,7 @@ def multiplier_scores(model: Predictor, data: Dataset) -> tuple[MultiplierScore,
 
 @torch.no_grad()
 def predicted_forces(model: Predictor, data: Dataset) -> Moments:
-    """Normal force of each contact `(n, contacts)`, and its deviation with the noise of the torque."""
+    """Return the normal force of each contact `(n, contacts)`, and its deviation with torque noise."""
     states, active = (data.q, data.qd, data.tau), data.active(model.system.contact_names)
     predicted = model.predict(*states, "multiplier", active=active)
     mean, variance = predicted.mean, predicted.variance
@@ -139,8 +139,8 @@ def predicted_forces(model: Predictor, data: Dataset) -> Moments:
 
 
 def logged_forces(model: Predictor, data: Dataset) -> dict[str, Tensor]:
-    """Normal force `(n,)` of contacts closed in training, by name: `multiplier`, or the sensor's for a single
-    contact.
+    """Return the normal force `(n,)` of contacts closed in training, by name: `multiplier`, or the sensor
+    force for a single contact.
     """
     never = model.result.never_closed if isinstance(model, StructuredFit) else ()
     names = [name for name in model.system.contact_names if name not in never]
@@ -153,7 +153,7 @@ def logged_forces(model: Predictor, data: Dataset) -> dict[str, Tensor]:
 
 @torch.no_grad()
 def sensed_scores(model: Predictor, data: Dataset) -> tuple[MultiplierScore, ...]:
-    """The same with the log's force sensor as a measurement at each state; empty without a sensor."""
+    """Return the scores with the log's force sensor as a measurement at each state, if it has one."""
     if not isinstance(model, StructuredFit) or "multiplier" not in model.noise:
         return ()
     if not has_sensor(data, model.system) or "multiplier" not in data.contact_extras:
@@ -167,7 +167,7 @@ def sensed_scores(model: Predictor, data: Dataset) -> tuple[MultiplierScore, ...
 
 
 def _scores(model: Predictor, data: Dataset, mean: Tensor, std: Tensor | None) -> tuple[MultiplierScore, ...]:
-    """Scores of λ `(n, contacts)` over the samples in which each contact is closed."""
+    """Return the scores of λ `(n, contacts)` over the samples in which each contact is closed."""
     names = model.system.contact_names
     scores, logged, active = [], logged_forces(model, data), data.active(names)
     for i, (name, rows) in enumerate(zip(names, active.T, strict=True)):

@@ -11,16 +11,16 @@ import torch
 from torch import Tensor
 
 REST = 0.02
-"""A joint rests below this share of its fast (95 % quantile) speed in the data, ..."""
+"""A joint is at rest below this fraction of the 95 % quantile of its speed in the data, ..."""
 SLOWEST = 5e-3
-"""... and always below this speed [rad/s, m/s], so that the noise of a resting joint is not motion."""
+"""... and always below this speed [rad/s, m/s], so noise of a joint at rest does not count as motion."""
 FEWEST = 10
 """Minimum number of samples for an error in a condition."""
 
 
 @dataclass(frozen=True)
 class Errors:
-    """Differences between predicted and given accelerations [rad/s², m/s²].
+    """Differences between predicted and reference accelerations [rad/s², m/s²].
 
     Attributes:
         mae: mean absolute error over samples and joints.
@@ -35,7 +35,7 @@ class Errors:
 
     @classmethod
     def of(cls, error: Tensor) -> Errors:
-        """From differences `(n, nq)`."""
+        """Compute errors from differences `(n, nq)`."""
         return cls(
             mae=float(error.abs().mean()),
             rmse=float((error**2).mean().sqrt()),
@@ -45,7 +45,7 @@ class Errors:
 
 
 ByJoint = tuple[float | None, ...]
-"""One value per joint; `None` where there are too few samples."""
+"""One value per joint, `None` if there are too few samples."""
 
 
 @dataclass(frozen=True)
@@ -53,10 +53,10 @@ class JointErrors:
     """Root-mean-square errors of one predictor in one unit, one per joint.
 
     Attributes:
-        all: over all samples.
-        moving: over the samples in which the joint moves.
-        rest: over the samples in which it rests.
-        normalised: of `all`, divided by the standard deviation of the measured quantity (nRMSE).
+        all: error over all samples.
+        moving: error over the samples in which the joint moves.
+        rest: error over the samples in which the joint is at rest.
+        normalised: `all` divided by the standard deviation of the measured quantity (nRMSE).
     """
 
     all: ByJoint
@@ -66,12 +66,12 @@ class JointErrors:
 
     @property
     def in_motion(self) -> ByJoint:
-        """The error in motion, or over all samples for a joint that does not move in the data."""
+        """Error in motion, or over all samples for a joint that does not move in the data."""
         return tuple(a if m is None else m for a, m in zip(self.all, self.moving, strict=True))
 
     @classmethod
     def of(cls, error: Tensor, measured: Tensor, moving: Tensor) -> JointErrors:
-        """From differences, the measured quantity and whether the joint moves, each `(n, nq)`."""
+        """Compute errors from differences, the measured quantity and motion flags, each `(n, nq)`."""
         spread = measured.std(0, correction=0)
         total = _rmse(error, torch.ones_like(moving), fewest=1)
         pairs = zip(total, spread.tolist(), strict=True)
@@ -85,13 +85,13 @@ def _rmse(error: Tensor, rows: Tensor, fewest: int) -> ByJoint:
 
 
 def moving_joints(qd: Tensor) -> Tensor:
-    """Whether each joint moves, `(n, nq)` bool: |q̇| > max(`REST` · its 95 % quantile, `SLOWEST`)."""
+    """Return whether each joint moves, `(n, nq)` bool: |q̇| > max(`REST` · its 95 % quantile, `SLOWEST`)."""
     fast = qd.abs().quantile(0.95, dim=0) if len(qd) < 1_000_000 else qd.abs().amax(0)
     return qd.abs() > (REST * fast).clamp(min=SLOWEST)
 
 
 LEVELS = (0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
-"""Probabilities of the central intervals whose coverage is counted."""
+"""Probabilities of the central intervals for which coverage is computed."""
 
 
 @dataclass(frozen=True)
@@ -99,11 +99,11 @@ class Uncertainty:
     """Coverage and density of predicted accelerations.
 
     Attributes:
-        coverage_noisy: share of measured accelerations within ±2σ, noise included.
-        coverage_clean: share of noise-free ones within ±2σ of the prediction, `None` if not logged.
-        coverage_by_joint: `coverage_noisy`, one per joint.
-        calibration: share of measured accelerations in the central interval of each level of `LEVELS`.
-        nlpd: mean negative log predictive density of one measured joint acceleration [nats].
+        coverage_noisy: fraction of measured accelerations within ±2σ, including noise.
+        coverage_clean: fraction of noise-free accelerations within ±2σ, `None` if not logged.
+        coverage_by_joint: `coverage_noisy` for each joint.
+        calibration: fraction of measured accelerations in the central interval of each level in `LEVELS`.
+        nlpd: mean negative log predictive density of a measured joint acceleration [nats].
     """
 
     coverage_noisy: float
@@ -116,7 +116,7 @@ class Uncertainty:
     def of(
         cls, mean: Tensor, variance: Tensor, noise_std: Tensor, measured: Tensor, clean: Tensor | None
     ) -> Uncertainty:
-        """From predictions and accelerations `(n, nq)` and the noise `(nq,)`."""
+        """Compute scores from predictions and accelerations `(n, nq)` and the noise `(nq,)`."""
         std = (variance + noise_std**2).sqrt()
         deviation = (measured - mean).abs() / std
         half_widths = {f"{level:g}": NormalDist().inv_cdf(0.5 + 0.5 * level) for level in LEVELS}
@@ -131,24 +131,24 @@ class Uncertainty:
 
 
 def nlpd(error: Tensor, std: Tensor) -> float:
-    """Mean negative log density of errors under a centred normal distribution [nats]."""
+    """Return the mean negative log density of errors under a centred normal distribution [nats]."""
     return float((0.5 * (error / std) ** 2 + std.log() + 0.5 * math.log(2.0 * math.pi)).mean())
 
 
 def share(inside: Tensor) -> float:
-    """Share of true entries."""
+    """Return the fraction of true entries."""
     return float(inside.to(torch.float64).mean())
 
 
 TINY = 1e-12
-"""Errors below this are equal: rounding of accelerations of the order of one."""
+"""Errors below this count as equal, due to rounding of accelerations of order one."""
 EQUAL = 1e-9
-"""Error ratios that are this close to one are equal, up to rounding."""
+"""Tolerance within which error ratios count as one, due to rounding."""
 
 
 @dataclass(frozen=True)
 class PredictorScores:
-    """Errors of one predictor, a model or a trivial one.
+    """Errors of a model or a trivial predictor.
 
     Attributes:
         name: `model`, `mean`, `robot file` or `least squares`.
@@ -156,7 +156,7 @@ class PredictorScores:
         acceleration: error of q̈ [rad/s², m/s²].
         nlpd: mean negative log predictive density of a measured joint acceleration [nats]; a trivial
             predictor has the constant uncertainty of its training error.
-        explained: R², share by joint of the torque beyond gravity that is explained.
+        explained: R² by joint, the explained fraction of the torque beyond gravity.
     """
 
     name: str
@@ -167,20 +167,20 @@ class PredictorScores:
 
     @property
     def beyond_gravity(self) -> float | None:
-        """Median over the joints of the explained share."""
+        """Median over the joints of the explained fraction."""
         known = [share for share in self.explained if share is not None]
         return median(known) if known else None
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """The model against one trivial predictor.
+    """Comparison of a model with a trivial predictor.
 
     Attributes:
         against: name of the predictor.
-        torque, acceleration: the model's error relative to the predictor's, geometric mean over the joints,
-            samples in motion; below 1 the model is better.
-        worse: joints on which the model's torque or acceleration error is larger, or `every joint`.
+        torque, acceleration: error of the model relative to the predictor (geometric mean over the joints,
+            samples in motion); below 1, the model is better.
+        worse: joints with a larger torque or acceleration error of the model, or `every joint`.
     """
 
     against: str
@@ -190,11 +190,11 @@ class Verdict:
 
     @property
     def better(self) -> bool:
-        """Whether the model is better in torque and in acceleration."""
+        """Whether the model is better in both torque and acceleration."""
         return max(self.torque, self.acceleration) < 1.0 - EQUAL
 
     def text(self) -> str:
-        """The comparison as one sentence."""
+        """Return the comparison as a sentence."""
         head = f"{'Better' if self.better else 'Not better'} than {_noun(self.against)}: error ratio "
         joints = f"; worse on {_listed(self.worse)}" if self.worse else ""
         return f"{head}{self.torque:.3g} in torque and {self.acceleration:.3g} in acceleration{joints}."
@@ -221,7 +221,7 @@ def _ratios(ours: JointErrors, theirs: JointErrors) -> list[float]:
 
 
 def sentence(comparisons: Sequence[Verdict]) -> str:
-    """The verdict in one sentence, or "" without a comparison."""
+    """Return the verdict in one sentence, or "" without a comparison."""
     better = _listed([_noun(v.against) for v in comparisons if v.better])
     worse = _listed([_noun(v.against) for v in comparisons if not v.better])
     parts = [f"is better than {better}"] if better else []

@@ -1,8 +1,8 @@
-"""Residual torques of a fit: their correlation in time, and their size on held-out stretches.
+"""Residual torques of a fit: their correlation in time, and their magnitude on held-out stretches.
 
-Temperature, hysteresis and filters leave residuals that are correlated in time, so a log holds less evidence
-than its samples suggest. The integrated autocorrelation time is the factor. The variance on new motions is
-measured on stretches of the training log that the posterior was not conditioned on.
+Temperature, hysteresis and filters leave residuals that are correlated in time, which reduces the information
+in a log by the integrated autocorrelation time. The variance on new motions is measured on stretches of the
+training log that the posterior was not conditioned on.
 """
 
 from __future__ import annotations
@@ -30,39 +30,40 @@ from forcegp.forces.quantities import States, affine_map
 from forcegp.robust import resolution
 
 STRETCHES = 8
-"""Contiguous stretches that a log of fewer than three segments is divided into."""
+"""Number of contiguous stretches into which a log of fewer than three segments is divided."""
 MOST_STRETCHES = 16
-"""Segments beyond this number are left out together with others, since each costs a conditioning."""
+"""Maximum number of stretches, each of which requires a posterior; further segments are combined."""
 FEWEST = 50
-"""Samples below which nothing is calibrated."""
+"""Minimum number of samples for calibration."""
 SWEEPS, SETTLED = 20, 1e-3
-"""Sweeps over the joints at most, and the relative change of their noise that ends them."""
+"""Maximum number of sweeps over the joints, and relative change of their noise at convergence."""
 MOST_RESIDUALS = 16_000
-"""Samples whose residuals are looked at for their correlation, in contiguous stretches of a longer log."""
+"""Maximum number of residuals for estimating correlation, in contiguous stretches of a longer log."""
 CHUNK_STATES = 2000
-"""States whose residuals are computed at a time, which bounds the memory."""
+"""Number of states for which residuals are computed at a time, to bound memory."""
 NEGLIGIBLE = 0.05
-"""Autocorrelation below which the rest is noise of the estimate."""
+"""Autocorrelation below which estimates are noise."""
 SIGNIFICANT = 2.0
-"""Standard errors of a covariance of neighbours beyond which samples are correlated."""
+"""Number of standard errors from which the covariance of neighbours is significant."""
 REGIME = 0.25
-"""Share of the samples that the fastest or most loaded regime has."""
+"""Fraction of the samples in the fastest or most loaded regime."""
 PRIOR_SAMPLES = 4.0
-"""Independent samples that the prior of `growth` is worth."""
+"""Weight of the prior in `growth`, as a number of independent samples."""
 WINDOW, WINDOWS = 10.0, 20
-"""Length of the windows of `correlation_times` in units of the autocorrelation time, and how many there are
-at least."""
+"""Length of the windows of `correlation_times` in units of the autocorrelation time, and their minimum
+number.
+"""
 
 
 def autocorrelation_time(x: Tensor, segment: Tensor, white: Tensor | float = 0.0) -> Tensor:
-    """Integrated autocorrelation time of each column, 1 + 2 Σ ρ_k, in samples `(d,)`.
+    """Return the integrated autocorrelation time of each column, 1 + 2 Σ ρ_k, in samples `(d,)`.
 
     The sum ends when ρ falls below 0.05, and at half the longest segment. It is 1 for a column whose
     neighbours have no significant covariance (two standard errors of that of white noise).
 
     Args:
-        x: `(n, d)` in the order of time, with mean zero.
-        white: variance of white noise in x, which is not counted.
+        x: `(n, d)` zero-mean signals in time order.
+        white: variance of white noise in x, which is excluded.
     """
     longest = int(segment.unique(return_counts=True)[1].max())
     variance, first = _variance_in_time(x, segment, white)
@@ -78,15 +79,15 @@ def autocorrelation_time(x: Tensor, segment: Tensor, white: Tensor | float = 0.0
 
 
 def correlation_times(x: Tensor, segment: Tensor, length: int, white: Tensor | float = 0.0) -> Tensor:
-    """Spectral density of each column at low frequencies over its variance, in samples `(d,)`.
+    """Return the spectral density of each column at low frequencies over its variance, in samples `(d,)`.
 
     L · mean(x̄²) / (mean(x²) − white) over windows of L samples with means x̄ (batch means, Flegal and Jones
-    2010). In contrast to `autocorrelation_time` it contains the negative lobes of a residual that oscillates,
+    2010). In contrast to `autocorrelation_time`, it includes the negative lobes of an oscillating residual,
     such as noise of differentiated positions or the ringing of a gear, which hardly move a robot.
 
     Args:
         x: `(n, d)` in the order of time, with mean zero.
-        length: L, several times the autocorrelation time.
+        length: window length L, several times the autocorrelation time.
         white: variance of white noise in x, which is not counted.
     """
     squares = []
@@ -98,24 +99,24 @@ def correlation_times(x: Tensor, segment: Tensor, length: int, white: Tensor | f
 
 
 def _variance_in_time(x: Tensor, segment: Tensor, white: Tensor | float) -> tuple[Tensor, Tensor]:
-    """Variance without white noise `(d,)`, and the covariance of neighbours, which it is not less than."""
+    """Return the variance without white noise `(d,)` and its lower bound, the covariance of neighbours."""
     first = _covariance(x, segment, 1)
     return (x.square().mean(0) - white).clamp(min=1e-300).maximum(first), first
 
 
 def _covariance(x: Tensor, segment: Tensor, lag: int) -> Tensor:
-    """Mean product of samples of one segment that are a lag apart `(d,)`."""
+    """Return the mean product `(d,)` of samples in a segment separated by a lag."""
     same = segment[:-lag] == segment[lag:]
     return ((x[:-lag] * x[lag:]) * same[:, None]).sum(0) / same.sum().clamp(min=1)
 
 
 def _motions(training: Training) -> list[int]:
-    """Measurements of accelerations, or of the joint forces from them and a force sensor."""
+    """Return the measurements of accelerations, or of the joint forces from them and a force sensor."""
     return [i for i, quantity in enumerate(training.quantities) if quantity in ("qdd", "joint_force")]
 
 
 def _of_force(at: States, quantity: str) -> Tensor:
-    """From an error of a measured quantity to that of a force `(n, nq, nq)`: M of accelerations."""
+    """Return the map from errors of a quantity to force errors `(n, nq, nq)`, M for accelerations."""
     M = at.eom.M
     return M if quantity == "qdd" else torch.eye(M.shape[-1], dtype=M.dtype, device=M.device).expand_as(M)
 
@@ -123,10 +124,10 @@ def _of_force(at: States, quantity: str) -> Tensor:
 def residual_times(
     problem: Problem, hyperparameters: Mapping[str, Tensor], training: Training
 ) -> tuple[float, Tensor | None]:
-    """κ ≤ 1, and `correlation_times` of joints `(nq,)` [s], `None` for too few samples.
+    """Return κ ≤ 1, and `correlation_times` of joints `(nq,)` [s], `None` for too few samples.
 
-    κ = 1/τ̄, τ̄ the geometric mean over the joints of the autocorrelation time of their torque noise in the
-    residuals of `training`, at its rate: n samples hold as much evidence as n/τ̄ independent ones.
+    κ = 1/τ̄, where τ̄ is the geometric mean over the joints of the autocorrelation time of torque noise in
+    the residuals of `training`: n samples contain as much information as n/τ̄ independent ones.
     """
     posterior = force_posterior(problem, hyperparameters)
     logs, times = [], []
@@ -153,7 +154,7 @@ def residual_times(
 
 
 def _some(n: int) -> Tensor:
-    """At most `MOST_RESIDUALS` of n rows in contiguous stretches, as neighbours show the correlation."""
+    """Return at most `MOST_RESIDUALS` of n rows in contiguous stretches, to keep neighbours together."""
     if n <= MOST_RESIDUALS:
         return torch.arange(n)
     length = MOST_RESIDUALS // STRETCHES
@@ -168,11 +169,11 @@ def _torque_noise(
     m: Measurement,
     std: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Estimated torque noise of each joint over its standard deviation, and the variance that white noise of
-    the accelerations has in it, `(n, nq)` each.
+    """Return the estimated torque noise of each joint relative to its standard deviation, and the
+    contribution of white acceleration noise to its variance, `(n, nq)` each.
 
-    Residuals are r = B ε + e with torque noise ε ~ N(0, S), B = H of accelerations, and white e ~ N(0, Σ),
-    which hides the correlation of ε. In E[ε | r] = G r it has the least share.
+    Residuals are r = B ε + e with torque noise ε ~ N(0, S), B = H for accelerations, and white e ~ N(0, Σ),
+    which masks the correlation of ε and is smallest in E[ε | r] = G r.
     """
     system, force_noise = problem.system, problem.force_noise(hyperparameters)
     assert force_noise is not None
@@ -188,7 +189,7 @@ def _torque_noise(
 
 
 def calibrated_noise(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Torque noise calibrated on held-out samples, the trained region, and the growth of errors beyond it."""
+    """Return torque noise calibrated on held-out samples, the trained region, and error growth beyond it."""
     load, training = problem.typical_load(), problem.training
     qd, tau = (torch.cat([getattr(m, name) for m in training.measurements]) for name in ("qd", "tau"))
     # Rounding to steps h has the variance h²/12.
@@ -202,9 +203,9 @@ def calibrated_noise(problem: Problem, hyperparameters: Mapping[str, Tensor]) ->
 
 
 def held_out_torque_std(problem: Problem, hyperparameters: Mapping[str, Tensor], least: Tensor) -> Tensor:
-    """Standard deviation of torque noise `(nq,)` with which held-out stretches have unit normalised errors.
+    """Return the torque noise `(nq,)` for which normalised errors on held-out stretches have unit variance.
 
-    Each stretch is predicted from all others with the given hyperparameters. The error of the force in
+    Each stretch is predicted from all others with the given hyperparameters. The force error computed from
     accelerations is r = M(q̈ − E q̈) = P ε, with P = I in free motion. For joint i, s_i² solves mean(r_i² /
     (Σ_k P_ik² s_k² + Var r_i)) = 1 over all samples with P_ii above one half.
 
@@ -223,16 +224,16 @@ def held_out_torque_std(problem: Problem, hyperparameters: Mapping[str, Tensor],
 
 
 def growth(problem: Problem, hyperparameters: Mapping[str, Tensor], load: Tensor) -> Tensor:
-    """g `(nq,)`: growth of the standard deviation of each torque beyond the trained region.
+    """Return the growth rate g `(nq,)` of torque standard deviations beyond the trained region.
 
     The fastest and the most loaded quarter of the training samples are predicted from the rest. With
-    g = c · load, one c for all joints, and D the distance beyond the region of the rest, c is most probable
-    under r_i ~ N(0, V_i + Σ_k P_ik² (s_k² + g_k² D_k²)), tempered like the likelihood, and a scaled
+    g = c · load, a common c for all joints, and the distance D beyond the region of the rest, c maximises the
+    posterior under r_i ~ N(0, V_i + Σ_k P_ik² (s_k² + g_k² D_k²)), tempered like the likelihood, and a scaled
     inverse-χ² prior, which dominates if the log has only one regime.
 
     Args:
         problem: the learned problem, with the power of its likelihood.
-        hyperparameters: including the predicted torque noise.
+        hyperparameters: hyperparameters including the predicted torque noise.
         load: typical torque of each joint `(nq,)` [N m, N].
     """
     s2, square, known, slope = hyperparameters[TORQUE_NOISE].exp() ** 2, [], [], []
@@ -265,7 +266,7 @@ def growth(problem: Problem, hyperparameters: Mapping[str, Tensor], load: Tensor
 
 
 def stretches(segment: Tensor) -> Tensor:
-    """Index of each sample's stretch: its segment, or an eighth of the log if there are few segments."""
+    """Return the stretch index of each sample: its segment, or an eighth of the log with few segments."""
     _, own = segment.unique(return_inverse=True)
     if int(own.max()) + 1 >= 3:
         return own % MOST_STRETCHES
@@ -276,8 +277,9 @@ def stretches(segment: Tensor) -> Tensor:
 def _held_out(
     problem: Problem, hyperparameters: Mapping[str, Tensor], i: int, own: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Torque residuals of samples of measurement i that are predicted from all others, their variance but
-    for torque noise, `(n, nq)` each, and P."""
+    """Return torque residuals of samples of measurement i predicted from all others, their variance without
+    torque noise, `(n, nq)` each, and P.
+    """
     training, std = problem.training, problem.noise_at(hyperparameters, i)
     m, system = training.measurements[i][own], problem.system
     posterior = force_posterior(
@@ -296,12 +298,12 @@ def _held_out(
 
 
 def unit_scales(r2: Tensor, V: Tensor, share: Tensor, least: Tensor) -> Tensor:
-    """s with mean(r_i² / (Σ_k share_ik s_k² + V_i)) = 1 for each joint i, found joint by joint.
+    """Solve mean(r_i² / (Σ_k share_ik s_k² + V_i)) = 1 for s, joint by joint.
 
     Args:
         r2, V: `(n, nq)` squared errors, and their variance without noise.
-        share: `(n, nq, nq)` P_ik², the share of the noise of joint k in the error of joint i.
-        least: `(nq,)` smallest values.
+        share: `(n, nq, nq)` P_ik², the contribution of noise of joint k to the error of joint i.
+        least: `(nq,)` lower bounds.
     """
     s = least.clone()
     for _ in range(SWEEPS):
@@ -319,7 +321,7 @@ def unit_scales(r2: Tensor, V: Tensor, share: Tensor, least: Tensor) -> Tensor:
 
 
 def _unit_scale(r2: Tensor, V: Tensor, least: Tensor) -> Tensor:
-    """s with mean(r² / (s² + V)) = 1, at least `least`."""
+    """Solve mean(r² / (s² + V)) = 1 for s, at least `least`."""
     low, high = 2.0 * math.log(float(least)), math.log(float(r2.mean()) + float(least) ** 2) + 1.0
 
     def excess(log_variance: float) -> float:

@@ -1,24 +1,23 @@
-"""The external wrench on a frame of the robot, from the equations of motion beyond the learned forces.
+"""External wrench on a robot frame, from the equations of motion beyond the learned forces.
 
 An undeclared wrench w acts on a frame with Jacobian J:
 
     M q̈ = Q̄ + Aᵀλ + Jᵀ w,   Q̄ ~ N(E Q̄, S).
 
-S is the posterior covariance of the learned forces with the noise of the torques.
+S is the posterior covariance of the learned forces with torque noise.
 
 - **From accelerations** (`least_squares`): r = M q̈ − E Q̄ = Jᵀ w + e with Cov(e) = S + M Σ_q̈ Mᵀ and a prior
-  w ~ N(0, W), by generalized least squares: C = (J Cov(e)⁻¹ Jᵀ + W⁻¹)⁻¹, E w = C J Cov(e)⁻¹ r. Along
-  directions without effect on the joints, the covariance is that of the prior.
+  w ~ N(0, W), by generalized least squares: C = (J Cov(e)⁻¹ Jᵀ + W⁻¹)⁻¹, E w = C J Cov(e)⁻¹ r. In directions
+  without effect on the joints, the covariance is that of the prior.
 - **From momenta** (`observe`), without accelerations: p = M q̇ obeys ṗ = Q̄ − Q_C + ½ ∂(q̇ᵀM q̇)/∂q + Jᵀ w. A
-  Kalman filter estimates p, w, and the error of the learned forces, whose correlation in time is that of the
+  Kalman filter estimates p, w, and the error of the learned forces, which has the correlation time of the
   torque residuals in the training log. The observer of De Luca and Mattone (*Sensorless robot collision
-  detection and hybrid force/motion control*, ICRA 2005) is the steady filter without errors of the forces.
-
+  detection and hybrid force/motion control*, ICRA 2005) is the steady-state filter without force errors.
 - **With an unknown lever** (`over_levers`): a moment about the point is a force times its distance. The
-  estimate is a mixture over priors with moments of several sizes, weighted by their evidence at the sample.
-  That decides along directions that the arm hardly feels.
+  estimate is a mixture over priors with moments of several scales, weighted by their evidence at the sample.
+  The evidence resolves directions that hardly affect the joints.
 
-The wrench is that of the environment on the robot. Multipliers of closed contacts are unknown too.
+The wrench acts from the environment on the robot. Multipliers of closed contacts are also unknown.
 """
 
 from __future__ import annotations
@@ -42,28 +41,28 @@ FORCES, MOMENTS = ("fx", "fy", "fz"), ("mx", "my", "mz")
 """Components of a wrench; moments are about the point."""
 AXES = (*FORCES, *MOMENTS)
 FORCE_STD, MOMENT_STD = 30.0, 5.0
-"""Standard deviation of each force [N] and moment [N m] before the data: wide beside pushes by hand."""
+"""Prior standard deviation of each force [N] and moment [N m], large compared with pushes by hand."""
 FORCE_CHANGE, MOMENT_CHANGE = 10.0, 1.0
-"""By how much they change within a second, in the momentum filter."""
+"""Standard deviations of their change within a second, in the momentum filter."""
 LEVERS = (1.0, 0.3, 0.1)
-"""Sizes of moments beside forces over that of the prior, each as likely before the data."""
+"""Scales of moments relative to the prior, with equal prior probability."""
 MULTIPLIER_STD = 1e4
-"""Of the multipliers of declared contacts [N], which are left open."""
+"""Large prior standard deviation of the multipliers of declared contacts [N]."""
 ROWS = {name: row for row, name in enumerate((*MOMENTS, *FORCES))}
 """Row of each component in `frame_jacobian`, which has rotations first."""
 
 
 @dataclass(frozen=True)
 class WrenchFrame:
-    """A frame on which an unknown wrench acts, and the components that it may have.
+    """A frame on which an unknown wrench acts, and its nonzero components.
 
     Args:
         frame: frame of the robot.
         reference: axes of the components, `"world"` or `"local"` (those of the frame).
-        axes: components of `AXES` that are estimated, in this order; the others are zero.
+        axes: components in `AXES` to estimate, in this order; the others are zero.
         point: point of application of the force and reference point of moments, in coordinates of the frame
             [m].
-        prior_std: standard deviation of forces [N] and moments [N m] before the data.
+        prior_std: prior standard deviation of forces [N] and moments [N m].
         change: standard deviation of the change of a force [N] and a moment [N m] within a second, for the
             momentum filter; larger values make it faster and noisier.
 
@@ -72,9 +71,9 @@ class WrenchFrame:
         [30.0, 30.0]
 
     Raises:
-        UnknownNameError: no such reference or component.
-        ParameterError: no component, a repeated component, or a standard deviation that is not positive and
-            finite.
+        UnknownNameError: the reference or a component does not exist.
+        ParameterError: there is no component, a component is repeated, or a standard deviation is not
+            positive and finite.
     """
 
     frame: str
@@ -114,15 +113,15 @@ class WrenchFrame:
 
     @property
     def levers(self) -> list[Tensor]:
-        """Factors on `prior` `(k,)` for each of `LEVERS`, if there are forces and moments."""
+        """Factors on `prior` `(k,)` for each of `LEVERS`, if there are both forces and moments."""
         both = len({axis in FORCES for axis in self.axes}) == 2
         return [self._each((1.0, lever)) for lever in (LEVERS if both else (1.0,))]
 
     def jacobian(self, robot: RobotModel, q: Tensor) -> Tensor:
-        """J `(*batch, k, nq)` of the components at q `(*batch, nq)`; the joint force is Jᵀ w.
+        """Return J `(*batch, k, nq)` of the components at q `(*batch, nq)`; the joint force is Jᵀ w.
 
         Raises:
-            UnknownNameError: no such frame.
+            UnknownNameError: the frame does not exist.
         """
         J = kinematics.frame_jacobian(robot, q, self.frame, self.point)
         if self.reference == "local":
@@ -133,12 +132,12 @@ class WrenchFrame:
 
 
 def least_squares(J: Tensor, r: Tensor, S: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
-    """Generalized least squares of r = Jᵀ w + e, e ~ N(0, S), w ~ N(0, diag prior²).
+    """Solve r = Jᵀ w + e with e ~ N(0, S), w ~ N(0, diag prior²) by generalized least squares.
 
     Args:
-        J: `(n, k, nq)`.
+        J: `(n, k, nq)` Jacobians.
         r: `(n, nq)` residual joint force.
-        S: `(n, nq, nq)` its covariance for w = 0.
+        S: `(n, nq, nq)` covariance of r for w = 0.
         prior: `(k,)` or `(n, k)` standard deviations.
 
     Returns:
@@ -156,14 +155,14 @@ def least_squares(J: Tensor, r: Tensor, S: Tensor, prior: Tensor) -> tuple[Tenso
 def over_levers(
     mean: Tensor, covariance: Tensor, prior: Tensor, levers: Sequence[Tensor]
 ) -> tuple[Tensor, Tensor]:
-    """An estimate under w ~ N(0, W), W = diag prior², for a mixture of priors W_s = diag (s prior)², s ≤ 1.
+    """Convert an estimate under w ~ N(0, diag prior²) to a mixture of priors W_s = diag (s prior)², s ≤ 1.
 
     C_s⁻¹ = C⁻¹ + W_s⁻¹ − W⁻¹ and m_s = C_s C⁻¹ m, with evidence ∝ (|C_s| / |W_s|)^½ exp(½ m_sᵀ C_s⁻¹ m_s).
 
     Args:
-        mean, covariance: m `(n, k)` and C `(n, k, k)`.
+        mean, covariance: m `(n, k)` and C `(n, k, k)` under W = diag prior².
         prior: `(k,)` standard deviations.
-        levers: s of each prior `(k,)`, which are as likely before the data.
+        levers: scales s of each prior `(k,)`, with equal prior probability.
 
     Returns:
         Mean `(n, k)` and covariance `(n, k, k)` of the mixture.
@@ -188,7 +187,7 @@ def over_levers(
 
 
 def momentum_force(robot: RobotModel, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
-    """M `(n, nq, nq)` and ½ ∂(q̇ᵀM q̇)/∂q = Ṁ q̇ + Q_C `(n, nq)`, the contribution of inertia to ṗ."""
+    """Return M `(n, nq, nq)` and ½ ∂(q̇ᵀM q̇)/∂q = Ṁ q̇ + Q_C `(n, nq)`, the contribution of inertia to ṗ."""
     with torch.enable_grad():
         x = q.detach().clone().requires_grad_()
         M = dynamics.mass_matrix(robot, x)
@@ -199,14 +198,14 @@ def momentum_force(robot: RobotModel, q: Tensor, qd: Tensor) -> tuple[Tensor, Te
 
 @dataclass(frozen=True)
 class MomentumLog:
-    """Inputs of the filter, as arrays over n samples in order of time.
+    """Inputs to the filter, as arrays over n samples in time order.
 
     Attributes:
         t: `(n,)` time [s].
-        p: M q̇ `(n, nq)`, with covariance `p_noise` `(n, nq, nq)` of its noise.
+        p: momentum M q̇ `(n, nq)`, with noise covariance `p_noise` `(n, nq, nq)`.
         u: `(n, nq)` mean of ṗ without the wrench.
-        J: `(n, k, nq)` of the unknown components.
-        prior, change: `(k,)` their standard deviations, and those of their change within a second.
+        J: `(n, k, nq)` Jacobians of the unknown components.
+        prior, change: `(k,)` standard deviations of the components and of their change within a second.
         factor: `(n, nq, nq)` lower Cholesky factor of S.
         correlation: `(nq,)` integral of the autocorrelation of the forces' error over all lags [s].
     """
@@ -223,13 +222,12 @@ class MomentumLog:
 
 
 def observe(log: MomentumLog) -> tuple[Array, Array]:
-    """Filtered wrench of one trajectory: its mean `(n, k)` and covariance `(n, k, k)`; causal, in one pass.
+    """Filter the wrench of a trajectory causally; return mean `(n, k)` and covariance `(n, k, k)`.
 
-    State x = (p, w, η): w is an Ornstein-Uhlenbeck process with the variance W of the prior, which changes by
-    `change` within a second; S½ η is the error of the learned forces, η of unit variance. Over a step h,
-    p⁺ = p + h (u + Jᵀ w + S½ η), w⁺ = φ w + √(1 − φ²) W½ ε, η⁺ = ψ η + √(1 − ψ²) ε, with
-    φ = exp(−h change²/2 W), and ψ = (c − h)/(c + h), which keeps the spectral density c of η at low
-    frequencies.
+    The state is x = (p, w, η): w is an Ornstein-Uhlenbeck process with the variance W of the prior and
+    changes of `change` within a second; S½ η is the error of the learned forces, with η of unit variance.
+    Over a step h, p⁺ = p + h (u + Jᵀ w + S½ η), w⁺ = φ w + √(1 − φ²) W½ ε, η⁺ = ψ η + √(1 − ψ²) ε, with φ =
+    exp(−h change²/2 W), and ψ = (c − h)/(c + h), which keeps the spectral density c of η at low frequencies.
     """
     n, nq = log.p.shape
     k = len(log.prior)

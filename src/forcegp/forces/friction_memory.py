@@ -1,11 +1,11 @@
 """Dry friction with memory in the torque residuals of a fit.
 
-Friction as a function of the velocity jumps when a joint reverses. Real friction develops over a
-distance δ: in Dahl's model it is proportional to z, dz/dt = q̇/δ − |q̇| z/δ (Dahl 1976, *Solid friction
-damping of mechanical vibrations*). Force priors depend only on the state, so around each reversal they are
-wrong by up to the whole friction, which makes other learned forces less certain. In a log in order of time z
-follows from the velocities. The correction is a ridge regression of the torque residual on z for some δ, on
-functions of the velocity, and on the weight of the links. A joint is corrected only if that explains held-out
+Friction as a function of velocity jumps when a joint reverses. Real friction develops over a distance δ: in
+Dahl's model it is proportional to z, with dz/dt = q̇/δ − |q̇| z/δ (Dahl 1976, *Solid friction damping of
+mechanical vibrations*). Force priors depend only on the state, so near reversals they can be wrong by the
+full friction, which makes other learned forces less certain. For a log in time order, z can be computed from
+the velocities. The correction is a ridge regression of the torque residual on z for several δ, on functions
+of the velocity, and on the weight of the links. A joint is corrected only if the correction explains held-out
 stretches of the training log.
 """
 
@@ -35,25 +35,26 @@ from forcegp.robot.model import RobotModel
 
 MEMORY = f"{NOISE}.memory."
 WEIGHTS, SHARE, CORRELATION = (MEMORY + name for name in ("weights", "share", "correlation"))
-"""Names of the correction among the hyperparameters."""
+"""Names of the correction in the hyperparameters."""
 RIDGE = 1e-3
-"""Of features of size 1, relative to the number of samples."""
+"""Ridge for features of unit size, relative to the number of samples."""
 LONGEST_STEP = 0.05
-"""Time between training samples beyond which they do not show what the velocities were between [s]."""
+"""Longest time between training samples for interpolation of velocities [s]."""
 LEAST_SHARE = 0.01
-"""Smallest share of the variance that is believed to remain."""
+"""Lower bound on the remaining fraction of the variance."""
 
 
 def _features(robot: RobotModel, log: Measurement | Dataset) -> Tensor:
-    """Bristles of all distances, friction without memory, an offset, and weight, `(n, nq, f)`."""
+    """Return features `(n, nq, f)`: bristles for all distances, memoryless friction, offset, and weight."""
     v = log.qd[..., None]
     friction = [bristles(log), *(torch.tanh(v / speed) for speed in SPEEDS), v, torch.ones_like(v)]
     return torch.cat([*friction, _weight(robot, log.q)], dim=-1)
 
 
 def _weight(robot: RobotModel, q: Tensor) -> Tensor:
-    """Torque of gravity on the mass and the first moment of each link, `(n, nq, 4 nq)` [N m, N], for errors
-    as large as `InertialPrior` expects."""
+    """Return the gravity torque for errors of mass and first moment of each link, `(n, nq, 4 nq)` [N m, N],
+    of one standard deviation of `InertialPrior`.
+    """
     columns, zero = torch.arange(10 * robot.nq).view(-1, 10)[:, :4].flatten(), torch.zeros_like(q)
     Y = regressor(robot, q, zero, zero)[..., columns]
     return Y * InertialPrior().scale(robot)[columns]
@@ -61,12 +62,11 @@ def _weight(robot: RobotModel, q: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class FrictionMemory:
-    """Corrections of the torques of a fit.
+    """Torque correction of a fit.
 
     Attributes:
-        weights: of the features, `(nq, f)` [N m, N].
-        share: remaining share of the variance of the torque noise, and of that of joints that stick, `(nq,
-            2)`.
+        weights: weights of the features, `(nq, f)` [N m, N].
+        share: remaining fraction of the variance of torque noise and of static friction, `(nq, 2)`.
         correlation: integral of the autocorrelation of the residual over all lags, `(nq,)` [s].
     """
 
@@ -76,13 +76,13 @@ class FrictionMemory:
 
     @classmethod
     def of(cls, hyperparameters: Mapping[str, Tensor]) -> FrictionMemory | None:
-        """The memory learned by a fit, if its log determines it."""
+        """Return the correction learned by a fit, if its log determines it."""
         if WEIGHTS not in hyperparameters:
             return None
         return cls(*(hyperparameters[name] for name in (WEIGHTS, SHARE, CORRELATION)))
 
     def force(self, robot: RobotModel, log: Measurement | Dataset) -> Tensor:
-        """Joint force of the correction in a log in order of time, `(n, nq)` [N m, N]."""
+        """Return the joint force of the correction for a log in time order, `(n, nq)` [N m, N]."""
         return (_features(robot, log) * self.weights).sum(-1)
 
 
@@ -90,8 +90,8 @@ class FrictionMemory:
 def memory_of(
     problem: Problem, hyperparameters: Mapping[str, Tensor], training: Training
 ) -> dict[str, Tensor]:
-    """The correction as hyperparameters, from samples in free motion; empty if these are not in order of
-    time, or too far apart.
+    """Return the correction as hyperparameters, from samples in free motion; empty if these are not in time
+    order or too far apart.
 
     Args:
         training: samples with the residuals to explain.
@@ -134,10 +134,10 @@ def learn_memory(
     """Learn the correction from training samples in free motion.
 
     Args:
-        residual: joint force that the fit does not explain, M q̈ − E Q̄ `(n, nq)`.
-        white: its variance that noise of the accelerations explains, `(n, nq)`.
-        forces: its variance that the learned forces explain, `(n, nq)`.
-        noise: its variance that torque noise and sticking explain, `(n, nq, 2)`.
+        residual: joint force not explained by the fit, M q̈ − E Q̄ `(n, nq)`.
+        white: contribution of acceleration noise to its variance, `(n, nq)`.
+        forces: contribution of the learned forces, `(n, nq)`.
+        noise: contributions of torque noise and of static friction, `(n, nq, 2)`.
 
     Returns:
         The correction, or `None` if the samples are too far apart.

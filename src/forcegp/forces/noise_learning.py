@@ -1,27 +1,28 @@
-"""Noise that depends on the learned forces: slopes that carry noise of the state, and weights of samples.
+"""Noise that depends on the learned forces: slopes that propagate state noise, and sample weights.
 
 Both alternate with the hyperparameters (`solve` in `models/structured_learning.py`).
 
-**Slopes.** The first fit propagates the noise of the state through the equations of motion of the robot file
-(`noise.py`), which lack the unknown forces: a spring of 100 N m/rad turns noise of 1 mrad into 0.1 N m.
-Following McHutchon and Rasmussen (*Gaussian process training with input noise*, 2011), take the slope of the
-posterior mean F̄ at each sample and learn again with
+**Slopes.** The first fit propagates state noise through the equations of motion of the robot file
+(`noise.py`),
+which lack the unknown forces: a spring of 100 N m/rad turns noise of 1 mrad into 0.1 N m. Following McHutchon
+and Rasmussen (*Gaussian process training with input noise*, 2011), the slope of the posterior mean F̄ is
+computed at each sample, and hyperparameters are relearned with
 
     cov(y_i) = Σ_y + G_i Σ_x G_iᵀ,   G_i = ∂(L b + H F̄)/∂(q, q̇) + H ∂F̄/∂(q, q̇),
 
 where the first derivative is at fixed F̄; likewise for multipliers. The posterior mean can be worse than the
-robot file, for example far from other samples, so new slopes are taken only if the evidence of the training
-data, with the weak priors, increases.
+robot file, for example far from other samples, so new slopes are accepted only if the evidence of the
+training data, with the weak priors, increases.
 
 **Weights.** Impacts, dropped packets and gear shocks violate the equations of motion for a few samples, which
-would dominate a Gaussian likelihood. With y_i | w_i ~ N(E y_i, Σ_i/w_i) and w_i ~ Γ(ν/2, ν/2) the noise of
-sample i, d numbers that share one w_i, has a t distribution with ν degrees of freedom. Given the weights all
-is Gaussian, so inference stays exact. Expectation maximisation alternates learning with
+would dominate a Gaussian likelihood. With y_i | w_i ~ N(E y_i, Σ_i/w_i) and w_i ~ Γ(ν/2, ν/2), the noise of
+sample i, d numbers that share one w_i, has a t distribution with ν degrees of freedom. Given the weights,
+everything is Gaussian, so inference stays exact. Expectation maximisation alternates learning with
 
     w_i = (ν + d) / (ν + E[r_iᵀ Σ_i⁻¹ r_i]),
 
-r_i the residual under the posterior: samples far outside the noise have almost no weight (Lange, Little
-and Taylor, *Robust statistical modeling using the t distribution*, 1989).
+where r_i is the residual under the posterior. Samples far outside the noise have almost no weight (Lange,
+Little and Taylor, *Robust statistical modeling using the t distribution*, 1989).
 """
 
 from __future__ import annotations
@@ -41,23 +42,23 @@ from forcegp.forces.search import Search
 from forcegp.gp.optimise import Learned, Progress
 
 STEPS = 5
-"""Steps of the weights at given hyperparameters; each needs one posterior."""
+"""Number of weight updates at given hyperparameters, each of which needs a posterior."""
 CHUNK_STATES = 1024
-"""Samples whose residuals are computed at a time."""
+"""Number of samples for which residuals are computed at a time."""
 IGNORED = 0.1
-"""A sample of less weight is counted as left out."""
+"""Weight below which a sample counts as ignored."""
 
 
 def with_learned_slopes(
     problem: Problem, search: Search, learned: Learned, progress: Progress | None = None
 ) -> tuple[Problem, Learned, tuple[str, ...]]:
-    """The problem with the slopes of its learned forces, what is learned with them, and warnings.
+    """Return the problem with slopes of its learned forces, the resulting hyperparameters, and warnings.
 
-    Nothing changes if the evidence does not increase, or if the slopes cannot be computed or learned with, as
-    those of a force that is not made of tensors.
+    Nothing changes if the evidence does not increase, or if the slopes cannot be computed or used, for
+    example for a force that is not computed with tensors.
 
     Args:
-        problem: exact, with noise of the state.
+        problem: problem with exact inference and state noise.
     """
     values = search.values(learned)
     posterior, system = force_posterior(problem, values), problem.system_at(values)
@@ -73,10 +74,10 @@ def with_learned_slopes(
 
 @torch.no_grad()
 def weighted(problem: Problem, values: Mapping[str, Tensor], degrees: float) -> Problem:
-    """The problem with the weights of its samples after `STEPS` further steps.
+    """Return the problem with sample weights after `STEPS` more updates.
 
     Args:
-        degrees: ν.
+        degrees: degrees of freedom ν.
     """
     for _ in range(STEPS):
         posterior = force_posterior(problem, values)
@@ -91,14 +92,14 @@ def weighted(problem: Problem, values: Mapping[str, Tensor], degrees: float) -> 
 
 
 def left_out(problem: Problem) -> int:
-    """Number of samples with almost no weight."""
+    """Return the number of samples with almost no weight."""
     return sum(int((w < IGNORED).sum()) for w in problem.training.weights or ())
 
 
 def _weights(
     problem: Problem, posterior: ForcePosterior, values: Mapping[str, Tensor], i: int, degrees: float
 ) -> Tensor:
-    """Weights of the samples of a measurement `(n,)`."""
+    """Return the weights of the samples of a measurement `(n,)`."""
     m, system, weights = problem.training.measurements[i], problem.system_at(values), []
     noise = problem.sample_noise(values, system, i)
     for first in range(0, len(m.q), CHUNK_STATES):

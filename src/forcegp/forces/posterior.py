@@ -1,17 +1,17 @@
-"""The impressed forces before data, after them (eqs. 22 to 25), and as functions drawn from the posterior.
+"""Prior and posterior (eqs. 22 to 25) of the impressed forces, and functions drawn from the posterior.
 
-Q̄ = m + Σ_p E_p f_p with f_p ~ GP(0, k_p), and Coulomb friction of contacts, proportional to the multiplier.
-Every quantity z = B_Q Q + B_z Q_z + o is an affine map of the latent forces f_p, so their posterior
-determines it. Each function drawn from it is a deterministic force field that can be integrated.
+Q̄ = m + Σ_p E_p f_p with f_p ~ GP(0, k_p), plus Coulomb friction of contacts, proportional to the multiplier.
+Every quantity z = B_Q Q + B_z Q_z + o is an affine map of the latent forces f_p and is determined by their
+posterior. Each function drawn from the posterior is a deterministic force field that can be integrated.
 
-Accelerations in contact depend on Q + Q_z alone (remark 3.3). The two are distinguished by their directions
+Accelerations in contact depend only on Q + Q_z (remark 3.3). The two are distinguished by their directions
 (Q_z acts only in contact, along the tangent), by their inputs, and by measurements of either. Their posterior
-correlation measures the separation: at −1 only the sum is identifiable, at 0 they are separated.
+correlation measures the separation: at −1, only the sum is identifiable; at 0, they are separated.
 
-**Forces that are no function of the state.** At rest, the friction of a joint balances the other forces. A
-joint that hardly moves therefore has an additional unknown force of variance σ_s² e^{−(q̇/v_s)²}. Beyond the
-trained range of speeds and torques of a joint, its force has an additional standard deviation g D, with D the
-distance from that range in training standard deviations. `calibration.growth` estimates g.
+**Forces that are not functions of the state.** At rest, joint friction balances the other forces. A joint
+that hardly moves therefore has an additional unknown force of variance σ_s² e^{−(q̇/v_s)²}. Beyond the
+trained range of speeds and torques, a joint force has an additional standard deviation g D, where D is the
+distance from that range in training standard deviations and g is estimated by `calibration.growth`.
 """
 
 from __future__ import annotations
@@ -38,18 +38,18 @@ from forcegp.gp.sparse import SparsePosterior
 STICK_NOISE, STICK_SPEED = f"{NOISE}.stick.log_noise_std", f"{NOISE}.stick.log_speed"
 """Names of the learned σ_s and v_s of each joint."""
 STICKING = 0.02
-"""v_s where learning begins [rad/s, m/s]."""
+"""Initial value of v_s [rad/s, m/s]."""
 REGION = f"{NOISE}.region."
 LOW, HIGH, SPREAD, GROWTH = (REGION + name for name in ("low", "high", "spread", "growth"))
 """Names of the trained region: limits and standard deviation of the speed and torque of each joint `(2, nq)`,
 and g `(nq,)` [N m, N]."""
 OUTERMOST = 0.01
-"""Share of the training samples that lies beyond either limit of the region."""
+"""Fraction of the training samples beyond either limit of the region."""
 RELATIVE = 0.05
-"""Growth g over the typical load of a joint that is expected before learning: torque constants and
-friction that depends on load are uncertain by some 5 %."""
+"""Prior growth g relative to the typical load of a joint: torque constants and load-dependent friction are
+    uncertain by about 5 %."""
 FAR_BEYOND = 3.0
-"""Distance beyond the trained region from which a prediction warns."""
+"""Distance beyond the trained region from which predictions warn."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -57,11 +57,11 @@ class ForceProcess:
     """Priors on forces with learned parameters of their operators.
 
     Attributes:
-        priors, scales: the force priors and the standardization of their inputs.
+        priors, scales: force priors and the standardization of their inputs.
         mean: prior mean of Q.
-        coulomb: friction of contacts that is proportional to the multiplier.
-        pinned: by number of the prior, value `(components,)` of a constant latent force that the robot
-            contains: its prior mean is minus this value, its posterior mean zero.
+        coulomb: contact friction proportional to the multiplier.
+        pinned: values `(components,)` of constant latent forces contained in the robot, by number of the
+            prior; their prior mean is minus this value, and their posterior mean is zero.
     """
 
     priors: tuple[ForcePrior, ...]
@@ -71,15 +71,15 @@ class ForceProcess:
     pinned: Mapping[int, Tensor] = field(default_factory=dict)
 
     def features(self, p: int, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
-        """Standardized kernel inputs of prior p at states."""
+        """Return the standardized kernel inputs of prior p at states."""
         return self.scales[p].apply(self.priors[p].features(system, at))
 
     def coupled(self, system: ConstrainedSystem, at: States, z: AffineMap) -> AffineMap:
-        """The affine map of a quantity with Coulomb friction of contacts."""
+        """Add Coulomb friction of contacts to the affine map of a quantity."""
         return coupled(system, at, z, self.coulomb)
 
     def rows(self, system: ConstrainedSystem, at: States, z: AffineMap) -> Block:
-        """A quantity as rows of the latent forces.
+        """Express a quantity as rows of the latent forces.
 
         Args:
             z: the quantity, with Coulomb friction of contacts.
@@ -103,16 +103,16 @@ class ForceProcess:
 
 
 LatentPosterior = ExactPosterior | SparsePosterior
-"""Latent processes conditioned on rows, exactly or through inducing points."""
+"""Latent processes conditioned on rows, exactly or with inducing points."""
 
 
 @dataclass(frozen=True, eq=False)
 class ForcePosterior:
-    """Latent forces conditioned on data; independent of the constraint at prediction.
+    """Latent forces conditioned on data, which do not depend on the constraint at prediction.
 
     Attributes:
-        process: the forces before the data.
-        latent: the conditioned processes.
+        process: prior of the forces.
+        latent: conditioned latent processes.
     """
 
     process: ForceProcess
@@ -124,26 +124,26 @@ class ForcePosterior:
         return self.process.priors
 
     def shift(self, p: int, features: Features) -> Tensor | float:
-        """Shift of samples of latent force p to the predicted mean."""
+        """Return the shift from samples of latent force p to the predicted mean."""
         if not self.process.pinned:
             return 0.0
         return self.means.latent_mean(p, features) - self.latent.latent_mean(p, features)
 
     @cached_property
     def means(self) -> LatentPosterior:
-        """The processes for means, given the forces that the robot contains."""
+        """Processes for means, given the forces contained in the robot."""
         means = self.latent
         for p, value in self.process.pinned.items():
             means = means.knowing(p, {"one": value.new_zeros(1, 1)}, value)
         return means
 
     def __call__(self, system: ConstrainedSystem, at: States) -> Tensor:
-        """Posterior mean of Q̄ = Σ E f + m, `(n, nq)`: the force field of a rollout."""
+        """Return the posterior mean of Q̄ = Σ E f + m, `(n, nq)`, the force field for rollouts."""
         force = self.unknown_force(system, at, range(len(self.priors))) + self.process.mean(system, at)
         return with_coulomb(system, at, force, self.process.coulomb)
 
     def unknown_force(self, system: ConstrainedSystem, at: States, priors: Iterable[int]) -> Tensor | float:
-        """Posterior mean of Σ E f over some priors, `(n, nq)`, without Coulomb friction of contacts."""
+        """Return the posterior mean of Σ E f over some priors, `(n, nq)`, without Coulomb friction."""
         # Σ_p E_p μ_p
         force: Tensor | float = 0.0
         for p in (p for p in priors if self.means.measured[p]):
@@ -152,7 +152,7 @@ class ForcePosterior:
         return force
 
     def rows(self, system: ConstrainedSystem, at: States, z: AffineMap) -> Block:
-        """A quantity at n states as rows of the processes, with its prior mean as target.
+        """Express a quantity at n states as rows of the processes, with its prior mean as target.
 
         Args:
             z: the quantity, without Coulomb friction of contacts.
@@ -161,19 +161,19 @@ class ForcePosterior:
         return self.process.rows(system, at, self.process.coupled(system, at, z))
 
     def read(self, system: ConstrainedSystem, at: States, z: AffineMap) -> tuple[Tensor, Tensor]:
-        """Posterior mean `(n, d)` and covariance `(n, d, d)` of a quantity, without measurement noise."""
+        """Return posterior mean `(n, d)` and covariance `(n, d, d)` of a quantity, excluding noise."""
         # o + B (m + Σ E μ), and W Cov(f) Wᵀ (eqs. 23 to 25)
         rows = self.rows(system, at, z)
         return rows.target + self.means.mean(rows), self.latent.covariance(rows)
 
     def read_mean(self, system: ConstrainedSystem, at: States, z: AffineMap) -> Tensor:
-        """Posterior mean o + B(m + Σ E f) of a quantity at states, `(n, d)`."""
+        """Return the posterior mean o + B(m + Σ E f) of a quantity at states, `(n, d)`."""
         rows = self.rows(system, at, z)
         return rows.target + self.means.mean(rows)
 
 
 def stick_variance(tensors: Mapping[str, Tensor], at: States) -> Tensor:
-    """Variance of the friction of joints that stick, `(n, nq)`; zero if it is not learned."""
+    """Return the variance of static joint friction, `(n, nq)`; zero if it is not learned."""
     if STICK_NOISE not in tensors:
         return torch.zeros_like(at.q)
     std, speed = tensors[STICK_NOISE].exp(), tensors[STICK_SPEED].exp()
@@ -181,13 +181,13 @@ def stick_variance(tensors: Mapping[str, Tensor], at: States) -> Tensor:
 
 
 def trained_region(qd: Tensor, tau: Tensor, load: Tensor, hidden: Tensor | None = None) -> dict[str, Tensor]:
-    """The region of the training samples `(n, nq)`, by the names of `LOW`, `HIGH` and `SPREAD`.
+    """Return the region of the training samples `(n, nq)`, with the names `LOW`, `HIGH` and `SPREAD`.
 
     Args:
-        qd, tau: of samples in motion.
-        load: typical torque of each joint `(nq,)`, a fraction of which bounds the spread of its torque from
-            below.
-        hidden: `(nq,)` bool, joints without effect of the torque on accelerations; their region is one
+        qd, tau: velocities and torques of samples in motion.
+        load: typical torque of each joint `(nq,)`, a fraction of which is the lower bound on the standard
+            deviation of the torque.
+        hidden: `(nq,)` bool, joints with torques that do not affect accelerations; their region is one
             standard deviation around the mean.
     """
     x = torch.stack([qd, tau], dim=1)
@@ -201,8 +201,8 @@ def trained_region(qd: Tensor, tau: Tensor, load: Tensor, hidden: Tensor | None 
 
 
 def distance_beyond(tensors: Mapping[str, Tensor], qd: Tensor, tau: Tensor) -> Tensor:
-    """D of each joint `(*batch, nq)` in training standard deviations; zero inside the trained region, or if
-    it is unknown.
+    """Return D of each joint `(*batch, nq)` in training standard deviations; zero inside the trained region
+    or if the region is unknown.
     """
     if LOW not in tensors:
         return torch.zeros_like(qd)
@@ -212,10 +212,10 @@ def distance_beyond(tensors: Mapping[str, Tensor], qd: Tensor, tau: Tensor) -> T
 
 
 def warnings_beyond(distance: Tensor, joints: Sequence[str]) -> tuple[str, ...]:
-    """A warning if states lie far beyond the trained region.
+    """Return a warning if states are far beyond the trained region.
 
     Args:
-        distance: D `(*batch, nq)`.
+        distance: distance D `(*batch, nq)`.
     """
     rows = distance.reshape(-1, distance.shape[-1])
     far = int((rows > FAR_BEYOND).any(-1).sum())
@@ -230,16 +230,16 @@ def warnings_beyond(distance: Tensor, joints: Sequence[str]) -> tuple[str, ...]:
 
 
 def hidden_variance(tensors: Mapping[str, Tensor], at: States, external: Tensor | None) -> Tensor:
-    """Variance of forces determined by neither state nor torque sensor, `(n, nq)`: of joints that stick, and
-    of unknown forces of stated size `(nq,)`.
+    """Return the variance of forces determined by neither state nor torque sensor, `(n, nq)`: static
+    friction, and unknown forces of given standard deviation `(nq,)`.
     """
     variance = stick_variance(tensors, at)
     return variance if external is None else variance + external**2
 
 
 def unknown_variance(tensors: Mapping[str, Tensor], at: States, external: Tensor | None) -> Tensor:
-    """Additional variance of forces in a prediction `(n, nq)`: hidden forces, and g² D² beyond the trained
-    region.
+    """Return the additional variance of predicted forces `(n, nq)`: hidden forces, and g² D² beyond the
+    trained region.
     """
     variance = hidden_variance(tensors, at, external)
     if GROWTH not in tensors:
@@ -248,7 +248,7 @@ def unknown_variance(tensors: Mapping[str, Tensor], at: States, external: Tensor
 
 
 CHUNK_STATES = 256
-"""States at which samples are evaluated at once, so that intermediate arrays stay in the cache."""
+"""Number of states at which samples are evaluated at a time, to keep arrays in the processor cache."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -257,7 +257,7 @@ class ForceSamples:
 
     Attributes:
         posterior: source of the samples.
-        functions: the latent functions.
+        functions: sampled latent functions.
     """
 
     posterior: ForcePosterior
@@ -269,10 +269,10 @@ class ForceSamples:
         return self.functions.count
 
     def __call__(self, system: ConstrainedSystem, at: States) -> Tensor:
-        """Q̄ = Q + Q_z of one sample per trajectory, the force field of a rollout.
+        """Return Q̄ = Q + Q_z of one sample per trajectory, the force field for rollouts.
 
         Args:
-            at: samples × k states, of which the s-th run of k belongs to sample s.
+            at: samples × k states, with the s-th run of k states for sample s.
 
         Returns:
             `(samples · k, nq)` [N m, N].
@@ -283,7 +283,7 @@ class ForceSamples:
         return with_coulomb(system, at, Q_bar, self.posterior.process.coulomb)
 
     def unknown_force(self, system: ConstrainedSystem, at: States, priors: Iterable[int]) -> Tensor | float:
-        """Σ E f over some priors, without Coulomb friction of contacts."""
+        """Return Σ E f over some priors, without contact Coulomb friction."""
         unknown: Tensor | float = 0.0
         runs = len(at.q) // self.count
         step = max(1, CHUNK_STATES // max(runs, 1))
@@ -313,26 +313,26 @@ def draw_samples(
 
     Args:
         generator: source of randomness, on the CPU.
-        features: random features per component; by default a number that depends on the posterior.
+        features: number of random features per component; the default depends on the posterior.
     """
     size = () if features is None else (features,)
     return ForceSamples(posterior, posterior.latent.draw(count, generator, *size))
 
 
 CORRELATION_STATES = 50
-"""Training states at which the correlation of Q and Q_z is evaluated after a fit."""
+"""Number of training states at which the correlation of Q and Q_z is evaluated after a fit."""
 FAR = 0.02
-"""Distance from its surface at which a closed contact is doubted [m]."""
+"""Distance from its surface from which a closed contact is doubtful [m]."""
 UNDETERMINED = 10.0
-"""Standard deviations of the multiplier per its size from which a fit warns."""
+"""Relative standard deviation of the multiplier from which a fit warns."""
 MISSED = 2.0
-"""Root mean square of residuals, in units of the noise, from which a fit warns."""
+"""Root mean square residual, in units of the noise, from which a fit warns."""
 LARGE_JITTER = 0.01
-"""Jitter, relative to unit noise, from which a fit warns: the noise grows by half of it."""
+"""Jitter, relative to unit noise, from which a fit warns; the noise increases by half of it."""
 
 
 def force_correlation(posterior: ForcePosterior, system: ConstrainedSystem, at: States) -> Tensor:
-    """Posterior correlation of Q and Q_z at each state and joint, `(n, nq)`; 0 if one of them is certain.
+    """Return the posterior correlation of Q and Q_z at each state and joint, `(n, nq)`; 0 if one is certain.
 
     corr_i = Cov(Q_i, Q_z,i) / √(Var Q_i Var Q_z,i). The part of Q along the constraint, which does not affect
     accelerations, is excluded.
@@ -353,11 +353,11 @@ def force_correlation(posterior: ForcePosterior, system: ConstrainedSystem, at: 
 def doubts_of(
     posterior: ForcePosterior, system: ConstrainedSystem, training: Training, power: float
 ) -> tuple[float | None, tuple[str, ...]]:
-    """Doubts about a posterior with a tempered likelihood, at training states in contact and overall.
+    """Return doubts about a posterior with a tempered likelihood, at training states in contact and overall.
 
     Returns:
-        Mean correlation of Q and Q_z over some of these states, where both have priors; and warnings, each
-        with a remedy.
+        Mean correlation of Q and Q_z over some of these states, if both have priors, and warnings, each with
+        a remedy.
     """
     few = training.evenly(min(CORRELATION_STATES, training.samples)).measurements if training.samples else ()
     # Elsewhere Q_z is zero, and there is no multiplier.
@@ -404,7 +404,7 @@ def doubts_of(
 
 
 def _on_multiplier(mean: Tensor, variance: Tensor) -> tuple[str, ...]:
-    """A warning where the multiplier is so uncertain that it is not determined by the data."""
+    """Return a warning if the multiplier is too uncertain to be determined by the data."""
     size, spread = float(mean.abs().median()), float(variance.sqrt().median())
     if spread <= UNDETERMINED * max(size, 1e-12):
         return ()

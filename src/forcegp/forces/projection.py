@@ -1,12 +1,12 @@
-"""Measurements as rows with unit white noise, with the directions fixed by the constraint projected out. If
-q̈ is measured in contact, A q̈ = b fixes the part of q̈ in the range of Aᵀ: it is prior mean plus white
-noise. With an orthonormal basis U of the null space of A (after scaling by the noise), Uᵀ q̈ carries the
-whole Gaussian process in nq − rank A rows per sample, and the likelihood splits exactly into the two parts.
+"""Measurements as rows with unit white noise, with the directions fixed by the constraint projected out.
 
-Noise of the motor torque is white noise on the joint force. It affects a sample's rows through the same
-operator as the force, so they have the covariance I + N Nᵀ with N = B Σ_τ½, whose Cholesky factor whitens
-them sample by sample. Noise of the state affects them, to first order, through the Jacobian of the measured
-quantity.
+If q̈ is measured in contact, A q̈ = b fixes the part of q̈ in the range of Aᵀ to prior mean plus white noise.
+With an orthonormal basis U of the null space of A (after scaling by the noise), Uᵀ q̈ contains the whole
+Gaussian process in nq − rank A rows per sample, and the likelihood splits exactly into the two parts.
+
+Motor torque noise is white noise on the joint force. It affects the rows of a sample through the same
+operator as the force. They have the covariance I + N Nᵀ with N = B Σ_τ½ and are whitened by its Cholesky
+factor. State noise affects the rows, to first order, through the Jacobian of the measured quantity.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from forcegp.gp.features import Block, Features
 
 @dataclass(frozen=True, eq=False)
 class WhitenedRows:
-    """The rows of all measurements, and the part of the likelihood independent of the latent forces.
+    """Rows of all measurements, and the part of the likelihood that does not depend on the latent forces.
 
     Attributes:
-        blocks: rows that the latent forces explain.
-        rest: computes the negative log likelihood of everything else; not needed for an update.
+        blocks: rows explained by the latent forces.
+        rest: function that returns the negative log likelihood of the remainder; not needed for an update.
     """
 
     blocks: list[Block]
@@ -42,13 +42,14 @@ class WhitenedRows:
 
     @cached_property
     def constant(self) -> Tensor:
-        """Negative log likelihood of the rest, with the normalisation of the noise `()`."""
+        """Negative log likelihood of the remainder, with the normalisation of the noise `()`."""
         return self.rest()
 
     def tempered(self, power: float) -> WhitenedRows:
-        """The rows of the likelihood to a power κ: noise variances over κ, normalisations times κ.
+        """Return the rows of the likelihood to a power κ: noise variances over κ, normalisations times κ.
 
-        With noise correlated over τ samples, n samples carry the evidence of n/τ; κ = 1/τ accounts for it.
+        With noise correlated over τ samples, n samples contain the information of n/τ; κ = 1/τ accounts for
+        this.
         """
         if power == 1.0:
             return self
@@ -79,10 +80,10 @@ class _NullSpaceBasis(torch.autograd.Function):
 
 
 def null_space_basis(A: Tensor, rank: int) -> Tensor:
-    """Orthonormal basis U of the null space of matrices of equal rank, A U = 0, UᵀU = I.
+    """Return the orthonormal basis U of the null space of matrices of equal rank, A U = 0, UᵀU = I.
 
-    The basis is defined up to a rotation U R, so only functions that do not depend on R have a
-    derivative; for these dU = −A⁺ dA U.
+    The basis is defined up to a rotation U R, so only functions that do not depend on R have a derivative;
+    for these, dU = −A⁺ dA U.
 
     Args:
         A: `(*batch, m, n)`.
@@ -98,11 +99,11 @@ def null_space_basis(A: Tensor, rank: int) -> Tensor:
 
 
 def _independent(A: Tensor, rank: int) -> tuple[Tensor, Tensor | None]:
-    """As many rows as the rank that the equations of motion count, and the combinations C that they are of
-    those of A; `None` for all of them.
+    """Return independent rows, as many as the rank in the equations of motion, and their combinations C of
+    the rows of A; `None` for all rows.
 
-    With another rank, A⁺ would magnify the contradictions of nearly redundant rows. Fixed combinations of
-    rows have the solutions, and so the derivative, of all rows that are consistent.
+    With another rank, A⁺ would amplify contradictions between nearly redundant rows. Fixed combinations of
+    consistent rows have the same solutions, and hence derivatives, as all rows.
     """
     if rank == A.shape[-2]:
         return A, None
@@ -111,7 +112,7 @@ def _independent(A: Tensor, rank: int) -> tuple[Tensor, Tensor | None]:
 
 
 def _by_rank(rank: Tensor) -> list[tuple[int, Tensor | slice]]:
-    """The samples of each rank; one slice of all of them where they share it, of which no copy is made."""
+    """Return the samples of each rank, or a slice of all samples without a copy if the rank is equal."""
     if not len(rank):
         return []
     low, high = (int(value) for value in rank.aminmax())
@@ -123,13 +124,13 @@ def _by_rank(rank: Tensor) -> list[tuple[int, Tensor | slice]]:
 
 @dataclass(frozen=True)
 class _Rows:
-    """Samples with a common number of rows.
+    """Samples with the same number of rows.
 
     Attributes:
         features: kernel inputs of each prior.
         widths: number of columns of each operator.
-        rows: the operators, the residual, and the factor N of the noise, side by side `(n, r, ·)`; the noise
-            of the rows has the covariance 1 + N Nᵀ.
+        rows: concatenated operators, residual, and noise factor N `(n, r, ·)`; the noise of the rows has the
+            covariance 1 + N Nᵀ.
     """
 
     features: tuple[Features, ...]
@@ -137,16 +138,16 @@ class _Rows:
     rows: Tensor
 
     def of(self, index: Tensor | slice, U: Tensor) -> _Rows:
-        """Uᵀ times the rows of some samples, or of all of them where `own` is a slice."""
+        """Return Uᵀ times the rows of some samples, or of all samples if `own` is a slice."""
         if isinstance(index, slice):
             return _Rows(self.features, self.widths, U.mT @ self.rows)
         features = tuple({name: x[index] for name, x in f.items()} for f in self.features)
         return _Rows(features, self.widths, U.mT @ self.rows[index])
 
     def whitened(self, weight: Tensor | None) -> tuple[Block, Tensor]:
-        """The rows divided by the factor of I + N Nᵀ, and the log determinant of the factors.
+        """Return the rows divided by the factor of I + N Nᵀ, and the log determinant of the factors.
 
-        Weighted samples have another noise variance.
+        Weighted samples have a different noise variance.
         """
         signal = sum(self.widths) + 1
         rows, N = self.rows.tensor_split([signal], dim=-1)
@@ -169,7 +170,7 @@ class _Rows:
 def whiten(
     system: ConstrainedSystem, process: ForceProcess, measurement: Measurement, noise: SampleNoise
 ) -> WhitenedRows:
-    """Rows of one measurement with unit white noise, without noise-free directions."""
+    """Return the rows of one measurement with unit white noise, without noise-free directions."""
     # z = B_Q Q + B_z Q_z + o (eqs. 19 and 20)
     at, std = measurement.at(system), noise.std.expand_as(measurement.values)
     z = process.coupled(system, at, affine_map(system, at, measurement.quantity))
@@ -197,7 +198,7 @@ def whiten(
 def _without_fixed(
     everything: _Rows, eom: Equations, values: Tensor, std: Tensor, weight: Tensor | None
 ) -> WhitenedRows:
-    """The rows of q̈ along the null space of A; the directions that A q̈ = b fixes go into the constant."""
+    """Return the rows of q̈ along the null space of A; directions fixed by A q̈ = b enter the constant."""
     # (A σ) U = 0, rows Uᵀ (W, y, N)
     A, b = eom.A, eom.b
     scaled, groups, blocks, log_determinants = A * std[:, None, :], _by_rank(eom.rank), [], []
@@ -218,14 +219,14 @@ def _without_fixed(
 
 
 def _log_scale(std: Tensor, weight: Tensor | None) -> Tensor:
-    """Logarithm of all standard deviations together, of weighted samples `()`."""
+    """Return the sum of log standard deviations over weighted samples `()`."""
     total = std.log().sum()
     return total if weight is None else total - 0.5 * std.shape[-1] * weight.log().sum()
 
 
 def _fixed(A: Tensor, rank: int, violated: Tensor, weight: Tensor) -> Tensor:
-    """Negative log likelihood of the directions that the constraint fixes `()`, where A q̈ − b is
-    violated."""
+    """Return the negative log likelihood of the directions fixed by the constraint `()`, from the violation
+    A q̈ − b."""
     # ½ w |(A σ)⁺ (A q̈ − b)|² + ½ rank A log 2π
     rows, C = _independent(A, rank)
     pinv = torch.linalg.pinv(rows) if C is None else torch.linalg.pinv(rows) @ C
@@ -234,6 +235,6 @@ def _fixed(A: Tensor, rank: int, violated: Tensor, weight: Tensor) -> Tensor:
 
 
 def combine(rows: Sequence[WhitenedRows]) -> WhitenedRows:
-    """The rows of several measurements together."""
+    """Combine the rows of several measurements."""
     blocks = [block for r in rows for block in r.blocks]
     return WhitenedRows(blocks, lambda: torch.stack([r.constant for r in rows]).sum())

@@ -1,4 +1,4 @@
-"""Every quantity as an affine map of the forces, z = B_Q Q + B_z Q_z + o.
+"""Quantities as affine maps of the forces, z = B_Q Q + B_z Q_z + o.
 
 The operators follow from M q̈ = Q̄ + Aᵀλ and A q̈ = b (eqs. 19 to 25 with two corrections: the operator
 from force to λ is −Lᵀ, and λ depends on all impressed forces Q + Q_z).
@@ -31,12 +31,13 @@ class States:
     """A batch of robot states with their equations of motion.
 
     Attributes:
-        q, qd, tau: `(n, nq)`.
-        active: `(n, n_contacts)` bool.
-        eom: the equations of motion at these states.
+        q, qd, tau: `(n, nq)` positions, velocities and motor torques.
+        active: `(n, n_contacts)` bool, closed contacts.
+        eom: equations of motion at these states.
         qdd: `(n, nq)` measured acceleration, if known.
-        slip: `(n, nq)` sliding direction of each joint, in place of the smooth tanh(q̇/v₀) of dry friction.
-        time: `(n, 2)` time [s] and number of the trajectory, for states of a training log.
+        slip: `(n, nq)` sliding direction of each joint, which replaces the smooth tanh(q̇/v₀) in dry
+            friction.
+        time: `(n, 2)` time [s] and trajectory number, for states in a training log.
     """
 
     q: Tensor
@@ -63,16 +64,16 @@ def states(
 
 
 ForceField = Callable[[ConstrainedSystem, States], Tensor]
-"""The impressed force Q̄ at states, `(n, nq)`; a batch of functions gives each its share of the n rows."""
+"""Function that returns the impressed force Q̄ at states, `(n, nq)`; batched functions split the n rows."""
 
 
 class FlatStates(NamedTuple):
-    """States of any batch shape as a list.
+    """Flattened states of any batch shape.
 
     Attributes:
-        q, qd, tau: `(n, nq)`.
-        active: `(n, n_contacts)` bool.
-        batch: shape whose product is n.
+        q, qd, tau: `(n, nq)` positions, velocities and motor torques.
+        active: `(n, n_contacts)` bool, closed contacts.
+        batch: original batch shape, with product n.
     """
 
     q: Tensor
@@ -82,11 +83,11 @@ class FlatStates(NamedTuple):
     batch: torch.Size
 
     def rows(self, index: slice) -> FlatStates:
-        """Some of the states."""
+        """Return some of the states."""
         return FlatStates(self.q[index], self.qd[index], self.tau[index], self.active[index], self.batch)
 
     def with_equations(self, system: ConstrainedSystem) -> States:
-        """The states with their equations of motion."""
+        """Return the states with their equations of motion."""
         eom = system.equations(self.q, self.qd, self.active)
         return States(self.q, self.qd, self.tau, self.active, eom)
 
@@ -94,10 +95,11 @@ class FlatStates(NamedTuple):
 def flat_states(
     system: ConstrainedSystem, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor | None
 ) -> FlatStates:
-    """Broadcast states `(*batch, nq)` against each other and flatten them; all contacts closed by default.
+    """Broadcast states `(*batch, nq)` against each other and flatten them; by default all contacts are
+    closed.
 
     Raises:
-        ShapeError: an argument does not fit the system, or is not finite.
+        ShapeError: an argument does not match the system, or is not finite.
     """
     inputs = {"q": q, "qd": qd, "tau": tau}
     system.robot.check_state(**inputs)
@@ -123,18 +125,21 @@ def flat_states(
 def states_at(
     system: ConstrainedSystem, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor | None
 ) -> tuple[States, torch.Size]:
-    """States `(*batch, nq)` as a list with their equations of motion, and the batch; errors as of
+    """Return the states `(*batch, nq)` as a list with their equations of motion, and the batch; errors as of
     `flat_states`."""
     flat = flat_states(system, q, qd, tau, active)
     return flat.with_equations(system), flat.batch
 
 
 class AffineMap(NamedTuple):
-    """z = B_Q Q + B_z Q_z + o at each state.
+    """Affine map z = B_Q Q + B_z Q_z + o at each state.
 
-    Attributes: B_Q: `(n, d, nq)` operator on the joint force Q. B_z: `(n, d, nq)` operator on the contact's
-    dissipative force Q_z. B_N: `(n, d, nq)` operator on the part of Q in the range of Aᵀ: B_Q, but `None` for
-    q̈, since H Aᵀ = 0. o: `(n, d)` offset.
+    Attributes:
+        B_Q: `(n, d, nq)` operator on the joint force Q.
+        B_z: `(n, d, nq)` operator on the dissipative contact force Q_z.
+        B_N: `(n, d, nq)` operator on the part of Q in the range of Aᵀ, equal to B_Q, or `None` for q̈, since
+            H Aᵀ = 0.
+        o: `(n, d)` offset.
     """
 
     B_Q: Tensor
@@ -144,49 +149,50 @@ class AffineMap(NamedTuple):
 
 
 def _identity(at: States) -> tuple[Tensor, Tensor, Tensor]:
-    """I, 0 and the offset 0 in joint space."""
+    """Return I, 0 and the offset 0 in joint space."""
     eye = torch.eye(at.q.shape[-1], dtype=at.q.dtype, device=at.q.device).expand(len(at.q), -1, -1)
     return eye, torch.zeros_like(eye), torch.zeros_like(at.q)
 
 
 def _times(C: Tensor, z: AffineMap) -> AffineMap:
-    """C z for matrices C `(n, c, d)`."""
+    """Return C z for matrices C `(n, c, d)`."""
     # C z = C B_Q Q + C B_z Q_z + C o
     B = C @ z.B_Q
     return AffineMap(B, C @ z.B_z, B, (C @ z.o[..., None])[..., 0])
 
 
 def _acceleration(system: ConstrainedSystem, at: States) -> AffineMap:
-    """q̈ = L b + H (Q + Q_z) (eqs. 4 and 15)."""
+    """Return q̈ = L b + H (Q + Q_z) (eqs. 4 and 15)."""
     H = at.eom.H
     return AffineMap(H, H, None, vecdot(at.eom.L, at.eom.b[..., None, :]))
 
 
 def _free_acceleration(system: ConstrainedSystem, at: States) -> AffineMap:
-    """q̈′ = M⁻¹ Q (eq. 1)."""
+    """Return q̈′ = M⁻¹ Q (eq. 1)."""
     _, zero, nothing = _identity(at)
     return AffineMap(at.eom.M_inv, zero, at.eom.M_inv, nothing)
 
 
 def _multiplier(system: ConstrainedSystem, at: States) -> AffineMap:
-    """λ = (A M⁻¹ Aᵀ)⁺ b − Lᵀ (Q + Q_z) (eqs. 16 and 19, with the two corrections)."""
+    """Return λ = (A M⁻¹ Aᵀ)⁺ b − Lᵀ (Q + Q_z) (eqs. 16 and 19, with the two corrections)."""
     B = -at.eom.L.mT
     return AffineMap(B, B, B, (at.eom.constraint_inertia @ at.eom.b[..., None])[..., 0])
 
 
 def _constraint_force(system: ConstrainedSystem, at: States) -> AffineMap:
-    """Q_I = Aᵀ λ (eq. 17)."""
+    """Return Q_I = Aᵀ λ (eq. 17)."""
     return _times(at.eom.A.mT, _multiplier(system, at))
 
 
 def _contact_force(system: ConstrainedSystem, at: States) -> AffineMap:
-    """F_I = ∇c λ of each surface contact, and (t_1, t_2) λ_t where it sticks: three Cartesian components per
-    contact, in the order of the contacts."""
+    """Return F_I = ∇c λ of each surface contact, plus (t_1, t_2) λ_t if it sticks, with three Cartesian
+    components per contact, in the order of the contacts.
+    """
     return _times(_directions(system, at), _multiplier(system, at))
 
 
 def _directions(system: ConstrainedSystem, at: States) -> Tensor:
-    """N with F_I = N λ `(n, 3 k, m)`: the directions of each surface contact in its rows and columns."""
+    """Return N with F_I = N λ `(n, 3 k, m)`, which contains the directions of each surface contact."""
     blocks, first = [at.q.new_zeros(len(at.q), 0, system.m)], 0
     for contact in system.contacts:
         if contact.name in at.eom.contact_points:
@@ -197,19 +203,19 @@ def _directions(system: ConstrainedSystem, at: States) -> Tensor:
 
 
 def _total_force(system: ConstrainedSystem, at: States) -> AffineMap:
-    """Q̄ = Q + Q_z (eq. 18)."""
+    """Return Q̄ = Q + Q_z (eq. 18)."""
     eye, _, nothing = _identity(at)
     return AffineMap(eye, eye, eye, nothing)
 
 
 def _joint_force(system: ConstrainedSystem, at: States) -> AffineMap:
-    """Q."""
+    """Return Q."""
     eye, zero, nothing = _identity(at)
     return AffineMap(eye, zero, eye, nothing)
 
 
 def _contact_friction(system: ConstrainedSystem, at: States) -> AffineMap:
-    """Q_z."""
+    """Return Q_z."""
     eye, zero, nothing = _identity(at)
     return AffineMap(zero, eye, zero, nothing)
 
@@ -224,17 +230,17 @@ QUANTITIES: dict[str, Callable[[ConstrainedSystem, States], AffineMap]] = {
     "joint_force": _joint_force,
     "contact_friction": _contact_friction,
 }
-"""The quantities that can be measured and predicted, by name."""
+"""Quantities that can be measured and predicted, by name."""
 
 
 def affine_maps(
     system: ConstrainedSystem, at: States, quantity: str | Sequence[str]
 ) -> tuple[AffineMap, dict[str, slice]]:
-    """The affine map of a quantity, or of several, stacked, and the rows of each.
+    """Return the affine map of one quantity or several stacked ones, and the rows of each.
 
     Raises:
-        UnknownNameError: no such quantity.
-        ModelError: none is named.
+        UnknownNameError: a quantity does not exist.
+        ModelError: no quantity is given.
     """
     names = list(quantity) if isinstance(quantity, Sequence) and not isinstance(quantity, str) else [quantity]
     if not names:
@@ -254,7 +260,7 @@ def affine_maps(
 
 
 ROUNDED = 1e-6
-"""Entries of the projector on hidden multipliers that are rounding of 0, or of 1."""
+"""Tolerance for entries of the projector on hidden multipliers that equal 0 or 1 up to rounding."""
 OPEN = (
     "contact {} was closed in no training sample: its force is not determined",
     "the point of contact {} cannot move against it: its force is not determined",
@@ -268,9 +274,9 @@ class Hidden(NamedTuple):
 
     Attributes:
         whole: `(n, d)` bool, undetermined components.
-        shared: `(n, d, d)` C R Cᵀ, the load sharing of contacts, with R the projector on Aᵀμ = 0.
+        shared: `(n, d, d)` C R Cᵀ, the load sharing of contacts, with the projector R onto Aᵀμ = 0.
         seen: `(n,)` number of directions of the shared load that motion determines.
-        doubts: the same in words.
+        doubts: descriptions of undetermined components.
     """
 
     whole: Tensor
@@ -279,8 +285,8 @@ class Hidden(NamedTuple):
     doubts: tuple[str, ...]
 
     def applied(self, mean: Tensor, covariance: Tensor | None) -> tuple[Tensor, Tensor | None]:
-        """Mean `(n, d)` and covariance, NaN for undetermined components; an undetermined direction has the
-        mean square of the determined ones as variance.
+        """Return mean `(n, d)` and covariance with NaN for undetermined components; undetermined directions
+        have the mean square of the determined ones as variance.
         """
         if covariance is not None:
             square = mean.square() + covariance.diagonal(dim1=-2, dim2=-1)
@@ -294,11 +300,11 @@ class Hidden(NamedTuple):
 def hidden_forces(
     system: ConstrainedSystem, at: States, parts: Mapping[str, slice], never: Sequence[str] = ()
 ) -> Hidden | None:
-    """Undetermined parts of some quantities; `None` if all of them are determined.
+    """Return the undetermined parts of some quantities; `None` if all are determined.
 
     Args:
-        parts: the rows of each quantity, as `affine_maps` gives them.
-        never: contacts that were closed in no training sample.
+        parts: rows of each quantity, from `affine_maps`.
+        never: contacts that are never closed in the training data.
 
     Raises:
         ModelError: all requested quantities are forces of such contacts.
@@ -339,7 +345,7 @@ def hidden_forces(
 
 
 def affine_map(system: ConstrainedSystem, at: States, quantity: str | Sequence[str]) -> AffineMap:
-    """The affine map of a quantity, or of several, stacked; errors as in `affine_maps`."""
+    """Return the affine map of one quantity or several stacked ones; errors as in `affine_maps`."""
     return affine_maps(system, at, quantity)[0]
 
 
@@ -349,8 +355,8 @@ class ForceLinearization(NamedTuple):
     Attributes:
         qdd: `(*batch, nq)` acceleration [rad/s², m/s²].
         dq, dqd, dtau: `(*batch, nq, nq)` dq̈/dq, dq̈/dq̇ and dq̈/dτ.
-        multiplier: `(*batch, m)` λ.
-        multiplier_dq, multiplier_dqd, multiplier_dtau: `(*batch, m, nq)`.
+        multiplier: `(*batch, m)` multiplier λ.
+        multiplier_dq, multiplier_dqd, multiplier_dtau: `(*batch, m, nq)` dλ/dq, dλ/dq̇ and dλ/dτ.
     """
 
     qdd: Tensor
@@ -374,12 +380,12 @@ def linearize_field(
     """Linearize the constrained motion under a force field.
 
     Args:
-        force: the impressed force Q̄ at states, `(n, nq)`.
+        force: function that returns the impressed force Q̄ at states, `(n, nq)`.
         q, qd, tau: `(*batch, nq)` states.
-        active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
+        active: `(*batch, n_contacts)` bool, the closed contacts; by default all.
 
     Raises:
-        ShapeError: an argument does not fit the system.
+        ShapeError: an argument does not match the system.
     """
     flat = flat_states(system, q, qd, tau, active)
     with torch.enable_grad():

@@ -1,10 +1,10 @@
 """Search for hyperparameters by L-BFGS: initial values, bounds, weak priors, warm starts, restarts.
 
 Inputs are standardized, so a length-scale of about the square root of their number relates typical samples. A
-log-normal prior around this start, with a different width on either side, keeps the length-scales of
+log-normal prior around this initial value, with different widths on either side, keeps the length-scales of
 irrelevant inputs from drifting to infinity (four e-folds above), and penalises length-scales so short that a
-force could fit the noise (one e-fold below). The standard deviation of a force starts at the root mean square
-of the force that explains the training residuals by least squares.
+force could fit the noise (one e-fold below). The initial standard deviation of a force is the root mean
+square of the force that explains the training residuals by least squares.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ LIMITS = {
     "log_smoothing": (math.log(1e-4), math.log(0.1)),
     MIXING: (-10.0, 10.0),
 }
-"""Bounds of what has a scale of its own, whatever the start."""
+"""Bounds of hyperparameters with an absolute scale."""
 REACH = {"log_lengthscale": (4.0, 8.0)}
-"""Range of the others below and above their start, in e-folds; `FAR` where not named. An input with a
+"""Range of the others below and above their initial value, in e-folds; `FAR` if not listed. An input with a
 length-scale 8 e-folds above its start no longer matters."""
 FAR = (7.0, 7.0)
 AT_BOUND = 1e-6
-"""Distance from a bound below which learning ended there, in e-folds."""
+"""Distance from a bound, in e-folds, within which learning counts as ended at the bound."""
 WIDTH = {
     "log_coefficient": (2.0, 1.0),
     "log_smoothing": (2.0, 1.0),
@@ -52,19 +52,19 @@ WIDTH = {
     "log_offset": (1.0, 1.0),
     "log_time": (1.0, 1.0),
 }
-"""Standard deviations of the log-normal priors below and above the start, in e-folds; 3 where not named."""
+"""Standard deviations of log-normal priors below and above the initial value, in e-folds (default 3)."""
 START_SAMPLES = 5000
-"""Evenly spaced samples that the start of learning is computed from, where there are more."""
+"""Maximum number of evenly spaced samples for computing initial values."""
 FRICTION_SAMPLES = 200
-"""Evenly spaced samples that the start of Coulomb friction is chosen on."""
+"""Maximum number of evenly spaced samples for selecting the initial Coulomb friction."""
 COEFFICIENTS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
-"""Friction coefficients that are tried."""
+"""Friction coefficients to try."""
 PARALLEL = 1e-9
-"""One minus the mean cosine below which two directions are the same."""
+"""One minus the mean cosine below which two directions count as equal."""
 
 
 def initial(problem: Problem, learn_noise: bool, learn_torque_noise: bool = False) -> Tensors:
-    """Default initial values of all learnable parameters of a problem."""
+    """Return the default initial values of all learnable parameters of a problem."""
     few = problem
     if problem.training.samples > START_SAMPLES:
         few = dataclasses.replace(problem, training=problem.training.evenly(START_SAMPLES))
@@ -90,9 +90,9 @@ def initial(problem: Problem, learn_noise: bool, learn_torque_noise: bool = Fals
 
 @torch.no_grad()
 def _with_friction(problem: Problem, noise: Tensors) -> Tensors:
-    """The likeliest coefficient of Coulomb friction, and hyperparameters of the forces that it leaves.
+    """Return the most likely Coulomb friction coefficient, and hyperparameters of the remaining forces.
 
-    From a coefficient that is far off, learning may give all friction to a function of the state, and end so.
+    From a poor coefficient, learning may attribute all friction to a function of the state, a local optimum.
     """
     few = dataclasses.replace(problem, training=problem.training.evenly(FRICTION_SAMPLES), inducing=None)
     like = problem.system.robot.mass
@@ -123,10 +123,10 @@ def _with_friction(problem: Problem, noise: Tensors) -> Tensors:
 def initial_hyperparameters(
     priors: Sequence[ForcePrior], blocks: Sequence[Block], beyond_noise: bool = False
 ) -> dict[str, Tensor]:
-    """Initial log-hyperparameters, by `<prior>.<name>`.
+    """Return the initial log-hyperparameters, by `<prior>.<name>`.
 
     Args:
-        beyond_noise: whether to subtract the share of the noise, for example if unknown forces are stated.
+        beyond_noise: whether to subtract the contribution of noise, for example if unknown forces are given.
     """
     params: dict[str, Tensor] = {}
     # Some priors share the hyperparameters of another one.
@@ -139,11 +139,10 @@ def initial_hyperparameters(
 
 
 def _force_scale(p: int, blocks: Sequence[Block], commensurate: bool, beyond_noise: bool) -> Tensor:
-    """Root mean square of the least-squares force of prior p, `(components,)`.
+    """Return the root mean square of the least-squares force of prior p, `(components,)`.
 
-    Rows only determine sums of components along one direction. The least norm divides it evenly where
-    all have one unit; that of viscous and dry friction it would divide by their units, so each of these
-    starts as if it were alone.
+    Rows determine only the sum of components along one direction. The least norm divides it evenly if all
+    have the same unit. Viscous and dry friction have different units, so each starts as if it were alone.
     """
     operators = [block.operators[p] for block in blocks]
     each = torch.arange(operators[0].shape[-1], device=operators[0].device)
@@ -163,7 +162,7 @@ def _force_scale(p: int, blocks: Sequence[Block], commensurate: bool, beyond_noi
 
 
 def _first_parallel(operators: Sequence[Tensor]) -> Tensor:
-    """For each component, the first one that has its direction at every sample, `(components,)`."""
+    """Return, for each component, the first one with the same direction at every sample, `(components,)`."""
     along = most = torch.zeros_like(operators[0][0].mT @ operators[0][0])
     for W in operators:
         size = W.square().sum(1).sqrt()
@@ -175,20 +174,20 @@ def _first_parallel(operators: Sequence[Tensor]) -> Tensor:
 
 
 def limits_of(params: Parameters) -> dict[str, tuple[float, float]]:
-    """Bounds of hyperparameters with an absolute scale."""
+    """Return the bounds of hyperparameters with an absolute scale."""
     return {key: LIMITS[_kind(key)] for key in params if _kind(key) in LIMITS}
 
 
 def box_around(
     start: Parameters, begin: Parameters | None = None
 ) -> dict[str, tuple[float | Tensor, float | Tensor]]:
-    """Box of each hyperparameter, for the optimiser.
+    """Return the box of each hyperparameter for the optimiser.
 
-    Far from the start, double precision does not resolve the likelihood, for example for forces a million
-    times the noise.
+    Far from the initial values, double precision does not resolve the likelihood, for example for forces a
+    million times the noise.
 
     Args:
-        begin: another start of learning; the box contains it.
+        begin: other initial values that the box must contain.
     """
     box: dict[str, tuple[float | Tensor, float | Tensor]] = {}
     for key, x in start.items():
@@ -199,9 +198,9 @@ def box_around(
 
 
 def doubts_at_bounds(tensors: Mapping[str, Tensor], box: Bounds) -> tuple[str, ...]:
-    """Warnings if learning ended at a bound.
+    """Return warnings if learning ended at a bound.
 
-    A force may vanish and an input may be irrelevant; a noise at a bound, or a force at its upper bound, is
+    A force may vanish and an input may be irrelevant, but noise at a bound, or a force at its upper bound, is
     doubtful.
     """
     doubts = []
@@ -221,12 +220,12 @@ def doubts_at_bounds(tensors: Mapping[str, Tensor], box: Bounds) -> tuple[str, .
 
 
 def _kind(key: str) -> str:
-    """The kind of a hyperparameter, the last part of its name."""
+    """Return the kind of a hyperparameter, the last part of its name."""
     return key.rsplit(".", 1)[-1]
 
 
 def negative_log_prior(params: Parameters, start: Mapping[str, Tensor]) -> Tensor | float:
-    """Σ ½ ((θ − θ_start)/width)², the weak prior on log-hyperparameters up to a constant."""
+    """Return Σ ½ ((θ − θ_start)/width)², the weak prior on log-hyperparameters up to a constant."""
     total: Tensor | float = 0.0
     for key, value in params.items():
         below, above = WIDTH.get(_kind(key), (3.0, 3.0))
@@ -236,7 +235,7 @@ def negative_log_prior(params: Parameters, start: Mapping[str, Tensor]) -> Tenso
 
 
 def checked_start(values: Mapping[str, Tensor], start: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Given initial values, checked against the default ones.
+    """Check given initial values against the default ones.
 
     Raises:
         ModelError: a value is missing, or has another shape.
@@ -254,7 +253,7 @@ def checked_start(values: Mapping[str, Tensor], start: Mapping[str, Tensor]) -> 
 
 
 def random_starts(start: Mapping[str, Tensor], restarts: int, seed: int) -> Iterator[dict[str, Tensor]]:
-    """The start, then one random start around it per restart."""
+    """Yield the initial values, followed by a random start around them per restart."""
     generator = torch.Generator().manual_seed(seed)
     yield dict(start)
     for _ in range(restarts):
@@ -267,7 +266,7 @@ def random_starts(start: Mapping[str, Tensor], restarts: int, seed: int) -> Iter
 
 
 def warm_start_sizes(samples: int, first: int | None) -> list[int]:
-    """Numbers of samples of the warm start, doubling up to half of all samples."""
+    """Return the numbers of samples of the warm start, doubling up to half of all samples."""
     sizes: list[int] = []
     size = first
     while size is not None and samples > 2 * size:
@@ -278,13 +277,13 @@ def warm_start_sizes(samples: int, first: int | None) -> list[int]:
 
 @dataclass(frozen=True)
 class Search:
-    """Search of hyperparameters.
+    """Search for hyperparameters.
 
     Attributes:
         start: default initial values, and centre of the weak priors.
         held: values that are not learned.
         options: optimiser and its limits.
-        recorded: wraps the objective, such as `Checkpoint.recorded`.
+        recorded: function that wraps the objective, such as `Checkpoint.recorded`.
     """
 
     start: Tensors
@@ -298,14 +297,14 @@ class Search:
         progress: Progress | None = None,
         begin: Mapping[str, Tensor] | None = None,
     ) -> Learned:
-        """Learn, first on a part of a large data set, and from several starts on request.
+        """Learn, initially from a part of a large data set, and from several starts if requested.
 
         Args:
             progress: called after each evaluation on all data.
             begin: initial values on all data, instead of warm starts and restarts.
 
         Raises:
-            ModelError: `begin` does not fit the learned parameters.
+            ModelError: `begin` does not match the learned parameters.
             NumericalError: the likelihood cannot be computed.
         """
         if begin is not None:
@@ -317,18 +316,18 @@ class Search:
         return min(candidates, key=lambda learned: learned.value)
 
     def values(self, learned: Learned) -> Tensors:
-        """All hyperparameters, learned and held."""
+        """Return all hyperparameters, learned and fixed."""
         return {**self.held, **learned.tensors}
 
     def objective(self, problem: Problem, tensors: Tensors) -> Tensor:
-        """−κ log p(y | θ) − log p(θ): exact or its bound, and weak priors around the start if any."""
+        """Return −κ log p(y | θ) − log p(θ), exact or a bound, with weak priors around the start if any."""
         hyper = {key: v for key, v in tensors.items() if not key.startswith(ANALYTICAL + ".")}
         weak = negative_log_prior(hyper, self.start) if self.options.hyperpriors else 0.0
         rows = problem.rows_for(tensors, self.held)
         return problem.negative_log_likelihood(kernel_parameters({**self.held, **tensors}), rows) + weak
 
     def _warmed(self, problem: Problem, cold: Tensors) -> Tensors:
-        """Start on all data: the end of learning on fewer samples, unless the cold start is better."""
+        """Return the start on all data: the result of fewer samples, unless the cold start is better."""
         first = cold
         for samples in warm_start_sizes(problem.training.samples, self.options.warm_start):
             small = dataclasses.replace(problem, training=problem.training.thinned(samples))

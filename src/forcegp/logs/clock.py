@@ -16,14 +16,15 @@ from forcegp.logs.table import Array, ImportReport, Signals
 from forcegp.rows import describe, numbered
 
 RESTART_STEPS, SHORTEST_TRAJECTORY = 2.0, 10
-"""A clock that falls back to within so many steps of where its trajectory began, or before, has restarted,
-after so many rows at least; fewer are stamps out of order."""
+"""A clock that falls back to within this many steps of the start of its trajectory, or before, has restarted,
+after this many rows at least; fewer are stamps out of order.
+"""
 GAP_STEPS = 5.0
-"""A step longer than so many usual ones is a gap."""
+"""Number of usual steps beyond which a step is a gap."""
 
 
 def usual_step(t: Array) -> float:
-    """The median of the positive time steps [s]; `DataError` if time never increases."""
+    """Return the median of the positive time steps [s]; `DataError` if time never increases."""
     steps = np.diff(t)
     steps = steps[steps > 0.0]
     if not len(steps):
@@ -57,11 +58,11 @@ def drop_repeated(signals: Signals, report: ImportReport) -> None:
 
 
 def split_trajectories(signals: Signals, gap: float | None, report: ImportReport) -> None:
-    """Number the trajectories: a new one begins at a new number in the log, at a restart of the clock, and
-    after a step longer than `gap` [s], by default `GAP_STEPS` usual steps.
+    """Number the trajectories, which begin at a new number in the log, at a clock restart, and after a step
+    longer than `gap` [s], by default `GAP_STEPS` usual steps.
 
     Raises:
-        DataError: time steps back without restarting; the message has the rows.
+        DataError: time steps back without a restart; the message lists the rows.
     """
     t = signals.t
     step = usual_step(t)
@@ -91,7 +92,7 @@ def split_trajectories(signals: Signals, gap: float | None, report: ImportReport
 
 
 def find_held(signals: Signals, drop: bool, report: ImportReport) -> None:
-    """Find, and on request drop, rows repeated because the logger is faster than its source."""
+    """Find, and drop if requested, rows repeated because the logger is faster than its source."""
     held = np.zeros(len(signals), dtype=bool)
     held[1:] = signals.segment[1:] == signals.segment[:-1]
     for name in ("q", "tau"):
@@ -108,7 +109,7 @@ def find_held(signals: Signals, drop: bool, report: ImportReport) -> None:
 def join_stream(
     signals: Signals, name: str, t: Array, values: Array, gap: float | None, report: ImportReport
 ) -> None:
-    """Add an interpolated vector of a stream with stamps t `(k,)`; rows outside its range are dropped."""
+    """Add an interpolated vector from a stream with stamps t `(k,)`; rows outside its range are dropped."""
     back = np.flatnonzero(np.diff(t) <= 0.0)
     if len(back):
         raise DataError(
@@ -137,13 +138,13 @@ def join_stream(
 
 
 UNEVEN = 0.02
-"""Largest departure of a time step from the usual one, as a fraction, that passes for even."""
+"""Largest relative deviation of a time step from the usual one that counts as even."""
 SMOOTH = ("q", "qd")
 """Quantities interpolated by a cubic spline; noisier quantities are interpolated linearly."""
 
 
 def onto(t: Array, values: Array, at: Array, cubic: bool = False) -> Array:
-    """Interpolate values `(n, d)` of a stream with stamps t at other times, linearly or by a cubic spline."""
+    """Interpolate values `(n, d)` with time stamps t at other times, linearly or by a cubic spline."""
     from scipy.interpolate import CubicSpline, make_interp_spline
 
     return CubicSpline(t, values)(at) if cubic and len(t) >= 4 else make_interp_spline(t, values, k=1)(at)

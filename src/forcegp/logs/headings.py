@@ -1,6 +1,6 @@
-"""Contents of headings: the column of time, families of columns with one member per joint, units, sensors.
+"""Interpretation of headings: the time column, families of columns with one member per joint, units, sensors.
 
-Columns without headings are recognised by their values.
+Columns without headings are identified by their values.
 """
 
 from __future__ import annotations
@@ -20,9 +20,9 @@ from forcegp.robot import RobotModel
 from forcegp.robust import robust_std
 
 WORDS: dict[str, list[str]] = units.VOCABULARY["words"]
-"""Words that name a quantity, by quantity, in the order in which they are looked for."""
+"""Words for each quantity, in search order."""
 MEASURED, COMMANDED = (units.VOCABULARY["columns"][kind] for kind in ("measured", "commanded"))
-"""Words of columns that were measured, and of columns that are not what is looked for."""
+"""Words for measured columns, and for columns to ignore, such as commands."""
 _TIME = re.compile(
     r"^(.*[ _./])?(t|mt|time|times|timestamp|stamp|clock|sec|secs|seconds|ms|millis|zeit)([ _./\[(].*)?$"
 )
@@ -32,7 +32,7 @@ _SEGMENTS = ("segment", "episode_index", "episode", "trial", "run")
 
 
 def tokens(name: str) -> list[str]:
-    """Words of a heading, in lower case; derivatives of q are one word.
+    """Return the words of a heading, in lower case; derivatives of q are one word.
 
     >>> tokens("actualJointPos_3 [deg]")
     ['actual', 'joint', 'pos', '3', 'deg']
@@ -47,7 +47,7 @@ def tokens(name: str) -> list[str]:
 
 
 def declared_unit(name: str, stream: Stream) -> str | None:
-    """The unit declared by a heading or the line below it, or `None`."""
+    """Return the unit declared by a heading or the line below it, or `None`."""
     if name in stream.units:
         return units.spelled(stream.units[name])
     for match in _DECLARED.finditer(name):
@@ -58,7 +58,7 @@ def declared_unit(name: str, stream: Stream) -> str | None:
 
 
 def find_time(table: LogTable, draft: Draft) -> Stream:
-    """The stream with the columns of the joints; its time column is added to the draft."""
+    """Return the stream with the joint columns, and add its time column to the draft."""
     stream = max(table.streams, key=lambda s: (len(s.columns), len(s)))
     candidates = []
     for name, values in stream.columns.items():
@@ -96,7 +96,7 @@ def find_time(table: LogTable, draft: Draft) -> Stream:
 
 
 def find_families(stream: Stream, robot: RobotModel, draft: Draft) -> None:
-    """The columns of each quantity, and the log's names of the joints."""
+    """Find the columns of each quantity, and the names of the joints in the log."""
     families = _families(stream, robot)
     if not any(re.search("[A-Za-z]", name) for name in stream.columns):
         find_by_values(stream, robot.joint_names, draft)
@@ -127,7 +127,7 @@ def find_families(stream: Stream, robot: RobotModel, draft: Draft) -> None:
 
 
 def _families(stream: Stream, robot: RobotModel) -> list[Family]:
-    """Columns that differ in a joint's name, a number, or what follows the first dot."""
+    """Return the columns that differ in a joint name, a number, or the part after the first dot."""
     groups: dict[str, dict[str, str]] = {}
     names = sorted(robot.joint_names, key=len, reverse=True)
     for column in stream.columns:
@@ -152,7 +152,7 @@ def _families(stream: Stream, robot: RobotModel) -> list[Family]:
 
 
 def _rate(family: Family, quantity: str) -> float:
-    """Agreement of a family's name with a quantity; 0 for none."""
+    """Return a score for the agreement of a family's name with a quantity, 0 for none."""
     words = tokens(family.pattern.replace("{joint}", " "))
     if not any(word in WORDS[quantity] for word in words):
         return 0.0
@@ -164,7 +164,7 @@ def _rate(family: Family, quantity: str) -> float:
 
 
 def _match_joints(robot: RobotModel, draft: Draft) -> None:
-    """Names of the joints in the log, from the names of the positions."""
+    """Find the names of the joints in the log from the names of the positions."""
     names = list(draft.families["position"].columns)
     if all(name.isdigit() for name in names):
         draft.say("joints", "the log numbers its joints; they were taken from base to tip", doubt=True)
@@ -197,7 +197,7 @@ def _likeness(joint: str, name: str) -> float:
 
 
 def find_wrench(table: LogTable, robot: RobotModel, draft: Draft) -> None:
-    """Columns of a force-torque sensor: `force.x`, `Fx`, `f_x`, …"""
+    """Find the columns of a force-torque sensor: `force.x`, `Fx`, `f_x`, …"""
     for stream in table.streams:
         columns: dict[tuple[int, str], str] = {}
         for column in stream.columns:
@@ -221,7 +221,7 @@ def find_wrench(table: LogTable, robot: RobotModel, draft: Draft) -> None:
 
 
 RELATED = 0.95
-"""Correlation of a velocity with the rate of change of its position, at least."""
+"""Minimum correlation of a velocity with the rate of change of its position."""
 
 
 def find_by_values(stream: Stream, joints: tuple[str, ...], draft: Draft) -> None:
@@ -250,7 +250,7 @@ def find_by_values(stream: Stream, joints: tuple[str, ...], draft: Draft) -> Non
 
 
 def _is_rate(t: np.ndarray, x: np.ndarray, v: np.ndarray) -> bool:
-    """Whether v is proportional to the rate of change of x in every column."""
+    """Return whether v is proportional to the rate of change of x in every column."""
     step = np.diff(t)[:, None]
     rate, mean = np.diff(x, axis=0), 0.5 * (v[1:] + v[:-1]) * step
     good = (step[:, 0] > 0.0) & np.isfinite(rate).all(axis=1) & np.isfinite(mean).all(axis=1)

@@ -1,7 +1,8 @@
 """Computation of missing velocities and accelerations by trajectory, never across a contact switch.
 
-The Kalman smoother of a joint gives position, velocity and acceleration with error bars. Its model is a
-constant jerk disturbed by white snap of intensity s, measured with white noise of deviation σ: x = (q, q̇,
+The Kalman smoother of a joint returns position, velocity and acceleration with error bars. Its model is
+constant
+jerk disturbed by white snap of intensity s, measured with white noise of deviation σ: x = (q, q̇,
 q̈, q⃛), dx = F x dt + e₄ √s dw, y = q + ε. In the scaled state z = (q, h q̇, h² q̈, h³ q⃛), h the time step,
 transition and noise are constant matrices: z⁺ = A z + w, A_ij = 1/(j−i)!, Cov(w)_ij = ρ σ² W_ij with ρ = s
 h⁷/σ² and W_ij = 1/((3−i)! (3−j)! (7−i−j)), i, j from 0. ρ is learned by evidence, σ in closed form (Rauch,
@@ -26,9 +27,10 @@ from forcegp.logs.table import Array, ImportReport, Signals
 from forcegp.rows import runs
 
 STATES, SHORTEST = 4, 8
-"""Size of the state, position to jerk, and rows that a piece needs."""
+"""Size of the state, from position to jerk, and minimum number of rows per piece."""
 LEARNED_ROWS, LOG_RHO = 2000, (-30.0, 8.0)
-"""Rows of the longest pieces that ρ is learned from, and range of log ρ: from a parabola to no smoothing."""
+"""Number of rows (of the longest pieces) for learning ρ, and range of log ρ, from parabola to no smoothing.
+"""
 DIFFUSE, SETTLED = 1e8, 1e-10
 """Uninformative prior variance of the first scaled state [σ²]; change of a stationary covariance."""
 
@@ -39,8 +41,7 @@ W = np.outer(TAYLOR, TAYLOR) / (7.0 - np.add.outer(np.arange(STATES), np.arange(
 
 @dataclass(frozen=True)
 class Smoothed:
-    """Estimates of one joint `(n,)`, another column through the same filter, and σ of the measured
-    position."""
+    """Estimates of a joint `(n,)`, another column after the same filter, and σ of the measured position."""
 
     position: Array
     velocity: Array
@@ -51,10 +52,10 @@ class Smoothed:
 
 
 def smooth(t: Array, q: Array, piece: NDArray[np.int64], also: Array | None = None) -> Smoothed:
-    """Smooth the positions q of one joint, piece by piece, with one ρ and σ for all pieces.
+    """Smooth the positions q of a joint, piece by piece, with common ρ and σ.
 
-    All are `(n,)`: evenly spaced time within each piece [s], the number of each row's piece, of at least
-    `SHORTEST` rows, and `also`, another quantity to filter in the same way.
+    All arguments are `(n,)`: evenly spaced time within each piece [s], the piece number of each row (pieces
+    have at least `SHORTEST` rows), and `also`, another quantity to filter in the same way.
 
     >>> t = np.arange(400) * 0.01
     >>> noise = 1e-3 * np.random.default_rng(0).standard_normal(400)
@@ -80,9 +81,7 @@ def smooth(t: Array, q: Array, piece: NDArray[np.int64], also: Array | None = No
 
 
 def learn(q: Array, stretches: list[slice]) -> tuple[float, float]:
-    """ρ and σ, in the unit of q, with the largest evidence on the longest pieces of measured positions
-    `(n,)`.
-    """
+    """Return ρ and σ (in the unit of q) with the largest evidence on the longest pieces of q `(n,)`."""
     chosen, remaining = [], LEARNED_ROWS
     for rows in sorted(stretches, key=lambda s: s.start - s.stop):
         chosen.append(q[rows][:remaining])
@@ -103,7 +102,7 @@ def learn(q: Array, stretches: list[slice]) -> tuple[float, float]:
 
 
 def _forward(n: int, rho: float) -> tuple[Array, Array, Array, Array]:
-    """Gains, innovation variances, and predicted and filtered covariances of n rows."""
+    """Return the gains, innovation variances, and predicted and filtered covariances of n rows."""
     gain, innovation = np.empty((n, STATES)), np.empty(n)
     predicted, filtered = np.empty((n, STATES, STATES)), np.empty((n, STATES, STATES))
     P = DIFFUSE * np.eye(STATES)
@@ -123,7 +122,7 @@ def _forward(n: int, rho: float) -> tuple[Array, Array, Array, Array]:
 
 
 def _gains(n: int, rho: float) -> tuple[Array, Array, Array]:
-    """Filter gains `(n, 4)`, smoother gains from the next row and covariances over σ², `(n, 4, 4)` each."""
+    """Return filter gains `(n, 4)`, and smoother gains and covariances divided by σ², `(n, 4, 4)` each."""
     gain, _, predicted, filtered = _forward(n, rho)
     back, covariance = np.zeros((n, STATES, STATES)), filtered.copy()
     settled = False
@@ -140,7 +139,7 @@ def _gains(n: int, rho: float) -> tuple[Array, Array, Array]:
 
 
 def _ahead(y: Array, gain: Array) -> tuple[Array, Array]:
-    """Innovations `(n,)`, what each row adds to the prediction, and predicted scaled states `(n, 4)`."""
+    """Return the innovations `(n,)` of the rows and the predicted scaled states `(n, 4)`."""
     e, ahead = np.empty(len(y)), np.empty((len(y), STATES))
     z = np.array([y[0], *[0.0] * (STATES - 1)])
     for k in range(len(y)):
@@ -150,7 +149,7 @@ def _ahead(y: Array, gain: Array) -> tuple[Array, Array]:
 
 
 def _run(y: Array, gain: Array, back: Array) -> Array:
-    """Smoothed scaled states `(n, 4)`."""
+    """Return the smoothed scaled states `(n, 4)`."""
     e, ahead = _ahead(y, gain)
     now = ahead + gain[: len(y)] * e[:, None]
     for k in range(len(y) - 2, -1, -1):
@@ -159,8 +158,9 @@ def _run(y: Array, gain: Array, back: Array) -> Array:
 
 
 def add_derivatives(signals: Signals, settings: DerivativesSection, report: ImportReport) -> Array | None:
-    """Compute missing `qd` and `qdd`, piece by piece between contact switches, and filter the torque in the
-    same way; returns σ of the computed q̈ `(n, nq)`, or `None` if it is logged.
+    """Compute missing `qd` and `qdd` piece by piece between contact switches, and filter the torque alike.
+
+    Return σ of the computed q̈ `(n, nq)`, or `None` if q̈ is logged.
     """
     logged = [name for name in ("qd", "qdd") if name in signals.vectors]
     if len(logged) == 2:
@@ -179,7 +179,7 @@ def add_derivatives(signals: Signals, settings: DerivativesSection, report: Impo
 
 
 def _pieces(signals: Signals, least: int, report: ImportReport) -> NDArray[np.int64]:
-    """Number of the piece of each row; pieces too short for the filter are dropped."""
+    """Return the piece number of each row; pieces too short for the filter are dropped."""
     keep = np.ones(len(signals), dtype=bool)
     for rows in signals.runs(*signals.contact.values()):
         keep[rows] = rows.stop - rows.start >= least
@@ -198,7 +198,7 @@ def _pieces(signals: Signals, least: int, report: ImportReport) -> NDArray[np.in
 
 
 def _filter(signals: Signals, piece: NDArray[np.int64], settings: DerivativesSection) -> Array | None:
-    """Derivatives of the polynomials fitted to a moving window (Savitzky and Golay)."""
+    """Return the derivatives of the polynomials fitted to a moving window (Savitzky and Golay)."""
     from scipy.signal import savgol_filter
 
     method, vectors = SavitzkyGolay(settings.window, settings.order), signals.vectors
@@ -216,7 +216,7 @@ def _filter(signals: Signals, piece: NDArray[np.int64], settings: DerivativesSec
 
 
 def _smooth(signals: Signals, piece: NDArray[np.int64], settings: DerivativesSection) -> Array | None:
-    """Means and error bars by the Kalman smoother, joint by joint; the torque passes through the same one."""
+    """Apply the Kalman smoother joint by joint, also to the torque, and return means and error bars."""
     vectors, missing = signals.vectors, {"qd", "qdd"} - set(signals.vectors)
     filtered, std = "qdd" in missing and settings.filter_torque, np.empty_like(vectors["q"])
     for name in missing:
@@ -234,7 +234,7 @@ def _smooth(signals: Signals, piece: NDArray[np.int64], settings: DerivativesSec
 
 
 def impact_mask(signals: Signals, margin: float) -> dict[str, NDArray[np.bool_]]:
-    """Rows within `margin` [s] of a switch of each contact: accelerations of an impact, or one-sided fits."""
+    """Return the rows within `margin` [s] of a switch of each contact, with impacts or one-sided fits."""
     masks = {}
     for name, closed in signals.contact.items():
         mask = np.zeros(len(signals), dtype=bool)

@@ -1,5 +1,7 @@
-"""The plane or sphere that the tip slid on, fitted to its path, with error bars that hold for residuals
-correlated in time; the tip is a point, or a ball of known or unknown radius.
+"""Fit of a plane or sphere to the path of the tip, with error bars that account for residuals correlated in
+time.
+
+The tip is a point, or a ball of known or unknown radius.
 """
 
 from __future__ import annotations
@@ -21,14 +23,14 @@ from forcegp.logs.table import Array
 from forcegp.robust import robust_std
 
 LEAST_POINTS, ROUNDING = 20, 1e-9
-"""Points that a fit needs, and the smallest scale of their residuals, so that an exact fit has one."""
+"""Minimum number of points for a fit, and minimum scale of their residuals."""
 OUTLIER_STD = 4.0
-"""Rows with residuals beyond so many deviations are outliers."""
+"""Number of deviations beyond which residuals are outliers."""
 
 
 @dataclass(frozen=True)
 class Solution:
-    """Parameters, covariance, residuals of the rows used, the number of independent ones, and outliers."""
+    """Parameters, covariance, residuals of the used rows, number of independent residuals, and outliers."""
 
     x: Array
     covariance: Array
@@ -38,7 +40,7 @@ class Solution:
 
 
 def robust_least_squares(residual: Callable[[Array], Array], start: Array) -> Solution:
-    """Least squares of the residuals `(n,)` of parameters `(k,)`, without outliers of a robust fit."""
+    """Minimise squared residuals `(n,)` over parameters `(k,)`, without outliers of a robust fit."""
     robust = start
     for _ in range(2):
         scale = max(float(robust_std(residual(robust))), ROUNDING)
@@ -58,27 +60,28 @@ def robust_least_squares(residual: Callable[[Array], Array], start: Array) -> So
 
 
 LEAST_RADIUS_STD = 4.0
-"""A fitted radius counts from so many of its standard deviations on."""
+"""Number of standard deviations from which a fitted radius is significant."""
 
 
 @dataclass(frozen=True)
 class Tip:
-    """A ball of radius r [m], to be fitted if `None`, with unit vectors `(n, 3)` to the path's points, or
-    zero."""
+    """A ball of radius r [m], fitted if `None`, with unit vectors `(n, 3)` to the points of the path, or
+    zero.
+    """
 
     axes: Array
     radius: float | None
 
     def start(self, *x: float) -> Array:
-        """Initial parameters, with those of a surface first."""
+        """Return the initial parameters, with those of a surface first."""
         return np.array([*x, 0.0] if self.radius is None else x)
 
     def of(self, x: Array) -> float:
-        """The radius by parameters."""
+        """Return the radius for parameters."""
         return float(x[-1]) if self.radius is None else self.radius
 
     def std(self, solution: Solution) -> dict[str, float]:
-        """Error bar of a fitted radius; `DataError` if the tip's orientation does not determine it."""
+        """Return the error bar of a fitted radius; `DataError` if tip orientations do not determine it."""
         if self.radius is not None:
             return {}
         radius, std = self.of(solution.x), float(np.sqrt(solution.covariance[-1, -1]))
@@ -95,7 +98,7 @@ class Tip:
 def tip_of(
     system: ConstrainedSystem, contact: SurfaceContact, q: torch.Tensor, radius: float | Literal["fit"] | None
 ) -> Tip:
-    """The tip that touched at positions `(n, nq)`: that of the scene, or a ball that ends at its point."""
+    """Return the tip in contact at positions `(n, nq)`: that in the scene, or a ball ending at its point."""
     if radius is None:
         return Tip(np.zeros((len(q), 3)), contact.radius)
     point = torch.tensor(tuple(contact.point), dtype=q.dtype)
@@ -111,17 +114,17 @@ def tip_of(
 
 
 MOST_POINTS = 20_000
-"""Points that are fitted; of a longer path, every k-th."""
+"""Maximum number of fitted points; for a longer path, every k-th point is used."""
 LEAST_WIDTH, LARGEST_TILT = 10.0, 0.2
-"""Least width of a path in deviations of its residuals, and largest deviation of a tilt [rad], of a plane."""
+"""For a plane: minimum width of a path in residual deviations, and largest tilt deviation [rad]."""
 
 
 @dataclass(frozen=True)
 class SurfaceFit:
-    """A fitted surface, with the radius of the tip that touched [m] and standard deviations.
+    """A fitted surface, with the radius of the tip [m] and standard deviations.
 
-    These are `offset` [m] (at the middle of the path) and `tilt` [rad] of a plane, `center` [m] (the largest
-    of three) and `radius` [m] of a sphere, and `tip_radius` [m] if fitted.
+    The standard deviations are `offset` [m] (at the middle of the path) and `tilt` [rad] of a plane, `center`
+    [m] (the largest of three) and `radius` [m] of a sphere, and `tip_radius` [m] if fitted.
     """
 
     contact: str
@@ -131,7 +134,7 @@ class SurfaceFit:
     tip_radius: float = 0.0
 
     def toml(self) -> str:
-        """The surface as a line of a scene file, with its error bars in a comment."""
+        """Return the surface as a line of a scene file, with its error bars in a comment."""
         bars = ", ".join(
             f"{name} ± {np.degrees(v):.2g}°" if name == "tilt" else f"{name} ± {1e3 * v:.2g} mm"
             for name, v in self.std.items()
@@ -153,16 +156,16 @@ def fit_surface(
     kind: Literal["plane", "sphere"] = "plane",
     tip_radius: float | Literal["fit"] | None = None,
 ) -> SurfaceFit:
-    """Fit a surface to the path of the touching point while a contact is closed.
+    """Fit a surface to the path of the contact point while a contact is closed.
 
-    Least squares of the signed distances, without outliers of a robust fit. The error bars account for
-    residuals that are correlated in time. A ball of `tip_radius` [m] or `"fit"` ends at the scene's point; by
-    default the tip is the scene's.
+    The squared signed distances are minimised without outliers of a robust fit. Error bars account for
+    residuals that are correlated in time. A ball of `tip_radius` [m] or `"fit"` ends at the point in the
+    scene; by default, the tip is that of the scene.
 
     Raises:
         DataError: the scene has another tip, the contact is closed in too few rows, or the path is too
             straight or too short.
-        UnknownNameError: the scene has no such contact.
+        UnknownNameError: the contact does not exist.
     """
     touching = system.contact(contact)
     if not isinstance(touching, SurfaceContact):
@@ -183,7 +186,7 @@ def fit_surface(
 
 
 def _plane(contact: str, points: Array, towards: Array, tip: Tip) -> SurfaceFit:
-    """n = n₀ + a u + b v, scaled to one, through the middle of the path moved by e along n.
+    """Return n = n₀ + a u + b v, scaled to one, through the middle of the path moved by e along n.
 
     The ball's centre p − r a is at n·(p − r a) − r = offset.
     """
@@ -217,7 +220,7 @@ def _plane(contact: str, points: Array, towards: Array, tip: Tip) -> SurfaceFit:
 
 
 def _sphere(contact: str, points: Array, towards: Array, tip: Tip) -> SurfaceFit:
-    """|p − r a − center| = radius + r; starts from the linear fit |p|² = 2 p·center + const."""
+    """Return |p − r a − center| = radius + r; starts from the linear fit |p|² = 2 p·center + const."""
     middle = points.mean(axis=0)
     centered = points - middle
     design = np.column_stack([2.0 * centered, np.ones(len(points))])

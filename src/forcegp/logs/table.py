@@ -1,5 +1,5 @@
-"""Named columns of numbers with a common clock, as returned by readers; quantities in SI units and in the
-robot's joint order on one clock, as used by the steps of an import; and the report of an import.
+"""Data of an import: named columns with a common clock from readers, quantities in SI units and the robot's
+joint order on one clock, and the report.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from forcegp.rows import numbered, runs
 
 
 def check_values(source: str, rows: int, columns: int) -> None:
-    """Raise `DataError` if a table is wider or larger than the limits; announce a large one."""
+    """Raise `DataError` if a table is wider or larger than the limits; warn if it is large."""
     check_count(source, "columns", columns, limits.COLUMNS)
     check_count(source, f"numbers ({rows:,} rows × {columns} columns)", rows * columns, limits.LOG_VALUES)
     announce_memory(2 * 8 * rows * columns, f"reading {source}")  # as in the file, and as float64
@@ -27,9 +27,9 @@ def check_values(source: str, rows: int, columns: int) -> None:
 
 Column = Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
-"""Called with the work done and the total, in bytes or messages."""
+"""Called with the completed and total work, in bytes or messages."""
 Wanted = Callable[[str], bool]
-"""Whether a column of this name is to be read."""
+"""Function that returns whether to read a column of this name."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,13 +41,13 @@ class Stream:
     units: Mapping[str, str] = field(default_factory=dict)
 
     def __len__(self) -> int:
-        """Number of rows."""
+        """Return the number of rows."""
         return len(next(iter(self.columns.values()))) if self.columns else 0
 
 
 @dataclass(frozen=True, eq=False)
 class LogTable:
-    """A log as it was read, with remarks on omissions and assumptions of the reader, one sentence each."""
+    """A log with remarks on omissions and assumptions of the reader, one sentence each."""
 
     source: str
     format: str
@@ -56,11 +56,11 @@ class LogTable:
 
     @property
     def names(self) -> list[str]:
-        """Every column name, stream by stream."""
+        """All column names, by stream."""
         return [name for stream in self.streams for name in stream.columns]
 
     def stream_of(self, column: str, stream: str | None = None) -> Stream:
-        """The stream of a column; `DataError` without one, or with several if none is named."""
+        """Return the stream of a column; `DataError` if there is none, or several without a given name."""
         among = [s for s in self.streams if stream is None or s.name == stream]
         if not among:
             raise missing(self.source, "stream", stream or "", [s.name for s in self.streams])
@@ -77,18 +77,18 @@ class LogTable:
 
 
 def joined(chunks: dict[str, list[Column]], rows: int | None) -> dict[str, Column]:
-    """Columns that were read piece by piece, truncated to `rows`; only one of them is copied at a time."""
+    """Join columns that were read piece by piece, truncated to `rows`, copying one column at a time."""
     return {name: np.concatenate(chunks.pop(name))[:rows] for name in list(chunks)}
 
 
 def streams_by_length(groups: Mapping[int, Mapping[str, Column]], common: int) -> tuple[Stream, ...]:
-    """A stream for each number of rows, with the most common one first and unnamed."""
+    """Return a stream for each number of rows, the most common one first and unnamed."""
     ordered = sorted(groups, key=lambda rows: rows != common)
     return tuple(Stream("" if rows == common else f"{rows} rows", groups[rows]) for rows in ordered)
 
 
 def missing(source: str, kind: str, name: str, names: list[str]) -> DataError:
-    """The error for a missing stream or column."""
+    """Return the error for a missing stream or column."""
     shown = ", ".join(repr(k) for k in names[:16]) + (f", … ({len(names)})" if len(names) > 16 else "")
     return DataError(
         f"{source}: the log has no {kind} {name!r}",
@@ -100,11 +100,11 @@ def missing(source: str, kind: str, name: str, names: list[str]) -> DataError:
 def table_of_arrays(
     path: Path, kind: str, arrays: Mapping[str, NDArray[np.generic]], remarks: Sequence[str] = ()
 ) -> LogTable:
-    """The log of the arrays of a file, a stream for each number of rows.
+    """Convert the arrays of a file to a log with a stream for each number of rows.
 
-    A matrix `(n, d)` becomes the columns `name[0]` to `name[d-1]`. Rows run along the axis whose length
-    most arrays share; `(d, n)` is transposed. Arrays of another length form separate streams. After the
-    `remarks` of the reader comes one for each array that was transposed or left out.
+    A matrix `(n, d)` becomes the columns `name[0]` to `name[d-1]`. Rows run along the axis with the most
+    common length, so `(d, n)` is transposed. Arrays of other lengths form separate streams. Remarks on
+    transposed or omitted arrays follow the `remarks` of the reader.
     """
     usable, remarks, source = {}, list(remarks), str(path)
     check_expansion(source, 8 * sum(array.size for array in arrays.values()), path.stat().st_size)
@@ -135,8 +135,7 @@ def table_of_arrays(
 @dataclass
 class Signals:
     """Quantities of a log: time [s], number in the log and trajectory of each row, `(n,)`; `q`, `qd`, `qdd`,
-    `tau` as far as they are logged, `(n, nq)` each, and `wrench` `(n, 6)`; name of each contact → `(n,)`
-    bool.
+    `tau`, if logged, `(n, nq)` each, and `wrench` `(n, 6)`; contacts by name, `(n,)` bool.
     """
 
     joint_names: tuple[str, ...]
@@ -147,7 +146,7 @@ class Signals:
     contact: dict[str, NDArray[np.bool_]] = field(default_factory=dict)
 
     def __len__(self) -> int:
-        """Number of rows."""
+        """Return the number of rows."""
         return len(self.t)
 
     def keep(self, mask: NDArray[np.bool_], split: bool = False) -> None:
@@ -162,18 +161,18 @@ class Signals:
         self.contact = {name: value[mask] for name, value in self.contact.items()}
 
     def runs(self, *keys: NDArray[np.generic]) -> list[slice]:
-        """Stretches of rows within one segment on which further keys do not change."""
+        """Return stretches of rows within a segment with constant additional keys."""
         return runs(self.segment, *keys)
 
 
 MOST_INTERVALS = 20
-"""Intervals of rows that a finding lists; its count covers all."""
+"""Maximum number of row intervals listed in a finding, which counts all."""
 
 
 @dataclass(frozen=True)
 class ImportFinding:
-    """A finding of an import: its kind, and a sentence with the action taken; `rows` has the first intervals
-    concerned.
+    """A finding of an import: its kind, and a sentence with the action taken; `rows` contains the first
+    affected intervals.
     """
 
     kind: str
@@ -184,7 +183,7 @@ class ImportFinding:
 
 @dataclass
 class ImportReport:
-    """Findings and actions, in order; `rows_read` are those of the stream that defines the clock."""
+    """Findings and actions in order; `rows_read` counts rows of the stream that defines the clock."""
 
     source: str
     format: str = ""
@@ -193,7 +192,7 @@ class ImportReport:
     steps: list[str] = field(default_factory=list)
 
     def find(self, kind: str, message: str, rows: NDArray[np.int64] | None = None) -> None:
-        """Add a finding on some rows, given by their numbers in the log, increasing."""
+        """Add a finding on rows, given by increasing row numbers in the log."""
         numbers = np.zeros(0, np.int64) if rows is None else rows
         first = tuple((a, b - 1) for a, b in numbered(numbers)[:MOST_INTERVALS])
         self.findings.append(ImportFinding(kind, message, len(numbers), first))

@@ -1,4 +1,4 @@
-"""Units of logs, as factors to SI and radians."""
+"""Units in logs, as factors to SI units and radians."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from importlib.resources import files
 from forcegp.scene.document import tomllib
 
 VOCABULARY = tomllib.loads((files("forcegp.logs") / "vocabulary.toml").read_text(encoding="utf-8"))
-"""Words of headings, and units with their spellings."""
+"""Words in headings, and units with their spellings."""
 _SPELLINGS = {text: unit for unit, texts in VOCABULARY["spellings"].items() for text in texts}
 _UNITS: dict[str, dict[str, float]] = VOCABULARY["units"]
 TIME, VELOCITY, TORQUE, CURRENT, FORCE = (
@@ -17,11 +17,11 @@ TIME, VELOCITY, TORQUE, CURRENT, FORCE = (
 QUANTITY: Mapping[str, Mapping[str, float]] = {**_UNITS, "torque": {**TORQUE, **CURRENT}}
 """Units of each quantity of a mapping → factor to SI; currents are in ampere."""
 SI = {name: next(iter(_UNITS[name])) for name in ("position", "velocity", "acceleration", "torque")}
-"""Unit of each joint vector of a rotating joint that is assumed before any is known."""
+"""Default unit of each joint vector of a revolute joint."""
 
 
 def spelled(text: str) -> str | None:
-    """The canonical name of a unit in common notation, or `None` if it is unknown.
+    """Return the canonical name of a unit in common notation, or `None` if it is unknown.
 
     >>> spelled("[deg/sec]"), spelled("Seconds"), spelled("furlong")
     ('deg/s', 's', None)

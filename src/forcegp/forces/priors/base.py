@@ -1,6 +1,6 @@
-"""Gaussian-process priors on unknown forces: direction, inputs and kernel of each force.
+"""Gaussian-process priors on unknown forces, defined by direction, inputs and kernel.
 
-`OperatorForcePrior` is a prior on any force, with a user-defined operator.
+`OperatorForcePrior` is a prior on any force with a user-defined operator.
 """
 
 from __future__ import annotations
@@ -18,74 +18,74 @@ from forcegp.gp.kernels import Kernel, SquaredExponential
 from forcegp.robot.model import RobotModel
 
 JOINT, CONTACT, CONSTRAINT = "joint", "contact", "constraint"
-"""Targets of priors: the joint force Q, the contact's dissipative force Q_z, or the part of Q that acts
-against the constraint (the range of Aᵀ), which no acceleration in contact shows."""
+"""Targets of priors: the joint force Q, the dissipative contact force Q_z, or the part of Q along the
+    constraint (the range of Aᵀ), which does not affect accelerations in contact."""
 NOISE, ANALYTICAL, COULOMB = "noise", "analytical_parameters", "coulomb"
 RESERVED = (NOISE, ANALYTICAL, COULOMB)
-"""Prefixes of what is learned beside the hyperparameters of the priors."""
+"""Prefixes of other learned parameters besides the hyperparameters of priors."""
 
 MIXING = "mixing"
-"""Last part of the names of what an operator learns."""
+"""Suffix of the names of learned operator parameters."""
 
 ForceMean = Callable[[ConstrainedSystem, States], Tensor]
 """Prior mean of the joint force Q at states, `(n, nq)`."""
 
 
 class ForcePrior(ABC):
-    """A zero-mean prior on an unknown force f(x), carried to generalized forces by a known operator E(x).
+    """A zero-mean prior on an unknown force f(x), mapped to generalized forces by a known operator E(x).
 
-    The generalized force is E(x) f(x); `target` is the part of Q̄ that it belongs to: Q, Q_z, or Q along the
+    The generalized force is E(x) f(x); `target` is the part of Q̄ to which it belongs: Q, Q_z, or Q along the
     constraint. A subclass has a `name`, a `kernel` and a `target`, and implements `outputs`, `features` and
-    `operator`; classes among `CLASSES` can be saved, see `models/structured_file.py`.
+    `operator`; classes listed in `CLASSES` of `models/structured_file.py` can be saved.
     """
 
     name: str
     kernel: Kernel
     target: str
     coupled: bool = False
-    """Whether Coulomb friction that is proportional to the multiplier goes with the prior."""
+    """Whether the prior includes Coulomb friction proportional to the multiplier."""
     vectors: tuple[str, ...] = ()
-    """Inputs whose components are standardized by one scale, as turning the axes must change nothing."""
+    """Vector inputs, standardized by one scale so that results do not depend on the axes."""
     commensurate: bool = True
-    """Whether all components of f have one unit."""
+    """Whether all components of f have the same unit."""
     sticks: bool = False
-    """Whether the force has dry friction of joints in it, which `States.slip` tells apart."""
+    """Whether the force includes dry joint friction, which `States.slip` separates."""
     in_time: bool = False
-    """Whether the force is a function of time, which couples the samples of a trajectory."""
+    """Whether the force is a function of time, which correlates the samples of a trajectory."""
     scaled: bool = True
-    """Whether the inputs are standardized."""
+    """Whether to standardize the inputs."""
     per_joint: bool = False
-    """Whether f has a component for each joint and E = I, so that no product with E is needed."""
+    """Whether f has one component per joint and E = I, so products with E can be skipped."""
     centred: bool = True
-    """Whether the mean of the training data is subtracted from the inputs before they are scaled."""
+    """Whether to subtract the mean of the training data from the inputs before scaling."""
 
     @property
     def prefix(self) -> str:
-        """Prefix of the hyperparameters; another prior's name if they are shared."""
+        """Prefix of the hyperparameters; the name of another prior if they are shared."""
         return self.name
 
     @abstractmethod
     def outputs(self, robot: RobotModel) -> int:
-        """Number of components of f."""
+        """Return the number of components of f."""
 
     @abstractmethod
     def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
-        """Named inputs of the kernel `(n, w)`, before standardization."""
+        """Return the named inputs of the kernel `(n, w)`, before standardization."""
 
     @abstractmethod
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
-        """E(x) `(n, nq, outputs)`."""
+        """Return E(x) `(n, nq, outputs)`."""
 
     def initial_parameters(self, robot: RobotModel) -> dict[str, Tensor]:
-        """Start of learned parameters of the operator E, by name; nothing for most priors."""
+        """Initial values of learned parameters of the operator E, by name; empty for most priors."""
         return {}
 
     def with_parameters(self, params: Mapping[str, Tensor]) -> ForcePrior:
-        """The prior with learned parameters of its operator (see `initial_parameters`)."""
+        """Return the prior with learned parameters of its operator (see `initial_parameters`)."""
         return self
 
     def check(self, system: ConstrainedSystem) -> None:  # noqa: B027  (most priors fit every system)
-        """Raise a typed error if the prior does not fit the system."""
+        """Raise a typed error if the prior does not match the system."""
 
 
 def check_inputs(name: str, inputs: tuple[str, ...], valid: tuple[str, ...]) -> None:
@@ -102,11 +102,11 @@ def check_inputs(name: str, inputs: tuple[str, ...], valid: tuple[str, ...]) -> 
 
 
 def check_priors(priors: tuple[ForcePrior, ...], system: ConstrainedSystem) -> None:
-    """Check that priors fit a system and have distinct names, the prefixes of their hyperparameters.
+    """Check that priors match a system and have distinct names, the prefixes of their hyperparameters.
 
     Raises:
-        ModelError: no prior is given, two share a name, a name is not one word, or a prior shares the
-            hyperparameters of one that is missing.
+        ModelError: there is no prior, two priors share a name, a name is not one word, or a prior shares the
+            hyperparameters of a missing one.
         UnknownNameError: a prior names a contact that the system does not have.
     """
     names = [prior.name for prior in priors]
@@ -130,16 +130,15 @@ def check_priors(priors: tuple[ForcePrior, ...], system: ConstrainedSystem) -> N
 
 @dataclass(frozen=True)
 class OperatorForcePrior(ForcePrior):
-    """A prior on any force, carried by a user-given operator ("any analytical tensor of appropriate size").
+    """A prior on any force with a user-defined operator ("any analytical tensor of appropriate size").
 
     Args:
         name: prefix of the hyperparameters.
         size: number of components of f.
-        operator_function: maps `(system, states)` to E(x) `(n, nq, size)`.
-        feature_function: maps `(system, states)` to named inputs `(n, w)`; q, q̇, τ by default.
+        operator_function: function that maps `(system, states)` to E(x) `(n, nq, size)`.
+        feature_function: function that maps `(system, states)` to named inputs `(n, w)`; by default q, q̇, τ.
         kernel: covariance of each component.
-        target: `joint`, `contact` or `constraint`: whether the force is part of Q, Q_z or Q along the
-            constraint.
+        target: `joint`, `contact` or `constraint`, for a force in Q, Q_z or Q along the constraint.
 
     Example:
         >>> import torch, forcegp

@@ -1,4 +1,4 @@
-"""Constants of drives, and constants that differ between recordings."""
+"""Priors on drive constants, and on constants that differ between recordings."""
 
 from __future__ import annotations
 
@@ -17,14 +17,15 @@ from forcegp.robot.model import RobotModel
 
 @dataclass(frozen=True)
 class DrivePrior(ForcePrior):
-    """Q_i = s τ_i δ_i, δ_i ~ N(0, 1): the drive constant (torque constant times gear ratio) is off by s δ_i.
+    """A prior on relative errors s δ_i of drive constants (torque constant times gear ratio).
 
-    Logged currents become torques by nominal drive constants (`torque_constant`, `gear_ratio` of a mapping);
-    the true ones are (1 + s δ_i) times these. Only the ratio of drive constants to inertia acts on a motion,
-    so links that are unknown too leave them open: give known masses, or record a known payload.
+    Q_i = s τ_i δ_i with δ_i ~ N(0, 1). Logged currents are converted to torques with nominal drive constants
+    (`torque_constant`, `gear_ratio` in a mapping); the true constants are (1 + s δ_i) times these. Motion
+    depends only on the ratio of drive constants to inertia, so provide known masses, or record a known
+    payload.
 
     Args:
-        std: s, relative standard deviation of the drive constants.
+        std: relative standard deviation s of the drive constants.
         kernel: covariance of δ.
         name: prefix of the hyperparameters.
 
@@ -62,14 +63,14 @@ class DrivePrior(ForcePrior):
 
 @dataclass(frozen=True)
 class PerRecording(ForcePrior):
-    """E(x) f_r for states of recording r: constants of a prior, such as a payload, one set per recording.
+    """A prior with separate constants f_r, such as a payload, for each recording r.
 
-    All other priors are shared, so that one fit of several recordings learns their friction from all of them.
-    New states have the constants of the last recording.
+    All other priors are shared, so a fit to several recordings learns friction from all of them. Predictions
+    use the constants of the last recording.
 
     Args:
-        prior: of the force in each recording, whose hyperparameters have its name.
-        starts: the first segment of each recording, as in `Dataset.segment`.
+        prior: prior on the force in each recording, which provides the name of the hyperparameters.
+        starts: first segment of each recording, as in `Dataset.segment`.
 
     Example:
         >>> import forcegp
@@ -78,7 +79,7 @@ class PerRecording(ForcePrior):
         8
 
     Raises:
-        ModelError: the starts do not ascend, or the prior is not one of constants.
+        ModelError: the starts are not increasing, or the prior is not a prior on constants.
     """
 
     prior: ForcePrior

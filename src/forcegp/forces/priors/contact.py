@@ -1,24 +1,24 @@
-"""Forces at a contact with a surface: along it, against it, and Coulomb friction from the multiplier.
+"""Forces at a surface contact: tangential, normal, and Coulomb friction proportional to the multiplier.
 
-Contact forces do not depend on world axes: vectors along the surface have two coordinates in a tangent frame
-that turns with the surface. The frame at normal n is (R e_x, R e_y), with the smallest rotation R that takes
-e_z to n. So forces learned on one surface carry over to one that is raised, tilted or curved. A force normal
-to the surface changes no acceleration.
+Contact forces do not depend on world axes: tangential vectors have two coordinates in a tangent frame of
+the surface. The frame at normal n is (R e_x, R e_y), with the smallest rotation R that takes e_z
+to n. Forces learned on one surface therefore transfer to a raised, tilted or curved one. A force normal to
+the surface changes no acceleration.
 
 Friction proportional to the normal force couples force and multiplier. With one contact, u = −J_Eᵀ s(v) and
 g = Lᵀ u, the equations λ = λ_K − Lᵀ Q_z and Q_z = μ λ u have the solution λ = λ_K / (1 + μ g), where λ_K is
-the multiplier without friction. A latent function must enter the force linearly, and μ does not: the operator
-is the secant at a given μ̂, u λ_K / (1 + μ̂ g).
+the multiplier without friction. Latent functions must enter the force linearly, but μ does not, so the
+operator is the secant at a given μ̂, u λ_K / (1 + μ̂ g).
 
 A learned coefficient is coupled exactly. Let Q_z = Q_z′ + U λ, where a contact with friction coefficient μ
 has the column μ u, and let λ₀ = (A M⁻¹ Aᵀ)⁺ b − Lᵀ (Q + Q_z′) be the multiplier without this friction. Then
-λ = λ₀ − LᵀU λ has the solution λ = (I + LᵀU)⁻¹ λ₀. So at a given μ every quantity remains an affine map of
-the forces: its operators and offset B_Q, B_z, o become
+λ = λ₀ − LᵀU λ has the solution λ = (I + LᵀU)⁻¹ λ₀. For given μ, every quantity therefore remains an affine
+map of the forces, with operators and offset B_Q, B_z, o replaced by
 
     B_Q − G Lᵀ,  B_z − G Lᵀ,  o + G (A M⁻¹ Aᵀ)⁺ b   with   G = B_z U (I + LᵀU)⁻¹.
 
-Learned μ and ε are uncertain. To first order in their errors δ, friction changes at fixed λ by
-∂(μ u λ)/∂(log μ, log ε) δ, a contact force to which λ responds as to any other. So δ is one more latent
+Learned μ and ε are uncertain. To first order in their errors δ, friction at fixed λ changes by
+∂(μ u λ)/∂(log μ, log ε) δ, a contact force to which λ responds as to any other. Hence δ is another latent
 force; the posterior over all of them is a Laplace approximation that marginalises δ, and the variance of
 every quantity z contains (∂z/∂δ)² Var δ.
 """
@@ -47,17 +47,18 @@ from forcegp.gp.kernels import Constant, Kernel, SquaredExponential
 from forcegp.robot.model import RobotModel
 
 WIDTHS = {"position": 2, "velocity": 2, "speed": 1}
-"""Columns of each input: tangential coordinates of the touching point [m] and of its velocity [m/s], and how
-fast it slides [m/s]."""
+"""Columns of each input: tangential coordinates of the contact point [m] and of its velocity [m/s], and how
+fast it slides [m/s].
+"""
 TERMS = ("viscous", "dry", "coulomb", "stribeck", "torsion")
-"""Kinds of friction, in the order of the components of the latent function."""
+"""Friction terms in the order of the components of the latent function."""
 LOADED = ("coulomb", "stribeck", "torsion")
-"""Kinds that are proportional to the multiplier."""
+"""Friction terms proportional to the multiplier."""
 
 
 @dataclass(frozen=True)
 class SurfaceForcePrior(ForcePrior):
-    """A force at a closed, sliding contact with a surface."""
+    """A prior on a force at a closed, sliding surface contact."""
 
     contact: str
     kernel: Kernel = field(default_factory=SquaredExponential)
@@ -95,17 +96,17 @@ class SurfaceForcePrior(ForcePrior):
 
     @abstractmethod
     def directions(self, system: ConstrainedSystem, at: States) -> Tensor:
-        """E(x) `(n, nq, outputs)` while the contact is closed and slides."""
+        """Return E(x) `(n, nq, outputs)` while the contact is closed and slides."""
 
     def _touching(self, system: ConstrainedSystem, at: States) -> ContactPoint:
-        """The touching point; errors as of `check` where the contact has none."""
+        """Return the contact point; raise the errors of `check` if the contact has none."""
         if self.contact not in at.eom.contact_points:
             self.check(system)
         return at.eom.contact_points[self.contact]
 
 
 def _along(point: ContactPoint, name: str) -> Tensor:
-    """An input along the surface: `position` or `velocity` in the tangent frame, or the sliding `speed`."""
+    """Return an input on the surface: `position` or `velocity` in the tangent frame, or sliding `speed`."""
     if name == "speed":
         # The floor keeps the derivative of the root finite at rest.
         return point.sliding[1].square().sum(-1, keepdim=True).clamp(min=1e-30).sqrt()
@@ -116,15 +117,15 @@ def _along(point: ContactPoint, name: str) -> Tensor:
 class ContactForcePrior(SurfaceForcePrior):
     """A prior on the dissipative force F_z at a contact, F_z = t_1 f_1 + t_2 f_2 along the surface.
 
-    E = J_Eᵀ (t_1, t_2) while the contact is closed, else 0; t_1 and
-    t_2 span the surface at the touching point and turn with it (`tangent_frame`).
+    E = J_Eᵀ (t_1, t_2) while the contact is closed, and otherwise 0; t_1 and t_2 span the tangent plane at
+    the contact point (`tangent_frame`).
 
     Args:
         contact: name of a surface contact of the system.
         kernel: covariance of each component.
-        inputs: which of `position`, `velocity` and `speed` of the touching point along the surface the force
-            depends on.
-        name: prefix of the hyperparameters; the contact's name by default.
+        inputs: inputs of the force, from `position`, `velocity` and `speed` of the contact point along the
+            surface.
+        name: prefix of the hyperparameters; by default the name of the contact.
 
     Example:
         >>> ContactForcePrior("table").target
@@ -144,35 +145,35 @@ class ContactForcePrior(SurfaceForcePrior):
 
 @dataclass(frozen=True)
 class SlidingFrictionPrior(SurfaceForcePrior):
-    """A prior on the friction that opposes sliding, with v = (1 − n nᵀ) ṗ_E and s(v) = v / √(|v|² + ε²).
+    """A prior on friction that opposes sliding, with v = (1 − n nᵀ) ṗ_E and s(v) = v / √(|v|² + ε²).
 
     F_z = −θ_v v − (θ_d + λ (μ + μ_s e^{−|v|²/v_s²})) s(v), and the moment −θ_t λ s(ω_n) n about the normal.
 
-    The unknowns are the scalar functions named in `terms`: `viscous` θ_v [N s/m], `dry` θ_d [N], `coulomb` μ,
-    `stribeck` μ_s, `torsion` θ_t [m]. They need fewer samples than the components of a force. By default they
-    depend on the sliding speed, so they carry over to surfaces of any position, tilt and shape.
+    The unknowns are the scalar functions listed in `terms`: `viscous` θ_v [N s/m], `dry` θ_d [N], `coulomb`
+    μ, `stribeck` μ_s, `torsion` θ_t [m]. They need fewer samples than the components of a force. By default
+    they depend on the sliding speed, so they transfer to surfaces of any position, tilt and shape.
 
     λ = max(λ_K, 0) / (1 + μ̂ g) with the multiplier λ_K of the analytical forces Q_K + τ without friction and
-    g = −Lᵀ J_Eᵀ s(v). This is exact for one contact whose friction is −μ̂ λ s(v). Otherwise it neglects terms
-    of second order: μ (μ − μ̂), μ times any other friction of the contact, and μ times unknown joint forces
-    or the friction of other contacts. If unknown joint forces are large, prefer `dry`, or learn them as
-    analytical parameters.
+    g = −Lᵀ J_Eᵀ s(v). This is exact for a single contact with friction −μ̂ λ s(v). Otherwise it neglects
+    second-order terms: μ (μ − μ̂), μ times any other friction of the contact, and μ times unknown joint
+    forces or the friction of other contacts. If unknown joint forces are large, prefer `dry`, or learn them
+    as analytical parameters.
 
     Args:
         contact: name of a surface contact of the system.
         kernel: covariance of each unknown.
-        inputs: which of `position`, `velocity`, `speed` they depend on.
-        name: prefix of the hyperparameters; the contact's name by default.
-        smoothing: ε [m/s].
-        terms: kinds of friction.
-        friction_coefficient: μ̂.
-        stribeck_speed: v_s [m/s].
+        inputs: inputs of the functions, from `position`, `velocity` and `speed`.
+        name: prefix of the hyperparameters; by default the name of the contact.
+        smoothing: smoothing speed ε [m/s].
+        terms: friction terms.
+        friction_coefficient: friction coefficient μ̂.
+        stribeck_speed: Stribeck speed v_s [m/s].
         torsion_smoothing: angular velocity about the normal below which torsional friction is smooth [rad/s].
-        coupled: whether Coulomb friction −μ λ s(v) with a constant μ, which is learned together with its ε,
-            is part of the mechanics beside the functions in `terms` (`forces/priors/contact.py`).
+        coupled: whether the mechanics include, in addition to `terms`, Coulomb friction −μ λ s(v) with a
+            constant μ, which is learned together with its ε (`forces/priors/contact.py`).
 
     Raises:
-        UnknownNameError: an input or a kind of friction is unknown.
+        UnknownNameError: an input or a friction term is unknown.
         ModelError: a speed is not positive, or the friction coefficient is negative.
 
     Example:
@@ -229,10 +230,10 @@ class SlidingFrictionPrior(SurfaceForcePrior):
         return torch.stack([columns[term] for term in self.terms], dim=-1)
 
     def _load(self, system: ConstrainedSystem, at: States, u: Tensor) -> Tensor:
-        """The multiplier of the analytical forces with the friction μ̂ λ u, `(n, 1)`.
+        """Return the multiplier of the analytical forces with the friction μ̂ λ u, `(n, 1)`.
 
         Raises:
-            ModelError: with this friction the contact jams.
+            ModelError: the contact jams with this friction.
         """
         contact = system.contact_names.index(self.contact)
         row = sum(c.rows for c in system.contacts[:contact])
@@ -246,7 +247,7 @@ class SlidingFrictionPrior(SurfaceForcePrior):
         return (free / gain)[:, None]
 
     def _spin(self, system: ConstrainedSystem, at: States) -> Tensor:
-        """Generalized force of a unit moment against the rotation about the normal, `(n, nq)`."""
+        """Return the generalized force of a unit moment against the rotation about the normal, `(n, nq)`."""
         contact = system.contact(self.contact)
         assert isinstance(contact, SurfaceContact)
         index, origin = (
@@ -263,9 +264,9 @@ class SlidingFrictionPrior(SurfaceForcePrior):
 class NormalForcePrior(ForcePrior):
     """A joint force along the constraint, E = Aᵀ Lᵀ = I − P, without effect on accelerations in contact.
 
-    H Aᵀ = 0, so a force Aᵀ g(x) changes the multiplier by −g(x) and no acceleration. A joint force prior
+    Since H Aᵀ = 0, a force Aᵀ g(x) changes the multiplier by −g(x) but no acceleration. A joint force prior
     alone is overconfident along the normal. This independent process, with the hyperparameters of the joint
-    force prior, keeps the uncertainty of that part unless, for example, a force sensor reduces it.
+    force prior, retains the uncertainty of that part unless, for example, a force sensor reduces it.
 
     Args:
         like: the joint force prior that provides kernel, inputs and hyperparameters.
@@ -298,25 +299,25 @@ class NormalForcePrior(ForcePrior):
 
 
 SHARP = 1e-6
-"""A smoothing speed so small that all friction has its full size [m/s]."""
+"""Smoothing speed small enough for friction to have its full magnitude [m/s]."""
 
 
 FRICTION_COEFFICIENT = 0.2
-"""Start of learning a friction coefficient."""
+"""Initial value of a learned friction coefficient."""
 NEARLY_JAMMED = 0.95
-"""Largest friction coefficient that is considered, relative to the one at which the contact jams."""
+"""Largest friction coefficient relative to the one at which the contact jams."""
 LEARNED = 2
-"""Numbers that are learned of the friction of a contact: μ and ε."""
+"""Number of learned friction parameters of a contact, μ and ε."""
 
 
 @dataclass(frozen=True, eq=False)
 class CoulombFriction:
-    """Friction −μ λ s(v) of a contact with a surface, s(v) = v / √(|v|² + ε²).
+    """Coulomb friction −μ λ s(v) of a surface contact, s(v) = v / √(|v|² + ε²).
 
     Attributes:
         contact: name of the contact.
-        coefficient: μ, a scalar.
-        smoothing: ε, a scalar [m/s].
+        coefficient: friction coefficient μ.
+        smoothing: smoothing speed ε [m/s].
     """
 
     contact: str
@@ -325,7 +326,7 @@ class CoulombFriction:
 
 
 def coulomb_keys(contact: str) -> tuple[str, str]:
-    """Names of the learned friction coefficient and smoothing speed of a contact."""
+    """Return the names of the learned friction coefficient and smoothing speed of a contact."""
     return f"{COULOMB}.{contact}.log_coefficient", f"{COULOMB}.{contact}.log_smoothing"
 
 
@@ -342,7 +343,7 @@ def initial_coulomb(priors: Iterable[ForcePrior], like: Tensor) -> dict[str, Ten
 def coulomb_of(
     priors: Sequence[ForcePrior], tensors: Mapping[str, Tensor], like: Tensor
 ) -> tuple[CoulombFriction, ...]:
-    """Friction at learned tensors, or its initial value if it is not among them."""
+    """Return the friction from learned tensors, or its initial value."""
     values = initial_coulomb(priors, like) | dict(tensors)
     return tuple(
         CoulombFriction(prior.contact, *(values[key].exp() for key in coulomb_keys(prior.contact)))
@@ -359,7 +360,7 @@ class CoulombErrorPrior(ForcePrior):
     """Q_z = λ̂ ∂(μ u)/∂(log μ, log ε) δ, δ ~ N(0, 1): remaining uncertainty of a contact's friction.
 
     λ̂ is the multiplier of the analytical forces with the learned friction. One e-fold is about the width of
-    the weak priors that μ and ε are learned with (`forces/search.py`).
+    the weak priors on μ and ε (`forces/search.py`).
 
     Attributes:
         contact: the contact with uncertain friction.
@@ -398,7 +399,7 @@ class CoulombErrorPrior(ForcePrior):
 
 
 def against_sliding(at: States, contact: str, smoothing: Tensor | float) -> Tensor:
-    """u = −J_Eᵀ s(v), the generalized force of a unit friction force, `(n, nq)`."""
+    """Return u = −J_Eᵀ s(v), the generalized force of a unit friction force, `(n, nq)`."""
     # s = v/√(|v|² + ε²); where the point sticks, its force is a multiplier
     point = at.eom.contact_points[contact]
     J, v = point.sliding
@@ -409,12 +410,12 @@ def against_sliding(at: States, contact: str, smoothing: Tensor | float) -> Tens
 def coupled(
     system: ConstrainedSystem, at: States, z: AffineMap, friction: Sequence[CoulombFriction]
 ) -> AffineMap:
-    """The affine map of a quantity with Coulomb friction of contacts.
+    """Return the affine map of a quantity with Coulomb friction of contacts.
 
     Args:
         system: robot and contacts; friction of other contacts is ignored.
         z: the quantity without this friction.
-        friction: of each contact that has one.
+        friction: Coulomb friction of contacts.
     """
     gain = _gain(system, at, friction)
     if gain is None:
@@ -429,7 +430,7 @@ def coupled(
 def with_coulomb(
     system: ConstrainedSystem, at: States, Q_bar: Tensor, friction: Sequence[CoulombFriction]
 ) -> Tensor:
-    """All impressed forces Q̄ `(n, nq)`, Coulomb friction included, from those without it."""
+    """Add Coulomb friction to impressed forces Q̄ `(n, nq)`."""
     gain = _gain(system, at, friction)
     if gain is None:
         return Q_bar
@@ -440,7 +441,7 @@ def with_coulomb(
 def coulomb_response(
     system: ConstrainedSystem, at: States, friction: Sequence[CoulombFriction]
 ) -> Tensor | None:
-    """∂Q̄/∂Q = I − G Lᵀ `(n, nq, nq)`: a joint force changes the contact's load; `None` for identity."""
+    """Return ∂Q̄/∂Q = I − G Lᵀ `(n, nq, nq)`, the effect of joint forces on contact load; `None` for I."""
     gain = _gain(system, at, friction)
     if gain is None:
         return None
@@ -454,7 +455,7 @@ def below_jamming(
     priors: Iterable[ForcePrior],
     bounds: Mapping[str, tuple[float, float]],
 ) -> dict[str, tuple[float, float]]:
-    """Bounds that exclude jamming, 1 + μ Lᵀu > 0, at all training states with sliding."""
+    """Return bounds that exclude jamming, 1 + μ Lᵀu > 0, at all training states with sliding."""
     changed = dict(bounds)
     for prior in _coupled_priors(priors):
         key, row = coulomb_keys(prior.contact)[0], _row(system, prior.contact)
@@ -469,17 +470,17 @@ def below_jamming(
 
 
 def _drag(at: States, contact: str, row: int) -> Tensor:
-    """Lᵀu of a contact `(n,)`: how much a unit friction force relieves it, negative where it presses."""
+    """Return Lᵀu of a contact `(n,)`, the load relief by a unit friction force, negative for an increase."""
     return (at.eom.L[..., row] * against_sliding(at, contact, SHARP)).sum(-1)
 
 
 def _row(system: ConstrainedSystem, contact: str) -> int:
-    """Row of a contact among the multipliers."""
+    """Return the row of a contact among the multipliers."""
     return sum(c.rows for c in system.contacts[: system.contact_names.index(contact)])
 
 
 def _gain(system: ConstrainedSystem, at: States, friction: Sequence[CoulombFriction]) -> Tensor | None:
-    """U (I + LᵀU)⁻¹ `(n, nq, m)`, from the multiplier without friction to the friction; `None` for none."""
+    """Return U (I + LᵀU)⁻¹ `(n, nq, m)`, from frictionless multiplier to friction, or `None`."""
     present = {f.contact: f for f in friction if f.contact in system.contact_names}
     if not present:
         return None

@@ -1,11 +1,11 @@
 """Gaussian priors on errors of inertial parameters and on a payload, marginalised in closed form.
 
 Inverse dynamics is linear in the inertial parameters π: with π = π₀ + δ, M₀ q̈ − Q_C,0 − Q_G,0 + Y(q, q̇,
-q̈) δ = Q is an identity at the measured acceleration. So δ acts like a joint force −Y δ with a constant
+q̈) δ = Q is an identity at the measured acceleration. Hence δ acts like a joint force −Y δ with a constant
 latent δ ~ N(0, S²), and least-squares identification with a ridge towards the file is a special case. A
 prediction uses the robot with the updated parameters; the remaining uncertainty acts through Y at the
-predicted acceleration. An unknown mass that is attached to a link is the same with the columns Y_k of that
-link for its mass and first moment (Atkeson, An, Hollerbach 1986).
+predicted acceleration. An unknown mass attached to a link is treated in the same way with the columns Y_k of
+that link for mass and first moment (Atkeson, An, Hollerbach 1986).
 """
 
 from __future__ import annotations
@@ -35,24 +35,24 @@ from forcegp.robot.inertia import (
 from forcegp.robot.model import RobotModel
 
 PER_LINK = 10
-"""m, m c and the inertia about the link origin."""
+"""Number of parameters per link: m, m c and the inertia about the link origin."""
 
 
 @dataclass(frozen=True)
 class InertialPrior(ForcePrior):
-    """Q = −[Y(q, q̇, q̈), diag q̈] S δ, δ ~ N(0, diag(s_k²)): one learned scale s_k per link k, 1 at the start.
+    """A prior on errors of inertial parameters, with one learned scale s_k (initially 1) per link k.
 
-    Without `drives`, Q = −Y S δ.
+    Q = −[Y(q, q̇, q̈), diag q̈] S δ with δ ~ N(0, diag(s_k²)). Without `drives`, Q = −Y S δ.
 
     Args:
         mass: relative standard deviation of each link's mass.
-        length: standard deviation of the first moment over the mass [m].
-        inertia: standard deviation of each link's moments of inertia over their values, and of products
-            I_ab over √(I_aa I_bb).
+        length: standard deviation of the first moment divided by the mass [m].
+        inertia: relative standard deviation of each link's moments of inertia, and standard deviation of
+            products I_ab relative to √(I_aa I_bb).
         kernel: covariance of the constants.
         name: prefix of the hyperparameters.
-        scales: S `(10 nq,)`; that of the robot by default.
-        drives: standard deviation of the inertia of each joint's drive [kg m², kg]; all are known by default.
+        scales: scales S `(10 nq,)`; by default those of the robot.
+        drives: standard deviation of the inertia of each joint's drive [kg m², kg]; by default all are known.
 
     Example:
         >>> import torch, forcegp
@@ -71,15 +71,14 @@ class InertialPrior(ForcePrior):
     drives: tuple[float, ...] = ()
 
     def around(self, robot: RobotModel) -> InertialPrior:
-        """The prior with the scale of this robot, for any robot."""
+        """Return the prior with the scale fixed to that of this robot."""
         return dataclasses.replace(self, scales=tuple(self.scale(robot)[: PER_LINK * robot.nq].tolist()))
 
     def with_drives(self, std: Tensor) -> InertialPrior:
-        """The prior with additional unknown inertia of drives, standard deviation `(nq,)`.
+        """Return the prior with unknown inertia of drives, with standard deviation `(nq,)`.
 
-        Motion hardly distinguishes the inertia of a drive from that of the links that it moves. If the drives
-        were treated as known, their errors would be attributed to the links, with too small a standard
-        deviation.
+        Motion hardly distinguishes drive inertia from that of the moved links. If the drives were treated as
+        known, their errors would be attributed to the links, with too small a standard deviation.
         """
         return dataclasses.replace(self, drives=tuple(std.tolist()), kernel=Constant())
 
@@ -100,7 +99,7 @@ class InertialPrior(ForcePrior):
         return -columns * self.scale(system.robot)
 
     def scale(self, robot: RobotModel) -> Tensor:
-        """S `(10 nq,)`, `(11 nq,)` with drives: standard deviations before a link's scale is learned."""
+        """Return S `(10 nq,)`, or `(11 nq,)` with drives: standard deviations before scales are learned."""
         if self.scales is not None:
             return robot.mass.new_tensor((*self.scales, *self.drives))
         m, J = robot.mass[:, None], inertial_parameters(robot.mass, robot.com, robot.inertia)
@@ -118,17 +117,17 @@ class InertialPrior(ForcePrior):
         precision: Tensor,
         log_volume: Callable[[RobotModel], Tensor] = lambda _: torch.zeros(()),
     ) -> tuple[RobotModel, Tensor]:
-        """The physically consistent robot that is most probable given δ ~ N(mean, precision⁻¹).
+        """Return the physically consistent robot that is most probable given δ ~ N(mean, precision⁻¹).
 
-        It minimises ½ (δ − mean)ᵀ precision (δ − mean) + γ Σ_k [tr(J₀⁻¹J) − log |J₀⁻¹J| − 4] − V(δ) over the
-        log-Cholesky coordinates of the pseudo-inertias J of the links; the second term (the divergence of
-        Lee, Wensing and Park, 2019, with the weight γ = 0.01) keeps a link that the log does not determine
-        from losing all its inertia.
+        The objective ½ (δ − mean)ᵀ precision (δ − mean) + γ Σ_k [tr(J₀⁻¹J) − log |J₀⁻¹J| − 4] − V(δ) is
+        minimised over the log-Cholesky coordinates of the pseudo-inertias J of the links. The second term
+        (the divergence of Lee, Wensing and Park, 2019, with weight γ = 0.01) keeps the inertia of links that
+        the log does not determine from vanishing.
 
         Args:
             robot: with π₀.
-            mean: of δ, `(10 nq,)`.
-            precision: of δ, `(10 nq, 10 nq)`.
+            mean: mean of δ, `(10 nq,)`.
+            precision: precision of δ, `(10 nq, 10 nq)`.
             log_volume: V, converts the density of a torque to that of an acceleration.
 
         Returns:
@@ -175,40 +174,42 @@ class InertialPrior(ForcePrior):
 
 
 DIVERGENCE = 0.01
-"""Weight of the divergence [nats]: enough to keep a link that the log does not determine from vanishing."""
+"""Weight of the divergence [nats], which keeps the inertia of undetermined links from vanishing."""
 CONSISTENT = LearningOptions(tolerance=1e-12, max_evaluations=500)
-"""Options of the search for the consistent robot."""
+"""Options of the search for the physically consistent robot."""
 
 
 PER_PAYLOAD = len(PARAMETER_NAMES)
 MASS_AND_MOMENT = 4
-"""Mass and first moment; weight shows them, and noise of accelerations is not taken for them."""
+"""Mass and first moment, which weight determines and acceleration noise does not bias."""
 FARTHEST = 3.0
-"""A point mass is at most so many standard lengths from the origin of its link."""
+"""Largest distance of a point mass from the origin of its link, in standard lengths."""
 
 
 @dataclass(frozen=True)
 class PayloadPrior(ForcePrior):
-    """Q = −Y_k(q, q̇, q̈) S δ, δ ~ N(0, s² I): a point mass on the link that a joint moves.
+    """A prior on a point mass on a link, Q = −Y_k(q, q̇, q̈) S δ with δ ~ N(0, s² I).
 
-    q̈ is the acceleration of the arm with the payload `known`, none at first. So the force is exact for that
-    payload, and accurate to first order for others; `around` moves to the current estimate.
+    q̈ is the acceleration of the arm with the payload `known` (by default none). The force is exact for this
+    payload and accurate to first order for others; `around` linearizes at the current estimate.
 
-    With `update` and `forget` it tracks a payload that is picked up or put down. A log without payload would
-    set its scale to zero, so keep the scale while other priors learn: `model.fit(data, learn=["joint"])`.
+    With `update` and `forget`, the prior tracks a payload that is picked up or put down. A log without
+    payload
+    would set its scale to zero, so keep the scale while learning other priors: `model.fit(data,
+    learn=["joint"])`.
 
     Args:
-        joint: joint of the link with the payload; the last one by default.
+        joint: joint that moves the link with the payload; by default the last one.
         mass: standard deviation of the mass [kg].
-        length: standard deviation of the first moment over that of the mass [m].
+        length: standard deviation of the first moment divided by that of the mass [m].
         kernel: covariance of the constants.
         name: prefix of the hyperparameters.
         known: mass [kg] and first moment [kg m] of the payload at which the acceleration is computed.
-        measured: take the measured acceleration where there is one: exact for any payload, but its noise
-            makes the payload too small where the arm hardly accelerates.
+        measured: whether to use the measured acceleration if available, which is exact for any payload but
+            noisy; the noise biases the payload towards zero if the arm hardly accelerates.
 
     Raises:
-        ModelError: the known payload is not a mass and a moment.
+        ModelError: the known payload does not consist of a mass and a moment.
     """
 
     joint: str | None = None
@@ -246,22 +247,22 @@ class PayloadPrior(ForcePrior):
         return -Y * self.units(at.q)
 
     def around(self, mean: Tensor) -> PayloadPrior:
-        """The prior with the acceleration of the arm with the estimated payload.
+        """Return the prior with the acceleration of the arm with the estimated payload.
 
         Args:
-            mean: of the latent constants `(4,)`; if it is not a point mass near the link, no payload is
-                assumed.
+            mean: mean of the latent constants `(4,)`; no payload is assumed unless it is a point mass near
+                the link.
         """
         mass, *moment = (mean * self.units(mean)).tolist()
         near = mass > 0.0 and math.hypot(*moment) <= FARTHEST * self.length * mass
         return dataclasses.replace(self, known=(mass, *moment) if near else ())
 
     def units(self, like: Tensor) -> Tensor:
-        """Mass and first moment for each unit of the latent constants, `(4,)`."""
+        """Return mass and first moment per unit of the latent constants, `(4,)`."""
         return like.new_tensor([self.mass, *3 * [self.mass * self.length]])
 
     def loaded(self, robot: RobotModel) -> RobotModel:
-        """The robot with the known payload, a point mass, if any."""
+        """Return the robot with the known payload, a point mass, if any."""
         if not self.known:
             return robot
         J = pseudo_inertia(robot.mass, robot.com, robot.inertia)
@@ -276,7 +277,7 @@ class PayloadPrior(ForcePrior):
         self.link(system.robot)
 
     def link(self, robot: RobotModel) -> int:
-        """Index of the joint that carries the payload."""
+        """Return the index of the joint that carries the payload."""
         if self.joint is None:
             return robot.nq - 1
         check_name("joint that carries a payload", self.joint, robot.joint_names)

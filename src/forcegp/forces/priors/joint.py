@@ -1,14 +1,14 @@
-"""The joint force Q before data: its mean from the robot file, and priors on the rest.
+"""Priors on the joint force Q: its mean from the robot file, and priors on the remainder.
 
-- `JointForcePrior`: any force, one process per joint.
-- `JointFrictionPrior`: friction that no robot file declares (viscous, Coulomb, a transition between the two,
-  a part that grows with the load) and the offset of the torque sensor. Each joint reads only its own
-  velocity, so the prior extrapolates to new motions of other joints. It does not depend on τ: in closed loop
-      the most likely force would cancel the noise of the torque sensor.
-- `DisturbancePrior`: slowly varying torques (temperature, hysteresis). As a function of the state they would
-be overfitted, and as white noise they would be underestimated.
-- `CoregionalPrior`: common causes of several joint forces, such as a cable or a contact that the scene lacks;
-  independent processes must learn such a force once per joint.
+- `JointForcePrior`: any force, with one process per joint.
+- `JointFrictionPrior`: friction missing from the robot file (viscous, Coulomb, a transition between the two,
+  and a part that grows with the load) and the offset of the torque sensor. The friction of a joint depends
+  only on the velocity of that joint, so the prior extrapolates to new motions of other joints. It does not
+  depend on τ, since in closed loop the most likely force would cancel torque-sensor noise.
+- `DisturbancePrior`: slowly varying torques (temperature, hysteresis), which functions of the state would
+  overfit and white noise would underestimate.
+- `CoregionalPrior`: common causes of several joint forces, such as a cable or a contact missing from the
+  scene; independent processes must learn such a force once per joint.
 """
 
 from __future__ import annotations
@@ -30,15 +30,15 @@ from forcegp.gp.kernels import SEGMENT, TIME, Kernel, Linear, OrnsteinUhlenbeck,
 from forcegp.robot.model import RobotModel
 
 TERMS = ("bias", "gravity", "friction", "actuation")
-"""Q_C, Q_G, Q_D and Q_u: the known parts of Q."""
+"""Known parts of Q: Q_C, Q_G, Q_D and Q_u."""
 
 
 @dataclass(frozen=True)
 class AnalyticalMean:
-    """m(x; θ_A) = Q_K, the sum of some of Q_C, Q_G, Q_D and Q_u.
+    """Prior mean m(x; θ_A) = Q_K, the sum of some of Q_C, Q_G, Q_D and Q_u.
 
     Args:
-        terms: which of `bias`, `gravity`, `friction`, `actuation` are known; none is the zero mean.
+        terms: known terms from `bias`, `gravity`, `friction`, `actuation`; empty for the zero mean.
 
     Example:
         >>> AnalyticalMean(("gravity", "actuation")).terms
@@ -58,17 +58,17 @@ class AnalyticalMean:
                 raise ModelError(f"term {term!r} of the analytical mean is named twice", got=self.terms)
 
     def __call__(self, system: ConstrainedSystem, at: States) -> Tensor:
-        """The mean of Q at states, `(n, nq)` [N m, N]."""
+        """Return the mean of Q at states, `(n, nq)` [N m, N]."""
         Q_D = at.eom.Q_D if at.slip is None else damping_force(system.robot, at.qd, at.slip)
         known = {"bias": at.eom.Q_C, "gravity": at.eom.Q_G, "friction": Q_D, "actuation": at.tau}
         return sum((known[term] for term in self.terms), start=torch.zeros_like(at.q))
 
 
 def mean_of(mean: str | AnalyticalMean) -> AnalyticalMean:
-    """The mean named `"zero"` or `"analytical"`, or a given mean.
+    """Return the mean named `"zero"` or `"analytical"`, or a given mean.
 
     Raises:
-        UnknownNameError: no such mean.
+        UnknownNameError: the mean does not exist.
     """
     if isinstance(mean, AnalyticalMean):
         return mean
@@ -78,7 +78,7 @@ def mean_of(mean: str | AnalyticalMean) -> AnalyticalMean:
 
 
 class PerJointPrior(ForcePrior):
-    """A force of each joint, E = I; a subclass may have another operator."""
+    """A prior on a force per joint, E = I; subclasses may have another operator."""
 
     per_joint = True
 
@@ -95,12 +95,12 @@ class PerJointPrior(ForcePrior):
 
 @dataclass(frozen=True)
 class JointForcePrior(PerJointPrior):
-    """An independent process for each joint's force Q_i (eq. 31), E = I.
+    """A prior with an independent process for each joint force Q_i (eq. 31), E = I.
 
     Args:
         kernel: covariance of each component.
-        inputs: which of `q`, `qd`, `tau` the force depends on.
-        periodic: replace the angle of each revolute joint by its sine and cosine.
+        inputs: inputs of the force, from `q`, `qd` and `tau`.
+        periodic: whether to replace the angle of each revolute joint by its sine and cosine.
         name: prefix of the hyperparameters.
 
     Example:
@@ -131,27 +131,27 @@ class JointForcePrior(PerJointPrior):
 
 
 SPEEDS = (0.02, 0.1, 0.5)
-"""Velocities at which the Coulomb features saturate [rad/s, m/s]: a sharp step, and two slower
-transitions."""
+"""Saturation velocities of the Coulomb features [rad/s, m/s]: a sharp step and two slower transitions.
+"""
 OFFSET = 0.3
-"""Initial standard deviation of an offset, as a fraction of that of a friction weight."""
+"""Initial standard deviation of an offset relative to that of a friction weight."""
 
 
 @dataclass(frozen=True)
 class JointFrictionPrior(PerJointPrior):
-    """Q_i = w_i·φ(q̇_i) + c_i with φ = (q̇_i, tanh(q̇_i/v_1), tanh(q̇_i/v_2), …, |Q_G,i| tanh(q̇_i/v_1)).
+    """A prior on viscous, Coulomb and load-dependent friction and an offset of each joint.
 
-    The weights w_i and the offset c_i are Gaussian and marginalised. Three scales are learned: the friction
-    of each joint, the relevance of each feature, and the offsets relative to friction; the last two are
-    shared by all joints. A joint that moved in one direction only does not separate offset and
-    friction, but the other joints indicate which is likely. With a separate standard deviation for each
-    weight, learning would set most of them to zero, and be overconfident on new motions. A kernel with a
-    smooth part, such as `Linear(shared=True, offset=0.3) + SquaredExponential(("velocity",))`, adds a smooth
-    remainder.
+    Q_i = w_i·φ(q̇_i) + c_i with φ = (q̇_i, tanh(q̇_i/v_1), tanh(q̇_i/v_2), …, |Q_G,i| tanh(q̇_i/v_1)). The
+    weights w_i and the offset c_i are Gaussian and marginalised. Three scales are learned: the friction of
+    each joint, the relevance of each feature, and the offsets relative to friction; the last two are shared
+    by all joints. A joint that moved in one direction only does not separate offset and friction, but the
+    other joints indicate which is likely. With a separate standard deviation for each weight, learning would
+    set most of them to zero and be overconfident on new motions. A kernel with a smooth part, such as
+    `Linear(shared=True, offset=0.3) + SquaredExponential(("velocity",))`, adds a smooth remainder.
 
     Args:
-        kernel: covariance of each component; linear in the features by default.
-        speeds: v_1, v_2, … [rad/s, m/s].
+        kernel: covariance of each component; by default linear in the features.
+        speeds: saturation speeds v_1, v_2, … [rad/s, m/s].
         load: whether friction proportional to the load |Q_G,i| is a feature.
         name: prefix of the hyperparameters.
 
@@ -185,7 +185,7 @@ class JointFrictionPrior(PerJointPrior):
 
     @property
     def sharpest(self) -> int:
-        """Index of the Coulomb feature that is the dry friction of a joint that may stick."""
+        """Index of the Coulomb feature for the dry friction of a sticking joint."""
         return self.speeds.index(min(self.speeds))
 
     def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
@@ -200,16 +200,16 @@ class JointFrictionPrior(PerJointPrior):
 
 
 NEW_MOTION = -1.0
-"""Number of the trajectory of states that are not of the training log."""
+"""Trajectory number of states that are not in the training log."""
 
 
 @dataclass(frozen=True)
 class DisturbancePrior(PerJointPrior):
-    """Q_i = d_i(t), an Ornstein–Uhlenbeck process of each joint, independent between trajectories.
+    """A prior on slow disturbances Q_i = d_i(t), with an Ornstein–Uhlenbeck process for each joint.
 
-    Its standard deviation σ_i and correlation time T_i are learned. It cannot be predicted on new
-    motions, so it adds σ_i² to the variance of the joint force there, and zero to the mean. Inference is
-    exact, since sparse inference assumes independent samples.
+    The processes are independent between trajectories; their standard deviations σ_i and correlation times
+    T_i are learned. They cannot be predicted on new motions, where they add σ_i² to the variance of the joint
+    force and zero to the mean. Inference is exact, since sparse inference assumes independent samples.
 
     Args:
         kernel: covariance over time.
@@ -236,18 +236,18 @@ class DisturbancePrior(PerJointPrior):
 
 @dataclass(frozen=True)
 class CoregionalPrior(ForcePrior):
-    """Q_i = Σ_r W_ir g_r(x) + h_i(x): covariance k(x, x′) (W Wᵀ + diag κ) between the joints.
+    """A prior on joint forces with common causes, with covariance k(x, x′) (W Wᵀ + diag κ) between joints.
 
-    The causes g_r and the remainders h_i are independent processes with the same length-scales, W has a
-    column for each cause, and κ is the variance of the remainders (the intrinsic coregionalisation model;
-    Álvarez, Rosasco and Lawrence, *Kernels for vector-valued functions*, 2012, section 4.2). All are learned;
-    the length of a column of W is the standard deviation of its cause. With a kernel whose length-scales are
-    not shared every process has its own (the linear model of coregionalisation).
+    Q_i = Σ_r W_ir g_r(x) + h_i(x). The causes g_r and the remainders h_i are independent processes with the
+    same length-scales, W has a column for each cause, and κ is the variance of the remainders (the intrinsic
+    coregionalisation model; Álvarez, Rosasco and Lawrence, *Kernels for vector-valued functions*, 2012,
+    section 4.2). All are learned; the length of a column of W is the standard deviation of its cause. With
+    separate length-scales, the kernel describes the linear model of coregionalisation.
 
     Args:
         kernel: covariance of each process.
         causes: number of columns of W.
-        inputs: which of `q`, `qd`, `tau` the force depends on.
+        inputs: inputs of the force, from `q`, `qd` and `tau`.
         name: prefix of the hyperparameters.
 
     Example:
@@ -256,7 +256,7 @@ class CoregionalPrior(ForcePrior):
         9
 
     Raises:
-        ModelError: there is no cause.
+        ModelError: the number of causes is zero.
         UnknownNameError: an input is not one of the three.
     """
 
@@ -279,7 +279,7 @@ class CoregionalPrior(ForcePrior):
         return {name: getattr(at, name) for name in self.inputs}
 
     def initial_parameters(self, robot: RobotModel) -> dict[str, Tensor]:
-        """Columns of a cosine transform: the sum of all joints first."""
+        """Return the columns of a cosine transform, starting with the sum of all joints."""
         i, r = torch.arange(robot.nq) + 0.5, torch.arange(self.causes)
         return {MIXING: torch.cos(math.pi / robot.nq * i[:, None] * r).to(robot.mass)}
 

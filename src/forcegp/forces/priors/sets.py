@@ -15,30 +15,29 @@ from forcegp.gp.kernels import Kernel, Linear, SquaredExponential
 PAPER = SquaredExponential()
 """The paper's kernel of a joint force (eq. 31)."""
 ANGLES, RATES = SquaredExponential(("q",), shared=True), Linear(("qd",), shared=True)
-"""Kernel of the configuration; what is linear in the speed of the joints."""
+"""Kernel on the configuration, and kernel linear in the joint velocities."""
 WHOLE = Linear(("tau",)) + ANGLES + RATES * RATES * ANGLES + SquaredExponential(("qd",), shared=True)
-"""Of a force that includes the motor torque, which enters linearly: weight, which the configuration decides,
-bias and damping, which there are quadratic and linear in the speed, and any friction of the joints."""
+"""Kernel of a force that includes the motor torque (linear), weight (depends on the configuration), bias and
+    damping (quadratic and linear in the velocity), and any joint friction."""
 REMAINING = RATES * ANGLES + SquaredExponential(shared=True)
-"""Of a force without it: damping that depends on the configuration, and anything else."""
+"""Kernel of a force without the motor torque: configuration-dependent damping, and anything else."""
 STATE_RESIDUAL = SquaredExponential(("q", "qd"), shared=True)
-"""Of a force that friction leaves. It does not read the motor torque: in closed loop, a residual that does
-learns to cancel it."""
+"""Kernel of a residual force besides friction. It does not depend on the motor torque, since in closed loop
+    such a residual learns to cancel it."""
 
 
 def default_priors(
     system: ConstrainedSystem, mean: str | AnalyticalMean = "analytical", kernel: Kernel | None = None
 ) -> tuple[ForcePrior, ...]:
-    """A joint force prior; with contacts also a prior on the part that accelerations do not determine.
+    """Return a joint force prior and, with contacts, a prior on the part that accelerations do not determine.
 
-    If the mean includes the motor torque, each contact with a surface also has a `SlidingFrictionPrior`;
-    without it, its friction would be attributed to the joints, and predictions in free motion would be
-    overconfident.
+    If the mean includes the motor torque, each surface contact also has a `SlidingFrictionPrior`; otherwise
+    its friction would be attributed to the joints, and predictions in free motion would be overconfident.
 
     Args:
         mean: the model's prior mean, which determines the default kernel.
-        kernel: covariance of each joint force, without a prior on the contact's friction; by default
-            `REMAINING` if the mean includes the motor torque, else `WHOLE`.
+        kernel: covariance of each joint force; by default `REMAINING` if the mean includes the motor torque,
+            and otherwise `WHOLE`. The prior on contact friction does not use it.
 
     Example:
         >>> import torch, forcegp
@@ -55,7 +54,7 @@ def default_priors(
 
 
 def friction_priors(system: ConstrainedSystem) -> tuple[ForcePrior, ...]:
-    """Friction of each joint, and Coulomb friction of each contact with a surface.
+    """Return priors on the friction of each joint and Coulomb friction of each surface contact.
 
     None of the priors depends on the motor torque.
 
@@ -73,7 +72,7 @@ def friction_priors(system: ConstrainedSystem) -> tuple[ForcePrior, ...]:
 
 
 def friction_and_residual_priors(system: ConstrainedSystem) -> tuple[ForcePrior, ...]:
-    """`friction_priors`, and any force of each joint that depends on (q, q̇)."""
+    """Return `friction_priors` and a prior on any joint force that depends on (q, q̇)."""
     residual = JointForcePrior(STATE_RESIDUAL, inputs=("q", "qd"))
     normal = (NormalForcePrior(residual),) if system.m else ()
     return (*friction_priors(system), residual, *normal)
@@ -81,15 +80,15 @@ def friction_and_residual_priors(system: ConstrainedSystem) -> tuple[ForcePrior,
 
 @dataclass(frozen=True)
 class PriorSet:
-    """Force priors around the analytical forces, by name.
+    """A named set of force priors for the analytical mean.
 
     Attributes:
-        name: of the set.
-        description: the forces that it models.
-        priors: the priors for a system.
+        name: name of the set.
+        description: the modelled forces.
+        priors: function that returns the priors for a system.
         has_joint_friction: whether joint friction and torque noise are modelled, which identification of
             inertia requires.
-        needs_surface: whether the set is for systems with a contact with a surface.
+        needs_surface: whether the set requires a surface contact.
     """
 
     name: str
@@ -99,12 +98,12 @@ class PriorSet:
     needs_surface: bool = False
 
     def fits(self, system: ConstrainedSystem) -> bool:
-        """Whether the set is for this system."""
+        """Return whether the set applies to this system."""
         return not self.needs_surface or bool(_surfaces(system))
 
 
 def contact_priors(system: ConstrainedSystem, kernel: Kernel | None = None) -> tuple[ForcePrior, ...]:
-    """A prior on the friction of each contact with a surface; a joint force prior without such contacts.
+    """Return a prior on the friction of each surface contact, or a joint force prior without such contacts.
 
     Args:
         kernel: covariance of each Cartesian component of any tangential force; by default the force is
@@ -125,7 +124,7 @@ def contact_priors(system: ConstrainedSystem, kernel: Kernel | None = None) -> t
 
 
 def _surfaces(system: ConstrainedSystem) -> list[str]:
-    """Names of the contacts with a surface."""
+    """Return the names of the contacts with a surface."""
     return [contact.name for contact in system.contacts if isinstance(contact, SurfaceContact)]
 
 
@@ -139,18 +138,18 @@ SETS: dict[str, PriorSet] = {
         ),
     )
 }
-"""Sets around the analytical forces that the data choose between, simplest first."""
+"""Sets for automatic selection with the analytical mean, simplest first."""
 FEW = SETS["friction"]
-"""The set for few samples."""
+"""Set used for few samples."""
 
 
 def priors_of(
     system: ConstrainedSystem, mean: AnalyticalMean, force_priors: str | Sequence[ForcePrior]
 ) -> tuple[ForcePrior, ...]:
-    """The given force priors, or those of a named set; for `"auto"` those for few samples.
+    """Return the given force priors, or those of a named set; for `"auto"`, those for few samples.
 
     Raises:
-        UnknownNameError: no such set.
+        UnknownNameError: the set does not exist.
     """
     if not isinstance(force_priors, str):
         return tuple(force_priors)

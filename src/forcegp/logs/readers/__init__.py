@@ -1,5 +1,5 @@
 """Detection of the format of a log by its first bytes, then by its name; formats that can run code are
-refused.
+rejected.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ _READERS = {
     "lerobot": ("LeRobot data set", "parquet.read_lerobot"),
 }
 FORMATS = {kind: name for kind, (name, _) in _READERS.items()}
-"""Formats that are read, with what they are called in messages."""
+"""Supported formats, with their names in messages."""
 
 _MAGIC = (
     (b"PAR1", "parquet"),
@@ -49,14 +49,14 @@ def read(
     rows: int | None = None,
     progress: Progress | None = None,
 ) -> LogTable:
-    """Read a log, a file or a folder, of any supported format.
+    """Read a log (a file or a folder) of any supported format.
 
-    Columns are read if `wanted`, and rows up to `rows` if the format allows it; `progress` receives the done
-    and total counts.
+    Columns are read if `wanted`, and rows up to `rows` if the format supports it; `progress` receives the
+    completed and total counts.
 
     Raises:
-        DataError: no such file, an unsupported or unsafe format, damage, or a size beyond the limits.
-        MissingDependencyError: the format's reader is not installed.
+        DataError: the file does not exist, is damaged or too large, or its format is unsupported or unsafe.
+        MissingDependencyError: the reader for the format is not installed.
 
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp()) / "run.csv"
@@ -73,7 +73,7 @@ def read(
 
 
 def format_of(path: Path) -> str:
-    """The key in `FORMATS` of a log."""
+    """Return the key in `FORMATS` of a log."""
     if path.is_dir():
         return _format_of_folder(path)
     if not path.is_file():

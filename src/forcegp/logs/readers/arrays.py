@@ -1,8 +1,8 @@
 """Files of named arrays: NumPy archives without pickled objects, HDF5 and MATLAB.
 
-MATLAB files of version 7.3 are read as HDF5 files, version 4 by SciPy. Of versions 5 to 7
-every tag is checked before it is followed, as SciPy's reader crashes the process on some damaged files; the
-layout is that of "MAT-File Format" (MathWorks), chapter 1. Links out of an HDF5 file are not followed.
+MATLAB files of version 7.3 are read as HDF5 files, and version 4 by SciPy. For versions 5 to 7, every tag is
+checked before it is followed, since SciPy's reader crashes on some damaged files; the layout is that of
+"MAT-File Format" (MathWorks), chapter 1. Links out of an HDF5 file are not followed.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ from forcegp.logs.table import LogTable
 
 Arrays = dict[str, NDArray[np.generic]]
 MAX_ARRAYS = 4096
-"""Arrays of one archive."""
+"""Maximum number of arrays in an archive."""
 
 
 def read_numpy(path: Path, **_: object) -> LogTable:
@@ -49,7 +49,7 @@ def read_numpy(path: Path, **_: object) -> LogTable:
 
 
 def _array(source: str, name: str, file: Any, size: int) -> Arrays:
-    """An array by name, the fields of a structured one each; what its header claims is checked first."""
+    """Return an array, or the fields of a structured one, by name, after a check of the declared size."""
     form = np.lib.format
     version = form.read_magic(file)  # pyright: ignore[reportArgumentType]
     read_header = {(1, 0): form.read_array_header_1_0, (2, 0): form.read_array_header_2_0}.get(version)
@@ -90,7 +90,7 @@ def _hdf5_arrays(path: Path, separator: str, remarks: list[str]) -> Arrays:
 def _walk(
     h5py: Any, group: Any, prefix: str, separator: str, arrays: Arrays, remarks: list[str], seen: set[Any]
 ) -> None:
-    """Collect the data sets below a group, each once, though links may lead to it several times."""
+    """Collect the data sets in a group without duplicates due to links."""
     if prefix.count(separator) > limits.GROUP_DEPTH:
         raise DataError(f"{group.file.filename}: groups are nested too deeply", got=prefix[:200])
     for key in group:
@@ -129,7 +129,7 @@ def _take(item: Any, name: str, arrays: Arrays, remarks: list[str]) -> None:
 HEADER_BYTES = 128
 MATRIX, COMPRESSED, INT8, UTF8 = 14, 15, 1, 16
 DTYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
-"""NumPy types of the element types that hold numbers."""
+"""NumPy types for numeric element types."""
 STRUCT, NUMERIC = 2, range(6, 16)
 OTHER_CLASSES = {1: "cell", 3: "object", 4: "char", 5: "sparse", 16: "function", 17: "opaque"}
 COMPLEX = 0x08
@@ -148,7 +148,7 @@ class _Element(NamedTuple):
 
 
 def variables(content: bytes, source: str) -> Iterator[Variable]:
-    """The variables of a file from its content, in order; `source` is its name in messages."""
+    """Return the variables of a file in order from its content; `source` is its name in messages."""
     order = {b"IM": "<", b"MI": ">"}.get(content[126:128])
     if order is None:
         raise DataError(f"{source}: not a MATLAB file of versions 5 to 7", got=content[:20])
@@ -182,7 +182,7 @@ class _Reader:
         return memoryview(content)
 
     def elements(self, content: memoryview) -> Iterator[_Element]:
-        """The elements that follow each other, aligned to eight bytes; short ones lie within their tag."""
+        """Yield consecutive elements, aligned to eight bytes; short ones are within their tag."""
         at = 0
         while at < len(content):
             if len(content) - at < 8:
@@ -205,7 +205,7 @@ class _Reader:
         return element
 
     def matrix(self, body: memoryview, field: str = "", depth: int = 0) -> Iterator[Variable]:
-        """A variable, or the field of a struct; of a struct its fields."""
+        """Yield a variable or the field of a struct; for a struct, its fields."""
         if depth > limits.GROUP_DEPTH:
             raise DataError(f"{self.source}: structs are nested more than {limits.GROUP_DEPTH} levels deep")
         self.count += 1
@@ -268,11 +268,11 @@ class _Reader:
 
 
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
-"""Version 7.3 puts it after a header of 512 bytes."""
+"""HDF5 signature, which follows a header of 512 bytes in version 7.3."""
 
 
 def read_matlab(path: Path, **_: object) -> LogTable:
-    """Read the numeric arrays of a MATLAB file, fields of a struct as `struct.field`; remark the rest."""
+    """Read the numeric arrays of a MATLAB file, with fields as `struct.field`; others cause remarks."""
     with path.open("rb") as file:
         head = file.read(520)
     remarks: list[str] = []
@@ -292,7 +292,7 @@ def read_matlab(path: Path, **_: object) -> LogTable:
 
 
 def _version4(path: Path) -> Iterator[Variable]:
-    """The variables of a file of version 4, which has no structs."""
+    """Yield the variables of a version 4 file, which has no structs."""
     from scipy.io import loadmat, whosmat
 
     listing = whosmat(path)

@@ -2,9 +2,9 @@
 
 Columns of a joint state: `position.<joint>`, `velocity.<joint>`, `effort.<joint>`. Columns of a wrench:
 `force.x` to `torque.z`. Both have `header`, the stamp of the driver [s], and `receive`, the time of recording
-[s], each counted from the earliest one in the log, as float64 has no nanoseconds since 1970.
+[s], each relative to the earliest one in the log, since float64 does not resolve nanoseconds since 1970.
 
-The layouts are those of the ROS distributions; definitions that a bag carries are not compiled.
+Message layouts are those of the ROS distributions; definitions stored in a bag are not compiled.
 """
 
 from __future__ import annotations
@@ -29,17 +29,17 @@ JOINT_STATE = "sensor_msgs/msg/JointState"
 WRENCH = "geometry_msgs/msg/WrenchStamped"
 KINDS = (JOINT_STATE, WRENCH)  # that are read
 UNITS = {"position": "rad", "velocity": "rad/s", "effort": "Nm", "force": "N", "torque": "Nm"}
-"""Units of the quantities of a joint state, by REP 103, and of a wrench."""
+"""Units of a joint state (REP 103) and of a wrench."""
 CLOCKS = ("header", "receive")
-"""Columns of time that every topic has."""
+"""Time columns of every topic."""
 
 Decode = Callable[[bytes], Any]
 Found = tuple[str, str, str, int, bytes, int]
-"""Topic, type, encoding, time of recording [ns] and content of a message, and how much was read by then."""
+"""Topic, type, encoding, recording time [ns] and content of a message, and the amount read so far."""
 
 
 def canonical(kind: str) -> str:
-    """The ROS 2 name of a message type.
+    """Return the ROS 2 name of a message type.
 
     >>> canonical("sensor_msgs/JointState")
     'sensor_msgs/msg/JointState'
@@ -50,7 +50,7 @@ def canonical(kind: str) -> str:
 
 @cache
 def decoder(kind: str, encoding: str) -> Decode:
-    """Decodes messages of a type in `KINDS`, in the encoding `ros1` or `cdr`."""
+    """Return a decoder for messages of a type in `KINDS`, in the encoding `ros1` or `cdr`."""
     typesys = optional_module("rosbags.typesys", "Reading ROS messages", "import")
     first = encoding == "ros1"
     store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC if first else typesys.Stores.ROS2_HUMBLE)
@@ -60,7 +60,7 @@ def decoder(kind: str, encoding: str) -> Decode:
 
 @dataclass
 class Messages:
-    """Messages of one topic with the same columns, their stamps and the times of recording [ns]."""
+    """Messages of a topic with the same columns, their time stamps and recording times [ns]."""
 
     topic: str
     columns: tuple[str, ...]
@@ -68,7 +68,7 @@ class Messages:
     stamps: list[tuple[int, int]] = field(default_factory=list)
 
     def stream(self, name: str, origin: np.ndarray, wanted: Wanted) -> Stream:
-        """The requested numeric columns, with times from `origin` [ns]."""
+        """Return the requested numeric columns, with times from `origin` [ns]."""
         stamps = (np.array(self.stamps, dtype=np.int64) - origin) * 1e-9
         order = np.argsort(stamps[:, 1], kind="stable")
         columns: dict[str, Column] = dict(zip(CLOCKS, np.ascontiguousarray(stamps[order].T), strict=True))
@@ -81,7 +81,7 @@ class Messages:
 
 @dataclass
 class Collector:
-    """Gathers the messages of a bag, one stream for each topic and set of joints."""
+    """Collects the messages of a bag in one stream per topic and set of joints."""
 
     source: str
     unpacking: Unpacking
@@ -91,7 +91,7 @@ class Collector:
     def take(
         self, messages: Iterable[Found], rows: int | None, progress: Progress | None, total: int
     ) -> None:
-        """Take messages of supported types, until a stream has `rows` of them."""
+        """Collect messages of supported types until a stream has `rows` messages."""
         for topic, kind, encoding, receive_ns, raw, done in messages:
             if kind in KINDS and encoding in ("cdr", "ros1"):
                 self._add(topic, kind, receive_ns, raw, decoder(kind, encoding))
@@ -101,7 +101,7 @@ class Collector:
                 return
 
     def _add(self, topic: str, kind: str, receive_ns: int, raw: bytes, decode: Decode) -> None:
-        """Take one message; `DataError` if it is too large, or its arrays do not fit its joint names."""
+        """Add a message; `DataError` if it is too large, or its arrays do not match its joint names."""
         check_count(self.source, "bytes in one message", len(raw), limits.MESSAGE_BYTES)
         message = decode(raw)
         if kind == JOINT_STATE:
@@ -123,7 +123,9 @@ class Collector:
         return max((len(stream.rows) for stream in self._streams.values()), default=0)
 
     def table(self, format_: str, topics: dict[str, str], wanted: Wanted) -> LogTable:
-        """The log with the requested columns; `topics` are all topics of the bag with their types."""
+        """Return the log with the requested columns; `topics` contains all topics of the bag with their
+        types.
+        """
         if not self._streams:
             listing = ", ".join(f"{topic} ({kind})" for topic, kind in topics.items())
             raise DataError(
@@ -147,7 +149,7 @@ class Collector:
 
 
 def _joint_state(source: str, topic: str, message: Any) -> dict[str, float]:
-    """Position, velocity and effort of each joint by column; NaN where a quantity is empty."""
+    """Return position, velocity and effort of each joint by column, NaN for empty quantities."""
     names = tuple(str(name)[: limits.LOG_NAME] for name in message.name)
     if not names or len(set(names)) < len(names):
         raise DataError(f"{source}: a joint state on {topic} has no joint names, or one twice", got=names[:8])
@@ -190,7 +192,7 @@ def read_bag(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress
 
 
 def _messages(bag: Any, encoding: str, unpacking: Unpacking) -> Iterator[Found]:
-    """The messages of a bag of ROS 1 or ROS 2 whose types are read."""
+    """Yield the messages of supported types from a ROS 1 or ROS 2 bag."""
     check_count(unpacking.source, "topics", len(bag.connections), limits.LOG_STREAMS)
     check_count(unpacking.source, "messages", bag.message_count, limits.LOG_MESSAGES)
     used = [c for c in bag.connections if canonical(c.msgtype) in KINDS]
@@ -201,7 +203,7 @@ def _messages(bag: Any, encoding: str, unpacking: Unpacking) -> Iterator[Found]:
 
 
 def _files(path: Path) -> list[Path]:
-    """The files of a folder that is a bag, but for its description; refused if they are compressed."""
+    """Return the files of a bag folder without its description; `DataError` if they are compressed."""
     description = path / "metadata.yaml"
     files = within(path, sorted(file for file in path.iterdir() if file.is_file()))
     check_count(str(description), "bytes", description.stat().st_size, limits.LISTING_BYTES)
@@ -217,7 +219,7 @@ def _files(path: Path) -> list[Path]:
 
 
 def _mcap_messages(path: Path, unpacking: Unpacking, topics: dict[str, str]) -> Iterator[Found]:
-    """The messages of an MCAP file in its order; adds its topics with their types."""
+    """Yield the messages of an MCAP file in file order, and add its topics with their types."""
     records = optional_module("mcap.records", "Reading MCAP files", "import")
     schemas, channels = {}, {}
     with path.open("rb") as file:
@@ -235,7 +237,7 @@ def _mcap_messages(path: Path, unpacking: Unpacking, topics: dict[str, str]) -> 
 
 
 def _mcap_records(file: io.BufferedReader, unpacking: Unpacking) -> Iterator[Any]:
-    """The records of an MCAP file in its order; chunks are unpacked one at a time, record by record."""
+    """Yield the records of an MCAP file in file order, unpacking one chunk at a time, record by record."""
     records = optional_module("mcap.records", "Reading MCAP files", "import")
     streams = optional_module("mcap.stream_reader", "Reading MCAP files", "import")
     reader = streams.StreamReader(file, emit_chunks=True, record_size_limit=limits.RECORD_BYTES)

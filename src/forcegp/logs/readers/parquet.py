@@ -22,7 +22,7 @@ if TYPE_CHECKING:
 
 
 BATCH_ROWS = 1 << 16
-"""Rows that are decoded at a time."""
+"""Number of rows decoded at a time."""
 
 
 def read_parquet(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
@@ -36,7 +36,7 @@ def read_parquet(path: Path, *, wanted: Wanted, rows: int | None, progress: Prog
 def read_columns(
     paths: list[Path], wanted: Wanted, rows: int | None, remarks: list[str], progress: Progress | None
 ) -> dict[str, Column]:
-    """Concatenated columns of files, lists by name or `name[i]`; omitted columns are added to `remarks`."""
+    """Return concatenated columns of files, lists by name or `name[i]`; `remarks` lists omitted columns."""
     import pyarrow.parquet as pq
 
     chunks: dict[str, list[Column]] = {}
@@ -70,7 +70,7 @@ def read_columns(
 
 
 def _check(path: Path, file: object, names: set[str]) -> int:
-    """Number of rows of a file whose columns of those names claim to be within the limits."""
+    """Return the number of rows of a file after a check of the declared size of its columns."""
     shape = file.metadata  # pyright: ignore[reportAttributeAccessIssue]
     guards.check_count(str(path), "columns", shape.num_columns, limits.COLUMNS)
     groups = [shape.row_group(i) for i in range(shape.num_row_groups)]
@@ -167,7 +167,7 @@ def read_lerobot(path: Path, *, wanted: Wanted, rows: int | None, progress: Prog
 
 
 def _motors(description: Any) -> list[str]:
-    """Names of the numbers of a feature: a list, or a list under one key such as `motors`."""
+    """Return the names of the values of a feature, a list or a list under one key such as `motors`."""
     names = description.get("names") if isinstance(description, dict) else None
     if isinstance(names, dict) and len(names) == 1:
         names = next(iter(names.values()))

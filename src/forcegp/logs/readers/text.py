@@ -1,6 +1,8 @@
-"""CSV and text columns with any separator, decimal mark and heading, read in blocks; folders of such files.
+"""CSV and text tables with any separator, decimal mark and heading, read in blocks, and folders of such
+files.
 
-The format of a table is inferred from its first lines. In a folder each file holds one quantity: `q.txt`, …
+The format of a table is inferred from its first lines. In a folder, each file contains one quantity: `q.txt`,
+…
 """
 
 from __future__ import annotations
@@ -24,7 +26,7 @@ if TYPE_CHECKING:
 
 
 SAMPLE_BYTES, SAMPLE_LINES = 1 << 18, 200
-"""Size of the part of a file that is inspected, and lines of numbers that must agree."""
+"""Size of the inspected part of a file, and number of lines of numbers that must agree."""
 
 SEPARATORS = (";", "\t", ",", "|", " ")
 """Candidates; a space stands for any run of blanks."""
@@ -73,7 +75,7 @@ def sniff(path: Path) -> Dialect:
 
 
 def split(line: str, separator: str) -> list[str]:
-    """Fields of a line, without blanks and quotation marks around them.
+    """Split a line into fields without surrounding blanks and quotation marks.
 
     >>> split("a;  b ;", ";")
     ['a', 'b', '']
@@ -83,7 +85,7 @@ def split(line: str, separator: str) -> list[str]:
 
 
 def is_number(field: str, decimal: str = ".") -> bool:
-    """Whether a field is a number, or marks a missing one."""
+    """Return whether a field is a number or marks a missing one."""
     if field in MISSING:
         return True
     return bool((_COMMA_NUMBER if decimal == "," else _NUMBER).match(field))
@@ -103,7 +105,9 @@ def _decode(path: Path, head: bytes) -> tuple[str, str]:
 
 
 def _try(lines: list[str], separator: str, decimal: str) -> tuple[float, str, str, int]:
-    """Score of a separator and a decimal mark: fields with a value, times their share."""
+    """Return the score of a separator and a decimal mark: number of fields with a value, times their
+    fraction.
+    """
     kept = [(i, split(line, separator)) for i, line in enumerate(lines) if line.strip()]
     rows = [(i, fields) for i, fields in kept if _numeric(fields, decimal)]
     if not rows:
@@ -123,7 +127,7 @@ def _is_value(field: str, decimal: str) -> bool:
 
 
 def _numeric(fields: list[str], decimal: str) -> bool:
-    """Whether a line is one of values: it has a number, and text at most in a minority of the fields."""
+    """Return whether a line contains values: at least one number, and text only in a minority of fields."""
     if fields and fields[0].startswith(("#", "%", "//")):
         return False
     values = [f for f in fields if f not in MISSING]
@@ -170,14 +174,14 @@ def _kind(fields: list[str], decimal: str) -> str:
 
 
 BLOCK_BYTES = 4 << 20
-"""Size of the text that is parsed at a time."""
+"""Size of the text parsed at a time."""
 
 _BLANKS = re.compile(rb"[ \t]+")
 _EDGES = re.compile(rb"(?m)^ | (?=\r?$)")
 
 
 def read_text(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read a text table; columns of text are left out with a remark."""
+    """Read a text table; text columns are omitted with a remark."""
     dialect = sniff(path)
     kinds = {n: kind for n, kind in zip(dialect.names, dialect.kinds, strict=True) if wanted(n)}
     remarks = [f"column {n!r} holds text and was left out" for n, kind in kinds.items() if kind == "text"]
@@ -201,7 +205,7 @@ def read_text(path: Path, *, wanted: Wanted, rows: int | None, progress: Progres
 
 
 def _batches(source: _Blocks, dialect: Dialect, kinds: dict[str, str]) -> Iterator[pa.RecordBatch]:
-    """Batches of rows of the chosen columns."""
+    """Yield batches of rows of the selected columns."""
     import pyarrow as pa
     from pyarrow import csv
 
@@ -226,7 +230,7 @@ def _batches(source: _Blocks, dialect: Dialect, kinds: dict[str, str]) -> Iterat
 
 
 def _numbers(values: pa.Array, kind: str) -> Column:
-    """A column as float64: times of day in seconds of the epoch, true and false as 1 and 0."""
+    """Convert a column to float64: dates to seconds since the epoch, true and false to 1 and 0."""
     import pyarrow as pa
     import pyarrow.compute as pc
 
@@ -238,11 +242,11 @@ def _numbers(values: pa.Array, kind: str) -> Column:
 
 
 DATE_ORIGIN_NS = 1_577_836_800_000_000_000
-"""2020-01-01 in nanoseconds of the epoch: the origin of times that are given as dates."""
+"""2020-01-01 in nanoseconds since the epoch, the origin of times given as dates."""
 
 
 class _Blocks(io.RawIOBase):
-    """A binary file for the parser: counts what was read, and makes one blank of a run of blanks."""
+    """A binary file for the parser, which counts the bytes read and collapses runs of blanks."""
 
     def __init__(self, file: IO[bytes], dialect: Dialect, size: int, progress: Progress | None) -> None:
         self._file, self._size, self._progress = file, size, progress
@@ -269,7 +273,7 @@ class _Blocks(io.RawIOBase):
 
 
 ENDINGS = (".txt", ".csv", ".tsv", ".dat", ".asc")
-"""Endings of the files that are read; others in the folder are not."""
+"""Suffixes of the files to read; others in the folder are ignored."""
 
 
 def read_folder(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
