@@ -57,9 +57,8 @@ def _inverse_derivatives(
 ) -> tuple[Tensor, Tensor]:
     """Return ∂ID/∂q and ∂ID/∂q̇ with the batch last, `(nq, nq, B)`.
 
-    With the composite inertia I and the composite 2B = [[N, 0], [−2 l×, 0]] of the subtree of joint i,
-    N = 2 ω×I − tr(I) ω× − 2 h×v×, l its linear momentum, F its force, and for each joint Ṡ = V×S,
-    S̈ = a×S + V×Ṡ:
+    With the composite inertia I and the composite 2B = [[N, 0], [−2 l×, 0]] of the subtree of joint i, N = 2
+    ω×I − tr(I) ω× − 2 h×v×, l its linear momentum, F its force, and for each joint Ṡ = V×S, S̈ = a×S + V×Ṡ:
     ∂τ_i/∂q_j = S_i·(2B Ṡ_j + I S̈_j) if j moves i, and S_i·(2B Ṡ_j + I S̈_j + S_j ×* F) of subtree j if i
     moves j; ∂τ/∂q̇ has S and 2 Ṡ instead of Ṡ and S̈, and no F.
     """

@@ -1,9 +1,8 @@
 """Information in the motion: joints that move, changes of direction, parameters that are identified, and
 the size of the faults that this log can reveal.
 
-A fault of size θ adds θ φ to the unexplained torque r, and the held-out residual is linear in it,
-e(r + θ φ) = e(r) + θ e(φ). The fault is detected if `explain.significant` accepts the increase of the
-residual.
+A fault of size θ adds θ φ to the unexplained torque r, and the held-out residual is linear in it, e(r + θ φ)
+= e(r) + θ e(φ). The fault is detected if `explain.significant` accepts the increase of the residual.
 """
 
 from __future__ import annotations

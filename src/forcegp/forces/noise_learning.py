@@ -3,10 +3,9 @@
 Both alternate with the hyperparameters (`solve` in `models/structured_learning.py`).
 
 **Slopes.** The first fit propagates state noise through the equations of motion of the robot file
-(`noise.py`),
-which lack the unknown forces: a spring of 100 N m/rad turns noise of 1 mrad into 0.1 N m. Following McHutchon
-and Rasmussen (*Gaussian process training with input noise*, 2011), the slope of the posterior mean F̄ is
-computed at each sample, and hyperparameters are relearned with
+(`noise.py`), which lack the unknown forces: a spring of 100 N m/rad turns noise of 1 mrad into 0.1 N m.
+Following McHutchon and Rasmussen (*Gaussian process training with input noise*, 2011), the slope of the
+posterior mean F̄ is computed at each sample, and hyperparameters are relearned with
 
     cov(y_i) = Σ_y + G_i Σ_x G_iᵀ,   G_i = ∂(L b + H F̄)/∂(q, q̇) + H ∂F̄/∂(q, q̇),
 

@@ -299,9 +299,8 @@ def touching(distance: Array) -> float:
 def force_levels(values: Array, name: str, section: ContactStateSection) -> tuple[float, float]:
     """Force threshold of a closed contact, and the lower force to which its interval extends [N].
 
-    The first separates the forces into the two groups with the least variance (Otsu 1979); the second
-    lies `RELEASE_STD` deviations above the median of the open group. `DataError` if the groups are not
-    distinct.
+    The first separates the forces into the two groups with the least variance (Otsu 1979); the second lies
+    `RELEASE_STD` deviations above the median of the open group. `DataError` if the groups are not distinct.
     """
     if section.threshold is not None:
         return section.threshold, section.release if section.release is not None else 0.5 * section.threshold

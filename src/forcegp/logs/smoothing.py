@@ -1,8 +1,7 @@
 """Computation of missing velocities and accelerations by trajectory, never across a contact switch.
 
 The Kalman smoother of a joint returns position, velocity and acceleration with error bars. Its model is
-constant
-jerk disturbed by white snap of intensity s, measured with white noise of deviation σ: x = (q, q̇,
+constant jerk disturbed by white snap of intensity s, measured with white noise of deviation σ: x = (q, q̇,
 q̈, q⃛), dx = F x dt + e₄ √s dw, y = q + ε. In the scaled state z = (q, h q̇, h² q̈, h³ q⃛), h the time step,
 transition and noise are constant matrices: z⁺ = A z + w, A_ij = 1/(j−i)!, Cov(w)_ij = ρ σ² W_ij with ρ = s
 h⁷/σ² and W_ij = 1/((3−i)! (3−j)! (7−i−j)), i, j from 0. ρ is learned by evidence, σ in closed form (Rauch,

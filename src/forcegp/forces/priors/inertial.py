@@ -194,8 +194,7 @@ class PayloadPrior(ForcePrior):
     payload and accurate to first order for others; `around` linearizes at the current estimate.
 
     With `update` and `forget`, the prior tracks a payload that is picked up or put down. A log without
-    payload
-    would set its scale to zero, so keep the scale while learning other priors: `model.fit(data,
+    payload would set its scale to zero, so keep the scale while learning other priors: `model.fit(data,
     learn=["joint"])`.
 
     Args:
