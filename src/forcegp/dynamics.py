@@ -103,9 +103,7 @@ def known_terms(
 def accelerations(
     robot: RobotModel, poses: LinkPoses, motion: LinkMotion, qdd: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return the spatial accelerations `(3, nq, B)` of the links at q̈ `(nq, B)`; gravity enters as an
-    acceleration of the base.
-    """
+    """Return spatial accelerations `(3, nq, B)` of the links at q̈ `(nq, B)`, with gravity at the base."""
     E = robot.ancestors
     linear = motion.acceleration + sum_over(E, poses.linear * qdd) - robot.gravity[:, None, None]
     return motion.alpha + sum_over(E, poses.angular * qdd), linear

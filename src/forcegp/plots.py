@@ -123,9 +123,7 @@ class Timeline:
         return np.insert(values, self.breaks, np.nan)
 
     def spans(self, closed: Tensor) -> list[tuple[float, float]]:
-        """Return the time intervals in which a flag `(n,)` is true; empty unless the samples are a time
-        series.
-        """
+        """Return the time intervals in which a flag `(n,)` is true; empty unless samples form a series."""
         flags = as_array(closed)[self.order] > 0
         if not self.ordered or not len(flags):
             return []

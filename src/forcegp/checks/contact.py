@@ -250,8 +250,7 @@ FORCE_ROWS = 4000
 PULLS = 0.5
 """Fraction of contact rows with a pulling force from which the normal must be reversed."""
 SIGNIFICANT, LARGEST_FRICTION = 4.0, 2.0
-"""Number of standard errors over blocks from which friction is significant, and largest plausible
-coefficient.
+"""Standard errors over blocks from which friction is significant, and largest plausible coefficient.
 """
 SLIDING_SLOW, NARROW = 0.01, 0.05
 """Speed below which the sliding direction is unknown [m/s], and minimum share of the second direction."""

@@ -96,9 +96,7 @@ class ContactPoint:
         return J - n[..., None] * (n[..., None, :] @ J), v - n * vecdot(n, v)[..., None]
 
     def directions(self, rows: int) -> Tensor:
-        """Return the directions of the multipliers `(*batch, 3, rows)`: ∇c, and the tangent frame if it may
-        stick.
-        """
+        """Return the directions of the multipliers `(*batch, 3, rows)`: ∇c, and tangents if it may stick."""
         normal = self.normal[..., None]
         return normal if rows == 1 else torch.cat([normal, tangent_frame(self.unit_normal)], dim=-1)
 

@@ -108,9 +108,7 @@ class Unknowns:
         return {"links": slice(0, links), "friction": slice(links, drives), "drives": slice(drives, None)}
 
     def basis(self, q: Tensor, qd: Tensor) -> Tensor:
-        """Return the functions of each joint `(n, nq, k)`: scaled q̇ and tanh q̇, bumps over q̇, bumps over
-        q.
-        """
+        """Return functions of each joint `(n, nq, k)`: scaled q̇ and tanh q̇, bumps over q̇ and over q."""
         u, place = qd / self.fastest, 2.0 * (q - self.low) / (self.high - self.low) - 1.0
         bumps = [
             torch.exp(-0.5 * ((x[..., None] - torch.linspace(-1.0, 1.0, k).to(x)) * (k - 1) / 2.0) ** 2)

@@ -36,9 +36,7 @@ class Trapezoid(NamedTuple):
     acceleration: Tensor
 
     def at(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return distance, speed and acceleration at time t from the start of the segment, held after its
-        end.
-        """
+        """Return distance, speed and acceleration at time t since the segment began, held after its end."""
         t = torch.minimum(t.clamp(min=0.0), self.travel_time)
         remaining = self.travel_time - t
         a, blend = self.acceleration, self.blend_time

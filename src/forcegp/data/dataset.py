@@ -81,9 +81,7 @@ class Dataset(Fields):
         fields.check_values(self)
 
     def __repr__(self) -> str:
-        """Return a summary of the columns without their numbers: samples, joints, duration, contacts, further
-        quantities.
-        """
+        """Return a summary: samples, joints, duration, contacts, and additional quantities."""
         robot = f" of {self.header.robot!r}" if self.header.robot else ""
         parts = [f"{len(self)} samples of {self.nq} joints"]
         if len(self):

@@ -233,9 +233,7 @@ def check_values(data: Fields) -> None:
 
 
 def check_time(data: Fields) -> None:
-    """Check that the rows of each segment are contiguous with strictly increasing time; `DataError` names the
-    row.
-    """
+    """Check that segments are contiguous with strictly increasing time; `DataError` names the row."""
     t, segment = data.t, data.segment
     same = segment[1:] == segment[:-1]
     back = same & (t[1:] <= t[:-1])
@@ -309,9 +307,7 @@ def lock_hint(joints: Sequence[str]) -> str:
 
 
 def check_robot(data: Fields, robot: RobotModel) -> None:
-    """Check that a log has the robot's joints in order; warn about different robot parameters and about
-    angles that may be in degrees.
-    """
+    """Check that joints match; warn about different robot parameters and angles that may be in degrees."""
     check_joints(data.joint_names, robot.joint_names, robot.name)
     q, free = data.q.to(robot.lower) * robot.revolute, torch.full_like(robot.lower, MOST_RADIANS)
     low, high = (

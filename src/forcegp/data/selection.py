@@ -123,9 +123,7 @@ def select_points(
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """Training rows in selection order, test rows in increasing order, and held-out stretches as half-open
-    row ranges.
-    """
+    """Training rows in selection order, test rows in increasing order, and held-out row ranges."""
 
     train: Int[Tensor, " count"]
     test: Int[Tensor, " rest"]

@@ -77,9 +77,7 @@ def beyond_gravity(system: ConstrainedSystem, data: Dataset) -> tuple[Tensor, fl
 
 
 def explained(error: Tensor, rest: Tensor) -> tuple[float | None, ...]:
-    """Return R² by joint of torque errors relative to the torque beyond gravity, `(n, nq)` each; `None` if
-    the latter is `FAINT`.
-    """
+    """Return R² by joint from torque errors and torques beyond gravity, `(n, nq)`; `None` if `FAINT`."""
     left, whole = (error**2).sum(0), (rest**2).sum(0)
     shares, seen = (1.0 - left / whole).tolist(), (whole > FAINT**2 * whole.max()).tolist()
     return tuple(share if clear else None for share, clear in zip(shares, seen, strict=True))

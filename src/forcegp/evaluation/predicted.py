@@ -139,9 +139,7 @@ def predicted_forces(model: Predictor, data: Dataset) -> Moments:
 
 
 def logged_forces(model: Predictor, data: Dataset) -> dict[str, Tensor]:
-    """Return the normal force `(n,)` of contacts closed in training, by name: `multiplier`, or the sensor
-    force for a single contact.
-    """
+    """Return the logged normal force `(n,)` of contacts closed in training, or the sensor force of one."""
     never = model.result.never_closed if isinstance(model, StructuredFit) else ()
     names = [name for name in model.system.contact_names if name not in never]
     logged = data.contact_extras.get("multiplier", {})

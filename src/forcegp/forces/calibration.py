@@ -50,8 +50,7 @@ REGIME = 0.25
 PRIOR_SAMPLES = 4.0
 """Weight of the prior in `growth`, as a number of independent samples."""
 WINDOW, WINDOWS = 10.0, 20
-"""Length of the windows of `correlation_times` in units of the autocorrelation time, and their minimum
-number.
+"""Length of the windows of `correlation_times` in autocorrelation times, and their minimum number.
 """
 
 
@@ -277,9 +276,7 @@ def stretches(segment: Tensor) -> Tensor:
 def _held_out(
     problem: Problem, hyperparameters: Mapping[str, Tensor], i: int, own: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return torque residuals of samples of measurement i predicted from all others, their variance without
-    torque noise, `(n, nq)` each, and P.
-    """
+    """Return held-out torque residuals of measurement i, their noise-free variance, `(n, nq)`, and P."""
     training, std = problem.training, problem.noise_at(hyperparameters, i)
     m, system = training.measurements[i][own], problem.system
     posterior = force_posterior(

@@ -201,9 +201,7 @@ def trained_region(qd: Tensor, tau: Tensor, load: Tensor, hidden: Tensor | None 
 
 
 def distance_beyond(tensors: Mapping[str, Tensor], qd: Tensor, tau: Tensor) -> Tensor:
-    """Return D of each joint `(*batch, nq)` in training standard deviations; zero inside the trained region
-    or if the region is unknown.
-    """
+    """Return D `(*batch, nq)` in training standard deviations; zero inside, or without, a trained region."""
     if LOW not in tensors:
         return torch.zeros_like(qd)
     x = torch.stack([qd, tau], dim=-2)
@@ -230,17 +228,13 @@ def warnings_beyond(distance: Tensor, joints: Sequence[str]) -> tuple[str, ...]:
 
 
 def hidden_variance(tensors: Mapping[str, Tensor], at: States, external: Tensor | None) -> Tensor:
-    """Return the variance of forces determined by neither state nor torque sensor, `(n, nq)`: static
-    friction, and unknown forces of given standard deviation `(nq,)`.
-    """
+    """Return the variance `(n, nq)` of static friction and of unknown forces with given deviation `(nq,)`."""
     variance = stick_variance(tensors, at)
     return variance if external is None else variance + external**2
 
 
 def unknown_variance(tensors: Mapping[str, Tensor], at: States, external: Tensor | None) -> Tensor:
-    """Return the additional variance of predicted forces `(n, nq)`: hidden forces, and g² D² beyond the
-    trained region.
-    """
+    """Return the additional variance of predicted forces `(n, nq)`: hidden forces, and g² D²."""
     variance = hidden_variance(tensors, at, external)
     if GROWTH not in tensors:
         return variance

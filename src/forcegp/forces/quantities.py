@@ -185,9 +185,7 @@ def _constraint_force(system: ConstrainedSystem, at: States) -> AffineMap:
 
 
 def _contact_force(system: ConstrainedSystem, at: States) -> AffineMap:
-    """Return F_I = ∇c λ of each surface contact, plus (t_1, t_2) λ_t if it sticks, with three Cartesian
-    components per contact, in the order of the contacts.
-    """
+    """Return F_I = ∇c λ, plus (t_1, t_2) λ_t for sticking contacts, with three components per contact."""
     return _times(_directions(system, at), _multiplier(system, at))
 
 

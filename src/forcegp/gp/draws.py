@@ -196,7 +196,7 @@ def _common(
 
 MISSED_FEATURES = 256
 """Random features per component. Only the part missed by the inducing points is drawn from them; its
-covariance about 1/√MISSED_FEATURES of its scale, and that of the rest not at all.
+    covariance errs by about 1/√MISSED_FEATURES of its scale, and that of the rest not at all.
 """
 
 

@@ -104,9 +104,7 @@ class ExactPosterior:
         return result
 
     def knowing(self, p: int, features: Features, value: Tensor) -> ExactPosterior:
-        """Return the posterior given the value `(components,)` of a constant process p, with its mean set to
-        zero.
-        """
+        """Return the posterior given the value `(components,)` of a constant process p, with zero mean."""
         # y ← y − W_p f_p, with W_p ← 0
         blocks = [
             Block(

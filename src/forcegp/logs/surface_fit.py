@@ -65,9 +65,7 @@ LEAST_RADIUS_STD = 4.0
 
 @dataclass(frozen=True)
 class Tip:
-    """A ball of radius r [m], fitted if `None`, with unit vectors `(n, 3)` to the points of the path, or
-    zero.
-    """
+    """A ball of radius r [m], fitted if `None`, with unit vectors `(n, 3)` to points of the path, or zero."""
 
     axes: Array
     radius: float | None

@@ -171,9 +171,7 @@ MOST_INTERVALS = 20
 
 @dataclass(frozen=True)
 class ImportFinding:
-    """A finding of an import: its kind, and a sentence with the action taken; `rows` contains the first
-    affected intervals.
-    """
+    """A finding of an import: its kind, a sentence with the action taken, and the first affected `rows`."""
 
     kind: str
     message: str

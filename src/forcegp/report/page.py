@@ -109,9 +109,7 @@ def cell(value: object, digits: int = 4) -> str:
 
 @dataclass(frozen=True)
 class PictureBlock:
-    """Plots with a common heading and caption, across the page if `wide`; `source` is the file with their
-    data.
-    """
+    """Plots with a common heading and caption, across the page if `wide`; `source` is their data file."""
 
     heading: str
     caption: str

@@ -115,9 +115,7 @@ class RolloutData(Header):
 
 
 def rollout_data(comparison: Comparison, calibration: Comparison | None = None) -> RolloutData:
-    """Return the data of the section, with curves from the first start; `calibration` on another motion
-    scales the bands.
-    """
+    """Return the data of the section, with curves from the first start and bands scaled by `calibration`."""
     horizons = [h for h in HORIZONS if h <= float(comparison.t[-1]) * (1.0 + 1e-9)]
     stride = max(1, round(1.0 / (FRAMES_PER_SECOND * float(comparison.t[1] - comparison.t[0]))))
     tip = comparison.frame, comparison.point

@@ -61,9 +61,7 @@ def from_log_cholesky(theta: InertialParameters) -> PseudoInertia:
 
 
 def log_cholesky(J: PseudoInertia) -> InertialParameters:
-    """Return θ `(*batch, 10)` of a pseudo-inertia J (inverse of `from_log_cholesky`); `InertiaError` if not J
-    > 0.
-    """
+    """Return θ `(*batch, 10)` of J (inverse of `from_log_cholesky`); `InertiaError` unless J > 0."""
     # An upper factor is the lower factor of the matrix with rows and columns reversed.
     lower, info = torch.linalg.cholesky_ex(J.flip(-1, -2))
     if bool((info != 0).any()):

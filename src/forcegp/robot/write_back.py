@@ -166,9 +166,7 @@ _PLACES = (0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)
 
 
 class _Part(NamedTuple):
-    """A link of the file that is part of a link of the robot: pose T and pseudo-inertia J `(4, 4)` in that
-    link, and whether a body in the file defines them.
-    """
+    """A file link in a robot link: pose T and pseudo-inertia J `(4, 4)` in it, and whether a body defines J."""
 
     name: str
     pose: Tensor

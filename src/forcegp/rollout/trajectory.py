@@ -181,9 +181,7 @@ class Rollout:
         return torch.where(rows, self.c, 0.0)
 
     def tip(self, frame: str, point: Sequence[float] = (0.0, 0.0, 0.0)) -> Tensor:
-        """Return the position `(*batch, T, 3)` of a point in a frame, in the world [m]; NaN after a
-        divergence.
-        """
+        """Return the world position `(*batch, T, 3)` of a point in a frame [m]; NaN after a divergence."""
         return kinematics.point_position(self.system.robot, self.q, frame, tuple(point))
 
     def bands(self, values: Tensor, level: float = 0.9) -> Bands:

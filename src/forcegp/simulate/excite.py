@@ -300,9 +300,7 @@ class Search:
 
     @torch.no_grad()
     def used(self, x: Array, step: float) -> tuple[dict[str, float], Array]:
-        """Return the largest fraction of each limit at multiples of `step`, the missing clearance, and the
-        times.
-        """
+        """Return the largest fractions of limits at multiples of `step`, missing clearance, and times."""
         t = np.linspace(0.0, self.spline.seconds, round(self.spline.seconds / step) + 1)
         worst: dict[str, float] = {}
         where, limits, near = [], self.limits, self.collisions

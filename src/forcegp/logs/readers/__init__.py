@@ -1,6 +1,4 @@
-"""Detection of the format of a log by its first bytes, then by its name; formats that can run code are
-rejected.
-"""
+"""Detection of log formats by the first bytes, then by name; formats that can run code are rejected."""
 
 from __future__ import annotations
 

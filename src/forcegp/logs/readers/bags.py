@@ -123,9 +123,7 @@ class Collector:
         return max((len(stream.rows) for stream in self._streams.values()), default=0)
 
     def table(self, format_: str, topics: dict[str, str], wanted: Wanted) -> LogTable:
-        """Return the log with the requested columns; `topics` contains all topics of the bag with their
-        types.
-        """
+        """Return the log with the requested columns; `topics` are all topics of the bag with their types."""
         if not self._streams:
             listing = ", ".join(f"{topic} ({kind})" for topic, kind in topics.items())
             raise DataError(

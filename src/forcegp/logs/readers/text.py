@@ -105,9 +105,7 @@ def _decode(path: Path, head: bytes) -> tuple[str, str]:
 
 
 def _try(lines: list[str], separator: str, decimal: str) -> tuple[float, str, str, int]:
-    """Return the score of a separator and a decimal mark: number of fields with a value, times their
-    fraction.
-    """
+    """Return the score of a separator and a decimal mark: number times fraction of fields with a value."""
     kept = [(i, split(line, separator)) for i, line in enumerate(lines) if line.strip()]
     rows = [(i, fields) for i, fields in kept if _numeric(fields, decimal)]
     if not rows:
