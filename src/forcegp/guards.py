@@ -148,7 +148,7 @@ DEFLATE_RATIO = 1032
 
 
 def check_chunks(dataset: Any, file: int) -> None:
-    """Check that no chunk of an h5py data set exceeds its declared size, and that compression is supported."""
+    """Check that no chunk of an h5py data set exceeds its declared size, and its compression is supported."""
     source, properties = f"{dataset.file.filename}: {dataset.name!r}", dataset.id.get_create_plist()
     filters = [properties.get_filter(i)[0] for i in range(properties.get_nfilters())]
     if not filters:

@@ -276,7 +276,7 @@ def test_a_file_that_claims_to_be_huge_is_refused_before_it_is_read(
     pq.write_table(columns, path)  # runs of equal values: some kilobytes on disk
     assert path.stat().st_size < 100_000
     monkeypatch.setattr(limits, "FREE_TABLE_BYTES", 1_000_000)
-    with pytest.raises(DataError, match="claims to be larger"):
+    with pytest.raises(DataError, match="declared size of the file exceeds"):
         Dataset.read(path)
 
 

@@ -105,7 +105,7 @@ def test_rows_of_a_recording_have_its_columns_only() -> None:
 
 
 def test_what_is_not_constant_or_ordered_is_refused() -> None:
-    with pytest.raises(ModelError, match="not one of constants"):
+    with pytest.raises(ModelError, match="not a prior on constants"):
         PerRecording(JointForcePrior(), (0, 1))
     with pytest.raises(ModelError, match="ascending"):
         PerRecording(PayloadPrior(), (1, 0))

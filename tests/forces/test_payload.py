@@ -75,5 +75,5 @@ def test_a_payload_that_cannot_be_is_not_known() -> None:
     assert prior.around(here).known == pytest.approx((2.0, 0.1, 0.0, 0.0))
     assert prior.around(far).known == ()
     assert prior.around(here).around(-here).known == ()
-    with pytest.raises(ModelError, match="no such known payload"):
+    with pytest.raises(ModelError, match="an invalid known payload"):
         PayloadPrior(known=(0.0, 0.0, 0.0, 0.0))

@@ -130,9 +130,9 @@ def test_a_tangent_frame_is_orthonormal_and_turns_smoothly() -> None:
     ("settings", "error", "message"),
     [
         ({"terms": ("sticky",)}, UnknownNameError, "sticky"),
-        ({"terms": ("dry", "dry")}, ModelError, "has a kind of friction twice"),
-        ({"terms": ()}, ModelError, "depends on nothing"),
-        ({"friction_coefficient": -0.1}, ModelError, "no such friction coefficient"),
+        ({"terms": ("dry", "dry")}, ModelError, "has a duplicate friction term"),
+        ({"terms": ()}, ModelError, "has no inputs"),
+        ({"friction_coefficient": -0.1}, ModelError, "an invalid friction coefficient"),
         ({"stribeck_speed": 0.0}, ModelError, "no such Stribeck speed"),
     ],
 )

@@ -172,7 +172,7 @@ def test_derivatives_spelled_with_d_are_no_positions(tmp_path: Path) -> None:
         "acceleration": "d_d_q[{joint}]",
         "torque": "tau[{joint}]",
     }
-    assert not any("also there" in doubt for doubt in proposal.doubts)
+    assert not any("also available" in doubt for doubt in proposal.doubts)
 
 
 def test_a_velocity_of_the_other_sign_is_asked_about(tmp_path: Path) -> None:

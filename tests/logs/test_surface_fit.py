@@ -178,7 +178,7 @@ def test_the_tip_is_that_of_the_scene_unless_it_is_a_point() -> None:
     assert isinstance(ball, forcegp.SurfaceContact)
     q = torch.zeros(3, 7, dtype=torch.float64)
     assert tip_of(system, ball, q, None).radius == ball.radius
-    with pytest.raises(DataError, match="leave out the radius"):
+    with pytest.raises(DataError, match="omit the radius"):
         tip_of(system, ball, q, 0.02)
     table = forcegp.SurfaceContact("table", "panda_link8", (0.0, 0.0, 0.1), Plane())
     tip = tip_of(system, table, q, "fit")

@@ -100,12 +100,12 @@ def test_of_contacts_at_one_place_only_the_sum_is_determined(data: forcegp.Datas
 def test_a_contact_that_was_never_closed_has_no_force(data: forcegp.Dataset, tmp_path: Path) -> None:
     never, states = closed_on(data, ["table"], closed=False), (data.q, data.qd, data.tau)
     fit = fitted(SYSTEM, never)
-    assert any("closed in no training sample" in text for text in fit.result.warnings)
+    assert any("never closed in the training data" in text for text in fit.result.warnings)
     fit.save(tmp_path / "model")
     for model in (fit, forcegp.load_model(tmp_path / "model")):
         for quantity in ("multiplier", "contact_force", "constraint_force"):
             for active in (None, torch.zeros(len(data), 1, dtype=torch.bool)):
-                with pytest.raises(ModelError, match="table was closed in no training sample"):
+                with pytest.raises(ModelError, match="table was never closed in the training data"):
                     model.predict(*states, quantity, active=active)
     found = fit.predict(*states, ["qdd", "multiplier"])
     assert found.mean[:, 7:].isnan().all() and found.mean[:, :7].isfinite().all()

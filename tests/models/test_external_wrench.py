@@ -171,7 +171,7 @@ def test_errors() -> None:
     plain = forcegp.StructuredGP(
         fitted().specified, "analytical", "friction", noise=forcegp.Noise(0.05, torque=None)
     )
-    with pytest.raises(ModelError, match="noise of the torques"):
+    with pytest.raises(ModelError, match="no learned torque noise"):
         plain.fit(data[:50], learn=[]).external_wrench(data, TOOL, method="momentum")
 
 

@@ -356,7 +356,7 @@ REFUSED: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
     "no prior": (
         lambda: StructuredGP(table, "zero", force_priors=[]),
         ModelError,
-        "distinct names, and one at least",
+        "distinct names, and at least one prior",
     ),
     "same names": (
         lambda: StructuredGP(table, "zero", force_priors=[both[0], both[0]]),
@@ -386,7 +386,7 @@ REFUSED: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
         UnknownNameError,
         r"unknown input of force prior 'joint'",
     ),
-    "no inputs": (lambda: JointForcePrior(inputs=()), ModelError, "depends on nothing"),
+    "no inputs": (lambda: JointForcePrior(inputs=()), ModelError, "has no inputs"),
     "contact inputs": (lambda: ContactForcePrior("table", inputs=("q",)), UnknownNameError, "contact_table"),
     "smoothing": (lambda: SlidingFrictionPrior("table", smoothing=0.0), ModelError, "smoothing speed"),
     "kernel": (

@@ -98,7 +98,7 @@ def check_contacts(system: ConstrainedSystem, log: Log) -> Outcome:
     findings = []
     for contact in system.contacts:
         if contact.name not in log.contact:
-            text = f"the scene has a contact {contact.name!r}, and the log does not say when it is closed"
+            text = f"the scene has a contact {contact.name!r}, but the log does not contain its state"
             findings.append(Finding("contact-unlabelled", text, log.all_rows, contact=contact.name))
         elif isinstance(contact, SurfaceContact):
             path = tip_path(system, contact, log)
@@ -122,8 +122,8 @@ def _beside(contact: SurfaceContact, path: Path, usable: np.ndarray) -> list[Fin
         return []
     spread = 1e3 * float(robust_std(path.c[rows & (np.abs(path.c - level) <= TOUCHING)]))
     text = (
-        f"contact {contact.name!r} is closed in no row, and the tip slides {1e3 * level:.3g} ± {spread:.2g} "
-        "mm from its surface: it may lie there (`forcegp import --fit-surface`), or the motion is free"
+        f"contact {contact.name!r} is never closed, but the tip slides {1e3 * level:.3g} ± {spread:.2g} "
+        "mm from its surface: it may be there (`forcegp import --fit-surface`), or the motion is free"
     )
     # A tip may hover over a surface, but not move inside the solid.
     weight = "error" if level < 0.0 else "warning"
@@ -317,6 +317,6 @@ def _directions(finding: partial[Finding], v: Array) -> list[Finding]:
     if size[1] > NARROW**2 * size[0]:
         return []
     name = finding.keywords["contact"]
-    text = f"the tip slides along one direction of {name!r} only; friction across it is not seen"
+    text = f"the tip slides along one direction of {name!r} only; friction across it is unknown"
     evidence = {"share_across": float(np.sqrt(size[1] / max(size[0], 1e-300)))}
     return [finding("force-directions", text, evidence=evidence)]

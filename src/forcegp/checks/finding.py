@@ -147,7 +147,7 @@ class Report:
         if errors:
             return f"verdict: stop; repair {errors} error{'s' * (errors > 1)} before fitting a model"
         if warnings:
-            return f"verdict: go on with care; {warnings} warning{'s' * (warnings > 1)} to look at"
+            return f"verdict: go on with care; {warnings} warning{'s' * (warnings > 1)} to review"
         return "verdict: go on"
 
     def to_dict(self) -> dict[str, Any]:

@@ -240,7 +240,7 @@ def derive(log: Log, absent: list[str]) -> Log:
 def of_robot(log: Log, robot: RobotModel) -> Log:
     """Return the log with the robot's joints in order; `DataError` if one is missing or the log is empty."""
     if len(log) == 0:
-        raise DataError("the log holds no rows", expected="one or more samples")
+        raise DataError("the log contains no rows", expected="one or more samples")
     if not set(robot.joint_names) <= set(log.joint_names):
         check_joints(log.joint_names, robot.joint_names, robot.name)
     order = [log.joint_names.index(joint) for joint in robot.joint_names]

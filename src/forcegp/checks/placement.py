@@ -79,7 +79,7 @@ def _never_closed(
         closed = np.abs(tip_path(system, contact, other).c) <= TOUCHING
         near.append((h, other.replace(contact={**log.contact, contact.name: closed})))
     motion = f"{100 * most:.0f} % of the motion"
-    where = f"{contact.name!r} is closed in no row, and the tip touches it in {motion} if"
+    where = f"{contact.name!r} is never closed, but the tip touches it in {motion} if"
     return _chosen(system, contact, log, near, where)
 
 

@@ -158,13 +158,13 @@ def compile_dynamics(robot: RobotModel, quantity: str = "forward_dynamics") -> C
     check_name("quantity to compile", quantity, QUANTITIES)
     if robot.learned:
         raise ModelError(
-            "a robot whose figures require a gradient cannot be compiled, as they become constants",
+            "a robot with parameters that require a gradient cannot be compiled, since they become constants",
             got=", ".join(robot.learned),
-            hint="use forcegp.dynamics while learning, and compile a robot with detached figures afterwards",
+            hint="use forcegp.dynamics while learning, and compile a detached robot afterwards",
         )
     if robot.dtype not in (torch.float64, torch.float32):
         raise ModelError(
-            "the compiled dynamics have no kernel in this precision",
+            "the compiled dynamics do not support this precision",
             expected="float64 or float32",
             got=robot.dtype,
         )

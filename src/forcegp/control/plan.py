@@ -143,9 +143,9 @@ def inverse_kinematics(
     reached = q[(error.abs().amax(-1) < POSE_TOLERANCE) & aligned]
     if len(reached) == 0:
         raise NumericalError(
-            f"no joint positions put {frame} of robot {robot.name!r} at the pose",
+            f"no joint positions place {frame} of robot {robot.name!r} at the pose",
             expected=f"tool point at {[round(v, 4) for v in position.tolist()]} m, normal to the surface",
-            got=f"{len(starts)} starts, of which none leads there",
+            got=f"{len(starts)} unsuccessful starts",
             hint="move the rectangle into the workspace of the robot",
         )
     return reached[(reached - near).abs().sum(-1).argmin()]

@@ -116,8 +116,8 @@ def joint_acceleration(tool: PointMotion, task: Tensor, posture: Tensor) -> Tens
     factor, failed = torch.linalg.cholesky_ex(Jt @ J if few else J @ Jt)
     if bool(failed.any()) or not float(factor.diagonal(dim1=-2, dim2=-1).min()) >= SINGULAR:
         raise NumericalError(
-            "the arm is singular: its joints cannot give the tool every velocity",
-            hint="a smaller rectangle, or one nearer to the centre of the workspace",
+            "the arm is singular: its joints cannot move the tool in every direction",
+            hint="use a smaller rectangle, or one closer to the centre of the workspace",
         )
     solved = torch.cholesky_solve(Jt @ missing if few else missing, factor)
     return posture + (solved if few else Jt @ solved)[..., 0]

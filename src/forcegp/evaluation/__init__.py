@@ -134,7 +134,7 @@ class Evaluation:
                 for j, x in zip(self.joint_names, self.response, strict=True)
                 if x < LEAST_RESPONSE
             ]
-            text = f"A torque that nobody chose acts by less than it should: {', '.join(weak)} of 1."
+            text = f"An added torque has less effect than it should: {', '.join(weak)} of 1."
             found.append(f"{text} The model has learned the controller, not the arm.")
         return tuple(found)
 

@@ -66,7 +66,7 @@ def with_learned_slopes(
         updated = dataclasses.replace(problem, training=training)
         relearned = search.solve(updated, progress, learned.tensors)
     except (NumericalError, RuntimeError) as cause:
-        text = "the slopes of the learned forces, which noise of the state asks for, cannot be used"
+        text = "the slopes of the learned forces, which state noise requires, cannot be used"
         return problem, learned, (f"{text}: {str(cause).splitlines()[0]}",)
     return (updated, relearned, ()) if relearned.value < learned.value else (problem, learned, ())
 

@@ -221,9 +221,8 @@ def warnings_beyond(distance: Tensor, joints: Sequence[str]) -> tuple[str, ...]:
         return ()
     most, joint = rows.amax(0).max(0)
     return (
-        f"{far} of {len(rows)} states lie beyond the trained speeds and torques, by up to {float(most):.3g} "
-        f"training standard deviations ({joints[int(joint)]}); their error bars are a guess: train on such "
-        "motion",
+        f"{far} of {len(rows)} states lie beyond the trained speeds and torques, by up to {float(most):.3g} training "
+        f"standard deviations ({joints[int(joint)]}); their error bars are a guess: train on such motion",
     )
 
 
@@ -386,13 +385,13 @@ def doubts_of(
     if residual > MISSED:
         warnings += (
             f"the model misses its training data by far: residuals are {residual:.3g} times the noise; check "
-            "the log and the robot file (`forcegp check`), or allow for other forces or a larger noise",
+            "the log and the robot file (`forcegp check`), or allow other forces or larger noise",
         )
     jitter = posterior.latent.jitter
     if jitter >= LARGE_JITTER:
         warnings += (
             f"the covariance was factorised with a jitter of {jitter:.2g} times the noise variance: "
-            "drop duplicated rows, or state a larger noise",
+            "drop duplicated rows, or specify a larger noise",
         )
     return correlation, warnings
 
@@ -404,6 +403,5 @@ def _on_multiplier(mean: Tensor, variance: Tensor) -> tuple[str, ...]:
         return ()
     return (
         f"the multiplier is not determined by these data: its standard deviation is {spread:.3g} N at a "
-        f"median of {size:.3g} N; use the analytical mean, measure a force, or leave out priors that act "
-        "along the normal",
+        f"median of {size:.3g} N; use the analytical mean, measure a force, or omit priors along the normal",
     )

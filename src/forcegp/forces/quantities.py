@@ -260,7 +260,7 @@ def affine_maps(
 ROUNDED = 1e-6
 """Tolerance for entries of the projector on hidden multipliers that equal 0 or 1 up to rounding."""
 OPEN = (
-    "contact {} was closed in no training sample: its force is not determined",
+    "contact {} is never closed in the training data: its force is not determined",
     "the point of contact {} cannot move against it: its force is not determined",
     "contacts {} hold the robot in the same direction: only the sum of their forces is determined",
 )
@@ -331,9 +331,9 @@ def hidden_forces(
     if bool(whole.all()) and any(found[0]):
         raise ModelError(
             OPEN[0].format(", ".join(never)),
-            expected="motion in contact among the training data",
-            hint="check where its surface lies (`forcegp check`); to read forces that were learned in free "
-            "motion, pass predict the system with the contact",
+            expected="motion in contact in the training data",
+            hint="check the position of its surface (`forcegp check`), or, for forces learned in free motion, "
+            "pass `predict` the system with the contact",
         )
     listed = (", ".join(dict.fromkeys(n for n, hit in zip(names, own, strict=True) if hit)) for own in found)
     doubts = tuple(text.format(own) for text, own in zip(OPEN, listed, strict=True) if own)

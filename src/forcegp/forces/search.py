@@ -214,7 +214,7 @@ def doubts_at_bounds(tensors: Mapping[str, Tensor], box: Bounds) -> tuple[str, .
             if count:
                 doubts.append(
                     f"{count} of {tensors[key].numel()} values of {key} ended at their {side} bound, "
-                    "far from where learning began: look for outliers, or state the noise"
+                    "far from their initial values: look for outliers, or specify the noise"
                 )
     return tuple(doubts)
 

@@ -49,9 +49,9 @@ def drop_repeated(signals: Signals, report: ImportReport) -> None:
         rows = signals.row[different]
         raise DataError(
             f"{describe(numbered(rows))}: the time stamp of the row before, with other values",
-            expected="one row for each time",
+            expected="one row per time stamp",
             got=f"{len(rows)} such rows",
-            hint="is this the right column of time? Its resolution may be too coarse",
+            hint="is this the correct time column? Its resolution may be too coarse",
         )
     report.find("repeated", f"{equal.sum()} repeated rows were dropped", signals.row[equal])
     signals.keep(~equal)
@@ -77,12 +77,16 @@ def split_trajectories(signals: Signals, gap: float | None, report: ImportReport
                 start = row
         if wrong:
             raise DataError(
-                f"time goes back in {describe(numbered(signals.row[wrong]))}",
+                f"time runs backward in {describe(numbered(signals.row[wrong]))}",
                 expected=f"more than {t[wrong[0] - 1]:.9g} s in row {signals.row[wrong[0]]}",
                 got=f"{t[wrong[0]]:.9g} s",
-                hint="sort the log by time, or take a column of time that increases within a trajectory",
+                hint="sort the log by time, or use a time column that increases within a trajectory",
             )
-        report.find("restart", f"the clock restarts {back.sum()} times: a trajectory each", signals.row[back])
+        report.find(
+            "restart",
+            f"the clock restarts {back.sum()} times: each restart begins a trajectory",
+            signals.row[back],
+        )
     longest = gap if gap is not None else GAP_STEPS * step
     gaps = np.concatenate([[False], np.diff(t) > longest]) & ~new & ~back
     if gaps.any():
@@ -100,7 +104,7 @@ def find_held(signals: Signals, drop: bool, report: ImportReport) -> None:
         held[1:] &= (values[1:] == values[:-1]).all(axis=1)
     if held.any():
         done = "were dropped" if drop else 'are kept; held = "drop" under [time] drops them'
-        message = f"{held.sum()} rows hold the values of the row before and {done}"
+        message = f"{held.sum()} rows repeat the values of the previous row and {done}"
         report.find("held", message, signals.row[held])
         if drop:
             signals.keep(~held)
@@ -115,7 +119,7 @@ def join_stream(
         raise DataError(
             f"the stream of {name} has a clock that does not increase in row {back[0] + 1}",
             expected="increasing stamps, to align it with the positions",
-            hint="import the trajectories one by one",
+            hint="import the trajectories separately",
         )
     longest = gap if gap is not None else GAP_STEPS * usual_step(t)
     after = np.searchsorted(t, signals.t, side="left").clip(1, len(t) - 1)
@@ -158,7 +162,7 @@ def even_clock(signals: Signals, period: float | None, report: ImportReport) -> 
     steps = [np.diff(signals.t[rows]) for rows in stretches]
     worst = max(float(np.abs(s - np.median(s)).max() / np.median(s)) for s in steps)
     if worst > UNEVEN:
-        report.find("uneven", f"time steps depart by up to {100.0 * worst:.3g} % from the usual step")
+        report.find("uneven", f"time steps deviate by up to {100.0 * worst:.3g} % from the usual step")
     elif period is None:
         return
     step = period if period is not None else usual_step(signals.t)

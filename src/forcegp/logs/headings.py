@@ -83,7 +83,7 @@ def find_time(table: LogTable, draft: Draft) -> Stream:
     else:
         # Robots are logged at 10 Hz to 10 kHz, so the step alone tells s, ms, µs and ns apart.
         unit = "s" if step <= 0.1 else "ms" if step <= 100.0 else "us" if step <= 1e5 else "ns"
-        text, doubt = f"steps of {step:.6g} were taken for {unit}", unit != "s"
+        text, doubt = f"steps of {step:.6g} were interpreted as {unit}", unit != "s"
     draft.say("time", text, doubt)
     for other in (s for s in table.streams if s is not stream and len(s) != len(stream)):
         stamps = [name for name in other.columns if _TIME.match(re.sub(r"\[\d+\]$", "", name.lower()))]
@@ -108,14 +108,14 @@ def find_families(stream: Stream, robot: RobotModel, draft: Draft) -> None:
             draft.families[quantity] = best
             if others:
                 listing = ", ".join(family.pattern for family in others)
-                draft.say(quantity, f"{best.pattern!r} was taken; also there: {listing}", doubt=True)
+                draft.say(quantity, f"{best.pattern!r} was selected; also available: {listing}", doubt=True)
     for quantity in ("position", "torque"):
         if quantity not in draft.families:
             raise MappingError(
                 f"{draft.source}: no columns were recognised as the {quantity} of {robot.nq} joints",
                 expected=f"headings such as {WORDS[quantity][1]}_1 to {WORDS[quantity][1]}_{robot.nq}",
                 got=", ".join(stream.columns)[:300],
-                hint="write the mapping by hand; docs/import.md shows every key",
+                hint="write the mapping yourself; docs/import.md shows every key",
             )
     _match_joints(robot, draft)
     for quantity, family in draft.families.items():
@@ -167,7 +167,7 @@ def _match_joints(robot: RobotModel, draft: Draft) -> None:
     """Find the names of the joints in the log from the names of the positions."""
     names = list(draft.families["position"].columns)
     if all(name.isdigit() for name in names):
-        draft.say("joints", "the log numbers its joints; they were taken from base to tip", doubt=True)
+        draft.say("joints", "the log numbers its joints; they were numbered from base to tip", doubt=True)
         draft.joints = dict(zip(robot.joint_names, sorted(names, key=int), strict=True))
     elif set(names) != set(robot.joint_names):
         likeness = np.array([[_likeness(j, name) for name in names] for j in robot.joint_names])
@@ -175,7 +175,7 @@ def _match_joints(robot: RobotModel, draft: Draft) -> None:
         likeness += 0.3 * np.eye(len(names))
         rows, columns = linear_sum_assignment(-likeness)
         draft.joints = {robot.joint_names[i]: names[k] for i, k in zip(rows, columns, strict=True)}
-        draft.say("joints", "the names were matched by their likeness", doubt=True)
+        draft.say("joints", "the names were matched by similarity", doubt=True)
     # Numbered families that call the joints otherwise than the positions do get a column per joint.
     for quantity, family in list(draft.families.items()):
         if set(family.columns) == set(names):
@@ -186,7 +186,9 @@ def _match_joints(robot: RobotModel, draft: Draft) -> None:
             draft.say(quantity, "numbered joints were taken from base to tip", doubt=True)
         else:
             del draft.families[quantity]
-            draft.say("joints", f"{family.pattern!r} names its joints otherwise and was left out", doubt=True)
+            draft.say(
+                "joints", f"{family.pattern!r} names its joints differently and was ignored", doubt=True
+            )
 
 
 def _likeness(joint: str, name: str) -> float:

@@ -88,7 +88,7 @@ class Tip:
                 "the path does not determine the radius of the tip",
                 expected=f"a positive radius, at least {LEAST_RADIUS_STD:g} times its standard deviation",
                 got=f"{1e3 * radius:.3g} ± {1e3 * std:.2g} mm",
-                hint="measure it, or turn the tool while it touches",
+                hint="measure it, or tilt the tool in contact",
             )
         return {"tip_radius": std}
 
@@ -105,7 +105,7 @@ def tip_of(
             f"the tip of contact {contact.name!r} is known, or has no axis",
             expected="a contact of a point away from the origin of its frame, without a radius",
             got=f"radius {contact.radius:g} m, point {tuple(contact.point)}",
-            hint="leave out the radius of the tip",
+            hint="omit the radius of the tip",
         )
     rotation, _ = kinematics.frame_pose(system.robot, q, contact.frame)
     return Tip((rotation @ (point / point.norm())).numpy(), None if radius == "fit" else radius)
@@ -240,7 +240,7 @@ def _sphere(contact: str, points: Array, towards: Array, tip: Tip) -> SurfaceFit
     std |= tip.std(solution)
     if not (std["radius"] < 0.5 * radius and (middle - center) @ towards > 0.0):
         raise DataError(
-            "the path does not determine a sphere that is touched from outside",
+            "the path does not determine a sphere for contact from outside",
             got=f"radius {radius:.4g} ± {std['radius']:.2g} m",
             hint="fit a plane, or slide over a larger part of the sphere",
         )

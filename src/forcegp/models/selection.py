@@ -219,7 +219,7 @@ def _result(spec: Specification, trials: Sequence[Trial]) -> tuple[Specification
 
 
 def halves_of(q: Tensor, qd: Tensor, in_order: bool) -> Tensor:
-    """Return the half of each row `(n,)`: alternating stretches in time or along a direction of the states."""
+    """Return the half of each row `(n,)`: alternating stretches in time or along a state direction."""
     n = len(q)
     rank = torch.arange(n, device=q.device)
     if not in_order:

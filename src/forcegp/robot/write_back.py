@@ -166,7 +166,7 @@ _PLACES = (0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)
 
 
 class _Part(NamedTuple):
-    """A file link in a robot link: pose T and pseudo-inertia J `(4, 4)` in it, and whether a body defines J."""
+    """A file link in a robot link: pose T and pseudo-inertia J `(4, 4)` in it, and if a body defines J."""
 
     name: str
     pose: Tensor

@@ -96,7 +96,7 @@ def check_inputs(name: str, inputs: tuple[str, ...], valid: tuple[str, ...]) -> 
         UnknownNameError: an input is unknown.
     """
     if not inputs:
-        raise ModelError(f"force prior {name!r} depends on nothing", expected="one input at least")
+        raise ModelError(f"force prior {name!r} has no inputs", expected="one input at least")
     for symbol in inputs:
         check_name(f"input of force prior {name!r}", symbol, valid)
 
@@ -111,12 +111,12 @@ def check_priors(priors: tuple[ForcePrior, ...], system: ConstrainedSystem) -> N
     """
     names = [prior.name for prior in priors]
     if not names or len(set(names)) != len(names):
-        raise ModelError("force priors need distinct names, and one at least", got=names)
+        raise ModelError("force priors need distinct names, and at least one prior", got=names)
     for name in names:
         if not name or "." in name or name in RESERVED:
             raise ModelError(
                 f"a force prior cannot be named {name!r}",
-                expected=f"a name without dots that is none of {', '.join(RESERVED)}",
+                expected=f"a name without dots that is not one of {', '.join(RESERVED)}",
             )
     for prior in priors:
         if prior.prefix not in names:

@@ -46,7 +46,7 @@ class DrivePrior(ForcePrior):
     def __post_init__(self) -> None:
         if not self.std > 0.0:
             raise ModelError(
-                f"force prior {self.name!r} has no such standard deviation",
+                f"force prior {self.name!r} has an invalid standard deviation",
                 expected="a positive number",
                 got=self.std,
             )
@@ -93,7 +93,7 @@ class PerRecording(ForcePrior):
             raise ModelError("recordings need ascending first segments", expected="(0, 1)", got=self.starts)
         if not isinstance(self.prior.kernel, Constant):
             raise ModelError(
-                f"force prior {self.prior.name!r} is not one of constants",
+                f"force prior {self.prior.name!r} is not a prior on constants",
                 expected="a prior with a Constant kernel, such as PayloadPrior()",
                 got=type(self.prior.kernel).__name__,
             )

@@ -196,7 +196,7 @@ class SlidingFrictionPrior(SurfaceForcePrior):
         super().__post_init__()
         check_inputs(f"{self.name}.terms", self.terms, TERMS)
         if len(set(self.terms)) < len(self.terms):
-            raise ModelError(f"force prior {self.name!r} has a kind of friction twice", got=self.terms)
+            raise ModelError(f"force prior {self.name!r} has a duplicate friction term", got=self.terms)
         speeds = {"smoothing speed": self.smoothing, "Stribeck speed": self.stribeck_speed}
         for what, value in (speeds | {"torsional smoothing speed": self.torsion_smoothing}).items():
             if not 0.0 < value < float("inf"):
@@ -207,7 +207,7 @@ class SlidingFrictionPrior(SurfaceForcePrior):
                 )
         if not 0.0 <= self.friction_coefficient < float("inf"):
             raise ModelError(
-                f"force prior {self.name!r} has no such friction coefficient",
+                f"force prior {self.name!r} has an invalid friction coefficient",
                 expected="a finite number, 0 or above",
                 got=self.friction_coefficient,
             )
@@ -242,7 +242,7 @@ class SlidingFrictionPrior(SurfaceForcePrior):
         if bool((gain[at.active[:, contact]] <= 0.0).any()):
             raise ModelError(
                 f"contact {self.contact!r} jams with a friction coefficient of {self.friction_coefficient:g}",
-                hint="friction would press harder than it opposes: give a smaller friction_coefficient",
+                hint="use a smaller friction_coefficient, with which friction opposes more than it presses",
             )
         return (free / gain)[:, None]
 

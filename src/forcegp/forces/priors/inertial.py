@@ -223,7 +223,7 @@ class PayloadPrior(ForcePrior):
     def __post_init__(self) -> None:
         if self.known and not (len(self.known) == MASS_AND_MOMENT and self.known[0] > 0.0):
             raise ModelError(
-                f"force prior {self.name!r} has no such known payload",
+                f"force prior {self.name!r} has an invalid known payload",
                 expected="a positive mass and three components of its first moment, or nothing",
                 got=self.known,
             )

@@ -103,7 +103,7 @@ def _format_of_folder(path: Path) -> str:
     endings = {child.suffix.lower() for child in path.iterdir() if child.is_file()}
     if endings & {".db3", ".mcap"}:
         text = f"{path}: a folder with bag files and no metadata.yaml"
-        raise DataError(text, hint="name the .db3 or .mcap file itself")
+        raise DataError(text, hint="pass the .db3 or .mcap file itself")
     if endings & set(_TEXT):
         return "text folder"
     raise _unknown(path, "a folder with files ending in " + (", ".join(sorted(endings)) or "nothing"))
@@ -124,11 +124,11 @@ def _format_of_zip(path: Path) -> str:
 
 def _unsafe(path: Path, what: str) -> DataError:
     return DataError(
-        f"{path}: refused, because reading {what} can run code that it holds",
+        f"{path}: refused, because reading {what} can run code in it",
         expected=", ".join(FORMATS.values()),
         hint="save the arrays as Parquet, CSV or .npz",
     )
 
 
 def _unknown(path: Path, got: str) -> DataError:
-    return DataError(f"{path}: not a log format that is read", expected=", ".join(FORMATS.values()), got=got)
+    return DataError(f"{path}: unsupported log format", expected=", ".join(FORMATS.values()), got=got)

@@ -60,12 +60,14 @@ def _array(source: str, name: str, file: Any, size: int) -> Arrays:
         raise DataError(
             f"{source}: refused, because an array of Python objects is a pickle, which can run code",
             expected="an array of numbers",
-            hint="save each quantity as an array of its own",
+            hint="save each quantity as a separate array",
         )
     count = int(np.prod(shape, dtype=object)) if shape else 1
     guards.check_count(source, "numbers", count, limits.LOG_VALUES)
     if count * dtype.itemsize > size:
-        raise DataError(f"{source}: the array claims to be larger than its file", got=f"{shape} of {dtype}")
+        raise DataError(
+            f"{source}: the declared size of the array exceeds the file", got=f"{shape} of {dtype}"
+        )
     data = file.read(count * dtype.itemsize)
     array = np.frombuffer(data, dtype=dtype, count=count).reshape(shape, order="F" if fortran else "C")
     if dtype.names:

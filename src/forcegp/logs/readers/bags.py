@@ -127,7 +127,7 @@ class Collector:
         if not self._streams:
             listing = ", ".join(f"{topic} ({kind})" for topic, kind in topics.items())
             raise DataError(
-                f"{self.source}: no message of a type that is read",
+                f"{self.source}: no messages of a supported type",
                 expected=" or ".join(KINDS),
                 got=listing[:600] or "no topics",
             )
@@ -178,7 +178,7 @@ def read_bag(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress
     number, encoding = (1, "ros1") if first else (2, "cdr")
     package = optional_module(f"rosbags.rosbag{number}", f"Reading ROS {number} bags", "import")
     if path.is_file() and not first and path.suffix != ".db3":
-        raise DataError(f"{path}: an SQLite file that is not named as a bag", hint="name it .db3")
+        raise DataError(f"{path}: an SQLite file without the suffix of a bag", hint="name it .db3")
     with foreign(str(path), "a bag"):
         for file in files:
             check_tables(file)

@@ -182,7 +182,7 @@ def read_text(path: Path, *, wanted: Wanted, rows: int | None, progress: Progres
     """Read a text table; text columns are omitted with a remark."""
     dialect = sniff(path)
     kinds = {n: kind for n, kind in zip(dialect.names, dialect.kinds, strict=True) if wanted(n)}
-    remarks = [f"column {n!r} holds text and was left out" for n, kind in kinds.items() if kind == "text"]
+    remarks = [f"column {n!r} contains text and was ignored" for n, kind in kinds.items() if kind == "text"]
     kinds = {name: kind for name, kind in kinds.items() if kind not in ("text", "empty")}
     chunks: dict[str, list[Column]] = {name: [] for name in kinds}
     done = 0
@@ -291,7 +291,7 @@ def read_folder(path: Path, *, wanted: Wanted, rows: int | None, progress: Progr
         except DataError as error:
             if "no table of numbers" not in error.message:
                 raise
-            remarks.append(f"{file.name} holds no table of numbers and was left out")
+            remarks.append(f"{file.name} contains no table of numbers and was ignored")
             continue
         remarks += [f"{file.name}: {remark}" for remark in part.remarks]
         columns = {in_file(file, name): values for name, values in part.streams[0].columns.items()}
