@@ -221,8 +221,8 @@ def warnings_beyond(distance: Tensor, joints: Sequence[str]) -> tuple[str, ...]:
         return ()
     most, joint = rows.amax(0).max(0)
     return (
-        f"{far} of {len(rows)} states lie beyond the trained speeds and torques, by up to {float(most):.3g} training "
-        f"standard deviations ({joints[int(joint)]}); their error bars are a guess: train on such motion",
+        f"{far} of {len(rows)} states lie beyond the trained speeds and torques, by up to {float(most):.3g} "
+        f"training deviations ({joints[int(joint)]}); their error bars are a guess: train on such motion",
     )
 
 

@@ -332,7 +332,7 @@ def hidden_forces(
         raise ModelError(
             OPEN[0].format(", ".join(never)),
             expected="motion in contact in the training data",
-            hint="check the position of its surface (`forcegp check`), or, for forces learned in free motion, "
+            hint="check the position of its surface (`forcegp check`), or for forces learned in free motion "
             "pass `predict` the system with the contact",
         )
     listed = (", ".join(dict.fromkeys(n for n, hit in zip(names, own, strict=True) if hit)) for own in found)
