@@ -209,7 +209,7 @@ def frame_pose(robot: RobotModel, q: JointVector, frame: str) -> tuple[Rotation,
         (torch.Size([5, 3, 3]), torch.Size([5, 3]))
 
     Raises:
-        UnknownNameError: no such frame.
+        UnknownNameError: the frame does not exist.
         ShapeError: q does not fit the robot.
     """
     rotation, position = pose_of_frame(robot, link_poses(robot, q), robot.frame_index(frame))
@@ -235,7 +235,7 @@ def frame_jacobian(
     """Return J with [ω; ṗ] = J q̇ for a frame and a point fixed in it, `(*batch, 6, nq)`, world axes.
 
     Raises:
-        UnknownNameError: no such frame.
+        UnknownNameError: the frame does not exist.
         ShapeError: q does not fit the robot.
     """
     index = robot.frame_index(frame)
@@ -253,7 +253,7 @@ def point_motion(
     """Return the motion of a point fixed in a frame, from links with known motion.
 
     Raises:
-        UnknownNameError: no such frame.
+        UnknownNameError: the frame does not exist.
     """
     index, local = robot.frame_index(frame), as_point(robot, point)
     rotation, origin = _frame_in_base(robot, poses, index)

@@ -43,7 +43,7 @@ def check_length(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def still_joints(log: Log) -> np.ndarray:
-    """`(nq,)` bool, joints that do not move."""
+    """Return `(nq,)` bool, joints that do not move."""
     return log.reach("q") < STILL if log.usable.any() else np.zeros(log.nq, bool)
 
 
@@ -90,7 +90,7 @@ def check_excitation(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def _sharpness(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> tuple[Array, tuple[str, ...], Array]:
-    """Deviation of each base parameter after the log, with torque noise of 1 %, over that before it."""
+    """Return the deviation of each base parameter after the log over that before, at 1 % torque noise."""
     robot = system.robot
     base = base_parameters(robot)
     columns = np.array(base.columns)
@@ -162,7 +162,7 @@ def check_visibility(system: ConstrainedSystem, explanation: Explanation) -> lis
 
 
 def _at_contact(explanation: Explanation, fault: Fault, size: float) -> str:
-    """The force at the tip that a fault of the whole arm passes for, root mean square."""
+    """Return the force at the tip that a fault of the whole arm passes for, root mean square."""
     J = explanation.problem.J
     J = J[:, : J.shape[1] - len(unmeasured(explanation.log))]
     touching = (J != 0.0).any(axis=(1, 2))
@@ -174,7 +174,7 @@ def _at_contact(explanation: Explanation, fault: Fault, size: float) -> str:
 
 
 def visible_size(explanation: Explanation, fault: Fault) -> float:
-    """Smallest detectable size of a fault of either sign, or `LARGEST`."""
+    """Return the smallest detectable size of a fault of either sign, or `LARGEST`."""
     problem = explanation.problem
     rest = held_out(problem, explanation.columns, explanation.prior)
     added = held_out(replace(problem, r=fault.column), explanation.columns, explanation.prior)

@@ -58,16 +58,16 @@ class Explanation:
 
     @cached_property
     def fit(self) -> TorqueFit:
-        """The remaining model."""
+        """Return the remaining model."""
         return cross_validate(self.problem, self.columns, self.prior)
 
     def on(self, log: Log, rows: np.ndarray | None = None) -> TorqueProblem:
-        """The problem on a log changed by a hypothesis, with the current weights of the joints."""
+        """Return the problem on a log changed by a hypothesis, with the current weights of the joints."""
         rows = self.rows if rows is None else rows
         return hypotheses.problem_of(self.system, log, rows, self.problem.scale)
 
     def weighed(self) -> Explanation:
-        """The same with joints weighted by their residual noise."""
+        """Return the problem with joints weighted by their residual noise."""
         result = self
         for _ in range(2):
             # The typical block counts: a disturbance must not make a joint look noisy.
@@ -135,7 +135,7 @@ def _round(model: Explanation) -> Explanation | None:
 
 
 def _accepted(model: Explanation, hypothesis: Hypothesis, theta: Array, finding: Finding) -> Explanation:
-    """The explanation with one hypothesis more: its fault undone, or its parameters in the model."""
+    """Return the explanation with one hypothesis more: its fault undone, or its parameters in the model."""
     taken = model.taken | {(hypothesis.name, hypothesis.joints)}
     model = replace(model, findings=(*model.findings, finding), taken=taken)
     if hypothesis.name in hypotheses.ROBOT:
@@ -150,7 +150,7 @@ def _accepted(model: Explanation, hypothesis: Hypothesis, theta: Array, finding:
 
 
 def _refined(model: Explanation, hypothesis: Hypothesis, fit: TorqueFit) -> TorqueFit:
-    """The fit of an encoder offset after Gauss-Newton steps, as its effect on the torque is not linear."""
+    """Fit an encoder offset by Gauss-Newton steps, since its effect on the torque is not linear."""
     theta = fit.theta[:1]
     for _ in range(2):
         moved = corrected(model.log, hypothesis, theta)
@@ -190,7 +190,7 @@ def _fits(model: Explanation) -> Iterator[Tried]:
 
 
 def _currents(model: Explanation) -> Iterator[Tried]:
-    """Gains of all joints that the log determines, tried where most torques are scaled wrongly."""
+    """Yield the gains of all joints that the log determines, tried where most torques are scaled wrongly."""
     log, rows, nq = model.log, model.rows, model.log.nq
     fit = model.with_(hypotheses.current_hypothesis(log, rows, model.problem, tuple(range(nq))))
     gains = 1.0 + fit.theta[:nq]
@@ -203,7 +203,7 @@ def _currents(model: Explanation) -> Iterator[Tried]:
 
 
 def significant(better: Array, worse: Array, concerned: int) -> bool:
-    """Whether a decrease of the score of shares `(blocks, nq)` is material and significant."""
+    """Return whether a decrease of the score of shares `(blocks, nq)` is material and significant."""
     least = max(MATERIAL, MATERIAL_EACH * concerned)
     gains = gain_of(score_of(better), score_of(worse)), pooled_gain_of(better, worse)
     # A drop that only quiet blocks show is an artefact of them: the other mean must bear it out.
@@ -221,7 +221,7 @@ ALONE = 2.0
 def alternatives_of(
     system: ConstrainedSystem, chosen: Tried, tried: Iterable[Tried], null: TorqueFit
 ) -> Iterator[Tried]:
-    """The hypotheses within a standard error of the chosen one on held-out blocks, best first."""
+    """Yield the hypotheses within a standard error of the chosen one on held-out blocks, best first."""
     for hypothesis, fit in sorted(tried, key=lambda one: one[1].score.mean()):
         if _says_the_same(chosen[0], hypothesis):
             continue
@@ -232,14 +232,14 @@ def alternatives_of(
 
 
 def _says_the_same(chosen: Hypothesis, other: Hypothesis) -> bool:
-    """Whether a hypothesis has the kind and joints of the chosen one, or contains it, as masses do a tool."""
+    """Return whether a hypothesis has the kind and joints of the chosen one, or contains it."""
     if (chosen.name, other.name) == ("payload", "masses"):
         return True
     return other.name == chosen.name and (not other.joints or bool({*other.joints} & {*chosen.joints}))
 
 
 def _possible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit) -> bool:
-    """Whether every link keeps a mass that is positive, or zero in the robot file."""
+    """Return whether every link keeps a mass that is positive, or zero in the robot file."""
     if hypothesis.name != "masses":
         return True
     masses = system.robot.mass.numpy()
@@ -248,7 +248,7 @@ def _possible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit)
 
 
 def with_alternatives(finding: Finding, others: Iterable[Finding]) -> Finding:
-    """The finding with its alternatives, if any, and a test that distinguishes them."""
+    """Return the finding with its alternatives, if any, and a test that separates them."""
     alternatives: list[Finding] = []
     for other in others:
         alike = (f for f in (finding, *alternatives) if f.kind == other.kind)

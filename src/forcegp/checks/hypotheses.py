@@ -60,7 +60,7 @@ class Hypothesis:
 def problem_of(
     system: ConstrainedSystem, log: Log, rows: np.ndarray, scale: Array | None = None
 ) -> TorqueProblem:
-    """The torque problem of some rows, with joint friction and an offset per joint."""
+    """Return the torque problem of some rows, with joint friction and an offset per joint."""
     nuisance = friction_columns(system, log, rows)
     size = np.sqrt((log.tau[rows] ** 2).mean(axis=0))
     size = np.maximum(size, 1e-3 * size.max())
@@ -68,21 +68,21 @@ def problem_of(
 
 
 def friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
-    """Viscous friction, Coulomb friction and a constant, one of each per joint, `(n, nq, 3 nq)`."""
+    """Return viscous and Coulomb friction and a constant, one of each per joint, `(n, nq, 3 nq)`."""
     qd = log.qd[rows]
     smooth = np.tanh(qd / system.robot.friction_velocity.numpy())
     return np.concatenate([_diagonal(x) for x in (qd, smooth, np.ones_like(qd))], axis=-1)
 
 
 def other_rise_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
-    """Change of the declared Coulomb friction with the smoothing velocity `(n, nq, p)`."""
+    """Return the change of declared Coulomb friction with the smoothing velocity `(n, nq, p)`."""
     x, declared = log.qd[rows] / system.robot.friction_velocity.numpy(), system.robot.friction.numpy() > 0.0
     columns = [_diagonal(np.tanh(k * x) - np.tanh(x))[..., np.flatnonzero(declared)] for k in RISES]
     return np.concatenate(columns, axis=-1)
 
 
 def contact_friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
-    """Viscous and dry friction of each contact with only the normal force removed, `(n, nq, p)`."""
+    """Return viscous and dry friction of each contact without the normal force, `(n, nq, p)`."""
     contacts = [] if takes_friction_out(system, log) else labelled_contacts(system, log)
     touching = [c for c in contacts if isinstance(c, SurfaceContact)]
     empty = np.zeros((len(rows), log.nq, 0))
@@ -90,7 +90,7 @@ def contact_friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarr
 
 
 def _sliding_columns(system: ConstrainedSystem, contact: SurfaceContact, log: Log, rows: np.ndarray) -> Array:
-    """Torque −Jᵀv and −Jᵀv/|v| of a point that slides at v where the contact is closed, `(n, nq, 2)`."""
+    """Return −Jᵀv and −Jᵀv/|v| of a point that slides at v while in contact, `(n, nq, 2)`."""
     (q,), v = tensors(log, rows, "q"), tip_path(system, contact, log, rows).along
     with torch.no_grad():
         J = kinematics.point_jacobian(system.robot, q, contact.frame, contact.point).numpy()
@@ -100,24 +100,24 @@ def _sliding_columns(system: ConstrainedSystem, contact: SurfaceContact, log: Lo
 
 
 def _diagonal(x: Array) -> Array:
-    """`(n, nq, nq)` with x on the diagonal."""
+    """Return `(n, nq, nq)` with x on the diagonal."""
     return x[..., None] * np.eye(x.shape[-1])
 
 
 def unchanged(log: Log) -> Log:
-    """The unchanged log."""
+    """Return the unchanged log."""
     return log
 
 
 def changed(log: Log, names: tuple[str, ...], *, order: Sequence[int] = (), flip: Sequence[int] = ()) -> Log:
-    """The log with two joints exchanged, or the sign of some joints changed, in some columns."""
+    """Return the log with two joints exchanged, or the sign of some joints changed, in some columns."""
     index, sign = np.arange(log.nq), np.ones(log.nq)
     index[list(order)], sign[list(flip)] = order[::-1], -1.0
     return log.replace(**{name: getattr(log, name)[:, index] * sign for name in names})
 
 
 def delayed(log: Log, shift: int, joints: tuple[int, ...] = ()) -> Log:
-    """The log with torques, all or some, of `shift` rows later in each stretch; rows without are masked."""
+    """Return the log with (some) torques taken `shift` rows later in each stretch; masked at its end."""
     tau, lost = log.tau.copy(), np.ones(len(log), bool)
     columns = list(joints) or list(range(log.nq))
     for s in log.stretches:
@@ -129,7 +129,7 @@ def delayed(log: Log, shift: int, joints: tuple[int, ...] = ()) -> Log:
 
 
 def discrete(log: Log) -> Iterator[Hypothesis]:
-    """Signs, orders and delays: hypotheses without parameters."""
+    """Yield hypotheses without parameters: signs, orders and delays."""
     every, motion = tuple(range(log.nq)), ("q", "qd", "qdd")
     if log.nq > 1:
         yield Hypothesis("torque-sign", 0, partial(changed, names=("tau",), flip=every), joints=every)
@@ -144,13 +144,13 @@ def discrete(log: Log) -> Iterator[Hypothesis]:
 
 
 def delays(log: Log) -> Iterator[Hypothesis]:
-    """Torques that are logged before or after the motion."""
+    """Yield hypotheses of torques logged before or after the motion."""
     for shift in (sign * lag for lag in (LAGS if log.stretches else ()) for sign in (1, -1)):
         yield Hypothesis("torque-delay", 1, partial(delayed, shift=shift), shift=shift)
 
 
 def joint_delays(log: Log, rows: np.ndarray, problem: TorqueProblem) -> Iterator[Hypothesis]:
-    """For each joint, the hypothesis that its torque lags the motion, with its best delay beside friction."""
+    """Yield, for each joint, the hypothesis that its torque lags the motion by the best delay."""
     shifts = list(LAGS) if log.stretches else []
     needed = problem.r + log.tau[rows]
     for j in range(log.nq if log.nq > 1 and shifts else 0):
@@ -163,7 +163,7 @@ def joint_delays(log: Log, rows: np.ndarray, problem: TorqueProblem) -> Iterator
 
 
 def continuous(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterator[Hypothesis]:
-    """Gains, encoder offsets, gravity, tool and masses: hypotheses with parameters."""
+    """Yield hypotheses with parameters: gains, encoder offsets, gravity, tool and masses."""
     for j in range(log.nq):
         yield gain_hypothesis(log, rows, (j,))
         yield encoder_hypothesis(system, log, rows, j)
@@ -171,7 +171,7 @@ def continuous(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterato
 
 
 def gain_hypothesis(log: Log, rows: np.ndarray, joints: tuple[int, ...]) -> Hypothesis:
-    """The torques of some joints have to be scaled: u − τ = g τ."""
+    """Return the hypothesis that the torques of some joints must be scaled: u − τ = g τ."""
     columns = _diagonal(log.tau[rows])[..., list(joints)]
     return Hypothesis("gains", len(joints), unchanged, columns, np.full(len(joints), 100.0), joints)
 
@@ -179,15 +179,13 @@ def gain_hypothesis(log: Log, rows: np.ndarray, joints: tuple[int, ...]) -> Hypo
 def current_hypothesis(
     log: Log, rows: np.ndarray, problem: TorqueProblem, joints: tuple[int, ...]
 ) -> Hypothesis:
-    """Gains with the torque required by the motion as instrument, since errors of the logged torque bias
-    them.
-    """
+    """Return the hypothesis of a gain, with the required torque as instrument, free of torque noise."""
     needed = _diagonal(problem.r + log.tau[rows])[..., list(joints)]
     return replace(gain_hypothesis(log, rows, joints), instruments=needed)
 
 
 def robot_hypotheses(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterator[Hypothesis]:
-    """Hypotheses on the robot file, which do not change the log."""
+    """Yield the hypotheses on the robot file, which do not change the log."""
     for name in ROBOT:
         columns, prior = robot_columns(system, log, rows, name)
         yield Hypothesis(name, columns.shape[-1], unchanged, columns, prior)
@@ -198,7 +196,7 @@ ROBOT = ("gravity", "payload", "masses")
 
 
 def robot_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray, name: str) -> tuple[Array, Array]:
-    """Torque `(n, nq, p)` per unit of each uncertain parameter, and its tolerance `(p,)`."""
+    """Return the torque `(n, nq, p)` per unit of each uncertain parameter, and its tolerance `(p,)`."""
     robot = system.robot
     q, qd, qdd = tensors(log, rows, "q", "qd", "qdd")
     with torch.no_grad():
@@ -214,14 +212,14 @@ def robot_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray, name: s
 
 
 def inertial_spread(robot: RobotModel) -> Array:
-    """Tolerances of the inertial parameters of a robot file, `(10 nq,)`."""
+    """Return the tolerances of the inertial parameters of a robot file, `(10 nq,)`."""
     mass = robot.mass.numpy()[:, None]
     share = np.repeat([MASS_SHARE, MOMENT_ARM, MOMENT_ARM**2], (1, 3, 6))
     return (np.maximum(mass, 0.01 * mass.max()) * share).ravel()
 
 
 def encoder_hypothesis(system: ConstrainedSystem, log: Log, rows: np.ndarray, j: int) -> Hypothesis:
-    """The encoder of joint j is off by δ: u(q + δ) − τ vanishes, so that r = u(q) − τ = −∂u/∂q δ."""
+    """Return the hypothesis that the encoder of joint j is off by δ: r = u(q) − τ = −∂u/∂q δ."""
     q, qd, qdd = tensors(log, rows, "q", "qd", "qdd")
     step = torch.zeros(log.nq, dtype=q.dtype)
     step[j] = 1e-4
@@ -257,7 +255,7 @@ DISCRETE = {
 
 
 def plausible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit) -> bool:
-    """Whether the parameters are physically plausible, such as a positive tool mass."""
+    """Return whether the parameters are physically plausible, such as a positive tool mass."""
     if hypothesis.name == "encoder-offset":
         least = max(SMALL_ANGLE, SIGNIFICANT * fit.spread[0])
         return bool(least < abs(fit.theta[0]) <= LARGEST_ANGLE)
@@ -279,7 +277,7 @@ def plausible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit)
 
 
 def corrected(log: Log, hypothesis: Hypothesis, theta: Array) -> Log:
-    """The log without the fault; unchanged if the robot is at fault."""
+    """Return the log without the fault, or unchanged if the fault is in the robot file."""
     joints = list(hypothesis.joints)
     if hypothesis.name == "gains":
         tau = log.tau.copy()
@@ -296,7 +294,7 @@ def corrected(log: Log, hypothesis: Hypothesis, theta: Array) -> Log:
 def finding_of(
     system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: TorqueFit, alike: tuple[int, ...] = ()
 ) -> Finding:
-    """The finding of a hypothesis; `alike` are the joints of equivalent hypotheses."""
+    """Return the finding of a hypothesis; `alike` are the joints of equivalent hypotheses."""
     name, theta, spread = hypothesis.name, fit.theta, fit.spread
     one_of = name == "joint-sign" and len(alike) > 1
     names = tuple(log.joint_names[j] for j in (alike if one_of else hypothesis.joints))
@@ -332,7 +330,7 @@ def finding_of(
 
 
 def _gains(log: Log, names: tuple[str, ...], gains: Array) -> Finding:
-    """Torques that have to be scaled: a wrong sign, a current, or a wrong gain."""
+    """Return the torques that have to be scaled: a wrong sign, a current, or a wrong gain."""
     evidence = {f"factor {name}": gain for name, gain in zip(names, gains, strict=True)}
     listed = ", ".join(f"{name} {gain:.3g}" for name, gain in zip(names, gains, strict=True))
     text = f"torques fit when multiplied by {listed}"
@@ -347,7 +345,7 @@ def _gains(log: Log, names: tuple[str, ...], gains: Array) -> Finding:
 
 
 def _gravity(system: ConstrainedSystem, log: Log, change: Array) -> Finding:
-    """Gravity that is absent from the torque, or has another direction than in the scene."""
+    """Return the gravity that is absent from the torque, or has another direction than in the scene."""
     assumed = system.robot.gravity.numpy()
     fitted = assumed + change
     strength = float(np.linalg.norm(assumed))
@@ -363,7 +361,7 @@ def _gravity(system: ConstrainedSystem, log: Log, change: Array) -> Finding:
 
 
 def _turn(assumed: Array, fitted: Array) -> tuple[float, float]:
-    """Angle between two vectors in degrees, and the length of the second over that of the first, if any."""
+    """Return the angle between two vectors [°], and the length of the second over that of the first."""
     lengths = float(np.linalg.norm(assumed)), float(np.linalg.norm(fitted))
     cosine = fitted @ assumed / max(lengths[0] * lengths[1], 1e-12)
     return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))), lengths[1] / (lengths[0] or EARTH)

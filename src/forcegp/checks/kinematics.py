@@ -64,13 +64,13 @@ class Match:
     def right(
         self, factor: float = 1.0, tolerance: float = TOLERANCE, least: Array | float = 1.0
     ) -> np.ndarray:
-        """`(nq,)` bool, whether a slope can lie between `least` times this factor and the factor."""
+        """Return `(nq,)` bool, whether a slope can lie between `least` times this factor and the factor."""
         ratio = np.stack([self.low, self.high]) / factor
         return (ratio.min(axis=0) < 1.0 + tolerance) & (ratio.max(axis=0) > least * (1.0 - tolerance))
 
 
 def match(log: Log, value: str, rate: str) -> Match | None:
-    """Compare changes of a column with integrals of its rate; `None` if there are too few windows."""
+    """Compare changes of a column with integrals of its rate; return `None` for too few windows."""
     x, v = getattr(log, value), getattr(log, rate)
     width = max(2, round(WINDOW / log.dt)) if log.dt < WINDOW else 2
     changes, integrals = [], []
@@ -145,7 +145,7 @@ def _clock_finding(log: Log, factor: float) -> Outcome:
 
 
 def _one_factor(level: Match, factor: float) -> bool:
-    """Whether several joints share one slope that is neither right nor that of degrees."""
+    """Return whether several joints share one slope that is neither right nor that of degrees."""
     degrees = any(abs(np.log(abs(factor) * unit)) <= UNIT_TOLERANCE for unit in (DEGREE, 1.0 / DEGREE))
     if factor <= 0.0 or abs(factor - 1.0) <= TOLERANCE or degrees or level.moving.sum() < 2:
         return False
@@ -154,7 +154,7 @@ def _one_factor(level: Match, factor: float) -> bool:
 
 
 def check_velocity(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find velocities that are not the derivative of the positions: unit, sign, order, or other."""
+    """Find velocities that are not the derivative of the positions, by unit, sign, order or otherwise."""
     if "qd" in log.derived:
         return [], log
     level = match(log, "q", "qd")
@@ -182,7 +182,7 @@ def check_velocity(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def _late(log: Log, level: Match) -> list[Finding]:
-    """Velocities after a filter of their own: a delay L leaves Δq − ∫q̇ dt = L Δq̇, which persists."""
+    """Find velocities delayed by a filter: a delay L leaves Δq − ∫q̇ dt = L Δq̇, which persists."""
     rates = match(log, "qd", "qdd")
     if rates is None or "qd" in log.header.derived:
         return []
@@ -196,7 +196,7 @@ def _late(log: Log, level: Match) -> list[Finding]:
 
 
 def _velocity_findings(log: Log, level: Match, wrong: np.ndarray) -> tuple[list[Finding], Array]:
-    """One finding per cause, and the factors that undo it."""
+    """Return one finding per cause, and the factors that undo it."""
     causes = (
         ("velocity-sign", -1.0, "runs against"),
         ("degrees", 1.0 / DEGREE, "is 1/57 of"),
@@ -215,7 +215,7 @@ def _velocity_findings(log: Log, level: Match, wrong: np.ndarray) -> tuple[list[
 
 
 def _mismatch(kind: str, log: Log, level: Match, wrong: np.ndarray, rate: str, value: str) -> list[Finding]:
-    """A rate without relation to its value."""
+    """Return a rate without relation to its value."""
     j = int(np.flatnonzero(wrong)[0])
     numbers = {"slope": level.low[j], "correlation": level.correlation[j]}
     shown = ", ".join(f"{name} {number:.3g}" for name, number in numbers.items())
@@ -226,7 +226,7 @@ def _mismatch(kind: str, log: Log, level: Match, wrong: np.ndarray, rate: str, v
 
 
 def _coarse(log: Log, level: Match) -> np.ndarray:
-    """Joints whose changes are of the size of encoder steps, so that their rate cannot be judged."""
+    """Return the joints that change by about one encoder step, too little to judge their rate."""
     size = np.sqrt((level.change**2).mean(axis=0))
     moves = np.abs(np.diff(log.q, axis=0))
     steps = np.nanmedian(np.where(moves > 0.0, moves, np.nan), axis=0)
@@ -234,7 +234,7 @@ def _coarse(log: Log, level: Match) -> np.ndarray:
 
 
 def _permutation(level: Match) -> np.ndarray | None:
-    """The order of rates that fits the changes of all joints where their own does not, if there is one."""
+    """Return the order of rates that fits the changes of all joints better than their own, if any."""
     from scipy.optimize import linear_sum_assignment
 
     # Windows without impacts are those in which a joint fits its own rate, which here is the wrong one.
@@ -253,7 +253,7 @@ def _permutation(level: Match) -> np.ndarray | None:
 
 
 def _held_torque(system: ConstrainedSystem, log: Log) -> Array:
-    """`(nq,)` mean acceleration over a period in which the torque is held, over that at its start.
+    """Return `(nq,)` mean acceleration over a period in which the torque is held, over that at its start.
 
     Viscous friction d slows a joint of inertia m as exp(−d t/m), which leaves (1 − exp(−x))/x, x = d dt/m:
     after a change of the torque, light damped joints accelerate more than their velocity will change.
@@ -305,7 +305,7 @@ NOISE_ROWS = 100
 
 
 def noise_levels(log: Log) -> tuple[Array, Array] | None:
-    """Standard deviation `(nq,)` of white noise, estimated from neighbours at distances 1 and 3."""
+    """Return the standard deviation `(nq,)` of white noise, from neighbours at distances 1 and 3."""
     from scipy.ndimage import correlate1d
 
     levels = []

@@ -33,14 +33,14 @@ OFTEN, UNIT_ROWS = 0.05, 400
 
 
 def _limits(system: ConstrainedSystem) -> dict[str, tuple[Array, Array]]:
-    """Lower and upper limits by column."""
+    """Return the lower and upper limits by column."""
     r = system.robot
     low, high, speed, effort = (x.numpy() for x in (r.lower, r.upper, r.velocity_limit, r.effort_limit))
     return {"q": (low, high), "qd": (-speed, speed), "tau": (-effort, effort)}
 
 
 def check_degrees(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find angles in degrees: they leave the joint's range, and fit range and torque once converted."""
+    """Find angles in degrees, which exceed the joint's range and fit range and torque once converted."""
     low, high = _limits(system)["q"]
     turning = system.robot.revolute.cpu().numpy() > 0.0
     low, high = np.where(np.isfinite(low), low, -TURN), np.where(np.isfinite(high), high, TURN)
@@ -64,7 +64,7 @@ def check_degrees(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def _misfit(system: ConstrainedSystem, log: Log) -> float:
-    """Held-out error of the torque, each joint's up to a gain; 0 where no torque is informative."""
+    """Return the held-out error of the torque up to a gain per joint; 0 if no torque is informative."""
     rows = log.rows(UNIT_ROWS)
     if len(rows) < UNIT_ROWS or not log.tau[rows].any():
         return 0.0
@@ -74,7 +74,7 @@ def _misfit(system: ConstrainedSystem, log: Log) -> float:
 
 
 def _angles(log: Log, turning: np.ndarray) -> list[str]:
-    """The columns in degrees where angles are: velocities that are the derivative of the angles."""
+    """Return the columns in degrees where angles are: velocities that are the derivative of the angles."""
     columns = ["q"]
     for name, source in (("qd", "q"), ("qdd", "qd")):
         step = [np.abs(np.diff(getattr(log, source)[s], axis=0)).sum() for s in log.stretches]
@@ -108,7 +108,7 @@ def check_saturation(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def clipped_torques(data: Dataset | Log) -> NDArray[np.bool_]:
-    """Mask `(n, nq)` of torques that stay at the largest or smallest value of their joint.
+    """Return the mask `(n, nq)` of torques that stay at the largest or smallest value of their joint.
 
     Use the unfiltered log, since filters smooth the plateaus. Exclude these rows from training data,
     or state their noise in `extras["tau_std"]` for an external wrench.
@@ -133,7 +133,7 @@ def clipped_torques(data: Dataset | Log) -> NDArray[np.bool_]:
 
 
 def limits_of(values: Array) -> tuple[float, float]:
-    """Value taken most often near the maximum, and near the minimum: a filter overshoots a limit."""
+    """Return the most frequent values near the maximum and minimum, since a filter overshoots a limit."""
     limits = []
     for extreme in (values.max(), values.min()):
         near, counts = np.unique(
@@ -145,7 +145,7 @@ def limits_of(values: Array) -> tuple[float, float]:
 
 
 def _plateaus(log: Log, j: int, extreme: float) -> Intervals:
-    """Runs of rows in which the torque of a joint is clipped at an extreme value, exactly or up to noise."""
+    """Return the runs of rows in which a torque is clipped at an extreme value, up to noise."""
     tau, moves = log.tau[:, j], np.abs(log.qd[:, j]) > MOVES * np.abs(log.qd[log.usable, j]).max()
     usable, width = tau[log.usable], BAND * np.ptp(tau[log.usable])
     if extreme == 0.0:

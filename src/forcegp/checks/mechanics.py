@@ -44,7 +44,7 @@ ONE_SIGMA = 84.13
 
 
 def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Check signs, orders, gains, delays, gravity, tool, masses, friction and offsets by the torques."""
+    """Check signs, orders, gains, delays, gravity, tool, masses, friction and offsets."""
     if len(log.rows(LEAST_ROWS)) < LEAST_ROWS:
         raise NotJudgedError(f"fewer than {LEAST_ROWS} usable rows")
     passive = _without_torque(log)
@@ -85,7 +85,7 @@ def _enough(log: Log) -> bool:
 
 
 def _without_torque(log: Log) -> list[Finding]:
-    """Torques that are constant though the joint moves."""
+    """Return the torques that are constant though the joint moves."""
     rows = log.usable
     still = (np.ptp(log.tau[rows], axis=0) == 0.0) & (np.ptp(log.q[rows], axis=0) > 0.0)
     still[unmeasured(log)] = False
@@ -97,7 +97,7 @@ def _without_torque(log: Log) -> list[Finding]:
 
 
 def _matters(explanation: Explanation, j: int, columns: list[int]) -> bool:
-    """Whether leaving out some columns of the nuisance raises the error of joint j."""
+    """Return whether leaving out some columns of the nuisance raises the error of joint j."""
     problem = explanation.problem
     keep = np.setdiff1d(np.arange(problem.nuisance.shape[-1]), columns)
     less = replace(problem, nuisance=problem.nuisance[..., keep])
@@ -108,7 +108,7 @@ def _matters(explanation: Explanation, j: int, columns: list[int]) -> bool:
 
 
 def _with_other_friction(system: ConstrainedSystem, explanation: Explanation) -> Explanation:
-    """The explanation beside friction of the contacts, and declared friction that rises more sharply."""
+    """Return the explanation with friction of contacts and a steeper friction of the joints as well."""
     functions = (hypotheses.contact_friction_columns, hypotheses.other_rise_columns)
     columns = [columns(system, explanation.log, explanation.rows) for columns in functions]
     nuisance = np.concatenate([explanation.problem.nuisance, *columns], axis=-1)
@@ -116,7 +116,7 @@ def _with_other_friction(system: ConstrainedSystem, explanation: Explanation) ->
 
 
 def _determined(robot: RobotModel, explanation: Explanation) -> Explanation:
-    """The explanation without friction that would drive, or is below its σ: parameter and spread become 0."""
+    """Return the explanation with friction set to 0 if it would drive, or is smaller than its σ."""
     declared = np.concatenate([robot.damping.numpy(), robot.friction.numpy()])
     for _ in range(robot.nq):
         fit = explanation.fit
@@ -131,7 +131,7 @@ def _determined(robot: RobotModel, explanation: Explanation) -> Explanation:
 
 
 def _confounded(explanation: Explanation) -> list[Finding]:
-    """The faults found; gains are no error beside masses that do not fit, which are their yardstick."""
+    """Return the faults found, gains as warnings if masses are wrong too, since masses calibrate gains."""
     findings = []
     for finding in explanation.findings:
         current = finding.kind == "torque-current" and "masses-mismatch" not in finding.kinds
@@ -199,7 +199,7 @@ def _unexplained(explanation: Explanation) -> list[Finding]:
 
 
 def _disturbances(system: ConstrainedSystem, explanation: Explanation) -> tuple[list[Finding], np.ndarray]:
-    """Times at which far more torque is unexplained than usual, and the rows around them."""
+    """Return the times at which far more torque is unexplained than usual, and the rows around them."""
     from scipy.ndimage import minimum_filter1d
 
     log, rows = explanation.log, explanation.log.rows(TRACE_ROWS)
@@ -233,7 +233,7 @@ def _disturbances(system: ConstrainedSystem, explanation: Explanation) -> tuple[
 
 
 def _stands_out(log: Log, rows: np.ndarray, level: Array) -> np.ndarray:
-    """`(n,)` bool, rows at which more is unexplained than is usual in the same state of the contacts."""
+    """Return `(n,)` bool, rows with a larger residual than usual at the same state of the contacts."""
     # An arm at rest leaves little unexplained; it says nothing of one that moves.
     speed = np.abs(log.qd[rows]).max(axis=1)
     moving, bad = speed >= MOVING * np.percentile(speed, 99), np.zeros(len(rows), bool)
@@ -252,13 +252,13 @@ def _stands_out(log: Log, rows: np.ndarray, level: Array) -> np.ndarray:
 
 
 def _upper_spread(level: Array) -> float:
-    """Deviation of the level, from its upper side where narrower: of few squares the lower tail is long."""
+    """Return the spread of the level, the upper one if smaller: few squares have a long lower tail."""
     middle, upper = np.percentile(level, [50.0, ONE_SIGMA])
     return float(min(robust_std(level), upper - middle))
 
 
 def residual_trace(system: ConstrainedSystem, explanation: Explanation, rows: np.ndarray) -> Array:
-    """Residual torque at some rows without contact forces, `(n, nq)` [N m, N]."""
+    """Return the residual torque at some rows without contact forces, `(n, nq)` [N m, N]."""
     log, scale = explanation.log, explanation.problem.scale
     parts, coefficients = [], robust_parameters(explanation.problem, explanation.columns, explanation.prior)
     for index in np.array_split(rows, max(1, len(rows) // 2048)):

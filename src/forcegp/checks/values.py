@@ -83,7 +83,7 @@ COARSE = 0.05
 
 
 def logged(log: Log) -> dict[str, Array]:
-    """The joint vectors that were logged, not derived."""
+    """Return the joint vectors that were logged rather than derived."""
     return {name: getattr(log, name) for name in JOINT_VECTORS if name not in log.derived}
 
 
@@ -144,7 +144,7 @@ def check_stuck(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def _expected_change(log: Log, name: str, j: int, a: int, b: int) -> float:
-    """Expected motion of a channel over rows a to b, judged by the channels of the same joint."""
+    """Return the expected motion of a channel over rows a to b, judged by the channels of the same joint."""
     if name == "q":
         return float(np.ptp(np.cumsum(log.qd[a:b, j])) * log.dt)
     if name == "qd":
@@ -187,7 +187,7 @@ def check_spikes(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def _departures(log: Log, value: Array) -> tuple[Array, Array, Array]:
-    """Departures of the values of a vector and of their neighbours `(n, nq)`, and their scale `(nq,)`."""
+    """Return how far values and their neighbours depart `(n, nq)`, and the usual scale `(nq,)`."""
     departure, around = np.zeros_like(value), np.zeros_like(value)
     for s in log.stretches:
         departure[s], around[s] = spikes(value[s])
@@ -199,7 +199,7 @@ def _departures(log: Log, value: Array) -> tuple[Array, Array, Array]:
 
 
 def _shocks(log: Log, departures: dict[str, tuple[Array, Array, Array]], name: str) -> np.ndarray:
-    """`(n, nq)` bool, values but positions that depart with others, each compared with its column's range."""
+    """Return `(n, nq)` bool, values (not positions) that depart together, relative to their ranges."""
     departure = departures[name][0]
     if name == "q":
         return np.zeros(departure.shape, bool)
@@ -215,7 +215,7 @@ def _shocks(log: Log, departures: dict[str, tuple[Array, Array, Array]], name: s
 
 
 def _driven(system: ConstrainedSystem, log: Log, departure: Array, outlier: np.ndarray) -> np.ndarray:
-    """`(n, nq)` bool, accelerations that a step of the joint's own torque makes: Δτ_j (M⁻¹)_jj."""
+    """Return `(n, nq)` bool, accelerations that a step of the joint's own torque makes: Δτ_j (M⁻¹)_jj."""
     step = np.pad(np.abs(np.diff(log.tau, axis=0)), ((1, 1), (0, 0)))
     step, driven = np.maximum(step[:-1], step[1:]), np.zeros_like(outlier)
     rows = np.flatnonzero(outlier.any(axis=1))
@@ -227,20 +227,20 @@ def _driven(system: ConstrainedSystem, log: Log, departure: Array, outlier: np.n
 
 
 def _size(log: Log, name: str, departure: Array, around: Array, scale: Array) -> Array:
-    """Largest departure within two rows over the range of the column; zero where it may be noise."""
+    """Return the largest departure within two rows over the column's range; zero if it may be noise."""
     size, reach = np.abs(departure), log.reach(name)
     return _within_two(np.where(size > SPIKE * scale, size / np.maximum(reach, 1e-300), 0.0))
 
 
 def _one_value(departure: Array, scale: Array) -> np.ndarray:
-    """`(n, d)` bool, departures h with −4h/6 and h/6 around: one wrong value makes them, a kink does not."""
+    """Return `(n, d)` bool, departures h beside −4h/6 and h/6, which one wrong value leaves, no kink."""
     around = np.lib.stride_tricks.sliding_window_view(np.pad(departure, ((2, 2), (0, 0))), 5, axis=0)
     misfit = np.abs(around - departure[..., None] * DEPARTURE).max(axis=-1)
     return misfit <= SPIKE_SHAPE * np.abs(departure) + SPIKE_NOISE * scale
 
 
 def _within_two(x: Array) -> Array:
-    """Largest value within two rows."""
+    """Return the largest value within two rows."""
     from scipy.ndimage import maximum_filter1d
 
     return maximum_filter1d(x, 5, axis=0, mode="constant")
@@ -273,7 +273,7 @@ of the fastest joint within a step by this factor."""
 
 
 def _jumps(x: Array, rate: Array, log: Log) -> np.ndarray:
-    """`(n, nq)` bool, rows at which a column jumps."""
+    """Return `(n, nq)` bool, rows at which a column jumps."""
     surplus, usable = np.zeros_like(x), log.usable
     for s in log.stretches:  # what the rate does not account for
         mean = 0.5 * (rate[s][1:] + rate[s][:-1])

@@ -197,9 +197,9 @@ class Equations:
 
     @cached_property
     def hidden(self) -> Tensor:
-        """Projector onto multipliers that do not affect the motion, Aᵀμ = 0 `(*batch, m, m)`: 1 for points
-            that
-        cannot move, fractions for contacts that share their load.
+        """Projector onto multipliers that do not affect the motion, Aᵀμ = 0 `(*batch, m, m)`.
+
+        It is 1 for points that cannot move, and a fraction for contacts that share their load.
         """
         # R = 1 − W W⁺
         return torch.diag_embed(self.holds.to(self.M)) - self.scaled_jacobian @ self.scaled_inverse

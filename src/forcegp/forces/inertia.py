@@ -65,13 +65,13 @@ WIDTHS = (0.0, 0.02, 0.05, 0.12)
 
 
 def rigid_robot(robot: RobotModel, rows: Rows) -> RobotModel | None:
-    """The physically consistent robot that predicts held-out torques better than the file, or `None`.
+    """Return the physically consistent robot that predicts held-out torques better than the file, or `None`.
 
     The improvement must exceed two standard errors over stretches of the log, over the file and over the file
     with additional drives, and no joint's held-out acceleration error may grow.
 
     Args:
-        robot: of the file.
+        robot: robot from the file.
         rows: samples in free motion.
     """
     prior, n = InertialPrior(), robot.nq
@@ -84,7 +84,7 @@ def rigid_robot(robot: RobotModel, rows: Rows) -> RobotModel | None:
     found = max(regressions, key=lambda each: float(torch.logdet(each.normal()[1])))
 
     def compared(estimate: Estimate) -> Tensor:
-        """Held-out errors of single samples in units of their noise; averages hardly show sharp friction."""
+        """Return held-out errors per sample in units of their noise; averages hide sharp friction."""
         return held_out(single.by_stretch, estimate, judged, found.by_stretch) / single.noise**2
 
     nothing = torch.zeros_like(found.mean)
@@ -120,7 +120,7 @@ class _Regression:
 
 
 def _over_widths(rows: Rows, C: Tensor, M: Tensor) -> Iterator[_Regression]:
-    """Regressions on equations that are averaged over time, by the width of the average."""
+    """Yield the regressions on equations that are averaged over time, by the width of the average."""
     inertial = (M @ rows.qdd[..., None])[..., 0]
     for width in WIDTHS if rows.step else WIDTHS[:1]:
         used, columns = averaged(rows, C, inertial, width) if rows.step else (rows, C)
@@ -138,13 +138,13 @@ def _over_widths(rows: Rows, C: Tensor, M: Tensor) -> Iterator[_Regression]:
 
 
 def _power(rows: Rows, left: Tensor) -> float:
-    """κ = 1/τ̄ of what nothing explains, as in `residual_times`."""
+    """Return κ = 1/τ̄ of what nothing explains, as in `residual_times`."""
     times = autocorrelation_time(left[: rows.leading], rows.segment[: rows.leading])
     return min(1.0, math.exp(-float(times.log().mean())))
 
 
 def _normal(given: NormalEquations, noise: Tensor, power: float) -> tuple[Tensor, Tensor]:
-    """Linear term κ h and precision κ H + 1 of the unknowns, without directions in which H is negative."""
+    """Return κ h and κ H + 1 of the unknowns, without directions in which H is negative."""
     H, h = given.quadratic(noise)
     values, vectors = torch.linalg.eigh(0.5 * (H + H.mT))
     shown = vectors * (values > 0.0)
@@ -153,7 +153,7 @@ def _normal(given: NormalEquations, noise: Tensor, power: float) -> tuple[Tensor
 
 
 def _estimate(given: NormalEquations, noise: Tensor, power: float) -> Tensor:
-    """Most probable unknowns, of which the first n, the drives, are not negative."""
+    """Return the most probable unknowns, of which the first n, the drives, are not negative."""
     h, precision = _normal(given, noise, power)
     n = len(noise)
     drives = torch.linalg.solve(precision, h)[:n].clamp(min=0.0)
@@ -162,14 +162,14 @@ def _estimate(given: NormalEquations, noise: Tensor, power: float) -> Tensor:
 
 
 def _drives_alone(every: NormalEquations, noise: Tensor, n: int) -> Tensor:
-    """The unknowns with the inertia of drives alone, which is not negative."""
+    """Return the unknowns with the inertia of drives alone, which is not negative."""
     H, h = every.quadratic(noise)
     drives = torch.linalg.lstsq(H[:n, :n], h[:n, None]).solution[:, 0].clamp(min=0.0)
     return torch.cat([drives, torch.zeros_like(h[n:])])
 
 
 def _is_better(after: Tensor, before: Tensor) -> bool:
-    """Whether errors `(groups, nq)` are significantly smaller, in the mean of the joints."""
+    """Return whether errors `(groups, nq)` are significantly smaller, in the mean of the joints."""
     return is_less((after - before).mean(-1))
 
 
@@ -224,7 +224,7 @@ def inertia_of(
 
 
 def _told(robot: RobotModel, armature: Tensor) -> tuple[str, ...]:
-    """Message on drives with identified inertia `(nq,)`."""
+    """Return the message on drives with identified inertia `(nq,)`."""
     pairs = zip(robot.joint_names, armature.tolist(), strict=True)
     found = ", ".join(f"{name} {a:.2g}" for name, a in pairs if a > 0.0)
     lacks = "the drives have inertia that the robot file lacks [kg m², kg for sliding joints]"
@@ -232,7 +232,8 @@ def _told(robot: RobotModel, armature: Tensor) -> tuple[str, ...]:
 
 
 def _lacking(rows: Rows, M: Tensor) -> Tensor:
-    """Inertia of drives `(nq,)` that predicts held-out torques significantly better than none, or zero.
+    """Return the inertia of drives `(nq,)` that predicts held-out torques significantly better than none, or
+    zero.
 
     No joint's acceleration error may grow.
     """
@@ -250,13 +251,13 @@ def _lacking(rows: Rows, M: Tensor) -> Tensor:
 
 
 def _noise(every: NormalEquations) -> Tensor:
-    """Root mean square of the torque that the file and friction leave `(nq,)`."""
+    """Return the root mean square of the torque that the file and friction leave `(nq,)`."""
     none = every.gram.new_zeros(every.unknowns)
     return every.error(none, every.friction(none)).clamp(min=1e-300).sqrt()
 
 
 def _excess(rows: Rows, every: NormalEquations, M: Tensor, armature: Tensor) -> float:
-    """Logarithm of the squared acceleration error over that of the mean acceleration, mean of the joints."""
+    """Return the log ratio of the squared acceleration error to the mean square, mean over joints."""
     friction = every.friction(armature)
     left = rows.slides * (rows.residual - armature * rows.qdd - (rows.friction * friction).sum(-1))
     missed = torch.linalg.solve(M + torch.diag(armature), left[..., None])[..., 0]
@@ -265,7 +266,8 @@ def _excess(rows: Rows, every: NormalEquations, M: Tensor, armature: Tensor) -> 
 
 
 def _damped(rows: Rows, M: Tensor, found: Tensor) -> Tensor:
-    """Inertia of drives beyond the file's `(nq,)`, raised where accelerations are below the noise of torques.
+    """Return the inertia of drives beyond the file's `(nq,)`, raised where accelerations are below the noise
+    of torques.
 
     They are if their mean predicts them better than the torques and friction with memory do: what that
     friction explains is no noise.
@@ -291,7 +293,7 @@ def _damped(rows: Rows, M: Tensor, found: Tensor) -> Tensor:
 
 
 def _drives(given: NormalEquations, noise: Tensor, M: Tensor, weight: float) -> Tensor:
-    """a ≥ 0 that minimises ½ Σ ε²/s² − v Σ log |M + diag a|, both over all samples."""
+    """Return a ≥ 0 that minimises ½ Σ ε²/s² − v Σ log |M + diag a|, both over all samples."""
     H, h = given.quadratic(noise)
     n, M = float(given.count.max()), M[:: max(1, len(M) // VOLUME_STATES)]
     scale = M.diagonal(dim1=-2, dim2=-1).mean(0)
@@ -313,7 +315,7 @@ def _drives(given: NormalEquations, noise: Tensor, M: Tensor, weight: float) -> 
 
 @torch.no_grad()
 def with_updated_robot(problem: Problem, values: Mapping[str, Tensor]) -> Problem:
-    """The problem with the robot at the posterior mean of its inertial parameters (a Gauss–Newton step)."""
+    """Return the problem at the posterior mean of inertial parameters (a Gauss–Newton step)."""
     for p, prior in enumerate(problem.priors):
         moves = prior.name not in problem.pinned and problem.parameters is None
         if isinstance(prior, InertialPrior) and moves and not prior.drives:
@@ -334,7 +336,7 @@ def with_updated_robot(problem: Problem, values: Mapping[str, Tensor]) -> Proble
 
 
 def _log_volume(problem: Problem, values: Mapping[str, Tensor]) -> Callable[[RobotModel], Tensor]:
-    """κ Σ_i log |M (Σ_τ + M Σ_q̈ Mᵀ)^−½| at the samples in free motion, as a function of the robot.
+    """Return κ Σ_i log |M (Σ_τ + M Σ_q̈ Mᵀ)^−½| at the samples in free motion, as a function of the robot.
 
     With it, the density of the torque's error is that of the acceleration's. Without it, a robot that has
     next to no inertia explains small torques best, whatever it does to the accelerations.
@@ -367,7 +369,7 @@ def _log_volume(problem: Problem, values: Mapping[str, Tensor]) -> Callable[[Rob
 
 
 def one_row(posterior: ForcePosterior, problem: Problem) -> list[dict[str, Tensor]]:
-    """Kernel inputs of every prior at the first sample; constants have the same value everywhere."""
+    """Return the kernel inputs of every prior at the first sample, since constants do not vary."""
     m = problem.training.measurements[0]
     at = m[torch.zeros(1, dtype=torch.int64, device=m.q.device)].at(problem.system)
     return [posterior.process.features(p, problem.system, at) for p in range(len(problem.priors))]
@@ -376,7 +378,7 @@ def one_row(posterior: ForcePosterior, problem: Problem) -> list[dict[str, Tenso
 def latent_precision(
     posterior: ForcePosterior, features: list[dict[str, Tensor]], p: int, robot: RobotModel
 ) -> Tensor:
-    """Inverse posterior covariance of the components of prior p, all others marginalised."""
+    """Return the inverse posterior covariance of the components of prior p, all others marginalised."""
     widths = [prior.outputs(robot) for prior in posterior.priors]
     eye = torch.eye(widths[p], dtype=robot.dtype, device=robot.device)
     operators = [eye[None] if q == p else eye.new_zeros(1, widths[p], w) for q, w in enumerate(widths)]

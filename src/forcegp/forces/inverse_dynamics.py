@@ -64,7 +64,7 @@ class Rows:
         partner: index of each sample's partner `(n,)`; its own index if there is none.
         memory: friction with memory, further features `(n, nq, k)`.
         step: time between neighbours [s]; 0 if they are not in order.
-        filter_variance: of the weights with which a filter averaged q̈ over time [s²].
+        filter_variance: variance of the weights with which a filter averaged q̈ over time [s²].
     """
 
     q: Tensor
@@ -81,12 +81,12 @@ class Rows:
     filter_variance: float = 0.0
 
     def with_memory(self) -> Rows:
-        """The samples with all features of friction in Φ."""
+        """Return the samples with all features of friction in Φ."""
         return dataclasses.replace(self, friction=torch.cat([self.friction, self.memory], dim=-1))
 
     @property
     def leading(self) -> int:
-        """Number of samples before their partners, in the order of the log."""
+        """Return the number of samples before their partners, in the order of the log."""
         paired = int(self.partner[0]) > 0
         return len(self.partner) // 2 if paired else len(self.partner)
 
@@ -106,15 +106,15 @@ class NormalEquations:
     unknowns: int
 
     def total(self) -> NormalEquations:
-        """Over all stretches."""
+        """Return the sum over all stretches."""
         return self._each(lambda x: x.sum(0))
 
     def of(self, g: int) -> NormalEquations:
-        """One stretch."""
+        """Return one stretch."""
         return self._each(lambda x: x[g])
 
     def without(self, g: int) -> NormalEquations:
-        """All stretches but one."""
+        """Return all stretches but one."""
         return self._each(lambda x: x.sum(0) - x[g])
 
     def _each(self, part: Callable[[Tensor], Tensor]) -> NormalEquations:
@@ -123,7 +123,7 @@ class NormalEquations:
         )
 
     def friction(self, delta: Tensor) -> Tensor:
-        """Friction weights w `(nq, f)` that fit the residual at δ."""
+        """Return the friction weights w `(nq, f)` that fit the residual at δ."""
         p = self.unknowns
         right = self.right[:, p:] - self.gram[:, p:, :p] @ delta
         return torch.linalg.solve(self._stiff(), right[..., None])[..., 0]
@@ -134,7 +134,7 @@ class NormalEquations:
         return self.gram[:, p:, p:] + RIDGE * self.count[:, None, None] * eye
 
     def quadratic(self, noise: Tensor) -> tuple[Tensor, Tensor]:
-        """H and h of H δ = h, with optimal friction; of Σ_j |ε_j|²/s_j² without instruments."""
+        """Return H and h of H δ = h, with optimal friction; of Σ_j |ε_j|²/s_j² without instruments."""
         # Friction eliminated, by Schur complement: H_j = G_δδ − G_δf (G_ff + D)⁻¹ G_fδ, H = Σ_j H_j/s_j²
         p = self.unknowns
         friction = torch.cat([self.gram[:, p:, :p], self.right[:, p:, None]], dim=-1)
@@ -145,7 +145,7 @@ class NormalEquations:
         return torch.einsum("j,jpq->pq", weight, H), weight @ h
 
     def error(self, delta: Tensor, friction: Tensor) -> Tensor:
-        """Mean of ε², or of ε ε′, `(nq,)`."""
+        """Return the mean of ε², or of ε ε′, `(nq,)`."""
         x = torch.cat([delta.expand(len(friction), -1), friction], dim=-1)
         fitted = 2.0 * (x * self.right).sum(-1) - torch.einsum("jp,jpq,jq->j", x, self.gram, x)
         return (self.square - fitted) / self.count
@@ -158,7 +158,7 @@ Estimate = Callable[[NormalEquations], Tensor]
 def free_rows(
     system: ConstrainedSystem, prior: JointFrictionPrior, mean: ForceMean, training: Training
 ) -> Rows:
-    """Samples in free motion and their partners, at least `LEAST` per measurement."""
+    """Return the samples in free motion and their partners, at least `LEAST` per measurement."""
     motions = (m for m in training.measurements if m.quantity == "qdd")
     free = ((m, (~m.active.any(-1)).nonzero()[:, 0]) for m in motions)
     m = next(m[rows] for m, rows in free if len(rows) >= LEAST)
@@ -179,13 +179,13 @@ def free_rows(
 
 
 def _in_time(m: Measurement | Dataset) -> Tensor:
-    """Indices of samples in the order of segment and time."""
+    """Return the indices of samples in the order of segment and time."""
     order = torch.argsort(m.t, stable=True)
     return order[torch.argsort(m.segment[order], stable=True)]
 
 
 def bristles(m: Measurement | Dataset) -> Tensor:
-    """Friction with memory: z of Dahl's model dz/dt = q̇/δ − |q̇| z/δ for some distances δ, `(n, nq, k)`.
+    """Return z of Dahl's friction model dz/dt = q̇/δ − |q̇| z/δ for some distances δ, `(n, nq, k)`.
 
     Within δ of a reversal this friction is a spring, and its torque is about proportional to −q̈: without
     these columns it resembles negative inertia.
@@ -210,7 +210,7 @@ def bristles(m: Measurement | Dataset) -> Tensor:
 
 
 def partners(m: Measurement, filter_span: float = 0.0) -> Tensor:
-    """Index of the sample of the same trajectory that is later by `APART`, or −1, `(n,)`.
+    """Return the index of the sample `APART` later in the same trajectory, or −1, `(n,)`.
 
     The lag is shorter if velocities would change too much, but never shorter than the span of the log's
     filter [s], within which noise is correlated.
@@ -252,7 +252,8 @@ def _rows(
 
 
 def _slides(moving: Tensor, Phi: Tensor, residual: Tensor) -> Tensor:
-    """`(n, nq)` bool, without the joints that stick: that hardly move, and whose torque then scatters more.
+    """Return `(n, nq)` bool, without the joints that stick: that hardly move, and whose torque then scatters
+    more.
 
     Args:
         moving: `(n, nq)` bool, faster than the sharpest dry friction.
@@ -270,7 +271,7 @@ def _slides(moving: Tensor, Phi: Tensor, residual: Tensor) -> Tensor:
 
 
 def averaged(rows: Rows, columns: Tensor, inertial: Tensor, width: float) -> tuple[Rows, Tensor]:
-    """Equations averaged over time with Gaussian weights; any sum of equations is one.
+    """Return equations averaged over time with Gaussian weights, as sums of equations are valid.
 
     Noise of differentiated positions has high frequencies, the motion low ones. And a filter has averaged the
     accelerations, so that the other terms are averaged by its variance more.
@@ -320,33 +321,33 @@ def averaged(rows: Rows, columns: Tensor, inertial: Tensor, width: float) -> tup
 
 
 def sums(rows: Rows, columns: Tensor) -> NormalEquations:
-    """NormalEquations by stretch, with C `(n, nq, p)`."""
+    """Return `NormalEquations` for each stretch, with C `(n, nq, p)`."""
     X, r = _equations(rows, columns)
     return _by_stretch(rows, X, X, r, r)
 
 
 def instrumental(rows: Rows, columns: Tensor) -> NormalEquations:
-    """The same with the columns of partners as instruments; velocities and friction are taken as precise."""
+    """Return the equations with partners as instruments; velocities and friction count as exact."""
     X, r = _equations(rows, columns, paired=True)
     p = columns.shape[-1]
     return _by_stretch(rows, torch.cat([X[rows.partner][..., :p], X[..., p:]], dim=-1), X, r, r)
 
 
 def products(rows: Rows, columns: Tensor) -> NormalEquations:
-    """NormalEquations of products with the partners."""
+    """Return `NormalEquations` of products with the partners."""
     X, r = _equations(rows, columns, paired=True)
     return _by_stretch(rows, X[rows.partner], X, r[rows.partner], r)
 
 
 def _equations(rows: Rows, columns: Tensor, paired: bool = False) -> tuple[Tensor, Tensor]:
-    """X and r of the joints that move, at the partner too where samples are paired; zero for others."""
+    """Return X and r of joints that move, at the partner too if samples are paired; else zero."""
     slides = rows.slides & rows.slides[rows.partner] if paired else rows.slides
     X = torch.cat([columns, rows.friction], dim=-1)
     return X * slides[..., None], rows.residual * slides
 
 
 def _by_stretch(rows: Rows, Z: Tensor, X: Tensor, s: Tensor, r: Tensor) -> NormalEquations:
-    """Σ ZᵀX, Σ Zᵀr and Σ s r; X holds a column of ones, which is zero for what does not count."""
+    """Return Σ ZᵀX, Σ Zᵀr and Σ s r; X holds a column of ones, which is zero for what does not count."""
     groups = []
     for g in range(int(rows.group.max()) + 1):
         inside = rows.group == g
@@ -364,7 +365,7 @@ def held_out(
     judged: NormalEquations | None = None,
     source: NormalEquations | None = None,
 ) -> Tensor:
-    """Mean squares of torque errors on stretches held out from δ and friction, `(groups, nq)`.
+    """Return the mean squares of torque errors on stretches held out from δ and friction, `(groups, nq)`.
 
     Args:
         by_stretch: the sums to estimate friction from.
@@ -383,7 +384,7 @@ def held_out(
 def acceleration_errors(
     rows: Rows, by_stretch: NormalEquations, columns: Tensor, delta: Tensor, M: Tensor
 ) -> Tensor:
-    """Mean squares of acceleration errors at δ on stretches held out from friction, `(groups, nq)`."""
+    """Return mean square acceleration errors at δ, with held-out friction, `(groups, nq)`."""
     residual, errors = rows.residual - columns @ delta, []
     for g in range(len(by_stretch.gram)):
         inside = rows.group == g
@@ -394,15 +395,15 @@ def acceleration_errors(
 
 
 def log_ratio(after: Tensor, before: Tensor) -> Tensor:
-    """Logarithm of the ratio of root mean squares; zero for a joint that does not move in a stretch."""
+    """Return the log ratio of root mean squares; zero for a joint at rest during a stretch."""
     return 0.5 * (after.clamp(min=LEAST_SQUARE) / before.clamp(min=LEAST_SQUARE)).log()
 
 
 def is_harmless(after: Tensor, before: Tensor) -> bool:
-    """Whether no joint's error grows beyond the tolerance."""
+    """Return whether no joint's error grows beyond the tolerance."""
     return bool((log_ratio(after, before).mean(0) <= TOLERATED).all())
 
 
 def is_less(difference: Tensor) -> bool:
-    """Whether differences `(groups,)` are significantly below zero."""
+    """Return whether differences `(groups,)` are significantly below zero."""
     return float(difference.mean()) < -SIGNIFICANT * float(difference.std()) / math.sqrt(len(difference))

@@ -56,28 +56,28 @@ class Measurement:
 
     @property
     def states(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """q, q̇, τ, and which contacts are closed."""
+        """Return q, q̇, τ and the closed contacts."""
         return self.q, self.qd, self.tau, self.active
 
     @property
     def tensors(self) -> tuple[Tensor, ...]:
-        """q, q̇, τ, which contacts are closed, and the values."""
+        """Return q, q̇, τ, the closed contacts, and the values."""
         return (*self.states, self.values)
 
     def at(self, system: ConstrainedSystem) -> States:
-        """The equations of motion at the states, with the measured acceleration if there is one."""
+        """Return the equations of motion at the states, with the measured acceleration if there is one."""
         time = torch.stack([self.t, self.segment.to(self.t)], dim=-1)
         return states(system, *self.states, qdd=self.values if self.quantity == "qdd" else None, time=time)
 
     @property
     def digests(self) -> Tensor:
-        """A hash of each sample `(n,)`."""
+        """Return a hash of each sample `(n,)`."""
         x = torch.cat([part.double() for part in self.tensors], dim=-1).contiguous().view(torch.int64)
         odd = torch.randint(2**62, x.shape[-1:], generator=torch.Generator().manual_seed(0)).to(x) * 2 + 1
         return ((x ^ (x >> 32)) * odd).sum(-1)
 
     def __getitem__(self, rows: Tensor) -> Measurement:
-        """The values at some of the states."""
+        """Return the values at some of the states."""
         return Measurement(self.quantity, *(part[rows] for part in (*self.tensors, self.segment, self.t)))
 
 
@@ -87,12 +87,12 @@ class Training:
 
     Attributes:
         measurements: the values.
-        noise_std: of each measurement, `(d,)` or `(n, d)`.
+        noise_std: standard deviation of each measurement, `(d,)` or `(n, d)`.
         scales: standardization of the inputs of each prior.
         part_of: number of all samples to condition on; 0 if these are all.
         period: sampling period of the log [s]; 0 if its rows are not in order.
-        filter_span: of the filter that computed the accelerations [s]; 0 if unknown.
-        filter_variance: of its weights over time [s²], as in `DataHeader`.
+        filter_span: time span of the filter that computed the accelerations [s]; 0 if unknown.
+        filter_variance: variance of its weights over time [s²], as in `DataHeader`.
         weights: of the samples of each measurement `(n,)`, divisors of their noise variance; `None` for one.
         slopes: G = dz/d(q, q̇) `(n, d, 2 nq)` of each measurement with learned forces, `None` for a quantity
             without; `None` for those of the robot file (`forces/noise.py`).
@@ -110,59 +110,59 @@ class Training:
 
     @property
     def samples(self) -> int:
-        """Number of samples in all measurements."""
+        """Return the number of samples in all measurements."""
         return sum(len(m.q) for m in self.measurements)
 
     @property
     def all_samples(self) -> int:
-        """Number of all samples to condition on."""
+        """Return the number of all samples to condition on."""
         return self.part_of or self.samples
 
     def pieces(self, samples: int) -> Iterator[Training]:
-        """The same samples in pieces of about this many, each with its share of every measurement."""
+        """Yield the same samples in pieces of about this many, each with its share of every measurement."""
         count = max(1, math.ceil(self.samples / samples))
         parts = [torch.arange(len(m.q), device=m.q.device).tensor_split(count) for m in self.measurements]
         yield from (self.of_rows(rows) for rows in zip(*parts, strict=True))
 
     @property
     def quantities(self) -> tuple[str, ...]:
-        """The measured quantities."""
+        """Return the measured quantities."""
         return tuple(m.quantity for m in self.measurements)
 
     @property
     def free_motions(self) -> int:
-        """Most accelerations in free motion that one measurement has."""
+        """Return the largest number of accelerations in free motion of any measurement."""
         free = [int((~m.active.any(-1)).sum()) for m in self.measurements if m.quantity == "qdd"]
         return max(free, default=0)
 
     @property
     def digests(self) -> Tensor:
-        """A hash of each sample of all measurements."""
+        """Return a hash of each sample of all measurements."""
         return torch.cat([m.digests for m in self.measurements])
 
     def never_closed(self, system: ConstrainedSystem) -> tuple[str, ...]:
-        """Contacts that are never closed."""
+        """Return the contacts that are never closed."""
         closed = torch.stack([m.active.any(0) for m in self.measurements]).any(0).tolist()
         return tuple(name for name, seen in zip(system.contact_names, closed, strict=True) if not seen)
 
     def thinned(self, samples: int) -> Training:
-        """Farthest points among the distinct states of each measurement, about this many samples."""
+        """Return about this many samples, the farthest points of the states of each measurement."""
         share = samples / self.samples
         return self.of_rows([_spread(m, math.ceil(share * len(m.q))) for m in self.measurements])
 
     def evenly(self, samples: int) -> Training:
-        """At most this many samples, evenly spaced in each measurement."""
+        """Return at most this many samples, evenly spaced."""
         step = max(1, math.ceil(self.samples / samples))
         return self.of_rows([torch.arange(0, len(m.q), step, device=m.q.device) for m in self.measurements])
 
     def without(self, measurement: int, rows: Tensor) -> Training:
-        """All samples but some rows of one measurement."""
+        """Return all samples but some rows of one measurement."""
         kept = [torch.ones(len(m.q), dtype=torch.bool, device=m.q.device) for m in self.measurements]
         kept[measurement][rows] = False
         return self.of_rows([mask.nonzero()[:, 0] for mask in kept])
 
     def of_rows(self, rows: Sequence[Tensor]) -> Training:
-        """Some rows of each measurement."""
+        """Return some rows of each measurement."""
         return dataclasses.replace(
             self,
             part_of=0,
@@ -176,7 +176,7 @@ class Training:
         )
 
     def joined(self, more: Training, noise_std: Sequence[Tensor]) -> Training:
-        """These and further measurements, with the noise of the latter; slopes are of both."""
+        """Return these and further measurements with their noise and the slopes of both."""
         weights, slopes = tuple(torch.ones_like(m.t) for m in more.measurements), more.slopes or ()
         return dataclasses.replace(
             self,
@@ -187,13 +187,13 @@ class Training:
         )
 
     def moving(self, speed: float) -> Training:
-        """The samples in which a joint moves faster than a speed [rad/s, m/s]."""
+        """Return the samples in which a joint moves faster than a speed [rad/s, m/s]."""
         fast = [(m.qd.abs().amax(-1) > speed).nonzero()[:, 0] for m in self.measurements]
         return self.of_rows(fast)
 
 
 def _spread(m: Measurement, count: int) -> Tensor:
-    """Rows of distinct states that are far from each other, at most `count`."""
+    """Return the rows of distinct states that are far from each other, at most `count`."""
     x = standardized(torch.cat([m.q, m.qd, m.tau], dim=-1))
     return farthest_points(x, min(count, len(x.unique(dim=0))))
 
@@ -203,7 +203,7 @@ FAR = 6.0
 
 
 def without_impacts(training: Training, system: ConstrainedSystem) -> tuple[Training, int]:
-    """The samples without impacts, and how many were left out.
+    """Return the samples without impacts, and how many were left out.
 
     Args:
         training: measured accelerations among others.
@@ -220,7 +220,7 @@ def without_impacts(training: Training, system: ConstrainedSystem) -> tuple[Trai
 
 
 def _persists(system: ConstrainedSystem, m: Measurement, std: Tensor) -> Tensor:
-    """Whether |A q̈ − b| of each sample is within the usual, `(n,)` bool; free motion always is."""
+    """Return whether |A q̈ − b| of each sample is within the usual, `(n,)` bool; free motion always is."""
     eom = system.equations(m.q, m.qd, m.active)
     violation = (eom.A @ m.values[..., None])[..., 0] - eom.b
     noise = (eom.A.square() @ std.expand_as(m.values)[..., None].square())[..., 0].sqrt()
@@ -241,7 +241,7 @@ DEFAULT_NOISE_STD = 0.1
 
 
 def plain(noise: NoiseStd | str | None) -> Any:
-    """A noise as JSON-compatible values."""
+    """Return a noise as JSON-compatible values."""
     if noise is None or isinstance(noise, str):
         return noise
     values = torch.as_tensor(noise, dtype=torch.float64).tolist()
@@ -276,7 +276,7 @@ class Observation:
 
 
 def observations_of(data: Dataset | Sequence[Observation]) -> Sequence[Observation]:
-    """A data set as measurements of accelerations, or the given measurements.
+    """Return a data set as measurements of accelerations, or the given measurements.
 
     Raises:
         ModelError: there are none, or the argument has another type.
@@ -296,7 +296,7 @@ def observations_of(data: Dataset | Sequence[Observation]) -> Sequence[Observati
 
 
 def states_noise(observations: Sequence[Observation]) -> bool:
-    """Whether the data state the noise of their accelerations."""
+    """Return whether the data state the noise of their accelerations."""
     return all(
         o.noise_std is not None or o.data.header.noise_std is not None or "qdd_std" in o.data.extras
         for o in observations
@@ -305,7 +305,7 @@ def states_noise(observations: Sequence[Observation]) -> bool:
 
 @torch.no_grad()
 def unmeasured_forces(system: ConstrainedSystem, observations: Sequence[Observation]) -> dict[str, float]:
-    """Root mean square of M q̈ − Q_C − Q_G of the joints without a logged torque, by name [N m, N]."""
+    """Return the RMS of M q̈ − Q_C − Q_G of joints without a logged torque, by name [N m, N]."""
     sizes: dict[str, float] = {}
     for data in (o.data for o in observations if o.data.header.unmeasured_torques):
         eom = system.equations(data.q, data.qd, contact_table(data, system.contact_names))
@@ -349,7 +349,7 @@ COLUMNS: Mapping[str, Callable[[Dataset, ConstrainedSystem], Tensor]] = {
 def measurement_of(
     observation: Observation, system: ConstrainedSystem, default_noise: NoiseStd | None = None
 ) -> tuple[Measurement, Tensor]:
-    """The measurement of an observation, and its noise `(d,)` or `(n, d)`.
+    """Return the measurement of an observation, and its noise `(d,)` or `(n, d)`.
 
     Raises:
         UnknownNameError: the quantity cannot be measured, or a contact is not logged.
@@ -370,7 +370,7 @@ def measurement_of(
 
 
 def _noise_of(observation: Observation, default: NoiseStd | None) -> NoiseStd:
-    """The noise stated by the observation, the model, the log (`qdd_std`), or the header, in this order."""
+    """Return the noise stated by the observation, model, log (`qdd_std`) or header, in this order."""
     data = observation.data
     if observation.noise_std is not None:
         return observation.noise_std
@@ -384,7 +384,7 @@ def _noise_of(observation: Observation, default: NoiseStd | None) -> NoiseStd:
 
 
 def _checked_noise(noise: NoiseStd, quantity: str, values: Tensor) -> Tensor:
-    """A noise as a tensor `(d,)` or `(n, d)`."""
+    """Return a noise as a tensor `(d,)` or `(n, d)`."""
     if isinstance(noise, float) and 0.0 < noise < math.inf:
         return values.new_full(values.shape[-1:], noise)
     try:
@@ -410,10 +410,10 @@ def training_of(
     kept: Mapping[str, Standardization],
     standardize: bool = True,
 ) -> Training:
-    """Measurements with their noise and input scales.
+    """Return the measurements with their noise and input scales.
 
     Args:
-        noise_std: of accelerations without a stated noise.
+        noise_std: standard deviation of accelerations without a stated noise.
         kept: earlier scales to keep, by name of the prior.
         standardize: whether to standardize the inputs of kernels.
 
@@ -440,7 +440,7 @@ def scaled(
     kept: Mapping[str, Standardization],
     standardize: bool = True,
 ) -> Training:
-    """Training data with the input scales of priors; the arguments are those of `training_of`."""
+    """Return the training data with the input scales of priors; the arguments are those of `training_of`."""
     new = [prior for prior in priors if prior.name not in kept]
     at = [m.at(system) for m in training.measurements] if new else []
     scales = dict(kept)
@@ -452,7 +452,7 @@ def scaled(
 
 
 def _period(data: Dataset) -> float:
-    """Median time step within the trajectories of a log in order; 0 otherwise [s]."""
+    """Return the median time step within the trajectories of a log in order; 0 otherwise [s]."""
     if not data.header.ordered or len(data.t) < 2:
         return 0.0
     steps = data.t.diff()[data.segment[1:] == data.segment[:-1]]

@@ -86,7 +86,7 @@ class Noise:
 
     @classmethod
     def of(cls, noise: NoiseStd | Noise | None) -> Noise:
-        """The given `Noise`, or one of accelerations alone."""
+        """Return the given `Noise`, or one of accelerations alone."""
         return noise if isinstance(noise, cls) else cls(noise)  # pyright: ignore[reportArgumentType]
 
     @property
@@ -95,7 +95,7 @@ class Noise:
         return self.torque == "learn" if isinstance(self.torque, str) else False
 
     def for_priors(self, priors: Sequence[ForcePrior]) -> Noise:
-        """The noise with `torque="auto"` resolved: learned with the priors of measured robots."""
+        """Return the noise with `torque="auto"` resolved: learned with the priors of measured robots."""
         if not isinstance(self.torque, str) or self.torque != "auto":
             return self
         measured = any(isinstance(prior, JointFrictionPrior | InertialPrior) for prior in priors)
@@ -107,7 +107,7 @@ TORQUE_NOISE = f"{NOISE}.torque.log_noise_std"
 
 
 def initial_torque_noise(residual: Tensor) -> dict[str, Tensor]:
-    """Start of learning, from the root mean square of unexplained torque `(nq,)` [N m, N]."""
+    """Return the start of learning from the RMS of unexplained torque `(nq,)` [N m, N]."""
     std = (0.5 * residual).clamp(min=1e-4).log().double()
     return {
         TORQUE_NOISE: std,
@@ -117,7 +117,7 @@ def initial_torque_noise(residual: Tensor) -> dict[str, Tensor]:
 
 
 def external_std(external: Mapping[str, float] | None, robot: RobotModel) -> Tensor | None:
-    """Standard deviation of unknown forces on the joints `(nq,)`; `None` where there are none.
+    """Return the standard deviation of unknown forces on the joints `(nq,)`, or `None`.
 
     Raises:
         UnknownNameError: the robot has no such joint.
@@ -151,18 +151,18 @@ class SampleNoise:
     weight: Tensor | None = None
 
     def factors(self, at: States, z: AffineMap) -> list[Tensor]:
-        """The terms N_k `(n, d, ·)` beside σ, at the states of the samples, of the quantity measured."""
+        """Return the terms N_k `(n, d, ·)` in addition to σ, for the quantity measured."""
         # N = (G Σ_x½, B_Q Σ_τ½)
         terms = [] if self.state is None else [self.state]
         return terms if self.force is None else [*terms, z.B_Q * self.force(at).sqrt()[:, None, :]]
 
     def covariance(self, at: States, z: AffineMap) -> Tensor:
-        """Σ_y + B_Q Σ_τ B_Qᵀ + G Σ_x Gᵀ of each sample `(n, d, d)`, without its weight."""
+        """Return Σ_y + B_Q Σ_τ B_Qᵀ + G Σ_x Gᵀ of each sample `(n, d, d)`, without its weight."""
         white = torch.diag_embed(self.std.square().expand_as(z.o))
         return sum((N @ N.mT for N in self.factors(at, z)), start=white)
 
     def __getitem__(self, rows: Tensor) -> SampleNoise:
-        """The noise of some of the samples."""
+        """Return the noise of some of the samples."""
         std = self.std if self.std.ndim == 1 else self.std[rows]
         state, weight = (None if x is None else x[rows] for x in (self.state, self.weight))
         return SampleNoise(std, self.force, state, weight)
@@ -171,7 +171,7 @@ class SampleNoise:
 def state_jacobian(
     system: ConstrainedSystem, m: Measurement, force: ForceField | None = None
 ) -> Tensor | None:
-    """G = dz/d(q, q̇) `(n, d, 2 nq)` of measured accelerations or multipliers; `None` for other quantities.
+    """Return G = dz/d(q, q̇) `(n, d, 2 nq)` of accelerations or multipliers, else `None`.
 
     Args:
         force: all impressed forces; by default those of the robot file and the measured torque.
@@ -187,13 +187,13 @@ def state_jacobian(
 
 
 def learned_slopes(training: Training, system: ConstrainedSystem, force: ForceField) -> Training:
-    """Training data with G of a force field at each sample."""
+    """Return the training data with G of a force field at each sample."""
     slopes = tuple(state_jacobian(system, m, force) for m in training.measurements)
     return dataclasses.replace(training, slopes=slopes)
 
 
 def state_std_of(given: Sequence[NoiseStd] | None, robot: RobotModel) -> Tensor | None:
-    """Standard deviation of the noise of q and q̇ as one vector `(2 nq,)`; `None` for none.
+    """Return the standard deviation of q and q̇ as one vector `(2 nq,)`, or `None`.
 
     Raises:
         ModelError: these are no two standard deviations, each one number or one per joint, 0 or above.

@@ -45,18 +45,18 @@ it, and how that grows with each training standard deviation beyond; 0.08 on a r
 
 
 def kernel_parameters(tensors: Mapping[str, Tensor]) -> Tensors:
-    """The hyperparameters of the priors among learned tensors."""
+    """Return the hyperparameters of the priors among learned tensors."""
     return {key: x for key, x in tensors.items() if not key.startswith(OWN) and not key.endswith(MIXED)}
 
 
 def analytical_parameters(tensors: Mapping[str, Tensor]) -> Tensors:
-    """The analytical parameters θ_A among learned tensors, by their name in the module."""
+    """Return the analytical parameters θ_A among learned tensors, by their name in the module."""
     prefix = ANALYTICAL + "."
     return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
 
 
 def noise_key(measurement: int) -> str:
-    """Name of the learned noise of a measurement."""
+    """Return the name of the learned noise of a measurement."""
     return f"{NOISE}.{measurement}.log_noise_std"
 
 
@@ -94,18 +94,18 @@ class Problem:
     external_std: Tensor | None = None
 
     def system_at(self, tensors: Mapping[str, Tensor]) -> ConstrainedSystem:
-        """The system with the robot at the analytical parameters among the tensors."""
+        """Return the system with the robot at the analytical parameters among the tensors."""
         own = {} if self.parameters is None else analytical_parameters(tensors)
         if self.parameters is None or not own:
             return self.system
         return self.system.with_robot(torch.func.functional_call(self.parameters, own, ()))
 
     def priors_at(self, tensors: Mapping[str, Tensor]) -> tuple[ForcePrior, ...]:
-        """The priors with learned parameters of their operators."""
+        """Return the priors with learned parameters of their operators."""
         return tuple(prior.with_parameters(sub(tensors, prior.name)) for prior in self.priors)
 
     def noise_at(self, tensors: Mapping[str, Tensor], measurement: int) -> Tensor:
-        """Noise of a measurement, `(d,)` or `(n, d)`; learning scales noise that varies by sample."""
+        """Return the noise of a measurement, `(d,)` or `(n, d)`; noise by sample is scaled."""
         std = self.training.noise_std[measurement]
         learned = tensors.get(noise_key(measurement))
         if learned is None:
@@ -113,7 +113,7 @@ class Problem:
         return learned.exp() if std.ndim == 1 else std * (learned.exp() / typical(std))
 
     def coulomb(self, tensors: Mapping[str, Tensor]) -> tuple[CoulombFriction, ...]:
-        """Coulomb friction of contacts, at its initial value if it is not among the tensors."""
+        """Return Coulomb friction of contacts, at its initial value if it is not among the tensors."""
         return coulomb_of(self.priors, tensors, self.system.robot.mass) if self.has_coulomb else ()
 
     @property
@@ -122,7 +122,7 @@ class Problem:
         return any(prior.coupled for prior in self.priors)
 
     def with_coulomb_errors(self, tensors: Mapping[str, Tensor]) -> tuple[Problem, Tensors]:
-        """The problem with the error of learned Coulomb friction as a further force, and its tensors.
+        """Return the problem with the error of learned Coulomb friction as a further force, and its tensors.
 
         Used for conditioning, not for learning.
         """
@@ -139,7 +139,7 @@ class Problem:
         ), {**tensors, **{f"{prior.name}.log_scale": one[0] for prior in priors}}
 
     def force_noise(self, tensors: Mapping[str, Tensor]) -> ForceNoise | None:
-        """Variance of the white noise on the joint force, or `None` for none."""
+        """Return the variance of the white noise on the joint force, or `None` for none."""
         learned = tensors.get(TORQUE_NOISE)
         std = self.torque_std if learned is None else learned.exp()
         if std is None and self.external_std is None:
@@ -148,7 +148,7 @@ class Problem:
         return lambda at: white + hidden_variance(tensors, at, self.external_std)
 
     def state_factor(self, system: ConstrainedSystem, measurement: int) -> Tensor | None:
-        """G Σ_x½ `(n, d, 2 nq)` of a measurement, or `None` without noise of the state."""
+        """Return G Σ_x½ `(n, d, 2 nq)` of a measurement, or `None` without noise of the state."""
         if self.state_std is None:
             return None
         m, slopes = self.training.measurements[measurement], self.training.slopes
@@ -156,7 +156,7 @@ class Problem:
         return None if G is None else G * self.state_std
 
     def process_at(self, tensors: Mapping[str, Tensor]) -> ForceProcess:
-        """The forces a priori, with learned operators and Coulomb friction."""
+        """Return the forces a priori, with learned operators and Coulomb friction."""
         names = [prior.name for prior in self.priors]
         pinned = {names.index(name): value for name, value in self.pinned.items()}
         return ForceProcess(
@@ -166,7 +166,7 @@ class Problem:
     def sample_noise(
         self, tensors: Mapping[str, Tensor], system: ConstrainedSystem, measurement: int
     ) -> SampleNoise:
-        """Noise of the samples of a measurement."""
+        """Return the noise of the samples of a measurement."""
         weights = self.training.weights
         return SampleNoise(
             self.noise_at(tensors, measurement),
@@ -176,7 +176,7 @@ class Problem:
         )
 
     def rows(self, tensors: Mapping[str, Tensor]) -> WhitenedRows:
-        """Whitened rows at the noise and analytical parameters among the tensors."""
+        """Return the whitened rows at the noise and analytical parameters among the tensors."""
         system, process = self.system_at(tensors), self.process_at(tensors)
         return combine(
             [
@@ -187,13 +187,12 @@ class Problem:
 
     @cached_property
     def fixed_rows(self) -> WhitenedRows:
-        """The rows at the given noise and robot."""
+        """Return the rows at the given noise and robot."""
         return self.rows({})
 
     @torch.no_grad()
     def torque_residual(self) -> Tensor:
-        """Root mean square of M times the residual of accelerations, and of that of joint forces `(nq,)`
-        [N m, N]."""
+        """Return the RMS of M times acceleration residuals and of force residuals `(nq,)` [N m, N]."""
         squares = [torch.zeros_like(self.system.robot.mass)[None]]
         for m in self.training.measurements:
             at = m.at(self.system)
@@ -207,7 +206,7 @@ class Problem:
 
     @torch.no_grad()
     def hidden_torque(self) -> Tensor:
-        """Standard deviation of torques with hardly any effect on accelerations, 0 for other joints `(nq,)`.
+        """Return σ of torques that hardly affect accelerations, 0 for other joints `(nq,)`.
 
         In contact, a force along the constraint changes no acceleration. A joint that acts along the
         constraint has P_ii near zero, and neither its noise nor its friction can be distinguished from those
@@ -239,26 +238,26 @@ class Problem:
 
     @torch.no_grad()
     def typical_load(self) -> Tensor:
-        """Root mean square of the torques that act on each joint (motor, weight, bias) `(nq,)` [N m, N]."""
+        """Return the RMS of the torques on each joint (motor, weight, bias) `(nq,)` [N m, N]."""
         states = [m.at(self.system) for m in self.training.measurements]
         squares = [at.tau**2 + at.eom.Q_G**2 + at.eom.Q_C**2 for at in states]
         return torch.cat(squares).mean(0).sqrt()
 
     def negative_log_likelihood(self, params: Tensors, rows: WhitenedRows) -> Tensor:
-        """Negative log likelihood of the rows, or for sparse inference of the weights of features."""
+        """Return the negative log likelihood of the rows, if sparse of the weights of features."""
         exact = self.inducing is None or not is_finite(self.priors)
         of = negative_log_likelihood if exact else negative_log_likelihood_of_weights
         return of(self.priors, params, rows.blocks) + rows.constant
 
     def rows_for(self, tensors: Tensors, held: Tensors) -> WhitenedRows:
-        """The rows at learned and fixed tensors, cached if none of them changes the rows."""
+        """Return the rows at learned and fixed tensors, cached if none of them changes the rows."""
         keys = [*tensors, *held]
         own = any(key.startswith(OWN) or key.endswith(MIXED) for key in keys)
         return self.rows({**held, **tensors}) if own else self.fixed_rows
 
 
 def typical(std: Tensor) -> Tensor:
-    """One standard deviation per component, `(d,)`."""
+    """Return one standard deviation per component, `(d,)`."""
     return std if std.ndim == 1 else std.square().mean(0).sqrt()
 
 
@@ -284,7 +283,7 @@ class Totals:
 
     @classmethod
     def zero(cls, problem: Problem, basis: LatentBasis) -> Totals:
-        """Totals of no samples."""
+        """Return the totals of no samples."""
         like = next(iter(basis.params.values()))
         return cls(Sums.zero(basis, like), like.new_zeros(()), like.new_zeros(()), 0)
 
@@ -295,7 +294,7 @@ class Totals:
 
 
 def basis_of(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> LatentBasis:
-    """The basis functions of a problem with inducing points.
+    """Return the basis functions of a problem with inducing points.
 
     Raises:
         ModelError: inference is exact.
@@ -315,7 +314,7 @@ def total_over(
     begin: Totals | None = None,
     after: Callable[[Totals], None] = lambda _: None,
 ) -> Totals:
-    """Sum over pieces of a log, in memory that does not depend on their number.
+    """Return the sum over pieces of a log, in memory that does not depend on their number.
 
     Args:
         problem: robot, priors and noise; its own training data are not read.
@@ -340,7 +339,7 @@ def total_over(
 def posterior_of(
     problem: Problem, hyperparameters: Mapping[str, Tensor], basis: LatentBasis, total: Totals
 ) -> ForcePosterior:
-    """Forces conditioned on the samples of totals.
+    """Return the forces conditioned on the samples of totals.
 
     Raises:
         NumericalError: the sums are not finite, or the noise is negligible beside the prior.
@@ -371,12 +370,12 @@ def require_double(system: ConstrainedSystem) -> None:
 
 
 def is_finite(priors: Sequence[ForcePrior]) -> bool:
-    """Whether all priors are a finite number of features, so that sparse inference is exact."""
+    """Return whether all priors are a finite number of features, so that sparse inference is exact."""
     return all(prior.kernel.is_finite for prior in priors)
 
 
 def is_sparse(inference: str, priors: Sequence[ForcePrior], samples: int) -> bool:
-    """Whether inference is sparse: on request, for finite priors, and beyond `EXACT_SAMPLES`.
+    """Return whether inference is sparse: on request, for finite priors, and beyond `EXACT_SAMPLES`.
 
     Raises:
         ModelError: sparse inference with a force that is a function of time.
@@ -395,7 +394,7 @@ def is_sparse(inference: str, priors: Sequence[ForcePrior], samples: int) -> boo
 
 @torch.no_grad()
 def with_inducing(problem: Problem, hyperparameters: Mapping[str, Tensor], limit: int = LIMIT) -> Problem:
-    """The problem with inducing points chosen from its data by conditional variance.
+    """Return the problem with inducing points, chosen from its data by conditional variance.
 
     Args:
         problem: with the samples to condition on.
@@ -415,14 +414,14 @@ def with_inducing(problem: Problem, hyperparameters: Mapping[str, Tensor], limit
 
 
 def without_inducing(problem: Problem) -> Problem:
-    """The problem for priors that are finite features, which need no inducing points."""
+    """Return the problem for priors that are finite features, which need no inducing points."""
     block = dataclasses.replace(problem, training=problem.training.evenly(1)).fixed_rows.blocks[0]
     empty = tuple({name: x[:0] for name, x in features.items()} for features in block.features)
     return dataclasses.replace(problem, inducing=empty)
 
 
 def force_posterior(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> ForcePosterior:
-    """Forces conditioned on the data of a problem.
+    """Return the forces conditioned on the data of a problem.
 
     Raises:
         NumericalError: the covariance of the data is not positive definite.
@@ -434,7 +433,7 @@ def force_posterior(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> 
 def forces_and_constant(
     problem: Problem, hyperparameters: Mapping[str, Tensor]
 ) -> tuple[ForcePosterior, Tensor]:
-    """Forces conditioned on the data of a problem, and the part of the likelihood independent of them.
+    """Return the forces given the data of a problem, and the likelihood's part without them.
 
     Raises:
         ModelError: exact inference does not fit into memory.
@@ -452,7 +451,7 @@ def forces_and_constant(
 
 
 def lost_by_inducing(posterior: ForcePosterior) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """The kind of inference of a posterior, and the information lost by inducing points.
+    """Return the kind of inference of a posterior, and the information lost by inducing points.
 
     Returns:
         The fields of `FitResult`, and a warning if the points miss much of the information in the data.

@@ -124,7 +124,7 @@ def import_log(
 
 
 def system_of(scene: Scene | ConstrainedSystem | RobotModel | str | Path) -> ConstrainedSystem:
-    """The robot with its contacts, from any accepted form."""
+    """Return the robot with its contacts, from any accepted form."""
     if isinstance(scene, ConstrainedSystem):
         return scene
     if isinstance(scene, RobotModel):
@@ -135,7 +135,7 @@ def system_of(scene: Scene | ConstrainedSystem | RobotModel | str | Path) -> Con
 def _contacts(
     signals: Signals, system: ConstrainedSystem, mapping: Mapping, report: ImportReport, displaced: bool
 ) -> list[Evidence]:
-    """Find the state of each contact; λ needs accelerations, which are first computed across the switches."""
+    """Find the state of each contact; for λ, compute accelerations across the switches first."""
     if not any(section.source == "multiplier" for section in mapping.sections.contact.values()):
         return detect(signals, system, mapping, report, displaced)
     copies = {name: value.copy() for name, value in signals.vectors.items()}
@@ -153,7 +153,7 @@ def _contacts(
 def _dataset(
     signals: Signals, std: Array | None, mapping: Mapping, system: ConstrainedSystem, report: ImportReport
 ) -> Dataset:
-    """The data set of finished signals."""
+    """Return the data set of finished signals."""
     robot = system.robot
     settings = mapping.sections.derivatives
     dt = usual_step(signals.t)

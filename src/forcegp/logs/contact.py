@@ -35,7 +35,7 @@ CHUNK = 1 << 12
 
 
 def _rowwise(signals: Signals, names: Sequence[str], function: Callable[..., torch.Tensor]) -> Array:
-    """A function of some vectors of the log, block by block of its rows."""
+    """Return a function of some vectors of the log, block by block of its rows."""
     blocks = []
     for start in range(0, len(signals), CHUNK):
         rows = slice(start, start + CHUNK)
@@ -51,7 +51,7 @@ def _tip(system: ConstrainedSystem, contact: SurfaceContact, q: torch.Tensor) ->
 def _wrench(
     robot: RobotModel, mapping: Mapping, q: torch.Tensor, reading: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Force, moment about the sensor and its position `(n, 3)` in the world, less the tool [N, N m]."""
+    """Return force, moment about the sensor, and its position `(n, 3)` in the world, without the tool."""
     section = mapping.sections.wrench
     assert section is not None
     if section.frame == GROUND:
@@ -72,7 +72,7 @@ def _wrench(
 
 
 def per_contact(signals: Signals, system: ConstrainedSystem, mapping: Mapping) -> dict[str, dict[str, Array]]:
-    """`F_sensor` and `M_sensor` at each contact with a surface, or the `multiplier` of a load cell."""
+    """Return `F_sensor` and `M_sensor` at each contact with a surface, or the `multiplier` of a load cell."""
     touching = [contact for contact in system.contacts if isinstance(contact, SurfaceContact)]
     section = mapping.sections.wrench
     if section is not None and len(section.force) == 1:
@@ -91,9 +91,7 @@ def per_contact(signals: Signals, system: ConstrainedSystem, mapping: Mapping) -
 
 
 def multiplier(signals: Signals, system: ConstrainedSystem, contact: SurfaceContact) -> Array:
-    """λ = (A M⁻¹Aᵀ)⁺ A (q̈ − M⁻¹Q) `(n,)` at one contact according to the robot file [N], about zero in free
-    motion.
-    """
+    """Return λ = (A M⁻¹Aᵀ)⁺ A (q̈ − M⁻¹Q) `(n,)` at a contact [N], about zero in free motion."""
     alone = ConstrainedSystem(system.robot, [contact])
 
     def value(q: torch.Tensor, qd: torch.Tensor, qdd: torch.Tensor, tau: torch.Tensor) -> torch.Tensor:
@@ -107,7 +105,7 @@ def multiplier(signals: Signals, system: ConstrainedSystem, contact: SurfaceCont
 def _evidence(
     signals: Signals, system: ConstrainedSystem, mapping: Mapping, contact: SurfaceContact, source: str
 ) -> Array:
-    """Signal that determines a contact's state, `(n,)`: c(q) [m], the sensor's n·F [N], or λ [N]."""
+    """Return the signal that decides on a contact, `(n,)`: c(q) [m], the sensor's n·F [N], or λ [N]."""
 
     def normal_force(q: torch.Tensor, reading: torch.Tensor) -> torch.Tensor:
         force = _wrench(system.robot, mapping, q, reading)[0]
@@ -158,7 +156,7 @@ class Evidence:
     merged: int
 
     def sentence(self) -> str:
-        """The evidence in one sentence."""
+        """Return the evidence as one sentence."""
         unit, scale = ("mm", 1e3) if self.source == "distance" else ("N", 1.0)
         listing = ""
         for state in ("closed", "open"):
@@ -225,7 +223,7 @@ def _misplaced(
     displaced: bool,
     report: ImportReport,
 ) -> float:
-    """Distance from the scene's surface at which the tip slides [m], 0 where it touches; else `DataError`."""
+    """Return the distance [m] from the surface at which the tip slides, 0 if it touches, or raise."""
     if len(c) < 2 or (np.abs(c) <= TOUCHING).mean() > TOUCHED:
         return 0.0
     p, name = _rowwise(signals, ("q",), lambda q: _tip(system, contact, q)), contact.name
@@ -251,7 +249,7 @@ def _misplaced(
 
 
 def exchanged_joints(system: ConstrainedSystem, contact: SurfaceContact, q: Array) -> tuple[int, ...]:
-    """The two joints that move the tip onto its surface in some of the rows when exchanged, if any."""
+    """Return the two joints that move the tip onto its surface in some of the rows when exchanged, if any."""
     q = q[:: max(1, len(q) // TRIED_ROWS)]
     for pair in combinations(range(q.shape[1]) if len(q) else (), 2):
         order = np.arange(q.shape[1])
@@ -281,7 +279,7 @@ def _detect(
 
 
 def touching(distance: Array) -> float:
-    """Distance up to which a contact is closed [m], at most `TOUCHING`.
+    """Return the distance up to which a contact is closed [m], at most `TOUCHING`.
 
     Most rows within this distance belong to the closed contact: the threshold, their median plus
     `DISTANCE_STD` deviations, separates them from approach and departure.
@@ -297,7 +295,7 @@ def touching(distance: Array) -> float:
 
 
 def force_levels(values: Array, name: str, section: ContactStateSection) -> tuple[float, float]:
-    """Force threshold of a closed contact, and the lower force to which its interval extends [N].
+    """Return the force that closes a contact, and the lower force to which its interval extends [N].
 
     The first separates the forces into the two groups with the least variance (Otsu 1979); the second lies
     `RELEASE_STD` deviations above the median of the open group. `DataError` if the groups are not distinct.
@@ -326,7 +324,7 @@ def force_levels(values: Array, name: str, section: ContactStateSection) -> tupl
 
 
 def hysteresis(values: Array, high: float, low: float, segment: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Stretches above `low` that reach `high` somewhere.
+    """Return the stretches above `low` that reach `high`.
 
     >>> hysteresis(np.array([0.0, 2, 5, 2, 0, 2, 0]), 4.0, 1.0, np.zeros(7, dtype=np.int64)).astype(int)
     array([0, 1, 1, 1, 0, 0, 0])
@@ -339,7 +337,7 @@ def hysteresis(values: Array, high: float, low: float, segment: NDArray[np.int64
 
 
 def _merge_short(closed: NDArray[np.bool_], signals: Signals, shortest: float) -> int:
-    """Give intervals that are shorter than `shortest` [s], between two of the other state, that state."""
+    """Merge intervals shorter than `shortest` [s] into the state on both sides."""
     count = 0
     for trajectory in signals.runs():
         for rows in runs(closed[trajectory])[1:-1]:
@@ -351,7 +349,7 @@ def _merge_short(closed: NDArray[np.bool_], signals: Signals, shortest: float) -
 
 
 def level_and_spread(values: Array) -> tuple[float, float]:
-    """Median, and the standard deviation of a normal distribution with the same median absolute deviation."""
+    """Return the median, and the median absolute deviation scaled to a standard deviation."""
     if not len(values):
         return float("nan"), float("nan")
     middle = float(np.median(values))

@@ -57,7 +57,7 @@ class _Gathering:
         self.reference = table.stream_of(position[0], mapping.sections.position.stream)
 
     def run(self) -> Signals:
-        """The quantities, those of the reference stream first."""
+        """Return the quantities, those of the reference stream first."""
         quantities = [name for name in SYMBOLS if self.mapping.quantity(name) is not None]
         vectors = {SYMBOLS[name]: self._vector(name) for name in quantities}
         if self.mapping.sections.wrench is not None:
@@ -78,7 +78,7 @@ class _Gathering:
         return self.table.stream_of(column, stream.name).columns[column]
 
     def _vector(self, name: str) -> tuple[Stream, Array]:
-        """A joint vector in SI units on the joint side, 0 for joints that the log does not have."""
+        """Return a joint vector in SI units on the joint side, 0 for joints that the log does not have."""
         joints = self.mapping.measured(name, self.joints)
 
         def numbers(key: str) -> Array:
@@ -106,7 +106,7 @@ class _Gathering:
         return stream, result
 
     def _wrench(self) -> tuple[Stream, Array]:
-        """Force and moment `(n, 6)` in SI units, offsets taken off; zero where the sensor measures none."""
+        """Return force and moment `(n, 6)` in SI units without offsets; zero if not measured."""
         section = self.mapping.sections.wrench
         assert section is not None
         stream = self.table.stream_of(section.force[0], section.stream)
@@ -137,7 +137,7 @@ class _Gathering:
         return flags
 
     def _stamps(self, stream: Stream) -> Array:
-        """Time stamps of a stream [s]."""
+        """Return the time stamps of a stream [s]."""
         holder = stream
         if self.time.column not in stream.columns:
             if len(self.table.streams) > 1 and stream is not self.reference:
@@ -149,7 +149,7 @@ class _Gathering:
         return holder.columns[self.time.column] * units.TIME[self.time.unit]
 
     def _reference(self, vectors: dict[str, Array]) -> Signals:
-        """The stream of the positions: complete rows, cropped, cut into trajectories."""
+        """Return the stream of the positions: complete rows, cropped, cut into trajectories."""
         t = self._stamps(self.reference)
         self.report.rows_read = len(t)
         segment = np.zeros(len(t), dtype=np.int64)

@@ -42,7 +42,7 @@ TRAJECTORY, LEAST_FORCE = 10, 1.0
 
 
 def guess_mapping(path: str | Path, system: ConstrainedSystem, progress: Progress | None = None) -> Draft:
-    """Propose a mapping for a log; `MappingError` if time, positions or torques are not recognised."""
+    """Propose a mapping for a log, or raise `MappingError` without time, positions or torques."""
     table = read(path, rows=ROWS, progress=progress)
     draft = Draft(str(path))
     with foreign(str(path), "a log that can be imported"):
@@ -64,7 +64,7 @@ def guess_mapping(path: str | Path, system: ConstrainedSystem, progress: Progres
 
 
 def _try(path: str | Path, draft: Draft, system: ConstrainedSystem, possible: list[str]) -> None:
-    """Read the log by the draft, and settle what its values can: units, and the sign of the torque."""
+    """Read the log with the draft, and find units and the sign of the torque from its values."""
     for quantity, family in draft.families.items():
         family.unit = family.unit or units.SI[quantity]
     fits = {}
@@ -87,7 +87,7 @@ def _try(path: str | Path, draft: Draft, system: ConstrainedSystem, possible: li
 
 
 def _window(draft: Draft, trial: Signals) -> None:
-    """A window as wide as the noise of positions and velocities in the longest trajectory asks for."""
+    """Return a filter window that suits the noise of positions and velocities in the longest trajectory."""
     rows = max(runs(trial.segment), key=lambda rows: rows.stop - rows.start)
     names = ["q", *(["qd"] if "velocity" in draft.families else [])]
     asked = cross_validated_window(
@@ -102,7 +102,7 @@ def _window(draft: Draft, trial: Signals) -> None:
 
 
 def _signals(path: str | Path, draft: Draft, system: ConstrainedSystem, without: str = "") -> Signals:
-    """The log by the draft, `without` one quantity, with accelerations; incomplete rows left out."""
+    """Return the log by the draft, `without` one quantity, with accelerations; incomplete rows left out."""
     families = {name: family for name, family in draft.families.items() if name != without}
     further = {name: table for name, table in draft.further.items() if not name.startswith("contact")}
     toml = replace(draft, time=draft.time | {"missing": "drop"}, families=families, further=further).toml()
@@ -115,7 +115,7 @@ def _signals(path: str | Path, draft: Draft, system: ConstrainedSystem, without:
 
 
 def _velocity_unit(draft: Draft, trial: Signals) -> None:
-    """The slope of the logged velocity over the derivative of the position names its unit and sign."""
+    """Find unit and sign of the velocity from its slope over the derivative of the position."""
     family = draft.families["velocity"]
     q, qd = trial.vectors["q"], trial.vectors["qd"]
     inner = np.flatnonzero(trial.segment[2:] == trial.segment[:-2]) + 1
@@ -142,7 +142,7 @@ def _velocity_unit(draft: Draft, trial: Signals) -> None:
 
 
 def _signs(slopes: Array, clear: np.ndarray, joints: tuple[str, ...]) -> float | dict[str, float]:
-    """One sign for all joints, or one for each where they differ."""
+    """Return one sign for all joints, or one for each where they differ."""
     negative = slopes[clear] < 0.0
     if negative.all() and clear.any():
         return -1.0
@@ -152,7 +152,7 @@ def _signs(slopes: Array, clear: np.ndarray, joints: tuple[str, ...]) -> float |
 
 
 def _torque(draft: Draft, trial: Signals, system: ConstrainedSystem) -> None:
-    """Compare the logged torque with that of the rigid body, beside friction and a constant per joint."""
+    """Compare the logged torque with that of the rigid body, friction and a constant per joint."""
     family = draft.families["torque"]
     slopes, correlation = torque_slopes(trial, system)
     clear = np.abs(correlation) > 0.5
@@ -181,7 +181,7 @@ def _torque(draft: Draft, trial: Signals, system: ConstrainedSystem) -> None:
 
 
 def torque_slopes(trial: Signals, system: ConstrainedSystem) -> tuple[Array, Array]:
-    """Slope and partial correlation of the logged torque over the inverse dynamics, `(nq,)` each.
+    """Return the slope and partial correlation of the logged torque over the inverse dynamics, `(nq,)` each.
 
     τ_log = k τ_rigid + v q̇ + f sign(q̇) + Aᵀλ + const by least squares, joint by joint, with a constant λ of
     each contact; the correlation is that of the residuals of both sides after the other terms.
@@ -207,7 +207,7 @@ def torque_slopes(trial: Signals, system: ConstrainedSystem) -> tuple[Array, Arr
 def propose_contacts(
     log: LogTable, draft: Draft, system: ConstrainedSystem, signals: Callable[[], Signals]
 ) -> None:
-    """Propose in a draft a source for the state of each contact of the scene; `signals` reads the log."""
+    """Propose in a draft a source for the state of each contact of the scene, from `signals`."""
     named = [(c, x) for s in log.streams for c, x in s.columns.items() if "contact" in c.lower()]
     flags = [name for name, x in named if np.isin(x, (0.0, 1.0)).all()]
     in_order = flags if len(system.contacts) in (1, len(flags)) else []
@@ -228,7 +228,7 @@ def propose_contacts(
 
 
 def _state(values: Array, name: str) -> tuple[str, str]:
-    """Whether λ of the rigid body shows two states, or which one it shows."""
+    """Return whether λ of the rigid body shows two states, or which one it shows."""
     middle, spread = level_and_spread(values)
     try:
         high, low = force_levels(values, name, ContactStateSection(source="multiplier"))

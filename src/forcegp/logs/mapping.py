@@ -48,7 +48,7 @@ class Family:
     by_joint: dict[str, str] = field(default_factory=dict)
 
     def table(self) -> dict[str, Any]:
-        """Keys of the mapping."""
+        """Return the keys of the mapping."""
         columns = {"columns": self.by_joint} if self.by_joint else {"column": self.pattern}
         sign = None if self.sign == 1.0 else self.sign
         current = CURRENT if self.unit in ("A", "mA") else {}
@@ -71,13 +71,13 @@ class Draft:
     window: int = 11
 
     def say(self, table: str, sentence: str, doubt: bool = False) -> None:
-        """Comment on a table; a doubt is also listed at the top."""
+        """Comment on a table; list a doubt at the top as well."""
         self.comments.setdefault(table, []).append((CHECK[2:] if doubt else "") + sentence)
         if doubt:
             self.doubts.append(sentence)
 
     def toml(self) -> str:
-        """The mapping file."""
+        """Return the mapping file."""
         lines = [f"# Mapping of {_plain(self.source)}, proposed from its headings and values."]
         lines += ["# Check it, above all the lines marked CHECK, and import with --mapping.", ""]
         quantities = {name: family.table() for name, family in self.families.items()}
@@ -95,12 +95,12 @@ class Draft:
 
 
 def _plain(text: str) -> str:
-    """One line without control characters, as TOML's comments demand."""
+    """Return one line without control characters, as TOML's comments demand."""
     return "".join(c if c.isprintable() else " " for c in text)
 
 
 def quoted(name: str) -> str:
-    """A name as a key of TOML."""
+    """Return a name as a key of TOML."""
     return name if name.replace("_", "").replace("-", "").isalnum() and name.isascii() else json.dumps(name)
 
 
@@ -227,17 +227,17 @@ class Mapping:
     doubts: tuple[str, ...] = ()
 
     def quantity(self, name: str) -> QuantitySection | None:
-        """The table of a joint vector: `position`, `velocity`, `acceleration` or `torque`."""
+        """Return the table of a joint vector: `position`, `velocity`, `acceleration` or `torque`."""
         return getattr(self.sections, name)
 
     def measured(self, name: str, joints: Sequence[str]) -> list[str]:
-        """The joints with a logged quantity: all except those with `unmeasured` torque."""
+        """Return the joints with a logged quantity: all except those with `unmeasured` torque."""
         unmeasured = self.sections.torque.unmeasured if name == "torque" else ()
         self._check_joints((name, "unmeasured"), unmeasured, joints)
         return [joint for joint in joints if joint not in unmeasured]
 
     def columns_of(self, name: str, joints: Sequence[str]) -> list[str]:
-        """The log's column of a quantity for each joint of the robot that has it."""
+        """Return the log's column of a quantity for each joint of the robot that has it."""
         section = self.quantity(name)
         assert section is not None
         self._check_joints(("joints",), self.sections.joints, joints)
@@ -258,7 +258,7 @@ class Mapping:
         return columns
 
     def per_joint(self, name: str, key: str, joints: Sequence[str]) -> NDArray[np.float64]:
-        """The numbers `(nq,)` of a key with one value for all joints or one per joint."""
+        """Return the numbers `(nq,)` of a key with one value for all joints or one per joint."""
         value: PerJoint = getattr(self.quantity(name), key)
         if not isinstance(value, dict):
             return np.full(len(joints), float(value))
@@ -271,7 +271,7 @@ class Mapping:
     def error(
         self, key: Key, message: str, expected: object = None, got: object = None, hint: str | None = None
     ) -> MappingError:
-        """An error at a key of the file."""
+        """Return an error at a key of the file."""
         place = self.document.place(key)
         return MappingError(f"{place}: {message}", expected=expected, got=got, hint=hint)
 
@@ -290,7 +290,7 @@ def load_mapping(source: str | Path) -> Mapping:
     """Read a mapping file by its path, or a bundled one by name.
 
     Raises:
-        MappingError: no such mapping, or it is not valid; the message names file, line and key.
+        MappingError: the mapping does not exist or is invalid; the message gives file, line and key.
 
     >>> load_mapping("ros_joint_states").sections.torque.unit
     'Nm'
@@ -307,7 +307,7 @@ def load_mapping(source: str | Path) -> Mapping:
 
 
 def parse_mapping(content: bytes, source: str) -> Mapping:
-    """A mapping from the bytes of its file; a `MappingError` names file, line and key."""
+    """Return a mapping from the bytes of its file; a `MappingError` gives file, line and key."""
     document = Document(content, source, MappingError)
     lines = content.decode().splitlines()
     doubts = tuple(line[len(CHECK) :] for line in lines if line.startswith(CHECK))
@@ -317,7 +317,7 @@ def parse_mapping(content: bytes, source: str) -> Mapping:
 
 
 def _check(mapping: Mapping) -> None:
-    """Checks across tables: units, and keys that need each other."""
+    """Check units, and keys that need each other."""
     sections = mapping.sections
     for name in ("position", "velocity", "acceleration", "torque"):
         section = mapping.quantity(name)
@@ -374,7 +374,7 @@ def _check_quantity(mapping: Mapping, name: str, section: QuantitySection) -> No
 
 
 def default_mapping(path: str | Path, system: ConstrainedSystem) -> Mapping:
-    """The mapping of a log with unambiguous names; otherwise `MappingError`, with a hint."""
+    """Return the mapping of a log with unambiguous names, or raise `MappingError` with a hint."""
     table, robot = read(path, rows=1), system.robot
     names, joints = set(table.names), robot.joint_names
     logged = {n: s for n, s in SYMBOLS.items() if names >= {f"{s}.{joint}" for joint in joints}}

@@ -436,7 +436,7 @@ class StructuredFit(FittedModel):
             q, qd, tau: `(*batch, nq)` states.
             quantity: the measured quantity; torque noise affects every quantity, and sensor noise is known
                 for quantities used in training.
-            active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
+            active: `(*batch, n_contacts)` bool, closed contacts; by default all.
             sensor: whether to include sensor noise.
         """
 

@@ -25,7 +25,7 @@ OPERATORS = {
 
 
 def casadi_function(model: ExportedModel, name: str = "forcegp") -> Any:
-    """A `casadi.Function` from (q, q̇, τ, closed) to the mean of each of `DIFFERENTIATED`.
+    """Return a `casadi.Function` from (q, q̇, τ, closed) to the mean of each of `DIFFERENTIATED`.
 
     `closed` is 1 for each closed contact, and 0 for an open one. The closed contacts must
     be independent of each other.
@@ -47,7 +47,7 @@ def casadi_function(model: ExportedModel, name: str = "forcegp") -> Any:
 
 
 def _vector(ca: Any, graph: Graph, given: Mapping[str, Any], outputs: Iterable[Scalar]) -> Any:
-    """Scalars as one CasADi vector."""
+    """Return the scalars as one CasADi vector."""
     outputs, values = list(outputs), dict[int, Any]()
     functions = {"step": lambda x: x > 0.0, "exp": ca.exp, "tanh": ca.tanh, "sqrt": ca.sqrt} | OPERATORS
     for position in graph.live(outputs):

@@ -32,7 +32,7 @@ int forcegp_size(unsigned quantities);
 /* Posterior mean and covariance of quantities at one state.
  *
  * q, qd, tau   FORCEGP_JOINTS positions, velocities and motor torques
- * closed       FORCEGP_CONTACTS flags, which contacts are closed; NULL for all
+ * closed       FORCEGP_CONTACTS flags of the closed contacts; NULL for all
  * quantities   such as FORCEGP_QDD | FORCEGP_MULTIPLIER
  * noise        whether the covariance is that of a measurement, noise of torque and sensor included
  * mean         d numbers

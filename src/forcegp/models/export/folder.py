@@ -93,7 +93,7 @@ def write_export(
 
 
 def loss_of(model: ExportedModel, fit: Predictor, training: Training) -> tuple[float, float]:
-    """Growth of σ of q̈ and λ by a reduced covariance at training states, or random ones if none are kept."""
+    """Return how much σ of q̈ and λ grows with a reduced covariance, at training or random states."""
     if model.functions is None:
         return 0.0, 0.0
     states = random_states(model, LOSS_STATES)
@@ -111,7 +111,7 @@ def loss_of(model: ExportedModel, fit: Predictor, training: Training) -> tuple[f
 
 
 def random_states(model: ExportedModel, count: int) -> tuple[Tensor, ...]:
-    """Random q, q̇, τ and closed contacts within the joint limits and, if it is known, the trained region."""
+    """Return random q, q̇, τ and closed contacts within joint limits and the trained region, if known."""
     robot, random = model.system.robot, torch.Generator().manual_seed(0)
     one = torch.ones(robot.nq, dtype=torch.float64)
     limits = [
@@ -127,7 +127,7 @@ def random_states(model: ExportedModel, count: int) -> tuple[Tensor, ...]:
 
 
 def _reference(model: ExportedModel, fit: Predictor, name: str) -> str:
-    """C tables of states, and of mean and covariance of all quantities and of Jacobians of Python there."""
+    """Return C tables of states, and Python's mean, covariance and Jacobians at these states."""
     q, qd, tau, active = random_states(model, STATES)
     read = fit.predict(q, qd, tau, list(READ[:-1]), active=active)  # pyright: ignore[reportArgumentType]
     assert read.covariance is not None

@@ -68,7 +68,7 @@ class CompiledFit(Predictor):
         self._known: dict[str | tuple[str, ...], _Rows] = {}
 
     def save(self, path: str | Path) -> None:
-        """Not available: save the fit itself.
+        """Raise an error: save the fit itself.
 
         Raises:
             ModelError: always.
@@ -76,7 +76,7 @@ class CompiledFit(Predictor):
         raise ModelError("a compiled fit cannot be saved", hint="save the fit, or call fit.export(path)")
 
     def force_field(self) -> ForceField:
-        """Posterior mean of Q̄ = Q + Q_z, `(n, nq)` at states, in PyTorch."""
+        """Return the posterior mean of Q̄ = Q + Q_z, `(n, nq)` at states, in PyTorch."""
         if self._learned is not None:
             raise ModelError("what was learned in C has no force field in PyTorch", hint="update the fit")
         return self.model.posterior
@@ -98,13 +98,13 @@ class CompiledFit(Predictor):
             q, qd, tau: `(*batch, nq)` states.
             measured: `(*batch, d)` values at these states.
             quantity: the measured quantity.
-            active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
-            noise_std: of the values `(d,)`; by default that of the fit.
+            active: `(*batch, n_contacts)` bool, closed contacts; by default all.
+            noise_std: standard deviation of the values `(d,)`; by default that of the fit.
 
         Raises:
             ModelError: the model cannot learn in C, or the noise of the quantity is unknown.
             ShapeError: an argument does not fit the system, or is not finite.
-            UnknownNameError: no such quantity.
+            UnknownNameError: the quantity does not exist.
         """
         read = self._read(quantity)
         flat = flat_states(self.system, q, qd, tau, active)
@@ -135,7 +135,7 @@ class CompiledFit(Predictor):
 
         Raises:
             ModelError: the model cannot learn in C, or the factor is out of range.
-            UnknownNameError: no such prior.
+            UnknownNameError: the prior does not exist.
         """
         newer, names = self._copy(), [prior.name for prior in self.model.posterior.priors]
         for name in priors or ():
@@ -150,7 +150,7 @@ class CompiledFit(Predictor):
         return newer
 
     def _copy(self) -> CompiledFit:
-        """The fit with its own copy of what it has learned."""
+        """Return the fit with its own copy of what it has learned."""
         newer, learned = copy.copy(self), self._begun if self._learned is None else self._learned
         newer._learned = learned.clone()
         newer._memory = newer._learned.data_ptr()
@@ -158,7 +158,7 @@ class CompiledFit(Predictor):
 
     @cached_property
     def _begun(self) -> Tensor:
-        """The learned state of the fit, as the numbers of a `forcegp_learned`."""
+        """Return the learned state of the fit as the numbers of a `forcegp_learned`."""
         if not self.model.online:
             raise ModelError(
                 "this fit cannot learn online in C",
@@ -183,7 +183,7 @@ class CompiledFit(Predictor):
         system: ConstrainedSystem | None = None,
         noise: bool = False,
     ) -> Prediction:
-        """Posterior mean and covariance of a quantity, as in `StructuredFit.predict`.
+        """Return the posterior mean and covariance of a quantity, as in `StructuredFit.predict`.
 
         Arguments and errors are those of that method. `quantity` may also be `"joint_friction"`, the friction
         of the joints, including that of the robot file [N m, N].
@@ -216,15 +216,15 @@ class CompiledFit(Predictor):
         *,
         active: Tensor | None = None,
     ) -> MeanJacobian:
-        """Posterior mean of quantities and its Jacobian with respect to q, q̇ and τ.
+        """Return the posterior mean of quantities and its Jacobian with respect to q, q̇ and τ.
 
         Args:
             q, qd, tau: `(*batch, nq)` states.
             quantity: `"qdd"`, `"multiplier"`, `"contact_force"` or `"joint_friction"`, or several of them.
-            active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
+            active: `(*batch, n_contacts)` bool, closed contacts; by default all.
 
         Raises:
-            UnknownNameError: no such quantity.
+            UnknownNameError: the quantity does not exist.
             ModelError: a contact that jams by friction, or a fit updated in C.
             NumericalError: closed contacts are not independent.
         """
@@ -255,7 +255,7 @@ class CompiledFit(Predictor):
         active: Tensor | None = None,
         system: ConstrainedSystem | None = None,
     ) -> ForceLinearization:
-        """Mean acceleration and multiplier with their Jacobians, as in `StructuredFit.linearize`."""
+        """Return mean acceleration and multiplier and their Jacobians, as `StructuredFit.linearize`."""
         if system is not None and system is not self.system:
             raise ModelError("a compiled fit predicts on its own system", hint="use that of the fit")
         found = self.jacobian(q, qd, tau, ["qdd", "multiplier"], active=active)
@@ -267,19 +267,19 @@ class CompiledFit(Predictor):
     def _states(
         self, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor | None
     ) -> tuple[tuple[Tensor | None, ...], torch.Size]:
-        """Arrays of states for the C code, and the batch."""
+        """Return the arrays of states for the C code, and the batch."""
         if active is None and self._plain(q, qd, tau):
             return (q, qd, tau, None), q.shape[:-1]
         *given, batch = flat_states(self.system, q, qd, tau, active)
         return tuple(x.contiguous() for x in given), batch
 
     def _error(self, status: int, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor | None) -> ForceGPError:
-        """The error that the C code reports; raises at once and names the state if it is not finite."""
+        """Return the error reported by the C code; raise and name the state if it is not finite."""
         flat_states(self.system, q, qd, tau, active)
         return KINDS.get(status, NumericalError)(MESSAGES[status])
 
     def _plain(self, *states: Tensor) -> bool:
-        """Whether states can be read where they are."""
+        """Return whether states can be read where they are."""
         q, known = states[0], all(isinstance(x, Tensor) for x in states)
         kinds = {(x.shape, x.dtype, x.device.type, x.is_contiguous()) for x in states if known}
         return (
@@ -289,7 +289,7 @@ class CompiledFit(Predictor):
         )
 
     def _read(self, quantity: str | tuple[str, ...]) -> _Rows:
-        """The rows of requested quantities, and their place in the C code."""
+        """Return the rows of requested quantities, and their place in the C code."""
         if quantity in self._known:
             return self._known[quantity]
         names = [quantity] if isinstance(quantity, str) else list(dict.fromkeys(quantity))

@@ -50,7 +50,7 @@ REST = 1e-30
 
 
 def _matern(square: Scalar, more: float) -> Scalar:
-    """(1 + r + more r²) e^{−r}; the root has a slope at a support point too."""
+    """Return (1 + r + more r²) e^{−r}; the root has a slope at a support point too."""
     r = (square + REST).sqrt()
     return (r + 1.0 + square * more) * (-r).exp()
 
@@ -112,17 +112,16 @@ class Mean:
         self.phi = [self._all_features(p, x) for p, x in enumerate(self.x)]
 
     def program(self, outputs: Iterable[Scalar], arguments: Sequence[str]) -> Program:
-        """A program with these arguments."""
+        """Return a program with these arguments."""
         outputs = list(outputs)
         return Program(tuple(arguments), (len(outputs),), self.graph, outputs)
 
     def zeros(self, *shape: int) -> Scalars:
-        """Zeros."""
+        """Return zeros."""
         return self.graph.constants(np.zeros(shape))
 
     def sliding(self) -> tuple[list[int], list[Scalar]]:
-        """The priors whose joints can stick; and of joints that slide in the directions `slip`, Q_D and their
-        inputs and features."""
+        """Return priors of joints that can stick; and, of those sliding along `slip`, Q_D and features."""
         slip = [self.graph.input("slip", i) for i in range(self.robot.nq)]
         priors = [p for p, part in enumerate(self.parts) if part.prior.sticks]
         x = [self._inputs(p, slip) for p in priors]
@@ -132,7 +131,7 @@ class Mean:
         return priors, outputs
 
     def _all_features(self, p: int, x: Scalars) -> list[list[Scalar]]:
-        """φ of each component of a prior at its inputs."""
+        """Return φ of each component of a prior at its inputs."""
         part = self.parts[p]
         return [
             [] if part.finite is None else self._features(p, part.finite, k, x[k if len(x) > 1 else 0])
@@ -140,7 +139,7 @@ class Mean:
         ]
 
     def _damping(self, slip: Sequence[Scalar] | None) -> Scalars:
-        """Q_D of the robot file: viscous, Coulomb and Stribeck friction; `slip` in place of tanh(q̇/v₀)."""
+        """Return Q_D of the robot file: viscous, Coulomb, Stribeck; `slip` replaces tanh(q̇/v₀)."""
         names = ("damping", "friction", "friction_velocity", "stribeck", "stribeck_velocity")
         force, columns = [], (numbers(getattr(self.robot, x)) for x in names)
         for i, (v, d, c, v_c, s, v_s) in enumerate(zip(self.qd, *columns, strict=True)):
@@ -177,7 +176,7 @@ class Mean:
         )
 
     def _surface(self, surface: object, p: Scalars, v: Scalars) -> tuple[Scalars, Scalar, Scalar]:
-        """Normal, signed distance c and vᵀ (∇²c) v of a point at velocity v."""
+        """Return the normal, signed distance c and vᵀ (∇²c) v of a point at velocity v."""
         constants = self.graph.constants
         if isinstance(surface, Plane):
             n = constants(surface.normal)
@@ -193,14 +192,14 @@ class Mean:
         return n, length - float(surface.radius), (v @ v - along * along) / length
 
     def _tangents(self, n: Scalars) -> Scalars:
-        """R e_x and R e_y of the smallest rotation with R e_z = n; a fixed frame where n is −e_z."""
+        """Return R e_x and R e_y of the smallest rotation with R e_z = n; a fixed frame where n is −e_z."""
         up = (n[2] + (1.0 - FACING_DOWN)).step()
         share = up / (n[2] * up + 1.0)
         x, y, both = 1.0 - n[0] * n[0] * share, up * 2.0 - 1.0 - n[1] * n[1] * share, -(n[0] * n[1] * share)
         return np.array([[x, both, -n[0]], [both, y, -n[1]]], dtype=object)
 
     def _inputs(self, p: int, slip: Sequence[Scalar] | None) -> Scalars:
-        """Standardized inputs x, one row for all components if they share them."""
+        """Return the standardized inputs x, one row for all components if they share them."""
         part, scales = self.parts[p], self.model.posterior.process.scales[p]
         shared = all(x.ndim == 2 for x in part.support.values())
         rows: list[list[Scalar]] = []
@@ -215,7 +214,7 @@ class Mean:
         return np.array(rows, dtype=object)
 
     def _raw_inputs(self, prior: ForcePrior, slip: Sequence[Scalar] | None) -> dict[str, list[Scalar]]:
-        """Inputs by name; of joint friction, one for each joint."""
+        """Return the inputs by name; of joint friction, one for each joint."""
         if isinstance(prior, contact.NormalForcePrior):
             return self._raw_inputs(prior.like, slip)
         if isinstance(prior, JointFrictionPrior):
@@ -245,7 +244,7 @@ class Mean:
         return raw
 
     def _features(self, p: int, part: KernelPart, k: int, x: Scalars) -> list[Scalar]:
-        """φ(x) of component k."""
+        """Return φ(x) of component k."""
         kernel, params = part.kernel, part.params
         if isinstance(kernel, kernels.Linear):
             columns = self.parts[p].columns(kernel.inputs)
@@ -260,7 +259,7 @@ class Mean:
         return [a * b for a in left for b in right] if product else left + right
 
     def _covariances(self, p: int, part: KernelPart, k: int) -> list[Scalar]:
-        """k(x, z_j) of component k and the support points of a prior."""
+        """Return k(x, z_j) of component k and the support points of a prior."""
         kernel, params, support = part.kernel, part.params, self.parts[p].support
         if isinstance(kernel, kernels.Sum):
             left, right = (self._covariances(p, KernelPart(*side), k) for side in kernel.parts(params))
@@ -313,13 +312,13 @@ class LearnedMotion(Mean):
             self.U[:, c] = self._against(c, float(law.smoothing)) * float(law.coefficient)
 
     def tangents(self, outputs: Iterable[Scalar]) -> Scalars:
-        """Derivatives of scalars, `(outputs, 3 nq)`."""
+        """Return the derivatives of scalars, `(outputs, 3 nq)`."""
         found, zero = self.graph.tangents(list(outputs), self.seeds), self.graph.constant(0.0)
         directions = range(3 * self.robot.nq)
         return np.array([[t.get(d, zero) for d in directions] for t in found], dtype=object)
 
     def quantities(self) -> dict[str, Scalars]:
-        """The posterior mean of each of `DIFFERENTIATED`."""
+        """Return the posterior mean of each of `DIFFERENTIATED`."""
         Q, Q_z, Q_F = self._forces_of_priors()
         motion = self._motion(Q + Q_z, self._mean_terms, self.U)
         normals = [at.normal * l for at, l in zip(self.touching, motion.multiplier, strict=True)]
@@ -337,7 +336,7 @@ class LearnedMotion(Mean):
 
     @cached_property
     def _inverses(self) -> tuple[Scalars, Scalars, Scalars]:
-        """M⁻¹, S = (A M⁻¹ Aᵀ)⁻¹ with ones for open contacts, and L = M⁻¹ Aᵀ S."""
+        """Return M⁻¹, S = (A M⁻¹ Aᵀ)⁻¹ with ones for open contacts, and L = M⁻¹ Aᵀ S."""
         M_inv, m = _solve(self.M, self.graph.constants(np.eye(self.robot.nq))), len(self.names)
         if not m:
             return M_inv, self.zeros(0, 0), self.zeros(self.robot.nq, 0)
@@ -354,7 +353,7 @@ class LearnedMotion(Mean):
         U: Scalars | None = None,
         pulled: bool = True,
     ) -> Motion:
-        """The motion M q̈ = Q_C + Q_G + rest + (A + U)ᵀ λ, A q̈ = b with its derivatives.
+        """Return the motion M q̈ = Q_C + Q_G + rest + (A + U)ᵀ λ, A q̈ = b with its derivatives.
 
         Args:
             rest: impressed forces beside Q_C and Q_G.
@@ -393,7 +392,7 @@ class LearnedMotion(Mean):
         return motion
 
     def _forces_of_priors(self) -> tuple[Scalars, Scalars, Scalars]:
-        """Q beside Q_C and Q_G, Q_z and the learned friction of the joints."""
+        """Return Q beside Q_C and Q_G, Q_z and the learned friction of the joints."""
         n, terms = self.robot.nq, self._mean_terms
         Q, Q_z, Q_F = self.zeros(n), self.zeros(n), self.zeros(n)
         Q = Q + (self.Q_D if "friction" in terms else Q) + (self.tau if "actuation" in terms else Q)
@@ -422,7 +421,7 @@ class LearnedMotion(Mean):
         return Q, Q_z, Q_F
 
     def _latent(self, p: int, first: int, slope: int) -> Scalars:
-        """f of a prior: its features, and what has support points, as an input with its slopes by x if
+        """Return f of a prior: its features, and what has support points, as an input with its slopes by x if
         derivatives are carried along."""
         part, forces = self.parts[p], []
         for k, phi in enumerate(self.phi[p]):
@@ -442,12 +441,12 @@ class LearnedMotion(Mean):
         return np.array(forces, dtype=object)
 
     def _against(self, c: int, smoothing: float) -> Scalars:
-        """u = −J_Eᵀ s(v), the generalized force of a unit friction force."""
+        """Return u = −J_Eᵀ s(v), the generalized force of a unit friction force."""
         at = self.touching[c]
         return -(at.sliding_jacobian.T @ at.sliding) / (at.sliding @ at.sliding + smoothing**2).sqrt()
 
     def _contact_operator(self, prior: ForcePrior) -> Scalars:
-        """E of a force at a contact, `(nq, components)`; see `forces/priors/contact.py`."""
+        """Return E of a force at a contact, `(nq, components)`; see `forces/priors/contact.py`."""
         assert isinstance(prior, contact.CoulombErrorPrior | contact.SurfaceForcePrior)
         c = self.names.index(prior.contact)
         at, closed = self.touching[c], self.closed[c]
@@ -476,8 +475,7 @@ class LearnedMotion(Mean):
         return np.stack([columns[term] * closed for term in prior.terms], axis=1)
 
     def _inertial_force(self, errors: Scalars, drives: Scalars) -> Scalars:
-        """[Y(q, q̇, q̈), diag q̈] δ at the analytical q̈: inverse dynamics of errors `(nq, 10)` of the links
-        alone, and of those of the drives if there are any."""
+        """Return [Y(q, q̇, q̈), diag q̈] δ at the analytical q̈ for errors of links `(nq, 10)` and drives."""
         links, qdd = self.links, self._motion(self.Q_D + self.tau, TERMS).qdd
         motion = _motion(links, list(self.qd), list(qdd), gravity=True)
         torques, forces = [], []
@@ -496,12 +494,12 @@ class LearnedMotion(Mean):
 
 
 def _times(K: Scalars, x: Scalars, zero: Scalars) -> Scalars:
-    """K x, zero where there is no x."""
+    """Return K x, zero where there is no x."""
     return K @ x if len(x) else zero
 
 
 def _eliminated(K: Scalars, rhs: Scalars) -> Scalars:
-    """K⁻¹ rhs by elimination without pivots."""
+    """Return K⁻¹ rhs by elimination without pivots."""
     K, x, n = K.copy(), rhs.copy(), len(rhs)
     for k in range(n):
         for i in range(k + 1, n):

@@ -46,7 +46,7 @@ class Functions:
         prior: the force prior.
         rest, finite: the part of its kernel that has support points, and that with features, if any.
         support: standardized inputs of the m support points.
-        weights: of k(x, X) and φ, whose sum is the posterior mean `(components, m + features)`.
+        weights: weights of k(x, X) and φ, whose sum is the posterior mean `(components, m + features)`.
         whitening: factor of k(x, X) in T, a matrix `(m, kept)` for each component, or `None`.
         roots: C of each component, `(functions, rank − first)`.
         first: first column that is not zero, by component.
@@ -77,7 +77,7 @@ class Functions:
         return 0 if self.rest is None else points(self.support)
 
     def columns(self, names: Sequence[str] | None) -> list[int]:
-        """Columns of named inputs, or of all."""
+        """Return the columns of named inputs, or of all."""
         widths = {name: x.shape[-1] for name, x in self.support.items()}
         starts = dict(zip(widths, accumulate(widths.values(), initial=0), strict=False))
         return [
@@ -147,11 +147,11 @@ class ExportedModel:
 
     @property
     def sign(self) -> int:
-        """Of T Tᵀ in the covariance."""
+        """Return the sign of T Tᵀ in the covariance."""
         return 1 if isinstance(self.posterior.latent, SparsePosterior) and self.functions is None else -1
 
     def parts(self) -> list[Functions]:
-        """The functions of each prior with their posterior."""
+        """Return the functions of each prior with their posterior."""
         if isinstance(self.posterior.latent, SparsePosterior):
             return self._of_basis(self.posterior.latent)
         return self._of_rows(self.posterior.latent)
@@ -216,7 +216,7 @@ class ExportedModel:
 
 
 def row_of(x: Tensor, k: int) -> Tensor:
-    """The row of component k, or the common one."""
+    """Return the row of component k, or the common one."""
     return x[k if len(x) > 1 else 0]
 
 

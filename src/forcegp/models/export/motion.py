@@ -42,7 +42,7 @@ class CompiledMotion:
             self._folded, self._waves = self._functions(model, samples)
 
     def _functions(self, model: ExportedModel, samples: ForceSamples) -> tuple[Tensor, ctypes.Array[Waves]]:
-        """Weights of the functions of all samples, a row each, and what their support points miss."""
+        """Return weights of all function samples, a row each, and what support points do not cover."""
         posterior, parts = samples.posterior, model.parts()
         assert samples.functions.folded is not None
         rows, waves = [], (Waves * len(parts))()
@@ -72,7 +72,7 @@ class CompiledMotion:
     def __call__(
         self, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor, h: Tensor, sticking: bool
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """See `rollout.inputs.CompiledMotion`."""
+        """Return q̈ and λ, as specified by `rollout.inputs.CompiledMotion`."""
         n, m = len(q), len(self.system.contacts)
         folded = None if self._folded is None else self._folded.data_ptr()
         states = [x.expand_as(q).contiguous() for x in (q, qd, tau)] + [active.contiguous(), h.contiguous()]
@@ -95,7 +95,7 @@ class CompiledMotion:
 def compiled_motion(
     model: ExportedModel, force: ForceField, trained: ConstrainedSystem
 ) -> CompiledMotion | None:
-    """The motion of a model by C code, `None` if a part of it, or of function samples, has no C form."""
+    """Return the motion of a model by C code, or `None` if a part or function sample has no C form."""
     system, samples = model.system, force if isinstance(force, ForceSamples) else None
     if system.contact_names != trained.contact_names or system.robot.learned:
         return None
@@ -109,7 +109,7 @@ def compiled_motion(
 
 
 def _folds(samples: ForceSamples) -> bool:
-    """Whether functions are weights of basis functions and of waves."""
+    """Return whether functions are weights of basis functions and of waves."""
     folded = samples.functions.folded
     return folded is not None and all(
         x.missed is None

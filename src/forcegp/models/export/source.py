@@ -56,7 +56,7 @@ SLOPES = "const equations *restrict e, double *restrict f, double *restrict slop
 
 
 def c_source(model: ExportedModel, name: str, rollout: bool = False) -> tuple[str, str]:
-    """Header and source text, with Jacobians or, for a rollout, with the motions of trajectories.
+    """Return the header and source text, with Jacobians or, for a rollout, with the motions of trajectories.
 
     Raises:
         ModelError: a part of the model has no C form; names it.
@@ -92,7 +92,7 @@ def c_source(model: ExportedModel, name: str, rollout: bool = False) -> tuple[st
 
 
 def template(name: str, fields: dict[str, object] | None = None) -> str:
-    """A template file with each `@field@` filled in."""
+    """Return a template file with each `@field@` filled in."""
     text = files("forcegp.models.export").joinpath(name).read_text(encoding="utf-8")
     for field, value in (fields or {}).items():
         text = text.replace(f"@{field}@", str(value))
@@ -100,18 +100,17 @@ def template(name: str, fields: dict[str, object] | None = None) -> str:
 
 
 def _comment(text: str) -> str:
-    """Names as they may stand in a comment of code that is run: a model file must not end the comment."""
+    """Return names made safe for a comment in C code, since a model file must not end the comment."""
     return re.sub(r"[^\w ,.+-]", "_", text)
 
 
 def _called(text: str) -> str:
-    """The name of the function that a C text defines."""
+    """Return the name of the function that a C text defines."""
     return text.partition("static ")[2].partition("(")[0].split()[-1]
 
 
 def _programs(mean: LearnedMotion, rollout: bool) -> list[str]:
-    """Mechanics, touching points and what priors read of the state; forward dynamics; Y; Jacobians, or the
-    friction of joints that slide."""
+    """Return the programs: mechanics with contacts; forward dynamics; Y; Jacobians or sliding friction."""
     robot = mean.robot
     blocks = [mean.M, mean.Q_C, mean.Q_G, mean.Q_D, *(x for at in mean.touching for x in at), *mean.x]
     outputs = [x for block in blocks for x in block.flat]
@@ -144,7 +143,7 @@ class Writer:
         self._online()
 
     def array(self, values: Tensor | Iterable[float], name: str = "", kind: str = "double") -> str:
-        """A constant array, and its name."""
+        """Return a constant array, and its name."""
         x = values if isinstance(values, Tensor) else torch.tensor(list(values), dtype=torch.float64)
         rows = x.detach().double().reshape(-1, x.shape[-1] if x.ndim else 1).tolist() or [[0.0]]
         texts = [", ".join(repr(v) if kind == "double" else str(int(v)) for v in row) for row in rows]
@@ -211,7 +210,7 @@ class Writer:
             self.array([float(x.smoothing) for x in process.coulomb], "COULOMB_SMOOTHING")
 
     def _noise(self) -> None:
-        """Variances beside those of the learned forces, and the trained region."""
+        """Add variances besides those of the learned forces, and the trained region."""
         nq, values = self.model.system.robot.nq, self.model.tensors
         zero, far = torch.zeros(nq, dtype=torch.float64), torch.full((2, nq), 1e300, dtype=torch.float64)
         for key, name, default in ((LOW, "LOW", -far), (HIGH, "HIGH", far), (SPREAD, "SPREAD", far)):
@@ -245,14 +244,14 @@ class Writer:
         self.lines.append(f"static const double TEMPERING = {power**0.5!r};")
 
     def online_header(self) -> str:
-        """The part of the header on learning online, if the model can."""
+        """Return the part of the header on learning online, if the model supports it."""
         names = ", ".join(f"{p} {_comment(part.prior.name)}" for p, part in enumerate(self.parts))
         folded = sum(part.weights.numel() for part in self.parts)
         fields = {"functions": self.parts[0].rank, "folded": folded, "priors": names}
         return template("online.h", fields) if self.model.online else ""
 
     def priors(self) -> list[str]:
-        """A function for each prior, and one that calls all of them."""
+        """Return a function for each prior, and one that calls all of them."""
         texts, calls = [], []
         for p, part in enumerate(self.parts):
             body = [*self._operator(part, self.starts[p]), *self._functions(p, part)]
@@ -272,8 +271,7 @@ class Writer:
         return [*texts, f"static int sticking_forces({GIVEN}) {{\n{unread}{chosen}  return 0;\n}}\n"]
 
     def sticking(self) -> dict[str, object]:
-        """Numbers of `motion.c`: which components are friction of joints that stick, where their inputs and
-        features lie, and of each prior where its inputs and components do."""
+        """Return the tables of `motion.c` on friction of joints that stick: components, inputs, features."""
         (priors, outputs), x, phi = self.mean.sliding(), self.mean.x, self.mean.phi
         sizes = [sum(map(len, features)) for features in phi]
         places = [("x", sum(each.size for each in x[:p]), x[p].size) for p in priors]
@@ -298,7 +296,7 @@ class Writer:
         }
 
     def _operator(self, part: Functions, start: int) -> list[str]:
-        """Code of E(x), from f to generalized forces; that of inertial errors is in `controller.c`."""
+        """Return the code of E(x), from f to generalized forces; for inertial errors see `controller.c`."""
         prior, E = part.prior, f"f->E + {start}"
         if isinstance(prior, InertialPrior | PayloadPrior):
             return []
@@ -321,7 +319,7 @@ class Writer:
         return [f"  if (! {called}) return 1;"]
 
     def _functions(self, p: int, part: Functions) -> list[str]:
-        """Code of the functions V of each component, and of their posterior."""
+        """Return the code of the functions V of each component, and of their posterior."""
         before = self.mean.phi[:p]
         lines, m, first = [], part.size, sum(len(phi) for features in before for phi in features)
         kernel = KernelCode(self, p, lines, f"e->x + {sum(x.size for x in self.mean.x[:p])}")
@@ -342,7 +340,7 @@ class Writer:
         return lines
 
     def _slopes(self) -> list[str]:
-        """For each prior with support points, its share of the mean of f and the derivatives by x."""
+        """Return, for each prior with support points, its share of the mean of f and its derivatives by x."""
         texts, calls, first, start = [], "", 0, 0
         for p, part in enumerate(self.parts):
             if not part.size or part.rest is None:
@@ -387,7 +385,7 @@ class KernelCode:
         lines.append(f"  const double *const x = {x};\n  (void)x;")
 
     def covariance(self, part: KernelPart, k: int) -> tuple[str, str]:
-        """k(x, z_j) and k(x, x) of component k."""
+        """Return k(x, z_j) and k(x, x) of component k."""
         kernel, params = part.kernel, part.params
         if isinstance(kernel, kernels.Sum):
             (a, aa), (b, bb) = (self.covariance(KernelPart(*side), k) for side in kernel.parts(params))
@@ -406,7 +404,7 @@ class KernelCode:
         )
 
     def slopes(self, part: KernelPart, k: int, value: str, f: str, slope: str) -> list[str]:
-        """Code of f = Σ w_j k(x, z_j) of component k, and of ∂f/∂x."""
+        """Return the code of f = Σ w_j k(x, z_j) of component k, and of ∂f/∂x."""
         m, w = self.part.size, self.writer.array(self.part.weights[k])
         lines = [f"  {{\n    double h[{m}];\n    for (int j = 0; j < {m}; ++j) h[j] = {value};"]
         lines.append(f"    *({f}) = dot(h, {w}, {m});")
@@ -419,7 +417,7 @@ class KernelCode:
         return [*lines, "  }"]
 
     def _leaves(self, part: KernelPart, k: int, factor: str) -> Iterable[tuple[Leaf, bool, str]]:
-        """The leaves of a kernel that depend on x, each with what it is multiplied by."""
+        """Yield the leaves of a kernel that depend on x, each with what it is multiplied by."""
         if isinstance(part.kernel, kernels.Sum):
             sides = [KernelPart(*side) for side in part.kernel.parts(part.params)]
             for side, other in zip(sides, sides[::-1], strict=True):
@@ -430,7 +428,7 @@ class KernelCode:
             yield self._leaf(part, k), isinstance(part.kernel, kernels.Stationary), factor
 
     def _leaf(self, part: KernelPart, k: int) -> Leaf:
-        """A local array over the support points: xᵀz_j, or a profile of |x − z_j|."""
+        """Return a local array over the support points: xᵀz_j, or a profile of |x − z_j|."""
         kernel, params = part.kernel, part.params
         if isinstance(kernel, kernels.Linear):
             # k = Σ_d (s σ_d)² x_d x′_d + σ_0²
@@ -454,12 +452,12 @@ class KernelCode:
         return self._known[key]._replace(size=size, bias=bias)
 
     def _x(self, leaf: Leaf, k: int) -> list[str]:
-        """The inputs of a leaf, each with its factor."""
+        """Return the inputs of a leaf, each with its factor."""
         first = 0 if self.shared else k * self._width
         return [f"{s!r} * x[{first + c}]" for c, s in zip(leaf.columns, leaf.scale, strict=True)]
 
     def _array(self, leaf: Leaf, kind: str, k: int) -> list[str]:
-        """Code that computes a leaf."""
+        """Return the code that computes a leaf."""
         u, m, x = leaf.u, self.part.size, self._x(leaf, k)
         if not m:
             return []
