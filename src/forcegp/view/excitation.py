@@ -84,7 +84,7 @@ def write_excitation(
         f"Largest fractions of the limits at 1 kHz: {used}. "
         f"All parts stay {1e3 * result.used['clearance_m']:.3g} mm apart.",
         (draw_limits(result),),
-        "the motion's file",
+        "the planned motion",
         wide=True,
     )
     text = render(
