@@ -111,7 +111,7 @@ def test_the_distance_shows_the_intervals(
 
 def test_one_state_only_is_not_split_in_two() -> None:
     noise = np.random.default_rng(0).standard_normal(2000)
-    with pytest.raises(DataError, match=r"does not show when contact 'table'(?s:.*)always, never"):
+    with pytest.raises(DataError, match=r"does not determine when contact 'table'(?s:.*)always, never"):
         contact.force_levels(noise, "table", ContactStateSection(source="wrench"))
 
 

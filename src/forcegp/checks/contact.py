@@ -162,7 +162,7 @@ def fit_surface(contact: SurfaceContact, path: Path, closed: np.ndarray) -> tupl
     keep, theta = closed, np.zeros(3)
     for _ in range(10):
         A = np.column_stack([x[keep], np.ones(keep.sum())])
-        # Directions along which the tip hardly moves do not show a tilt.
+        # A tilt has no effect along directions in which the tip hardly moves.
         theta = np.linalg.lstsq(A, path.c[keep], rcond=1e-3)[0]
         rest = path.c - x @ theta[:2] - theta[2]
         limit = max(TOUCH, 4.0 * float(robust_std(rest[keep])))

@@ -154,7 +154,7 @@ def check_visibility(system: ConstrainedSystem, explanation: Explanation) -> lis
         texts += (
             [f"{what}{': ' if parts[0].startswith(tuple(units)) else ' '}{', '.join(parts)}"] if parts else []
         )
-    text = f"this log does not show {'; '.join(texts)}"
+    text = f"this log cannot reveal {'; '.join(texts)}"
     joints = tuple(dict.fromkeys(fault.joint for fault, _ in hidden if fault.joint))
     pairs = zip(faults, sizes, strict=True)
     evidence = {f"{fault.kind} {fault.joint}".strip(): size for fault, size in pairs}

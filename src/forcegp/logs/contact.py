@@ -313,7 +313,7 @@ def force_levels(values: Array, name: str, section: ContactStateSection) -> tupl
     closed_level, _ = level_and_spread(values[values > high])
     if not closed_level - open_level > SEPARATION * open_spread:
         raise DataError(
-            f"the {section.source} does not show when contact {name!r} is closed",
+            f"the {section.source} does not determine when contact {name!r} is closed",
             expected=f"two levels at least {SEPARATION:g} standard deviations apart",
             got=f"{open_level:.3g} ± {open_spread:.2g} N and {closed_level:.3g} N",
             hint=f"set threshold under [contact.{name}], or source to always, never or distance",

@@ -40,7 +40,7 @@ class Solution:
 
 
 def robust_least_squares(residual: Callable[[Array], Array], start: Array) -> Solution:
-    """Minimise squared residuals `(n,)` over parameters `(k,)`, without outliers of a robust fit."""
+    """Minimise squared residuals `(n,)` over parameters `(k,)`, leaving out the outliers of a robust fit."""
     robust = start
     for _ in range(2):
         scale = max(float(robust_std(residual(robust))), ROUNDING)

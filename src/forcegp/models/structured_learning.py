@@ -288,7 +288,7 @@ def search_of(
         current |= {key: value for key, value in known.items() if key.startswith((REGION, MEMORY))}
 
     def is_held(name: str) -> bool:
-        # Residuals of a robot that contains a force do not show the scale of that force.
+        # Residuals of a robot that contains a force do not reveal the scale of that force.
         return name in problem.pinned or (chosen is not None and name not in chosen)
 
     held = {key: value for key, value in current.items() if is_held(key.split(".")[0])}

@@ -274,7 +274,7 @@ HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
 
 
 def read_matlab(path: Path, **_: object) -> LogTable:
-    """Read the numeric arrays of a MATLAB file, with fields as `struct.field`; others cause remarks."""
+    """Read the numeric arrays of a MATLAB file, with fields as `struct.field`; remark on others."""
     with path.open("rb") as file:
         head = file.read(520)
     remarks: list[str] = []
