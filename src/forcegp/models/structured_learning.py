@@ -7,8 +7,9 @@
    they also determine slopes and weights (`forces/noise_learning.py`), and hyperparameters are learned again.
 4. Inertial parameters move to their posterior mean in one physically consistent Gauss–Newton step.
 5. Torque noise is increased to that on held-out stretches of the training log, and its growth beyond the
-trained speeds and torques is learned from held-out regimes; dry friction with memory is learned from the
-residuals of logs in order of time. 6. The posterior is conditioned on all samples.
+   trained speeds and torques is learned from held-out regimes; dry friction with memory is learned from
+   the residuals of logs in order of time.
+6. The posterior is conditioned on all samples.
 """
 
 from __future__ import annotations
