@@ -30,7 +30,7 @@ def test_what_is_loaded_predicts_the_same_and_can_be_updated(tmp_path: Path) -> 
 def test_what_does_not_fit_is_refused() -> None:
     block, params = rows(30), parameters()
     tensors = condition_sparse(PROCESSES, params, [block], first(block, 8)).tensors()
-    with pytest.raises(ModelError, match=r"not complete[\s\S]*L"):
+    with pytest.raises(ModelError, match=r"incomplete[\s\S]*L"):
         SparsePosterior.of_tensors(PROCESSES, params, {k: x for k, x in tensors.items() if k != "L"})
     with pytest.raises(ModelError, match="does not match its processes"):
         SparsePosterior.of_tensors(PROCESSES, params, tensors | {"L": tensors["L"][:-1, :-1]})

@@ -39,7 +39,7 @@ SLOW, GRAVITY = 0.01, 10.0
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """One explanation, named by a kind of finding, or a family of kinds.
+    """An explanation, named after a kind of finding or a family of kinds.
 
     `size` counts parameters, discrete choices as none; `change` corrects the log under this hypothesis, apart
     from parameters. `columns` `(n, nq, p)` are the torque that parameters of size `prior` `(p,)` add to r,

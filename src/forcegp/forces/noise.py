@@ -107,7 +107,7 @@ TORQUE_NOISE = f"{NOISE}.torque.log_noise_std"
 
 
 def initial_torque_noise(residual: Tensor) -> dict[str, Tensor]:
-    """Return the start of learning from the RMS of unexplained torque `(nq,)` [N m, N]."""
+    """Return the initial torque noise from the RMS of unexplained torque `(nq,)` [N m, N]."""
     std = (0.5 * residual).clamp(min=1e-4).log().double()
     return {
         TORQUE_NOISE: std,
