@@ -8,7 +8,7 @@ link stays physically consistent, and the inertia of a drive is not negative.
 
 Torques alone do not suffice. In a closed loop the noise of the torque sensor exceeds the torque
 that accelerates a light joint; divided by the inertia of the file it predicts accelerations far larger than
-the measured ones. In that case, the drives get the inertia that maximises −½ Σ ε²/s² + v Σ log |M|, with the
+the measured ones. From ten times their mean square on, the drives get the inertia that maximises −½ Σ ε²/s² + v Σ log |M|, with the
 smallest v ≤ 1 at which accelerations are predicted as well as by their mean, as long as the error of no
 joint's torque on held-out stretches grows by more than 2 %.
 
@@ -43,7 +43,6 @@ from forcegp.forces.inverse_dynamics import (
     instrumental,
     is_harmless,
     is_less,
-    log_ratio,
     products,
     sums,
 )
@@ -64,11 +63,12 @@ WIDTHS = (0.0, 0.02, 0.05, 0.12)
 """Standard deviations of averages over time that are tried [s]; the narrowest posterior is taken."""
 
 
-def rigid_robot(robot: RobotModel, rows: Rows) -> RobotModel | None:
-    """The physically consistent robot that predicts held-out torques better than the file, or `None`.
+def rigid_robot(robot: RobotModel, rows: Rows) -> tuple[RobotModel, bool]:
+    """The robot that predicts held-out torques best, and whether its links were identified.
 
-    The improvement must exceed two standard errors over stretches of the log, over the file and over the file
-    with additional drives, and no joint's held-out acceleration error may grow.
+    Candidates are the file, the file with drives that it lacks, and physically consistent links with drives.
+    Each must be better by two standard errors over stretches of the log than those before it, and no joint's
+    held-out acceleration error may grow.
 
     Args:
         robot: of the file.
@@ -87,23 +87,25 @@ def rigid_robot(robot: RobotModel, rows: Rows) -> RobotModel | None:
         """Held-out errors of single samples in units of their noise; averages hardly show sharp friction."""
         return held_out(single.by_stretch, estimate, judged, found.by_stretch) / single.noise**2
 
-    nothing = torch.zeros_like(found.mean)
-    drives = _drives_alone(found.by_stretch.total(), found.noise, n)
-    known = min(
-        (compared(lambda _, x=x: x) for x in (nothing, drives)), key=lambda error: float(error.mean())
-    )
-    if not _is_better(compared(lambda rest: _estimate(rest, found.noise, found.power)), known):
-        return None
-    driven = robot.replace(armature=robot.armature + size * found.mean[:n])
-    _, precision = found.normal()
-    consistent, moved = prior.updated(driven, found.mean[n:], precision[n:, n:])
-    delta = torch.cat([found.mean[:n], moved])
-    before, after = (
-        acceleration_errors(rows, single.by_stretch, C, x, mass_matrix(each, rows.q))
-        for each, x in ((robot, nothing), (consistent, delta))
-    )
-    better = _is_better(compared(lambda _: delta), known)
-    return consistent if better and is_harmless(after, before) else None
+    def accelerations(other: RobotModel, delta: Tensor) -> Tensor:
+        return acceleration_errors(rows, single.by_stretch, C, delta, mass_matrix(other, rows.q))
+
+    nothing, every = torch.zeros_like(found.mean), found.by_stretch.total()
+    drives = _drives_alone(every, found, n)
+    driven = robot.replace(armature=robot.armature + size * drives[:n])
+    file, driving = compared(lambda _: nothing), compared(lambda rest: _drives_alone(rest, found, n))
+    before = accelerations(robot, nothing)
+    known = min((file, driving), key=lambda error: float(error.mean()))
+    if _is_better(compared(lambda rest: _estimate(rest, found.noise, found.power)), known):
+        moving = robot.replace(armature=robot.armature + size * found.mean[:n])
+        _, precision = found.normal()
+        consistent, moved = prior.updated(moving, found.mean[n:], precision[n:, n:])
+        delta = torch.cat([found.mean[:n], moved])
+        better = _is_better(compared(lambda _: delta), known)
+        if better and is_harmless(accelerations(consistent, delta), before):
+            return consistent, True
+    better = _is_better(driving, file) and is_harmless(accelerations(driven, drives), before)
+    return driven if better else robot, False
 
 
 @dataclass(frozen=True)
@@ -161,11 +163,13 @@ def _estimate(given: NormalEquations, noise: Tensor, power: float) -> Tensor:
     return torch.cat([drives, links])
 
 
-def _drives_alone(every: NormalEquations, noise: Tensor, n: int) -> Tensor:
-    """The unknowns with the inertia of drives alone, which is not negative."""
-    H, h = every.quadratic(noise)
-    drives = torch.linalg.lstsq(H[:n, :n], h[:n, None]).solution[:, 0].clamp(min=0.0)
-    return torch.cat([drives, torch.zeros_like(h[n:])])
+def _drives_alone(given: NormalEquations, found: _Regression, n: int) -> Tensor:
+    """The unknowns with the inertia of n drives alone, which is not negative."""
+    h, precision = _normal(given, found.noise, found.power)
+    L = torch.linalg.cholesky(precision[:n, :n])
+    right = torch.linalg.solve_triangular(L, h[:n, None], upper=False)[:, 0]
+    drives, _ = scipy.optimize.nnls(L.mT.cpu().numpy(), right.cpu().numpy())
+    return torch.cat([torch.from_numpy(drives).to(h), torch.zeros_like(h[n:])])
 
 
 def _is_better(after: Tensor, before: Tensor) -> bool:
@@ -175,6 +179,8 @@ def _is_better(after: Tensor, before: Tensor) -> bool:
 
 VOLUME_STATES = 100
 """States that log |M|, or the volume of the noise, is averaged over."""
+FAR_LARGER = 10.0
+"""Mean squared error of accelerations over that of their mean from which drives are damped."""
 NEGLIGIBLE = 0.02
 """Inertia of a drive over its joint's that is left out: a gain of the torque sensor explains as much."""
 WEIGHTS = tuple(2.0 ** (-k / 2) for k in range(20, -1, -1))
@@ -210,13 +216,12 @@ def inertia_of(
     """
     robot = system.robot
     rows = free_rows(system, friction, mean, training)
-    remembering = rows.with_memory()
-    identified = rigid_robot(robot, remembering)
-    if identified is not None:
+    better, has_links = rigid_robot(robot, rows.with_memory())
+    if has_links:
         text = "held-out torques favour other inertial parameters than the robot file's, now identified"
-        return Inertia(identified, True, (text, *_told(robot, identified.armature - robot.armature)))
+        return Inertia(better, True, (text, *_told(robot, better.armature - robot.armature)))
     M = mass_matrix(robot, rows.q)
-    armature = _damped(rows, M, _lacking(remembering, M))
+    armature = _damped(rows, M, better.armature - robot.armature)
     armature = armature * (armature > NEGLIGIBLE * M.diagonal(dim1=-2, dim2=-1).mean(0))
     if not bool(armature.any()):
         return Inertia(robot)
@@ -229,24 +234,6 @@ def _told(robot: RobotModel, armature: Tensor) -> tuple[str, ...]:
     found = ", ".join(f"{name} {a:.2g}" for name, a in pairs if a > 0.0)
     lacks = "the drives have inertia that the robot file lacks [kg m², kg for sliding joints]"
     return (f"{lacks}: {found}",) if found else ()
-
-
-def _lacking(rows: Rows, M: Tensor) -> Tensor:
-    """Inertia of drives `(nq,)` that predicts held-out torques significantly better than none, or zero.
-
-    No joint's acceleration error may grow.
-    """
-    C = torch.diag_embed(rows.qdd)
-    drives, none = sums(rows, C), torch.zeros_like(M[0, 0])
-    every = drives.total()
-    noise = _noise(every)
-    alone = held_out(drives, lambda given: _drives(given, noise, M, 0.0))
-    if not is_less(log_ratio(alone, held_out(drives, lambda _: none)).mean(-1)):
-        return none
-    found = _drives(every, noise, M, 0.0)
-    before = acceleration_errors(rows, drives, C, none, M)
-    after = acceleration_errors(rows, drives, C, found, M + torch.diag(found))
-    return found if is_harmless(after, before) else none
 
 
 def _noise(every: NormalEquations) -> Tensor:
@@ -267,15 +254,15 @@ def _excess(rows: Rows, every: NormalEquations, M: Tensor, armature: Tensor) -> 
 def _damped(rows: Rows, M: Tensor, found: Tensor) -> Tensor:
     """Inertia of drives beyond the file's `(nq,)`, raised where accelerations are below the noise of torques.
 
-    They are if their mean predicts them better than the torques and friction with memory do: what that
-    friction explains is no noise.
+    They are if torques and friction with memory predict them far worse than their mean does: what that
+    friction explains is no noise. Drives are then raised until both are equal.
 
     Args:
         M: mass matrix of the file at the samples.
         found: inertia of drives identified from torques.
     """
     remembering, C = rows.with_memory(), torch.diag_embed(rows.qdd)
-    if _excess(remembering, sums(remembering, C).total(), M, found) <= 0.0:
+    if _excess(remembering, sums(remembering, C).total(), M, found) <= math.log(FAR_LARGER):
         return found
     by_stretch = sums(rows, C)
     every = by_stretch.total()

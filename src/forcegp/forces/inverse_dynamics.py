@@ -30,6 +30,8 @@ LEAST, MOST = 200, 4000
 """Samples in free motion needed at least, and used at most, evenly spaced."""
 SCATTER = 4.0
 """Ratio of mean squares of the torque at rest and in motion from which a joint sticks at rest."""
+NOISY = (1.0, 2.0, 4.0)
+"""Speeds that a joint at rest may seem to have, over the one of the sharpest dry friction."""
 MOVES = 0.1
 """Share of the samples in which a joint moves at least, for its sticking to count."""
 RIDGE = 1e-8
@@ -247,26 +249,36 @@ def _rows(
     Phi = torch.cat([*prior.features(system, at).values(), torch.ones_like(at.q)[..., None]], dim=-1)
     Phi, memory = (x / x.square().mean(0).sqrt().clamp(min=1e-12) for x in (Phi, memory))
     residual = mean(system, at) - (at.eom.M @ m.values[..., None])[..., 0]
-    slides = _slides(m.qd.abs() >= min(prior.speeds), Phi, residual)
+    slides = _slides(m.qd.abs(), min(prior.speeds), Phi, residual)
     return Rows(m.q, m.qd, m.values, residual, Phi, slides, group, m.segment, partner, memory)
 
 
-def _slides(moving: Tensor, Phi: Tensor, residual: Tensor) -> Tensor:
-    """`(n, nq)` bool, without the joints that stick: that hardly move, and whose torque then scatters more.
+def _slides(speed: Tensor, slowest: float, Phi: Tensor, residual: Tensor) -> Tensor:
+    """`(n, nq)` bool, without the samples of joints that stick: slow ones, whose torque then scatters more.
+
+    Noise of velocities hides that a joint rests, so the bound of slow is the one with the largest ratio.
 
     Args:
-        moving: `(n, nq)` bool, faster than the sharpest dry friction.
+        speed: |q̇| `(n, nq)`.
+        slowest: sharpest dry friction [rad/s, m/s].
         Phi: features of friction `(n, nq, f)`.
         residual: `(n, nq)` torque that the robot of the file leaves.
     """
-    weighted = moving[..., None] * Phi
-    w = torch.linalg.lstsq(weighted.transpose(0, 1), (moving * residual).mT[..., None]).solution[..., 0]
-    square = (residual - (Phi * w).sum(-1)).square()
-    at_rest, sliding = (
-        (part * square).sum(0) / part.sum(0).clamp(min=1) for part in ((~moving).double(), moving.double())
-    )
-    sticks = (at_rest > SCATTER * sliding) & (moving.double().mean(0) >= MOVES)
-    return moving | ~sticks
+    slides, ratio = torch.ones_like(speed, dtype=torch.bool), torch.full_like(speed[0], SCATTER)
+    for bound in (slowest * factor for factor in NOISY):
+        moving = speed >= bound
+        weighted = moving[..., None] * Phi
+        w = torch.linalg.lstsq(weighted.transpose(0, 1), (moving * residual).mT[..., None]).solution[..., 0]
+        square = (residual - (Phi * w).sum(-1)).square()
+        at_rest, sliding = (
+            (part * square).sum(0) / part.sum(0).clamp(min=1)
+            for part in ((~moving).double(), moving.double())
+        )
+        scatter = at_rest / sliding.clamp(min=LEAST_SQUARE)
+        sticks = (scatter > ratio) & (moving.double().mean(0) >= MOVES)
+        slides = torch.where(sticks, moving, slides)
+        ratio = torch.where(sticks, scatter, ratio)
+    return slides
 
 
 def averaged(rows: Rows, columns: Tensor, inertial: Tensor, width: float) -> tuple[Rows, Tensor]:
