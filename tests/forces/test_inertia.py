@@ -236,7 +236,9 @@ def test_averaged_equations_are_sums_of_neighbours_within_a_stretch() -> None:
     i, group = torch.arange(n), (torch.arange(n) // 60).repeat(2)
     slides = torch.ones_like(r, dtype=torch.bool)
     slides[30, 0] = False
-    rows = Rows(r, r, r, r, Phi, slides, group, group, torch.cat([i + n, i]), Phi[..., :0], 0.01, 0.03**2)
+    rows = Rows(
+        r, r, r, r, Phi, slides, group, group, torch.cat([i + n, i]), Phi[..., :0], 0.0 * r, 0.01, 0.03**2
+    )
     mean, columns = averaged(rows, C, inertial, 0.04)
     assert mean.step == 0.02 and len(columns) == 2 * len(range(15, n - 15, 2))
     k = torch.arange(-15, 16).double()
@@ -321,7 +323,7 @@ def test_sums_give_the_dense_least_squares() -> None:
     r = torch.randn(n, nq, generator=random, dtype=torch.float64)
     group = torch.arange(n) * 3 // n
     moves = torch.ones_like(r, dtype=torch.bool)
-    by_stretch = sums(Rows(r, r, r, r, Phi, moves, group, group, torch.arange(n), Phi[..., :0]), C)
+    by_stretch = sums(Rows(r, r, r, r, Phi, moves, group, group, torch.arange(n), Phi[..., :0], r), C)
     every, rest = by_stretch.total(), by_stretch.without(1)
     for given, own in ((every, group >= 0), (rest, group != 1)):
         H, h = given.quadratic(NOISE)
@@ -346,7 +348,7 @@ def test_instruments_give_the_textbook_estimate() -> None:
     r = torch.randn(n, nq, generator=random, dtype=torch.float64)
     partner = torch.cat([torch.arange(n // 2) + n // 2, torch.arange(n // 2)])
     group = torch.arange(n // 2).repeat(2) * 3 // (n // 2)
-    rows = Rows(r, r, r, r, Phi, torch.ones_like(r, dtype=torch.bool), group, group, partner, Phi[..., :0])
+    rows = Rows(r, r, r, r, Phi, torch.ones_like(r, dtype=torch.bool), group, group, partner, Phi[..., :0], r)
     every = instrumental(rows, C).total()
     delta = torch.linalg.solve(*every.quadratic(NOISE))
     X, Z = (torch.zeros(n, nq, p + nq * f, dtype=torch.float64) for _ in range(2))

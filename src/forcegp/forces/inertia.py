@@ -6,11 +6,14 @@ closed loop, the likelihood of accelerations given torques overestimates it. The
 earlier and later are instruments without either bias. The unknowns are Gaussian around the robot file, each
 link stays physically consistent, and the inertia of a drive is not negative.
 
-Torques alone do not suffice. In a closed loop the noise of the torque sensor exceeds the torque
-that accelerates a light joint; divided by the inertia of the file it predicts accelerations far larger than
-the measured ones. From ten times their mean square on, the drives get the inertia that maximises −½ Σ ε²/s² + v Σ log |M|, with the
-smallest v ≤ 1 at which accelerations are predicted as well as by their mean, as long as the error of no
-joint's torque on held-out stretches grows by more than 2 %.
+Torque and motion are seldom read at the same instant, and milliseconds between them make the inertia of a
+light joint wrong. So a delay is a further unknown.
+
+Torques alone do not suffice. In a closed loop the noise of the torque sensor exceeds the torque that
+accelerates a light joint; divided by the inertia of the file it predicts accelerations far larger than the
+measured ones. From ten times their mean square on, the drives get the inertia that maximises
+−½ Σ ε²/s² + v Σ log |M|, with the smallest v ≤ 1 at which accelerations are predicted as well as by their
+mean, as long as the error of no joint's torque on held-out stretches grows by more than 2 %.
 
 If an `InertialPrior` is given, the robot moves to the posterior mean of its inertial
 parameters: one Gauss–Newton step, physically consistent.
@@ -32,6 +35,7 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.dynamics import mass_matrix
 from forcegp.forces.calibration import autocorrelation_time
 from forcegp.forces.inverse_dynamics import (
+    LATE,
     LEAST,
     Estimate,
     NormalEquations,
@@ -78,34 +82,44 @@ def rigid_robot(robot: RobotModel, rows: Rows) -> tuple[RobotModel, bool]:
     M = mass_matrix(robot, rows.q)
     size = M.diagonal(dim1=-2, dim2=-1).mean(0)
     links = regressor(robot, rows.q, rows.qd, rows.qdd) * prior.scale(robot)
-    C = torch.cat([size * torch.diag_embed(rows.qdd), links], dim=-1)
-    regressions, judged = tuple(_over_widths(rows, C, M)), products(rows, C)
+    inertial = torch.cat([size * torch.diag_embed(rows.qdd), links], dim=-1)
+    C = with_delay(rows, inertial)
+    regressions, judged = tuple(_over_widths(rows, inertial, M)), products(rows, C)
     single = regressions[0]
     found = max(regressions, key=lambda each: float(torch.logdet(each.normal()[1])))
+    delay = torch.tensor([C.shape[-1] - 1])
+    driving, everything = torch.cat([torch.arange(n), delay]), torch.arange(C.shape[-1])
 
     def compared(estimate: Estimate) -> Tensor:
         """Held-out errors of single samples in units of their noise; averages hardly show sharp friction."""
         return held_out(single.by_stretch, estimate, judged, found.by_stretch) / single.noise**2
 
+    def estimated(kept: Tensor) -> Tensor:
+        return compared(lambda rest: found.estimate(rest, kept, n))
+
     def accelerations(other: RobotModel, delta: Tensor) -> Tensor:
         return acceleration_errors(rows, single.by_stretch, C, delta, mass_matrix(other, rows.q))
 
-    nothing, every = torch.zeros_like(found.mean), found.by_stretch.total()
-    drives = _drives_alone(every, found, n)
-    driven = robot.replace(armature=robot.armature + size * drives[:n])
-    file, driving = compared(lambda _: nothing), compared(lambda rest: _drives_alone(rest, found, n))
-    before = accelerations(robot, nothing)
-    known = min((file, driving), key=lambda error: float(error.mean()))
-    if _is_better(compared(lambda rest: _estimate(rest, found.noise, found.power)), known):
-        moving = robot.replace(armature=robot.armature + size * found.mean[:n])
+    every = found.by_stretch.total()
+    nothing, drives, delta = (found.estimate(every, kept, n) for kept in (delay, driving, everything))
+    file, driven = estimated(delay), estimated(driving)
+    before, known = accelerations(robot, nothing), min((file, driven), key=lambda error: float(error.mean()))
+    if _is_better(estimated(everything), known):
+        moving = robot.replace(armature=robot.armature + size * delta[:n])
         _, precision = found.normal()
-        consistent, moved = prior.updated(moving, found.mean[n:], precision[n:, n:])
-        delta = torch.cat([found.mean[:n], moved])
+        consistent, moved = prior.updated(moving, delta[n:-1], precision[n:-1, n:-1])
+        delta = torch.cat([delta[:n], moved, delta[-1:]])
         better = _is_better(compared(lambda _: delta), known)
         if better and is_harmless(accelerations(consistent, delta), before):
             return consistent, True
-    better = _is_better(driving, file) and is_harmless(accelerations(driven, drives), before)
-    return driven if better else robot, False
+    with_drives = robot.replace(armature=robot.armature + size * drives[:n])
+    better = _is_better(driven, file) and is_harmless(accelerations(with_drives, drives), before)
+    return with_drives if better else robot, False
+
+
+def with_delay(rows: Rows, columns: Tensor) -> Tensor:
+    """Columns of inertial parameters and, last, of the delay s of the torque: τ(t + s) ≈ τ(t) + s dτ/dt."""
+    return torch.cat([columns, LATE * rows.rate[..., None]], dim=-1)
 
 
 @dataclass(frozen=True)
@@ -113,63 +127,57 @@ class _Regression:
     """Unknowns by instrumental variables, with the noise `(nq,)` and the power κ that they leave."""
 
     by_stretch: NormalEquations
-    mean: Tensor
     noise: Tensor
     power: float
 
-    def normal(self) -> tuple[Tensor, Tensor]:
-        return _normal(self.by_stretch.total(), self.noise, self.power)
+    def normal(self, given: NormalEquations | None = None) -> tuple[Tensor, Tensor]:
+        """Linear term κ h and precision κ H + 1 of the unknowns, without directions of negative H."""
+        H, h = (given or self.by_stretch.total()).quadratic(self.noise)
+        values, vectors = torch.linalg.eigh(0.5 * (H + H.mT))
+        shown = vectors * (values > 0.0)
+        precision = self.power * (vectors * values.clamp(min=0.0)) @ vectors.mT
+        eye = torch.eye(len(h), dtype=h.dtype, device=h.device)
+        return self.power * shown @ (vectors.mT @ h), precision + eye
+
+    def estimate(self, given: NormalEquations, kept: Tensor, n: int) -> Tensor:
+        """Most probable unknowns among those that are kept; the first n, drives, are not negative."""
+        h, precision = self.normal(given)
+        L = torch.linalg.cholesky(precision[kept][:, kept])
+        right = torch.linalg.solve_triangular(L, h[kept, None], upper=False)[:, 0]
+        lower = torch.where(kept < n, 0.0, -math.inf)
+        found = scipy.optimize.lsq_linear(L.mT.cpu().numpy(), right.cpu().numpy(), (lower.numpy(), math.inf))
+        return torch.zeros_like(h).index_put((kept,), torch.from_numpy(found.x).to(h))
 
 
-def _over_widths(rows: Rows, C: Tensor, M: Tensor) -> Iterator[_Regression]:
-    """Regressions on equations that are averaged over time, by the width of the average."""
-    inertial = (M @ rows.qdd[..., None])[..., 0]
+def _over_widths(rows: Rows, inertial: Tensor, M: Tensor) -> Iterator[_Regression]:
+    """Regressions on equations that are averaged over time, by the width of the average.
+
+    Args:
+        inertial: columns of drives and links `(n, nq, p)`.
+        M: mass matrix of the file.
+    """
+    accelerating, n = (M @ rows.qdd[..., None])[..., 0], M.shape[-1]
     for width in WIDTHS if rows.step else WIDTHS[:1]:
-        used, columns = averaged(rows, C, inertial, width) if rows.step else (rows, C)
+        used, columns = averaged(rows, inertial, accelerating, width) if rows.step else (rows, inertial)
         if width and (int(used.slides.sum(0).min()) < LEAST or int(used.group.max()) < int(rows.group.max())):
             break
-        by_stretch = instrumental(used, columns)
-        every, mean, noise, power = by_stretch.total(), C.new_zeros(C.shape[-1]), C.new_ones(C.shape[1]), 1.0
+        columns = with_delay(used, columns)
+        by_stretch, kept = instrumental(used, columns), torch.arange(columns.shape[-1])
+        every, mean = by_stretch.total(), columns.new_zeros(len(kept))
+        found = _Regression(by_stretch, M.new_ones(n), 1.0)
         for _ in range(PASSES):
             left = used.residual - columns @ mean - (used.friction * every.friction(mean)).sum(-1)
             left = used.slides * left
             noise = (left.square().sum(0) / used.slides.sum(0).clamp(min=1)).sqrt().clamp(min=1e-300)
-            power = _power(used, left / noise)
-            mean = _estimate(every, noise, power)
-        yield _Regression(by_stretch, mean, noise, power)
+            found = _Regression(by_stretch, noise, _power(used, left / noise))
+            mean = found.estimate(every, kept, n)
+        yield found
 
 
 def _power(rows: Rows, left: Tensor) -> float:
     """κ = 1/τ̄ of what nothing explains, as in `residual_times`."""
     times = autocorrelation_time(left[: rows.leading], rows.segment[: rows.leading])
     return min(1.0, math.exp(-float(times.log().mean())))
-
-
-def _normal(given: NormalEquations, noise: Tensor, power: float) -> tuple[Tensor, Tensor]:
-    """Linear term κ h and precision κ H + 1 of the unknowns, without directions in which H is negative."""
-    H, h = given.quadratic(noise)
-    values, vectors = torch.linalg.eigh(0.5 * (H + H.mT))
-    shown = vectors * (values > 0.0)
-    precision = power * (vectors * values.clamp(min=0.0)) @ vectors.mT
-    return power * shown @ (vectors.mT @ h), precision + torch.eye(len(h), dtype=h.dtype, device=h.device)
-
-
-def _estimate(given: NormalEquations, noise: Tensor, power: float) -> Tensor:
-    """Most probable unknowns, of which the first n, the drives, are not negative."""
-    h, precision = _normal(given, noise, power)
-    n = len(noise)
-    drives = torch.linalg.solve(precision, h)[:n].clamp(min=0.0)
-    links = torch.linalg.solve(precision[n:, n:], h[n:] - precision[n:, :n] @ drives)
-    return torch.cat([drives, links])
-
-
-def _drives_alone(given: NormalEquations, found: _Regression, n: int) -> Tensor:
-    """The unknowns with the inertia of n drives alone, which is not negative."""
-    h, precision = _normal(given, found.noise, found.power)
-    L = torch.linalg.cholesky(precision[:n, :n])
-    right = torch.linalg.solve_triangular(L, h[:n, None], upper=False)[:, 0]
-    drives, _ = scipy.optimize.nnls(L.mT.cpu().numpy(), right.cpu().numpy())
-    return torch.cat([torch.from_numpy(drives).to(h), torch.zeros_like(h[n:])])
 
 
 def _is_better(after: Tensor, before: Tensor) -> bool:
