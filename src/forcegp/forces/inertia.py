@@ -105,16 +105,40 @@ def rigid_robot(robot: RobotModel, rows: Rows) -> tuple[RobotModel, bool]:
     file, driven = estimated(delay), estimated(driving)
     before, known = accelerations(robot, nothing), min((file, driven), key=lambda error: float(error.mean()))
     if _is_better(estimated(everything), known):
-        moving = robot.replace(armature=robot.armature + size * delta[:n])
-        _, precision = found.normal()
-        consistent, moved = prior.updated(moving, delta[n:-1], precision[n:-1, n:-1])
-        delta = torch.cat([delta[:n], moved, delta[-1:]])
+        consistent, delta = _consistent(robot, prior, found, size)
         better = _is_better(compared(lambda _: delta), known)
         if better and is_harmless(accelerations(consistent, delta), before):
             return consistent, True
     with_drives = robot.replace(armature=robot.armature + size * drives[:n])
     better = _is_better(driven, file) and is_harmless(accelerations(with_drives, drives), before)
     return with_drives if better else robot, False
+
+
+def _consistent(
+    robot: RobotModel, prior: InertialPrior, found: _Regression, size: Tensor
+) -> tuple[RobotModel, Tensor]:
+    """The robot with consistent links and drives that are not negative, and the unknowns.
+
+    Links are moved without knowledge of the drives, which adapt to them; a drive that would be negative then
+    is left out.
+
+    Args:
+        size: unit of the inertia of each drive `(nq,)`.
+    """
+    every, n = found.by_stretch.total(), len(size)
+    _, precision = found.normal()
+    p = len(precision)
+    links, last = torch.arange(n, p - 1), torch.tensor([p - 1])
+    unknowns = found.estimate(every, torch.arange(p), n)
+    while True:
+        drives = (unknowns[:n] > 0.0).nonzero()[:, 0]
+        others = torch.cat([drives, last])
+        best = found.estimate(every, torch.cat([others, links]), n)
+        moved, delta = prior.updated(robot, best[links], _marginal(precision, links, others))
+        known = torch.zeros_like(best).index_put((links,), delta)
+        unknowns = found.estimate(every, others, n, known)
+        if bool((unknowns[drives] > 0.0).all()):
+            return moved.replace(armature=robot.armature + size * unknowns[:n]), unknowns
 
 
 def with_delay(rows: Rows, columns: Tensor) -> Tensor:
@@ -139,14 +163,27 @@ class _Regression:
         eye = torch.eye(len(h), dtype=h.dtype, device=h.device)
         return self.power * shown @ (vectors.mT @ h), precision + eye
 
-    def estimate(self, given: NormalEquations, kept: Tensor, n: int) -> Tensor:
-        """Most probable unknowns among those that are kept; the first n, drives, are not negative."""
+    def estimate(self, given: NormalEquations, kept: Tensor, n: int, known: Tensor | None = None) -> Tensor:
+        """Most probable unknowns among those that are kept; the first n, drives, are not negative.
+
+        Args:
+            known: values of the others, zero by default.
+        """
         h, precision = self.normal(given)
+        known = torch.zeros_like(h) if known is None else known
+        h = h - precision @ known
         L = torch.linalg.cholesky(precision[kept][:, kept])
         right = torch.linalg.solve_triangular(L, h[kept, None], upper=False)[:, 0]
         lower = torch.where(kept < n, 0.0, -math.inf)
-        found = scipy.optimize.lsq_linear(L.mT.cpu().numpy(), right.cpu().numpy(), (lower.numpy(), math.inf))
-        return torch.zeros_like(h).index_put((kept,), torch.from_numpy(found.x).to(h))
+        bounds = lower.numpy(), math.inf
+        found = scipy.optimize.lsq_linear(L.mT.cpu().numpy(), right.cpu().numpy(), bounds, method="bvls")
+        return known.index_put((kept,), torch.from_numpy(found.x).to(h))
+
+
+def _marginal(precision: Tensor, kept: Tensor, others: Tensor) -> Tensor:
+    """Precision of some unknowns without knowledge of others: a Schur complement."""
+    across = precision[kept][:, others]
+    return precision[kept][:, kept] - across @ torch.linalg.solve(precision[others][:, others], across.mT)
 
 
 def _over_widths(rows: Rows, inertial: Tensor, M: Tensor) -> Iterator[_Regression]:

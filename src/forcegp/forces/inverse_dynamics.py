@@ -277,11 +277,11 @@ def _rows(
     Phi = torch.cat([*prior.features(system, at).values(), torch.ones_like(at.q)[..., None]], dim=-1)
     Phi, memory = (x / x.square().mean(0).sqrt().clamp(min=1e-12) for x in (Phi, memory))
     residual = mean(system, at) - (at.eom.M @ m.values[..., None])[..., 0]
-    slides = _slides(m.qd.abs(), min(prior.speeds), Phi, residual)
+    slides = sliding(m.qd.abs(), min(prior.speeds), Phi, residual)
     return Rows(m.q, m.qd, m.values, residual, Phi, slides, group, m.segment, partner, memory, rate)
 
 
-def _slides(speed: Tensor, slowest: float, Phi: Tensor, residual: Tensor) -> Tensor:
+def sliding(speed: Tensor, slowest: float, Phi: Tensor, residual: Tensor) -> Tensor:
     """`(n, nq)` bool, without the samples of joints that stick: slow ones, whose torque then scatters more.
 
     Noise of velocities hides that a joint rests, so the bound of slow is the one with the largest ratio.
@@ -298,11 +298,11 @@ def _slides(speed: Tensor, slowest: float, Phi: Tensor, residual: Tensor) -> Ten
         weighted = moving[..., None] * Phi
         w = torch.linalg.lstsq(weighted.transpose(0, 1), (moving * residual).mT[..., None]).solution[..., 0]
         square = (residual - (Phi * w).sum(-1)).square()
-        at_rest, sliding = (
+        at_rest, in_motion = (
             (part * square).sum(0) / part.sum(0).clamp(min=1)
             for part in ((~moving).double(), moving.double())
         )
-        scatter = at_rest / sliding.clamp(min=LEAST_SQUARE)
+        scatter = at_rest / in_motion.clamp(min=LEAST_SQUARE)
         sticks = (scatter > ratio) & (moving.double().mean(0) >= MOVES)
         slides = torch.where(sticks, moving, slides)
         ratio = torch.where(sticks, scatter, ratio)
