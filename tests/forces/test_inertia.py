@@ -393,8 +393,8 @@ def test_a_joint_at_rest_is_found_behind_the_noise_of_its_velocity() -> None:
     friction = torch.where(true == 0.0, 2.0 * torch.rand(n, 2, generator=random).double() - 1.0, true.sign())
     Phi = torch.stack([torch.tanh(qd / 0.02), qd, torch.ones_like(qd)], dim=-1)
     slides = sliding(qd.abs(), 0.02, Phi, friction + 0.1 * torch.randn(n, 2, generator=random).double())
-    assert float(slides[: n // 3, 0].double().mean()) < 0.1 and bool(slides[:, 1].all())
-    assert float(slides[n // 3 :, 0].double().mean()) > 0.9
+    assert float(slides[: n // 3, 0].double().mean()) < 0.1
+    assert bool((slides[n // 3 :].double().mean(0) > 0.9).all()), "but for rows as slow as the noise"
 
 
 def test_harm_is_what_one_joint_suffers() -> None:
