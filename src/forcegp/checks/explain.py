@@ -161,16 +161,18 @@ def _refined(model: Explanation, hypothesis: Hypothesis, fit: TorqueFit) -> Torq
 
 def _fits(model: Explanation) -> Iterator[Tried]:
     system, log, rows = model.system, model.log, model.rows
+    needed = model.problem.r - model.columns @ model.fit.theta + log.tau[rows]
+    late = hypotheses.joint_delays(log, rows, needed)
     if len(model.prior):
         # Once the robot is at fault and its parameters are free, they bend to any sign and order. A delay
         # leaves the motion, and with it the columns of the robot's parameters, as they are.
         for hypothesis in hypotheses.delays(log):
             yield hypothesis, cross_validate(model.on(hypothesis.change(log)), model.columns, model.prior)
+        yield from ((h, fit) for h in late if (fit := _beside_friction(model, h)))
         tried = hypotheses.robot_hypotheses(system, log, rows)
     else:
         few = model.rows[::SCREENING]
         null = cross_validate(model.on(log, few)).score.mean()
-        late = hypotheses.joint_delays(log, rows, model.problem)
         for hypothesis in (*hypotheses.discrete(log), *late):
             changed = hypothesis.change(log)
             if cross_validate(model.on(changed, few)).score.mean() < null:
@@ -187,6 +189,21 @@ def _fits(model: Explanation) -> Iterator[Tried]:
         yield together, model.with_(together)
     if 2 * len(off) > log.nq > 1:
         yield from _currents(model)
+
+
+def _beside_friction(model: Explanation, late: Hypothesis) -> TorqueFit | None:
+    """The fit of a torque that is late, if friction of no other shape explains it as well."""
+    changed, shapes = (
+        model.on(late.change(model.log)),
+        hypotheses.shape_columns(model.system, model.log, model.rows),
+    )
+    fits = []
+    for problem in (changed, model.problem):
+        nuisance = np.concatenate([problem.nuisance, shapes], axis=-1)
+        fits.append(cross_validate(replace(problem, nuisance=nuisance), model.columns, model.prior))
+    if not significant(fits[0].shares, fits[1].shares, 1):
+        return None
+    return cross_validate(changed, model.columns, model.prior)
 
 
 def _currents(model: Explanation) -> Iterator[Tried]:

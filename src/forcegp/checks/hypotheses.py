@@ -76,9 +76,16 @@ def friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> A
 
 def other_rise_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
     """Change of the declared Coulomb friction with the smoothing velocity `(n, nq, p)`."""
-    x, declared = log.qd[rows] / system.robot.friction_velocity.numpy(), system.robot.friction.numpy() > 0.0
-    columns = [_diagonal(np.tanh(k * x) - np.tanh(x))[..., np.flatnonzero(declared)] for k in RISES]
-    return np.concatenate(columns, axis=-1)
+    declared = np.tile(system.robot.friction.numpy() > 0.0, len(RISES))
+    return shape_columns(system, log, rows)[..., : len(declared)][..., declared]
+
+
+def shape_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
+    """Dry friction that rises otherwise, and quadratic friction, of each joint, `(n, nq, p)`."""
+    qd = log.qd[rows]
+    x = qd / system.robot.friction_velocity.numpy()
+    shapes = *(np.tanh(k * x) - np.tanh(x) for k in RISES), qd * np.abs(qd)
+    return np.concatenate([_diagonal(shape) for shape in shapes], axis=-1)
 
 
 def contact_friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
@@ -149,10 +156,11 @@ def delays(log: Log) -> Iterator[Hypothesis]:
         yield Hypothesis("torque-delay", 1, partial(delayed, shift=shift), shift=shift)
 
 
-def joint_delays(log: Log, rows: np.ndarray, problem: TorqueProblem) -> Iterator[Hypothesis]:
-    """For each joint, the hypothesis that its torque lags the motion, with its best delay beside friction."""
+def joint_delays(log: Log, rows: np.ndarray, needed: Array) -> Iterator[Hypothesis]:
+    """For each joint, the hypothesis that its torque lags what the motion needs `(n, nq)`, beside friction,
+    with its best delay.
+    """
     shifts = list(LAGS) if log.stretches else []
-    needed = problem.r + log.tau[rows]
     for j in range(log.nq if log.nq > 1 and shifts else 0):
         x = log.qd[rows, j]
         Q = np.linalg.qr(np.column_stack([x, np.sign(x), np.ones(len(x))]))[0]
