@@ -79,10 +79,14 @@ class Explanation:
     def with_(self, hypothesis: Hypothesis) -> TorqueFit:
         """Fit a hypothesis with parameters, in addition to those already in the model."""
         assert hypothesis.columns is not None and hypothesis.prior is not None
-        columns = np.concatenate([hypothesis.columns, self.columns], axis=-1)
         gains = hypothesis.joints if hypothesis.name == "gains" else ()
-        prior = np.concatenate([hypothesis.prior, self.prior])
-        return cross_validate(self.problem, columns, prior, gains, hypothesis.instruments)
+        wider = self.beside(hypothesis.columns, hypothesis.prior)
+        return cross_validate(self.problem, wider.columns, wider.prior, gains, hypothesis.instruments)
+
+    def beside(self, columns: Array, prior: Array) -> Explanation:
+        """The same with more parameters, which come first."""
+        columns = np.concatenate([columns, self.columns], axis=-1)
+        return replace(self, columns=columns, prior=np.concatenate([prior, self.prior]))
 
 
 def explain(system: ConstrainedSystem, log: Log) -> Explanation:
@@ -140,9 +144,8 @@ def _accepted(model: Explanation, hypothesis: Hypothesis, theta: Array, finding:
     model = replace(model, findings=(*model.findings, finding), taken=taken)
     if hypothesis.name in hypotheses.ROBOT:
         assert hypothesis.columns is not None and hypothesis.prior is not None
-        columns = np.concatenate([hypothesis.columns, model.columns], axis=-1)
-        prior = np.concatenate([hypothesis.prior, model.prior])
-        return replace(model, columns=columns, prior=prior, robot=(hypothesis.name, *model.robot)).weighed()
+        model = model.beside(hypothesis.columns, hypothesis.prior)
+        return replace(model, robot=(hypothesis.name, *model.robot)).weighed()
     repair = partial(corrected, hypothesis=hypothesis, theta=theta)
     log = repair(model.log)
     problem = hypotheses.problem_of(model.system, log, model.rows)
@@ -193,11 +196,8 @@ def _fits(model: Explanation) -> Iterator[Tried]:
 
 def _beside_friction(model: Explanation, late: Hypothesis) -> TorqueFit | None:
     """The fit of a torque that is late, if friction of no other shape explains it as well."""
-    changed, shapes = (
-        model.on(late.change(model.log)),
-        hypotheses.shape_columns(model.system, model.log, model.rows),
-    )
-    fits = []
+    shapes = hypotheses.shape_columns(model.system, model.log, model.rows)
+    changed, fits = model.on(late.change(model.log)), []
     for problem in (changed, model.problem):
         nuisance = np.concatenate([problem.nuisance, shapes], axis=-1)
         fits.append(cross_validate(replace(problem, nuisance=nuisance), model.columns, model.prior))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -66,7 +67,7 @@ def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
         *passive,
         *_confounded(explanation),
         *_friction(system.robot, _determined(system.robot, _with_other_friction(system, explanation))),
-        *_offsets(system.robot, losses),
+        *_offsets(system, losses),
         *_unexplained(explanation),
         *check_visibility(system, explanation),
     ]
@@ -175,7 +176,7 @@ def _friction(robot: RobotModel, explanation: Explanation) -> list[Finding]:
     return findings
 
 
-def _offsets(robot: RobotModel, explanation: Explanation) -> list[Finding]:
+def _offsets(system: ConstrainedSystem, explanation: Explanation) -> list[Finding]:
     log, nq = explanation.log, explanation.log.nq
     offset = -explanation.fit.nuisance[2 * nq : 3 * nq]
     known = np.abs(offset) > explanation.fit.nuisance_spread[2 * nq : 3 * nq]
@@ -183,10 +184,27 @@ def _offsets(robot: RobotModel, explanation: Explanation) -> list[Finding]:
     if not off:
         return []
     joints = tuple(off.values())
-    listed = ", ".join(f"{joint} {offset[j]:+.3g} {force_unit(robot, j)}" for j, joint in off.items())
+    listed = ", ".join(f"{joint} {offset[j]:+.3g} {force_unit(system.robot, j)}" for j, joint in off.items())
     evidence = {f"offset {joint}": offset[j] for j, joint in off.items()}
-    text = f"the logged torque is off by a constant: {listed}"
+    others = [
+        word
+        for word, columns, prior in _rivals(system, explanation, tuple(off))
+        if not any(_matters(explanation.beside(columns, prior), j, [2 * nq + j]) for j in off)
+    ]
+    or_else = f"; in this motion, {' or '.join(others)} would look the same" if others else ""
+    text = f"the logged torque is off by a constant: {listed}{or_else}"
     return [log.finding("torque-offset", text, joints, **evidence)]
+
+
+def _rivals(
+    system: ConstrainedSystem, explanation: Explanation, joints: tuple[int, ...]
+) -> Iterator[tuple[str, Array, Array]]:
+    """What may look like an offset: words, columns and prior."""
+    for name, word in (("gravity", "a tilt of the base"), ("masses", "other masses")):
+        yield word, *hypotheses.robot_columns(system, explanation.log, explanation.rows, name)
+    gain = hypotheses.gain_hypothesis(explanation.log, explanation.rows, joints)
+    assert gain.columns is not None and gain.prior is not None
+    yield "a wrong gain", gain.columns, gain.prior
 
 
 def _unexplained(explanation: Explanation) -> list[Finding]:
