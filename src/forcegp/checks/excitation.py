@@ -112,20 +112,18 @@ LEAST_TOUCHING = 20
 LARGEST = 1e3
 SIZES = np.geomspace(1e-3, LARGEST, 200)
 """Sizes that are tried."""
-MOST = {"encoder-offset": np.pi, "base-tilted": 180.0, "masses-mismatch": 1.0, "heavier-link": 10.0}
-"""Largest sizes that faults can have: half a turn, in rad and degrees, and masses of zero."""
 SPAN = 1
 """Rows on either side of which the rate of the torque is taken; fewer than the margin of `explain`."""
 EXPECTED = {
-    "torque-delay": (0.02, 1e3, "a delay of the torque", "{:.0f} ms"),
-    "base-tilted": (3.0, 1.0, "a tilt of the base", "{:.2g}°"),
-    "masses-mismatch": (0.2, 100.0, "errors of all masses", "{:.0f} %"),
-    "heavier-link": (0.2, 100.0, "a heavier link", "{:.0f} %"),
-    "torque-gain": (0.5, 100.0, "a wrong gain", "{:.0f} %"),
-    "encoder-offset": (0.1, 1.0, "an encoder offset", "{:.2g} {unit}"),
+    "torque-delay": (0.02, LARGEST, 1e3, "a delay of the torque", "{:.0f} ms"),
+    "base-tilted": (3.0, 180.0, 1.0, "a tilt of the base", "{:.2g}°"),
+    "masses-mismatch": (0.2, 1.0, 100.0, "errors of all masses", "{:.0f} %"),
+    "heavier-link": (0.2, 10.0, 100.0, "a heavier link", "{:.0f} %"),
+    "torque-gain": (0.5, LARGEST, 100.0, "a wrong gain", "{:.0f} %"),
+    "encoder-offset": (0.1, np.pi, 1.0, "an encoder offset", "{:.2g} {unit}"),
 }
-"""Size that a user expects to be seen [s, degrees, share, rad], factor to the unit of its words, the fault,
-and its size in words; what concerns the whole arm comes first."""
+"""Size that a user expects to be seen and largest size [s, degrees, share, rad], factor to the unit of its
+words, the fault, and its size in words; what concerns the whole arm comes first."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -139,30 +137,27 @@ class Fault:
 
 
 def check_visibility(system: ConstrainedSystem, explanation: Explanation) -> list[Finding]:
-    """Note the size from which this log shows each fault, and what one of the expected size does to a force.
-
-    A fault of one joint is left out if the log shows the expected size.
-    """
+    """Note from which size this log shows faults, and what one of the expected size does to a force."""
     faults = list(_faults(system, explanation.log, explanation.rows))
     sizes = {fault: visible_size(explanation, fault) for fault in faults}
     units = {name: position_unit(system.robot, j) for j, name in enumerate(system.robot.joint_names)}
     texts, hidden = [], [f for f in faults if not f.joint or sizes[f] > EXPECTED[f.kind][0]]
-    for kind, (expected, scale, what, words) in EXPECTED.items():
+    for kind, (expected, most, scale, what, words) in EXPECTED.items():
         alike, parts = [fault for fault in hidden if fault.kind == kind], []
         if not alike:
             continue
         for fault in alike:
             size = words.format(scale * sizes[fault], unit=units.get(fault.joint))
-            seen = size if sizes[fault] < MOST.get(kind, LARGEST) else "never"
-            parts.append(f"{fault.joint} {seen}".strip())
+            parts.append(f"{fault.joint} {size if sizes[fault] < most else 'never'}".strip())
         force = max(force_of(explanation, fault) for fault in alike) * expected
         size = words.format(scale * expected, unit=units.get(alike[0].joint))
         changed = f" ({size}: force at the contact off by about {force:.2g} N)" if force else ""
         texts.append(f"{what}{': ' if alike[0].joint else ' '}{', '.join(parts)}{changed}")
-    text = f"seen only from: {'; '.join(texts)}"
     joints = tuple(dict.fromkeys(fault.joint for fault in hidden if fault.joint))
     evidence = {f"{fault.kind} {fault.joint}".strip(): size for fault, size in sizes.items()}
-    return [explanation.log.finding("faults-hidden", text, joints, **evidence)]
+    return [
+        explanation.log.finding("faults-hidden", f"seen only from: {'; '.join(texts)}", joints, **evidence)
+    ]
 
 
 def force_of(explanation: Explanation, fault: Fault) -> float:

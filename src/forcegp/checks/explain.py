@@ -76,17 +76,22 @@ class Explanation:
             result = replace(result, problem=replace(result.problem, scale=scale))
         return result
 
+    def beside(self, hypothesis: Hypothesis) -> Explanation:
+        """The same with the parameters of a hypothesis, which come first."""
+        assert hypothesis.columns is not None and hypothesis.prior is not None
+        columns = np.concatenate([hypothesis.columns, self.columns], axis=-1)
+        return replace(self, columns=columns, prior=np.concatenate([hypothesis.prior, self.prior]))
+
+    def with_nuisance(self, *columns: Array) -> Explanation:
+        """The same with more columns that every hypothesis may use."""
+        nuisance = np.concatenate([self.problem.nuisance, *columns], axis=-1)
+        return replace(self, problem=replace(self.problem, nuisance=nuisance))
+
     def with_(self, hypothesis: Hypothesis) -> TorqueFit:
         """Fit a hypothesis with parameters, in addition to those already in the model."""
-        assert hypothesis.columns is not None and hypothesis.prior is not None
         gains = hypothesis.joints if hypothesis.name == "gains" else ()
-        wider = self.beside(hypothesis.columns, hypothesis.prior)
+        wider = self.beside(hypothesis)
         return cross_validate(self.problem, wider.columns, wider.prior, gains, hypothesis.instruments)
-
-    def beside(self, columns: Array, prior: Array) -> Explanation:
-        """The same with more parameters, which come first."""
-        columns = np.concatenate([columns, self.columns], axis=-1)
-        return replace(self, columns=columns, prior=np.concatenate([prior, self.prior]))
 
 
 def explain(system: ConstrainedSystem, log: Log) -> Explanation:
@@ -143,9 +148,7 @@ def _accepted(model: Explanation, hypothesis: Hypothesis, theta: Array, finding:
     taken = model.taken | {(hypothesis.name, hypothesis.joints)}
     model = replace(model, findings=(*model.findings, finding), taken=taken)
     if hypothesis.name in hypotheses.ROBOT:
-        assert hypothesis.columns is not None and hypothesis.prior is not None
-        model = model.beside(hypothesis.columns, hypothesis.prior)
-        return replace(model, robot=(hypothesis.name, *model.robot)).weighed()
+        return replace(model.beside(hypothesis), robot=(hypothesis.name, *model.robot)).weighed()
     repair = partial(corrected, hypothesis=hypothesis, theta=theta)
     log = repair(model.log)
     problem = hypotheses.problem_of(model.system, log, model.rows)
@@ -196,14 +199,10 @@ def _fits(model: Explanation) -> Iterator[Tried]:
 
 def _beside_friction(model: Explanation, late: Hypothesis) -> TorqueFit | None:
     """The fit of a torque that is late, if friction of no other shape explains it as well."""
+    changed = replace(model, problem=model.on(late.change(model.log)))
     shapes = hypotheses.shape_columns(model.system, model.log, model.rows)
-    changed, fits = model.on(late.change(model.log)), []
-    for problem in (changed, model.problem):
-        nuisance = np.concatenate([problem.nuisance, shapes], axis=-1)
-        fits.append(cross_validate(replace(problem, nuisance=nuisance), model.columns, model.prior))
-    if not significant(fits[0].shares, fits[1].shares, 1):
-        return None
-    return cross_validate(changed, model.columns, model.prior)
+    better, worse = (one.with_nuisance(shapes).fit.shares for one in (changed, model))
+    return changed.fit if significant(better, worse, 1) else None
 
 
 def _currents(model: Explanation) -> Iterator[Tried]:
@@ -238,21 +237,18 @@ ALONE = 2.0
 def alternatives_of(
     system: ConstrainedSystem, chosen: Tried, tried: Iterable[Tried], null: TorqueFit
 ) -> Iterator[Tried]:
-    """The hypotheses within a standard error of the chosen one on held-out blocks, best first."""
+    """The hypotheses within a standard error of the chosen one on held-out blocks, best first, without those
+    of its kind and joints, or that contain it, as masses do a tool.
+    """
+    name, joints = chosen[0].name, {*chosen[0].joints}
     for hypothesis, fit in sorted(tried, key=lambda one: one[1].score.mean()):
-        if _says_the_same(chosen[0], hypothesis):
+        same = name == hypothesis.name and (not hypothesis.joints or bool(joints & {*hypothesis.joints}))
+        if same or (name, hypothesis.name) == ("payload", "masses"):
             continue
         gain, error = gain_of(fit.score, null.score)
         loss, tie = gain_of(chosen[1].score, fit.score)
         if gain > ALONE * error and abs(loss) <= tie and _possible(system, hypothesis, fit):
             yield hypothesis, fit
-
-
-def _says_the_same(chosen: Hypothesis, other: Hypothesis) -> bool:
-    """Whether a hypothesis has the kind and joints of the chosen one, or contains it, as masses do a tool."""
-    if (chosen.name, other.name) == ("payload", "masses"):
-        return True
-    return other.name == chosen.name and (not other.joints or bool({*other.joints} & {*chosen.joints}))
 
 
 def _possible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit) -> bool:

@@ -89,21 +89,15 @@ def shape_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Arra
 
 
 def contact_friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
-    """Viscous and dry friction of each contact with only the normal force removed, `(n, nq, p)`."""
-    contacts = [] if takes_friction_out(system, log) else labelled_contacts(system, log)
-    touching = [c for c in contacts if isinstance(c, SurfaceContact)]
-    empty = np.zeros((len(rows), log.nq, 0))
-    return np.concatenate([empty, *(_sliding_columns(system, c, log, rows) for c in touching)], axis=-1)
-
-
-def _sliding_columns(system: ConstrainedSystem, contact: SurfaceContact, log: Log, rows: np.ndarray) -> Array:
-    """Torque −Jᵀv and −Jᵀv/|v| of a point that slides at v where the contact is closed, `(n, nq, 2)`."""
-    (q,), v = tensors(log, rows, "q"), tip_path(system, contact, log, rows).along
-    with torch.no_grad():
-        J = kinematics.point_jacobian(system.robot, q, contact.frame, contact.point).numpy()
-    speed = np.sqrt((v**2).sum(axis=1, keepdims=True) + SLOW**2)
-    closed = log.contact[contact.name][rows][:, None]
-    return np.stack([np.einsum("nkj,nk->nj", J, closed * f) for f in (v, v / speed)], axis=-1)
+    """Friction −Jᵀv, −Jᵀv/|v| of each contact that slides at v unless it is removed, `(n, nq, p)`."""
+    (q,), columns = tensors(log, rows, "q"), [np.zeros((len(rows), log.nq, 0))]
+    for contact in [] if takes_friction_out(system, log) else labelled_contacts(system, log):
+        if isinstance(contact, SurfaceContact):
+            v = tip_path(system, contact, log, rows).along * log.contact[contact.name][rows][:, None]
+            J = kinematics.point_jacobian(system.robot, q, contact.frame, contact.point).detach().numpy()
+            speed = np.sqrt((v**2).sum(axis=1, keepdims=True) + SLOW**2)
+            columns.append(np.stack([np.einsum("nkj,nk->nj", J, f) for f in (v, v / speed)], axis=-1))
+    return np.concatenate(columns, axis=-1)
 
 
 def _diagonal(x: Array) -> Array:
@@ -157,9 +151,7 @@ def delays(log: Log) -> Iterator[Hypothesis]:
 
 
 def joint_delays(log: Log, rows: np.ndarray, needed: Array) -> Iterator[Hypothesis]:
-    """For each joint, the hypothesis that its torque lags what the motion needs `(n, nq)`, beside friction,
-    with its best delay.
-    """
+    """For each joint, the hypothesis that its torque lags the needed one `(n, nq)`, with its best delay."""
     shifts = list(LAGS) if log.stretches else []
     for j in range(log.nq if log.nq > 1 and shifts else 0):
         x = log.qd[rows, j]

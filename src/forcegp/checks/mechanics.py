@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import replace
 
 import numpy as np
@@ -40,6 +39,8 @@ DISTURBANCE, LOUD = 5.0, 4.0
 over the residual of the worst tenth of the motion."""
 MOVING, VISIBLE = 0.05, 0.1
 """Share of the largest speed of an arm that moves; least disturbance, beyond dry friction, as a share."""
+RIVALS = {"gravity": "a tilt of the base", "masses": "other masses", "gains": "a wrong gain"}
+"""What may look like a constant torque, by hypothesis."""
 ONE_SIGMA = 84.13
 """Percentile of a normal distribution at one standard deviation above the mean."""
 
@@ -63,10 +64,13 @@ def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
         # What happened in these rows must pass neither for friction nor for a mass.
         explanation = explain(system, smooth.mask(rows))
     losses = _determined(system.robot, explanation)
+    # Friction of the contacts, and declared friction that rises more sharply, must not pass for more.
+    functions = (hypotheses.contact_friction_columns, hypotheses.other_rise_columns)
+    shapes = [columns(system, explanation.log, explanation.rows) for columns in functions]
     findings = [
         *passive,
         *_confounded(explanation),
-        *_friction(system.robot, _determined(system.robot, _with_other_friction(system, explanation))),
+        *_friction(system.robot, _determined(system.robot, explanation.with_nuisance(*shapes))),
         *_offsets(system, losses),
         *_unexplained(explanation),
         *check_visibility(system, explanation),
@@ -106,14 +110,6 @@ def _matters(explanation: Explanation, j: int, columns: list[int]) -> bool:
     floor = FLOOR * problem.size[j] / problem.scale[j]
     gain, error = gain_of(*(np.log(np.hypot(fit.error[:, j], floor)) for fit in (explanation.fit, without)))
     return gain > MATERIAL and gain > SIGNIFICANT * error
-
-
-def _with_other_friction(system: ConstrainedSystem, explanation: Explanation) -> Explanation:
-    """The explanation beside friction of the contacts, and declared friction that rises more sharply."""
-    functions = (hypotheses.contact_friction_columns, hypotheses.other_rise_columns)
-    columns = [columns(system, explanation.log, explanation.rows) for columns in functions]
-    nuisance = np.concatenate([explanation.problem.nuisance, *columns], axis=-1)
-    return replace(explanation, problem=replace(explanation.problem, nuisance=nuisance))
 
 
 def _determined(robot: RobotModel, explanation: Explanation) -> Explanation:
@@ -186,25 +182,13 @@ def _offsets(system: ConstrainedSystem, explanation: Explanation) -> list[Findin
     joints = tuple(off.values())
     listed = ", ".join(f"{joint} {offset[j]:+.3g} {force_unit(system.robot, j)}" for j, joint in off.items())
     evidence = {f"offset {joint}": offset[j] for j, joint in off.items()}
-    others = [
-        word
-        for word, columns, prior in _rivals(system, explanation, tuple(off))
-        if not any(_matters(explanation.beside(columns, prior), j, [2 * nq + j]) for j in off)
-    ]
-    or_else = f"; in this motion, {' or '.join(others)} would look the same" if others else ""
+    tried = list(hypotheses.robot_hypotheses(system, log, explanation.rows))
+    tried += [hypotheses.gain_hypothesis(log, explanation.rows, tuple(off))]
+    beside = {RIVALS[h.name]: explanation.beside(h) for h in tried if h.name in RIVALS}
+    others = [w for w, one in beside.items() if not any(_matters(one, j, [2 * nq + j]) for j in off)]
+    or_else = f"; in this motion, {', '.join(others)} would look the same" if others else ""
     text = f"the logged torque is off by a constant: {listed}{or_else}"
     return [log.finding("torque-offset", text, joints, **evidence)]
-
-
-def _rivals(
-    system: ConstrainedSystem, explanation: Explanation, joints: tuple[int, ...]
-) -> Iterator[tuple[str, Array, Array]]:
-    """What may look like an offset: words, columns and prior."""
-    for name, word in (("gravity", "a tilt of the base"), ("masses", "other masses")):
-        yield word, *hypotheses.robot_columns(system, explanation.log, explanation.rows, name)
-    gain = hypotheses.gain_hypothesis(explanation.log, explanation.rows, joints)
-    assert gain.columns is not None and gain.prior is not None
-    yield "a wrong gain", gain.columns, gain.prior
 
 
 def _unexplained(explanation: Explanation) -> list[Finding]:

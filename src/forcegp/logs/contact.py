@@ -27,7 +27,7 @@ from forcegp.errors import DataError
 from forcegp.logs.mapping import GROUND, ContactStateSection, Mapping
 from forcegp.logs.table import Array, ImportReport, Signals
 from forcegp.robot import RobotModel
-from forcegp.robust import level_of, robust_std
+from forcegp.robust import level_and_spread, level_of
 from forcegp.rows import runs
 
 CHUNK = 1 << 12
@@ -349,11 +349,3 @@ def _merge_short(closed: NDArray[np.bool_], signals: Signals, shortest: float) -
                 closed[span] = ~closed[span]
                 count += 1
     return count
-
-
-def level_and_spread(values: Array) -> tuple[float, float]:
-    """Median, and the standard deviation of a normal distribution with the same median absolute deviation."""
-    if not len(values):
-        return float("nan"), float("nan")
-    middle = float(np.median(values))
-    return middle, float(robust_std(values))
