@@ -195,16 +195,19 @@ def visible_size(explanation: Explanation, fault: Fault) -> float:
 
 
 def _faults(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterator[Fault]:
+    delays = []
+    if log.header.ordered:  # rows in order of selection have no neighbours in time
+        # The torque that the motion needs; the measured one has more noise.
+        ahead, behind = (residual(system, log, rows + k)[0] + log.tau[rows + k] for k in (SPAN, -SPAN))
+        delays = [(ahead - behind) / (2.0 * SPAN * log.dt)]
+        yield Fault("torque-delay", "", delays[0], log.nq)
     for j, joint in enumerate(log.joint_names):
         only = np.arange(log.nq) == j
+        yield from (Fault("torque-delay", joint, delay * only, 1) for delay in delays)
         yield Fault("torque-gain", joint, log.tau[rows] * only, 1)
         column = encoder_hypothesis(system, log, rows, j).columns
         assert column is not None
         yield Fault("encoder-offset", joint, column[..., 0], 1)
-    if log.header.ordered:  # rows in order of selection have no neighbours in time
-        # The torque that the motion needs; the measured one has more noise.
-        ahead, behind = (residual(system, log, rows + k)[0] + log.tau[rows + k] for k in (SPAN, -SPAN))
-        yield Fault("torque-delay", "", (ahead - behind) / (2.0 * SPAN * log.dt), log.nq)
     # Per degree of a tilt, about the horizontal axis that shows it better.
     gravity, columns = system.robot.gravity.numpy(), robot_columns(system, log, rows, "gravity")[0]
     axes = np.linalg.svd(gravity[None])[2][1:] * np.linalg.norm(gravity) * np.pi / 180.0

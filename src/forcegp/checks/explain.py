@@ -20,8 +20,8 @@ from forcegp.checks.log import Array, Log
 from forcegp.checks.placement import leaves_surface
 from forcegp.constraints import ConstrainedSystem
 
-ROWS, SCREENING = 1600, 4
-"""Rows that hypotheses are tested on; on one in so many they must do better first."""
+ROWS, SCREENING, DELAYS = 1600, 4, 3
+"""Rows that hypotheses are tested on; on one in so many they must do better first; delays of one joint."""
 ROUNDS = 5
 """Faults that are looked for at most."""
 SIGNIFICANT = 4.0
@@ -167,19 +167,17 @@ def _refined(model: Explanation, hypothesis: Hypothesis, fit: TorqueFit) -> Torq
 
 def _fits(model: Explanation) -> Iterator[Tried]:
     system, log, rows = model.system, model.log, model.rows
-    needed = model.problem.r - model.columns @ model.fit.theta + log.tau[rows]
-    late = hypotheses.joint_delays(log, rows, needed)
     if len(model.prior):
         # Once the robot is at fault and its parameters are free, they bend to any sign and order. A delay
         # leaves the motion, and with it the columns of the robot's parameters, as they are.
         for hypothesis in hypotheses.delays(log):
             yield hypothesis, cross_validate(model.on(hypothesis.change(log)), model.columns, model.prior)
-        yield from ((h, fit) for h in late if (fit := _beside_friction(model, h)))
+        yield from ((h, fit) for h in _joint_delays(model) if (fit := _beside_friction(model, h)))
         tried = hypotheses.robot_hypotheses(system, log, rows)
     else:
         few = model.rows[::SCREENING]
         null = cross_validate(model.on(log, few)).score.mean()
-        for hypothesis in (*hypotheses.discrete(log), *late):
+        for hypothesis in (*hypotheses.discrete(log), *_joint_delays(model)):
             changed = hypothesis.change(log)
             if cross_validate(model.on(changed, few)).score.mean() < null:
                 yield hypothesis, cross_validate(model.on(changed))
@@ -195,6 +193,21 @@ def _fits(model: Explanation) -> Iterator[Tried]:
         yield together, model.with_(together)
     if 2 * len(off) > log.nq > 1:
         yield from _currents(model)
+
+
+def _joint_delays(model: Explanation) -> Iterator[Hypothesis]:
+    """For each joint, the delays of its torque that leave least unexplained on the screened rows, if any."""
+    log, few = model.log, model.rows[::SCREENING]
+    problem, columns = model.on(log, few), model.columns[::SCREENING]
+    null = cross_validate(problem, columns, model.prior).score.mean()
+    for j in range(log.nq if log.nq > 1 and log.stretches else 0):
+        scores, only = {}, np.arange(log.nq) == j
+        for shift in hypotheses.LAGS:
+            r = problem.r + only * (log.tau[few] - log.tau[few + shift])
+            scores[shift] = cross_validate(replace(problem, r=r), columns, model.prior).score.mean()
+        for shift in sorted((k for k in scores if scores[k] < null), key=scores.__getitem__)[:DELAYS]:
+            change = partial(hypotheses.delayed, shift=shift, joints=(j,))
+            yield Hypothesis("torque-delay", 1, change, joints=(j,), shift=shift)
 
 
 def _beside_friction(model: Explanation, late: Hypothesis) -> TorqueFit | None:

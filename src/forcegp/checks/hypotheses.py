@@ -82,8 +82,7 @@ def other_rise_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) ->
 
 def shape_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
     """Dry friction that rises otherwise, and quadratic friction, of each joint, `(n, nq, p)`."""
-    qd = log.qd[rows]
-    x = qd / system.robot.friction_velocity.numpy()
+    x, qd = log.qd[rows] / system.robot.friction_velocity.numpy(), log.qd[rows]
     shapes = *(np.tanh(k * x) - np.tanh(x) for k in RISES), qd * np.abs(qd)
     return np.concatenate([_diagonal(shape) for shape in shapes], axis=-1)
 
@@ -148,18 +147,6 @@ def delays(log: Log) -> Iterator[Hypothesis]:
     """Torques that are logged before or after the motion."""
     for shift in (sign * lag for lag in (LAGS if log.stretches else ()) for sign in (1, -1)):
         yield Hypothesis("torque-delay", 1, partial(delayed, shift=shift), shift=shift)
-
-
-def joint_delays(log: Log, rows: np.ndarray, needed: Array) -> Iterator[Hypothesis]:
-    """For each joint, the hypothesis that its torque lags the needed one `(n, nq)`, with its best delay."""
-    shifts = list(LAGS) if log.stretches else []
-    for j in range(log.nq if log.nq > 1 and shifts else 0):
-        x = log.qd[rows, j]
-        Q = np.linalg.qr(np.column_stack([x, np.sign(x), np.ones(len(x))]))[0]
-        rest = needed[:, [j]] - np.column_stack([log.tau[rows + shift, j] for shift in shifts])
-        shift = shifts[int(((rest - Q @ (Q.T @ rest)) ** 2).sum(axis=0).argmin())]
-        change = partial(delayed, shift=shift, joints=(j,))
-        yield Hypothesis("torque-delay", 1, change, joints=(j,), shift=shift)
 
 
 def continuous(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterator[Hypothesis]:

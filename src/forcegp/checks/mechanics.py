@@ -173,22 +173,20 @@ def _friction(robot: RobotModel, explanation: Explanation) -> list[Finding]:
 
 
 def _offsets(system: ConstrainedSystem, explanation: Explanation) -> list[Finding]:
-    log, nq = explanation.log, explanation.log.nq
+    log, nq, rows = explanation.log, explanation.log.nq, explanation.rows
     offset = -explanation.fit.nuisance[2 * nq : 3 * nq]
     known = np.abs(offset) > explanation.fit.nuisance_spread[2 * nq : 3 * nq]
     off = {j: log.joint_names[j] for j in range(nq) if known[j] and _matters(explanation, j, [2 * nq + j])}
     if not off:
         return []
-    joints = tuple(off.values())
     listed = ", ".join(f"{joint} {offset[j]:+.3g} {force_unit(system.robot, j)}" for j, joint in off.items())
     evidence = {f"offset {joint}": offset[j] for j, joint in off.items()}
-    tried = list(hypotheses.robot_hypotheses(system, log, explanation.rows))
-    tried += [hypotheses.gain_hypothesis(log, explanation.rows, tuple(off))]
+    tried = *hypotheses.robot_hypotheses(system, log, rows), hypotheses.gain_hypothesis(log, rows, tuple(off))
     beside = {RIVALS[h.name]: explanation.beside(h) for h in tried if h.name in RIVALS}
     others = [w for w, one in beside.items() if not any(_matters(one, j, [2 * nq + j]) for j in off)]
     or_else = f"; in this motion, {', '.join(others)} would look the same" if others else ""
     text = f"the logged torque is off by a constant: {listed}{or_else}"
-    return [log.finding("torque-offset", text, joints, **evidence)]
+    return [log.finding("torque-offset", text, tuple(off.values()), **evidence)]
 
 
 def _unexplained(explanation: Explanation) -> list[Finding]:
