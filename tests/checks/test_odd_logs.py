@@ -14,7 +14,6 @@ from forcegp.checks.explain import _possible, with_alternatives
 from forcegp.checks.finding import Finding
 from forcegp.checks.fit import cross_validate
 from forcegp.checks.hypotheses import Hypothesis, problem_of, unchanged
-from forcegp.constraints import ConstrainedSystem
 from forcegp.scene import load_scene
 from forcegp.simulate import simulate
 from planted_faults import Case, free_log, serious
