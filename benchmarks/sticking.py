@@ -10,7 +10,8 @@ three components of the force on the tip. Joints at rest creep in MuJoCo's frict
 springs in Dahl's (`dahl`). The speed below which the tip sticks is that which an import reads off the log.
 
 - `equations of motion`: least squares of M q̈ − Q_K − τ = J_EᵀF with the file.
-- `with friction`: the same, with viscous and dry friction of each joint from the free motion of training.
+- `with friction`: the same, with viscous and dry friction and an offset of each joint from the free motion of
+  training; `and gain`: with a gain and load friction too.
 - `forcegp`: force predicted from q, q̇, τ, with a tip that may stick.
 - `forcegp wrench`: the external wrench at the tip, no contact declared.
 """
@@ -29,6 +30,7 @@ from typing import Any
 
 import numpy as np
 import torch
+from classical_wrench import TERMS, identified_losses
 from results_page import table
 from solver_contacts import KUKA, MOTION
 from torch import Tensor
@@ -48,8 +50,8 @@ DURATION, AREA = 40.0, (0.03, 0.03)
 HIGH_FRICTION = 3.0
 EVERY, TESTED = 4, 3
 """Every so many rows are learned from, and tested."""
-DRY_SPEED = 0.05
-"""Speed over which dry friction of the plain regression changes sign [rad/s]."""
+FRICTION = ("offset", "viscous", "Coulomb")
+"""Terms of the plain regression."""
 
 
 class Dahl:
@@ -95,11 +97,6 @@ def residual(system: forcegp.ConstrainedSystem, data: forcegp.Dataset) -> tuple[
     return left, point.jacobian, point.sliding[1].norm(dim=-1)
 
 
-def friction(data: forcegp.Dataset) -> Tensor:
-    """Columns of viscous and dry friction and an offset of each joint, `(n, nq, 3)`."""
-    return torch.stack([data.qd, torch.tanh(data.qd / DRY_SPEED), torch.ones_like(data.qd)], dim=-1)
-
-
 def plain(
     system: forcegp.ConstrainedSystem, train: forcegp.Dataset, test: forcegp.Dataset
 ) -> dict[str, Tensor]:
@@ -107,10 +104,11 @@ def plain(
     name = system.contacts[0].name
     free = train[~train.contact[name]]
     left, _, _ = residual(system, free)
-    weights = torch.linalg.lstsq(friction(free).transpose(0, 1), left.T[..., None]).solution[..., 0]
     rest, J, _ = residual(system, test)
-    learned = rest - (friction(test) * weights).sum(-1)
-    forces = {"equations of motion": rest, "with friction": learned}
+    forces = {"equations of motion": rest}
+    for name, terms in {"with friction": FRICTION, "and gain": tuple(TERMS)}.items():
+        losses = identified_losses(left, free.qd, free.tau, terms)
+        forces[name] = rest - losses(test.qd, test.tau)
     return {k: torch.linalg.lstsq(J.mT, r[..., None]).solution[..., 0] for k, r in forces.items()}
 
 

@@ -15,7 +15,7 @@ from forcegp.errors import DataError, MappingError
 from forcegp.logs import import_log, parse_mapping
 from forcegp.logs.from_contact import dividing_speed, resting_speed
 from forcegp.simulate import simulate
-from log_files import motion, write_csv
+from log_files import REAL, motion, real_logs, write_csv
 
 CLOSED = 1e-6
 """Accuracy of joints that follow from a contact [rad, rad/s, rad/s²]; Gauss-Newton ends at 1e-9 m."""
@@ -166,3 +166,38 @@ def test_a_fit_does_not_learn_from_torques_of_unknown_size() -> None:
     believed = model.fit(data, learn=[], after=without)
     one, two, far = (fit.predict(q, qd, tau).mean for fit in (without, stated, believed))
     assert float((two - one).abs().max()) < 1e-6 * float((far - one).abs().max())
+
+
+@real_logs
+def test_the_height_of_a_pushed_leg_follows_from_its_foot(tmp_path: Path) -> None:
+    """As by the kinematics of the foot that is held; the torque that clips is found in the raw log."""
+    folder = REAL / "hopper"
+    read = [
+        np.loadtxt(folder / "pushed" / f"dg_hopper_teststand-joint_{name}.dat")
+        for name in ("positions", "torques")
+    ]
+    first, last = max(x[0, 0] for x in read), min(x[-1, 0] for x in read)
+    q, tau = (x[(x[:, 0] >= first) & (x[:, 0] <= last), 1:] for x in read)
+    columns = np.column_stack([np.arange(len(q)) * 1e-3, q, tau])
+    header = "t,q.HFE,q.KFE,tau.HFE,tau.KFE"
+    np.savetxt(tmp_path / "pushed.csv", columns, delimiter=",", header=header, comments="")
+    robot = forcegp.load_robot(folder / "teststand.urdf")
+    foot = forcegp.SurfaceContact("ground", "contact", (0.0, 0.0, 0.0), forcegp.Plane((0.0, 0.0, 1.0), 0.0))
+    toml = """
+    time = { column = "t" }
+    position = { column = "q.{joint}", unit = "rad", from_contact = { joint_z = "ground" } }
+    torque = { column = "tau.{joint}", unit = "Nm", unmeasured = ["joint_z"] }
+    derivatives = { window = 61 }
+    contact.ground = { source = "always", stick_speed = 1.0 }
+    """
+    system = forcegp.ConstrainedSystem(robot, [foot])
+    found = import_log(tmp_path / "pushed.csv", system, parse_mapping(toml.encode(), "mapping")).data
+    still = found.q.clone()
+    still[:, 0] = 0.0
+    height = forcegp.kinematics.frame_pose(robot, still, "contact")[1][:, 2]
+    np.testing.assert_allclose(found.q[:, 0], -height, rtol=0.0, atol=1e-9)
+    std = found.extras["tau_std"]
+    assert not std[:, :2].any()
+    # A third of the rows, and half a window on either side of each stretch.
+    assert 0.33 < float((std[:, 2] > 0.0).double().mean()) < 0.6
+    assert found.header.unmeasured_torques == ("joint_z",) and found.header.stick_speeds == {"ground": 1.0}
