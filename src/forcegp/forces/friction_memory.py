@@ -115,8 +115,9 @@ def memory_of(
         white = (M.square() @ std[rows].square()[..., None])[..., 0]
         residual = (M @ part.values[..., None])[..., 0] - mean
         parts.append((residual, white, S.diagonal(dim1=-2, dim2=-1), noise))
-    columns = [torch.cat(column) for column in zip(*parts, strict=True)]
-    memory = learn_memory(problem.system.robot, m, *columns, rows=free)
+    memory = learn_memory(
+        problem.system.robot, m[free], *(torch.cat(columns) for columns in zip(*parts, strict=True))
+    )
     if memory is None:
         return {}
     return {WEIGHTS: memory.weights, SHARE: memory.share, CORRELATION: memory.correlation}
@@ -129,17 +130,14 @@ def learn_memory(
     white: Tensor,
     forces: Tensor,
     noise: Tensor,
-    rows: Tensor | None = None,
 ) -> FrictionMemory | None:
     """Learn the correction from training samples in free motion.
 
     Args:
-        motion: samples in order of time, on all of which z depends.
         residual: joint force that the fit does not explain, M q̈ − E Q̄ `(n, nq)`.
         white: its variance that noise of the accelerations explains, `(n, nq)`.
         forces: its variance that the learned forces explain, `(n, nq)`.
         noise: its variance that torque noise and sticking explain, `(n, nq, 2)`.
-        rows: the samples in free motion `(n,)`; all by default.
 
     Returns:
         The correction, or `None` if the samples are too far apart.
@@ -147,9 +145,7 @@ def learn_memory(
     steps = motion.t.diff()[motion.segment[1:] == motion.segment[:-1]]
     if not len(steps) or not 0.0 < float(steps.median()) <= LONGEST_STEP or float(steps.min()) <= 0.0:
         return None
-    rows = torch.arange(len(motion.q)) if rows is None else rows
-    X, segment = _features(robot, motion)[rows], motion.segment[rows]
-    group = stretches(segment)
+    X, group = _features(robot, motion), stretches(motion.segment)
     grams, rights = [], []
     for g in group.unique():
         x = X[group == g].transpose(0, 1)
@@ -165,9 +161,9 @@ def learn_memory(
     total, share = white + forces + noise.sum(-1), torch.ones_like(noise[0])
     for j in better.nonzero()[:, 0].tolist():
         # r² − white − forces ≈ share · noise, with weights by the variance of r²
-        shares = noise[:, j] / total[:, j, None]
+        rows = noise[:, j] / total[:, j, None]
         target = (remaining[:, j].square() - white[:, j] - forces[:, j]) / total[:, j]
-        found = torch.from_numpy(scipy.optimize.nnls(shares.cpu().numpy(), target.cpu().numpy())[0])
+        found = torch.from_numpy(scipy.optimize.nnls(rows.cpu().numpy(), target.cpu().numpy())[0])
         share[j] = found.to(share).clamp(min=LEAST_SHARE, max=1.0)
         # A new motion is one more stretch, so its variance scatters as that of the stretches does.
         square = remaining[:, j].square() / (white[:, j] + forces[:, j] + noise[:, j] @ share[j])
@@ -175,5 +171,5 @@ def learn_memory(
         share[j] *= (by_stretch.mean() + by_stretch.std()).clamp(min=1.0)
     weights = torch.linalg.solve(gram.sum(0) + ridge, right.sum(0)) * better[:, None]
     left = torch.where(better, remaining, residual)
-    times = autocorrelation_time(left, segment, white.mean(0))
+    times = autocorrelation_time(left, motion.segment, white.mean(0))
     return FrictionMemory(weights, share, steps.median() * times)
