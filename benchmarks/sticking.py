@@ -121,7 +121,7 @@ def score(error: Tensor, std: Tensor | None = None) -> dict[str, float]:
 
 
 def recorded(
-    scene: str, friction: str, seed: int
+    scene: str, friction: str, seed: int, seconds: float
 ) -> tuple[forcegp.ConstrainedSystem, dict[str, forcegp.Dataset]]:
     """The system, and the logs in which the tip slides and sticks."""
     loaded = load_scene(scene)
@@ -129,7 +129,7 @@ def recorded(
     if scene == "kuka_plane":
         solver = dataclasses.replace(config.solver, **KUKA)
         config = dataclasses.replace(MOTION, center=config.center, size=config.size, solver=solver)
-    slides = dataclasses.replace(config, seed=seed, duration=DURATION)
+    slides = dataclasses.replace(config, seed=seed, duration=seconds)
     solver = dataclasses.replace(slides.solver, friction=HIGH_FRICTION)
     sticks = dataclasses.replace(slides, seed=seed + 100, size=AREA, solver=solver)
     logs = {}
@@ -139,9 +139,11 @@ def recorded(
     return system, logs
 
 
-def scores(scene: str, friction: str, seed: int) -> dict[str, dict[str, dict[str, float]]]:
+def scores(
+    scene: str, friction: str, seed: int, seconds: float, priors: str
+) -> dict[str, dict[str, dict[str, float]]]:
     """Scores of each method, where the tip sticks and where it slides."""
-    system, logs = recorded(scene, friction, seed)
+    system, logs = recorded(scene, friction, seed, seconds)
     (contact,) = system.contacts
     assert isinstance(contact, forcegp.SurfaceContact)
     half = {name: len(log) // 2 for name, log in logs.items()}
@@ -149,7 +151,7 @@ def scores(scene: str, friction: str, seed: int) -> dict[str, dict[str, dict[str
     stick_speed = resting_speed(residual(system, train[train.contact[contact.name]])[2].numpy())
     assert stick_speed is not None
     both = system.with_stick_speeds({contact.name: stick_speed})
-    fit = forcegp.StructuredGP(both, "analytical").fit(train[::EVERY])
+    fit = forcegp.StructuredGP(both, "analytical", priors).fit(train[::EVERY])
     result = {}
     for name, log in logs.items():
         test = log[half[name] :: TESTED]
@@ -177,6 +179,8 @@ def main() -> None:
     )
     parser.add_argument("--scene", choices=SCENES, action="append")
     parser.add_argument("--friction", choices=FRICTIONS, action="append")
+    parser.add_argument("--seconds", type=float, default=DURATION, help="length of each log")
+    parser.add_argument("--priors", default="auto", help="of StructuredGP, such as friction")
     parser.add_argument("--seeds", type=int, nargs="*", default=list(range(5)))
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
@@ -185,7 +189,7 @@ def main() -> None:
     result: dict[str, list[dict[str, dict[str, dict[str, float]]]]] = {}
     cases = options.scene or SCENES, options.friction or FRICTIONS
     for seed, scene, friction in itertools.product(options.seeds, *cases):
-        found = scores(scene, friction, seed)
+        found = scores(scene, friction, seed, options.seconds, options.priors)
         result.setdefault(f"{scene}, {friction}", []).append(found)
         print(scene, friction, seed, json.dumps(found), flush=True)
     lines = []
