@@ -33,8 +33,9 @@ UNMOVED = 1e-6
 """Smallest singular value of A_u over the largest of A at which a contact determines its joints."""
 BINS, SMOOTH = 10, 1.5
 """Bins in a decade of speeds, and the standard deviation that smooths them in bins."""
-VALLEY, SHARE = 0.5, 0.05
-"""Height of a valley over that of the lower mode beside it, and least share of the rows on either side."""
+VALLEY, SHARE = 0.5, 0.1
+"""Height of a valley over that of the lower mode beside it, and least share of the rows on either side: a tip
+that only pauses where it turns round slides."""
 SLOWEST = 1e-6
 """Speeds below count as this [m/s]."""
 
