@@ -15,7 +15,7 @@ from forcegp.errors import ModelError, RobotFileError, check_name
 if TYPE_CHECKING:
     from forcegp.models.structured_fit import StructuredFit
 
-TARGETS = ("c", "casadi", "urdf", "mjcf")
+TARGETS = ("c", "casadi", "torch", "urdf", "mjcf")
 
 
 def export(
@@ -23,7 +23,7 @@ def export(
     out: Annotated[
         Path, typer.Option("--out", "-o", help="Folder for the code and its test, or the robot file.")
     ],
-    to: Annotated[str, typer.Option("--to", help="c, casadi, urdf or mjcf.")] = "c",
+    to: Annotated[str, typer.Option("--to", help="c, casadi, torch, urdf or mjcf.")] = "c",
     name: Annotated[
         str, typer.Option(help="Of C code: name of the files, and prefix of the functions.")
     ] = "controller",
@@ -54,6 +54,8 @@ def export(
     CMakeLists.txt and a README are included.
 
     CasADi: the mean as a function with exact derivatives, in a file for `casadi.Function.load`.
+
+    torch: mean and covariance as a program for `torch.export.load`.
 
     URDF, MJCF: a copy of the robot's file with identified inertia, damping and friction, and no other change;
     a report with standard deviations and losses; and robots drawn from the posterior.

@@ -210,7 +210,7 @@ class StructuredFit(FittedModel):
 
         Args:
             path: folder to create.
-            language: `"c"` or `"casadi"`.
+            language: `"c"`, `"casadi"`, or `"torch"` for mean and covariance as a `torch.export` program.
             name: of the files, and prefix of all names in them.
             functions: number r of functions of a reduced covariance; `None` for all.
             wrench: frame and components of an external wrench, estimated from accelerations beside the state.

@@ -21,10 +21,11 @@ from forcegp.models.export.casadi_function import write_casadi
 from forcegp.models.export.library import CompiledFit
 from forcegp.models.export.model import ExportedModel
 from forcegp.models.export.source import READ, c_source, template
+from forcegp.models.export.torch_program import write_torch
 from forcegp.models.external_wrench import LearnedForces, external_wrench
 from forcegp.models.prediction import Predictor
 
-LANGUAGES = ("c", "casadi")
+LANGUAGES = ("c", "casadi", "torch")
 STATES, LOSS_STATES = 16, 200
 """States of the test program, and those at which the loss of a reduced posterior is measured."""
 TOLERANCE, ZERO = 1e-10, 1e-5
@@ -69,10 +70,14 @@ def write_export(
         "README.md",
         "build",
         f"{name}.casadi",
+        f"{name}.pt2",
     )
     check_destination(path, folder=True, own_files=own)
     if language == "casadi":
         write_casadi(model, Path(path), name)
+        return Export(Path(path), model.parts()[0].rank)
+    if language == "torch":
+        write_torch(fit, Path(path), name)
         return Export(Path(path), model.parts()[0].rank)
     header, source = c_source(model, name)
     exact = dataclasses.replace(model, dtype=torch.float64)
