@@ -8,10 +8,10 @@ of a residual force of 21 inputs (some 460). Nothing is learned: time does not d
 The C code is compiled by gcc with `-O3 -march=native -ffp-contract=fast` and with `-O2`, both `-std=c99`,
 and runs on one core over 256 logged states, contact closed; the time is the least mean of several rounds.
 The Jacobian is that of q̈ and λ by q, q̇ and τ, mean included; the CasADi function gives the same.
-Peers in the same run: `predict` and `update` of the fit; for the mechanics alone Pinocchio's `aba`, from Python
-and in C++, and for the Gaussian processes alone GPyTorch, from Python, if they are installed (`pip install
---target peers --no-deps gpytorch linear_operator mpmath cmeel-eigen`, on PYTHONPATH). Updates are timed four at
-a time, to be short beside the time slices of a shared core.
+Peers in the same run, if they are installed: `predict` and `update` of the fit; for the mechanics alone
+Pinocchio's `aba`, from Python and in C++, and for the Gaussian processes alone GPyTorch, from Python (`pip
+install --target peers --no-deps gpytorch linear_operator mpmath cmeel-eigen`, on PYTHONPATH). Updates are
+timed four at a time, to be short beside the time slices of a shared core.
 
 Then 100 function samples are rolled out for 10 s, and the examples of the force observer (60 s) and of
 predictive control run. Times of calls are least ones, those of rollouts and control steps processor time.
