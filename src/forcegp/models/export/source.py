@@ -73,7 +73,7 @@ def c_source(model: ExportedModel, name: str, rollout: bool = False) -> tuple[st
     used = (
         text for text in helpers.strip().split("\n\n")[1:] if any(f" {_called(text)}(" in x for x in priors)
     )
-    head = '#include <math.h>\n#include <string.h>\n#include "forcegp.h"\n'
+    head = GUIDE + '#include <math.h>\n#include <string.h>\n#include "forcegp.h"\n'
     head += "#ifdef __cplusplus\n#define restrict __restrict__\n#endif\n"
     blocks = [head, "\n".join(writer.lines), *_programs(writer.mean, rollout), before, *used, *priors, after]
     blocks += [template("motion.c", writer.sticking()) if rollout else template("jacobian.c")]
@@ -99,6 +99,16 @@ def c_source(model: ExportedModel, name: str, rollout: bool = False) -> tuple[st
     )
 
 
+GUIDE = """/* Tables of numbers come first, then straight-line code, and from `dot` on what can be read:
+ *
+ *   mechanics     M, Q_C, Q_G, Q_D, touching points; inputs x and features phi of the priors
+ *   assemble      A, b, M^-1, H and L of these: the struct `equations`
+ *   component     mean and covariance of one latent force f, from its kernel functions
+ *   prior_0, ...  kernel and generalized force E of each prior, named above it
+ *   maps          every quantity as an affine map of the forces
+ *   predict       all of it, at one state
+ */
+"""
 NUMBER = re.compile(r"/\*.*?\*/|(?<![\w.])(?:\d+\.\d*(?:e[+-]?\d+)?|\d+e[+-]?\d+)(?![\w.])", re.DOTALL)
 """A comment, or a number with a fraction or an exponent."""
 
