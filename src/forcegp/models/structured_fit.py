@@ -175,7 +175,12 @@ class StructuredFit(FittedModel):
         data.check_robot(self.specified.robot)
         return external_wrench(self, data, WrenchFrame(frame, **components), method, external)
 
-    def _exported(self, functions: int | None) -> ExportedModel:
+    def _exported(
+        self,
+        functions: int | None,
+        wrench: WrenchFrame | None = None,
+        dtype: torch.dtype = torch.float64,
+    ) -> ExportedModel:
         if functions is not None and functions < 1:
             raise ModelError("a posterior has one function at least", expected="1 or more", got=functions)
         parts = self.system, self.posterior, self.hyperparameters, self.noise, self.torque_std
@@ -185,10 +190,17 @@ class StructuredFit(FittedModel):
         moving = self.specification.noise.learns_torque
         # Noise of the state makes the rows of a sample depend on the slopes of the learned forces.
         sampling = None if self.problem.state_std is not None else (variance, self.problem.power, moving)
-        return ExportedModel(*parts, self.problem.external_std, functions, sampling)
+        return ExportedModel(*parts, self.problem.external_std, functions, sampling, wrench, dtype)
 
     def export(
-        self, path: str | Path, *, language: str = "c", name: str = "controller", functions: int | None = None
+        self,
+        path: str | Path,
+        *,
+        language: str = "c",
+        name: str = "controller",
+        functions: int | None = None,
+        wrench: WrenchFrame | None = None,
+        dtype: torch.dtype = torch.float64,
     ) -> Export:
         """Write the fit as C99 code that needs only libm, with a test program, or its mean as a CasADi
         function.
@@ -198,32 +210,40 @@ class StructuredFit(FittedModel):
 
         Args:
             path: folder to create.
-            language: `"c"` or `"casadi"`.
+            language: `"c"`, `"casadi"`, or `"torch"` for mean and covariance as a `torch.export` program.
             name: of the files, and prefix of all names in them.
             functions: number r of functions of a reduced covariance; `None` for all.
+            wrench: frame and components of an external wrench, estimated from accelerations beside the state.
+            dtype: precision of the C code, `torch.float64` or `torch.float32`.
 
         Returns:
-            The folder, and the growth of error bars by a reduced covariance at training states.
+            The folder, the growth of error bars by a reduced covariance, and errors by single precision, at
+            training states.
 
         Raises:
             ModelError: a prior, kernel or contact has no C form, or the posterior is too large; names it.
-            UnknownNameError, ParameterError: no such language, or a name that is no C identifier.
+            NumericalError: single precision does not resolve a variance.
+            UnknownNameError, ParameterError: no such language or frame, or a name that is no C identifier.
             DestinationError: the folder cannot be written, or holds other files.
             MissingDependencyError: CasADi is not installed.
         """
-        return write_export(self._exported(functions), self, self.training, path, language, name)
+        return write_export(
+            self._exported(functions, wrench, dtype), self, self.training, path, language, name
+        )
 
-    def compiled(self, *, functions: int | None = None) -> CompiledFit:
+    def compiled(self, *, functions: int | None = None, wrench: WrenchFrame | None = None) -> CompiledFit:
         """The fit as a fast predictor in C, compiled once by the machine's compiler.
 
         Args:
             functions: number r of functions of a reduced covariance, which can only widen; `None` for all.
+            wrench: frame and components of `external_wrench`.
 
         Raises:
             ModelError: a prior, kernel or contact has no C form, or the posterior is too large.
+            UnknownNameError: no such frame.
             MissingDependencyError: there is no C++ compiler.
         """
-        return CompiledFit(self._exported(functions))
+        return CompiledFit(self._exported(functions, wrench))
 
     def beyond(self, qd: Tensor, tau: Tensor) -> Tensor | None:
         """Distance of the speed and torque of each joint beyond those of the training data, in training
