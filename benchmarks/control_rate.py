@@ -8,9 +8,10 @@ of a residual force of 21 inputs (some 460). Nothing is learned: time does not d
 The C code is compiled by gcc with `-O3 -march=native -ffp-contract=fast` and with `-O2`, both `-std=c99`,
 and runs on one core over 256 logged states, contact closed; the time is the least mean of several rounds.
 The Jacobian is that of q̈ and λ by q, q̇ and τ, mean included; the CasADi function gives the same.
-Peers in the same run: `predict` and `update` of the fit; for the mechanics alone Pinocchio's `aba`, and for
-the Gaussian processes alone GPyTorch, both from Python, if they are installed. Updates are timed four at a
-time, to be short beside the time slices of a shared core.
+Peers in the same run, if they are installed: `predict` and `update` of the fit; for the mechanics alone
+Pinocchio's `aba`, from Python and in C++, and for the Gaussian processes alone GPyTorch, from Python (`pip
+install --target peers --no-deps gpytorch linear_operator mpmath cmeel-eigen`, on PYTHONPATH). Updates are
+timed four at a time, to be short beside the time slices of a shared core.
 
 Then 100 function samples are rolled out for 10 s, and the examples of the force observer (60 s) and of
 predictive control run. Times of calls are least ones, those of rollouts and control steps processor time.
@@ -64,8 +65,8 @@ BOUNDS = {  # µs, at -O3
     "residual covariance": 120.0,
     "residual jacobian": 60.0,
     "forward dynamics": 1.0,
-    "python mean": 50.0,
-    "python covariance": 150.0,
+    **{f"{name} mean python": 50.0 for name in ("friction", "friction+inertia", "residual")},
+    **{f"{name} covariance python": 150.0 for name in ("friction", "friction+inertia", "residual")},
     "residual update": 400.0,
     "python update": 600.0,
     # s of processor time for 100 trajectories of 10 s
@@ -162,16 +163,20 @@ def logged(fit: StructuredFit) -> tuple[Tensor, Tensor, Tensor, Tensor]:
     return m.q[:STATES], m.qd[:STATES], m.tau[:STATES], m.values[:STATES]
 
 
+def states_in_c(fit: StructuredFit) -> str:
+    """Logged states as C tables."""
+    lines = [f"enum {{ STATES = {STATES}, ROUNDS = {ROUNDS} }};"]
+    for name, x in zip(("q", "qd", "tau", "qdd"), logged(fit), strict=True):
+        rows = ", ".join("{" + ", ".join(map(repr, row)) + "}" for row in x.tolist())
+        lines.append(f"static const double {name}[STATES][7] = {{{rows}}};")
+    return "\n".join(lines)
+
+
 def in_c(fit: StructuredFit, flags: list[str]) -> dict[str, float]:
     """µs of each of `KINDS`."""
     with tempfile.TemporaryDirectory() as place:
         folder = fit.export(Path(place) / "c").folder
-        tables = dict(zip(("q", "qd", "tau", "qdd"), logged(fit), strict=True))
-        lines = [f"enum {{ STATES = {STATES}, ROUNDS = {ROUNDS} }};"]
-        for name, x in tables.items():
-            rows = ", ".join("{" + ", ".join(map(repr, row)) + "}" for row in x.tolist())
-            lines.append(f"static const double {name}[STATES][7] = {{{rows}}};")
-        (folder / "states.h").write_text("\n".join(lines))
+        (folder / "states.h").write_text(states_in_c(fit))
         (folder / "time.c").write_text(PROGRAM)
         command = ["gcc", "-std=c99", *flags, "time.c", "controller.c", "-o", "run", "-lm"]
         subprocess.run(command, cwd=folder, check=True)
@@ -238,6 +243,57 @@ def pinocchio(fit: StructuredFit) -> float | None:
     return in_python(lambda i: pin.aba(model, data, *(x[i] for x in states)))
 
 
+PINOCCHIO = """\
+#include <pinocchio/algorithm/aba.hpp>
+#include <pinocchio/multibody.hpp>
+#include <pinocchio/serialization.hpp>
+#include <chrono>
+#include <cstdio>
+#include "states.h"
+
+int main() {
+  pinocchio::Model model;
+  model.loadFromText("model.txt");
+  pinocchio::Data data(model);
+  double best = 1e30, sink = 0.0;
+  typedef Eigen::Map<const Eigen::VectorXd> V;
+  for (int round = 0; round < ROUNDS; ++round) {
+    const auto start = std::chrono::steady_clock::now();
+    for (int i = 0; i < STATES; ++i)
+      sink += pinocchio::aba(model, data, V(q[i], 7), V(qd[i], 7), V(tau[i], 7))[0];
+    const std::chrono::duration<double, std::micro> time = std::chrono::steady_clock::now() - start;
+    best = std::min(best, time.count() / STATES);
+  }
+  std::printf("%g %g\\n", best, sink);
+}
+"""
+
+
+def pinocchio_in_cpp(fit: StructuredFit) -> float | None:
+    """µs of the same in C++ with the headers of the wheels, if that of Eigen, `cmeel-eigen`, is installed."""
+    places = [Path(x) / "cmeel.prefix" for x in sys.path]
+    eigen = [x / "include/eigen3" for x in places if (x / "include/eigen3").is_dir()]
+    prefix = [x for x in places if (x / "include/pinocchio").is_dir()]
+    if not eigen or not prefix:
+        return None
+    import pinocchio
+
+    pin: Any = pinocchio
+    with tempfile.TemporaryDirectory() as place:
+        robot = Path(forcegp.__file__).parent / "robot/bundled/kuka_iiwa.urdf"
+        pin.buildModelFromUrdf(str(robot)).saveToText(str(Path(place) / "model.txt"))
+        (Path(place) / "states.h").write_text(states_in_c(fit))
+        (Path(place) / "aba.cpp").write_text(PINOCCHIO)
+        flags = ["-std=c++17", "-O3", "-march=native", "-DNDEBUG", "-w", "-DEIGEN_MAX_ALIGN_BYTES=16"]
+        flags += ["-DBOOST_MPL_LIMIT_LIST_SIZE=30", "-DBOOST_MPL_CFG_NO_PREPROCESSED_HEADERS"]
+        flags += [f"-I{prefix[0] / 'include'}", f"-I{eigen[0]}"]
+        library = prefix[0] / "lib"
+        link = [f"-L{library}", f"-Wl,-rpath,{library}", "-lpinocchio_default", "-lboost_serialization"]
+        subprocess.run(["g++", *flags, "aba.cpp", "-o", "aba", *link], cwd=place, check=True)
+        done = subprocess.run(["./aba"], cwd=place, capture_output=True, text=True, check=True)
+    return float(done.stdout.split()[0])
+
+
 def gpytorch(fit: StructuredFit) -> dict[str, float]:
     """µs of GPyTorch's fast predictive variances for the Gaussian processes of `residual` alone, one for each
     joint over `POINTS` points, without mechanics."""
@@ -298,6 +354,8 @@ def calls(name: str, fit: StructuredFit) -> dict[str, float]:
     result |= gpytorch(fit) if name == "residual" else {}
     if name == "friction" and (peer := pinocchio(fit)) is not None:
         result["forward dynamics pinocchio from python"] = peer
+    if name == "friction" and (peer := pinocchio_in_cpp(fit)) is not None:
+        result["forward dynamics pinocchio in C++"] = peer
     return result
 
 
@@ -390,10 +448,9 @@ def main() -> None:
         print(f"{name:52} {value:10.3f}")
     calls_of = {
         "forward dynamics": "friction forward dynamics -O3",
-        "python mean": "friction mean python compiled",
-        "python covariance": "friction covariance python compiled",
         "python update": "residual update python compiled",
     }
+    calls_of |= {name: f"{name} compiled" for name in BOUNDS if name.endswith(" python")}
     found = {name: calls_of.get(name, name if name in result else f"{name} -O3") for name in BOUNDS}
     found = {name: result[key] for name, key in found.items() if key in result}
     for name, value in found.items():

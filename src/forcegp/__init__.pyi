@@ -19,6 +19,7 @@ from .data import SavitzkyGolay as SavitzkyGolay
 from .data import StreamedDataset as StreamedDataset
 from .evaluation import Evaluation as Evaluation
 from .evaluation import evaluate as evaluate
+from .forces.external_wrench import WrenchFrame as WrenchFrame
 from .forces.measurements import Observation as Observation
 from .forces.noise import Noise as Noise
 from .forces.priors.base import OperatorForcePrior as OperatorForcePrior

@@ -23,6 +23,7 @@ from forcegp.errors import (
     DestinationError,
     ForceGPError,
     ModelError,
+    NumericalError,
     ParameterError,
     ShapeError,
     UnknownNameError,
@@ -365,6 +366,47 @@ def test_more_functions_lose_less() -> None:
     assert lost[0] > lost[1] > lost[2] and lost[2] < 1e-6 * float(theirs.max())
 
 
+@pytest.mark.parametrize("compiler", COMPILERS)
+@pytest.mark.parametrize("name", slow_except(["sparse", "exact", "one_contact"], "one_contact"))
+def test_single_precision_errs_by_what_the_export_states(name: str, compiler: str, tmp_path: Path) -> None:
+    fit = fitted(name)
+    written = fit.export(tmp_path / "c", dtype=torch.float32)
+    assert "double" not in (written.folder / "controller.c").read_text()
+    assert f"err by {written.rounding[0]:.2g} of" in (written.folder / "README.md").read_text()
+    sanitized = ["-O0", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    ran = built(written.folder, *sanitized, compiler=compiler)
+    assert ran.returncode == 0, ran.stdout + ran.stderr
+    m, flags = fit.training.measurements[0], ["-O1", "-shared", "-fPIC", "-std=c99"]
+    command = [compiler, *flags, "controller.c", "-o", "single.so", "-lm"]
+    subprocess.run(command, cwd=written.folder, check=True)
+    library = ctypes.CDLL(str(written.folder / "single.so"))
+    d = 7 + len(fit.system.contacts)
+    mean, spread = torch.empty(len(m.q), d), torch.empty(len(m.q), d, d)
+    for i in range(len(m.q)):
+        state = [x[i].float().contiguous() for x in (m.q, m.qd, m.tau)] + [m.active[i].contiguous()]
+        given = [ctypes.c_void_p(x.data_ptr()) for x in (*state, mean[i], spread[i])]
+        assert library.controller_predict(*given[:4], 5, 0, *given[4:], None) == 0
+    theirs = fit.predict(m.q, m.qd, m.tau, ["qdd", "multiplier"], active=m.active)
+    assert theirs.std is not None
+    error = ((mean - theirs.mean).abs() / floored(theirs.mean.abs().maximum(theirs.std))).max()
+    in_std = (spread.diagonal(dim1=-2, dim2=-1).sqrt() / theirs.std - 1.0).abs()
+    seen = theirs.std > ZERO * theirs.std.max()
+    for ours, stated in ((error, written.rounding[0]), (in_std[seen].max(), written.rounding[1])):
+        assert 1e-8 < float(ours) < 4.0 * stated, "other compilers round differently, but not much worse"
+
+
+def test_a_torch_program_has_the_mean_and_covariance(tmp_path: Path) -> None:
+    fit = fitted("one_contact")
+    folder = fit.export(tmp_path / "program", language="torch", name="arm").folder
+    assert [path.name for path in folder.iterdir()] == ["arm.pt2"]
+    program = torch.export.load(str(folder / "arm.pt2")).module()
+    (q, qd, tau), active = states(fit, 8)
+    theirs = fit.predict(q, qd, tau, ["qdd", "multiplier"], active=active)
+    rows = [program(*(x[i : i + 1] for x in (q, qd, tau, active)))[:2] for i in range(len(q))]
+    ours = Prediction(*(torch.cat(x) for x in zip(*rows, strict=True)))
+    assert max(differences(ours, theirs)) < SAME
+
+
 class Bowl(forcegp.ImplicitSurface):
     """A surface without a C form."""
 
@@ -477,6 +519,39 @@ def test_the_c_code_reports_a_state_that_is_not_finite() -> None:
     assert status() == 0 and not bool((mean == 5.0).any())
     mean[:], qd[4] = 5.0, float("inf")
     assert status() == 1 and bool((mean == 5.0).all())
+
+
+CHECK = """
+#include "controller.c"
+int check(const double *covariance, int n) { return semidefinite(covariance, n); }
+"""
+
+
+@needs_gcc
+def test_the_c_code_finds_negative_eigenvalues(tmp_path: Path) -> None:
+    """The check of `Prediction`, on covariances of variables of very different sizes."""
+    folder = fitted("one_contact").export(tmp_path / "c").folder
+    (folder / "check.c").write_text(CHECK)
+    command = ["gcc", "-std=c99", "-O1", "-shared", "-fPIC", "check.c", "-o", "check.so", "-lm"]
+    subprocess.run(command, cwd=folder, check=True)
+    check, random = ctypes.CDLL(str(folder / "check.so")).check, torch.Generator().manual_seed(3)
+    verdicts = []
+    for k in range(200):
+        basis = torch.linalg.qr(torch.randn(8, 8, dtype=torch.float64, generator=random)).Q
+        values = torch.rand(8, dtype=torch.float64, generator=random)
+        values[0] = (0.0, 1e-3, -1e-5, -0.1)[k % 4]
+        size = 10.0 ** torch.randint(-4, 4, (8,), generator=random).double()
+        covariance = (basis * values @ basis.mT) * size[:, None] * size
+        covariance = 0.5 * (covariance + covariance.mT)
+        try:
+            Prediction(torch.zeros(8, dtype=torch.float64), covariance)
+            sound = True
+        except NumericalError:
+            sound = False
+        assert bool(check(ctypes.c_void_p(covariance.data_ptr()), 8)) == sound
+        verdicts.append(sound)
+    assert all(verdicts[0::4] + verdicts[1::4] + verdicts[2::4]) and not all(verdicts[3::4])
+    assert sum(verdicts[3::4]) < 5
 
 
 def test_a_contact_that_jams_is_an_error_in_both() -> None:

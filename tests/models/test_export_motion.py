@@ -2,15 +2,20 @@
 
 from __future__ import annotations
 
+import dataclasses
+import subprocess
+from pathlib import Path
+
 import pytest
 import torch
 from torch import Tensor
 
 from forcegp import dynamics
 from forcegp.models.export.motion import CompiledMotion
+from forcegp.models.export.source import c_source
 from forcegp.rollout import RolloutOptions, forward
 from forcegp.rollout.trajectory import Rollout
-from models.test_export import fitted, states
+from models.test_export import COMPILERS, STRICT, fitted, states
 from slow import slow_except
 
 SAME = 1e-9  # of the largest value: sums in another order, carried over twenty steps
@@ -86,3 +91,50 @@ def test_the_law_in_pytorch_gives_gradients(monkeypatch: pytest.MonkeyPatch) -> 
     q, qd, tau = (x[1].clone() for x in states(fit)[0])
     fit.rollout(q, qd.requires_grad_(), tau[None], 0.005, options=RolloutOptions(dt=1e-3)).q.sum().backward()
     assert qd.grad is not None and bool((qd.grad != 0.0).any())
+
+
+MAIN = """
+#include "forcegp.c"
+
+int main(void) {
+  static double table[4096];
+  waves w[PRIORS];
+  double q[4][NQ], qd[4][NQ], tau[4][NQ], h[4] = {1e-3, 1e-3, 1e-3, 1e-3}, qdd[4][NQ];
+  double multiplier[4 * SOME(ROWS)], c[4 * SOME(ROWS)], cd[4 * SOME(ROWS)];
+  unsigned char closed[4 * SOME(CONTACTS)], held[4][NQ];
+  int wrong = 0;
+  memset(closed, 1, sizeof closed);
+  for (int i = 0; i < 4096; ++i) table[i] = 1e-3 * (i % 17);
+  for (int p = 0; p < PRIORS; ++p) {
+    w[p].turn = w[p].phase = w[p].weights = table;
+    w[p].rows = 1, w[p].n = p % 2 ? 5 : 0;
+  }
+  for (int i = 0; i < 4; ++i)
+    for (int j = 0; j < NQ; ++j)
+      q[i][j] = 0.3 * j - 0.2 * i, qd[i][j] = i < 2 ? 0.0 : 0.1 * j, tau[i][j] = i * j;
+  qd[3][1] = NAN; /* its motion is not a number, those of others are */
+  for (int sticking = 0; sticking < 2; ++sticking) {
+    wrong |= forcegp_motions(NULL, w, 4, 2, q[0], qd[0], tau[0], closed, h, sticking, qdd[0], multiplier, c,
+                             cd, held[0]);
+    for (int i = 0; i < 4; ++i) wrong |= (isfinite(qdd[i][0]) != 0) != (i < 3);
+  }
+  return wrong;
+}
+"""
+
+
+@pytest.mark.parametrize("compiler", COMPILERS)
+@pytest.mark.parametrize("name", slow_except(["one_contact", "sparse", "contained_inertia"], "one_contact"))
+def test_its_code_compiles_without_warnings_and_sanitizers_find_nothing(
+    name: str, compiler: str, tmp_path: Path
+) -> None:
+    model = dataclasses.replace(fitted(name)._exported(None), functions=0)
+    header, source = c_source(model, "forcegp", rollout=True)
+    for file, text in (("forcegp.h", header), ("forcegp.c", source), ("main.c", MAIN)):
+        (tmp_path / file).write_text(text)
+    sanitized = ["-O0", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
+    command = [compiler, *STRICT, *sanitized, "main.c", "-o", "run", "-lm"]
+    done = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stderr[:3000]
+    ran = subprocess.run([str(tmp_path / "run")], capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stdout + ran.stderr

@@ -15,7 +15,7 @@ from forcegp.errors import ModelError, RobotFileError, check_name
 if TYPE_CHECKING:
     from forcegp.models.structured_fit import StructuredFit
 
-TARGETS = ("c", "casadi", "urdf", "mjcf")
+TARGETS = ("c", "casadi", "torch", "urdf", "mjcf")
 
 
 def export(
@@ -23,7 +23,7 @@ def export(
     out: Annotated[
         Path, typer.Option("--out", "-o", help="Folder for the code and its test, or the robot file.")
     ],
-    to: Annotated[str, typer.Option("--to", help="c, casadi, urdf or mjcf.")] = "c",
+    to: Annotated[str, typer.Option("--to", help="c, casadi, torch, urdf or mjcf.")] = "c",
     name: Annotated[
         str, typer.Option(help="C code: name of the files, and prefix of the functions.")
     ] = "controller",
@@ -33,6 +33,13 @@ def export(
             min=1, help="C code: number of basis functions of a reduced covariance, which is wider."
         ),
     ] = None,
+    frame: Annotated[
+        str | None, typer.Option(help="Of C code: frame of an external wrench, estimated from accelerations.")
+    ] = None,
+    reference: Annotated[str, typer.Option(help="Axes of the external wrench: world or local.")] = "world",
+    float32: Annotated[
+        bool, typer.Option("--float32", help="Of C code: single precision; its error is measured.")
+    ] = False,
     robot: Annotated[
         str | None, typer.Option(help="URDF or MJCF file of the robot, or name of a bundled robot.")
     ] = None,
@@ -50,8 +57,10 @@ def export(
 
     CasADi: the mean as a function with exact derivatives, in a file for `casadi.Function.load`.
 
-    URDF, MJCF: a copy of the robot file in which only inertia, damping and friction are changed to identified
-    values; a report with standard deviations and losses; and robots drawn from the posterior.
+    torch: mean and covariance as a program for `torch.export.load`.
+
+    URDF, MJCF: a copy of the robot's file with identified inertia, damping and friction, and no other change;
+    a report with standard deviations and losses; and robots drawn from the posterior.
 
     [bold]Examples[/bold]
 
@@ -59,10 +68,15 @@ def export(
 
     forcegp export -m model --functions 100 --name arm -o controller/
 
+    forcegp export -m model --frame tool -o controller/
+
     forcegp export -m model --to casadi -o mpc/
 
     forcegp export -m model --to urdf --robot my.urdf --samples 100 -o calibrated.urdf
     """
+    import torch
+
+    from forcegp.forces.external_wrench import WrenchFrame
     from forcegp.models.structured_fit import StructuredFit
 
     check_name("format to export to", to, TARGETS)
@@ -72,8 +86,12 @@ def export(
     if to in ("urdf", "mjcf"):
         show(_written_back(fit, to, robot, out, samples, seed), as_json)
         return
-    written = fit.export(out, language=to, name=name, functions=functions)
+    wrench = None if frame is None else WrenchFrame(frame, reference)
+    dtype = torch.float32 if float32 else torch.float64
+    written = fit.export(out, language=to, name=name, functions=functions, wrench=wrench, dtype=dtype)
     lost = {"widest": written.widest, "wider": written.wider} if functions is not None else {}
+    if float32:
+        lost |= dict(zip(("rounding of the mean", "rounding of σ"), written.rounding, strict=True))
     show({"folder": str(out), "functions": written.functions, **lost}, as_json)
 
 

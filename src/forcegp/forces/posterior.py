@@ -17,6 +17,7 @@ distance from that range in training standard deviations and g is estimated by `
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -43,8 +44,9 @@ REGION = f"{NOISE}.region."
 LOW, HIGH, SPREAD, GROWTH = (REGION + name for name in ("low", "high", "spread", "growth"))
 """Names of the trained region: limits and standard deviation of the speed and torque of each joint `(2, nq)`,
 and g `(nq,)` [N m, N]."""
-OUTERMOST = 0.01
-"""Fraction of the training samples beyond either limit of the region."""
+OUTERMOST, WIDEST = 0.01, 0.16
+"""Least and largest fraction of the training samples beyond either limit of the region; the largest is one
+standard deviation of a Gaussian. With fewer than 100 independent samples, one of them lies beyond."""
 RELATIVE = 0.05
 """Prior growth g relative to the typical load of a joint: torque constants and load-dependent friction are
     uncertain by about 5 %."""
@@ -180,7 +182,9 @@ def stick_variance(tensors: Mapping[str, Tensor], at: States) -> Tensor:
     return std**2 * torch.exp(-((at.qd / speed) ** 2))
 
 
-def trained_region(qd: Tensor, tau: Tensor, load: Tensor, hidden: Tensor | None = None) -> dict[str, Tensor]:
+def trained_region(
+    qd: Tensor, tau: Tensor, load: Tensor, hidden: Tensor | None = None, independent: float = math.inf
+) -> dict[str, Tensor]:
     """Return the region of the training samples `(n, nq)`, with the names `LOW`, `HIGH` and `SPREAD`.
 
     Args:
@@ -189,9 +193,11 @@ def trained_region(qd: Tensor, tau: Tensor, load: Tensor, hidden: Tensor | None 
             deviation of the torque.
         hidden: `(nq,)` bool, joints with torques that do not affect accelerations; their region is one
             standard deviation around the mean.
+        independent: number of independent samples, one of which lies beyond each end.
     """
     x = torch.stack([qd, tau], dim=1)
-    low, high = x.quantile(torch.tensor([OUTERMOST, 1.0 - OUTERMOST]).to(x), dim=0)
+    share = min(max(OUTERMOST, 1.0 / independent), WIDEST)
+    low, high = x.quantile(torch.tensor([share, 1.0 - share]).to(x), dim=0)
     least = torch.stack([torch.full_like(load, STICKING), RELATIVE * load])
     spread = x.std(0, correction=0).maximum(least)
     if hidden is not None:

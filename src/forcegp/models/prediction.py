@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import InitVar, dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -57,6 +57,7 @@ class Prediction:
         determined: `(*batch, d)` bool, components determined by data and motion; the others are NaN. `None`
             if all are determined.
         doubts: descriptions of undetermined components.
+        checked: whether the maker has checked mean and covariance, as C code does.
     """
 
     mean: Tensor
@@ -66,14 +67,17 @@ class Prediction:
     joint_names: tuple[str, ...] = ()
     determined: Tensor | None = field(default=None, kw_only=True)
     doubts: tuple[str, ...] = field(default=(), kw_only=True)
+    checked: InitVar[bool] = field(default=False, kw_only=True)
 
-    def __post_init__(self) -> None:
+    def __post_init__(self, checked: bool) -> None:
         """Reject non-finite numbers and invalid covariances.
 
         Raises:
             NumericalError: a determined mean or covariance is not finite, or an eigenvalue is clearly
                 negative.
         """
+        if checked:
+            return
         mean, covariance = self.mean, self.covariance
         if self.determined is not None:
             mean = mean.where(self.determined, 0.0)

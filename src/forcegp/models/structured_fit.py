@@ -176,7 +176,12 @@ class StructuredFit(FittedModel):
         data.check_robot(self.specified.robot)
         return external_wrench(self, data, WrenchFrame(frame, **components), method, external)
 
-    def _exported(self, functions: int | None) -> ExportedModel:
+    def _exported(
+        self,
+        functions: int | None,
+        wrench: WrenchFrame | None = None,
+        dtype: torch.dtype = torch.float64,
+    ) -> ExportedModel:
         if functions is not None and functions < 1:
             raise ModelError("a posterior has one function at least", expected="1 or more", got=functions)
         parts = self.system, self.posterior, self.hyperparameters, self.noise, self.torque_std
@@ -186,10 +191,17 @@ class StructuredFit(FittedModel):
         moving = self.specification.noise.learns_torque
         # Noise of the state makes the rows of a sample depend on the slopes of the learned forces.
         sampling = None if self.problem.state_std is not None else (variance, self.problem.power, moving)
-        return ExportedModel(*parts, self.problem.external_std, functions, sampling)
+        return ExportedModel(*parts, self.problem.external_std, functions, sampling, wrench, dtype)
 
     def export(
-        self, path: str | Path, *, language: str = "c", name: str = "controller", functions: int | None = None
+        self,
+        path: str | Path,
+        *,
+        language: str = "c",
+        name: str = "controller",
+        functions: int | None = None,
+        wrench: WrenchFrame | None = None,
+        dtype: torch.dtype = torch.float64,
     ) -> Export:
         """Export the fit as C99 code that needs only libm, with a test program, or its mean as a CasADi
         function.
@@ -199,33 +211,42 @@ class StructuredFit(FittedModel):
 
         Args:
             path: folder to create.
-            language: `"c"` or `"casadi"`.
+            language: `"c"`, `"casadi"`, or `"torch"` for mean and covariance as a `torch.export` program.
             name: name of the files, and prefix of all names in them.
             functions: number r of basis functions for a reduced covariance; `None` for all.
+            wrench: frame and components of an external wrench, estimated from accelerations beside the state.
+            dtype: precision of the C code, `torch.float64` or `torch.float32`.
 
         Returns:
-            The folder, and the growth of error bars by a reduced covariance at training states.
+            The folder, the growth of error bars by a reduced covariance, and errors by single precision, at
+            training states.
 
         Raises:
             ModelError: a prior, kernel or contact cannot be exported to C, or the posterior is too large.
-            UnknownNameError, ParameterError: the language does not exist, or the name is not a C identifier.
+            NumericalError: single precision does not resolve a variance.
+            UnknownNameError, ParameterError: the language or frame does not exist, or the name is not a C
+                identifier.
             DestinationError: the folder cannot be written, or contains other files.
             MissingDependencyError: CasADi is not installed.
         """
-        return write_export(self._exported(functions), self, self.training, path, language, name)
+        return write_export(
+            self._exported(functions, wrench, dtype), self, self.training, path, language, name
+        )
 
-    def compiled(self, *, functions: int | None = None) -> CompiledFit:
+    def compiled(self, *, functions: int | None = None, wrench: WrenchFrame | None = None) -> CompiledFit:
         """Compile the fit to a fast predictor in C with the local compiler.
 
         Args:
             functions: number r of basis functions for a reduced covariance, which can only be wider; `None`
                 for all.
+            wrench: frame and components of `external_wrench`.
 
         Raises:
             ModelError: a prior, kernel or contact cannot be exported to C, or the posterior is too large.
+            UnknownNameError: no such frame.
             MissingDependencyError: there is no C++ compiler.
         """
-        return CompiledFit(self._exported(functions))
+        return CompiledFit(self._exported(functions, wrench))
 
     def beyond(self, qd: Tensor, tau: Tensor) -> Tensor | None:
         """Return the distance of the speed and torque of each joint beyond the training data, in training

@@ -46,21 +46,20 @@ typedef struct {
   double x[SOME(INPUTS)], phi[SOME(FEATURES)]; /* standardized inputs and features of the priors */
 } equations;
 
-/* K = G^-1 of the lower Cholesky factor, M = G G^T; 0 unless M is positive definite */
-static int inverse_factor(const double *restrict M, double *restrict K) {
-  double G[NQ * NQ];
-  for (int i = 0; i < NQ; ++i)
+/* the lower Cholesky factor of M = G G^T `(n, n)`, and K = G^-1; 0 unless M is positive definite */
+static int inverse_factor(const double *restrict M, int n, double *restrict G, double *restrict K) {
+  for (int i = 0; i < n; ++i)
     for (int j = 0; j <= i; ++j) {
-      double sum = M[i * NQ + j];
-      for (int k = 0; k < j; ++k) sum -= G[i * NQ + k] * G[j * NQ + k];
+      double sum = M[i * n + j];
+      for (int k = 0; k < j; ++k) sum -= G[i * n + k] * G[j * n + k];
       if (i == j && !(sum > 0.0)) return 0;
-      G[i * NQ + j] = i == j ? sqrt(sum) : sum / G[j * NQ + j];
+      G[i * n + j] = i == j ? sqrt(sum) : sum / G[j * n + j];
     }
-  for (int j = 0; j < NQ; ++j)
-    for (int i = 0; i < NQ; ++i) {
+  for (int j = 0; j < n; ++j)
+    for (int i = 0; i < n; ++i) {
       double sum = i == j ? 1.0 : 0.0;
-      for (int k = j; k < i; ++k) sum -= G[i * NQ + k] * K[k * NQ + j];
-      K[i * NQ + j] = i < j ? 0.0 : sum / G[i * NQ + i];
+      for (int k = j; k < i; ++k) sum -= G[i * n + k] * K[k * n + j];
+      K[i * n + j] = i < j ? 0.0 : sum / G[i * n + i];
     }
   return 1;
 }
@@ -77,7 +76,7 @@ static void pseudo_inverse(double *restrict W, double *restrict P) {
         double *u = W + r * NQ, *v = W + s * NQ;
         const double uu = dot(u, u, NQ), vv = dot(v, v, NQ), uv = dot(u, v, NQ);
         double zeta, t, cosine, sine;
-        if (fabs(uv) <= 1e-16 * sqrt(uu * vv)) continue;
+        if (fabs(uv) <= 0.5 * EPSILON * sqrt(uu * vv)) continue;
         turned = 1, zeta = (vv - uu) / (2.0 * uv);
         t = (zeta < 0.0 ? -1.0 : 1.0) / (fabs(zeta) + sqrt(1.0 + zeta * zeta));
         cosine = 1.0 / sqrt(1.0 + t * t), sine = cosine * t;
@@ -115,7 +114,7 @@ static void motion_under(const equations *restrict e, const double *restrict Q, 
 
 static int assemble(const double *restrict q, const double *restrict qd, const double *restrict tau,
                     const unsigned char *restrict closed, equations *restrict e) {
-  double sine[NQ], cosine[NQ], out[MECHANICS], K[NQ * NQ], Q[NQ];
+  double sine[NQ], cosine[NQ], out[MECHANICS], G[NQ * NQ], K[NQ * NQ], Q[NQ];
   const double *next = out + NQ * NQ + 3 * NQ;
   (void)closed;
   for (int i = 0; i < NQ; ++i) sine[i] = sin(q[i]), cosine[i] = cos(q[i]);
@@ -128,7 +127,7 @@ static int assemble(const double *restrict q, const double *restrict qd, const d
   memcpy(e->x, next, sizeof(double) * INPUTS), next += INPUTS;
   memcpy(e->phi, next, sizeof(double) * FEATURES);
   for (int i = 0; i < NQ; ++i) Q[i] = e->Q_C[i] + e->Q_G[i] + e->Q_D[i] + tau[i];
-  if (!inverse_factor(&e->M[0][0], K)) return 0;
+  if (!inverse_factor(&e->M[0][0], NQ, G, K)) return 0;
   for (int i = 0; i < NQ; ++i)
     for (int j = 0; j <= i; ++j) {
       double sum = 0.0;
@@ -470,6 +469,17 @@ static void inertial(const double *restrict q, const double *restrict qd, const 
 }
 #endif
 
+/* E of errors of the inertia at the acceleration qdd or, with NULL, at that of the analytical forces */
+static void inertial_errors(const double *q, const double *qd, const equations *e, const double *qdd, latent *f) {
+  (void)q, (void)qd, (void)e, (void)qdd, (void)f;
+#ifdef PAYLOAD
+  inertial(q, qd, PAYLOAD_MEASURED && qdd ? qdd : e->qdd, PAYLOAD, PAYLOAD_COLUMN, 4, PAYLOAD_UNITS, f);
+#endif
+#ifdef INERTIAL
+  inertial(q, qd, qdd ? qdd : e->qdd, INERTIAL, 0, INERTIAL_COLUMNS, INERTIAL_SCALE, f);
+#endif
+}
+
 /* ---- reading quantities off the posterior of the forces ---- */
 
 /* z = o + B_Q (m + sum of E f) + B_z ... */
@@ -547,49 +557,87 @@ static int prepare(const double *q, const double *qd, const double *tau, const u
   return 0;
 }
 
-static int predict(const forcegp_learned *learned, const double *q, const double *qd, const double *tau,
-                   const unsigned char *closed, unsigned quantities, int noise, double *mean, double *covariance,
-                   double *beyond) {
+/* equations of motion and posterior of the forces at a state */
+typedef struct {
   equations e;
   latent f;
-  affine z;
-  double prior_mean[NQ], far[NQ], unknown[NQ], gain[NQ * SOME(ROWS)];
-  int size, status;
-  if ((status = prepare(q, qd, tau, closed, &e, gain)) != 0) return status;
-  distance(qd, tau, far);
-  if (beyond) memcpy(beyond, far, sizeof far);
-  expected_force(&e, tau, prior_mean);
-  f.learned = learned, f.folded = NULL, f.functions = NULL;
+  double gain[NQ * SOME(ROWS)], prior_mean[NQ], far[NQ];
+} situation;
+
+/* errors of the inertia are multiplied by the acceleration qdd; see `inertial_errors` */
+static int evaluate(const forcegp_learned *learned, const double *q, const double *qd, const double *tau,
+                    const unsigned char *closed, const double *qdd, int spread, situation *s) {
+  int status = prepare(q, qd, tau, closed, &s->e, s->gain);
+  if (status) return status;
+  distance(qd, tau, s->far);
+  expected_force(&s->e, tau, s->prior_mean);
+  s->f.learned = learned, s->f.folded = NULL, s->f.functions = NULL;
 #if ONLINE
-  if (learned) f.folded = learned->folded;
+  if (learned) s->f.folded = learned->folded;
 #endif
-  if ((status = latent_forces(q, qd, tau, &e, gain, covariance != NULL, &f)) != 0) return status;
-#ifdef PAYLOAD
-  inertial(q, qd, e.qdd, PAYLOAD, PAYLOAD_COLUMN, 4, PAYLOAD_UNITS, &f);
-#endif
-#ifdef INERTIAL
-  inertial(q, qd, e.qdd, INERTIAL, 0, INERTIAL_COLUMNS, INERTIAL_SCALE, &f);
-  if (covariance) { /* errors of the inertia are multiplied by the predicted acceleration */
-    double qdd[NQ];
-    maps(&e, gain, FORCEGP_QDD, &z);
-    read_mean(&z, &f, prior_mean, NQ, qdd);
-    inertial(q, qd, qdd, INERTIAL, 0, INERTIAL_COLUMNS, INERTIAL_SCALE, &f);
-  }
-#endif
-  size = maps(&e, gain, quantities, &z);
-  read_mean(&z, &f, prior_mean, size, mean);
-  if (!covariance) return 0;
+  if ((status = latent_forces(q, qd, tau, &s->e, s->gain, spread, &s->f)) != 0) return status;
+  inertial_errors(q, qd, &s->e, qdd, &s->f);
+  return 0;
+}
+
+/* variance of forces beside the learned ones: of joints that stick, beyond the trained region, and noise of the torques */
+static void unknown_forces(const double *qd, const double *far, int noise, double *unknown) {
   for (int i = 0; i < NQ; ++i) {
     const double slow = qd[i] / STICK_SPEED[i], grown = GROWTH[i] * far[i];
     unknown[i] = STICK_VARIANCE[i] * exp(-slow * slow) + EXTERNAL_VARIANCE[i] + grown * grown;
     if (noise) unknown[i] += TORQUE_VARIANCE[i];
   }
-  status = read_covariance(&z, &f, unknown, size, covariance) ? 0 : FORCEGP_UNRESOLVED;
+}
+
+/* whether no eigenvalue is clearly negative, of variables in units of their standard deviation */
+static int semidefinite(const double *restrict covariance, int n) {
+  double G[SIZE_OF_ALL * SIZE_OF_ALL], scale[SIZE_OF_ALL], most = 0.0;
+  for (int i = 0; i < n; ++i) most = fmax(most, covariance[i * n + i]);
+  for (int i = 0; i < n; ++i) {
+    const double variance = fmax(covariance[i * n + i], ROUNDING * most);
+    scale[i] = variance > 0.0 ? 1.0 / sqrt(variance) : 1.0;
+  }
+  for (int i = 0; i < n; ++i)
+    for (int j = 0; j <= i; ++j) {
+      double sum = covariance[i * n + j] * scale[i] * scale[j] - dot(G + i * n, G + j * n, j);
+      if (i == j && !((sum += NEGATIVE) > 0.0)) return 0;
+      G[i * n + j] = i == j ? sqrt(sum) : sum / G[j * n + j];
+    }
+  return 1;
+}
+
+static int all_finite(const double *x, int n) {
+  double sum = 0.0; /* 0 x is not a number unless x is finite */
+  for (int i = 0; i < n; ++i) sum += 0.0 * x[i];
+  return sum == 0.0;
+}
+
+static int predict(const forcegp_learned *learned, const double *q, const double *qd, const double *tau,
+                   const unsigned char *closed, unsigned quantities, int noise, double *mean, double *covariance,
+                   double *beyond) {
+  situation s;
+  affine z;
+  double unknown[NQ], qdd[NQ];
+  int size, resolved, status = evaluate(learned, q, qd, tau, closed, NULL, covariance != NULL, &s);
+  if (status) return status;
+  if (beyond) memcpy(beyond, s.far, sizeof s.far);
+  if (INERTIA_LEARNED && covariance) { /* at the predicted acceleration */
+    maps(&s.e, s.gain, FORCEGP_QDD, &z);
+    read_mean(&z, &s.f, s.prior_mean, NQ, qdd);
+    inertial_errors(q, qd, &s.e, qdd, &s.f);
+  }
+  size = maps(&s.e, s.gain, quantities, &z);
+  read_mean(&z, &s.f, s.prior_mean, size, mean);
+  if (!all_finite(mean, size)) return FORCEGP_OVERFLOW;
+  if (!covariance) return 0;
+  unknown_forces(qd, s.far, noise, unknown);
+  resolved = read_covariance(&z, &s.f, unknown, size, covariance);
   if (noise)
     for (int bit = 0, row = 0; bit < QUANTITIES; ++bit)
       for (int i = 0; quantities >> bit & 1u && i < SIZES[bit]; ++i, ++row)
         covariance[row * size + row] += SENSOR_VARIANCE[bit] ? SENSOR_VARIANCE[bit][i] : 0.0;
-  return status;
+  if (!all_finite(covariance, size * size)) return FORCEGP_OVERFLOW;
+  return resolved && semidefinite(covariance, size) ? 0 : FORCEGP_UNRESOLVED;
 }
 
 int forcegp_equations(const double *q, const double *qd, double *M, double *A) {

@@ -20,11 +20,12 @@ extern "C" {
 @bits@
 
 /* What is returned other than 0 */
-#define FORCEGP_NOT_FINITE 1 /* a state is not finite; nothing is written */
-#define FORCEGP_JAMMED 2     /* friction of a contact would press harder than it opposes */
-#define FORCEGP_UNRESOLVED 3 /* a variance is rounding */
-#define FORCEGP_NO_INERTIA 4 /* the mass matrix is not positive definite */
+#define FORCEGP_NOT_FINITE 1  /* a state is not finite; nothing is written */
+#define FORCEGP_JAMMED 2      /* friction of a contact would press harder than it opposes */
+#define FORCEGP_UNRESOLVED 3  /* a variance is rounding, or a covariance has a negative eigenvalue */
+#define FORCEGP_NO_INERTIA 4  /* the mass matrix is not positive definite */
 #define FORCEGP_NO_JACOBIAN 5 /* not of this quantity, or the closed contacts are not independent */
+#define FORCEGP_OVERFLOW 9    /* a result is not finite */
 
 /* Number d of components of quantities. */
 int forcegp_size(unsigned quantities);
@@ -49,7 +50,7 @@ int forcegp_predict_learned(const forcegp_learned *learned, long count, const do
                             const double *tau, const unsigned char *closed, unsigned quantities, int noise, double *mean,
                             double *covariance, double *beyond);
 
-@online@/* Mass matrix M and, of all contacts, the rows of A; these are the Jacobian of a tool in three planes through it. */
+@online@@wrench@/* Mass matrix M and, of all contacts, the rows of A; these are the Jacobian of a tool in three planes through it. */
 int forcegp_equations(const double *q, const double *qd, double *M, double *A);
 
 /* Posterior mean and its Jacobian: of qdd, multiplier, contact force and joint friction.

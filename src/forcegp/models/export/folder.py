@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import re
 from dataclasses import dataclass
 from pathlib import Path
@@ -9,6 +10,8 @@ from pathlib import Path
 import torch
 from torch import Tensor
 
+from forcegp.data import Dataset
+from forcegp.data.fields import DataHeader
 from forcegp.destination import check_destination, write_or_keep
 from forcegp.errors import ParameterError, check_name
 from forcegp.files import written_folder
@@ -18,9 +21,11 @@ from forcegp.models.export.casadi_function import write_casadi
 from forcegp.models.export.library import CompiledFit
 from forcegp.models.export.model import ExportedModel
 from forcegp.models.export.source import READ, c_source, template
+from forcegp.models.export.torch_program import write_torch
+from forcegp.models.external_wrench import LearnedForces, external_wrench
 from forcegp.models.prediction import Predictor
 
-LANGUAGES = ("c", "casadi")
+LANGUAGES = ("c", "casadi", "torch")
 STATES, LOSS_STATES = 16, 200
 """States of the test program, and those at which the loss of a reduced posterior is measured."""
 TOLERANCE, ZERO = 1e-10, 1e-5
@@ -36,12 +41,15 @@ class Export:
         functions: number of functions of the covariance.
         widest, wider: growth of σ of q̈ and λ by a reduced covariance, the largest and the median one, as
             fractions, at training states or, if a saved fit has none, at random ones.
+        rounding: largest error by single precision of means of q̈ and λ in units of max(|mean|, σ), and of σ
+            as a fraction, at these states; zero in double precision.
     """
 
     folder: Path
     functions: int
     widest: float = 0.0
     wider: float = 0.0
+    rounding: tuple[float, float] = (0.0, 0.0)
 
 
 def write_export(
@@ -62,17 +70,29 @@ def write_export(
         "README.md",
         "build",
         f"{name}.casadi",
+        f"{name}.pt2",
     )
     check_destination(path, folder=True, own_files=own)
     if language == "casadi":
         write_casadi(model, Path(path), name)
         return Export(Path(path), model.parts()[0].rank)
+    if language == "torch":
+        write_torch(fit, Path(path), name)
+        return Export(Path(path), model.parts()[0].rank)
     header, source = c_source(model, name)
-    result = Export(Path(path), model.parts()[0].rank, *loss_of(model, fit, training))
+    exact = dataclasses.replace(model, dtype=torch.float64)
+    result = Export(
+        Path(path), model.parts()[0].rank, *loss_of(exact, fit, training), rounding_of(model, training)
+    )
     where = "training" if training.samples else "random"
     loss = f"It is reduced: at {where} states σ of q̈ and λ is wider by a fraction\n"
     loss += f"of {result.widest:.2g} at most, {result.wider:.2g} in the median. The mean loses nothing."
+    rounding = "Single precision: at {} states means of q̈ and λ err by {:.2g} of max(|mean|, σ) at most,\n"
+    rounding = rounding.format(where, result.rounding[0]) + f"σ by a fraction of {result.rounding[1]:.2g}."
+    coarse = model.dtype == torch.float32
     fields = {
+        "real": "float" if coarse else "double",
+        "rounding": rounding if coarse else "",
         "name": name,
         "NAME": name.upper(),
         "robot": model.system.robot.name,
@@ -92,14 +112,31 @@ def write_export(
     return result
 
 
+def rounding_of(model: ExportedModel, training: Training) -> tuple[float, float]:
+    """Error of means and of σ of q̈ and λ by single precision; see `Export.rounding`.
+
+    Raises:
+        NumericalError: single precision does not resolve a variance.
+    """
+    if model.dtype == torch.float64:
+        return 0.0, 0.0
+    *states, active = states_of(model, training)
+    coarse, fine = (
+        CompiledFit(x).predict(*states, ["qdd", "multiplier"], active=active)  # pyright: ignore
+        for x in (model, dataclasses.replace(model, dtype=torch.float64))
+    )
+    assert coarse.std is not None and fine.std is not None
+    size = fine.mean.abs().maximum(fine.std)
+    size = size.maximum(ZERO * size.amax(-1, keepdim=True))
+    in_std = (coarse.std / fine.std - 1.0).abs()[fine.std > ZERO * fine.std.amax()]
+    return float(((coarse.mean - fine.mean).abs() / size).max()), float(in_std.max())
+
+
 def loss_of(model: ExportedModel, fit: Predictor, training: Training) -> tuple[float, float]:
     """Return how much σ of q̈ and λ grows with a reduced covariance, at training or random states."""
     if model.functions is None:
         return 0.0, 0.0
-    states = random_states(model, LOSS_STATES)
-    if training.samples:
-        few = training.evenly(LOSS_STATES).measurements
-        states = tuple(torch.cat([getattr(m, x) for m in few]) for x in ("q", "qd", "tau", "active"))
+    states = states_of(model, training)
     read = [
         x.predict(*states[:3], ["qdd", "multiplier"], active=states[3])  # pyright: ignore
         for x in (CompiledFit(model), fit)
@@ -108,6 +145,14 @@ def loss_of(model: ExportedModel, fit: Predictor, training: Training) -> tuple[f
     # Nothing is lost of structural zeros, such as λ of an open contact.
     growth = (small / whole - 1.0)[whole > ZERO * whole.amax()]
     return float(growth.max()), float(growth.median())
+
+
+def states_of(model: ExportedModel, training: Training) -> tuple[Tensor, ...]:
+    """q, q̇, τ and closed contacts of training states, or random ones if none are kept."""
+    if not training.samples:
+        return random_states(model, LOSS_STATES)
+    few = training.evenly(LOSS_STATES).measurements
+    return tuple(torch.cat([getattr(m, x) for m in few]) for x in ("q", "qd", "tau", "active"))
 
 
 def random_states(model: ExportedModel, count: int) -> tuple[Tensor, ...]:
@@ -132,19 +177,32 @@ def _reference(model: ExportedModel, fit: Predictor, name: str) -> str:
     read = fit.predict(q, qd, tau, list(READ[:-1]), active=active)  # pyright: ignore[reportArgumentType]
     assert read.covariance is not None
     wanted = " | ".join(f"{name.upper()}_{x.upper()}" for x in READ[:-1])
-    reduced = int(model.functions is not None)
+    reduced, real = int(model.functions is not None), "float" if model.dtype == torch.float32 else "double"
     lines = [
         f"enum {{ STATES = {STATES}, D = {read.mean.shape[1]}, REDUCED = {reduced}, WANTED = {wanted} }};"
     ]
-    lines.append(f"static const double TOLERANCE = {TOLERANCE!r}, ZERO = {ZERO!r};")
+    tolerance = TOLERANCE * torch.finfo(model.dtype).eps / torch.finfo(torch.float64).eps
+    lines.append(f"static const double TOLERANCE = {tolerance!r}, ZERO = {ZERO!r};")
     flags = torch.nn.functional.pad(active, (0, int(not active.shape[1]))).int()
     tables = {"q": q, "qd": qd, "tau": tau, "mean": read.mean, "covariance": read.covariance.flatten(1)}
     along = fit.linearize(q, qd, tau, active=active)
     both = [torch.stack(along[at : at + 3], dim=-2).flatten(1) for at in (1, 5)]
     tables["slopes"] = torch.cat(both, dim=1)
     lines.append(f"enum {{ SLOPES = {tables['slopes'].shape[1]} }};")
+    if model.wrench is not None:
+        # Accelerations that errors of the model explain: rounding counts for more the stronger the wrench is.
+        std = read.covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt()
+        far = torch.linspace(-2.0, 2.0, len(q), dtype=q.dtype)[:, None]
+        qdd = (read.mean + far * std)[:, read.parts["qdd"]]
+        closed = dict(zip(model.system.contact_names, active.unbind(1), strict=True))
+        time, header = torch.arange(len(q), dtype=q.dtype), DataHeader(ordered=False)
+        data = Dataset(time, q, qd, tau, qdd, model.system.robot.joint_names, contact=closed, header=header)
+        assert isinstance(fit, LearnedForces)
+        found = external_wrench(fit, data, model.wrench, "acceleration")
+        assert found.covariance is not None
+        tables |= {"qdd": qdd, "wrench": found.mean, "wrench_covariance": found.covariance.flatten(1)}
     for key, x in {**tables, "closed": flags}.items():
-        kind = "unsigned char" if key == "closed" else "double"
+        kind = {"closed": "unsigned char"}.get(key, real if key in ("q", "qd", "tau", "qdd") else "double")
         rows = ",\n  ".join("{" + ", ".join(map(repr, row)) + "}" for row in x.tolist())
         lines.append(f"static const {kind} {key}[STATES][{x.shape[1]}] = {{{rows}}};")
     return "\n".join(lines)

@@ -21,15 +21,17 @@ from forcegp.forces.quantities import ForceField, ForceLinearization, flat_state
 from forcegp.models.export.mean import DIFFERENTIATED
 from forcegp.models.export.model import ExportedModel
 from forcegp.models.export.source import READ, c_source
+from forcegp.models.external_wrench import ExternalWrench
 from forcegp.models.prediction import Prediction, Predictor
 from forcegp.native import load_library
 
 NAME = "forcegp"
-NOT_FINITE, JAMMED, UNRESOLVED, NO_INERTIA, NO_JACOBIAN, AT_REST, NO_NOISE = 1, 2, 3, 4, 5, 6, 7
+NOT_FINITE, JAMMED, UNRESOLVED, NO_INERTIA, NO_JACOBIAN, AT_REST, NO_NOISE, OVERFLOW = 1, 2, 3, 4, 5, 6, 7, 9
 """What the C code returns other than 0."""
 MESSAGES = {
     JAMMED: "friction of a contact would press harder than it opposes",
-    UNRESOLVED: "double precision does not resolve a predicted variance",
+    UNRESOLVED: "the precision of the C code does not resolve a predicted variance",
+    OVERFLOW: "a predicted number is not finite: states beyond what a robot can do overflow",
     NO_INERTIA: "the mass matrix is not positive definite",
     NO_JACOBIAN: "closed contacts hold the robot in the same direction, so that a Jacobian is not determined",
     NOT_FINITE: "a measured value is not finite, or its noise not positive",
@@ -62,6 +64,8 @@ class CompiledFit(Predictor):
             getattr(self.library, f"forcegp_{name}").argtypes = [POINTER, *FUNCTIONS[name]]
         self._many, self._slopes = self.library.forcegp_predict_learned, self.library.forcegp_jacobian_many
         self._slopes.argtypes = [ctypes.c_long, *[POINTER] * 4, ctypes.c_uint, *[POINTER] * 2]
+        if model.wrench is not None:
+            self.library.forcegp_external_wrench.argtypes = [POINTER, ctypes.c_long, *[POINTER] * 10]
         self._learned: Tensor | None = None
         self._memory: int | None = None
         self._sizes = {name: self.library.forcegp_size(1 << bit) for bit, name in enumerate(READ)}
@@ -195,8 +199,9 @@ class CompiledFit(Predictor):
             raise ModelError("a compiled fit predicts on its own system", hint="use the predict of the fit")
         read = self._read(quantity if isinstance(quantity, str) else tuple(quantity))
         nq, (arrays, batch) = self.system.robot.nq, self._states(q, qd, tau, active)
-        mean, beyond = q.new_empty((*batch, read.size)), q.new_empty((*batch, nq))
-        spread = q.new_empty((*batch, read.size, read.size)) if covariance else None
+        new = self._new
+        mean, beyond = new(*batch, read.size), new(*batch, nq)
+        spread = new(*batch, read.size, read.size) if covariance else None
         pointers = [None if x is None else x.data_ptr() for x in (*arrays, mean, spread, beyond)]
         status = self._many(self._memory, batch.numel(), *pointers[:4], read.bits, noise, *pointers[4:])
         if status:
@@ -205,7 +210,8 @@ class CompiledFit(Predictor):
             mean = mean[..., read.order]
             spread = None if spread is None else spread[..., read.order, :][..., read.order]
         joints = self.system.robot.joint_names
-        return Prediction(mean, spread, read.parts, beyond if LOW in self.model.tensors else None, joints)
+        far = beyond if LOW in self.model.tensors else None
+        return Prediction(mean, spread, read.parts, far, joints, checked=True)
 
     def jacobian(
         self,
@@ -237,7 +243,7 @@ class CompiledFit(Predictor):
             check_name("quantity with a Jacobian", name, DIFFERENTIATED)
         read, nq = self._read(tuple(names)), self.system.robot.nq
         arrays, batch = self._states(q, qd, tau, active)
-        mean, slopes = q.new_empty((*batch, read.size)), q.new_empty((*batch, read.size, 3, nq))
+        mean, slopes = self._new(*batch, read.size), self._new(*batch, read.size, 3, nq)
         pointers = [None if x is None else x.data_ptr() for x in (*arrays, mean, slopes)]
         status = self._slopes(batch.numel(), *pointers[:4], read.bits, *pointers[4:])
         if status:
@@ -245,6 +251,89 @@ class CompiledFit(Predictor):
         if read.order is not None:
             mean, slopes = mean[..., read.order], slopes[..., read.order, :, :]
         return MeanJacobian(mean, slopes[..., 0, :], slopes[..., 1, :], slopes[..., 2, :], read.parts)
+
+    def external_wrench(
+        self,
+        q: Tensor,
+        qd: Tensor,
+        tau: Tensor,
+        qdd: Tensor,
+        *,
+        active: Tensor | None = None,
+        qdd_std: Tensor | None = None,
+    ) -> ExternalWrench:
+        """Wrench of the environment on the frame passed to `compiled(wrench=...)`, each state on its own.
+
+        The result is that of `StructuredFit.external_wrench` on samples in any order: friction with memory of
+        a log in order of time is not tracked.
+
+        Args:
+            q, qd, tau, qdd: `(*batch, nq)` states with measured accelerations.
+            active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
+            qdd_std: noise of the accelerations `(nq,)`; default that of the fit.
+
+        Raises:
+            ModelError: the fit was compiled without a wrench, or a contact jams by friction.
+            ShapeError: an argument does not fit the system, or is not finite.
+        """
+        mean, covariance, beyond, _ = self._wrench(q, qd, tau, qdd, active, qdd_std, False)
+        frame, joints = self.model.wrench, self.system.robot.joint_names
+        assert frame is not None
+        parts = {"external_wrench": slice(0, len(frame.axes))}
+        far = beyond if LOW in self.model.tensors else None
+        return ExternalWrench(mean, covariance, parts, far, joints, frame, checked=True)
+
+    def wrench_jacobian(
+        self,
+        q: Tensor,
+        qd: Tensor,
+        tau: Tensor,
+        qdd: Tensor,
+        *,
+        active: Tensor | None = None,
+        qdd_std: Tensor | None = None,
+    ) -> WrenchJacobian:
+        """The mean of `external_wrench` and its Jacobian by q, q̇, τ and q̈, by fourth-order differences.
+
+        Arguments and errors are those of `external_wrench`.
+        """
+        mean, _, _, slopes = self._wrench(q, qd, tau, qdd, active, qdd_std, True)
+        return WrenchJacobian(mean, *slopes.unbind(-2))
+
+    def _wrench(
+        self,
+        q: Tensor,
+        qd: Tensor,
+        tau: Tensor,
+        qdd: Tensor,
+        active: Tensor | None,
+        qdd_std: Tensor | None,
+        differentiate: bool,
+    ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+        """Mean, covariance, distance from the training data, and slopes `(*batch, k, 4, nq)`."""
+        if self.model.wrench is None:
+            raise ModelError(
+                "this fit was compiled without an external wrench",
+                hint='fit.compiled(wrench=forcegp.WrenchFrame("tool"))',
+            )
+        nq, k = self.system.robot.nq, len(self.model.wrench.axes)
+        flat = flat_states(self.system, q, qd, tau, active)
+        self.system.robot.check_state(qdd=qdd)
+        if not bool(torch.isfinite(qdd).all()):
+            raise ShapeError("qdd holds values that are not finite", expected="finite numbers")
+        rows = qdd.expand(*flat.batch, nq).reshape(-1, nq)
+        std = None if qdd_std is None else qdd_std.to(q).expand(nq).contiguous()
+        mean, covariance = q.new_empty(*flat.batch, k), q.new_empty(*flat.batch, k, k)
+        beyond = q.new_empty(*flat.batch, nq)
+        slopes = q.new_empty((*flat.batch, k, 4, nq) if differentiate else (0, k, 4, nq))
+        given = [x.contiguous() for x in (flat.q, flat.qd, flat.tau, rows, flat.active)]
+        pointers = [None if x is None else x.data_ptr() for x in (*given, std, mean, covariance, beyond)]
+        along = slopes.data_ptr() if differentiate else None
+        count = flat.batch.numel()
+        status = self.library.forcegp_external_wrench(self._memory, count, *pointers, along)
+        if status:
+            raise KINDS.get(status, NumericalError)(MESSAGES[status])
+        return mean, covariance, beyond, slopes
 
     def linearize(
         self,
@@ -271,7 +360,12 @@ class CompiledFit(Predictor):
         if active is None and self._plain(q, qd, tau):
             return (q, qd, tau, None), q.shape[:-1]
         *given, batch = flat_states(self.system, q, qd, tau, active)
+        given[:3] = (x.to(self.model.dtype) for x in given[:3])
         return tuple(x.contiguous() for x in given), batch
+
+    def _new(self, *shape: int) -> Tensor:
+        """A new array in the precision of the C code."""
+        return torch.empty(shape, dtype=self.model.dtype)
 
     def _error(self, status: int, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor | None) -> ForceGPError:
         """Return the error reported by the C code; raise and name the state if it is not finite."""
@@ -285,6 +379,7 @@ class CompiledFit(Predictor):
         return (
             known
             and kinds == {(q.shape, torch.float64, "cpu", True)}
+            and self.model.dtype == torch.float64
             and q.shape[-1:] == (self.system.robot.nq,)
         )
 
@@ -322,6 +417,21 @@ class MeanJacobian(NamedTuple):
     dqd: Tensor
     dtau: Tensor
     parts: dict[str, slice]
+
+
+class WrenchJacobian(NamedTuple):
+    """The mean of an external wrench with its Jacobian; row = component.
+
+    Attributes:
+        mean: `(*batch, k)`.
+        dq, dqd, dtau, dqdd: `(*batch, k, nq)` derivatives with respect to q, q̇, τ and q̈.
+    """
+
+    mean: Tensor
+    dq: Tensor
+    dqd: Tensor
+    dtau: Tensor
+    dqdd: Tensor
 
 
 class _Rows(NamedTuple):

@@ -33,6 +33,7 @@ from forcegp.compiled.program import (
 )
 from forcegp.constraints import Cylinder, Plane, Sphere, SurfaceContact
 from forcegp.constraints.gauss import FACING_DOWN
+from forcegp.forces.external_wrench import ROWS, WrenchFrame
 from forcegp.forces.priors import contact
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.inertial import MASS_AND_MOMENT, InertialPrior, PayloadPrior
@@ -129,6 +130,14 @@ class Mean:
         for p, rows in zip(priors, x, strict=True):
             outputs += [each for phi in self._all_features(p, rows) for each in phi]
         return priors, outputs
+
+    def wrench_jacobian(self, frame: WrenchFrame) -> Program:
+        """J of the components of a wrench on a frame, by q; see `WrenchFrame.jacobian`."""
+        index, point = self.robot.frame_index(frame.frame), np.array(frame.point, dtype=float)
+        rotation, _, J, _ = _point_blocks(self.links, self.robot, index, point)
+        if frame.reference == "local":
+            J = np.concatenate([rotation.T @ J[:3], rotation.T @ J[3:]])
+        return self.program(J[[ROWS[axis] for axis in frame.axes]].flat, ARGUMENTS[:1])
 
     def _all_features(self, p: int, x: Scalars) -> list[list[Scalar]]:
         """Return φ of each component of a prior at its inputs."""

@@ -20,6 +20,7 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem, Cylinder, Plane, Sphere, SurfaceContact
 from forcegp.errors import ModelError
+from forcegp.forces.external_wrench import WrenchFrame
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors import contact, joint
 from forcegp.forces.priors.base import ForcePrior
@@ -98,6 +99,8 @@ class ExportedModel:
         functions: number r of functions of a reduced covariance; `None` for all, 0 for the mean alone.
         sampling: of a sample learned online, the variance of the motor torques' noise `(nq,)`, the power κ of
             its likelihood, and whether it must be in motion; `None` for a model that cannot.
+        wrench: frame and components of an external wrench that is estimated, or `None`.
+        dtype: precision of the C code.
     """
 
     system: ConstrainedSystem
@@ -108,6 +111,8 @@ class ExportedModel:
     external_std: Tensor | None
     functions: int | None = None
     sampling: tuple[Tensor, float, bool] | None = None
+    wrench: WrenchFrame | None = None
+    dtype: torch.dtype = torch.float64
 
     @property
     def online(self) -> bool:
@@ -119,7 +124,14 @@ class ExportedModel:
 
         Raises:
             ModelError: a prior, kernel, contact or mean has none, or the posterior is too large; names it.
+            UnknownNameError: no such frame of the external wrench.
         """
+        if self.dtype not in (torch.float64, torch.float32):
+            raise ModelError("invalid precision of C code", expected="float64 or float32", got=self.dtype)
+        if self.wrench is not None:
+            self.system.robot.frame_index(self.wrench.frame)
+            if self.dtype != torch.float64:
+                raise ModelError("an external wrench needs double precision", hint="M q̈ − Q̄ cancels digits")
         if self.system.robot.device.type != "cpu":
             raise ModelError("a fit on a GPU is not exported", hint="save it, and load it on the CPU")
         for each in self.system.contacts:

@@ -85,12 +85,7 @@ int forcegp_update(forcegp_learned *s, const double *q, const double *qd, const 
   if (fastest <= REST_SPEED) return FORCEGP_AT_REST;
   f.learned = s, f.folded = s->folded, f.functions = V;
   if ((status = latent_forces(q, qd, tau, &e, gain, 1, &f)) != 0) return status;
-#ifdef PAYLOAD
-  inertial(q, qd, e.qdd, PAYLOAD, PAYLOAD_COLUMN, 4, PAYLOAD_UNITS, &f);
-#endif
-#ifdef INERTIAL
-  inertial(q, qd, quantity == FORCEGP_QDD ? measured : e.qdd, INERTIAL, 0, INERTIAL_COLUMNS, INERTIAL_SCALE, &f);
-#endif
+  inertial_errors(q, qd, &e, quantity == FORCEGP_QDD ? measured : NULL, &f);
   /* rows (W V^T, y - E[y]) / sigma with W = B E, of noise (1 + N N^T) / kappa with N = B_Q Sigma_tau^1/2 / sigma */
   size = maps(&e, gain, quantity, &z);
   operators(&z, &f, size, W);

@@ -6,7 +6,7 @@ Code that does not depend on the model is in `controller.c`.
 from __future__ import annotations
 
 import re
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from importlib.resources import files
 from itertools import accumulate
 from typing import NamedTuple
@@ -19,6 +19,7 @@ from forcegp.compiled.program import Links, regressor_program, trace
 from forcegp.compiled.source import c_function
 from forcegp.constraints import SurfaceContact
 from forcegp.constraints.gauss import rank_tolerance
+from forcegp.forces.external_wrench import MULTIPLIER_STD
 from forcegp.forces.posterior import GROWTH, HIGH, LOW, SPREAD, STICK_NOISE, STICK_SPEED
 from forcegp.forces.priors import contact
 from forcegp.forces.priors.base import CONSTRAINT, CONTACT, JOINT
@@ -32,10 +33,11 @@ from forcegp.gp.features import SMALLEST_FRACTION, stacked
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.export.mean import ARGUMENTS, DIFFERENTIATED, LearnedMotion
 from forcegp.models.export.model import ExportedModel, Functions, row_of
+from forcegp.models.prediction import NEGATIVE, ROUNDING
 from forcegp.models.structured_learning import REST_SPEED
 from forcegp.rollout import law
 
-NO_FRICTION = 9
+NO_FRICTION = 10
 """What C code returns if no dry friction solves the problem of `rollout/law.py`."""
 LAW = (
     "REGULARIZATION",
@@ -49,6 +51,8 @@ LAW = (
 )
 READ = (*QUANTITIES, "joint_friction")
 """The quantities of the C code, in the order of its bits; the last one is not in `QUANTITIES`."""
+STEPS = 2e-5, 1e-3
+"""Of differences of the fourth order by q and q̇, and by τ and q̈: friction changes within 0.01 rad/s."""
 TARGETS = (JOINT, CONTACT, CONSTRAINT)
 GIVEN = """const double *restrict q, const double *restrict qd, const double *restrict tau,
     const equations *restrict e, const double *restrict gain, int spread, latent *restrict f"""
@@ -69,11 +73,12 @@ def c_source(model: ExportedModel, name: str, rollout: bool = False) -> tuple[st
     used = (
         text for text in helpers.strip().split("\n\n")[1:] if any(f" {_called(text)}(" in x for x in priors)
     )
-    head = '#include <math.h>\n#include <string.h>\n#include "forcegp.h"\n'
+    head = GUIDE + '#include <math.h>\n#include <string.h>\n#include "forcegp.h"\n'
     head += "#ifdef __cplusplus\n#define restrict __restrict__\n#endif\n"
     blocks = [head, "\n".join(writer.lines), *_programs(writer.mean, rollout), before, *used, *priors, after]
     blocks += [template("motion.c", writer.sticking()) if rollout else template("jacobian.c")]
     blocks += [template("online.c")] if model.online else []
+    blocks += [template("wrench.c")] if model.wrench and not rollout else []
     robot, contacts = model.system.robot, model.system.contact_names
     fields = {
         "nq": robot.nq,
@@ -82,16 +87,46 @@ def c_source(model: ExportedModel, name: str, rollout: bool = False) -> tuple[st
         "touching": _comment(", ".join(contacts) or "none"),
         "bits": "\n".join(f"#define FORCEGP_{x.upper()} {1 << i}u" for i, x in enumerate(READ)),
         "online": writer.online_header(),
+        "wrench": writer.wrench_header(),
     }
+    precise = in_single_precision if model.dtype == torch.float32 else str
     return tuple(  # pyright: ignore[reportReturnType]
-        text.replace("forcegp_", f"{name}_")
+        precise(text)
+        .replace("forcegp_", f"{name}_")
         .replace("forcegp.h", f"{name}.h")
         .replace("FORCEGP_", f"{name.upper()}_")
         for text in (template("controller.h", fields), "\n".join(blocks))
     )
 
 
-def template(name: str, fields: dict[str, object] | None = None) -> str:
+GUIDE = """/* Tables of numbers come first, then straight-line code, and from `dot` on what can be read:
+ *
+ *   mechanics     M, Q_C, Q_G, Q_D, touching points; inputs x and features phi of the priors
+ *   assemble      A, b, M^-1, H and L of these: the struct `equations`
+ *   component     mean and covariance of one latent force f, from its kernel functions
+ *   prior_0, ...  kernel and generalized force E of each prior, named above it
+ *   maps          every quantity as an affine map of the forces
+ *   predict       all of it, at one state
+ */
+"""
+NUMBER = re.compile(r"/\*.*?\*/|(?<![\w.])(?:\d+\.\d*(?:e[+-]?\d+)?|\d+e[+-]?\d+)(?![\w.])", re.DOTALL)
+"""A comment, or a number with a fraction or an exponent."""
+
+
+def in_single_precision(text: str) -> str:
+    """Return the C text with float in place of double; `tgmath.h` chooses the functions."""
+    largest = torch.finfo(torch.float32).max
+
+    def literal(match: re.Match[str]) -> str:
+        if match[0].startswith("/"):
+            return match[0]
+        return f"{np.float32(min(float(match[0]), largest))!s}f"
+
+    text = re.sub(r"\bdouble\b", "float", NUMBER.sub(literal, text))
+    return text.replace("#include <math.h>", "#include <math.h>\n#include <tgmath.h>")
+
+
+def template(name: str, fields: Mapping[str, object] | None = None) -> str:
     """Return a template file with each `@field@` filled in."""
     text = files("forcegp.models.export").joinpath(name).read_text(encoding="utf-8")
     for field, value in (fields or {}).items():
@@ -121,6 +156,8 @@ def _programs(mean: LearnedMotion, rollout: bool) -> list[str]:
     }
     if any(isinstance(part.prior, InertialPrior | PayloadPrior) for part in mean.parts):
         programs["regressor"] = regressor_program(Links(robot))
+    if mean.model.wrench is not None and not rollout:
+        programs["wrench_jacobian"] = mean.wrench_jacobian(mean.model.wrench)
     if rollout:
         programs["sliding"] = mean.program(mean.sliding()[1], (*ARGUMENTS[:3], "slip"))
     else:
@@ -141,6 +178,7 @@ class Writer:
         self._constants()
         self._noise()
         self._online()
+        self._wrench()
 
     def array(self, values: Tensor | Iterable[float], name: str = "", kind: str = "double") -> str:
         """Return a constant array, and its name."""
@@ -161,6 +199,7 @@ class Writer:
         robot, contacts = system.robot, [c for c in system.contacts if isinstance(c, SurfaceContact)]
         sizes = {"multiplier": len(contacts), "contact_force": 3 * len(contacts)}
         sizes = [sizes.get(name, robot.nq) for name in READ]
+        coarser = torch.finfo(self.model.dtype).eps / torch.finfo(torch.float64).eps
         defined = {
             "NQ": robot.nq,
             "CONTACTS": len(contacts),
@@ -182,8 +221,13 @@ class Writer:
                 if part.size
             ),
             "DIFFERENTIATED": f"({' | '.join(f'FORCEGP_{x.upper()}' for x in DIFFERENTIATED)})",
-            "SMALLEST_FRACTION": repr(SMALLEST_FRACTION),
-            "RANK_TOLERANCE": repr(rank_tolerance(robot.dtype)),
+            "INERTIA_LEARNED": int(any(isinstance(part.prior, InertialPrior) for part in self.parts)),
+            # Sums of squares do not cancel.
+            "SMALLEST_FRACTION": repr(SMALLEST_FRACTION * (coarser if self.model.sign < 0 else 1.0)),
+            "EPSILON": repr(torch.finfo(self.model.dtype).eps),
+            "NEGATIVE": repr(NEGATIVE),
+            "ROUNDING": repr(ROUNDING),
+            "RANK_TOLERANCE": repr(rank_tolerance(self.model.dtype)),
         }
         self.lines += [f"#define {name} {value}" for name, value in defined.items()]
         self.lines.append("enum { JOINT, CONTACT, CONSTRAINT, JOINT_FRICTION };")
@@ -202,6 +246,7 @@ class Writer:
             if isinstance(part.prior, PayloadPrior):
                 column = PER_PAYLOAD * part.prior.link(robot)
                 self.lines += [f"#define PAYLOAD {start}", f"#define PAYLOAD_COLUMN {column}"]
+                self.lines.append(f"#define PAYLOAD_MEASURED {int(part.prior.measured)}")
                 self.array(part.prior.units(robot.mass), "PAYLOAD_UNITS")
         if process.coulomb:
             where = [system.contact_names.index(x.contact) for x in process.coulomb]
@@ -242,6 +287,26 @@ class Writer:
         )
         self.lines.append(f"static const double REST_SPEED = {REST_SPEED if moving else -1.0!r};")
         self.lines.append(f"static const double TEMPERING = {power**0.5!r};")
+
+    def _wrench(self) -> None:
+        """Add the priors of an external wrench and of the multipliers beside it."""
+        frame, rows = self.model.wrench, len(self.model.system.contacts)
+        if frame is None or self.rollout:
+            return
+        self.array([*frame.prior.tolist(), *rows * [MULTIPLIER_STD]], "WRENCH_PRIOR")
+        self.array(torch.stack(frame.levers), "LEVERS")
+        most = max(len(frame.axes) + rows, self.model.system.robot.nq)
+        self.lines.append(f"enum {{ LEVER_COUNT = {len(frame.levers)}, MOST_UNKNOWNS = {most} }};")
+        self.lines.append("static const double STATE_STEP = {!r}, FORCE_STEP = {!r};".format(*STEPS))
+
+    def wrench_header(self) -> str:
+        """The part of the header on an external wrench, if there is one."""
+        frame = self.model.wrench
+        if frame is None:
+            return ""
+        fields = {"components": len(frame.axes), "axes": ", ".join(frame.axes), "reference": frame.reference}
+        at = {"frame": _comment(frame.frame), "point": ", ".join(map(repr, map(float, frame.point)))}
+        return template("wrench.h", fields | at)
 
     def online_header(self) -> str:
         """Return the part of the header on learning online, if the model supports it."""

@@ -10,32 +10,45 @@ static double differs(double ours, double theirs, double scale) {
   return REDUCED && ours > theirs ? 0.0 : fabs(ours - theirs) / scale;
 }
 
+static double in_mean = 0.0, in_covariance = 0.0;
+
+/* largest difference of a mean in units of max(|mean|, std), and of its covariance; what is below ZERO of the largest
+ * component is compared with that */
+static void compare(int n, const @real@ *m, const @real@ *C, const double *mean, const double *covariance) {
+  double std[D + 6], size[D + 6], most = 0.0, widest = 0.0;
+  for (int a = 0; a < n; ++a) {
+    std[a] = sqrt(covariance[a * n + a]), widest = fmax(widest, std[a]);
+    size[a] = fmax(fabs(mean[a]), std[a]), most = fmax(most, size[a]);
+  }
+  for (int a = 0; a < n; ++a) std[a] = fmax(std[a], ZERO * widest), size[a] = fmax(size[a], ZERO * most);
+  for (int a = 0; a < n; ++a) {
+    in_mean = fmax(in_mean, fabs(m[a] - mean[a]) / size[a]);
+    for (int b = 0; b < n; ++b)
+      if (a == b || !REDUCED)
+        in_covariance = fmax(in_covariance, differs(C[a * n + b], covariance[a * n + b], std[a] * std[b]));
+  }
+}
+
 int main(void) {
-  double in_mean = 0.0, in_covariance = 0.0, in_slopes = 0.0, m[D], C[D * D], beyond[@NAME@_JOINTS], J[SLOPES];
+  double in_slopes = 0.0;
+  @real@ m[D], C[D * D], beyond[@NAME@_JOINTS], J[SLOPES];
   if (@name@_size(WANTED) != D) return 2;
   for (int i = 0; i < STATES; ++i) {
-    double std[D], size[D], most = 0.0, widest = 0.0;
+    double most = 0.0;
     const int second = @name@_jacobian(q[i], qd[i], tau[i], closed[i], @NAME@_QDD | @NAME@_MULTIPLIER, m, J);
-    const int status = @name@_predict(q[i], qd[i], tau[i], closed[i], WANTED, 0, m, C, beyond);
+    int status = @name@_predict(q[i], qd[i], tau[i], closed[i], WANTED, 0, m, C, beyond);
+    if (status == 0) compare(D, m, C, mean[i], covariance[i]);
+#ifdef @NAME@_WRENCH
+    if (status == 0)
+      status = @name@_external_wrench(NULL, 1, q[i], qd[i], tau[i], qdd[i], closed[i], NULL, m, C, beyond, NULL);
+    if (status == 0 && !REDUCED) compare(@NAME@_WRENCH, m, C, wrench[i], wrench_covariance[i]);
+#endif
     if (status != 0 || (second != 0 && second != @NAME@_NO_JACOBIAN)) {
       printf("state %d: errors %d, %d\n", i, status, second);
       return 1;
     }
     for (int a = 0; a < SLOPES; ++a) most = fmax(most, fabs(slopes[i][a]));
     for (int a = 0; second == 0 && a < SLOPES; ++a) in_slopes = fmax(in_slopes, fabs(J[a] - slopes[i][a]) / most);
-    most = 0.0;
-    for (int a = 0; a < D; ++a) {
-      std[a] = sqrt(covariance[i][a * D + a]), widest = fmax(widest, std[a]);
-      size[a] = fmax(fabs(mean[i][a]), std[a]), most = fmax(most, size[a]);
-    }
-    /* what is below ZERO of the largest component is compared with that */
-    for (int a = 0; a < D; ++a) std[a] = fmax(std[a], ZERO * widest), size[a] = fmax(size[a], ZERO * most);
-    for (int a = 0; a < D; ++a) {
-      in_mean = fmax(in_mean, fabs(m[a] - mean[i][a]) / size[a]);
-      for (int b = 0; b < D; ++b)
-        if (a == b || !REDUCED)
-          in_covariance = fmax(in_covariance, differs(C[a * D + b], covariance[i][a * D + b], std[a] * std[b]));
-    }
   }
   printf("largest difference in units of max(|mean|, std): %.2g; of a variance: %.2g\n", in_mean, in_covariance);
   printf("of a Jacobian, in units of its largest entry: %.2g\n", in_slopes);
