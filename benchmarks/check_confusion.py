@@ -104,7 +104,7 @@ def least_visible(fault: Fault, log: Log, sizes: dict[str, float]) -> float | No
     """That size for a planted fault, if the check states one."""
     names = [fault.kind]
     if fault.joint is not None:
-        names.append(f"{fault.kind} {log.joint_names[joint(log, fault.joint)]}")
+        names.insert(0, f"{fault.kind} {log.joint_names[joint(log, fault.joint)]}")
     return next((sizes[name] for name in names if name in sizes), None)
 
 

@@ -6,12 +6,14 @@
   external joint force, ρ → Jᵀ w, from which `wrench_of` gives w. Here u = Q − Q_C + ½ ∂(q̇ᵀM q̇)/∂q of the
   robot file, or of a robot and its friction that least squares has identified
   (`forcegp.evaluation.least_squares`).
+- Equations of motion with friction, offset and gain of each joint by least squares (`identified_losses`),
+  from free motion, or from a log with a force sensor.
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import torch
 from torch import Tensor
@@ -20,6 +22,34 @@ from forcegp import dynamics
 from forcegp.data import Dataset
 from forcegp.forces.external_wrench import WrenchFrame, momentum_force
 from forcegp.robot.model import RobotModel
+
+DRY_SPEED = 0.05
+"""Speed over which dry friction changes sign [rad/s, m/s]."""
+TERMS: dict[str, Callable[[Tensor, Tensor], Tensor]] = {
+    "offset": lambda qd, tau: torch.ones_like(qd),
+    "gain": lambda qd, tau: tau,
+    "viscous": lambda qd, tau: qd,
+    "Coulomb": lambda qd, tau: torch.tanh(qd / DRY_SPEED),
+    "load": lambda qd, tau: tau.abs() * torch.tanh(qd / DRY_SPEED),
+}
+"""Torques that a robot file lacks, of each joint, up to a factor."""
+
+
+def identified_losses(
+    left: Tensor, qd: Tensor, tau: Tensor, terms: Sequence[str] = tuple(TERMS)
+) -> Callable[[Tensor, Tensor], Tensor]:
+    """Torque that each joint lacks, as a function of q̇ and τ `(n, nq)`, by least squares of some of `TERMS`.
+
+    Args:
+        left: M q̈ − Q − τ − Jᵀw `(n, nq)`, with the wrench of a sensor, or of free motion.
+        qd, tau: velocities and torques `(n, nq)`.
+    """
+
+    def columns(qd: Tensor, tau: Tensor) -> Tensor:
+        return torch.stack([TERMS[name](qd, tau) for name in terms], dim=-1)
+
+    weights = torch.linalg.lstsq(columns(qd, tau).transpose(0, 1), left.T[..., None]).solution[..., 0]
+    return lambda qd, tau: (columns(qd, tau) * weights).sum(-1)
 
 
 def wrench_of(J: Tensor, force: Tensor, damping: float = 0.0) -> Tensor:

@@ -11,6 +11,8 @@ height of the foot.
 
 - `static`: f = −J⁻ᵀ(τ + Q_G) of the two joints of the leg.
 - `equations of motion`: of these two joints, with the masses of the file and no friction.
+- `least squares`: the same, with offset, gain and friction of these joints (`TERMS`), learned from the force
+  sensor in training.
 - `weighted`: of all three, the slider's missing force known to ± 1 N in motion and ± 4 N at rest.
 - `forcegp`: the external wrench at the foot, learned with a foot that sticks and no force sensor; `sensor`:
   learned from the joint forces that sensor and accelerations show together; `vertical axis`: from the
@@ -27,6 +29,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from classical_wrench import TERMS, identified_losses
 from numpy.typing import NDArray
 from real_cases import evenly, existing, iiwa14, moving
 from results_page import table
@@ -161,20 +164,38 @@ def sensor_std(logs: Path, log: str, half: tuple[float, float], window: int) -> 
     return float(white.max() * np.linalg.norm(savgol_coeffs(window, ORDER)))
 
 
-def classical(robot: forcegp.RobotModel, data: forcegp.Dataset) -> dict[str, Tensor]:
-    """Fore-aft and vertical force of each method without learning, `(n, 2)`."""
+def unexplained(robot: forcegp.RobotModel, data: forcegp.Dataset) -> tuple[Tensor, Tensor]:
+    """M q̈ − Q − τ `(n, 3)` and the Jacobian `(n, 2, 3)` of the foot's fore-aft and vertical position."""
     eom = forcegp.ConstrainedSystem(robot).equations(data.q, data.qd)
     J = kinematics.frame_jacobian(robot, data.q, "contact", (0.0, 0.0, 0.0))[:, [3, 5]]
-    moving = (eom.M @ data.qdd[..., None])[..., 0] - eom.Q_K - data.tau
+    return (eom.M @ data.qdd[..., None])[..., 0] - eom.Q_K - data.tau, J
+
+
+def classical(
+    robot: forcegp.RobotModel, data: forcegp.Dataset, train: forcegp.Dataset | None = None
+) -> dict[str, Tensor]:
+    """Fore-aft and vertical force by each method without learning `(n, 2)`, and by least squares from a
+    training log with its force sensor."""
+    moving, J = unexplained(robot, data)
+    Q_G = forcegp.dynamics.gravity_force(robot, data.q)
     # 1/σ² of the three rows; those of the leg count most
     weight = torch.where(data.qd[:, :1].abs() > 0.02, 1.0, 1.0 / 16.0).expand_as(moving).clone()
     weight[:, 1:] = 1.0 / 0.03**2
     JW = J * weight[:, None, :]
-    return {
-        "static": torch.linalg.solve(J[..., 1:].mT, -(eom.Q_G + data.tau)[:, 1:]),
+    forces = {
+        "static": torch.linalg.solve(J[..., 1:].mT, -(Q_G + data.tau)[:, 1:]),
         "equations of motion": torch.linalg.solve(J[..., 1:].mT, moving[:, 1:]),
         "weighted": torch.linalg.solve(JW @ J.mT, JW @ moving[..., None])[..., 0],
     }
+    if train is not None:
+        left, foot = unexplained(robot, train)
+        force = train.contact_extras[SENSOR]["ground"][:, [0, 2]]
+        left = left - (force[:, None, :] @ foot)[:, 0]
+        for terms in (("offset", "gain"), ("offset", "viscous", "Coulomb"), tuple(TERMS)):
+            losses = identified_losses(left, train.qd, train.tau, terms)(data.qd, data.tau)
+            name = f"least squares, {', '.join(terms)}"
+            forces[name] = torch.linalg.solve(J[..., 1:].mT, (moving - losses)[:, 1:])
+    return forces
 
 
 def scores(
@@ -226,7 +247,7 @@ def hopping_scores(logs: Path, train: tuple[float, float], test: tuple[float, fl
     first, second = between(data, train), between(data, test)
     rows = second.contact["ground"]
     result: dict[str, object] = {"window": window}
-    for name, force in classical(system.robot, second).items():
+    for name, force in classical(system.robot, second, first).items():
         result[name] = scores(force, second, rows)
     std = sensor_std(logs, "hopping", train, window)
     for name in ("", "sensor", "vertical axis"):
@@ -249,6 +270,9 @@ def pushed_scores(logs: Path) -> dict[str, object]:
     result["forcegp, learned on hopping"] = wrench_scores(fit, log, rows, hand)
     std = sensor_std(logs, "pushed", (0.0, float(log.t[-1]) / 2.0), window)
     fit = learned(system, log[rows & ~later], "sensor", std)
+    for name, force in classical(system.robot, log, log[rows & ~later]).items():
+        if name.startswith("least squares"):
+            result[f"{name}, second half"] = scores(force, log, later)
     result["forcegp sensor, second half"] = wrench_scores(fit, log, later, hand)
     return result
 

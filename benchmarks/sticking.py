@@ -1,15 +1,17 @@
 """Contact forces where the tip sticks and where it slides, beside equations of motion; MuJoCo is the truth.
 
     python benchmarks/sticking.py --json result.json      # some minutes
-    python benchmarks/sticking.py --scene ur5_wiping --seeds 1
+    python benchmarks/sticking.py --scene ur5_wiping --friction dahl --seeds 1
 
 Two logs of one robot, whose file lacks the friction of its joints: in one the tip slides with the scene's
 friction, in the other friction is so high that the tip sticks while the controller pulls at it; in both it
 lifts off now and then. The first halves of both are learned from together, the second halves are tested, all
-three components of the force on the tip.
+three components of the force on the tip. Joints at rest creep in MuJoCo's friction (`soft`), or hold like
+springs in Dahl's (`dahl`). The speed below which the tip sticks is that which an import reads off the log.
 
 - `equations of motion`: least squares of M q̈ − Q_K − τ = J_EᵀF with the file.
-- `with friction`: the same, with viscous and dry friction of each joint from the free motion of training.
+- `with friction`: the same, with viscous and dry friction and an offset of each joint from the free motion of
+  training; `and gain`: with a gain and load friction too.
 - `forcegp`: force predicted from q, q̇, τ, with a tip that may stick.
 - `forcegp wrench`: the external wrench at the tip, no contact declared.
 """
@@ -18,30 +20,68 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import itertools
 import json
 import warnings
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import torch
+from classical_wrench import TERMS, identified_losses
 from results_page import table
+from solver_contacts import KUKA, MOTION
 from torch import Tensor
 
 import forcegp
+from forcegp.errors import optional_module
+from forcegp.logs.from_contact import resting_speed
 from forcegp.scene import load_scene
 from forcegp.simulate import simulate
 
-SCENES = ("ur5_wiping", "panda_sphere")
+SCENES = ("ur5_wiping", "kuka_plane", "panda_sphere")
+FRICTIONS = ("soft", "dahl")
+DISTANCE = 0.02
+"""Over which Dahl's friction develops [rad]."""
 DURATION, AREA = 40.0, (0.03, 0.03)
 """Of each log [s], and where the tip that sticks is pulled to [m]."""
 HIGH_FRICTION = 3.0
-STICK_SPEED = 0.003
-"""Below which the tip sticks [m/s]: it creeps by some mm/s in MuJoCo's soft friction."""
-SLIDING = 0.01
-"""Speed above which rows count as sliding [m/s]."""
 EVERY, TESTED = 4, 3
 """Every so many rows are learned from, and tested."""
-DRY_SPEED = 0.05
-"""Speed over which dry friction of the plain regression changes sign [rad/s]."""
+FRICTION = ("offset", "viscous", "Coulomb")
+"""Terms of the plain regression."""
+
+
+class Dahl:
+    """Dry friction with memory in place of MuJoCo's, dz/dt = q̇/δ − |q̇| z/δ, as its callback."""
+
+    def __init__(self, robot: forcegp.RobotModel) -> None:
+        self.joint_names = robot.joint_names
+
+    @contextmanager
+    def installed(self, model: Any) -> Iterator[None]:
+        """Install the callback, and take the dry friction out of the model."""
+        mujoco = optional_module("mujoco", "This benchmark")
+        self.dof = np.array([model.joint(name).dofadr[0] for name in self.joint_names])
+        self.dry, self.bristle, self.time = model.dof_frictionloss[self.dof], np.zeros(len(self.dof)), 0.0
+        model.dof_frictionloss[self.dof] = 0.0
+        mujoco.set_mjcb_passive(self)
+        try:
+            yield
+        finally:
+            mujoco.set_mjcb_passive(None)
+
+    def __call__(self, model: Any, data: Any) -> None:
+        """Add the force; the bristles move on with the time of the engine."""
+        speed = data.qvel[self.dof]
+        end = np.sign(speed)
+        self.bristle = end + (self.bristle - end) * np.exp(
+            -np.abs(speed) * (data.time - self.time) / DISTANCE
+        )
+        self.time = data.time
+        data.qfrc_passive[self.dof] -= self.dry * self.bristle
 
 
 def truth(data: forcegp.Dataset, contact: str) -> Tensor:
@@ -57,11 +97,6 @@ def residual(system: forcegp.ConstrainedSystem, data: forcegp.Dataset) -> tuple[
     return left, point.jacobian, point.sliding[1].norm(dim=-1)
 
 
-def friction(data: forcegp.Dataset) -> Tensor:
-    """Columns of viscous and dry friction and an offset of each joint, `(n, nq, 3)`."""
-    return torch.stack([data.qd, torch.tanh(data.qd / DRY_SPEED), torch.ones_like(data.qd)], dim=-1)
-
-
 def plain(
     system: forcegp.ConstrainedSystem, train: forcegp.Dataset, test: forcegp.Dataset
 ) -> dict[str, Tensor]:
@@ -69,10 +104,11 @@ def plain(
     name = system.contacts[0].name
     free = train[~train.contact[name]]
     left, _, _ = residual(system, free)
-    weights = torch.linalg.lstsq(friction(free).transpose(0, 1), left.T[..., None]).solution[..., 0]
     rest, J, _ = residual(system, test)
-    learned = rest - (friction(test) * weights).sum(-1)
-    forces = {"equations of motion": rest, "with friction": learned}
+    forces = {"equations of motion": rest}
+    for name, terms in {"with friction": FRICTION, "and gain": tuple(TERMS)}.items():
+        losses = identified_losses(left, free.qd, free.tau, terms)
+        forces[name] = rest - losses(test.qd, test.tau)
     return {k: torch.linalg.lstsq(J.mT, r[..., None]).solution[..., 0] for k, r in forces.items()}
 
 
@@ -84,25 +120,43 @@ def score(error: Tensor, std: Tensor | None = None) -> dict[str, float]:
     return result
 
 
-def scores(scene: str, seed: int) -> dict[str, dict[str, dict[str, float]]]:
-    """Scores of each method, where the tip sticks and where it slides."""
+def recorded(
+    scene: str, friction: str, seed: int, seconds: float
+) -> tuple[forcegp.ConstrainedSystem, dict[str, forcegp.Dataset]]:
+    """The system, and the logs in which the tip slides and sticks."""
     loaded = load_scene(scene)
-    system = loaded.system()
-    (contact,) = system.contacts
-    assert isinstance(contact, forcegp.SurfaceContact)
-    slides = dataclasses.replace(loaded.simulation, seed=seed, duration=DURATION)
+    system, config = loaded.system(), loaded.simulation
+    if scene == "kuka_plane":
+        solver = dataclasses.replace(config.solver, **KUKA)
+        config = dataclasses.replace(MOTION, center=config.center, size=config.size, solver=solver)
+    slides = dataclasses.replace(config, seed=seed, duration=seconds)
     solver = dataclasses.replace(slides.solver, friction=HIGH_FRICTION)
     sticks = dataclasses.replace(slides, seed=seed + 100, size=AREA, solver=solver)
-    logs = {"slides": simulate(system, slides).data, "sticks": simulate(system, sticks).data}
+    logs = {}
+    for name, each in {"slides": slides, "sticks": sticks}.items():
+        forces: Any = Dahl(system.robot) if friction == "dahl" else None
+        logs[name] = simulate(system, each, forces=forces).data
+    return system, logs
+
+
+def scores(
+    scene: str, friction: str, seed: int, seconds: float, priors: str
+) -> dict[str, dict[str, dict[str, float]]]:
+    """Scores of each method, where the tip sticks and where it slides."""
+    system, logs = recorded(scene, friction, seed, seconds)
+    (contact,) = system.contacts
+    assert isinstance(contact, forcegp.SurfaceContact)
     half = {name: len(log) // 2 for name, log in logs.items()}
     train = forcegp.Dataset.concatenate([log[: half[name]] for name, log in logs.items()])
-    both = dataclasses.replace(system, contacts=[dataclasses.replace(contact, stick_speed=STICK_SPEED)])
-    fit = forcegp.StructuredGP(both, "analytical").fit(train[::EVERY])
+    stick_speed = resting_speed(residual(system, train[train.contact[contact.name]])[2].numpy())
+    assert stick_speed is not None
+    both = system.with_stick_speeds({contact.name: stick_speed})
+    fit = forcegp.StructuredGP(both, "analytical", priors).fit(train[::EVERY])
     result = {}
     for name, log in logs.items():
         test = log[half[name] :: TESTED]
         _, _, speed = residual(system, test)
-        moves = speed < STICK_SPEED if name == "sticks" else speed > SLIDING
+        moves = speed < stick_speed if name == "sticks" else speed > stick_speed
         rows, true = test.contact[contact.name] & moves, truth(test, contact.name)
         own = {k: score((force - true)[rows]) for k, force in plain(system, train, test).items()}
         force = fit.predict(
@@ -124,23 +178,29 @@ def main() -> None:
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
     )
     parser.add_argument("--scene", choices=SCENES, action="append")
-    parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--friction", choices=FRICTIONS, action="append")
+    parser.add_argument("--seconds", type=float, default=DURATION, help="length of each log")
+    parser.add_argument("--priors", default="auto", help="of StructuredGP, such as friction")
+    parser.add_argument("--seeds", type=int, nargs="*", default=list(range(5)))
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
     torch.set_num_threads(1)
     warnings.simplefilter("ignore")
-    result = {
-        scene: [scores(scene, seed) for seed in range(options.seeds)] for scene in options.scene or SCENES
-    }
+    result: dict[str, list[dict[str, dict[str, dict[str, float]]]]] = {}
+    cases = options.scene or SCENES, options.friction or FRICTIONS
+    for seed, scene, friction in itertools.product(options.seeds, *cases):
+        found = scores(scene, friction, seed, options.seconds, options.priors)
+        result.setdefault(f"{scene}, {friction}", []).append(found)
+        print(scene, friction, seed, json.dumps(found), flush=True)
     lines = []
-    for scene, seeds in result.items():
+    for case, seeds in result.items():
         for state in seeds[0]:
             for method in seeds[0][state]:
                 own = [seed[state][method] for seed in seeds]
                 keys = ("rmse_N", "median_std_N", "coverage")
                 means = [sum(x[k] for x in own) / len(own) if k in own[0] else None for k in keys]
-                lines.append([scene, state, method, *("–" if x is None else f"{x:.2f}" for x in means)])
-    print(table(["scene", "tip", "method", "RMSE [N]", "median σ [N]", "coverage of ±2σ"], lines))
+                lines.append([case, state, method, *("–" if x is None else f"{x:.2f}" for x in means)])
+    print(table(["scene, friction", "tip", "method", "RMSE [N]", "median σ [N]", "coverage of ±2σ"], lines))
     if options.json:
         options.json.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
 

@@ -16,6 +16,11 @@ def robust_std(x: NDArray[Any]) -> NDArray[Any]:
     return np.asarray(MAD_TO_STD * np.median(np.abs(x - np.median(x, axis=0)), axis=0))
 
 
+def level_and_spread(x: NDArray[Any]) -> tuple[float, float]:
+    """Median and robust standard deviation, NaN without values."""
+    return (float(np.median(x)), float(robust_std(x))) if len(x) else (float("nan"), float("nan"))
+
+
 def level_of(x: NDArray[Any], width: float, share: float) -> float | None:
     """Median of the values within `width` of the mode of a histogram, if they exceed a share of all values.
 

@@ -12,8 +12,10 @@ import torch
 import forcegp
 from forcegp import dynamics
 from forcegp.checks import Log, Report, check, log_of
+from forcegp.checks.excitation import Fault, force_of
+from forcegp.checks.explain import Explanation
 from forcegp.checks.fit import TorqueFit
-from forcegp.checks.hypotheses import Hypothesis, plausible, unchanged
+from forcegp.checks.hypotheses import Hypothesis, plausible, problem_of, unchanged
 from forcegp.checks.limits import check_saturation
 from forcegp.checks.values import check_stuck
 from forcegp.constraints import ConstrainedSystem
@@ -28,12 +30,16 @@ PENDULUM = ConstrainedSystem(forcegp.load_robot("double_pendulum"))
 
 
 @pytest.fixture(scope="module")
-def wiping() -> Report:
-    """The report on a log of MuJoCo's solver whose joints have friction that the robot file lacks."""
+def wiped() -> Case:
+    """A log of MuJoCo's solver whose joints have friction that the robot file lacks."""
     scene = load_scene("ur5_wiping")
     config = replace(scene.simulation, duration=20.0, dt=0.004, seed=0, lift_probability=0.2)
-    data = simulate(scene.system(), config).data
-    return check(scene.system(), data)
+    return scene.system(), log_of(simulate(scene.system(), config).data)
+
+
+@pytest.fixture(scope="module")
+def wiping(wiped: Case) -> Report:
+    return check(*wiped)
 
 
 def of_kind(report: Report, kind: str) -> list:
@@ -55,6 +61,57 @@ def test_friction_that_would_drive_a_joint_is_not_determined(wiping: Report) -> 
     assert "shoulder_lift_joint" in finding.joints and "not determined" in finding.message
     assert "viscous shoulder_lift_joint" not in sizes and min(sizes.values()) > 0.0
     assert 3.0 < sizes["coulomb shoulder_lift_joint"] < 6.0
+
+
+def heavier(system: ConstrainedSystem, link: int, share: float) -> ConstrainedSystem:
+    factor = 1.0 + share * (torch.arange(system.robot.nq) == link).double()
+    robot = system.robot
+    changed = {"mass": robot.mass * factor, "inertia": robot.inertia * factor[:, None, None]}
+    return system.with_robot(replace(robot, **changed))
+
+
+def leaning(system: ConstrainedSystem, degrees: float) -> ConstrainedSystem:
+    angle = np.radians(degrees)
+    gravity = 9.81 * torch.tensor([np.sin(angle), 0.0, -np.cos(angle)], dtype=torch.float64)
+    return system.with_robot(replace(system.robot, gravity=gravity))
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("name", "word", "size"),
+    [("base-tilted", "a tilt of the base", 5.0), ("heavier-link elbow_joint", "other masses", 0.3)],
+)
+def test_what_this_motion_hides_is_said(
+    name: str, word: str, size: float, wiping: Report, wiped: Case
+) -> None:
+    """The clean log says that the fault is too small; where an offset is reported for it, it is a rival."""
+    (note,) = of_kind(wiping, "faults-hidden")
+    assert note.evidence[name] > size
+    assert "a tilt of the base " in note.message and "a heavier link: " in note.message
+    assert "(3°: force at the contact off by about " in note.message
+    system = leaning(wiped[0], size) if name == "base-tilted" else heavier(wiped[0], 2, size)
+    (offset,) = of_kind(check(system, wiped[1]), "torque-offset")
+    assert "in this motion, " in offset.message and word in offset.message
+
+
+@pytest.mark.slow
+def test_a_late_torque_is_found_if_it_is_not_said_to_be_hidden(wiping: Report, wiped: Case) -> None:
+    (note,) = of_kind(wiping, "faults-hidden")
+    late = wiped[1].replace(tau=np.roll(wiped[1].tau, 10, axis=0))
+    assert note.evidence["torque-delay"] < 0.04 and of_kind(check(wiped[0], late), "torque-delay")
+
+
+def test_the_force_of_a_hidden_fault_is_what_no_fit_takes_for_friction(touching: Case) -> None:
+    """A torque Jᵀf is a force |f|; a constant torque is an offset, which a fit learns, and no force."""
+    system, log = touching
+    rows = log.rows(400)
+    problem = problem_of(system, log, rows)
+    model = Explanation(system, log, rows, problem, np.zeros((*problem.r.shape, 0)), np.zeros(0))
+    force = np.array([3.0, 0.0, -4.0])
+    fault = Fault("base-tilted", "", np.einsum("nkj,k->nj", problem.J, force), log.nq)
+    assert force_of(model, fault) == pytest.approx(5.0, rel=1e-6)
+    constant = replace(fault, column=np.ones_like(problem.r))
+    assert force_of(model, constant) == pytest.approx(0.0, abs=1e-4)
 
 
 def torque_fit(theta: list[float], spread: list[float]) -> TorqueFit:

@@ -6,6 +6,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+import torch
 
 import forcegp
 from forcegp.checks import Log, check, log_of
@@ -13,12 +14,9 @@ from forcegp.checks.explain import _possible, with_alternatives
 from forcegp.checks.finding import Finding
 from forcegp.checks.fit import cross_validate
 from forcegp.checks.hypotheses import Hypothesis, problem_of, unchanged
-from forcegp.constraints import ConstrainedSystem
 from forcegp.scene import load_scene
 from forcegp.simulate import simulate
-from planted_faults import free_log
-
-Case = tuple[ConstrainedSystem, Log]
+from planted_faults import Case, free_log, serious
 
 
 @pytest.fixture(scope="module")
@@ -153,3 +151,19 @@ def test_milliseconds_beside_an_acceleration_that_the_import_derived() -> None:
     late = log.replace(t=1e3 * log.t, qdd=1e-3 * log.qdd, header=header)
     kinds = [finding.kind for finding in check(forcegp.ConstrainedSystem(robot), late).findings]
     assert kinds[0] == "time-unit" and "filter-wide" not in kinds and "masses-mismatch" not in kinds
+
+
+def test_a_pulse_of_the_torque_that_drives_the_arm_is_no_outlier(free: Case) -> None:
+    """A controller's pulse of one row, larger than the torque is elsewhere, accelerates every joint."""
+    system, log = free
+    k, pulse = 700, np.zeros(log.nq)
+    pulse[0] = 2.0 * np.ptp(log.tau[:, 0])
+    M = forcegp.dynamics.mass_matrix(system.robot, torch.from_numpy(log.q[k])).numpy()
+    tau, qdd = log.tau.copy(), log.qdd.copy()
+    tau[k] += pulse
+    outliers = [f for f in check(system, log.replace(tau=tau)).findings if f.kind == "spike"]
+    assert [f.intervals for f in outliers] == [((k, k + 1),)], (
+        "a wrong value, without the motion that it makes"
+    )
+    qdd[k] += np.linalg.solve(M, pulse)
+    assert "spike" not in serious(check(system, log.replace(tau=tau, qdd=qdd)))

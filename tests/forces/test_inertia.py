@@ -23,6 +23,7 @@ from forcegp.forces.inverse_dynamics import (
     log_ratio,
     partners,
     products,
+    sliding,
     sums,
 )
 from forcegp.forces.measurements import Observation, training_of
@@ -47,24 +48,30 @@ def log(
     acceleration_noise: float = 0.0,
     memory: float = 0.0,
     window: int = 1,
+    late: float = 0.0,
 ) -> forcegp.Dataset:
     """Torques that move a robot with joint friction along sums of sines, measured with noise.
 
     With memory, dry friction is four times as large and develops over that distance [rad] (Dahl's model).
-    Noise of accelerations is that of a Savitzky-Golay filter of a window.
+    Torques are logged late [s]. Noise of accelerations is that of a Savitzky-Golay filter of a window.
     """
     generator = torch.Generator().manual_seed(seed)
     t = torch.arange(n, dtype=torch.float64) * 0.01
     segment = torch.arange(n) * segments // n
     w = speed * (1.0 + 5.0 * torch.rand(segments, 3, 2, generator=generator, dtype=torch.float64))
     phase = 6.3 * torch.rand(segments, 3, 2, generator=generator, dtype=torch.float64)
-    angle = w[segment] * t[:, None, None] + phase[segment]
-    parts = torch.sin(angle), w[segment] * torch.cos(angle), -(w[segment] ** 2) * torch.sin(angle)
-    q, qd, qdd = (0.4 * part.sum(1) for part in parts)
+
+    def motion(t: Tensor) -> Tensor:
+        angle = w[segment] * t[:, None, None] + phase[segment]
+        parts = torch.sin(angle), w[segment] * torch.cos(angle), -(w[segment] ** 2) * torch.sin(angle)
+        return torch.stack([0.4 * part.sum(1) for part in parts])
+
+    q, qd, qdd = motion(t - late)
     noise = NOISE * torch.randn(n, 2, generator=generator, dtype=torch.float64)
     dry = 1.6 * dahl(q, segment, memory) if memory else 0.4 * torch.tanh(qd / 0.02)
     friction = 0.3 * qd + dry
     tau = dynamics.inverse_dynamics(robot, q, qd, qdd) + friction + noise
+    q, qd, qdd = motion(t)
     white = torch.randn(n + window - 1, 2, generator=generator, dtype=torch.float64)
     weights = torch.ones(1) if window == 1 else torch.from_numpy(savgol_coeffs(window, 3, deriv=2))
     weights = weights.double() / weights.norm()
@@ -144,6 +151,16 @@ def test_links_that_the_file_describes_wrongly_are_identified(file: RobotModel) 
     again = model.fit(log(truth, 800), learn=["joint_friction"], after=fitted)
     torch.testing.assert_close(again.system.robot.mass, fitted.system.robot.mass, rtol=0.0, atol=0.0)
     assert again.problem.pinned.keys() == {prior.name}
+
+
+@pytest.mark.parametrize("late", [0.0, 0.008])
+def test_a_late_torque_is_not_taken_for_inertia(file: RobotModel, late: float) -> None:
+    assert found(file, log(file, late=late)).robot is file
+    truth = file.replace(mass=1.3 * file.mass, com=0.9 * file.com)
+    data = log(truth, late=late)
+    M, exact = (dynamics.mass_matrix(each, data.q).diagonal(dim1=-2, dim2=-1).mean(0)
+                for each in (found(file, data).robot, truth))  # fmt: skip
+    torch.testing.assert_close(M, exact, rtol=0.01, atol=0.0)
 
 
 def test_links_and_drives_are_identified_together(file: RobotModel) -> None:
@@ -236,7 +253,9 @@ def test_averaged_equations_are_sums_of_neighbours_within_a_stretch() -> None:
     i, group = torch.arange(n), (torch.arange(n) // 60).repeat(2)
     slides = torch.ones_like(r, dtype=torch.bool)
     slides[30, 0] = False
-    rows = Rows(r, r, r, r, Phi, slides, group, group, torch.cat([i + n, i]), Phi[..., :0], 0.01, 0.03**2)
+    rows = Rows(
+        r, r, r, r, Phi, slides, group, group, torch.cat([i + n, i]), Phi[..., :0], 0.0 * r, 0.01, 0.03**2
+    )
     mean, columns = averaged(rows, C, inertial, 0.04)
     assert mean.step == 0.02 and len(columns) == 2 * len(range(15, n - 15, 2))
     k = torch.arange(-15, 16).double()
@@ -321,7 +340,7 @@ def test_sums_give_the_dense_least_squares() -> None:
     r = torch.randn(n, nq, generator=random, dtype=torch.float64)
     group = torch.arange(n) * 3 // n
     moves = torch.ones_like(r, dtype=torch.bool)
-    by_stretch = sums(Rows(r, r, r, r, Phi, moves, group, group, torch.arange(n), Phi[..., :0]), C)
+    by_stretch = sums(Rows(r, r, r, r, Phi, moves, group, group, torch.arange(n), Phi[..., :0], r), C)
     every, rest = by_stretch.total(), by_stretch.without(1)
     for given, own in ((every, group >= 0), (rest, group != 1)):
         H, h = given.quadratic(NOISE)
@@ -346,7 +365,7 @@ def test_instruments_give_the_textbook_estimate() -> None:
     r = torch.randn(n, nq, generator=random, dtype=torch.float64)
     partner = torch.cat([torch.arange(n // 2) + n // 2, torch.arange(n // 2)])
     group = torch.arange(n // 2).repeat(2) * 3 // (n // 2)
-    rows = Rows(r, r, r, r, Phi, torch.ones_like(r, dtype=torch.bool), group, group, partner, Phi[..., :0])
+    rows = Rows(r, r, r, r, Phi, torch.ones_like(r, dtype=torch.bool), group, group, partner, Phi[..., :0], r)
     every = instrumental(rows, C).total()
     delta = torch.linalg.solve(*every.quadratic(NOISE))
     X, Z = (torch.zeros(n, nq, p + nq * f, dtype=torch.float64) for _ in range(2))
@@ -362,6 +381,20 @@ def test_instruments_give_the_textbook_estimate() -> None:
     left = r - X @ dense
     found = products(rows, C).total().error(delta, every.friction(delta))
     torch.testing.assert_close(found, (left * left[partner]).mean(0), rtol=1e-7, atol=1e-10)
+
+
+def test_a_joint_at_rest_is_found_behind_the_noise_of_its_velocity() -> None:
+    """At rest, friction has any value below that of motion; the noise is twice the sharpest speed."""
+    random = torch.Generator().manual_seed(0)
+    n = 2000
+    true = torch.randn(n, 2, generator=random, dtype=torch.float64)
+    true[: n // 3, 0] = 0.0
+    qd = true + 0.04 * torch.randn(n, 2, generator=random, dtype=torch.float64)
+    friction = torch.where(true == 0.0, 2.0 * torch.rand(n, 2, generator=random).double() - 1.0, true.sign())
+    Phi = torch.stack([torch.tanh(qd / 0.02), qd, torch.ones_like(qd)], dim=-1)
+    slides = sliding(qd.abs(), 0.02, Phi, friction + 0.1 * torch.randn(n, 2, generator=random).double())
+    assert float(slides[: n // 3, 0].double().mean()) < 0.1
+    assert bool((slides[n // 3 :].double().mean(0) > 0.9).all()), "but for rows as slow as the noise"
 
 
 def test_harm_is_what_one_joint_suffers() -> None:

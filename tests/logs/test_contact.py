@@ -185,6 +185,10 @@ def with_table(offset: float) -> forcegp.ConstrainedSystem:
 def test_a_table_that_lies_elsewhere_is_an_error_that_names_the_distance_and_the_remedy(
     slides: tuple[forcegp.Dataset, Path], offset: float, seen: str
 ) -> None:
+    own = SLIDING.replace('"distance"', '"distance"\nthreshold = 0.0005')
+    assert own != SLIDING
+    with pytest.raises(DataError, match="the tip is " + seen):
+        import_log(logged(slides), with_table(offset), parse_mapping(own.encode(), "m.toml"))
     log, mapping = logged(slides), parse_mapping(SLIDING.encode(), "m.toml")
     with pytest.raises(DataError, match="the tip is " + seen + r".* mm from .*'table'") as caught:
         import_log(log, with_table(offset), mapping)

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import json
+import math
 from functools import cache
 from pathlib import Path
 
 import numpy as np
 import pytest
 import torch
+from scipy.signal import lfilter
 from typer.testing import CliRunner
 
 import forcegp
@@ -140,6 +142,31 @@ def test_detection_keeps_its_false_alarm_rate() -> None:
     mean = torch.randn(20_000, 3, dtype=torch.float64, generator=generator)
     wrench = ExternalWrench(mean, torch.eye(3, dtype=torch.float64).expand(20_000, 3, 3))
     assert float(wrench.detect(2.0).double().mean()) == pytest.approx(false_alarm_rate(2.0), rel=0.1)
+
+
+def test_a_limit_from_free_motion_keeps_lasting_errors_from_being_contacts() -> None:
+    """Errors that last 0.1 s, with heavier tails than their covariance says: a limit read off one minute
+    bounds the false alarms of ten, of which the threshold for Gaussian errors has many."""
+    generator = torch.Generator().manual_seed(0)
+    t = 0.004 * torch.arange(150_000, dtype=torch.float64)
+    keep = math.exp(-0.04)
+    steps = torch.randn(len(t), 6, generator=generator, dtype=torch.float64).numpy()
+    errors = torch.from_numpy(lfilter([(1.0 - keep**2) ** 0.5], [1.0, -keep], steps, axis=0))
+    # A scale that changes slowly makes the tails heavy.
+    scale = 1.0 + 0.7 * torch.sin(0.5 * t).square()
+    covariance = torch.eye(6, dtype=torch.float64).expand(len(t), 6, 6)
+    free = ExternalWrench(scale[:, None] * errors, covariance)
+    minute = ExternalWrench(free.mean[:15_000], covariance[:15_000])
+    limit = minute.exceeded_once_in(600.0, t[:15_000])
+
+    def alarms(found: torch.Tensor) -> int:
+        rows = found.nonzero()[:, 0]
+        return int(len(rows) > 0) + int((rows.diff() > 125).sum())
+
+    assert alarms(free.detect(limit=limit)) <= 4, "a Poisson variable of mean 1, at 4 of 1000"
+    assert alarms(free.detect()) > 20
+    with pytest.raises(DataError, match="free motion is too short"):
+        minute.exceeded_once_in(600.0, t[:15_000] / 100.0)
 
 
 def test_the_observer_without_learning_finds_a_push_of_a_frictionless_arm() -> None:

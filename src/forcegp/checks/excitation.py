@@ -16,7 +16,7 @@ import torch
 
 from forcegp.checks.explain import Explanation, significant
 from forcegp.checks.finding import Finding
-from forcegp.checks.fit import BLOCKS, blocks_of, held_out, residual, tensors, unmeasured
+from forcegp.checks.fit import BLOCKS, blocks_of, cross_validate, held_out, residual, tensors, unmeasured
 from forcegp.checks.hypotheses import encoder_hypothesis, inertial_spread, robot_columns
 from forcegp.checks.log import Array, Log, Outcome, position_unit
 from forcegp.constraints import ConstrainedSystem
@@ -112,22 +112,21 @@ LEAST_TOUCHING = 20
 LARGEST = 1e3
 SIZES = np.geomspace(1e-3, LARGEST, 200)
 """Sizes that are tried."""
-MOST = {"encoder-offset": np.pi, "base-tilted": 180.0, "masses-mismatch": 1.0}
-"""Largest sizes that faults can have: half a turn, in rad and degrees, and masses of zero."""
 SPAN = 1
 """Rows on either side of which the rate of the torque is taken; fewer than the margin of `explain`."""
-HIDDEN = {
-    "torque-delay": (0.02, 1e3, "a delay of the torque", "{:.0f} ms"),
-    "base-tilted": (3.0, 1.0, "a tilt of the base", "{:.2g}°"),
-    "masses-mismatch": (0.2, 100.0, "an error of the masses", "{:.0f} %"),
-    "torque-gain": (0.5, 100.0, "a wrong gain", "{:.0f} %"),
-    "encoder-offset": (0.1, 1.0, "an encoder offset", "{:.2g} {unit}"),
+EXPECTED = {
+    "torque-delay": (0.02, LARGEST, 1e3, "a delay of the torque", "{:.0f} ms"),
+    "base-tilted": (3.0, 180.0, 1.0, "a tilt of the base", "{:.2g}°"),
+    "masses-mismatch": (0.2, 1.0, 100.0, "errors of all masses", "{:.0f} %"),
+    "heavier-link": (0.2, 10.0, 100.0, "a heavier link", "{:.0f} %"),
+    "torque-gain": (0.5, LARGEST, 100.0, "a wrong gain", "{:.0f} %"),
+    "encoder-offset": (0.1, np.pi, 1.0, "an encoder offset", "{:.2g} {unit}"),
 }
-"""Size that a user expects to be seen [s, degrees, share, share, rad], factor to the unit of its words, what
-is hidden, and its size in words; what concerns the whole arm comes first."""
+"""Size that a user expects to be seen and largest size [s, degrees, share, rad], factor to the unit of its
+words, the fault, and its size in words; what concerns the whole arm comes first."""
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class Fault:
     """A fault of unit size: its kind, its joint if any, and the torque `(n, nq)` that it adds."""
 
@@ -138,40 +137,42 @@ class Fault:
 
 
 def check_visibility(system: ConstrainedSystem, explanation: Explanation) -> list[Finding]:
-    """Note the faults that this log would hide."""
+    """Note from which size this log shows faults, and what one of the expected size does to a force."""
     faults = list(_faults(system, explanation.log, explanation.rows))
-    sizes = [visible_size(explanation, fault) for fault in faults]
-    hidden = [(f, size) for f, size in zip(faults, sizes, strict=True) if size > HIDDEN[f.kind][0]]
-    if not hidden:
-        return []
+    sizes = {fault: visible_size(explanation, fault) for fault in faults}
     units = {name: position_unit(system.robot, j) for j, name in enumerate(system.robot.joint_names)}
-    texts = []
-    for kind, (_, scale, what, words) in HIDDEN.items():
-        parts = []
-        for fault, size in (pair for pair in hidden if pair[0].kind == kind):
-            part = "of any size" if size >= MOST.get(kind, LARGEST) else f"under {words}"
-            part = part.format(scale * size, unit=units.get(fault.joint))
-            parts.append(f"{fault.joint} {part}".strip() + _at_contact(explanation, fault, size))
-        texts += (
-            [f"{what}{': ' if parts[0].startswith(tuple(units)) else ' '}{', '.join(parts)}"] if parts else []
-        )
-    text = f"this log does not show {'; '.join(texts)}"
-    joints = tuple(dict.fromkeys(fault.joint for fault, _ in hidden if fault.joint))
-    pairs = zip(faults, sizes, strict=True)
-    evidence = {f"{fault.kind} {fault.joint}".strip(): size for fault, size in pairs}
-    return [explanation.log.finding("faults-hidden", text, joints, **evidence)]
+    texts, hidden = [], [f for f in faults if not f.joint or sizes[f] > EXPECTED[f.kind][0]]
+    for kind, (expected, most, scale, what, words) in EXPECTED.items():
+        alike, parts = [fault for fault in hidden if fault.kind == kind], []
+        if not alike:
+            continue
+        for fault in alike:
+            size = words.format(scale * sizes[fault], unit=units.get(fault.joint))
+            parts.append(f"{fault.joint} {size if sizes[fault] < most else 'never'}".strip())
+        force = max(force_of(explanation, fault) for fault in alike) * expected
+        size = words.format(scale * expected, unit=units.get(alike[0].joint))
+        changed = f" ({size}: force at the contact off by about {force:.2g} N)" if force else ""
+        texts.append(f"{what}{': ' if alike[0].joint else ' '}{', '.join(parts)}{changed}")
+    joints = tuple(dict.fromkeys(fault.joint for fault in hidden if fault.joint))
+    evidence = {f"{fault.kind} {fault.joint}".strip(): size for fault, size in sizes.items()}
+    return [
+        explanation.log.finding("faults-hidden", f"seen only from: {'; '.join(texts)}", joints, **evidence)
+    ]
 
 
-def _at_contact(explanation: Explanation, fault: Fault, size: float) -> str:
-    """The force at the tip that a fault of the whole arm passes for, root mean square."""
-    J = explanation.problem.J
-    J = J[:, : J.shape[1] - len(unmeasured(explanation.log))]
+def force_of(explanation: Explanation, fault: Fault) -> float:
+    """Force at the tip that a fault of unit size passes for beside what a fit learns [N], rms; 0 if free."""
+    problem = replace(explanation.problem, r=fault.column)
+    J = problem.J[:, : problem.J.shape[1] - len(unmeasured(explanation.log))]
     touching = (J != 0.0).any(axis=(1, 2))
-    if fault.joint or size >= MOST.get(fault.kind, LARGEST) or touching.sum() < LEAST_TOUCHING:
-        return ""
+    if touching.sum() < LEAST_TOUCHING:
+        return 0.0
+    fit = cross_validate(problem, explanation.columns, explanation.prior)
+    learned = explanation.columns @ fit.theta + problem.nuisance @ fit.nuisance
     # τ = Jᵀ F by least squares.
-    force = np.einsum("nkj,nj->nk", np.linalg.pinv(J[touching].transpose(0, 2, 1)), fault.column[touching])
-    return f" (up to {size * float(np.sqrt((force**2).sum(axis=1).mean())):.2g} N at the contact)"
+    inverse = np.linalg.pinv(J[touching].transpose(0, 2, 1))
+    force = np.einsum("nkj,nj->nk", inverse, (fault.column - learned)[touching])
+    return float(np.sqrt((force**2).sum(axis=1).mean()))
 
 
 def visible_size(explanation: Explanation, fault: Fault) -> float:
@@ -194,21 +195,27 @@ def visible_size(explanation: Explanation, fault: Fault) -> float:
 
 
 def _faults(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterator[Fault]:
+    delays = []
+    if log.header.ordered:  # rows in order of selection have no neighbours in time
+        # The torque that the motion needs; the measured one has more noise.
+        ahead, behind = (residual(system, log, rows + k)[0] + log.tau[rows + k] for k in (SPAN, -SPAN))
+        delays = [(ahead - behind) / (2.0 * SPAN * log.dt)]
+        yield Fault("torque-delay", "", delays[0], log.nq)
     for j, joint in enumerate(log.joint_names):
         only = np.arange(log.nq) == j
+        yield from (Fault("torque-delay", joint, delay * only, 1) for delay in delays)
         yield Fault("torque-gain", joint, log.tau[rows] * only, 1)
         column = encoder_hypothesis(system, log, rows, j).columns
         assert column is not None
         yield Fault("encoder-offset", joint, column[..., 0], 1)
-    if log.header.ordered:  # rows in order of selection have no neighbours in time
-        # The torque that the motion needs; the measured one has more noise.
-        ahead, behind = (residual(system, log, rows + k)[0] + log.tau[rows + k] for k in (SPAN, -SPAN))
-        yield Fault("torque-delay", "", (ahead - behind) / (2.0 * SPAN * log.dt), log.nq)
     # Per degree of a tilt, about the horizontal axis that shows it better.
     gravity, columns = system.robot.gravity.numpy(), robot_columns(system, log, rows, "gravity")[0]
     axes = np.linalg.svd(gravity[None])[2][1:] * np.linalg.norm(gravity) * np.pi / 180.0
     tilt = max((columns @ axis for axis in axes), key=lambda torque: float((torque**2).sum()))
     yield Fault("base-tilted", "", tilt, log.nq)
+    links = robot_columns(system, log, rows, "masses")[0] * parameter_vector(system.robot).numpy()
+    links = links.reshape(*links.shape[:2], log.nq, 10).sum(axis=-1)
     # The inertial parameters of every other link are taken as wrong by the same share.
-    wrong = -np.repeat((-1.0) ** np.arange(log.nq), 10) * parameter_vector(system.robot).numpy()
-    yield Fault("masses-mismatch", "", robot_columns(system, log, rows, "masses")[0] @ wrong, log.nq)
+    yield Fault("masses-mismatch", "", links @ -((-1.0) ** np.arange(log.nq)), log.nq)
+    for j, joint in enumerate(log.joint_names):
+        yield Fault("heavier-link", joint, links[..., j], log.nq)

@@ -20,8 +20,8 @@ from forcegp.checks.log import Array, Log
 from forcegp.checks.placement import leaves_surface
 from forcegp.constraints import ConstrainedSystem
 
-ROWS, SCREENING = 1600, 4
-"""Rows that hypotheses are tested on; on one in so many they must do better first."""
+ROWS, SCREENING, DELAYS = 1600, 4, 3
+"""Rows that hypotheses are tested on; on one in so many they must do better first; delays of one joint."""
 ROUNDS = 5
 """Faults that are looked for at most."""
 SIGNIFICANT = 4.0
@@ -76,13 +76,22 @@ class Explanation:
             result = replace(result, problem=replace(result.problem, scale=scale))
         return result
 
-    def with_(self, hypothesis: Hypothesis) -> TorqueFit:
-        """Fit a hypothesis with parameters, in addition to those already in the model."""
+    def beside(self, hypothesis: Hypothesis) -> Explanation:
+        """The same with the parameters of a hypothesis, which come first."""
         assert hypothesis.columns is not None and hypothesis.prior is not None
         columns = np.concatenate([hypothesis.columns, self.columns], axis=-1)
+        return replace(self, columns=columns, prior=np.concatenate([hypothesis.prior, self.prior]))
+
+    def with_nuisance(self, *columns: Array) -> Explanation:
+        """The same with more columns that every hypothesis may use."""
+        nuisance = np.concatenate([self.problem.nuisance, *columns], axis=-1)
+        return replace(self, problem=replace(self.problem, nuisance=nuisance))
+
+    def with_(self, hypothesis: Hypothesis) -> TorqueFit:
+        """Fit a hypothesis with parameters, in addition to those already in the model."""
         gains = hypothesis.joints if hypothesis.name == "gains" else ()
-        prior = np.concatenate([hypothesis.prior, self.prior])
-        return cross_validate(self.problem, columns, prior, gains, hypothesis.instruments)
+        wider = self.beside(hypothesis)
+        return cross_validate(self.problem, wider.columns, wider.prior, gains, hypothesis.instruments)
 
 
 def explain(system: ConstrainedSystem, log: Log) -> Explanation:
@@ -139,10 +148,7 @@ def _accepted(model: Explanation, hypothesis: Hypothesis, theta: Array, finding:
     taken = model.taken | {(hypothesis.name, hypothesis.joints)}
     model = replace(model, findings=(*model.findings, finding), taken=taken)
     if hypothesis.name in hypotheses.ROBOT:
-        assert hypothesis.columns is not None and hypothesis.prior is not None
-        columns = np.concatenate([hypothesis.columns, model.columns], axis=-1)
-        prior = np.concatenate([hypothesis.prior, model.prior])
-        return replace(model, columns=columns, prior=prior, robot=(hypothesis.name, *model.robot)).weighed()
+        return replace(model.beside(hypothesis), robot=(hypothesis.name, *model.robot)).weighed()
     repair = partial(corrected, hypothesis=hypothesis, theta=theta)
     log = repair(model.log)
     problem = hypotheses.problem_of(model.system, log, model.rows)
@@ -166,12 +172,12 @@ def _fits(model: Explanation) -> Iterator[Tried]:
         # leaves the motion, and with it the columns of the robot's parameters, as they are.
         for hypothesis in hypotheses.delays(log):
             yield hypothesis, cross_validate(model.on(hypothesis.change(log)), model.columns, model.prior)
+        yield from ((h, fit) for h in _joint_delays(model) if (fit := _beside_friction(model, h)))
         tried = hypotheses.robot_hypotheses(system, log, rows)
     else:
         few = model.rows[::SCREENING]
         null = cross_validate(model.on(log, few)).score.mean()
-        late = hypotheses.joint_delays(log, rows, model.problem)
-        for hypothesis in (*hypotheses.discrete(log), *late):
+        for hypothesis in (*hypotheses.discrete(log), *_joint_delays(model)):
             changed = hypothesis.change(log)
             if cross_validate(model.on(changed, few)).score.mean() < null:
                 yield hypothesis, cross_validate(model.on(changed))
@@ -187,6 +193,29 @@ def _fits(model: Explanation) -> Iterator[Tried]:
         yield together, model.with_(together)
     if 2 * len(off) > log.nq > 1:
         yield from _currents(model)
+
+
+def _joint_delays(model: Explanation) -> Iterator[Hypothesis]:
+    """For each joint, the delays of its torque that leave least unexplained on the screened rows, if any."""
+    log, few = model.log, model.rows[::SCREENING]
+    problem, columns = model.on(log, few), model.columns[::SCREENING]
+    null = cross_validate(problem, columns, model.prior).score.mean()
+    for j in range(log.nq if log.nq > 1 and log.stretches else 0):
+        scores, only = {}, np.arange(log.nq) == j
+        for shift in hypotheses.LAGS:
+            r = problem.r + only * (log.tau[few] - log.tau[few + shift])
+            scores[shift] = cross_validate(replace(problem, r=r), columns, model.prior).score.mean()
+        for shift in sorted((k for k in scores if scores[k] < null), key=scores.__getitem__)[:DELAYS]:
+            change = partial(hypotheses.delayed, shift=shift, joints=(j,))
+            yield Hypothesis("torque-delay", 1, change, joints=(j,), shift=shift)
+
+
+def _beside_friction(model: Explanation, late: Hypothesis) -> TorqueFit | None:
+    """The fit of a torque that is late, if friction of no other shape explains it as well."""
+    changed = replace(model, problem=model.on(late.change(model.log)))
+    shapes = hypotheses.shape_columns(model.system, model.log, model.rows)
+    better, worse = (one.with_nuisance(shapes).fit.shares for one in (changed, model))
+    return changed.fit if significant(better, worse, 1) else None
 
 
 def _currents(model: Explanation) -> Iterator[Tried]:
@@ -221,21 +250,18 @@ ALONE = 2.0
 def alternatives_of(
     system: ConstrainedSystem, chosen: Tried, tried: Iterable[Tried], null: TorqueFit
 ) -> Iterator[Tried]:
-    """The hypotheses within a standard error of the chosen one on held-out blocks, best first."""
+    """The hypotheses within a standard error of the chosen one on held-out blocks, best first, without those
+    of its kind and joints, or that contain it, as masses do a tool.
+    """
+    name, joints = chosen[0].name, {*chosen[0].joints}
     for hypothesis, fit in sorted(tried, key=lambda one: one[1].score.mean()):
-        if _says_the_same(chosen[0], hypothesis):
+        same = name == hypothesis.name and (not hypothesis.joints or bool(joints & {*hypothesis.joints}))
+        if same or (name, hypothesis.name) == ("payload", "masses"):
             continue
         gain, error = gain_of(fit.score, null.score)
         loss, tie = gain_of(chosen[1].score, fit.score)
         if gain > ALONE * error and abs(loss) <= tie and _possible(system, hypothesis, fit):
             yield hypothesis, fit
-
-
-def _says_the_same(chosen: Hypothesis, other: Hypothesis) -> bool:
-    """Whether a hypothesis has the kind and joints of the chosen one, or contains it, as masses do a tool."""
-    if (chosen.name, other.name) == ("payload", "masses"):
-        return True
-    return other.name == chosen.name and (not other.joints or bool({*other.joints} & {*chosen.joints}))
 
 
 def _possible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit) -> bool:

@@ -76,27 +76,27 @@ def friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> A
 
 def other_rise_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
     """Change of the declared Coulomb friction with the smoothing velocity `(n, nq, p)`."""
-    x, declared = log.qd[rows] / system.robot.friction_velocity.numpy(), system.robot.friction.numpy() > 0.0
-    columns = [_diagonal(np.tanh(k * x) - np.tanh(x))[..., np.flatnonzero(declared)] for k in RISES]
-    return np.concatenate(columns, axis=-1)
+    declared = np.tile(system.robot.friction.numpy() > 0.0, len(RISES))
+    return shape_columns(system, log, rows)[..., : len(declared)][..., declared]
+
+
+def shape_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
+    """Dry friction that rises otherwise, and quadratic friction, of each joint, `(n, nq, p)`."""
+    x, qd = log.qd[rows] / system.robot.friction_velocity.numpy(), log.qd[rows]
+    shapes = *(np.tanh(k * x) - np.tanh(x) for k in RISES), qd * np.abs(qd)
+    return np.concatenate([_diagonal(shape) for shape in shapes], axis=-1)
 
 
 def contact_friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
-    """Viscous and dry friction of each contact with only the normal force removed, `(n, nq, p)`."""
-    contacts = [] if takes_friction_out(system, log) else labelled_contacts(system, log)
-    touching = [c for c in contacts if isinstance(c, SurfaceContact)]
-    empty = np.zeros((len(rows), log.nq, 0))
-    return np.concatenate([empty, *(_sliding_columns(system, c, log, rows) for c in touching)], axis=-1)
-
-
-def _sliding_columns(system: ConstrainedSystem, contact: SurfaceContact, log: Log, rows: np.ndarray) -> Array:
-    """Torque −Jᵀv and −Jᵀv/|v| of a point that slides at v where the contact is closed, `(n, nq, 2)`."""
-    (q,), v = tensors(log, rows, "q"), tip_path(system, contact, log, rows).along
-    with torch.no_grad():
-        J = kinematics.point_jacobian(system.robot, q, contact.frame, contact.point).numpy()
-    speed = np.sqrt((v**2).sum(axis=1, keepdims=True) + SLOW**2)
-    closed = log.contact[contact.name][rows][:, None]
-    return np.stack([np.einsum("nkj,nk->nj", J, closed * f) for f in (v, v / speed)], axis=-1)
+    """Friction −Jᵀv, −Jᵀv/|v| of each contact that slides at v unless it is removed, `(n, nq, p)`."""
+    (q,), columns = tensors(log, rows, "q"), [np.zeros((len(rows), log.nq, 0))]
+    for contact in [] if takes_friction_out(system, log) else labelled_contacts(system, log):
+        if isinstance(contact, SurfaceContact):
+            v = tip_path(system, contact, log, rows).along * log.contact[contact.name][rows][:, None]
+            J = kinematics.point_jacobian(system.robot, q, contact.frame, contact.point).detach().numpy()
+            speed = np.sqrt((v**2).sum(axis=1, keepdims=True) + SLOW**2)
+            columns.append(np.stack([np.einsum("nkj,nk->nj", J, f) for f in (v, v / speed)], axis=-1))
+    return np.concatenate(columns, axis=-1)
 
 
 def _diagonal(x: Array) -> Array:
@@ -147,19 +147,6 @@ def delays(log: Log) -> Iterator[Hypothesis]:
     """Torques that are logged before or after the motion."""
     for shift in (sign * lag for lag in (LAGS if log.stretches else ()) for sign in (1, -1)):
         yield Hypothesis("torque-delay", 1, partial(delayed, shift=shift), shift=shift)
-
-
-def joint_delays(log: Log, rows: np.ndarray, problem: TorqueProblem) -> Iterator[Hypothesis]:
-    """For each joint, the hypothesis that its torque lags the motion, with its best delay beside friction."""
-    shifts = list(LAGS) if log.stretches else []
-    needed = problem.r + log.tau[rows]
-    for j in range(log.nq if log.nq > 1 and shifts else 0):
-        x = log.qd[rows, j]
-        Q = np.linalg.qr(np.column_stack([x, np.sign(x), np.ones(len(x))]))[0]
-        rest = needed[:, [j]] - np.column_stack([log.tau[rows + shift, j] for shift in shifts])
-        shift = shifts[int(((rest - Q @ (Q.T @ rest)) ** 2).sum(axis=0).argmin())]
-        change = partial(delayed, shift=shift, joints=(j,))
-        yield Hypothesis("torque-delay", 1, change, joints=(j,), shift=shift)
 
 
 def continuous(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterator[Hypothesis]:

@@ -31,7 +31,7 @@ RELATED = 0.7
 EXCHANGED, CLEARLY = 0.9, 5.0
 """Correlation with another joint's rate from which columns are exchanged; factor of unexplained variance by
 which that order must be better."""
-LATE, PERSISTS = 0.1, 0.5
+LATE, PERSISTS = 0.05, 0.5
 """Share of the motion that a filtered velocity misses, and correlation of what it misses in neighbouring
 windows: noise has none."""
 JUMPS = 0.05

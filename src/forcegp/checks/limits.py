@@ -11,23 +11,12 @@ from forcegp.checks.hypotheses import gain_hypothesis, problem_of
 from forcegp.checks.log import Array, Log, Outcome, log_of
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
-from forcegp.rows import Intervals, intervals
+from forcegp.data.clipped import clipped
 
 DEGREE = np.pi / 180.0
 TURN = 2.0 * np.pi
 SLACK = 1e-3
 """Share of a limit by which it may be exceeded: rounding, and encoders that read a little beyond a stop."""
-CLIPPED_RUN, OFTENER = 3, 5.0
-"""Successive rows at an extreme value that make a plateau; factor by which a clipped value occurs more
-often than its neighbours; at the peaks of a sine, 2.4."""
-BAND = 0.03
-"""Part of the range of a torque that noise of a clipped one stays within."""
-PLATEAUS, FLAT_ROWS, FLAT = 3, 10, 0.35
-"""Least plateaus of a noisy clipped torque while its joint moves, rows of each, and variance of steps over
-twice that of the values in their middle halves: 1 for white noise about a limit, 0.43 for the current of a
-real drive, 0.05 to 0.3 at smooth peaks."""
-MOVES = 0.02
-"""Part of its largest speed from which a joint moves; the torque of one that rests is constant."""
 OFTEN, UNIT_ROWS = 0.05, 400
 """Share of rows beyond the limits that suggests a wrong unit, and number of rows for comparing torques."""
 
@@ -101,17 +90,17 @@ def check_limits(system: ConstrainedSystem, log: Log) -> Outcome:
 
 def check_saturation(system: ConstrainedSystem, log: Log) -> Outcome:
     """Find torques that stay at their largest value for several rows: the amplifier clips."""
-    clipped = clipped_torques(log)
-    joints = log.named(clipped.any(axis=0))
+    mask = clipped_torques(log)
+    joints = log.named(mask.any(axis=0))
     text = f"the torque of {', '.join(joints)} stays at its largest value in"
-    return at_rows(np.asarray(clipped.any(axis=1)), "torque-saturated", text, joints), log
+    return at_rows(np.asarray(mask.any(axis=1)), "torque-saturated", text, joints), log
 
 
 def clipped_torques(data: Dataset | Log) -> NDArray[np.bool_]:
     """Mask `(n, nq)` of torques that stay at the largest or smallest value of their joint.
 
-    Use the unfiltered log, since filters smooth the plateaus. Exclude these rows from training data,
-    or state their noise in `extras["tau_std"]` for an external wrench.
+    Use the unfiltered log, since filters smooth the plateaus. `forcegp import` states the noise of these rows
+    in `extras["tau_std"]`, or drops them.
 
     Args:
         data: a log in order of time.
@@ -120,49 +109,4 @@ def clipped_torques(data: Dataset | Log) -> NDArray[np.bool_]:
         `train = log[torch.from_numpy(~clipped_torques(log).any(-1))]`
     """
     log = data if isinstance(data, Log) else log_of(data)
-    clipped = np.zeros(log.tau.shape, bool)
-    for j in range(log.nq):
-        tau = log.tau[:, j]
-        usable = tau[log.usable]
-        if not len(usable) or np.ptp(usable) == 0.0:
-            continue
-        for extreme in limits_of(usable):
-            for first, last in _plateaus(log, j, extreme):
-                clipped[first:last, j] = True
-    return clipped
-
-
-def limits_of(values: Array) -> tuple[float, float]:
-    """Value taken most often near the maximum, and near the minimum: a filter overshoots a limit."""
-    limits = []
-    for extreme in (values.max(), values.min()):
-        near, counts = np.unique(
-            values[np.abs(values - extreme) <= BAND * np.ptp(values)], return_counts=True
-        )
-        often = near[counts == counts.max()]
-        limits.append(float(often[np.abs(often - extreme).argmin()]))
-    return limits[0], limits[1]
-
-
-def _plateaus(log: Log, j: int, extreme: float) -> Intervals:
-    """Runs of rows in which the torque of a joint is clipped at an extreme value, exactly or up to noise."""
-    tau, moves = log.tau[:, j], np.abs(log.qd[:, j]) > MOVES * np.abs(log.qd[log.usable, j]).max()
-    usable, width = tau[log.usable], BAND * np.ptp(tau[log.usable])
-    if extreme == 0.0:
-        return ()
-    # A value that the column reaches far more often than its neighbourhood is a limit.
-    at = (tau == extreme) & log.usable
-    near = np.abs(usable - extreme) <= width
-    runs = tuple((a, b) for a, b in intervals(at) if b - a >= CLIPPED_RUN)
-    others = (near.sum() - at.sum()) / max(len(np.unique(usable[near])) - 1, 1)
-    if runs and at.sum() > OFTENER * max(others, 1.0):
-        return runs
-    # With noise, a band of values, beside the next one of the same width.
-    band = (np.abs(tau - extreme) <= width) & log.usable & moves
-    beside = (np.abs(tau - extreme) > width) & (np.abs(tau - extreme) <= 2.0 * width) & log.usable & moves
-    runs = tuple((a, b) for a, b in intervals(band) if b - a >= FLAT_ROWS)
-    if len(runs) < PLATEAUS or band.sum() <= OFTENER * max(beside.sum(), 1):
-        return ()
-    middles = [tau[(3 * a + b) // 4 : (a + 3 * b + 3) // 4] for a, b in runs]
-    steps = sum(float((np.diff(x) ** 2).sum()) for x in middles)
-    return runs if steps > 2.0 * FLAT * sum(len(x) * float(x.var()) for x in middles) else ()
+    return clipped(log.tau, log.qd, log.usable)

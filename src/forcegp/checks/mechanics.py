@@ -39,6 +39,8 @@ DISTURBANCE, LOUD = 5.0, 4.0
 over the residual of the worst tenth of the motion."""
 MOVING, VISIBLE = 0.05, 0.1
 """Share of the largest speed of an arm that moves; least disturbance, beyond dry friction, as a share."""
+RIVALS = {"gravity": "a tilt of the base", "masses": "other masses", "gains": "a wrong gain"}
+"""What may look like a constant torque, by hypothesis."""
 ONE_SIGMA = 84.13
 """Percentile of a normal distribution at one standard deviation above the mean."""
 
@@ -62,11 +64,14 @@ def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
         # What happened in these rows must pass neither for friction nor for a mass.
         explanation = explain(system, smooth.mask(rows))
     losses = _determined(system.robot, explanation)
+    # Friction of the contacts, and declared friction that rises more sharply, must not pass for more.
+    functions = (hypotheses.contact_friction_columns, hypotheses.other_rise_columns)
+    shapes = [columns(system, explanation.log, explanation.rows) for columns in functions]
     findings = [
         *passive,
         *_confounded(explanation),
-        *_friction(system.robot, _determined(system.robot, _with_other_friction(system, explanation))),
-        *_offsets(system.robot, losses),
+        *_friction(system.robot, _determined(system.robot, explanation.with_nuisance(*shapes))),
+        *_offsets(system, losses),
         *_unexplained(explanation),
         *check_visibility(system, explanation),
     ]
@@ -105,14 +110,6 @@ def _matters(explanation: Explanation, j: int, columns: list[int]) -> bool:
     floor = FLOOR * problem.size[j] / problem.scale[j]
     gain, error = gain_of(*(np.log(np.hypot(fit.error[:, j], floor)) for fit in (explanation.fit, without)))
     return gain > MATERIAL and gain > SIGNIFICANT * error
-
-
-def _with_other_friction(system: ConstrainedSystem, explanation: Explanation) -> Explanation:
-    """The explanation beside friction of the contacts, and declared friction that rises more sharply."""
-    functions = (hypotheses.contact_friction_columns, hypotheses.other_rise_columns)
-    columns = [columns(system, explanation.log, explanation.rows) for columns in functions]
-    nuisance = np.concatenate([explanation.problem.nuisance, *columns], axis=-1)
-    return replace(explanation, problem=replace(explanation.problem, nuisance=nuisance))
 
 
 def _determined(robot: RobotModel, explanation: Explanation) -> Explanation:
@@ -175,18 +172,21 @@ def _friction(robot: RobotModel, explanation: Explanation) -> list[Finding]:
     return findings
 
 
-def _offsets(robot: RobotModel, explanation: Explanation) -> list[Finding]:
-    log, nq = explanation.log, explanation.log.nq
+def _offsets(system: ConstrainedSystem, explanation: Explanation) -> list[Finding]:
+    log, nq, rows = explanation.log, explanation.log.nq, explanation.rows
     offset = -explanation.fit.nuisance[2 * nq : 3 * nq]
     known = np.abs(offset) > explanation.fit.nuisance_spread[2 * nq : 3 * nq]
     off = {j: log.joint_names[j] for j in range(nq) if known[j] and _matters(explanation, j, [2 * nq + j])}
     if not off:
         return []
-    joints = tuple(off.values())
-    listed = ", ".join(f"{joint} {offset[j]:+.3g} {force_unit(robot, j)}" for j, joint in off.items())
+    listed = ", ".join(f"{joint} {offset[j]:+.3g} {force_unit(system.robot, j)}" for j, joint in off.items())
     evidence = {f"offset {joint}": offset[j] for j, joint in off.items()}
-    text = f"the logged torque is off by a constant: {listed}"
-    return [log.finding("torque-offset", text, joints, **evidence)]
+    tried = *hypotheses.robot_hypotheses(system, log, rows), hypotheses.gain_hypothesis(log, rows, tuple(off))
+    beside = {RIVALS[h.name]: explanation.beside(h) for h in tried if h.name in RIVALS}
+    others = [w for w, one in beside.items() if not any(_matters(one, j, [2 * nq + j]) for j in off)]
+    or_else = f"; in this motion, {', '.join(others)} would look the same" if others else ""
+    text = f"the logged torque is off by a constant: {listed}{or_else}"
+    return [log.finding("torque-offset", text, tuple(off.values()), **evidence)]
 
 
 def _unexplained(explanation: Explanation) -> list[Finding]:

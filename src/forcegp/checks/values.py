@@ -9,9 +9,9 @@ from forcegp import dynamics
 from forcegp.checks.excitation import still_joints
 from forcegp.checks.finding import Finding, at_rows
 from forcegp.checks.fit import tensors
-from forcegp.checks.limits import limits_of
 from forcegp.checks.log import DEPARTURE, Array, Log, Outcome, spikes
 from forcegp.constraints import ConstrainedSystem
+from forcegp.data.clipped import limits_of
 from forcegp.data.derivative import UNIFORM_TOLERANCE
 from forcegp.data.fields import JOINT_VECTORS
 from forcegp.robust import resolution, robust_std
@@ -72,8 +72,8 @@ SPIKE, SPIKE_ALONE = 12.0, 4.0
 SPIKE_SHAPE, SPIKE_NOISE = 0.2, 4.0
 """Share of a wrong value, and robust deviations, by which departures of its neighbours may differ."""
 SPIKE_SHARED, DRIVEN = 0.05, 0.5
-"""The motion jumped where another channel departs by this share of a value's own; a step of the torque is the
-cause of a departing acceleration from this share on."""
+"""The motion jumped where another channel departs by this share of a value's own, or by the second beyond the
+range of the motion; a step of the torque is the cause of a departing acceleration from the second on."""
 FEWEST = 50
 """Values that a scale is taken from."""
 SPIKE_VISIBLE = (0.01, 0.002)
@@ -209,8 +209,8 @@ def _shocks(log: Log, departures: dict[str, tuple[Array, Array, Array]], name: s
     for j in range(departure.shape[1]):
         others = [np.delete(part, j, axis=1) if key == name else part for key, part in size.items()]
         most = np.concatenate([*others, np.zeros((len(departure), 1))], axis=1).max(axis=1)
-        # No shock exceeds the range of the whole motion.
-        confirmed[:, j] = (most > SPIKE_SHARED * size[name][:, j]) & (size[name][:, j] < 1.0)
+        own = size[name][:, j]
+        confirmed[:, j] = most > own * np.where(own < 1.0, SPIKE_SHARED, DRIVEN)
     return confirmed
 
 

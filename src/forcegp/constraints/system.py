@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property, partial
 
@@ -178,6 +178,17 @@ class ConstrainedSystem:
     def with_robot(self, robot: RobotModel) -> ConstrainedSystem:
         """The same constraints on a robot with other parameters."""
         return dataclasses.replace(self, robot=robot)
+
+    def with_stick_speeds(self, speeds: Mapping[str, float]) -> ConstrainedSystem:
+        """The same robot with contacts that stick below given speeds [m/s], unless they state one."""
+        contacts = [
+            dataclasses.replace(each, stick_speed=speeds[each.name])
+            if isinstance(each, SurfaceContact) and each.stick_speed is None and each.name in speeds
+            else each
+            for each in self.contacts
+        ]
+        changed = any(new is not old for new, old in zip(contacts, self.contacts, strict=True))
+        return dataclasses.replace(self, contacts=contacts) if changed else self
 
     def active_rows(self, active: Tensor | None, batch: torch.Size) -> Tensor:
         """`(*batch, m)` bool from `(*batch, n_contacts)` bool, all active for `None`.

@@ -8,7 +8,7 @@ from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
 import torch
-from pydantic import NonNegativeFloat, PositiveFloat
+from pydantic import Field, NonNegativeFloat, PositiveFloat
 from torch import Tensor
 
 from forcegp.errors import DataError, near_names
@@ -34,6 +34,7 @@ class DataHeader(Header):
         derived: joint vectors computed by a filter.
         imported: kind and sentence of each finding of the import, including doubts about its mapping.
         unmeasured_torques: joints whose motor torque was not measured; the column is 0.
+        stick_speeds: speed below which a contact sticks, by its name [m/s]; others always slide.
         joint_names, contact_names: in the order of the columns; empty if not logged.
     """
 
@@ -52,6 +53,7 @@ class DataHeader(Header):
     derived: tuple[str, ...] = ()
     imported: tuple[tuple[str, str], ...] = ()
     unmeasured_torques: tuple[str, ...] = ()
+    stick_speeds: dict[str, PositiveFloat] = Field(default_factory=dict)
     joint_names: tuple[str, ...] = ()
     contact_names: tuple[str, ...] = ()
 
@@ -382,6 +384,8 @@ def common_header(headers: Sequence[DataHeader]) -> DataHeader:
     agreed["provenance"] = (*steps, f"concatenated {len(headers)} data sets")
     for name in ("derived", "imported"):
         agreed[name] = tuple(dict.fromkeys(value for header in headers for value in getattr(header, name)))
+    speeds = [pair for header in headers for pair in header.stick_speeds.items()]
+    agreed["stick_speeds"] = dict(sorted(speeds, key=lambda pair: pair[1]))
     agreed["ordered"] = all(header.ordered for header in headers)
     agreed["filtered"] = any(header.filtered for header in headers)
     agreed["filter_span"] = max((h.filter_span for h in headers if h.filter_span is not None), default=None)

@@ -198,7 +198,8 @@ def calibrated_noise(problem: Problem, hyperparameters: Mapping[str, Tensor]) ->
     noise = {TORQUE_NOISE: held_out_torque_std(problem, hyperparameters, learned).log()}
     grows = growth(problem, {**hyperparameters, **noise}, load)
     grows = torch.where(hidden, grows.maximum(UNSHOWN * load), grows)
-    return {**noise, **trained_region(qd, tau, load, hidden), GROWTH: grows}
+    region = trained_region(qd, tau, load, hidden, problem.power * len(qd))
+    return {**noise, **region, GROWTH: grows}
 
 
 def held_out_torque_std(problem: Problem, hyperparameters: Mapping[str, Tensor], least: Tensor) -> Tensor:

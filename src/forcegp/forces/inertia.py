@@ -6,11 +6,14 @@ closed loop, the likelihood of accelerations given torques overestimates it. The
 earlier and later are instruments without either bias. The unknowns are Gaussian around the robot file, each
 link stays physically consistent, and the inertia of a drive is not negative.
 
-Torques alone do not suffice. In a closed loop the noise of the torque sensor exceeds the torque
-that accelerates a light joint; divided by the inertia of the file it predicts accelerations far larger than
-the measured ones. In that case, the drives get the inertia that maximises −½ Σ ε²/s² + v Σ log |M|, with the
-smallest v ≤ 1 at which accelerations are predicted as well as by their mean, as long as the error of no
-joint's torque on held-out stretches grows by more than 2 %.
+Torque and motion are seldom read at the same instant, and milliseconds between them make the inertia of a
+light joint wrong. So a delay is a further unknown.
+
+Torques alone do not suffice. In a closed loop the noise of the torque sensor exceeds the torque that
+accelerates a light joint; divided by the inertia of the file it predicts accelerations far larger than the
+measured ones. From ten times their mean square on, the drives get the inertia that maximises
+−½ Σ ε²/s² + v Σ log |M|, with the smallest v ≤ 1 at which accelerations are predicted as well as by their
+mean, as long as the error of no joint's torque on held-out stretches grows by more than 2 %.
 
 If an `InertialPrior` is given, the robot moves to the posterior mean of its inertial
 parameters: one Gauss–Newton step, physically consistent.
@@ -32,6 +35,7 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.dynamics import mass_matrix
 from forcegp.forces.calibration import autocorrelation_time
 from forcegp.forces.inverse_dynamics import (
+    LATE,
     LEAST,
     Estimate,
     NormalEquations,
@@ -43,7 +47,6 @@ from forcegp.forces.inverse_dynamics import (
     instrumental,
     is_harmless,
     is_less,
-    log_ratio,
     products,
     sums,
 )
@@ -64,11 +67,12 @@ WIDTHS = (0.0, 0.02, 0.05, 0.12)
 """Standard deviations of averages over time that are tried [s]; the narrowest posterior is taken."""
 
 
-def rigid_robot(robot: RobotModel, rows: Rows) -> RobotModel | None:
-    """The physically consistent robot that predicts held-out torques better than the file, or `None`.
+def rigid_robot(robot: RobotModel, rows: Rows) -> tuple[RobotModel, bool]:
+    """The robot that predicts held-out torques best, and whether its links were identified.
 
-    The improvement must exceed two standard errors over stretches of the log, over the file and over the file
-    with additional drives, and no joint's held-out acceleration error may grow.
+    Candidates are the file, the file with drives that it lacks, and physically consistent links with drives.
+    Each must be better by two standard errors over stretches of the log than those before it, and no joint's
+    held-out acceleration error may grow.
 
     Args:
         robot: of the file.
@@ -78,32 +82,68 @@ def rigid_robot(robot: RobotModel, rows: Rows) -> RobotModel | None:
     M = mass_matrix(robot, rows.q)
     size = M.diagonal(dim1=-2, dim2=-1).mean(0)
     links = regressor(robot, rows.q, rows.qd, rows.qdd) * prior.scale(robot)
-    C = torch.cat([size * torch.diag_embed(rows.qdd), links], dim=-1)
-    regressions, judged = tuple(_over_widths(rows, C, M)), products(rows, C)
+    inertial = torch.cat([size * torch.diag_embed(rows.qdd), links], dim=-1)
+    C = with_delay(rows, inertial)
+    regressions, judged = tuple(_over_widths(rows, inertial, M)), products(rows, C)
     single = regressions[0]
     found = max(regressions, key=lambda each: float(torch.logdet(each.normal()[1])))
+    delay = torch.tensor([C.shape[-1] - 1])
+    driving, everything = torch.cat([torch.arange(n), delay]), torch.arange(C.shape[-1])
 
     def compared(estimate: Estimate) -> Tensor:
         """Held-out errors of single samples in units of their noise; averages hardly show sharp friction."""
         return held_out(single.by_stretch, estimate, judged, found.by_stretch) / single.noise**2
 
-    nothing = torch.zeros_like(found.mean)
-    drives = _drives_alone(found.by_stretch.total(), found.noise, n)
-    known = min(
-        (compared(lambda _, x=x: x) for x in (nothing, drives)), key=lambda error: float(error.mean())
-    )
-    if not _is_better(compared(lambda rest: _estimate(rest, found.noise, found.power)), known):
-        return None
-    driven = robot.replace(armature=robot.armature + size * found.mean[:n])
+    def estimated(kept: Tensor) -> Tensor:
+        return compared(lambda rest: found.estimate(rest, kept, n))
+
+    def accelerations(other: RobotModel, delta: Tensor) -> Tensor:
+        return acceleration_errors(rows, single.by_stretch, C, delta, mass_matrix(other, rows.q))
+
+    every = found.by_stretch.total()
+    nothing, drives, delta = (found.estimate(every, kept, n) for kept in (delay, driving, everything))
+    file, driven = estimated(delay), estimated(driving)
+    before, known = accelerations(robot, nothing), min((file, driven), key=lambda error: float(error.mean()))
+    if _is_better(estimated(everything), known):
+        consistent, delta = _consistent(robot, prior, found, size)
+        better = _is_better(compared(lambda _: delta), known)
+        if better and is_harmless(accelerations(consistent, delta), before):
+            return consistent, True
+    with_drives = robot.replace(armature=robot.armature + size * drives[:n])
+    better = _is_better(driven, file) and is_harmless(accelerations(with_drives, drives), before)
+    return with_drives if better else robot, False
+
+
+def _consistent(
+    robot: RobotModel, prior: InertialPrior, found: _Regression, size: Tensor
+) -> tuple[RobotModel, Tensor]:
+    """The robot with consistent links and drives that are not negative, and the unknowns.
+
+    Links are moved without knowledge of the drives, which adapt to them; a drive that would be negative then
+    is left out.
+
+    Args:
+        size: unit of the inertia of each drive `(nq,)`.
+    """
+    every, n = found.by_stretch.total(), len(size)
     _, precision = found.normal()
-    consistent, moved = prior.updated(driven, found.mean[n:], precision[n:, n:])
-    delta = torch.cat([found.mean[:n], moved])
-    before, after = (
-        acceleration_errors(rows, single.by_stretch, C, x, mass_matrix(each, rows.q))
-        for each, x in ((robot, nothing), (consistent, delta))
-    )
-    better = _is_better(compared(lambda _: delta), known)
-    return consistent if better and is_harmless(after, before) else None
+    p = len(precision)
+    links, last = torch.arange(n, p - 1), torch.tensor([p - 1])
+    unknowns = found.estimate(every, torch.arange(p), n)
+    while True:
+        drives = (unknowns[:n] > 0.0).nonzero()[:, 0]
+        others = torch.cat([drives, last])
+        best = found.estimate(every, torch.cat([others, links]), n)
+        moved, delta = prior.updated(robot, best[links], _marginal(precision, links, others))
+        known = torch.zeros_like(best).index_put((links,), delta)
+        unknowns = found.estimate(every, others, n, known)
+        if bool((unknowns[drives] > 0.0).all()):
+            return moved.replace(armature=robot.armature + size * unknowns[:n]), unknowns
+
+
+def with_delay(rows: Rows, columns: Tensor) -> Tensor:
+    """Columns of inertial parameters and, last, of the delay s of the torque: τ(t + s) ≈ τ(t) + s dτ/dt."""
+    return torch.cat([columns, LATE * rows.rate[..., None]], dim=-1)
 
 
 @dataclass(frozen=True)
@@ -111,61 +151,70 @@ class _Regression:
     """Unknowns by instrumental variables, with the noise `(nq,)` and the power κ that they leave."""
 
     by_stretch: NormalEquations
-    mean: Tensor
     noise: Tensor
     power: float
 
-    def normal(self) -> tuple[Tensor, Tensor]:
-        return _normal(self.by_stretch.total(), self.noise, self.power)
+    def normal(self, given: NormalEquations | None = None) -> tuple[Tensor, Tensor]:
+        """Linear term κ h and precision κ H + 1 of the unknowns, without directions of negative H."""
+        H, h = (given or self.by_stretch.total()).quadratic(self.noise)
+        values, vectors = torch.linalg.eigh(0.5 * (H + H.mT))
+        shown = vectors * (values > 0.0)
+        precision = self.power * (vectors * values.clamp(min=0.0)) @ vectors.mT
+        eye = torch.eye(len(h), dtype=h.dtype, device=h.device)
+        return self.power * shown @ (vectors.mT @ h), precision + eye
+
+    def estimate(self, given: NormalEquations, kept: Tensor, n: int, known: Tensor | None = None) -> Tensor:
+        """Most probable unknowns among those that are kept; the first n, drives, are not negative.
+
+        Args:
+            known: values of the others, zero by default.
+        """
+        h, precision = self.normal(given)
+        known = torch.zeros_like(h) if known is None else known
+        h = h - precision @ known
+        L = torch.linalg.cholesky(precision[kept][:, kept])
+        right = torch.linalg.solve_triangular(L, h[kept, None], upper=False)[:, 0]
+        lower = torch.where(kept < n, 0.0, -math.inf)
+        bounds = lower.numpy(), math.inf
+        found = scipy.optimize.lsq_linear(L.mT.cpu().numpy(), right.cpu().numpy(), bounds, method="bvls")
+        return known.index_put((kept,), torch.from_numpy(found.x).to(h))
 
 
-def _over_widths(rows: Rows, C: Tensor, M: Tensor) -> Iterator[_Regression]:
-    """Regressions on equations that are averaged over time, by the width of the average."""
-    inertial = (M @ rows.qdd[..., None])[..., 0]
+def _marginal(precision: Tensor, kept: Tensor, others: Tensor) -> Tensor:
+    """Precision of some unknowns without knowledge of others: a Schur complement."""
+    across = precision[kept][:, others]
+    return precision[kept][:, kept] - across @ torch.linalg.solve(precision[others][:, others], across.mT)
+
+
+def _over_widths(rows: Rows, inertial: Tensor, M: Tensor) -> Iterator[_Regression]:
+    """Regressions on equations that are averaged over time, by the width of the average.
+
+    Args:
+        inertial: columns of drives and links `(n, nq, p)`.
+        M: mass matrix of the file.
+    """
+    accelerating, n = (M @ rows.qdd[..., None])[..., 0], M.shape[-1]
     for width in WIDTHS if rows.step else WIDTHS[:1]:
-        used, columns = averaged(rows, C, inertial, width) if rows.step else (rows, C)
+        used, columns = averaged(rows, inertial, accelerating, width) if rows.step else (rows, inertial)
         if width and (int(used.slides.sum(0).min()) < LEAST or int(used.group.max()) < int(rows.group.max())):
             break
-        by_stretch = instrumental(used, columns)
-        every, mean, noise, power = by_stretch.total(), C.new_zeros(C.shape[-1]), C.new_ones(C.shape[1]), 1.0
+        columns = with_delay(used, columns)
+        by_stretch, kept = instrumental(used, columns), torch.arange(columns.shape[-1])
+        every, mean = by_stretch.total(), columns.new_zeros(len(kept))
+        found = _Regression(by_stretch, M.new_ones(n), 1.0)
         for _ in range(PASSES):
             left = used.residual - columns @ mean - (used.friction * every.friction(mean)).sum(-1)
             left = used.slides * left
             noise = (left.square().sum(0) / used.slides.sum(0).clamp(min=1)).sqrt().clamp(min=1e-300)
-            power = _power(used, left / noise)
-            mean = _estimate(every, noise, power)
-        yield _Regression(by_stretch, mean, noise, power)
+            found = _Regression(by_stretch, noise, _power(used, left / noise))
+            mean = found.estimate(every, kept, n)
+        yield found
 
 
 def _power(rows: Rows, left: Tensor) -> float:
     """κ = 1/τ̄ of what nothing explains, as in `residual_times`."""
     times = autocorrelation_time(left[: rows.leading], rows.segment[: rows.leading])
     return min(1.0, math.exp(-float(times.log().mean())))
-
-
-def _normal(given: NormalEquations, noise: Tensor, power: float) -> tuple[Tensor, Tensor]:
-    """Linear term κ h and precision κ H + 1 of the unknowns, without directions in which H is negative."""
-    H, h = given.quadratic(noise)
-    values, vectors = torch.linalg.eigh(0.5 * (H + H.mT))
-    shown = vectors * (values > 0.0)
-    precision = power * (vectors * values.clamp(min=0.0)) @ vectors.mT
-    return power * shown @ (vectors.mT @ h), precision + torch.eye(len(h), dtype=h.dtype, device=h.device)
-
-
-def _estimate(given: NormalEquations, noise: Tensor, power: float) -> Tensor:
-    """Most probable unknowns, of which the first n, the drives, are not negative."""
-    h, precision = _normal(given, noise, power)
-    n = len(noise)
-    drives = torch.linalg.solve(precision, h)[:n].clamp(min=0.0)
-    links = torch.linalg.solve(precision[n:, n:], h[n:] - precision[n:, :n] @ drives)
-    return torch.cat([drives, links])
-
-
-def _drives_alone(every: NormalEquations, noise: Tensor, n: int) -> Tensor:
-    """The unknowns with the inertia of drives alone, which is not negative."""
-    H, h = every.quadratic(noise)
-    drives = torch.linalg.lstsq(H[:n, :n], h[:n, None]).solution[:, 0].clamp(min=0.0)
-    return torch.cat([drives, torch.zeros_like(h[n:])])
 
 
 def _is_better(after: Tensor, before: Tensor) -> bool:
@@ -175,6 +224,8 @@ def _is_better(after: Tensor, before: Tensor) -> bool:
 
 VOLUME_STATES = 100
 """States that log |M|, or the volume of the noise, is averaged over."""
+FAR_LARGER = 10.0
+"""Mean squared error of accelerations over that of their mean from which drives are damped."""
 NEGLIGIBLE = 0.02
 """Inertia of a drive over its joint's that is left out: a gain of the torque sensor explains as much."""
 WEIGHTS = tuple(2.0 ** (-k / 2) for k in range(20, -1, -1))
@@ -210,13 +261,12 @@ def inertia_of(
     """
     robot = system.robot
     rows = free_rows(system, friction, mean, training)
-    remembering = rows.with_memory()
-    identified = rigid_robot(robot, remembering)
-    if identified is not None:
+    better, has_links = rigid_robot(robot, rows.with_memory())
+    if has_links:
         text = "held-out torques favour other inertial parameters than the robot file's, now identified"
-        return Inertia(identified, True, (text, *_told(robot, identified.armature - robot.armature)))
+        return Inertia(better, True, (text, *_told(robot, better.armature - robot.armature)))
     M = mass_matrix(robot, rows.q)
-    armature = _damped(rows, M, _lacking(remembering, M))
+    armature = _damped(rows, M, better.armature - robot.armature)
     armature = armature * (armature > NEGLIGIBLE * M.diagonal(dim1=-2, dim2=-1).mean(0))
     if not bool(armature.any()):
         return Inertia(robot)
@@ -229,24 +279,6 @@ def _told(robot: RobotModel, armature: Tensor) -> tuple[str, ...]:
     found = ", ".join(f"{name} {a:.2g}" for name, a in pairs if a > 0.0)
     lacks = "the drives have inertia that the robot file lacks [kg m², kg for sliding joints]"
     return (f"{lacks}: {found}",) if found else ()
-
-
-def _lacking(rows: Rows, M: Tensor) -> Tensor:
-    """Inertia of drives `(nq,)` that predicts held-out torques significantly better than none, or zero.
-
-    No joint's acceleration error may grow.
-    """
-    C = torch.diag_embed(rows.qdd)
-    drives, none = sums(rows, C), torch.zeros_like(M[0, 0])
-    every = drives.total()
-    noise = _noise(every)
-    alone = held_out(drives, lambda given: _drives(given, noise, M, 0.0))
-    if not is_less(log_ratio(alone, held_out(drives, lambda _: none)).mean(-1)):
-        return none
-    found = _drives(every, noise, M, 0.0)
-    before = acceleration_errors(rows, drives, C, none, M)
-    after = acceleration_errors(rows, drives, C, found, M + torch.diag(found))
-    return found if is_harmless(after, before) else none
 
 
 def _noise(every: NormalEquations) -> Tensor:
@@ -267,15 +299,15 @@ def _excess(rows: Rows, every: NormalEquations, M: Tensor, armature: Tensor) -> 
 def _damped(rows: Rows, M: Tensor, found: Tensor) -> Tensor:
     """Inertia of drives beyond the file's `(nq,)`, raised where accelerations are below the noise of torques.
 
-    They are if their mean predicts them better than the torques and friction with memory do: what that
-    friction explains is no noise.
+    They are if torques and friction with memory predict them far worse than their mean does: what that
+    friction explains is no noise. Drives are then raised until both are equal.
 
     Args:
         M: mass matrix of the file at the samples.
         found: inertia of drives identified from torques.
     """
     remembering, C = rows.with_memory(), torch.diag_embed(rows.qdd)
-    if _excess(remembering, sums(remembering, C).total(), M, found) <= 0.0:
+    if _excess(remembering, sums(remembering, C).total(), M, found) <= math.log(FAR_LARGER):
         return found
     by_stretch = sums(rows, C)
     every = by_stretch.total()

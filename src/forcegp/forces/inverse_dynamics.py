@@ -30,6 +30,8 @@ LEAST, MOST = 200, 4000
 """Samples in free motion needed at least, and used at most, evenly spaced."""
 SCATTER = 4.0
 """Ratio of mean squares of the torque at rest and in motion from which a joint sticks at rest."""
+NOISY = (1.0, 2.0, 4.0)
+"""Speeds that a joint at rest may seem to have, over the one of the sharpest dry friction."""
 MOVES = 0.1
 """Share of the samples in which a joint moves at least, for its sticking to count."""
 RIDGE = 1e-8
@@ -46,6 +48,8 @@ LEAST_SQUARE = 1e-300
 """Mean square of a joint that does not move in a stretch, which has no error."""
 TOLERATED = 0.02
 """Relative increase of the held-out error of a joint that is tolerated."""
+LATE = 0.01
+"""Standard deviation a priori of the time between torque and motion [s]."""
 COHERENT = 0.9
 """Autocorrelation that the velocities of the two have at least, the median of the joints."""
 
@@ -63,6 +67,7 @@ class Rows:
         segment: `(n,)`.
         partner: index of each sample's partner `(n,)`; its own index if there is none.
         memory: friction with memory, further features `(n, nq, k)`.
+        rate: derivative of the torque in time `(n, nq)`.
         step: time between neighbours [s]; 0 if they are not in order.
         filter_variance: of the weights with which a filter averaged q̈ over time [s²].
     """
@@ -77,6 +82,7 @@ class Rows:
     segment: Tensor
     partner: Tensor
     memory: Tensor
+    rate: Tensor
     step: float = 0.0
     filter_variance: float = 0.0
 
@@ -162,7 +168,7 @@ def free_rows(
     motions = (m for m in training.measurements if m.quantity == "qdd")
     free = ((m, (~m.active.any(-1)).nonzero()[:, 0]) for m in motions)
     m = next(m[rows] for m, rows in free if len(rows) >= LEAST)
-    later, memory = partners(m, training.filter_span), bristles(m)
+    later, memory, rate = partners(m, training.filter_span), bristles(m), torque_rate(m)
     first = (later >= 0).nonzero()[:, 0]
     paired = len(first) >= LEAST
     if not paired:
@@ -171,9 +177,10 @@ def free_rows(
     _, group = stretches(m.segment[first]).unique(return_inverse=True)
     i = torch.arange(len(first), device=m.t.device)
     if not paired:
-        return _rows(system, prior, mean, m[first], memory[first], group, i)
+        return _rows(system, prior, mean, m[first], memory[first], rate[first], group, i)
     both, n = torch.cat([first, later[first]]), len(first)
-    rows = _rows(system, prior, mean, m[both], memory[both], group.repeat(2), torch.cat([i + n, i]))
+    partner = torch.cat([i + n, i])
+    rows = _rows(system, prior, mean, m[both], memory[both], rate[both], group.repeat(2), partner)
     step = max(0.0, float(m.t[first].diff().median()))
     return dataclasses.replace(rows, step=step, filter_variance=training.filter_variance)
 
@@ -209,6 +216,28 @@ def bristles(m: Measurement | Dataset) -> Tensor:
     return z
 
 
+def torque_rate(m: Measurement) -> Tensor:
+    """Derivative of the torque in time, from differences over `LATE` to either side `(n, nq)`.
+
+    It is the effect of a small delay between torque and motion.
+    """
+    order = _in_time(m)
+    t, tau, segment = m.t[order], m.tau[order], m.segment[order]
+    step = float(t.diff()[segment[1:] == segment[:-1]].median()) if len(t) > 1 else 0.0
+    rate = torch.zeros_like(tau)
+    if step > 0.0:
+        i, reach = torch.arange(len(t), device=t.device), max(1, round(LATE / step))
+        ends = [i, i]
+        for _ in range(reach):
+            for side, move in enumerate((-1, 1)):
+                next_ = (ends[side] + move).clamp(0, len(t) - 1)
+                ends[side] = torch.where(segment[next_] == segment, next_, ends[side])
+        before, after = ends
+        span = (t[after] - t[before])[:, None]
+        rate[order] = torch.where(span > 0.0, (tau[after] - tau[before]) / span.clamp(min=1e-300), 0.0)
+    return rate
+
+
 def partners(m: Measurement, filter_span: float = 0.0) -> Tensor:
     """Index of the sample of the same trajectory that is later by `APART`, or −1, `(n,)`.
 
@@ -240,6 +269,7 @@ def _rows(
     mean: ForceMean,
     m: Measurement,
     memory: Tensor,
+    rate: Tensor,
     group: Tensor,
     partner: Tensor,
 ) -> Rows:
@@ -247,26 +277,36 @@ def _rows(
     Phi = torch.cat([*prior.features(system, at).values(), torch.ones_like(at.q)[..., None]], dim=-1)
     Phi, memory = (x / x.square().mean(0).sqrt().clamp(min=1e-12) for x in (Phi, memory))
     residual = mean(system, at) - (at.eom.M @ m.values[..., None])[..., 0]
-    slides = _slides(m.qd.abs() >= min(prior.speeds), Phi, residual)
-    return Rows(m.q, m.qd, m.values, residual, Phi, slides, group, m.segment, partner, memory)
+    slides = sliding(m.qd.abs(), min(prior.speeds), Phi, residual)
+    return Rows(m.q, m.qd, m.values, residual, Phi, slides, group, m.segment, partner, memory, rate)
 
 
-def _slides(moving: Tensor, Phi: Tensor, residual: Tensor) -> Tensor:
-    """`(n, nq)` bool, without the joints that stick: that hardly move, and whose torque then scatters more.
+def sliding(speed: Tensor, slowest: float, Phi: Tensor, residual: Tensor) -> Tensor:
+    """`(n, nq)` bool, without the samples of joints that stick: slow ones, whose torque then scatters more.
+
+    Noise of velocities hides that a joint rests, so the bound of slow is the one with the largest ratio.
 
     Args:
-        moving: `(n, nq)` bool, faster than the sharpest dry friction.
+        speed: |q̇| `(n, nq)`.
+        slowest: sharpest dry friction [rad/s, m/s].
         Phi: features of friction `(n, nq, f)`.
         residual: `(n, nq)` torque that the robot of the file leaves.
     """
-    weighted = moving[..., None] * Phi
-    w = torch.linalg.lstsq(weighted.transpose(0, 1), (moving * residual).mT[..., None]).solution[..., 0]
-    square = (residual - (Phi * w).sum(-1)).square()
-    at_rest, sliding = (
-        (part * square).sum(0) / part.sum(0).clamp(min=1) for part in ((~moving).double(), moving.double())
-    )
-    sticks = (at_rest > SCATTER * sliding) & (moving.double().mean(0) >= MOVES)
-    return moving | ~sticks
+    slides, ratio = torch.ones_like(speed, dtype=torch.bool), torch.full_like(speed[0], SCATTER)
+    for bound in (slowest * factor for factor in NOISY):
+        moving = speed >= bound
+        weighted = moving[..., None] * Phi
+        w = torch.linalg.lstsq(weighted.transpose(0, 1), (moving * residual).mT[..., None]).solution[..., 0]
+        square = (residual - (Phi * w).sum(-1)).square()
+        at_rest, in_motion = (
+            (part * square).sum(0) / part.sum(0).clamp(min=1)
+            for part in ((~moving).double(), moving.double())
+        )
+        scatter = at_rest / in_motion.clamp(min=LEAST_SQUARE)
+        sticks = (scatter > ratio) & (moving.double().mean(0) >= MOVES)
+        slides = torch.where(sticks, moving, slides)
+        ratio = torch.where(sticks, scatter, ratio)
+    return slides
 
 
 def averaged(rows: Rows, columns: Tensor, inertial: Tensor, width: float) -> tuple[Rows, Tensor]:
@@ -311,6 +351,7 @@ def averaged(rows: Rows, columns: Tensor, inertial: Tensor, width: float) -> tup
         residual=over(rows.residual + inertial, wide) - over(inertial, narrow),
         friction=over(rows.friction, wide),
         memory=over(rows.memory, wide),
+        rate=over(rows.rate, wide),
         slides=slides,
         partner=torch.cat([i + count, i]) if len(starts) == 2 else i,
         step=stride * rows.step,

@@ -36,6 +36,7 @@ class Measurement:
         values: `(n, d)`.
         segment: `(n,)` trajectory of each sample; one trajectory by default.
         t: `(n,)` time of each sample [s]; zero by default.
+        tau_std: `(n, nq)` standard deviation of each torque beyond the usual noise [N m, N]; `None` for zero.
     """
 
     quantity: str
@@ -46,6 +47,7 @@ class Measurement:
     values: Tensor
     segment: Tensor = None  # pyright: ignore[reportAssignmentType]  # filled in below
     t: Tensor = None  # pyright: ignore[reportAssignmentType]  # filled in below
+    tau_std: Tensor | None = None
 
     def __post_init__(self) -> None:
         if self.segment is None:
@@ -78,7 +80,9 @@ class Measurement:
 
     def __getitem__(self, rows: Tensor) -> Measurement:
         """The values at some of the states."""
-        return Measurement(self.quantity, *(part[rows] for part in (*self.tensors, self.segment, self.t)))
+        tau_std = None if self.tau_std is None else self.tau_std[rows]
+        parts = (part[rows] for part in (*self.tensors, self.segment, self.t))
+        return Measurement(self.quantity, *parts, tau_std=tau_std)
 
 
 @dataclass(frozen=True)
@@ -366,7 +370,9 @@ def measurement_of(
         raise ModelError("there are no samples to learn from", expected="at least one sample", got="none")
     values = COLUMNS[quantity](data, system)
     std = _checked_noise(_noise_of(observation, default_noise), quantity, values)
-    return Measurement(quantity, data.q, data.qd, data.tau, active, values, data.segment, data.t), std
+    state = data.q, data.qd, data.tau, active
+    stated = data.extras.get("tau_std")
+    return Measurement(quantity, *state, values, data.segment, data.t, stated), std
 
 
 def _noise_of(observation: Observation, default: NoiseStd | None) -> NoiseStd:

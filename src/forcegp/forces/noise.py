@@ -141,6 +141,7 @@ class SampleNoise:
     Attributes:
         std: σ of each component, `(d,)` or `(n, d)`.
         force: Σ_τ, the variance of the joint force.
+        torque: `(n, nq)` standard deviation of single torques beside it.
         state: G Σ_x½ `(n, d, 2 nq)`, factor of the noise of the state.
         weight: w of each sample `(n,)`; `None` for one.
     """
@@ -149,11 +150,14 @@ class SampleNoise:
     force: ForceNoise | None = None
     state: Tensor | None = None
     weight: Tensor | None = None
+    torque: Tensor | None = None
 
     def factors(self, at: States, z: AffineMap) -> list[Tensor]:
         """The terms N_k `(n, d, ·)` beside σ, at the states of the samples, of the quantity measured."""
         # N = (G Σ_x½, B_Q Σ_τ½)
         terms = [] if self.state is None else [self.state]
+        if self.torque is not None:
+            terms.append(z.B_Q * self.torque[:, None, :])
         return terms if self.force is None else [*terms, z.B_Q * self.force(at).sqrt()[:, None, :]]
 
     def covariance(self, at: States, z: AffineMap) -> Tensor:
@@ -164,8 +168,8 @@ class SampleNoise:
     def __getitem__(self, rows: Tensor) -> SampleNoise:
         """The noise of some of the samples."""
         std = self.std if self.std.ndim == 1 else self.std[rows]
-        state, weight = (None if x is None else x[rows] for x in (self.state, self.weight))
-        return SampleNoise(std, self.force, state, weight)
+        parts = (None if x is None else x[rows] for x in (self.state, self.weight, self.torque))
+        return SampleNoise(std, self.force, *parts)
 
 
 def state_jacobian(

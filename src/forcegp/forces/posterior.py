@@ -17,6 +17,7 @@ distance from that range in training standard deviations. `calibration.growth` e
 from __future__ import annotations
 
 import dataclasses
+import math
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -43,8 +44,9 @@ REGION = f"{NOISE}.region."
 LOW, HIGH, SPREAD, GROWTH = (REGION + name for name in ("low", "high", "spread", "growth"))
 """Names of the trained region: limits and standard deviation of the speed and torque of each joint `(2, nq)`,
 and g `(nq,)` [N m, N]."""
-OUTERMOST = 0.01
-"""Share of the training samples that lies beyond either limit of the region."""
+OUTERMOST, WIDEST = 0.01, 0.16
+"""Share of the training samples beyond either limit of the region, at least, and at most: one standard
+deviation of a Gaussian. With fewer than 100 independent samples, one of them lies beyond."""
 RELATIVE = 0.05
 """Growth g over the typical load of a joint that is expected before learning: torque constants and
 friction that depends on load are uncertain by some 5 %."""
@@ -180,7 +182,9 @@ def stick_variance(tensors: Mapping[str, Tensor], at: States) -> Tensor:
     return std**2 * torch.exp(-((at.qd / speed) ** 2))
 
 
-def trained_region(qd: Tensor, tau: Tensor, load: Tensor, hidden: Tensor | None = None) -> dict[str, Tensor]:
+def trained_region(
+    qd: Tensor, tau: Tensor, load: Tensor, hidden: Tensor | None = None, independent: float = math.inf
+) -> dict[str, Tensor]:
     """The region of the training samples `(n, nq)`, by the names of `LOW`, `HIGH` and `SPREAD`.
 
     Args:
@@ -189,9 +193,11 @@ def trained_region(qd: Tensor, tau: Tensor, load: Tensor, hidden: Tensor | None 
             below.
         hidden: `(nq,)` bool, joints without effect of the torque on accelerations; their region is one
             standard deviation around the mean.
+        independent: number of independent samples, one of which lies beyond each end.
     """
     x = torch.stack([qd, tau], dim=1)
-    low, high = x.quantile(torch.tensor([OUTERMOST, 1.0 - OUTERMOST]).to(x), dim=0)
+    share = min(max(OUTERMOST, 1.0 / independent), WIDEST)
+    low, high = x.quantile(torch.tensor([share, 1.0 - share]).to(x), dim=0)
     least = torch.stack([torch.full_like(load, STICKING), RELATIVE * load])
     spread = x.std(0, correction=0).maximum(least)
     if hidden is not None:

@@ -173,6 +173,7 @@ class Problem:
             self.force_noise(tensors),
             self.state_factor(system, measurement),
             None if weights is None else weights[measurement],
+            self.training.measurements[measurement].tau_std,
         )
 
     def rows(self, tensors: Mapping[str, Tensor]) -> WhitenedRows:

@@ -11,13 +11,16 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.ndimage import maximum_filter1d
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import DataHeader, Dataset
+from forcegp.data.clipped import clipped
 from forcegp.errors import DataError
 from forcegp.guards import foreign
 from forcegp.logs.clock import even_clock, usual_step
 from forcegp.logs.contact import Evidence, detect, per_contact
+from forcegp.logs.from_contact import derive_joints, stick_speeds
 from forcegp.logs.gather import gather
 from forcegp.logs.mapping import Mapping, default_mapping, load_mapping, parse_mapping
 from forcegp.logs.smoothing import add_derivatives, impact_mask
@@ -115,8 +118,11 @@ def import_log(
             numbers = NUMBERS * len(signals.joint_names) * len(signals)
             announce_memory(8 * numbers, f"importing {len(signals):,} rows")
             even_clock(signals, log_mapping.sections.time.period, report)
+            derive_joints(signals, system, log_mapping, report)
+            _find_clipped(signals, log_mapping)
             evidence = _contacts(signals, system, log_mapping, report, displaced)
             std = add_derivatives(signals, log_mapping.sections.derivatives, report)
+            std = _treat_clipped(signals, std, log_mapping, report)
             data = _dataset(signals, std, log_mapping, system, report)
     except DataError as error:
         raise error if str(path) in error.message else DataError.at(str(path), error) from None
@@ -150,6 +156,39 @@ def _contacts(
     return evidence
 
 
+def _find_clipped(signals: Signals, mapping: Mapping) -> None:
+    """Mark torques that clip, before a filter smooths their plateaus, as the vector `clipped`."""
+    speed = np.gradient(signals.vectors["q"], axis=0) if len(signals) > 1 else signals.vectors["q"]
+    if mapping.sections.torque.clipped != "keep":
+        usable = np.ones(len(signals), dtype=bool)
+        signals.vectors["clipped"] = clipped(signals.vectors["tau"], speed, usable).astype(np.float64)
+
+
+def _treat_clipped(
+    signals: Signals, std: Array | None, mapping: Mapping, report: ImportReport
+) -> Array | None:
+    """Drop rows with clipped torques, or give these torques their own size as noise, as `tau_std`; returns σ
+    of q̈ of the rows that are left.
+
+    A filter carries a clipped torque to the rows within half its window.
+    """
+    if "clipped" not in signals.vectors or not (mask := signals.vectors.pop("clipped")).any():
+        return std
+    settings, how = mapping.sections.derivatives, mapping.sections.torque.clipped
+    window = settings.window if std is not None and settings.filter_torque else 1
+    size = np.abs(signals.vectors["tau"]) * mask
+    for rows in signals.runs():
+        mask[rows], size[rows] = (maximum_filter1d(x[rows], window, axis=0) for x in (mask, size))
+    hit, joints = np.asarray(mask.any(axis=1)), ", ".join(np.array(signals.joint_names)[mask.any(axis=0)])
+    done = "were dropped" if how == "drop" else "have a torque noise of its size"
+    report.find("clipped", f"the torque of {joints} clips: {hit.sum()} rows {done}", signals.row[hit])
+    if how == "drop":
+        signals.keep(~hit, split=True)
+        return None if std is None else std[~hit]
+    signals.vectors["tau_std"] = size
+    return std
+
+
 def _dataset(
     signals: Signals, std: Array | None, mapping: Mapping, system: ConstrainedSystem, report: ImportReport
 ) -> Dataset:
@@ -164,6 +203,10 @@ def _dataset(
         sensed = per_contact(signals, system, mapping)
         of_contacts |= {name: {key: _tensor(x) for key, x in group.items()} for name, group in sensed.items()}
         report.steps.append("took the tool's weight off the wrench and carried it to the contact")
+    sticking = stick_speeds(signals, system, mapping, report)
+    extras = {} if std is None else {"qdd_std": _tensor(std)}
+    if "tau_std" in signals.vectors:
+        extras["tau_std"] = _tensor(signals.vectors.pop("tau_std"))
     vectors = {name: _tensor(signals.vectors.pop(name)) for name in ("q", "qd", "qdd", "tau")}
     header = DataHeader(
         dt=dt,
@@ -180,6 +223,7 @@ def _dataset(
         ),
         imported=tuple((found.kind, found.message) for found in report.findings),
         unmeasured_torques=mapping.sections.torque.unmeasured,
+        stick_speeds=sticking,
         joint_names=robot.joint_names,
         contact_names=tuple(signals.contact),
     )
@@ -188,7 +232,7 @@ def _dataset(
         **vectors,
         joint_names=robot.joint_names,
         contact={name: torch.from_numpy(value) for name, value in signals.contact.items()},
-        extras={} if std is None else {"qdd_std": _tensor(std)},
+        extras=extras,
         contact_extras=of_contacts,
         segment=torch.from_numpy(signals.segment),
         header=header,

@@ -27,7 +27,7 @@ from forcegp.errors import DataError
 from forcegp.logs.mapping import GROUND, ContactStateSection, Mapping
 from forcegp.logs.table import Array, ImportReport, Signals
 from forcegp.robot import RobotModel
-from forcegp.robust import level_of, robust_std
+from forcegp.robust import level_and_spread, level_of
 from forcegp.rows import runs
 
 CHUNK = 1 << 12
@@ -206,7 +206,8 @@ def detect(
             raise mapping.error(("contact", name, "source"), text, "column, always or never")
         else:
             values = _evidence(signals, system, mapping, contact, source)
-            if source == "distance" and sections[name].threshold is None:
+            touches = np.abs(values) <= (sections[name].threshold or TOUCHING)
+            if source == "distance" and len(values) > 1 and touches.mean() <= TOUCHED:
                 values = values - _misplaced(signals, system, contact, values, displaced, report)
             states[name], detection = _detect(signals, values, name, sections[name])
             evidence.append(detection)
@@ -225,9 +226,7 @@ def _misplaced(
     displaced: bool,
     report: ImportReport,
 ) -> float:
-    """Distance from the scene's surface at which the tip slides [m], 0 where it touches; else `DataError`."""
-    if len(c) < 2 or (np.abs(c) <= TOUCHING).mean() > TOUCHED:
-        return 0.0
+    """Distance from the scene's surface at which the tip slides [m], if `displaced`; else `DataError`."""
     p, name = _rowwise(signals, ("q",), lambda q: _tip(system, contact, q)), contact.name
     moves = np.linalg.norm(np.gradient(p, axis=0), axis=1) > SLIDING * np.median(np.diff(signals.t))
     level, (middle, spread) = level_of(c[moves], TOUCHING, LEVEL), level_and_spread(1e3 * c)
@@ -349,11 +348,3 @@ def _merge_short(closed: NDArray[np.bool_], signals: Signals, shortest: float) -
                 closed[span] = ~closed[span]
                 count += 1
     return count
-
-
-def level_and_spread(values: Array) -> tuple[float, float]:
-    """Median, and the standard deviation of a normal distribution with the same median absolute deviation."""
-    if not len(values):
-        return float("nan"), float("nan")
-    middle = float(np.median(values))
-    return middle, float(robust_std(values))

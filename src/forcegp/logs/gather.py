@@ -21,6 +21,9 @@ from forcegp.logs.readers import read
 from forcegp.logs.table import Array, ImportReport, LogTable, Progress, Signals, Stream
 from forcegp.rows import describe, numbered
 
+CLOSED, STICKS = "contact ", "sticks "
+"""Before the name of a contact: vectors of `Signals` with the flag of its state."""
+
 
 def gather(
     path: str | Path,
@@ -38,7 +41,7 @@ def gather(
             needed |= set(mapping.columns_of(name, joints))
     if sections.wrench is not None:
         needed |= {*sections.wrench.force, *(sections.wrench.torque or ())}
-    needed |= {contact.column for contact in sections.contact.values() if contact.column is not None}
+    needed |= {c for each in sections.contact.values() for c in (each.column, each.sticks) if c is not None}
     table = read(path, wanted=needed.__contains__, rows=rows, progress=progress)
     report.format = table.format
     for remark in table.remarks:
@@ -62,16 +65,15 @@ class _Gathering:
         vectors = {SYMBOLS[name]: self._vector(name) for name in quantities}
         if self.mapping.sections.wrench is not None:
             vectors["wrench"] = self._wrench()
-        flags = self._flags()
-        vectors |= {f"contact {name}": flag for name, flag in flags.items()}
+        vectors |= self._flags()
         signals = self._reference({n: x for n, (stream, x) in vectors.items() if stream is self.reference})
         for name, (stream, values) in vectors.items():
             if stream is not self.reference:
                 t = self._stamps(stream)
                 good = np.isfinite(values).all(axis=1) & np.isfinite(t)
                 join_stream(signals, name, t[good], values[good], self.time.gap, self.report)
-        for name in flags:
-            signals.contact[name] = signals.vectors.pop(f"contact {name}")[:, 0] >= 0.5
+        for key in [key for key in signals.vectors if key.startswith(CLOSED)]:
+            signals.contact[key.removeprefix(CLOSED)] = signals.vectors.pop(key)[:, 0] >= 0.5
         return signals
 
     def _take(self, stream: Stream, column: str) -> Array:
@@ -121,20 +123,26 @@ class _Gathering:
         return stream, result
 
     def _flags(self) -> dict[str, tuple[Stream, Array]]:
+        """Flags of contacts that are closed or stick, by `CLOSED` or `STICKS` and the name."""
         flags = {}
         for name, section in self.mapping.sections.contact.items():
-            if section.source == "column" and section.column is not None:
-                stream = self.table.stream_of(section.column, section.stream)
-                values = self._take(stream, section.column)
-                wrong = np.flatnonzero((values != 0.0) & (values != 1.0))
-                if len(wrong):
-                    raise DataError(
-                        f"{self.table.source}: column {section.column!r} is not a flag in row {wrong[0]}",
-                        expected="0 or 1",
-                        got=values[wrong[0]],
-                    )
-                flags[name] = (stream, values[:, None])
+            closed = section.column if section.source == "column" else None
+            for key, column in ((CLOSED, closed), (STICKS, section.sticks)):
+                if column is not None:
+                    flags[f"{key}{name}"] = self._flag(column, section.stream)
         return flags
+
+    def _flag(self, column: str, named: str | None) -> tuple[Stream, Array]:
+        stream = self.table.stream_of(column, named)
+        values = self._take(stream, column)
+        wrong = np.flatnonzero((values != 0.0) & (values != 1.0))
+        if len(wrong):
+            raise DataError(
+                f"{self.table.source}: column {column!r} is not a flag in row {wrong[0]}",
+                expected="0 or 1",
+                got=values[wrong[0]],
+            )
+        return stream, values[:, None]
 
     def _stamps(self, stream: Stream) -> Array:
         """Time stamps of a stream [s]."""

@@ -22,13 +22,14 @@ from forcegp.errors import DataError
 from forcegp.guards import foreign
 from forcegp.logs import units
 from forcegp.logs.clock import even_clock
-from forcegp.logs.contact import force_levels, level_and_spread, multiplier
+from forcegp.logs.contact import force_levels, multiplier
 from forcegp.logs.gather import gather
 from forcegp.logs.headings import find_families, find_time, find_wrench, tokens
 from forcegp.logs.mapping import ContactStateSection, Draft, parse_mapping, quoted
 from forcegp.logs.readers import read
 from forcegp.logs.smoothing import add_derivatives
 from forcegp.logs.table import Array, ImportReport, LogTable, Progress, Signals
+from forcegp.robust import level_and_spread
 from forcegp.rows import runs
 
 ROWS, TRIED_ROWS = 100_000, 3000

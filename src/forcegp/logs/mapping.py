@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, field
 from importlib.resources import files
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -146,10 +146,17 @@ class QuantitySection(Section):
 
 class TorqueSection(QuantitySection):
     """`[torque]`: a torque, or a current with the torque constant of the motor [N m/A]; joints without either
-    are `unmeasured`."""
+    are `unmeasured`. Rows with `clipped` torques get the noise that these have, or are dropped."""
 
     torque_constant: PerJoint | None = None
     unmeasured: tuple[str, ...] = ()
+    clipped: Literal["noise", "drop", "keep"] = "noise"
+
+
+class PositionSection(QuantitySection):
+    """`[position]`; `from_contact` names the closed contact that determines a joint without a column."""
+
+    from_contact: dict[str, str] = Field(default_factory=dict)
 
 
 GROUND = "ground"
@@ -187,6 +194,8 @@ class ContactStateSection(Section):
     threshold: float | None = Field(default=None, gt=0.0)
     release: float | None = Field(default=None, gt=0.0)
     shortest: float = Field(default=0.05, ge=0.0)
+    stick_speed: Annotated[float, Field(gt=0.0)] | Literal["auto", "never"] = "auto"
+    sticks: str | None = None
 
 
 class DerivativesSection(Section):
@@ -205,7 +214,7 @@ class MappingSections(Section):
 
     time: TimeSection
     joints: dict[str, str] = Field(default_factory=dict)
-    position: QuantitySection
+    position: PositionSection
     velocity: QuantitySection | None = None
     acceleration: QuantitySection | None = None
     torque: TorqueSection
@@ -231,10 +240,12 @@ class Mapping:
         return getattr(self.sections, name)
 
     def measured(self, name: str, joints: Sequence[str]) -> list[str]:
-        """The joints with a logged quantity: all except those with `unmeasured` torque."""
-        unmeasured = self.sections.torque.unmeasured if name == "torque" else ()
-        self._check_joints((name, "unmeasured"), unmeasured, joints)
-        return [joint for joint in joints if joint not in unmeasured]
+        """The joints with a logged quantity: all except those with `unmeasured` torque, or whose motion
+        follows from a contact."""
+        name, key = ("torque", "unmeasured") if name == "torque" else ("position", "from_contact")
+        lacking = self.sections.torque.unmeasured if name == "torque" else self.sections.position.from_contact
+        self._check_joints((name, key), lacking, joints)
+        return [joint for joint in joints if joint not in lacking]
 
     def columns_of(self, name: str, joints: Sequence[str]) -> list[str]:
         """The log's column of a quantity for each joint of the robot that has it."""

@@ -39,6 +39,9 @@ LEAST_NOISE = 1e-9
 THRESHOLD = 5.0
 """σ beyond which a contact is detected."""
 
+BLOCK, LEAST_BLOCKS = 0.5, 20
+"""Length of the blocks whose largest d² are independent [s], and how many a tail is read off."""
+
 
 @dataclass(frozen=True, repr=False)
 class ExternalWrench(Prediction):
@@ -53,16 +56,17 @@ class ExternalWrench(Prediction):
 
     frame: WrenchFrame | None = None
 
-    def detect(self, threshold: float = THRESHOLD, hold: int = 1) -> Tensor:
+    def detect(self, threshold: float = THRESHOLD, hold: int = 1, limit: float = 0.0) -> Tensor:
         """Whether a wrench acts at each sample, `(n,)` bool.
 
         Without a wrench, d² = ŵᵀ C⁻¹ ŵ is at most a χ² variable with k degrees of freedom. A contact is
         detected if d² exceeds the χ² quantile with the probability of a Gaussian beyond ± `threshold`
-        standard deviations, at `hold` samples in a row.
+        standard deviations, and `limit`, at `hold` samples in a row.
 
         Args:
             threshold: [σ]; `false_alarm_rate(threshold)` is the probability of a false alarm at a sample.
             hold: number of consecutive samples, including the current one.
+            limit: smallest d², such as `exceeded_once_in` of an estimate in free motion.
 
         Raises:
             ParameterError: the threshold is not positive, or `hold` is below one.
@@ -72,12 +76,40 @@ class ExternalWrench(Prediction):
                 "invalid detection", expected="threshold > 0 [σ] and hold ≥ 1", got=(threshold, hold)
             )
         quantile = float(scipy.stats.chi2.isf(false_alarm_rate(threshold), self.mean.shape[-1]))
-        far = self.distance_squared > quantile
+        far = self.distance_squared > max(quantile, limit)
         held = far.clone()
         for lag in range(1, hold):
             held[lag:] &= far[:-lag]
             held[:lag] = False
         return held
+
+    def exceeded_once_in(self, seconds: float, t: Tensor) -> float:
+        """d² that a log of free motion, such as that of training, exceeds about once in a time.
+
+        Errors of friction last, and have heavier tails than a Gaussian. The largest values of d² in blocks of
+        `BLOCK` are independent; above their median u, P(d² > u + x) = ½ exp(−x/β).
+
+        Args:
+            seconds: time in free motion with one false alarm [s].
+            t: times of this estimate `(n,)` [s], in order within each trajectory.
+
+        Example:
+            `wrench.detect(limit=fit.external_wrench(train, "tool").exceeded_once_in(600.0, train.t))`
+
+        Raises:
+            DataError: the log has less than `LEAST_BLOCKS` blocks.
+        """
+        numbers = torch.div(t, BLOCK, rounding_mode="floor").unique_consecutive(return_inverse=True)[1]
+        largest = t.new_zeros(int(numbers[-1]) + 1).scatter_reduce(0, numbers, self.distance_squared, "amax")
+        if len(largest) < LEAST_BLOCKS:
+            raise DataError(
+                "the free motion is too short to predict false alarms",
+                expected=f"at least {LEAST_BLOCKS * BLOCK:g} s",
+                got=f"{len(largest) * BLOCK:g} s",
+            )
+        median = largest.median()
+        excess = float((largest[largest > median] - median).mean())
+        return float(median) + excess * math.log(max(0.5 * seconds / BLOCK, 1.0))
 
     @property
     def distance_squared(self) -> Tensor:

@@ -24,6 +24,7 @@ from torch import Tensor, nn
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
+from forcegp.data.fields import common_header
 from forcegp.dynamics import mass_matrix
 from forcegp.errors import check_name
 from forcegp.forces.calibration import calibrated_noise, residual_times
@@ -98,16 +99,20 @@ class Specification:
         """The specification with the noise resolved for given data.
 
         Unless it is stated, the noise of accelerations is learned together with that of the torque, or to
-        compare sets of priors. Joints without a measured torque have an unknown force.
+        compare sets of priors. Joints without a measured torque have an unknown force. Contacts stick below
+        the speeds that the log states.
         """
         observations, noise = observations_of(data), self.noise
+        system = self.system.with_stick_speeds(
+            common_header([o.data.header for o in observations]).stick_speeds
+        )
         learns = noise.learns_torque or self.automatic
         if learns and noise.acceleration is None and not states_noise(observations):
             noise = dataclasses.replace(noise, learn=True)
-        unmeasured = unmeasured_forces(self.system, observations)
+        unmeasured = unmeasured_forces(system, observations)
         if unmeasured:
             noise = dataclasses.replace(noise, external={**unmeasured, **(noise.external or {})})
-        return dataclasses.replace(self, noise=noise)
+        return dataclasses.replace(self, system=system, noise=noise)
 
     def with_options(self, **changed: Any) -> Specification:
         """The specification with other options."""

@@ -1,0 +1,197 @@
+"""Joints whose motion follows from a closed contact, and speeds below which the tip of a contact sticks.
+
+**A joint without a column.** A closed contact has c(q) = 0, A q̇ = 0 and A q̈ = b. With the unknown joints u
+and the logged ones o, q_u solves c(q_o, q_u) = 0 by Gauss-Newton, and
+
+    q̇_u = −A_u⁺ A_o q̇_o,   q̈_u = A_u⁺ (b − A_o q̈_o).
+
+**Sticking.** The logarithm of the speed of a touching point that now sticks and now slides has two modes. The
+tip sticks below the valley between them: where it creeps by some mm/s too, as in MuJoCo. A sliding tip that
+turns round has slow rows, but no mode of them.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from scipy.ndimage import gaussian_filter1d
+from torch import Tensor
+
+from forcegp.constraints import ConstrainedSystem, SurfaceContact
+from forcegp.errors import DataError
+from forcegp.logs.contact import SLIDING
+from forcegp.logs.gather import STICKS
+from forcegp.logs.mapping import Mapping
+from forcegp.logs.table import Array, ImportReport, Signals
+
+STEPS, SOLVED = 50, 1e-9
+"""Most Gauss-Newton steps, and the constraint error that they leave, in m."""
+UNMOVED = 1e-6
+"""Smallest singular value of A_u over the largest of A at which a contact determines its joints."""
+BINS, SMOOTH = 10, 1.5
+"""Bins in a decade of speeds, and the standard deviation that smooths them in bins."""
+VALLEY, SHARE = 0.5, 0.1
+"""Height of a valley over that of the lower mode beside it, and least share of the rows on either side: a tip
+that only pauses where it turns round slides."""
+SLOWEST = 1e-6
+"""Speeds below count as this [m/s]."""
+
+
+def derive_joints(
+    signals: Signals, system: ConstrainedSystem, mapping: Mapping, report: ImportReport
+) -> None:
+    """Fill in position, and velocity and acceleration if logged, of the joints of `from_contact`; rows with
+    an open contact are dropped.
+
+    Raises:
+        MappingError: no such contact, or its state is not known without the position.
+        DataError: a contact does not determine its joints.
+    """
+    asked = mapping.sections.position.from_contact
+    if not asked:
+        return
+    key = ("position", "from_contact")
+    closed = np.ones(len(signals), dtype=bool)
+    for joint, name in asked.items():
+        if name not in system.contact_names:
+            listing = ", ".join(system.contact_names) or "no contacts"
+            raise mapping.error((*key, joint), f"the scene has no contact {name!r}", listing)
+        section = mapping.sections.contact.get(name)
+        if section is None or section.source not in ("always", "column"):
+            text = f"the state of contact {name!r} needs the position of {joint!r}"
+            raise mapping.error(
+                (*key, joint), text, expected=f'[contact.{name}] source = "always" or "column"'
+            )
+        if section.source == "column":
+            closed &= signals.contact[name]
+    if not closed.all():
+        report.find("open", f"{(~closed).sum()} rows were dropped: an open contact tells no joint")
+        signals.keep(closed, split=True)
+    unknown = [signals.joint_names.index(joint) for joint in asked]
+    slides = [
+        dataclasses.replace(c, stick_speed=None) if isinstance(c, SurfaceContact) else c
+        for c in map(system.contact, dict.fromkeys(asked.values()))
+    ]
+    held = dataclasses.replace(system, contacts=slides)
+    vectors = {
+        name: torch.from_numpy(signals.vectors[name])
+        for name in ("q", "qd", "qdd")
+        if name in signals.vectors
+    }
+    solved = _solve(held, vectors, unknown, tuple(asked))
+    signals.vectors |= {name: value.numpy() for name, value in solved.items()}
+    report.steps.append("; ".join(f"{joint} follows from contact {name!r}" for joint, name in asked.items()))
+
+
+def _solve(
+    system: ConstrainedSystem, vectors: dict[str, Tensor], u: list[int], joints: tuple[str, ...]
+) -> dict[str, Tensor]:
+    """q, q̇ and q̈ `(n, nq)`, as far as logged, with the joints u that hold the contacts closed."""
+    robot, q = system.robot, vectors["q"].clone()
+    zero = torch.zeros_like(q)
+    middle = 0.5 * (robot.lower + robot.upper)
+    q[:, u] = torch.where(middle.isfinite(), middle, 0.0)[u]
+    step, eom = q, system.equations(q, zero)
+    for _ in range(STEPS):
+        step = torch.linalg.lstsq(eom.A[..., u], eom.c[..., None]).solution[..., 0]
+        q[:, u] -= step
+        eom = system.equations(q, zero)
+        if float(step.abs().max()) < SOLVED:
+            break
+    A = eom.A
+    moved = torch.linalg.svdvals(A[..., u])[..., -1] > UNMOVED * torch.linalg.svdvals(A)[..., 0]
+    if not bool(moved.all()) or not float(step.abs().max()) < SOLVED or float(eom.c.abs().max()) > SOLVED:
+        raise DataError(
+            f"the contact does not determine {', '.join(joints)}",
+            expected=f"positions within {STEPS} Gauss-Newton steps that close the contact in every row",
+            got=f"{float(eom.c.abs().max()):.3g} m of distance left",
+            hint="check the place of the surface, and that the joint moves the point along its normal",
+        )
+    solved = {"q": q}
+    if "qd" in vectors:
+        solved["qd"] = qd = vectors["qd"].clone()
+        qd[:, u] = 0.0
+        qd[:, u] = -torch.linalg.lstsq(A[..., u], A @ qd[..., None]).solution[..., 0]
+        if "qdd" in vectors:
+            solved["qdd"] = qdd = vectors["qdd"].clone()
+            qdd[:, u] = 0.0
+            left = system.equations(q, qd).b[..., None] - A @ qdd[..., None]
+            qdd[:, u] = torch.linalg.lstsq(A[..., u], left).solution[..., 0]
+    return solved
+
+
+@torch.no_grad()
+def stick_speeds(
+    signals: Signals, system: ConstrainedSystem, mapping: Mapping, report: ImportReport
+) -> dict[str, float]:
+    """Speed below which a contact with a surface sticks [m/s], by name, from the mapping or the log."""
+    speeds: dict[str, float] = {}
+    for contact in system.contacts:
+        section, closed = mapping.sections.contact.get(contact.name), signals.contact.get(contact.name)
+        if not isinstance(contact, SurfaceContact) or section is None or closed is None or not closed.any():
+            continue
+        if contact.stick_speed is not None or section.stick_speed == "never":
+            continue
+        q, qd = (
+            torch.from_numpy(np.ascontiguousarray(signals.vectors[name][closed])) for name in ("q", "qd")
+        )
+        alone = ConstrainedSystem(system.robot, [contact])
+        point = alone.equations(q, qd).contact_points[contact.name]
+        speed = point.sliding[1].norm(dim=-1).numpy()
+        flag = signals.vectors.get(f"{STICKS}{contact.name}")
+        if section.stick_speed != "auto":
+            found = section.stick_speed
+        elif flag is not None:
+            found = dividing_speed(speed, flag[closed, 0] >= 0.5)
+        else:
+            found = resting_speed(speed)
+        if found is not None:
+            speeds[contact.name] = found
+            share = 100.0 * (speed < found).mean()
+            text = f"contact {contact.name!r} sticks below {1e3 * found:.3g} mm/s, {share:.0f} % of its rows"
+            report.find(
+                "sticks", f'{text}; stick_speed = "never" under [contact.{contact.name}] if it slides'
+            )
+    return speeds
+
+
+def resting_speed(speed: Array) -> float | None:
+    """Speed that separates a tip's rows at rest from those in motion, `None` where it never rests.
+
+    Args:
+        speed: of the touching point along the surface `(n,)` [m/s].
+
+    >>> creeps, slides = np.geomspace(1e-4, 3e-3, 100), np.geomspace(0.05, 0.2, 300)
+    >>> 3e-3 < resting_speed(np.concatenate([creeps, slides])) < 0.05
+    True
+    >>> resting_speed(slides) is None
+    True
+    """
+    x = np.log10(np.maximum(speed, SLOWEST))
+    edges = np.arange(np.floor(x.min()), np.ceil(x.max()) + 1.0 / BINS, 1.0 / BINS)
+    rows, edges = np.histogram(x, edges if len(edges) > 1 else 1)
+    density = gaussian_filter1d(rows.astype(float), SMOOTH, mode="constant")
+    left, right = np.maximum.accumulate(density), np.maximum.accumulate(density[::-1])[::-1]
+    depth = density / np.maximum(np.minimum(left, right), np.finfo(float).tiny)
+    below = (np.cumsum(rows) - 0.5 * rows) / len(x)
+    depth[(below < SHARE) | (below > 1.0 - SHARE)] = 1.0
+    if depth.min() <= VALLEY:
+        # The middle of the deepest bins: an empty valley has several.
+        deepest = np.flatnonzero(depth <= depth.min() + 1e-12)
+        return float(10.0 ** (0.5 * (edges[deepest[0]] + edges[deepest[-1] + 1])))
+    return SLIDING if np.median(speed) < SLIDING else None
+
+
+def dividing_speed(speed: Array, sticks: NDArray[np.bool_]) -> float | None:
+    """The speed that separates rows marked as sticking from the others with the fewest errors."""
+    if not sticks.any():
+        return None
+    order = np.argsort(speed)
+    # Errors of a threshold above the first k rows: sliding ones among them, sticking ones beyond.
+    slide = np.concatenate([[0], np.cumsum(~sticks[order])])
+    wrong = slide + sticks.sum() - (np.arange(len(slide)) - slide)
+    k, ranked = int(np.argmin(wrong)), np.append(speed[order], 2.0 * speed.max())
+    return max(float(0.5 * (ranked[max(k - 1, 0)] + ranked[k])), SLOWEST)
