@@ -26,7 +26,7 @@ def test_kinds_that_do_not_fit_are_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("precious")
     with pytest.raises(DestinationError, match="is a file, but a folder"):
         check_destination(tmp_path / "file", folder=True)
-    with pytest.raises(DestinationError, match="is a folder, and a file"):
+    with pytest.raises(DestinationError, match="is a folder, but a file"):
         check_destination(tmp_path)
     with pytest.raises(DestinationError, match="cannot be written"):
         check_destination(tmp_path / "file" / "model", folder=True)
@@ -98,7 +98,7 @@ def test_a_result_that_cannot_be_written_is_kept(
         path.mkdir()
         (path / "model.json").write_text("the result")
 
-    with pytest.raises(DestinationError, match=r"could not be written there(.|\n)*it was saved to") as error:
+    with pytest.raises(DestinationError, match=r"could not be written(.|\n)*it was saved to") as error:
         write_or_keep(write, place / "model")
     [kept] = spare.iterdir()
     assert str(kept / "model") in str(error.value)

@@ -228,7 +228,10 @@ def header(text: bytes) -> Callable[[pa.Table], pa.Table]:
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        (renamed("qd.elbow", "qd.elbwo"), r"column 'qd.elbow' is missing(?s:.*)is 'qd.elbwo' the column"),
+        (
+            renamed("qd.elbow", "qd.elbwo"),
+            r"column 'qd.elbow' is missing(?s:.*)did you mean column 'qd.elbwo'",
+        ),
         (renamed("t", "time"), "column 't' is missing"),
         (renamed("Q_z.wrist", "Q_z.wirst"), "column 'Q_z.wrist' is missing"),
         (lambda table: table.drop_columns([f"qdd.{j}" for j in JOINTS]), "SavitzkyGolay"),

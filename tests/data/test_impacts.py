@@ -16,5 +16,5 @@ def test_rows_that_a_mask_marks_are_left_out() -> None:
     marked = data.replace(contact_extras={**data.contact_extras, "impact": {"table": mask}})
     clear = without_marked_impacts(marked)
     assert clear.t.tolist() == [*data.t[:10].tolist(), *data.t[14:].tolist()]
-    assert clear.header.provenance[-1] == "left out 4 rows at impacts"
+    assert clear.header.provenance[-1] == "excluded 4 rows at impacts"
     assert clear.header.ordered

@@ -36,7 +36,7 @@ def test_a_clock_that_restarts_begins_a_trajectory() -> None:
 def test_a_step_back_within_a_trajectory_is_an_error_with_its_rows() -> None:
     t = np.arange(60) * 0.01
     t[40], t[50:52] = t[38], t[45]
-    with pytest.raises(DataError, match=r"goes back in rows 40, 50(?s:.*)0.39 s in row 40(?s:.*)0.38 s"):
+    with pytest.raises(DataError, match=r"runs backward in rows 40, 50(?s:.*)0.39 s in row 40(?s:.*)0.38 s"):
         split(signals(t))
 
 

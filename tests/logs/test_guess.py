@@ -86,7 +86,7 @@ def test_formats_with_names_leave_no_doubt_about_joints(kind: str, tmp_path: Pat
     numbered = kind in ("npz", "lerobot")
     assert any("base to tip" in doubt for doubt in proposal.doubts) == numbered
     if not numbered:
-        assert "likeness" not in " ".join(proposal.doubts)
+        assert "similarity" not in " ".join(proposal.doubts)
         data = read_log(path, system, mapping)
         np.testing.assert_array_equal(data.q.numpy(), motion().q)
 
@@ -122,7 +122,7 @@ def test_names_that_are_only_alike_are_matched_and_doubted() -> None:
     proposal = guess.guess_mapping(REAL / "ur3" / "id1.bag", forcegp.ConstrainedSystem(robot))
     joints = mapping_of(proposal).sections.joints
     assert list(joints.values()) == ["Base", "Shoulder", "Elbow", "Wrist 1", "Wrist 2", "Wrist 3"]
-    assert any("likeness" in doubt for doubt in proposal.doubts)
+    assert any("similarity" in doubt for doubt in proposal.doubts)
     assert mapping_of(proposal).sections.torque.sign == -1.0
 
 

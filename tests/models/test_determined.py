@@ -105,7 +105,7 @@ def test_a_contact_that_was_never_closed_has_no_force(data: forcegp.Dataset, tmp
     for model in (fit, forcegp.load_model(tmp_path / "model")):
         for quantity in ("multiplier", "contact_force", "constraint_force"):
             for active in (None, torch.zeros(len(data), 1, dtype=torch.bool)):
-                with pytest.raises(ModelError, match="table was never closed in the training data"):
+                with pytest.raises(ModelError, match="table is never closed in the training data"):
                     model.predict(*states, quantity, active=active)
     found = fit.predict(*states, ["qdd", "multiplier"])
     assert found.mean[:, 7:].isnan().all() and found.mean[:, :7].isfinite().all()
@@ -185,7 +185,7 @@ def test_held_out_stretches_show_a_model_that_misses_the_log(
         result = forcegp.StructuredGP(SYSTEM, "analytical", noise=0.1).fit(pushed).result
         (chosen,) = (each for each in result.comparison if each.chosen)
         assert chosen.coverage is not None and (chosen.coverage < 0.8) == misses
-        assert any(f"±2σ holds {chosen.coverage:.0%}" in text for text in result.warnings) == misses
+        assert any(f"±2σ coverage is {chosen.coverage:.0%}" in text for text in result.warnings) == misses
 
 
 def test_options_without_effect_are_said(data: forcegp.Dataset) -> None:

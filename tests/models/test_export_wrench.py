@@ -122,7 +122,7 @@ def test_what_is_refused() -> None:
     fast = fit.compiled(wrench=TOOL)
     for i, name in enumerate(("q", "qd", "tau", "qdd")):
         wrong = [x * float("nan") if k == i else x for k, x in enumerate(at)]
-        with pytest.raises(ShapeError, match=f"{name} holds values that are not finite"):
+        with pytest.raises(ShapeError, match=f"{name} contains values that are not finite"):
             fast.external_wrench(*wrong)
     with pytest.raises(ShapeError, match="qdd"):
         fast.external_wrench(*at[:3], data.qdd[:, :3])

@@ -193,7 +193,7 @@ def test_errors() -> None:
         fitted().external_wrench(data, "toool")
     with pytest.raises(UnknownNameError, match="method"):
         fitted().external_wrench(data, TOOL, method="static")
-    with pytest.raises(DataError, match="in order of time"):
+    with pytest.raises(DataError, match="in time order"):
         fitted().external_wrench(data[[3, 1, 2]], TOOL, method="momentum")
     plain = forcegp.StructuredGP(
         fitted().specified, "analytical", "friction", noise=forcegp.Noise(0.05, torque=None)

@@ -115,7 +115,7 @@ def test_a_prediction_by_itself() -> None:
     axes = found.plot(names=["table", "ball"])
     np.testing.assert_allclose(curve(axes[1], "predicted"), found.mean[:, 1])
     assert axes[-1].get_xlabel() == "sample"
-    with pytest.raises(ShapeError, match="names does not fit"):
+    with pytest.raises(ShapeError, match="names does not match"):
         found.plot(names=["table"])
     with pytest.raises(ShapeError, match=r"\(n, d\)"):
         model.predict(data.q[0], data.qd[0], data.tau[0]).plot()

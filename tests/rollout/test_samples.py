@@ -226,7 +226,7 @@ def test_a_selected_log_cannot_be_compared_with() -> None:
         compare(models, data, 50.0)
     with pytest.raises(DataError, match="too short"):
         compare(models, data, 0.1, torch.tensor([0, len(data) - 2]))
-    with pytest.raises(DataError, match="order of time"):
+    with pytest.raises(DataError, match="time order"):
         compare(models, data[torch.randperm(len(data), generator=torch.Generator().manual_seed(0))], 0.1)
 
 

@@ -136,7 +136,7 @@ class Fault:
 
 
 def check_visibility(system: ConstrainedSystem, explanation: Explanation) -> list[Finding]:
-    """Note from which size this log shows faults, and what one of the expected size does to a force."""
+    """Note the size from which each fault is found, and the effect of a usual one on a contact force."""
     faults = list(_faults(system, explanation.log, explanation.rows))
     sizes = {fault: visible_size(explanation, fault) for fault in faults}
     units = {name: position_unit(system.robot, j) for j, name in enumerate(system.robot.joint_names)}

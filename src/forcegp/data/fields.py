@@ -372,6 +372,12 @@ def check_alike(parts: Sequence[Fields]) -> None:
                 )
 
 
+def common_stick_speeds(headers: Sequence[DataHeader]) -> dict[str, float]:
+    """Return the largest speed below which each contact sticks [m/s], by name."""
+    speeds = [pair for header in headers for pair in header.stick_speeds.items()]
+    return dict(sorted(speeds, key=lambda pair: pair[1]))
+
+
 def common_header(headers: Sequence[DataHeader]) -> DataHeader:
     """Return a header with the fields that agree; the others have their default values."""
     first = headers[0].model_dump()
@@ -380,8 +386,7 @@ def common_header(headers: Sequence[DataHeader]) -> DataHeader:
     agreed["provenance"] = (*steps, f"concatenated {len(headers)} data sets")
     for name in ("derived", "imported"):
         agreed[name] = tuple(dict.fromkeys(value for header in headers for value in getattr(header, name)))
-    speeds = [pair for header in headers for pair in header.stick_speeds.items()]
-    agreed["stick_speeds"] = dict(sorted(speeds, key=lambda pair: pair[1]))
+    agreed["stick_speeds"] = common_stick_speeds(headers)
     agreed["ordered"] = all(header.ordered for header in headers)
     agreed["filtered"] = any(header.filtered for header in headers)
     agreed["filter_span"] = max((h.filter_span for h in headers if h.filter_span is not None), default=None)

@@ -105,7 +105,7 @@ def flat_states(
     system.robot.check_state(**inputs)
     for name, x in inputs.items():
         if not bool(torch.isfinite(x).all()):
-            raise ShapeError(f"{name} holds values that are not finite", expected="finite numbers")
+            raise ShapeError(f"{name} contains values that are not finite", expected="finite numbers")
     try:
         batch = torch.broadcast_shapes(*(x.shape[:-1] for x in inputs.values()))
     except RuntimeError as cause:

@@ -25,7 +25,7 @@ from torch import Tensor, nn
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
-from forcegp.data.fields import common_header
+from forcegp.data.fields import common_stick_speeds
 from forcegp.dynamics import mass_matrix
 from forcegp.errors import check_name
 from forcegp.forces.calibration import calibrated_noise, residual_times
@@ -104,9 +104,7 @@ class Specification:
         log's header.
         """
         observations, noise = observations_of(data), self.noise
-        system = self.system.with_stick_speeds(
-            common_header([o.data.header for o in observations]).stick_speeds
-        )
+        system = self.system.with_stick_speeds(common_stick_speeds([o.data.header for o in observations]))
         learns = noise.learns_torque or self.automatic
         if learns and noise.acceleration is None and not states_noise(observations):
             noise = dataclasses.replace(noise, learn=True)

@@ -320,7 +320,7 @@ class CompiledFit(Predictor):
         flat = flat_states(self.system, q, qd, tau, active)
         self.system.robot.check_state(qdd=qdd)
         if not bool(torch.isfinite(qdd).all()):
-            raise ShapeError("qdd holds values that are not finite", expected="finite numbers")
+            raise ShapeError("qdd contains values that are not finite", expected="finite numbers")
         rows = qdd.expand(*flat.batch, nq).reshape(-1, nq)
         std = None if qdd_std is None else qdd_std.to(q).expand(nq).contiguous()
         mean, covariance = q.new_empty(*flat.batch, k), q.new_empty(*flat.batch, k, k)
