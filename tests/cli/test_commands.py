@@ -204,7 +204,7 @@ def test_from_simulation_to_evaluation(fail: Fail, tmp_path: Path) -> None:
     assert path["largest_constraint_error_m"] < 1e-3
     rolled = Dataset.read(path["file"])
     assert torch.equal(rolled.q_logged, data.q[24:85]) and torch.equal(rolled.q[0], data.q[24])
-    assert "in order of time" in fail("rollout", "-m", model, "-d", train, "-o", motion)
+    assert "in time order" in fail("rollout", "-m", model, "-d", train, "-o", motion)
     assert "constant sampling period" in fail("rollout", "-m", model, "-d", test, "-o", motion)
 
     assert "did you mean 'multiplier'?" in fail(
