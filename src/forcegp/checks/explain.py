@@ -109,15 +109,10 @@ def explain(system: ConstrainedSystem, log: Log) -> Explanation:
 
 def _round(model: Explanation) -> Explanation | None:
     """Accept the simplest hypothesis within one standard error of the best, if it explains enough."""
-    system, log = model.system, model.log
-    tried = [
-        (h, fit)
-        for h, fit in _fits(model)
-        if (h.name, h.joints) not in model.taken
-        and hypotheses.plausible(system, h, fit)
-        and not leaves_surface(system, log, corrected(log, h, fit.theta))
-    ]
-    null = model.fit
+    system, log, null = model.system, model.log, model.fit
+    fits = ((h, fit) for h, fit in _fits(model) if (h.name, h.joints) not in model.taken)
+    fits = ((h, fit) for h, fit in fits if hypotheses.plausible(system, h, fit))
+    tried = [(h, fit) for h, fit in fits if not leaves_surface(system, log, corrected(log, h, fit.theta))]
     good = [(h, fit) for h, fit in tried if significant(fit.shares, null.shares, len(h.joints) or log.nq)]
     if not good:
         return None
@@ -131,13 +126,9 @@ def _round(model: Explanation) -> Explanation | None:
         if not hypotheses.plausible(system, chosen, fit):
             return replace(model, taken=model.taken | {(chosen.name, chosen.joints)})
     # The errors of an arm and of its mirror image are equal but for rounding.
-    alike = [
-        joint
-        for other, its in near
-        if other.name == chosen.name and np.allclose(its.error, fit.error, rtol=SAME, atol=0.0)
-        for joint in other.joints
-    ]
-    finding = hypotheses.finding_of(system, log, chosen, fit, tuple(dict.fromkeys(alike)))
+    twins = (h for h, its in near if h.name == chosen.name and np.allclose(its.error, fit.error, SAME, 0.0))
+    alike = tuple(dict.fromkeys(joint for twin in twins for joint in twin.joints))
+    finding = hypotheses.finding_of(system, log, chosen, fit, alike)
     alternatives = alternatives_of(system, (chosen, fit), tried, null)
     finding = with_alternatives(finding, [hypotheses.finding_of(system, log, *pair) for pair in alternatives])
     return _accepted(model, chosen, fit.theta, finding)

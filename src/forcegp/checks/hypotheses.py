@@ -121,10 +121,9 @@ def delayed(log: Log, shift: int, joints: tuple[int, ...] = ()) -> Log:
     tau, lost = log.tau.copy(), np.ones(len(log), bool)
     columns = list(joints) or list(range(log.nq))
     for s in log.stretches:
-        source = np.arange(s.start, s.stop) + shift
-        inside = (source >= s.start) & (source < s.stop)
-        tau[np.ix_(source[inside] - shift, columns)] = log.tau[np.ix_(source[inside], columns)]
-        lost[s] = ~inside
+        rows = np.arange(max(s.start, s.start - shift), min(s.stop, s.stop - shift))
+        tau[np.ix_(rows, columns)] = log.tau[np.ix_(rows + shift, columns)]
+        lost[rows] = False
     return log.replace(tau=tau).mask(lost)
 
 
@@ -282,11 +281,10 @@ def finding_of(
     system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: TorqueFit, alike: tuple[int, ...] = ()
 ) -> Finding:
     """Return the finding of a hypothesis; `alike` are the joints of equivalent hypotheses."""
-    name, theta, spread = hypothesis.name, fit.theta, fit.spread
+    name, theta, spread, evidence = hypothesis.name, fit.theta, fit.spread, dict[str, float]()
     one_of = name == "joint-sign" and len(alike) > 1
     names = tuple(log.joint_names[j] for j in (alike if one_of else hypothesis.joints))
     listed = "all joints" if len(names) == log.nq > 1 else (" or " if one_of else " and ").join(names)
-    evidence: dict[str, float] = {}
     if name == "gains":
         return _gains(log, names, 1.0 + theta[: len(names)])
     if name == "gravity":
@@ -295,9 +293,9 @@ def finding_of(
         text = DISCRETE[name].format(listed)
     elif name == "torque-delay":
         rows, seconds = abs(hypothesis.shift), abs(hypothesis.shift) * log.dt
+        about = "about" if rows < LAGS[-1] else "at least"
         word = "after" if hypothesis.shift > 0 else "before"
         which = f" of {listed}" if hypothesis.joints else ""
-        about = "about" if rows < LAGS[-1] else "at least"
         text = f"the torque{which} is logged {about} {1e3 * seconds:.3g} ms ({rows} rows) {word} the motion"
         evidence = {"rows": hypothesis.shift, "seconds": seconds}
     elif name == "encoder-offset":

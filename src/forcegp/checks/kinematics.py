@@ -115,15 +115,12 @@ def check_clock_unit(system: ConstrainedSystem, log: Log) -> Outcome:
         near = any(abs(factor / unit - 1.0) <= UNIT_TOLERANCE for unit in UNITS)
         return _clock_finding(log, factor) if near or _one_factor(first, factor) else ([], log)
     second = match(log, "qd", "qdd")
-    if second is None or not (first.moving & second.moving).any():
+    if second is None or not (both := first.moving & second.moving).any():
         return [], log
-    if factor <= 0.0 or abs(factor - 1.0) <= TOLERANCE or not first.right(factor)[first.moving].all():
-        return [], log
-    both = first.moving & second.moving
+    off = factor > 0.0 and abs(factor - 1.0) > TOLERANCE and first.right(factor)[first.moving].all()
     # The velocity alone being off leaves the acceleration its derivative.
-    if second.right()[both].mean() > 0.5 or second.right(factor)[both].mean() < 0.5:
-        return [], log
-    return _clock_finding(log, factor)
+    off = off and second.right()[both].mean() <= 0.5 <= second.right(factor)[both].mean()
+    return _clock_finding(log, factor) if off else ([], log)
 
 
 def _clock_finding(log: Log, factor: float) -> Outcome:
@@ -163,17 +160,14 @@ def check_velocity(system: ConstrainedSystem, log: Log) -> Outcome:
     wrong = level.moving & (~level.right() | (np.abs(level.correlation) < RELATED)) & ~_coarse(log, level)
     if not wrong.any():
         if late := _late(log, level):
-            computed = log.derived | {*log.header.derived}
-            log = derive(log, ["qd", "qdd"] if "qdd" in computed else ["qd"])
+            log = derive(log, ["qd", "qdd"] if "qdd" in log.derived | {*log.header.derived} else ["qd"])
         return late, log
     if "qd" in log.header.derived:
         return _mismatch("filter-wide", log, level, wrong, "qd", "q"), log
-    permutation = _permutation(level)
-    if permutation is not None:
+    if (permutation := _permutation(level)) is not None:
         rates, moved = match(log, "qd", "qdd"), permutation != np.arange(log.nq)
-        findings = log.on_joints(
-            "velocity-order", moved, "the velocities of {} belong to each other's positions"
-        )
+        text = "the velocities of {} belong to each other's positions"
+        findings = log.on_joints("velocity-order", moved, text)
         follows = rates is not None and np.median(rates.correlation[moved]) > RELATED
         qdd = log.qdd[:, permutation] if follows else log.qdd  # where they had the order of the wrong ones
         return findings, log.replace(qd=log.qd[:, permutation], qdd=qdd)
@@ -197,32 +191,25 @@ def _late(log: Log, level: Match) -> list[Finding]:
 
 def _velocity_findings(log: Log, level: Match, wrong: np.ndarray) -> tuple[list[Finding], Array]:
     """Return one finding per cause, and the factors that undo it."""
-    causes = (
-        ("velocity-sign", -1.0, "runs against"),
-        ("degrees", 1.0 / DEGREE, "is 1/57 of"),
-        ("degrees", DEGREE, "is 57 times"),
-    )
+    causes = ("velocity-sign", -1.0, "runs against"), ("degrees", 1.0 / DEGREE, "is 1/57 of")
     findings, factor, unexplained = [], np.ones(log.nq), wrong.copy()
-    for kind, slope, what in causes:
+    for kind, slope, what in (*causes, ("degrees", DEGREE, "is 57 times")):
         hit = unexplained & level.right(slope) & (np.abs(level.correlation) >= RELATED)
         if hit.any():
-            text, median = f"qd of {{}} {what} the rate of change of q", float(np.median(level.low[hit]))
-            findings += log.on_joints(kind, hit, text, slope=median)
+            text = f"qd of {{}} {what} the rate of change of q"
+            findings += log.on_joints(kind, hit, text, slope=np.median(level.low[hit]))
             factor[hit], unexplained = slope, unexplained & ~hit
-    if unexplained.any():
-        findings += _mismatch("velocity-mismatch", log, level, unexplained, "qd", "q")
-    return findings, factor
+    return findings + _mismatch("velocity-mismatch", log, level, unexplained, "qd", "q"), factor
 
 
 def _mismatch(kind: str, log: Log, level: Match, wrong: np.ndarray, rate: str, value: str) -> list[Finding]:
-    """Return a rate without relation to its value."""
-    j = int(np.flatnonzero(wrong)[0])
+    """Return a rate without relation to its value, if any."""
+    j = int(np.argmax(wrong))
     numbers = {"slope": level.low[j], "correlation": level.correlation[j]}
     shown = ", ".join(f"{name} {number:.3g}" for name, number in numbers.items())
     is_not = "was computed by a filter and has not" if kind == "filter-wide" else "is not"
-    return log.on_joints(
-        kind, wrong, f"{rate} of {{}} {is_not} the rate of change of {value}: {shown}", **numbers
-    )
+    text = f"{rate} of {{}} {is_not} the rate of change of {value}: {shown}"
+    return log.on_joints(kind, wrong, text, **numbers)
 
 
 def _coarse(log: Log, level: Match) -> np.ndarray:
@@ -333,9 +320,8 @@ def check_noise(system: ConstrainedSystem, log: Log) -> Outcome:
         evidence["stated_std"] = stated
         filtered &= top < stated / NOISE_FACTOR
     if filtered.mean() > 0.5 and not log.header.filtered:
-        share = f"{100 * np.median(top / middle):.2g} % of the noise that it holds at a third of them"
-        high = f"at the highest frequencies it holds {share}"
-        text = f"the acceleration is filtered: {high}, so it is not white"
+        high = f"at the highest frequencies it holds {100 * np.median(top / middle):.2g} % of the noise"
+        text = f"the acceleration is filtered: {high} that it holds at a third of them, so it is not white"
         # Without a claim of white noise a filter contradicts nothing, but a likelihood has to know.
         weight = "note" if stated is None else "warning"
         finding = log.finding("noise-filtered", text, log.named(filtered), **evidence)
@@ -347,7 +333,7 @@ def check_noise(system: ConstrainedSystem, log: Log) -> Outcome:
         kinds.append(("noise-overstated", top < stated / NOISE_FACTOR, np.min))
     findings = []
     for kind, wrong, worst in (one for one in kinds if one[1].any()):
-        place = f"{worst(top[wrong]):.3g} rad/s² at {{}}"
-        text = f"the noise of qdd is {place}, and the header states {stated:.3g}"
+        size = f"{worst(top[wrong]):.3g} rad/s²"
+        text = f"the noise of qdd is {size} at {{}}, and the header states {stated:.3g}"
         findings += log.on_joints(kind, wrong, text, **evidence)
     return findings, log

@@ -44,7 +44,7 @@ def check_degrees(system: ConstrainedSystem, log: Log) -> Outcome:
         return [], log
     factor = np.where(turning, DEGREE, 1.0)
     # Velocities follow the angles where they are their derivative; the check of units comes after.
-    radians = log.replace(**{name: getattr(log, name) * factor for name in _angles(log, turning)})
+    radians = log.replace(**{name: getattr(log, name) * factor for name in _angles(log)})
     if _misfit(system, radians) > _misfit(system, log):
         return [], log
     beyond = f"beyond the joint limits in {100 * outside:.0f} % of the rows"
@@ -62,14 +62,13 @@ def _misfit(system: ConstrainedSystem, log: Log) -> float:
     return float(fit.score.mean())
 
 
-def _angles(log: Log, turning: np.ndarray) -> list[str]:
+def _angles(log: Log) -> list[str]:
     """Return the columns in degrees where angles are: velocities that are the derivative of the angles."""
     columns = ["q"]
     for name, source in (("qd", "q"), ("qdd", "qd")):
-        step = [np.abs(np.diff(getattr(log, source)[s], axis=0)).sum() for s in log.stretches]
-        path = [np.abs(getattr(log, name)[s]).sum() * log.dt for s in log.stretches]
-        if source in columns and sum(path) > 0.1 * sum(step):
-            columns.append(name)
+        step = sum(np.abs(np.diff(getattr(log, source)[s], axis=0)).sum() for s in log.stretches)
+        path = sum(np.abs(getattr(log, name)[s]).sum() * log.dt for s in log.stretches)
+        columns += [name] if source in columns and path > 0.1 * step else []
     return columns
 
 
