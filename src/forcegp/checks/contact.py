@@ -182,7 +182,9 @@ def _labels(
     moving = closed & (np.linalg.norm(path.v, axis=1) > CREEP)
     slow = max(CREEP, ROUGH * float(robust_std(path.approach[moving])) if moving.any() else 0.0)
     findings = []
-    for kind, rows in _runs_off(path.approach, closed, c, touch, slow, log).items():
+    # Rows that are masked, as at the impact of a landing tip, do not end an interval.
+    label, off = log.contact[contact.name] & np.isfinite(c), closed & (np.abs(c) > touch)
+    for kind, rows in _runs_off(path.approach, label, off, c, touch, slow, log).items():
         if rows:
             most = max(float(np.abs(c[a:b]).max()) for a, b in rows)
             where = f"by up to {1e3 * most:.3g} mm, in {describe(rows)}"
@@ -193,14 +195,13 @@ def _labels(
 
 
 def _runs_off(
-    approach: Array, closed: np.ndarray, c: Array, touch: float, slow: float, log: Log
+    approach: Array, label: np.ndarray, off: np.ndarray, c: Array, touch: float, slow: float, log: Log
 ) -> dict[str, Intervals]:
     """Return runs labelled closed off the surface, by kind of finding, extended until the tip settles."""
     settled = approach <= slow
     least = max(2, round(RUN_SECONDS / log.dt)) if np.isfinite(log.dt) else 2
-    off = closed & (np.abs(c) > touch)
     runs: dict[str, Intervals] = dict.fromkeys(OFF, ())
-    for start, stop in intervals(closed):
+    for start, stop in intervals(label):
         for a, b in intervals(off[start:stop], join=least):
             if b - a < least:
                 continue

@@ -161,14 +161,12 @@ def _fits(model: Explanation) -> Iterator[Tried]:
     if len(model.prior):
         # Once the robot is at fault and its parameters are free, they bend to any sign and order. A delay
         # leaves the motion, and with it the columns of the robot's parameters, as they are.
-        for hypothesis in hypotheses.delays(log):
-            yield hypothesis, cross_validate(model.on(hypothesis.change(log)), model.columns, model.prior)
-        yield from ((h, fit) for h in _joint_delays(model) if (fit := _beside_friction(model, h)))
+        yield from ((h, fit) for h in _delays(model) if (fit := _beside_friction(model, h)))
         tried = hypotheses.robot_hypotheses(system, log, rows)
     else:
         few = model.rows[::SCREENING]
         null = cross_validate(model.on(log, few)).score.mean()
-        for hypothesis in (*hypotheses.discrete(log), *_joint_delays(model)):
+        for hypothesis in (*hypotheses.discrete(log), *_delays(model)):
             changed = hypothesis.change(log)
             if cross_validate(model.on(changed, few)).score.mean() < null:
                 yield hypothesis, cross_validate(model.on(changed))
@@ -176,6 +174,8 @@ def _fits(model: Explanation) -> Iterator[Tried]:
     off = []
     for hypothesis in tried:
         fit = model.with_(hypothesis)
+        if hypotheses.is_tilt(system, hypothesis, fit) and not _beside_size(model, hypothesis, fit):
+            continue
         yield hypothesis, fit
         if hypothesis.name == "gains" and significant(fit.shares, model.fit.shares, 1):
             off += hypothesis.joints
@@ -186,19 +186,20 @@ def _fits(model: Explanation) -> Iterator[Tried]:
         yield from _currents(model)
 
 
-def _joint_delays(model: Explanation) -> Iterator[Hypothesis]:
-    """For each joint, the delays of its torque that leave least unexplained on the screened rows, if any."""
+def _delays(model: Explanation) -> Iterator[Hypothesis]:
+    """Yield the delays of all torques, and of each, that leave least unexplained on the screened rows."""
     log, few = model.log, model.rows[::SCREENING]
     problem, columns = model.on(log, few), model.columns[::SCREENING]
     null = cross_validate(problem, columns, model.prior).score.mean()
-    for j in range(log.nq if log.nq > 1 and log.stretches else 0):
-        scores, only = {}, np.arange(log.nq) == j
-        for shift in hypotheses.LAGS:
+    alone = [(j,) for j in range(log.nq if log.nq > 1 else 0)]
+    for joints in ((), *alone) if log.stretches else ():
+        scores, only = {}, np.isin(np.arange(log.nq), joints) | (not joints)
+        for shift in (*hypotheses.LAGS, *([] if joints else [-lag for lag in hypotheses.LAGS])):
             r = problem.r + only * (log.tau[few] - log.tau[few + shift])
             scores[shift] = cross_validate(replace(problem, r=r), columns, model.prior).score.mean()
         for shift in sorted((k for k in scores if scores[k] < null), key=scores.__getitem__)[:DELAYS]:
-            change = partial(hypotheses.delayed, shift=shift, joints=(j,))
-            yield Hypothesis("torque-delay", 1, change, joints=(j,), shift=shift)
+            change = partial(hypotheses.delayed, shift=shift, joints=joints)
+            yield Hypothesis("torque-delay", 1, change, joints=joints, shift=shift)
 
 
 def _beside_friction(model: Explanation, late: Hypothesis) -> TorqueFit | None:
@@ -206,7 +207,15 @@ def _beside_friction(model: Explanation, late: Hypothesis) -> TorqueFit | None:
     changed = replace(model, problem=model.on(late.change(model.log)))
     shapes = hypotheses.shape_columns(model.system, model.log, model.rows)
     better, worse = (one.with_nuisance(shapes).fit.shares for one in (changed, model))
-    return changed.fit if significant(better, worse, 1) else None
+    return changed.fit if significant(better, worse, len(late.joints) or model.log.nq) else None
+
+
+def _beside_size(model: Explanation, tilt: Hypothesis, fit: TorqueFit) -> bool:
+    """Return whether gravity of another size, for which wrong masses pass, explains less than a tilt."""
+    assert tilt.columns is not None and tilt.prior is not None
+    along = model.system.robot.gravity.numpy()[:, None]
+    size = model.with_(replace(tilt, columns=tilt.columns @ along, prior=tilt.prior[:1]))
+    return significant(fit.shares, size.shares, model.log.nq)
 
 
 def _currents(model: Explanation) -> Iterator[Tried]:

@@ -128,7 +128,7 @@ def delayed(log: Log, shift: int, joints: tuple[int, ...] = ()) -> Log:
 
 
 def discrete(log: Log) -> Iterator[Hypothesis]:
-    """Yield hypotheses without parameters: signs, orders and delays."""
+    """Yield hypotheses without parameters: signs and orders."""
     every, motion = tuple(range(log.nq)), ("q", "qd", "qdd")
     if log.nq > 1:
         yield Hypothesis("torque-sign", 0, partial(changed, names=("tau",), flip=every), joints=every)
@@ -139,13 +139,6 @@ def discrete(log: Log) -> Iterator[Hypothesis]:
     for pair in combinations(every, 2):
         yield Hypothesis("torque-order", 0, partial(changed, names=("tau",), order=pair), joints=pair)
         yield Hypothesis("joint-order", 0, partial(changed, names=(*motion, "tau"), order=pair), joints=pair)
-    yield from delays(log)
-
-
-def delays(log: Log) -> Iterator[Hypothesis]:
-    """Yield hypotheses of torques logged before or after the motion."""
-    for shift in (sign * lag for lag in (LAGS if log.stretches else ()) for sign in (1, -1)):
-        yield Hypothesis("torque-delay", 1, partial(delayed, shift=shift), shift=shift)
 
 
 def continuous(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterator[Hypothesis]:
@@ -343,6 +336,13 @@ def _gravity(system: ConstrainedSystem, log: Log, change: Array) -> Finding:
     tilted = strength > 0.0 and angle <= TILT
     text = f"the torque fits with gravity ({vector}) m/s², {angle:.3g}° from the scene's"
     return log.finding("base-tilted" if tilted else "gravity-direction", text, **evidence)
+
+
+def is_tilt(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit) -> bool:
+    """Return whether a hypothesis turns gravity by a small angle."""
+    assumed = system.robot.gravity.numpy()
+    angle, size = _turn(assumed, assumed + fit.theta[:3]) if hypothesis.name == "gravity" else (np.inf, 0.0)
+    return bool(assumed.any()) and angle <= TILT and size >= WEIGHTLESS
 
 
 def _turn(assumed: Array, fitted: Array) -> tuple[float, float]:

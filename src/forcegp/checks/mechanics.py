@@ -139,7 +139,9 @@ def _friction(robot: RobotModel, explanation: Explanation) -> list[Finding]:
     resists = ((viscous + damping) * speeds + coulomb + declared > 0.0).all(axis=0)
     spread = explanation.fit.nuisance_spread
     significant = np.array([_matters(explanation, j, [j, nq + j]) for j in range(nq)])
-    significant &= resists & ~still_joints(log)
+    # Within the rise of declared friction, whose law is rarely known, a slow joint shows nothing beyond it.
+    rising = (speeds[1] <= robot.friction_velocity.numpy()) & (declared > 0.0)
+    significant &= resists & ~still_joints(log) & ~rising
     findings = []
     for hit, word in ((significant & (power > 0.0), "more"), (significant & (power <= 0.0), "less")):
         evidence, parts = {}, []

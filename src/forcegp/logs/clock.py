@@ -45,12 +45,9 @@ def drop_repeated(signals: Signals, report: ImportReport) -> None:
     different = np.flatnonzero(same & ~equal)
     if len(different):
         rows = signals.row[different]
-        raise DataError(
-            f"{describe(numbered(rows))}: the time stamp of the row before, with other values",
-            expected="one row per time stamp",
-            got=f"{len(rows)} such rows",
-            hint="is this the correct time column? Its resolution may be too coarse",
-        )
+        text = f"{describe(numbered(rows))}: the time stamp of the row before, with other values"
+        hint = "is this the correct time column? Its resolution may be too coarse"
+        raise DataError(text, expected="one row per time stamp", got=f"{len(rows)} such rows", hint=hint)
     report.find("repeated", f"{equal.sum()} repeated rows were dropped", signals.row[equal])
     signals.keep(~equal)
 
@@ -113,11 +110,9 @@ def join_stream(
     """Add an interpolated vector from a stream with stamps t `(k,)`; rows outside its range are dropped."""
     back = np.flatnonzero(np.diff(t) <= 0.0)
     if len(back):
-        raise DataError(
-            f"the stream of {name} has a clock that does not increase in row {back[0] + 1}",
-            expected="increasing stamps, to align it with the positions",
-            hint="import the trajectories separately",
-        )
+        text = f"the stream of {name} has a clock that does not increase in row {back[0] + 1}"
+        expected = "increasing stamps, to align it with the positions"
+        raise DataError(text, expected=expected, hint="import the trajectories separately")
     longest = gap if gap is not None else GAP_STEPS * usual_step(t)
     after = np.searchsorted(t, signals.t, side="left").clip(1, len(t) - 1)
     covered = (signals.t >= t[0]) & (signals.t <= t[-1])

@@ -171,12 +171,10 @@ class _Gathering:
             return
         rows = signals.row[bad]
         if self.time.missing == "error":
-            raise DataError(
-                f"{self.table.source}: values are missing or not finite in {describe(numbered(rows))}",
-                expected="a number in every mapped column",
-                got=f"{len(rows)} incomplete rows of {len(signals)}",
-                hint='missing = "drop" under [time] drops them',
-            )
+            text = f"{self.table.source}: values are missing or not finite in {describe(numbered(rows))}"
+            expected, hint = "a number in every mapped column", 'missing = "drop" under [time] drops them'
+            got = f"{len(rows)} incomplete rows of {len(signals)}"
+            raise DataError(text, expected=expected, got=got, hint=hint)
         self.report.find("missing", f"{len(rows)} incomplete rows were dropped", rows)
         signals.keep(~bad)
 

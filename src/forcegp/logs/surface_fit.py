@@ -234,10 +234,8 @@ def _sphere(contact: str, points: Array, towards: Array, tip: Tip) -> SurfaceFit
     std = {"center": float(np.sqrt(np.diag(cov)[:3].max())), "radius": float(np.sqrt(cov[3, 3]))}
     std |= tip.std(solution)
     if not (std["radius"] < 0.5 * radius and (middle - center) @ towards > 0.0):
-        raise DataError(
-            "the path does not determine a sphere for contact from outside",
-            got=f"radius {radius:.4g} ± {std['radius']:.2g} m",
-            hint="fit a plane, or slide over a larger part of the sphere",
-        )
+        text, got = "the path does not determine a sphere for contact from outside", f"radius {radius:.4g}"
+        hint = "fit a plane, or slide over a larger part of the sphere"
+        raise DataError(text, got=f"{got} ± {std['radius']:.2g} m", hint=hint)
     sphere = Sphere(tuple(float(c) for c in center), radius)
     return SurfaceFit(contact, sphere, std, solution, tip.of(x))

@@ -57,11 +57,9 @@ def _array(source: str, name: str, file: Any, size: int) -> Arrays:
         raise DataError(f"{source}: version {version} of the NumPy format is not read")
     shape, fortran, dtype = read_header(file)  # pyright: ignore[reportArgumentType]
     if dtype.hasobject:
-        raise DataError(
-            f"{source}: refused, because an array of Python objects is a pickle, which can run code",
-            expected="an array of numbers",
-            hint="save each quantity as a separate array",
-        )
+        text = f"{source}: refused, because an array of Python objects is a pickle, which can run code"
+        hint = "save each quantity as a separate array"
+        raise DataError(text, expected="an array of numbers", hint=hint)
     count = int(np.prod(shape, dtype=object)) if shape else 1
     guards.check_count(source, "numbers", count, limits.LOG_VALUES)
     if count * dtype.itemsize > size:

@@ -196,11 +196,9 @@ def _files(path: Path) -> list[Path]:
     check_count(str(description), "bytes", description.stat().st_size, limits.LISTING_BYTES)
     text = description.read_text(encoding="utf-8", errors="replace")
     if compression := re.search(r"compression_mode:\s*[\"']?(file|message)", text, re.IGNORECASE):
-        raise DataError(
-            f"{path}: the bag is compressed by {compression[1].lower()}",
-            expected="a bag without compression, or MCAP with compressed chunks",
-            hint="unpack it with `ros2 bag convert`",
-        )
+        text = f"{path}: the bag is compressed by {compression[1].lower()}"
+        expected = "a bag without compression, or MCAP with compressed chunks"
+        raise DataError(text, expected=expected, hint="unpack it with `ros2 bag convert`")
     return [file for file in files if file != description]
 
 
