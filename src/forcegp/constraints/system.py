@@ -143,12 +143,17 @@ class ConstrainedSystem:
         return self.contacts[self.contact_names.index(name)]
 
     @cached_property
+    def rows(self) -> dict[str, slice]:
+        """Constraint rows of each constraint, by name."""
+        ends = itertools.accumulate(contact.rows for contact in self.contacts)
+        return {c.name: slice(end - c.rows, end) for c, end in zip(self.contacts, ends, strict=True)}
+
+    @cached_property
     def may_stick(self) -> list[tuple[int, SurfaceContact, slice]]:
         """The contacts that may stick: index, contact and its two tangential rows."""
-        ends = itertools.accumulate(contact.rows for contact in self.contacts)
         return [
-            (k, contact, slice(end - 2, end))
-            for k, (contact, end) in enumerate(zip(self.contacts, ends, strict=True))
+            (k, contact, slice(rows.start + 1, rows.stop))
+            for k, (contact, rows) in enumerate(zip(self.contacts, self.rows.values(), strict=True))
             if isinstance(contact, SurfaceContact) and contact.stick_speed is not None
         ]
 
@@ -237,7 +242,7 @@ class ConstrainedSystem:
             raise ShapeError("q and qd have different batch shapes", expected=[*q.shape], got=[*qd.shape])
         poses, motion, point_motion = self._moving(q, qd)
         robot_terms = dynamics.known_terms(robot, poses, motion, qd)
-        return self._assembled(q, qd, active, robot_terms, point_motion, lambda: (poses, motion))
+        return self._assembled(q, qd, active, robot_terms, point_motion, lambda: poses)
 
     def _assembled(
         self,
@@ -246,7 +251,7 @@ class ConstrainedSystem:
         active: Tensor | None,
         robot_terms: tuple[Tensor, Tensor, Tensor, Tensor],
         point_motion: Callable[[str, Sequence[float]], PointMotion],
-        links: Callable[[], tuple[LinkPoses, LinkMotion]],
+        link_poses: Callable[[], LinkPoses],
     ) -> Equations:
         """Return the equations of motion from M, Q_C, Q_G, Q_D and the motion of the points."""
         terms = self._terms(point_motion)
@@ -254,7 +259,7 @@ class ConstrainedSystem:
         touching = zip(self.contact_names, (term.point for term in terms), strict=True)
         points = {name: point for name, point in touching if point is not None}
         M, Q_C, Q_G, Q_D = robot_terms
-        return Equations(M, A, b, c, cd, Q_C, Q_G, Q_D, points, point_motion, links, holds)
+        return Equations(M, A, b, c, cd, Q_C, Q_G, Q_D, points, point_motion, link_poses, holds)
 
     def linearize(
         self, q: JointVector, qd: JointVector, force: JointVector, active: Tensor | None = None
