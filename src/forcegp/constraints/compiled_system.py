@@ -67,7 +67,7 @@ class CompiledSystem(ConstrainedSystem):
             return self._moving(q, qd)[2](frame, point) if known is None else known
 
         robot_terms = M, Q_C, Q_G, dynamics.damping_force(self.robot, qd)
-        return self._assembled(q, qd, active, robot_terms, point_motion, lambda: self._moving(q, qd)[0])
+        return self._assembled(q, qd, active, robot_terms, point_motion, lambda: self._moving(q, qd)[:2])
 
 
 def compiled_system(system: ConstrainedSystem, *points: Anchor) -> ConstrainedSystem:

@@ -27,7 +27,7 @@ from torch.nn.functional import normalize
 from forcegp import dynamics
 from forcegp.derivatives import inverse_dynamics_derivatives
 from forcegp.errors import MassMatrixError
-from forcegp.kinematics import LinkPoses, PointMotion
+from forcegp.kinematics import LinkMotion, LinkPoses, PointMotion
 from forcegp.robot.model import RobotModel
 from forcegp.types import ConstraintInverse, ConstraintMatrix, ConstraintVector, JointMatrix, JointVector
 
@@ -113,7 +113,7 @@ class Equations:
         Q_C, Q_G, Q_D: `(*batch, nq)` bias, gravity and dissipative joint force.
         contact_points: contact point of each surface contact, by name.
         point_motion: function that returns the motion of a point `(frame, point)` at the states.
-        link_poses: function that returns the poses of the links at the states.
+        links: function that returns the poses and the motion of the links at the states.
         holds: `(*batch, m)` bool, rows of A that apply: those of closed contacts, including tangential rows
             if they stick.
     """
@@ -128,13 +128,22 @@ class Equations:
     Q_D: JointVector
     contact_points: dict[str, ContactPoint]
     point_motion: Callable[[str, Sequence[float]], PointMotion]
-    link_poses: Callable[[], LinkPoses]
+    links: Callable[[], tuple[LinkPoses, LinkMotion]]
     holds: Tensor
 
     @cached_property
+    def _links(self) -> tuple[LinkPoses, LinkMotion]:
+        return self.links()
+
+    @property
     def poses(self) -> LinkPoses:
         """Poses of the links."""
-        return self.link_poses()
+        return self._links[0]
+
+    @property
+    def motion(self) -> LinkMotion:
+        """Velocities of the links."""
+        return self._links[1]
 
     @cached_property
     def M_cholesky(self) -> JointMatrix:

@@ -242,7 +242,7 @@ class ConstrainedSystem:
             raise ShapeError("q and qd have different batch shapes", expected=[*q.shape], got=[*qd.shape])
         poses, motion, point_motion = self._moving(q, qd)
         robot_terms = dynamics.known_terms(robot, poses, motion, qd)
-        return self._assembled(q, qd, active, robot_terms, point_motion, lambda: poses)
+        return self._assembled(q, qd, active, robot_terms, point_motion, lambda: (poses, motion))
 
     def _assembled(
         self,
@@ -251,7 +251,7 @@ class ConstrainedSystem:
         active: Tensor | None,
         robot_terms: tuple[Tensor, Tensor, Tensor, Tensor],
         point_motion: Callable[[str, Sequence[float]], PointMotion],
-        link_poses: Callable[[], LinkPoses],
+        links: Callable[[], tuple[LinkPoses, LinkMotion]],
     ) -> Equations:
         """Return the equations of motion from M, Q_C, Q_G, Q_D and the motion of the points."""
         terms = self._terms(point_motion)
@@ -259,7 +259,7 @@ class ConstrainedSystem:
         touching = zip(self.contact_names, (term.point for term in terms), strict=True)
         points = {name: point for name, point in touching if point is not None}
         M, Q_C, Q_G, Q_D = robot_terms
-        return Equations(M, A, b, c, cd, Q_C, Q_G, Q_D, points, point_motion, link_poses, holds)
+        return Equations(M, A, b, c, cd, Q_C, Q_G, Q_D, points, point_motion, links, holds)
 
     def linearize(
         self, q: JointVector, qd: JointVector, force: JointVector, active: Tensor | None = None

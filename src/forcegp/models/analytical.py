@@ -15,7 +15,7 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
-from forcegp.errors import ForceGPError, ModelError
+from forcegp.errors import ModelError
 from forcegp.files import Record
 from forcegp.forces.measurements import Observation, measurement_of
 from forcegp.forces.priors.joint import AnalyticalMean
@@ -171,10 +171,8 @@ class AnalyticalFit(FittedModel):
         settings = header.settings_as(AnalyticalSettings, source)
         original = system.with_robot(take_robot(tensors, "start.", system.robot, source))
         window = Window(relative=settings.relative, length=settings.length, angle=settings.angle)
-        try:
+        with ModelError.within(f"{source}: field 'settings.analytical_parameters'"):
             model = AnalyticalModel(original, settings.analytical_parameters, window, settings.seed)
-        except ForceGPError as cause:
-            raise ModelError.at(f"{source}: field 'settings.analytical_parameters'", cause) from cause
         theta = model.parameters
         state = {
             name: take(tensors, name, tuple(old.shape), old.dtype, source)

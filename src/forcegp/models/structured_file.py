@@ -16,7 +16,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, field_serializer
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.errors import ForceGPError, ModelError
+from forcegp.errors import ModelError
 from forcegp.files import Record
 from forcegp.forces.measurements import Measurement, Training, plain
 from forcegp.forces.noise import Noise
@@ -225,10 +225,8 @@ def _specification(
     original, parameters = take_robot(tensors, "start.", system.robot, source), None
     system = system.with_robot(original)
     if settings.analytical_parameters is not None:
-        try:
+        with ModelError.within(f"{source}: field 'settings.analytical_parameters'"):
             parameters = AnalyticalParameters(original, settings.analytical_parameters)
-        except ForceGPError as cause:
-            raise ModelError.at(f"{source}: field 'settings.analytical_parameters'", cause) from cause
     return Specification(
         system,
         AnalyticalMean(settings.mean),
