@@ -209,7 +209,8 @@ def _robot(record: RobotRecord, tensors: Mapping[str, Tensor], source: str) -> R
     for field in dataclasses.fields(RobotModel):
         if field.name not in type(record).model_fields:
             shape = tuple(sizes.get(str(n), n) for n in SHAPES.get(field.name, ("nq",)))
-            arrays[field.name] = take(tensors, PREFIX + field.name, shape, dtype, source)
+            finite = field.name not in MAY_BE_INFINITE
+            arrays[field.name] = take(tensors, PREFIX + field.name, shape, dtype, source, finite=finite)
     return RobotModel(**{name: getattr(record, name) for name in type(record).model_fields}, **arrays)
 
 
@@ -219,8 +220,10 @@ def take(
     shape: tuple[int | str, ...] | None,
     dtype: torch.dtype,
     source: str,
+    *,
+    finite: bool = True,
 ) -> Tensor:
-    """Return a tensor of a saved model; `ModelError` unless it has the type and the shape (`None`: any)."""
+    """Return a tensor of a saved model; `ModelError` unless it is finite and has the shape (`None`: any)."""
     if name not in tensors:
         raise ModelError(f"{source}: tensor {name!r} is missing")
     value = tensors[name]
@@ -230,6 +233,8 @@ def take(
             expected=f"{dtype} of shape {shape if shape is not None else 'any'}",
             got=f"{value.dtype} of shape {tuple(value.shape)}",
         )
+    if bool(value.isnan().any()) or (finite and not bool(torch.isfinite(value).all())):
+        raise ModelError(f"{source}: tensor {name!r} contains values that are not finite")
     return value
 
 
@@ -237,5 +242,6 @@ def take_robot(tensors: Mapping[str, Tensor], prefix: str, like: RobotModel, sou
     """Return a robot with tensors named `<prefix><field>`, checked by `take`, and other fields copied."""
     fields = {}
     for name, value in like.tensors.items():
-        fields[name] = take(tensors, prefix + name, tuple(value.shape), value.dtype, source)
+        shape, finite = tuple(value.shape), name not in MAY_BE_INFINITE
+        fields[name] = take(tensors, prefix + name, shape, value.dtype, source, finite=finite)
     return like.replace(**fields)
