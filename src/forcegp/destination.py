@@ -11,7 +11,7 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 
 from forcegp.errors import DestinationError, ForceGPError
-from forcegp.files import check_kind, writable
+from forcegp.files import check_kind, writable, written_folder
 
 PROBE_BYTES = 1 << 16
 """Bytes written and removed again to test for free space and quotas."""
@@ -56,6 +56,16 @@ def write_or_keep(write: Callable[[Path], object], path: str | Path) -> None:
         got=reason,
         hint=f"it was saved to {kept}; move it to its destination",
     ) from cause
+
+
+def folder_or_keep(fill: Callable[[Path], object], path: str | Path) -> None:
+    """Write a folder, whose files `fill(folder)` writes, or keep it elsewhere as `write_or_keep` does."""
+
+    def write(target: Path) -> None:
+        with written_folder(target) as temporary:
+            fill(temporary)
+
+    write_or_keep(write, path)
 
 
 def _kept(write: Callable[[Path], object], name: str) -> Path | None:

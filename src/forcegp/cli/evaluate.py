@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 import forcegp
-from forcegp.cli.common import fitted, model_table, progress_bar, read_data, save, show, warn_beyond
+from forcegp.cli.common import fitted, model_table, progress_bar, read_data, show, warn_beyond
 from forcegp.cli.options import AsJson, Config, DataFile
 from forcegp.errors import ForceGPError
 
@@ -87,19 +87,19 @@ def _written(
     names: tuple[str, str, str | None],
 ) -> dict[str, object]:
     """Write the page and its data, and print their paths; `names` are the file names in the title."""
-    from forcegp.files import write_json, written_folder
+    from forcegp.destination import folder_or_keep
+    from forcegp.files import write_json
     from forcegp.report.evaluation import PAGE, write_evaluation
     from forcegp.report.window import opening, predicted_window
 
     comparison = getattr(getattr(model, "result", None), "comparison", ())
     window = predicted_window(model, opening(test, WINDOW_SECONDS), model.kind)
 
-    def write(folder: Path) -> None:
-        with written_folder(folder) as temporary:
-            write_json(temporary / "evaluation.json", scores.to_dict())
-            write_evaluation(temporary, *names, scores, window, comparison)
+    def fill(folder: Path) -> None:
+        write_json(folder / "evaluation.json", scores.to_dict())
+        write_evaluation(folder, *names, scores, window, comparison)
 
-    save(write, out)
+    folder_or_keep(fill, out)
     return {"file": str(out / "evaluation.json"), "page": str(out / PAGE)}
 
 

@@ -71,7 +71,6 @@ def excite(
     from forcegp.models.calibrated import unknowns_after
     from forcegp.models.load import load_model
     from forcegp.models.structured_fit import StructuredFit
-    from forcegp.robot.load import BUNDLED
     from forcegp.robot.shapes import shapes_of
     from forcegp.scene import load_scene
     from forcegp.simulate.collisions import Collisions
@@ -83,10 +82,8 @@ def excite(
     page = out.with_suffix(".html")
     check_output(page)
     read = load_scene(scene)
-    system, named = read.system(), read.sections.robot.model
-    shapes = shapes_of(
-        system.robot, named if named in BUNDLED else read.folder / named, ("collision", "visual")
-    )
+    system = read.system()
+    shapes = shapes_of(system.robot, read.robot_source, ("collision", "visual"))
     fit = None if model is None else load_model(model)
     if fit is not None:
         if not isinstance(fit, StructuredFit):

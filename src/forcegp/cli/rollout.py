@@ -51,8 +51,7 @@ def rollout(
 
     forcegp rollout -m model -d run.parquet --start 2400 --samples 50 -o rollout/
     """
-    from forcegp.destination import check_destination
-    from forcegp.files import written_folder
+    from forcegp.destination import check_destination, folder_or_keep
     from forcegp.report.page import label
     from forcegp.report.rollouts import rollout_data, write_rollouts
     from forcegp.rollout import beside_log
@@ -71,12 +70,11 @@ def rollout(
     compared = rollout_data(beside_log(regression.kind, path, log, dt))
     step = f"rolled out by the model in {model} from row {start}"
 
-    def write(folder: Path) -> None:
-        with written_folder(folder) as temporary:
-            rolled.with_step(step).write(temporary / "rollout.parquet")
-            write_rollouts(temporary, f"{label(regression.kind)} rolled out on {data}", compared)
+    def fill(folder: Path) -> None:
+        rolled.with_step(step).write(folder / "rollout.parquet")
+        write_rollouts(folder, f"{label(regression.kind)} rolled out on {data}", compared)
 
-    save(write, out)
+    folder_or_keep(fill, out)
     written = {"page": str(out / "rollout.html"), "file": str(out / "rollout.parquet")}
     show({**_figures(path, rolled, dt), **written}, as_json)
 

@@ -90,7 +90,6 @@ def view(
 
 def _target(target: str) -> tuple[forcegp.ConstrainedSystem, FittedModel | None, list[Shape]]:
     """Return the system, the model if the target is one, and the shapes of the robot."""
-    from forcegp.robot.load import BUNDLED
     from forcegp.robot.shapes import shapes_of
     from forcegp.storage.model_file import model_path
 
@@ -98,8 +97,8 @@ def _target(target: str) -> tuple[forcegp.ConstrainedSystem, FittedModel | None,
         model = forcegp.load_model(target)
         return model.system, model, shapes_of(model.system.robot)
     scene = forcegp.load_scene(target)
-    system, named = scene.system(), scene.sections.robot.model
-    return system, None, shapes_of(system.robot, named if named in BUNDLED else scene.folder / named)
+    system = scene.system()
+    return system, None, shapes_of(system.robot, scene.robot_source)
 
 
 def _stretch(log: Path, system: forcegp.ConstrainedSystem, start: int, seconds: float) -> forcegp.Dataset:

@@ -143,12 +143,17 @@ class ConstrainedSystem:
         return self.contacts[self.contact_names.index(name)]
 
     @cached_property
+    def rows(self) -> dict[str, slice]:
+        """Constraint rows of each constraint, by name."""
+        ends = itertools.accumulate(contact.rows for contact in self.contacts)
+        return {c.name: slice(end - c.rows, end) for c, end in zip(self.contacts, ends, strict=True)}
+
+    @cached_property
     def may_stick(self) -> list[tuple[int, SurfaceContact, slice]]:
         """The contacts that may stick: index, contact and its two tangential rows."""
-        ends = itertools.accumulate(contact.rows for contact in self.contacts)
         return [
-            (k, contact, slice(end - 2, end))
-            for k, (contact, end) in enumerate(zip(self.contacts, ends, strict=True))
+            (k, contact, slice(rows.start + 1, rows.stop))
+            for k, (contact, rows) in enumerate(zip(self.contacts, self.rows.values(), strict=True))
             if isinstance(contact, SurfaceContact) and contact.stick_speed is not None
         ]
 

@@ -85,8 +85,7 @@ def normal_rows(system: ConstrainedSystem, rows: Tensor) -> Tensor:
     """Select the first (normal) row of each contact: `(*batch, n_contacts)` from `(*batch, m)`."""
     if system.m == len(system.contacts):
         return rows
-    first = [sum(contact.rows for contact in system.contacts[:i]) for i in range(len(system.contacts))]
-    return rows[..., first]
+    return rows[..., [own.start for own in system.rows.values()]]
 
 
 def pulling(system: ConstrainedSystem, active: Tensor, multiplier: Tensor) -> Tensor:

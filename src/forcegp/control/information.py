@@ -93,9 +93,8 @@ class Unknowns:
         functions = torque.new_tensor([FRICTION] * 2 + [BUMP] * (SPEEDS + PLACES))
         base = base_parameters(robot)
         # β = B π
-        links = torch.linalg.cholesky(
-            _squared(torch.from_numpy(base.combination) * InertialPrior().scale(robot))
-        )
+        B = torch.from_numpy(base.combination) * InertialPrior().scale(robot)
+        links = torch.linalg.cholesky(B @ B.mT)
         friction, drives = (torque[:, None] * functions).flatten().diag(), torch.zeros_like(torque).diag()
         root = torch.block_diag(links, friction, drives)
         noise = NOISE * torque if noise is None else noise
@@ -160,10 +159,6 @@ class Unknowns:
         parts = {"all": slice(None), **self.parts}
         spread = {name: Phi[..., part] @ self.root[part] for name, part in parts.items()}
         return {name: x.square().sum(-1).mean(0).sqrt() for name, x in spread.items()}
-
-
-def _squared(X: Tensor) -> Tensor:
-    return X @ X.mT
 
 
 def rigid_torque(robot: RobotModel, q: Tensor, qd: Tensor, qdd: Tensor, Y: Tensor | None = None) -> Tensor:

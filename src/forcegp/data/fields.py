@@ -334,19 +334,6 @@ def check_robot(data: Fields, robot: RobotModel) -> None:
         )
 
 
-def contact_table(data: Fields, contacts: Sequence[str]) -> Tensor:
-    """Return `(n, len(contacts))` bool, true if the named contact is closed."""
-    for name in contacts:
-        if name not in data.contact:
-            raise DataError(
-                f"column 'contact.{name}' is missing",
-                expected=f"contact.{name}, 1 where the contact is closed and 0 elsewhere",
-                got=", ".join(f"contact.{c}" for c in data.contact) or "no contact column",
-            )
-    closed = [data.contact[name] for name in contacts]
-    return torch.stack(closed, dim=-1) if closed else data.segment.new_zeros(len(data), 0).bool()
-
-
 def check_alike(parts: Sequence[Fields]) -> None:
     """Check that data sets have the same columns and can be concatenated."""
     if not parts:

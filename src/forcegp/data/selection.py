@@ -238,27 +238,3 @@ def without_marked_impacts(data: Dataset) -> Dataset:
     if count == 0:
         return data
     return data[torch.nonzero(~marked)[:, 0]].with_step(f"excluded {count} rows at impacts")
-
-
-def with_noise(data: Dataset, std: float, generator: torch.Generator) -> Dataset:
-    """Add Gaussian noise to q̈ and keep the noise-free value: q̈ = q̈_clean + std ε, ε ~ N(0, I).
-
-    If the data contain `qdd_clean`, the noise is added to it, so repeated calls do not accumulate.
-
-    Args:
-        data: the log.
-        std: standard deviation [rad/s², m/s²].
-        generator: source of the random numbers; its seed is recorded in the header.
-
-    Raises:
-        DataError: the standard deviation is negative or not finite.
-    """
-    if not 0.0 <= std < float("inf"):
-        raise DataError("the noise is invalid", expected="a finite standard deviation ≥ 0", got=std)
-    clean = data.extras.get("qdd_clean", data.qdd)
-    noise = torch.randn(clean.shape, dtype=clean.dtype, device=generator.device, generator=generator)
-    step = f"noise of standard deviation {std:g} on qdd, seed {generator.initial_seed()}"
-    derived = tuple(name for name in data.header.derived if name != "qdd")
-    header = data.header.with_step(step, noise_std=std, filtered=False, filter_span=None, derived=derived)
-    qdd, extras = clean + std * noise.to(clean.device), {**data.extras, "qdd_clean": clean}
-    return data.replace(qdd=qdd, extras=extras, header=header)

@@ -26,7 +26,7 @@ from forcegp.forces.posterior import (
     trained_region,
 )
 from forcegp.forces.problem import UNSHOWN, Problem, force_posterior, typical
-from forcegp.forces.quantities import States, affine_map
+from forcegp.forces.quantities import affine_map
 from forcegp.robust import resolution
 
 STRETCHES = 8
@@ -112,12 +112,6 @@ def _covariance(x: Tensor, segment: Tensor, lag: int) -> Tensor:
 def _motions(training: Training) -> list[int]:
     """Return the measurements of accelerations, or of the joint forces from them and a force sensor."""
     return [i for i, quantity in enumerate(training.quantities) if quantity in ("qdd", "joint_force")]
-
-
-def _of_force(at: States, quantity: str) -> Tensor:
-    """Return the map from errors of a quantity to force errors `(n, nq, nq)`, M for accelerations."""
-    M = at.eom.M
-    return M if quantity == "qdd" else torch.eye(M.shape[-1], dtype=M.dtype, device=M.device).expand_as(M)
 
 
 def residual_times(
@@ -284,7 +278,9 @@ def _held_out(
         dataclasses.replace(problem, training=training.without(i, own)), hyperparameters
     )
     at = m.at(system)
-    z, M = affine_map(system, at, m.quantity), _of_force(at, m.quantity)
+    z, M = affine_map(system, at, m.quantity), at.eom.M
+    if m.quantity == "joint_force":
+        M = torch.eye(M.shape[-1], dtype=M.dtype, device=M.device).expand_as(M)
     P = M @ z.B_Q
     mean, covariance = posterior.read(system, at, z)
     residual = (M @ (m.values - mean)[..., None])[..., 0]

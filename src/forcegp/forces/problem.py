@@ -100,10 +100,6 @@ class Problem:
             return self.system
         return self.system.with_robot(torch.func.functional_call(self.parameters, own, ()))
 
-    def priors_at(self, tensors: Mapping[str, Tensor]) -> tuple[ForcePrior, ...]:
-        """Return the priors with learned parameters of their operators."""
-        return tuple(prior.with_parameters(sub(tensors, prior.name)) for prior in self.priors)
-
     def noise_at(self, tensors: Mapping[str, Tensor], measurement: int) -> Tensor:
         """Return the noise of a measurement, `(d,)` or `(n, d)`; noise by sample is scaled."""
         std = self.training.noise_std[measurement]
@@ -159,9 +155,8 @@ class Problem:
         """Return the forces a priori, with learned operators and Coulomb friction."""
         names = [prior.name for prior in self.priors]
         pinned = {names.index(name): value for name, value in self.pinned.items()}
-        return ForceProcess(
-            self.priors_at(tensors), self.training.scales, self.mean, self.coulomb(tensors), pinned
-        )
+        priors = tuple(prior.with_parameters(sub(tensors, prior.name)) for prior in self.priors)
+        return ForceProcess(priors, self.training.scales, self.mean, self.coulomb(tensors), pinned)
 
     def sample_noise(
         self, tensors: Mapping[str, Tensor], system: ConstrainedSystem, measurement: int

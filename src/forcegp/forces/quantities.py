@@ -191,12 +191,11 @@ def _contact_force(system: ConstrainedSystem, at: States) -> AffineMap:
 
 def _directions(system: ConstrainedSystem, at: States) -> Tensor:
     """Return N with F_I = N λ `(n, 3 k, m)`, which contains the directions of each surface contact."""
-    blocks, first = [at.q.new_zeros(len(at.q), 0, system.m)], 0
-    for contact in system.contacts:
-        if contact.name in at.eom.contact_points:
-            own = at.eom.contact_points[contact.name].directions(contact.rows)
-            blocks.append(torch.nn.functional.pad(own, (first, system.m - first - contact.rows)))
-        first += contact.rows
+    blocks = [at.q.new_zeros(len(at.q), 0, system.m)]
+    for name, rows in system.rows.items():
+        if name in at.eom.contact_points:
+            own = at.eom.contact_points[name].directions(rows.stop - rows.start)
+            blocks.append(torch.nn.functional.pad(own, (rows.start, system.m - rows.stop)))
     return torch.cat(blocks, dim=1)
 
 

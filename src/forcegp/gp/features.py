@@ -217,7 +217,11 @@ class FeatureMap:
         """Return all pairs of features, for the product of two kernels."""
         a, b = self.joined(), other.joined()
         scale = (a.scale[:, :, None] * b.scale[:, None, :]).flatten(-2)
-        return FeatureMap((FeatureTerm(lambda x: _all_pairs(a.values(x), b.values(x)), scale),))
+
+        def products(x: Features) -> Tensor:
+            return (a.values(x)[..., :, None] * b.values(x)[..., None, :]).flatten(-2)
+
+        return FeatureMap((FeatureTerm(products, scale),))
 
     def paired(self, other: FeatureMap, count: int, generator: torch.Generator) -> FeatureMap:
         """Return `count` random pairs of features, for the product of two kernels with many features each."""
@@ -312,8 +316,3 @@ def linear_features(x: Features, inputs: tuple[str, ...] | None, slope: Tensor, 
 def constant_features(std: Tensor) -> FeatureMap:
     """Return one constant feature per component, with standard deviations `(k,)`."""
     return FeatureMap((FeatureTerm(lambda x: std.new_ones(1, stacked(x, None).shape[-2], 1), std[:, None]),))
-
-
-def _all_pairs(a: Tensor, b: Tensor) -> Tensor:
-    """Return all products a_i b_j of features `(k, n, f)` and `(k, n, g)`, `(k, n, f g)`."""
-    return (a[..., :, None] * b[..., None, :]).flatten(-2)

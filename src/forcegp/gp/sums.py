@@ -208,23 +208,6 @@ def _runs(columns: list[slice]) -> list[slice]:
     return runs
 
 
-def shard(samples: int, rank: int, processes: int) -> slice:
-    """Return the samples of one process; all processes have contiguous runs of equal length to within one.
-
-    Example:
-        >>> [shard(7, rank, 3) for rank in range(3)]
-        [slice(0, 3, None), slice(3, 5, None), slice(5, 7, None)]
-
-    Raises:
-        ModelError: the process does not exist.
-    """
-    if not 0 <= rank < processes:
-        raise ModelError("no such process", expected=f"a rank from 0 to {processes - 1}", got=rank)
-    size, more = divmod(samples, processes)
-    first = rank * size + min(rank, more)
-    return slice(first, first + size + (rank < more))
-
-
 def reduce_sums(sums: Sums) -> Sums:
     """Add the sums of all processes; each process obtains the same result.
 

@@ -15,9 +15,9 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
-from forcegp.errors import ForceGPError, ModelError
+from forcegp.errors import ModelError
 from forcegp.files import Record
-from forcegp.forces.measurements import Measurement, Observation, measurement_of
+from forcegp.forces.measurements import Observation, measurement_of
 from forcegp.forces.priors.joint import AnalyticalMean
 from forcegp.forces.quantities import FlatStates, ForceField, affine_maps, hidden_forces
 from forcegp.gp.optimise import LearningOptions
@@ -28,7 +28,7 @@ from forcegp.models.prediction import Answer, Query
 from forcegp.robot.parameters import AnalyticalParameters
 from forcegp.storage.model_file import ModelHeader
 from forcegp.storage.options import Window
-from forcegp.storage.system import pack_system, robot_tensors, take, take_robot
+from forcegp.storage.system import pack_system, take, take_robot
 
 KIND = "analytical"
 LearnedParameters = Mapping[str, Sequence[str] | Literal["all"]]
@@ -102,8 +102,12 @@ class AnalyticalModel(Model["AnalyticalFit"]):
         start = {name: value.detach().clone() for name, value in theta.named_parameters()}
 
         def loss(tensors: Mapping[str, Tensor], rows: Tensor) -> Tensor:
-            robot = torch.func.functional_call(theta, dict(tensors), ())
-            return _mean_squared_error(self.system.with_robot(robot), measured, rows)
+            system, part = (
+                self.system.with_robot(torch.func.functional_call(theta, dict(tensors), ())),
+                measured[rows],
+            )
+            eom = system.equations(part.q, part.qd, part.active)
+            return ((eom.acceleration(eom.Q_K + part.tau) - part.values) ** 2).mean()
 
         record, robot = pack_system(self.system)
         key = (self.seed, record, *robot.values(), *measured.tensors)
@@ -167,10 +171,8 @@ class AnalyticalFit(FittedModel):
         settings = header.settings_as(AnalyticalSettings, source)
         original = system.with_robot(take_robot(tensors, "start.", system.robot, source))
         window = Window(relative=settings.relative, length=settings.length, angle=settings.angle)
-        try:
+        with ModelError.within(f"{source}: field 'settings.analytical_parameters'"):
             model = AnalyticalModel(original, settings.analytical_parameters, window, settings.seed)
-        except ForceGPError as cause:
-            raise ModelError.at(f"{source}: field 'settings.analytical_parameters'", cause) from cause
         theta = model.parameters
         state = {
             name: take(tensors, name, tuple(old.shape), old.dtype, source)
@@ -183,10 +185,5 @@ class AnalyticalFit(FittedModel):
     def record(self) -> tuple[Record, dict[str, Tensor]]:
         theta = self.parameters
         settings = AnalyticalSettings(**dict(self.window), analytical_parameters=theta.joints, seed=self.seed)
-        start = {f"start.{name}": getattr(theta.start, name) for name in robot_tensors(theta.start)}
+        start = {f"start.{name}": value for name, value in theta.start.tensors.items()}
         return settings, dict(theta.state_dict()) | start
-
-
-def _mean_squared_error(system: ConstrainedSystem, measured: Measurement, rows: Tensor) -> Tensor:
-    eom = system.equations(measured.q[rows], measured.qd[rows], measured.active[rows])
-    return ((eom.acceleration(eom.Q_K + measured.tau[rows]) - measured.values[rows]) ** 2).mean()

@@ -17,7 +17,7 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
-from forcegp.errors import ForceGPError, ModelError
+from forcegp.errors import ModelError
 from forcegp.files import Record
 from forcegp.forces.measurements import NoiseStd, Observation, measurement_of, plain
 from forcegp.forces.noise import Noise
@@ -265,10 +265,8 @@ class IndependentFit(AccelerationFit):
             for name, value in prior.kernel.initial(1, dict.fromkeys(features, nq)).items()
         }
         training.announce(0)
-        try:
+        with ModelError.within(f"{source}: the training data"):
             return fitted(model, training, hyperparameters)
-        except ForceGPError as cause:
-            raise ModelError.at(f"{source}: the training data", cause) from cause
 
     def record(self) -> tuple[Record, dict[str, Tensor]]:
         model = self.specification

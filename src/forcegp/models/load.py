@@ -20,11 +20,10 @@ from forcegp.storage.model_file import (
     ModelHeader,
     model_bytes,
     model_path,
-    model_tensors,
     parse_model,
     read_model,
 )
-from forcegp.storage.system import unpack_system
+from forcegp.storage.system import PREFIX, unpack_system
 
 KINDS: dict[str, type[FittedModel]] = {
     kind.kind: kind for kind in (AnalyticalFit, NetworkFit, IndependentFit, StructuredFit)
@@ -76,9 +75,10 @@ def _restored(
 ) -> FittedModel:
     """Restore a model from header and tensors."""
     check_name(f"kind of models in {source}", header.kind, KINDS)
+    own = {name: value for name, value in tensors.items() if not name.startswith(PREFIX)}
     try:
         model_system = unpack_system(header.system, tensors, source, system)
-        return KINDS[header.kind].restored(header, model_tensors(tensors), model_system, source)
+        return KINDS[header.kind].restored(header, own, model_system, source)
     except ForceGPError:
         raise
     except (ArithmeticError, LookupError, RuntimeError, TypeError, ValueError) as cause:

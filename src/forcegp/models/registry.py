@@ -40,11 +40,6 @@ class Entry:
     priors: Callable[[ConstrainedSystem, Any, Kernel | None], Sequence[ForcePrior]] | None = None
     kernel: Kernel | None = None
 
-    @property
-    def kind(self) -> str:
-        """Kind of the model as in saved files."""
-        return self.made.kind
-
 
 def _contact(system: ConstrainedSystem, mean: Any, kernel: Kernel | None) -> Sequence[ForcePrior]:
     """Return priors on contact friction only, for any mean."""

@@ -16,7 +16,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, field_serializer
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.errors import ForceGPError, ModelError
+from forcegp.errors import ModelError
 from forcegp.files import Record
 from forcegp.forces.measurements import Measurement, Training, plain
 from forcegp.forces.noise import Noise
@@ -44,7 +44,7 @@ from forcegp.robot.parameters import AnalyticalParameters
 from forcegp.storage.descriptions import decode, encode
 from forcegp.storage.model_file import ModelHeader
 from forcegp.storage.options import StructuredOptions
-from forcegp.storage.system import robot_tensors, take_robot
+from forcegp.storage.system import take_robot
 
 Stated = NonNegativeFloat | tuple[NonNegativeFloat, ...]
 """Noise that may be zero, as one number or one per joint."""
@@ -140,7 +140,7 @@ def pack(
         tensors["torque_correlation"] = problem.correlation
     tensors |= _conditioned_on(spec, problem.training, posterior)
     start = own.start if own is not None else spec.system.robot
-    tensors |= {f"start.{name}": getattr(start, name) for name in robot_tensors(start)}
+    tensors |= {f"start.{name}": value for name, value in start.tensors.items()}
     for prior, scale in zip(spec.priors, problem.training.scales, strict=True):
         tensors |= {f"scale.{prior.name}.mean.{key}": value for key, value in scale.mean.items()}
         tensors |= {f"scale.{prior.name}.std.{key}": value for key, value in scale.std.items()}
@@ -225,10 +225,8 @@ def _specification(
     original, parameters = take_robot(tensors, "start.", system.robot, source), None
     system = system.with_robot(original)
     if settings.analytical_parameters is not None:
-        try:
+        with ModelError.within(f"{source}: field 'settings.analytical_parameters'"):
             parameters = AnalyticalParameters(original, settings.analytical_parameters)
-        except ForceGPError as cause:
-            raise ModelError.at(f"{source}: field 'settings.analytical_parameters'", cause) from cause
     return Specification(
         system,
         AnalyticalMean(settings.mean),

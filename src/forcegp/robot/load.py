@@ -244,7 +244,9 @@ def load_robot(
         "base_position": _vector(base_position, "base_position"),
         "gravity": _vector(gravity, "gravity"),
     }
-    return robot_of(checked(lock_joints(_read(source), locked_joints or {})), world).to(device, dtype)
+    path = robot_path(source)
+    tree = checked(lock_joints(read_tree(read_bytes(path), path), locked_joints or {}))
+    return robot_of(tree, world).to(device, dtype)
 
 
 def robot_path(source: str | Path) -> Path:
@@ -255,11 +257,6 @@ def robot_path(source: str | Path) -> Path:
     if not path.suffix and path.name == str(source):
         raise UnknownNameError("robot", source, (*BUNDLED, "path of a .urdf or .xml file"))
     return path
-
-
-def _read(source: str | Path) -> Tree:
-    path = robot_path(source)
-    return read_tree(read_bytes(path), path)
 
 
 def read_tree(data: bytes, path: Path) -> Tree:

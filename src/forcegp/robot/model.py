@@ -145,7 +145,7 @@ class RobotModel:
     def fingerprint(self) -> str:
         """SHA-256 of joint names, kinematics and inertial parameters: equal for equal robots."""
         digest = hashlib.sha256(repr((self.joint_names, self.joint_types, self.parents)).encode())
-        for name, value in self._tensors.items():
+        for name, value in self.tensors.items():
             digest.update(name.encode())
             digest.update(value.detach().to("cpu", torch.float64).contiguous().numpy().tobytes())
         return digest.hexdigest()[:16]
@@ -153,10 +153,10 @@ class RobotModel:
     @property
     def learned(self) -> tuple[str, ...]:
         """Names of the constants that require a gradient."""
-        return tuple(name for name, x in self._tensors.items() if x.requires_grad)
+        return tuple(name for name, x in self.tensors.items() if x.requires_grad)
 
     @property
-    def _tensors(self) -> dict[str, Tensor]:
+    def tensors(self) -> dict[str, Tensor]:
         """Every constant that is a tensor, by name."""
         values = ((field.name, getattr(self, field.name)) for field in dataclasses.fields(self))
         return {name: value for name, value in values if isinstance(value, Tensor)}
@@ -173,7 +173,7 @@ class RobotModel:
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> RobotModel:
         """Return the same robot with its constants on another device or in another precision."""
-        return self.replace(**{name: x.to(device=device, dtype=dtype) for name, x in self._tensors.items()})
+        return self.replace(**{name: x.to(device=device, dtype=dtype) for name, x in self.tensors.items()})
 
     def replace(self, **fields: object) -> RobotModel:
         """Return a robot with some fields changed, such as `robot.replace(mass=mass)`.

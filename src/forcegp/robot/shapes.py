@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
@@ -13,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
-from forcegp.robot.load import BUNDLED
+from forcegp.robot.load import BUNDLED, robot_path
 from forcegp.robot.model import RobotModel
 from forcegp.robot.safety import parse_numbers, parse_xml, read_bytes
 
@@ -77,13 +76,9 @@ def shapes_of(
     Raises:
         RobotFileError: the shapes in the file are invalid.
     """
-    name = str(source) if source is not None else robot.name
-    if name in BUNDLED:
-        path = Path(str(files("forcegp.robot") / "bundled" / f"{name}.urdf"))
-    elif source is None:
+    if source is None and robot.name not in BUNDLED:
         return rods(robot)
-    else:
-        path = Path(source)
+    path = robot_path(robot.name if source is None else source)
     root = parse_xml(read_bytes(path), str(path))
     found = (_parts(root, path, robot, element) for element in elements if root.tag == "robot")
     return next(filter(None, found), None) or rods(robot)

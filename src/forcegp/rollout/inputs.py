@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -25,15 +25,9 @@ EVEN = 0.02
 """Largest relative deviation of a step from the sampling period in a replayed log."""
 
 
-@runtime_checkable
-class CompiledMotion(Protocol):
-    """Function that computes the motion of trajectories, without gradients."""
-
-    def __call__(
-        self, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor, h: Tensor, sticking: bool
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Return q̈, λ, constraint error and rate, and joints held by friction over steps h `(n, 1)`."""
-        ...
+CompiledMotion = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor, bool], tuple[Tensor, ...]]
+"""From q, q̇, τ, closed contacts, step lengths h `(n, 1)` and whether joints stick: q̈, λ, constraint error and
+rate, and the joints held by friction, without gradients."""
 
 
 class ForwardModel(ABC):

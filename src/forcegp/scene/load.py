@@ -49,12 +49,16 @@ class Scene:
         """Settings of the model to fit."""
         return ModelTable(self.sections.model, self.document)
 
+    @property
+    def robot_source(self) -> str | Path:
+        """Name of the bundled robot, or path of the robot file."""
+        named = self.sections.robot.model
+        return named if named in BUNDLED_ROBOTS else self.folder / named
+
     def robot(self, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> RobotModel:
         """Return the robot; a `SceneError` names the key and line."""
-        section = self.sections.robot
-        bundled = section.model in BUNDLED_ROBOTS
-        source = section.model if bundled else self.folder / section.model
-        if not bundled and not is_file(Path(source)):
+        section, source = self.sections.robot, self.robot_source
+        if isinstance(source, Path) and not is_file(source):
             raise SceneError(
                 f"{self.document.place(('robot', 'model'))}: no such robot",
                 expected=f"a URDF or MJCF file, or one of {', '.join(BUNDLED_ROBOTS)}",

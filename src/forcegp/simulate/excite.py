@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.interpolate import BSpline
 from scipy.optimize import minimize
 from torch import Tensor
 
@@ -101,6 +102,16 @@ class Limits:
         low, high = robot.lower.clamp(min=-torch.pi), robot.upper.clamp(max=torch.pi)
         return cls(low, high, share * speed, share * rate, share * effort)
 
+    def shares(self, q: Tensor, qd: Tensor, qdd: Tensor, torque: Tensor) -> dict[str, Tensor]:
+        """Return the signed fractions of the limits in use, `(n, nq)` each."""
+        middle, half = 0.5 * (self.low + self.high), 0.5 * (self.high - self.low)
+        return {
+            "position": (q - middle) / half,
+            "velocity": qd / self.velocity,
+            "acceleration": qdd / self.acceleration,
+            "torque": torque / self.torque,
+        }
+
 
 def _given(robot: RobotModel, name: str, values: Sequence[float], default: Tensor) -> Tensor:
     """Return the limits of all joints, given or from the robot."""
@@ -182,19 +193,10 @@ class Spline:
 
     def at(self, t: Array) -> tuple[Array, Array, Array]:
         """Return matrices `(n, free)` from control points (relative to the start) to q, q̇, q̈ at times."""
-        s = np.clip(np.floor(t / self.h).astype(int), 0, self.spans - 1)
-        u, h = t / self.h - s, self.h
-        v = 1.0 - u
-        weights = (
-            (v**3 / 6, (3 * u**3 - 6 * u**2 + 4) / 6, (3 * v**3 - 6 * v**2 + 4) / 6, u**3 / 6),
-            (-(v**2) / 2 / h, (3 * u**2 - 4 * u) / 2 / h, -(3 * v**2 - 4 * v) / 2 / h, u**2 / 2 / h),
-            (v / h**2, (3 * u - 2) / h**2, (3 * v - 2) / h**2, u / h**2),
-        )
-        found = np.zeros((3, len(t), self.free + 6))
-        for matrix, columns in zip(found, weights, strict=True):
-            for k, column in enumerate(columns):
-                matrix[np.arange(len(t)), s + k] = column
-        return found[0][:, 3:-3], found[1][:, 3:-3], found[2][:, 3:-3]
+        knots = self.h * np.arange(-3, self.spans + 4)
+        spline = BSpline(knots, np.eye(self.free + 6), 3)
+        q, qd, qdd = (spline(t, order)[:, 3:-3] for order in range(3))
+        return q, qd, qdd
 
     def differences(self, x: Tensor) -> tuple[Tensor, Tensor]:
         """Return the control points of velocity and acceleration."""
@@ -304,18 +306,12 @@ class Search:
         t = np.linspace(0.0, self.spline.seconds, round(self.spline.seconds / step) + 1)
         worst: dict[str, float] = {}
         where, limits, near = [], self.limits, self.collisions
-        middle, half = 0.5 * (limits.low + limits.high), 0.5 * (limits.high - limits.low)
         for rows in np.split(t, range(CHUNK, len(t), CHUNK)):
             q, qd, qdd = (torch.from_numpy(m @ x) for m in self.spline.at(rows))
             q = q + torch.from_numpy(self.spline.start)
             torque = rigid_torque(self.unknowns.robot, q, qd, qdd)
-            shares = {
-                "position": (q - middle) / half,
-                "velocity": qd / limits.velocity,
-                "acceleration": qdd / limits.acceleration,
-                "torque": torque / limits.torque,
-                "clearance": 1.0 + torch.from_numpy(near.depth(q.numpy()))[:, None] / near.clearance,
-            }
+            shares = limits.shares(q, qd, qdd, torque)
+            shares["clearance"] = 1.0 + torch.from_numpy(near.depth(q.numpy()))[:, None] / near.clearance
             found = {name: share.abs().amax(-1).numpy() for name, share in shares.items()}
             worst = {name: max(worst.get(name, 0.0), float(share.max())) for name, share in found.items()}
             where.append(rows[np.max(list(found.values()), axis=0) > 1.0 + TOLERANCE])

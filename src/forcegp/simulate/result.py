@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass, field
 
 import torch
@@ -182,10 +181,9 @@ def _dataset(
         joint_names=robot.joint_names,
         contact_names=names,
     )
-    ends = itertools.accumulate(contact.rows for contact in system.contacts)
     multipliers = {
-        contact.name: log.multiplier[:, end - contact.rows]
-        for contact, end in zip(system.contacts, ends, strict=True)
+        contact.name: log.multiplier[:, system.rows[contact.name].start]
+        for contact in system.contacts
         if isinstance(contact, SurfaceContact)
     }
     clean = {f"{name}_clean": getattr(log, name) for name in ("qdd", *log.measured)}

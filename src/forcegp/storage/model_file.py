@@ -24,7 +24,7 @@ from forcegp.errors import ModelError
 from forcegp.files import Header, M, Record, atomic_file, validated
 from forcegp.limits import HEADER_BYTES, MODEL_BYTES, TENSORS
 from forcegp.resources import announce_memory
-from forcegp.storage.system import MAY_BE_INFINITE, PREFIX, pack_system
+from forcegp.storage.system import MAY_BE_INFINITE, pack_system
 
 TYPES = (torch.float64, torch.float32, torch.int64, torch.bool)
 """Data types of tensors in a model."""
@@ -181,8 +181,3 @@ def _digest(data: bytes, stated: str) -> str:
 def _entry(digest: str) -> bytes:
     """Return the hash entry in the header, which is unique since quotes in other entries are escaped."""
     return f'"{HEADER}":"{digest}'.encode()
-
-
-def model_tensors(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the tensors of the model without those of its system."""
-    return {name: value for name, value in tensors.items() if not name.startswith(PREFIX)}

@@ -150,8 +150,8 @@ def pack_system(system: ConstrainedSystem) -> tuple[dict[str, Any], dict[str, Te
         baumgarte=system.baumgarte,
     )
     tensors = {
-        PREFIX + name: getattr(system.robot, name).detach().to("cpu", copy=True).contiguous()
-        for name in robot_tensors(system.robot)
+        PREFIX + name: x.detach().to("cpu", copy=True).contiguous()
+        for name, x in system.robot.tensors.items()
     }
     return record.model_dump(mode="json"), tensors
 
@@ -238,17 +238,10 @@ def take(
     return value
 
 
-def robot_tensors(robot: RobotModel) -> list[str]:
-    """Return the names of the fields of a robot that are tensors."""
-    names = [field.name for field in dataclasses.fields(robot)]
-    return [name for name in names if isinstance(getattr(robot, name), Tensor)]
-
-
 def take_robot(tensors: Mapping[str, Tensor], prefix: str, like: RobotModel, source: str) -> RobotModel:
     """Return a robot with tensors named `<prefix><field>`, checked by `take`, and other fields copied."""
     fields = {}
-    for name in robot_tensors(like):
-        value, finite = getattr(like, name), name not in MAY_BE_INFINITE
-        shape = tuple(value.shape)
+    for name, value in like.tensors.items():
+        shape, finite = tuple(value.shape), name not in MAY_BE_INFINITE
         fields[name] = take(tensors, prefix + name, shape, value.dtype, source, finite=finite)
     return like.replace(**fields)

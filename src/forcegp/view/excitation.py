@@ -25,14 +25,8 @@ MOST = 1500
 
 def draw_limits(result: Excitation) -> Picture:
     """Plot position, velocity, acceleration and torque of each joint as fractions of their limits."""
-    limits, motion = result.limits, result.motion[:: -(-len(result.motion) // MOST)]
-    middle, half = 0.5 * (limits.low + limits.high), 0.5 * (limits.high - limits.low)
-    curves = {
-        "position": (motion.q - middle) / half,
-        "velocity": motion.qd / limits.velocity,
-        "acceleration": motion.qdd / limits.acceleration,
-        "torque": motion.tau / limits.torque,
-    }
+    motion = result.motion[:: -(-len(result.motion) // MOST)]
+    curves = result.limits.shares(motion.q, motion.qd, motion.qdd, motion.tau)
 
     def paint(figure: Figure) -> None:
         for axes, (name, values) in zip(figure.subplots(4, 1, sharex=True), curves.items(), strict=True):

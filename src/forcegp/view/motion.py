@@ -118,14 +118,13 @@ def _forces(system: ConstrainedSystem, data: Dataset, model: Predictor | None) -
     if model is not None and model.force_field() is not None and never != set(system.contact_names):
         prediction = model.predict(data.q, data.qd, data.tau, "multiplier", active=active)
         value, std = prediction.mean, prediction.std
-    forces, row, logged = [], 0, data.contact_extras.get("multiplier", {})
+    forces, logged = [], data.contact_extras.get("multiplier", {})
     for i, contact in enumerate(system.contacts):
-        point = eom.contact_points.get(contact.name)
+        point, row = eom.contact_points.get(contact.name), system.rows[contact.name].start
         multiplier = logged.get(contact.name) if value is None else value[:, row]
         if point is not None and multiplier is not None:
             spread = torch.zeros_like(multiplier) if std is None else std[:, row]
             shown = torch.where(active[:, i], multiplier, torch.nan)
             parts = (point.position, point.normal, shown, spread)
             forces.append(Force(contact.name, *(as_array(x) for x in parts)))
-        row += contact.rows
     return forces

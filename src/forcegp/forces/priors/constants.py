@@ -9,14 +9,14 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError
-from forcegp.forces.priors.base import JOINT, ForcePrior
+from forcegp.forces.priors.base import JOINT, ConstantForcePrior, ForcePrior
 from forcegp.forces.quantities import States
 from forcegp.gp.kernels import Constant, Kernel
 from forcegp.robot.model import RobotModel
 
 
 @dataclass(frozen=True)
-class DrivePrior(ForcePrior):
+class DrivePrior(ConstantForcePrior):
     """A prior on relative errors s δ_i of drive constants (torque constant times gear ratio).
 
     Q_i = s τ_i δ_i with δ_i ~ N(0, 1). Logged currents are converted to torques with nominal drive constants
@@ -53,9 +53,6 @@ class DrivePrior(ForcePrior):
 
     def outputs(self, robot: RobotModel) -> int:
         return robot.nq
-
-    def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
-        return {"one": torch.zeros_like(at.q[:, :1])}
 
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
         return self.std * torch.diag_embed(at.tau)

@@ -40,7 +40,14 @@ from forcegp.constraints.contact import SurfaceContact
 from forcegp.constraints.gauss import ContactPoint, tangent_frame
 from forcegp.errors import ModelError
 from forcegp.forces.measurements import Measurement
-from forcegp.forces.priors.base import CONSTRAINT, CONTACT, COULOMB, ForcePrior, check_inputs
+from forcegp.forces.priors.base import (
+    CONSTRAINT,
+    CONTACT,
+    COULOMB,
+    ConstantForcePrior,
+    ForcePrior,
+    check_inputs,
+)
 from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.forces.quantities import AffineMap, States
 from forcegp.gp.kernels import Constant, Kernel, SquaredExponential
@@ -236,7 +243,7 @@ class SlidingFrictionPrior(SurfaceForcePrior):
             ModelError: the contact jams with this friction.
         """
         contact = system.contact_names.index(self.contact)
-        row = sum(c.rows for c in system.contacts[:contact])
+        row = system.rows[self.contact].start
         free = at.eom.multiplier(at.eom.Q_K + at.tau)[:, row].clamp(min=0.0)
         gain = 1.0 + self.friction_coefficient * (at.eom.L[..., row] * u).sum(-1)
         if bool((gain[at.active[:, contact]] <= 0.0).any()):
@@ -356,7 +363,7 @@ def _coupled_priors(priors: Iterable[ForcePrior]) -> list[SlidingFrictionPrior]:
 
 
 @dataclass(frozen=True, eq=False)
-class CoulombErrorPrior(ForcePrior):
+class CoulombErrorPrior(ConstantForcePrior):
     """Q_z = λ̂ ∂(μ u)/∂(log μ, log ε) δ, δ ~ N(0, 1): remaining uncertainty of a contact's friction.
 
     λ̂ is the multiplier of the analytical forces with the learned friction. One e-fold is about the width of
@@ -379,9 +386,6 @@ class CoulombErrorPrior(ForcePrior):
     def outputs(self, robot: RobotModel) -> int:
         return LEARNED
 
-    def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
-        return {"one": torch.zeros_like(at.q[:, :1])}
-
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
         if self.contact not in system.contact_names:
             return at.q.new_zeros(*at.q.shape, LEARNED)
@@ -392,7 +396,7 @@ class CoulombErrorPrior(ForcePrior):
         )
         # μ λ̂, with λ̂ under Q_C + Q_G + Q_D + Q_u and all friction
         Q_bar = with_coulomb(system, at, at.eom.Q_K + at.tau, self.friction)
-        load = law.coefficient * at.eom.multiplier(Q_bar)[:, _row(system, self.contact)]
+        load = law.coefficient * at.eom.multiplier(Q_bar)[:, system.rows[self.contact].start]
         # ∂(μ u)/∂log μ = μ u, ∂s/∂log ε = −s ε²/(|v|² + ε²)
         fading = law.smoothing**2 / (v.square().sum(-1) + law.smoothing**2)
         return torch.stack([load, -load * fading], dim=-1)[:, None, :] * u[..., None]
@@ -458,25 +462,19 @@ def below_jamming(
     """Return bounds that exclude jamming, 1 + μ Lᵀu > 0, at all training states with sliding."""
     changed = dict(bounds)
     for prior in _coupled_priors(priors):
-        key, row = coulomb_keys(prior.contact)[0], _row(system, prior.contact)
+        key, row = coulomb_keys(prior.contact)[0], system.rows[prior.contact].start
         if key in changed:
-            gains = [_drag(m.at(system), prior.contact, row) for m in measurements]
+            # Lᵀu, the load relief by a unit friction force
+            states = (m.at(system) for m in measurements)
+            gains = [
+                (at.eom.L[..., row] * against_sliding(at, prior.contact, SHARP)).sum(-1) for at in states
+            ]
             # 1 + μ Lᵀu > 0, so μ < −1/Lᵀu wherever Lᵀu < 0
             worst = float(torch.cat(gains).min())
             low, high = changed[key]
             if worst < 0.0:
                 changed[key] = low, max(low, min(high, math.log(-NEARLY_JAMMED / worst)))
     return changed
-
-
-def _drag(at: States, contact: str, row: int) -> Tensor:
-    """Return Lᵀu of a contact `(n,)`, the load relief by a unit friction force, negative for an increase."""
-    return (at.eom.L[..., row] * against_sliding(at, contact, SHARP)).sum(-1)
-
-
-def _row(system: ConstrainedSystem, contact: str) -> int:
-    """Return the row of a contact among the multipliers."""
-    return sum(c.rows for c in system.contacts[: system.contact_names.index(contact)])
 
 
 def _gain(system: ConstrainedSystem, at: States, friction: Sequence[CoulombFriction]) -> Tensor | None:

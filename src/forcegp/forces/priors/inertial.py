@@ -20,7 +20,7 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError, check_name
-from forcegp.forces.priors.base import JOINT, ForcePrior
+from forcegp.forces.priors.base import JOINT, ConstantForcePrior
 from forcegp.forces.quantities import States
 from forcegp.gp.kernels import Constant, Kernel
 from forcegp.gp.optimise import LearningOptions, minimise
@@ -39,7 +39,7 @@ PER_LINK = 10
 
 
 @dataclass(frozen=True)
-class InertialPrior(ForcePrior):
+class InertialPrior(ConstantForcePrior):
     """A prior on errors of inertial parameters, with one learned scale s_k (initially 1) per link k.
 
     Q = −[Y(q, q̇, q̈), diag q̈] S δ with δ ~ N(0, diag(s_k²)). Without `drives`, Q = −Y S δ.
@@ -84,9 +84,6 @@ class InertialPrior(ForcePrior):
 
     def outputs(self, robot: RobotModel) -> int:
         return PER_LINK * robot.nq + len(self.drives)
-
-    def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
-        return {"one": torch.zeros_like(at.q[:, :1])}
 
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
         # A state without a measured acceleration has the one that the analytical model predicts.
@@ -187,7 +184,7 @@ FARTHEST = 3.0
 
 
 @dataclass(frozen=True)
-class PayloadPrior(ForcePrior):
+class PayloadPrior(ConstantForcePrior):
     """A prior on a point mass on a link, Q = −Y_k(q, q̇, q̈) S δ with δ ~ N(0, s² I).
 
     q̈ is the acceleration of the arm with the payload `known` (by default none). The force is exact for this
@@ -230,9 +227,6 @@ class PayloadPrior(ForcePrior):
 
     def outputs(self, robot: RobotModel) -> int:
         return MASS_AND_MOMENT
-
-    def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
-        return {"one": at.q.new_zeros(len(at.q), 1)}
 
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
         qdd = at.qdd

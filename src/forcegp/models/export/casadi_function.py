@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from forcegp.compiled.expression import Graph, Scalar
-from forcegp.destination import write_or_keep
+from forcegp.destination import folder_or_keep
 from forcegp.errors import optional_module
-from forcegp.files import written_folder
 from forcegp.models.export.mean import ARGUMENTS, DIFFERENTIATED, LearnedMotion
 from forcegp.models.export.model import ExportedModel
 from forcegp.models.export.source import template
@@ -68,10 +67,8 @@ def write_casadi(model: ExportedModel, path: Path, name: str) -> None:
     fields: dict[str, object] = {"name": name, "robot": model.system.robot.name}
     fields |= {key: ", ".join(x) for key, x in names.items()}
 
-    def write(folder: Path) -> None:
-        with written_folder(folder) as temporary:
-            function.save(str(temporary / f"{name}.casadi"))
-            text = template("casadi.md.in", fields)
-            (temporary / "README.md").write_text(text, encoding="utf-8")
+    def fill(folder: Path) -> None:
+        function.save(str(folder / f"{name}.casadi"))
+        (folder / "README.md").write_text(template("casadi.md.in", fields), encoding="utf-8")
 
-    write_or_keep(write, path)
+    folder_or_keep(fill, path)

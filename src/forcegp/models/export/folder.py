@@ -12,18 +12,17 @@ from torch import Tensor
 
 from forcegp.data import Dataset
 from forcegp.data.fields import DataHeader
-from forcegp.destination import check_destination, write_or_keep
+from forcegp.destination import check_destination, folder_or_keep
 from forcegp.errors import ParameterError, check_name
-from forcegp.files import written_folder
 from forcegp.forces.measurements import Training
 from forcegp.forces.posterior import HIGH, LOW
+from forcegp.forces.quantities import FlatStates
 from forcegp.models.export.casadi_function import write_casadi
 from forcegp.models.export.library import CompiledFit
 from forcegp.models.export.model import ExportedModel
 from forcegp.models.export.source import READ, c_source, template
-from forcegp.models.export.torch_program import write_torch
 from forcegp.models.external_wrench import LearnedForces, external_wrench
-from forcegp.models.prediction import Predictor
+from forcegp.models.prediction import Predictor, Query
 
 LANGUAGES = ("c", "casadi", "torch")
 STATES, LOSS_STATES = 16, 200
@@ -62,22 +61,14 @@ def write_export(
             f"{name!r} cannot be the prefix of C functions",
             expected="lower-case letters, digits and underscores, a letter first",
         )
-    own = (
-        f"{name}.h",
-        f"{name}.c",
-        f"test_{name}.c",
-        "CMakeLists.txt",
-        "README.md",
-        "build",
-        f"{name}.casadi",
-        f"{name}.pt2",
-    )
+    own = [f"{name}{suffix}" for suffix in (".h", ".c", ".casadi", ".pt2")]
+    own += [f"test_{name}.c", "CMakeLists.txt", "README.md", "build"]
     check_destination(path, folder=True, own_files=own)
-    if language == "casadi":
-        write_casadi(model, Path(path), name)
-        return Export(Path(path), model.parts()[0].rank)
-    if language == "torch":
-        write_torch(fit, Path(path), name)
+    if language != "c":
+        if language == "casadi":
+            write_casadi(model, Path(path), name)
+        else:
+            write_torch(fit, Path(path), name)
         return Export(Path(path), model.parts()[0].rank)
     header, source = c_source(model, name)
     exact = dataclasses.replace(model, dtype=torch.float64)
@@ -103,12 +94,11 @@ def write_export(
     texts = {f"{name}.h": header, f"{name}.c": source, f"test_{name}.c": template("test.c", fields)}
     texts |= {file: template(f"{file}.in", fields) for file in ("CMakeLists.txt", "README.md")}
 
-    def write(folder: Path) -> None:
-        with written_folder(folder) as temporary:
-            for file, text in texts.items():
-                (temporary / file).write_text(text, encoding="utf-8")
+    def fill(folder: Path) -> None:
+        for file, text in texts.items():
+            (folder / file).write_text(text, encoding="utf-8")
 
-    write_or_keep(write, path)
+    folder_or_keep(fill, path)
     return result
 
 
@@ -206,3 +196,28 @@ def _reference(model: ExportedModel, fit: Predictor, name: str) -> str:
         rows = ",\n  ".join("{" + ", ".join(map(repr, row)) + "}" for row in x.tolist())
         lines.append(f"static const {kind} {key}[STATES][{x.shape[1]}] = {{{rows}}};")
     return "\n".join(lines)
+
+
+class _Posterior(torch.nn.Module):
+    def __init__(self, fit: Predictor) -> None:
+        super().__init__()
+        self.fit = fit
+
+    def forward(self, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor) -> tuple[Tensor | None, ...]:
+        flat, query = (
+            FlatStates(q, qd, tau, active, q.shape[:-1]),
+            Query(("qdd", "multiplier"), None, True, False),
+        )
+        return self.fit.at(flat, query)[0][:3]
+
+
+@torch.no_grad()
+def write_torch(fit: Predictor, path: Path, name: str) -> None:
+    """Write the program from q, q̇, τ `(1, nq)` and closed contacts `(1, n_contacts)` to mean, covariance and
+    distance from the training data; it raises no errors."""
+    system = fit.system
+    state = [torch.zeros(1, system.robot.nq, dtype=system.robot.dtype) for _ in range(3)]
+    closed = torch.ones(1, len(system.contacts), dtype=torch.bool)
+    program = torch.export.export(_Posterior(fit), (*state, closed), strict=False)
+
+    folder_or_keep(lambda folder: torch.export.save(program, str(folder / f"{name}.pt2")), path)
