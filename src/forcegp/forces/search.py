@@ -142,7 +142,7 @@ def _force_scale(p: int, blocks: Sequence[Block], commensurate: bool, beyond_noi
     """Return the root mean square of the least-squares force of prior p, `(components,)`.
 
     The rows determine only the sum of components along one direction. If all have the same unit, the
-    least-norm solution divides it evenly. Viscous and dry friction differ in unit, so each starts as if alone.
+    least-norm solution divides it evenly. Viscous and dry friction have different units and start separately.
     """
     operators = [block.operators[p] for block in blocks]
     each = torch.arange(operators[0].shape[-1], device=operators[0].device)
