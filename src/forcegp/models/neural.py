@@ -1,5 +1,4 @@
-"""Neural-network baseline: sigmoid layers from (q, q̇, τ) to q̈, with no knowledge of mechanics (section 5.4).
-"""
+"""Neural-network baseline: sigmoid layers from (q, q̇, τ) to q̈, without knowledge of mechanics (sec. 5.4)."""
 
 from __future__ import annotations
 
