@@ -226,7 +226,7 @@ def _stretches(data: Dataset, stretch: float) -> list[tuple[int, int]]:
 
 
 IMPACT = "impact"
-"""Name of the mask of each contact that `forcegp import` writes; it is 1 near a switch."""
+"""Name of the masks that `forcegp import` writes for each contact; they are 1 near a contact change."""
 
 
 def without_marked_impacts(data: Dataset) -> Dataset:

@@ -138,7 +138,7 @@ class _Trajectories:
 PIECE_ROWS = 8192
 """Number of rows read at a time."""
 Keep = Callable[[Dataset], Tensor]
-"""Function that returns the row numbers to keep of a piece."""
+"""Function that returns the numbers of the rows to keep in a piece."""
 
 
 @dataclass(frozen=True)

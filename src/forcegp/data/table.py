@@ -110,7 +110,7 @@ def _read_parquet(file: Path) -> tuple[pa.Table, DataHeader]:
 
 @contextmanager
 def opened_parquet(file: Path) -> Iterator[tuple[pq.ParquetFile, list[str], DataHeader]]:
-    """Open a Parquet file, and yield it with numeric columns and header; raise `DataError` if not a log."""
+    """Open a Parquet file and yield it with numeric columns and header; raise `DataError` if it is no log."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 

@@ -38,7 +38,7 @@ FEWEST = 50
 SWEEPS, SETTLED = 20, 1e-3
 """Maximum number of sweeps over the joints, and relative change in their noise at convergence."""
 MOST_RESIDUALS = 16_000
-"""Maximum number of residuals used to estimate correlation; from a longer log, contiguous stretches."""
+"""Maximum number of residuals used to estimate correlation; longer logs are reduced to some stretches."""
 CHUNK_STATES = 2000
 """Number of states for which residuals are computed at a time, to limit memory use."""
 NEGLIGIBLE = 0.05

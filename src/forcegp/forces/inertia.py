@@ -227,7 +227,7 @@ VOLUME_STATES = 100
 FAR_LARGER = 10.0
 """Mean squared acceleration error, relative to that of the mean, above which drive inertia is raised."""
 NEGLIGIBLE = 0.02
-"""Drive inertia, relative to its joint's, that is neglected, since a gain error of the sensor explains it."""
+"""Ratio of drive to joint inertia below which it is neglected: a gain error of the sensor can explain it."""
 WEIGHTS = tuple(2.0 ** (-k / 2) for k in range(20, -1, -1))
 """Weights v of the volume term, from 1/1024 to 1."""
 

@@ -219,7 +219,7 @@ def bristles(m: Measurement | Dataset) -> Tensor:
 def torque_rate(m: Measurement) -> Tensor:
     """Return the time derivative of the torque, from differences over `LATE` on either side `(n, nq)`.
 
-    A small delay between torque and motion changes the torque in proportion to it.
+    A small delay between torque and motion changes the torque in proportion to this derivative.
     """
     order = _in_time(m)
     t, tau, segment = m.t[order], m.tau[order], m.segment[order]
@@ -322,7 +322,8 @@ def averaged(rows: Rows, columns: Tensor, inertial: Tensor, width: float) -> tup
         width: standard deviation of the weights [s].
 
     Returns:
-        Averaged samples, which count as moving only if the whole average is within a stretch, and columns.
+        The averaged samples, which count as moving only if the whole window does so within one stretch, and
+        their columns.
     """
     stds = [x / rows.step for x in (width, math.hypot(width, math.sqrt(rows.filter_variance)))]
     reach, stride = math.ceil(REACH * stds[1]), max(1, int(0.5 * stds[0]))

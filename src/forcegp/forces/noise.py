@@ -35,7 +35,7 @@ class Noise:
     Args:
         acceleration: standard deviation of measured accelerations [rad/s², m/s²], one number or one per
             joint; by default the value in the log (`qdd_std` of each sample, else its header), else 0.1.
-        learn: whether the acceleration noise is learned, starting from this value.
+        learn: whether the acceleration noise is learned, starting from `acceleration`.
         torque: standard deviation of the motor torque's white noise [N m, N], one number or one per joint;
             `"learn"`, `None` for no noise, or `"auto"` to learn it with the priors for measured robots.
         state: standard deviations of the white noise of measured q and q̇ [rad, rad/s], each one number or

@@ -46,7 +46,7 @@ LOW, HIGH, SPREAD, GROWTH = (REGION + name for name in ("low", "high", "spread",
 and torque of each joint `(2, nq)`, and g `(nq,)` [N m, N]."""
 OUTERMOST, WIDEST = 0.01, 0.16
 """Smallest and largest fraction of the training samples beyond either limit of the region. The largest
-corresponds to one Gaussian standard deviation. One of fewer than 100 independent samples lies beyond."""
+corresponds to one Gaussian standard deviation. Of fewer than 100 independent samples, one lies beyond."""
 RELATIVE = 0.05
 """Prior growth g relative to the typical load of a joint: torque constants and load-dependent friction are
     uncertain by about 5 %."""

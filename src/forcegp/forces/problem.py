@@ -40,8 +40,8 @@ MIXED = "." + MIXING
 SHOWN = 10.0
 """Independent samples with accelerations sensitive to a joint's torque that are needed to learn its noise."""
 UNSHOWN = 0.1
-"""Uncertainty, relative to its load, of a joint's torque and friction if no measurement is sensitive to them,
-and growth per training standard deviation beyond the trained region; 0.08 on a real iiwa 14."""
+"""Uncertainty of a joint's torque and friction, as a fraction of its load, if no measurement is sensitive to
+them, and its growth per training standard deviation beyond the trained region; 0.08 on a real iiwa 14."""
 
 
 def kernel_parameters(tensors: Mapping[str, Tensor]) -> Tensors:
@@ -245,7 +245,7 @@ class Problem:
         return torch.cat(squares).mean(0).sqrt()
 
     def negative_log_likelihood(self, params: Tensors, rows: WhitenedRows) -> Tensor:
-        """Return the negative log likelihood of the rows, in weight space for sparse finite priors."""
+        """Return the negative log likelihood of the rows, in weight space if sparse and priors are finite."""
         exact = self.inducing is None or not is_finite(self.priors)
         of = negative_log_likelihood if exact else negative_log_likelihood_of_weights
         return of(self.priors, params, rows.blocks) + rows.constant

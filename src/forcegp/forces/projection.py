@@ -5,9 +5,8 @@ orthonormal basis U of the null space of A (after scaling by the noise), Uᵀ q�
 process in nq − rank A rows per sample, and the likelihood splits exactly into the two parts.
 
 Motor torque noise is white noise on the joint force. It affects the rows of a sample through the same
-operator as the force. The noise of these rows has covariance I + N Nᵀ with N = B Σ_τ½, and they are whitened
-by its Cholesky factor. State noise affects the rows, to first order, through the Jacobian of the measured
-quantity.
+operator as the force, so their noise has covariance I + N Nᵀ with N = B Σ_τ½. They are whitened by its
+Cholesky factor. State noise affects the rows, to first order, through the Jacobian of the measured quantity.
 """
 
 from __future__ import annotations

@@ -64,7 +64,7 @@ def states(
 
 
 ForceField = Callable[[ConstrainedSystem, States], Tensor]
-"""Function that returns the impressed force Q̄ at states `(n, nq)`; each of several samples takes n/k rows."""
+"""Function that returns the impressed force Q̄ at states, `(n, nq)`; k samples share the n rows equally."""
 
 
 class FlatStates(NamedTuple):
@@ -95,7 +95,7 @@ class FlatStates(NamedTuple):
 def flat_states(
     system: ConstrainedSystem, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor | None
 ) -> FlatStates:
-    """Broadcast states `(*batch, nq)` against each other and flatten them; by default, contacts are closed.
+    """Broadcast states `(*batch, nq)` against each other and flatten them; contacts are closed by default.
 
     Raises:
         ShapeError: an argument does not match the system, or is not finite.
@@ -227,7 +227,7 @@ QUANTITIES: dict[str, Callable[[ConstrainedSystem, States], AffineMap]] = {
     "joint_force": _joint_force,
     "contact_friction": _contact_friction,
 }
-"""Quantities that can be measured and predicted, by name."""
+"""Quantities that can be measured and predicted, keyed by name."""
 
 
 def affine_maps(

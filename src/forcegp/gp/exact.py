@@ -1,6 +1,6 @@
 """Exact posterior of latent processes given whitened rows (eqs. 11 and 22 to 24).
 
-Memory use grows with the square of the number of rows. Fits that would not fit into memory are rejected.
+Memory use grows with the square of the number of rows. Fits that would exceed the memory are rejected.
 """
 
 from __future__ import annotations
@@ -104,7 +104,7 @@ class ExactPosterior:
         return result
 
     def knowing(self, p: int, features: Features, value: Tensor) -> ExactPosterior:
-        """Return the posterior given the value `(components,)` of a constant process p, and zero its mean."""
+        """Return the posterior given the value `(components,)` of a constant process p, which gets mean 0."""
         # y ← y − W_p f_p, with W_p ← 0
         blocks = [
             Block(
@@ -133,11 +133,11 @@ class ExactPosterior:
 
     @cached_property
     def _weights(self) -> list[list[Tensor]]:
-        """Weights `(components, n, 1)` for each process and block; k(x, X) times these is the mean."""
+        """Weights `(components, n, 1)` by process and block; the mean is the sum of k(x, X) times weights."""
         return self.weights_of(self.alpha[:, None])
 
     def weights_of(self, rows: Tensor) -> list[list[Tensor]]:
-        """Apply Wᵀ to row vectors `(rows, s)`; return `(components, n, s)` for each process and block."""
+        """Apply Wᵀ to vectors over the rows `(rows, s)`; return `(components, n, s)` by process and block."""
         weights: list[list[Tensor]] = [[] for _ in self.processes]
         first = 0
         for block in self.blocks:

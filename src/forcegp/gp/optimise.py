@@ -21,7 +21,7 @@ Progress = Callable[[int, float, dict[str, Tensor]], None]
 FitProgress = Callable[[int, int, float], None]
 """Function called with the number of evaluations, their maximum number, and the objective."""
 Bounds = Mapping[str, tuple[float | Tensor, float | Tensor]]
-"""Lower and upper bound of each tensor, common to all its entries or separate for each entry."""
+"""Lower and upper bounds on each tensor, common to all its entries or separate for each entry."""
 
 OPTIMIZERS = ("lbfgs", "adam")
 FIRST_STEP = 2.0

@@ -209,7 +209,7 @@ def _runs(columns: list[slice]) -> list[slice]:
 
 
 def shard(samples: int, rank: int, processes: int) -> slice:
-    """Return the samples of one process: a contiguous run, whose length differs by at most one among them.
+    """Return the contiguous samples of one process; their numbers differ by at most one between processes.
 
     Example:
         >>> [shard(7, rank, 3) for rank in range(3)]

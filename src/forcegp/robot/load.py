@@ -33,7 +33,7 @@ FRICTION_VELOCITY = 0.1
 SINGULAR = 1e-12
 """Eigenvalue of the scaled mass matrix below which the matrix is considered singular in double precision."""
 LIMB_JOINTS, WALKING_JOINTS, BODY_MASS = 2, 6, 1.0
-"""Minimum number of joints of a limb, and minimum number of joints and base mass [kg] of a robot that might
+"""Minimum number of joints in a limb, and minimum number of joints and base mass [kg] of a robot that might
 walk (hands are lighter)."""
 OF_JOINTS = ("axis", "damping", "friction", "armature", "lower", "upper", "velocity_limit", "effort_limit")
 """Joint attributes copied unchanged from the file."""

@@ -89,7 +89,7 @@ def transform(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
 
 
 def joint_motion(kind: JointKind, axis: np.ndarray, q: float) -> np.ndarray:
-    """Return the pose of a link in its joint frame at joint position q `(4, 4)`."""
+    """Return the pose `(4, 4)` of a link in its joint frame at joint position q."""
     if kind == "prismatic":
         return transform(np.eye(3), q * axis)
     return transform(scipy.spatial.transform.Rotation.from_rotvec(q * axis).as_matrix(), np.zeros(3))

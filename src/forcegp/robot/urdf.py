@@ -160,7 +160,7 @@ def _unit(axis: np.ndarray, where: str) -> np.ndarray:
 
 
 def _limits(limit: dict[str, Any], kind: str, where: str) -> dict[str, float]:
-    """Return position, effort and velocity limits; effort and velocity limits of 0 or none are infinite."""
+    """Return position, effort and velocity limits; zero or missing effort or velocity limits are infinite."""
     effort, velocity = (limit.get(name) or np.inf for name in ("effort", "velocity"))
     if min(effort, velocity) < 0.0:
         raise RobotFileError(

@@ -265,9 +265,8 @@ class NormalForcePrior(ForcePrior):
     """A joint force along the constraint, E = Aᵀ Lᵀ = I − P, which does not affect accelerations in contact.
 
     Since H Aᵀ = 0, a force Aᵀ g(x) changes the multiplier by −g(x) but not the accelerations. A joint force
-    prior alone is overconfident along the normal. This independent process, which shares the joint force
-    prior's hyperparameters, retains the uncertainty of that part unless, for example, a force sensor reduces
-    it.
+    prior alone is overconfident along the normal. This independent process shares its hyperparameters but
+    retains the uncertainty of that part unless it is reduced, for example by a force sensor.
 
     Args:
         like: the joint force prior that provides the kernel, inputs and hyperparameters.

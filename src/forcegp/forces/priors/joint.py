@@ -208,9 +208,8 @@ class DisturbancePrior(PerJointPrior):
     """A prior on slow disturbances Q_i = d_i(t), with one Ornstein–Uhlenbeck process per joint.
 
     The processes are independent between trajectories; their standard deviations σ_i and correlation times
-    T_i are learned. Disturbances of new motions cannot be predicted: there, they add σ_i² to the variance of
-    the joint force and zero to its mean. Inference is exact, since sparse inference assumes independent
-    samples.
+    T_i are learned. On new motions, they cannot be predicted, and they add σ_i² to the variance of the joint
+    force but nothing to its mean. Inference is exact, since sparse inference assumes independent samples.
 
     Args:
         kernel: covariance over time.
