@@ -1,4 +1,4 @@
-"""Mean and covariance as a `torch.export` program."""
+"""The posterior mean and covariance as a `torch.export` program."""
 
 from __future__ import annotations
 
@@ -27,8 +27,8 @@ class _Posterior(torch.nn.Module):
 
 @torch.no_grad()
 def write_torch(fit: Predictor, path: Path, name: str) -> None:
-    """Write the program from q, q̇, τ `(1, nq)` and closed contacts `(1, n_contacts)` to mean, covariance and
-    distance from the training data; it raises no errors."""
+    """Write the program that maps q, q̇, τ `(1, nq)` and closed contacts `(1, n_contacts)` to mean, covariance
+    and distance beyond the training data; the program raises no errors."""
     system = fit.system
     state = [torch.zeros(1, system.robot.nq, dtype=system.robot.dtype) for _ in range(3)]
     closed = torch.ones(1, len(system.contacts), dtype=torch.bool)
