@@ -26,14 +26,14 @@ OFFSET, TILT = 5e-4, np.radians(0.2)
 FAR = 0.01
 """Median distance in contact above which the surface, the point or the labels must be wrong [m]."""
 TOUCH, ROUGH = 2e-4, 8.0
-"""Distance within which a tip counts as in contact, given the stiffness of surfaces and arms: [m], and in
+"""Distance within which a tip counts as touching, given the stiffness of surfaces and arms, in m and in
 robust standard deviations of the distance in contact."""
 CREEP = 1e-3
 """Speed along the normal that is always allowed in contact [m/s]."""
 LANDING, STOPS = 5, 2.0
 """Number of rows within which a landing tip stops, and ratio of its speed to that of a tip in contact."""
 DRIFT, RUN_SECONDS = 2e-3, 0.02
-"""Change in distance allowed while the tip touches, due to soft ground, a bent arm or drift [m]; duration of
+"""Change in distance allowed in contact, due to soft ground, deflection of the arm, or drift [m]; duration of
 the shortest run of rows for which a wrong label is reported [s]."""
 MISSED_SECONDS, MISSED_DISTANCE = 0.1, 2e-3
 """Shortest time [s] and distance [m] of sliding along the surface that count as an unlabelled contact."""
@@ -250,10 +250,10 @@ FORCE_ROWS = 4000
 PULLS = 0.5
 """Fraction of contact rows with a pulling force above which the normal must be reversed."""
 SIGNIFICANT, LARGEST_FRICTION = 4.0, 2.0
-"""Number of standard errors over blocks above which friction is significant, and largest plausible
-coefficient."""
+"""Standard errors over blocks above which friction is significant, and largest plausible coefficient."""
 SLIDING_SLOW, NARROW = 0.01, 0.05
-"""Speed below which the sliding direction is unknown [m/s], and minimum ratio of minor to major direction."""
+"""Speed below which the sliding direction is unknown [m/s], and minimum RMS speed across the main direction
+relative to that along it."""
 
 
 def check_forces(system: ConstrainedSystem, log: Log) -> Outcome:

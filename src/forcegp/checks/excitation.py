@@ -90,7 +90,7 @@ def check_excitation(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def _sharpness(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> tuple[Array, tuple[str, ...], Array]:
-    """Return the posterior over the prior standard deviation of each base parameter, at 1 % torque noise."""
+    """Return the ratio of posterior to prior deviation of each base parameter, at 1 % torque noise."""
     robot = system.robot
     base = base_parameters(robot)
     columns = np.array(base.columns)
@@ -175,7 +175,7 @@ def force_of(explanation: Explanation, fault: Fault) -> float:
 
 
 def visible_size(explanation: Explanation, fault: Fault) -> float:
-    """Return the size above which a fault is detected whatever its sign, or `LARGEST` if there is none."""
+    """Return the size above which a fault of either sign is detected, or `LARGEST` if there is none."""
     problem = explanation.problem
     rest = held_out(problem, explanation.columns, explanation.prior)
     added = held_out(replace(problem, r=fault.column), explanation.columns, explanation.prior)

@@ -31,7 +31,7 @@ SHARE, SAME = 0.03, 1e-3
 DETERMINED = 3.0
 """A gain counts as determined if it exceeds this many standard errors."""
 MATERIAL, MATERIAL_EACH = 0.15, 0.05
-"""Material drop in Σ_j log error (14 % less error at one joint); the drop required per affected joint."""
+"""Minimum drop in Σ_j log error that is material: in total (14 % at one joint), and per affected joint."""
 
 Tried = tuple[Hypothesis, TorqueFit]
 
@@ -41,7 +41,7 @@ class Explanation:
     """Faults that explain the torque: faults of the log, which are corrected in `log`, and of the robot file.
 
     `problem` contains the remaining torques at `rows`. Accepted hypotheses about the robot stay in the model
-    with their `columns`, `prior` and names `robot`. `repairs` correct the faults of a log, one after another.
+    with their `columns`, `prior` and names `robot`. Calling `repairs` in order corrects the faults of a log.
     """
 
     system: ConstrainedSystem

@@ -44,7 +44,7 @@ class Finding:
 
     Args:
         kind: a key of `KINDS`.
-        message: a sentence that states numbers.
+        message: a sentence that quotes the relevant numbers.
         intervals: affected rows as half-open intervals in increasing order, counted from 0.
         joints: affected joints.
         contact: affected contact, if any.
@@ -113,7 +113,7 @@ class Finding:
 def at_rows(
     mask: NDArray[np.bool_], kind: str, text: str, joints: tuple[str, ...] = (), **evidence: SupportsFloat
 ) -> list[Finding]:
-    """Return a finding on the rows selected by a mask, which its text lists; none if the mask is empty."""
+    """Return a finding on the rows selected by a mask, which are listed in its text, or no finding."""
     rows = intervals(mask)
     return [Finding(kind, f"{text} {describe(rows)}", rows, joints, evidence=evidence)] if rows else []
 

@@ -42,9 +42,9 @@ class Hypothesis:
     """A possible explanation of the torque, named after a kind of finding or a group of kinds.
 
     `size` is the number of parameters, where discrete choices count as zero. `change` corrects the log under
-    this hypothesis, except for effects of parameters. `columns` `(n, nq, p)` are the torques added to r per
-    unit of each parameter, whose prior standard deviations are `prior` `(p,)`. `instruments` have the same
-    shape and allow for errors in the columns. `shift` is a delay of the torque in samples.
+    this hypothesis, except for the effects of its parameters. `columns` `(n, nq, p)` are the torques added to
+    r per unit of each parameter, whose prior standard deviations are `prior` `(p,)`. `instruments` have the
+    same shape and allow for errors in the columns. `shift` is a delay of the torque in samples.
     """
 
     name: str
@@ -230,7 +230,7 @@ SMALL_GAIN, EXPLAINED = 0.2, 0.5
 SMALL_TILT, EARTH = 1.0, 9.81
 """Tilt that wrong masses may cause [degrees]; magnitude assumed if the scene has no gravity [m/s²]."""
 SAME_GRAVITY = 0.2, 0.5
-"""Accepted relative error in the magnitude of gravity, for a tilt and for larger angles (masses err, too)."""
+"""Accepted relative error in the magnitude of gravity due to wrong masses, for tilts and larger angles."""
 
 
 DISCRETE = {

@@ -29,7 +29,7 @@ TOLERANCE, INSTANT = 0.05, 0.15
 RELATED = 0.7
 """Correlation below which a velocity does not belong to its position, unless encoder steps are coarse."""
 EXCHANGED, CLEARLY = 0.9, 5.0
-"""Correlation with another joint's rate above which columns are swapped; factor by which that order must
+"""Correlation with another joint's rate that indicates swapped columns; factor by which that order must
 reduce the unexplained variance."""
 LATE, PERSISTS = 0.05, 0.5
 """Fraction of the motion that a delayed velocity misses, and correlation of the missing motion in adjacent
@@ -154,7 +154,7 @@ def _one_factor(level: Match, factor: float) -> bool:
 
 
 def check_velocity(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find velocities that are not the derivative of the positions, or only up to unit, sign or order."""
+    """Find velocities that are not the derivative of the positions, or have a wrong unit, sign or order."""
     if "qd" in log.derived:
         return [], log
     level = match(log, "q", "qd")
@@ -256,7 +256,7 @@ def _held_torque(system: ConstrainedSystem, log: Log) -> Array:
     """Return the mean acceleration over a period of constant torque relative to that at its start, `(nq,)`.
 
     Viscous friction d slows a joint of inertia m as exp(−d t/m), so the ratio is (1 − exp(−x))/x, x = d dt/m.
-    After a change in the torque, light damped joints accelerate more than their velocity changes.
+    After a change in the torque, lightweight damped joints accelerate more than their velocity changes.
     """
     rows = log.rows(INERTIA_ROWS)
     (q,) = tensors(log, rows, "q")
@@ -300,7 +300,7 @@ DEPARTURE_STRIDE = 3
 """Stride at which the deviation from a cubic reveals noise below the cut-off frequency of a filter."""
 NOISE_FACTOR, FILTERED = 2.0, 0.4
 """Ratio of measured to stated noise above which it is reported; ratio of the noise at the highest frequency
-to that at a third of it below which it is filtered."""
+to that at a third of it below which the noise counts as filtered."""
 NOISE_ROWS = 100
 
 
@@ -343,7 +343,7 @@ def check_noise(system: ConstrainedSystem, log: Log) -> Outcome:
     if stated is None:
         return [], log
     kinds = [("noise-understated", top > NOISE_FACTOR * stated, np.max)]
-    if not log.header.filtered:  # a filter removes noise at the highest frequencies only
+    if not log.header.filtered:  # after filtering, little noise is left at high frequencies
         kinds.append(("noise-overstated", top < stated / NOISE_FACTOR, np.min))
     findings = []
     for kind, wrong, worst in (one for one in kinds if one[1].any()):

@@ -121,7 +121,7 @@ class Log:
         return Finding(kind, text, self.all_rows, joints, evidence=evidence)
 
     def on_joints(self, kind: str, mask: Array, text: str, **evidence: Any) -> list[Finding]:
-        """Return a finding on the joints selected by a mask, named at `{}` in its text, or no finding."""
+        """Return a finding on the joints selected by a mask, whose names replace `{}`, or no finding."""
         joints = self.named(mask)
         return [self.finding(kind, text.format(", ".join(joints)), joints, **evidence)] if joints else []
 

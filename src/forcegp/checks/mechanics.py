@@ -38,7 +38,7 @@ DISTURBANCE, LOUD = 5.0, 4.0
 """A stretch stands out if its log residual exceeds the median by this many robust standard deviations, or its
 residual exceeds the 90 % quantile by this factor."""
 MOVING, VISIBLE = 0.05, 0.1
-"""Fraction of its largest speed above which an arm moves; smallest disturbance beyond friction, relative."""
+"""Fraction of its largest speed above which an arm moves; fraction of the torque that disturbances exceed."""
 RIVALS = {"gravity": "a tilt of the base", "masses": "other masses", "gains": "a wrong gain"}
 """Faults that may look like a constant torque, by hypothesis."""
 ONE_SIGMA = 84.13
@@ -64,7 +64,7 @@ def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
         # A disturbance in these rows must not be attributed to friction or a mass.
         explanation = explain(system, smooth.mask(rows))
     losses = _determined(system.robot, explanation)
-    # Friction of contacts, and declared friction of another slope, must not be taken for undeclared friction.
+    # Friction of contacts, and steeper declared friction, must not be taken for undeclared friction.
     functions = (hypotheses.contact_friction_columns, hypotheses.other_rise_columns)
     shapes = [columns(system, explanation.log, explanation.rows) for columns in functions]
     findings = [
