@@ -35,7 +35,7 @@ _TOKEN = re.compile(rf"({_NAME})|(\.)|[^\S\n]+|(.|\n)")
 
 
 class Document:
-    """A parsed TOML file with the line of each key; errors are raised as `error` and name `source`."""
+    """A parsed TOML file that records the line of each key. Errors are of class `error` and name `source`."""
 
     def __init__(self, content: bytes, source: str, error: type[ForceGPError] = SceneError) -> None:
         self.source, self.error = source, error

@@ -110,7 +110,7 @@ class ContactSection(ContactFields, strict=True):
 
 
 class ConnectionSection(ConnectionFields, strict=True):
-    """`[[connection]]`: two coincident points; if `other_frame` is omitted, the second is a world point."""
+    """`[[connection]]`: two coincident points, the second fixed in the world if `other_frame` is omitted."""
 
 
 class SceneSections(Section):
