@@ -17,7 +17,7 @@ O = TypeVar("O", bound="KernelOptions")
 
 
 class Window(Record):
-    """Window around the parameters in the robot file from which initial values are drawn.
+    """Window from which initial values are drawn, centred on the parameters in the robot file.
 
     Attributes:
         relative: half-width for logarithms of masses, moments and friction; 0.5 corresponds to a factor

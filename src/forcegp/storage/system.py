@@ -70,7 +70,7 @@ class ContactFields(Record):
 
 
 class ConnectionFields(Record):
-    """Two coincident points; if `other_frame` is `None`, the second is a world point."""
+    """Two coincident points, the second fixed in the world if `other_frame` is `None`."""
 
     name: str
     frame: str
