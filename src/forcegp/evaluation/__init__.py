@@ -37,7 +37,7 @@ from forcegp.models.base import FittedModel, Predictor
 __all__ = ["Evaluation", "evaluate"]
 
 GRAVITY_ALONE, LEAST_RESPONSE = 0.99, 0.5
-"""Gravity's share of the torque above which data test little else; minimum response to an added torque."""
+"""Fraction of torque due to gravity above which data are a weak test; minimum response to an added torque."""
 
 
 @dataclass(frozen=True)
@@ -58,7 +58,7 @@ class Evaluation:
         predictors: per-joint errors of the model and of the trivial predictors.
         verdicts: comparison of the model with each trivial predictor; empty if there are too few samples.
         multipliers: comparison of λ with logged values, if the model predicts forces and the log contains λ.
-        sensed: the same for predictions that use the force sensor at each state, if the fit used it, too.
+        sensed: the same for predictions that also use the force sensor at each state, if the fit included it.
         gravity: fraction R² of the torque explained by gravity alone; if it is close to 1, the log is a weak
             test of a model.
         response: fraction of an added torque that takes effect, one per joint: 1 for a rigid robot, 0 for a
@@ -86,7 +86,7 @@ class Evaluation:
 
     @property
     def verdict(self) -> str:
-        """Verdict in one sentence, based on torque beyond gravity, open-loop motion and contact force."""
+        """Verdict in one sentence on explained torque beyond gravity, open-loop motion and contact force."""
         parts, shares = [], {p.name: p.beyond_gravity for p in self.predictors}
         if (share := shares.pop("model", None)) is not None:
             others = [
@@ -256,7 +256,7 @@ def _predictors(
 def _trivial(
     system: ConstrainedSystem, data: Dataset, train: Dataset | None
 ) -> dict[str, tuple[Tensor, Tensor, Tensor]]:
-    """Return acceleration errors, torque errors and standard deviations `(n, nq)` on data not trained on."""
+    """Return errors, torque errors and standard deviations `(n, nq)` on data not used for training."""
     half = len(data) // 2
     parts = [(train, data)] if train is not None else [(data[half:], data[:half]), (data[:half], data[half:])]
     errors: dict[str, list[tuple[Tensor, Tensor, Tensor]]] = {}

@@ -70,7 +70,7 @@ def data_chunks(data: Dataset) -> Iterator[Dataset]:
 
 
 def identify_rigid(system: ConstrainedSystem, train: Dataset) -> LeastSquares:
-    """Identify inertial parameters, friction and offsets; if not excited, they keep their file values."""
+    """Identify inertial parameters, friction and offsets; those not excited remain as in the robot file."""
     rows = torch.linspace(0, len(train) - 1, min(len(train), MOST)).round().long()
     train, robot = train[rows.unique()], system.robot
     prior = _prior_std(robot, train)
