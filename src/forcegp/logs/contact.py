@@ -120,7 +120,7 @@ def _evidence(
 
 SEPARATION, RELEASE_STD, RELEASE = 6.0, 4.0, 0.01
 """Minimum difference between the force levels of open and closed contact, in standard deviations of the open
-level; margin above the open level in closed intervals, in the same unit and relative to the difference."""
+level; minimum margin above the open level in closed intervals, in the same unit and as a fraction of it."""
 TOUCHING, DISTANCE_STD, SMALLEST_DISTANCE = 1e-3, 6.0, 1e-6
 """Largest distance in contact [m]; margin above the median distance of the closed contact, in standard
 deviations and at least, to allow for rounding [m]; a mapping may override the result."""
@@ -296,9 +296,9 @@ def touching(distance: Array) -> float:
 def force_levels(values: Array, name: str, section: ContactStateSection) -> tuple[float, float]:
     """Return the force above which a contact is closed, and the lower force to which intervals extend [N].
 
-    The first separates the forces into the two groups with the least variance (Otsu 1979). The second lies
-    `RELEASE_STD` standard deviations, and a fraction `RELEASE` of the difference, above the median of the
-    open group. Raise `DataError` if the groups are not distinct.
+    The first separates the forces into the two groups with the least variance (Otsu 1979). The second exceeds
+    the median of the open group by `RELEASE_STD` standard deviations, or by a fraction `RELEASE` of the
+    difference if that is larger. Raise `DataError` if the groups are not distinct.
     """
     if section.threshold is not None:
         return section.threshold, section.release if section.release is not None else 0.5 * section.threshold

@@ -146,7 +146,7 @@ class QuantitySection(Section):
 
 class TorqueSection(QuantitySection):
     """`[torque]`: a torque, or a current and the torque constant of the motor [N m/A]; joints without either
-    are listed as `unmeasured`. `clipped` states whether clipped torques become noisy, or rows are dropped."""
+    are listed as `unmeasured`. Rows with `clipped` torques are kept, given large noise, or dropped."""
 
     torque_constant: PerJoint | None = None
     unmeasured: tuple[str, ...] = ()

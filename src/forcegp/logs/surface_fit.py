@@ -161,8 +161,8 @@ def fit_surface(
     ends at the contact point of the scene; by default, the tip is that of the scene.
 
     Raises:
-        DataError: the tip in the scene cannot be a ball, the contact is closed in too few rows, or the path
-            is too straight or too short.
+        DataError: the tip in the scene already has a radius or lacks an axis, the contact is closed in too
+            few rows, or the path is too straight or too short.
         UnknownNameError: the contact does not exist.
     """
     touching = system.contact(contact)

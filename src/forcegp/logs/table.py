@@ -82,7 +82,7 @@ def joined(chunks: dict[str, list[Column]], rows: int | None) -> dict[str, Colum
 
 
 def streams_by_length(groups: Mapping[int, Mapping[str, Column]], common: int) -> tuple[Stream, ...]:
-    """Return one stream for each number of rows; that with the most common number is first and unnamed."""
+    """Return one stream for each number of rows; the stream with `common` rows is first and unnamed."""
     ordered = sorted(groups, key=lambda rows: rows != common)
     return tuple(Stream("" if rows == common else f"{rows} rows", groups[rows]) for rows in ordered)
 
