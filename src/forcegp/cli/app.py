@@ -1,4 +1,4 @@
-"""The application with all commands; invalid input ends in one message on stderr and exit code 2."""
+"""The application with all commands. Invalid input causes one message on stderr and exit code 2."""
 
 from __future__ import annotations
 
