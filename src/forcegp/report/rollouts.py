@@ -183,7 +183,7 @@ def _bands(rolled, values: Tensor, n: int) -> list[Band]:
 
 
 def _sound(q: Tensor) -> int:
-    """Return the number of times at which the state is finite, given `(T, nq)`."""
+    """Return the number of time steps at which the state `(T, nq)` is finite."""
     return int(torch.isfinite(q).all(-1).sum())
 
 
