@@ -1,4 +1,4 @@
-"""Checks that a result can be written, made before the work starts, and a fallback path if writing fails."""
+"""Early checks that a result can be written, and a fallback path if writing fails after all."""
 
 from __future__ import annotations
 

@@ -61,7 +61,7 @@ class ForceGPError(Exception):
 
 
 def _plain(value: object) -> object:
-    """Return a plain value unchanged, and any other as text, so that every process can unpickle it."""
+    """Return a plain value unchanged, and any other value as text, so that every process can unpickle it."""
     return value if isinstance(value, str | int | float | None) else str(value)
 
 
@@ -74,7 +74,7 @@ def _rebuilt(kind: type[E], args: tuple[object, ...], state: dict[str, object]) 
 
 
 def near_names(name: object, valid: Iterable[str], cutoff: float = 0.6) -> list[str]:
-    """Return the closest valid name to a misspelt one, if any, comparing a limited number of short names."""
+    """Return the valid name closest to a misspelt one, if any, among a limited number of short names."""
     text = str(name)
     if len(text) > NAME_COMPARED:
         return []
@@ -83,7 +83,7 @@ def near_names(name: object, valid: Iterable[str], cutoff: float = 0.6) -> list[
 
 
 def did_you_mean(name: object, valid: Iterable[str], cutoff: float = 0.6) -> str | None:
-    """Return a hint that suggests the closest valid name to a misspelt one, if there is one."""
+    """Return a hint that suggests the valid name closest to a misspelt one, if there is one."""
     near = near_names(name, valid, cutoff)
     return f"did you mean {near[0]!r}?" if near else None
 
@@ -105,7 +105,7 @@ class RobotFileWarning(UserWarning):
 
 
 class UnknownNameError(ForceGPError, LookupError):
-    """Raised if a name (joint, frame, contact, quantity, model) does not exist; lists the valid names."""
+    """Raised if a name (of a joint, frame, model, …) does not exist; the message lists the valid names."""
 
     def __init__(self, kind: str, name: object, valid: Iterable[str]) -> None:
         names = list(valid)
@@ -145,7 +145,7 @@ class SceneError(ForceGPError, ValueError):
 
 
 class MappingError(ForceGPError, ValueError):
-    """Raised if a mapping of log columns is invalid or does not match the log (names file, line and key)."""
+    """Raised if a mapping of log columns is invalid or does not match the log; the message names the key."""
 
 
 class ModelError(ForceGPError, ValueError):

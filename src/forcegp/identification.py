@@ -26,7 +26,8 @@ from forcegp.types import JointVector
 
 Regressor = Float[Tensor, "*batch nq p"]
 RANK = 1e-9
-"""Fraction of the scaled regressor's largest pivot below which a direction has no effect on the motion."""
+"""Pivot of the scaled regressor, relative to the largest, below which a direction does not affect the motion.
+"""
 STATES = 100
 """Number of random states from which the rank is determined."""
 MASS_SHARE, MOMENT_ARM = 0.3, 0.1
@@ -36,10 +37,10 @@ PARAMETER_NAMES = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", 
 
 
 def regressor(robot: RobotModel, q: JointVector, qd: JointVector, qdd: JointVector) -> Regressor:
-    """Return Y `(*batch, nq, 10 nq)` with Y π = M q̈ − Q_C − Q_G without armature, π from `parameter_vector`.
+    """Return Y `(*batch, nq, 10 nq)` such that Y π = M q̈ − Q_C − Q_G without armature (`parameter_vector`).
 
-    Inverse dynamics is linear in π, so column k of link i contains the forces caused by this link if only
-    π_k = 1 is nonzero. Only the kinematics and the gravity vector of the robot are used.
+    Inverse dynamics is linear in π, so column k of link i contains the forces caused by a unit parameter π_k
+    of this link. Only the kinematics and the gravity vector of the robot are used.
 
     Example:
         >>> import torch, forcegp

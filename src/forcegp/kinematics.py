@@ -44,12 +44,12 @@ class LinkPoses:
 
     @property
     def rotation(self) -> Tensor:
-        """`(*batch, nq, 3, 3)` link axes."""
+        """Link axes `(*batch, nq, 3, 3)`."""
         return batch_first(self.R, self.batch).movedim(-1, -3)
 
     @property
     def position(self) -> Tensor:
-        """`(*batch, nq, 3)` link origins [m]."""
+        """Link origins `(*batch, nq, 3)` [m]."""
         return batch_first(self.p, self.batch).mT
 
 
@@ -264,7 +264,7 @@ def point_motion(
 
 
 def jacobian_of_poses(robot: RobotModel, poses: LinkPoses, index: int, point: Tensor) -> FrameJacobian:
-    """Return the Jacobian of `frame_jacobian`, computed from known poses."""
+    """Return the same Jacobian as `frame_jacobian`, computed from known poses."""
     rotation, origin = _frame_in_base(robot, poses, index)
     x = origin + batchlast.apply(rotation, point[:, None])
     return batch_first(_jacobian(robot, poses, index, x), poses.batch)

@@ -2,7 +2,7 @@
 
 Compiled kernels are code, so they are stored in a folder to which only its owner can write, and are checked
 before they run. A kernel is named `<key>-<SHA-256 of the file>.so`. The key identifies the source; the digest
-verifies that the file is complete. Folder (0700) and files (0600) are private regardless of the umask.
+verifies that the file is complete. The folder (0700) and files (0600) are private regardless of the umask.
 """
 
 from __future__ import annotations

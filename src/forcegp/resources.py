@@ -35,7 +35,7 @@ def free_memory() -> int | None:
 
 
 def announce_memory(needed: int, what: str, *, certain: int | None = None) -> None:
-    """Warn if work needs more than half of the free memory; raise `MemoryLimitError` if it exceeds it.
+    """Warn if work needs over half of the free memory; raise `MemoryLimitError` if it needs more than all.
 
     Call this before the allocation with an upper bound `needed` [bytes] and, if it is rough, a lower bound
     `certain`. `what` is the subject of the message, such as "the covariance of 20,000 points".

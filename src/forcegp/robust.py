@@ -22,7 +22,7 @@ def level_and_spread(x: NDArray[Any]) -> tuple[float, float]:
 
 
 def level_of(x: NDArray[Any], width: float, share: float) -> float | None:
-    """Return the median of the values within `width` of the mode, if they exceed a `share` of all values.
+    """Return the median of the values within `width` of the mode, if they are more than a `share` of all.
 
     >>> level_of(np.array([5.0, 5.1, 4.9, 40.0, -7.0]), 1.0, 0.5)
     5.0

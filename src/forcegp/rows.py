@@ -1,4 +1,4 @@
-"""Stretches of rows of a log, and their description in messages."""
+"""Stretches of rows in a log, and their description in messages."""
 
 from __future__ import annotations
 

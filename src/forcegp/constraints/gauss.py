@@ -159,7 +159,7 @@ class Equations:
 
     @cached_property
     def M_inv(self) -> JointMatrix:
-        """M⁻¹."""
+        """M⁻¹ `(*batch, nq, nq)`."""
         eye = torch.eye(self.M.shape[-1], dtype=self.M.dtype, device=self.M.device)
         return torch.cholesky_solve(eye.expand_as(self.M), self.M_cholesky)
 

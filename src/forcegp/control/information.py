@@ -168,7 +168,7 @@ def _squared(X: Tensor) -> Tensor:
 
 
 def rigid_torque(robot: RobotModel, q: Tensor, qd: Tensor, qdd: Tensor, Y: Tensor | None = None) -> Tensor:
-    """Return the torque of a motion by the robot file, Y π + armature q̈ − Q_D `(n, nq)` [N m, N]."""
+    """Return the torque that a motion requires, Y π + armature q̈ − Q_D `(n, nq)` [N m, N]."""
     Y = regressor(robot, q, qd, qdd) if Y is None else Y
     return Y @ parameter_vector(robot) + robot.armature * qdd - damping_force(robot, qd)
 

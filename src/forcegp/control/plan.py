@@ -104,7 +104,7 @@ class MotionConfig:
 POSE_TOLERANCE = 1e-10
 """Largest error in a component of a reached pose (metres, or the sine of an angle)."""
 ITERATIONS = 150
-"""Maximum number of steps from each start; successful ones need about thirty."""
+"""Maximum number of steps from each start; successful starts need about thirty."""
 MAX_STEP = 0.3
 """Largest rotation of a joint in one step [rad], within the range of the linear model of the pose."""
 DAMPING = 0.1

@@ -17,7 +17,7 @@ from forcegp.constraints.surface import Plane, Surface
 from forcegp.errors import ForceGPError
 
 PROJECTION_STEPS = 8
-"""Number of Newton steps onto a surface; one is exact for a signed distance, others double the digits."""
+"""Number of Newton steps onto a surface; one is exact for a signed distance, else each doubles the digits."""
 
 
 class Trapezoid(NamedTuple):
@@ -36,7 +36,7 @@ class Trapezoid(NamedTuple):
     acceleration: Tensor
 
     def at(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return distance, speed and acceleration at time t after the start, at rest after the end."""
+        """Return distance, speed and acceleration at time t after the start; the motion ends at rest."""
         t = torch.minimum(t.clamp(min=0.0), self.travel_time)
         remaining = self.travel_time - t
         a, blend = self.acceleration, self.blend_time

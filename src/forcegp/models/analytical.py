@@ -53,7 +53,7 @@ class AnalyticalModel(Model["AnalyticalFit"]):
     Args:
         system: robot and contacts.
         analytical_parameters: parameters to learn, as joint names by quantity (see `AnalyticalParameters`).
-        window: window around the parameters in the file from which initial values are drawn.
+        window: window, around the parameters in the file, for random initial values.
         seed: seed for the initial values.
 
     Raises:
@@ -87,8 +87,8 @@ class AnalyticalModel(Model["AnalyticalFit"]):
 
         Args:
             data: states and measured accelerations.
-            options: by default, options for ADAM on batches with early stopping; with `LearningOptions`, the
-                loss over all samples is minimised by L-BFGS or ADAM.
+            options: by default, ADAM on batches with early stopping is used; with `LearningOptions`, the loss
+                over all samples is minimised by L-BFGS or ADAM.
             progress: called after each epoch or evaluation.
             checkpoint: see `Model.fit`.
 
@@ -140,7 +140,7 @@ class AnalyticalFit(FittedModel):
 
     @property
     def specified(self) -> ConstrainedSystem:
-        """System with the robot from before the fit."""
+        """System before the fit, with the initial robot."""
         return self.system.with_robot(self.parameters.start)
 
     def described(self) -> list[tuple[str, object]]:

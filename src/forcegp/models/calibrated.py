@@ -1,4 +1,4 @@
-"""The robot identified by a fit, expressed in the parameters of robot files, and samples of it.
+"""The robot identified by a fit, expressed in the parameters of robot files, and posterior samples of it.
 
 Links have the identified inertia. Robot files only support joint friction of the form d q̇ + f sign q̇, so d
 and f are fitted to the learned friction Q_D(q̇) over the trained speeds by least squares with an offset,
@@ -42,7 +42,7 @@ from forcegp.robot.write_back import is_mjcf, write_robot
 SPEEDS, POSES = 20, 20
 """Number of speeds in each direction, and number of poses, at which friction is evaluated."""
 SLOWEST = 0.05
-"""Smallest of these speeds relative to the largest trained one; dry friction is smooth below it."""
+"""Smallest of these speeds relative to the largest trained speed; below it, dry friction is smooth."""
 UNTRAINED = 1.0
 """Largest speed that is assumed if the trained speeds are unknown [rad/s, m/s]."""
 DRAWS = 400
@@ -50,7 +50,7 @@ DRAWS = 400
 OPEN = 2.0
 """Number of standard deviations from zero within which an offset counts as undetermined."""
 DETERMINED = 0.5
-"""Standard deviation, relative to the prior's or to the magnitude, below which a parameter is determined."""
+"""Standard deviation below which a parameter is determined, relative to the prior's or to the magnitude."""
 SMALLEST = 1e-2
 """Smallest eigenvalue ε of a link's pseudo-inertia relative to the identified pseudo-inertia."""
 ROUNDS, RELAXATION = 300, 1.6
@@ -280,7 +280,7 @@ Curve = tuple[Tensor, Tensor, Tensor]
 
 @dataclass(frozen=True, eq=False)
 class _Reader:
-    """Computes robots from the posterior of a fit.
+    """Computation of robots from the posterior of a fit.
 
     Attributes:
         fit: the fit.

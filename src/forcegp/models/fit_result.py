@@ -12,7 +12,7 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.notebook import html_table
 
 COVERED = 0.8
-"""Held-out ±2σ coverage below which a fit issues a warning; a σ of 64 % of the correct one leads to it."""
+"""Held-out ±2σ coverage below which a fit issues a warning; it results if σ is 36 % too small."""
 
 
 @dataclass(frozen=True)

@@ -81,7 +81,7 @@ def train(
         The tensors, their loss, and one entry per epoch or evaluation as history.
 
     Raises:
-        ModelError: there are too few samples to hold any out, or the checkpoint belongs to another fit.
+        ModelError: there are too few samples to hold any out, or the checkpoint belongs to a different fit.
         NumericalError: the loss is not finite.
     """
     key = (options, *key, *(part for pair in start.items() for part in pair))

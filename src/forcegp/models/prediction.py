@@ -52,7 +52,7 @@ class Prediction:
             if the model does not provide it or it was not requested.
         parts: slice of each requested quantity.
         beyond: `(*batch, nq)` distance by which the speed and torque of each joint exceed the training data,
-            in training standard deviations; `None` if the model does not provide it.
+            in standard deviations of these data; `None` if the model does not provide it.
         joint_names: joints in the order of `beyond`.
         determined: `(*batch, d)` bool, components determined by the data and the motion; the others are NaN.
             `None` if all are determined.

@@ -240,7 +240,7 @@ def _specification(
 
 
 def _check_types(tensors: Mapping[str, Tensor]) -> None:
-    """Raise `ValueError` if a tensor does not have real numbers or the type in `NOT_REAL`."""
+    """Raise `ValueError` if a tensor does not contain real numbers or have its type in `NOT_REAL`."""
     for name, value in tensors.items():
         dtype = next((dtype for names, dtype in NOT_REAL if names.fullmatch(name)), None)
         if not value.is_floating_point() if dtype is None else value.dtype != dtype:

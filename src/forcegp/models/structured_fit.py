@@ -250,7 +250,7 @@ class StructuredFit(FittedModel):
 
     def beyond(self, qd: Tensor, tau: Tensor) -> Tensor | None:
         """Return the distance `(*batch, nq)` by which the speed and torque of each joint exceed the training
-        data, in training standard deviations; `None` if no torque noise was learned.
+        data, in standard deviations of these data; `None` if no torque noise was learned.
         """
         return distance_beyond(self.hyperparameters, qd, tau) if LOW in self.hyperparameters else None
 

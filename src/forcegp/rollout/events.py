@@ -60,7 +60,7 @@ def switch(problem: RolloutProblem, state: State, crossed: Tensor) -> State:
 
 
 def settle(problem: RolloutProblem, state: State, end: Tensor) -> tuple[State, Instant, list[ContactEvent]]:
-    """Return the state at the start of a step, after pulling contacts are opened and reached ones closed.
+    """Return the state at the start of a step, after contacts that pull are opened and those reached closed.
 
     The torque, and therefore λ, may jump at the start of a step.
     """

@@ -110,7 +110,7 @@ class Reached:
 
     Attributes:
         system: robot and contacts.
-        q, qd: `(n, nq)`.
+        q, qd: `(n, nq)` positions and velocities.
         active: `(n, n_contacts)` bool, closed contacts.
     """
 
@@ -247,7 +247,7 @@ class TaskSpaceControl(Inputs):
 def inputs_of(
     tau: Torque, batch: torch.Size, rows: int, dt: float | None, interpolation: str = "hold"
 ) -> Inputs:
-    """Return the inputs defined by `tau` for `rows` trajectories, a multiple of the initial states' number.
+    """Return the inputs defined by `tau` for `rows` trajectories, a multiple of the batch size.
 
     `tau` is an array `(*batch, samples, nq)` or `(samples, nq)` with period dt [s], a log, a feedback law of
     (t, q, q̇), or `Inputs`. A single sample is a constant torque. `interpolation` is `"hold"` or `"linear"`.

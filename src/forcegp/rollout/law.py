@@ -148,7 +148,7 @@ def overshooting(G: Tensor, damping: Tensor, h: Tensor) -> Tensor | None:
 
 
 def at_the_end(qdd: Tensor, G: Tensor, damping: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
-    """Return acceleration (1 + h G D)⁻¹ q̈₀ and response (1 + h G D)⁻¹ G with damping at the end of the step.
+    """Return (1 + h G D)⁻¹ q̈₀ and (1 + h G D)⁻¹ G, the motion with damping evaluated at the end of the step.
 
     Example:
         >>> import torch
@@ -405,7 +405,7 @@ class RolloutProblem:
         return self._instant(sliding_away(self.system, at, now.multiplier, slides, rough), h)
 
     def stopped(self, before: State, after: State) -> State:
-        """Return the state after a step, with contacts at rest that friction stopped in this step."""
+        """Return the state after a step, in which contacts that friction has stopped are at rest."""
         if not self.rough:
             return after
         first, last = (self.system.equations(x.q, x.qd, x.active) for x in (before, after))

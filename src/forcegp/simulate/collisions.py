@@ -20,7 +20,7 @@ from forcegp.simulate.urdf import link_name, write_urdf
 from forcegp.types import Array
 
 POSITIONS, MOST = 200, 0.5
-"""Number of random positions, and fraction of them above which a pair that overlaps is ignored."""
+"""Number of random positions, and fraction of overlaps in these positions above which a pair is ignored."""
 TIP = 0.005
 """Tip radius for point contacts [m]."""
 SURROUNDINGS = "surroundings"

@@ -61,7 +61,7 @@ class ContactSolver:
 
 @dataclass(frozen=True)
 class Sensors:
-    """Imperfect sensors, which provide the values for the controller and the log; the default is perfect.
+    """Imperfect sensors, which provide the values for the controller and the log; perfect by default.
 
     Args:
         encoder_resolution: resolution of the measured joint positions [rad, m].

@@ -39,11 +39,11 @@ SINES, SLOWEST, QUICKEST = 6, 0.05, 0.6
 STEEP = 5.0
 """Initial weight of the squared hinges, which is doubled after each round that violates a limit."""
 INSIDE = 0.97
-"""Fraction of a limit above which a hinge is active; for the clearance, its inverse."""
+"""Fraction of a limit above which its hinge is active."""
 KEEP = 1.5
 """Distance, relative to the clearance, below which the hinge for the clearance is active."""
 ROUNDS, STEPS, REPAIRS = 4, 150, 30
-"""Number of verification rounds, and of evaluations in the first round and in later ones."""
+"""Number of verification rounds, and of evaluations in the first round and in later rounds."""
 SHARES = (1.0, 0.98, 0.95, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1, 0.05)
 """Scales of a motion, which are tried in order until all limits are satisfied."""
 REGION = 300

@@ -65,7 +65,7 @@ class RunLog:
 
 
 def noise(like: Tensor, generator: torch.Generator) -> Tensor:
-    """Draw white noise of unit variance; it is drawn in double precision for any type."""
+    """Draw white noise of unit variance in double precision, and convert it to the type of `like`."""
     return torch.randn(like.shape, dtype=torch.float64, generator=generator).to(like.dtype)
 
 

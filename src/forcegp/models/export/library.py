@@ -50,7 +50,7 @@ FUNCTIONS = {
 
 
 class CompiledFit(Predictor):
-    """A fit that predicts with its C code, with the results of `StructuredFit.predict`, in microseconds.
+    """A fit that predicts in C: it computes the results of `StructuredFit.predict` in microseconds.
 
     It is created by `StructuredFit.compiled`; `library` has the functions of the C header, `forcegp_…`."""
 
