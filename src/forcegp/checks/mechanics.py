@@ -1,4 +1,4 @@
-"""Residual torque after the faults are explained: friction, offsets, disturbances."""
+"""Checks of the torque: faults that explain it, and then friction, offsets and disturbances."""
 
 from __future__ import annotations
 
@@ -27,26 +27,26 @@ from forcegp.robust import robust_std
 from forcegp.rows import describe, intervals
 
 LEAST_ROWS = 200
-"""Rows from which dynamics are judged."""
+"""Minimum number of rows for checking the dynamics."""
 SIGNIFICANT, MATERIAL = 3.0, 0.1
-"""Standard errors over blocks, and drop of a joint's log error, from which friction or offsets count."""
+"""Standard errors over blocks, and drop in a joint's log error, above which friction or offsets count."""
 SPEEDS, UNEXPLAINED = (25.0, 95.0), 0.5
-"""Percentiles of speed between which friction resists; share of the torque (RMS) that may be left."""
+"""Percentiles of speed at which friction must oppose motion; RMS fraction of unexplained torque allowed."""
 TRACE_ROWS, DISTURBANCE_SECONDS = 20_000, 0.1
-"""Rows at which the residual is looked at over time; length over which the residual is averaged [s]."""
+"""Maximum number of rows for inspecting the residual over time; duration over which it is averaged [s]."""
 DISTURBANCE, LOUD = 5.0, 4.0
-"""A stretch of time stands out by so many robust standard deviations of the log residual, or by this factor
-over the residual of the worst tenth of the motion."""
+"""A stretch stands out if its log residual exceeds the median by this many robust standard deviations, or its
+residual exceeds the 90 % quantile by this factor."""
 MOVING, VISIBLE = 0.05, 0.1
-"""Share of the largest speed of an arm that moves; least disturbance, beyond dry friction, as a share."""
+"""Fraction of its largest speed above which an arm moves; fraction of the torque that disturbances exceed."""
 RIVALS = {"gravity": "a tilt of the base", "masses": "other masses", "gains": "a wrong gain"}
-"""What may look like a constant torque, by hypothesis."""
+"""Faults that may look like a constant torque, by hypothesis."""
 ONE_SIGMA = 84.13
 """Percentile of a normal distribution at one standard deviation above the mean."""
 
 
 def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Check signs, orders, gains, delays, gravity, tool, masses, friction and offsets."""
+    """Check signs, order, gains and delays of torques, gravity, payload, masses, friction and offsets."""
     if len(log.rows(LEAST_ROWS)) < LEAST_ROWS:
         raise NotJudgedError(f"fewer than {LEAST_ROWS} usable rows")
     passive = _without_torque(log)
@@ -61,10 +61,10 @@ def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
     if log.header.ordered:
         disturbed, rows = _disturbances(system, explanation)
     if disturbed and _enough(smooth.mask(rows)):
-        # What happened in these rows must pass neither for friction nor for a mass.
+        # A disturbance in these rows must not be attributed to friction or a mass.
         explanation = explain(system, smooth.mask(rows))
     losses = _determined(system.robot, explanation)
-    # Friction of the contacts, and declared friction that rises more sharply, must not pass for more.
+    # Friction of contacts, and steeper declared friction, must not be taken for undeclared friction.
     functions = (hypotheses.contact_friction_columns, hypotheses.other_rise_columns)
     shapes = [columns(system, explanation.log, explanation.rows) for columns in functions]
     findings = [
@@ -78,7 +78,7 @@ def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
     for repair in explanation.repairs:
         log = repair(log)
     if log.contact and log.nq > 3:
-        # Friction and offsets of the joints must not pass for a force at the tip.
+        # Friction and offsets of the joints must not be taken for a force at the tip.
         viscous, dry, offset = losses.fit.nuisance.reshape(3, log.nq)
         smooth = np.tanh(log.qd / system.robot.friction_velocity.numpy())
         log = log.replace(tau=log.tau + viscous * log.qd + dry * smooth + offset)
@@ -90,19 +90,19 @@ def _enough(log: Log) -> bool:
 
 
 def _without_torque(log: Log) -> list[Finding]:
-    """Return the torques that are constant though the joint moves."""
+    """Find torques that are constant although the joint moves."""
     rows = log.usable
     still = (np.ptp(log.tau[rows], axis=0) == 0.0) & (np.ptp(log.q[rows], axis=0) > 0.0)
     still[unmeasured(log)] = False
     zero = still & (log.tau[rows] == 0.0).all(axis=0)
     word = "zero" if zero[still].all() else "constant"
     findings = log.on_joints("torque-zero", still, f"the torque of {{}} is {word} throughout")
-    # One passive joint is a design; an arm without any torque is a missing column.
+    # One joint may be passive; if all torques are constant, the column is missing.
     return [replace(finding, weight="error" if still.all() else "warning") for finding in findings]
 
 
 def _matters(explanation: Explanation, j: int, columns: list[int]) -> bool:
-    """Return whether leaving out some columns of the nuisance raises the error of joint j."""
+    """Return whether omitting the given nuisance columns raises the error of joint j significantly."""
     problem = explanation.problem
     keep = np.setdiff1d(np.arange(problem.nuisance.shape[-1]), columns)
     less = replace(problem, nuisance=problem.nuisance[..., keep])
@@ -113,7 +113,7 @@ def _matters(explanation: Explanation, j: int, columns: list[int]) -> bool:
 
 
 def _determined(robot: RobotModel, explanation: Explanation) -> Explanation:
-    """Return the explanation with friction set to 0 if it would drive, or is smaller than its σ."""
+    """Return the explanation with friction set to 0 if it would drive a joint, or is smaller than its σ."""
     declared = np.concatenate([robot.damping.numpy(), robot.friction.numpy()])
     for _ in range(robot.nq):
         fit = explanation.fit
@@ -128,7 +128,7 @@ def _determined(robot: RobotModel, explanation: Explanation) -> Explanation:
 
 
 def _confounded(explanation: Explanation) -> list[Finding]:
-    """Return the faults found, gains as warnings if masses are wrong too, since masses calibrate gains."""
+    """Return the faults found; currents become warnings if masses are wrong, since gains depend on masses."""
     findings = []
     for finding in explanation.findings:
         current = finding.kind == "torque-current" and "masses-mismatch" not in finding.kinds
@@ -144,7 +144,7 @@ def _friction(robot: RobotModel, explanation: Explanation) -> list[Finding]:
     viscous, coulomb = -explanation.fit.nuisance[:nq], -explanation.fit.nuisance[nq : 2 * nq]
     rows = log.qd[explanation.rows]
     power = (viscous * rows**2 + coulomb * np.abs(rows)).mean(axis=0)
-    # What drives a joint at some speed, declared friction included, is an error of the model, not friction.
+    # If total friction would drive a joint at some speed, it is a model error rather than friction.
     speeds = np.percentile(np.abs(rows), SPEEDS, axis=0)
     damping, declared = robot.damping.numpy(), robot.friction.numpy()
     resists = ((viscous + damping) * speeds + coulomb + declared > 0.0).all(axis=0)
@@ -199,7 +199,7 @@ def _unexplained(explanation: Explanation) -> list[Finding]:
 
 
 def _disturbances(system: ConstrainedSystem, explanation: Explanation) -> tuple[list[Finding], np.ndarray]:
-    """Return the times at which far more torque is unexplained than usual, and the rows around them."""
+    """Find stretches in which far more torque than usual is unexplained; also mask the rows around them."""
     from scipy.ndimage import minimum_filter1d
 
     log, rows = explanation.log, explanation.log.rows(TRACE_ROWS)
@@ -233,8 +233,8 @@ def _disturbances(system: ConstrainedSystem, explanation: Explanation) -> tuple[
 
 
 def _stands_out(log: Log, rows: np.ndarray, level: Array) -> np.ndarray:
-    """Return `(n,)` bool, rows with a larger residual than usual at the same state of the contacts."""
-    # An arm at rest leaves little unexplained; it says nothing of one that moves.
+    """Return the mask `(n,)` of rows with a larger residual than usual for the same contact state."""
+    # At rest, little torque is unexplained, so these rows do not define what is usual in motion.
     speed = np.abs(log.qd[rows]).max(axis=1)
     moving, bad = speed >= MOVING * np.percentile(speed, 99), np.zeros(len(rows), bool)
     labels = [label[rows] for label in log.contact.values()]
@@ -252,13 +252,13 @@ def _stands_out(log: Log, rows: np.ndarray, level: Array) -> np.ndarray:
 
 
 def _upper_spread(level: Array) -> float:
-    """Return the spread of the level, the upper one if smaller: few squares have a long lower tail."""
+    """Return the spread above the median if it is smaller: log sums of few squares have a long lower tail."""
     middle, upper = np.percentile(level, [50.0, ONE_SIGMA])
     return float(min(robust_std(level), upper - middle))
 
 
 def residual_trace(system: ConstrainedSystem, explanation: Explanation, rows: np.ndarray) -> Array:
-    """Return the residual torque at some rows without contact forces, `(n, nq)` [N m, N]."""
+    """Return the residual torque at the given rows without contact forces, `(n, nq)` [N m, N]."""
     log, scale = explanation.log, explanation.problem.scale
     parts, coefficients = [], robust_parameters(explanation.problem, explanation.columns, explanation.prior)
     for index in np.array_split(rows, max(1, len(rows) // 2048)):

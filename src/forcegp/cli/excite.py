@@ -1,4 +1,4 @@
-"""`forcegp excite`: the next motion to record."""
+"""`forcegp excite`: plan the next motion to record."""
 
 from __future__ import annotations
 
@@ -53,12 +53,12 @@ def excite(
     seed: Annotated[int, typer.Option(help="Seed of the random starts.")] = 0,
     as_json: AsJson = False,
 ) -> None:
-    """Plan the motion in free space that best identifies inertia and friction.
+    """Plan a motion in free space that identifies inertia and friction as well as possible.
 
-    The motion starts and ends at rest, respects the limits in the robot file or the given ones, and avoids
+    The motion starts and ends at rest, respects the limits given as options or in the robot file, and avoids
     collisions of the robot with itself, the surfaces of the scene, and boxes. A page of the same name
-    displays the motion, its limits, and the expected standard deviation of the torque before and after
-    recording.
+    displays the motion, its use of the limits, and the expected standard deviation of the torque before and
+    after the motion is recorded.
 
     [bold]Examples[/bold]
 

@@ -1,4 +1,4 @@
-"""Logged motion: data sets and their files, derivatives, noise, selection and splits."""
+"""Logged motion: data sets and their files, derivatives, noise, selection, and splits."""
 
 from forcegp.data.dataset import Dataset as Dataset
 from forcegp.data.dataset import NotLoggedError as NotLoggedError

@@ -1,8 +1,8 @@
-"""The force sensor of a log as a measurement of the normal force λ in addition to accelerations.
+"""Use of a logged force sensor as a measurement of the normal force λ in addition to accelerations.
 
-A model is fitted to both. At a state with a sensor reading, the reading is an additional measurement of λ: λ̂
-= (λ_m/w² + s/σ²) / (1/w² + 1/σ²), with the model's λ_m ± w, in which w includes motor torque noise, and the
-sensor's s ± σ. The two errors are independent.
+A model is fitted to both. At a state with a sensor reading s ± σ, the reading is combined with the model's
+prediction λ_m ± w, where w includes motor torque noise: λ̂ = (λ_m/w² + s/σ²) / (1/w² + 1/σ²). The two errors
+are independent.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ TINY = 1e-12
 
 
 def with_sensor(data: Dataset, system: ConstrainedSystem, noise_std: float) -> list[Observation]:
-    """Return the accelerations of a log, and the sensor's normal force λ = n·F while the contact is closed.
+    """Return the accelerations of a log, and the sensed normal force λ = n·F while the contact is closed.
 
     Args:
         data: a log with `F_sensor`.
         system: robot with a single surface contact.
-        noise_std: standard deviation of the normal force due to the sensor and unmeasured forces, such as the
-            inertial force of the tool [N].
+        noise_std: standard deviation of the errors in the normal force that are caused by the sensor and by
+            unmeasured forces, such as the inertial force of the tool [N].
 
     Raises:
-        ModelError: there is no sensor, no row in contact, or more than one contact.
+        ModelError: the log has no sensor or no row in contact, or the system has more than one contact.
     """
     contact = _contact(system)
     closed = data.active([contact.name])[:, 0]
@@ -51,7 +51,7 @@ def with_sensor(data: Dataset, system: ConstrainedSystem, noise_std: float) -> l
 
 
 def _contact(system: ConstrainedSystem) -> SurfaceContact:
-    """Return the contact that a sensor measures."""
+    """Return the contact at which the sensor measures the force."""
     contact = system.contacts[0] if len(system.contacts) == 1 else None
     if not isinstance(contact, SurfaceContact):
         raise ModelError(
@@ -68,7 +68,7 @@ def has_sensor(data: Dataset, system: ConstrainedSystem) -> bool:
 
 
 def sensed_force(data: Dataset, system: ConstrainedSystem) -> Tensor:
-    """Return the normal force n·F of the sensor `(n,)` [N].
+    """Return the normal force n·F measured by the sensor, `(n,)` [N].
 
     Raises:
         ModelError: the system has more than one contact, or none with a surface.
@@ -80,14 +80,14 @@ def sensed_force(data: Dataset, system: ConstrainedSystem) -> Tensor:
 
 
 def sensor_noise_std(data: Dataset, system: ConstrainedSystem) -> float:
-    """Estimate the standard deviation of the white noise of the sensor's normal force from the log [N].
+    """Estimate, from a log, the standard deviation of the white noise in the sensed normal force [N].
 
     Args:
         data: a log in time order, with `F_sensor`.
         system: robot with a single surface contact.
 
     Raises:
-        ModelError: there are no five consecutive rows in contact.
+        ModelError: the log does not have five consecutive rows in contact.
     """
     closed, force = data.active([_contact(system).name])[:, 0], sensed_force(data, system)
     steps = data.t.diff()
@@ -103,10 +103,10 @@ def sensor_noise_std(data: Dataset, system: ConstrainedSystem) -> float:
 
 @torch.no_grad()
 def force_from_sensor(fit: StructuredFit, data: Dataset) -> tuple[Tensor, Tensor]:
-    """Return mean and standard deviation `(n,)` [N] of λ, with the sensor reading as a measurement.
+    """Return the mean and standard deviation `(n,)` [N] of λ given the sensor readings.
 
     Args:
-        fit: model fitted to the accelerations and the sensor (`with_sensor`).
+        fit: model fitted to the accelerations and the sensor (see `with_sensor`).
         data: states with `F_sensor`.
 
     Raises:

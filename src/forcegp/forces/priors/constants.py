@@ -20,9 +20,9 @@ class DrivePrior(ConstantForcePrior):
     """A prior on relative errors s δ_i of drive constants (torque constant times gear ratio).
 
     Q_i = s τ_i δ_i with δ_i ~ N(0, 1). Logged currents are converted to torques with nominal drive constants
-    (`torque_constant`, `gear_ratio` in a mapping); the true constants are (1 + s δ_i) times these. Motion
-    depends only on the ratio of drive constants to inertia, so provide known masses, or record a known
-    payload.
+    (`torque_constant` and `gear_ratio` in a mapping); the true constants are (1 + s δ_i) times these. Motion
+    depends only on the ratio of drive constants to inertia, so specify known masses or record a log with a
+    known payload.
 
     Args:
         std: relative standard deviation s of the drive constants.
@@ -66,7 +66,7 @@ class PerRecording(ForcePrior):
     use the constants of the last recording.
 
     Args:
-        prior: prior on the force in each recording, which provides the name of the hyperparameters.
+        prior: prior on the force in each recording, which also provides the names of the hyperparameters.
         starts: first segment of each recording, as in `Dataset.segment`.
 
     Example:
@@ -76,7 +76,7 @@ class PerRecording(ForcePrior):
         8
 
     Raises:
-        ModelError: the starts are not increasing, or the prior is not a prior on constants.
+        ModelError: the starts are not increasing, or `prior` is not a prior on constants.
     """
 
     prior: ForcePrior

@@ -1,4 +1,4 @@
-"""The folder of an exported model: C code with its test program and CMakeLists.txt, or a CasADi function."""
+"""The folder of an exported model: C code with a test program and CMakeLists.txt, or a CasADi function."""
 
 from __future__ import annotations
 
@@ -26,22 +26,22 @@ from forcegp.models.prediction import Predictor, Query
 
 LANGUAGES = ("c", "casadi", "torch")
 STATES, LOSS_STATES = 16, 200
-"""States of the test program, and those at which the loss of a reduced posterior is measured."""
+"""Number of states in the test program, and number at which the loss of a reduced posterior is measured."""
 TOLERANCE, ZERO = 1e-10, 1e-5
-"""Largest difference from Python in units of max(|mean|, σ), or `ZERO` of the largest one of a state."""
+"""Largest difference from Python, relative to max(|mean|, σ), or to `ZERO` times its maximum at a state."""
 
 
 @dataclass(frozen=True)
 class Export:
-    """Files of an export.
+    """The files of an export, and their errors.
 
     Attributes:
-        folder: its path.
-        functions: number of functions of the covariance.
-        widest, wider: growth of σ of q̈ and λ by a reduced covariance, the largest and the median one, as
-            fractions, at training states or, if a saved fit has none, at random ones.
-        rounding: largest error by single precision of means of q̈ and λ in units of max(|mean|, σ), and of σ
-            as a fraction, at these states; zero in double precision.
+        folder: path of the folder.
+        functions: number of basis functions of the covariance.
+        widest, wider: largest and median relative growth of σ of q̈ and λ caused by a reduced covariance, at
+            training states or, if a saved fit has none, at random states.
+        rounding: largest errors caused by single precision at these states: of the means of q̈ and λ, in
+            units of max(|mean|, σ), and of σ, as a fraction; zero in double precision.
     """
 
     folder: Path
@@ -54,7 +54,7 @@ class Export:
 def write_export(
     model: ExportedModel, fit: Predictor, training: Training, path: str | Path, language: str, name: str
 ) -> Export:
-    """Write a model to a folder; arguments and errors as in `StructuredFit.export`."""
+    """Write a model to a folder; see `StructuredFit.export` for the arguments and errors."""
     check_name("language of an export", language, LANGUAGES)
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,40}", name):
         raise ParameterError(
@@ -103,10 +103,10 @@ def write_export(
 
 
 def rounding_of(model: ExportedModel, training: Training) -> tuple[float, float]:
-    """Error of means and of σ of q̈ and λ by single precision; see `Export.rounding`.
+    """Return the errors of the means and σ of q̈ and λ caused by single precision; see `Export.rounding`.
 
     Raises:
-        NumericalError: single precision does not resolve a variance.
+        NumericalError: single precision cannot resolve a variance.
     """
     if model.dtype == torch.float64:
         return 0.0, 0.0
@@ -123,7 +123,7 @@ def rounding_of(model: ExportedModel, training: Training) -> tuple[float, float]
 
 
 def loss_of(model: ExportedModel, fit: Predictor, training: Training) -> tuple[float, float]:
-    """Return how much σ of q̈ and λ grows with a reduced covariance, at training or random states."""
+    """Return the largest and median growth of σ of q̈ and λ caused by a reduced covariance."""
     if model.functions is None:
         return 0.0, 0.0
     states = states_of(model, training)
@@ -132,13 +132,13 @@ def loss_of(model: ExportedModel, fit: Predictor, training: Training) -> tuple[f
         for x in (CompiledFit(model), fit)
     ]
     small, whole = (x.covariance.diagonal(dim1=-2, dim2=-1).sqrt() for x in read if x.covariance is not None)
-    # Nothing is lost of structural zeros, such as λ of an open contact.
+    # Structural zeros, such as λ of an open contact, have no loss.
     growth = (small / whole - 1.0)[whole > ZERO * whole.amax()]
     return float(growth.max()), float(growth.median())
 
 
 def states_of(model: ExportedModel, training: Training) -> tuple[Tensor, ...]:
-    """q, q̇, τ and closed contacts of training states, or random ones if none are kept."""
+    """Return q, q̇, τ and closed contacts at training states, or at random states if none were kept."""
     if not training.samples:
         return random_states(model, LOSS_STATES)
     few = training.evenly(LOSS_STATES).measurements
@@ -146,7 +146,7 @@ def states_of(model: ExportedModel, training: Training) -> tuple[Tensor, ...]:
 
 
 def random_states(model: ExportedModel, count: int) -> tuple[Tensor, ...]:
-    """Return random q, q̇, τ and closed contacts within joint limits and the trained region, if known."""
+    """Return random q, q̇, τ and closed contacts, within the joint limits and any known trained region."""
     robot, random = model.system.robot, torch.Generator().manual_seed(0)
     one = torch.ones(robot.nq, dtype=torch.float64)
     limits = [
@@ -162,7 +162,7 @@ def random_states(model: ExportedModel, count: int) -> tuple[Tensor, ...]:
 
 
 def _reference(model: ExportedModel, fit: Predictor, name: str) -> str:
-    """Return C tables of states, and Python's mean, covariance and Jacobians at these states."""
+    """Return C tables of states and of the mean, covariance and Jacobians that Python computes at them."""
     q, qd, tau, active = random_states(model, STATES)
     read = fit.predict(q, qd, tau, list(READ[:-1]), active=active)  # pyright: ignore[reportArgumentType]
     assert read.covariance is not None
@@ -180,7 +180,7 @@ def _reference(model: ExportedModel, fit: Predictor, name: str) -> str:
     tables["slopes"] = torch.cat(both, dim=1)
     lines.append(f"enum {{ SLOPES = {tables['slopes'].shape[1]} }};")
     if model.wrench is not None:
-        # Accelerations that errors of the model explain: rounding counts for more the stronger the wrench is.
+        # The accelerations are within the model's errors, since rounding errors grow with the wrench.
         std = read.covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt()
         far = torch.linspace(-2.0, 2.0, len(q), dtype=q.dtype)[:, None]
         qdd = (read.mean + far * std)[:, read.parts["qdd"]]
