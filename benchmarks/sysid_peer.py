@@ -18,15 +18,15 @@ from forcegp.errors import optional_module
 from forcegp.robot.model import RobotModel
 from forcegp.simulate.urdf import write_urdf
 
+mujoco = optional_module("mujoco", "This benchmark")
 STEP, CHUNK, CHUNKS, ITERATIONS = 0.001, 0.2, 50, 40
 """Time step and length of a rollout [s], number of rollouts, and iterations."""
-LARGEST = {"armature": 3.0, "damping": 60.0, "frictionloss": 60.0}
+LARGEST, START = 10.0, 0.1
+"""Upper bound and initial value of armature, damping and friction loss, over std τ ÷ (std q̈, std q̇, 1)."""
 
 
 def specification(robot: RobotModel) -> Any:
     """The robot file with a motor and two sensors per joint."""
-    import mujoco
-
     urdf = mujoco.MjSpec.from_string(write_urdf(robot))
     urdf.compile()
     spec = mujoco.MjSpec.from_string(urdf.to_xml())
@@ -96,17 +96,17 @@ def identified(robot: RobotModel, log: forcegp.Dataset) -> Any:
             with_inertia(spec, name, parameter.value)
 
         params.add(sysid.body_inertia_param(spec, model, name, sysid.InertiaType.Pseudo, modifier=move))
+    torque = log.tau.std(0)
+    sizes = {"armature": torque / log.qdd.std(0), "damping": torque / log.qd.std(0), "frictionloss": torque}
     for j, joint in enumerate(spec.joints):
-        start = (robot.armature[j], robot.damping[j], robot.friction[j])
-        for (field, largest), value in zip(LARGEST.items(), start, strict=True):
+        for field, size in sizes.items():
 
             def change(spec: Any, parameter: Any, joint: str = joint.name, field: str = field) -> None:
                 value = [parameter.value[0], 0.0, 0.0] if field == "damping" else parameter.value[0]
                 setattr(spec.joint(joint), field, value)
 
-            parameter = sysid.Parameter(f"{joint.name}_{field}", float(value), 0.0, largest, modifier=change)
-            parameter.value[:] = max(float(value), 0.01 * largest)
-            params.add(parameter)
+            name, scale = f"{joint.name}_{field}", float(size[j])
+            params.add(sysid.Parameter(name, START * scale, 0.0, LARGEST * scale, modifier=change))
     residual = sysid.build_residual_fn(models_sequences=[recordings(spec, log)], n_threads=1)
     found, _ = sysid.optimize(params, residual, verbose=False, max_iters=ITERATIONS)
     return sysid.apply_param_modifiers(found, spec)

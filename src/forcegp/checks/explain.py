@@ -76,7 +76,7 @@ class Explanation:
         return result
 
     def beside(self, hypothesis: Hypothesis) -> Explanation:
-        """Return the explanation with the parameters of a hypothesis added in front."""
+        """Prepend the parameters of a hypothesis to the explanation."""
         assert hypothesis.columns is not None and hypothesis.prior is not None
         columns = np.concatenate([hypothesis.columns, self.columns], axis=-1)
         return replace(self, columns=columns, prior=np.concatenate([hypothesis.prior, self.prior]))

@@ -41,7 +41,7 @@ INERTIA_ROWS = 200
 FRICTION_ROWS, LEAST_ROWS = 4000, 20
 """Maximum and minimum number of rows from which viscous friction is estimated."""
 ALIKE = 0.02
-"""Tolerance within which the slopes of all joints have a common factor, which indicates a wrong clock."""
+"""Tolerance within which the slopes of all joints share a factor, which indicates an incorrect clock rate."""
 UNITS = (1e-9, 1e-6, 1e-3, 1e3)
 """Lengths of 1 ns, 1 µs, 1 ms and 1 ks, possible units of a clock [s]."""
 UNIT_TOLERANCE = 0.1
@@ -100,7 +100,7 @@ def match(log: Log, value: str, rate: str) -> Match | None:
 
 
 def check_clock_unit(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find a factor common to all joints and both derivatives, which indicates a wrong clock."""
+    """Find a factor common to all joints and both derivatives, which indicates an incorrect clock rate."""
     if not log.stretches:
         return [], log
     if "qd" in log.derived:  # only the length of a time step can be checked

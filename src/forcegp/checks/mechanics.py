@@ -258,7 +258,7 @@ def _upper_spread(level: Array) -> float:
 
 
 def residual_trace(system: ConstrainedSystem, explanation: Explanation, rows: np.ndarray) -> Array:
-    """Return the residual torque at the given rows without contact forces, `(n, nq)` [N m, N]."""
+    """Return the residual torque, excluding contact forces, at the given rows, `(n, nq)` [N m, N]."""
     log, scale = explanation.log, explanation.problem.scale
     parts, coefficients = [], robust_parameters(explanation.problem, explanation.columns, explanation.prior)
     for index in np.array_split(rows, max(1, len(rows) // 2048)):

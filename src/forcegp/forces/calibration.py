@@ -1,4 +1,4 @@
-"""Residual torques of a fit: their autocorrelation, and their magnitude on held-out stretches of the log.
+"""Residual torques of a fit: their autocorrelation, and their magnitude on held-out blocks of the log.
 
 Temperature, hysteresis and filters leave residuals that are correlated in time, which divides the number of
 independent samples in a log by the integrated autocorrelation time. The variance on new motions is estimated
@@ -197,7 +197,7 @@ def calibrated_noise(problem: Problem, hyperparameters: Mapping[str, Tensor]) ->
 
 
 def held_out_torque_std(problem: Problem, hyperparameters: Mapping[str, Tensor], least: Tensor) -> Tensor:
-    """Return the torque noise `(nq,)` for which normalised errors on held-out stretches have unit variance.
+    """Return the torque noise `(nq,)` for which normalised errors on held-out blocks have unit variance.
 
     Each stretch is predicted from all others with the given hyperparameters. The force error computed from
     accelerations is r = M(q̈ − E q̈) = P ε, where P = I in free motion. For joint i, s_i² solves

@@ -161,7 +161,7 @@ class Signals:
         self.contact = {name: value[mask] for name, value in self.contact.items()}
 
     def runs(self, *keys: NDArray[np.generic]) -> list[slice]:
-        """Return stretches of rows within one segment in which the additional keys are constant."""
+        """Return runs of rows, each within one segment, over which the additional keys are constant."""
         return runs(self.segment, *keys)
 
 

@@ -237,8 +237,8 @@ class StructuredFit(FittedModel):
         """Compile the fit to a fast predictor in C with the local compiler.
 
         Args:
-            functions: number r of basis functions for a reduced covariance, which can only be wider; `None`
-                uses all.
+            functions: number r of basis functions for a reduced-rank covariance, which can only be larger;
+                `None` uses all.
             wrench: frame and components to estimate by `external_wrench`.
 
         Raises:
