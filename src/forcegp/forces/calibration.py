@@ -15,6 +15,7 @@ import scipy
 import torch
 from torch import Tensor
 
+from forcegp.data.fields import resolution
 from forcegp.forces.measurements import Measurement, Training
 from forcegp.forces.noise import TORQUE_NOISE
 from forcegp.forces.posterior import (
@@ -27,7 +28,6 @@ from forcegp.forces.posterior import (
 )
 from forcegp.forces.problem import UNSHOWN, Problem, force_posterior, typical
 from forcegp.forces.quantities import affine_map
-from forcegp.robust import resolution
 
 STRETCHES = 8
 """Number of contiguous stretches into which a log of fewer than three segments is divided."""

@@ -40,15 +40,8 @@ from forcegp.constraints.contact import SurfaceContact
 from forcegp.constraints.gauss import ContactPoint, tangent_frame
 from forcegp.errors import ModelError
 from forcegp.forces.measurements import Measurement
-from forcegp.forces.priors.base import (
-    CONSTRAINT,
-    CONTACT,
-    COULOMB,
-    ConstantForcePrior,
-    ForcePrior,
-    check_inputs,
-)
-from forcegp.forces.priors.joint import JointForcePrior
+from forcegp.forces.priors.base import CONSTRAINT, CONTACT, COULOMB, ForcePrior, check_inputs
+from forcegp.forces.priors.joint import ConstantForcePrior, JointForcePrior
 from forcegp.forces.quantities import AffineMap, States
 from forcegp.gp.kernels import Constant, Kernel, SquaredExponential
 from forcegp.robot.model import RobotModel
