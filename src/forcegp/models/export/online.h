@@ -5,6 +5,7 @@ struct forcegp_learned {
   double folded[@folded@];                                         /* the same of kernels and features */
   double root[FORCEGP_FUNCTIONS * (FORCEGP_FUNCTIONS + 1) / 2]; /* K, by rows; their covariance is K^T K */
   double faded[FORCEGP_FUNCTIONS];                                 /* share of each prior that waits to be renewed */
+  double touched[@contacts@];                                      /* 1 for contacts that were closed in a sample */
   int next;                                                        /* the first one that waits */
 };
 #define FORCEGP_AT_REST 6      /* nothing is learned from a robot at rest, as in a fit */
