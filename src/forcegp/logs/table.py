@@ -68,11 +68,9 @@ class LogTable:
         if not holding:
             raise missing(self.source, "column", column, [n for s in among for n in s.columns])
         if len(holding) > 1:
-            raise DataError(
-                f"{self.source}: several streams have a column {column!r}",
-                expected="a key 'stream' that names one of them",
-                got=", ".join(s.name or "(unnamed)" for s in holding),
-            )
+            text, got = f"several streams have a column {column!r}", [s.name or "(unnamed)" for s in holding]
+            expected = "a key 'stream' that names one of them"
+            raise DataError(f"{self.source}: {text}", expected=expected, got=", ".join(got))
         return holding[0]
 
 
