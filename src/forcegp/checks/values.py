@@ -13,8 +13,8 @@ from forcegp.checks.log import DEPARTURE, Array, Log, Outcome, spikes
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data.clipped import limits_of
 from forcegp.data.derivative import UNIFORM_TOLERANCE
-from forcegp.data.fields import JOINT_VECTORS
-from forcegp.robust import resolution, robust_std
+from forcegp.data.fields import JOINT_VECTORS, resolution
+from forcegp.robust import robust_std
 from forcegp.rows import describe, intervals
 
 
