@@ -32,15 +32,3 @@ def level_of(x: NDArray[Any], width: float, share: float) -> float | None:
     bins, counts = np.unique(np.floor(x / width), return_counts=True)
     near = x[np.abs(x - width * (bins[counts.argmax()] + 0.5)) <= width]
     return float(np.median(near)) if len(near) > share * len(x) else None
-
-
-def resolution(x: NDArray[Any]) -> NDArray[Any]:
-    """Return the step between the levels of each column with few distinct values, and zero for the others."""
-    steps = np.zeros(x.shape[1])
-    for j, levels in enumerate(map(np.unique, x.T)):
-        if 2 < len(levels) < 0.75 * len(x):
-            gaps = np.diff(levels)
-            # Rounding in the last digit can split one level into two; such gaps are not steps.
-            gaps = gaps[gaps > 1e-6 * gaps.max()]
-            steps[j] = np.median(gaps)
-    return steps

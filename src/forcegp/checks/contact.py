@@ -78,11 +78,10 @@ def tip_path(
             p = kinematics.point_position(system.robot, q, contact.frame, contact.point)
             v = kinematics.point_velocity(system.robot, q, qd, contact.frame, contact.point)
             paths.append((contact.center_surface.value(p), p, v, contact.surface.gradient(p)))
-    path = [np.concatenate(part) for part in zip(*paths, strict=True)]
-    if rows is None:
-        for value in path:
-            value[~log.finite] = np.nan
-    return Path(*path)
+    path = Path(*(np.concatenate(part) for part in zip(*paths, strict=True)))
+    for value in (path.c, path.p, path.v, path.normal) if rows is None else ():
+        value[~log.finite] = np.nan
+    return path
 
 
 def touching(system: ConstrainedSystem, log: Log) -> Iterator[tuple[SurfaceContact, np.ndarray]]:
@@ -105,7 +104,7 @@ def check_contacts(system: ConstrainedSystem, log: Log) -> Outcome:
             usable = np.isfinite(path.c) & log.usable
             closed = log.contact[contact.name] & usable
             if closed.sum() >= LEAST_ROWS:
-                placement, distance = _placement(contact, path, closed, log)
+                placement, distance = _placement(contact, path, closed)
                 findings += [*placement, *_labels(contact, path, closed, usable, distance, log)]
             else:
                 slides = usable & ~closed & (path.approach <= CREEP)
@@ -131,9 +130,7 @@ def _beside(contact: SurfaceContact, path: Path, usable: np.ndarray) -> list[Fin
     return [Finding("contact-far", text, intervals(rows), (), contact.name, evidence, weight)]
 
 
-def _placement(
-    contact: SurfaceContact, path: Path, closed: np.ndarray, log: Log
-) -> tuple[list[Finding], Array]:
+def _placement(contact: SurfaceContact, path: Path, closed: np.ndarray) -> tuple[list[Finding], Array]:
     """Return findings on displacement and tilt of the surface, and distances from the corrected surface."""
     offset, tilt, shift = fit_surface(contact, path, closed)
     name, evidence = contact.name, {"offset_m": offset, "tilt_deg": float(np.degrees(np.linalg.norm(tilt)))}
@@ -185,9 +182,10 @@ def _labels(
     moving = closed & (np.linalg.norm(path.v, axis=1) > CREEP)
     slow = max(CREEP, ROUGH * float(robust_std(path.approach[moving])) if moving.any() else 0.0)
     findings = []
-    for kind, spans in _runs_off(path.approach, closed, c, touch, slow, log).items():
-        if spans:
-            rows: Intervals = tuple(spans)
+    # Rows that are masked, as at the impact of a landing tip, do not end an interval.
+    label, off = log.contact[contact.name] & np.isfinite(c), closed & (np.abs(c) > touch)
+    for kind, rows in _runs_off(path.approach, label, off, c, touch, slow, log).items():
+        if rows:
             most = max(float(np.abs(c[a:b]).max()) for a, b in rows)
             where = f"by up to {1e3 * most:.3g} mm, in {describe(rows)}"
             text = f"contact {contact.name!r} is {OFF[kind]}, {where}"
@@ -197,33 +195,29 @@ def _labels(
 
 
 def _runs_off(
-    approach: Array, closed: np.ndarray, c: Array, touch: float, slow: float, log: Log
-) -> dict[str, list[tuple[int, int]]]:
+    approach: Array, label: np.ndarray, off: np.ndarray, c: Array, touch: float, slow: float, log: Log
+) -> dict[str, Intervals]:
     """Return runs of closed rows with the tip off the surface, by kind, extended until the tip settles."""
     settled = approach <= slow
     least = max(2, round(RUN_SECONDS / log.dt)) if np.isfinite(log.dt) else 2
-    off = closed & (np.abs(c) > touch)
-    runs: dict[str, list[tuple[int, int]]] = {kind: [] for kind in OFF}
-    for start, stop in intervals(closed):
+    runs: dict[str, Intervals] = dict.fromkeys(OFF, ())
+    for start, stop in intervals(label):
         for a, b in intervals(off[start:stop], join=least):
             if b - a < least:
                 continue
             kind = "contact-early" if a == 0 and b < stop - start else "contact-late"
             inside = (a > 0) == (b < stop - start)
-            a, b = (a, b) if inside else _until_settled(a, b, settled[start:stop])
+            before, after = settled[start : start + a][::-1], settled[start + b : stop]
+            if not inside and a == 0 and after.any():
+                b += int(np.argmax(after))
+            elif not inside and before.any():
+                a -= int(np.argmax(before))
             far = float(np.abs(c[start + a : start + b]).max()) > max(DRIFT, touch)
-            # A landing tip stops at once; a tip slightly off the surface approaches it slowly.
+            # A tip that lands stops at once; a constraint missed by a little is approached slowly.
             landing = approach[start + max(a, b - LANDING) : start + b].max() > STOPS * slow
             if far or not (inside or (kind == "contact-early" and not landing)):
-                runs["contact-far" if inside else kind].append((start + a, start + b))
+                runs["contact-far" if inside else kind] += ((start + a, start + b),)
     return runs
-
-
-def _until_settled(a: int, b: int, settled: np.ndarray) -> tuple[int, int]:
-    """Extend a run at the start or the end of an interval up to the row at which the tip settles."""
-    if a == 0:
-        return a, b + int(np.argmax(settled[b:])) if settled[b:].any() else b
-    return (a - int(np.argmax(settled[:a][::-1])) if settled[:a].any() else a), b
 
 
 def _missed(
@@ -283,11 +277,10 @@ def _force(system: ConstrainedSystem, log: Log, rows: np.ndarray, path: Path) ->
 def _pulls(finding: partial[Finding], path: Path, force: Array) -> list[Finding]:
     normal = (force * path.normal).sum(axis=1)
     middle = float(np.median(normal))
-    # The scatter includes both noise and true changes; a genuine contact force exceeds it.
-    if not (middle < 0.0 and (normal < 0.0).mean() > PULLS and -middle > robust_std(normal)):
-        return []
+    # The scatter holds noise and true changes alike; the force of an arm that presses stays above it.
+    pulls = middle < 0.0 and (normal < 0.0).mean() > PULLS and -middle > robust_std(normal)
     text = f"the force at {finding.keywords['contact']!r} pulls with {-middle:.3g} N along the normal"
-    return [finding("contact-pulls", text, evidence={"normal_force_N": middle})]
+    return [finding("contact-pulls", text, evidence={"normal_force_N": middle})] if pulls else []
 
 
 def _friction(finding: partial[Finding], path: Path, force: Array) -> list[Finding]:
@@ -298,25 +291,19 @@ def _friction(finding: partial[Finding], path: Path, force: Array) -> list[Findi
         return []
     drag = -(force * path.along).sum(axis=1)[sliding] / speed[sliding]
     press = np.maximum((force * path.normal).sum(axis=1)[sliding], 0.0)
-    # The scatter of the coefficients of separate blocks gives the standard error.
+    # One coefficient per block: the scatter between blocks gives the standard error.
     parts = [blocks_of(len(drag)) == k for k in range(BLOCKS)]
     each = [(drag[part] @ press[part]) / max(press[part] @ press[part], 1e-12) for part in parts]
     mean, error = float(np.mean(each)), float(np.std(each, ddof=1) / np.sqrt(BLOCKS))
-    if mean <= SIGNIFICANT * error:
-        return []
-    name = finding.keywords["contact"]
     size = "not determined" if mean > LARGEST_FRICTION else f"about {100 * mean:.0f} % of the normal force"
-    text = f"friction at {name!r} while it slides is {size}"
+    text = f"friction at {finding.keywords['contact']!r} while it slides is {size}"
     evidence = {"friction_coefficient": mean, "standard_error": error}
-    return [finding("contact-friction", text, evidence=evidence)]
+    return [finding("contact-friction", text, evidence=evidence)] if mean > SIGNIFICANT * error else []
 
 
 def _directions(finding: partial[Finding], v: Array) -> list[Finding]:
     """Report sliding along a single line, from which friction in the other direction cannot be determined."""
-    size = np.linalg.svd(v.T @ v / len(v), compute_uv=False)
-    if size[1] > NARROW**2 * size[0]:
-        return []
-    name = finding.keywords["contact"]
+    size, name = np.linalg.svd(v.T @ v / len(v), compute_uv=False), finding.keywords["contact"]
     text = f"the tip slides along one direction of {name!r} only; friction across it is unknown"
     evidence = {"share_across": float(np.sqrt(size[1] / max(size[0], 1e-300)))}
-    return [finding("force-directions", text, evidence=evidence)]
+    return [finding("force-directions", text, evidence=evidence)] if size[1] <= NARROW**2 * size[0] else []

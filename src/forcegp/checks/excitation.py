@@ -36,10 +36,8 @@ deviation below which a parameter counts as identified."""
 def check_length(system: ConstrainedSystem, log: Log) -> Outcome:
     """Check that the log is long enough."""
     seconds = len(log.rows(len(log))) * log.dt if np.isfinite(log.dt) else 0.0
-    if not log.header.ordered or seconds >= SHORT_SECONDS:
-        return [], log
-    text = f"{seconds:.3g} s of the log can be used"
-    return [log.finding("log-short", text, seconds=seconds)], log
+    short = log.finding("log-short", f"{seconds:.3g} s of the log can be used", seconds=seconds)
+    return [short] if log.header.ordered and seconds < SHORT_SECONDS else [], log
 
 
 def still_joints(log: Log) -> np.ndarray:
@@ -69,10 +67,9 @@ def check_excitation(system: ConstrainedSystem, log: Log) -> Outcome:
     if len(rows) < 50 or still_joints(log).all():
         return [], log
     sharpness, names, columns = _sharpness(system, log, rows)
-    weak = sharpness > LEARNED
-    if not weak.any():
+    if not (weak := sharpness > LEARNED).any():
         return [], log
-    joints = sorted({int(columns[k]) // 10 for k in np.flatnonzero(weak)})
+    joints = np.unique(columns[weak] // 10)
     listed = ", ".join(names[k] for k in np.flatnonzero(weak)[:6])
     more = f" and {weak.sum() - 6} more" if weak.sum() > 6 else ""
     count = f"{weak.sum()} of {len(weak)} base parameters are not identified"
@@ -80,8 +77,8 @@ def check_excitation(system: ConstrainedSystem, log: Log) -> Outcome:
     reach, push = np.ptp(log.q[log.usable], axis=0), np.sqrt((log.qdd[log.usable] ** 2).mean(axis=0))
     narrow = [log.joint_names[j] for j in joints if reach[j] < 0.5]
     slow = [log.joint_names[j] for j in joints if push[j] < 1.0]
-    parts = [f"larger range of {', '.join(narrow[:3])}"] if narrow else []
-    parts += [f"faster changes of speed of {', '.join(slow[:3])}"] if slow else []
+    pairs = ("larger range", narrow), ("faster changes of speed", slow)
+    parts = [f"{what} of {', '.join(few[:3])}" for what, few in pairs if few]
     missing = "; ".join(parts) or "other poses of the whole arm, fast and slow"
     text = f"{count}: {listed}{more}; missing: {missing}"
     concerned = tuple(log.joint_names[j] for j in joints)
@@ -154,9 +151,8 @@ def check_visibility(system: ConstrainedSystem, explanation: Explanation) -> lis
         texts.append(f"{what}{': ' if alike[0].joint else ' '}{', '.join(parts)}{changed}")
     joints = tuple(dict.fromkeys(fault.joint for fault in hidden if fault.joint))
     evidence = {f"{fault.kind} {fault.joint}".strip(): size for fault, size in sizes.items()}
-    return [
-        explanation.log.finding("faults-hidden", f"seen only from: {'; '.join(texts)}", joints, **evidence)
-    ]
+    text = f"seen only from: {'; '.join(texts)}"
+    return [explanation.log.finding("faults-hidden", text, joints, **evidence)]
 
 
 def force_of(explanation: Explanation, fault: Fault) -> float:

@@ -69,14 +69,14 @@ class Explanation:
         """Return the explanation with joints weighted according to their residual noise."""
         result = self
         for _ in range(2):
-            # The median over blocks prevents a disturbance from making a joint look noisy.
+            # The typical block counts: a disturbance must not make a joint look noisy.
             noise = np.median(result.fit.error, axis=0) * result.problem.scale
             scale = np.maximum(noise, 1e-3 * result.problem.size)
             result = replace(result, problem=replace(result.problem, scale=scale))
         return result
 
     def beside(self, hypothesis: Hypothesis) -> Explanation:
-        """Return the explanation with the parameters of a hypothesis added in front."""
+        """Prepend the parameters of a hypothesis to the explanation."""
         assert hypothesis.columns is not None and hypothesis.prior is not None
         columns = np.concatenate([hypothesis.columns, self.columns], axis=-1)
         return replace(self, columns=columns, prior=np.concatenate([hypothesis.prior, self.prior]))
@@ -108,15 +108,10 @@ def explain(system: ConstrainedSystem, log: Log) -> Explanation:
 
 def _round(model: Explanation) -> Explanation | None:
     """Accept the simplest hypothesis within one standard error of the best, if any explains enough."""
-    system, log = model.system, model.log
-    tried = [
-        (h, fit)
-        for h, fit in _fits(model)
-        if (h.name, h.joints) not in model.taken
-        and hypotheses.plausible(system, h, fit)
-        and not leaves_surface(system, log, corrected(log, h, fit.theta))
-    ]
-    null = model.fit
+    system, log, null = model.system, model.log, model.fit
+    fits = ((h, fit) for h, fit in _fits(model) if (h.name, h.joints) not in model.taken)
+    fits = ((h, fit) for h, fit in fits if hypotheses.plausible(system, h, fit))
+    tried = [(h, fit) for h, fit in fits if not leaves_surface(system, log, corrected(log, h, fit.theta))]
     good = [(h, fit) for h, fit in tried if significant(fit.shares, null.shares, len(h.joints) or log.nq)]
     if not good:
         return None
@@ -129,14 +124,10 @@ def _round(model: Explanation) -> Explanation | None:
         fit = _refined(model, chosen, fit)
         if not hypotheses.plausible(system, chosen, fit):
             return replace(model, taken=model.taken | {(chosen.name, chosen.joints)})
-    # The errors of an arm and its mirror image are equal up to rounding.
-    alike = [
-        joint
-        for other, its in near
-        if other.name == chosen.name and np.allclose(its.error, fit.error, rtol=SAME, atol=0.0)
-        for joint in other.joints
-    ]
-    finding = hypotheses.finding_of(system, log, chosen, fit, tuple(dict.fromkeys(alike)))
+    # The errors of an arm and of its mirror image are equal but for rounding.
+    twins = (h for h, its in near if h.name == chosen.name and np.allclose(its.error, fit.error, SAME, 0.0))
+    alike = tuple(dict.fromkeys(joint for twin in twins for joint in twin.joints))
+    finding = hypotheses.finding_of(system, log, chosen, fit, alike)
     alternatives = alternatives_of(system, (chosen, fit), tried, null)
     finding = with_alternatives(finding, [hypotheses.finding_of(system, log, *pair) for pair in alternatives])
     return _accepted(model, chosen, fit.theta, finding)
@@ -167,16 +158,14 @@ def _refined(model: Explanation, hypothesis: Hypothesis, fit: TorqueFit) -> Torq
 def _fits(model: Explanation) -> Iterator[Tried]:
     system, log, rows = model.system, model.log, model.rows
     if len(model.prior):
-        # Once the parameters of the robot are free, they can compensate any sign and order. A delay does not
-        # change the motion, and therefore not the columns of the robot's parameters.
-        for hypothesis in hypotheses.delays(log):
-            yield hypothesis, cross_validate(model.on(hypothesis.change(log)), model.columns, model.prior)
-        yield from ((h, fit) for h in _joint_delays(model) if (fit := _beside_friction(model, h)))
+        # Once the robot is at fault and its parameters are free, they bend to any sign and order. A delay
+        # leaves the motion, and with it the columns of the robot's parameters, as they are.
+        yield from ((h, fit) for h in _delays(model) if (fit := _beside_friction(model, h)))
         tried = hypotheses.robot_hypotheses(system, log, rows)
     else:
         few = model.rows[::SCREENING]
         null = cross_validate(model.on(log, few)).score.mean()
-        for hypothesis in (*hypotheses.discrete(log), *_joint_delays(model)):
+        for hypothesis in (*hypotheses.discrete(log), *_delays(model)):
             changed = hypothesis.change(log)
             if cross_validate(model.on(changed, few)).score.mean() < null:
                 yield hypothesis, cross_validate(model.on(changed))
@@ -184,6 +173,8 @@ def _fits(model: Explanation) -> Iterator[Tried]:
     off = []
     for hypothesis in tried:
         fit = model.with_(hypothesis)
+        if hypotheses.is_tilt(system, hypothesis, fit) and not _beside_size(model, hypothesis, fit):
+            continue
         yield hypothesis, fit
         if hypothesis.name == "gains" and significant(fit.shares, model.fit.shares, 1):
             off += hypothesis.joints
@@ -194,19 +185,20 @@ def _fits(model: Explanation) -> Iterator[Tried]:
         yield from _currents(model)
 
 
-def _joint_delays(model: Explanation) -> Iterator[Hypothesis]:
-    """Yield, for each joint, the torque delays that reduce the error on the screening rows the most."""
+def _delays(model: Explanation) -> Iterator[Hypothesis]:
+    """Yield the delays of all torques, and of each, that leave least unexplained on the screened rows."""
     log, few = model.log, model.rows[::SCREENING]
     problem, columns = model.on(log, few), model.columns[::SCREENING]
     null = cross_validate(problem, columns, model.prior).score.mean()
-    for j in range(log.nq if log.nq > 1 and log.stretches else 0):
-        scores, only = {}, np.arange(log.nq) == j
-        for shift in hypotheses.LAGS:
+    alone = [(j,) for j in range(log.nq if log.nq > 1 else 0)]
+    for joints in ((), *alone) if log.stretches else ():
+        scores, only = {}, np.isin(np.arange(log.nq), joints) | (not joints)
+        for shift in (*hypotheses.LAGS, *([] if joints else [-lag for lag in hypotheses.LAGS])):
             r = problem.r + only * (log.tau[few] - log.tau[few + shift])
             scores[shift] = cross_validate(replace(problem, r=r), columns, model.prior).score.mean()
         for shift in sorted((k for k in scores if scores[k] < null), key=scores.__getitem__)[:DELAYS]:
-            change = partial(hypotheses.delayed, shift=shift, joints=(j,))
-            yield Hypothesis("torque-delay", 1, change, joints=(j,), shift=shift)
+            change = partial(hypotheses.delayed, shift=shift, joints=joints)
+            yield Hypothesis("torque-delay", 1, change, joints=joints, shift=shift)
 
 
 def _beside_friction(model: Explanation, late: Hypothesis) -> TorqueFit | None:
@@ -214,7 +206,15 @@ def _beside_friction(model: Explanation, late: Hypothesis) -> TorqueFit | None:
     changed = replace(model, problem=model.on(late.change(model.log)))
     shapes = hypotheses.shape_columns(model.system, model.log, model.rows)
     better, worse = (one.with_nuisance(shapes).fit.shares for one in (changed, model))
-    return changed.fit if significant(better, worse, 1) else None
+    return changed.fit if significant(better, worse, len(late.joints) or model.log.nq) else None
+
+
+def _beside_size(model: Explanation, tilt: Hypothesis, fit: TorqueFit) -> bool:
+    """Return whether gravity of another size, for which wrong masses pass, explains less than a tilt."""
+    assert tilt.columns is not None and tilt.prior is not None
+    along = model.system.robot.gravity.numpy()[:, None]
+    size = model.with_(replace(tilt, columns=tilt.columns @ along, prior=tilt.prior[:1]))
+    return significant(fit.shares, size.shares, model.log.nq)
 
 
 def _currents(model: Explanation) -> Iterator[Tried]:
@@ -223,7 +223,7 @@ def _currents(model: Explanation) -> Iterator[Tried]:
     fit = model.with_(hypotheses.current_hypothesis(log, rows, model.problem, tuple(range(nq))))
     gains = 1.0 + fit.theta[:nq]
     determined = np.flatnonzero(np.abs(gains) > DETERMINED * fit.spread[:nq])
-    # A current has the sign of its torque, so gains of both signs must have a different cause.
+    # A current has the sign of its torque, so gains of both signs have another cause.
     if 2 * len(determined) > nq and (gains[determined] > 0.0).all():
         joints = tuple(determined.tolist())
         hypothesis = hypotheses.current_hypothesis(log, rows, model.problem, joints)
@@ -234,7 +234,7 @@ def significant(better: Array, worse: Array, concerned: int) -> bool:
     """Return whether the decrease in the score, from errors `(blocks, nq)`, is material and significant."""
     least = max(MATERIAL, MATERIAL_EACH * concerned)
     gains = gain_of(score_of(better), score_of(worse)), pooled_gain_of(better, worse)
-    # A drop that occurs only in blocks with little motion is an artefact: both means must show it.
+    # A drop that only quiet blocks show is an artefact of them: the other mean must bear it out.
     agree = all(gain > error for gain, error in gains)
     return gains[0][0] > least and agree and any(gain > SIGNIFICANT * error for gain, error in gains)
 

@@ -178,8 +178,7 @@ def _equations(
     unit = np.sqrt((A**2).sum(axis=(0, 1)))
     # A column without effect gets no parameter.
     unit = np.where(unit > 1e-12 * unit.max(), unit, np.inf)
-    weight = np.full(A.shape[-1], 1e-10)
-    weight[~np.isfinite(unit)] = 1.0
+    weight = np.where(np.isfinite(unit), 1e-10, 1.0)
     if prior is not None:
         weight[:p] += 1.0 / (prior * unit[:p]) ** 2
     return A / unit, y, unit, weight

@@ -121,15 +121,14 @@ def delayed(log: Log, shift: int, joints: tuple[int, ...] = ()) -> Log:
     tau, lost = log.tau.copy(), np.ones(len(log), bool)
     columns = list(joints) or list(range(log.nq))
     for s in log.stretches:
-        source = np.arange(s.start, s.stop) + shift
-        inside = (source >= s.start) & (source < s.stop)
-        tau[np.ix_(source[inside] - shift, columns)] = log.tau[np.ix_(source[inside], columns)]
-        lost[s] = ~inside
+        rows = np.arange(max(s.start, s.start - shift), min(s.stop, s.stop - shift))
+        tau[np.ix_(rows, columns)] = log.tau[np.ix_(rows + shift, columns)]
+        lost[rows] = False
     return log.replace(tau=tau).mask(lost)
 
 
 def discrete(log: Log) -> Iterator[Hypothesis]:
-    """Yield the hypotheses without parameters: wrong signs, wrong orders and delays."""
+    """Yield hypotheses without parameters: signs and orders."""
     every, motion = tuple(range(log.nq)), ("q", "qd", "qdd")
     if log.nq > 1:
         yield Hypothesis("torque-sign", 0, partial(changed, names=("tau",), flip=every), joints=every)
@@ -140,13 +139,6 @@ def discrete(log: Log) -> Iterator[Hypothesis]:
     for pair in combinations(every, 2):
         yield Hypothesis("torque-order", 0, partial(changed, names=("tau",), order=pair), joints=pair)
         yield Hypothesis("joint-order", 0, partial(changed, names=(*motion, "tau"), order=pair), joints=pair)
-    yield from delays(log)
-
-
-def delays(log: Log) -> Iterator[Hypothesis]:
-    """Yield the hypotheses that all torques are logged before or after the motion."""
-    for shift in (sign * lag for lag in (LAGS if log.stretches else ()) for sign in (1, -1)):
-        yield Hypothesis("torque-delay", 1, partial(delayed, shift=shift), shift=shift)
 
 
 def continuous(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterator[Hypothesis]:
@@ -187,12 +179,12 @@ def robot_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray, name: s
     robot = system.robot
     q, qd, qdd = tensors(log, rows, "q", "qd", "qdd")
     with torch.no_grad():
-        if name == "gravity":  # r = Q_G(δ) if gravity is wrong by δ
+        if name == "gravity":  # r = Q_G(δ) for gravity off by δ
             axes = torch.eye(3, dtype=q.dtype)
             columns = [dynamics.gravity_force(replace(robot, gravity=axis), q) for axis in axes]
             return torch.stack(columns, dim=-1).numpy(), np.full(3, GRAVITY)
         Y = regressor(robot, q, qd, qdd).numpy()
-    # r = Y π₀ − τ = −Y δ if the parameters are wrong by δ.
+    # r = Y π₀ − τ = −Y δ for parameters that are off by δ.
     if name == "payload":
         return -Y[..., -10:], TOOL_MASS * np.repeat([1.0, MOMENT_ARM, MOMENT_ARM**2], (1, 3, 6))
     return -Y, inertial_spread(robot)
@@ -242,20 +234,20 @@ DISCRETE = {
 
 
 def plausible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit) -> bool:
-    """Return whether the parameters are physically plausible, such as a positive tool mass."""
+    """Return whether the parameters are physically plausible (a tool has a positive mass, for example)."""
     if hypothesis.name == "encoder-offset":
         least = max(SMALL_ANGLE, SIGNIFICANT * fit.spread[0])
         return bool(least < abs(fit.theta[0]) <= LARGEST_ANGLE)
     if hypothesis.name == "gains":
         joints = list(hypothesis.joints)
-        # A gain explains nothing if it merely makes the torque larger than the error.
+        # A gain that only makes the torque larger than its error explains nothing.
         explained = float(np.median(np.median(fit.shares[:, joints], axis=0))) < EXPLAINED
         size, spread = (np.abs(x[: len(joints)]) for x in (fit.theta, fit.spread))
         return explained and bool((size > np.maximum(SMALL_GAIN, spread)).any())
     if hypothesis.name == "gravity":
         assumed = system.robot.gravity.numpy()
         angle, size = _turn(assumed, assumed + fit.theta[:3])
-        # The magnitude of gravity is the same everywhere on Earth, so otherwise masses or gains are wrong.
+        # No place on earth has another size of gravity: such a fit has masses or gains that are wrong.
         same = abs(size - 1.0) <= SAME_GRAVITY[angle > TILT]
         return bool(size < WEIGHTLESS) or (angle > SMALL_TILT and same)
     if hypothesis.name == "payload":
@@ -268,7 +260,7 @@ def corrected(log: Log, hypothesis: Hypothesis, theta: Array) -> Log:
     joints = list(hypothesis.joints)
     if hypothesis.name == "gains":
         tau = log.tau.copy()
-        # r = u − τ = g τ, so the correct torque is (1 + g) τ.
+        # r = u − τ = g τ: the right torque is (1 + g) τ.
         tau[:, joints] *= 1.0 + theta[: len(joints)]
         return log.replace(tau=tau)
     if hypothesis.name == "encoder-offset":
@@ -282,11 +274,10 @@ def finding_of(
     system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: TorqueFit, alike: tuple[int, ...] = ()
 ) -> Finding:
     """Return the finding that states a hypothesis; `alike` contains the joints of equivalent hypotheses."""
-    name, theta, spread = hypothesis.name, fit.theta, fit.spread
+    name, theta, spread, evidence = hypothesis.name, fit.theta, fit.spread, dict[str, float]()
     one_of = name == "joint-sign" and len(alike) > 1
     names = tuple(log.joint_names[j] for j in (alike if one_of else hypothesis.joints))
     listed = "all joints" if len(names) == log.nq > 1 else (" or " if one_of else " and ").join(names)
-    evidence: dict[str, float] = {}
     if name == "gains":
         return _gains(log, names, 1.0 + theta[: len(names)])
     if name == "gravity":
@@ -295,9 +286,9 @@ def finding_of(
         text = DISCRETE[name].format(listed)
     elif name == "torque-delay":
         rows, seconds = abs(hypothesis.shift), abs(hypothesis.shift) * log.dt
+        about = "about" if rows < LAGS[-1] else "at least"
         word = "after" if hypothesis.shift > 0 else "before"
         which = f" of {listed}" if hypothesis.joints else ""
-        about = "about" if rows < LAGS[-1] else "at least"
         text = f"the torque{which} is logged {about} {1e3 * seconds:.3g} ms ({rows} rows) {word} the motion"
         evidence = {"rows": hypothesis.shift, "seconds": seconds}
     elif name == "encoder-offset":
@@ -345,6 +336,13 @@ def _gravity(system: ConstrainedSystem, log: Log, change: Array) -> Finding:
     tilted = strength > 0.0 and angle <= TILT
     text = f"the torque fits with gravity ({vector}) m/s², {angle:.3g}° from the scene's"
     return log.finding("base-tilted" if tilted else "gravity-direction", text, **evidence)
+
+
+def is_tilt(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit) -> bool:
+    """Return whether a hypothesis turns gravity by a small angle."""
+    assumed = system.robot.gravity.numpy()
+    angle, size = _turn(assumed, assumed + fit.theta[:3]) if hypothesis.name == "gravity" else (np.inf, 0.0)
+    return bool(assumed.any()) and angle <= TILT and size >= WEIGHTLESS
 
 
 def _turn(assumed: Array, fitted: Array) -> tuple[float, float]:

@@ -41,7 +41,7 @@ INERTIA_ROWS = 200
 FRICTION_ROWS, LEAST_ROWS = 4000, 20
 """Maximum and minimum number of rows from which viscous friction is estimated."""
 ALIKE = 0.02
-"""Tolerance within which the slopes of all joints have a common factor, which indicates a wrong clock."""
+"""Tolerance within which the slopes of all joints share a factor, which indicates an incorrect clock rate."""
 UNITS = (1e-9, 1e-6, 1e-3, 1e3)
 """Lengths of 1 ns, 1 µs, 1 ms and 1 ks, possible units of a clock [s]."""
 UNIT_TOLERANCE = 0.1
@@ -82,7 +82,7 @@ def match(log: Log, value: str, rate: str) -> Match | None:
     if sum(map(len, changes)) < 20:
         return None
     whole = change, integral = np.concatenate(changes), np.concatenate(integrals)
-    # Windows in which an impact occurs are left out, up to a fraction `JUMPS`.
+    # Windows that an impact crosses, `JUMPS` of them at most, are left out.
     scale = np.sqrt((change**2).sum(axis=0) / np.maximum((integral**2).sum(axis=0), 1e-300))
     misfit = change - scale * integral
     outlier = np.abs(misfit) > 8.0 * robust_std(misfit) + 1e-12
@@ -100,10 +100,10 @@ def match(log: Log, value: str, rate: str) -> Match | None:
 
 
 def check_clock_unit(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find a factor common to all joints and both derivatives, which indicates a wrong clock."""
+    """Find a factor common to all joints and both derivatives, which indicates an incorrect clock rate."""
     if not log.stretches:
         return [], log
-    if "qd" in log.derived:  # only the length of a time step can be checked
+    if "qd" in log.derived:  # only the length of a step says anything
         step = f"{log.dt:.4g} apart, which in seconds is an implausible sampling period of a robot's log"
         long = log.finding("time-unit", f"rows are {step}", period=log.dt)
         return [long] if log.dt >= 1.0 else [], log
@@ -115,15 +115,12 @@ def check_clock_unit(system: ConstrainedSystem, log: Log) -> Outcome:
         near = any(abs(factor / unit - 1.0) <= UNIT_TOLERANCE for unit in UNITS)
         return _clock_finding(log, factor) if near or _one_factor(first, factor) else ([], log)
     second = match(log, "qd", "qdd")
-    if second is None or not (first.moving & second.moving).any():
+    if second is None or not (both := first.moving & second.moving).any():
         return [], log
-    if factor <= 0.0 or abs(factor - 1.0) <= TOLERANCE or not first.right(factor)[first.moving].all():
-        return [], log
-    both = first.moving & second.moving
-    # If only the velocity is wrong, the acceleration is not its derivative scaled by the same factor.
-    if second.right()[both].mean() > 0.5 or second.right(factor)[both].mean() < 0.5:
-        return [], log
-    return _clock_finding(log, factor)
+    off = factor > 0.0 and abs(factor - 1.0) > TOLERANCE and first.right(factor)[first.moving].all()
+    # The velocity alone being off leaves the acceleration its derivative.
+    off = off and second.right()[both].mean() <= 0.5 <= second.right(factor)[both].mean()
+    return _clock_finding(log, factor) if off else ([], log)
 
 
 def _clock_finding(log: Log, factor: float) -> Outcome:
@@ -139,7 +136,7 @@ def _clock_finding(log: Log, factor: float) -> Outcome:
     ratio, second = ratio / (log.t[1] - log.t[0]), match(log, "qd", "qdd")
     if "qdd" in log.derived | {*log.header.derived} and second is not None and second.moving.any():
         slope = max(float(np.median(second.low[second.moving])), 1e-300)
-        if abs(np.log(slope / ratio)) < abs(np.log(slope)):  # computed with the wrong clock
+        if abs(np.log(slope / ratio)) < abs(np.log(slope)):  # derived by the wrong clock
             log = log.replace(qdd=log.qdd * ratio)
     return [found], log
 
@@ -163,19 +160,16 @@ def check_velocity(system: ConstrainedSystem, log: Log) -> Outcome:
     wrong = level.moving & (~level.right() | (np.abs(level.correlation) < RELATED)) & ~_coarse(log, level)
     if not wrong.any():
         if late := _late(log, level):
-            computed = log.derived | {*log.header.derived}
-            log = derive(log, ["qd", "qdd"] if "qdd" in computed else ["qd"])
+            log = derive(log, ["qd", "qdd"] if "qdd" in log.derived | {*log.header.derived} else ["qd"])
         return late, log
     if "qd" in log.header.derived:
         return _mismatch("filter-wide", log, level, wrong, "qd", "q"), log
-    permutation = _permutation(level)
-    if permutation is not None:
+    if (permutation := _permutation(level)) is not None:
         rates, moved = match(log, "qd", "qdd"), permutation != np.arange(log.nq)
-        findings = log.on_joints(
-            "velocity-order", moved, "the velocities of {} belong to each other's positions"
-        )
+        text = "the velocities of {} belong to each other's positions"
+        findings = log.on_joints("velocity-order", moved, text)
         follows = rates is not None and np.median(rates.correlation[moved]) > RELATED
-        qdd = log.qdd[:, permutation] if follows else log.qdd  # if they have the same wrong order
+        qdd = log.qdd[:, permutation] if follows else log.qdd  # where they had the order of the wrong ones
         return findings, log.replace(qd=log.qd[:, permutation], qdd=qdd)
     findings, factor = _velocity_findings(log, level, wrong)
     return findings, log.replace(qd=log.qd * factor)
@@ -197,32 +191,25 @@ def _late(log: Log, level: Match) -> list[Finding]:
 
 def _velocity_findings(log: Log, level: Match, wrong: np.ndarray) -> tuple[list[Finding], Array]:
     """Return one finding per cause, and the factors that correct the velocities."""
-    causes = (
-        ("velocity-sign", -1.0, "runs against"),
-        ("degrees", 1.0 / DEGREE, "is 1/57 of"),
-        ("degrees", DEGREE, "is 57 times"),
-    )
+    causes = ("velocity-sign", -1.0, "runs against"), ("degrees", 1.0 / DEGREE, "is 1/57 of")
     findings, factor, unexplained = [], np.ones(log.nq), wrong.copy()
-    for kind, slope, what in causes:
+    for kind, slope, what in (*causes, ("degrees", DEGREE, "is 57 times")):
         hit = unexplained & level.right(slope) & (np.abs(level.correlation) >= RELATED)
         if hit.any():
-            text, median = f"qd of {{}} {what} the rate of change of q", float(np.median(level.low[hit]))
-            findings += log.on_joints(kind, hit, text, slope=median)
+            text = f"qd of {{}} {what} the rate of change of q"
+            findings += log.on_joints(kind, hit, text, slope=np.median(level.low[hit]))
             factor[hit], unexplained = slope, unexplained & ~hit
-    if unexplained.any():
-        findings += _mismatch("velocity-mismatch", log, level, unexplained, "qd", "q")
-    return findings, factor
+    return findings + _mismatch("velocity-mismatch", log, level, unexplained, "qd", "q"), factor
 
 
 def _mismatch(kind: str, log: Log, level: Match, wrong: np.ndarray, rate: str, value: str) -> list[Finding]:
-    """Return a finding on rates that are not the derivative of their values."""
-    j = int(np.flatnonzero(wrong)[0])
+    """Return a rate without relation to its value, if any."""
+    j = int(np.argmax(wrong))
     numbers = {"slope": level.low[j], "correlation": level.correlation[j]}
     shown = ", ".join(f"{name} {number:.3g}" for name, number in numbers.items())
     is_not = "was computed by a filter and has not" if kind == "filter-wide" else "is not"
-    return log.on_joints(
-        kind, wrong, f"{rate} of {{}} {is_not} the rate of change of {value}: {shown}", **numbers
-    )
+    text = f"{rate} of {{}} {is_not} the rate of change of {value}: {shown}"
+    return log.on_joints(kind, wrong, text, **numbers)
 
 
 def _coarse(log: Log, level: Match) -> np.ndarray:
@@ -237,7 +224,7 @@ def _permutation(level: Match) -> np.ndarray | None:
     """Return the order of rates that fits the changes of the joints better than the logged one, if any."""
     from scipy.optimize import linear_sum_assignment
 
-    # All windows are used, since impacts were detected with the logged rates, which may be the wrong ones.
+    # Windows without impacts are those in which a joint fits its own rate, which here is the wrong one.
     change, integral = level.whole
     size = np.sqrt((change**2).sum(axis=0)), np.sqrt((integral**2).sum(axis=0))
     with np.errstate(divide="ignore", invalid="ignore"):
@@ -247,7 +234,7 @@ def _permutation(level: Match) -> np.ndarray | None:
     if not moved.any():
         return None
     fits, unchanged = alike[np.arange(len(order)), order][moved], np.diag(alike)[moved]
-    # Joints that move together correlate in any order; the correct one leaves far less unexplained.
+    # Joints that move together are alike in any order; the right one leaves far less unexplained.
     better = (1.0 - unchanged**2) > CLEARLY * (1.0 - fits**2)
     return order if fits.min() >= EXCHANGED and better.all() else None
 
@@ -269,7 +256,7 @@ def _held_torque(system: ConstrainedSystem, log: Log) -> Array:
         problem = problem_of(system, log, rows)
         viscous, others = problem.nuisance[..., :nq], problem.nuisance[..., nq:]
         fit = cross_validate(replace(problem, nuisance=others), viscous)
-        # Friction that is missing in the robot file also slows a joint.
+        # Friction that the robot file lacks slows a joint as well.
         damping = damping - np.where(-fit.theta > CLEARLY * fit.spread, fit.theta, 0.0)
     x = np.maximum(damping * log.dt * inverse.median(dim=0).values.numpy(), 1e-6)
     return -np.expm1(-x) / x
@@ -284,7 +271,7 @@ def check_acceleration(system: ConstrainedSystem, log: Log) -> Outcome:
         return [], log
     related = np.abs(level.correlation) > 0.3
     wrong = level.moving & related & ~level.right(tolerance=INSTANT, least=_held_torque(system, log))
-    # An acceleration unrelated to the motion is reported if its integral is about as large as the change.
+    # An acceleration without relation to the motion is found if its integral is as large as the change.
     size = np.sqrt((level.integral**2).sum(axis=0) / np.maximum((level.change**2).sum(axis=0), 1e-300))
     wrong |= level.moving & ~related & ((size < 3.0) | (level.correlation < -0.3))
     if not wrong.any():
@@ -333,21 +320,20 @@ def check_noise(system: ConstrainedSystem, log: Log) -> Outcome:
         evidence["stated_std"] = stated
         filtered &= top < stated / NOISE_FACTOR
     if filtered.mean() > 0.5 and not log.header.filtered:
-        share = f"{100 * np.median(top / middle):.2g} % of the noise that it holds at a third of them"
-        high = f"at the highest frequencies it holds {share}"
-        text = f"the acceleration is filtered: {high}, so it is not white"
-        # If no white noise is stated, a filter contradicts nothing, but it matters for the likelihood.
+        high = f"at the highest frequencies it holds {100 * np.median(top / middle):.2g} % of the noise"
+        text = f"the acceleration is filtered: {high} that it holds at a third of them, so it is not white"
+        # Without a claim of white noise a filter contradicts nothing, but a likelihood has to know.
         weight = "note" if stated is None else "warning"
         finding = log.finding("noise-filtered", text, log.named(filtered), **evidence)
         return [replace(finding, weight=weight)], log
     if stated is None:
         return [], log
     kinds = [("noise-understated", top > NOISE_FACTOR * stated, np.max)]
-    if not log.header.filtered:  # after filtering, little noise is left at high frequencies
+    if not log.header.filtered:  # the highest frequencies show little of what a filter lets through
         kinds.append(("noise-overstated", top < stated / NOISE_FACTOR, np.min))
     findings = []
     for kind, wrong, worst in (one for one in kinds if one[1].any()):
-        place = f"{worst(top[wrong]):.3g} rad/s² at {{}}"
-        text = f"the noise of qdd is {place}, and the header states {stated:.3g}"
+        size = f"{worst(top[wrong]):.3g} rad/s²"
+        text = f"the noise of qdd is {size} at {{}}, and the header states {stated:.3g}"
         findings += log.on_joints(kind, wrong, text, **evidence)
     return findings, log

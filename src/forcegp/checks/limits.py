@@ -43,8 +43,8 @@ def check_degrees(system: ConstrainedSystem, log: Log) -> Outcome:
     if outside < OFTEN or still > 0.0 or largest < TURN:
         return [], log
     factor = np.where(turning, DEGREE, 1.0)
-    # Velocities are converted, too, if they are the derivative of the angles; their units are checked later.
-    radians = log.replace(**{name: getattr(log, name) * factor for name in _angles(log, turning)})
+    # Velocities follow the angles where they are their derivative; the check of units comes after.
+    radians = log.replace(**{name: getattr(log, name) * factor for name in _angles(log)})
     if _misfit(system, radians) > _misfit(system, log):
         return [], log
     beyond = f"beyond the joint limits in {100 * outside:.0f} % of the rows"
@@ -62,14 +62,13 @@ def _misfit(system: ConstrainedSystem, log: Log) -> float:
     return float(fit.score.mean())
 
 
-def _angles(log: Log, turning: np.ndarray) -> list[str]:
+def _angles(log: Log) -> list[str]:
     """Return the columns that are in degrees if angles are, including their derivatives unless in radians."""
     columns = ["q"]
     for name, source in (("qd", "q"), ("qdd", "qd")):
-        step = [np.abs(np.diff(getattr(log, source)[s], axis=0)).sum() for s in log.stretches]
-        path = [np.abs(getattr(log, name)[s]).sum() * log.dt for s in log.stretches]
-        if source in columns and sum(path) > 0.1 * sum(step):
-            columns.append(name)
+        step = sum(np.abs(np.diff(getattr(log, source)[s], axis=0)).sum() for s in log.stretches)
+        path = sum(np.abs(getattr(log, name)[s]).sum() * log.dt for s in log.stretches)
+        columns += [name] if source in columns and path > 0.1 * step else []
     return columns
 
 

@@ -155,8 +155,7 @@ class Log:
     @cached_property
     def steps(self) -> Array:
         """Time steps `(n − 1,)` [s], NaN between segments."""
-        steps = np.diff(self.t)
-        return np.where(np.diff(self.segment) == 0, steps, np.nan)
+        return np.where(np.diff(self.segment) == 0, np.diff(self.t), np.nan)
 
     @cached_property
     def dt(self) -> float:
@@ -228,9 +227,7 @@ def derive(log: Log, absent: list[str]) -> Log:
     method = SavitzkyGolay(window=window, order=3)
     for rows in filled.stretches:
         even = filled.dt * np.arange(rows.stop - rows.start)
-        if len(even) < window:
-            continue
-        for name in absent:
+        for name in absent if len(even) >= window else ():
             source, degree = ("q", 1) if name == "qd" else ("qd", 1) if "qd" in logged else ("q", 2)
             one = np.zeros(len(even), np.int64)
             values[name][rows] = differentiate(even, getattr(log, source)[rows], one, method, degree)[0]
@@ -265,9 +262,8 @@ def smoothed(log: Log) -> Log:
         log = log.replace(segment=2 * log.segment * len(log) + np.cumsum(switch))
     columns = {name: getattr(log, name).copy() for name in JOINT_VECTORS}
     lost = np.ones(len(log), bool)
-    for s in log.stretches:
-        if s.stop - s.start > 2 * half:
-            for name, value in columns.items():
-                value[s] = savgol_filter(getattr(log, name)[s], 2 * half + 1, SMOOTHED_ORDER, axis=0)
-            lost[s.start + half : s.stop - half] = False
+    for s in (s for s in log.stretches if s.stop - s.start > 2 * half):
+        lost[s.start + half : s.stop - half] = False
+        for name, value in columns.items():
+            value[s] = savgol_filter(getattr(log, name)[s], 2 * half + 1, SMOOTHED_ORDER, axis=0)
     return log.replace(**columns).mask(lost) if not lost.all() else log

@@ -10,17 +10,8 @@ from forcegp.checks import hypotheses
 from forcegp.checks.excitation import check_visibility, still_joints
 from forcegp.checks.explain import Explanation, explain
 from forcegp.checks.finding import Finding, NotJudgedError
-from forcegp.checks.fit import (
-    FLOOR,
-    Array,
-    cross_validate,
-    gain_of,
-    projector,
-    residual,
-    robust_parameters,
-    unmeasured,
-)
-from forcegp.checks.log import Log, Outcome, force_unit, position_unit, smoothed
+from forcegp.checks.fit import FLOOR, cross_validate, gain_of, robust_parameters, unmeasured
+from forcegp.checks.log import Array, Log, Outcome, force_unit, position_unit, smoothed
 from forcegp.constraints import ConstrainedSystem
 from forcegp.robot.model import RobotModel
 from forcegp.robust import robust_std
@@ -61,10 +52,10 @@ def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
     if log.header.ordered:
         disturbed, rows = _disturbances(system, explanation)
     if disturbed and _enough(smooth.mask(rows)):
-        # A disturbance in these rows must not be attributed to friction or a mass.
+        # What happened in these rows must pass neither for friction nor for a mass.
         explanation = explain(system, smooth.mask(rows))
     losses = _determined(system.robot, explanation)
-    # Friction of contacts, and steeper declared friction, must not be taken for undeclared friction.
+    # Friction of the contacts, and declared friction that rises more sharply, must not pass for more.
     functions = (hypotheses.contact_friction_columns, hypotheses.other_rise_columns)
     shapes = [columns(system, explanation.log, explanation.rows) for columns in functions]
     findings = [
@@ -78,7 +69,7 @@ def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
     for repair in explanation.repairs:
         log = repair(log)
     if log.contact and log.nq > 3:
-        # Friction and offsets of the joints must not be taken for a force at the tip.
+        # Friction and offsets of the joints must not pass for a force at the tip.
         viscous, dry, offset = losses.fit.nuisance.reshape(3, log.nq)
         smooth = np.tanh(log.qd / system.robot.friction_velocity.numpy())
         log = log.replace(tau=log.tau + viscous * log.qd + dry * smooth + offset)
@@ -97,7 +88,7 @@ def _without_torque(log: Log) -> list[Finding]:
     zero = still & (log.tau[rows] == 0.0).all(axis=0)
     word = "zero" if zero[still].all() else "constant"
     findings = log.on_joints("torque-zero", still, f"the torque of {{}} is {word} throughout")
-    # One joint may be passive; if all torques are constant, the column is missing.
+    # One passive joint is a design; an arm without any torque is a missing column.
     return [replace(finding, weight="error" if still.all() else "warning") for finding in findings]
 
 
@@ -129,13 +120,11 @@ def _determined(robot: RobotModel, explanation: Explanation) -> Explanation:
 
 def _confounded(explanation: Explanation) -> list[Finding]:
     """Return the faults found; currents become warnings if masses are wrong, since gains depend on masses."""
-    findings = []
-    for finding in explanation.findings:
-        current = finding.kind == "torque-current" and "masses-mismatch" not in finding.kinds
-        if current and "masses" in explanation.robot:
+    findings = list(explanation.findings)
+    for k, finding in enumerate(findings if "masses" in explanation.robot else ()):
+        if finding.kind == "torque-current" and "masses-mismatch" not in finding.kinds:
             text = f"{finding.message}; or the masses, which do not fit either, are to blame for both"
-            finding = replace(finding, message=text, weight="warning")
-        findings.append(finding)
+            findings[k] = replace(finding, message=text, weight="warning")
     return findings
 
 
@@ -144,31 +133,29 @@ def _friction(robot: RobotModel, explanation: Explanation) -> list[Finding]:
     viscous, coulomb = -explanation.fit.nuisance[:nq], -explanation.fit.nuisance[nq : 2 * nq]
     rows = log.qd[explanation.rows]
     power = (viscous * rows**2 + coulomb * np.abs(rows)).mean(axis=0)
-    # If total friction would drive a joint at some speed, it is a model error rather than friction.
+    # What drives a joint at some speed, declared friction included, is an error of the model, not friction.
     speeds = np.percentile(np.abs(rows), SPEEDS, axis=0)
     damping, declared = robot.damping.numpy(), robot.friction.numpy()
     resists = ((viscous + damping) * speeds + coulomb + declared > 0.0).all(axis=0)
     spread = explanation.fit.nuisance_spread
     significant = np.array([_matters(explanation, j, [j, nq + j]) for j in range(nq)])
-    significant &= resists & ~still_joints(log)
+    # Within the rise of declared friction, whose law is rarely known, a slow joint shows nothing beyond it.
+    rising = (speeds[1] <= robot.friction_velocity.numpy()) & (declared > 0.0)
+    significant &= resists & ~still_joints(log) & ~rising
     findings = []
     for hit, word in ((significant & (power > 0.0), "more"), (significant & (power <= 0.0), "less")):
-        if not hit.any():
-            continue
-        joints, parts = log.named(hit), []
+        evidence, parts = {}, []
         for j in np.flatnonzero(hit):
-            units = f"{force_unit(robot, j)} s/{position_unit(robot, j)}", force_unit(robot, j)
-            pairs = zip((viscous[j], coulomb[j]), (spread[j], spread[nq + j]), units, strict=True)
-            sizes = (f"{x:.3g} ± {s:.1g} {unit}" if s else "not determined" for x, s, unit in pairs)
-            parts.append(f"{log.joint_names[j]} {', '.join(sizes)}")
-        listed = "; ".join(parts)
-        text = f"joints have {word} friction than the robot file declares (viscous, Coulomb): {listed}"
-        evidence = {
-            f"{word} {log.joint_names[j]}": value[j]
-            for word, value in (("viscous", viscous), ("coulomb", coulomb))
-            for j in np.flatnonzero(hit & (value != 0.0))
-        }
-        findings.append(log.finding("friction-undeclared", text, joints, **evidence))
+            unit, name, sizes = force_unit(robot, j), log.joint_names[j], []
+            units = f"{unit} s/{position_unit(robot, j)}", unit
+            for k, kind in enumerate(("viscous", "coulomb")):
+                x, s = -explanation.fit.nuisance[k * nq + j], spread[k * nq + j]
+                sizes.append(f"{x:.3g} ± {s:.1g} {units[k]}" if s else "not determined")
+                evidence |= {f"{kind} {name}": x} if x else {}
+            parts.append(f"{name} {', '.join(sizes)}")
+        what = f"{word} friction than the robot file declares (viscous, Coulomb)"
+        text = f"joints have {what}: {'; '.join(parts)}"
+        findings += [log.finding("friction-undeclared", text, log.named(hit), **evidence)] if parts else []
     return findings
 
 
@@ -192,10 +179,9 @@ def _offsets(system: ConstrainedSystem, explanation: Explanation) -> list[Findin
 def _unexplained(explanation: Explanation) -> list[Finding]:
     error = np.median(explanation.fit.error, axis=0) * explanation.problem.scale
     share = float(np.sqrt((error**2).sum() / (explanation.problem.size**2).sum()))
-    if share <= UNEXPLAINED:
-        return []
     text = f"robot file, friction and offsets leave {100 * share:.0f} % of the torque unexplained"
-    return [explanation.log.finding("torque-unexplained", text, share=share)]
+    finding = explanation.log.finding("torque-unexplained", text, share=share)
+    return [finding] if share > UNEXPLAINED else []
 
 
 def _disturbances(system: ConstrainedSystem, explanation: Explanation) -> tuple[list[Finding], np.ndarray]:
@@ -203,7 +189,7 @@ def _disturbances(system: ConstrainedSystem, explanation: Explanation) -> tuple[
     from scipy.ndimage import minimum_filter1d
 
     log, rows = explanation.log, explanation.log.rows(TRACE_ROWS)
-    trace = residual_trace(system, explanation, rows)
+    trace = residual_trace(explanation, rows)
     scale = np.maximum(explanation.problem.scale, FLOOR * explanation.problem.size)
     stride = np.median(np.diff(rows)) * log.dt
     width = max(1, round(DISTURBANCE_SECONDS / stride))
@@ -234,7 +220,7 @@ def _disturbances(system: ConstrainedSystem, explanation: Explanation) -> tuple[
 
 def _stands_out(log: Log, rows: np.ndarray, level: Array) -> np.ndarray:
     """Return the mask `(n,)` of rows with a larger residual than usual for the same contact state."""
-    # At rest, little torque is unexplained, so these rows do not define what is usual in motion.
+    # An arm at rest leaves little unexplained; it says nothing of one that moves.
     speed = np.abs(log.qd[rows]).max(axis=1)
     moving, bad = speed >= MOVING * np.percentile(speed, 99), np.zeros(len(rows), bool)
     labels = [label[rows] for label in log.contact.values()]
@@ -257,14 +243,13 @@ def _upper_spread(level: Array) -> float:
     return float(min(robust_std(level), upper - middle))
 
 
-def residual_trace(system: ConstrainedSystem, explanation: Explanation, rows: np.ndarray) -> Array:
-    """Return the residual torque at the given rows without contact forces, `(n, nq)` [N m, N]."""
-    log, scale = explanation.log, explanation.problem.scale
+def residual_trace(explanation: Explanation, rows: np.ndarray) -> Array:
+    """Return the residual torque, excluding contact forces, at the given rows, `(n, nq)` [N m, N]."""
+    system, log = explanation.system, explanation.log
     parts, coefficients = [], robust_parameters(explanation.problem, explanation.columns, explanation.prior)
     for index in np.array_split(rows, max(1, len(rows) // 2048)):
-        r, J = residual(system, log, index)
+        part = explanation.on(log, index)
         columns = [hypotheses.robot_columns(system, log, index, name)[0] for name in explanation.robot]
-        columns = np.concatenate([*columns, hypotheses.friction_columns(system, log, index)], axis=-1)
-        r = r - columns @ coefficients
-        parts.append((projector(J, scale) @ (r / scale)[..., None])[..., 0] * scale)
+        r = part.r - np.concatenate([*columns, part.nuisance], axis=-1) @ coefficients
+        parts.append(part.without_contact(r[..., None])[..., 0] * part.scale)
     return np.concatenate(parts)

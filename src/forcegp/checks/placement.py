@@ -38,28 +38,28 @@ def check_placement(system: ConstrainedSystem, log: Log) -> Outcome:
             continue
         scatter = robust_std(path.c - fit_surface(contact, path, np.ones(len(rows), bool))[2])
         rows = evenly(rows, ROWS)
-        outcome = _explanation(system, contact, log, rows, min(OFFSET, BETTER * float(scatter)))
-        if outcome is not None:
+        most = min(OFFSET, BETTER * float(scatter))
+        if (outcome := _explanation(system, contact, log, rows, most)) is not None:
             return outcome
     for contact in labelled_contacts(system, log):
-        # If the position of the tip is wrong, labels based on distance are open throughout.
-        if isinstance(contact, SurfaceContact) and not log.contact[contact.name].any():
-            path = tip_path(system, contact, log)
-            moves = log.usable & (np.linalg.norm(path.v, axis=1) > SLIDING_SLOW)
-            on = (np.abs(path.c[moves]) <= TOUCHING).sum() > LEVEL * moves.sum()
-            if not on and (pair := exchanged_joints(system, contact, log.q[moves])):
-                both, c = tuple(log.joint_names[j] for j in pair), 1e3 * path.c[moves]
-                text = (
-                    f"the tip is {np.median(c):+.3g} ± {robust_std(c):.2g} mm from the surface of "
-                    f"{contact.name!r}, and on it if {' and '.join(both)} are exchanged"
-                )
-                found = log.finding("joint-order", text, both)
-                return [found], changed(log, ("q", "qd", "qdd", "tau"), order=pair)
-            if not on and level_of(path.c[moves], TOUCHING, LEVEL) is None:
-                rows = evenly(np.flatnonzero(moves), TRIED_ROWS)
-                outcome = _never_closed(system, contact, log, rows) if len(rows) else None
-                if outcome is not None:
-                    return outcome
+        # Labels by distance are lost with the place of the tip.
+        if not isinstance(contact, SurfaceContact) or log.contact[contact.name].any():
+            continue
+        path = tip_path(system, contact, log)
+        moves = log.usable & (np.linalg.norm(path.v, axis=1) > SLIDING_SLOW)
+        c = path.c[moves]
+        if (np.abs(c) <= TOUCHING).sum() > LEVEL * len(c):
+            continue
+        if pair := exchanged_joints(system, contact, log.q[moves]):
+            both, where = tuple(log.joint_names[j] for j in pair), f"{1e3 * np.median(c):+.3g}"
+            where = f"{where} ± {1e3 * robust_std(c):.2g} mm from the surface of {contact.name!r}"
+            text = f"the tip is {where}, and on it if {' and '.join(both)} are exchanged"
+            found = log.finding("joint-order", text, both)
+            return [found], changed(log, ("q", "qd", "qdd", "tau"), order=pair)
+        if len(c) and level_of(c, TOUCHING, LEVEL) is None:
+            rows = evenly(np.flatnonzero(moves), TRIED_ROWS)
+            if (outcome := _never_closed(system, contact, log, rows)) is not None:
+                return outcome
     return [], log
 
 
@@ -141,9 +141,9 @@ def _offsets(
             moved = (few.q + np.outer(offset + step, np.eye(log.nq)[j]) for step in (0.0, 1e-5))
             c, ahead = (tip_path(system, contact, few.replace(q=q), np.arange(len(q))).c for q in moved)
             slope = (ahead - c) / 1e-5
-            total = slope**2 if share is not None else (slope**2).sum()
-            ascent = slope * c if share is not None else (slope * c).sum()
-            offset = offset - ascent / np.maximum(total, 1e-12)
+            ascent = np.stack([slope * c, slope**2])
+            total = ascent if share is not None else ascent.sum(axis=1, keepdims=True)
+            offset = offset - total[0] / np.maximum(total[1], 1e-12)
         if share is not None:
             offset = np.array([level_of(offset, hypotheses.SMALL_ANGLE, share) or 0.0])
         if abs(offset[0]) <= hypotheses.LARGEST_ANGLE:

@@ -13,8 +13,8 @@ from forcegp.checks.log import DEPARTURE, Array, Log, Outcome, spikes
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data.clipped import limits_of
 from forcegp.data.derivative import UNIFORM_TOLERANCE
-from forcegp.data.fields import JOINT_VECTORS
-from forcegp.robust import resolution, robust_std
+from forcegp.data.fields import JOINT_VECTORS, resolution
+from forcegp.robust import robust_std
 from forcegp.rows import describe, intervals
 
 
@@ -31,7 +31,7 @@ def check_gaps(system: ConstrainedSystem, log: Log) -> Outcome:
     with np.errstate(invalid="ignore"):
         gaps = log.steps > log.longest_step
     if log.masked is not None:
-        # The step after a wrong time stamp is long only because of that time stamp.
+        # The step after a wrong time stamp is long because of that stamp.
         gaps &= ~log.masked[:-1]
     if not gaps.any():
         return [], log
@@ -48,10 +48,9 @@ def check_jitter(system: ConstrainedSystem, log: Log) -> Outcome:
     with np.errstate(invalid="ignore"):
         regular = log.steps[(log.steps > 0.0) & (log.steps <= log.longest_step)]
     spread = float(robust_std(regular) / log.dt) if len(regular) > 1 else 0.0
-    if spread <= UNIFORM_TOLERANCE:
-        return [], log
     text = f"the time steps vary by {100 * spread:.2g} % around {log.dt:.4g} s"
-    return [log.finding("time-jitter", text, relative_spread=spread, period_s=log.dt)], log
+    jitter = log.finding("time-jitter", text, relative_spread=spread, period_s=log.dt)
+    return [jitter] if spread > UNIFORM_TOLERANCE else [], log
 
 
 def check_period(system: ConstrainedSystem, log: Log) -> Outcome:
@@ -89,9 +88,9 @@ def logged(log: Log) -> dict[str, Array]:
 
 def check_finite(system: ConstrainedSystem, log: Log) -> Outcome:
     """Find NaN and infinite values."""
-    vectors, bad = logged(log), ~np.isfinite(log.t)
+    bad = ~np.isfinite(log.t)
     columns = ["t"] if bad.any() else []
-    for name, value in vectors.items():
+    for name, value in logged(log).items():
         wrong = ~np.isfinite(value)
         columns += [f"{name}.{log.joint_names[j]}" for j in np.flatnonzero(wrong.any(axis=0))]
         bad = bad | wrong.any(axis=1)
@@ -102,11 +101,9 @@ def check_finite(system: ConstrainedSystem, log: Log) -> Outcome:
 
 def check_held(system: ConstrainedSystem, log: Log) -> Outcome:
     """Find rows in which every channel repeats its value while the arm moves."""
-    same = np.ones(len(log) - 1, bool)
-    for value in logged(log).values():
-        same &= (np.diff(value, axis=0) == 0.0).all(axis=1)
+    differs = np.any([np.diff(value, axis=0).any(axis=1) for value in logged(log).values()], axis=0)
     moving = np.abs(log.qd).max(axis=1)[1:] > 0.0
-    held = np.concatenate([[False], same & moving & (np.diff(log.segment) == 0)])
+    held = np.append(False, ~differs & moving & (np.diff(log.segment) == 0))
     if held.sum() < HELD_RUN:
         return [], log
     text = f"{int(held.sum())} rows ({100 * held.mean():.2g} %) repeat the one before:"
@@ -126,20 +123,14 @@ def check_stuck(system: ConstrainedSystem, log: Log) -> Outcome:
             if (steps > 0.0).mean() < 0.1 or (still[j] and name != "tau"):
                 continue
             visible = STUCK_VISIBLE * np.ptp(np.percentile(x[log.usable], (0.5, 99.5)))
-            runs = [
-                (a, b + 1)
-                for a, b in intervals((steps == 0.0) & log.usable[1:] & log.usable[:-1])
-                if b - a >= least
-                # A torque that stays at its extreme is clipped, which is a different finding.
-                and not (name == "tau" and x[a] in limits_of(x[log.usable]))
-                and _expected_change(log, name, j, a, b) > visible
-            ]
-            if runs:
-                spans = tuple(runs)
-                text = f"{name}.{joint} keeps one value while the arm moves, in {describe(spans)}"
-                findings.append(Finding("channel-stuck", text, spans, (joint,)))
-                for a, b in runs:
-                    bad[a:b] = True
+            runs, same = np.zeros(len(log), bool), (steps == 0.0) & log.usable[1:] & log.usable[:-1]
+            for a, b in ((a, b) for a, b in intervals(same) if b - a >= least):
+                # A torque that stays at its extreme is clipped, which is another finding.
+                clips = name == "tau" and x[a] in limits_of(x[log.usable])
+                runs[a : b + 1] = not clips and _expected_change(log, name, j, a, b) > visible
+            text = f"{name}.{joint} keeps one value while the arm moves, in"
+            findings += at_rows(runs, "channel-stuck", text, (joint,))
+            bad |= runs
     return findings, log.mask(bad) if findings else log
 
 
@@ -149,8 +140,8 @@ def _expected_change(log: Log, name: str, j: int, a: int, b: int) -> float:
         return float(np.ptp(np.cumsum(log.qd[a:b, j])) * log.dt)
     if name == "qd":
         return float(np.ptp(np.cumsum(log.qdd[a:b, j])) * log.dt)
-    # A torque should change as much as it does elsewhere over as many rows if the arm moves, and an
-    # acceleration if the joint itself moves.
+    # Torque and acceleration: as far as they change over as many rows elsewhere, if the arm moves, for the
+    # torque, or the joint itself, for the acceleration.
     x, moved = getattr(log, name)[:, j], log.q[a:b] if name == "tau" else log.q[a:b, j : j + 1]
     lag = b - a
     usual = float(np.median(np.abs(x[lag:] - x[:-lag])))
@@ -159,10 +150,10 @@ def _expected_change(log: Log, name: str, j: int, a: int, b: int) -> float:
 
 def check_spikes(system: ConstrainedSystem, log: Log) -> Outcome:
     """Find isolated values far from the curve through their neighbours."""
-    bad, hit, joints, vectors = np.zeros(len(log), bool), [], [], logged(log)
+    bad, hit, vectors = np.zeros(len(log), bool), [], logged(log)
     departures = {name: _departures(log, value) for name, value in vectors.items()}
     near = np.zeros(len(log), bool)
-    for label in log.contact.values():  # values naturally jump near a contact switch
+    for label in log.contact.values():  # next to a contact switch values jump by nature
         near[1:] |= label[1:] != label[:-1]
     for name in vectors:
         departure, around, scale = departures[name]
@@ -177,13 +168,13 @@ def check_spikes(system: ConstrainedSystem, log: Log) -> Outcome:
         )
         if name == "qdd" and "tau" in vectors:
             outlier &= ~_driven(system, log, departure, outlier)
-        # The neighbours of a spike deviate as well, but by less.
+        # The neighbours of a spike are off as well, by less.
         peak = outlier & (np.abs(departure) >= _within_two(np.abs(departure)))
         bad |= peak.any(axis=1)
-        joints += log.named(peak.any(axis=0))
-        hit += [f"{name}.{joint}" for joint in log.named(peak.any(axis=0))]
-    text = f"{int(bad.sum())} isolated outliers in {', '.join(hit[:4])}:"
-    return at_rows(bad, "spike", text, tuple(dict.fromkeys(joints)), rows=bad.sum()), log.mask(bad)
+        hit += [(name, joint) for joint in log.named(peak.any(axis=0))]
+    text = f"{int(bad.sum())} isolated outliers in {', '.join(map('.'.join, hit[:4]))}:"
+    joints = tuple(dict.fromkeys(joint for _, joint in hit))
+    return at_rows(bad, "spike", text, joints, rows=bad.sum()), log.mask(bad)
 
 
 def _departures(log: Log, value: Array) -> tuple[Array, Array, Array]:
@@ -206,10 +197,9 @@ def _shocks(log: Log, departures: dict[str, tuple[Array, Array, Array]], name: s
     pair = ("tau", "qdd") if name in ("tau", "qdd") else (name,)
     size = {key: _size(log, key, *departures[key]) for key in pair if key in departures}
     confirmed = np.zeros(departure.shape, bool)
-    for j in range(departure.shape[1]):
+    for j, own in enumerate(size[name].T):
         others = [np.delete(part, j, axis=1) if key == name else part for key, part in size.items()]
-        most = np.concatenate([*others, np.zeros((len(departure), 1))], axis=1).max(axis=1)
-        own = size[name][:, j]
+        most = np.concatenate(others, axis=1).max(axis=1, initial=0.0)
         confirmed[:, j] = most > own * np.where(own < 1.0, SPIKE_SHARED, DRIVEN)
     return confirmed
 
@@ -252,19 +242,17 @@ def check_resolution(system: ConstrainedSystem, log: Log) -> Outcome:
     if len(q) < FEWEST:
         return [], log
     step = resolution(q)
-    # A step Δ causes noise Δ/√12, and the difference of two samples over dt has √2 times as much.
+    # A step Δ is noise of Δ/√12; the difference of two samples over dt has √2 of it.
     noise = step / np.sqrt(6.0) / log.dt
     speed = np.sqrt(np.mean(log.qd[log.usable] ** 2, axis=0))
-    coarse = np.flatnonzero((noise > COARSE * speed) & (step > 0.0))
-    if not len(coarse):
-        return [], log
-    joints = tuple(log.joint_names[j] for j in coarse)
-    worst = int(coarse[np.argmax(noise[coarse] / np.maximum(speed[coarse], 1e-300))])
+    coarse = (noise > COARSE * speed) & (step > 0.0)
+    worst = int(np.argmax(np.where(coarse, noise / np.maximum(speed, 1e-300), 0.0)))
     text = (
         f"positions come in steps of {step[worst]:.3g} rad ({log.joint_names[worst]}), which add noise of "
         f"{noise[worst]:.3g} rad/s to a velocity from neighbouring samples"
     )
-    return [log.finding("quantised", text, joints, step=step[worst])], log
+    joints = log.named(coarse)
+    return [log.finding("quantised", text, joints, step=step[worst])] if joints else [], log
 
 
 JUMP, FASTEST = 30.0, 2.0
@@ -272,10 +260,13 @@ JUMP, FASTEST = 30.0, 2.0
 change of the fastest joint within a step by this factor."""
 
 
-def _jumps(x: Array, rate: Array, log: Log) -> np.ndarray:
-    """Return the mask `(n, nq)` of rows at which a column jumps."""
-    surplus, usable = np.zeros_like(x), log.usable
-    for s in log.stretches:  # the change that the rate does not account for
+def _jumps(log: Log, value: str, derivative: str) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return `(n,)` bool, rows at which a column jumps, and the joints; none if a column is derived."""
+    x, rate, usable = getattr(log, value), getattr(log, derivative), log.usable
+    if log.derived & {value, derivative}:
+        return np.zeros(len(log), bool), ()
+    surplus = np.zeros_like(x)
+    for s in log.stretches:  # what the rate does not account for
         mean = 0.5 * (rate[s][1:] + rate[s][:-1])
         surplus[s][1:] = np.diff(x[s], axis=0) - mean * np.diff(log.t[s])[:, None]
     rounding = np.finfo(float).eps * np.abs(x[usable]).max()
@@ -284,26 +275,21 @@ def _jumps(x: Array, rate: Array, log: Log) -> np.ndarray:
     change[1:] = np.abs(np.diff(x, axis=0))
     fastest = float(np.percentile(np.abs(rate[usable]), 99.9)) * log.dt
     big = (np.abs(surplus) > JUMP * scale) & (np.abs(surplus) > FASTEST * fastest)
-    # If the column itself does not change faster than usual, its rate is wrong rather than its value.
-    return big & (change > JUMP * np.median(change[usable], axis=0)) & usable[:, None]
+    # Where the column itself does not change faster than usual, its rate is at fault, not the position.
+    jumps = big & (change > JUMP * np.median(change[usable], axis=0)) & usable[:, None]
+    return np.asarray(jumps.any(axis=1)), log.named(jumps.any(axis=0))
 
 
 def check_jumps(system: ConstrainedSystem, log: Log) -> Outcome:
     """Find position jumps that the velocity does not explain, due to missing rows or wrapped angles."""
-    if "qd" in log.derived:
-        return [], log
-    jumps = _jumps(log.q, log.qd, log)
-    at, joints = np.asarray(jumps.any(axis=1)), log.named(jumps.any(axis=0))
+    at, joints = _jumps(log, "q", "qd")
     findings = at_rows(at, "position-jump", f"the position of {', '.join(joints)} jumps at", joints)
     return findings, log.replace(segment=log.segment + np.cumsum(at))
 
 
 def check_impacts(system: ConstrainedSystem, log: Log) -> Outcome:
     """Find impacts, where the velocity jumps by more than the acceleration explains."""
-    if log.derived:
-        return [], log
-    jumps = _jumps(log.qd, log.qdd, log)
-    around, joints = np.asarray(jumps.any(axis=1)), log.named(jumps.any(axis=0))
+    around, joints = _jumps(log, "qd", "qdd")
     findings = at_rows(around, "impact", "the velocity jumps, as at an impact, at", joints)
     around[:-1] |= around[1:]
     return findings, log.mask(around)

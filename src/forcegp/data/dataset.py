@@ -144,15 +144,7 @@ class Dataset(Fields):
         Raises:
             DataError: the state of a contact is not logged.
         """
-        for name in contacts:
-            if name not in self.contact:
-                raise DataError(
-                    f"column 'contact.{name}' is missing",
-                    expected=f"contact.{name}, 1 where the contact is closed and 0 elsewhere",
-                    got=", ".join(f"contact.{c}" for c in self.contact) or "no contact column",
-                )
-        closed = [self.contact[name] for name in contacts]
-        return torch.stack(closed, dim=-1) if closed else self.segment.new_zeros(len(self), 0).bool()
+        return fields.contact_table(self, contacts)
 
     def replace(self, **fields: object) -> Dataset:
         """Return a data set with the given fields changed."""

@@ -7,7 +7,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 from torch import Tensor
 
@@ -332,6 +334,31 @@ def check_robot(data: Fields, robot: RobotModel) -> None:
             RobotMismatchWarning,
             stacklevel=3,
         )
+
+
+def contact_table(data: Fields, contacts: Sequence[str]) -> Tensor:
+    """Return `(n, len(contacts))` bool, true if the named contact is closed."""
+    for name in contacts:
+        if name not in data.contact:
+            raise DataError(
+                f"column 'contact.{name}' is missing",
+                expected=f"contact.{name}, 1 where the contact is closed and 0 elsewhere",
+                got=", ".join(f"contact.{c}" for c in data.contact) or "no contact column",
+            )
+    closed = [data.contact[name] for name in contacts]
+    return torch.stack(closed, dim=-1) if closed else data.segment.new_zeros(len(data), 0).bool()
+
+
+def resolution(x: NDArray[Any]) -> NDArray[Any]:
+    """Return the step between the levels of each column with few distinct values, and zero for the others."""
+    steps = np.zeros(x.shape[1])
+    for j, levels in enumerate(map(np.unique, x.T)):
+        if 2 < len(levels) < 0.75 * len(x):
+            gaps = np.diff(levels)
+            # Rounding in the last digit can split one level into two; such gaps are not steps.
+            gaps = gaps[gaps > 1e-6 * gaps.max()]
+            steps[j] = np.median(gaps)
+    return steps
 
 
 def check_alike(parts: Sequence[Fields]) -> None:

@@ -1,8 +1,8 @@
-"""Preparation of a log for learning: selection of points, held-out stretches, impacts, and noise.
+"""Preparation of a log for learning: selection of points, held-out blocks, impacts, and noise.
 
 Farthest-point sampling selects a few points that cover the inputs of a log (section 5.3 of the paper). If
 training points come from the same stretches as the test rows, as in the paper, the test error measures
-interpolation. Held-out stretches measure how well unseen motion is predicted.
+interpolation. Held-out blocks measure how well unseen motion is predicted.
 """
 
 from __future__ import annotations
@@ -101,7 +101,7 @@ def select_points(
         data: the log.
         count: number of points.
         method: `"farthest"` (on standardized q, q̇, τ), `"even"` (evenly spaced rows, in order), or
-            `"random"` for comparison. Farthest-point selection favours outliers in measured logs.
+            `"random"` for comparison. Farthest-point selection favours outliers in real logs.
         seed: seed for random selection.
         candidates: row numbers to select from; by default all rows.
         progress: called with the number of points selected so far.
@@ -168,13 +168,13 @@ def split_by_stretches(
         count: number of training points.
         stretch: approximate duration of the equal stretches into which each trajectory is divided [s].
         fraction: fraction of the stretches to hold out.
-        margin: duration before and after each held-out stretch that contains no training points [s].
+        margin: duration before and after each held-out block that contains no training points [s].
         method: selection method, as in `select_points`.
-        seed: seed for the held-out stretches and for random selection.
+        seed: seed for the held-out blocks and for random selection.
         progress: called with the number of points selected so far.
 
     Returns:
-        Training rows, all rows of the held-out stretches, and the stretches. Rows in a margin and unselected
+        Training rows, all rows of the held-out blocks, and the stretches. Rows in a margin and unselected
         rows outside the stretches are in neither set.
 
     Raises:
@@ -206,7 +206,7 @@ def _stretches(data: Dataset, stretch: float) -> list[tuple[int, int]]:
     """Divide the trajectories into parts of equal duration, and return their row ranges."""
     if not data.header.ordered:
         raise DataError(
-            "held-out stretches need a log in order of time",
+            "held-out blocks need a log in order of time",
             got="points in order of selection",
             hint="split the log before selecting points from it",
         )

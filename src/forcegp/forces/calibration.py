@@ -1,4 +1,4 @@
-"""Residual torques of a fit: their autocorrelation, and their magnitude on held-out stretches of the log.
+"""Residual torques of a fit: their autocorrelation, and their magnitude on held-out blocks of the log.
 
 Temperature, hysteresis and filters leave residuals that are correlated in time, which divides the number of
 independent samples in a log by the integrated autocorrelation time. The variance on new motions is estimated
@@ -15,6 +15,7 @@ import scipy
 import torch
 from torch import Tensor
 
+from forcegp.data.fields import resolution
 from forcegp.forces.measurements import Measurement, Training
 from forcegp.forces.noise import TORQUE_NOISE
 from forcegp.forces.posterior import (
@@ -27,7 +28,6 @@ from forcegp.forces.posterior import (
 )
 from forcegp.forces.problem import UNSHOWN, Problem, force_posterior, typical
 from forcegp.forces.quantities import affine_map
-from forcegp.robust import resolution
 
 STRETCHES = 8
 """Number of contiguous stretches into which a log of fewer than three segments is divided."""
@@ -183,8 +183,7 @@ def _torque_noise(
 
 def calibrated_noise(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return torque noise calibrated on held-out samples, the trained region, and error growth beyond it."""
-    load, training = problem.typical_load(), problem.training
-    qd, tau = (torch.cat([getattr(m, name) for m in training.measurements]) for name in ("qd", "tau"))
+    load, (qd, tau) = problem.typical_load(), _speeds_and_torques(problem.training)
     # Rounding to steps h has the variance h²/12.
     rounding = torch.from_numpy(resolution(tau.cpu().numpy())).to(tau) / math.sqrt(12.0)
     least = problem.hidden_torque()
@@ -196,8 +195,20 @@ def calibrated_noise(problem: Problem, hyperparameters: Mapping[str, Tensor]) ->
     return {**noise, **region, GROWTH: grows}
 
 
+def region_of(problem: Problem) -> dict[str, Tensor]:
+    """Return the region of speeds and torques of the training data, where no noise is calibrated."""
+    training = problem.training.evenly(MOST_RESIDUALS)
+    load = dataclasses.replace(problem, training=training).typical_load()
+    return trained_region(*_speeds_and_torques(training), load)
+
+
+def _speeds_and_torques(training: Training) -> tuple[Tensor, Tensor]:
+    qd, tau = (torch.cat([getattr(m, name) for m in training.measurements]) for name in ("qd", "tau"))
+    return qd, tau
+
+
 def held_out_torque_std(problem: Problem, hyperparameters: Mapping[str, Tensor], least: Tensor) -> Tensor:
-    """Return the torque noise `(nq,)` for which normalised errors on held-out stretches have unit variance.
+    """Return the torque noise `(nq,)` for which normalised errors on held-out blocks have unit variance.
 
     Each stretch is predicted from all others with the given hyperparameters. The force error computed from
     accelerations is r = M(q̈ − E q̈) = P ε, where P = I in free motion. For joint i, s_i² solves

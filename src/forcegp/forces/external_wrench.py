@@ -54,7 +54,7 @@ ROWS = {name: row for row, name in enumerate((*MOMENTS, *FORCES))}
 
 @dataclass(frozen=True)
 class WrenchFrame:
-    """A frame on which an unknown wrench acts, and its nonzero components.
+    """A frame on which an unknown wrench acts, and the nonzero components of the wrench.
 
     Args:
         frame: frame of the robot.

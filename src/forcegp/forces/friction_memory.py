@@ -6,7 +6,7 @@ damping of mechanical vibrations*). Force priors depend only on the state, so ne
 by the full friction, which makes other learned forces less certain. For a log in time order, z can be
 computed from the velocities. The correction is a ridge regression of the torque residual on z for several
 values of δ, on functions of the velocity, and on the gravity torques of the links. A joint is corrected only
-if the correction reduces the residual on held-out stretches of the training log.
+if the correction reduces the residual on held-out blocks of the training log.
 """
 
 from __future__ import annotations

@@ -1,6 +1,6 @@
-"""Inertia of a measured robot: that of its file, optionally with added drive inertia, or identified inertia.
+"""Inertia of a real robot: that of its file, optionally with added drive inertia, or identified inertia.
 
-Held-out stretches of the log decide whether an estimate predicts torques better than the robot file
+Held-out blocks of the log decide whether an estimate predicts torques better than the robot file
 (`inverse_dynamics.py`). With noisy accelerations, least squares underestimates inertia. With noisy torques in
 closed loop, the likelihood of accelerations given torques overestimates it. The equations of motion slightly
 earlier and later are instruments that avoid both biases. The unknowns are Gaussian around the robot file,
@@ -13,7 +13,7 @@ Torques alone are not sufficient. In closed loop, torque-sensor noise exceeds th
 light joint. Divided by the inertia in the file, it predicts accelerations far larger than the measured ones.
 If their mean square is ten times too large, the drives are assigned the inertia that maximises
 −½ Σ ε²/s² + v Σ log |M|, with the smallest v ≤ 1 at which accelerations are predicted as well as by their
-mean, provided that no joint's torque error on held-out stretches increases by more than 2 %.
+mean, provided that no joint's torque error on held-out blocks increases by more than 2 %.
 
 If an `InertialPrior` is given, the inertial parameters of the robot are set to their posterior mean in one
 physically consistent Gauss–Newton step.
@@ -71,7 +71,7 @@ def rigid_robot(robot: RobotModel, rows: Rows) -> tuple[RobotModel, bool]:
     """Return the robot that best predicts held-out torques, and whether its links were identified.
 
     The candidates are the robot file, the file with added drive inertia, and physically consistent links with
-    drives. Each must outperform the previous ones by two standard errors over stretches of the log, and no
+    drives. Each must outperform the previous ones by two standard errors over blocks of the log, and no
     joint's held-out acceleration error may increase.
 
     Args:
@@ -142,7 +142,7 @@ def _consistent(
 
 
 def with_delay(rows: Rows, columns: Tensor) -> Tensor:
-    """Append a column for the delay s of the torque to the given ones: τ(t + s) ≈ τ(t) + s dτ/dt."""
+    """Append a column for the delay s of the torque: τ(t + s) ≈ τ(t) + s dτ/dt."""
     return torch.cat([columns, LATE * rows.rate[..., None]], dim=-1)
 
 
@@ -251,7 +251,7 @@ class Inertia:
 def inertia_of(
     system: ConstrainedSystem, friction: JointFrictionPrior, mean: ForceMean, training: Training
 ) -> Inertia:
-    """Identify the inertia of a measured robot from samples in free motion.
+    """Identify the inertia of a real robot from samples in free motion.
 
     Args:
         system: robot and contacts of the robot file.

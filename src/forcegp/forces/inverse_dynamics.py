@@ -1,4 +1,4 @@
-"""Inverse dynamics of a measured robot as a linear regression, validated on held-out stretches of the log.
+"""Inverse dynamics of a real robot as a linear regression, validated on held-out blocks of the log.
 
 In free motion, r = τ + Q_C + Q_G + Q_D − M₀ q̈ = C δ + Φ w + ε, with separate friction Φ w for each joint.
 Each column of C is the torque due to one unknown: the inertia of a drive or an inertial parameter of a link.
@@ -112,7 +112,7 @@ class NormalEquations:
     unknowns: int
 
     def total(self) -> NormalEquations:
-        """Return the equations summed over all stretches."""
+        """Return the equations summed over all blocks."""
         return self._each(lambda x: x.sum(0))
 
     def of(self, g: int) -> NormalEquations:
@@ -120,7 +120,7 @@ class NormalEquations:
         return self._each(lambda x: x[g])
 
     def without(self, g: int) -> NormalEquations:
-        """Return the equations summed over all stretches except g."""
+        """Return the equations summed over all blocks except g."""
         return self._each(lambda x: x.sum(0) - x[g])
 
     def _each(self, part: Callable[[Tensor], Tensor]) -> NormalEquations:
@@ -164,7 +164,7 @@ Estimate = Callable[[NormalEquations], Tensor]
 def free_rows(
     system: ConstrainedSystem, prior: JointFrictionPrior, mean: ForceMean, training: Training
 ) -> Rows:
-    """Return samples in free motion and their partners, from the first measurement with enough samples."""
+    """Return samples in free motion and the samples matched to them, of the first measurement with enough."""
     motions = (m for m in training.measurements if m.quantity == "qdd")
     free = ((m, (~m.active.any(-1)).nonzero()[:, 0]) for m in motions)
     m = next(m[rows] for m, rows in free if len(rows) >= LEAST)
@@ -407,11 +407,11 @@ def held_out(
     judged: NormalEquations | None = None,
     source: NormalEquations | None = None,
 ) -> Tensor:
-    """Return mean squared torque errors on stretches held out from estimating δ and w, `(groups, nq)`.
+    """Return mean squared torque errors on blocks held out from estimating δ and w, `(groups, nq)`.
 
     Args:
         by_stretch: equations from which friction is estimated.
-        estimate: function that estimates δ from all stretches except one.
+        estimate: function that estimates δ from all blocks except one.
         judged: equations from which errors are computed, such as `products`; by default `by_stretch`.
         source: equations from which δ is estimated, such as averaged ones; by default `by_stretch`.
     """

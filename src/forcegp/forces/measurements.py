@@ -17,7 +17,7 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset, farthest_points, standardized
-from forcegp.data.fields import check_robot
+from forcegp.data.fields import check_robot, contact_table
 from forcegp.errors import ModelError, UnknownNameError
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.quantities import QUANTITIES, States, states
@@ -312,7 +312,7 @@ def unmeasured_forces(system: ConstrainedSystem, observations: Sequence[Observat
     """Return the RMS of M q̈ − Q_C − Q_G for joints without a logged torque, keyed by joint name [N m, N]."""
     sizes: dict[str, float] = {}
     for data in (o.data for o in observations if o.data.header.unmeasured_torques):
-        eom = system.equations(data.q, data.qd, data.active(system.contact_names))
+        eom = system.equations(data.q, data.qd, contact_table(data, system.contact_names))
         force = (eom.M @ data.qdd[..., None])[..., 0] - eom.Q_C - eom.Q_G
         rms = force.square().mean(0).sqrt().tolist()
         sizes |= {joint: rms[data.joint_names.index(joint)] for joint in data.header.unmeasured_torques}
@@ -364,7 +364,7 @@ def measurement_of(
     if quantity not in QUANTITIES or quantity not in COLUMNS:
         raise UnknownNameError("measured quantity", quantity, COLUMNS)
     check_robot(data, system.robot)
-    active = data.active(system.contact_names)
+    active = contact_table(data, system.contact_names)
     if not len(data.q):
         raise ModelError("there are no samples to learn from", expected="at least one sample", got="none")
     values = COLUMNS[quantity](data, system)

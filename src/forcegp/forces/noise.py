@@ -37,7 +37,7 @@ class Noise:
             joint; by default the value in the log (`qdd_std` of each sample, else its header), else 0.1.
         learn: whether the acceleration noise is learned, starting from `acceleration`.
         torque: standard deviation of the motor torque's white noise [N m, N], one number or one per joint;
-            `"learn"`, `None` for no noise, or `"auto"` to learn it with the priors for measured robots.
+            `"learn"`, `None` for no noise, or `"auto"` to learn it with the priors for real robots.
         state: standard deviations of the white noise of measured q and q̇ [rad, rad/s], each one number or
             one per joint; `None` for no noise. It is propagated to first order (`forces/noise.py`).
         degrees_of_freedom: ν > 2 of a Student t distribution of each sample's noise, such as 4, for logs with
@@ -95,7 +95,7 @@ class Noise:
         return self.torque == "learn" if isinstance(self.torque, str) else False
 
     def for_priors(self, priors: Sequence[ForcePrior]) -> Noise:
-        """Return the noise with `torque="auto"` resolved: learned with the priors for measured robots."""
+        """Return the noise with `torque="auto"` resolved: learned with the priors for real robots."""
         if not isinstance(self.torque, str) or self.torque != "auto":
             return self
         measured = any(isinstance(prior, JointFrictionPrior | InertialPrior) for prior in priors)

@@ -53,8 +53,8 @@ def with_learned_slopes(
 ) -> tuple[Problem, Learned, tuple[str, ...]]:
     """Return the problem with slopes of its learned forces, the resulting hyperparameters, and warnings.
 
-    Problem and hyperparameters are unchanged if the evidence does not increase, or if the slopes cannot be
-    computed or used, for example because a force is not computed with tensors.
+    The problem and the hyperparameters are unchanged if the evidence does not increase, or if the slopes
+    cannot be computed or used, for example because a force is not computed with tensors.
 
     Args:
         problem: problem with exact inference and state noise.

@@ -1,6 +1,6 @@
 """Prior and posterior (eqs. 22 to 25) of the impressed forces, and functions drawn from the posterior.
 
-Q̄ = m + Σ_p E_p f_p with f_p ~ GP(0, k_p), plus contact Coulomb friction proportional to the multiplier.
+Q̄ = m + Σ_p E_p f_p with f_p ~ GP(0, k_p), plus contact friction proportional to the multiplier.
 Every quantity z = B_Q Q + B_z Q_z + o is an affine map of the latent forces f_p and is determined by their
 posterior. Each function drawn from the posterior is a deterministic force field that can be integrated.
 
@@ -77,14 +77,14 @@ class ForceProcess:
         return self.scales[p].apply(self.priors[p].features(system, at))
 
     def coupled(self, system: ConstrainedSystem, at: States, z: AffineMap) -> AffineMap:
-        """Add contact Coulomb friction to the affine map of a quantity."""
+        """Add Coulomb friction at the contacts to the affine map of a quantity."""
         return coupled(system, at, z, self.coulomb)
 
     def rows(self, system: ConstrainedSystem, at: States, z: AffineMap) -> Block:
         """Express a quantity as rows of the latent forces.
 
         Args:
-            z: the quantity, including contact Coulomb friction.
+            z: the quantity, including Coulomb friction at the contacts.
 
         Returns:
             Kernel inputs and operators B(x) E(x) of each prior, with o(x) + B(x) m(x) as target.
@@ -157,7 +157,7 @@ class ForcePosterior:
         """Express a quantity at n states as rows of the processes, with its prior mean as target.
 
         Args:
-            z: the quantity, without contact Coulomb friction.
+            z: the quantity, without Coulomb friction at the contacts.
         """
         # W = B E, target o + B m (eqs. 12 and 15)
         return self.process.rows(system, at, self.process.coupled(system, at, z))
@@ -282,7 +282,7 @@ class ForceSamples:
         return with_coulomb(system, at, Q_bar, self.posterior.process.coulomb)
 
     def unknown_force(self, system: ConstrainedSystem, at: States, priors: Iterable[int]) -> Tensor | float:
-        """Return Σ E f over the given priors, without contact Coulomb friction."""
+        """Return Σ E f over the given priors, without Coulomb friction at the contacts."""
         unknown: Tensor | float = 0.0
         runs = len(at.q) // self.count
         step = max(1, CHUNK_STATES // max(runs, 1))

@@ -109,7 +109,7 @@ class Problem:
         return learned.exp() if std.ndim == 1 else std * (learned.exp() / typical(std))
 
     def coulomb(self, tensors: Mapping[str, Tensor]) -> tuple[CoulombFriction, ...]:
-        """Return contact Coulomb friction, with initial values for parameters missing from the tensors."""
+        """Return Coulomb friction at the contacts, with initial values for missing parameters."""
         return coulomb_of(self.priors, tensors, self.system.robot.mass) if self.has_coulomb else ()
 
     @property

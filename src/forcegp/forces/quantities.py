@@ -282,7 +282,7 @@ class Hidden(NamedTuple):
 
     def applied(self, mean: Tensor, covariance: Tensor | None) -> tuple[Tensor, Tensor | None]:
         """Return the mean `(n, d)` and covariance, with NaN for undetermined components. The variance of
-        undetermined directions is the mean square of the determined ones.
+        undetermined directions is the mean square of the components in determined directions.
         """
         if covariance is not None:
             square = mean.square() + covariance.diagonal(dim1=-2, dim2=-1)

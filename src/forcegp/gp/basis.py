@@ -214,7 +214,7 @@ class ProcessBasis:
         return rest.kernel.variance(rest.params)
 
     def evaluate(self, features: Features) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the part of `LatentBasis.evaluate` that belongs to this process, with V `(n, Σ sizes)`."""
+        """Return the part of `LatentBasis.evaluate` for this process, with V `(n, Σ sizes)`."""
         values, explained = self.values(features)
         V = values.transpose(0, 1).reshape(points(features), -1).index_select(1, self.columns)
         prior = self.rest_variance(features)

@@ -51,7 +51,7 @@ class FunctionSamples:
     Attributes:
         bases: bases of each process, as functions of its standardized features.
         weights: weights for each process and basis, `(components, terms, samples)`.
-        folded: for a sparse posterior, the same samples as `FoldedSamples` of each process.
+        folded: for a sparse posterior, these samples as one `FoldedSamples` per process.
     """
 
     bases: tuple[tuple[Basis, ...], ...]

@@ -234,7 +234,7 @@ class FeatureMap:
 
 
 def require_resolved_noise(prior: Tensor) -> None:
-    """Reject a prior that is so large that double precision cannot resolve the noise.
+    """Reject a prior whose variance is so large that double precision cannot resolve the noise.
 
     Args:
         prior: prior variance of a row, in units of the noise variance `()`.

@@ -294,7 +294,7 @@ class SparsePosterior:
         return 0.5 * (covariance + covariance.mT)
 
     def require_resolved(self) -> None:
-        """Reject a prior that is so large that double precision cannot resolve the noise.
+        """Reject a prior whose variance is so large that double precision cannot resolve the noise.
 
         Raises:
             NumericalError: the prior of the approximated part is too large.

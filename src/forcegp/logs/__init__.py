@@ -22,7 +22,7 @@ from forcegp.logs.clock import even_clock, usual_step
 from forcegp.logs.contact import Evidence, detect, per_contact
 from forcegp.logs.from_contact import derive_joints, stick_speeds
 from forcegp.logs.gather import gather
-from forcegp.logs.mapping import Mapping, default_mapping, load_mapping, parse_mapping
+from forcegp.logs.mapping import SYMBOLS, Mapping, default_mapping, load_mapping, parse_mapping
 from forcegp.logs.smoothing import add_derivatives, impact_mask
 from forcegp.logs.table import Array, ImportFinding, ImportReport, Signals
 from forcegp.resources import announce_memory
@@ -104,10 +104,8 @@ def import_log(
     """Read a log as in `read_log`, with a report; if `displaced`, the tip may slide away from its surface."""
     system = system_of(scene)
     robot = system.robot
-    if mapping is None:
-        log_mapping = default_mapping(path, system)
-    else:
-        log_mapping = mapping if isinstance(mapping, Mapping) else load_mapping(mapping)
+    log_mapping = default_mapping(path, system) if mapping is None else mapping
+    log_mapping = log_mapping if isinstance(log_mapping, Mapping) else load_mapping(log_mapping)
     report = ImportReport(str(path))
     report.steps.append(f"read {Path(path).name} by mapping {Path(log_mapping.document.source).name}")
     for doubt in log_mapping.doubts:
@@ -197,17 +195,16 @@ def _dataset(
     settings = mapping.sections.derivatives
     dt = usual_step(signals.t)
     margin = settings.impact_margin if settings.impact_margin is not None else 0.5 * settings.window * dt
-    impact = {name: _tensor(mask.astype(np.float64)) for name, mask in impact_mask(signals, margin).items()}
-    of_contacts = {"impact": impact} if impact else {}
+    of_contacts = {"impact": impact_mask(signals, margin)} if signals.contact else {}
     if "wrench" in signals.vectors and signals.contact:
-        sensed = per_contact(signals, system, mapping)
-        of_contacts |= {name: {key: _tensor(x) for key, x in group.items()} for name, group in sensed.items()}
+        of_contacts |= per_contact(signals, system, mapping)
         report.steps.append("took the tool's weight off the wrench and carried it to the contact")
     sticking = stick_speeds(signals, system, mapping, report)
     extras = {} if std is None else {"qdd_std": _tensor(std)}
     if "tau_std" in signals.vectors:
         extras["tau_std"] = _tensor(signals.vectors.pop("tau_std"))
     vectors = {name: _tensor(signals.vectors.pop(name)) for name in ("q", "qd", "qdd", "tau")}
+    of_contacts = {key: {name: _tensor(x) for name, x in of.items()} for key, of in of_contacts.items()}
     header = DataHeader(
         dt=dt,
         noise_std=None if std is None else float(np.sqrt(np.mean(std**2))),
@@ -216,11 +213,7 @@ def _dataset(
         robot=robot.name,
         robot_fingerprint=robot.fingerprint,
         provenance=tuple(report.steps),
-        derived=tuple(
-            name
-            for name, logged in (("qd", mapping.sections.velocity), ("qdd", mapping.sections.acceleration))
-            if logged is None
-        ),
+        derived=tuple(SYMBOLS[n] for n in ("velocity", "acceleration") if mapping.quantity(n) is None),
         imported=tuple((found.kind, found.message) for found in report.findings),
         unmeasured_torques=mapping.sections.torque.unmeasured,
         stick_speeds=sticking,
@@ -239,5 +232,5 @@ def _dataset(
     )
 
 
-def _tensor(values: np.ndarray) -> torch.Tensor:
-    return torch.from_numpy(np.ascontiguousarray(values))
+def _tensor(values: Array) -> torch.Tensor:
+    return torch.from_numpy(np.ascontiguousarray(values, dtype=np.float64))

@@ -38,23 +38,24 @@ def usual_step(t: Array) -> float:
 
 def drop_repeated(signals: Signals, report: ImportReport) -> None:
     """Drop rows that repeat the previous row; raise `DataError` if only the time stamp is repeated."""
-    same = np.concatenate([[False], np.diff(signals.t) == 0.0])
+    same = np.append(False, np.diff(signals.t) == 0.0)
     if not same.any():
         return
-    equal = same.copy()
-    for values in signals.vectors.values():
-        equal[1:] &= (values[1:] == values[:-1]).all(axis=1)
+    equal = same & _repeats(signals, *signals.vectors)
     different = np.flatnonzero(same & ~equal)
     if len(different):
         rows = signals.row[different]
-        raise DataError(
-            f"{describe(numbered(rows))}: the time stamp of the row before, with other values",
-            expected="one row per time stamp",
-            got=f"{len(rows)} such rows",
-            hint="is this the correct time column? Its resolution may be too coarse",
-        )
+        text = f"{describe(numbered(rows))}: the time stamp of the row before, with other values"
+        hint = "is this the correct time column? Its resolution may be too coarse"
+        raise DataError(text, expected="one row per time stamp", got=f"{len(rows)} such rows", hint=hint)
     report.find("repeated", f"{equal.sum()} repeated rows were dropped", signals.row[equal])
     signals.keep(~equal)
+
+
+def _repeats(signals: Signals, *names: str) -> NDArray[np.bool_]:
+    """Return the rows in which some vectors have the values of the previous row."""
+    differs = [np.diff(signals.vectors[name], axis=0).any(axis=1) for name in names]
+    return np.append(False, ~np.any(differs, axis=0))
 
 
 def split_trajectories(signals: Signals, gap: float | None, report: ImportReport) -> None:
@@ -66,8 +67,8 @@ def split_trajectories(signals: Signals, gap: float | None, report: ImportReport
     """
     t = signals.t
     step = usual_step(t)
-    new = np.concatenate([[True], signals.segment[1:] != signals.segment[:-1]])
-    back = np.concatenate([[False], np.diff(t) < 0.0]) & ~new
+    new = np.append(True, np.diff(signals.segment) != 0)
+    back = np.append(False, np.diff(t) < 0.0) & ~new
     if back.any():
         start, wrong = 0, []
         for row in np.flatnonzero(back | new):
@@ -82,13 +83,10 @@ def split_trajectories(signals: Signals, gap: float | None, report: ImportReport
                 got=f"{t[wrong[0]]:.9g} s",
                 hint="sort the log by time, or use a time column that increases within a trajectory",
             )
-        report.find(
-            "restart",
-            f"the clock restarts {back.sum()} times: each restart begins a trajectory",
-            signals.row[back],
-        )
+        message = f"the clock restarts {back.sum()} times: each restart begins a trajectory"
+        report.find("restart", message, signals.row[back])
     longest = gap if gap is not None else GAP_STEPS * step
-    gaps = np.concatenate([[False], np.diff(t) > longest]) & ~new & ~back
+    gaps = np.append(False, np.diff(t) > longest) & ~new & ~back
     if gaps.any():
         message = f"{gaps.sum()} gaps longer than {longest:.4g} s: a new trajectory begins after each"
         report.find("gap", message, signals.row[gaps])
@@ -97,11 +95,7 @@ def split_trajectories(signals: Signals, gap: float | None, report: ImportReport
 
 def find_held(signals: Signals, drop: bool, report: ImportReport) -> None:
     """Find rows repeated because the logger is faster than its source, and drop them if requested."""
-    held = np.zeros(len(signals), dtype=bool)
-    held[1:] = signals.segment[1:] == signals.segment[:-1]
-    for name in ("q", "tau"):
-        values = signals.vectors[name]
-        held[1:] &= (values[1:] == values[:-1]).all(axis=1)
+    held = np.append(False, np.diff(signals.segment) == 0) & _repeats(signals, "q", "tau")
     if held.any():
         done = "were dropped" if drop else 'are kept; held = "drop" under [time] drops them'
         message = f"{held.sum()} rows repeat the values of the previous row and {done}"
@@ -116,11 +110,9 @@ def join_stream(
     """Add a vector interpolated from a stream with time stamps t `(k,)`, and drop rows outside its range."""
     back = np.flatnonzero(np.diff(t) <= 0.0)
     if len(back):
-        raise DataError(
-            f"the stream of {name} has a clock that does not increase in row {back[0] + 1}",
-            expected="increasing stamps, to align it with the positions",
-            hint="import the trajectories separately",
-        )
+        text = f"the stream of {name} has a clock that does not increase in row {back[0] + 1}"
+        expected = "increasing stamps, to align it with the positions"
+        raise DataError(text, expected=expected, hint="import the trajectories separately")
     longest = gap if gap is not None else GAP_STEPS * usual_step(t)
     after = np.searchsorted(t, signals.t, side="left").clip(1, len(t) - 1)
     covered = (signals.t >= t[0]) & (signals.t <= t[-1])
@@ -166,22 +158,22 @@ def even_clock(signals: Signals, period: float | None, report: ImportReport) -> 
     elif period is None:
         return
     step = period if period is not None else usual_step(signals.t)
-    grids, nearest = [], []
     length = sum(float(signals.t[rows.stop - 1] - signals.t[rows.start]) for rows in stretches)
     most = max(limits.FREE_ROWS, limits.TABLE_EXPANSION * len(signals))
     check_count(report.source, "rows on an even clock", math.ceil(min(length / step, 2.0**62)), most)
+    parts = []
     for rows in stretches:
         t = signals.t[rows]
         count = int(np.floor((t[-1] - t[0]) / step + 1e-6)) + 1
-        grids.append(np.minimum(t[0] + step * np.arange(count), t[-1]))
-        nearest.append(np.searchsorted(t, grids[-1] + 0.5 * step).clip(1, len(t)) - 1 + rows.start)
+        grid = np.minimum(t[0] + step * np.arange(count), t[-1])
+        nearest = np.searchsorted(t, grid + 0.5 * step).clip(1, len(t)) - 1 + rows.start
+        parts.append((rows, t, grid, nearest))
     for name in list(signals.vectors):
         old = signals.vectors.pop(name)
-        pairs = zip(stretches, grids, strict=True)
-        parts = [onto(signals.t[s], old[s], grid, cubic=name in SMOOTH) for s, grid in pairs]
-        signals.vectors[name] = np.concatenate(parts)
-    index: NDArray[np.int64] = np.concatenate(nearest)
+        new = [onto(t, old[rows], grid, cubic=name in SMOOTH) for rows, t, grid, _ in parts]
+        signals.vectors[name] = np.concatenate(new)
+    index: NDArray[np.int64] = np.concatenate([nearest for *_, nearest in parts])
     signals.contact = {name: value[index] for name, value in signals.contact.items()}
-    signals.t, signals.row = np.concatenate(grids), signals.row[index]
-    signals.segment = signals.segment[index]
+    signals.t = np.concatenate([grid for _, _, grid, _ in parts])
+    signals.row, signals.segment = signals.row[index], signals.segment[index]
     report.steps.append(f"resampled to steps of {step:.9g} s (positions by cubic splines, torques linearly)")

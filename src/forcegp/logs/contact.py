@@ -189,11 +189,9 @@ def detect(
     for contact in system.contacts:
         name = contact.name
         if name not in sections:
-            raise mapping.error(
-                ("contact",),
-                f"no source determines whether contact {name!r} is closed",
-                f"[contact.{name}] with source = column, wrench, multiplier, distance, always or never",
-            )
+            text = f"no source determines whether contact {name!r} is closed"
+            sources = "column, wrench, multiplier, distance, always or never"
+            raise mapping.error(("contact",), text, f"[contact.{name}] with source = {sources}")
         source = sections[name].source
         if source in ("always", "never"):
             states[name] = np.full(len(signals), source == "always")
@@ -263,9 +261,8 @@ def _detect(
     signals: Signals, values: Array, name: str, section: ContactStateSection
 ) -> tuple[NDArray[np.bool_], Evidence]:
     if section.source == "distance":
-        high = section.threshold if section.threshold is not None else touching(values)
-        low = section.release if section.release is not None else high
-        below = section.threshold if section.threshold is not None else TOUCHING
+        high = section.threshold or touching(values)
+        low, below = section.release or high, section.threshold or TOUCHING
         closed = hysteresis(-values, -high, -low, signals.segment) & (values >= -below)
     else:
         high, low = force_levels(values, name, section)
@@ -287,10 +284,8 @@ def touching(distance: Array) -> float:
     True
     """
     near = distance[np.abs(distance) <= TOUCHING]
-    if not len(near):
-        return TOUCHING
     level, spread = level_and_spread(near)
-    return min(TOUCHING, level + max(DISTANCE_STD * spread, SMALLEST_DISTANCE))
+    return min(TOUCHING, level + max(DISTANCE_STD * spread, SMALLEST_DISTANCE)) if len(near) else TOUCHING
 
 
 def force_levels(values: Array, name: str, section: ContactStateSection) -> tuple[float, float]:
@@ -301,7 +296,7 @@ def force_levels(values: Array, name: str, section: ContactStateSection) -> tupl
     difference if that is larger. Raise `DataError` if the groups are not distinct.
     """
     if section.threshold is not None:
-        return section.threshold, section.release if section.release is not None else 0.5 * section.threshold
+        return section.threshold, section.release or 0.5 * section.threshold
     counts, edges = np.histogram(values, BINS)
     centers = 0.5 * (edges[1:] + edges[:-1])
     below, sums = np.cumsum(counts), np.cumsum(counts * centers)
@@ -319,8 +314,7 @@ def force_levels(values: Array, name: str, section: ContactStateSection) -> tupl
             hint=f"set threshold under [contact.{name}], or source to always, never or distance",
         )
     away = max(RELEASE_STD * open_spread, RELEASE * (closed_level - open_level))
-    low = section.release if section.release is not None else open_level + away
-    return high, min(low, high)
+    return high, min(section.release or open_level + away, high)
 
 
 def hysteresis(values: Array, high: float, low: float, segment: NDArray[np.int64]) -> NDArray[np.bool_]:
@@ -329,10 +323,9 @@ def hysteresis(values: Array, high: float, low: float, segment: NDArray[np.int64
     >>> hysteresis(np.array([0.0, 2, 5, 2, 0, 2, 0]), 4.0, 1.0, np.zeros(7, dtype=np.int64)).astype(int)
     array([0, 1, 1, 1, 0, 0, 0])
     """
-    above = values >= low
-    result = np.zeros(len(values), dtype=bool)
-    for rows in runs(segment, above):
-        result[rows] = above[rows.start] and bool((values[rows] >= high).any())
+    result = values >= low
+    for rows in runs(segment, result):
+        result[rows] &= (values[rows] >= high).any()
     return result
 
 
@@ -340,9 +333,9 @@ def _merge_short(closed: NDArray[np.bool_], signals: Signals, shortest: float) -
     """Merge intervals shorter than `shortest` [s] with their neighbours, and return their number."""
     count = 0
     for trajectory in signals.runs():
-        for rows in runs(closed[trajectory])[1:-1]:
-            span = slice(trajectory.start + rows.start, trajectory.start + rows.stop)
-            if signals.t[span.stop - 1] - signals.t[span.start] < shortest:
-                closed[span] = ~closed[span]
+        t, state = signals.t[trajectory], closed[trajectory]
+        for rows in runs(state)[1:-1]:
+            if t[rows.stop - 1] - t[rows.start] < shortest:
+                state[rows] = ~state[rows]
                 count += 1
     return count

@@ -12,7 +12,7 @@ tip that reverses is slow in a few rows, but these do not form a mode.
 
 from __future__ import annotations
 
-import dataclasses
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -62,26 +62,19 @@ def derive_joints(
         section = mapping.sections.contact.get(name)
         if section is None or section.source not in ("always", "column"):
             text = f"the state of contact {name!r} needs the position of {joint!r}"
-            raise mapping.error(
-                (*key, joint), text, expected=f'[contact.{name}] source = "always" or "column"'
-            )
+            expected = f'[contact.{name}] source = "always" or "column"'
+            raise mapping.error((*key, joint), text, expected)
         if section.source == "column":
             closed &= signals.contact[name]
     if not closed.all():
         report.find("open", f"{(~closed).sum()} rows were dropped: an open contact tells no joint")
         signals.keep(closed, split=True)
     unknown = [signals.joint_names.index(joint) for joint in asked]
-    slides = [
-        dataclasses.replace(c, stick_speed=None) if isinstance(c, SurfaceContact) else c
-        for c in map(system.contact, dict.fromkeys(asked.values()))
-    ]
-    held = dataclasses.replace(system, contacts=slides)
-    vectors = {
-        name: torch.from_numpy(signals.vectors[name])
-        for name in ("q", "qd", "qdd")
-        if name in signals.vectors
-    }
-    solved = _solve(held, vectors, unknown, tuple(asked))
+    contacts = map(system.contact, dict.fromkeys(asked.values()))
+    slides = [replace(c, stick_speed=None) if isinstance(c, SurfaceContact) else c for c in contacts]
+    logged = {"q", "qd", "qdd"} & {*signals.vectors}
+    vectors = {name: torch.from_numpy(signals.vectors[name]) for name in logged}
+    solved = _solve(replace(system, contacts=slides), vectors, unknown, tuple(asked))
     signals.vectors |= {name: value.numpy() for name, value in solved.items()}
     report.steps.append("; ".join(f"{joint} follows from contact {name!r}" for joint, name in asked.items()))
 
@@ -135,12 +128,9 @@ def stick_speeds(
             continue
         if contact.stick_speed is not None or section.stick_speed == "never":
             continue
-        q, qd = (
-            torch.from_numpy(np.ascontiguousarray(signals.vectors[name][closed])) for name in ("q", "qd")
-        )
-        alone = ConstrainedSystem(system.robot, [contact])
-        point = alone.equations(q, qd).contact_points[contact.name]
-        speed = point.sliding[1].norm(dim=-1).numpy()
+        rows = (np.ascontiguousarray(signals.vectors[name][closed]) for name in ("q", "qd"))
+        eom = ConstrainedSystem(system.robot, [contact]).equations(*map(torch.from_numpy, rows))
+        speed = eom.contact_points[contact.name].sliding[1].norm(dim=-1).numpy()
         flag = signals.vectors.get(f"{STICKS}{contact.name}")
         if section.stick_speed != "auto":
             found = section.stick_speed
@@ -150,11 +140,9 @@ def stick_speeds(
             found = resting_speed(speed)
         if found is not None:
             speeds[contact.name] = found
-            share = 100.0 * (speed < found).mean()
+            share, other = 100.0 * (speed < found).mean(), f'"never" under [contact.{contact.name}]'
             text = f"contact {contact.name!r} sticks below {1e3 * found:.3g} mm/s, {share:.0f} % of its rows"
-            report.find(
-                "sticks", f'{text}; stick_speed = "never" under [contact.{contact.name}] if it slides'
-            )
+            report.find("sticks", f"{text}; stick_speed = {other} if it slides")
     return speeds
 
 

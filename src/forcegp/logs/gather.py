@@ -112,14 +112,12 @@ class _Gathering:
         section = self.mapping.sections.wrench
         assert section is not None
         stream = self.table.stream_of(section.force[0], section.stream)
-        result = np.zeros((len(stream), 6))
-        force, moment = units.FORCE[section.force_unit], units.TORQUE[section.torque_unit]
-        if len(section.force) == 1:
-            cell = (self._take(stream, section.force[0]) - section.offset[0]) * force
-            result[:, :3] = cell[:, None] * np.array(section.axis)
-            return stream, result
-        for i, column in enumerate((*section.force, *(section.torque or ()))):
-            result[:, i] = (self._take(stream, column) - section.offset[i]) * (force if i < 3 else moment)
+        scales = [units.FORCE[section.force_unit]] * 3 + [units.TORQUE[section.torque_unit]] * 3
+        columns, result = (*section.force, *(section.torque or ())), np.zeros((len(stream), 6))
+        for i, column in enumerate(columns):
+            result[:, i] = (self._take(stream, column) - section.offset[i]) * scales[i]
+        if len(columns) == 1:
+            result[:, :3] = np.outer(result[:, 0], section.axis)
         return stream, result
 
     def _flags(self) -> dict[str, tuple[Stream, Array]]:
@@ -127,32 +125,24 @@ class _Gathering:
         flags = {}
         for name, section in self.mapping.sections.contact.items():
             closed = section.column if section.source == "column" else None
-            for key, column in ((CLOSED, closed), (STICKS, section.sticks)):
-                if column is not None:
-                    flags[f"{key}{name}"] = self._flag(column, section.stream)
+            columns = {CLOSED: closed, STICKS: section.sticks}
+            for key, column in ((key, column) for key, column in columns.items() if column is not None):
+                stream = self.table.stream_of(column, section.stream)
+                values = self._take(stream, column)
+                wrong = np.flatnonzero((values != 0.0) & (values != 1.0))
+                if len(wrong):
+                    text = f"{self.table.source}: column {column!r} is not a flag in row {wrong[0]}"
+                    raise DataError(text, expected="0 or 1", got=values[wrong[0]])
+                flags[f"{key}{name}"] = stream, values[:, None]
         return flags
-
-    def _flag(self, column: str, named: str | None) -> tuple[Stream, Array]:
-        stream = self.table.stream_of(column, named)
-        values = self._take(stream, column)
-        wrong = np.flatnonzero((values != 0.0) & (values != 1.0))
-        if len(wrong):
-            raise DataError(
-                f"{self.table.source}: column {column!r} is not a flag in row {wrong[0]}",
-                expected="0 or 1",
-                got=values[wrong[0]],
-            )
-        return stream, values[:, None]
 
     def _stamps(self, stream: Stream) -> Array:
         """Return the time stamps of a stream [s]."""
         holder = stream
         if self.time.column not in stream.columns:
             if len(self.table.streams) > 1 and stream is not self.reference:
-                raise DataError(
-                    f"{self.table.source}: stream {stream.name!r} has no column {self.time.column!r}",
-                    expected="a time stamp in every stream that is used",
-                )
+                text = f"{self.table.source}: stream {stream.name!r} has no column {self.time.column!r}"
+                raise DataError(text, expected="a time stamp in every stream that is used")
             holder = self.table.stream_of(self.time.column, self.time.stream)
         return holder.columns[self.time.column] * units.TIME[self.time.unit]
 
@@ -181,18 +171,15 @@ class _Gathering:
             return
         rows = signals.row[bad]
         if self.time.missing == "error":
-            raise DataError(
-                f"{self.table.source}: values are missing or not finite in {describe(numbered(rows))}",
-                expected="a number in every mapped column",
-                got=f"{len(rows)} incomplete rows of {len(signals)}",
-                hint='missing = "drop" under [time] drops them',
-            )
+            text = f"{self.table.source}: values are missing or not finite in {describe(numbered(rows))}"
+            expected, hint = "a number in every mapped column", 'missing = "drop" under [time] drops them'
+            got = f"{len(rows)} incomplete rows of {len(signals)}"
+            raise DataError(text, expected=expected, got=got, hint=hint)
         self.report.find("missing", f"{len(rows)} incomplete rows were dropped", rows)
         signals.keep(~bad)
 
     def _crop(self, signals: Signals) -> None:
-        start = -np.inf if self.time.start is None else self.time.start
-        stop = np.inf if self.time.stop is None else self.time.stop
+        start, stop = self.time.start, self.time.stop
         inside = (signals.t >= start) & (signals.t <= stop)
         if not inside.any():
             span = f"{signals.t.min():.6g} to {signals.t.max():.6g} s" if len(signals) else "no complete row"

@@ -56,9 +56,7 @@ def guess_mapping(path: str | Path, system: ConstrainedSystem, progress: Progres
         else:
             reach = max(float(np.nanmax(np.abs(stream.columns[c]))) for c in family.columns.values())
             draft.say("position", f"values up to {reach:.4g}")
-            possible = (
-                ["deg"] if reach > MOST_RADIANS else ["rad"] if reach < LEAST_DEGREES else ["rad", "deg"]
-            )
+            possible = ["rad"] * (not reach > MOST_RADIANS) + ["deg"] * (not reach < LEAST_DEGREES)
         _try(path, draft, system, possible)
         propose_contacts(table, draft, system, cache(lambda: _signals(path, draft, system)))
     return draft
@@ -91,15 +89,12 @@ def _window(draft: Draft, trial: Signals) -> None:
     """Choose a filter window that suits the noise in positions and velocities of the longest trajectory."""
     rows = max(runs(trial.segment), key=lambda rows: rows.stop - rows.start)
     names = ["q", *(["qd"] if "velocity" in draft.families else [])]
-    asked = cross_validated_window(
-        [trial.vectors[name][rows] for name in names], most=(rows.stop - rows.start) // TRAJECTORY
-    )
+    samples, most = [trial.vectors[name][rows] for name in names], (rows.stop - rows.start) // TRAJECTORY
+    asked = cross_validated_window(samples, most=most)
     draft.window = max(asked, draft.window)
     period = float(np.median(np.diff(trial.t[rows])))
-    draft.say(
-        "derivatives",
-        f"window of {1e3 * period * draft.window:.3g} ms: cross-validation asks for {asked} samples",
-    )
+    text = f"window of {1e3 * period * draft.window:.3g} ms: cross-validation asks for {asked} samples"
+    draft.say("derivatives", text)
 
 
 def _signals(path: str | Path, draft: Draft, system: ConstrainedSystem, without: str = "") -> Signals:
@@ -161,8 +156,7 @@ def _torque(draft: Draft, trial: Signals, system: ConstrainedSystem) -> None:
     draft.say("torque", f"correlation with the robot's inverse dynamics: {listing}")
     if not clear.any():
         unknown = "no joint's torque follows the robot's inverse dynamics: sign unknown"
-        draft.say("torque", unknown, doubt=True)
-        return
+        return draft.say("torque", unknown, doubt=True)
     family.sign = _signs(slopes, clear, trial.joint_names)
     if isinstance(family.sign, dict):
         draft.say("torque", "the sign differs between joints; are the joints in the right order?", doubt=True)

@@ -50,11 +50,8 @@ def declared_unit(name: str, stream: Stream) -> str | None:
     """Return the unit declared in a heading or in the line below it, or `None`."""
     if name in stream.units:
         return units.spelled(stream.units[name])
-    for match in _DECLARED.finditer(name):
-        unit = units.spelled(match[1] if match[1] is not None else match[2])
-        if unit is not None:
-            return unit
-    return None
+    found = (units.spelled(match[1] or match[2] or "") for match in _DECLARED.finditer(name))
+    return next((unit for unit in found if unit is not None), None)
 
 
 def find_time(table: LogTable, draft: Draft) -> Stream:
@@ -154,10 +151,8 @@ def _families(stream: Stream, robot: RobotModel) -> list[Family]:
 def _rate(family: Family, quantity: str) -> float:
     """Return a score for how well the name of a family matches a quantity, or 0 if it does not."""
     words = tokens(family.pattern.replace("{joint}", " "))
-    if not any(word in WORDS[quantity] for word in words):
-        return 0.0
-    earlier = list(WORDS)[: list(WORDS).index(quantity)]
-    if any(word in WORDS[other] for other in earlier for word in words):
+    meant = (other for other in WORDS if any(word in WORDS[other] for word in words))
+    if next(meant, None) != quantity:
         return 0.0
     score = 1.0 + 0.5 * any(w in MEASURED for w in words) - 0.8 * any(w in COMMANDED for w in words)
     return score - 0.01 * len(words) - 0.2 * ("current" in words or "currents" in words)
@@ -186,9 +181,8 @@ def _match_joints(robot: RobotModel, draft: Draft) -> None:
             draft.say(quantity, "numbered joints were taken from base to tip", doubt=True)
         else:
             del draft.families[quantity]
-            draft.say(
-                "joints", f"{family.pattern!r} names its joints differently and was ignored", doubt=True
-            )
+            text = f"{family.pattern!r} names its joints differently and was ignored"
+            draft.say("joints", text, doubt=True)
 
 
 def _likeness(joint: str, name: str) -> float:
@@ -211,12 +205,9 @@ def find_wrench(table: LogTable, robot: RobotModel, draft: Draft) -> None:
                     columns.setdefault((part, axis), column)
         force, moment = ([columns.get((part, axis)) for axis in "xyz"] for part in range(2))
         if all(force):
-            wrench = {
-                "force": force,
-                "stream": stream.name or None,
-                "torque": moment if all(moment) else None,
-            }
-            draft.further["wrench"] = {**wrench, "frame": robot.frame_names[-1]}
+            wrench = {"force": force, "stream": stream.name or None}
+            wrench |= {"torque": moment if all(moment) else None, "frame": robot.frame_names[-1]}
+            draft.further["wrench"] = wrench
             unknown = "the sensor's frame, its sign (acts_on) and the tool's weight are not in the log"
             draft.say("wrench", unknown, doubt=True)
             return

@@ -122,8 +122,8 @@ class TimeSection(Section):
     column: str
     stream: str | None = None
     unit: Literal["s", "ms", "us", "ns", "min"] = "s"
-    start: float | None = None
-    stop: float | None = None
+    start: float = -np.inf
+    stop: float = np.inf
     segment: str | None = None
     period: float | None = Field(default=None, gt=0.0)
     gap: float | None = Field(default=None, gt=0.0)
@@ -243,7 +243,7 @@ class Mapping:
         """Return the joints for which a quantity is logged: all except those with an `unmeasured` torque, or
         with motion derived from a contact."""
         name, key = ("torque", "unmeasured") if name == "torque" else ("position", "from_contact")
-        lacking = self.sections.torque.unmeasured if name == "torque" else self.sections.position.from_contact
+        lacking = getattr(self.quantity(name), key)
         self._check_joints((name, key), lacking, joints)
         return [joint for joint in joints if joint not in lacking]
 
@@ -289,12 +289,8 @@ class Mapping:
     def _check_joints(self, key: Key, named: Iterable[str], joints: Sequence[str]) -> None:
         for joint in named:
             if joint not in joints:
-                raise self.error(
-                    (*key, joint),
-                    f"{joint!r} is not a joint of the robot",
-                    expected=", ".join(joints),
-                    hint=did_you_mean(joint, joints),
-                )
+                text, hint = f"{joint!r} is not a joint of the robot", did_you_mean(joint, joints)
+                raise self.error((*key, joint), text, expected=", ".join(joints), hint=hint)
 
 
 def load_mapping(source: str | Path) -> Mapping:
@@ -309,11 +305,9 @@ def load_mapping(source: str | Path) -> Mapping:
     bundled = str(source) in BUNDLED
     path = Path(str(files("forcegp.logs") / "bundled" / f"{source}.toml")) if bundled else Path(source)
     if not is_file(path):
-        raise MappingError(
-            f"{path}: no such mapping",
-            expected=f"a TOML file, or one of {', '.join(BUNDLED)}",
-            hint=did_you_mean(source, BUNDLED) or "write one with --guess",
-        )
+        hint = did_you_mean(source, BUNDLED) or "write one with --guess"
+        expected = f"a TOML file, or one of {', '.join(BUNDLED)}"
+        raise MappingError(f"{path}: no such mapping", expected=expected, hint=hint)
     return parse_mapping(path.read_bytes(), str(path))
 
 
@@ -330,17 +324,13 @@ def parse_mapping(content: bytes, source: str) -> Mapping:
 def _check(mapping: Mapping) -> None:
     """Check units, and keys that depend on each other."""
     sections = mapping.sections
-    for name in ("position", "velocity", "acceleration", "torque"):
-        section = mapping.quantity(name)
-        if section is not None:
+    for name in SYMBOLS:
+        if (section := mapping.quantity(name)) is not None:
             _check_quantity(mapping, name, section)
     if (sections.torque.unit in units.CURRENT) != (sections.torque.torque_constant is not None):
-        raise mapping.error(
-            ("torque", "unit"),
-            "a current needs a torque constant, and nothing else has one",
-            expected='unit = "A" with torque_constant = … [N m/A], or a unit of torque without it',
-            got=repr(sections.torque.unit),
-        )
+        text, got = "a current needs a torque constant, and nothing else has one", repr(sections.torque.unit)
+        expected = 'unit = "A" with torque_constant = … [N m/A], or a unit of torque without it'
+        raise mapping.error(("torque", "unit"), text, expected, got)
     for name, contact in sections.contact.items():
         key = ("contact", name, "source")
         if contact.source == "column" and contact.column is None:
@@ -352,7 +342,7 @@ def _check(mapping: Mapping) -> None:
         got = f"{len(wrench.force)} columns{', and those of a torque' if wrench.torque else ''}"
         raise mapping.error(("wrench", "force"), "not a force", "one column, or three, of x, y and z", got)
     time, derivatives = sections.time, sections.derivatives
-    if time.start is not None and time.stop is not None and time.start >= time.stop:
+    if time.start >= time.stop:
         raise mapping.error(("time", "stop"), "the log would be empty", f"more than {time.start}", time.stop)
     if derivatives.window % 2 == 0 or derivatives.order >= derivatives.window:
         key, got = ("derivatives", "window"), f"window {derivatives.window}, order {derivatives.order}"

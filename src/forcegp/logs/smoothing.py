@@ -107,7 +107,7 @@ def _forward(n: int, rho: float) -> tuple[Array, Array, Array, Array]:
     for k in range(n):
         predicted[k], S = P, P[0, 0] + 1.0
         K = P[:, 0] / S
-        # The Joseph form keeps the covariance symmetric and positive definite.
+        # Joseph's form keeps the covariance symmetric and positive.
         J = np.eye(STATES)
         J[:, 0] -= K
         F = J @ P @ J.T + np.outer(K, K)
@@ -160,8 +160,8 @@ def add_derivatives(signals: Signals, settings: DerivativesSection, report: Impo
 
     Return σ of the computed q̈ `(n, nq)`, or `None` if q̈ is logged.
     """
-    logged = [name for name in ("qd", "qdd") if name in signals.vectors]
-    if len(logged) == 2:
+    missing = [name for name in ("qd", "qdd") if name not in signals.vectors]
+    if not missing:
         return None
     golay = settings.method == "savitzky_golay"
     piece = _pieces(signals, settings.window if golay else SHORTEST, report)
@@ -169,19 +169,17 @@ def add_derivatives(signals: Signals, settings: DerivativesSection, report: Impo
     how = "a Kalman (RTS) smoother with white snap"
     if golay:
         how = f"a Savitzky-Golay filter of window {settings.window} and order {settings.order}"
-    computed = " and ".join(name for name in ("qd", "qdd") if name not in logged)
-    report.steps.append(f"computed {computed} by {how}")
-    if "qdd" not in logged and settings.filter_torque:
+    report.steps.append(f"computed {' and '.join(missing)} by {how}")
+    if "qdd" in missing and settings.filter_torque:
         report.steps.append("passed the torque through the same filter")
     return std
 
 
 def _pieces(signals: Signals, least: int, report: ImportReport) -> NDArray[np.int64]:
     """Drop pieces that are too short for the filter, and return the piece number of each remaining row."""
-    keep = np.ones(len(signals), dtype=bool)
-    for rows in signals.runs(*signals.contact.values()):
-        keep[rows] = rows.stop - rows.start >= least
-    if not keep.any():
+    lengths = np.array([rows.stop - rows.start for rows in signals.runs(*signals.contact.values())], int)
+    length = np.repeat(lengths, lengths)
+    if not (keep := length >= least).any():
         raise DataError(
             "no stretch of the log is long enough to compute accelerations",
             expected=f"{least} rows without a contact switch",
@@ -191,8 +189,7 @@ def _pieces(signals: Signals, least: int, report: ImportReport) -> NDArray[np.in
         message = f"{(~keep).sum()} rows in stretches shorter than {least} rows were dropped"
         report.find("short", message, signals.row[~keep])
         signals.keep(keep, split=True)
-    lengths = [rows.stop - rows.start for rows in signals.runs(*signals.contact.values())]
-    return np.repeat(np.arange(len(lengths)), lengths)
+    return np.repeat(np.arange(len(lengths)), lengths * (lengths >= least))
 
 
 def _filter(signals: Signals, piece: NDArray[np.int64], settings: DerivativesSection) -> Array | None:
@@ -231,15 +228,14 @@ def _smooth(signals: Signals, piece: NDArray[np.int64], settings: DerivativesSec
     return std if "qdd" in missing else None
 
 
-def impact_mask(signals: Signals, margin: float) -> dict[str, NDArray[np.bool_]]:
-    """Return masks of rows within `margin` [s] of a switch of each contact, which may contain impacts."""
+def impact_mask(signals: Signals, margin: float) -> dict[str, Array]:
+    """Mark the rows within `margin` [s] of a switch of each contact, with impacts or one-sided fits, by 1."""
     masks = {}
     for name, closed in signals.contact.items():
-        mask = np.zeros(len(signals), dtype=bool)
+        masks[name] = np.zeros(len(signals))
         for rows in signals.runs():
             t, state = signals.t[rows], closed[rows]
-            # A switch occurs between the last row of one state and the first row of the other.
+            # The switch lies between the last row of one state and the first row of the other.
             for at in t[1:][state[1:] != state[:-1]]:
-                mask[rows] |= np.abs(t - at) <= margin
-        masks[name] = mask
+                masks[name][rows][np.abs(t - at) <= margin] = 1.0
     return masks

@@ -44,8 +44,7 @@ def robust_least_squares(residual: Callable[[Array], Array], start: Array) -> So
     robust = start
     for _ in range(2):
         scale = max(float(robust_std(residual(robust))), ROUNDING)
-        fit = least_squares(residual, robust, loss="soft_l1", f_scale=scale, x_scale="jac")
-        robust = fit.x
+        robust = least_squares(residual, robust, loss="soft_l1", f_scale=scale, x_scale="jac").x
     first = residual(robust)
     inside = np.abs(first - np.median(first)) <= OUTLIER_STD * max(float(robust_std(first)), ROUNDING)
     final = least_squares(lambda x: residual(x)[inside], robust, x_scale="jac")
@@ -170,11 +169,8 @@ def fit_surface(
         raise DataError(f"{contact!r} is not a contact with a surface")
     rows = data.active([contact])[:, 0].nonzero()[:, 0]
     if len(rows) < LEAST_POINTS:
-        raise DataError(
-            f"contact {contact!r} is closed in too few rows to fit a surface",
-            expected=f"at least {LEAST_POINTS}",
-            got=len(rows),
-        )
+        text = f"contact {contact!r} is closed in too few rows to fit a surface"
+        raise DataError(text, expected=f"at least {LEAST_POINTS}", got=len(rows))
     rows = rows[:: -(-len(rows) // MOST_POINTS)]
     q = data.select(system.robot.joint_names).q[rows]
     points = kinematics.point_position(system.robot, q, touching.frame, tuple(touching.point))
@@ -225,9 +221,8 @@ def _sphere(contact: str, points: Array, towards: Array, tip: Tip) -> SurfaceFit
     start, _, rank, _ = np.linalg.lstsq(design, (centered**2).sum(axis=1), rcond=1e-10)
     squared = start[3] + start[:3] @ start[:3]
     if rank < 4 or not squared > 0.0:
-        raise DataError(
-            "the path does not determine a sphere", got="points in a plane or on a line", hint="fit a plane"
-        )
+        got = "points in a plane or on a line"
+        raise DataError("the path does not determine a sphere", got=got, hint="fit a plane")
 
     def residual(x: Array) -> Array:
         r = tip.of(x)
@@ -239,10 +234,8 @@ def _sphere(contact: str, points: Array, towards: Array, tip: Tip) -> SurfaceFit
     std = {"center": float(np.sqrt(np.diag(cov)[:3].max())), "radius": float(np.sqrt(cov[3, 3]))}
     std |= tip.std(solution)
     if not (std["radius"] < 0.5 * radius and (middle - center) @ towards > 0.0):
-        raise DataError(
-            "the path does not determine a sphere for contact from outside",
-            got=f"radius {radius:.4g} ± {std['radius']:.2g} m",
-            hint="fit a plane, or slide over a larger part of the sphere",
-        )
+        text, got = "the path does not determine a sphere for contact from outside", f"radius {radius:.4g}"
+        hint = "fit a plane, or slide over a larger part of the sphere"
+        raise DataError(text, got=f"{got} ± {std['radius']:.2g} m", hint=hint)
     sphere = Sphere(tuple(float(c) for c in center), radius)
     return SurfaceFit(contact, sphere, std, solution, tip.of(x))

@@ -68,11 +68,9 @@ class LogTable:
         if not holding:
             raise missing(self.source, "column", column, [n for s in among for n in s.columns])
         if len(holding) > 1:
-            raise DataError(
-                f"{self.source}: several streams have a column {column!r}",
-                expected="a key 'stream' that names one of them",
-                got=", ".join(s.name or "(unnamed)" for s in holding),
-            )
+            text, got = f"several streams have a column {column!r}", [s.name or "(unnamed)" for s in holding]
+            expected = "a key 'stream' that names one of them"
+            raise DataError(f"{self.source}: {text}", expected=expected, got=", ".join(got))
         return holding[0]
 
 
@@ -161,7 +159,7 @@ class Signals:
         self.contact = {name: value[mask] for name, value in self.contact.items()}
 
     def runs(self, *keys: NDArray[np.generic]) -> list[slice]:
-        """Return stretches of rows within one segment in which the additional keys are constant."""
+        """Return runs of rows, each within one segment, over which the additional keys are constant."""
         return runs(self.segment, *keys)
 
 

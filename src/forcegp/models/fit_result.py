@@ -17,7 +17,7 @@ COVERED = 0.8
 
 @dataclass(frozen=True)
 class Compared:
-    """Score of a set of force priors in the comparison on held-out stretches of the training log.
+    """Score of a set of force priors in the comparison on held-out blocks of the training log.
 
     Attributes:
         name: name of the set.
@@ -44,7 +44,7 @@ class Compared:
         if self.coverage is None or self.coverage >= COVERED:
             return ""
         return (
-            f"the model misses held-out stretches of this log: ±2σ coverage is {self.coverage:.0%} instead "
+            f"the model misses held-out blocks of this log: ±2σ coverage is {self.coverage:.0%} instead "
             "of 95%; check the log and the robot file (`forcegp check`)"
         )
 

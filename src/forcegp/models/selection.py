@@ -86,7 +86,7 @@ def candidates_of(spec: Specification) -> list[Candidate]:
 
 
 def without_comparison(spec: Specification, note: str) -> tuple[Specification, tuple[Compared, ...]]:
-    """Return the specification with the set for few samples, and a comparison table with only this set."""
+    """Return the specification with the set for small data sets, and a table that contains only this set."""
     spec = spec.with_options(inertia=spec.options.inertia or "auto")
     return spec.with_set(FEW), (Compared(FEW.name, chosen=True, note=note),)
 

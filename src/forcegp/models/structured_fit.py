@@ -16,6 +16,7 @@ from forcegp.constraints.compiled_system import compiled_system
 from forcegp.data import Dataset
 from forcegp.errors import ModelError, check_name
 from forcegp.files import Record
+from forcegp.forces.calibration import region_of
 from forcegp.forces.external_wrench import WrenchFrame
 from forcegp.forces.measurements import Observation, Training
 from forcegp.forces.noise import TORQUE_NOISE, learned_slopes
@@ -191,7 +192,8 @@ class StructuredFit(FittedModel):
         moving = self.specification.noise.learns_torque
         # With state noise, the rows of a sample depend on the slopes of the learned forces.
         sampling = None if self.problem.state_std is not None else (variance, self.problem.power, moving)
-        return ExportedModel(*parts, self.problem.external_std, functions, sampling, wrench, dtype)
+        never = self.result.never_closed
+        return ExportedModel(*parts, self.problem.external_std, functions, sampling, wrench, dtype, never)
 
     def export(
         self,
@@ -237,8 +239,8 @@ class StructuredFit(FittedModel):
         """Compile the fit to a fast predictor in C with the local compiler.
 
         Args:
-            functions: number r of basis functions for a reduced covariance, which can only be wider; `None`
-                uses all.
+            functions: number r of basis functions for a reduced-rank covariance, which can only be larger;
+                `None` uses all.
             wrench: frame and components to estimate by `external_wrench`.
 
         Raises:
@@ -249,8 +251,8 @@ class StructuredFit(FittedModel):
         return CompiledFit(self._exported(functions, wrench))
 
     def beyond(self, qd: Tensor, tau: Tensor) -> Tensor | None:
-        """Return the distance `(*batch, nq)` by which the speed and torque of each joint exceed the training
-        data, in standard deviations of these data; `None` if no torque noise was learned.
+        """Return the distance of the speed and torque of each joint beyond the training data, in training
+        standard deviations `(*batch, nq)`; `None` for a model from a file without the trained region.
         """
         return distance_beyond(self.hyperparameters, qd, tau) if LOW in self.hyperparameters else None
 
@@ -513,6 +515,8 @@ def conditioned(
     Raises:
         NumericalError: the covariance of the data is not positive definite.
     """
+    if LOW not in hyperparameters:
+        hyperparameters = {**hyperparameters, **region_of(problem)}
     measured = enumerate(problem.training.measurements)
     noise = {m.quantity: typical(problem.noise_at(hyperparameters, i)) for i, m in measured}
     posterior, constant = forces or forces_and_constant(*problem.with_coulomb_errors(hyperparameters))

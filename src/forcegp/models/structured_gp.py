@@ -43,7 +43,7 @@ class StructuredGP(Model[StructuredFit]):
         mean: `"analytical"`, `"zero"`, or an `AnalyticalMean` with a subset of its terms.
         force_priors: priors on the unknown forces, the name of a set in `SETS` (`"sliding"`, `"friction"`,
             `"friction+residual"`), or `"auto"`. With `"auto"` and the analytical mean, the set is selected on
-            held-out stretches of the training log (`models/selection.py`); `fit.result.comparison` contains
+            held-out blocks of the training log (`models/selection.py`); `fit.result.comparison` contains
             the scores. Logs of fewer than 100 samples, and fits with `learn=`, use `"friction"`. If the mean
             does not include the motor torque, `"auto"` means `default_priors`: a `JointForcePrior` and, in
             contact, its `NormalForcePrior`, which only affects multipliers.

@@ -7,7 +7,7 @@
    Residuals also determine slopes and weights (`forces/noise_learning.py`), after which hyperparameters are
    learned again.
 4. Inertial parameters move to their posterior mean in one physically consistent Gauss–Newton step.
-5. Torque noise is increased to the level on held-out stretches of the training log, and its growth beyond the
+5. Torque noise is increased to the level on held-out blocks of the training log, and its growth beyond the
    trained speeds and torques is learned from held-out regimes. Dry friction with memory is learned from the
    residuals of logs in time order.
 6. The posterior is conditioned on all samples.

@@ -164,5 +164,5 @@ def comparison_tables(comparison: Sequence[Compared]) -> tuple[Table, ...]:
         for each in comparison
         for note in [", ".join(part for part in ("chosen" if each.chosen else "", each.note) if part)]
     )
-    caption = "Force priors, compared on held-out stretches of the training log [nats per sample]"
+    caption = "Force priors, compared on held-out blocks of the training log [nats per sample]"
     return (Table(caption, ("set", "log density", "behind", "standard error", ""), rows),) if rows else ()

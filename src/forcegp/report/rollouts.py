@@ -314,7 +314,7 @@ def rollout_table(data: RolloutData) -> Table:
         caption += (
             f"; fraction of logged tip positions inside the {data.level:.0%} bands over function samples "
             f"({_starts(data.band_starts)}, {data.band_seconds:.3g} s), and inside the bands widened by the "
-            "factor calibrated on held-out stretches of the training run"
+            "factor calibrated on held-out blocks of the training run"
         )
     return Table(caption, head, tuple(rows))
 

@@ -162,7 +162,7 @@ class RobotModel:
         return {name: value for name, value in values if isinstance(value, Tensor)}
 
     def frame_index(self, frame: str) -> int:
-        """Return the index of a named frame; an `UnknownNameError` lists the frames and the nearest one."""
+        """Return the index of a named frame; an `UnknownNameError` suggests the closest name."""
         check_name(f"frame of robot {self.name!r}", frame, self.frame_names)
         return self.frame_names.index(frame)
 

@@ -58,7 +58,7 @@ class RunLog:
         return RunLog(q, qd, qdd, tau, Q, Q_I, Q_z, columns(m), columns(m), contact, saturated)
 
     def write(self, k: int, **values: Tensor) -> None:
-        """Write the values of row k, given by column."""
+        """Write the values of row k, a mapping from columns to values."""
         for name, value in values.items():
             getattr(self, name)[k] = value
 

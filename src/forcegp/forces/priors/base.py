@@ -88,13 +88,6 @@ class ForcePrior(ABC):
         """Raise a typed error if the prior does not match the system."""
 
 
-class ConstantForcePrior(ForcePrior):
-    """A prior on constants, whose kernel has no inputs."""
-
-    def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
-        return {"one": at.q.new_zeros(len(at.q), 1)}
-
-
 def check_inputs(name: str, inputs: tuple[str, ...], valid: tuple[str, ...]) -> None:
     """Check the inputs of a force.
 

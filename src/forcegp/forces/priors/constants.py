@@ -9,7 +9,8 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError
-from forcegp.forces.priors.base import JOINT, ConstantForcePrior, ForcePrior
+from forcegp.forces.priors.base import JOINT, ForcePrior
+from forcegp.forces.priors.joint import ConstantForcePrior
 from forcegp.forces.quantities import States
 from forcegp.gp.kernels import Constant, Kernel
 from forcegp.robot.model import RobotModel

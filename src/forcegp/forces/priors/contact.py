@@ -40,15 +40,8 @@ from forcegp.constraints.contact import SurfaceContact
 from forcegp.constraints.gauss import ContactPoint, tangent_frame
 from forcegp.errors import ModelError
 from forcegp.forces.measurements import Measurement
-from forcegp.forces.priors.base import (
-    CONSTRAINT,
-    CONTACT,
-    COULOMB,
-    ConstantForcePrior,
-    ForcePrior,
-    check_inputs,
-)
-from forcegp.forces.priors.joint import JointForcePrior
+from forcegp.forces.priors.base import CONSTRAINT, CONTACT, COULOMB, ForcePrior, check_inputs
+from forcegp.forces.priors.joint import ConstantForcePrior, JointForcePrior
 from forcegp.forces.quantities import AffineMap, States
 from forcegp.gp.kernels import Constant, Kernel, SquaredExponential
 from forcegp.robot.model import RobotModel
@@ -273,7 +266,7 @@ class NormalForcePrior(ForcePrior):
 
     Since H Aᵀ = 0, a force Aᵀ g(x) changes the multiplier by −g(x) but not the accelerations. A joint force
     prior alone is overconfident along the normal. This independent process shares its hyperparameters but
-    retains the uncertainty of that part unless it is reduced, for example by a force sensor.
+    retains the uncertainty along the normal until a force sensor, for example, reduces it.
 
     Args:
         like: the joint force prior that provides the kernel, inputs and hyperparameters.
@@ -414,7 +407,7 @@ def against_sliding(at: States, contact: str, smoothing: Tensor | float) -> Tens
 def coupled(
     system: ConstrainedSystem, at: States, z: AffineMap, friction: Sequence[CoulombFriction]
 ) -> AffineMap:
-    """Return the affine map of a quantity including contact Coulomb friction.
+    """Return the affine map of a quantity including Coulomb friction at the contacts.
 
     Args:
         system: robot and contacts; friction of contacts that it does not have is ignored.
@@ -434,7 +427,7 @@ def coupled(
 def with_coulomb(
     system: ConstrainedSystem, at: States, Q_bar: Tensor, friction: Sequence[CoulombFriction]
 ) -> Tensor:
-    """Add contact Coulomb friction to impressed forces Q̄ `(n, nq)`."""
+    """Add Coulomb friction at the contacts to impressed forces Q̄ `(n, nq)`."""
     gain = _gain(system, at, friction)
     if gain is None:
         return Q_bar

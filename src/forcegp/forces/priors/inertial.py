@@ -20,7 +20,8 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError, check_name
-from forcegp.forces.priors.base import JOINT, ConstantForcePrior
+from forcegp.forces.priors.base import JOINT
+from forcegp.forces.priors.joint import ConstantForcePrior
 from forcegp.forces.quantities import States
 from forcegp.gp.kernels import Constant, Kernel
 from forcegp.gp.optimise import LearningOptions, minimise

@@ -33,6 +33,13 @@ TERMS = ("bias", "gravity", "friction", "actuation")
 """Known parts of Q: Q_C, Q_G, Q_D and Q_u."""
 
 
+class ConstantForcePrior(ForcePrior):
+    """A prior on constants, whose kernel has no inputs."""
+
+    def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
+        return {"one": at.q.new_zeros(len(at.q), 1)}
+
+
 @dataclass(frozen=True)
 class AnalyticalMean:
     """Prior mean m(x; θ_A) = Q_K, the sum of selected terms among Q_C, Q_G, Q_D and Q_u.

@@ -146,7 +146,7 @@ FEW = SETS["friction"]
 def priors_of(
     system: ConstrainedSystem, mean: AnalyticalMean, force_priors: str | Sequence[ForcePrior]
 ) -> tuple[ForcePrior, ...]:
-    """Return the given force priors, or those of a named set; `"auto"` selects those for few samples.
+    """Return the given force priors, or those of a named set; `"auto"` selects the set for small data sets.
 
     Raises:
         UnknownNameError: the set does not exist.

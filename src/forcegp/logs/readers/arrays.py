@@ -57,22 +57,18 @@ def _array(source: str, name: str, file: Any, size: int) -> Arrays:
         raise DataError(f"{source}: version {version} of the NumPy format is not read")
     shape, fortran, dtype = read_header(file)  # pyright: ignore[reportArgumentType]
     if dtype.hasobject:
-        raise DataError(
-            f"{source}: refused, because an array of Python objects is a pickle, which can run code",
-            expected="an array of numbers",
-            hint="save each quantity as a separate array",
-        )
+        text = f"{source}: refused, because an array of Python objects is a pickle, which can run code"
+        hint = "save each quantity as a separate array"
+        raise DataError(text, expected="an array of numbers", hint=hint)
     count = int(np.prod(shape, dtype=object)) if shape else 1
     guards.check_count(source, "numbers", count, limits.LOG_VALUES)
     if count * dtype.itemsize > size:
-        raise DataError(
-            f"{source}: the declared size of the array exceeds the file", got=f"{shape} of {dtype}"
-        )
+        text = f"{source}: the declared size of the array exceeds the file"
+        raise DataError(text, got=f"{shape} of {dtype}")
     data = file.read(count * dtype.itemsize)
     array = np.frombuffer(data, dtype=dtype, count=count).reshape(shape, order="F" if fortran else "C")
-    if dtype.names:
-        return {f"{name}.{field}".lstrip("."): array[field] for field in dtype.names}
-    return {name: array}
+    names = {field: f"{name}.{field}".lstrip(".") for field in dtype.names or ()}
+    return {title: array[field] for field, title in names.items()} or {name: array}
 
 
 def read_hdf5(path: Path, **_: object) -> LogTable:
@@ -97,14 +93,13 @@ def _walk(
         raise DataError(f"{group.file.filename}: groups are nested too deeply", got=prefix[:200])
     for key in group:
         name = f"{prefix}{key}"
-        if key.startswith("#"):  # internal data of MATLAB
+        if key.startswith("#"):  # MATLAB's own bookkeeping
             continue
         if not isinstance(group.get(key, getlink=True), h5py.HardLink):
             remarks.append(f"{name!r} is a link and was not followed")
             continue
         item = group[key]
-        mark = h5py.h5o.get_info(item.id).addr
-        if mark in seen:
+        if (mark := h5py.h5o.get_info(item.id).addr) in seen:
             continue
         seen.add(mark)
         guards.check_count(group.file.filename, "objects", len(seen), limits.COLUMNS)
@@ -154,21 +149,19 @@ def variables(content: bytes, source: str) -> Iterator[Variable]:
     order = {b"IM": "<", b"MI": ">"}.get(content[126:128])
     if order is None:
         raise DataError(f"{source}: not a MATLAB file of versions 5 to 7", got=content[:20])
-    return _Reader(source, order).variables(memoryview(content))
+    left = min(guards.allowed_bytes(len(content)), limits.TABLE_BYTES)
+    return _Reader(source, order, left).variables(memoryview(content))
 
 
 class _Reader:
-    def __init__(self, source: str, order: str) -> None:
-        self.source, self.order, self.count, self.left = source, order, 0, 0
+    def __init__(self, source: str, order: str, left: int) -> None:
+        self.source, self.order, self.count, self.left = source, order, 0, left
 
     def variables(self, content: memoryview) -> Iterator[Variable]:
-        self.left = min(guards.allowed_bytes(len(content)), limits.TABLE_BYTES)
         for element in self.elements(content[HEADER_BYTES:]):
             if element.kind == COMPRESSED:
                 element = self.next(self.elements(self.inflated(element.body)))
-            if element.kind != MATRIX:
-                raise self.damaged("a variable", f"an element of type {element.kind}")
-            yield from self.matrix(element.body)
+            yield from self.matrix(element, "a variable")
 
     def inflated(self, body: memoryview) -> memoryview:
         stream = zlib.decompressobj()
@@ -177,9 +170,8 @@ class _Reader:
         except zlib.error as cause:
             raise self.damaged("compressed data", str(cause)) from cause
         if stream.unconsumed_tail:
-            raise DataError(
-                f"{self.source}: a variable inflates to more than the {self.left:,} bytes that are left"
-            )
+            text = f"a variable inflates to more than the {self.left:,} bytes that are left"
+            raise DataError(f"{self.source}: {text}")
         self.left -= len(content)
         return memoryview(content)
 
@@ -197,7 +189,7 @@ class _Reader:
             if size > end - start or end > len(content):
                 raise self.damaged(f"an element of {size} bytes", f"{len(content) - start} bytes")
             yield _Element(kind, content[start : start + size])
-            # All elements except compressed ones are padded.
+            # Only compressed elements are not padded.
             at = end if kind == COMPRESSED else end + -end % 8
 
     def next(self, elements: Iterator[_Element]) -> _Element:
@@ -206,26 +198,30 @@ class _Reader:
             raise self.damaged("a further element", "the end of the variable")
         return element
 
-    def matrix(self, body: memoryview, field: str = "", depth: int = 0) -> Iterator[Variable]:
+    def matrix(self, element: _Element, what: str, field: str = "", depth: int = 0) -> Iterator[Variable]:
         """Yield a variable or a field of a struct or, if it is itself a struct, all of its fields."""
+        if element.kind != MATRIX:
+            raise self.damaged(what, f"an element of type {element.kind}")
         if depth > limits.GROUP_DEPTH:
             raise DataError(f"{self.source}: structs are nested more than {limits.GROUP_DEPTH} levels deep")
         self.count += 1
         guards.check_count(self.source, "variables and fields", self.count, limits.COLUMNS)
-        if not len(body):
+        if not len(element.body):
             yield Variable(field, "holds nothing")
             return
-        parts = self.elements(body)
+        parts = self.elements(element.body)
         flags = self.numbers(self.next(parts))
         if not len(flags):
             raise self.damaged("the class of an array", "nothing")
         kind, flag = int(flags[0]) & 0xFF, int(flags[0]) >> 8 & 0xFF
-        if kind in (16, 17):  # functions and classes have a different layout
+        if kind in (16, 17):  # functions and classes have a layout of their own
             yield Variable(field, f"is of class {OTHER_CLASSES[kind]}")
             return
         shape = tuple(int(x) for x in self.numbers(self.next(parts)))
-        name = self.text(self.next(parts))
-        name = field or name
+        title = self.next(parts)
+        if title.kind not in (INT8, UTF8):
+            raise self.damaged("a name", f"an element of type {title.kind}")
+        name = field or bytes(title.body).decode("utf-8", "replace")
         if kind == STRUCT and math.prod(shape) == 1:
             yield from self.fields(parts, name, depth)
         elif kind in NUMERIC:
@@ -240,11 +236,8 @@ class _Reader:
         if length <= 0 or len(names) % length or len(names) // length > limits.COLUMNS:
             raise self.damaged("the names of a struct's fields", f"{len(names)} bytes in steps of {length}")
         for start in range(0, len(names), length):
-            element = self.next(parts)
-            if element.kind != MATRIX:
-                raise self.damaged("a field of a struct", f"an element of type {element.kind}")
             field = names[start : start + length].split(b"\0")[0].decode("utf-8", "replace")
-            yield from self.matrix(element.body, f"{struct}.{field}", depth + 1)
+            yield from self.matrix(self.next(parts), "a field of a struct", f"{struct}.{field}", depth + 1)
 
     def array(self, element: _Element, shape: tuple[int, ...]) -> NDArray[np.generic]:
         values = self.numbers(element)
@@ -260,11 +253,6 @@ class _Reader:
             raise self.damaged(f"numbers of {dtype.itemsize} bytes", f"{len(element.body)} bytes")
         return np.frombuffer(element.body, dtype).astype(dtype.newbyteorder("="), copy=False)
 
-    def text(self, element: _Element) -> str:
-        if element.kind not in (INT8, UTF8):
-            raise self.damaged("a name", f"an element of type {element.kind}")
-        return bytes(element.body).decode("utf-8", "replace")
-
     def damaged(self, expected: str, got: str) -> DataError:
         return DataError(f"{self.source}: the MATLAB file is damaged", expected=expected, got=got)
 
@@ -277,9 +265,8 @@ def read_matlab(path: Path, **_: object) -> LogTable:
     """Read the numeric arrays in a MATLAB file, naming fields `struct.field`; note any other variables."""
     with path.open("rb") as file:
         head = file.read(520)
-    remarks: list[str] = []
-    arrays: Arrays = {}
-    if HDF5_MAGIC in (head[:8], head[512:520]):  # version 7.3: use the names and axis order of MATLAB
+    arrays, remarks = Arrays(), list[str]()
+    if HDF5_MAGIC in (head[:8], head[512:520]):  # version 7.3: names as in MATLAB, and axes in its order
         arrays = {name: array.T for name, array in _hdf5_arrays(path, ".", remarks).items()}
     else:
         with guards.foreign(str(path), "a MATLAB file"):

@@ -10,10 +10,10 @@ from __future__ import annotations
 
 import io
 import re
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import cache
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -26,7 +26,7 @@ from forcegp.logs.table import Column, LogTable, Progress, Stream, Wanted
 
 JOINT_STATE = "sensor_msgs/msg/JointState"
 WRENCH = "geometry_msgs/msg/WrenchStamped"
-KINDS = (JOINT_STATE, WRENCH)  # types that are read
+KINDS = (JOINT_STATE, WRENCH)  # that are read
 UNITS = {"position": "rad", "velocity": "rad/s", "effort": "Nm", "force": "N", "torque": "Nm"}
 """Units in joint states (REP 103) and wrenches."""
 CLOCKS = ("header", "receive")
@@ -96,7 +96,7 @@ class Collector:
                 self._add(topic, kind, receive_ns, raw, decoder(kind, encoding))
             if progress is not None and self.unpacking.records % 1024 == 0:
                 progress(done, total)
-            if rows is not None and self.rows >= rows:
+            if rows is not None and any(len(stream.rows) >= rows for stream in self._streams.values()):
                 return
 
     def _add(self, topic: str, kind: str, receive_ns: int, raw: bytes, decode: Decode) -> None:
@@ -116,29 +116,20 @@ class Collector:
         check_count(self.source, "numbers", self._numbers, limits.LOG_VALUES)
         check_count(self.source, "streams", len(self._streams), limits.LOG_STREAMS)
 
-    @property
-    def rows(self) -> int:
-        """Number of rows in the longest stream so far."""
-        return max((len(stream.rows) for stream in self._streams.values()), default=0)
-
     def table(self, format_: str, topics: dict[str, str], wanted: Wanted) -> LogTable:
         """Return the log with the requested columns; `topics` maps all topics in the bag to their types."""
         if not self._streams:
             listing = ", ".join(f"{topic} ({kind})" for topic, kind in topics.items())
-            raise DataError(
-                f"{self.source}: no messages of a supported type",
-                expected=" or ".join(KINDS),
-                got=listing[:600] or "no topics",
-            )
+            text, got = f"{self.source}: no messages of a supported type", listing[:600] or "no topics"
+            raise DataError(text, expected=" or ".join(KINDS), got=got)
         found = sorted(self._streams.values(), key=lambda s: (s.topic, -len(s.rows)))
         origin = np.min([np.min(np.array(stream.stamps), axis=0) for stream in found], axis=0)
-        taken: Counter[str] = Counter()
         streams = []
-        for stream in found:
-            taken[stream.topic] += 1
-            number = f"#{taken[stream.topic]}" if taken[stream.topic] > 1 else ""
-            streams.append(stream.stream(f"{stream.topic}{number}", origin, wanted))
-            stream.rows.clear()
+        for topic, group in groupby(found, key=lambda stream: stream.topic):
+            for number, stream in enumerate(group, start=1):
+                name = f"{topic}#{number}" if number > 1 else topic
+                streams.append(stream.stream(name, origin, wanted))
+                stream.rows.clear()
         unread = [f"{t} ({k})" for t, k in topics.items() if canonical(k) not in KINDS]
         remarks = [f"topics of other types were not read: {', '.join(unread)[:600]}"] if unread else []
         remarks.append(f"time 0 is {origin[0] * 1e-9:.9f} s on the clock of the headers")
@@ -154,10 +145,8 @@ def _joint_state(source: str, topic: str, message: Any) -> dict[str, float]:
     for quantity in ("position", "velocity", "effort"):
         numbers = getattr(message, quantity)
         if len(numbers) not in (0, len(names)):
-            raise DataError(
-                f"{source}: a joint state on {topic} has {len(numbers)} values of {quantity}",
-                expected=f"one for each of its {len(names)} joints, or none",
-            )
+            text = f"{source}: a joint state on {topic} has {len(numbers)} values of {quantity}"
+            raise DataError(text, expected=f"one for each of its {len(names)} joints, or none")
         numbers = numbers if len(numbers) else [np.nan] * len(names)
         values |= {f"{quantity}.{name}": float(x) for name, x in zip(names, numbers, strict=True)}
     return values
@@ -205,13 +194,10 @@ def _files(path: Path) -> list[Path]:
     files = within(path, sorted(file for file in path.iterdir() if file.is_file()))
     check_count(str(description), "bytes", description.stat().st_size, limits.LISTING_BYTES)
     text = description.read_text(encoding="utf-8", errors="replace")
-    compression = re.search(r"compression_mode:\s*[\"']?(file|message)", text, re.IGNORECASE)
-    if compression:
-        raise DataError(
-            f"{path}: the bag is compressed by {compression[1].lower()}",
-            expected="a bag without compression, or MCAP with compressed chunks",
-            hint="unpack it with `ros2 bag convert`",
-        )
+    if compression := re.search(r"compression_mode:\s*[\"']?(file|message)", text, re.IGNORECASE):
+        text = f"{path}: the bag is compressed by {compression[1].lower()}"
+        expected = "a bag without compression, or MCAP with compressed chunks"
+        raise DataError(text, expected=expected, hint="unpack it with `ros2 bag convert`")
     return [file for file in files if file != description]
 
 
@@ -244,14 +230,13 @@ def _mcap_records(file: io.BufferedReader, unpacking: Unpacking) -> Iterator[Any
             continue
         content = unpacking.unpack(record.data, record.compression)
         part = streams.ReadDataStream(io.BytesIO(content))
+        kinds = {streams.Opcode.SCHEMA: records.Schema, streams.Opcode.CHANNEL: records.Channel}
         while part.count < len(content):
             opcode, size = part.read1(), part.read8()
             unpacking.record()
             if opcode == streams.Opcode.MESSAGE:
                 yield records.Message.read(part, size)
-            elif opcode == streams.Opcode.SCHEMA:
-                yield records.Schema.read(part)
-            elif opcode == streams.Opcode.CHANNEL:
-                yield records.Channel.read(part)
+            elif opcode in kinds:
+                yield kinds[opcode].read(part)
             else:
                 part.read(size)

@@ -92,11 +92,11 @@ def _readable(file: object, wanted: Wanted, remarks: list[str]) -> list[str]:
         kind = field.type.value_type if listed else field.type
         numeric = kinds.is_floating(kind) or kinds.is_integer(kind) or kinds.is_boolean(kind)
         selected = wanted(field.name) or (listed and any(wanted(f"{field.name}[{i}]") for i in range(64)))
+        remark = f"column {field.name!r} of type {field.type} was left out"
         if selected and (numeric or (kinds.is_timestamp(kind) and not listed)):
             names.append(field.name)
-        elif selected:
-            remark = f"column {field.name!r} of type {field.type} was left out"
-            remarks += [remark] if remark not in remarks else []
+        elif selected and remark not in remarks:
+            remarks.append(remark)
     return names
 
 
@@ -118,13 +118,10 @@ def _expand(source: str, name: str, values: pa.Array) -> dict[str, Column]:
         return {name: pc.cast(values, pa.float64(), safe=False).to_numpy(zero_copy_only=False)}
     lengths = pc.call_function("list_value_length", [values]).to_numpy(zero_copy_only=False)
     width = int(lengths[0]) if len(lengths) and lengths[0] == lengths[0] else 0
-    if len(lengths) and not (lengths == width).all():
-        row = int(np.flatnonzero(lengths != width)[0])
-        raise DataError(
-            f"{source}: column {name!r} has lists of different length",
-            expected=f"{width} numbers in every row",
-            got=f"{lengths[row]} in row {row}",
-        )
+    if (other := lengths != width).any():
+        row, text = int(np.argmax(other)), f"{source}: column {name!r} has lists of different length"
+        got = f"{lengths[row]} in row {row}"
+        raise DataError(text, expected=f"{width} numbers in every row", got=got)
     guards.check_count(source, "columns", width, limits.COLUMNS)
     flat = pc.cast(values.flatten(), pa.float64(), safe=False).to_numpy(zero_copy_only=False)
     numbers = flat.reshape(len(values), width)
@@ -137,20 +134,16 @@ MAX_INFO_BYTES = 4 << 20
 
 def read_lerobot(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
     """Read the numbers in all episodes, named as in `meta/info.json`, such as `observation.state.<motor>`."""
-    description, *files = within(
-        path, [path / "meta" / "info.json", *sorted((path / "data").rglob("*.parquet"))]
-    )
+    listed = path / "meta" / "info.json", *sorted((path / "data").rglob("*.parquet"))
+    description, *files = within(path, listed)
     guards.check_count(str(description), "bytes", description.stat().st_size, MAX_INFO_BYTES)
     try:
         features = json.loads(description.read_text(encoding="utf-8"))["features"]
         if not isinstance(features, dict):
             raise TypeError("features is not a table")
     except (ValueError, KeyError, TypeError, RecursionError) as cause:
-        raise DataError(
-            f"{description}: not the description of a LeRobot data set",
-            expected="JSON with 'features'",
-            got=str(cause)[:200],
-        ) from cause
+        text = f"{description}: not the description of a LeRobot data set"
+        raise DataError(text, expected="JSON with 'features'", got=str(cause)[:200]) from cause
     guards.check_count(str(path), "files", len(files), limits.LOG_FILES)
     if not files:
         raise DataError(f"{path}: no episodes", expected=f"Parquet files below {path / 'data'}")

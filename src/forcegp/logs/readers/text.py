@@ -58,19 +58,15 @@ def sniff(path: Path) -> Dialect:
     with path.open("rb") as file:
         head = file.read(SAMPLE_BYTES)
     text, encoding = _decode(path, head)
-    lines = text.splitlines()
-    if len(head) == SAMPLE_BYTES:
-        lines = lines[:-1]
+    lines = text.splitlines()[: -1 if len(head) == SAMPLE_BYTES else None]
     if not any(line.strip() for line in lines):
         raise DataError(f"{path}: the file is empty" if not head else f"{path}: a line is too long")
-    best = max((_try(lines, s, d) for s in SEPARATORS for d in ".," if s != d), key=lambda item: item[0])
-    score, separator, decimal, first = best
+    tried = (_try(lines, s, d) for s in SEPARATORS for d in ".," if s != d)
+    score, separator, decimal, first = max(tried, key=lambda item: item[0])
     if score <= 0:
-        raise DataError(
-            f"{path}: no table of numbers was found",
-            expected="lines of numbers with one separator, after an optional heading",
-            got=repr(lines[0][:120]),
-        )
+        expected = "lines of numbers with one separator, after an optional heading"
+        text = f"{path}: no table of numbers was found"
+        raise DataError(text, expected=expected, got=repr(lines[0][:120]))
     return _dialect(path, lines, encoding, separator, decimal, first)
 
 
@@ -84,11 +80,15 @@ def split(line: str, separator: str) -> list[str]:
     return [part.strip().strip('"').strip() for part in parts]
 
 
-def is_number(field: str, decimal: str = ".") -> bool:
-    """Return whether a field is a number or marks a missing value."""
+def kind_of(field: str, decimal: str = ".") -> str:
+    """Return the kind of a field as in `Dialect`; a missing value is `empty`."""
     if field in MISSING:
-        return True
-    return bool((_COMMA_NUMBER if decimal == "," else _NUMBER).match(field))
+        return "empty"
+    if (_COMMA_NUMBER if decimal == "," else _NUMBER).match(field):
+        return "number"
+    if field.lower() in ("true", "false"):
+        return "bool"
+    return "date" if _DATE.match(field) else "text"
 
 
 def _decode(path: Path, head: bytes) -> tuple[str, str]:
@@ -98,7 +98,7 @@ def _decode(path: Path, head: bytes) -> tuple[str, str]:
     if b"\x00" in head:
         raise DataError(f"{path}: a binary file, not text", got=repr(head[:16]))
     try:
-        # The last character of the sample may be cut off.
+        # A character may be cut at the end of the sample.
         return head[: len(head) - 4 if len(head) == SAMPLE_BYTES else None].decode("utf-8"), "utf-8"
     except UnicodeDecodeError:
         return head.decode("cp1252", errors="replace"), "cp1252"
@@ -107,30 +107,23 @@ def _decode(path: Path, head: bytes) -> tuple[str, str]:
 def _try(lines: list[str], separator: str, decimal: str) -> tuple[float, str, str, int]:
     """Return the score of a separator and a decimal mark: the number times the fraction of valid fields."""
     kept = [(i, split(line, separator)) for i, line in enumerate(lines) if line.strip()]
-    rows = [(i, fields) for i, fields in kept if _numeric(fields, decimal)]
-    if not rows:
+    first = next((i for i, fields in kept if _numeric(fields, decimal)), None)
+    if first is None:
         return 0.0, separator, decimal, 0
-    first = rows[0][0]
     after = [fields for i, fields in kept if i >= first][:SAMPLE_LINES]
     width = len(after[0])
-    values = sum(_is_value(f, decimal) for fields in after for f in fields) / len(after)
-    # If a decimal comma is taken for a separator, fields such as "5;2" are left, which are not values.
+    values = sum(f != "" and kind_of(f, decimal) != "text" for fields in after for f in fields) / len(after)
+    # A comma inside numbers, taken for a separator, leaves fields such as "5;2" that are not values.
     score = values**2 / width + (0.01 if decimal == "." else 0.0)
     return (score if all(len(fields) == width for fields in after) else 0.0), separator, decimal, first
-
-
-def _is_value(field: str, decimal: str) -> bool:
-    special = bool(_DATE.match(field)) or field.lower() in ("true", "false")
-    return field != "" and (special or is_number(field, decimal))
 
 
 def _numeric(fields: list[str], decimal: str) -> bool:
     """Return whether a line contains values, that is, numbers or dates in more than half of its fields."""
     if fields and fields[0].startswith(("#", "%", "//")):
         return False
-    values = [f for f in fields if f not in MISSING]
-    good = sum(is_number(f, decimal) or bool(_DATE.match(f)) for f in values)
-    return good > 0 and 2 * good > len(values)
+    kinds = [kind for kind in (kind_of(f, decimal) for f in fields) if kind != "empty"]
+    return 2 * sum(kind in ("number", "date") for kind in kinds) > len(kinds)
 
 
 def _dialect(
@@ -145,30 +138,18 @@ def _dialect(
     units: dict[str, str] = {}
     names = [str(i) for i in range(width)]
     if above:
-        heading, unit_line = above[-1], None
-        if len(above) > 1 and all(_UNIT.match(f) for f in above[-1]) and any("[" in f for f in above[-1]):
-            heading, unit_line = above[-2], above[-1]
+        below = all(_UNIT.match(f) for f in above[-1]) and any("[" in f for f in above[-1])
+        heading, unit_line = above[-2:] if below and len(above) > 1 else (above[-1], ())
         heading = [*heading, *[""] * (width - len(heading))]
         names = [name[: limits.LOG_NAME] or f"column {i}" for i, name in enumerate(heading)]
-        pairs = zip(names, unit_line or [], strict=False)
+        pairs = zip(names, unit_line, strict=False)
         units = {name: unit.strip("[]() ") for name, unit in pairs if unit.strip("[]() ")}
-    for name in names:
-        if names.count(name) > 1:
-            text = f"{path}: column {name!r} occurs more than once"
-            raise DataError(text, hint="rename one of the columns")
-    kinds = tuple(_kind([row[i] for row in rows if i < len(row)], decimal) for i in range(width))
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        text = f"{path}: column {twice!r} occurs more than once"
+        raise DataError(text, hint="rename one of the columns")
+    columns = ({kind_of(row[i], decimal) for row in rows if i < len(row)} - {"empty"} for i in range(width))
+    kinds = tuple("text" if len(kinds) > 1 else next(iter(kinds), "empty") for kinds in columns)
     return Dialect(encoding, separator, decimal, first, tuple(names), kinds, units)
-
-
-def _kind(fields: list[str], decimal: str) -> str:
-    values = [f for f in fields if f not in MISSING]
-    if all(is_number(f, decimal) for f in values):
-        return "number" if values else "empty"
-    if all(f.lower() in ("true", "false") for f in values):
-        return "bool"
-    if all(_DATE.match(f) for f in values):
-        return "date"
-    return "text"
 
 
 BLOCK_BYTES = 4 << 20
@@ -233,7 +214,7 @@ def _numbers(values: pa.Array, kind: str) -> Column:
     import pyarrow.compute as pc
 
     if kind == "date":
-        # In float64, seconds since 2020 preserve more digits than seconds since 1970.
+        # Seconds since 2020 keep the nanoseconds that seconds since 1970 lose in float64.
         whole = pc.cast(values, pa.int64()).to_numpy(zero_copy_only=False)
         return (whole - DATE_ORIGIN_NS).astype(np.float64) * 1e-9
     return pc.cast(values, pa.float64()).to_numpy(zero_copy_only=False)
@@ -262,7 +243,7 @@ class _Blocks(io.RawIOBase):
         if not self._collapse:
             return block
         text = self._rest + block
-        # Blanks at the ends of a line can only be recognised once the line is complete.
+        # Blanks at the edges of a line are only known once the line is complete.
         end = text.rfind(b"\n") + 1 if block else len(text)
         self._rest, text = text[end:], text[:end]
         guards.check_count("the text", "bytes in a line", len(self._rest), limits.LINE_BYTES + BLOCK_BYTES)

@@ -40,7 +40,8 @@ typedef struct {
   double M_inv[NQ][NQ], H[NQ][NQ];             /* H = M^-1 - L A M^-1 maps forces to accelerations */
   double L[NQ][SOME(ROWS)];                    /* L = M^-1 A^T (A M^-1 A^T)^+ */
   double S[SOME(ROWS)][SOME(ROWS)];            /* (A M^-1 A^T)^+ */
-  double qdd[NQ], load[SOME(ROWS)];            /* qdd and lambda under the analytical forces */
+  double hidden[SOME(ROWS)][SOME(ROWS)];       /* projector on multipliers that move nothing, A^T mu = 0 */
+  double qdd[NQ], load[SOME(ROWS)];            /* qdd and lambda of the analytical forces */
   int closed[SOME(CONTACTS)];
   touching contact[SOME(CONTACTS)];
   double x[SOME(INPUTS)], phi[SOME(FEATURES)]; /* standardized inputs and features of the priors */
@@ -65,8 +66,9 @@ static int inverse_factor(const double *restrict M, int n, double *restrict G, d
 }
 
 #if CONTACTS > 0
-/* P = W^+ `(NQ, ROWS)` by one-sided Jacobi rotations of the rows; small singular values count as zero */
-static void pseudo_inverse(double *restrict W, double *restrict P) {
+/* P = W^+ `(NQ, ROWS)` by one-sided Jacobi rotations of the rows, and R = 1 - W W^+; small singular values count as
+ * zero */
+static void pseudo_inverse(double *restrict W, double *restrict P, double (*restrict R)[ROWS]) {
   double V[ROWS * ROWS], square[ROWS], most = 0.0;
   for (int r = 0; r < ROWS * ROWS; ++r) V[r] = r % (ROWS + 1) == 0 ? 1.0 : 0.0;
   for (int sweep = 0; sweep < 30; ++sweep) {
@@ -98,6 +100,12 @@ static void pseudo_inverse(double *restrict W, double *restrict P) {
       for (int r = 0; r < ROWS; ++r)
         if (square[r] > RANK_TOLERANCE * RANK_TOLERANCE * most) sum += W[r * NQ + j] / square[r] * V[s * ROWS + r];
       P[j * ROWS + s] = sum;
+    }
+  for (int r = 0; r < ROWS; ++r)
+    for (int s = 0; s < ROWS; ++s) {
+      R[r][s] = 0.0;
+      for (int i = 0; i < ROWS; ++i)
+        if (!(square[i] > RANK_TOLERANCE * RANK_TOLERANCE * most)) R[r][s] += V[r * ROWS + i] * V[s * ROWS + i];
     }
 }
 #endif
@@ -146,7 +154,9 @@ static int assemble(const double *restrict q, const double *restrict qd, const d
     for (int r = 0; r < ROWS; ++r) combine(&e->M_inv[0][0], e->A[r], NQ, NQ, along[r]);
     for (int r = 0; r < ROWS; ++r)
       for (int i = 0; i < NQ; ++i) W[r * NQ + i] = dot(K + i * NQ, e->A[r], i + 1);
-    pseudo_inverse(W, P);
+    pseudo_inverse(W, P, e->hidden);
+    for (int r = 0; r < ROWS; ++r)
+      if (!e->closed[r]) e->hidden[r][r] = 0.0;
     for (int r = 0; r < ROWS; ++r)
       for (int s = 0; s < ROWS; ++s) {
         double sum = 0.0;
@@ -612,32 +622,83 @@ static int all_finite(const double *x, int n) {
   return sum == 0.0;
 }
 
-static int predict(const forcegp_learned *learned, const double *q, const double *qd, const double *tau,
-                   const unsigned char *closed, unsigned quantities, int noise, double *mean, double *covariance,
-                   double *beyond) {
-  situation s;
+/* Forces of contacts that are never closed in the data, or that cannot move, become NaN; loads that contacts share get
+ * the mean square of those that motion determines as variance. As in `hidden_forces` of forcegp */
+static int undetermined(const situation *restrict s, unsigned wanted, int size, double *restrict mean,
+                        double *restrict covariance) {
+#if CONTACTS > 0
+  double share[SIZE_OF_ALL], square = 0.0, seen = 0.0;
+  int owner[SIZE_OF_ALL], lost[SIZE_OF_ALL], whole[ROWS], shared[ROWS], never = 0, found = 0, row = 0;
+  for (int r = 0; r < ROWS; ++r) {
+    const double part = s->e.hidden[r][r];
+    int unseen = NEVER_CLOSED[r];
+#if ONLINE
+    unseen &= !(s->f.learned && s->f.learned->touched[r] > 0.0);
+#endif
+    whole[r] = unseen || part > 1.0 - HIDDEN, shared[r] = !(part > 1.0 - HIDDEN) && part > HIDDEN;
+    never |= unseen, found |= whole[r] | shared[r];
+    if (shared[r]) seen += (1.0 - part) * (!!(wanted & FORCEGP_MULTIPLIER) + !!(wanted & FORCEGP_CONTACT_FORCE));
+  }
+  if (!found) return 0;
+  found = 0;
+  for (int bit = 0; bit < QUANTITIES; ++bit)
+    for (int i = 0; wanted >> bit & 1u && i < SIZES[bit]; ++i, ++row) {
+      const unsigned what = 1u << bit;
+      const int r = what == FORCEGP_MULTIPLIER ? i : what == FORCEGP_CONTACT_FORCE ? i / 3 : -1;
+      owner[row] = r < 0 ? 0 : r, share[row] = 0.0;
+      lost[row] = r < 0 ? what == FORCEGP_CONSTRAINT_FORCE && never : whole[r];
+      if (r >= 0 && shared[r]) share[row] = what == FORCEGP_MULTIPLIER ? 1.0 : s->e.contact[r].normal[i % 3];
+      found |= lost[row] || share[row] != 0.0;
+      if (covariance && share[row] != 0.0) square += mean[row] * mean[row] + covariance[row * size + row];
+    }
+  for (int a = 0; a < size; ++a) {
+    for (int b = 0; covariance && b < size; ++b) {
+      covariance[a * size + b] += square / fmax(seen, HIDDEN) * share[a] * share[b] * s->e.hidden[owner[a]][owner[b]];
+      if (lost[a] || lost[b]) covariance[a * size + b] = NAN;
+    }
+    if (lost[a]) mean[a] = NAN;
+  }
+  return found ? FORCEGP_UNDETERMINED : 0;
+#else
+  (void)s, (void)wanted, (void)size, (void)mean, (void)covariance;
+  return 0;
+#endif
+}
+
+/* mean and covariance, of undetermined forces too */
+static int posterior(const forcegp_learned *learned, const double *q, const double *qd, const double *tau,
+                     const unsigned char *closed, unsigned quantities, int noise, double *mean, double *covariance,
+                     double *beyond, situation *s) {
   affine z;
   double unknown[NQ], qdd[NQ];
-  int size, resolved, status = evaluate(learned, q, qd, tau, closed, NULL, covariance != NULL, &s);
+  int size, resolved, status = evaluate(learned, q, qd, tau, closed, NULL, covariance != NULL, s);
   if (status) return status;
-  if (beyond) memcpy(beyond, s.far, sizeof s.far);
+  if (beyond) memcpy(beyond, s->far, sizeof s->far);
   if (INERTIA_LEARNED && covariance) { /* at the predicted acceleration */
-    maps(&s.e, s.gain, FORCEGP_QDD, &z);
-    read_mean(&z, &s.f, s.prior_mean, NQ, qdd);
-    inertial_errors(q, qd, &s.e, qdd, &s.f);
+    maps(&s->e, s->gain, FORCEGP_QDD, &z);
+    read_mean(&z, &s->f, s->prior_mean, NQ, qdd);
+    inertial_errors(q, qd, &s->e, qdd, &s->f);
   }
-  size = maps(&s.e, s.gain, quantities, &z);
-  read_mean(&z, &s.f, s.prior_mean, size, mean);
+  size = maps(&s->e, s->gain, quantities, &z);
+  read_mean(&z, &s->f, s->prior_mean, size, mean);
   if (!all_finite(mean, size)) return FORCEGP_OVERFLOW;
   if (!covariance) return 0;
-  unknown_forces(qd, s.far, noise, unknown);
-  resolved = read_covariance(&z, &s.f, unknown, size, covariance);
+  unknown_forces(qd, s->far, noise, unknown);
+  resolved = read_covariance(&z, &s->f, unknown, size, covariance);
   if (noise)
     for (int bit = 0, row = 0; bit < QUANTITIES; ++bit)
       for (int i = 0; quantities >> bit & 1u && i < SIZES[bit]; ++i, ++row)
         covariance[row * size + row] += SENSOR_VARIANCE[bit] ? SENSOR_VARIANCE[bit][i] : 0.0;
   if (!all_finite(covariance, size * size)) return FORCEGP_OVERFLOW;
   return resolved && semidefinite(covariance, size) ? 0 : FORCEGP_UNRESOLVED;
+}
+
+static int predict(const forcegp_learned *learned, const double *q, const double *qd, const double *tau,
+                   const unsigned char *closed, unsigned quantities, int noise, double *mean, double *covariance,
+                   double *beyond) {
+  situation s;
+  const int status = posterior(learned, q, qd, tau, closed, quantities, noise, mean, covariance, beyond, &s);
+  return status ? status : undetermined(&s, quantities, forcegp_size(quantities), mean, covariance);
 }
 
 int forcegp_equations(const double *q, const double *qd, double *M, double *A) {
@@ -664,7 +725,7 @@ int forcegp_predict_learned(const forcegp_learned *learned, long count, const do
     const int status = predict(learned, q + i * NQ, qd + i * NQ, tau + i * NQ, closed ? closed + i * CONTACTS : NULL,
                                quantities, noise, mean + i * d, covariance ? covariance + i * d * d : NULL,
                                beyond ? beyond + i * NQ : NULL);
-    worst = worst ? worst : status;
+    if (status && (!worst || worst == FORCEGP_UNDETERMINED)) worst = status;
   }
   return worst;
 }

@@ -26,6 +26,8 @@ extern "C" {
 #define FORCEGP_NO_INERTIA 4  /* the mass matrix is not positive definite */
 #define FORCEGP_NO_JACOBIAN 5 /* the quantity has no Jacobian, or the closed contacts are not independent */
 #define FORCEGP_OVERFLOW 9    /* a result is not finite */
+#define FORCEGP_UNDETERMINED 11 /* all is written, but some forces of contacts are not determined: those of contacts
+                                 * that are never closed in the data or cannot move are NaN, and shared loads wide */
 
 /* Number d of components of the given quantities. */
 int forcegp_size(unsigned quantities);
@@ -44,7 +46,8 @@ int forcegp_size(unsigned quantities);
 int forcegp_predict(const double *q, const double *qd, const double *tau, const unsigned char *closed,
                     unsigned quantities, int noise, double *mean, double *covariance, double *beyond);
 
-/* The same at `count` states, given the online state, or NULL for that of the fit; returns the first error. */
+/* The same at `count` states, from what was learned online, or, with NULL, in the fit; returns the first error, if there is
+ * none FORCEGP_UNDETERMINED where it holds for a state. */
 typedef struct forcegp_learned forcegp_learned;
 int forcegp_predict_learned(const forcegp_learned *learned, long count, const double *q, const double *qd,
                             const double *tau, const unsigned char *closed, unsigned quantities, int noise, double *mean,
@@ -53,7 +56,7 @@ int forcegp_predict_learned(const forcegp_learned *learned, long count, const do
 @online@@wrench@/* Mass matrix M, and the rows of A for all contacts; three planes through a tool give its Jacobian. */
 int forcegp_equations(const double *q, const double *qd, double *M, double *A);
 
-/* Posterior mean and its Jacobian, for qdd, multiplier, contact force and joint friction.
+/* Posterior mean and its Jacobian: of qdd, multiplier, contact force and joint friction, undetermined ones included.
  *
  * jacobian     d x 3 FORCEGP_JOINTS numbers, row by row: derivatives with respect to q, then qd, then tau
  */

@@ -117,9 +117,10 @@ def rounding_of(model: ExportedModel, training: Training) -> tuple[float, float]
     )
     assert coarse.std is not None and fine.std is not None
     size = fine.mean.abs().maximum(fine.std)
-    size = size.maximum(ZERO * size.amax(-1, keepdim=True))
-    in_std = (coarse.std / fine.std - 1.0).abs()[fine.std > ZERO * fine.std.amax()]
-    return float(((coarse.mean - fine.mean).abs() / size).max()), float(in_std.max())
+    size = size.maximum(ZERO * size.nan_to_num().amax(-1, keepdim=True))
+    in_mean = ((coarse.mean - fine.mean).abs() / size)[~size.isnan()]
+    in_std = (coarse.std / fine.std - 1.0).abs()[fine.std > ZERO * fine.std.nan_to_num().amax()]
+    return float(in_mean.max()), float(in_std.max())
 
 
 def loss_of(model: ExportedModel, fit: Predictor, training: Training) -> tuple[float, float]:
@@ -132,8 +133,8 @@ def loss_of(model: ExportedModel, fit: Predictor, training: Training) -> tuple[f
         for x in (CompiledFit(model), fit)
     ]
     small, whole = (x.covariance.diagonal(dim1=-2, dim2=-1).sqrt() for x in read if x.covariance is not None)
-    # Structural zeros, such as λ of an open contact, have no loss.
-    growth = (small / whole - 1.0)[whole > ZERO * whole.amax()]
+    # Nothing is lost of structural zeros, such as λ of an open contact.
+    growth = (small / whole - 1.0)[whole > ZERO * whole.nan_to_num().amax()]
     return float(growth.max()), float(growth.median())
 
 
@@ -146,7 +147,10 @@ def states_of(model: ExportedModel, training: Training) -> tuple[Tensor, ...]:
 
 
 def random_states(model: ExportedModel, count: int) -> tuple[Tensor, ...]:
-    """Return random q, q̇, τ and closed contacts, within the joint limits and any known trained region."""
+    """Return random q, q̇, τ and closed contacts within joint limits and the trained region, if known.
+
+    At least one direction of motion is free.
+    """
     robot, random = model.system.robot, torch.Generator().manual_seed(0)
     one = torch.ones(robot.nq, dtype=torch.float64)
     limits = [
@@ -158,7 +162,9 @@ def random_states(model: ExportedModel, count: int) -> tuple[Tensor, ...]:
         limits[1:] = zip(model.tensors[LOW], model.tensors[HIGH], strict=True)
     shares = torch.rand(3, count, robot.nq, dtype=torch.float64, generator=random)
     state = [low + share * (high - low) for (low, high), share in zip(limits, shares, strict=True)]
-    return *state, torch.rand(count, len(model.system.contacts), generator=random) < 0.7
+    closed = torch.rand(count, len(model.system.contacts), generator=random) < 0.7
+    # Accelerations of an arm that contacts hold completely are rounding.
+    return *state, closed & (closed.cumsum(-1) < robot.nq)
 
 
 def _reference(model: ExportedModel, fit: Predictor, name: str) -> str:
@@ -193,7 +199,7 @@ def _reference(model: ExportedModel, fit: Predictor, name: str) -> str:
         tables |= {"qdd": qdd, "wrench": found.mean, "wrench_covariance": found.covariance.flatten(1)}
     for key, x in {**tables, "closed": flags}.items():
         kind = {"closed": "unsigned char"}.get(key, real if key in ("q", "qd", "tau", "qdd") else "double")
-        rows = ",\n  ".join("{" + ", ".join(map(repr, row)) + "}" for row in x.tolist())
+        rows = ",\n  ".join("{" + ", ".join(map(repr, row)) + "}" for row in x.tolist()).replace("nan", "NAN")
         lines.append(f"static const {kind} {key}[STATES][{x.shape[1]}] = {{{rows}}};")
     return "\n".join(lines)
 

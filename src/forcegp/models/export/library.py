@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import copy
 import ctypes
+import dataclasses
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
@@ -17,17 +18,18 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ForceGPError, ModelError, NumericalError, ShapeError, check_name
 from forcegp.forces.posterior import LOW
-from forcegp.forces.quantities import ForceField, ForceLinearization, flat_states
+from forcegp.forces.quantities import FlatStates, ForceField, ForceLinearization, flat_states, hidden_forces
 from forcegp.models.export.mean import DIFFERENTIATED
 from forcegp.models.export.model import ExportedModel
 from forcegp.models.export.source import READ, c_source
 from forcegp.models.external_wrench import ExternalWrench
-from forcegp.models.prediction import Prediction, Predictor
+from forcegp.models.prediction import Prediction, Predictor, in_pieces
 from forcegp.native import load_library
 
 NAME = "forcegp"
 NOT_FINITE, JAMMED, UNRESOLVED, NO_INERTIA, NO_JACOBIAN, AT_REST, NO_NOISE, OVERFLOW = 1, 2, 3, 4, 5, 6, 7, 9
-"""Error codes that the C code returns; 0 means success."""
+UNDETERMINED = 11
+"""What the C code returns other than 0."""
 MESSAGES = {
     JAMMED: "friction of a contact would press harder than it opposes",
     UNRESOLVED: "the precision of the C code does not resolve a predicted variance",
@@ -171,7 +173,8 @@ class CompiledFit(Predictor):
             )
         parts = self.model.parts()
         n, folded = parts[0].rank, sum(part.weights.numel() for part in parts)
-        begun = torch.empty(2 * n + folded + n * (n + 1) // 2 + 1, dtype=torch.float64)
+        contacts = max(len(self.system.contacts), 1)
+        begun = torch.empty(2 * n + folded + n * (n + 1) // 2 + contacts + 1, dtype=torch.float64)
         self.library.forcegp_begin(begun.data_ptr())
         return begun
 
@@ -204,14 +207,36 @@ class CompiledFit(Predictor):
         spread = new(*batch, read.size, read.size) if covariance else None
         pointers = [None if x is None else x.data_ptr() for x in (*arrays, mean, spread, beyond)]
         status = self._many(self._memory, batch.numel(), *pointers[:4], read.bits, noise, *pointers[4:])
-        if status:
+        if status not in (0, UNDETERMINED):
             raise self._error(status, q, qd, tau, active)
         if read.order is not None:
             mean = mean[..., read.order]
             spread = None if spread is None else spread[..., read.order, :][..., read.order]
         joints = self.system.robot.joint_names
         far = beyond if LOW in self.model.tensors else None
-        return Prediction(mean, spread, read.parts, far, joints, checked=True)
+        result = Prediction(mean, spread, read.parts, far, joints, checked=True)
+        return self._doubted(result, flat_states(self.system, q, qd, tau, active)) if status else result
+
+    def _doubted(self, prediction: Prediction, flat: FlatStates) -> Prediction:
+        """Return a prediction with descriptions of its undetermined components.
+
+        Raises:
+            ModelError: all requested quantities are forces of contacts that are never closed in the data.
+        """
+        names, doubts = self.system.contact_names, dict[str, None]()
+        closed = self._learned[-1 - len(names) : -1] if self._learned is not None else torch.zeros(len(names))
+        never = [name for name, own in zip(names, closed, strict=True) if own == 0.0]
+        never = [name for name in never if name in self.model.never_closed]
+
+        def read(piece: FlatStates) -> tuple[Tensor | None, ...]:
+            at = piece.with_equations(self.system)
+            hidden = hidden_forces(self.system, at, prediction.parts, never)
+            doubts.update(dict.fromkeys(() if hidden is None else hidden.doubts))
+            return ()
+
+        in_pieces(flat, read)
+        known = ~prediction.mean.isnan()
+        return dataclasses.replace(prediction, determined=known, doubts=tuple(doubts), checked=True)
 
     def jacobian(
         self,

@@ -35,6 +35,14 @@ PRIORS = (joint.JointForcePrior, joint.JointFrictionPrior, InertialPrior, Payloa
 PRIORS += (contact.NormalForcePrior, contact.SlidingFrictionPrior, contact.ContactForcePrior)
 PRIORS += (contact.CoulombErrorPrior,)
 KERNELS = (Linear, Constant, SquaredExponential, Matern32, Matern52)
+WHY = {
+    "DisturbancePrior": "its force depends on time",
+    "CoregionalPrior": "its components share functions",
+    "OperatorForcePrior": "its operator is Python code",
+    "PayloadPrior": "it has a known payload, and the code has the mechanics of the bare arm only",
+    "ImplicitSurface": "it is Python code",
+}
+"""Reasons, by type; others have no C form yet."""
 LARGEST = 1700
 """Maximum number of functions of a posterior that is not reduced: about 30 MB of text, which a compiler
 translates in half a minute."""
@@ -102,6 +110,7 @@ class ExportedModel:
             likelihood, and whether samples must be in motion; `None` if the model cannot learn online.
         wrench: frame and components of an external wrench to estimate, or `None`.
         dtype: precision of the C code.
+        never_closed: contacts that are never closed in the training data.
     """
 
     system: ConstrainedSystem
@@ -114,6 +123,7 @@ class ExportedModel:
     sampling: tuple[Tensor, float, bool] | None = None
     wrench: WrenchFrame | None = None
     dtype: torch.dtype = torch.float64
+    never_closed: tuple[str, ...] = ()
 
     @property
     def online(self) -> bool:
@@ -246,8 +256,10 @@ def _check_kernel(name: str, kernel: Kernel) -> None:
 
 
 def _no_c(what: str, name: str, thing: object, expected: str) -> ModelError:
+    kinds = [kind.__name__ for kind in type(thing).__mro__]
+    why = next((WHY[kind] for kind in kinds if kind in WHY), "its type has no C form")
     return ModelError(
-        f"the {what} {name!r} cannot be exported as C",
+        f"the {what} {name!r} cannot be exported as C: {why}",
         expected=expected,
         got=type(thing).__name__,
         hint="predict in Python, or leave it out of the model",

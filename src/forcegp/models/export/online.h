@@ -2,10 +2,11 @@
 #define FORCEGP_FUNCTIONS @functions@
 struct forcegp_learned {
   double weights[FORCEGP_FUNCTIONS];                               /* mean of the weights of all functions */
-  double folded[@folded@];                                         /* mean of the weights of kernels and features */
-  double root[FORCEGP_FUNCTIONS * (FORCEGP_FUNCTIONS + 1) / 2]; /* K, by rows; the weights' covariance is K^T K */
-  double faded[FORCEGP_FUNCTIONS];                                 /* fraction of each weight's prior still to be renewed */
-  int next;                                                        /* the next weight to renew */
+  double folded[@folded@];                                         /* the same of kernels and features */
+  double root[FORCEGP_FUNCTIONS * (FORCEGP_FUNCTIONS + 1) / 2]; /* K, by rows; their covariance is K^T K */
+  double faded[FORCEGP_FUNCTIONS];                                 /* share of each prior that waits to be renewed */
+  double touched[@contacts@];                                      /* 1 for contacts that were closed in a sample */
+  int next;                                                        /* the first one that waits */
 };
 #define FORCEGP_AT_REST 6      /* as in a fit, nothing is learned while the robot is at rest */
 #define FORCEGP_NO_NOISE 7     /* the fit has not measured the quantity, and no noise is given */

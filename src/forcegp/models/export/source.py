@@ -25,7 +25,7 @@ from forcegp.forces.priors import contact
 from forcegp.forces.priors.base import CONSTRAINT, CONTACT, JOINT
 from forcegp.forces.priors.inertial import PER_PAYLOAD, InertialPrior, PayloadPrior
 from forcegp.forces.priors.joint import TERMS, JointFrictionPrior
-from forcegp.forces.quantities import QUANTITIES
+from forcegp.forces.quantities import QUANTITIES, ROUNDED
 from forcegp.gp import kernels
 from forcegp.gp.basis import KernelPart
 from forcegp.gp.draws import MISSED_FEATURES
@@ -228,10 +228,13 @@ class Writer:
             "NEGATIVE": repr(NEGATIVE),
             "ROUNDING": repr(ROUNDING),
             "RANK_TOLERANCE": repr(rank_tolerance(self.model.dtype)),
+            "HIDDEN": repr(ROUNDED),
         }
         self.lines += [f"#define {name} {value}" for name, value in defined.items()]
         self.lines.append("enum { JOINT, CONTACT, CONSTRAINT, JOINT_FRICTION };")
         self.array(sizes, "SIZES", "int")
+        if contacts:
+            self.array([c.name in self.model.never_closed for c in contacts], "NEVER_CLOSED", "int")
         self.array(accumulate((len(w) for x in self.parts for w in x.weights), initial=0), "FOLDED", "int")
         owners = [part.prior for part in self.parts for _ in range(part.components)]
         self.array([TARGETS.index(prior.target) for prior in owners], "TARGET", "int")
@@ -313,6 +316,7 @@ class Writer:
         names = ", ".join(f"{p} {_comment(part.prior.name)}" for p, part in enumerate(self.parts))
         folded = sum(part.weights.numel() for part in self.parts)
         fields = {"functions": self.parts[0].rank, "folded": folded, "priors": names}
+        fields["contacts"] = max(len(self.model.system.contacts), 1)
         return template("online.h", fields) if self.model.online else ""
 
     def priors(self) -> list[str]:
