@@ -16,10 +16,8 @@ from torch import nn
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset, StreamedDataset
 from forcegp.errors import ModelError
-from forcegp.forces.calibration import region_of
 from forcegp.forces.measurements import NoiseStd, Observation
 from forcegp.forces.noise import Noise, state_std_of
-from forcegp.forces.posterior import GROWTH
 from forcegp.forces.priors.base import ForcePrior, check_priors
 from forcegp.forces.priors.joint import AnalyticalMean, JointFrictionPrior, mean_of
 from forcegp.forces.priors.sets import priors_of
@@ -173,9 +171,7 @@ class StructuredGP(Model[StructuredFit]):
         file = None if checkpoint is None else Path(checkpoint)
         neighbours = None if sample.log is None else sample.neighbours(spec, problem.training)
         lesson = learned(spec, problem, search, file, progress, begin, neighbours)
-        values, forces = dict(lesson.hyperparameters), None
-        if GROWTH not in values:  # a region that was not calibrated with the noise belongs to the data
-            values |= region_of(lesson.problem)
+        values, forces = lesson.hyperparameters, None
         if sample.log is not None and lesson.problem.inducing is not None:
             whole = Pass(spec, sample.log, sample, file, progress)
             forces = whole.forces(*lesson.problem.with_coulomb_errors(values))
