@@ -40,3 +40,19 @@ def test_a_tip_that_takes_off_gently_was_labelled_rightly(acceleration: float) -
 
 def test_a_tip_that_slides_on_is_found() -> None:
     assert kinds_of(0.0) == ["contact-missed"]
+
+
+def test_a_masked_impact_does_not_end_a_label_that_starts_too_early() -> None:
+    """A tip comes down from 5 mm while labelled closed; the rows at which it lands are masked."""
+    rows, lands, speed = SLIDES, 24, 0.05
+    time, zero = DT * np.arange(rows), np.zeros((rows, 1))
+    falls = np.arange(rows) < lands
+    height = np.where(falls, speed * DT * (lands - np.arange(rows)), 0.0)
+    v = np.column_stack([np.full(rows, 0.1), np.zeros(rows), -speed * falls])
+    p = np.column_stack([np.cumsum(v[:, 0]) * DT, 0.0 * time, height])
+    path = Path(height, p, v, np.tile([0.0, 0.0, 1.0], (rows, 1)))
+    usable = ~np.isin(np.arange(rows), [lands - 1, lands])
+    label = {"table": np.ones(rows, bool)}
+    log = Log(time, *[zero] * 4, np.zeros(rows, np.int64), label, ("j",), DataHeader(), masked=~usable)
+    (finding,) = _labels(TABLE, path, usable, usable, height, log)
+    assert finding.kind == "contact-early" and finding.intervals == ((0, lands),)

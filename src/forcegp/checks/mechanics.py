@@ -1,4 +1,4 @@
-"""Residual torque after the faults are explained: friction, offsets, disturbances."""
+"""Checks of the torque: faults that explain it, and then friction, offsets and disturbances."""
 
 from __future__ import annotations
 
@@ -10,43 +10,34 @@ from forcegp.checks import hypotheses
 from forcegp.checks.excitation import check_visibility, still_joints
 from forcegp.checks.explain import Explanation, explain
 from forcegp.checks.finding import Finding, NotJudgedError
-from forcegp.checks.fit import (
-    FLOOR,
-    Array,
-    cross_validate,
-    gain_of,
-    projector,
-    residual,
-    robust_parameters,
-    unmeasured,
-)
-from forcegp.checks.log import Log, Outcome, force_unit, position_unit, smoothed
+from forcegp.checks.fit import FLOOR, cross_validate, gain_of, robust_parameters, unmeasured
+from forcegp.checks.log import Array, Log, Outcome, force_unit, position_unit, smoothed
 from forcegp.constraints import ConstrainedSystem
 from forcegp.robot.model import RobotModel
 from forcegp.robust import robust_std
 from forcegp.rows import describe, intervals
 
 LEAST_ROWS = 200
-"""Rows from which dynamics are judged."""
+"""Minimum number of rows for checking the dynamics."""
 SIGNIFICANT, MATERIAL = 3.0, 0.1
-"""Standard errors over blocks, and drop of a joint's log error, from which friction or offsets count."""
+"""Standard errors over blocks, and drop in a joint's log error, above which friction or offsets count."""
 SPEEDS, UNEXPLAINED = (25.0, 95.0), 0.5
-"""Percentiles of speed between which friction resists; share of the torque (RMS) that may be left."""
+"""Percentiles of speed at which friction must oppose motion; RMS fraction of unexplained torque allowed."""
 TRACE_ROWS, DISTURBANCE_SECONDS = 20_000, 0.1
-"""Rows at which the residual is looked at over time; length over which the residual is averaged [s]."""
+"""Maximum number of rows for inspecting the residual over time; duration over which it is averaged [s]."""
 DISTURBANCE, LOUD = 5.0, 4.0
-"""A stretch of time stands out by so many robust standard deviations of the log residual, or by this factor
-over the residual of the worst tenth of the motion."""
+"""A stretch stands out if its log residual exceeds the median by this many robust standard deviations, or its
+residual exceeds the 90 % quantile by this factor."""
 MOVING, VISIBLE = 0.05, 0.1
-"""Share of the largest speed of an arm that moves; least disturbance, beyond dry friction, as a share."""
+"""Fraction of its largest speed above which an arm moves; fraction of the torque that disturbances exceed."""
 RIVALS = {"gravity": "a tilt of the base", "masses": "other masses", "gains": "a wrong gain"}
-"""What may look like a constant torque, by hypothesis."""
+"""Faults that may look like a constant torque, by hypothesis."""
 ONE_SIGMA = 84.13
 """Percentile of a normal distribution at one standard deviation above the mean."""
 
 
 def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Check signs, orders, gains, delays, gravity, tool, masses, friction and offsets."""
+    """Check signs, order, gains and delays of torques, gravity, payload, masses, friction and offsets."""
     if len(log.rows(LEAST_ROWS)) < LEAST_ROWS:
         raise NotJudgedError(f"fewer than {LEAST_ROWS} usable rows")
     passive = _without_torque(log)
@@ -90,7 +81,7 @@ def _enough(log: Log) -> bool:
 
 
 def _without_torque(log: Log) -> list[Finding]:
-    """Return the torques that are constant though the joint moves."""
+    """Find torques that are constant although the joint moves."""
     rows = log.usable
     still = (np.ptp(log.tau[rows], axis=0) == 0.0) & (np.ptp(log.q[rows], axis=0) > 0.0)
     still[unmeasured(log)] = False
@@ -102,7 +93,7 @@ def _without_torque(log: Log) -> list[Finding]:
 
 
 def _matters(explanation: Explanation, j: int, columns: list[int]) -> bool:
-    """Return whether leaving out some columns of the nuisance raises the error of joint j."""
+    """Return whether omitting the given nuisance columns raises the error of joint j significantly."""
     problem = explanation.problem
     keep = np.setdiff1d(np.arange(problem.nuisance.shape[-1]), columns)
     less = replace(problem, nuisance=problem.nuisance[..., keep])
@@ -113,7 +104,7 @@ def _matters(explanation: Explanation, j: int, columns: list[int]) -> bool:
 
 
 def _determined(robot: RobotModel, explanation: Explanation) -> Explanation:
-    """Return the explanation with friction set to 0 if it would drive, or is smaller than its σ."""
+    """Return the explanation with friction set to 0 if it would drive a joint, or is smaller than its σ."""
     declared = np.concatenate([robot.damping.numpy(), robot.friction.numpy()])
     for _ in range(robot.nq):
         fit = explanation.fit
@@ -128,14 +119,12 @@ def _determined(robot: RobotModel, explanation: Explanation) -> Explanation:
 
 
 def _confounded(explanation: Explanation) -> list[Finding]:
-    """Return the faults found, gains as warnings if masses are wrong too, since masses calibrate gains."""
-    findings = []
-    for finding in explanation.findings:
-        current = finding.kind == "torque-current" and "masses-mismatch" not in finding.kinds
-        if current and "masses" in explanation.robot:
+    """Return the faults found; currents become warnings if masses are wrong, since gains depend on masses."""
+    findings = list(explanation.findings)
+    for k, finding in enumerate(findings if "masses" in explanation.robot else ()):
+        if finding.kind == "torque-current" and "masses-mismatch" not in finding.kinds:
             text = f"{finding.message}; or the masses, which do not fit either, are to blame for both"
-            finding = replace(finding, message=text, weight="warning")
-        findings.append(finding)
+            findings[k] = replace(finding, message=text, weight="warning")
     return findings
 
 
@@ -150,25 +139,23 @@ def _friction(robot: RobotModel, explanation: Explanation) -> list[Finding]:
     resists = ((viscous + damping) * speeds + coulomb + declared > 0.0).all(axis=0)
     spread = explanation.fit.nuisance_spread
     significant = np.array([_matters(explanation, j, [j, nq + j]) for j in range(nq)])
-    significant &= resists & ~still_joints(log)
+    # Within the rise of declared friction, whose law is rarely known, a slow joint shows nothing beyond it.
+    rising = (speeds[1] <= robot.friction_velocity.numpy()) & (declared > 0.0)
+    significant &= resists & ~still_joints(log) & ~rising
     findings = []
     for hit, word in ((significant & (power > 0.0), "more"), (significant & (power <= 0.0), "less")):
-        if not hit.any():
-            continue
-        joints, parts = log.named(hit), []
+        evidence, parts = {}, []
         for j in np.flatnonzero(hit):
-            units = f"{force_unit(robot, j)} s/{position_unit(robot, j)}", force_unit(robot, j)
-            pairs = zip((viscous[j], coulomb[j]), (spread[j], spread[nq + j]), units, strict=True)
-            sizes = (f"{x:.3g} ± {s:.1g} {unit}" if s else "not determined" for x, s, unit in pairs)
-            parts.append(f"{log.joint_names[j]} {', '.join(sizes)}")
-        listed = "; ".join(parts)
-        text = f"joints have {word} friction than the robot file declares (viscous, Coulomb): {listed}"
-        evidence = {
-            f"{word} {log.joint_names[j]}": value[j]
-            for word, value in (("viscous", viscous), ("coulomb", coulomb))
-            for j in np.flatnonzero(hit & (value != 0.0))
-        }
-        findings.append(log.finding("friction-undeclared", text, joints, **evidence))
+            unit, name, sizes = force_unit(robot, j), log.joint_names[j], []
+            units = f"{unit} s/{position_unit(robot, j)}", unit
+            for k, kind in enumerate(("viscous", "coulomb")):
+                x, s = -explanation.fit.nuisance[k * nq + j], spread[k * nq + j]
+                sizes.append(f"{x:.3g} ± {s:.1g} {units[k]}" if s else "not determined")
+                evidence |= {f"{kind} {name}": x} if x else {}
+            parts.append(f"{name} {', '.join(sizes)}")
+        what = f"{word} friction than the robot file declares (viscous, Coulomb)"
+        text = f"joints have {what}: {'; '.join(parts)}"
+        findings += [log.finding("friction-undeclared", text, log.named(hit), **evidence)] if parts else []
     return findings
 
 
@@ -192,18 +179,17 @@ def _offsets(system: ConstrainedSystem, explanation: Explanation) -> list[Findin
 def _unexplained(explanation: Explanation) -> list[Finding]:
     error = np.median(explanation.fit.error, axis=0) * explanation.problem.scale
     share = float(np.sqrt((error**2).sum() / (explanation.problem.size**2).sum()))
-    if share <= UNEXPLAINED:
-        return []
     text = f"robot file, friction and offsets leave {100 * share:.0f} % of the torque unexplained"
-    return [explanation.log.finding("torque-unexplained", text, share=share)]
+    finding = explanation.log.finding("torque-unexplained", text, share=share)
+    return [finding] if share > UNEXPLAINED else []
 
 
 def _disturbances(system: ConstrainedSystem, explanation: Explanation) -> tuple[list[Finding], np.ndarray]:
-    """Return the times at which far more torque is unexplained than usual, and the rows around them."""
+    """Find stretches in which far more torque than usual is unexplained; also mask the rows around them."""
     from scipy.ndimage import minimum_filter1d
 
     log, rows = explanation.log, explanation.log.rows(TRACE_ROWS)
-    trace = residual_trace(system, explanation, rows)
+    trace = residual_trace(explanation, rows)
     scale = np.maximum(explanation.problem.scale, FLOOR * explanation.problem.size)
     stride = np.median(np.diff(rows)) * log.dt
     width = max(1, round(DISTURBANCE_SECONDS / stride))
@@ -233,7 +219,7 @@ def _disturbances(system: ConstrainedSystem, explanation: Explanation) -> tuple[
 
 
 def _stands_out(log: Log, rows: np.ndarray, level: Array) -> np.ndarray:
-    """Return `(n,)` bool, rows with a larger residual than usual at the same state of the contacts."""
+    """Return the mask `(n,)` of rows with a larger residual than usual for the same contact state."""
     # An arm at rest leaves little unexplained; it says nothing of one that moves.
     speed = np.abs(log.qd[rows]).max(axis=1)
     moving, bad = speed >= MOVING * np.percentile(speed, 99), np.zeros(len(rows), bool)
@@ -252,19 +238,18 @@ def _stands_out(log: Log, rows: np.ndarray, level: Array) -> np.ndarray:
 
 
 def _upper_spread(level: Array) -> float:
-    """Return the spread of the level, the upper one if smaller: few squares have a long lower tail."""
+    """Return the spread above the median if it is smaller: log sums of few squares have a long lower tail."""
     middle, upper = np.percentile(level, [50.0, ONE_SIGMA])
     return float(min(robust_std(level), upper - middle))
 
 
-def residual_trace(system: ConstrainedSystem, explanation: Explanation, rows: np.ndarray) -> Array:
-    """Return the residual torque at some rows without contact forces, `(n, nq)` [N m, N]."""
-    log, scale = explanation.log, explanation.problem.scale
+def residual_trace(explanation: Explanation, rows: np.ndarray) -> Array:
+    """Return the residual torque, excluding contact forces, at the given rows, `(n, nq)` [N m, N]."""
+    system, log = explanation.system, explanation.log
     parts, coefficients = [], robust_parameters(explanation.problem, explanation.columns, explanation.prior)
     for index in np.array_split(rows, max(1, len(rows) // 2048)):
-        r, J = residual(system, log, index)
+        part = explanation.on(log, index)
         columns = [hypotheses.robot_columns(system, log, index, name)[0] for name in explanation.robot]
-        columns = np.concatenate([*columns, hypotheses.friction_columns(system, log, index)], axis=-1)
-        r = r - columns @ coefficients
-        parts.append((projector(J, scale) @ (r / scale)[..., None])[..., 0] * scale)
+        r = part.r - np.concatenate([*columns, part.nuisance], axis=-1) @ coefficients
+        parts.append(part.without_contact(r[..., None])[..., 0] * part.scale)
     return np.concatenate(parts)

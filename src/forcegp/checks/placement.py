@@ -1,7 +1,7 @@
 """Check that the joint angles place the tip on the surface in rows labelled as contact.
 
-If the surface is displaced, the distance of the tip is a plane over the path. If the angles are wrong, a
-single correction moves the tip onto the surface in all rows.
+If the surface is displaced, the distance of the tip is a linear function of its position. If the angles are
+wrong, a single correction moves the tip onto the surface in all rows.
 """
 
 from __future__ import annotations
@@ -23,50 +23,50 @@ from forcegp.robot.model import RobotModel
 from forcegp.robust import level_of, robust_std
 
 ROWS = 2000
-"""Maximum number of contact rows."""
+"""Maximum number of contact rows used."""
 BETTER = 0.25
-"""Largest accepted residual of corrected angles, relative to that of a displaced surface."""
+"""Largest accepted residual with corrected angles, relative to that with a displaced surface."""
 STEPS = 6
-"""Number of Gauss-Newton steps for an encoder offset."""
+"""Number of Gauss-Newton steps for finding an encoder offset."""
 
 
 def check_placement(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find joints with wrong sign, order or offset from the position of the tip in contact."""
+    """Find joints with a wrong sign, order or offset from the position of the tip in contact."""
     for contact, rows in touching(system, log):
         path = tip_path(system, contact, log, rows)
         if abs(np.median(path.c)) <= FAR:
             continue
         scatter = robust_std(path.c - fit_surface(contact, path, np.ones(len(rows), bool))[2])
         rows = evenly(rows, ROWS)
-        outcome = _explanation(system, contact, log, rows, min(OFFSET, BETTER * float(scatter)))
-        if outcome is not None:
+        most = min(OFFSET, BETTER * float(scatter))
+        if (outcome := _explanation(system, contact, log, rows, most)) is not None:
             return outcome
     for contact in labelled_contacts(system, log):
         # Labels by distance are lost with the place of the tip.
-        if isinstance(contact, SurfaceContact) and not log.contact[contact.name].any():
-            path = tip_path(system, contact, log)
-            moves = log.usable & (np.linalg.norm(path.v, axis=1) > SLIDING_SLOW)
-            on = (np.abs(path.c[moves]) <= TOUCHING).sum() > LEVEL * moves.sum()
-            if not on and (pair := exchanged_joints(system, contact, log.q[moves])):
-                both, c = tuple(log.joint_names[j] for j in pair), 1e3 * path.c[moves]
-                text = (
-                    f"the tip is {np.median(c):+.3g} ± {robust_std(c):.2g} mm from the surface of "
-                    f"{contact.name!r}, and on it if {' and '.join(both)} are exchanged"
-                )
-                found = log.finding("joint-order", text, both)
-                return [found], changed(log, ("q", "qd", "qdd", "tau"), order=pair)
-            if not on and level_of(path.c[moves], TOUCHING, LEVEL) is None:
-                rows = evenly(np.flatnonzero(moves), TRIED_ROWS)
-                outcome = _never_closed(system, contact, log, rows) if len(rows) else None
-                if outcome is not None:
-                    return outcome
+        if not isinstance(contact, SurfaceContact) or log.contact[contact.name].any():
+            continue
+        path = tip_path(system, contact, log)
+        moves = log.usable & (np.linalg.norm(path.v, axis=1) > SLIDING_SLOW)
+        c = path.c[moves]
+        if (np.abs(c) <= TOUCHING).sum() > LEVEL * len(c):
+            continue
+        if pair := exchanged_joints(system, contact, log.q[moves]):
+            both, where = tuple(log.joint_names[j] for j in pair), f"{1e3 * np.median(c):+.3g}"
+            where = f"{where} ± {1e3 * robust_std(c):.2g} mm from the surface of {contact.name!r}"
+            text = f"the tip is {where}, and on it if {' and '.join(both)} are exchanged"
+            found = log.finding("joint-order", text, both)
+            return [found], changed(log, ("q", "qd", "qdd", "tau"), order=pair)
+        if len(c) and level_of(c, TOUCHING, LEVEL) is None:
+            rows = evenly(np.flatnonzero(moves), TRIED_ROWS)
+            if (outcome := _never_closed(system, contact, log, rows)) is not None:
+                return outcome
     return [], log
 
 
 def _never_closed(
     system: ConstrainedSystem, contact: SurfaceContact, log: Log, rows: np.ndarray
 ) -> Outcome | None:
-    """Return the single correction that moves a tip that is never in contact to the surface, if any."""
+    """Return the single correction that brings a tip that is never in contact to the surface, if any."""
     signs = ((h, h.change(log)) for h in discrete(log) if h.name == "joint-sign")
     tried = []
     for h, other in (*signs, *_offsets(system, contact, log, rows, LEVEL)):
@@ -90,7 +90,7 @@ def _chosen(
     near: list[tuple[Hypothesis, Log]],
     where: str,
 ) -> Outcome:
-    """Return corrections that place the tip equally well, such as two joints in a plane, ranked by torque."""
+    """Return a finding on equally good corrections, and the log corrected by that which fits torques best."""
     rows = evenly(np.flatnonzero(log.usable), TRIED_ROWS)
     scores = [cross_validate(hypotheses.problem_of(system, other, rows)).score.mean() for _, other in near]
     best, repaired = near[int(np.argmin(scores))]
@@ -99,7 +99,7 @@ def _chosen(
 
 
 def leaves_surface(system: ConstrainedSystem, before: Log, after: Log) -> bool:
-    """Return whether a correction moves the tip off the surface in rows labelled as contact."""
+    """Return whether a correction moves the tip away from the surface in rows labelled as contact."""
     if after.q is before.q:
         return False
     for contact, rows in touching(system, before):
@@ -112,7 +112,7 @@ def leaves_surface(system: ConstrainedSystem, before: Log, after: Log) -> bool:
 def _explanation(
     system: ConstrainedSystem, contact: SurfaceContact, log: Log, rows: np.ndarray, most: float
 ) -> Outcome | None:
-    """Return the correction of angles that places the tip on the surface, if any."""
+    """Return the correction of the angles that places the tip on the surface, if any."""
     angles = ((h, h.change(log)) for h in discrete(log) if h.name in ("joint-sign", "joint-order"))
     for candidates in (angles, _offsets(system, contact, log, rows)):
         near = [(h, other) for h, other in candidates if _off(system, contact, other, rows) <= most]
@@ -130,9 +130,9 @@ def _off(system: ConstrainedSystem, contact: SurfaceContact, log: Log, rows: np.
 def _offsets(
     system: ConstrainedSystem, contact: SurfaceContact, log: Log, rows: np.ndarray, share: float | None = None
 ) -> Iterator[tuple[Hypothesis, Log]]:
-    """Yield each encoder with the offset that moves the tip to the surface, by Gauss-Newton steps.
+    """Yield for each encoder the offset that moves the tip to the surface, found by Gauss-Newton steps.
 
-    With a share, offsets are computed per row, and one on which this share of them agrees is used.
+    If `share` is given, offsets are computed for each row, and the offset common to this fraction is used.
     """
     few = log.replace(q=log.q[rows], qd=log.qd[rows])
     for j in range(log.nq):
@@ -141,9 +141,9 @@ def _offsets(
             moved = (few.q + np.outer(offset + step, np.eye(log.nq)[j]) for step in (0.0, 1e-5))
             c, ahead = (tip_path(system, contact, few.replace(q=q), np.arange(len(q))).c for q in moved)
             slope = (ahead - c) / 1e-5
-            total = slope**2 if share is not None else (slope**2).sum()
-            ascent = slope * c if share is not None else (slope * c).sum()
-            offset = offset - ascent / np.maximum(total, 1e-12)
+            ascent = np.stack([slope * c, slope**2])
+            total = ascent if share is not None else ascent.sum(axis=1, keepdims=True)
+            offset = offset - total[0] / np.maximum(total[1], 1e-12)
         if share is not None:
             offset = np.array([level_of(offset, hypotheses.SMALL_ANGLE, share) or 0.0])
         if abs(offset[0]) <= hypotheses.LARGEST_ANGLE:

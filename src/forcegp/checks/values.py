@@ -1,4 +1,4 @@
-"""Checks of single columns: an even clock, plausible values, steps of the state."""
+"""Checks of single columns: regular time stamps, plausible values, and jumps in the state."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from forcegp.checks.log import DEPARTURE, Array, Log, Outcome, spikes
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data.clipped import limits_of
 from forcegp.data.derivative import UNIFORM_TOLERANCE
-from forcegp.data.fields import JOINT_VECTORS
-from forcegp.robust import resolution, robust_std
+from forcegp.data.fields import JOINT_VECTORS, resolution
+from forcegp.robust import robust_std
 from forcegp.rows import describe, intervals
 
 
@@ -27,7 +27,7 @@ def check_order(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_gaps(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find steps longer than the clock's jitter: missing samples."""
+    """Find missing samples, where a time step is longer than clock jitter explains."""
     with np.errstate(invalid="ignore"):
         gaps = log.steps > log.longest_step
     if log.masked is not None:
@@ -44,18 +44,17 @@ def check_gaps(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_jitter(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find steps too uneven for filters that assume even sampling."""
+    """Find time steps that are too uneven for filters that assume even sampling."""
     with np.errstate(invalid="ignore"):
         regular = log.steps[(log.steps > 0.0) & (log.steps <= log.longest_step)]
     spread = float(robust_std(regular) / log.dt) if len(regular) > 1 else 0.0
-    if spread <= UNIFORM_TOLERANCE:
-        return [], log
     text = f"the time steps vary by {100 * spread:.2g} % around {log.dt:.4g} s"
-    return [log.finding("time-jitter", text, relative_spread=spread, period_s=log.dt)], log
+    jitter = log.finding("time-jitter", text, relative_spread=spread, period_s=log.dt)
+    return [jitter] if spread > UNIFORM_TOLERANCE else [], log
 
 
 def check_period(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Compare the sampling period with that of the header."""
+    """Compare the sampling period with the period stated in the header."""
     stated = log.header.dt
     if stated is None or not abs(log.dt / stated - 1.0) > UNIFORM_TOLERANCE:
         return [], log
@@ -64,22 +63,22 @@ def check_period(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 HELD_RUN = 2
-"""A logger that fails to update repeats a row at least this often before it is reported as held."""
+"""Minimum number of repeated rows for which a logger is reported as having failed to update."""
 STUCK_SECONDS, STUCK_VISIBLE = 0.05, 0.02
-"""A channel that repeats one value for so long [s] should have moved by this share of its range."""
+"""Duration for which a channel must repeat a value [s], and fraction of its range by which it should move."""
 SPIKE, SPIKE_ALONE = 12.0, 4.0
-"""Robust standard deviations of a spike, never reached by noise; its factor over the neighbours' misfit."""
+"""Robust standard deviations that define a spike, never reached by noise; ratio to the neighbours' misfit."""
 SPIKE_SHAPE, SPIKE_NOISE = 0.2, 4.0
-"""Share of a wrong value, and robust deviations, by which departures of its neighbours may differ."""
+"""Tolerance for deviations of its neighbours, as a fraction of a spike and in robust standard deviations."""
 SPIKE_SHARED, DRIVEN = 0.05, 0.5
-"""The motion jumped where another channel departs by this share of a value's own, or by the second beyond the
-range of the motion; a step of the torque is the cause of a departing acceleration from the second on."""
+"""A value is not a spike if another channel deviates by this fraction of it (by the second fraction, if it
+exceeds its range), or if a torque step accounts for the second fraction of a deviating acceleration."""
 FEWEST = 50
-"""Values that a scale is taken from."""
+"""Minimum number of values for estimating a scale."""
 SPIKE_VISIBLE = (0.01, 0.002)
-"""A spike is also this share of its own column's range, and of the largest range of the joints."""
+"""Minimum size of a spike as fractions of its column's range and of the largest range among the joints."""
 COARSE = 0.05
-"""Share of the velocity that the steps of an encoder may make up when positions are differentiated."""
+"""Fraction of the velocity that noise from encoder steps may reach when positions are differentiated."""
 
 
 def logged(log: Log) -> dict[str, Array]:
@@ -88,10 +87,10 @@ def logged(log: Log) -> dict[str, Array]:
 
 
 def check_finite(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find NaN and infinite values, by column."""
-    vectors, bad = logged(log), ~np.isfinite(log.t)
+    """Find NaN and infinite values."""
+    bad = ~np.isfinite(log.t)
     columns = ["t"] if bad.any() else []
-    for name, value in vectors.items():
+    for name, value in logged(log).items():
         wrong = ~np.isfinite(value)
         columns += [f"{name}.{log.joint_names[j]}" for j in np.flatnonzero(wrong.any(axis=0))]
         bad = bad | wrong.any(axis=1)
@@ -101,12 +100,10 @@ def check_finite(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_held(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find rows that repeat every channel while the arm moves."""
-    same = np.ones(len(log) - 1, bool)
-    for value in logged(log).values():
-        same &= (np.diff(value, axis=0) == 0.0).all(axis=1)
+    """Find rows in which every channel repeats its value while the arm moves."""
+    differs = np.any([np.diff(value, axis=0).any(axis=1) for value in logged(log).values()], axis=0)
     moving = np.abs(log.qd).max(axis=1)[1:] > 0.0
-    held = np.concatenate([[False], same & moving & (np.diff(log.segment) == 0)])
+    held = np.append(False, ~differs & moving & (np.diff(log.segment) == 0))
     if held.sum() < HELD_RUN:
         return [], log
     text = f"{int(held.sum())} rows ({100 * held.mean():.2g} %) repeat the one before:"
@@ -114,7 +111,7 @@ def check_held(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_stuck(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find channels that keep one value while the joint moves by more than their resolution."""
+    """Find channels that keep a constant value although the joint moves."""
     if not np.isfinite(log.dt):
         return [], log
     least, findings, bad = max(5, round(STUCK_SECONDS / log.dt)), [], np.zeros(len(log), bool)
@@ -126,25 +123,19 @@ def check_stuck(system: ConstrainedSystem, log: Log) -> Outcome:
             if (steps > 0.0).mean() < 0.1 or (still[j] and name != "tau"):
                 continue
             visible = STUCK_VISIBLE * np.ptp(np.percentile(x[log.usable], (0.5, 99.5)))
-            runs = [
-                (a, b + 1)
-                for a, b in intervals((steps == 0.0) & log.usable[1:] & log.usable[:-1])
-                if b - a >= least
+            runs, same = np.zeros(len(log), bool), (steps == 0.0) & log.usable[1:] & log.usable[:-1]
+            for a, b in ((a, b) for a, b in intervals(same) if b - a >= least):
                 # A torque that stays at its extreme is clipped, which is another finding.
-                and not (name == "tau" and x[a] in limits_of(x[log.usable]))
-                and _expected_change(log, name, j, a, b) > visible
-            ]
-            if runs:
-                spans = tuple(runs)
-                text = f"{name}.{joint} keeps one value while the arm moves, in {describe(spans)}"
-                findings.append(Finding("channel-stuck", text, spans, (joint,)))
-                for a, b in runs:
-                    bad[a:b] = True
+                clips = name == "tau" and x[a] in limits_of(x[log.usable])
+                runs[a : b + 1] = not clips and _expected_change(log, name, j, a, b) > visible
+            text = f"{name}.{joint} keeps one value while the arm moves, in"
+            findings += at_rows(runs, "channel-stuck", text, (joint,))
+            bad |= runs
     return findings, log.mask(bad) if findings else log
 
 
 def _expected_change(log: Log, name: str, j: int, a: int, b: int) -> float:
-    """Return the expected motion of a channel over rows a to b, judged by the channels of the same joint."""
+    """Return the expected change of a channel over rows a to b, given the other channels of the joint."""
     if name == "q":
         return float(np.ptp(np.cumsum(log.qd[a:b, j])) * log.dt)
     if name == "qd":
@@ -158,8 +149,8 @@ def _expected_change(log: Log, name: str, j: int, a: int, b: int) -> float:
 
 
 def check_spikes(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find single values far from the curve through their neighbours."""
-    bad, hit, joints, vectors = np.zeros(len(log), bool), [], [], logged(log)
+    """Find isolated values far from the curve through their neighbours."""
+    bad, hit, vectors = np.zeros(len(log), bool), [], logged(log)
     departures = {name: _departures(log, value) for name, value in vectors.items()}
     near = np.zeros(len(log), bool)
     for label in log.contact.values():  # next to a contact switch values jump by nature
@@ -180,14 +171,14 @@ def check_spikes(system: ConstrainedSystem, log: Log) -> Outcome:
         # The neighbours of a spike are off as well, by less.
         peak = outlier & (np.abs(departure) >= _within_two(np.abs(departure)))
         bad |= peak.any(axis=1)
-        joints += log.named(peak.any(axis=0))
-        hit += [f"{name}.{joint}" for joint in log.named(peak.any(axis=0))]
-    text = f"{int(bad.sum())} isolated outliers in {', '.join(hit[:4])}:"
-    return at_rows(bad, "spike", text, tuple(dict.fromkeys(joints)), rows=bad.sum()), log.mask(bad)
+        hit += [(name, joint) for joint in log.named(peak.any(axis=0))]
+    text = f"{int(bad.sum())} isolated outliers in {', '.join(map('.'.join, hit[:4]))}:"
+    joints = tuple(dict.fromkeys(joint for _, joint in hit))
+    return at_rows(bad, "spike", text, joints, rows=bad.sum()), log.mask(bad)
 
 
 def _departures(log: Log, value: Array) -> tuple[Array, Array, Array]:
-    """Return how far values and their neighbours depart `(n, nq)`, and the usual scale `(nq,)`."""
+    """Return the deviations of values and of their neighbours `(n, nq)`, and the usual scale `(nq,)`."""
     departure, around = np.zeros_like(value), np.zeros_like(value)
     for s in log.stretches:
         departure[s], around[s] = spikes(value[s])
@@ -199,23 +190,22 @@ def _departures(log: Log, value: Array) -> tuple[Array, Array, Array]:
 
 
 def _shocks(log: Log, departures: dict[str, tuple[Array, Array, Array]], name: str) -> np.ndarray:
-    """Return `(n, nq)` bool, values (not positions) that depart together, relative to their ranges."""
+    """Return the mask `(n, nq)` of values (not positions) that deviate together with other channels."""
     departure = departures[name][0]
     if name == "q":
         return np.zeros(departure.shape, bool)
     pair = ("tau", "qdd") if name in ("tau", "qdd") else (name,)
     size = {key: _size(log, key, *departures[key]) for key in pair if key in departures}
     confirmed = np.zeros(departure.shape, bool)
-    for j in range(departure.shape[1]):
+    for j, own in enumerate(size[name].T):
         others = [np.delete(part, j, axis=1) if key == name else part for key, part in size.items()]
-        most = np.concatenate([*others, np.zeros((len(departure), 1))], axis=1).max(axis=1)
-        own = size[name][:, j]
+        most = np.concatenate(others, axis=1).max(axis=1, initial=0.0)
         confirmed[:, j] = most > own * np.where(own < 1.0, SPIKE_SHARED, DRIVEN)
     return confirmed
 
 
 def _driven(system: ConstrainedSystem, log: Log, departure: Array, outlier: np.ndarray) -> np.ndarray:
-    """Return `(n, nq)` bool, accelerations that a step of the joint's own torque makes: Δτ_j (M⁻¹)_jj."""
+    """Return the mask `(n, nq)` of accelerations caused by a step in the joint's torque, Δτ_j (M⁻¹)_jj."""
     step = np.pad(np.abs(np.diff(log.tau, axis=0)), ((1, 1), (0, 0)))
     step, driven = np.maximum(step[:-1], step[1:]), np.zeros_like(outlier)
     rows = np.flatnonzero(outlier.any(axis=1))
@@ -227,13 +217,13 @@ def _driven(system: ConstrainedSystem, log: Log, departure: Array, outlier: np.n
 
 
 def _size(log: Log, name: str, departure: Array, around: Array, scale: Array) -> Array:
-    """Return the largest departure within two rows over the column's range; zero if it may be noise."""
+    """Return the largest deviation within two rows relative to the range; zero if it may be noise."""
     size, reach = np.abs(departure), log.reach(name)
     return _within_two(np.where(size > SPIKE * scale, size / np.maximum(reach, 1e-300), 0.0))
 
 
 def _one_value(departure: Array, scale: Array) -> np.ndarray:
-    """Return `(n, d)` bool, departures h beside −4h/6 and h/6, which one wrong value leaves, no kink."""
+    """Return the mask `(n, d)` of deviations h next to −4h/6 and h/6, which a kink does not cause."""
     around = np.lib.stride_tricks.sliding_window_view(np.pad(departure, ((2, 2), (0, 0))), 5, axis=0)
     misfit = np.abs(around - departure[..., None] * DEPARTURE).max(axis=-1)
     return misfit <= SPIKE_SHAPE * np.abs(departure) + SPIKE_NOISE * scale
@@ -247,7 +237,7 @@ def _within_two(x: Array) -> Array:
 
 
 def check_resolution(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find encoder steps so coarse that they dominate a differentiated position."""
+    """Find encoder steps so coarse that they add too much noise to differentiated positions."""
     q = log.q[log.usable]
     if len(q) < FEWEST:
         return [], log
@@ -255,26 +245,27 @@ def check_resolution(system: ConstrainedSystem, log: Log) -> Outcome:
     # A step Δ is noise of Δ/√12; the difference of two samples over dt has √2 of it.
     noise = step / np.sqrt(6.0) / log.dt
     speed = np.sqrt(np.mean(log.qd[log.usable] ** 2, axis=0))
-    coarse = np.flatnonzero((noise > COARSE * speed) & (step > 0.0))
-    if not len(coarse):
-        return [], log
-    joints = tuple(log.joint_names[j] for j in coarse)
-    worst = int(coarse[np.argmax(noise[coarse] / np.maximum(speed[coarse], 1e-300))])
+    coarse = (noise > COARSE * speed) & (step > 0.0)
+    worst = int(np.argmax(np.where(coarse, noise / np.maximum(speed, 1e-300), 0.0)))
     text = (
         f"positions come in steps of {step[worst]:.3g} rad ({log.joint_names[worst]}), which add noise of "
         f"{noise[worst]:.3g} rad/s to a velocity from neighbouring samples"
     )
-    return [log.finding("quantised", text, joints, step=step[worst])], log
+    joints = log.named(coarse)
+    return [log.finding("quantised", text, joints, step=step[worst])] if joints else [], log
 
 
 JUMP, FASTEST = 30.0, 2.0
-"""A jump exceeds so many robust standard deviations of the steps, fifteen at each of two rows, and the change
-of the fastest joint within a step by this factor."""
+"""A jump exceeds this many robust standard deviations of the steps (fifteen at each of two rows), and the
+change of the fastest joint within a step by this factor."""
 
 
-def _jumps(x: Array, rate: Array, log: Log) -> np.ndarray:
-    """Return `(n, nq)` bool, rows at which a column jumps."""
-    surplus, usable = np.zeros_like(x), log.usable
+def _jumps(log: Log, value: str, derivative: str) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Return `(n,)` bool, rows at which a column jumps, and the joints; none if a column is derived."""
+    x, rate, usable = getattr(log, value), getattr(log, derivative), log.usable
+    if log.derived & {value, derivative}:
+        return np.zeros(len(log), bool), ()
+    surplus = np.zeros_like(x)
     for s in log.stretches:  # what the rate does not account for
         mean = 0.5 * (rate[s][1:] + rate[s][:-1])
         surplus[s][1:] = np.diff(x[s], axis=0) - mean * np.diff(log.t[s])[:, None]
@@ -285,25 +276,20 @@ def _jumps(x: Array, rate: Array, log: Log) -> np.ndarray:
     fastest = float(np.percentile(np.abs(rate[usable]), 99.9)) * log.dt
     big = (np.abs(surplus) > JUMP * scale) & (np.abs(surplus) > FASTEST * fastest)
     # Where the column itself does not change faster than usual, its rate is at fault, not the position.
-    return big & (change > JUMP * np.median(change[usable], axis=0)) & usable[:, None]
+    jumps = big & (change > JUMP * np.median(change[usable], axis=0)) & usable[:, None]
+    return np.asarray(jumps.any(axis=1)), log.named(jumps.any(axis=0))
 
 
 def check_jumps(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find position jumps that the velocity does not explain: missing rows, or a wrapped joint."""
-    if "qd" in log.derived:
-        return [], log
-    jumps = _jumps(log.q, log.qd, log)
-    at, joints = np.asarray(jumps.any(axis=1)), log.named(jumps.any(axis=0))
+    """Find position jumps that the velocity does not explain, due to missing rows or wrapped angles."""
+    at, joints = _jumps(log, "q", "qd")
     findings = at_rows(at, "position-jump", f"the position of {', '.join(joints)} jumps at", joints)
     return findings, log.replace(segment=log.segment + np.cumsum(at))
 
 
 def check_impacts(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find velocity jumps that the acceleration does not explain: impacts."""
-    if log.derived:
-        return [], log
-    jumps = _jumps(log.qd, log.qdd, log)
-    around, joints = np.asarray(jumps.any(axis=1)), log.named(jumps.any(axis=0))
+    """Find impacts, where the velocity jumps by more than the acceleration explains."""
+    around, joints = _jumps(log, "qd", "qdd")
     findings = at_rows(around, "impact", "the velocity jumps, as at an impact, at", joints)
     around[:-1] |= around[1:]
     return findings, log.mask(around)

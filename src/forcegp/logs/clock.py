@@ -1,5 +1,5 @@
-"""Time stamps: units, steps back, restarts, gaps, repeated and held rows; streams of different rates on one
-clock, and uneven clocks made even.
+"""Processing of time stamps: backward steps, restarts, gaps, repeated and held rows, alignment of streams
+with different rates, and resampling of uneven clocks.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from forcegp.logs.table import Array, ImportReport, Signals
 from forcegp.rows import describe, numbered
 
 RESTART_STEPS, SHORTEST_TRAJECTORY = 2.0, 10
-"""A clock that falls back to within this many steps of the start of its trajectory, or before, has restarted,
-after this many rows at least; fewer are stamps out of order.
+"""A clock has restarted if it falls back to at most this many steps after the start of its trajectory, and
+the trajectory has at least this many rows; otherwise, time stamps are out of order.
 """
 GAP_STEPS = 5.0
-"""Number of usual steps beyond which a step is a gap."""
+"""Multiple of the usual step above which a step counts as a gap."""
 
 
 def usual_step(t: Array) -> float:
-    """Return the median of the positive time steps [s]; `DataError` if time never increases."""
+    """Return the median of the positive time steps [s]; raise `DataError` if time never increases."""
     steps = np.diff(t)
     steps = steps[steps > 0.0]
     if not len(steps):
@@ -37,37 +37,38 @@ def usual_step(t: Array) -> float:
 
 
 def drop_repeated(signals: Signals, report: ImportReport) -> None:
-    """Drop rows that repeat the previous one; `DataError` if only the stamp is the same."""
-    same = np.concatenate([[False], np.diff(signals.t) == 0.0])
+    """Drop rows that repeat the previous row; raise `DataError` if only the time stamp is repeated."""
+    same = np.append(False, np.diff(signals.t) == 0.0)
     if not same.any():
         return
-    equal = same.copy()
-    for values in signals.vectors.values():
-        equal[1:] &= (values[1:] == values[:-1]).all(axis=1)
+    equal = same & _repeats(signals, *signals.vectors)
     different = np.flatnonzero(same & ~equal)
     if len(different):
         rows = signals.row[different]
-        raise DataError(
-            f"{describe(numbered(rows))}: the time stamp of the row before, with other values",
-            expected="one row per time stamp",
-            got=f"{len(rows)} such rows",
-            hint="is this the correct time column? Its resolution may be too coarse",
-        )
+        text = f"{describe(numbered(rows))}: the time stamp of the row before, with other values"
+        hint = "is this the correct time column? Its resolution may be too coarse"
+        raise DataError(text, expected="one row per time stamp", got=f"{len(rows)} such rows", hint=hint)
     report.find("repeated", f"{equal.sum()} repeated rows were dropped", signals.row[equal])
     signals.keep(~equal)
 
 
+def _repeats(signals: Signals, *names: str) -> NDArray[np.bool_]:
+    """Return the rows in which some vectors have the values of the previous row."""
+    differs = [np.diff(signals.vectors[name], axis=0).any(axis=1) for name in names]
+    return np.append(False, ~np.any(differs, axis=0))
+
+
 def split_trajectories(signals: Signals, gap: float | None, report: ImportReport) -> None:
-    """Number the trajectories, which begin at a new number in the log, at a clock restart, and after a step
-    longer than `gap` [s], by default `GAP_STEPS` usual steps.
+    """Number the trajectories. A new one begins if the number in the log changes, if the clock restarts, or
+    after a step longer than `gap` [s], by default `GAP_STEPS` usual steps.
 
     Raises:
-        DataError: time steps back without a restart; the message lists the rows.
+        DataError: time runs backward without a restart; the message lists the rows.
     """
     t = signals.t
     step = usual_step(t)
-    new = np.concatenate([[True], signals.segment[1:] != signals.segment[:-1]])
-    back = np.concatenate([[False], np.diff(t) < 0.0]) & ~new
+    new = np.append(True, np.diff(signals.segment) != 0)
+    back = np.append(False, np.diff(t) < 0.0) & ~new
     if back.any():
         start, wrong = 0, []
         for row in np.flatnonzero(back | new):
@@ -82,13 +83,10 @@ def split_trajectories(signals: Signals, gap: float | None, report: ImportReport
                 got=f"{t[wrong[0]]:.9g} s",
                 hint="sort the log by time, or use a time column that increases within a trajectory",
             )
-        report.find(
-            "restart",
-            f"the clock restarts {back.sum()} times: each restart begins a trajectory",
-            signals.row[back],
-        )
+        message = f"the clock restarts {back.sum()} times: each restart begins a trajectory"
+        report.find("restart", message, signals.row[back])
     longest = gap if gap is not None else GAP_STEPS * step
-    gaps = np.concatenate([[False], np.diff(t) > longest]) & ~new & ~back
+    gaps = np.append(False, np.diff(t) > longest) & ~new & ~back
     if gaps.any():
         message = f"{gaps.sum()} gaps longer than {longest:.4g} s: a new trajectory begins after each"
         report.find("gap", message, signals.row[gaps])
@@ -96,12 +94,8 @@ def split_trajectories(signals: Signals, gap: float | None, report: ImportReport
 
 
 def find_held(signals: Signals, drop: bool, report: ImportReport) -> None:
-    """Find, and drop if requested, rows repeated because the logger is faster than its source."""
-    held = np.zeros(len(signals), dtype=bool)
-    held[1:] = signals.segment[1:] == signals.segment[:-1]
-    for name in ("q", "tau"):
-        values = signals.vectors[name]
-        held[1:] &= (values[1:] == values[:-1]).all(axis=1)
+    """Find rows repeated because the logger is faster than its source, and drop them if requested."""
+    held = np.append(False, np.diff(signals.segment) == 0) & _repeats(signals, "q", "tau")
     if held.any():
         done = "were dropped" if drop else 'are kept; held = "drop" under [time] drops them'
         message = f"{held.sum()} rows repeat the values of the previous row and {done}"
@@ -113,14 +107,12 @@ def find_held(signals: Signals, drop: bool, report: ImportReport) -> None:
 def join_stream(
     signals: Signals, name: str, t: Array, values: Array, gap: float | None, report: ImportReport
 ) -> None:
-    """Add an interpolated vector from a stream with stamps t `(k,)`; rows outside its range are dropped."""
+    """Add a vector interpolated from a stream with time stamps t `(k,)`, and drop rows outside its range."""
     back = np.flatnonzero(np.diff(t) <= 0.0)
     if len(back):
-        raise DataError(
-            f"the stream of {name} has a clock that does not increase in row {back[0] + 1}",
-            expected="increasing stamps, to align it with the positions",
-            hint="import the trajectories separately",
-        )
+        text = f"the stream of {name} has a clock that does not increase in row {back[0] + 1}"
+        expected = "increasing stamps, to align it with the positions"
+        raise DataError(text, expected=expected, hint="import the trajectories separately")
     longest = gap if gap is not None else GAP_STEPS * usual_step(t)
     after = np.searchsorted(t, signals.t, side="left").clip(1, len(t) - 1)
     covered = (signals.t >= t[0]) & (signals.t <= t[-1])
@@ -142,20 +134,20 @@ def join_stream(
 
 
 UNEVEN = 0.02
-"""Largest relative deviation of a time step from the usual one that counts as even."""
+"""Largest relative deviation of time steps from the median for which sampling counts as even."""
 SMOOTH = ("q", "qd")
-"""Quantities interpolated by a cubic spline; noisier quantities are interpolated linearly."""
+"""Quantities interpolated by cubic splines; noisier quantities are interpolated linearly."""
 
 
 def onto(t: Array, values: Array, at: Array, cubic: bool = False) -> Array:
-    """Interpolate values `(n, d)` with time stamps t at other times, linearly or by a cubic spline."""
+    """Interpolate values `(n, d)` with time stamps t at times `at`, linearly or by a cubic spline."""
     from scipy.interpolate import CubicSpline, make_interp_spline
 
     return CubicSpline(t, values)(at) if cubic and len(t) >= 4 else make_interp_spline(t, values, k=1)(at)
 
 
 def even_clock(signals: Signals, period: float | None, report: ImportReport) -> None:
-    """Resample uneven trajectories with the step `period` [s], by default the usual one."""
+    """Resample uneven trajectories with the step `period` [s], by default the usual step."""
     stretches = [rows for rows in signals.runs() if rows.stop - rows.start > 1]
     if not stretches:
         raise DataError("the log has no trajectory of two rows or more")
@@ -166,22 +158,22 @@ def even_clock(signals: Signals, period: float | None, report: ImportReport) -> 
     elif period is None:
         return
     step = period if period is not None else usual_step(signals.t)
-    grids, nearest = [], []
     length = sum(float(signals.t[rows.stop - 1] - signals.t[rows.start]) for rows in stretches)
     most = max(limits.FREE_ROWS, limits.TABLE_EXPANSION * len(signals))
     check_count(report.source, "rows on an even clock", math.ceil(min(length / step, 2.0**62)), most)
+    parts = []
     for rows in stretches:
         t = signals.t[rows]
         count = int(np.floor((t[-1] - t[0]) / step + 1e-6)) + 1
-        grids.append(np.minimum(t[0] + step * np.arange(count), t[-1]))
-        nearest.append(np.searchsorted(t, grids[-1] + 0.5 * step).clip(1, len(t)) - 1 + rows.start)
+        grid = np.minimum(t[0] + step * np.arange(count), t[-1])
+        nearest = np.searchsorted(t, grid + 0.5 * step).clip(1, len(t)) - 1 + rows.start
+        parts.append((rows, t, grid, nearest))
     for name in list(signals.vectors):
         old = signals.vectors.pop(name)
-        pairs = zip(stretches, grids, strict=True)
-        parts = [onto(signals.t[s], old[s], grid, cubic=name in SMOOTH) for s, grid in pairs]
-        signals.vectors[name] = np.concatenate(parts)
-    index: NDArray[np.int64] = np.concatenate(nearest)
+        new = [onto(t, old[rows], grid, cubic=name in SMOOTH) for rows, t, grid, _ in parts]
+        signals.vectors[name] = np.concatenate(new)
+    index: NDArray[np.int64] = np.concatenate([nearest for *_, nearest in parts])
     signals.contact = {name: value[index] for name, value in signals.contact.items()}
-    signals.t, signals.row = np.concatenate(grids), signals.row[index]
-    signals.segment = signals.segment[index]
+    signals.t = np.concatenate([grid for _, _, grid, _ in parts])
+    signals.row, signals.segment = signals.row[index], signals.segment[index]
     report.steps.append(f"resampled to steps of {step:.9g} s (positions by cubic splines, torques linearly)")

@@ -1,8 +1,8 @@
-"""Files of named arrays: NumPy archives without pickled objects, HDF5 and MATLAB.
+"""Readers of files with named arrays: NumPy archives without pickled objects, HDF5 and MATLAB.
 
-MATLAB files of version 7.3 are read as HDF5 files, and version 4 by SciPy. For versions 5 to 7, every tag is
-checked before it is followed, since SciPy's reader crashes on some damaged files; the layout is that of
-"MAT-File Format" (MathWorks), chapter 1. Links out of an HDF5 file are not followed.
+MATLAB files of version 7.3 are read as HDF5 files, and those of version 4 by SciPy. In versions 5 to 7, every
+tag is checked before it is followed, since SciPy's reader crashes on some damaged files; for the layout, see
+"MAT-File Format" (MathWorks), chapter 1. Links to other files from an HDF5 file are not followed.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ def read_numpy(path: Path, **_: object) -> LogTable:
 
 
 def _array(source: str, name: str, file: Any, size: int) -> Arrays:
-    """Return an array, or the fields of a structured one, by name, after a check of the declared size."""
+    """Return an array, or the fields of a structured array, by name, after checking the declared size."""
     form = np.lib.format
     version = form.read_magic(file)  # pyright: ignore[reportArgumentType]
     read_header = {(1, 0): form.read_array_header_1_0, (2, 0): form.read_array_header_2_0}.get(version)
@@ -57,26 +57,22 @@ def _array(source: str, name: str, file: Any, size: int) -> Arrays:
         raise DataError(f"{source}: version {version} of the NumPy format is not read")
     shape, fortran, dtype = read_header(file)  # pyright: ignore[reportArgumentType]
     if dtype.hasobject:
-        raise DataError(
-            f"{source}: refused, because an array of Python objects is a pickle, which can run code",
-            expected="an array of numbers",
-            hint="save each quantity as a separate array",
-        )
+        text = f"{source}: refused, because an array of Python objects is a pickle, which can run code"
+        hint = "save each quantity as a separate array"
+        raise DataError(text, expected="an array of numbers", hint=hint)
     count = int(np.prod(shape, dtype=object)) if shape else 1
     guards.check_count(source, "numbers", count, limits.LOG_VALUES)
     if count * dtype.itemsize > size:
-        raise DataError(
-            f"{source}: the declared size of the array exceeds the file", got=f"{shape} of {dtype}"
-        )
+        text = f"{source}: the declared size of the array exceeds the file"
+        raise DataError(text, got=f"{shape} of {dtype}")
     data = file.read(count * dtype.itemsize)
     array = np.frombuffer(data, dtype=dtype, count=count).reshape(shape, order="F" if fortran else "C")
-    if dtype.names:
-        return {f"{name}.{field}".lstrip("."): array[field] for field in dtype.names}
-    return {name: array}
+    names = {field: f"{name}.{field}".lstrip(".") for field in dtype.names or ()}
+    return {title: array[field] for field, title in names.items()} or {name: array}
 
 
 def read_hdf5(path: Path, **_: object) -> LogTable:
-    """Read the numeric data sets of an HDF5 file; those in groups are named `group/name`."""
+    """Read the numeric data sets in an HDF5 file; those in groups are named `group/name`."""
     remarks: list[str] = []
     return table.table_of_arrays(path, "hdf5", _hdf5_arrays(path, "/", remarks), remarks)
 
@@ -92,7 +88,7 @@ def _hdf5_arrays(path: Path, separator: str, remarks: list[str]) -> Arrays:
 def _walk(
     h5py: Any, group: Any, prefix: str, separator: str, arrays: Arrays, remarks: list[str], seen: set[Any]
 ) -> None:
-    """Collect the data sets in a group without duplicates due to links."""
+    """Collect the data sets in a group, omitting duplicates due to links."""
     if prefix.count(separator) > limits.GROUP_DEPTH:
         raise DataError(f"{group.file.filename}: groups are nested too deeply", got=prefix[:200])
     for key in group:
@@ -103,8 +99,7 @@ def _walk(
             remarks.append(f"{name!r} is a link and was not followed")
             continue
         item = group[key]
-        mark = h5py.h5o.get_info(item.id).addr
-        if mark in seen:
+        if (mark := h5py.h5o.get_info(item.id).addr) in seen:
             continue
         seen.add(mark)
         guards.check_count(group.file.filename, "objects", len(seen), limits.COLUMNS)
@@ -131,14 +126,14 @@ def _take(item: Any, name: str, arrays: Arrays, remarks: list[str]) -> None:
 HEADER_BYTES = 128
 MATRIX, COMPRESSED, INT8, UTF8 = 14, 15, 1, 16
 DTYPES = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 7: "f4", 9: "f8", 12: "i8", 13: "u8"}
-"""NumPy types for numeric element types."""
+"""NumPy types that correspond to numeric element types."""
 STRUCT, NUMERIC = 2, range(6, 16)
 OTHER_CLASSES = {1: "cell", 3: "object", 4: "char", 5: "sparse", 16: "function", 17: "opaque"}
 COMPLEX = 0x08
 
 
 class Variable(NamedTuple):
-    """A named array (`struct.field` in a struct), or the reason why it cannot be read."""
+    """A named array (`struct.field` for the field of a struct), or the reason why it cannot be read."""
 
     name: str
     value: NDArray[np.generic] | str
@@ -150,25 +145,23 @@ class _Element(NamedTuple):
 
 
 def variables(content: bytes, source: str) -> Iterator[Variable]:
-    """Return the variables of a file in order from its content; `source` is its name in messages."""
+    """Yield the variables in the content of a file, in order; `source` is the file name for messages."""
     order = {b"IM": "<", b"MI": ">"}.get(content[126:128])
     if order is None:
         raise DataError(f"{source}: not a MATLAB file of versions 5 to 7", got=content[:20])
-    return _Reader(source, order).variables(memoryview(content))
+    left = min(guards.allowed_bytes(len(content)), limits.TABLE_BYTES)
+    return _Reader(source, order, left).variables(memoryview(content))
 
 
 class _Reader:
-    def __init__(self, source: str, order: str) -> None:
-        self.source, self.order, self.count, self.left = source, order, 0, 0
+    def __init__(self, source: str, order: str, left: int) -> None:
+        self.source, self.order, self.count, self.left = source, order, 0, left
 
     def variables(self, content: memoryview) -> Iterator[Variable]:
-        self.left = min(guards.allowed_bytes(len(content)), limits.TABLE_BYTES)
         for element in self.elements(content[HEADER_BYTES:]):
             if element.kind == COMPRESSED:
                 element = self.next(self.elements(self.inflated(element.body)))
-            if element.kind != MATRIX:
-                raise self.damaged("a variable", f"an element of type {element.kind}")
-            yield from self.matrix(element.body)
+            yield from self.matrix(element, "a variable")
 
     def inflated(self, body: memoryview) -> memoryview:
         stream = zlib.decompressobj()
@@ -177,14 +170,13 @@ class _Reader:
         except zlib.error as cause:
             raise self.damaged("compressed data", str(cause)) from cause
         if stream.unconsumed_tail:
-            raise DataError(
-                f"{self.source}: a variable inflates to more than the {self.left:,} bytes that are left"
-            )
+            text = f"a variable inflates to more than the {self.left:,} bytes that are left"
+            raise DataError(f"{self.source}: {text}")
         self.left -= len(content)
         return memoryview(content)
 
     def elements(self, content: memoryview) -> Iterator[_Element]:
-        """Yield consecutive elements, aligned to eight bytes; short ones are within their tag."""
+        """Yield consecutive elements, which are aligned to eight bytes; short ones are part of their tag."""
         at = 0
         while at < len(content):
             if len(content) - at < 8:
@@ -206,16 +198,18 @@ class _Reader:
             raise self.damaged("a further element", "the end of the variable")
         return element
 
-    def matrix(self, body: memoryview, field: str = "", depth: int = 0) -> Iterator[Variable]:
-        """Yield a variable or the field of a struct; for a struct, its fields."""
+    def matrix(self, element: _Element, what: str, field: str = "", depth: int = 0) -> Iterator[Variable]:
+        """Yield a variable or a field of a struct or, if it is itself a struct, all of its fields."""
+        if element.kind != MATRIX:
+            raise self.damaged(what, f"an element of type {element.kind}")
         if depth > limits.GROUP_DEPTH:
             raise DataError(f"{self.source}: structs are nested more than {limits.GROUP_DEPTH} levels deep")
         self.count += 1
         guards.check_count(self.source, "variables and fields", self.count, limits.COLUMNS)
-        if not len(body):
+        if not len(element.body):
             yield Variable(field, "holds nothing")
             return
-        parts = self.elements(body)
+        parts = self.elements(element.body)
         flags = self.numbers(self.next(parts))
         if not len(flags):
             raise self.damaged("the class of an array", "nothing")
@@ -224,8 +218,10 @@ class _Reader:
             yield Variable(field, f"is of class {OTHER_CLASSES[kind]}")
             return
         shape = tuple(int(x) for x in self.numbers(self.next(parts)))
-        name = self.text(self.next(parts))
-        name = field or name
+        title = self.next(parts)
+        if title.kind not in (INT8, UTF8):
+            raise self.damaged("a name", f"an element of type {title.kind}")
+        name = field or bytes(title.body).decode("utf-8", "replace")
         if kind == STRUCT and math.prod(shape) == 1:
             yield from self.fields(parts, name, depth)
         elif kind in NUMERIC:
@@ -240,11 +236,8 @@ class _Reader:
         if length <= 0 or len(names) % length or len(names) // length > limits.COLUMNS:
             raise self.damaged("the names of a struct's fields", f"{len(names)} bytes in steps of {length}")
         for start in range(0, len(names), length):
-            element = self.next(parts)
-            if element.kind != MATRIX:
-                raise self.damaged("a field of a struct", f"an element of type {element.kind}")
             field = names[start : start + length].split(b"\0")[0].decode("utf-8", "replace")
-            yield from self.matrix(element.body, f"{struct}.{field}", depth + 1)
+            yield from self.matrix(self.next(parts), "a field of a struct", f"{struct}.{field}", depth + 1)
 
     def array(self, element: _Element, shape: tuple[int, ...]) -> NDArray[np.generic]:
         values = self.numbers(element)
@@ -260,25 +253,19 @@ class _Reader:
             raise self.damaged(f"numbers of {dtype.itemsize} bytes", f"{len(element.body)} bytes")
         return np.frombuffer(element.body, dtype).astype(dtype.newbyteorder("="), copy=False)
 
-    def text(self, element: _Element) -> str:
-        if element.kind not in (INT8, UTF8):
-            raise self.damaged("a name", f"an element of type {element.kind}")
-        return bytes(element.body).decode("utf-8", "replace")
-
     def damaged(self, expected: str, got: str) -> DataError:
         return DataError(f"{self.source}: the MATLAB file is damaged", expected=expected, got=got)
 
 
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
-"""HDF5 signature, which follows a header of 512 bytes in version 7.3."""
+"""HDF5 signature, which in version 7.3 follows a header of 512 bytes."""
 
 
 def read_matlab(path: Path, **_: object) -> LogTable:
-    """Read the numeric arrays of a MATLAB file, with fields as `struct.field`; remark on others."""
+    """Read the numeric arrays in a MATLAB file, naming fields `struct.field`; note any other variables."""
     with path.open("rb") as file:
         head = file.read(520)
-    remarks: list[str] = []
-    arrays: Arrays = {}
+    arrays, remarks = Arrays(), list[str]()
     if HDF5_MAGIC in (head[:8], head[512:520]):  # version 7.3: names as in MATLAB, and axes in its order
         arrays = {name: array.T for name, array in _hdf5_arrays(path, ".", remarks).items()}
     else:
@@ -294,7 +281,7 @@ def read_matlab(path: Path, **_: object) -> LogTable:
 
 
 def _version4(path: Path) -> Iterator[Variable]:
-    """Yield the variables of a version 4 file, which has no structs."""
+    """Yield the variables in a version 4 file, which has no structs."""
     from scipy.io import loadmat, whosmat
 
     listing = whosmat(path)

@@ -1,20 +1,19 @@
-"""ROS 1 and ROS 2 bags and MCAP files: joint states and wrenches as columns, without a ROS installation.
+"""Reader of ROS 1 and ROS 2 bags and MCAP files, which needs no ROS installation.
 
-Columns of a joint state: `position.<joint>`, `velocity.<joint>`, `effort.<joint>`. Columns of a wrench:
-`force.x` to `torque.z`. Both have `header`, the stamp of the driver [s], and `receive`, the time of recording
-[s], each relative to the earliest one in the log, since float64 does not resolve nanoseconds since 1970.
-
-Message layouts are those of the ROS distributions; definitions stored in a bag are not compiled.
+Joint states become the columns `position.<joint>`, `velocity.<joint>` and `effort.<joint>`, and wrenches the
+columns `force.x` to `torque.z`. Both also have `header`, the time stamp of the driver [s], and `receive`, the
+time of recording [s], each relative to the earliest one in the log, since float64 cannot resolve nanoseconds
+since 1970. Message layouts are those of the ROS distributions; definitions stored in a bag are not compiled.
 """
 
 from __future__ import annotations
 
 import io
 import re
-from collections import Counter
 from collections.abc import Callable, Iterable, Iterator
 from dataclasses import dataclass, field
 from functools import cache
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -29,13 +28,13 @@ JOINT_STATE = "sensor_msgs/msg/JointState"
 WRENCH = "geometry_msgs/msg/WrenchStamped"
 KINDS = (JOINT_STATE, WRENCH)  # that are read
 UNITS = {"position": "rad", "velocity": "rad/s", "effort": "Nm", "force": "N", "torque": "Nm"}
-"""Units of a joint state (REP 103) and of a wrench."""
+"""Units in joint states (REP 103) and wrenches."""
 CLOCKS = ("header", "receive")
-"""Time columns of every topic."""
+"""Time columns of each topic."""
 
 Decode = Callable[[bytes], Any]
 Found = tuple[str, str, str, int, bytes, int]
-"""Topic, type, encoding, recording time [ns] and content of a message, and the amount read so far."""
+"""Topic, type, encoding, recording time [ns] and content of a message, and the amount of data read so far."""
 
 
 def canonical(kind: str) -> str:
@@ -50,7 +49,7 @@ def canonical(kind: str) -> str:
 
 @cache
 def decoder(kind: str, encoding: str) -> Decode:
-    """Return a decoder for messages of a type in `KINDS`, in the encoding `ros1` or `cdr`."""
+    """Return a decoder for messages of a type in `KINDS` with the encoding `ros1` or `cdr`."""
     typesys = optional_module("rosbags.typesys", "Reading ROS messages", "import")
     first = encoding == "ros1"
     store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC if first else typesys.Stores.ROS2_HUMBLE)
@@ -60,7 +59,7 @@ def decoder(kind: str, encoding: str) -> Decode:
 
 @dataclass
 class Messages:
-    """Messages of a topic with the same columns, their time stamps and recording times [ns]."""
+    """Messages of a topic that have the same columns, with their time stamps and recording times [ns]."""
 
     topic: str
     columns: tuple[str, ...]
@@ -68,7 +67,7 @@ class Messages:
     stamps: list[tuple[int, int]] = field(default_factory=list)
 
     def stream(self, name: str, origin: np.ndarray, wanted: Wanted) -> Stream:
-        """Return the requested numeric columns, with times from `origin` [ns]."""
+        """Return the requested columns, with times [s] relative to `origin` [ns]."""
         stamps = (np.array(self.stamps, dtype=np.int64) - origin) * 1e-9
         order = np.argsort(stamps[:, 1], kind="stable")
         columns: dict[str, Column] = dict(zip(CLOCKS, np.ascontiguousarray(stamps[order].T), strict=True))
@@ -81,7 +80,7 @@ class Messages:
 
 @dataclass
 class Collector:
-    """Collects the messages of a bag in one stream per topic and set of joints."""
+    """Collects the messages in a bag, in one stream for each topic and set of joints."""
 
     source: str
     unpacking: Unpacking
@@ -97,11 +96,11 @@ class Collector:
                 self._add(topic, kind, receive_ns, raw, decoder(kind, encoding))
             if progress is not None and self.unpacking.records % 1024 == 0:
                 progress(done, total)
-            if rows is not None and self.rows >= rows:
+            if rows is not None and any(len(stream.rows) >= rows for stream in self._streams.values()):
                 return
 
     def _add(self, topic: str, kind: str, receive_ns: int, raw: bytes, decode: Decode) -> None:
-        """Add a message; `DataError` if it is too large, or its arrays do not match its joint names."""
+        """Add a message; raise `DataError` if it is too large, or its arrays do not match its joint names."""
         check_count(self.source, "bytes in one message", len(raw), limits.MESSAGE_BYTES)
         message = decode(raw)
         if kind == JOINT_STATE:
@@ -117,29 +116,20 @@ class Collector:
         check_count(self.source, "numbers", self._numbers, limits.LOG_VALUES)
         check_count(self.source, "streams", len(self._streams), limits.LOG_STREAMS)
 
-    @property
-    def rows(self) -> int:
-        """Rows of the longest stream so far."""
-        return max((len(stream.rows) for stream in self._streams.values()), default=0)
-
     def table(self, format_: str, topics: dict[str, str], wanted: Wanted) -> LogTable:
-        """Return the log with the requested columns; `topics` are all topics of the bag with their types."""
+        """Return the log with the requested columns; `topics` maps all topics in the bag to their types."""
         if not self._streams:
             listing = ", ".join(f"{topic} ({kind})" for topic, kind in topics.items())
-            raise DataError(
-                f"{self.source}: no messages of a supported type",
-                expected=" or ".join(KINDS),
-                got=listing[:600] or "no topics",
-            )
+            text, got = f"{self.source}: no messages of a supported type", listing[:600] or "no topics"
+            raise DataError(text, expected=" or ".join(KINDS), got=got)
         found = sorted(self._streams.values(), key=lambda s: (s.topic, -len(s.rows)))
         origin = np.min([np.min(np.array(stream.stamps), axis=0) for stream in found], axis=0)
-        taken: Counter[str] = Counter()
         streams = []
-        for stream in found:
-            taken[stream.topic] += 1
-            number = f"#{taken[stream.topic]}" if taken[stream.topic] > 1 else ""
-            streams.append(stream.stream(f"{stream.topic}{number}", origin, wanted))
-            stream.rows.clear()
+        for topic, group in groupby(found, key=lambda stream: stream.topic):
+            for number, stream in enumerate(group, start=1):
+                name = f"{topic}#{number}" if number > 1 else topic
+                streams.append(stream.stream(name, origin, wanted))
+                stream.rows.clear()
         unread = [f"{t} ({k})" for t, k in topics.items() if canonical(k) not in KINDS]
         remarks = [f"topics of other types were not read: {', '.join(unread)[:600]}"] if unread else []
         remarks.append(f"time 0 is {origin[0] * 1e-9:.9f} s on the clock of the headers")
@@ -147,7 +137,7 @@ class Collector:
 
 
 def _joint_state(source: str, topic: str, message: Any) -> dict[str, float]:
-    """Return position, velocity and effort of each joint by column, NaN for empty quantities."""
+    """Return the position, velocity and effort of each joint by column, with NaN for empty quantities."""
     names = tuple(str(name)[: limits.LOG_NAME] for name in message.name)
     if not names or len(set(names)) < len(names):
         raise DataError(f"{source}: a joint state on {topic} has no joint names, or one twice", got=names[:8])
@@ -155,17 +145,15 @@ def _joint_state(source: str, topic: str, message: Any) -> dict[str, float]:
     for quantity in ("position", "velocity", "effort"):
         numbers = getattr(message, quantity)
         if len(numbers) not in (0, len(names)):
-            raise DataError(
-                f"{source}: a joint state on {topic} has {len(numbers)} values of {quantity}",
-                expected=f"one for each of its {len(names)} joints, or none",
-            )
+            text = f"{source}: a joint state on {topic} has {len(numbers)} values of {quantity}"
+            raise DataError(text, expected=f"one for each of its {len(names)} joints, or none")
         numbers = numbers if len(numbers) else [np.nan] * len(names)
         values |= {f"{quantity}.{name}": float(x) for name, x in zip(names, numbers, strict=True)}
     return values
 
 
 def read_bag(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read the joint states and wrenches of a bag of ROS 1 or ROS 2, or of an MCAP file."""
+    """Read the joint states and wrenches in a ROS 1 bag, a ROS 2 bag or an MCAP file."""
     files = _files(path) if path.is_dir() else [path]
     unpacking = Unpacking(str(path), sum(file.stat().st_size for file in files))
     collector, topics = Collector(str(path), unpacking), dict[str, str]()
@@ -190,7 +178,7 @@ def read_bag(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress
 
 
 def _messages(bag: Any, encoding: str, unpacking: Unpacking) -> Iterator[Found]:
-    """Yield the messages of supported types from a ROS 1 or ROS 2 bag."""
+    """Yield the messages of supported types in a ROS 1 or ROS 2 bag."""
     check_count(unpacking.source, "topics", len(bag.connections), limits.LOG_STREAMS)
     check_count(unpacking.source, "messages", bag.message_count, limits.LOG_MESSAGES)
     used = [c for c in bag.connections if canonical(c.msgtype) in KINDS]
@@ -201,23 +189,20 @@ def _messages(bag: Any, encoding: str, unpacking: Unpacking) -> Iterator[Found]:
 
 
 def _files(path: Path) -> list[Path]:
-    """Return the files of a bag folder without its description; `DataError` if they are compressed."""
+    """Return the files in a bag folder except its description; raise `DataError` if they are compressed."""
     description = path / "metadata.yaml"
     files = within(path, sorted(file for file in path.iterdir() if file.is_file()))
     check_count(str(description), "bytes", description.stat().st_size, limits.LISTING_BYTES)
     text = description.read_text(encoding="utf-8", errors="replace")
-    compression = re.search(r"compression_mode:\s*[\"']?(file|message)", text, re.IGNORECASE)
-    if compression:
-        raise DataError(
-            f"{path}: the bag is compressed by {compression[1].lower()}",
-            expected="a bag without compression, or MCAP with compressed chunks",
-            hint="unpack it with `ros2 bag convert`",
-        )
+    if compression := re.search(r"compression_mode:\s*[\"']?(file|message)", text, re.IGNORECASE):
+        text = f"{path}: the bag is compressed by {compression[1].lower()}"
+        expected = "a bag without compression, or MCAP with compressed chunks"
+        raise DataError(text, expected=expected, hint="unpack it with `ros2 bag convert`")
     return [file for file in files if file != description]
 
 
 def _mcap_messages(path: Path, unpacking: Unpacking, topics: dict[str, str]) -> Iterator[Found]:
-    """Yield the messages of an MCAP file in file order, and add its topics with their types."""
+    """Yield the messages in an MCAP file in file order, and add its topics and their types to `topics`."""
     records = optional_module("mcap.records", "Reading MCAP files", "import")
     schemas, channels = {}, {}
     with path.open("rb") as file:
@@ -235,7 +220,7 @@ def _mcap_messages(path: Path, unpacking: Unpacking, topics: dict[str, str]) -> 
 
 
 def _mcap_records(file: io.BufferedReader, unpacking: Unpacking) -> Iterator[Any]:
-    """Yield the records of an MCAP file in file order, unpacking one chunk at a time, record by record."""
+    """Yield the records in an MCAP file in file order, unpacking one chunk at a time."""
     records = optional_module("mcap.records", "Reading MCAP files", "import")
     streams = optional_module("mcap.stream_reader", "Reading MCAP files", "import")
     reader = streams.StreamReader(file, emit_chunks=True, record_size_limit=limits.RECORD_BYTES)
@@ -245,14 +230,13 @@ def _mcap_records(file: io.BufferedReader, unpacking: Unpacking) -> Iterator[Any
             continue
         content = unpacking.unpack(record.data, record.compression)
         part = streams.ReadDataStream(io.BytesIO(content))
+        kinds = {streams.Opcode.SCHEMA: records.Schema, streams.Opcode.CHANNEL: records.Channel}
         while part.count < len(content):
             opcode, size = part.read1(), part.read8()
             unpacking.record()
             if opcode == streams.Opcode.MESSAGE:
                 yield records.Message.read(part, size)
-            elif opcode == streams.Opcode.SCHEMA:
-                yield records.Schema.read(part)
-            elif opcode == streams.Opcode.CHANNEL:
-                yield records.Channel.read(part)
+            elif opcode in kinds:
+                yield kinds[opcode].read(part)
             else:
                 part.read(size)

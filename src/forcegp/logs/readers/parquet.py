@@ -1,6 +1,6 @@
-"""Parquet tables, with vectors in one column or one column per number, and LeRobot data sets.
+"""Readers of Parquet tables, with vectors in list columns or in separate columns, and of LeRobot data sets.
 
-A LeRobot data set, version 2.1 or 3, is a folder with `meta/info.json` and Parquet files of episodes.
+A LeRobot data set (version 2.1 or 3) is a folder with `meta/info.json` and the Parquet files of its episodes.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ BATCH_ROWS = 1 << 16
 
 
 def read_parquet(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read the columns of numbers, flags and times; a list column becomes `name[0]`, `name[1]`, …"""
+    """Read the columns that contain numbers, flags and times; list columns become `name[0]`, `name[1]`, …"""
     remarks: list[str] = []
     with guards.foreign(str(path), "Parquet"):
         columns = read_columns([path], wanted, rows, remarks, progress)
@@ -36,7 +36,7 @@ def read_parquet(path: Path, *, wanted: Wanted, rows: int | None, progress: Prog
 def read_columns(
     paths: list[Path], wanted: Wanted, rows: int | None, remarks: list[str], progress: Progress | None
 ) -> dict[str, Column]:
-    """Return concatenated columns of files, lists by name or `name[i]`; `remarks` lists omitted columns."""
+    """Return the concatenated columns of files, with lists as `name[i]`; add omitted columns to `remarks`."""
     import pyarrow.parquet as pq
 
     chunks: dict[str, list[Column]] = {}
@@ -70,7 +70,7 @@ def read_columns(
 
 
 def _check(path: Path, file: object, names: set[str]) -> int:
-    """Return the number of rows of a file after a check of the declared size of its columns."""
+    """Return the number of rows in a file after checking the declared size of its columns."""
     shape = file.metadata  # pyright: ignore[reportAttributeAccessIssue]
     guards.check_count(str(path), "columns", shape.num_columns, limits.COLUMNS)
     groups = [shape.row_group(i) for i in range(shape.num_row_groups)]
@@ -92,11 +92,11 @@ def _readable(file: object, wanted: Wanted, remarks: list[str]) -> list[str]:
         kind = field.type.value_type if listed else field.type
         numeric = kinds.is_floating(kind) or kinds.is_integer(kind) or kinds.is_boolean(kind)
         selected = wanted(field.name) or (listed and any(wanted(f"{field.name}[{i}]") for i in range(64)))
+        remark = f"column {field.name!r} of type {field.type} was left out"
         if selected and (numeric or (kinds.is_timestamp(kind) and not listed)):
             names.append(field.name)
-        elif selected:
-            remark = f"column {field.name!r} of type {field.type} was left out"
-            remarks += [remark] if remark not in remarks else []
+        elif selected and remark not in remarks:
+            remarks.append(remark)
     return names
 
 
@@ -118,13 +118,10 @@ def _expand(source: str, name: str, values: pa.Array) -> dict[str, Column]:
         return {name: pc.cast(values, pa.float64(), safe=False).to_numpy(zero_copy_only=False)}
     lengths = pc.call_function("list_value_length", [values]).to_numpy(zero_copy_only=False)
     width = int(lengths[0]) if len(lengths) and lengths[0] == lengths[0] else 0
-    if len(lengths) and not (lengths == width).all():
-        row = int(np.flatnonzero(lengths != width)[0])
-        raise DataError(
-            f"{source}: column {name!r} has lists of different length",
-            expected=f"{width} numbers in every row",
-            got=f"{lengths[row]} in row {row}",
-        )
+    if (other := lengths != width).any():
+        row, text = int(np.argmax(other)), f"{source}: column {name!r} has lists of different length"
+        got = f"{lengths[row]} in row {row}"
+        raise DataError(text, expected=f"{width} numbers in every row", got=got)
     guards.check_count(source, "columns", width, limits.COLUMNS)
     flat = pc.cast(values.flatten(), pa.float64(), safe=False).to_numpy(zero_copy_only=False)
     numbers = flat.reshape(len(values), width)
@@ -132,25 +129,21 @@ def _expand(source: str, name: str, values: pa.Array) -> dict[str, Column]:
 
 
 MAX_INFO_BYTES = 4 << 20
-"""Size of the description of a data set."""
+"""Maximum size of the description of a data set."""
 
 
 def read_lerobot(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read the numbers of all episodes, with the names in `meta/info.json`: `observation.state.<motor>`."""
-    description, *files = within(
-        path, [path / "meta" / "info.json", *sorted((path / "data").rglob("*.parquet"))]
-    )
+    """Read the numbers in all episodes, named as in `meta/info.json`, such as `observation.state.<motor>`."""
+    listed = path / "meta" / "info.json", *sorted((path / "data").rglob("*.parquet"))
+    description, *files = within(path, listed)
     guards.check_count(str(description), "bytes", description.stat().st_size, MAX_INFO_BYTES)
     try:
         features = json.loads(description.read_text(encoding="utf-8"))["features"]
         if not isinstance(features, dict):
             raise TypeError("features is not a table")
     except (ValueError, KeyError, TypeError, RecursionError) as cause:
-        raise DataError(
-            f"{description}: not the description of a LeRobot data set",
-            expected="JSON with 'features'",
-            got=str(cause)[:200],
-        ) from cause
+        text = f"{description}: not the description of a LeRobot data set"
+        raise DataError(text, expected="JSON with 'features'", got=str(cause)[:200]) from cause
     guards.check_count(str(path), "files", len(files), limits.LOG_FILES)
     if not files:
         raise DataError(f"{path}: no episodes", expected=f"Parquet files below {path / 'data'}")
@@ -167,7 +160,7 @@ def read_lerobot(path: Path, *, wanted: Wanted, rows: int | None, progress: Prog
 
 
 def _motors(description: Any) -> list[str]:
-    """Return the names of the values of a feature, a list or a list under one key such as `motors`."""
+    """Return the names of a feature's values, given as a list, possibly under a key such as `motors`."""
     names = description.get("names") if isinstance(description, dict) else None
     if isinstance(names, dict) and len(names) == 1:
         names = next(iter(names.values()))

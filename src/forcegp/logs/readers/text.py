@@ -1,8 +1,8 @@
-"""CSV and text tables with any separator, decimal mark and heading, read in blocks, and folders of such
+"""Readers of CSV and text tables with any separator, decimal mark and headings, and of folders of such
 files.
 
-The format of a table is inferred from its first lines. In a folder, each file contains one quantity: `q.txt`,
-…
+The format of a table is inferred from its first lines. In a folder, each file contains one quantity, such as
+`q.txt`.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ if TYPE_CHECKING:
 
 
 SAMPLE_BYTES, SAMPLE_LINES = 1 << 18, 200
-"""Size of the inspected part of a file, and number of lines of numbers that must agree."""
+"""Size of the part of a file that is inspected, and number of data lines that must agree in format."""
 
 SEPARATORS = (";", "\t", ",", "|", " ")
-"""Candidates; a space stands for any run of blanks."""
+"""Candidate separators; a space stands for any run of blanks."""
 MISSING = ("", "nan", "NaN", "NAN", "null", "NULL", "NA", "N/A", "None", "-nan", "#N/A")
 """Fields that mark a missing value."""
 
@@ -41,8 +41,8 @@ _UNIT = re.compile(r"^[\[(]?\s*([A-Za-zµ°%][\w°²^/*·. -]{0,15}|-|1)?\s*[\])
 
 @dataclass(frozen=True)
 class Dialect:
-    """Format of a text table from `first_line` on: columns are `number`, `bool`, `date`, `text` or
-    `empty`."""
+    """Format of a text table that begins at `first_line`; columns are of type `number`, `bool`, `date`,
+    `text` or `empty`."""
 
     encoding: str
     separator: str
@@ -58,24 +58,20 @@ def sniff(path: Path) -> Dialect:
     with path.open("rb") as file:
         head = file.read(SAMPLE_BYTES)
     text, encoding = _decode(path, head)
-    lines = text.splitlines()
-    if len(head) == SAMPLE_BYTES:
-        lines = lines[:-1]
+    lines = text.splitlines()[: -1 if len(head) == SAMPLE_BYTES else None]
     if not any(line.strip() for line in lines):
         raise DataError(f"{path}: the file is empty" if not head else f"{path}: a line is too long")
-    best = max((_try(lines, s, d) for s in SEPARATORS for d in ".," if s != d), key=lambda item: item[0])
-    score, separator, decimal, first = best
+    tried = (_try(lines, s, d) for s in SEPARATORS for d in ".," if s != d)
+    score, separator, decimal, first = max(tried, key=lambda item: item[0])
     if score <= 0:
-        raise DataError(
-            f"{path}: no table of numbers was found",
-            expected="lines of numbers with one separator, after an optional heading",
-            got=repr(lines[0][:120]),
-        )
+        expected = "lines of numbers with one separator, after an optional heading"
+        text = f"{path}: no table of numbers was found"
+        raise DataError(text, expected=expected, got=repr(lines[0][:120]))
     return _dialect(path, lines, encoding, separator, decimal, first)
 
 
 def split(line: str, separator: str) -> list[str]:
-    """Split a line into fields without surrounding blanks and quotation marks.
+    """Split a line into fields, removing surrounding blanks and quotation marks.
 
     >>> split("a;  b ;", ";")
     ['a', 'b', '']
@@ -84,11 +80,15 @@ def split(line: str, separator: str) -> list[str]:
     return [part.strip().strip('"').strip() for part in parts]
 
 
-def is_number(field: str, decimal: str = ".") -> bool:
-    """Return whether a field is a number or marks a missing one."""
+def kind_of(field: str, decimal: str = ".") -> str:
+    """Return the kind of a field as in `Dialect`; a missing value is `empty`."""
     if field in MISSING:
-        return True
-    return bool((_COMMA_NUMBER if decimal == "," else _NUMBER).match(field))
+        return "empty"
+    if (_COMMA_NUMBER if decimal == "," else _NUMBER).match(field):
+        return "number"
+    if field.lower() in ("true", "false"):
+        return "bool"
+    return "date" if _DATE.match(field) else "text"
 
 
 def _decode(path: Path, head: bytes) -> tuple[str, str]:
@@ -105,32 +105,25 @@ def _decode(path: Path, head: bytes) -> tuple[str, str]:
 
 
 def _try(lines: list[str], separator: str, decimal: str) -> tuple[float, str, str, int]:
-    """Return the score of a separator and a decimal mark: number times fraction of fields with a value."""
+    """Return the score of a separator and a decimal mark: the number times the fraction of valid fields."""
     kept = [(i, split(line, separator)) for i, line in enumerate(lines) if line.strip()]
-    rows = [(i, fields) for i, fields in kept if _numeric(fields, decimal)]
-    if not rows:
+    first = next((i for i, fields in kept if _numeric(fields, decimal)), None)
+    if first is None:
         return 0.0, separator, decimal, 0
-    first = rows[0][0]
     after = [fields for i, fields in kept if i >= first][:SAMPLE_LINES]
     width = len(after[0])
-    values = sum(_is_value(f, decimal) for fields in after for f in fields) / len(after)
+    values = sum(f != "" and kind_of(f, decimal) != "text" for fields in after for f in fields) / len(after)
     # A comma inside numbers, taken for a separator, leaves fields such as "5;2" that are not values.
     score = values**2 / width + (0.01 if decimal == "." else 0.0)
     return (score if all(len(fields) == width for fields in after) else 0.0), separator, decimal, first
 
 
-def _is_value(field: str, decimal: str) -> bool:
-    special = bool(_DATE.match(field)) or field.lower() in ("true", "false")
-    return field != "" and (special or is_number(field, decimal))
-
-
 def _numeric(fields: list[str], decimal: str) -> bool:
-    """Return whether a line contains values: at least one number, and text only in a minority of fields."""
+    """Return whether a line contains values, that is, numbers or dates in more than half of its fields."""
     if fields and fields[0].startswith(("#", "%", "//")):
         return False
-    values = [f for f in fields if f not in MISSING]
-    good = sum(is_number(f, decimal) or bool(_DATE.match(f)) for f in values)
-    return good > 0 and 2 * good > len(values)
+    kinds = [kind for kind in (kind_of(f, decimal) for f in fields) if kind != "empty"]
+    return 2 * sum(kind in ("number", "date") for kind in kinds) > len(kinds)
 
 
 def _dialect(
@@ -145,41 +138,29 @@ def _dialect(
     units: dict[str, str] = {}
     names = [str(i) for i in range(width)]
     if above:
-        heading, unit_line = above[-1], None
-        if len(above) > 1 and all(_UNIT.match(f) for f in above[-1]) and any("[" in f for f in above[-1]):
-            heading, unit_line = above[-2], above[-1]
+        below = all(_UNIT.match(f) for f in above[-1]) and any("[" in f for f in above[-1])
+        heading, unit_line = above[-2:] if below and len(above) > 1 else (above[-1], ())
         heading = [*heading, *[""] * (width - len(heading))]
         names = [name[: limits.LOG_NAME] or f"column {i}" for i, name in enumerate(heading)]
-        pairs = zip(names, unit_line or [], strict=False)
+        pairs = zip(names, unit_line, strict=False)
         units = {name: unit.strip("[]() ") for name, unit in pairs if unit.strip("[]() ")}
-    for name in names:
-        if names.count(name) > 1:
-            text = f"{path}: column {name!r} occurs more than once"
-            raise DataError(text, hint="rename one of the columns")
-    kinds = tuple(_kind([row[i] for row in rows if i < len(row)], decimal) for i in range(width))
+    if twice := next((name for name in names if names.count(name) > 1), None):
+        text = f"{path}: column {twice!r} occurs more than once"
+        raise DataError(text, hint="rename one of the columns")
+    columns = ({kind_of(row[i], decimal) for row in rows if i < len(row)} - {"empty"} for i in range(width))
+    kinds = tuple("text" if len(kinds) > 1 else next(iter(kinds), "empty") for kinds in columns)
     return Dialect(encoding, separator, decimal, first, tuple(names), kinds, units)
 
 
-def _kind(fields: list[str], decimal: str) -> str:
-    values = [f for f in fields if f not in MISSING]
-    if all(is_number(f, decimal) for f in values):
-        return "number" if values else "empty"
-    if all(f.lower() in ("true", "false") for f in values):
-        return "bool"
-    if all(_DATE.match(f) for f in values):
-        return "date"
-    return "text"
-
-
 BLOCK_BYTES = 4 << 20
-"""Size of the text parsed at a time."""
+"""Size of the blocks in which text is parsed."""
 
 _BLANKS = re.compile(rb"[ \t]+")
 _EDGES = re.compile(rb"(?m)^ | (?=\r?$)")
 
 
 def read_text(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read a text table; text columns are omitted with a remark."""
+    """Read a text table; text columns are skipped with a note."""
     dialect = sniff(path)
     kinds = {n: kind for n, kind in zip(dialect.names, dialect.kinds, strict=True) if wanted(n)}
     remarks = [f"column {n!r} contains text and was ignored" for n, kind in kinds.items() if kind == "text"]
@@ -203,7 +184,7 @@ def read_text(path: Path, *, wanted: Wanted, rows: int | None, progress: Progres
 
 
 def _batches(source: _Blocks, dialect: Dialect, kinds: dict[str, str]) -> Iterator[pa.RecordBatch]:
-    """Yield batches of rows of the selected columns."""
+    """Yield batches of rows with the selected columns."""
     import pyarrow as pa
     from pyarrow import csv
 
@@ -228,7 +209,7 @@ def _batches(source: _Blocks, dialect: Dialect, kinds: dict[str, str]) -> Iterat
 
 
 def _numbers(values: pa.Array, kind: str) -> Column:
-    """Convert a column to float64: dates to seconds since the epoch, true and false to 1 and 0."""
+    """Convert a column to float64: dates to seconds since 2020, true and false to 1 and 0."""
     import pyarrow as pa
     import pyarrow.compute as pc
 
@@ -240,11 +221,11 @@ def _numbers(values: pa.Array, kind: str) -> Column:
 
 
 DATE_ORIGIN_NS = 1_577_836_800_000_000_000
-"""2020-01-01 in nanoseconds since the epoch, the origin of times given as dates."""
+"""Origin of times given as dates: 2020-01-01 in nanoseconds since the epoch."""
 
 
 class _Blocks(io.RawIOBase):
-    """A binary file for the parser, which counts the bytes read and collapses runs of blanks."""
+    """A binary file passed to the parser, which counts the bytes read and collapses runs of blanks."""
 
     def __init__(self, file: IO[bytes], dialect: Dialect, size: int, progress: Progress | None) -> None:
         self._file, self._size, self._progress = file, size, progress
@@ -271,11 +252,11 @@ class _Blocks(io.RawIOBase):
 
 
 ENDINGS = (".txt", ".csv", ".tsv", ".dat", ".asc")
-"""Suffixes of the files to read; others in the folder are ignored."""
+"""Suffixes of the files to read; other files in the folder are ignored."""
 
 
 def read_folder(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read the tables of a folder as `file[i]` or `file.heading`; tables of equal length form one stream."""
+    """Read the tables in a folder as `file[i]` or `file.heading`; tables of equal length form one stream."""
 
     def in_file(file: Path, column: str) -> str:
         return f"{file.stem}[{column}]" if column.isdigit() else f"{file.stem}.{column}"

@@ -1,4 +1,4 @@
-/* Compares @name@.c with the values of forcegp; 0 if all agree. */
+/* Compares @name@.c with the values computed by forcegp; returns 0 if all agree. */
 #include <math.h>
 #include <stdio.h>
 #include "@name@.h"
@@ -14,8 +14,8 @@ static double worse(double most, double ours, double theirs, double scale, int r
 
 static double in_mean = 0.0, in_covariance = 0.0;
 
-/* largest difference of a mean in units of max(|mean|, std), and of its covariance; what is below ZERO of the largest
- * component is compared with that */
+/* largest difference in the mean, in units of max(|mean|, std), and in its covariance; these units are at least ZERO
+ * times those of the largest component */
 static void compare(int n, const @real@ *m, const @real@ *C, const double *mean, const double *covariance) {
   double std[D + 6], size[D + 6], most = 0.0, widest = 0.0;
   for (int a = 0; a < n; ++a) {
