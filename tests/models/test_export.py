@@ -324,6 +324,20 @@ def test_states_beyond_the_training_data_are_flagged_without_learned_noise(name:
     assert inside is not None and float(inside.max()) < 1.0
 
 
+def test_the_trained_region_is_that_of_the_last_fit() -> None:
+    robot = forcegp.load_robot("kuka_iiwa")
+    model = forcegp.StructuredGP(
+        forcegp.ConstrainedSystem(robot), "analytical", [JointFrictionPrior()], noise=0.1
+    )
+    slow = free_log(robot, 20)
+    fast, few = slow.replace(qd=3.0 * slow.qd), forcegp.LearningOptions(max_evaluations=2)
+    first = model.fit(slow, learn=[])
+    second = model.fit(fast, learn=["joint_friction"], after=first, options=few)
+    before, after = (x.predict(fast.q, fast.qd, fast.tau).beyond for x in (first, second))
+    assert before is not None and after is not None
+    assert float(before.max()) > 2.0 and float(after.max()) < 1.0
+
+
 def test_friction_of_the_joints() -> None:
     fit = fitted("free_inertial")
     state, _ = states(fit)

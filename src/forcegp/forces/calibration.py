@@ -183,7 +183,8 @@ def _torque_noise(
 
 def calibrated_noise(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return torque noise calibrated on held-out samples, the trained region, and error growth beyond it."""
-    load, (qd, tau) = problem.typical_load(), _speeds_and_torques(problem.training)
+    load, training = problem.typical_load(), problem.training
+    qd, tau = (torch.cat([getattr(m, name) for m in training.measurements]) for name in ("qd", "tau"))
     # Rounding to steps h has the variance h²/12.
     rounding = torch.from_numpy(resolution(tau.cpu().numpy())).to(tau) / math.sqrt(12.0)
     least = problem.hidden_torque()
@@ -193,18 +194,6 @@ def calibrated_noise(problem: Problem, hyperparameters: Mapping[str, Tensor]) ->
     grows = torch.where(hidden, grows.maximum(UNSHOWN * load), grows)
     region = trained_region(qd, tau, load, hidden, problem.power * len(qd))
     return {**noise, **region, GROWTH: grows}
-
-
-def region_of(problem: Problem) -> dict[str, Tensor]:
-    """Return the region of speeds and torques of the training data, where no noise is calibrated."""
-    training = problem.training.evenly(MOST_RESIDUALS)
-    load = dataclasses.replace(problem, training=training).typical_load()
-    return trained_region(*_speeds_and_torques(training), load)
-
-
-def _speeds_and_torques(training: Training) -> tuple[Tensor, Tensor]:
-    qd, tau = (torch.cat([getattr(m, name) for m in training.measurements]) for name in ("qd", "tau"))
-    return qd, tau
 
 
 def held_out_torque_std(problem: Problem, hyperparameters: Mapping[str, Tensor], least: Tensor) -> Tensor:

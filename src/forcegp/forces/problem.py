@@ -19,7 +19,7 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError
 from forcegp.forces.measurements import Training
 from forcegp.forces.noise import TORQUE_NOISE, ForceNoise, SampleNoise, state_jacobian
-from forcegp.forces.posterior import ForcePosterior, ForceProcess, hidden_variance
+from forcegp.forces.posterior import ForcePosterior, ForceProcess, hidden_variance, trained_region
 from forcegp.forces.priors.base import ANALYTICAL, MIXING, NOISE, RESERVED, ForceMean, ForcePrior
 from forcegp.forces.priors.contact import CoulombErrorPrior, CoulombFriction, coulomb_of
 from forcegp.forces.projection import WhitenedRows, combine, whiten
@@ -42,6 +42,9 @@ SHOWN = 10.0
 UNSHOWN = 0.1
 """Uncertainty of a joint's torque and friction, as a fraction of its load, if no measurement is sensitive to
 them, and its growth per training standard deviation beyond the trained region; 0.08 on a real iiwa 14."""
+
+REGION_STATES = 10_000
+"""Maximum number of training states for the trained region."""
 
 
 def kernel_parameters(tensors: Mapping[str, Tensor]) -> Tensors:
@@ -238,6 +241,14 @@ class Problem:
         states = [m.at(self.system) for m in self.training.measurements]
         squares = [at.tau**2 + at.eom.Q_G**2 + at.eom.Q_C**2 for at in states]
         return torch.cat(squares).mean(0).sqrt()
+
+    @cached_property
+    @torch.no_grad()
+    def region(self) -> dict[str, Tensor]:
+        """Region of speeds and torques of the training data, from `REGION_STATES` of them at most."""
+        training = self.training.evenly(REGION_STATES)
+        qd, tau = (torch.cat([getattr(m, name) for m in training.measurements]) for name in ("qd", "tau"))
+        return trained_region(qd, tau, dataclasses.replace(self, training=training).typical_load())
 
     def negative_log_likelihood(self, params: Tensors, rows: WhitenedRows) -> Tensor:
         """Return the negative log likelihood of the rows, in weight space if sparse and priors are finite."""

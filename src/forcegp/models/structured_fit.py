@@ -16,11 +16,11 @@ from forcegp.constraints.compiled_system import compiled_system
 from forcegp.data import Dataset
 from forcegp.errors import ModelError, check_name
 from forcegp.files import Record
-from forcegp.forces.calibration import region_of
 from forcegp.forces.external_wrench import WrenchFrame
 from forcegp.forces.measurements import Observation, Training
 from forcegp.forces.noise import TORQUE_NOISE, learned_slopes
 from forcegp.forces.posterior import (
+    GROWTH,
     LOW,
     ForcePosterior,
     distance_beyond,
@@ -185,7 +185,8 @@ class StructuredFit(FittedModel):
     ) -> ExportedModel:
         if functions is not None and functions < 1:
             raise ModelError("a posterior has one function at least", expected="1 or more", got=functions)
-        parts = self.system, self.posterior, self.hyperparameters, self.noise, self.torque_std
+        tensors = {**self.hyperparameters, **self._region}
+        parts = self.system, self.posterior, tensors, self.noise, self.torque_std
         learned, std = self.hyperparameters.get(TORQUE_NOISE), self.problem.torque_std
         std = learned.exp() if learned is not None else 0.0 if std is None else std
         variance = torch.zeros_like(self.system.robot.mass) + std**2
@@ -254,7 +255,14 @@ class StructuredFit(FittedModel):
         """Return the distance of the speed and torque of each joint beyond the training data, in training
         standard deviations `(*batch, nq)`; `None` for a model from a file without the trained region.
         """
-        return distance_beyond(self.hyperparameters, qd, tau) if LOW in self.hyperparameters else None
+        region = self._region
+        return distance_beyond(region, qd, tau) if LOW in region else None
+
+    @property
+    def _region(self) -> Mapping[str, Tensor]:
+        """Return the trained region: that of the calibrated noise or, without it, of the training data."""
+        calibrated = GROWTH in self.hyperparameters or not self.training.samples
+        return self.hyperparameters if calibrated else self.problem.region
 
     def force_field(self) -> ForceField:
         """Return the posterior mean of Q̄ = Q + Q_z as a force field."""
@@ -397,9 +405,8 @@ class StructuredFit(FittedModel):
         return cls(*unpack(header, tensors, system, source), added)
 
     def record(self) -> tuple[Record, dict[str, Tensor]]:
-        settings, tensors = pack(
-            self.specification, self.problem, self.hyperparameters, self.posterior, self.result
-        )
+        values = {**self.hyperparameters, **self._region}
+        settings, tensors = pack(self.specification, self.problem, values, self.posterior, self.result)
         tensors |= {"added": torch.cat(self.added)} if self.added else {}
         return settings, tensors | {f"noise_std.{name}": std for name, std in self.noise.items()}
 
@@ -515,8 +522,6 @@ def conditioned(
     Raises:
         NumericalError: the covariance of the data is not positive definite.
     """
-    if LOW not in hyperparameters:
-        hyperparameters = {**hyperparameters, **region_of(problem)}
     measured = enumerate(problem.training.measurements)
     noise = {m.quantity: typical(problem.noise_at(hyperparameters, i)) for i, m in measured}
     posterior, constant = forces or forces_and_constant(*problem.with_coulomb_errors(hyperparameters))
