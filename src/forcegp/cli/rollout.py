@@ -140,7 +140,8 @@ def _spread(q: Tensor) -> Tensor:
 
 def _as_data(path: forcegp.Rollout, log: forcegp.Dataset, dt: float) -> forcegp.Dataset:
     """Return a data set with the simulated motion, up to a divergence, and the logged motion."""
-    length = len(path.t) if not path.diverged else round(path.diverged[0].t / dt) + 1
+    # A prediction that diverges between two rows ends at the first of them.
+    length = min([len(path.t), *(round(diverged.t / dt) + 1 for diverged in path.diverged[:1])])
     extras = {"q_logged": log.q, "qd_logged": log.qd}
     if path.samples is not None and path.samples.rows > 1:
         extras["q_std"] = _spread(path.samples.q)
