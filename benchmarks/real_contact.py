@@ -35,6 +35,7 @@ from real_cases import evenly, existing, iiwa14, moving
 from results_page import table
 from scipy.ndimage import binary_dilation
 from scipy.signal import savgol_coeffs, savgol_filter
+from sensed_forces import with_sensed_forces
 from torch import Tensor
 
 import forcegp
@@ -42,7 +43,7 @@ from forcegp import kinematics
 from forcegp.checks import clipped_torques
 from forcegp.data.derivative import cross_validated_window
 from forcegp.errors import DataError
-from forcegp.models.sensed import SENSOR, with_sensed_forces
+from forcegp.models.sensed import SENSOR
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.robust import MAD_TO_STD
 

@@ -27,6 +27,7 @@ from numpy.typing import NDArray
 from real_cases import moving
 from results_page import table
 from solver_arms import ARMS, STEP, Arm, Imperfections, case_of
+from sysid_peer import identified
 
 import forcegp
 from forcegp.dynamics import inverse_dynamics, mass_matrix
@@ -45,7 +46,7 @@ mujoco = optional_module("mujoco", "This benchmark")
 WRONG = Imperfections(mass=0.3, gain=0.0, offset=0.0)
 """Links off by up to 30 %, undeclared friction and drives; torque sensors are right."""
 RIGHT = replace(WRONG, mass=0.0, drive=0.0, dry=0.0, viscous=0.0)
-FORMATS = ("urdf", "xml")
+FORMATS, SYSID = ("urdf", "xml"), "mujoco.sysid"
 SAMPLES, SMALLEST = 200, 1e-6
 """Sampled robots, and the least eigenvalue of the information on a base parameter, over the largest."""
 STARTS, AHEAD = 30, 1.0
@@ -66,15 +67,15 @@ def simulated(robot: RobotModel) -> Any:
     return model
 
 
-def torques(robot: RobotModel, log: forcegp.Dataset) -> Array:
-    """Inverse dynamics of a robot file along a log, dry friction against the motion."""
-    model = simulated(robot)
+def torques(model: Any, log: forcegp.Dataset) -> Array:
+    """Inverse dynamics of a MuJoCo model along a log, dry friction against the motion."""
+    dry = model.dof_frictionloss.copy()
     model.dof_frictionloss[:] = 0.0
     data, found = mujoco.MjData(model), []
     for q, qd, qdd in zip(log.q.numpy(), log.qd.numpy(), log.qdd.numpy(), strict=True):
         data.qpos[:], data.qvel[:], data.qacc[:] = q, qd, qdd
         mujoco.mj_inverse(model, data)
-        found.append(data.qfrc_inverse + robot.friction.numpy() * np.sign(qd))
+        found.append(data.qfrc_inverse + dry * np.sign(qd))
     return np.array(found)
 
 
@@ -131,8 +132,8 @@ def tip_error(robot: RobotModel, file: RobotModel, log: forcegp.Dataset) -> floa
     return float((there - was).norm(dim=-1).median())
 
 
-def measured(name: str, seed: int, wrong: Imperfections, folder: Path) -> dict:
-    """Errors of the original file, the calibrated one and least squares on another motion."""
+def measured(name: str, seed: int, wrong: Imperfections, folder: Path, *, sysid: bool = False) -> dict:
+    """Errors of the original file, the calibrated one and the peers on another motion."""
     robot = forcegp.load_robot(name)
     arm = Arm(robot, wrong, np.random.default_rng(seed))
     case = case_of(name, arm, folder)
@@ -144,10 +145,12 @@ def measured(name: str, seed: int, wrong: Imperfections, folder: Path) -> dict:
         write_calibrated(fit, source, folder / f"calibrated.{kind}")
         files[kind] = forcegp.load_robot(folder / f"calibrated.{kind}")
     rows = moving(test)
-    errors = {key: torques(each, rows) - rows.tau.numpy() for key, each in files.items()}
+    errors = {key: torques(simulated(each), rows) - rows.tau.numpy() for key, each in files.items()}
     squares = identify_rigid(case.system, case.train)
     rigid = inverse_dynamics(squares.system.robot, rows.q, rows.qd, rows.qdd)
     errors["least squares"] = (rigid + squares.losses(rows.qd) - rows.tau).numpy()
+    if sysid:
+        errors[SYSID] = torques(identified(robot, case.train), rows) - rows.tau.numpy()
     rmse = {key: np.sqrt((error**2).mean(0)) for key, error in errors.items()}
     tip = {key: tip_error(robot, each, test) for key, each in files.items()}
     found: dict[str, Any] = {
@@ -163,6 +166,10 @@ def measured(name: str, seed: int, wrong: Imperfections, folder: Path) -> dict:
             "worst_joint_over_least_squares": float(by_squares.max()),
             "tip_over_file": tip[kind] / tip["file"],
         }
+        if sysid:
+            by_sysid = rmse[kind] / rmse[SYSID]
+            found[kind]["over_sysid"] = float(np.exp(np.log(by_sysid).mean()))
+            found[kind]["worst_joint_over_sysid"] = float(by_sysid.max())
     return found
 
 
@@ -173,22 +180,27 @@ def main() -> None:
     parser.add_argument("--arm", choices=ARMS, nargs="*", default=list(ARMS))
     parser.add_argument("--seed", type=int, nargs="*", default=[0, 1, 2, 3, 4])
     parser.add_argument("--right-file", action="store_true", help="arms whose file is right")
+    parser.add_argument("--sysid", action="store_true", help=f"{SYSID} too (sysid_peer.py; minutes for each)")
     parser.add_argument("--json", type=Path, help="write all results to this file")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
     torch.set_num_threads(1)
     result = {}
-    keys = ("over_file", "over_least_squares", "worst_joint_over_least_squares", "tip_over_file")
+    keys = ["over_file", "over_least_squares", "worst_joint_over_least_squares", "tip_over_file"]
+    keys += ["over_sysid", "worst_joint_over_sysid"] if options.sysid else []
     rows = []
     for name in options.arm:
         for seed in options.seed:
             with tempfile.TemporaryDirectory() as folder:
                 wrong = RIGHT if options.right_file else WRONG
-                found = result[f"{name}, seed {seed}"] = measured(name, seed, wrong, Path(folder))
+                found = result[f"{name}, seed {seed}"] = measured(
+                    name, seed, wrong, Path(folder), sysid=options.sysid
+                )
             for kind in FORMATS:
                 rows.append([f"{name}, seed {seed}", kind, *(f"{found[kind][key]:.3f}" for key in keys)])
                 print(*rows[-1], flush=True)
     head = ["arm, seed", "format", "torque ÷ file", "÷ least squares", "worst joint", "tip after 1 s ÷ file"]
+    head += [f"÷ {SYSID}", "worst joint"] if options.sysid else []
     print(table(head, rows))
     for kind in ("base", "friction"):
         z = np.abs(np.concatenate([found["deviations"][kind] for found in result.values()]))

@@ -195,10 +195,14 @@ def live():
     def show(readings: np.ndarray, forces: np.ndarray) -> None:
         ax.clear()
         n = min(len(readings), len(forces))
+        t = readings[-n:, 0]
         for i, name in enumerate("xyz"):
-            ax.plot(readings[-n:, 0], readings[-n:, 1 + i], label=f"f{name} [N]")
-            ax.plot(readings[-n:, 0], forces[-n:, i], "k--", lw=0.5)
-        ax.legend(loc="upper left")
+            force, std = readings[-n:, 1 + i], readings[-n:, 4 + i]
+            (line,) = ax.plot(t, force, label=f"f{name}, ±2σ")
+            ax.fill_between(t, force - 2 * std, force + 2 * std, color=line.get_color(), alpha=0.2)
+            ax.plot(t, forces[-n:, i], "k--", lw=0.5, label="" if i else "true")
+        ax.set(xlabel="time [s]", ylabel="force [N]")
+        ax.legend(loc="upper left", ncols=2)
         plt.pause(0.001)
 
     return show

@@ -1,7 +1,7 @@
 """Forward dynamics of robot arms, free or in contact, with Gaussian-process priors on the unknown forces.
 
-The public names in `__init__.pyi` are imported on first use: `import forcegp` alone does not load PyTorch, so
-the command line starts quickly.
+The public names listed in `__init__.pyi` are imported on first use. Since `import forcegp` alone does not
+load PyTorch, the command line starts quickly.
 """
 
 import lazy_loader

@@ -1,4 +1,4 @@
-"""`python -m forcegp` runs the command line even if the script `forcegp` is not on the path."""
+"""Run the command line with `python -m forcegp`, even if the script `forcegp` is not on the path."""
 
 from forcegp.cli import main
 

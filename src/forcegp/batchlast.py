@@ -1,8 +1,8 @@
 """Arithmetic on many small vectors and matrices, with the batch as the last dimension.
 
-Public tensors have their batch first. Inside kinematics and dynamics it is last and flat, so that one
-element-wise operation runs along memory over all samples instead of one small matrix at a time: a vector
-per link is `(3, nq, B)`, a matrix per link `(3, 3, nq, B)`, a joint-space vector `(nq, B)`.
+Public tensors have their batch dimensions first. Inside kinematics and dynamics, the batch is flattened and
+comes last, so that each element-wise operation runs over contiguous memory for all samples. A vector per link
+has shape `(3, nq, B)`, a matrix per link `(3, 3, nq, B)`, and a joint-space vector `(nq, B)`.
 """
 
 from __future__ import annotations
@@ -20,19 +20,19 @@ _SMALL = 4096
 
 
 def batch_last(x: Tensor, tail: int) -> Tensor:
-    """Return `(*batch, *tail)` as `(*tail, B)`, contiguous in memory."""
+    """Convert `(*batch, *tail)`, with `tail` trailing dimensions, to a contiguous tensor `(*tail, B)`."""
     shape = x.shape[x.ndim - tail :]
     flat = x.reshape((math.prod(x.shape[: x.ndim - tail]), *shape))
     return flat.movedim(0, -1).contiguous()
 
 
 def batch_first(x: Tensor, batch: torch.Size) -> Tensor:
-    """Return `(*tail, B)` as a view `(*batch, *tail)`."""
+    """Return a view of shape `(*batch, *tail)` of a tensor `(*tail, B)`."""
     return x.movedim(-1, 0).reshape((*batch, *x.shape[:-1]))
 
 
 def cross(a: Tensor, b: Tensor) -> Tensor:
-    """Return the vector product over the first dimension, broadcasting over the others."""
+    """Return the cross product a × b over the first dimension, broadcasting over the others."""
     if a.numel() < _SMALL:
         return torch.linalg.cross(*torch.broadcast_tensors(a, b), dim=0)
     (ax, ay, az), (bx, by, bz) = a, b
@@ -46,7 +46,7 @@ def cross(a: Tensor, b: Tensor) -> Tensor:
 
 
 def skew(v: Tensor) -> Tensor:
-    """Return `(3, 3, …)` matrices [v]× with [v]× w = v × w."""
+    """Return the matrices [v]× `(3, 3, …)` for which [v]× w = v × w."""
     x, y, z = v
     zero = torch.zeros_like(x)
     return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).unflatten(0, (3, 3))
@@ -63,22 +63,22 @@ def dot(a: Tensor, b: Tensor) -> Tensor:
 
 
 def apply(A: Tensor, v: Tensor) -> Tensor:
-    """Return a v for matrices `(r, k, …)` and vectors `(k, …)`."""
+    """Return the products A v of matrices `(r, k, …)` and vectors `(k, …)`."""
     return dot(A.transpose(0, 1), v.unsqueeze(1))
 
 
 def product(A: Tensor, X: Tensor) -> Tensor:
-    """Return a X for matrices `(r, k, …)` and `(k, c, …)`."""
+    """Return the products A X of matrices `(r, k, …)` and `(k, c, …)`."""
     return dot(A.transpose(0, 1).unsqueeze(2), X.unsqueeze(1))
 
 
 def sum_over(E: Tensor, x: Tensor) -> Tensor:
-    """Return Σ_j E_ij x_j over the joint dimension of `(…, nq, B)`."""
+    """Return Σ_j E_ij x_j, the sum over the joint dimension of x `(…, nq, B)`."""
     return E @ x
 
 
 def take(x: Tensor, joints: Sequence[int]) -> Tensor:
-    """Return the entries of some joints of `(…, nq, B)`, as a view if they are evenly spaced."""
+    """Return the entries of x `(…, nq, B)` for the given joints, as a view if these are evenly spaced."""
     first, last, count = joints[0], joints[-1], len(joints)
     step = (last - first) // (count - 1) if count > 1 else 1
     if step > 0 and list(joints) == list(range(first, last + 1, step)):
@@ -87,9 +87,9 @@ def take(x: Tensor, joints: Sequence[int]) -> Tensor:
 
 
 def solve_spd(M: Tensor, rhs: Tensor) -> Tensor:
-    """Return M⁻¹ rhs for symmetric positive definite `(n, n, B)` and `(n, k, B)`.
+    """Return M⁻¹ rhs for symmetric positive definite matrices M `(n, n, B)` and rhs `(n, k, B)`.
 
-    Large batches use elimination without pivoting (stable for such M), vectorized over the samples.
+    Large batches are solved by elimination without pivoting (stable for such M), vectorized over samples.
     """
     n, B = M.shape[0], M.shape[-1]
     if M.numel() < _SMALL:

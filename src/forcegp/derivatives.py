@@ -1,7 +1,7 @@
 """Closed-form derivatives of inverse and forward dynamics with respect to the state and the force.
 
-Differentiating M q̈ − Q_C − Q_G = τ at constant τ gives ∂q̈ = M⁻¹(∂τ − ∂ID) (Carpentier & Mansard,
-*Analytical derivatives of rigid body dynamics algorithms*, RSS 2018); ∂ID follows in world axes from
+Differentiating M q̈ − Q_C − Q_G = τ gives ∂q̈ = M⁻¹(∂τ − ∂ID), with ∂ID at constant q̈ (Carpentier & Mansard,
+*Analytical derivatives of rigid body dynamics algorithms*, RSS 2018). ∂ID is computed in world axes from
 composite quantities of the subtrees (Singh, Russell & Wensing, *Efficient analytical derivatives of
 rigid-body dynamics using spatial vector algebra*, RA-L 2022).
 """
@@ -21,7 +21,7 @@ from forcegp.types import JointMatrix, JointVector
 
 
 class InverseDynamicsDerivatives(NamedTuple):
-    """∂ID/∂q, ∂ID/∂q̇ and ∂ID/∂q̈ = M, each `(*batch, nq, nq)`, row = component of the force."""
+    """∂ID/∂q, ∂ID/∂q̇ and ∂ID/∂q̈ = M, each `(*batch, nq, nq)`, with one row per component of the force."""
 
     dq: JointMatrix
     dqd: JointMatrix
@@ -29,7 +29,7 @@ class InverseDynamicsDerivatives(NamedTuple):
 
 
 class ForwardDynamicsDerivatives(NamedTuple):
-    """∂q̈/∂q, ∂q̈/∂q̇ and ∂q̈/∂force = M⁻¹, each `(*batch, nq, nq)`, row = component of q̈."""
+    """∂q̈/∂q, ∂q̈/∂q̇ and ∂q̈/∂force = M⁻¹, each `(*batch, nq, nq)`, with one row per component of q̈."""
 
     dq: JointMatrix
     dqd: JointMatrix
@@ -44,7 +44,7 @@ def _pairs(robot: RobotModel, up: Tensor, down: Tensor) -> Tensor:
 
 
 def _gyration(links: dynamics.LinkInertia, omega: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-    """Return N = 2 ω×I − tr(I) ω× − 2 h×v× and the linear momentum l of each link."""
+    """Return N = 2 ω×I − tr(I) ω× − 2 h×v×, and the linear momentum l, for each link."""
     w = batchlast.skew(omega)
     trace = links.inertia.diagonal(dim1=0, dim2=1).sum(-1)
     N = 2.0 * batchlast.product(w, links.inertia) - trace * w
@@ -57,10 +57,10 @@ def _inverse_derivatives(
 ) -> tuple[Tensor, Tensor]:
     """Return ∂ID/∂q and ∂ID/∂q̇ with the batch last, `(nq, nq, B)`.
 
-    With the composite inertia I and the composite 2B = [[N, 0], [−2 l×, 0]] of the subtree of joint i, N = 2
-    ω×I − tr(I) ω× − 2 h×v×, l its linear momentum, F its force, and for each joint Ṡ = V×S, S̈ = a×S + V×Ṡ:
-    ∂τ_i/∂q_j = S_i·(2B Ṡ_j + I S̈_j) if j moves i, and S_i·(2B Ṡ_j + I S̈_j + S_j ×* F) of subtree j if i
-    moves j; ∂τ/∂q̇ has S and 2 Ṡ instead of Ṡ and S̈, and no F.
+    The subtree of joint i has the composite inertia I, linear momentum l, force F, and 2B = [[N, 0], [−2 l×,
+    0]] with N from `_gyration`. With Ṡ = V×S and S̈ = a×S + V×Ṡ for each joint, ∂τ_i/∂q_j is S_i·(2B Ṡ_j +
+    I S̈_j) if j moves i, and S_i·(2B Ṡ_j + I S̈_j + S_j ×* F), evaluated for the subtree of j, if i moves j.
+    In ∂τ/∂q̇, S and 2 Ṡ replace Ṡ and S̈, and the term with F is absent.
     """
     Et, z, l, omega, v = robot.ancestors.mT, poses.angular, poses.linear, motion.omega, motion.velocity
     alpha, a = dynamics.accelerations(robot, poses, motion, qdd)
@@ -102,10 +102,10 @@ def _inverse_derivatives(
 def inverse_dynamics_derivatives(
     robot: RobotModel, q: JointVector, qd: JointVector, qdd: JointVector
 ) -> InverseDynamicsDerivatives:
-    """Return Jacobians of `inverse_dynamics` with respect to q, q̇ and q̈ at states `(*batch, nq)`.
+    """Return the Jacobians of `inverse_dynamics` with respect to q, q̇ and q̈ at states `(*batch, nq)`.
 
     Raises:
-        ShapeError: an argument does not fit the robot.
+        ShapeError: an argument has the wrong shape for the robot.
     """
     q, qd, qdd = common_states(robot, q=q, qd=qd, qdd=qdd)
     poses = link_poses(robot, q)
@@ -118,11 +118,11 @@ def inverse_dynamics_derivatives(
 def forward_dynamics_derivatives(
     robot: RobotModel, q: JointVector, qd: JointVector, force: JointVector
 ) -> ForwardDynamicsDerivatives:
-    """Return Jacobians of `forward_dynamics` with respect to q, q̇ and force: −M⁻¹ ∂ID/∂q, −M⁻¹ ∂ID/∂q̇ and
-    M⁻¹, at its q̈.
+    """Return the Jacobians −M⁻¹ ∂ID/∂q, −M⁻¹ ∂ID/∂q̇ and M⁻¹ of `forward_dynamics` with respect to q, q̇ and
+    the force, with ∂ID evaluated at the resulting q̈.
 
     Raises:
-        ShapeError: an argument does not fit the robot.
+        ShapeError: an argument has the wrong shape for the robot.
     """
     q, qd, force = common_states(robot, q=q, qd=qd, force=force)
     poses = link_poses(robot, q)

@@ -1,4 +1,4 @@
-"""Checks before the work starts that a result can be written, and a fallback path if writing fails."""
+"""Early checks that a result can be written, and a fallback path if writing fails after all."""
 
 from __future__ import annotations
 
@@ -11,21 +11,21 @@ from fnmatch import fnmatchcase
 from pathlib import Path
 
 from forcegp.errors import DestinationError, ForceGPError
-from forcegp.files import check_kind, writable
+from forcegp.files import check_kind, writable, written_folder
 
 PROBE_BYTES = 1 << 16
-"""Bytes written and removed again to test for free space and quotas."""
+"""Number of bytes that are written and removed again to test for free space and quotas."""
 
 
 def check_destination(path: str | Path, *, folder: bool = False, own_files: Iterable[str] = ()) -> None:
-    """Check, before long work, that a file or folder can be written, without leaving anything behind.
+    """Check before a long computation that a file or folder can be written, without leaving anything behind.
 
-    A folder may replace an empty folder or one that contains only `own_files` (patterns). Without patterns,
-    it may replace any folder.
+    A folder may replace an empty folder, or one that only contains files matching the patterns `own_files`.
+    Without patterns, it may replace any folder.
 
     Raises:
-        DestinationError: a file would replace a folder or the reverse, the folder contains other files, or
-            the path cannot be written or the disk is full.
+        DestinationError: a file would replace a folder or vice versa, the folder contains other files, the
+            path cannot be written, or the disk is full.
     """
     target = Path(path)
     with writable(target):
@@ -40,7 +40,7 @@ def check_destination(path: str | Path, *, folder: bool = False, own_files: Iter
 
 
 def write_or_keep(write: Callable[[Path], object], path: str | Path) -> None:
-    """Write a result with `write(path)` or, if that fails, to a path named in the `DestinationError`."""
+    """Call `write(path)`; if it fails, write to another path, which the raised `DestinationError` names."""
     target = Path(path)
     try:
         write(target)
@@ -58,8 +58,18 @@ def write_or_keep(write: Callable[[Path], object], path: str | Path) -> None:
     ) from cause
 
 
+def folder_or_keep(fill: Callable[[Path], object], path: str | Path) -> None:
+    """Write a folder, whose files `fill(folder)` writes, or keep it elsewhere as `write_or_keep` does."""
+
+    def write(target: Path) -> None:
+        with written_folder(target) as temporary:
+            fill(temporary)
+
+    write_or_keep(write, path)
+
+
 def _kept(write: Callable[[Path], object], name: str) -> Path | None:
-    """Write the result to a private location and return its path, or `None`."""
+    """Write the result to a private location and return its path, or `None` if this fails as well."""
     for parent in (tempfile.gettempdir(), os.getcwd(), str(Path.home())):
         with contextlib.suppress(OSError, ForceGPError):
             place = Path(tempfile.mkdtemp(prefix="forcegp-kept-", dir=parent))

@@ -1,8 +1,8 @@
-"""Mass matrix, bias and gravity forces, inverse and forward dynamics of a tree of rigid links.
+"""Mass matrix, bias and gravity forces, and inverse and forward dynamics of a tree of rigid links.
 
-All forces are on the right-hand side: M q̈ = Q_C + Q_G + Q_D + Q_u. The algorithms are the composite
-rigid-body and the recursive Newton-Euler algorithm (Featherstone, *Rigid Body Dynamics Algorithms*,
-ch. 5 and 6), written in world axes so that sums over subtrees are products with the ancestor matrix.
+All forces are on the right-hand side: M q̈ = Q_C + Q_G + Q_D + Q_u. The composite rigid-body algorithm and the
+recursive Newton-Euler algorithm (Featherstone, *Rigid Body Dynamics Algorithms*, ch. 5 and 6) are formulated
+in world axes, so that sums over subtrees are products with the ancestor matrix.
 """
 
 from __future__ import annotations
@@ -21,7 +21,7 @@ from forcegp.types import JointMatrix, JointVector
 
 @dataclass(frozen=True)
 class LinkInertia:
-    """Spatial inertias of the links about the base origin, world axes.
+    """Spatial inertias of the links about the base origin, in world axes.
 
     Attributes:
         mass: `(nq, 1)` [kg].
@@ -47,7 +47,7 @@ def link_inertia(robot: RobotModel, poses: LinkPoses) -> LinkInertia:
 
 
 def mass_matrix_of(robot: RobotModel, poses: LinkPoses, links: LinkInertia) -> Tensor:
-    """Return M_ij = s_iᵀ I^c_j s_j, i an ancestor of j, composite I^c = Eᵀ I, plus drives, `(nq, nq, B)`."""
+    """Return M `(nq, nq, B)`: s_iᵀ I^c_j s_j for ancestors i of j, with I^c = Eᵀ I, plus the armature."""
     E, S, L = robot.ancestors, poses.angular, poses.linear
     whole = LinkInertia(E.mT @ links.mass, sum_over(E.mT, links.moment), sum_over(E.mT, links.inertia))
     angular, linear = momentum(whole, S, L)
@@ -65,14 +65,14 @@ def _gravity_force(robot: RobotModel, poses: LinkPoses, links: LinkInertia) -> T
 
 
 def momentum(links: LinkInertia, w: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the inertia times a motion vector [w; v], `(3, nq, B)` each: [I w + h × v; m v − h × w]."""
+    """Return the inertia times a motion vector [w; v]: I w + h × v and m v − h × w, each `(3, nq, B)`."""
     return apply(links.inertia, w) + cross(links.moment, v), links.mass * v - cross(links.moment, w)
 
 
 def link_force(
     links: LinkInertia, motion: LinkMotion, alpha: Tensor, acceleration: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return torque and force I a + V ×* I V, `(3, nq, B)`, of links with velocity V and acceleration a."""
+    """Return the torque and force I a + V ×* I V of links at velocity V and acceleration a, `(3, nq, B)`."""
     n, l = momentum(links, motion.omega, motion.velocity)
     torque, force = momentum(links, alpha, acceleration)
     torque = torque + cross(motion.omega, n) + cross(motion.velocity, l)
@@ -80,7 +80,7 @@ def link_force(
 
 
 def _joint_force(robot: RobotModel, poses: LinkPoses, torque: Tensor, force: Tensor) -> Tensor:
-    """Return the joint forces sᵀ Eᵀ [torque; force], `(nq, B)`, that balance forces on the links."""
+    """Return the joint forces sᵀ Eᵀ [torque; force], `(nq, B)`, that balance the forces on the links."""
     Et = robot.ancestors.mT
     return dot(poses.angular, sum_over(Et, torque)) + dot(poses.linear, sum_over(Et, force))
 
@@ -93,7 +93,7 @@ def _bias_force(robot: RobotModel, poses: LinkPoses, links: LinkInertia, motion:
 def known_terms(
     robot: RobotModel, poses: LinkPoses, motion: LinkMotion, qd: JointVector
 ) -> tuple[JointMatrix, JointVector, JointVector, JointVector]:
-    """Return M, Q_C, Q_G and Q_D, all forces of the robot file, from the motion of the links."""
+    """Return M, Q_C, Q_G and Q_D with the parameters of the robot file, from the motion of the links."""
     links, Q_D = link_inertia(robot, poses), damping_force(robot, qd)
     M, Q_C = mass_matrix_of(robot, poses, links), _bias_force(robot, poses, links, motion)
     Q_G = _gravity_force(robot, poses, links)
@@ -103,7 +103,7 @@ def known_terms(
 def accelerations(
     robot: RobotModel, poses: LinkPoses, motion: LinkMotion, qdd: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return spatial accelerations `(3, nq, B)` of the links at q̈ `(nq, B)`, with gravity at the base."""
+    """Return the spatial accelerations `(3, nq, B)` of the links for q̈ `(nq, B)` and base acceleration −g."""
     E = robot.ancestors
     linear = motion.acceleration + sum_over(E, poses.linear * qdd) - robot.gravity[:, None, None]
     return motion.alpha + sum_over(E, poses.angular * qdd), linear
@@ -130,7 +130,7 @@ def mass_matrix(robot: RobotModel, q: JointVector) -> JointMatrix:
         torch.Size([5, 2, 2])
 
     Raises:
-        ShapeError: q does not fit the robot.
+        ShapeError: q has the wrong shape for the robot.
     """
     poses = link_poses(robot, q)
     return batch_first(mass_matrix_of(robot, poses, link_inertia(robot, poses)), poses.batch)
@@ -140,7 +140,7 @@ def gravity_force(robot: RobotModel, q: JointVector) -> JointVector:
     """Return the generalized gravity force Q_G(q), `(*batch, nq)` [N m, N].
 
     Raises:
-        ShapeError: q does not fit the robot.
+        ShapeError: q has the wrong shape for the robot.
     """
     poses = link_poses(robot, q)
     return batch_first(_gravity_force(robot, poses, link_inertia(robot, poses)), poses.batch)
@@ -150,7 +150,7 @@ def bias_force(robot: RobotModel, q: JointVector, qd: JointVector) -> JointVecto
     """Return the Coriolis and centrifugal force Q_C(q, q̇) on the right-hand side, `(*batch, nq)` [N m, N].
 
     Raises:
-        ShapeError: q or qd does not fit the robot.
+        ShapeError: q or qd has the wrong shape for the robot.
     """
     q, qd = common_states(robot, q=q, qd=qd)
     poses = link_poses(robot, q)
@@ -159,14 +159,14 @@ def bias_force(robot: RobotModel, q: JointVector, qd: JointVector) -> JointVecto
 
 
 def damping_force(robot: RobotModel, qd: JointVector, slip: JointVector | None = None) -> JointVector:
-    """Return the joint friction of the robot: viscous, Coulomb (smoothed at zero speed) and Stribeck.
+    """Return the viscous, Coulomb (smoothed at zero speed) and Stribeck friction of the joints.
 
-    Q_D = −d q̇ − (f_c + f_s e^{−(q̇/v_s)²}) tanh(q̇/v_0), `(*batch, nq)` [N m, N]; `slip` `(*batch, nq)` is a
-    direction of sliding in place of tanh(q̇/v_0). See Armstrong-Hélouvry, Dupont, Canudas de Wit, *A survey
-    of models, analysis tools and compensation methods for the control of machines with friction* (1994).
+    Q_D = −d q̇ − (f_c + f_s e^{−(q̇/v_s)²}) tanh(q̇/v_0), `(*batch, nq)` [N m, N]. If given, the direction of
+    sliding `slip` `(*batch, nq)` replaces tanh(q̇/v_0). Source: Armstrong-Hélouvry et al., *A survey of
+    models, analysis tools and compensation methods for the control of machines with friction* (1994).
 
     Raises:
-        ShapeError: qd does not fit the robot.
+        ShapeError: qd has the wrong shape for the robot.
     """
     robot.check_state(qd=qd)
     dry = robot.friction + robot.stribeck * torch.exp(-((qd / robot.stribeck_velocity) ** 2))
@@ -174,7 +174,7 @@ def damping_force(robot: RobotModel, qd: JointVector, slip: JointVector | None =
 
 
 def inverse_dynamics(robot: RobotModel, q: JointVector, qd: JointVector, qdd: JointVector) -> JointVector:
-    """Force Q_D + Q_u required by a motion, M q̈ − Q_C − Q_G (Newton-Euler), `(*batch, nq)` [N m, N].
+    """Return the force Q_D + Q_u = M q̈ − Q_C − Q_G required for a motion, `(*batch, nq)` [N m, N].
 
     Example:
         >>> import torch, forcegp
@@ -185,7 +185,7 @@ def inverse_dynamics(robot: RobotModel, q: JointVector, qd: JointVector, qdd: Jo
         True
 
     Raises:
-        ShapeError: an argument does not fit the robot.
+        ShapeError: an argument has the wrong shape for the robot.
     """
     q, qd, qdd = common_states(robot, q=q, qd=qd, qdd=qdd)
     poses = link_poses(robot, q)
@@ -211,7 +211,7 @@ def forward_dynamics(robot: RobotModel, q: JointVector, qd: JointVector, force: 
         True
 
     Raises:
-        ShapeError: an argument does not fit the robot.
+        ShapeError: an argument has the wrong shape for the robot.
     """
     q, qd, force = common_states(robot, q=q, qd=qd, force=force)
     poses = link_poses(robot, q)

@@ -1,4 +1,4 @@
-"""Typed errors: the expected value, the given value, and a remedy."""
+"""Typed errors that give the expected value, the actual value, and a remedy."""
 
 from __future__ import annotations
 
@@ -12,16 +12,16 @@ from typing import Any, TypeVar
 from forcegp.limits import NAME_COMPARED, NAMES_COMPARED
 
 LONGEST_VALUE = 2000
-"""Maximum number of characters of a wrong value in a message."""
+"""Maximum number of characters of an invalid value that a message contains."""
 
 E = TypeVar("E", bound="ForceGPError")
 
 
 class ForceGPError(Exception):
-    """Base of every error that a user of the library can cause.
+    """Base class of all errors that a user of the library can cause.
 
     Args:
-        message: one sentence with the fault and its location (file, joint, row).
+        message: one sentence that describes the fault and its location (file, joint, row).
         expected: the valid value.
         got: the value found.
         hint: what to change.
@@ -48,20 +48,20 @@ class ForceGPError(Exception):
     @classmethod
     @contextmanager
     def within(cls, place: str) -> Iterator[None]:
-        """Re-raise errors of the library in the block as errors of this class that name a file or a line."""
+        """Re-raise library errors in the block as errors of this class that name the location."""
         try:
             yield
         except ForceGPError as cause:
             raise cls.at(place, cause) from cause
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Return text and plain values, from which the error can be copied or sent to another process."""
+        """Reduce the error to text and plain values, so that it can be copied or sent to another process."""
         state = {name: _plain(value) for name, value in self.__dict__.items()}
         return _rebuilt, (type(self), tuple(map(_plain, self.args)), state)
 
 
 def _plain(value: object) -> object:
-    """Return a value that every process can unpickle, and the text of the message for any other."""
+    """Return a plain value unchanged, and any other value as text, so that every process can unpickle it."""
     return value if isinstance(value, str | int | float | None) else str(value)
 
 
@@ -74,7 +74,7 @@ def _rebuilt(kind: type[E], args: tuple[object, ...], state: dict[str, object]) 
 
 
 def near_names(name: object, valid: Iterable[str], cutoff: float = 0.6) -> list[str]:
-    """Return the valid name nearest to a misspelt one, if any; long names and long lists are not compared."""
+    """Return the valid name closest to a misspelt one, if any, among a limited number of short names."""
     text = str(name)
     if len(text) > NAME_COMPARED:
         return []
@@ -83,29 +83,29 @@ def near_names(name: object, valid: Iterable[str], cutoff: float = 0.6) -> list[
 
 
 def did_you_mean(name: object, valid: Iterable[str], cutoff: float = 0.6) -> str | None:
-    """Return a hint that names the valid name nearest to a misspelt one, if there is one."""
+    """Return a hint that suggests the valid name closest to a misspelt one, if there is one."""
     near = near_names(name, valid, cutoff)
     return f"did you mean {near[0]!r}?" if near else None
 
 
 class RobotFileError(ForceGPError, ValueError):
-    """A robot file that cannot be read or does not describe a valid robot."""
+    """Raised if a robot file cannot be read or does not describe a valid robot."""
 
 
 class UnsupportedRobotError(RobotFileError):
-    """A valid robot file with unsupported elements (the message names the joint)."""
+    """Raised if a valid robot file contains unsupported elements (the message names the joint)."""
 
 
 class InertiaError(RobotFileError):
-    """Inertial parameters that are physically impossible (the message names the link and the reason)."""
+    """Raised if inertial parameters are physically impossible (the message names the link and the reason)."""
 
 
 class RobotFileWarning(UserWarning):
-    """A robot file that is usable but doubtful; the message is also in `RobotModel.remarks`."""
+    """Issued if a robot file is usable but questionable; `RobotModel.remarks` also contains the message."""
 
 
 class UnknownNameError(ForceGPError, LookupError):
-    """A name (joint, frame, contact, quantity, model) that does not exist; lists the valid ones."""
+    """Raised if a name (of a joint, frame, model, …) does not exist; the message lists the valid names."""
 
     def __init__(self, kind: str, name: object, valid: Iterable[str]) -> None:
         names = list(valid)
@@ -119,13 +119,13 @@ class UnknownNameError(ForceGPError, LookupError):
 
 
 def check_name(kind: str, name: object, valid: Collection[str]) -> None:
-    """Raise `UnknownNameError` unless a name is one of the valid ones."""
+    """Raise `UnknownNameError` unless a name is one of the valid names."""
     if name not in valid:
         raise UnknownNameError(kind, name, valid)
 
 
 class ParameterError(ForceGPError, ValueError):
-    """A parameter that is out of range, such as a radius or a time step (the message names it)."""
+    """Raised if a parameter, such as a radius or a time step, is out of range (the message names it)."""
 
 
 def _shortened(text: str, length: int) -> str:
@@ -133,31 +133,31 @@ def _shortened(text: str, length: int) -> str:
 
 
 class ShapeError(ForceGPError, ValueError):
-    """A tensor with a wrong shape, dtype or device."""
+    """Raised if a tensor has the wrong shape, dtype or device."""
 
 
 class DataError(ForceGPError, ValueError):
-    """A data set, or a data file, that cannot be used (the message names file, column and row)."""
+    """Raised if a data set or a data file cannot be used (the message names the file, column and row)."""
 
 
 class SceneError(ForceGPError, ValueError):
-    """An invalid scene file (the message names file, line and key)."""
+    """Raised if a scene file is invalid (the message names the file, line and key)."""
 
 
 class MappingError(ForceGPError, ValueError):
-    """A mapping of log columns that is invalid or does not match the log (names file, line and key)."""
+    """Raised if a mapping of log columns is invalid or does not match the log; the message names the key."""
 
 
 class ModelError(ForceGPError, ValueError):
-    """A model that does not support the request, or a saved model that cannot be read."""
+    """Raised if a model does not support the request, or if a saved model cannot be read."""
 
 
 class NumericalError(ForceGPError, ArithmeticError):
-    """A computation without a trustworthy result (an indefinite matrix, a diverging run)."""
+    """Raised if a computation has no trustworthy result (an indefinite matrix, a diverging run)."""
 
 
 class MassMatrixError(NumericalError):
-    """A mass matrix that is not positive definite, for example due to negative masses."""
+    """Raised if a mass matrix is not positive definite, for example because of negative masses."""
 
     def __init__(self, cause: Exception) -> None:
         text, hint = "a mass matrix is not positive definite", "check the robot's masses and inertias"
@@ -165,15 +165,15 @@ class MassMatrixError(NumericalError):
 
 
 class MissingDependencyError(ForceGPError, ImportError):
-    """A required optional package that is not installed."""
+    """Raised if a required optional package is not installed."""
 
 
 class DestinationError(ForceGPError, OSError):
-    """A path that cannot be written; the message names the location of any results that were kept."""
+    """Raised if a path cannot be written; the message gives the location of any results that were kept."""
 
 
 class MemoryLimitError(ForceGPError, RuntimeError):
-    """A computation that was not started since it needs more than the free memory."""
+    """Raised instead of starting a computation that needs more than the free memory."""
 
 
 def optional_module(name: str, purpose: str, extra: str | None = None) -> Any:
@@ -182,13 +182,13 @@ def optional_module(name: str, purpose: str, extra: str | None = None) -> Any:
     Args:
         name: the module to import.
         purpose: the subject of the message, such as `"Reading MJCF files"`.
-        extra: the extra of this library that installs it; default its own name.
+        extra: the extra of this library that installs the package; by default, the name of the package.
 
     Returns:
         The module.
 
     Raises:
-        MissingDependencyError: the package is not installed; the hint is the command that installs it.
+        MissingDependencyError: the package is not installed; the hint gives the command that installs it.
 
     Example:
         >>> optional_module("math", "Arithmetic").sqrt(4.0)
@@ -198,7 +198,7 @@ def optional_module(name: str, purpose: str, extra: str | None = None) -> Any:
         return import_module(name)
     except ModuleNotFoundError as error:
         package = name.partition(".")[0]
-        # A package that is installed but lacks something itself is broken, which is another error.
+        # If an installed package lacks one of its own dependencies, that is a different error.
         if error.name is None or error.name.partition(".")[0] != package:
             raise
         raise MissingDependencyError(

@@ -1,8 +1,8 @@
-"""Files that are written atomically, and JSON headers with format and version.
+"""Atomic writing of files, and JSON headers with a format and a version.
 
-Temporary files are hidden, locked while their writer runs, and deleted after a crash. Their name is
-`.forcegp-new-<12 hex digits>-<name of the target>`. The lock (flock) ends with the process; without flock
-(Windows, some network file systems), such files remain after a crash.
+Temporary files are hidden, locked while their writer runs, and deleted after a crash. They are named
+`.forcegp-new-<12 hex digits>-<name of the target>`. The lock (flock) is released when the process ends.
+Without flock (on Windows and some network file systems), such files remain after a crash.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ M = TypeVar("M", bound=BaseModel)
 
 
 LONGEST = 200
-"""Maximum bytes of a target's name in temporary names; file systems allow 255 in total."""
+"""Maximum number of bytes of a target's name in a temporary name; file systems allow 255 in total."""
 NEW = ".forcegp-new-"
 """Prefix of temporary names."""
 
 
 def _short(target: Path) -> str:
-    """Return the name of a target, or for a long name a digest with its suffix (needed by some writers)."""
+    """Return the name of a target, or, if it is long, its digest with the suffix, which some writers need."""
     name = os.fsencode(target.name)
     if len(name) <= LONGEST:
         return target.name
@@ -59,7 +59,7 @@ class Temporary:
             else:
                 os.close(os.open(self.path, os.O_CREAT | os.O_EXCL | os.O_WRONLY, mode))
             locked, self._descriptor = _lock(self.path)
-            # A sweep between the two steps has taken it for litter: make another.
+            # If a sweep has deleted it between the two steps, create another.
             if locked:
                 return
 
@@ -72,7 +72,7 @@ class Temporary:
 
 
 def sweep(target: Path) -> None:
-    """Delete temporary files of crashed writers of a target."""
+    """Delete temporary files left by crashed writers of a target."""
     form = re.compile(re.escape(NEW) + "[0-9a-f]{12}-" + re.escape(_short(target)))
     try:
         matches = [path for path in target.parent.iterdir() if form.fullmatch(path.name)]
@@ -87,7 +87,7 @@ def sweep(target: Path) -> None:
 
 
 def discard(path: Path) -> None:
-    """Remove a file or folder as far as possible."""
+    """Remove a file or folder, ignoring any error."""
     try:
         if stat.S_ISDIR(path.lstat().st_mode):
             shutil.rmtree(path, ignore_errors=True)
@@ -98,7 +98,7 @@ def discard(path: Path) -> None:
 
 
 def _lock(path: Path) -> tuple[bool, int | None]:
-    """Return whether we hold the lock of a path that still exists (or need none), and the descriptor."""
+    """Lock a path; return whether it still exists and is locked (or needs no lock), and the descriptor."""
     if fcntl is None:
         return True, None
     try:
@@ -110,7 +110,7 @@ def _lock(path: Path) -> tuple[bool, int | None]:
         return os.path.samestat(os.fstat(descriptor), path.lstat()), descriptor
     except OSError as error:
         os.close(descriptor)
-        # Any other error: no flock on this file system.
+        # Any other error means that the file system does not support flock.
         return not isinstance(error, BlockingIOError | FileNotFoundError), None
 
 
@@ -158,7 +158,7 @@ def _sync(path: Path) -> None:
 
 @contextmanager
 def _temporary(target: Path, *, folder: bool, mode: int) -> Iterator[Path]:
-    """Yield a temporary file for a target, which is deleted when the block ends unless it was moved."""
+    """Yield a temporary file or folder for a target, and delete it after the block unless it was moved."""
     with writable(target):
         check_kind(target, folder=folder)
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -174,14 +174,14 @@ def _temporary(target: Path, *, folder: bool, mode: int) -> Iterator[Path]:
 def atomic_file(path: str | Path, mode: int = 0o666) -> Iterator[Path]:
     """Yield a temporary path that replaces `path` if the block ends without an error.
 
-    Temporary files of crashed writers of the same file are removed.
+    Temporary files left by crashed writers of the same file are removed.
 
     Args:
         path: the file to write; missing parent folders are created.
-        mode: permissions of the new file before the umask.
+        mode: permissions of the new file before the umask is applied.
 
     Yields:
-        The path to write to. Readers of `path` see the old file or the complete new one.
+        The path to write to. Readers of `path` see either the old file or the complete new one.
 
     Raises:
         DestinationError: the path cannot be written, or is a folder, a pipe or a device.
@@ -200,7 +200,7 @@ def atomic_file(path: str | Path, mode: int = 0o666) -> Iterator[Path]:
             yield temporary
             _sync(temporary)
             os.replace(temporary, target)
-        with suppress(OSError):  # not every system can
+        with suppress(OSError):  # not supported on every system
             _sync(target.parent)
 
 
@@ -208,8 +208,8 @@ def atomic_file(path: str | Path, mode: int = 0o666) -> Iterator[Path]:
 def written_folder(path: str | Path) -> Iterator[Path]:
     """Yield a temporary folder, which is moved into the target folder if the block ends without an error.
 
-    Each file replaces its namesake in one step, in the order of writing, so the last one exists only
-    together with the others. Then all other files in the folder are removed. Symbolic links are followed.
+    Each file atomically replaces the file of the same name, in the order of writing, so the last one exists
+    only if the others do. Then all other files in the folder are removed. Symbolic links are followed.
 
     Yields:
         The folder to write the files to.
@@ -241,26 +241,26 @@ def written_folder(path: str | Path) -> Iterator[Path]:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a text file (UTF-8), whole or not at all."""
+    """Write a UTF-8 text file, either completely or not at all."""
     with atomic_file(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
 def write_json(path: str | Path, value: object) -> None:
-    """Write a value as indented JSON, whole or not at all; NaN and infinity are refused."""
+    """Write a value as indented JSON, either completely or not at all; NaN and infinity are rejected."""
     write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
 
 
 class Record(BaseModel):
-    """A frozen part of a file: unknown fields and numbers that are not finite are errors."""
+    """A frozen part of a file, in which unknown fields and non-finite numbers are errors."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, from_attributes=True)
 
 
 class Header(Record):
-    """A frozen, versioned JSON header; a subclass names its `FORMAT` and `VERSION` and adds fields.
+    """A frozen, versioned JSON header; a subclass sets `FORMAT` and `VERSION` and adds fields.
 
-    Unknown fields are errors, and text of more than `MAX_BYTES` is not read.
+    Unknown fields are errors, and text longer than `MAX_BYTES` is rejected.
     """
 
     FORMAT: ClassVar[str]
@@ -268,13 +268,13 @@ class Header(Record):
     MAX_BYTES: ClassVar[int] = HEADER_BYTES
 
     def to_json(self) -> str:
-        """Return the header as JSON text, format and version first."""
+        """Return the header as JSON text that starts with the format and the version."""
         head = {"format": self.FORMAT, "version": self.VERSION}
         return json.dumps(head | self.model_dump(mode="json"), indent=2, allow_nan=False)
 
     @classmethod
     def from_json(cls: type[H], text: str | bytes, source: str, error: type[ForceGPError]) -> H:
-        """Read a header, checking its format, version and fields; an `error` names `source` and the field."""
+        """Read and check a header; raise an `error` that names `source` and the invalid field."""
         fields = _json_object(text, source, error, cls.MAX_BYTES)
         name, version = fields.pop("format", None), fields.pop("version", None)
         if name != cls.FORMAT:
@@ -297,7 +297,7 @@ def validated(
     place: tuple[str, ...] = (),
     what: str = "field",
 ) -> M:
-    """Validate values as a pydantic model; an `error` names `source`, `place` and the invalid field."""
+    """Validate values as a pydantic model; raise an `error` that names `source`, `place` and the field."""
     try:
         return kind.model_validate(fields)
     except ValidationError as cause:
@@ -323,7 +323,7 @@ def _json_object(text: str | bytes, source: str, error: type[ForceGPError], most
 
 
 def depth(value: object) -> int:
-    """Return the largest depth of nested mappings and lists, found without recursion."""
+    """Return the maximum nesting depth of mappings and lists, computed without recursion."""
     level, levels = [value], 0
     while level := [part for part in level if isinstance(part, dict | list)]:
         levels += 1

@@ -1,6 +1,6 @@
-"""Guards for readers, which check the declared size of a file before reading it, and convert errors.
+"""Guards for readers, which check the declared size of a file before it is read, and convert errors.
 
-A small compressed file may declare more content than fits into memory. The bounds are in `forcegp.limits`.
+A small compressed file may declare more content than fits into memory. `forcegp.limits` defines the bounds.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from forcegp.errors import DataError, ForceGPError, optional_module
 
 
 def check_count(source: str, what: str, count: int, most: int) -> None:
-    """Raise `DataError` if a log declares more than `most` items (a plural noun).
+    """Raise `DataError` if a log declares more than `most` items; `what` is a plural noun for them.
 
     >>> check_count("run.csv", "columns", 12, limits.COLUMNS)
     """
@@ -36,7 +36,7 @@ def check_count(source: str, what: str, count: int, most: int) -> None:
 
 
 def check_expansion(source: str, size: int, file: int, free: int | None = None) -> None:
-    """Raise `DataError` if a file of `file` bytes declares a far larger content of `size` bytes."""
+    """Raise `DataError` if the declared `size` of the content is far larger than the file of `file` bytes."""
     allowed = allowed_bytes(file, free)
     if size > allowed:
         raise DataError(
@@ -48,13 +48,13 @@ def check_expansion(source: str, size: int, file: int, free: int | None = None) 
 
 
 def allowed_bytes(file: int, free: int | None = None) -> int:
-    """Return the number of bytes that a file of `file` bytes may unpack to, at least `free`."""
+    """Return the number of bytes to which a file of `file` bytes may be unpacked, at least `free`."""
     return max(free or limits.FREE_TABLE_BYTES, limits.TABLE_EXPANSION * file)
 
 
 @dataclass
 class Unpacking:
-    """Counter of the bytes and records unpacked from a log of `file` bytes, bounded by its size."""
+    """Counter of the bytes and records unpacked from a log, limited according to its `file` size [bytes]."""
 
     source: str
     file: int
@@ -62,7 +62,7 @@ class Unpacking:
     records: int = 0
 
     def unpack(self, packed: bytes, compression: str) -> bytes:
-        """Unpack a part, up to the allowed size."""
+        """Unpack a part of the log, up to the allowed size."""
         left = allowed_bytes(self.file, limits.FREE_BAG_BYTES) - self.size
         content = _opened(packed, compression).read(left + 1)
         self.read(len(content))
@@ -81,7 +81,7 @@ class Unpacking:
 
 
 def _opened(packed: bytes, compression: str) -> Any:
-    """Return a compressed part as a file that is unpacked as it is read."""
+    """Return a compressed part as a file object that is unpacked while it is read."""
     stream = io.BytesIO(packed)
     if compression in ("", "none"):
         return stream
@@ -96,7 +96,7 @@ def _opened(packed: bytes, compression: str) -> Any:
 
 
 def bounded(reader: Any, unpacking: Unpacking) -> Any:
-    """Return the reader of ROS 1 bags with bounds on unpacked chunks and on the index."""
+    """Return a subclass of a ROS 1 bag reader that limits the sizes of unpacked chunks and of the index."""
 
     class Bounded(reader):
         indexed = 0
@@ -117,7 +117,7 @@ def bounded(reader: Any, unpacking: Unpacking) -> Any:
 
 
 def check_tables(file: Path) -> None:
-    """Check that an SQLite bag has no computed rows or duplicate topics; other files pass."""
+    """Check that an SQLite bag has no computed rows or duplicate topics; other files are accepted."""
     if not starts_with(file, b"SQLite format 3"):
         return
     with closing(sqlite3.connect(f"{file.absolute().as_uri()}?immutable=1", uri=True)) as bag:
@@ -129,7 +129,7 @@ def check_tables(file: Path) -> None:
 
 
 def is_file(path: Path) -> bool:
-    """Return whether a file exists; false for invalid names."""
+    """Return whether a file exists, or false if its name is invalid."""
     try:
         return path.is_file()
     except (OSError, ValueError):
@@ -137,18 +137,18 @@ def is_file(path: Path) -> bool:
 
 
 def starts_with(file: Path, magic: bytes) -> bool:
-    """Return whether a file begins with some bytes."""
+    """Return whether a file begins with the given bytes."""
     with file.open("rb") as opened:
         return opened.read(len(magic)) == magic
 
 
 DEFLATE, SHUFFLE, FLETCHER32, LZF = 1, 2, 3, 32000
 DEFLATE_RATIO = 1032
-"""Maximum number of bytes that one byte of deflated data unpacks to."""
+"""Maximum number of bytes to which one byte of deflated data can expand."""
 
 
 def check_chunks(dataset: Any, file: int) -> None:
-    """Check that no chunk of an h5py data set exceeds its declared size, and its compression is supported."""
+    """Check that an h5py data set uses supported compression and that no chunk exceeds its declared size."""
     source, properties = f"{dataset.file.filename}: {dataset.name!r}", dataset.id.get_create_plist()
     filters = [properties.get_filter(i)[0] for i in range(properties.get_nfilters())]
     if not filters:
@@ -171,7 +171,7 @@ def check_chunks(dataset: Any, file: int) -> None:
 
 
 def within(folder: Path, files: Iterable[Path]) -> list[Path]:
-    """Return the files of a folder that is read as one log; `DataError` for links to paths outside it."""
+    """Return the files of a folder that is read as one log; raise `DataError` if a link leads outside it."""
     files, root = list(files), folder.resolve()
     for file in files:
         if not file.resolve().is_relative_to(root):
@@ -184,7 +184,7 @@ def within(folder: Path, files: Iterable[Path]) -> list[Path]:
 
 @contextmanager
 def foreign(source: str, kind: str) -> Iterator[None]:
-    """Convert any exception of a third-party parser on a damaged file to `DataError`."""
+    """Convert any exception that a third-party parser raises on a damaged file to `DataError`."""
     try:
         yield
     except ForceGPError:

@@ -1,4 +1,4 @@
-"""Identification of inertial parameters: inverse dynamics is linear in them, τ = Y(q, q̇, q̈) π.
+"""Identification of inertial parameters π, in which inverse dynamics is linear: τ = Y(q, q̇, q̈) π.
 
 Sources: Atkeson, An, Hollerbach, *Estimation of inertial parameters of manipulator loads and links*
 (IJRR 1986); Gautier, *Numerical calculation of the base inertial parameters of robots* (J. Robotic
@@ -26,21 +26,21 @@ from forcegp.types import JointVector
 
 Regressor = Float[Tensor, "*batch nq p"]
 RANK = 1e-9
-"""Fraction of the largest pivot of the scaled regressor below which a direction does not affect the motion.
+"""Pivot of the scaled regressor, relative to the largest, below which a direction does not affect the motion.
 """
 STATES = 100
-"""Number of random states for determining the rank."""
+"""Number of random states from which the rank is determined."""
 MASS_SHARE, MOMENT_ARM = 0.3, 0.1
-"""Tolerance of a robot file, for the mass m of a link (relative) and its centre of mass [m]. The standard
-deviations of its parameters are 30 % of m, m · 0.1 m and m · (0.1 m)²."""
+"""Assumed errors of a robot file in the mass m of a link (relative) and in its centre of mass [m]. The
+standard deviations of m, m c and the inertia are 30 % of m, m · 0.1 m and m · (0.1 m)²."""
 PARAMETER_NAMES = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
 
 
 def regressor(robot: RobotModel, q: JointVector, qd: JointVector, qdd: JointVector) -> Regressor:
-    """Return Y `(*batch, nq, 10 nq)` with Y π = M q̈ − Q_C − Q_G without drives, π as in `parameter_vector`.
+    """Return Y `(*batch, nq, 10 nq)` such that Y π = M q̈ − Q_C − Q_G without armature (`parameter_vector`).
 
-    Inverse dynamics is linear in π, so column k of link i contains the forces due to that link with unit π_k.
-    Only kinematics and gravity of the robot are used.
+    Inverse dynamics is linear in π, so column k of link i contains the forces caused by a unit parameter π_k
+    of this link. Only the kinematics and the gravity vector of the robot are used.
 
     Example:
         >>> import torch, forcegp
@@ -51,7 +51,7 @@ def regressor(robot: RobotModel, q: JointVector, qd: JointVector, qdd: JointVect
         torch.Size([5, 2, 20])
 
     Raises:
-        ShapeError: an argument does not fit the robot.
+        ShapeError: an argument has the wrong shape for the robot.
     """
     q, qd, qdd = common_states(robot, q=q, qd=qd, qdd=qdd)
     poses = link_poses(robot, q)
@@ -68,7 +68,7 @@ def regressor(robot: RobotModel, q: JointVector, qd: JointVector, qdd: JointVect
 
 
 def _links_of(poses: LinkPoses, parameters: Tensor) -> LinkInertia:
-    """Return the inertias of links that all have the same π `(10,)`, moved to the base origin."""
+    """Return the inertias, about the base origin, of links that all have the same π `(10,)`."""
     rows = torch.tensor([[4, 5, 6], [5, 7, 8], [6, 8, 9]], device=parameters.device)
     R, p, mass = poses.R, poses.p, parameters[0].expand(poses.p.shape[1], 1)
     # I_o = R I Rᵀ + (2 p·h + m p·p) 1 − p hᵀ − h pᵀ − m p pᵀ with h = R m c
@@ -80,17 +80,17 @@ def _links_of(poses: LinkPoses, parameters: Tensor) -> LinkInertia:
 
 
 def parameter_vector(robot: RobotModel) -> Float[Tensor, " p"]:
-    """Return π `(10 nq,)`: m, m c and the inertia about the link origin of each link in turn."""
+    """Return π `(10 nq,)`: for each link in turn, m, m c and the inertia about the link origin."""
     return inertial_parameters(robot.mass, robot.com, robot.inertia).flatten()
 
 
 @dataclass(frozen=True)
 class BaseParameters:
-    """The combinations β = B π that affect the motion.
+    """The combinations β = B π of inertial parameters that affect the motion.
 
     Attributes:
         columns: indices in π of the r independent parameters, one per combination.
-        combination: B `(r, 10 nq)`, with the identity in these columns.
+        combination: matrix B `(r, 10 nq)`, which is the identity in these columns.
         names: names of the combinations, such as `"Izz[joint_1] + 3 more"`.
     """
 
@@ -111,7 +111,7 @@ class BaseParameters:
 def base_parameters(robot: RobotModel) -> BaseParameters:
     """Compute the base parameters by rank-revealing QR of the regressor at random states (Gautier 1991).
 
-    Runs in double precision on the CPU. Only kinematics and gravity of the robot are used.
+    Runs in double precision on the CPU. Only the kinematics and the gravity vector of the robot are used.
 
     Example:
         >>> import torch, forcegp
@@ -120,7 +120,7 @@ def base_parameters(robot: RobotModel) -> BaseParameters:
         >>> base.rank, base.names[0]
         (6, 'mcx[shoulder]')
     """
-    # Kinematics in single precision break symmetries by its rounding, and so seem to have a higher rank.
+    # Rounding of kinematic parameters to single precision breaks symmetries, so the rank appears higher.
     tolerance = max(RANK, 100.0 * torch.finfo(robot.dtype).eps)
     robot = robot.to("cpu", torch.float64)
     random = np.random.default_rng(0)
@@ -158,9 +158,9 @@ class Identification:
         base: definition of the base parameters.
         value, standard_error: `(r,)` estimate of β and its standard error.
         covariance: `(r, r)` covariance of the estimate.
-        damping, friction: `(nq,)` viscous and Coulomb friction if requested, else None.
+        damping, friction: `(nq,)` viscous and Coulomb friction coefficients if requested, otherwise `None`.
         noise_std: `(nq,)` standard deviation of the torque residual [N m, N].
-        condition: condition number of the scaled problem; above about 100, the motion is not exciting enough.
+        condition: condition number of the scaled problem; above about 100, the excitation is insufficient.
     """
 
     base: BaseParameters
@@ -182,13 +182,13 @@ def identify(
     *,
     friction: bool = False,
 ) -> Identification:
-    """Identify base parameters from a log of free motion by weighted linear least squares.
+    """Identify the base parameters from a log of free motion by weighted linear least squares.
 
     Solves τ − armature q̈ = Y_b β (+ d q̇ + f_c tanh(q̇/v_0)) + ε, first with equal weights, then with each
-    joint weighted by its residual noise. The accelerations are treated as exact.
+    joint weighted by the inverse of its residual noise. The accelerations are treated as exact.
 
     Args:
-        robot: robot that provides kinematics, gravity, drive inertia and v_0.
+        robot: robot that provides the kinematics, gravity, drive inertia and v_0.
         q, qd, qdd: `(n, nq)` positions, velocities and accelerations.
         tau: `(n, nq)` measured joint force, excluding friction unless `friction` is true [N m, N].
         friction: whether to identify viscous and Coulomb friction as well.
@@ -202,8 +202,8 @@ def identify(
         (2,)
 
     Raises:
-        ShapeError: an argument does not fit the robot.
-        DataError: a value is not finite, there are too few samples, or the motion is not exciting enough.
+        ShapeError: an argument has the wrong shape for the robot.
+        DataError: a value is not finite, there are too few samples, or the excitation is insufficient.
     """
     robot.check_state(q=q, qd=qd, qdd=qdd, tau=tau)
     if not all(bool(torch.isfinite(x).all()) for x in (q, qd, qdd, tau)):
@@ -223,7 +223,7 @@ def identify(
         )
     freedom = n - unknowns / nq
     x, _, _ = _least_squares(W, y, np.ones(nq))
-    # An exact log leaves no noise to weigh by.
+    # A noise-free log leaves no residuals from which weights can be computed.
     floor = 1e-12 * np.abs(y).max() + 1e-300
     first = np.sqrt(((y - W @ x) ** 2).sum(axis=0) / freedom)
     x, covariance, condition = _least_squares(W, y, 1.0 / np.maximum(first, floor))
@@ -236,7 +236,7 @@ def identify(
 
 
 def _least_squares(W: np.ndarray, y: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the weighted solution, its covariance, and the condition number with unit columns."""
+    """Return the weighted solution, its covariance, and the condition number with columns of unit norm."""
     A = (W * weights[:, None]).reshape(-1, W.shape[-1])
     b = (y * weights).ravel()
     scale = np.linalg.norm(A, axis=0)

@@ -1,8 +1,8 @@
 """Poses, Jacobians and bias accelerations of a tree of joints, batched over states.
 
-Spatial vectors are `[angular, linear]`, in world axes, about the origin of the base. With joint screws s_j in
-this form and the ancestor matrix E, the twist of link i is V_i = Σ_j E_ij s_j q̇_j, so only the poses need a
-recursion over the depth of the tree.
+Spatial vectors are `[angular, linear]`, in world axes, about the origin of the base. With the joint screws
+s_j in this form and the ancestor matrix E, the twist of link i is V_i = Σ_j E_ij s_j q̇_j, so only the poses
+require recursion over the depth of the tree.
 """
 
 from __future__ import annotations
@@ -27,13 +27,13 @@ Anchor = tuple[str, Sequence[float]]
 
 @dataclass(frozen=True)
 class LinkPoses:
-    """Poses of the links relative to the base origin and the screws of their joints, world axes.
+    """Poses of the links relative to the base origin, and the screws of their joints, in world axes.
 
     Attributes:
-        batch: shape of the batch, B states in all.
+        batch: batch shape, with B states in total.
         R: `(3, 3, nq, B)` link axes.
         p: `(3, nq, B)` link origins [m].
-        angular, linear: `(3, nq, B)` the joint screws s_j.
+        angular, linear: `(3, nq, B)` angular and linear parts of the joint screws s_j.
     """
 
     batch: torch.Size
@@ -44,12 +44,12 @@ class LinkPoses:
 
     @property
     def rotation(self) -> Tensor:
-        """`(*batch, nq, 3, 3)` link axes."""
+        """Link axes `(*batch, nq, 3, 3)`."""
         return batch_first(self.R, self.batch).movedim(-1, -3)
 
     @property
     def position(self) -> Tensor:
-        """`(*batch, nq, 3)` link origins [m]."""
+        """Link origins `(*batch, nq, 3)` [m]."""
         return batch_first(self.p, self.batch).mT
 
 
@@ -69,13 +69,13 @@ class LinkMotion:
 
 
 class PointMotion(NamedTuple):
-    """The motion of a point fixed in a frame of the robot, world axes.
+    """Motion of a point fixed in a frame of the robot, in world axes.
 
     Attributes:
         rotation: `(*batch, 3, 3)` axes of the frame.
-        position: `(*batch, 3)` of the point [m].
+        position: `(*batch, 3)` position of the point [m].
         twist: `(*batch, 6)` [ω; ṗ] [rad/s], [m/s].
-        jacobian: J `(*batch, 6, nq)` with [ω; ṗ] = J q̇.
+        jacobian: J `(*batch, 6, nq)` such that [ω; ṗ] = J q̇.
         bias: J̇ q̇ `(*batch, 6)`, the acceleration [ω̇; p̈] at q̈ = 0.
     """
 
@@ -87,18 +87,18 @@ class PointMotion(NamedTuple):
 
     @classmethod
     def of(cls, blocks: Sequence[Tensor], qd: Tensor) -> PointMotion:
-        """Construct from rotation, position, J and J̇ q̇ of a compiled kernel, and q̇."""
+        """Construct from the rotation, position, J and J̇ q̇ computed by a compiled kernel, and from q̇."""
         rotation, position, J, bias = blocks
         return cls(rotation, position, vecdot(J, qd[..., None, :]), J, bias)
 
 
 def skew(v: Vector3) -> Rotation:
-    """Return the matrix [v]× with [v]× w = v × w."""
+    """Return the matrix [v]× for which [v]× w = v × w."""
     return batchlast.skew(v.movedim(-1, 0)).movedim((0, 1), (-2, -1))
 
 
 def common_states(robot: RobotModel, **states: Tensor) -> tuple[Tensor, ...]:
-    """Return joint-space arguments, checked and broadcast to one batch; `ShapeError` if one does not fit."""
+    """Check joint-space arguments and broadcast them to one batch shape; raise `ShapeError` on a mismatch."""
     robot.check_state(**states)
     if len({value.shape for value in states.values()}) == 1:
         return tuple(states.values())
@@ -114,14 +114,14 @@ def common_states(robot: RobotModel, **states: Tensor) -> tuple[Tensor, ...]:
 
 
 def _local_poses(robot: RobotModel, q: Tensor) -> Tensor:
-    """Return the pose [R p] of each link in its parent link, `(3, 4, nq, B)`, by Rodrigues' formula.
+    """Return the pose [R p] of each link relative to its parent, `(3, 4, nq, B)`, by Rodrigues' formula.
 
-    With a constant axis a, K = [a]× and the placement P: R = P a aᵀ + sin(q) P K + cos(q) (P − P a aᵀ).
+    For the constant axis a, K = [a]× and the placement P, R = P a aᵀ + sin(q) P K + cos(q) (P − P a aᵀ).
     """
     q, P, a = batch_last(q, 1), robot.placement_rotation, robot.axis[:, None, :]
     slide = (P * a).sum(-1)
     along = slide[..., None] * a
-    # The fourth column holds the placement and takes no part in the turn.
+    # The fourth column contains the position of the joint, which does not rotate.
     still = torch.cat([along, robot.placement_position[..., None]], dim=-1)
     sine = torch.nn.functional.pad(torch.linalg.cross(P, a.expand_as(P)), (0, 1))
     cosine = torch.nn.functional.pad(P - along, (0, 1))
@@ -136,7 +136,7 @@ def _local_poses(robot: RobotModel, q: Tensor) -> Tensor:
 
 
 def _chain(robot: RobotModel, levels: Sequence[Sequence[int]], q: JointVector) -> Tensor:
-    """Return R_parent [R p]_local of every link, `(3, 4, nq, B)`, level by level of the tree."""
+    """Return R_parent [R p]_local of every link, `(3, 4, nq, B)`, computed level by level of the tree."""
     local = _local_poses(robot, q)
     turned, parents = robot.base_rotation[..., None, None], [BASE]
     blocks, order = [], []
@@ -151,10 +151,10 @@ def _chain(robot: RobotModel, levels: Sequence[Sequence[int]], q: JointVector) -
 
 
 def link_poses(robot: RobotModel, q: JointVector) -> LinkPoses:
-    """Return the poses R_i = R_parent R_i^local of all links and the joint screws (world axes) at q.
+    """Return the poses R_i = R_parent R_i^local of all links and the joint screws at q, in world axes.
 
     Raises:
-        ShapeError: q does not fit the robot.
+        ShapeError: q has the wrong shape for the robot.
     """
     robot.check_state(q=q)
     T = _chain(robot, robot.levels, q)
@@ -177,7 +177,7 @@ def link_motion(robot: RobotModel, poses: LinkPoses, qd: JointVector) -> LinkMot
 
 
 def _frame_in_base(robot: RobotModel, poses: LinkPoses, index: int) -> tuple[Tensor, Tensor]:
-    """Return rotation `(3, 3, B)` and position `(3, B)` of a frame relative to the base, world axes."""
+    """Return rotation `(3, 3, B)` and position `(3, B)` of a frame relative to the base, in world axes."""
     parent, R, p = robot.frame_parents[index], robot.frame_rotation[index], robot.frame_position[index]
     if parent == BASE:
         B, base = poses.p.shape[-1], robot.base_rotation
@@ -187,7 +187,7 @@ def _frame_in_base(robot: RobotModel, poses: LinkPoses, index: int) -> tuple[Ten
 
 
 def pose_of_frame(robot: RobotModel, poses: LinkPoses, index: int) -> tuple[Rotation, Vector3]:
-    """Return axes `(*batch, 3, 3)` and position `(*batch, 3)` [m] of a frame relative to the base origin."""
+    """Return the axes `(*batch, 3, 3)` and position `(*batch, 3)` [m] of a frame relative to the base."""
     rotation, position = _frame_in_base(robot, poses, index)
     return batch_first(rotation, poses.batch), batch_first(position, poses.batch)
 
@@ -210,14 +210,14 @@ def frame_pose(robot: RobotModel, q: JointVector, frame: str) -> tuple[Rotation,
 
     Raises:
         UnknownNameError: the frame does not exist.
-        ShapeError: q does not fit the robot.
+        ShapeError: q has the wrong shape for the robot.
     """
     rotation, position = pose_of_frame(robot, link_poses(robot, q), robot.frame_index(frame))
     return rotation, position + robot.base_position
 
 
 def point_position(robot: RobotModel, q: JointVector, frame: str, point: object = (0.0, 0.0, 0.0)) -> Vector3:
-    """Return the world position `(*batch, 3)` [m] of a point fixed in a frame (coordinates in that frame)."""
+    """Return the world position `(*batch, 3)` [m] of a point given in the coordinates of a frame."""
     R, p = frame_pose(robot, q, frame)
     return p + (R @ as_point(robot, point)[..., None])[..., 0]
 
@@ -225,18 +225,18 @@ def point_position(robot: RobotModel, q: JointVector, frame: str, point: object 
 def point_jacobian(
     robot: RobotModel, q: JointVector, frame: str, point: object = (0.0, 0.0, 0.0)
 ) -> PointJacobian:
-    """Return J with ṗ = J q̇ for a point in a frame, `(*batch, 3, nq)`, world axes; see `frame_jacobian`."""
+    """Return J `(*batch, 3, nq)` with ṗ = J q̇ for a point fixed in a frame; see `frame_jacobian`."""
     return frame_jacobian(robot, q, frame, point)[..., 3:, :]
 
 
 def frame_jacobian(
     robot: RobotModel, q: JointVector, frame: str, point: object = (0.0, 0.0, 0.0)
 ) -> FrameJacobian:
-    """Return J with [ω; ṗ] = J q̇ for a frame and a point fixed in it, `(*batch, 6, nq)`, world axes.
+    """Return J `(*batch, 6, nq)` with [ω; ṗ] = J q̇ for a frame and a point fixed in it, in world axes.
 
     Raises:
         UnknownNameError: the frame does not exist.
-        ShapeError: q does not fit the robot.
+        ShapeError: q has the wrong shape for the robot.
     """
     index = robot.frame_index(frame)
     return jacobian_of_poses(robot, link_poses(robot, q), index, as_point(robot, point))
@@ -250,7 +250,7 @@ def point_motion(
     frame: str,
     point: object = (0.0, 0.0, 0.0),
 ) -> PointMotion:
-    """Return the motion of a point fixed in a frame, from links with known motion.
+    """Return the motion of a point fixed in a frame, computed from the motion of the links.
 
     Raises:
         UnknownNameError: the frame does not exist.
@@ -264,14 +264,14 @@ def point_motion(
 
 
 def jacobian_of_poses(robot: RobotModel, poses: LinkPoses, index: int, point: Tensor) -> FrameJacobian:
-    """Return `frame_jacobian` from known poses."""
+    """Return the same Jacobian as `frame_jacobian`, computed from known poses."""
     rotation, origin = _frame_in_base(robot, poses, index)
     x = origin + batchlast.apply(rotation, point[:, None])
     return batch_first(_jacobian(robot, poses, index, x), poses.batch)
 
 
 def _jacobian(robot: RobotModel, poses: LinkPoses, index: int, x: Tensor) -> Tensor:
-    """Return J `(6, nq, B)` of the point of a frame that is at x `(3, B)`."""
+    """Return J `(6, nq, B)` for the point at x `(3, B)` that is fixed in a frame."""
     linear = poses.linear + batchlast.cross(poses.angular, x[:, None])
     parent = robot.frame_parents[index]
     moving = torch.zeros_like(robot.revolute) if parent == BASE else robot.ancestors[parent]
@@ -281,12 +281,12 @@ def _jacobian(robot: RobotModel, poses: LinkPoses, index: int, x: Tensor) -> Ten
 def point_velocity(
     robot: RobotModel, q: JointVector, qd: JointVector, frame: str, point: object = (0.0, 0.0, 0.0)
 ) -> Vector3:
-    """Return ṗ = J q̇ of a point fixed in a frame, `(*batch, 3)` [m/s], world axes."""
+    """Return the velocity ṗ = J q̇ `(*batch, 3)` [m/s] of a point fixed in a frame, in world axes."""
     return (point_jacobian(robot, q, frame, point) @ qd[..., None])[..., 0]
 
 
 def _bias(robot: RobotModel, poses: LinkPoses, motion: LinkMotion, index: int, x: Tensor) -> Tensor:
-    """Return [α; a + α × x + ω × (v + ω × x)] `(6, B)` of the point of a frame that is at x `(3, B)`."""
+    """Return [α; a + α × x + ω × (v + ω × x)] `(6, B)` for the point at x `(3, B)` fixed in a frame."""
     parent = robot.frame_parents[index]
     if parent == BASE:
         return poses.p.new_zeros(6, poses.p.shape[-1])

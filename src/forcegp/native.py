@@ -1,8 +1,8 @@
 """Compilation of C++ source text to a shared library, with a cache on disk.
 
-Compiled kernels are code, so they are stored in a folder that only their owner can write to, and checked
-before they run. A kernel is named `<key>-<SHA-256 of the file>.so`; the key identifies the source, and the
-digest a complete file. The folder (0700) and the files (0600) are private regardless of the umask.
+Compiled kernels are code, so they are stored in a folder to which only its owner can write, and are checked
+before they run. A kernel is named `<key>-<SHA-256 of the file>.so`. The key identifies the source; the digest
+verifies that the file is complete. The folder (0700) and files (0600) are private regardless of the umask.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from forcegp.files import Temporary, atomic_file, discard, sweep
 FLAGS = ["-std=c++17", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-w", "-shared", "-fPIC"]
 LIBRARY = "kernel.so"
 PROC = Path("/proc/self/fd")
-"""Names of open files and folders by their descriptors, on Linux."""
+"""Folder in which Linux lists the open files and folders by their descriptors."""
 
 
 def find_compiler() -> str:
-    """Return the path of the C++ compiler, `$CXX` or on the PATH, or raise `MissingDependencyError`."""
+    """Return the path of `$CXX` or of a C++ compiler on the PATH; raise `MissingDependencyError` if none."""
     wanted = [os.environ["CXX"]] if os.environ.get("CXX") else ["c++", "g++", "clang++"]
     for name in wanted:
         if path := shutil.which(name):
@@ -52,7 +52,7 @@ def _machine() -> str:
 
 
 def load_library(source: str, level: str = "-O2") -> ctypes.CDLL:
-    """Return the library of a C++ source, compiled unless cached; `MissingDependencyError` if that fails."""
+    """Load the library of a C++ source, compiled unless cached; raise `MissingDependencyError` on failure."""
     compiler = find_compiler()
     try:
         version = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=False).stdout
@@ -70,7 +70,7 @@ def load_library(source: str, level: str = "-O2") -> ctypes.CDLL:
         if kept is not None:
             try:
                 return ctypes.CDLL(str(kept))
-            except OSError:  # of another machine that shares the folder: build it anew
+            except OSError:  # built on a different machine that shares the folder: rebuild it
                 discard(kept)
         return ctypes.CDLL(str(store(folder, key, _compiled([compiler, level], source, folder))))
     except OSError as cause:
@@ -82,7 +82,7 @@ def load_library(source: str, level: str = "-O2") -> ctypes.CDLL:
 
 
 def _compiled(compiler: Sequence[str], source: str, folder: Path) -> bytes:
-    """Return the content of the shared library, and remove files left by killed compilers."""
+    """Compile a shared library and return its content; remove files left by killed compilers."""
     target = folder / "build"
     sweep(target)
     build = Temporary(target, folder=True, mode=0o700)
@@ -95,7 +95,7 @@ def _compiled(compiler: Sequence[str], source: str, folder: Path) -> bytes:
 
 def _built(compiler: Sequence[str], source: str, folder: Path) -> bytes:
     """Return the compiler output from a private folder, which is held open in case its path is replaced."""
-    if not PROC.is_dir():  # no folder has a name by its descriptor here
+    if not PROC.is_dir():  # this system cannot address a folder by its descriptor
         _run_compiler(compiler, source, folder)
         return (folder / LIBRARY).read_bytes()
     held = os.open(folder, os.O_RDONLY | os.O_DIRECTORY | os.O_NOFOLLOW)
@@ -122,7 +122,7 @@ def _run_compiler(compiler: Sequence[str], source: str, folder: Path) -> None:
 
 
 def cache_directory() -> Path:
-    """Return the folder of compiled kernels: `$FORCEGP_CACHE`, or `forcegp` in the user's cache folder."""
+    """Return the folder for compiled kernels: `$FORCEGP_CACHE`, or `forcegp` in the user's cache folder."""
     chosen = os.environ.get("FORCEGP_CACHE")
     if chosen:
         return Path(chosen)
@@ -130,7 +130,7 @@ def cache_directory() -> Path:
 
 
 def private_folder(folder: Path) -> Path:
-    """Return a folder private to its owner; `MissingDependencyError` if others can replace it."""
+    """Return a folder private to its owner; raise `MissingDependencyError` if others can replace it."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     with contextlib.suppress(FileExistsError):
         folder.mkdir(mode=0o700)
@@ -146,7 +146,7 @@ def _check_owner(folder: Path) -> None:
         status = place.stat()
         if status.st_uid not in ((os.geteuid(),) if place == folder else (os.geteuid(), 0)):
             raise _untrusted(folder, place, f"owned by user {status.st_uid}")
-        # In a folder with the sticky bit, such as /tmp, nobody replaces what belongs to another.
+        # In a folder with the sticky bit, such as /tmp, users cannot replace files of other users.
         sticky = place != folder and bool(status.st_mode & stat.S_ISVTX)
         shared = bool(status.st_mode & stat.S_IWGRP) and not (place != folder and _is_alone_in(status.st_gid))
         if (shared or status.st_mode & stat.S_IWOTH) and not sticky:
@@ -176,7 +176,7 @@ def _untrusted(folder: Path, place: Path, got: str) -> MissingDependencyError:
 
 
 def find(folder: Path, key: str) -> Path | None:
-    """Return the kernel with a key if it is complete and owned by this user; others are removed."""
+    """Return the kernel with a given key if it is complete and owned by this user; remove all others."""
     for path in sorted(folder.glob(f"{key}-*.so")):
         if _trusted(path):
             return path
@@ -201,7 +201,7 @@ def _trusted(path: Path) -> bool:
 
 
 def store(folder: Path, key: str, content: bytes) -> Path:
-    """Write a kernel; OSError if it cannot be written."""
+    """Write a kernel and return its path; raise `OSError` if it cannot be written."""
     library = folder / f"{key}-{hashlib.sha256(content).hexdigest()}.so"
     with atomic_file(library, mode=0o600) as temporary:
         temporary.chmod(0o600)

@@ -36,7 +36,7 @@ def html_table(
 
 
 def text(value: object, digits: int = 4) -> str:
-    """Format a value as text, floats with significant digits."""
+    """Format a value as text, with floats rounded to `digits` significant digits."""
     return f"{value:.{digits}g}" if isinstance(value, float) else str(value)
 
 
@@ -47,7 +47,7 @@ def _row(cells: Sequence[str], tag: str) -> str:
 
 
 class FitBar:
-    """A progress bar in the output of a notebook cell, for `fit(…, progress=FitBar())`; silent elsewhere.
+    """A progress bar for `fit(…, progress=FitBar())` in a notebook cell; it shows nothing elsewhere.
 
     Example:
         >>> bar = FitBar()
@@ -73,7 +73,7 @@ class FitBar:
             self._shown.update(content, raw=True)
 
     def html(self) -> str:
-        """Return the bar and its numbers."""
+        """Return the bar and its numbers as HTML."""
         bar = f'<progress value="{self.done}" max="{self.total}"></progress>'
         most = f" of at most {self.total}" if self.done < self.total else ""
         return f"{bar} {self.done}{most} evaluations, objective {text(self.objective)}"

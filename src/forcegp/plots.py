@@ -1,4 +1,4 @@
-"""Plots over time of data sets, predictions, models and rollouts with matplotlib.
+"""Plots of data sets, predictions, models and rollouts over time, drawn with matplotlib.
 
 Panels share a time axis and contain curves, bands of ±2 standard deviations, and shading for contact.
 Segments are placed one after the other, with gaps between them.
@@ -21,9 +21,9 @@ from forcegp.errors import ParameterError, check_name
 MEASURED = "#222222"
 PREDICTED = "#0072b2"
 CONTACT = "#f5eed6"
-"""Shading for contact."""
+"""Colour of the shading during contact."""
 CYCLE = ("#0072b2", "#d55e00", "#007a5e", "#c4488c", "#6a3d9a", "#d08c00", "#555555")
-"""One colour per joint; further joints reuse the colours."""
+"""Colours of the joints, which are reused if there are more joints."""
 SYMBOLS = {
     "q": "q",
     "qd": r"\dot{q}",
@@ -39,15 +39,15 @@ SYMBOLS = {
     "c": "c",
     "cd": r"\dot{c}",
 }
-"""Quantities in the library's notation, as mathematical text."""
+"""Symbols of quantities in the library's notation, as matplotlib math text."""
 POWERS = {"q": "", "qd": "/s", "qdd": "/s²", "qdd_free": "/s²"}
 CARTESIAN = {"multiplier": "N", "contact_force": "N", "c": "m", "cd": "m/s"}
 
 
 def unit(quantity: str, kinds: Sequence[str] = ()) -> str:
-    """Return the unit of a quantity in `SYMBOLS`, without brackets; empty for an unknown quantity.
+    """Return the unit of a quantity in `SYMBOLS` without brackets, or "" for an unknown quantity.
 
-    Without the types of the joints on the axis (`"revolute"` or `"prismatic"`), both units are returned.
+    If the types of the plotted joints (`"revolute"` or `"prismatic"`) are not given, both units are returned.
 
     Example:
         >>> unit("qdd", ["revolute"]), unit("tau"), unit("multiplier")
@@ -64,7 +64,7 @@ def unit(quantity: str, kinds: Sequence[str] = ()) -> str:
 
 
 def axis_label(quantity: str, kinds: Sequence[str] = (), symbol: str | None = None) -> str:
-    """Return the axis label of a quantity; `symbol` replaces the symbol of the library."""
+    """Return the axis label of a quantity; `symbol` overrides the library's default symbol."""
     label = symbol or (f"${SYMBOLS[quantity]}$" if quantity in SYMBOLS else quantity)
     units = unit(quantity, kinds)
     return f"{label} [{units}]" if units else label
@@ -72,7 +72,7 @@ def axis_label(quantity: str, kinds: Sequence[str] = (), symbol: str | None = No
 
 Array = NDArray[np.float64]
 GAP = 3.0
-"""Number of median steps beyond which a time step interrupts a curve."""
+"""Multiple of the median time step beyond which a step interrupts the curve."""
 
 
 @dataclass(frozen=True)
@@ -98,7 +98,7 @@ class Timeline:
 
         Args:
             t: `(n,)` [s].
-            segment: `(n,)` trajectory of each sample; by default a single one.
+            segment: `(n,)` trajectory number of each sample; by default, all samples form one trajectory.
             ordered: whether the rows are in time order within each segment.
         """
         x, segments = as_array(t), np.zeros(len(t)) if segment is None else as_array(segment)
@@ -115,15 +115,15 @@ class Timeline:
         return cls(x, order, breaks, ordered, label)
 
     def place(self, values: Tensor) -> Array:
-        """Return the values `(n, …)` in axis order."""
+        """Return the values `(n, …)` in the order of the axis."""
         return as_array(values)[self.order]
 
     def open(self, values: Array) -> Array:
-        """Return the values `(n,)` in axis order, with NaN at interruptions of the curve."""
+        """Return values `(n,)`, given in the order of the axis, with NaN inserted at interruptions."""
         return np.insert(values, self.breaks, np.nan)
 
     def spans(self, closed: Tensor) -> list[tuple[float, float]]:
-        """Return the time intervals in which a flag `(n,)` is true; empty unless samples form a series."""
+        """Return the time intervals in which a flag `(n,)` is true, or none if samples are not in order."""
         flags = as_array(closed)[self.order] > 0
         if not self.ordered or not len(flags):
             return []
@@ -140,12 +140,12 @@ def as_array(values: Any) -> Array:
 Target = Axes | Iterable[Axes] | None
 """Axes to draw on, one per panel, or `None` for a new figure."""
 WIDTH, ROW, MARGIN = 7.0, 1.25, 0.9
-"""Size of a new figure [inch]."""
+"""Width, height per panel, and margin of a new figure [inch]."""
 
 
 @dataclass(frozen=True)
 class Curve:
-    """Values over time `(n,)`, with their standard deviation as a band of ±2, and the line's `width` [pt]."""
+    """Values over time `(n,)`, their standard deviation, drawn as a ±2σ band, and the line `width` [pt]."""
 
     values: Tensor
     label: str
@@ -168,7 +168,7 @@ def draw_panels(
 ) -> list[Axes]:
     """Draw panels from top to bottom on `ax`, by default a new figure, and return their axes.
 
-    Intervals with any `closed` `(n,)` contact are shaded.
+    Intervals in which at least one contact is `closed` (flags `(n,)` for each contact) are shaded.
 
     Raises:
         ParameterError: the number of axes is wrong.
@@ -224,7 +224,7 @@ def _draw(axes: Axes, curve: Curve, time: Timeline) -> None:
 
 
 def chosen(wanted: Sequence[str] | None, names: Sequence[str], kind: str) -> list[int]:
-    """Return the indices of the selected names, by default all; `UnknownNameError` for unknown names."""
+    """Return the indices of the wanted names, by default all; raise `UnknownNameError` for unknown names."""
     for name in wanted or ():
         check_name(kind, name, names)
     return [list(names).index(name) for name in (names if wanted is None else wanted)]

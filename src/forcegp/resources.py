@@ -1,4 +1,4 @@
-"""Memory and threads: large allocations cause a warning or an error before they are made.
+"""Checks of memory, with a warning or an error before a large allocation, and control of threads.
 
 Operations on small tensors run on one thread, and SciPy uses as many threads as PyTorch.
 """
@@ -29,16 +29,16 @@ class MemoryNeedWarning(UserWarning):
 
 
 def free_memory() -> int | None:
-    """Return the memory available without swapping, within the container's limit [bytes], if known."""
+    """Return the memory available without swapping and within the container's limit [bytes], if known."""
     limits = [value for value in (_available(), _container_memory()) if value is not None]
     return min(limits) if limits else None
 
 
 def announce_memory(needed: int, what: str, *, certain: int | None = None) -> None:
-    """Warn if work needs more than half of the free memory; `MemoryLimitError` if it needs more than all.
+    """Warn if work needs over half of the free memory; raise `MemoryLimitError` if it needs more than all.
 
-    Call this before the allocation, with an upper bound [bytes], and a `certain` lower bound if the upper one
-    is rough; `what` is the subject of the message, such as "the covariance of 20,000 points".
+    Call this before the allocation with an upper bound `needed` [bytes] and, if it is rough, a lower bound
+    `certain`. `what` is the subject of the message, such as "the covariance of 20,000 points".
     """
     free = free_memory()
     if free is None or needed <= LARGE * free:
@@ -85,8 +85,8 @@ def _container_memory() -> int | None:
 def one_thread() -> Iterator[None]:
     """Run PyTorch on one thread within the block, in the calling thread only.
 
-    Threads cost more than they save on small matrices. OpenMP has this setting per thread;
-    `torch.set_num_threads` would change it permanently for all threads.
+    For small matrices, threads cost more time than they save. OpenMP limits the calling thread only, whereas
+    `torch.set_num_threads` would permanently change the setting for all threads.
     """
     if torch.get_num_threads() == 1:
         yield
@@ -99,8 +99,8 @@ def one_thread() -> Iterator[None]:
 def threads_of_pytorch() -> Iterator[None]:
     """Run SciPy's and NumPy's BLAS on as many threads as PyTorch within the block.
 
-    OpenBLAS starts one spinning thread per processor, which slows down several processes considerably. Its
-    setting is per process, so blocks of several threads take turns.
+    OpenBLAS starts one spinning thread per processor, which considerably slows down concurrent processes. Its
+    setting applies to the whole process, so blocks in different threads take turns.
     """
     threads = torch.get_num_threads()
     with _TURN:
@@ -119,6 +119,6 @@ def _openblas() -> ThreadpoolController:
 
 @cache
 def _openmp() -> ThreadpoolController:
-    """Return the OpenMP libraries of the process; found once, which takes milliseconds."""
+    """Return the OpenMP libraries of the process, which are looked up once since this takes milliseconds."""
     torch.get_num_threads()
     return ThreadpoolController().select(user_api="openmp")

@@ -12,17 +12,17 @@ MAD_TO_STD = 1.4826
 
 
 def robust_std(x: NDArray[Any]) -> NDArray[Any]:
-    """Return the standard deviation of a normal distribution with the same median absolute deviation."""
+    """Return the standard deviation of the normal distribution with the same median absolute deviation."""
     return np.asarray(MAD_TO_STD * np.median(np.abs(x - np.median(x, axis=0)), axis=0))
 
 
 def level_and_spread(x: NDArray[Any]) -> tuple[float, float]:
-    """Median and robust standard deviation, NaN without values."""
+    """Return the median and the robust standard deviation, or NaN if there are no values."""
     return (float(np.median(x)), float(robust_std(x))) if len(x) else (float("nan"), float("nan"))
 
 
 def level_of(x: NDArray[Any], width: float, share: float) -> float | None:
-    """Return the median within `width` of the mode of a histogram, if it contains a share of all values.
+    """Return the median of the values within `width` of the mode, if they are more than a `share` of all.
 
     >>> level_of(np.array([5.0, 5.1, 4.9, 40.0, -7.0]), 1.0, 0.5)
     5.0
@@ -32,15 +32,3 @@ def level_of(x: NDArray[Any], width: float, share: float) -> float | None:
     bins, counts = np.unique(np.floor(x / width), return_counts=True)
     near = x[np.abs(x - width * (bins[counts.argmax()] + 0.5)) <= width]
     return float(np.median(near)) if len(near) > share * len(x) else None
-
-
-def resolution(x: NDArray[Any]) -> NDArray[Any]:
-    """Return the step between the values of a column with few distinct values, and zero for other columns."""
-    steps = np.zeros(x.shape[1])
-    for j, levels in enumerate(map(np.unique, x.T)):
-        if 2 < len(levels) < 0.75 * len(x):
-            gaps = np.diff(levels)
-            # Rounding in the last digit makes two levels of one; those gaps are not steps.
-            gaps = gaps[gaps > 1e-6 * gaps.max()]
-            steps[j] = np.median(gaps)
-    return steps

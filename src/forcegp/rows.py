@@ -1,4 +1,4 @@
-"""Stretches of rows of a log, and their description in messages."""
+"""Stretches of rows in a log, and their description in messages."""
 
 from __future__ import annotations
 
@@ -9,11 +9,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 Intervals = tuple[tuple[int, int], ...]
-"""Half-open, increasing intervals."""
+"""Half-open intervals in increasing order."""
 
 
 def runs(*keys: NDArray[Any]) -> list[slice]:
-    """Return the stretches of rows with constant keys.
+    """Return the stretches of rows over which all keys are constant.
 
     >>> runs(np.array([0, 0, 1, 1]), np.array([True, True, True, False]))
     [slice(0, 2, None), slice(2, 3, None), slice(3, 4, None)]
@@ -27,7 +27,7 @@ def runs(*keys: NDArray[Any]) -> list[slice]:
 
 
 def intervals(mask: NDArray[np.bool_], join: int = 0) -> Intervals:
-    """Return the runs of true rows, merging runs at most `join` rows apart.
+    """Return the runs of true rows, merging runs that are at most `join` rows apart.
 
     >>> intervals(np.array([True, True, False, True]))
     ((0, 2), (3, 4))

@@ -1,4 +1,4 @@
-"""Fits of several models for several robots and seeds, on the workers of a Dask cluster.
+"""Fits of several models for several robots and seeds, run by the workers of a Dask cluster.
 
 Each fit is a task that writes a folder, so an interrupted sweep resumes with the missing fits.
 """
@@ -29,9 +29,9 @@ SCORE, MODEL = "score.json", "model"
 
 @dataclass(frozen=True)
 class SweptFit:
-    """A fit of a sweep: a scene with its simulated motion, a model, and a seed.
+    """A fit in a sweep, defined by a scene with its simulated motion, a model, and a seed.
 
-    `duration` is the simulated time [s]; `None` uses that of the scene.
+    `duration` is the simulated time [s]; if it is `None`, the duration in the scene is used.
     """
 
     scene: str
@@ -58,7 +58,7 @@ def fits_of(
 
 
 def run_fit(fit: SweptFit, out: str) -> dict[str, Any]:
-    """Simulate, fit and score, unless already done, on a worker in one thread."""
+    """Simulate, fit and score on one thread of a worker, or return the scores of an earlier run."""
     folder = Path(out) / fit.name
     if (folder / SCORE).is_file():
         return json.loads((folder / SCORE).read_text(encoding="utf-8"))

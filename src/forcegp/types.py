@@ -1,8 +1,8 @@
-"""Shape aliases: every batched quantity has its batch dimensions first, `(*batch, …)`.
+"""Shape aliases, in which every batched quantity has its batch dimensions first, `(*batch, …)`.
 
-The batches of joint vectors broadcast against each other (`*#batch`). Sizes are `nq` joints, `nf` frames, `m`
-constraint rows, `n` samples and `d` components. The aliases document shapes in signatures; the test suite
-enforces them at run time.
+The batch dimensions of joint vectors broadcast against each other (`*#batch`). The sizes are `nq` joints,
+`nf` frames, `m` constraint rows, `n` samples and `d` components. The aliases document shapes in signatures,
+and the test suite enforces them at run time.
 """
 
 from __future__ import annotations
@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 Array = Any
-"""NumPy arrays (shapes in docstrings)."""
+"""A NumPy array, the shape of which is given in the docstring."""
 Scalars = Float[Tensor, "*batch"]
 Vector3 = Float[Tensor, "*batch 3"]
 Rotation = Float[Tensor, "*batch 3 3"]

@@ -4,12 +4,10 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-import torch
 
-from forcegp.data import SavitzkyGolay, with_noise
+from forcegp.data import SavitzkyGolay
 from forcegp.data.derivative import differentiate
 from forcegp.errors import DataError
-from logs import random_log
 
 DT = 1.0 / 240.0
 
@@ -67,17 +65,3 @@ def test_uneven_time_and_short_segments_are_refused() -> None:
 def test_filters_that_are_not_defined(window: int, order: int) -> None:
     with pytest.raises(DataError, match="not defined"):
         SavitzkyGolay(window, order)
-
-
-def test_noise_is_added_to_the_clean_value_once() -> None:
-    log = random_log(4000)
-    noisy = with_noise(log, 0.1, torch.Generator().manual_seed(3))
-    twice = with_noise(noisy, 0.1, torch.Generator().manual_seed(4))
-    for data in (noisy, twice):
-        assert torch.equal(data.qdd_clean, log.qdd)
-        # 12,000 draws give the spread to 0.65 %.
-        assert float((data.qdd - log.qdd).std()) == pytest.approx(0.1, rel=0.03)
-    assert torch.equal(with_noise(log, 0.1, torch.Generator().manual_seed(3)).qdd, noisy.qdd)
-    assert noisy.header.noise_std == 0.1 and "seed 3" in noisy.header.provenance[-1]
-    with pytest.raises(DataError, match="noise is invalid"):
-        with_noise(log, float("nan"), torch.Generator())

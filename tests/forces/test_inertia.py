@@ -49,6 +49,7 @@ def log(
     memory: float = 0.0,
     window: int = 1,
     late: float = 0.0,
+    step: float = 0.01,
 ) -> forcegp.Dataset:
     """Torques that move a robot with joint friction along sums of sines, measured with noise.
 
@@ -56,7 +57,7 @@ def log(
     Torques are logged late [s]. Noise of accelerations is that of a Savitzky-Golay filter of a window.
     """
     generator = torch.Generator().manual_seed(seed)
-    t = torch.arange(n, dtype=torch.float64) * 0.01
+    t = torch.arange(n, dtype=torch.float64) * step
     segment = torch.arange(n) * segments // n
     w = speed * (1.0 + 5.0 * torch.rand(segments, 3, 2, generator=generator, dtype=torch.float64))
     phase = 6.3 * torch.rand(segments, 3, 2, generator=generator, dtype=torch.float64)
@@ -76,7 +77,7 @@ def log(
     weights = torch.ones(1) if window == 1 else torch.from_numpy(savgol_coeffs(window, 3, deriv=2))
     weights = weights.double() / weights.norm()
     qdd = qdd + acceleration_noise * (white.unfold(0, window, 1) @ weights)
-    header = DataHeader(filter_span=None if window == 1 else window * 0.01)
+    header = DataHeader(filter_span=None if window == 1 else window * step)
     return forcegp.Dataset(
         t=t, q=q, qd=qd, qdd=qdd, tau=tau, joint_names=robot.joint_names, segment=segment, header=header
     )
@@ -225,10 +226,13 @@ def test_noise_of_accelerations_does_not_make_inertia_smaller(file: RobotModel, 
     torch.testing.assert_close(own, exact, rtol=0.04, atol=0.0)
 
 
-def test_correlated_noise_of_a_filter_leaves_the_inertia_right(file: RobotModel) -> None:
+@pytest.mark.parametrize(("window", "step"), [(11, 0.01), (61, 0.001), (151, 0.001)])
+def test_correlated_noise_of_a_filter_leaves_the_inertia_right(
+    file: RobotModel, window: int, step: float
+) -> None:
     """Whether or not the log states the span of the filter, within which instruments have the noise too."""
     truth = file.replace(mass=1.3 * file.mass, com=0.9 * file.com)
-    data = log(truth, 6400, 0.6, acceleration_noise=0.7, window=11)
+    data = log(truth, round(64.0 / step), 0.6, acceleration_noise=0.7, window=window, step=step)
     exact = dynamics.mass_matrix(truth, data.q).diagonal(dim1=-2, dim2=-1).mean(0)
     for each in (data, data.replace(header=DataHeader())):
         M = dynamics.mass_matrix(found(file, each).robot, data.q).diagonal(dim1=-2, dim2=-1).mean(0)

@@ -10,7 +10,7 @@ from safetensors.torch import save_file
 
 from forcegp.gp.basis import latent_basis
 from forcegp.gp.features import rows_of
-from forcegp.gp.sums import accumulate, reduce_sums, shard, share_basis
+from forcegp.gp.sums import accumulate, reduce_sums, share_basis
 from gp.sparse_cases import COMPONENTS, PROCESSES, first, parameters, rows
 
 SAMPLES, POINTS = 61, 12
@@ -22,7 +22,7 @@ def run(rank: int, processes: int, folder: str) -> None:
     store = Path(folder) / "store"
     dist.init_process_group("gloo", init_method=store.as_uri(), rank=rank, world_size=processes)
     block = rows(SAMPLES)
-    own = rows_of(block, shard(SAMPLES, rank, processes))
+    own = rows_of(block, torch.arange(SAMPLES).tensor_split(processes)[rank])
     wrong = {key: value + 0.1 * rank for key, value in parameters().items()}
     mine = latent_basis(PROCESSES, wrong, first(rows(POINTS, seed=5 + rank), POINTS), COMPONENTS)
     sums = reduce_sums(accumulate(share_basis(mine), [own]))

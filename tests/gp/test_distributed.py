@@ -11,7 +11,7 @@ from safetensors.torch import load_file
 
 from forcegp.errors import ModelError
 from forcegp.gp.basis import latent_basis
-from forcegp.gp.sums import accumulate, reduce_sums, shard
+from forcegp.gp.sums import accumulate, reduce_sums
 from gp.distributed_worker import POINTS, SAMPLES, run
 from gp.sparse_cases import COMPONENTS, PROCESSES, first, parameters, rows
 
@@ -29,15 +29,6 @@ def test_two_processes_equal_one(tmp_path: Path) -> None:
         for i, part in enumerate(one.tensors):
             scale = float(part.abs().max())
             assert float((got[f"sum.{i}"] - part).abs().max()) < ADDED * scale
-
-
-def test_shards_cover_all_samples_once() -> None:
-    for samples, processes in ((7, 3), (2, 5), (100, 1), (0, 2)):
-        own = [range(samples)[shard(samples, rank, processes)] for rank in range(processes)]
-        assert [i for part in own for i in part] == list(range(samples))
-        assert max(map(len, own)) - min(map(len, own)) <= 1
-    with pytest.raises(ModelError, match="no such process"):
-        shard(5, 2, 2)
 
 
 def test_without_a_group_the_message_says_how_to_start() -> None:

@@ -148,6 +148,18 @@ def rounded_tip() -> StructuredFit:
     return model.fit(free_log(robot, 40).replace(contact=contact), learn=[])
 
 
+def undetermined() -> StructuredFit:
+    """Contacts that share a load, one that is never closed, and one that cannot move."""
+    robot, up = forcegp.load_robot("kuka_iiwa"), forcegp.Plane()
+    at = {"a": ("lbr_iiwa_link_7", 0.1), "b": ("lbr_iiwa_link_7", 0.1)}
+    at |= {"never": ("lbr_iiwa_link_5", 0.1), "base": ("lbr_iiwa_link_0", 0.1)}
+    contacts = [forcegp.SurfaceContact(name, frame, (0, 0, z), up) for name, (frame, z) in at.items()]
+    closed = {name: mixed_contacts(40)[:, int(name == "b")] for name in at}
+    closed["never"] = torch.zeros(40, dtype=torch.bool)
+    model = forcegp.StructuredGP(forcegp.ConstrainedSystem(robot, contacts), "analytical", "friction", 0.1)
+    return model.fit(free_log(robot, 40).replace(contact=closed), learn=[])
+
+
 CASES: dict[str, Callable[[], StructuredFit]] = {
     f.__name__: f
     for f in (
@@ -162,11 +174,12 @@ CASES: dict[str, Callable[[], StructuredFit]] = {
         rounded_tip,
     )
 }
+MORE: dict[str, Callable[[], StructuredFit]] = {"undetermined": undetermined}
 
 
 @cache
 def fitted(name: str) -> StructuredFit:
-    return CASES[name]()
+    return (CASES | MORE)[name]()
 
 
 @cache
@@ -250,6 +263,79 @@ def test_batches_and_single_states() -> None:
     assert list(swapped.parts) == ["qdd", "multiplier"] and list(flat.parts) == ["multiplier", "qdd"]
     assert torch.equal(swapped.mean, flat.mean.roll(-2, dims=-1)) and flat.covariance is not None
     assert torch.equal(swapped.covariance, flat.covariance.roll((-2, -2), dims=(-2, -1)))
+
+
+def log_of(fit: StructuredFit) -> forcegp.Dataset:
+    m, t = fit.training.measurements[0], torch.arange(len(fit.training.measurements[0].q)).double()
+    closed = dict(zip(fit.system.contact_names, m.active.mT, strict=True))
+    return forcegp.Dataset(t, m.q, m.qd, m.tau, m.values, fit.system.robot.joint_names, contact=closed)
+
+
+@pytest.mark.parametrize("first", [0, 2])
+def test_undetermined_forces_are_those_of_the_fit(first: int) -> None:
+    fit, n = fitted("undetermined"), 16
+    fast, state, active = compiled("undetermined"), draw(n, 11), mixed_contacts(n).repeat(1, 2)
+    assert fit.result.never_closed == ("never",)
+    if first:
+        log = log_of(fit)[:first]
+        log = log.replace(contact={**log.contact, "never": torch.tensor([False, True])})
+        for i in range(first):
+            fit = fit.update(log[i : i + 1])
+        fast = fast.update(log.q, log.qd, log.tau, log.qdd, active=log.active(fit.system.contact_names))
+        assert fit.result.never_closed == ()
+    some = ["contact_force", "multiplier", "qdd"]
+    for quantity in (["multiplier"], some, ["constraint_force", "qdd"], ALL):
+        theirs = fit.predict(*state, quantity, active=active)
+        ours = fast.predict(*state, quantity, active=active)
+        assert ours.doubts == theirs.doubts and ours.mean.isnan().equal(theirs.mean.isnan())
+        assert (ours.determined is None) == (theirs.determined is None)
+        assert theirs.determined is None or torch.equal(ours.determined, theirs.determined)
+        assert theirs.covariance is not None and ours.covariance is not None
+        assert ours.covariance.isnan().equal(theirs.covariance.isnan())
+        known = [Prediction(x.mean.nan_to_num(), x.covariance.nan_to_num()) for x in (ours, theirs)]  # type: ignore[union-attr]
+        assert max(differences(*known)) < SAME
+        assert quantity[0] == "constraint_force" or any("same direction" in doubt for doubt in ours.doubts)
+    if not first:
+        for predictor in (fit, fast):
+            with pytest.raises(ModelError, match="contact never is never closed"):
+                predictor.predict(*state, "constraint_force", active=active)
+
+
+@needs_gcc
+def test_the_test_program_expects_undetermined_forces(tmp_path: Path) -> None:
+    folder = fitted("undetermined").export(tmp_path / "c").folder
+    ran = built(folder, "-O1")
+    assert ran.returncode == 0, ran.stdout
+    path = folder / "controller.c"
+    path.write_text(path.read_text().replace("if (lost[a]) mean[a] = NAN;", "if (lost[a]) mean[a] = 0.0;"))
+    assert built(folder, "-O1").returncode == 1
+
+
+@pytest.mark.parametrize("name", ["one_contact", "exact", "zero_mean"])
+def test_states_beyond_the_training_data_are_flagged_without_learned_noise(name: str) -> None:
+    fit = fitted(name)
+    q, qd, tau = (x[0] for x in states(fit)[0])
+    for predictor in (fit, compiled(name)):
+        far = predictor.predict(q, 100.0 * qd, tau)
+        assert far.beyond is not None and float(far.beyond.max()) > 30.0
+        assert "beyond the trained speeds" in far.warnings[0]
+    m = fit.training.measurements[0]
+    inside = fit.predict(m.q, m.qd, m.tau, active=m.active).beyond
+    assert inside is not None and float(inside.max()) < 1.0
+
+
+def test_the_trained_region_is_that_of_the_last_fit() -> None:
+    robot = forcegp.load_robot("kuka_iiwa")
+    model = forcegp.StructuredGP(
+        forcegp.ConstrainedSystem(robot), "analytical", [JointFrictionPrior()], noise=0.1
+    )
+    slow = free_log(robot, 20)
+    fast, few = slow.replace(qd=3.0 * slow.qd), forcegp.LearningOptions(max_evaluations=2)
+    first = model.fit(slow, learn=[])
+    second = model.fit(fast, learn=["joint_friction"], after=first, options=few)
+    before, after = (x.predict(fast.q, fast.qd, fast.tau).beyond for x in (first, second))
+    assert before is not None and after is not None
+    assert float(before.max()) > 2.0 and float(after.max()) < 1.0
 
 
 def test_friction_of_the_joints() -> None:
@@ -414,13 +500,13 @@ class Bowl(forcegp.ImplicitSurface):
 @pytest.mark.parametrize(
     ("priors", "named"),
     [
-        ([forcegp.DisturbancePrior()], "'disturbance' .*DisturbancePrior"),
+        ([forcegp.DisturbancePrior()], "'disturbance' cannot .*depends on time.*DisturbancePrior"),
         (
             [JointFrictionPrior(), forcegp.PayloadPrior(known=(1.0, 0.0, 0.0, 0.0))],
-            "'payload' .*PayloadPrior",
+            "'payload' cannot .* known payload.*PayloadPrior",
         ),
-        ([forcegp.CoregionalPrior()], "'coregional' .*CoregionalPrior"),
-        ([forcegp.OperatorForcePrior("wind", 7, lambda s, at: at.eom.M)], "'wind' .*OperatorForcePrior"),
+        ([forcegp.CoregionalPrior()], "'coregional' cannot .*share functions.*CoregionalPrior"),
+        ([forcegp.OperatorForcePrior("wind", 7, lambda s, at: at.eom.M)], "'wind' cannot .*Python code"),
     ],
     ids=["disturbance", "payload", "coregional", "operator"],
 )

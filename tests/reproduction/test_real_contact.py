@@ -10,6 +10,7 @@ import pytest
 import torch
 
 from benchmarks.foreign_log import mapping_of, rows_of, rows_right, surface_error, write_foreign_log
+from benchmarks.sensed_forces import with_sensed_forces
 from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.data import Dataset
@@ -23,7 +24,6 @@ from forcegp.models.sensed import (
     force_from_sensor,
     sensed_force,
     sensor_noise_std,
-    with_sensed_forces,
     with_sensor,
 )
 from forcegp.models.structured_gp import StructuredGP

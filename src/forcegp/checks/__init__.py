@@ -1,4 +1,4 @@
-"""Checks of a log against a scene before fitting a model: all checks in order, and their report."""
+"""Checks of a log against a scene before a model is fitted: all checks in order, and their report."""
 
 from __future__ import annotations
 
@@ -20,17 +20,17 @@ from forcegp.resources import announce_memory
 __all__ = ["KINDS", "Finding", "Log", "Report", "check", "clipped_torques", "log_of", "read_log"]
 
 NUMBERS = 24
-"""Upper bound on the numbers in memory per joint and row; twenty were measured."""
+"""Upper bound on the count of numbers held in memory per joint and row; about twenty were measured."""
 OF_CONTACTS = frozenset({"contact", "contact force"})
-"""Checks of contacts, which are skipped without contacts."""
+"""Checks of contacts, which are skipped if there are no contacts."""
 OF_TIME = frozenset({"order of time", "held rows", "gaps", "jitter", "sampling period", "standing channels"})
-"""Checks that need rows in time order."""
+"""Checks that require rows in time order."""
 Check = Callable[[ConstrainedSystem, Log], Outcome]
 Progress = Callable[[int, int], None]
 
 
 def check_robot(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Compare the robot named in the header with that of the scene."""
+    """Compare the robot named in the header with the robot of the scene."""
     logged = log.header.robot_fingerprint
     if logged is None or logged == system.robot.fingerprint:
         return [], log
@@ -39,7 +39,7 @@ def check_robot(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_import(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Return the findings of the import, except those on contacts, which are checked here."""
+    """Return the findings made during import, except those on contacts, which are checked separately."""
     doubts = [text for kind, text in log.header.imported if kind == "doubt"]
     others = [text for kind, text in log.header.imported if kind not in ("doubt", "contact")]
     pairs = ("import-doubt", doubts), ("import-found", others)
@@ -75,32 +75,32 @@ CHECKS: tuple[tuple[str, Check], ...] = (
     ("contact force", contact.check_forces),
     ("excitation", excitation.check_excitation),
 )
-"""All checks in the order in which they run, each on the log corrected by the previous ones."""
+"""All checks in the order in which they run; each is applied to the log as corrected by the previous ones."""
 
 _MOTION = frozenset({"velocity-mismatch"})
 _ROBOT = frozenset(
     {"gravity-direction", "base-tilted", "payload-missing", "masses-mismatch", "torque-unexplained"}
 )
 VOIDS = {"dynamics": _MOTION, "contact force": _MOTION | _ROBOT, "excitation": _MOTION}
-"""Findings that invalidate a check."""
+"""Findings that invalidate each check."""
 
 
 def check(system: ConstrainedSystem, data: Dataset | Log, *, progress: Progress | None = None) -> Report:
     """Check a log against a scene before fitting a model.
 
-    Checks return no findings for a valid log. A fault is corrected before the next check, so it is reported
-    only once; the log itself is not changed.
+    A valid log has no findings. Each fault is corrected before the next check, so it is reported only once;
+    the log itself is not changed.
 
     Args:
         system: robot and contacts.
         data: the log; `forcegp.checks.read_log` reads logs that `Dataset` rejects.
-        progress: called with the number of completed checks and their total number.
+        progress: called with the number of completed checks and the total number.
 
     Returns:
         The findings, sorted by severity; `report.usable` is true if a model can be fitted.
 
     Raises:
-        DataError: a joint of the robot is not in the log, or the log is empty.
+        DataError: a joint of the robot is missing in the log, or the log is empty.
 
     Example:
         >>> import forcegp
@@ -136,6 +136,6 @@ def check(system: ConstrainedSystem, data: Dataset | Log, *, progress: Progress 
             skipped |= {other: "no row is usable" for other, _ in CHECKS[done + 1 :]}
             break
     order = list(KINDS)
-    # What concerns most of the log comes before what concerns a few rows of it.
+    # Findings that affect most of the log come before those that affect only a few rows.
     findings.sort(key=lambda f: (SEVERITIES.index(f.severity), 2 * f.rows < samples, order.index(f.kind)))
     return Report(tuple(findings), samples, system.robot.joint_names, skipped)

@@ -1,6 +1,6 @@
-"""Distance of the tip from the surface while a contact is labelled closed, and forces of contacts.
+"""Checks of the distance of the tip from the surface in rows labelled as contact, and of contact forces.
 
-The surface can only push, and friction opposes sliding.
+A surface can only push, and friction opposes sliding.
 """
 
 from __future__ import annotations
@@ -22,34 +22,34 @@ from forcegp.robust import level_of, robust_std
 from forcegp.rows import Intervals, describe, intervals
 
 OFFSET, TILT = 5e-4, np.radians(0.2)
-"""Displacement [m] and tilt [rad] from which a surface is reported."""
+"""Displacement [m] and tilt [rad] of a surface above which they are reported."""
 FAR = 0.01
-"""Displacement of all contact rows from which surface, point or label must be wrong [m]."""
+"""Median distance in contact above which the surface, the point or the labels must be wrong [m]."""
 TOUCH, ROUGH = 2e-4, 8.0
-"""Distance within which a tip is in contact, given the stiffness of surfaces and arms [m], and the same in
-    robust standard deviations of the distance in contact."""
+"""Distance within which a tip counts as touching, given the stiffness of surfaces and arms, in m and in
+robust standard deviations of the distance in contact."""
 CREEP = 1e-3
-"""Minimum speed along the normal that is allowed in contact [m/s]."""
+"""Speed along the normal that is always allowed in contact [m/s]."""
 LANDING, STOPS = 5, 2.0
-"""Number of rows within which a landing tip stops, and ratio of its speed to that of a resting tip."""
+"""Number of rows within which a landing tip stops, and ratio of its speed to that of a tip in contact."""
 DRIFT, RUN_SECONDS = 2e-3, 0.02
-"""Distance that a tip may gain and lose while it touches [m]: soft ground, a bent arm, a drift; shortest run
-of rows that a wrong label is reported for [s]."""
+"""Change in distance allowed in contact, due to soft ground, deflection of the arm, or drift [m]; duration of
+the shortest run of rows for which a wrong label is reported [s]."""
 MISSED_SECONDS, MISSED_DISTANCE = 0.1, 2e-3
-"""Shortest time [s] and distance [m] along the surface that count as an unlabelled contact."""
+"""Shortest time [s] and distance [m] of sliding along the surface that count as an unlabelled contact."""
 LEAST_ROWS = 20
 OFF = {
     "contact-early": "labelled closed before the tip touches",
     "contact-late": "labelled closed after the tip has left",
     "contact-far": "labelled closed while the tip is off the surface",
 }
-"""Rows labelled closed while off the surface, by kind of finding."""
+"""Descriptions of rows that are labelled closed although the tip is off the surface, by kind of finding."""
 
 
 @dataclass(frozen=True)
 class Path:
-    """Distance `(n,)` of a contact point from the surface in the scene [m]; its position and velocity in the
-    world and the normal out of the solid, `(n, 3)` each [m], [m/s]."""
+    """Distance `(n,)` of a contact point from the surface in the scene [m]; its position [m] and velocity
+    [m/s] in the world, and the outward surface normal, `(n, 3)` each."""
 
     c: Array
     p: Array
@@ -58,7 +58,7 @@ class Path:
 
     @cached_property
     def approach(self) -> Array:
-        """Speed along the normal `(n,)` [m/s]."""
+        """Absolute speed along the normal `(n,)` [m/s]."""
         return np.abs((self.v * self.normal).sum(axis=1))
 
     @cached_property
@@ -70,7 +70,7 @@ class Path:
 def tip_path(
     system: ConstrainedSystem, contact: SurfaceContact, log: Log, rows: np.ndarray | None = None
 ) -> Path:
-    """Return the position of the contact point at some or all rows, NaN for non-finite rows."""
+    """Return the path of the contact point at the given rows, or at all rows, with NaN in non-finite rows."""
     parts = np.array_split(np.arange(len(log)) if rows is None else rows, -(-len(log) // CHUNK))
     paths = []
     with torch.no_grad():
@@ -85,7 +85,7 @@ def tip_path(
 
 
 def touching(system: ConstrainedSystem, log: Log) -> Iterator[tuple[SurfaceContact, np.ndarray]]:
-    """Yield surface contacts that are labelled as closed in enough rows, and these rows."""
+    """Yield each surface contact that is labelled as closed in enough rows, together with these rows."""
     for contact in labelled_contacts(system, log):
         rows = np.flatnonzero(log.contact[contact.name] & log.usable)
         if isinstance(contact, SurfaceContact) and len(rows) >= LEAST_ROWS:
@@ -93,7 +93,7 @@ def touching(system: ConstrainedSystem, log: Log) -> Iterator[tuple[SurfaceConta
 
 
 def check_contacts(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Compare contact labels with the distance of the tip from the surface."""
+    """Check contact labels against the distance of the tip from the surface."""
     findings = []
     for contact in system.contacts:
         if contact.name not in log.contact:
@@ -114,7 +114,7 @@ def check_contacts(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def _beside(contact: SurfaceContact, path: Path, usable: np.ndarray) -> list[Finding]:
-    """Return a tip that keeps a constant distance from the surface of a contact that is never closed."""
+    """Find a tip that stays at a constant distance from the surface although the contact never closes."""
     rows = usable & (np.linalg.norm(path.along, axis=1) > SLIDING_SLOW)
     level = level_of(path.c[rows], TOUCHING, LEVEL)
     if level is None or abs(level) <= TOUCHING:
@@ -131,7 +131,7 @@ def _beside(contact: SurfaceContact, path: Path, usable: np.ndarray) -> list[Fin
 
 
 def _placement(contact: SurfaceContact, path: Path, closed: np.ndarray) -> tuple[list[Finding], Array]:
-    """Return displacement and tilt of the surface, and the distance from it after correction."""
+    """Return findings on displacement and tilt of the surface, and distances from the corrected surface."""
     offset, tilt, shift = fit_surface(contact, path, closed)
     name, evidence = contact.name, {"offset_m": offset, "tilt_deg": float(np.degrees(np.linalg.norm(tilt)))}
     finding = partial(Finding, intervals=intervals(closed), contact=name)
@@ -150,7 +150,7 @@ def _placement(contact: SurfaceContact, path: Path, closed: np.ndarray) -> tuple
 
 
 def fit_surface(contact: SurfaceContact, path: Path, closed: np.ndarray) -> tuple[float, Array, Array]:
-    """Fit offset [m] and slope `(3,)` of the surface, and return distances `(n,)`; outliers are trimmed."""
+    """Fit offset [m], slope `(3,)` and resulting distances `(n,)` of the surface, trimming outliers."""
     offset = float(np.median(path.c[closed]))
     if not isinstance(contact.surface, Plane):
         return offset, np.zeros(3), np.full(len(path.c), offset)
@@ -177,7 +177,7 @@ def fit_surface(contact: SurfaceContact, path: Path, closed: np.ndarray) -> tupl
 def _labels(
     contact: SurfaceContact, path: Path, closed: np.ndarray, usable: np.ndarray, c: Array, log: Log
 ) -> list[Finding]:
-    """Return rows labelled closed off the surface, by position in the interval, and open ones that slide."""
+    """Find rows labelled closed with the tip off the surface, and rows labelled open with a sliding tip."""
     touch = max(TOUCH, ROUGH * float(robust_std(c[closed])))
     moving = closed & (np.linalg.norm(path.v, axis=1) > CREEP)
     slow = max(CREEP, ROUGH * float(robust_std(path.approach[moving])) if moving.any() else 0.0)
@@ -197,7 +197,7 @@ def _labels(
 def _runs_off(
     approach: Array, label: np.ndarray, off: np.ndarray, c: Array, touch: float, slow: float, log: Log
 ) -> dict[str, Intervals]:
-    """Return runs labelled closed off the surface, by kind of finding, extended until the tip settles."""
+    """Return runs of closed rows with the tip off the surface, by kind, extended until the tip settles."""
     settled = approach <= slow
     least = max(2, round(RUN_SECONDS / log.dt)) if np.isfinite(log.dt) else 2
     runs: dict[str, Intervals] = dict.fromkeys(OFF, ())
@@ -223,7 +223,7 @@ def _runs_off(
 def _missed(
     contact: SurfaceContact, path: Path, open_: np.ndarray, c: Array, touch: float, log: Log
 ) -> list[Finding]:
-    """Return rows labelled open in which the tip slides on the surface, longer than at a gentle lift-off."""
+    """Find rows labelled open in which the tip slides on the surface for longer than in a gentle lift-off."""
     if not np.isfinite(log.dt):
         return []
     near, speed = open_ & (np.abs(c) <= touch), np.linalg.norm(path.along, axis=1)
@@ -240,18 +240,18 @@ def _missed(
 
 
 FORCE_ROWS = 4000
-"""Maximum number of contact rows for computing forces."""
+"""Maximum number of contact rows at which forces are computed."""
 PULLS = 0.5
-"""Fraction of contact rows with a pulling force from which the normal must be reversed."""
+"""Fraction of contact rows with a pulling force above which the normal must be reversed."""
 SIGNIFICANT, LARGEST_FRICTION = 4.0, 2.0
-"""Standard errors over blocks from which friction is significant, and largest plausible coefficient.
-"""
+"""Standard errors over blocks above which friction is significant, and largest plausible coefficient."""
 SLIDING_SLOW, NARROW = 0.01, 0.05
-"""Speed below which the sliding direction is unknown [m/s], and minimum share of the second direction."""
+"""Speed below which the sliding direction is unknown [m/s], and minimum RMS speed across the main direction
+relative to that along it."""
 
 
 def check_forces(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Check normal force, friction and sliding direction of each contact, if the force is determined."""
+    """Check the normal force, friction and sliding directions of each contact, if torques determine them."""
     findings = []
     for contact, rows in touching(system, log):
         finding = partial(Finding, intervals=intervals(log.contact[contact.name]), contact=contact.name)
@@ -264,7 +264,7 @@ def check_forces(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def _force(system: ConstrainedSystem, log: Log, rows: np.ndarray, path: Path) -> Array:
-    """Return the force `(n, 3)` that best explains the torque, r = Jᵀ F; normal for up to three torques."""
+    """Return the force F `(n, 3)` that best fits r = Jᵀ F; with up to three joints, only its normal part."""
     r, J = residual(system, log, rows)
     if log.nq <= 3:
         A = J[:, 0] * ~np.isin(np.arange(log.nq), unmeasured(log))
@@ -284,7 +284,7 @@ def _pulls(finding: partial[Finding], path: Path, force: Array) -> list[Finding]
 
 
 def _friction(finding: partial[Finding], path: Path, force: Array) -> list[Finding]:
-    """Return the friction coefficient from the force against the direction of sliding."""
+    """Report the friction coefficient, estimated from the force opposite to the direction of sliding."""
     speed = np.linalg.norm(path.along, axis=1)
     sliding = speed > SLIDING_SLOW
     if sliding.sum() < LEAST_ROWS:
@@ -302,7 +302,7 @@ def _friction(finding: partial[Finding], path: Path, force: Array) -> list[Findi
 
 
 def _directions(finding: partial[Finding], v: Array) -> list[Finding]:
-    """Report sliding along a single line, which leaves friction across it unknown."""
+    """Report sliding along a single line, from which friction in the other direction cannot be determined."""
     size, name = np.linalg.svd(v.T @ v / len(v), compute_uv=False), finding.keywords["contact"]
     text = f"the tip slides along one direction of {name!r} only; friction across it is unknown"
     evidence = {"share_across": float(np.sqrt(size[1] / max(size[0], 1e-300)))}

@@ -1,8 +1,8 @@
-"""Information in the motion: joints that move, changes of direction, parameters that are identified, and
-the size of the faults that this log can reveal.
+"""Information contained in the motion: which joints move and change direction, which parameters can be
+identified, and how large a fault must be for the log to reveal it.
 
 A fault of size θ adds θ φ to the unexplained torque r, and the held-out residual is linear in it, e(r + θ φ)
-= e(r) + θ e(φ). The fault is detected if `explain.significant` accepts the increase of the residual.
+= e(r) + θ e(φ). The fault is detected if `explain.significant` accepts the increase in the residual.
 """
 
 from __future__ import annotations
@@ -22,15 +22,15 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.identification import base_parameters, parameter_vector, regressor
 
 STILL = 0.05
-"""Range of motion below which a joint does not move [rad, m]."""
+"""Range of motion below which a joint counts as not moving [rad, m]."""
 REVERSALS, HYSTERESIS = 4, 0.05
-"""Changes of direction that separate Coulomb friction from an offset of the torque; share of its largest
-speed that a joint must reach for one to count."""
+"""Number of changes of direction needed to separate Coulomb friction from a torque offset; fraction of its
+largest speed that a joint must reach for a change of direction to count."""
 SHORT_SECONDS, ROWS = 2.0, 1000
-"""Length of a log below which little is learned [s]; rows of which the regressor is made."""
+"""Duration below which a log contains little information [s]; maximum number of rows of the regressor."""
 LOOK, LEARNED = 0.1, 0.5
-"""Time after which the torque contains new information [s]; standard deviation after the log, as a share of
-that before it, below which a parameter is identified."""
+"""Time after which the torque provides new information [s]; ratio of the posterior to the prior standard
+deviation below which a parameter counts as identified."""
 
 
 def check_length(system: ConstrainedSystem, log: Log) -> Outcome:
@@ -41,7 +41,7 @@ def check_length(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def still_joints(log: Log) -> np.ndarray:
-    """Return `(nq,)` bool, joints that do not move."""
+    """Return the mask `(nq,)` of joints that do not move."""
     return log.reach("q") < STILL if log.usable.any() else np.zeros(log.nq, bool)
 
 
@@ -62,7 +62,7 @@ def check_motion(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_excitation(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find base parameters that the log does not determine, and the motion that would."""
+    """Find base parameters that the log does not determine, and the motion that would determine them."""
     rows = log.rows(ROWS)
     if len(rows) < 50 or still_joints(log).all():
         return [], log
@@ -73,7 +73,7 @@ def check_excitation(system: ConstrainedSystem, log: Log) -> Outcome:
     listed = ", ".join(names[k] for k in np.flatnonzero(weak)[:6])
     more = f" and {weak.sum() - 6} more" if weak.sum() > 6 else ""
     count = f"{weak.sum()} of {len(weak)} base parameters are not identified"
-    # The motion that would show the parameters of these links.
+    # The motion that would reveal the parameters of these links.
     reach, push = np.ptp(log.q[log.usable], axis=0), np.sqrt((log.qdd[log.usable] ** 2).mean(axis=0))
     narrow = [log.joint_names[j] for j in joints if reach[j] < 0.5]
     slow = [log.joint_names[j] for j in joints if push[j] < 1.0]
@@ -87,7 +87,7 @@ def check_excitation(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def _sharpness(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> tuple[Array, tuple[str, ...], Array]:
-    """Return the deviation of each base parameter after the log over that before, at 1 % torque noise."""
+    """Return the ratio of posterior to prior deviation of each base parameter, at 1 % torque noise."""
     robot = system.robot
     base = base_parameters(robot)
     columns = np.array(base.columns)
@@ -96,7 +96,7 @@ def _sharpness(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> tuple[A
     tau = np.sqrt((log.tau[rows] ** 2).mean(axis=0))
     noise = np.maximum(0.01 * tau, 1e-3 * tau.max()) + 1e-12
     A = (Y / noise[:, None]).reshape(-1, len(columns)) * inertial_spread(robot)[columns]
-    # Neighbouring rows repeat each other: the log counts as one row per tenth of a second.
+    # Neighbouring rows are redundant, so the log counts as one row per tenth of a second.
     looks = int(log.usable.sum()) * log.dt / LOOK if log.header.ordered else len(rows)
     gram = A.T @ A * (looks / len(rows))
     after = np.linalg.inv(gram + np.eye(len(columns)))
@@ -104,12 +104,12 @@ def _sharpness(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> tuple[A
 
 
 LEAST_TOUCHING = 20
-"""Rows in contact from which the force of a fault is stated."""
+"""Minimum number of rows in contact for stating the force that a fault mimics."""
 LARGEST = 1e3
 SIZES = np.geomspace(1e-3, LARGEST, 200)
-"""Sizes that are tried."""
+"""Fault sizes that are tried."""
 SPAN = 1
-"""Rows on either side of which the rate of the torque is taken; fewer than the margin of `explain`."""
+"""Number of rows to either side used for the torque rate; smaller than the margin of `explain`."""
 EXPECTED = {
     "torque-delay": (0.02, LARGEST, 1e3, "a delay of the torque", "{:.0f} ms"),
     "base-tilted": (3.0, 180.0, 1.0, "a tilt of the base", "{:.2g}°"),
@@ -118,13 +118,13 @@ EXPECTED = {
     "torque-gain": (0.5, LARGEST, 100.0, "a wrong gain", "{:.0f} %"),
     "encoder-offset": (0.1, np.pi, 1.0, "an encoder offset", "{:.2g} {unit}"),
 }
-"""Size that a user expects to be seen and largest size [s, degrees, share, rad], factor to the unit of its
-words, the fault, and its size in words; what concerns the whole arm comes first."""
+"""Size that a user expects to be detected and largest size [s, degrees, fraction, rad], factor for conversion
+to the unit of the message, name of the fault, and format of its size; faults of the whole arm come first."""
 
 
 @dataclass(frozen=True, eq=False)
 class Fault:
-    """A fault of unit size: its kind, its joint if any, and the torque `(n, nq)` that it adds."""
+    """A fault of unit size: its kind, its joint (if any), and the torque `(n, nq)` that it adds."""
 
     kind: str
     joint: str
@@ -133,7 +133,7 @@ class Fault:
 
 
 def check_visibility(system: ConstrainedSystem, explanation: Explanation) -> list[Finding]:
-    """Note the size from which each fault is found, and the effect of a usual one on a contact force."""
+    """Report the size above which each fault is detected, and the force error due to a typical one."""
     faults = list(_faults(system, explanation.log, explanation.rows))
     sizes = {fault: visible_size(explanation, fault) for fault in faults}
     units = {name: position_unit(system.robot, j) for j, name in enumerate(system.robot.joint_names)}
@@ -156,7 +156,7 @@ def check_visibility(system: ConstrainedSystem, explanation: Explanation) -> lis
 
 
 def force_of(explanation: Explanation, fault: Fault) -> float:
-    """Return the tip force that a fault of unit size mimics beside what a fit learns [N], rms; 0 if free."""
+    """Return the RMS tip force [N] that a unit fault mimics after a fit, or 0 without enough contact."""
     problem = replace(explanation.problem, r=fault.column)
     J = problem.J[:, : problem.J.shape[1] - len(unmeasured(explanation.log))]
     touching = (J != 0.0).any(axis=(1, 2))
@@ -164,14 +164,14 @@ def force_of(explanation: Explanation, fault: Fault) -> float:
         return 0.0
     fit = cross_validate(problem, explanation.columns, explanation.prior)
     learned = explanation.columns @ fit.theta + problem.nuisance @ fit.nuisance
-    # τ = Jᵀ F by least squares.
+    # Least-squares solution of τ = Jᵀ F.
     inverse = np.linalg.pinv(J[touching].transpose(0, 2, 1))
     force = np.einsum("nkj,nj->nk", inverse, (fault.column - learned)[touching])
     return float(np.sqrt((force**2).sum(axis=1).mean()))
 
 
 def visible_size(explanation: Explanation, fault: Fault) -> float:
-    """Return the smallest detectable size of a fault of either sign, or `LARGEST`."""
+    """Return the size above which a fault of either sign is detected, or `LARGEST` if there is none."""
     problem = explanation.problem
     rest = held_out(problem, explanation.columns, explanation.prior)
     added = held_out(replace(problem, r=fault.column), explanation.columns, explanation.prior)
@@ -191,8 +191,8 @@ def visible_size(explanation: Explanation, fault: Fault) -> float:
 
 def _faults(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterator[Fault]:
     delays = []
-    if log.header.ordered:  # rows in order of selection have no neighbours in time
-        # The torque that the motion needs; the measured one has more noise.
+    if log.header.ordered:  # unordered rows have no neighbours in time
+        # Use the torque required by the motion, since the measured torque is noisier.
         ahead, behind = (residual(system, log, rows + k)[0] + log.tau[rows + k] for k in (SPAN, -SPAN))
         delays = [(ahead - behind) / (2.0 * SPAN * log.dt)]
         yield Fault("torque-delay", "", delays[0], log.nq)
@@ -203,14 +203,14 @@ def _faults(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterator[F
         column = encoder_hypothesis(system, log, rows, j).columns
         assert column is not None
         yield Fault("encoder-offset", joint, column[..., 0], 1)
-    # Per degree of a tilt, about the horizontal axis that shows it better.
+    # Torque per degree of tilt about the horizontal axis for which the tilt is more visible.
     gravity, columns = system.robot.gravity.numpy(), robot_columns(system, log, rows, "gravity")[0]
     axes = np.linalg.svd(gravity[None])[2][1:] * np.linalg.norm(gravity) * np.pi / 180.0
     tilt = max((columns @ axis for axis in axes), key=lambda torque: float((torque**2).sum()))
     yield Fault("base-tilted", "", tilt, log.nq)
     links = robot_columns(system, log, rows, "masses")[0] * parameter_vector(system.robot).numpy()
     links = links.reshape(*links.shape[:2], log.nq, 10).sum(axis=-1)
-    # The inertial parameters of every other link are taken as wrong by the same share.
+    # The inertial parameters are assumed wrong by the same fraction, with signs that alternate along the arm.
     yield Fault("masses-mismatch", "", links @ -((-1.0) ** np.arange(log.nq)), log.nq)
     for j, joint in enumerate(log.joint_names):
         yield Fault("heavier-link", joint, links[..., j], log.nq)

@@ -1,7 +1,7 @@
-"""Greedy search for the faults that explain the torque, by cross-validation and the one-standard-error rule.
+"""Greedy search for faults that explain the torque, using cross-validation and the one-standard-error rule.
 
 The simplest hypothesis within one standard error of the best is accepted (Breiman, Friedman, Olshen, Stone,
-*Classification and Regression Trees*, 1984, sec. 3.4.3), the log is corrected, and the search repeated.
+*Classification and Regression Trees*, 1984, sec. 3.4.3), the log is corrected, and the search is repeated.
 """
 
 from __future__ import annotations
@@ -21,28 +21,27 @@ from forcegp.checks.placement import leaves_surface
 from forcegp.constraints import ConstrainedSystem
 
 ROWS, SCREENING, DELAYS = 1600, 4, 3
-"""Rows that hypotheses are tested on; on one in so many they must do better first; delays of one joint."""
+"""Number of rows for testing hypotheses; stride of the rows for screening; delays kept per joint."""
 ROUNDS = 5
-"""Faults that are looked for at most."""
+"""Maximum number of faults searched for."""
 SIGNIFICANT = 4.0
-"""Standard errors by which the held-out score must drop; there are about a hundred hypotheses."""
+"""Standard errors by which the held-out score must drop; about a hundred hypotheses are compared."""
 SHARE, SAME = 0.03, 1e-3
-"""Share of the best drop that a simpler hypothesis may leave to a second round; equal errors."""
+"""Fraction of the best drop that a simpler hypothesis may lack; tolerance within which errors are equal."""
 DETERMINED = 3.0
-"""A gain counts as known if it exceeds this many standard errors."""
+"""A gain counts as determined if it exceeds this many standard errors."""
 MATERIAL, MATERIAL_EACH = 0.15, 0.05
-"""Drop of Σ_j log error that matters, 14 % less error in one joint; per joint where all are concerned."""
+"""Minimum drop in Σ_j log error that is material: in total (14 % at one joint), and per affected joint."""
 
 Tried = tuple[Hypothesis, TorqueFit]
 
 
 @dataclass(frozen=True)
 class Explanation:
-    """Faults that explain the torque: of the log, corrected in `log`, and of the robot file.
+    """Faults that explain the torque: faults of the log, which are corrected in `log`, and of the robot file.
 
-    `problem` has the torques that remain over `rows`; `columns`, `prior` and the names `robot` are those of
-    the accepted hypotheses on the robot, which stay in the model; `repairs` correct the faults of a log, in
-    order.
+    `problem` contains the remaining torques at `rows`. Accepted hypotheses about the robot stay in the model
+    with their `columns`, `prior` and names `robot`. Calling `repairs` in order corrects the faults of a log.
     """
 
     system: ConstrainedSystem
@@ -58,16 +57,16 @@ class Explanation:
 
     @cached_property
     def fit(self) -> TorqueFit:
-        """Return the remaining model."""
+        """Fit of the current model to the remaining torques."""
         return cross_validate(self.problem, self.columns, self.prior)
 
     def on(self, log: Log, rows: np.ndarray | None = None) -> TorqueProblem:
-        """Return the problem on a log changed by a hypothesis, with the current weights of the joints."""
+        """Return the problem for a log modified according to a hypothesis, keeping the joint weights."""
         rows = self.rows if rows is None else rows
         return hypotheses.problem_of(self.system, log, rows, self.problem.scale)
 
     def weighed(self) -> Explanation:
-        """Return the problem with joints weighted by their residual noise."""
+        """Return the explanation with joints weighted according to their residual noise."""
         result = self
         for _ in range(2):
             # The typical block counts: a disturbance must not make a joint look noisy.
@@ -77,25 +76,25 @@ class Explanation:
         return result
 
     def beside(self, hypothesis: Hypothesis) -> Explanation:
-        """The same with the parameters of a hypothesis, which come first."""
+        """Prepend the parameters of a hypothesis to the explanation."""
         assert hypothesis.columns is not None and hypothesis.prior is not None
         columns = np.concatenate([hypothesis.columns, self.columns], axis=-1)
         return replace(self, columns=columns, prior=np.concatenate([hypothesis.prior, self.prior]))
 
     def with_nuisance(self, *columns: Array) -> Explanation:
-        """The same with more columns that every hypothesis may use."""
+        """Return the explanation with additional columns that are common to all hypotheses."""
         nuisance = np.concatenate([self.problem.nuisance, *columns], axis=-1)
         return replace(self, problem=replace(self.problem, nuisance=nuisance))
 
     def with_(self, hypothesis: Hypothesis) -> TorqueFit:
-        """Fit a hypothesis with parameters, in addition to those already in the model."""
+        """Fit the parameters of a hypothesis in addition to those already in the model."""
         gains = hypothesis.joints if hypothesis.name == "gains" else ()
         wider = self.beside(hypothesis)
         return cross_validate(self.problem, wider.columns, wider.prior, gains, hypothesis.instruments)
 
 
 def explain(system: ConstrainedSystem, log: Log) -> Explanation:
-    """Find the faults that explain the residual torque of the robot file."""
+    """Find the faults that explain the torque that remains unexplained by the robot file."""
     rows = log.rows(ROWS, margin=max(hypotheses.LAGS))
     problem = hypotheses.problem_of(system, log, rows)
     model = Explanation(system, log, rows, problem, np.zeros((*problem.r.shape, 0)), np.zeros(0)).weighed()
@@ -108,7 +107,7 @@ def explain(system: ConstrainedSystem, log: Log) -> Explanation:
 
 
 def _round(model: Explanation) -> Explanation | None:
-    """Accept the simplest hypothesis within one standard error of the best, if it explains enough."""
+    """Accept the simplest hypothesis within one standard error of the best, if any explains enough."""
     system, log, null = model.system, model.log, model.fit
     fits = ((h, fit) for h, fit in _fits(model) if (h.name, h.joints) not in model.taken)
     fits = ((h, fit) for h, fit in fits if hypotheses.plausible(system, h, fit))
@@ -135,7 +134,7 @@ def _round(model: Explanation) -> Explanation | None:
 
 
 def _accepted(model: Explanation, hypothesis: Hypothesis, theta: Array, finding: Finding) -> Explanation:
-    """Return the explanation with one hypothesis more: its fault undone, or its parameters in the model."""
+    """Return the explanation with one more hypothesis: undo its fault, or add its parameters to the model."""
     taken = model.taken | {(hypothesis.name, hypothesis.joints)}
     model = replace(model, findings=(*model.findings, finding), taken=taken)
     if hypothesis.name in hypotheses.ROBOT:
@@ -147,7 +146,7 @@ def _accepted(model: Explanation, hypothesis: Hypothesis, theta: Array, finding:
 
 
 def _refined(model: Explanation, hypothesis: Hypothesis, fit: TorqueFit) -> TorqueFit:
-    """Fit an encoder offset by Gauss-Newton steps, since its effect on the torque is not linear."""
+    """Refine an encoder offset by Gauss-Newton steps, since its effect on the torque is nonlinear."""
     theta = fit.theta[:1]
     for _ in range(2):
         moved = corrected(model.log, hypothesis, theta)
@@ -203,7 +202,7 @@ def _delays(model: Explanation) -> Iterator[Hypothesis]:
 
 
 def _beside_friction(model: Explanation, late: Hypothesis) -> TorqueFit | None:
-    """The fit of a torque that is late, if friction of no other shape explains it as well."""
+    """Return the fit with a delayed torque, unless friction of a different shape explains it as well."""
     changed = replace(model, problem=model.on(late.change(model.log)))
     shapes = hypotheses.shape_columns(model.system, model.log, model.rows)
     better, worse = (one.with_nuisance(shapes).fit.shares for one in (changed, model))
@@ -219,7 +218,7 @@ def _beside_size(model: Explanation, tilt: Hypothesis, fit: TorqueFit) -> bool:
 
 
 def _currents(model: Explanation) -> Iterator[Tried]:
-    """Yield the gains of all joints that the log determines, tried where most torques are scaled wrongly."""
+    """Yield the hypothesis that all torques with a determined gain are scaled, if they are the majority."""
     log, rows, nq = model.log, model.rows, model.log.nq
     fit = model.with_(hypotheses.current_hypothesis(log, rows, model.problem, tuple(range(nq))))
     gains = 1.0 + fit.theta[:nq]
@@ -232,7 +231,7 @@ def _currents(model: Explanation) -> Iterator[Tried]:
 
 
 def significant(better: Array, worse: Array, concerned: int) -> bool:
-    """Return whether a decrease of the score of shares `(blocks, nq)` is material and significant."""
+    """Return whether the decrease in the score, from errors `(blocks, nq)`, is material and significant."""
     least = max(MATERIAL, MATERIAL_EACH * concerned)
     gains = gain_of(score_of(better), score_of(worse)), pooled_gain_of(better, worse)
     # A drop that only quiet blocks show is an artefact of them: the other mean must bear it out.
@@ -241,18 +240,19 @@ def significant(better: Array, worse: Array, concerned: int) -> bool:
 
 
 SMALL_MASS = 1e-6
-"""Share of the robot's mass below which a mass is zero."""
+"""Fraction of the robot's mass below which a mass counts as zero."""
 ALONE = 2.0
-"""Standard errors by which an alternative must lower the held-out error on its own, which chance exceeds in 4
-% of cases: it is already known that something is wrong."""
+"""Standard errors by which an alternative must lower the held-out error on its own. Chance exceeds this in
+4 % of cases, which suffices because something is already known to be wrong."""
 
 
 def alternatives_of(
     system: ConstrainedSystem, chosen: Tried, tried: Iterable[Tried], null: TorqueFit
 ) -> Iterator[Tried]:
-    """Yield the hypotheses within a standard error of the chosen one on held-out blocks, best first.
+    """Yield the hypotheses within one standard error of the chosen one on held-out blocks, best first.
 
-    Those of its kind and joints, or that contain it, as masses contain a tool, are left out.
+    Hypotheses of the same kind with common joints are omitted, as are those that contain the chosen one (for
+    example, masses contain a payload).
     """
     name, joints = chosen[0].name, {*chosen[0].joints}
     for hypothesis, fit in sorted(tried, key=lambda one: one[1].score.mean()):
@@ -266,7 +266,7 @@ def alternatives_of(
 
 
 def _possible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit) -> bool:
-    """Return whether every link keeps a mass that is positive, or zero in the robot file."""
+    """Return whether the mass of every link remains positive (or zero if it is zero in the robot file)."""
     if hypothesis.name != "masses":
         return True
     masses = system.robot.mass.numpy()
@@ -275,7 +275,7 @@ def _possible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit)
 
 
 def with_alternatives(finding: Finding, others: Iterable[Finding]) -> Finding:
-    """Return the finding with its alternatives, if any, and a test that separates them."""
+    """Return the finding with its alternatives, if any, and a test that distinguishes them."""
     alternatives: list[Finding] = []
     for other in others:
         alike = (f for f in (finding, *alternatives) if f.kind == other.kind)

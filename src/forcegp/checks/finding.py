@@ -1,4 +1,4 @@
-"""Findings with rows, severity and remedy, their report, and all `KINDS` with meaning and remedy."""
+"""Findings with their rows, severity and remedy, the report of a check, and the table of all `KINDS`."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ Severity = Literal["note", "warning", "error"]
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of finding, with its part of the log, default severity, title and remedy."""
+    """A kind of finding: the part of the log it belongs to, default severity, title and remedy."""
 
     family: str
     severity: Severity
@@ -29,9 +29,9 @@ class Kind:
 
 _FAMILIES = tomllib.loads((files("forcegp.checks") / "kinds.toml").read_text(encoding="utf-8"))
 TESTS: dict[str, str] = _FAMILIES.pop("tests")
-"""Tests for each kind of fault, in order of preference."""
+"""Test that distinguishes each kind of fault from its alternatives, in order of preference."""
 KINDS = {name: Kind(family, *row) for family, rows in _FAMILIES.items() for name, row in rows.items()}
-"""Every kind of finding by name, family by family."""
+"""All kinds of findings by name, grouped by family."""
 
 
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
@@ -40,18 +40,18 @@ SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 
 @dataclass(frozen=True)
 class Finding:
-    """A fault or property that a check found in a log.
+    """A fault or property of a log, as found by a check.
 
     Args:
-        kind: one of `KINDS`.
-        message: a sentence with numbers.
-        intervals: affected rows as half-open, increasing intervals, counted from 0.
+        kind: a key of `KINDS`.
+        message: a sentence that quotes the relevant numbers.
+        intervals: affected rows as half-open intervals in increasing order, counted from 0.
         joints: affected joints.
         contact: affected contact, if any.
-        evidence: numbers behind the message, by name.
+        evidence: numbers on which the message is based, by name.
         weight: severity, if it differs from that of the kind.
         alternatives: other explanations that fit the log equally well.
-        told_apart_by: a test that distinguishes them.
+        told_apart_by: a test that distinguishes the alternatives.
 
     Raises:
         UnknownNameError: the kind does not exist.
@@ -72,9 +72,9 @@ class Finding:
 
     @property
     def severity(self) -> Severity:
-        """`"error"` makes a fit worthless, `"warning"` biases it, `"note"` is worth knowing.
+        """Severity: an `"error"` makes a fit worthless, a `"warning"` biases it, a `"note"` is worth knowing.
 
-        A finding with alternatives takes their lowest severity.
+        A finding with alternatives has the lowest severity among them.
         """
         weight: Severity = self.weight or KINDS[self.kind].severity
         every = {weight, *(other.severity for other in self.alternatives)}
@@ -82,12 +82,12 @@ class Finding:
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """Kinds of the finding and its alternatives, without duplicates."""
+        """Kinds of the finding and of its alternatives, without duplicates."""
         return tuple(dict.fromkeys((self.kind, *(other.kind for other in self.alternatives))))
 
     @property
     def remedy(self) -> str:
-        """Remedy; with alternatives, a test that distinguishes them and the remedy for each."""
+        """Remedy or, if there are alternatives, a test that distinguishes them and the remedy for each."""
         if not self.alternatives:
             return KINDS[self.kind].remedy
         each = "; ".join(f"{kind}: {KINDS[kind].remedy}" for kind in self.kinds)
@@ -113,18 +113,18 @@ class Finding:
 def at_rows(
     mask: NDArray[np.bool_], kind: str, text: str, joints: tuple[str, ...] = (), **evidence: SupportsFloat
 ) -> list[Finding]:
-    """Return a finding on the rows of a mask, described in its text; empty for an empty mask."""
+    """Return a finding on the rows selected by a mask, which are listed in its text, or no finding."""
     rows = intervals(mask)
     return [Finding(kind, f"{text} {describe(rows)}", rows, joints, evidence=evidence)] if rows else []
 
 
 class NotJudgedError(Exception):
-    """Raised if a check cannot be applied to a log; `Report.skipped` contains the message."""
+    """Raised if a check cannot be applied to a log; the message is stored in `Report.skipped`."""
 
 
 @dataclass(frozen=True)
 class Report:
-    """All findings on a log, sorted by severity, and skipped checks with the reason."""
+    """All findings on a log, sorted by severity, and the skipped checks with their reasons."""
 
     findings: tuple[Finding, ...]
     samples: int
@@ -132,7 +132,7 @@ class Report:
     skipped: Mapping[str, str] = field(default_factory=dict)
 
     def count(self, severity: Severity) -> int:
-        """Return the number of findings of a severity."""
+        """Return the number of findings with a given severity."""
         return sum(finding.severity == severity for finding in self.findings)
 
     @property
@@ -142,7 +142,7 @@ class Report:
 
     @property
     def verdict(self) -> str:
-        """One-line verdict on whether a model can be fitted."""
+        """Verdict in one line on whether a model can be fitted."""
         errors, warnings = self.count("error"), self.count("warning")
         if errors:
             return f"verdict: stop; repair {errors} error{'s' * (errors > 1)} before fitting a model"

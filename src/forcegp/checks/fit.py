@@ -1,8 +1,8 @@
-"""Fit of a hypothesis to the torque by least squares on all blocks of a log except one.
+"""Least-squares fit of a hypothesis to the torque, using all blocks of a log except one.
 
-The residual torque of the robot file is explained, without possible contributions of a labelled contact: r =
-M q̈ − Q_C − Q_G − Q_D − Q_u is Aᵀλ + Q_z = Jᵀ F in contact, and zero elsewhere. Projecting r on the null
-space of J removes any contact force, normal and tangential.
+The torque left unexplained by the robot file is r = M q̈ − Q_C − Q_G − Q_D − Q_u. If there are no faults, it
+equals Aᵀλ + Q_z = Jᵀ F in contact and zero elsewhere. The hypothesis explains the part of r that remains when
+any contact force, normal or tangential, is removed by projection onto the null space of J.
 """
 
 from __future__ import annotations
@@ -18,16 +18,16 @@ from forcegp.checks.log import Array, Log
 from forcegp.constraints import ConstrainedSystem, Constraint, SurfaceContact
 
 CHUNK = 8192
-"""Number of rows with dynamics in memory at a time."""
+"""Number of rows whose dynamics are held in memory at a time."""
 
 
 def tensors(log: Log, rows: np.ndarray, *names: str) -> list[Tensor]:
-    """Return selected rows of columns as tensors."""
+    """Return the selected rows of the named columns as tensors."""
     return [torch.from_numpy(np.ascontiguousarray(getattr(log, name)[rows])) for name in names]
 
 
 def residual(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> tuple[Array, Array]:
-    """Return the unexplained torque r `(n, nq)` [N m, N], and J `(n, k, nq)` of the points, 0 if open."""
+    """Return the unexplained torque r `(n, nq)` [N m, N] and J `(n, k, nq)`, with zeros for open contacts."""
     robot, r, J = system.robot, [], []
     with torch.no_grad():
         for part in np.array_split(rows, max(1, -(-len(rows) // CHUNK))):
@@ -39,25 +39,25 @@ def residual(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> tuple[Arr
 
 
 def labelled_contacts(system: ConstrainedSystem, log: Log) -> list[Constraint]:
-    """Return the contacts with a logged state."""
+    """Return the contacts whose state is logged."""
     return [c for c in system.contacts if c.name in log.contact]
 
 
 def takes_friction_out(system: ConstrainedSystem, log: Log) -> bool:
-    """Return whether enough torques remain after removing all contact forces, not only the normal force."""
+    """Return whether torques remain after all components of the contact forces are removed."""
     return 3 * len(labelled_contacts(system, log)) < log.nq
 
 
 def unmeasured(log: Log) -> list[int]:
-    """Return the joints without a logged torque, according to the header."""
+    """Return the joints whose torque is not measured according to the header."""
     return [j for j, name in enumerate(log.joint_names) if name in log.header.unmeasured_torques]
 
 
 def _contact_jacobian(system: ConstrainedSystem, log: Log, rows: np.ndarray, q: Tensor, qd: Tensor) -> Array:
-    """Return the rows of J of all contacts, or only those of the surface normals if all would leave no
+    """Return the rows of J for all contacts, or only for the surface normals if all rows would leave no
     torque.
 
-    Unlogged torques follow as additional rows, since they may have any value.
+    Additional rows represent unmeasured torques, which may have any value.
     """
     contacts, whole = labelled_contacts(system, log), takes_friction_out(system, log)
     free = np.broadcast_to(np.eye(log.nq)[unmeasured(log)], (len(rows), len(unmeasured(log)), log.nq))
@@ -74,12 +74,12 @@ def _contact_jacobian(system: ConstrainedSystem, log: Log, rows: np.ndarray, q: 
 
 
 def projector(J: Array, scale: Array) -> Array:
-    """Return the projector `(n, nq, nq)` onto torques r/scale that no force at contact points can produce."""
+    """Return the projector `(n, nq, nq)` onto torques r/scale that forces at contacts cannot produce."""
     J = J * (1.0 / scale)
     eye = np.broadcast_to(np.eye(J.shape[-1]), (len(J), *2 * (J.shape[-1],))).copy()
     touching = (J != 0.0).any(axis=(1, 2))
     if touching.any():
-        # Jᵀ = U S Vᵀ; directions beyond the rank do not count.
+        # Jᵀ = U S Vᵀ; directions beyond the rank are ignored.
         U, S, _ = np.linalg.svd(J[touching].transpose(0, 2, 1), full_matrices=False)
         U = U * (1e-9 * S[:, :1] < S)[:, None, :]
         eye[touching] -= U @ U.transpose(0, 2, 1)
@@ -87,16 +87,16 @@ def projector(J: Array, scale: Array) -> Array:
 
 
 BLOCKS, REWEIGHTED = 8, 10
-"""Number of contiguous blocks of the log, each held out once, and of rounds of a robust fit."""
+"""Number of contiguous blocks of the log, each of which is held out once; number of robust-fit iterations."""
 FLOOR = 0.03
-"""Negligible error relative to a joint's torque, the accuracy of robot files."""
+"""Error that is negligible relative to a joint's torque, given the accuracy of robot files."""
 
 
 @dataclass(frozen=True)
 class TorqueProblem:
     """Unexplained torque r `(n, nq)` [N m, N], Jacobian J of the contact points `(n, k, nq)`, columns common
-    to all hypotheses `(n, nq, p)`, magnitude of the logged torque, and scale of its noise, which weights the
-    joints.
+    to all hypotheses `(n, nq, p)`, magnitude of the logged torque, and scale of its noise, which determines
+    the weights of the joints.
     """
 
     r: Array
@@ -106,17 +106,17 @@ class TorqueProblem:
     scale: Array
 
     def without_contact(self, x: Array) -> Array:
-        """Return P x/scale of columns x `(n, nq, p)`."""
+        """Return P x/scale for columns x `(n, nq, p)`."""
         x = x / self.scale[:, None]
         return projector(self.J, self.scale) @ x if self.J.any() else x
 
 
 @dataclass(frozen=True)
 class TorqueFit:
-    """A hypothesis fitted to a log and tested on its blocks.
+    """A hypothesis fitted to a log and tested on held-out blocks.
 
-    `error` and `shares` `(blocks, nq)` are the root mean square held-out residual relative to `scale` and to
-    `size`; `theta` and `nuisance` `(p,)` are parameters, with jackknife deviations over blocks.
+    `error` and `shares` `(blocks, nq)` are RMS held-out residuals relative to `scale` and to `size`. The
+    parameters `theta` and `nuisance` `(p,)` have the jackknife standard errors `spread` over blocks.
     """
 
     error: Array
@@ -129,7 +129,7 @@ class TorqueFit:
 
 
 def blocks_of(n: int) -> Array:
-    """Return the number of the block of each row."""
+    """Return the index of the block that contains each row."""
     return np.minimum(np.arange(n) * BLOCKS // max(n, 1), BLOCKS - 1)
 
 
@@ -140,17 +140,17 @@ def cross_validate(
     gains: tuple[int, ...] = (),
     instruments: Array | None = None,
 ) -> TorqueFit:
-    """Fit the nuisance and the columns of a hypothesis, and test them on held-out blocks.
+    """Fit the nuisance columns N and the columns Φ of a hypothesis, and test the fit on held-out blocks.
 
-    Minimises |P(r − N η − Φ θ)/σ|² + |θ/s|², where P removes contact forces. Φ contains the columns
-    `(n, nq, p)`, by default none; the prior s `(p,)` bounds the parameters; the first parameters scale the
-    torque of the joints `gains`. Instruments Z replace least squares by Zᵀ P (r − N η − Φ θ) = 0, for columns
-    with errors (Wooldridge, *Introductory Econometrics*, ch. 15).
+    Minimises |P(r − N η − Φ θ)/σ|² + |θ/s|², where P removes contact forces. Φ contains `columns`
+    `(n, nq, p)`, by default none. The prior s `(p,)` bounds the parameters, the first of which scale the
+    torques of the joints `gains`. With instruments Z, the fit solves Zᵀ P (r − N η − Φ θ) = 0 instead, which
+    allows for errors in the columns (Wooldridge, *Introductory Econometrics*, ch. 15).
     """
     p = columns.shape[-1] if columns is not None else 0
     A, y, unit, weight = _equations(problem, columns, prior)
     Z = None
-    if instruments is not None:  # in place of the leading columns, in the same units
+    if instruments is not None:  # replace the leading columns, normalised in the same way
         Z = problem.without_contact(instruments)
         size = np.sqrt((Z**2).sum(axis=(0, 1)))
         Z = np.concatenate([Z / np.where(size > 0.0, size, np.inf), A[..., Z.shape[-1] :]], axis=-1)
@@ -160,7 +160,7 @@ def cross_validate(
     # Jackknife: (K − 1)/K Σ (θ_k − mean)².
     spread = np.sqrt(BLOCKS - 1.0) * np.std(thetas, axis=0) / unit
     theta = (whole / unit)[:p]
-    # An error counts in relation to the torque: a gain of zero explains a noisy torque, and nothing.
+    # Errors are relative to the scaled torque: a gain of zero would fit a noisy torque but explain nothing.
     factor = np.ones(len(problem.size))
     factor[list(gains)] += theta[: len(gains)]
     shares = error * problem.scale / (problem.size * np.abs(factor) + 1e-12)
@@ -170,13 +170,13 @@ def cross_validate(
 def _equations(
     problem: TorqueProblem, columns: Array | None, prior: Array | None
 ) -> tuple[Array, Array, Array, Array]:
-    """Return normalised columns and right-hand side without contact forces, and units and weights."""
+    """Return normalised columns and the right-hand side without contact forces, and units and weights."""
     extra = columns if columns is not None else np.zeros((*problem.r.shape, 0))
     p = extra.shape[-1]
     every = problem.without_contact(np.concatenate([problem.r[..., None], extra, problem.nuisance], axis=-1))
     y, A = every[..., 0], every[..., 1:]
     unit = np.sqrt((A**2).sum(axis=(0, 1)))
-    # A column that does nothing gets no parameter.
+    # A column without effect gets no parameter.
     unit = np.where(unit > 1e-12 * unit.max(), unit, np.inf)
     weight = np.where(np.isfinite(unit), 1e-10, 1.0)
     if prior is not None:
@@ -185,7 +185,7 @@ def _equations(
 
 
 def robust_parameters(problem: TorqueProblem, columns: Array, prior: Array) -> Array:
-    """Fit with Huber's weights min(1, k/|r|), k twice the median (*Robust Statistics*, 1981, ch. 7)."""
+    """Fit with Huber weights min(1, k/|r|); k is twice the median |r| (*Robust Statistics*, 1981, ch. 7)."""
     A, y, unit, weight = _equations(problem, columns, prior)
     w, theta = np.ones(len(y)), np.zeros(A.shape[-1])
     for _ in range(REWEIGHTED):
@@ -197,7 +197,7 @@ def robust_parameters(problem: TorqueProblem, columns: Array, prior: Array) -> A
 
 
 def _held_out(A: Array, y: Array, weight: Array, Z: Array | None = None) -> tuple[Array, Array, Array]:
-    """Return the residual of each block for parameters of the others, these parameters, and those of all."""
+    """Return held-out residuals, the parameters fitted without each block, and those fitted to all blocks."""
     block, rest, symmetric = blocks_of(len(y)), np.zeros_like(y), Z is None
     Z = A if Z is None else Z
     grams, sides, thetas = [], [], []
@@ -213,13 +213,13 @@ def _held_out(A: Array, y: Array, weight: Array, Z: Array | None = None) -> tupl
 
 
 def held_out(problem: TorqueProblem, columns: Array, prior: Array) -> Array:
-    """Return the held-out residual of each row relative to the torque `(n, nq)`, linear in `problem.r`."""
+    """Return held-out residuals relative to the torque `(n, nq)`, which are linear in `problem.r`."""
     A, y, _, weight = _equations(problem, columns, prior)
     return _held_out(A, y, weight)[0] * problem.scale / problem.size
 
 
 def _solve(gram: Array, side: Array, weight: Array, symmetric: bool = True) -> Array:
-    """Solve the normal equations, or those with instruments, whose `gram` is not symmetric."""
+    """Solve the normal equations, or the equations with instruments, for which `gram` is not symmetric."""
     from scipy.linalg import cho_factor, cho_solve
 
     gram = gram + np.diag(weight + 1e-12 * np.trace(gram) / len(gram))
@@ -227,21 +227,21 @@ def _solve(gram: Array, side: Array, weight: Array, symmetric: bool = True) -> A
 
 
 def score_of(shares: Array) -> Array:
-    """Return `(blocks,)` Σ_j log error_j of errors `(blocks, nq)`, with a floor for negligible errors."""
+    """Return Σ_j log error_j `(blocks,)` of errors `(blocks, nq)`, with a floor for negligible errors."""
     return 0.5 * np.log(shares**2 + FLOOR**2).sum(axis=1)
 
 
 def gain_of(better: Array, worse: Array) -> tuple[float, float]:
-    """Return the mean decrease of a score by block, and its standard error."""
+    """Return the mean decrease in a score over blocks, and its standard error."""
     drop = worse - better
     return float(drop.mean()), float(drop.std(ddof=1) / np.sqrt(len(drop)))
 
 
 def pooled_gain_of(better: Array, worse: Array) -> tuple[float, float]:
-    """Return the decrease of Σ_j log errors `(blocks, nq)` over all blocks, and its jackknife standard error.
+    """Return the decrease in Σ_j log error over all blocks, and its jackknife standard error.
 
-    Unlike the mean over blocks, this does not depend on the excitation of single blocks (Cochran, *Sampling
-    Techniques*, ch. 6).
+    Errors have shape `(blocks, nq)`. Unlike the mean over blocks, the result does not depend on the
+    excitation in individual blocks (Cochran, *Sampling Techniques*, ch. 6).
     """
 
     def drop(rows: Array) -> float:

@@ -1,4 +1,4 @@
-"""Possible faults of a log or a robot file, their findings, and the log without the fault."""
+"""Possible faults of a log or a robot file, the resulting findings, and the correction of logs."""
 
 from __future__ import annotations
 
@@ -27,24 +27,24 @@ from forcegp.identification import MASS_SHARE, MOMENT_ARM, regressor
 from forcegp.robot.model import RobotModel
 
 LAGS = (1, 2, 3, 4, 6, 8, 11, 15, 20)
-"""Delays between torque and motion that are tried, in samples either way."""
+"""Delays between torque and motion that are tried, in samples, in either direction."""
 TOOL_MASS = 5.0
-"""Largest mass of a tool that the robot file lacks [kg]."""
+"""Prior standard deviation of the mass of a tool that is missing in the robot file [kg]."""
 RISES = (0.3, 2.0, 10.0)
-"""Factors by which the rise of dry friction may differ from the declared one: its law near rest is rarely
-known, and that of MuJoCo is more gentle."""
+"""Factors by which the slope of dry friction near rest may differ from that declared: its shape is rarely
+known, and friction in MuJoCo rises more gently."""
 SLOW, GRAVITY = 0.01, 10.0
-"""Sliding speed below which dry friction of a contact is smooth [m/s]; how far gravity may be off [m/s²]."""
+"""Sliding speed below which dry friction of contacts is smoothed [m/s]; possible error in gravity [m/s²]."""
 
 
 @dataclass(frozen=True)
 class Hypothesis:
-    """An explanation, named after a kind of finding or a family of kinds.
+    """A possible explanation of the torque, named after a kind of finding or a group of kinds.
 
-    `size` counts parameters, discrete choices as none; `change` corrects the log under this hypothesis, apart
-    from parameters. `columns` `(n, nq, p)` are the torque that parameters of size `prior` `(p,)` add to r,
-    `instruments` of the same shape replace least squares for columns with errors, and `shift` is a delay
-    of the torque in samples.
+    `size` is the number of parameters, where discrete choices count as zero. `change` corrects the log under
+    this hypothesis, except for the effects of its parameters. `columns` `(n, nq, p)` are the torques added to
+    r per unit of each parameter, whose prior standard deviations are `prior` `(p,)`. `instruments` have the
+    same shape and allow for errors in the columns. `shift` is a delay of the torque in samples.
     """
 
     name: str
@@ -60,7 +60,7 @@ class Hypothesis:
 def problem_of(
     system: ConstrainedSystem, log: Log, rows: np.ndarray, scale: Array | None = None
 ) -> TorqueProblem:
-    """Return the torque problem of some rows, with joint friction and an offset per joint."""
+    """Return the torque problem for the given rows, with friction and an offset at each joint."""
     nuisance = friction_columns(system, log, rows)
     size = np.sqrt((log.tau[rows] ** 2).mean(axis=0))
     size = np.maximum(size, 1e-3 * size.max())
@@ -68,27 +68,27 @@ def problem_of(
 
 
 def friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
-    """Return viscous and Coulomb friction and a constant, one of each per joint, `(n, nq, 3 nq)`."""
+    """Return columns for viscous friction, Coulomb friction and an offset at each joint, `(n, nq, 3 nq)`."""
     qd = log.qd[rows]
     smooth = np.tanh(qd / system.robot.friction_velocity.numpy())
     return np.concatenate([_diagonal(x) for x in (qd, smooth, np.ones_like(qd))], axis=-1)
 
 
 def other_rise_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
-    """Return the change of declared Coulomb friction with the smoothing velocity `(n, nq, p)`."""
+    """Return columns for declared Coulomb friction with a different slope near rest, `(n, nq, p)`."""
     declared = np.tile(system.robot.friction.numpy() > 0.0, len(RISES))
     return shape_columns(system, log, rows)[..., : len(declared)][..., declared]
 
 
 def shape_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
-    """Return columns of other shapes of dry friction, and of quadratic friction, by joint, `(n, nq, p)`."""
+    """Return columns for other shapes of dry friction and for quadratic friction, by joint, `(n, nq, p)`."""
     x, qd = log.qd[rows] / system.robot.friction_velocity.numpy(), log.qd[rows]
     shapes = *(np.tanh(k * x) - np.tanh(x) for k in RISES), qd * np.abs(qd)
     return np.concatenate([_diagonal(shape) for shape in shapes], axis=-1)
 
 
 def contact_friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
-    """Return the friction −Jᵀv, −Jᵀv/|v| of each contact sliding at v unless it is removed, `(n, nq, p)`."""
+    """Return friction columns Jᵀv, Jᵀv/|v| for each contact that slides at v, `(n, nq, p)`; `p` may be 0."""
     (q,), columns = tensors(log, rows, "q"), [np.zeros((len(rows), log.nq, 0))]
     for contact in [] if takes_friction_out(system, log) else labelled_contacts(system, log):
         if isinstance(contact, SurfaceContact):
@@ -100,7 +100,7 @@ def contact_friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarr
 
 
 def _diagonal(x: Array) -> Array:
-    """Return `(n, nq, nq)` with x on the diagonal."""
+    """Return matrices `(n, nq, nq)` with x on the diagonal."""
     return x[..., None] * np.eye(x.shape[-1])
 
 
@@ -110,14 +110,14 @@ def unchanged(log: Log) -> Log:
 
 
 def changed(log: Log, names: tuple[str, ...], *, order: Sequence[int] = (), flip: Sequence[int] = ()) -> Log:
-    """Return the log with two joints exchanged, or the sign of some joints changed, in some columns."""
+    """Return the log with two joints swapped, or the signs of the given joints flipped, in given columns."""
     index, sign = np.arange(log.nq), np.ones(log.nq)
     index[list(order)], sign[list(flip)] = order[::-1], -1.0
     return log.replace(**{name: getattr(log, name)[:, index] * sign for name in names})
 
 
 def delayed(log: Log, shift: int, joints: tuple[int, ...] = ()) -> Log:
-    """Return the log with (some) torques taken `shift` rows later in each stretch; masked at its end."""
+    """Return the log with the torques of all (or given) joints taken `shift` rows later, masking the ends."""
     tau, lost = log.tau.copy(), np.ones(len(log), bool)
     columns = list(joints) or list(range(log.nq))
     for s in log.stretches:
@@ -142,7 +142,7 @@ def discrete(log: Log) -> Iterator[Hypothesis]:
 
 
 def continuous(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterator[Hypothesis]:
-    """Yield hypotheses with parameters: gains, encoder offsets, gravity, tool and masses."""
+    """Yield the hypotheses with parameters: gains, encoder offsets, gravity, payload and masses."""
     for j in range(log.nq):
         yield gain_hypothesis(log, rows, (j,))
         yield encoder_hypothesis(system, log, rows, j)
@@ -150,7 +150,7 @@ def continuous(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterato
 
 
 def gain_hypothesis(log: Log, rows: np.ndarray, joints: tuple[int, ...]) -> Hypothesis:
-    """Return the hypothesis that the torques of some joints must be scaled: u − τ = g τ."""
+    """Return the hypothesis that the torques of the given joints must be scaled: u − τ = g τ."""
     columns = _diagonal(log.tau[rows])[..., list(joints)]
     return Hypothesis("gains", len(joints), unchanged, columns, np.full(len(joints), 100.0), joints)
 
@@ -158,24 +158,24 @@ def gain_hypothesis(log: Log, rows: np.ndarray, joints: tuple[int, ...]) -> Hypo
 def current_hypothesis(
     log: Log, rows: np.ndarray, problem: TorqueProblem, joints: tuple[int, ...]
 ) -> Hypothesis:
-    """Return the hypothesis of a gain, with the required torque as instrument, free of torque noise."""
+    """Return a gain hypothesis with the required torque as an instrument, which is free of torque noise."""
     needed = _diagonal(problem.r + log.tau[rows])[..., list(joints)]
     return replace(gain_hypothesis(log, rows, joints), instruments=needed)
 
 
 def robot_hypotheses(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterator[Hypothesis]:
-    """Yield the hypotheses on the robot file, which do not change the log."""
+    """Yield the hypotheses about the robot file, which do not change the log."""
     for name in ROBOT:
         columns, prior = robot_columns(system, log, rows, name)
         yield Hypothesis(name, columns.shape[-1], unchanged, columns, prior)
 
 
 ROBOT = ("gravity", "payload", "masses")
-"""Hypotheses about the robot file, which leave the log as it is."""
+"""Hypotheses about the robot file, which do not change the log."""
 
 
 def robot_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray, name: str) -> tuple[Array, Array]:
-    """Return the torque `(n, nq, p)` per unit of each uncertain parameter, and its tolerance `(p,)`."""
+    """Return the torque `(n, nq, p)` per unit of each uncertain parameter, and the tolerances `(p,)`."""
     robot = system.robot
     q, qd, qdd = tensors(log, rows, "q", "qd", "qdd")
     with torch.no_grad():
@@ -198,7 +198,7 @@ def inertial_spread(robot: RobotModel) -> Array:
 
 
 def encoder_hypothesis(system: ConstrainedSystem, log: Log, rows: np.ndarray, j: int) -> Hypothesis:
-    """Return the hypothesis that the encoder of joint j is off by δ: r = u(q) − τ = −∂u/∂q δ."""
+    """Return the hypothesis that the encoder of joint j has an offset δ: r = u(q) − τ = −∂u/∂q δ."""
     q, qd, qdd = tensors(log, rows, "q", "qd", "qdd")
     step = torch.zeros(log.nq, dtype=q.dtype)
     step[j] = 1e-4
@@ -209,20 +209,20 @@ def encoder_hypothesis(system: ConstrainedSystem, log: Log, rows: np.ndarray, j:
 
 
 CURRENT = 1.6
-"""Gains of all joints beyond this factor are no calibration error: another quantity was logged."""
+"""Median gain factor above which the error is not one of calibration: a different quantity was logged."""
 TILT = 30.0
-"""Largest angle at which a base counts as tilted, not as mounted another way round [degrees]."""
+"""Largest angle at which a base counts as tilted rather than mounted in a different orientation [degrees]."""
 WEIGHTLESS, SIGNIFICANT = 0.3, 3.0
-"""Share of gravity below which the torque has none; standard errors from which a tool's parameter counts."""
+"""Fraction of gravity below which torques lack it; standard errors above which payload and offsets count."""
 SMALL_ANGLE, LARGEST_ANGLE = np.radians(0.5), 1.0
-"""Encoder offsets below the first are within calibration, or an error of a centre of mass; one beyond the
-second is none that a slope of the torque determines [rad, m]."""
+"""Encoder offset below which calibration or the centres of mass may be the cause, and offset above which a
+linearisation cannot determine it [rad, m]."""
 SMALL_GAIN, EXPLAINED = 0.2, 0.5
-"""Gains closer to 1 may as well be errors of masses; share of the torque that a gain may not explain."""
+"""Deviation of a gain from 1 that wrong masses may cause; fraction of torque it may leave unexplained."""
 SMALL_TILT, EARTH = 1.0, 9.81
-"""Tilts that are errors of the masses [degrees]; size of gravity where the scene has none [m/s²]."""
+"""Tilt that wrong masses may cause [degrees]; magnitude assumed if the scene has no gravity [m/s²]."""
 SAME_GRAVITY = 0.2, 0.5
-"""Share by which a gravity that turned may seem larger or smaller: a tilt, and more. Masses are off too."""
+"""Accepted relative error in the magnitude of gravity due to wrong masses, for tilts and larger angles."""
 
 
 DISCRETE = {
@@ -234,7 +234,7 @@ DISCRETE = {
 
 
 def plausible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit) -> bool:
-    """Return whether the parameters are physically plausible, such as a positive tool mass."""
+    """Return whether the parameters are physically plausible (a tool has a positive mass, for example)."""
     if hypothesis.name == "encoder-offset":
         least = max(SMALL_ANGLE, SIGNIFICANT * fit.spread[0])
         return bool(least < abs(fit.theta[0]) <= LARGEST_ANGLE)
@@ -256,7 +256,7 @@ def plausible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit)
 
 
 def corrected(log: Log, hypothesis: Hypothesis, theta: Array) -> Log:
-    """Return the log without the fault, or unchanged if the fault is in the robot file."""
+    """Return the log with the fault corrected, or the same log if the fault is in the robot file."""
     joints = list(hypothesis.joints)
     if hypothesis.name == "gains":
         tau = log.tau.copy()
@@ -273,7 +273,7 @@ def corrected(log: Log, hypothesis: Hypothesis, theta: Array) -> Log:
 def finding_of(
     system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: TorqueFit, alike: tuple[int, ...] = ()
 ) -> Finding:
-    """Return the finding of a hypothesis; `alike` are the joints of equivalent hypotheses."""
+    """Return the finding that states a hypothesis; `alike` contains the joints of equivalent hypotheses."""
     name, theta, spread, evidence = hypothesis.name, fit.theta, fit.spread, dict[str, float]()
     one_of = name == "joint-sign" and len(alike) > 1
     names = tuple(log.joint_names[j] for j in (alike if one_of else hypothesis.joints))
@@ -308,7 +308,7 @@ def finding_of(
 
 
 def _gains(log: Log, names: tuple[str, ...], gains: Array) -> Finding:
-    """Return the torques that have to be scaled: a wrong sign, a current, or a wrong gain."""
+    """Return the finding on torques that must be scaled: a wrong sign, a current, or a wrong gain."""
     evidence = {f"factor {name}": gain for name, gain in zip(names, gains, strict=True)}
     listed = ", ".join(f"{name} {gain:.3g}" for name, gain in zip(names, gains, strict=True))
     text = f"torques fit when multiplied by {listed}"
@@ -323,7 +323,7 @@ def _gains(log: Log, names: tuple[str, ...], gains: Array) -> Finding:
 
 
 def _gravity(system: ConstrainedSystem, log: Log, change: Array) -> Finding:
-    """Return the gravity that is absent from the torque, or has another direction than in the scene."""
+    """Return the finding on gravity that the torque lacks, or whose direction differs from the scene's."""
     assumed = system.robot.gravity.numpy()
     fitted = assumed + change
     strength = float(np.linalg.norm(assumed))
@@ -346,7 +346,7 @@ def is_tilt(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit) -
 
 
 def _turn(assumed: Array, fitted: Array) -> tuple[float, float]:
-    """Return the angle between two vectors [°], and the length of the second over that of the first."""
+    """Return the angle between two vectors [°], and the ratio of the second length to the first."""
     lengths = float(np.linalg.norm(assumed)), float(np.linalg.norm(fitted))
     cosine = fitted @ assumed / max(lengths[0] * lengths[1], 1e-12)
     return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))), lengths[1] / (lengths[0] or EARTH)

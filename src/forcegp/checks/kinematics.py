@@ -1,9 +1,9 @@
-"""Is qd the derivative of q, and qdd that of qd? Units of time and angle, signs, order, and noise of columns.
+"""Checks that qd is the derivative of q, and qdd that of qd: units, signs and order of columns, and noise.
 
-A rate is wrong if both bounds of its slope are: noise flattens one of the two regression lines of the change
-of x over short windows on the integral of its logged rate. Is the noise on the acceleration white, and as
-large as the header says? For white noise, the deviations from cubics through neighbours at distances of one
-and of three samples agree; for filtered noise they do not.
+Changes of x over short windows are compared with integrals of its logged rate. Since noise flattens one of
+the two regression lines between them, a rate is wrong only if both slopes are. The noise in the acceleration
+should be white and as large as the header states. For white noise, the deviations from cubics through
+neighbours at distances of one and of three samples have the same size; for filtered noise they do not.
 """
 
 from __future__ import annotations
@@ -23,34 +23,34 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.robust import robust_std
 
 WINDOW = 0.05
-"""Length of a window [s]; long enough that noise averages out, short against the motion."""
+"""Length of a window [s], long enough to average out noise and short compared with the motion."""
 TOLERANCE, INSTANT = 0.05, 0.15
-"""A slope within this of 1 is right: filters cost a few percent, and accelerations change within a period."""
+"""Accepted deviations of a slope from 1, for filters and for accelerations that change within a period."""
 RELATED = 0.7
-"""Correlation below which a velocity does not belong to its position, encoder steps aside."""
+"""Correlation below which a velocity does not belong to its position, unless encoder steps are coarse."""
 EXCHANGED, CLEARLY = 0.9, 5.0
-"""Correlation with another joint's rate from which columns are exchanged; factor of unexplained variance by
-which that order must be better."""
+"""Correlation with another joint's rate that indicates swapped columns; factor by which that order must
+reduce the unexplained variance."""
 LATE, PERSISTS = 0.05, 0.5
-"""Share of the motion that a filtered velocity misses, and correlation of what it misses in neighbouring
-windows: noise has none."""
+"""Fraction of the motion that a delayed velocity misses, and correlation of the missing motion in adjacent
+windows; noise is uncorrelated."""
 JUMPS = 0.05
-"""Largest share of windows that impacts cross: the velocity jumps there, which no acceleration holds."""
+"""Largest fraction of windows left out because of impacts, whose velocity jumps no acceleration explains."""
 INERTIA_ROWS = 200
-"""Rows at which inertias are computed."""
+"""Maximum number of rows at which inertias are computed."""
 FRICTION_ROWS, LEAST_ROWS = 4000, 20
-"""Rows from which viscous friction is estimated, at most and at least."""
+"""Maximum and minimum number of rows from which viscous friction is estimated."""
 ALIKE = 0.02
-"""Slopes of all joints within this of one factor have one cause: the clock."""
+"""Tolerance within which the slopes of all joints share a factor, which indicates an incorrect clock rate."""
 UNITS = (1e-9, 1e-6, 1e-3, 1e3)
-"""Seconds over the unit of a clock in ns, µs, ms or ks."""
+"""Lengths of 1 ns, 1 µs, 1 ms and 1 ks, possible units of a clock [s]."""
 UNIT_TOLERANCE = 0.1
 
 
 @dataclass(frozen=True)
 class Match:
-    """Changes and integrals of one level `(w, nq)` over windows, zero where an impact crosses one (`whole`:
-    as they are), bounds of the slopes between them `(nq,)`, and joints that change significantly.
+    """Changes of a column and integrals of its rate over windows `(w, nq)`, set to zero if the window has an
+    impact (except in `whole`), bounds on the slopes between them `(nq,)`, and joints that move.
     """
 
     change: Array
@@ -64,13 +64,13 @@ class Match:
     def right(
         self, factor: float = 1.0, tolerance: float = TOLERANCE, least: Array | float = 1.0
     ) -> np.ndarray:
-        """Return `(nq,)` bool, whether a slope can lie between `least` times this factor and the factor."""
+        """Return `(nq,)` bool, whether the slope can lie between `least` · `factor` and `factor`."""
         ratio = np.stack([self.low, self.high]) / factor
         return (ratio.min(axis=0) < 1.0 + tolerance) & (ratio.max(axis=0) > least * (1.0 - tolerance))
 
 
 def match(log: Log, value: str, rate: str) -> Match | None:
-    """Compare changes of a column with integrals of its rate; return `None` for too few windows."""
+    """Compare changes of a column with integrals of its rate; return `None` if there are too few windows."""
     x, v = getattr(log, value), getattr(log, rate)
     width = max(2, round(WINDOW / log.dt)) if log.dt < WINDOW else 2
     changes, integrals = [], []
@@ -100,7 +100,7 @@ def match(log: Log, value: str, rate: str) -> Match | None:
 
 
 def check_clock_unit(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find a common factor between changes and integrals of all joints and both levels: a wrong clock."""
+    """Find a factor common to all joints and both derivatives, which indicates an incorrect clock rate."""
     if not log.stretches:
         return [], log
     if "qd" in log.derived:  # only the length of a step says anything
@@ -142,7 +142,7 @@ def _clock_finding(log: Log, factor: float) -> Outcome:
 
 
 def _one_factor(level: Match, factor: float) -> bool:
-    """Return whether several joints share one slope that is neither right nor that of degrees."""
+    """Return whether several joints share a slope that is neither correct nor explained by degrees."""
     degrees = any(abs(np.log(abs(factor) * unit)) <= UNIT_TOLERANCE for unit in (DEGREE, 1.0 / DEGREE))
     if factor <= 0.0 or abs(factor - 1.0) <= TOLERANCE or degrees or level.moving.sum() < 2:
         return False
@@ -151,7 +151,7 @@ def _one_factor(level: Match, factor: float) -> bool:
 
 
 def check_velocity(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find velocities that are not the derivative of the positions, by unit, sign, order or otherwise."""
+    """Find velocities that are not the derivative of the positions, or have a wrong unit, sign or order."""
     if "qd" in log.derived:
         return [], log
     level = match(log, "q", "qd")
@@ -176,7 +176,7 @@ def check_velocity(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def _late(log: Log, level: Match) -> list[Finding]:
-    """Find velocities delayed by a filter: a delay L leaves Δq − ∫q̇ dt = L Δq̇, which persists."""
+    """Find velocities delayed by a filter: a delay L causes a persistent error Δq − ∫q̇ dt = L Δq̇."""
     rates = match(log, "qd", "qdd")
     if rates is None or "qd" in log.header.derived:
         return []
@@ -190,7 +190,7 @@ def _late(log: Log, level: Match) -> list[Finding]:
 
 
 def _velocity_findings(log: Log, level: Match, wrong: np.ndarray) -> tuple[list[Finding], Array]:
-    """Return one finding per cause, and the factors that undo it."""
+    """Return one finding per cause, and the factors that correct the velocities."""
     causes = ("velocity-sign", -1.0, "runs against"), ("degrees", 1.0 / DEGREE, "is 1/57 of")
     findings, factor, unexplained = [], np.ones(log.nq), wrong.copy()
     for kind, slope, what in (*causes, ("degrees", DEGREE, "is 57 times")):
@@ -213,7 +213,7 @@ def _mismatch(kind: str, log: Log, level: Match, wrong: np.ndarray, rate: str, v
 
 
 def _coarse(log: Log, level: Match) -> np.ndarray:
-    """Return the joints that change by about one encoder step, too little to judge their rate."""
+    """Return the joints that move by about one encoder step per window, too little to judge their rate."""
     size = np.sqrt((level.change**2).mean(axis=0))
     moves = np.abs(np.diff(log.q, axis=0))
     steps = np.nanmedian(np.where(moves > 0.0, moves, np.nan), axis=0)
@@ -221,7 +221,7 @@ def _coarse(log: Log, level: Match) -> np.ndarray:
 
 
 def _permutation(level: Match) -> np.ndarray | None:
-    """Return the order of rates that fits the changes of all joints better than their own, if any."""
+    """Return the order of rates that fits the changes of the joints better than the logged one, if any."""
     from scipy.optimize import linear_sum_assignment
 
     # Windows without impacts are those in which a joint fits its own rate, which here is the wrong one.
@@ -240,10 +240,10 @@ def _permutation(level: Match) -> np.ndarray | None:
 
 
 def _held_torque(system: ConstrainedSystem, log: Log) -> Array:
-    """Return `(nq,)` mean acceleration over a period in which the torque is held, over that at its start.
+    """Return the mean acceleration over a period of constant torque relative to that at its start, `(nq,)`.
 
-    Viscous friction d slows a joint of inertia m as exp(−d t/m), which leaves (1 − exp(−x))/x, x = d dt/m:
-    after a change of the torque, light damped joints accelerate more than their velocity will change.
+    Viscous friction d slows a joint of inertia m as exp(−d t/m), so the ratio is (1 − exp(−x))/x, x = d dt/m.
+    After a change in the torque, lightweight damped joints accelerate more than their velocity changes.
     """
     rows = log.rows(INERTIA_ROWS)
     (q,) = tensors(log, rows, "q")
@@ -263,7 +263,7 @@ def _held_torque(system: ConstrainedSystem, log: Log) -> Array:
 
 
 def check_acceleration(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find accelerations that differ from the derivative of the velocities by more than noise."""
+    """Find accelerations that differ from the derivative of the velocities by more than the noise."""
     if log.derived:
         return [], log
     level = match(log, "qd", "qdd")
@@ -284,15 +284,15 @@ def check_acceleration(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 DEPARTURE_STRIDE = 3
-"""At this stride the departure, zero on cubics, shows noise below the corner of a filter."""
+"""Stride at which the deviation from a cubic reveals noise below the cut-off frequency of a filter."""
 NOISE_FACTOR, FILTERED = 2.0, 0.4
-"""Ratio of noise found to noise stated that is reported; noise at the highest frequency, as a share of that
-at a third of it, of a filter."""
+"""Ratio of measured to stated noise above which it is reported; ratio of the noise at the highest frequency
+to that at a third of it below which the noise counts as filtered."""
 NOISE_ROWS = 100
 
 
 def noise_levels(log: Log) -> tuple[Array, Array] | None:
-    """Return the standard deviation `(nq,)` of white noise, from neighbours at distances 1 and 3."""
+    """Return standard deviations `(nq,)` of white noise, estimated from neighbours at distances 1 and 3."""
     from scipy.ndimage import correlate1d
 
     levels = []
@@ -308,7 +308,7 @@ def noise_levels(log: Log) -> tuple[Array, Array] | None:
 
 
 def check_noise(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Compare the noise of the logged acceleration with that of the header."""
+    """Compare the noise in the logged acceleration with the noise stated in the header."""
     levels = noise_levels(log) if "qdd" not in log.derived else None
     if levels is None:
         return [], log

@@ -1,4 +1,4 @@
-"""Values beyond the limits of the robot file, torques that clip, and degrees that look like radians."""
+"""Checks for values beyond the limits in the robot file, clipped torques, and degrees instead of radians."""
 
 from __future__ import annotations
 
@@ -16,20 +16,20 @@ from forcegp.data.clipped import clipped
 DEGREE = np.pi / 180.0
 TURN = 2.0 * np.pi
 SLACK = 1e-3
-"""Share of a limit by which it may be exceeded: rounding, and encoders that read a little beyond a stop."""
+"""Fraction of the range by which a limit may be exceeded, due to rounding or encoder readings at a stop."""
 OFTEN, UNIT_ROWS = 0.05, 400
-"""Share of rows beyond the limits that suggests a wrong unit, and number of rows for comparing torques."""
+"""Fraction of rows beyond the limits that suggests a wrong unit, and number of rows for comparing torques."""
 
 
 def _limits(system: ConstrainedSystem) -> dict[str, tuple[Array, Array]]:
-    """Return the lower and upper limits by column."""
+    """Return the lower and upper limits of each column."""
     r = system.robot
     low, high, speed, effort = (x.numpy() for x in (r.lower, r.upper, r.velocity_limit, r.effort_limit))
     return {"q": (low, high), "qd": (-speed, speed), "tau": (-effort, effort)}
 
 
 def check_degrees(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find angles in degrees, which exceed the joint's range and fit range and torque once converted."""
+    """Find angles in degrees: they exceed the joint ranges, but match ranges and torques once converted."""
     low, high = _limits(system)["q"]
     turning = system.robot.revolute.cpu().numpy() > 0.0
     low, high = np.where(np.isfinite(low), low, -TURN), np.where(np.isfinite(high), high, TURN)
@@ -53,7 +53,7 @@ def check_degrees(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def _misfit(system: ConstrainedSystem, log: Log) -> float:
-    """Return the held-out error of the torque up to a gain per joint; 0 if no torque is informative."""
+    """Return the held-out torque error score with a free gain per joint; 0 if the torque is uninformative."""
     rows = log.rows(UNIT_ROWS)
     if len(rows) < UNIT_ROWS or not log.tau[rows].any():
         return 0.0
@@ -63,7 +63,7 @@ def _misfit(system: ConstrainedSystem, log: Log) -> float:
 
 
 def _angles(log: Log) -> list[str]:
-    """Return the columns in degrees where angles are: velocities that are the derivative of the angles."""
+    """Return the columns that are in degrees if angles are, including their derivatives unless in radians."""
     columns = ["q"]
     for name, source in (("qd", "q"), ("qdd", "qd")):
         step = sum(np.abs(np.diff(getattr(log, source)[s], axis=0)).sum() for s in log.stretches)
@@ -73,7 +73,7 @@ def _angles(log: Log) -> list[str]:
 
 
 def check_limits(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find positions, velocities and torques beyond the limits of the robot file."""
+    """Find positions, velocities and torques beyond the limits in the robot file."""
     kinds = {"q": "position-limit", "qd": "velocity-limit", "tau": "torque-limit"}
     findings = []
     for name, (low, high) in _limits(system).items():
@@ -88,7 +88,7 @@ def check_limits(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_saturation(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find torques that stay at their largest value for several rows: the amplifier clips."""
+    """Find torques that stay at their largest value for several rows because the amplifier clips."""
     mask = clipped_torques(log)
     joints = log.named(mask.any(axis=0))
     text = f"the torque of {', '.join(joints)} stays at its largest value in"
@@ -96,13 +96,13 @@ def check_saturation(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def clipped_torques(data: Dataset | Log) -> NDArray[np.bool_]:
-    """Return the mask `(n, nq)` of torques that stay at the largest or smallest value of their joint.
+    """Return the mask `(n, nq)` of torques that remain at the largest or smallest value of their joint.
 
     Use the unfiltered log, since filters smooth the plateaus. `forcegp import` states the noise of these rows
     in `extras["tau_std"]`, or drops them.
 
     Args:
-        data: a log in order of time.
+        data: a log in time order.
 
     Example:
         `train = log[torch.from_numpy(~clipped_torques(log).any(-1))]`

@@ -1,9 +1,9 @@
-"""Recorded logs, valid or not, and the filter for the torque checks.
+"""Recorded logs, which may be invalid, and the filter used by the torque checks.
 
-Noise ε on q̈ enters the explained torque as M ε, and a fit gains by shrinking the inertia, like any
-regression on noisy columns. The same filter of a tenth of a second on positions, velocities, accelerations
-and torques removes the noise and preserves M q̈ = Q, up to changes of M and of the bias force within its
-window.
+Noise ε in q̈ enters the explained torque as M ε. As in any regression on noisy columns, a fit would reduce
+its error by shrinking the inertia. Applying the same filter of a tenth of a second to positions, velocities,
+accelerations and torques removes the noise and preserves M q̈ = Q, up to changes in M and in the bias force
+within the window.
 """
 
 from __future__ import annotations
@@ -38,19 +38,19 @@ def evenly(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
 
 
 DEPARTURE = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0
-"""Weights of the deviation of a value from the cubic through its four neighbours."""
+"""Weights for the deviation of a value from the cubic through its four neighbours."""
 OUTER, SPREAD = np.array([3.0, -10.0, 10.0, 0.0, -5.0, 2.0, 0.0]) / 3.0, 3.7
-"""Weights of the departure at x = −3 from the cubic through x = −2, −1, 1, 2, and the standard deviation of
-that contrast over the one of the middle value, for white noise."""
+"""Weights for the deviation at x = −3 from the cubic through x = −2, −1, 1, 2, and the ratio of its standard
+deviation to that of the deviation at x = 0, for white noise."""
 
 
 def spikes(x: Array) -> tuple[Array, Array]:
     """Return the deviation of each value from the cubic through its four neighbours, and that of the
     neighbours.
 
-    e_i = x_i − (−x_{i−2} + 4 x_{i−1} + 4 x_{i+1} − x_{i+2})/6. The second result is the same deviation for
-    the neighbours alone, without x_i: a kink of the motion increases both, a spike only the first. Values are
-    evenly sampled, `(n, d)` with n ≥ 7; both results are zero in the three outermost rows.
+    e_i = x_i − (−x_{i−2} + 4 x_{i−1} + 4 x_{i+1} − x_{i+2})/6. The second result is the deviation among the
+    neighbours alone, without x_i. A kink in the motion increases both, a spike only the first. Values must be
+    evenly sampled, `(n, d)` with n ≥ 7; both results are zero in the three rows at either end.
     """
     from scipy.ndimage import correlate1d
 
@@ -67,27 +67,27 @@ def position_unit(robot: RobotModel, j: int | np.integer) -> str:
 
 
 def force_unit(robot: RobotModel, j: int | np.integer) -> str:
-    """Return the unit of the force of joint j."""
+    """Return the unit of the force or torque at joint j."""
     return "N m" if robot.joint_types[j] == "revolute" else "N"
 
 
 def displacement(robot: RobotModel, j: int | np.integer, offset: float) -> str:
-    """Return an offset of the position of joint j in words, with angles also in degrees."""
+    """Return an offset in the position of joint j as text, with angles also in degrees."""
     degrees = f" ({np.degrees(offset):+.2f}°)" if robot.joint_types[j] == "revolute" else ""
     return f"{offset:+.4f} {position_unit(robot, j)}{degrees}"
 
 
 GAP, CLOCK_SPREAD = 1.5, 10.0
-"""A gap is longer than this multiple of the median step, as half a sample is missing, and this many robust
-standard deviations of the steps longer than it, as clocks jitter."""
+"""A gap is longer than this multiple of the median step, and exceeds the median step by this many robust
+standard deviations, to allow for clock jitter."""
 SHORTEST, SMOOTHING = 8, 0.1
-"""Minimum number of rows in a stretch, and length of the filter for missing accelerations [s]."""
+"""Minimum number of rows in a stretch, and length of the filter that computes missing derivatives [s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """Unchecked columns of a log, named as in a `Dataset`; `qd` and `qdd` may be `derived`, and rows may be
-    `masked` `(n,)` for subsequent checks.
+    """Unchecked columns of a log, named as in a `Dataset`. `derived` names computed columns, and `masked`
+    `(n,)` marks rows that subsequent checks ignore.
     """
 
     t: Array
@@ -113,53 +113,53 @@ class Log:
 
     @property
     def all_rows(self) -> tuple[tuple[int, int], ...]:
-        """The whole log as one interval."""
+        """All rows of the log as a single interval."""
         return ((0, len(self)),)
 
     def finding(self, kind: str, text: str, joints: tuple[str, ...] = (), **evidence: Any) -> Finding:
-        """Return a finding on the whole log."""
+        """Return a finding that concerns the whole log."""
         return Finding(kind, text, self.all_rows, joints, evidence=evidence)
 
     def on_joints(self, kind: str, mask: Array, text: str, **evidence: Any) -> list[Finding]:
-        """Return a finding on the joints of a mask, named at `{}` in its text; empty without joints."""
+        """Return a finding on the joints selected by a mask, whose names replace `{}`, or no finding."""
         joints = self.named(mask)
         return [self.finding(kind, text.format(", ".join(joints)), joints, **evidence)] if joints else []
 
     def named(self, joints: Array | np.bool_) -> tuple[str, ...]:
-        """Return the names of the joints of a mask."""
+        """Return the names of the joints selected by a mask."""
         return tuple(self.joint_names[j] for j in np.flatnonzero(joints))
 
     def replace(self, **fields: Any) -> Log:
-        """Return the log with some fields changed."""
+        """Return the log with the given fields replaced."""
         return dataclasses.replace(self, **fields)
 
     def mask(self, rows: NDArray[np.bool_]) -> Log:
-        """Return the log with more rows masked."""
+        """Return the log with additional rows masked."""
         return self.replace(masked=rows if self.masked is None else self.masked | rows)
 
     @cached_property
     def finite(self) -> NDArray[np.bool_]:
-        """`(n,)` rows in which every number is finite."""
+        """Mask `(n,)` of rows in which all numbers are finite."""
         vectors = np.concatenate([getattr(self, name) for name in JOINT_VECTORS], axis=1)
         return np.isfinite(self.t) & np.isfinite(vectors).all(axis=1)
 
     @cached_property
     def usable(self) -> NDArray[np.bool_]:
-        """`(n,)` rows that are finite and not masked."""
+        """Mask `(n,)` of rows that are finite and not masked."""
         return self.finite if self.masked is None else self.finite & ~self.masked
 
     def reach(self, name: str) -> Array:
-        """Return `(nq,)` range of a column without its outermost values."""
+        """Return the range `(nq,)` of a column without its most extreme values."""
         return np.ptp(np.percentile(getattr(self, name)[self.usable], (0.5, 99.5), axis=0), axis=0)
 
     @cached_property
     def steps(self) -> Array:
-        """`(n − 1,)` time steps, NaN between segments."""
+        """Time steps `(n − 1,)` [s], NaN between segments."""
         return np.where(np.diff(self.segment) == 0, np.diff(self.t), np.nan)
 
     @cached_property
     def dt(self) -> float:
-        """Median of the positive time steps [s]; NaN if there is none."""
+        """Median of the positive time steps [s]; NaN if there are none."""
         forward = self.steps[self.steps > 0.0]
         return float(np.median(forward)) if len(forward) else float("nan")
 
@@ -172,7 +172,7 @@ class Log:
 
     @cached_property
     def stretches(self) -> list[slice]:
-        """Contiguous runs of usable rows: finite, not masked, in one segment, without a gap in time."""
+        """Contiguous runs of usable rows that lie in one segment and have no gap in time."""
         linked = (self.steps > 0.0) & (self.steps <= self.longest_step) & self.usable[1:] & self.usable[:-1]
         runs = intervals(linked) if self.header.ordered else ()
         return [slice(a, b + 1) for a, b in runs if b + 1 - a >= SHORTEST]
@@ -186,11 +186,11 @@ class Log:
 
 
 Outcome = tuple[list[Finding], Log]
-"""Result of a check: its findings, and the corrected log for the checks after it."""
+"""Result of a check: its findings, and the corrected log for subsequent checks."""
 
 
 def log_of(data: Dataset) -> Log:
-    """Return the log of a data set."""
+    """Convert a data set to a log."""
     return Log(
         **{n: getattr(data, n).detach().cpu().numpy().astype(float) for n in ("t", *JOINT_VECTORS)},
         segment=data.segment.cpu().numpy(),
@@ -201,9 +201,9 @@ def log_of(data: Dataset) -> Log:
 
 
 def read_log(path: str | Path) -> Log:
-    """Read a log from Parquet or CSV, accepting NaN, empty values and time stamps that run backward.
+    """Read a log from a Parquet or CSV file, accepting NaN, empty values and time stamps that run backward.
 
-    The columns are those of docs/formats.md; missing q̇ and q̈ are computed by a Savitzky-Golay filter.
+    The columns are described in docs/formats.md. Missing q̇ and q̈ are computed by a Savitzky-Golay filter.
 
     Raises:
         DataError: the file is damaged, or a column is missing.
@@ -219,7 +219,7 @@ def read_log(path: str | Path) -> Log:
 
 
 def derive(log: Log, absent: list[str]) -> Log:
-    """Return the log with missing derivatives computed on each contiguous stretch, NaN elsewhere."""
+    """Return the log with missing derivatives computed on each contiguous stretch, and NaN elsewhere."""
     logged = [name for name in JOINT_VECTORS if name not in absent]
     filled = log.replace(**{name: np.zeros_like(log.q) for name in absent})
     values = {name: np.full_like(log.q, np.nan) for name in absent}
@@ -235,7 +235,7 @@ def derive(log: Log, absent: list[str]) -> Log:
 
 
 def of_robot(log: Log, robot: RobotModel) -> Log:
-    """Return the log with the robot's joints in order; `DataError` if one is missing or the log is empty."""
+    """Return the log with joints ordered as in the robot; raise `DataError` if it is empty or lacks one."""
     if len(log) == 0:
         raise DataError("the log contains no rows", expected="one or more samples")
     if not set(robot.joint_names) <= set(log.joint_names):
@@ -246,11 +246,11 @@ def of_robot(log: Log, robot: RobotModel) -> Log:
 
 
 SMOOTHED_SECONDS, SMOOTHED_ORDER = 0.1, 3
-"""Length of the filter [s], and degree of its polynomial, which preserves curvature within the window."""
+"""Length of the filter [s], and degree of its polynomials, which preserve curvature within the window."""
 
 
 def smoothed(log: Log) -> Log:
-    """Apply a Savitzky-Golay filter to a valid log between contact switches, masking the ends."""
+    """Apply a Savitzky-Golay filter to a valid log between contact switches, and mask the ends."""
     from scipy.signal import savgol_filter
 
     half = round(SMOOTHED_SECONDS / log.dt / 2.0) if np.isfinite(log.dt) and log.header.ordered else 0

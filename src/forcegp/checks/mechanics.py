@@ -1,4 +1,4 @@
-"""Residual torque after the faults are explained: friction, offsets, disturbances."""
+"""Checks of the torque: faults that explain it, and then friction, offsets and disturbances."""
 
 from __future__ import annotations
 
@@ -18,26 +18,26 @@ from forcegp.robust import robust_std
 from forcegp.rows import describe, intervals
 
 LEAST_ROWS = 200
-"""Rows from which dynamics are judged."""
+"""Minimum number of rows for checking the dynamics."""
 SIGNIFICANT, MATERIAL = 3.0, 0.1
-"""Standard errors over blocks, and drop of a joint's log error, from which friction or offsets count."""
+"""Standard errors over blocks, and drop in a joint's log error, above which friction or offsets count."""
 SPEEDS, UNEXPLAINED = (25.0, 95.0), 0.5
-"""Percentiles of speed between which friction resists; share of the torque (RMS) that may be left."""
+"""Percentiles of speed at which friction must oppose motion; RMS fraction of unexplained torque allowed."""
 TRACE_ROWS, DISTURBANCE_SECONDS = 20_000, 0.1
-"""Rows at which the residual is looked at over time; length over which the residual is averaged [s]."""
+"""Maximum number of rows for inspecting the residual over time; duration over which it is averaged [s]."""
 DISTURBANCE, LOUD = 5.0, 4.0
-"""A stretch of time stands out by so many robust standard deviations of the log residual, or by this factor
-over the residual of the worst tenth of the motion."""
+"""A stretch stands out if its log residual exceeds the median by this many robust standard deviations, or its
+residual exceeds the 90 % quantile by this factor."""
 MOVING, VISIBLE = 0.05, 0.1
-"""Share of the largest speed of an arm that moves; least disturbance, beyond dry friction, as a share."""
+"""Fraction of its largest speed above which an arm moves; fraction of the torque that disturbances exceed."""
 RIVALS = {"gravity": "a tilt of the base", "masses": "other masses", "gains": "a wrong gain"}
-"""What may look like a constant torque, by hypothesis."""
+"""Faults that may look like a constant torque, by hypothesis."""
 ONE_SIGMA = 84.13
 """Percentile of a normal distribution at one standard deviation above the mean."""
 
 
 def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Check signs, orders, gains, delays, gravity, tool, masses, friction and offsets."""
+    """Check signs, order, gains and delays of torques, gravity, payload, masses, friction and offsets."""
     if len(log.rows(LEAST_ROWS)) < LEAST_ROWS:
         raise NotJudgedError(f"fewer than {LEAST_ROWS} usable rows")
     passive = _without_torque(log)
@@ -81,7 +81,7 @@ def _enough(log: Log) -> bool:
 
 
 def _without_torque(log: Log) -> list[Finding]:
-    """Return the torques that are constant though the joint moves."""
+    """Find torques that are constant although the joint moves."""
     rows = log.usable
     still = (np.ptp(log.tau[rows], axis=0) == 0.0) & (np.ptp(log.q[rows], axis=0) > 0.0)
     still[unmeasured(log)] = False
@@ -93,7 +93,7 @@ def _without_torque(log: Log) -> list[Finding]:
 
 
 def _matters(explanation: Explanation, j: int, columns: list[int]) -> bool:
-    """Return whether leaving out some columns of the nuisance raises the error of joint j."""
+    """Return whether omitting the given nuisance columns raises the error of joint j significantly."""
     problem = explanation.problem
     keep = np.setdiff1d(np.arange(problem.nuisance.shape[-1]), columns)
     less = replace(problem, nuisance=problem.nuisance[..., keep])
@@ -104,7 +104,7 @@ def _matters(explanation: Explanation, j: int, columns: list[int]) -> bool:
 
 
 def _determined(robot: RobotModel, explanation: Explanation) -> Explanation:
-    """Return the explanation with friction set to 0 if it would drive, or is smaller than its σ."""
+    """Return the explanation with friction set to 0 if it would drive a joint, or is smaller than its σ."""
     declared = np.concatenate([robot.damping.numpy(), robot.friction.numpy()])
     for _ in range(robot.nq):
         fit = explanation.fit
@@ -119,7 +119,7 @@ def _determined(robot: RobotModel, explanation: Explanation) -> Explanation:
 
 
 def _confounded(explanation: Explanation) -> list[Finding]:
-    """Return the faults found, gains as warnings if masses are wrong too, since masses calibrate gains."""
+    """Return the faults found; currents become warnings if masses are wrong, since gains depend on masses."""
     findings = list(explanation.findings)
     for k, finding in enumerate(findings if "masses" in explanation.robot else ()):
         if finding.kind == "torque-current" and "masses-mismatch" not in finding.kinds:
@@ -185,7 +185,7 @@ def _unexplained(explanation: Explanation) -> list[Finding]:
 
 
 def _disturbances(system: ConstrainedSystem, explanation: Explanation) -> tuple[list[Finding], np.ndarray]:
-    """Return the times at which far more torque is unexplained than usual, and the rows around them."""
+    """Find stretches in which far more torque than usual is unexplained; also mask the rows around them."""
     from scipy.ndimage import minimum_filter1d
 
     log, rows = explanation.log, explanation.log.rows(TRACE_ROWS)
@@ -219,7 +219,7 @@ def _disturbances(system: ConstrainedSystem, explanation: Explanation) -> tuple[
 
 
 def _stands_out(log: Log, rows: np.ndarray, level: Array) -> np.ndarray:
-    """Return `(n,)` bool, rows with a larger residual than usual at the same state of the contacts."""
+    """Return the mask `(n,)` of rows with a larger residual than usual for the same contact state."""
     # An arm at rest leaves little unexplained; it says nothing of one that moves.
     speed = np.abs(log.qd[rows]).max(axis=1)
     moving, bad = speed >= MOVING * np.percentile(speed, 99), np.zeros(len(rows), bool)
@@ -238,13 +238,13 @@ def _stands_out(log: Log, rows: np.ndarray, level: Array) -> np.ndarray:
 
 
 def _upper_spread(level: Array) -> float:
-    """Return the spread of the level, the upper one if smaller: few squares have a long lower tail."""
+    """Return the spread above the median if it is smaller: log sums of few squares have a long lower tail."""
     middle, upper = np.percentile(level, [50.0, ONE_SIGMA])
     return float(min(robust_std(level), upper - middle))
 
 
 def residual_trace(explanation: Explanation, rows: np.ndarray) -> Array:
-    """Return the residual torque at some rows without contact forces, `(n, nq)` [N m, N]."""
+    """Return the residual torque, excluding contact forces, at the given rows, `(n, nq)` [N m, N]."""
     system, log = explanation.system, explanation.log
     parts, coefficients = [], robust_parameters(explanation.problem, explanation.columns, explanation.prior)
     for index in np.array_split(rows, max(1, len(rows) // 2048)):

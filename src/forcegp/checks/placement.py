@@ -1,7 +1,7 @@
 """Check that the joint angles place the tip on the surface in rows labelled as contact.
 
-If the surface is displaced, the distance of the tip is a plane over the path. If the angles are wrong, a
-single correction moves the tip onto the surface in all rows.
+If the surface is displaced, the distance of the tip is a linear function of its position. If the angles are
+wrong, a single correction moves the tip onto the surface in all rows.
 """
 
 from __future__ import annotations
@@ -23,15 +23,15 @@ from forcegp.robot.model import RobotModel
 from forcegp.robust import level_of, robust_std
 
 ROWS = 2000
-"""Maximum number of contact rows."""
+"""Maximum number of contact rows used."""
 BETTER = 0.25
-"""Largest accepted residual of corrected angles, relative to that of a displaced surface."""
+"""Largest accepted residual with corrected angles, relative to that with a displaced surface."""
 STEPS = 6
-"""Number of Gauss-Newton steps for an encoder offset."""
+"""Number of Gauss-Newton steps for finding an encoder offset."""
 
 
 def check_placement(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find joints with wrong sign, order or offset from the position of the tip in contact."""
+    """Find joints with a wrong sign, order or offset from the position of the tip in contact."""
     for contact, rows in touching(system, log):
         path = tip_path(system, contact, log, rows)
         if abs(np.median(path.c)) <= FAR:
@@ -66,7 +66,7 @@ def check_placement(system: ConstrainedSystem, log: Log) -> Outcome:
 def _never_closed(
     system: ConstrainedSystem, contact: SurfaceContact, log: Log, rows: np.ndarray
 ) -> Outcome | None:
-    """Return the single correction that moves a tip that is never in contact to the surface, if any."""
+    """Return the single correction that brings a tip that is never in contact to the surface, if any."""
     signs = ((h, h.change(log)) for h in discrete(log) if h.name == "joint-sign")
     tried = []
     for h, other in (*signs, *_offsets(system, contact, log, rows, LEVEL)):
@@ -90,7 +90,7 @@ def _chosen(
     near: list[tuple[Hypothesis, Log]],
     where: str,
 ) -> Outcome:
-    """Return corrections that place the tip equally well, such as two joints in a plane, ranked by torque."""
+    """Return a finding on equally good corrections, and the log corrected by that which fits torques best."""
     rows = evenly(np.flatnonzero(log.usable), TRIED_ROWS)
     scores = [cross_validate(hypotheses.problem_of(system, other, rows)).score.mean() for _, other in near]
     best, repaired = near[int(np.argmin(scores))]
@@ -99,7 +99,7 @@ def _chosen(
 
 
 def leaves_surface(system: ConstrainedSystem, before: Log, after: Log) -> bool:
-    """Return whether a correction moves the tip off the surface in rows labelled as contact."""
+    """Return whether a correction moves the tip away from the surface in rows labelled as contact."""
     if after.q is before.q:
         return False
     for contact, rows in touching(system, before):
@@ -112,7 +112,7 @@ def leaves_surface(system: ConstrainedSystem, before: Log, after: Log) -> bool:
 def _explanation(
     system: ConstrainedSystem, contact: SurfaceContact, log: Log, rows: np.ndarray, most: float
 ) -> Outcome | None:
-    """Return the correction of angles that places the tip on the surface, if any."""
+    """Return the correction of the angles that places the tip on the surface, if any."""
     angles = ((h, h.change(log)) for h in discrete(log) if h.name in ("joint-sign", "joint-order"))
     for candidates in (angles, _offsets(system, contact, log, rows)):
         near = [(h, other) for h, other in candidates if _off(system, contact, other, rows) <= most]
@@ -130,9 +130,9 @@ def _off(system: ConstrainedSystem, contact: SurfaceContact, log: Log, rows: np.
 def _offsets(
     system: ConstrainedSystem, contact: SurfaceContact, log: Log, rows: np.ndarray, share: float | None = None
 ) -> Iterator[tuple[Hypothesis, Log]]:
-    """Yield each encoder with the offset that moves the tip to the surface, by Gauss-Newton steps.
+    """Yield for each encoder the offset that moves the tip to the surface, found by Gauss-Newton steps.
 
-    With a share, offsets are computed per row, and one on which this share of them agrees is used.
+    If `share` is given, offsets are computed for each row, and the offset common to this fraction is used.
     """
     few = log.replace(q=log.q[rows], qd=log.qd[rows])
     for j in range(log.nq):

@@ -1,4 +1,4 @@
-"""Checks of single columns: an even clock, plausible values, steps of the state."""
+"""Checks of single columns: regular time stamps, plausible values, and jumps in the state."""
 
 from __future__ import annotations
 
@@ -13,8 +13,8 @@ from forcegp.checks.log import DEPARTURE, Array, Log, Outcome, spikes
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data.clipped import limits_of
 from forcegp.data.derivative import UNIFORM_TOLERANCE
-from forcegp.data.fields import JOINT_VECTORS
-from forcegp.robust import resolution, robust_std
+from forcegp.data.fields import JOINT_VECTORS, resolution
+from forcegp.robust import robust_std
 from forcegp.rows import describe, intervals
 
 
@@ -27,7 +27,7 @@ def check_order(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_gaps(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find steps longer than the clock's jitter: missing samples."""
+    """Find missing samples, where a time step is longer than clock jitter explains."""
     with np.errstate(invalid="ignore"):
         gaps = log.steps > log.longest_step
     if log.masked is not None:
@@ -44,7 +44,7 @@ def check_gaps(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_jitter(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find steps too uneven for filters that assume even sampling."""
+    """Find time steps that are too uneven for filters that assume even sampling."""
     with np.errstate(invalid="ignore"):
         regular = log.steps[(log.steps > 0.0) & (log.steps <= log.longest_step)]
     spread = float(robust_std(regular) / log.dt) if len(regular) > 1 else 0.0
@@ -54,7 +54,7 @@ def check_jitter(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_period(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Compare the sampling period with that of the header."""
+    """Compare the sampling period with the period stated in the header."""
     stated = log.header.dt
     if stated is None or not abs(log.dt / stated - 1.0) > UNIFORM_TOLERANCE:
         return [], log
@@ -63,22 +63,22 @@ def check_period(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 HELD_RUN = 2
-"""A logger that fails to update repeats a row at least this often before it is reported as held."""
+"""Minimum number of repeated rows for which a logger is reported as having failed to update."""
 STUCK_SECONDS, STUCK_VISIBLE = 0.05, 0.02
-"""A channel that repeats one value for so long [s] should have moved by this share of its range."""
+"""Duration for which a channel must repeat a value [s], and fraction of its range by which it should move."""
 SPIKE, SPIKE_ALONE = 12.0, 4.0
-"""Robust standard deviations of a spike, never reached by noise; its factor over the neighbours' misfit."""
+"""Robust standard deviations that define a spike, never reached by noise; ratio to the neighbours' misfit."""
 SPIKE_SHAPE, SPIKE_NOISE = 0.2, 4.0
-"""Share of a wrong value, and robust deviations, by which departures of its neighbours may differ."""
+"""Tolerance for deviations of its neighbours, as a fraction of a spike and in robust standard deviations."""
 SPIKE_SHARED, DRIVEN = 0.05, 0.5
-"""The motion jumped where another channel departs by this share of a value's own, or by the second beyond the
-range of the motion; a step of the torque is the cause of a departing acceleration from the second on."""
+"""A value is not a spike if another channel deviates by this fraction of it (by the second fraction, if it
+exceeds its range), or if a torque step accounts for the second fraction of a deviating acceleration."""
 FEWEST = 50
-"""Values that a scale is taken from."""
+"""Minimum number of values for estimating a scale."""
 SPIKE_VISIBLE = (0.01, 0.002)
-"""A spike is also this share of its own column's range, and of the largest range of the joints."""
+"""Minimum size of a spike as fractions of its column's range and of the largest range among the joints."""
 COARSE = 0.05
-"""Share of the velocity that the steps of an encoder may make up when positions are differentiated."""
+"""Fraction of the velocity that noise from encoder steps may reach when positions are differentiated."""
 
 
 def logged(log: Log) -> dict[str, Array]:
@@ -87,7 +87,7 @@ def logged(log: Log) -> dict[str, Array]:
 
 
 def check_finite(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find NaN and infinite values, by column."""
+    """Find NaN and infinite values."""
     bad = ~np.isfinite(log.t)
     columns = ["t"] if bad.any() else []
     for name, value in logged(log).items():
@@ -100,7 +100,7 @@ def check_finite(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_held(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find rows that repeat every channel while the arm moves."""
+    """Find rows in which every channel repeats its value while the arm moves."""
     differs = np.any([np.diff(value, axis=0).any(axis=1) for value in logged(log).values()], axis=0)
     moving = np.abs(log.qd).max(axis=1)[1:] > 0.0
     held = np.append(False, ~differs & moving & (np.diff(log.segment) == 0))
@@ -111,7 +111,7 @@ def check_held(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_stuck(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find channels that keep one value while the joint moves by more than their resolution."""
+    """Find channels that keep a constant value although the joint moves."""
     if not np.isfinite(log.dt):
         return [], log
     least, findings, bad = max(5, round(STUCK_SECONDS / log.dt)), [], np.zeros(len(log), bool)
@@ -135,7 +135,7 @@ def check_stuck(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def _expected_change(log: Log, name: str, j: int, a: int, b: int) -> float:
-    """Return the expected motion of a channel over rows a to b, judged by the channels of the same joint."""
+    """Return the expected change of a channel over rows a to b, given the other channels of the joint."""
     if name == "q":
         return float(np.ptp(np.cumsum(log.qd[a:b, j])) * log.dt)
     if name == "qd":
@@ -149,7 +149,7 @@ def _expected_change(log: Log, name: str, j: int, a: int, b: int) -> float:
 
 
 def check_spikes(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find single values far from the curve through their neighbours."""
+    """Find isolated values far from the curve through their neighbours."""
     bad, hit, vectors = np.zeros(len(log), bool), [], logged(log)
     departures = {name: _departures(log, value) for name, value in vectors.items()}
     near = np.zeros(len(log), bool)
@@ -178,7 +178,7 @@ def check_spikes(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def _departures(log: Log, value: Array) -> tuple[Array, Array, Array]:
-    """Return how far values and their neighbours depart `(n, nq)`, and the usual scale `(nq,)`."""
+    """Return the deviations of values and of their neighbours `(n, nq)`, and the usual scale `(nq,)`."""
     departure, around = np.zeros_like(value), np.zeros_like(value)
     for s in log.stretches:
         departure[s], around[s] = spikes(value[s])
@@ -190,7 +190,7 @@ def _departures(log: Log, value: Array) -> tuple[Array, Array, Array]:
 
 
 def _shocks(log: Log, departures: dict[str, tuple[Array, Array, Array]], name: str) -> np.ndarray:
-    """Return `(n, nq)` bool, values (not positions) that depart together, relative to their ranges."""
+    """Return the mask `(n, nq)` of values (not positions) that deviate together with other channels."""
     departure = departures[name][0]
     if name == "q":
         return np.zeros(departure.shape, bool)
@@ -205,7 +205,7 @@ def _shocks(log: Log, departures: dict[str, tuple[Array, Array, Array]], name: s
 
 
 def _driven(system: ConstrainedSystem, log: Log, departure: Array, outlier: np.ndarray) -> np.ndarray:
-    """Return `(n, nq)` bool, accelerations that a step of the joint's own torque makes: Δτ_j (M⁻¹)_jj."""
+    """Return the mask `(n, nq)` of accelerations caused by a step in the joint's torque, Δτ_j (M⁻¹)_jj."""
     step = np.pad(np.abs(np.diff(log.tau, axis=0)), ((1, 1), (0, 0)))
     step, driven = np.maximum(step[:-1], step[1:]), np.zeros_like(outlier)
     rows = np.flatnonzero(outlier.any(axis=1))
@@ -217,13 +217,13 @@ def _driven(system: ConstrainedSystem, log: Log, departure: Array, outlier: np.n
 
 
 def _size(log: Log, name: str, departure: Array, around: Array, scale: Array) -> Array:
-    """Return the largest departure within two rows over the column's range; zero if it may be noise."""
+    """Return the largest deviation within two rows relative to the range; zero if it may be noise."""
     size, reach = np.abs(departure), log.reach(name)
     return _within_two(np.where(size > SPIKE * scale, size / np.maximum(reach, 1e-300), 0.0))
 
 
 def _one_value(departure: Array, scale: Array) -> np.ndarray:
-    """Return `(n, d)` bool, departures h beside −4h/6 and h/6, which one wrong value leaves, no kink."""
+    """Return the mask `(n, d)` of deviations h next to −4h/6 and h/6, which a kink does not cause."""
     around = np.lib.stride_tricks.sliding_window_view(np.pad(departure, ((2, 2), (0, 0))), 5, axis=0)
     misfit = np.abs(around - departure[..., None] * DEPARTURE).max(axis=-1)
     return misfit <= SPIKE_SHAPE * np.abs(departure) + SPIKE_NOISE * scale
@@ -237,7 +237,7 @@ def _within_two(x: Array) -> Array:
 
 
 def check_resolution(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find encoder steps so coarse that they dominate a differentiated position."""
+    """Find encoder steps so coarse that they add too much noise to differentiated positions."""
     q = log.q[log.usable]
     if len(q) < FEWEST:
         return [], log
@@ -256,8 +256,8 @@ def check_resolution(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 JUMP, FASTEST = 30.0, 2.0
-"""A jump exceeds so many robust standard deviations of the steps, fifteen at each of two rows, and the change
-of the fastest joint within a step by this factor."""
+"""A jump exceeds this many robust standard deviations of the steps (fifteen at each of two rows), and the
+change of the fastest joint within a step by this factor."""
 
 
 def _jumps(log: Log, value: str, derivative: str) -> tuple[np.ndarray, tuple[str, ...]]:
@@ -281,14 +281,14 @@ def _jumps(log: Log, value: str, derivative: str) -> tuple[np.ndarray, tuple[str
 
 
 def check_jumps(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find position jumps that the velocity does not explain: missing rows, or a wrapped joint."""
+    """Find position jumps that the velocity does not explain, due to missing rows or wrapped angles."""
     at, joints = _jumps(log, "q", "qd")
     findings = at_rows(at, "position-jump", f"the position of {', '.join(joints)} jumps at", joints)
     return findings, log.replace(segment=log.segment + np.cumsum(at))
 
 
 def check_impacts(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find velocity jumps that the acceleration does not explain: impacts."""
+    """Find impacts, where the velocity jumps by more than the acceleration explains."""
     around, joints = _jumps(log, "qd", "qdd")
     findings = at_rows(around, "impact", "the velocity jumps, as at an impact, at", joints)
     around[:-1] |= around[1:]

@@ -1,4 +1,4 @@
-"""The command line `forcegp`, in which each command is a thin wrapper around the library."""
+"""The command-line interface `forcegp`, in which each command is a thin wrapper around the library."""
 
 from forcegp.cli.app import app, main
 

@@ -1,4 +1,4 @@
-"""All commands, and error handling: one message on stderr, exit code 2, no traceback."""
+"""The application with all commands. Invalid input causes one message on stderr and exit code 2."""
 
 from __future__ import annotations
 
@@ -24,11 +24,11 @@ from forcegp.cli.view import view
 from forcegp.errors import ForceGPError
 
 USER_ERROR = 2
-"""Exit code for invalid input, the same as for an invalid option."""
+"""Exit code for invalid input, which is the same as for an invalid option."""
 INTERRUPTED = 130
 """Exit code after an interrupt (SIGINT), as in a shell."""
 GRACE = 0.6
-"""Time for an orderly exit after an interrupt [s]."""
+"""Time allowed for an orderly exit after an interrupt [s]."""
 
 app = typer.Typer(
     name="forcegp",
@@ -62,9 +62,9 @@ def _options(
 
 
 def main(program: typer.Typer = app) -> None:
-    """Run a command line; user errors exit with one message and code 2, interrupts with code 130.
+    """Run a command line; exit with one message and code 2 on a user error, and code 130 on an interrupt.
 
-    Temporary files left by an interrupt are removed by the next run, as after a crash.
+    Temporary files that remain after an interrupt are removed by the next run, as after a crash.
     """
     _end_when_interrupted()
     with warnings.catch_warnings():
@@ -78,18 +78,18 @@ def main(program: typer.Typer = app) -> None:
             _fail(f"{name}{error.strerror or error}")
         except SystemExit as ended:
             if ended.code == INTERRUPTED:
-                os._exit(INTERRUPTED)  # to take PyTorch down would take longer than the grace
+                os._exit(INTERRUPTED)  # shutting down PyTorch would take longer than `GRACE`
             raise
 
 
 def _end_when_interrupted() -> None:
-    """Exit on an interrupt, at the latest after `GRACE`.
+    """Exit on an interrupt, after `GRACE` at the latest.
 
-    Python handles signals only between its operations, not within long operations of other libraries, and
-    loses exceptions in destructors. The file descriptor receives the signal immediately.
+    Python handles signals only between its own operations, not during long operations of other libraries,
+    and loses exceptions raised in destructors. The file descriptor receives the signal immediately.
     """
     if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
-        return  # ignored, as in a background job, or in the hands of the caller
+        return  # ignored, as in a background job, or handled by the caller
     wake, signals = os.pipe()
     os.set_blocking(signals, False)
     signal.set_wakeup_fd(signals, warn_on_full_buffer=False)

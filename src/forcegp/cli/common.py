@@ -1,4 +1,4 @@
-"""Functions shared by commands: progress bars, results, and reading data for a robot."""
+"""Functions shared by commands: progress bars, output of results, and input of data for a robot."""
 
 from __future__ import annotations
 
@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class Advance(Protocol):
-    """Move a progress bar; `note` is a short status, such as the objective."""
+    """Function that advances a progress bar; `note` is a short status, such as the objective."""
 
     def __call__(self, done: int, total: int | None = None, note: str = "") -> None: ...
 
@@ -45,7 +45,7 @@ def warn(text: object) -> None:
 
 @contextmanager
 def progress_bar(description: str, total: int) -> Iterator[Advance]:
-    """Yield a function that updates a progress bar on stderr with completed steps, new total, and note."""
+    """Yield a function that updates a progress bar on stderr with completed steps, a new total and a note."""
     from rich.console import Console
     from rich.markup import escape
     from rich.progress import BarColumn, Progress, TextColumn, TimeElapsedColumn, TimeRemainingColumn
@@ -53,14 +53,14 @@ def progress_bar(description: str, total: int) -> Iterator[Advance]:
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"))
     times = (TimeElapsedColumn(), TimeRemainingColumn(), TextColumn("{task.fields[note]}"))
     console = Console(stderr=True)
-    # A file or a pipe gets no bar: its steps would only fill the log.
+    # No bar is shown in a file or a pipe, which it would only fill.
     with Progress(*columns, *times, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(escape(printable(description)), total=total, note="")
         yield lambda done, total=None, note="": bar.update(task, completed=done, total=total, note=note)
 
 
 def show(result: Mapping[str, object], as_json: bool) -> None:
-    """Print the nonempty values of a result, one per line, or all as JSON."""
+    """Print the nonempty values of a result, one per line, or all values as JSON."""
     if as_json:
         typer.echo(json.dumps(dict(result), default=str))
         return
@@ -73,7 +73,7 @@ def show(result: Mapping[str, object], as_json: bool) -> None:
 
 
 def check_output(out: Path, *inputs: Path) -> None:
-    """Check, before long work, that a file can be written and is not an input."""
+    """Check, before long computations, that a file can be written and is not an input."""
     from forcegp.destination import check_destination
 
     check_destination(out)
@@ -82,14 +82,14 @@ def check_output(out: Path, *inputs: Path) -> None:
 
 
 def save(write: Callable[[Path], object], out: Path) -> None:
-    """Write a result with `write(out)` or, if that fails, to a path named in the error."""
+    """Write a result by `write(out)` or, if that fails, to a different path, which the error names."""
     from forcegp.destination import write_or_keep
 
     write_or_keep(write, out)
 
 
 def check_data_destination(path: Path, *inputs: Path) -> None:
-    """Check, before long work, that a data set can be written without overwriting its inputs."""
+    """Check, before long computations, that a data set can be written without overwriting an input."""
     from forcegp.data.table import check_ending
 
     check_ending(path)
@@ -97,14 +97,14 @@ def check_data_destination(path: Path, *inputs: Path) -> None:
 
 
 def derivatives(window: int | None) -> forcegp.SavitzkyGolay | None:
-    """Return the filter for a window, if there is one."""
+    """Return the filter with a given window, or `None` if no window is given."""
     return None if window is None else forcegp.SavitzkyGolay(window=window)
 
 
 def read_data(
     path: Path, robot: forcegp.RobotModel | None = None, differentiate: int | None = None
 ) -> forcegp.Dataset:
-    """Read a data set with the joints of a robot in order, computing derivatives if a window is given."""
+    """Read a data set with joints ordered as in a robot; compute derivatives if a window is given."""
     data = forcegp.Dataset.read(path, differentiate=derivatives(differentiate))
     if robot is not None and set(robot.joint_names) <= set(data.joint_names):
         data = data.select(robot.joint_names)
@@ -128,7 +128,7 @@ def trajectory_from(data: forcegp.Dataset, start: int, purpose: str) -> forcegp.
 
 
 def fitted(model: Configured, data: Any, **options: Any) -> FittedModel:
-    """Fit a model with a progress bar that displays the objective."""
+    """Fit a model while showing a progress bar with the objective."""
 
     with progress_bar(f"fitting {model.name}", 1) as advance:
 
@@ -139,7 +139,7 @@ def fitted(model: Configured, data: Any, **options: Any) -> FittedModel:
 
 
 def check_robot_named(scene: str | None, robot: str | None) -> None:
-    """Check that either a scene or a robot was given."""
+    """Check that exactly one of a scene and a robot was given."""
     if (scene is None) == (robot is None):
         problems = "no robot was given", "both --scene and --robot were given"
         raise ForceGPError(problems[scene is not None], hint="pass either --scene or --robot")
@@ -154,7 +154,7 @@ def system_of(scene: str | None, robot: str | None) -> forcegp.ConstrainedSystem
 
 
 def model_table(config: Path | None, scene: str | None) -> ModelTable:
-    """Return the table [model] from a separate file if given, otherwise from the scene, if any."""
+    """Return the table [model] from a separate file or, if none is given, from the scene, if any."""
     from forcegp.scene import default_model_table, load_model_table
 
     if config is not None:
@@ -163,7 +163,7 @@ def model_table(config: Path | None, scene: str | None) -> ModelTable:
 
 
 def warn_beyond(model: Predictor, data: forcegp.Dataset, doubts: Iterable[str] = ()) -> None:
-    """Print doubts about predictions, and warn about states far from the training data."""
+    """Warn about questionable predictions, and about states far from the training data."""
     from forcegp.forces.posterior import warnings_beyond
     from forcegp.models.structured_fit import StructuredFit
 

@@ -1,4 +1,4 @@
-"""`forcegp evaluate`: compare a model's predictions with a log."""
+"""`forcegp evaluate`: compare the predictions of a model with a log."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING, Annotated
 import typer
 
 import forcegp
-from forcegp.cli.common import fitted, model_table, progress_bar, read_data, save, show, warn_beyond
+from forcegp.cli.common import fitted, model_table, progress_bar, read_data, show, warn_beyond
 from forcegp.cli.options import AsJson, Config, DataFile
 from forcegp.errors import ForceGPError
 
@@ -16,7 +16,7 @@ if TYPE_CHECKING:
     from forcegp.models.base import Predictor
 
 WINDOW_SECONDS = 3.0
-"""Length of the plots over time [s], as in the paper."""
+"""Duration shown in plots over time [s], as in the paper."""
 
 
 def evaluate(
@@ -39,16 +39,17 @@ def evaluate(
     config: Config = None,
     as_json: AsJson = False,
 ) -> None:
-    """Compare a model's predictions with a data set and with trivial predictors.
+    """Compare the predictions of a model with a data set and with trivial predictors.
 
-    The trivial predictors are the mean, the robot file alone, and least squares for inertial parameters,
-    viscous and Coulomb friction and offsets. The verdict states the fraction of the torque beyond gravity
-    that the model explains, the error of open-loop motion, and the error of the contact force, if logged.
-    The next line compares the model with each predictor in torque and acceleration. Errors are in rad/s²
-    (m/s² for sliding joints); coverage is the fraction of samples within two standard deviations.
+    The trivial predictors are the mean, the robot file alone, and a least-squares fit of inertial parameters,
+    viscous and Coulomb friction, and offsets. The verdict states the fraction of the torque beyond gravity
+    that the model explains, the error in open-loop motion, and the error in the contact force, if logged. It
+    is followed by a comparison of the model with each predictor in torque and acceleration. Errors are in
+    rad/s² (m/s² for prismatic joints); coverage is the fraction of samples within two standard deviations.
 
-    With --out, the command writes a page with the verdict, the errors by joint, the calibration and the
-    predictions over the first seconds, prints its path, and writes all scores to evaluation.json.
+    With --out, the command writes a page that shows the verdict, the errors by joint, the calibration and
+    the predictions over the first seconds. It prints the path of the page, and writes all scores to
+    evaluation.json.
 
     [bold]Examples[/bold]
 
@@ -86,25 +87,25 @@ def _written(
     test: forcegp.Dataset,
     names: tuple[str, str, str | None],
 ) -> dict[str, object]:
-    """Write the page and its data, and print their paths; `names` are the file names in the title."""
-    from forcegp.files import write_json, written_folder
+    """Write the page and its data, and return their paths; `names` are the file names shown on the page."""
+    from forcegp.destination import folder_or_keep
+    from forcegp.files import write_json
     from forcegp.report.evaluation import PAGE, write_evaluation
     from forcegp.report.window import opening, predicted_window
 
     comparison = getattr(getattr(model, "result", None), "comparison", ())
     window = predicted_window(model, opening(test, WINDOW_SECONDS), model.kind)
 
-    def write(folder: Path) -> None:
-        with written_folder(folder) as temporary:
-            write_json(temporary / "evaluation.json", scores.to_dict())
-            write_evaluation(temporary, *names, scores, window, comparison)
+    def fill(folder: Path) -> None:
+        write_json(folder / "evaluation.json", scores.to_dict())
+        write_evaluation(folder, *names, scores, window, comparison)
 
-    save(write, out)
+    folder_or_keep(fill, out)
     return {"file": str(out / "evaluation.json"), "page": str(out / PAGE)}
 
 
 def _model(model: Path | None, scene: str | None, config: Path | None, train: Path | None) -> Predictor:
-    """Load a fitted model from a file, or fit one to the training data."""
+    """Load a fitted model from a file, or fit a model to the training data."""
     from forcegp.models.configured import configured
 
     if model is not None:

@@ -1,4 +1,4 @@
-"""`forcegp excite`: the next motion to record."""
+"""`forcegp excite`: plan the next motion to record."""
 
 from __future__ import annotations
 
@@ -53,12 +53,12 @@ def excite(
     seed: Annotated[int, typer.Option(help="Seed of the random starts.")] = 0,
     as_json: AsJson = False,
 ) -> None:
-    """Plan the motion in free space that best identifies inertia and friction.
+    """Plan a motion in free space that identifies inertia and friction as well as possible.
 
-    The motion starts and ends at rest, respects the limits in the robot file or the given ones, and avoids
+    The motion starts and ends at rest, respects the limits given as options or in the robot file, and avoids
     collisions of the robot with itself, the surfaces of the scene, and boxes. A page of the same name
-    displays the motion, its limits, and the expected standard deviation of the torque before and after
-    recording.
+    displays the motion, its use of the limits, and the expected standard deviation of the torque before and
+    after the motion is recorded.
 
     [bold]Examples[/bold]
 
@@ -71,7 +71,6 @@ def excite(
     from forcegp.models.calibrated import unknowns_after
     from forcegp.models.load import load_model
     from forcegp.models.structured_fit import StructuredFit
-    from forcegp.robot.load import BUNDLED
     from forcegp.robot.shapes import shapes_of
     from forcegp.scene import load_scene
     from forcegp.simulate.collisions import Collisions
@@ -83,10 +82,8 @@ def excite(
     page = out.with_suffix(".html")
     check_output(page)
     read = load_scene(scene)
-    system, named = read.system(), read.sections.robot.model
-    shapes = shapes_of(
-        system.robot, named if named in BUNDLED else read.folder / named, ("collision", "visual")
-    )
+    system = read.system()
+    shapes = shapes_of(system.robot, read.robot_source, ("collision", "visual"))
     fit = None if model is None else load_model(model)
     if fit is not None:
         if not isinstance(fit, StructuredFit):

@@ -1,4 +1,4 @@
-"""`forcegp export`: convert a fitted model to controller code or to parameters in a robot file."""
+"""`forcegp export`: export a fitted model as controller code or as parameters in a robot file."""
 
 from __future__ import annotations
 
@@ -49,18 +49,18 @@ def export(
     seed: Annotated[int, typer.Option(help="Seed of these samples.")] = 0,
     as_json: AsJson = False,
 ) -> None:
-    """Export a structured Gaussian process as C99 or CasADi code, or into a copy of its robot file.
+    """Export a structured Gaussian process as C99, CasADi or torch code, or into a copy of its robot file.
 
-    C: one .h and one .c file that map state and closed contacts to mean and covariance of accelerations,
-    multipliers and forces, and to Jacobians of the mean. They need only libm. A test program with reference
-    values, CMakeLists.txt and a README are included.
+    C: one .h and one .c file that compute the mean and covariance of accelerations, multipliers and forces,
+    and the Jacobians of the mean, given the state and the closed contacts. They depend only on libm. A test
+    program with reference values, a CMakeLists.txt and a README are included.
 
     CasADi: the mean as a function with exact derivatives, in a file for `casadi.Function.load`.
 
-    torch: mean and covariance as a program for `torch.export.load`.
+    torch: the mean and covariance as a program for `torch.export.load`.
 
-    URDF, MJCF: a copy of the robot's file with identified inertia, damping and friction, and no other change;
-    a report with standard deviations and losses; and robots drawn from the posterior.
+    URDF, MJCF: a copy of the robot file in which only inertia, damping and friction are replaced by their
+    identified values; a report with standard deviations and losses; and robots drawn from the posterior.
 
     [bold]Examples[/bold]
 
@@ -98,7 +98,7 @@ def export(
 def _written_back(
     fit: StructuredFit, to: str, robot: str | None, out: Path, samples: int, seed: int
 ) -> dict[str, object]:
-    """Write the robot file and print the changes."""
+    """Write the robot file, and return a summary."""
     from forcegp.models.calibrated import write_calibrated
     from forcegp.robot.write_back import is_mjcf
 

@@ -1,4 +1,4 @@
-"""`forcegp fit` trains a model on a log; `forcegp sweep` trains many models on a cluster."""
+"""`forcegp fit`: fit a model to a log; `forcegp sweep`: fit many models on a cluster."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from forcegp.models.fit_result import FitResult
 
 STREAM_ROWS = 100_000
-"""Number of rows from which a log is read piece by piece."""
+"""Number of rows above which a log is read piece by piece."""
 
 
 def fit(
@@ -50,9 +50,10 @@ def fit(
     """Fit a model of the forward dynamics to logged motion.
 
     The table \\[model] in the scene or in --config defines priors, kernels, noise, robot parameters and
-    learning; options override it.
+    learning; command-line options override it.
 
-    Structured models read Parquet logs of more than 100,000 rows, and several files, piece by piece.
+    For structured models, Parquet logs are read piece by piece if they have more than 100,000 rows or consist
+    of several files.
 
     [bold]Examples[/bold]
 
@@ -87,7 +88,7 @@ def fit(
 
 
 def _figures(result: FitResult, as_json: bool) -> dict[str, object]:
-    """Return the result by name; as text, without empty fields and the warnings already printed."""
+    """Return the fields of the result by name; for text output, omit empty fields and printed warnings."""
     figures = {name: value for name, value in asdict(result).items() if name != "history"}
     if as_json:
         return figures
@@ -98,7 +99,7 @@ def _figures(result: FitResult, as_json: bool) -> dict[str, object]:
 def _training(
     regression: Model, files: list[Path], differentiate: int | None, robot: forcegp.RobotModel
 ) -> forcegp.Dataset | forcegp.StreamedDataset:
-    """Return the training data, streamed if they are long and the model supports it."""
+    """Return the training data, streamed if they are large and the model supports streaming."""
     parquet = all(file.suffix.lower() == ".parquet" for file in files)
     if parquet and isinstance(regression, forcegp.StructuredGP):
         log = forcegp.StreamedDataset(tuple(files), common.derivatives(differentiate), robot.joint_names)
@@ -122,9 +123,9 @@ def sweep(
     ] = None,
     as_json: options.AsJson = False,
 ) -> None:
-    """Simulate, fit and score several models on several robots with several seeds.
+    """Simulate several scenes, and fit and score several models on each, with several seeds.
 
-    Finished fits are not run again. This command needs the extra `sweep` (Dask).
+    Completed fits are not repeated. This command requires the extra `sweep` (Dask).
 
     [bold]Examples[/bold]
 

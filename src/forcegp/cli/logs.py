@@ -1,4 +1,4 @@
-"""`forcegp import`, `check` and `select`: convert a log to a data set, find its faults, select points."""
+"""`forcegp import`, `check` and `select`: convert a log to a data set, find faults, and select points."""
 
 from __future__ import annotations
 
@@ -45,9 +45,10 @@ def import_(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Import a log from CSV, text, Parquet, NumPy, MATLAB, HDF5, ROS bags, MCAP or LeRobot.
+    """Import a log from a CSV, text, Parquet, NumPy, MATLAB, HDF5, ROS bag, MCAP or LeRobot file.
 
-    A mapping in TOML assigns columns to joints, with units, signs and frames; --guess proposes one.
+    A mapping file in TOML assigns columns to joints and states their units, signs and frames; --guess
+    proposes one.
 
     [bold]Examples[/bold]
 
@@ -89,7 +90,7 @@ def _guess(log: Path, system: forcegp.ConstrainedSystem, out: Path) -> dict[str,
 
 
 def _summary(imported: Imported) -> dict[str, object]:
-    """Return rows, trajectories and period, followed by findings and processing steps."""
+    """Return the numbers of rows and trajectories and the period, and then findings and processing steps."""
     data, report = imported.data, imported.report
     rows, segments = f"{len(data)} from {report.rows_read} logged", int(data.segment[-1]) + 1
     result: dict[str, object] = {"rows": rows, "segments": segments, "period_s": data.header.dt}
@@ -113,7 +114,7 @@ def _surfaces(
     kind: Literal["plane", "sphere"],
     tip_radius: float | Literal["fit"] | None,
 ) -> dict[str, object]:
-    """Return the surface of each contact that was closed, as a line for the scene file."""
+    """Return the fitted surface of each contact that was closed, as a line for the scene file."""
     from forcegp.logs.surface_fit import fit_surface
 
     touched = [name for name, closed in imported.data.contact.items() if bool(closed.any())]
@@ -154,10 +155,10 @@ def check(
     ] = None,
     as_json: AsJson = False,
 ) -> None:
-    """Check a log against a scene before fitting: clock, units, signs, masses, contact, noise, motion.
+    """Check a log against a scene before fitting: clock, units, signs, masses, contact, noise and motion.
 
     The last line is the verdict. The exit code is 0 if a model can be fitted, 1 if a finding makes a fit
-    worthless, and 2 if scene or log cannot be read.
+    worthless, and 2 if the scene or the log cannot be read.
 
     [bold]Examples[/bold]
 
@@ -173,7 +174,7 @@ def check(
         common.check_output(out, data)
     system = common.system_of(scene, robot)
     log = checks.read_log(data)
-    # Matrices are small: threads of BLAS cost more than they save, and two checks at once would fight.
+    # Matrices are small, so BLAS threads cost more than they save, and concurrent checks would compete.
     with progress_bar("checking", 1) as progress, threadpool_limits(1, user_api="blas"):
         report = checks.check(system, log, progress=progress)
     if out is not None:
@@ -206,7 +207,7 @@ def _print(report: Report) -> None:
         for finding in report.findings:
             rows = re.sub("^rows? ", "", describe(finding.intervals, most=2))
             rows = "all" if finding.intervals == ((0, report.samples),) else rows
-            # Joint and parameter names may hold brackets, which are no markup.
+            # Joint and parameter names may contain brackets, which must not be read as markup.
             body = Text(printable(f"{finding.message}\n")).append(
                 printable(f"→ {finding.remedy}"), style="dim"
             )
@@ -243,8 +244,9 @@ def select(
 ) -> None:
     """Select training points that cover a log, and keep the rest for testing.
 
-    Points are selected by exact farthest-point sampling on standardized positions, velocities and torques.
-    They are deterministic and in selection order: the first k rows are the selection of k points.
+    By default, points are selected by exact farthest-point sampling of standardized positions, velocities
+    and torques. They are deterministic and in order of selection, so the first k rows are the selection of k
+    points.
 
     [bold]Examples[/bold]
 
@@ -275,7 +277,7 @@ def select(
 def _written(
     data: forcegp.Dataset, parts: Split, how: str, out: Path, rest: Path | None
 ) -> dict[str, object]:
-    """Write training and test points, and print a summary."""
+    """Write training and test points, and return a summary."""
     result: dict[str, object] = {}
     files = ("selected", "training", parts.train, out), ("kept", "test", parts.test, rest)
     for done, kind, rows, path in files:

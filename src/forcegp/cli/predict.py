@@ -20,9 +20,9 @@ if TYPE_CHECKING:
     from forcegp.models.base import Predictor
 
 PER_CONTACT = ("multiplier", "contact_force")
-"""Quantities with one value or one vector per contact; the others have one component per joint."""
+"""Quantities with one value or one vector per contact; all others have one component per joint."""
 WRENCH = "external_wrench"
-"""Wrench on a frame, saved as force and moment of a contact named after the frame."""
+"""Wrench on a frame, saved as the force and moment of a contact named after the frame."""
 
 
 def predict(
@@ -68,7 +68,7 @@ def predict(
 
     The output is the data set with the additional column predicted_<quantity> and, for models with
     uncertainty, predicted_<quantity>_std. The standard deviation includes the noise of the motor torque and
-    of the sensor, except with --no-noise, the default in Python.
+    of the sensor. With --no-noise, which is the default in Python, it does not.
 
     [bold]Examples[/bold]
 
@@ -106,7 +106,7 @@ def predict(
 def _predicted(
     model: Predictor, doubts: dict[str, None], part: forcegp.Dataset, quantity: str, noise: bool, sensor: bool
 ) -> Moments:
-    """Return mean and standard deviation of a quantity; undetermined components are added to `doubts`."""
+    """Return the mean and standard deviation of a quantity, and add warnings about it to `doubts`."""
     from forcegp.models.sensed import force_from_sensor
     from forcegp.models.structured_fit import StructuredFit
 
@@ -127,9 +127,9 @@ def _predicted(
 def _with_wrench(
     model: Predictor, test: forcegp.Dataset, frame: str | None, reference: str, momentum: bool
 ) -> tuple[forcegp.Dataset, dict[str, object]]:
-    """Add the external wrench on a frame and detected contact, with the frame as a contact.
+    """Add the external wrench on a frame, and the detected contact, as a contact named after the frame.
 
-    Return the data set and the fraction of samples in contact.
+    Return the data set, and a summary with the fraction of samples in contact.
     """
     from forcegp.models.structured_fit import StructuredFit
 
@@ -153,7 +153,7 @@ def _with_wrench(
 def _with_columns(
     data: forcegp.Dataset, system: forcegp.ConstrainedSystem, quantity: str, name: str, values: Tensor
 ) -> forcegp.Dataset:
-    """Add a predicted quantity to the logged ones."""
+    """Add a predicted quantity to the logged quantities."""
     if quantity not in PER_CONTACT:
         return data.replace(extras={**data.extras, name: values})
     if quantity == "multiplier":

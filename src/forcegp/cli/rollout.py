@@ -1,4 +1,4 @@
-"""`forcegp rollout` and `forcegp simulate`: simulate motion with a model or with a physics engine."""
+"""`forcegp rollout` and `forcegp simulate`: simulate motion with a model or a physics engine."""
 
 from __future__ import annotations
 
@@ -39,11 +39,11 @@ def rollout(
     seed: Annotated[int, typer.Option(help="Seed of the samples.")] = 0,
     as_json: AsJson = False,
 ) -> None:
-    """Simulate forward with a model, from a logged state under the logged torques.
+    """Simulate motion with a model, starting from a logged state and applying the logged torques.
 
-    The output folder contains rollout.parquet (the predicted motion, the logged one as q_logged, and the
+    The output folder contains rollout.parquet (the predicted motion, the logged motion as q_logged, and the
     standard deviation over samples as q_std), rollout.html with plots and an animation of the arm, the plots
-    as SVG, and their data as rollout.json.
+    as SVG files, and their data as rollout.json.
 
     [bold]Examples[/bold]
 
@@ -51,8 +51,7 @@ def rollout(
 
     forcegp rollout -m model -d run.parquet --start 2400 --samples 50 -o rollout/
     """
-    from forcegp.destination import check_destination
-    from forcegp.files import written_folder
+    from forcegp.destination import check_destination, folder_or_keep
     from forcegp.report.page import label
     from forcegp.report.rollouts import rollout_data, write_rollouts
     from forcegp.rollout import beside_log
@@ -71,18 +70,17 @@ def rollout(
     compared = rollout_data(beside_log(regression.kind, path, log, dt))
     step = f"rolled out by the model in {model} from row {start}"
 
-    def write(folder: Path) -> None:
-        with written_folder(folder) as temporary:
-            rolled.with_step(step).write(temporary / "rollout.parquet")
-            write_rollouts(temporary, f"{label(regression.kind)} rolled out on {data}", compared)
+    def fill(folder: Path) -> None:
+        rolled.with_step(step).write(folder / "rollout.parquet")
+        write_rollouts(folder, f"{label(regression.kind)} rolled out on {data}", compared)
 
-    save(write, out)
+    folder_or_keep(fill, out)
     written = {"page": str(out / "rollout.html"), "file": str(out / "rollout.parquet")}
     show({**_figures(path, rolled, dt), **written}, as_json)
 
 
 def _figures(path: forcegp.Rollout, rolled: forcegp.Dataset, dt: float) -> dict[str, object]:
-    """Return the reported numbers, computed up to a divergence of the prediction."""
+    """Return the numbers to report, computed up to the point where the prediction diverges."""
     error = (rolled.q - rolled.q_logged).abs()
     figures: dict[str, object] = {
         "duration_s": dt * (len(rolled) - 1),
@@ -100,7 +98,7 @@ def _figures(path: forcegp.Rollout, rolled: forcegp.Dataset, dt: float) -> dict[
 
 
 def _say_contact(log: forcegp.Dataset, unilateral: bool) -> None:
-    """Warn if a contact changes in the log but not in the rollout."""
+    """Warn if a contact changes its state in the log but not in the rollout."""
     for name, closed in log.contact.items():
         changed = (closed != closed[0]).nonzero()
         if not unilateral and len(changed):
@@ -114,7 +112,7 @@ def _say_contact(log: forcegp.Dataset, unilateral: bool) -> None:
 
 
 def _stretch(data: forcegp.Dataset, start: int, duration: float | None) -> forcegp.Dataset:
-    """Return the rows from `start` to the end of the trajectory or the duration."""
+    """Return the rows from `start` until the end of the trajectory or of the duration."""
     from forcegp.data.derivative import UNIFORM_TOLERANCE
 
     stretch = trajectory_from(data, start, "rollout")
@@ -130,7 +128,7 @@ def _stretch(data: forcegp.Dataset, start: int, duration: float | None) -> force
 
 
 def _spread(q: Tensor) -> Tensor:
-    """Return the standard deviation `(T, nq)` over undiverged samples `(S, T, nq)`, if two remain."""
+    """Return the standard deviation over samples `(S, T, nq)`, as long as two have not diverged."""
     import numpy as np
     import torch
 
@@ -141,7 +139,7 @@ def _spread(q: Tensor) -> Tensor:
 
 
 def _as_data(path: forcegp.Rollout, log: forcegp.Dataset, dt: float) -> forcegp.Dataset:
-    """Return the simulated motion, up to a divergence, and the logged motion as a data set."""
+    """Return a data set with the simulated motion, up to a divergence, and the logged motion."""
     # A prediction that diverges between two rows ends at the first of them.
     length = min([len(path.t), *(round(diverged.t / dt) + 1 for diverged in path.diverged[:1])])
     extras = {"q_logged": log.q, "qd_logged": log.qd}
@@ -158,7 +156,7 @@ def _as_data(path: forcegp.Rollout, log: forcegp.Dataset, dt: float) -> forcegp.
 
 
 def _learned(path: Path, sample: bool, seed: int) -> PassiveForces:
-    """Return the forces of a fitted model, or one function of its posterior."""
+    """Return the mean forces of a fitted model, or one function sampled from their posterior."""
     import torch
 
     from forcegp.errors import ModelError
@@ -199,10 +197,10 @@ def simulate(
     ] = False,
     as_json: AsJson = False,
 ) -> None:
-    """Simulate the robot of a scene while it slides over its surface or follows a motion, and log it.
+    """Simulate and log the robot of a scene while it slides over a surface or follows a given motion.
 
-    With a model, MuJoCo simulates the fitted robot under the learned joint forces, which replace joint
-    friction, and computes contact forces itself.
+    If a model is given, MuJoCo simulates the fitted robot with the learned joint forces, which replace joint
+    friction, and computes the contact forces itself.
 
     [bold]Examples[/bold]
 

@@ -1,4 +1,4 @@
-"""`forcegp view`: display robot, surface, contact force and predicted paths in 3D."""
+"""`forcegp view`: display a robot, its surfaces, contact forces and predicted paths in 3D."""
 
 from __future__ import annotations
 
@@ -46,11 +46,12 @@ def view(
 ) -> None:
     """View a robot, its surfaces, contact forces and predicted paths in 3D.
 
-    With a model and a log, the view contains the logged motion, the predicted contact force as an arrow with
-    ±2 standard deviations at its tip, and the paths of the tip predicted from the first state. With a scene
-    and a log, it contains the logged force. Without a log, the robot does not move.
+    Given a model and a log, the view shows the logged motion, the predicted contact force as an arrow with a
+    bar of ±2 standard deviations at its head, and the tip paths predicted from the first state. Given a scene
+    and a log, it shows the logged force instead. Without a log, the robot does not move.
 
-    The page is served to this computer only. With --out, it is written as one HTML file that works offline.
+    The page is accessible from this computer only. With --out, it is written as one HTML file that works
+    offline.
 
     [bold]Examples[/bold]
 
@@ -89,8 +90,7 @@ def view(
 
 
 def _target(target: str) -> tuple[forcegp.ConstrainedSystem, FittedModel | None, list[Shape]]:
-    """Return the system, the model if the target is one, and the shapes of the robot."""
-    from forcegp.robot.load import BUNDLED
+    """Return the system, the model (if the target is a model), and the shapes of the robot."""
     from forcegp.robot.shapes import shapes_of
     from forcegp.storage.model_file import model_path
 
@@ -98,12 +98,12 @@ def _target(target: str) -> tuple[forcegp.ConstrainedSystem, FittedModel | None,
         model = forcegp.load_model(target)
         return model.system, model, shapes_of(model.system.robot)
     scene = forcegp.load_scene(target)
-    system, named = scene.system(), scene.sections.robot.model
-    return system, None, shapes_of(system.robot, named if named in BUNDLED else scene.folder / named)
+    system = scene.system()
+    return system, None, shapes_of(system.robot, scene.robot_source)
 
 
 def _stretch(log: Path, system: forcegp.ConstrainedSystem, start: int, seconds: float) -> forcegp.Dataset:
-    """Return the rows of a trajectory from `start` to its first gap or the requested duration."""
+    """Return the rows of a trajectory from `start` until the first gap or the end of the given duration."""
     stretch = trajectory_from(read_data(log, system.robot), start, "view")
     steps = stretch.t.diff()
     gaps = (steps > 1.5 * steps.median()).nonzero() if len(steps) > 0 else steps  # left by `forcegp select`

@@ -1,7 +1,7 @@
 """Opt-in compiled dynamics with one fused kernel per robot and quantity, cached on disk.
 
-The robot's parameters are folded into the kernel. Use compiled functions for many evaluations of one robot;
-the eager functions in `forcegp.dynamics` need no compiler and accept learned robots.
+The robot's parameters are compiled into the kernel as constants. Use compiled functions for many evaluations
+of one robot; the eager functions in `forcegp.dynamics` need no compiler and accept learned robots.
 """
 
 from __future__ import annotations
@@ -28,10 +28,10 @@ def _stacked_derivatives(robot: RobotModel, q: Tensor, qd: Tensor, force: Tensor
 
 
 class CompiledDynamics:
-    """A quantity of a robot as a compiled function of joint-space arguments.
+    """A robot quantity, such as the mass matrix, compiled as a function of joint-space arguments.
 
-    Call it like the eager function of the same name, without the robot. Derivatives of any order are those of
-    the eager function; the first derivatives of forward dynamics have a separate kernel, built on first use.
+    Call it like the eager function of the same name, but without the robot. Derivatives of any order are
+    those of the eager function; first derivatives of forward dynamics use a kernel built on first use.
     """
 
     def __init__(self, robot: RobotModel, quantity: str) -> None:
@@ -52,7 +52,7 @@ class CompiledDynamics:
         return CompiledDynamics(self.robot, "forward_dynamics_derivatives")
 
     def __call__(self, *states: Tensor) -> Tensor:
-        """Return the quantity at states `(*batch, nq)`.
+        """Return the quantity at the given states `(*batch, nq)`.
 
         Raises:
             ShapeError: an argument is missing or does not match the robot.
@@ -67,18 +67,18 @@ class CompiledDynamics:
         return _Kernel.apply(self, *common)  # pyright: ignore[reportReturnType]
 
     def eager(self, *states: Tensor) -> Tensor:
-        """Evaluate the eager function instead."""
+        """Evaluate the eager function at the given states."""
         return self._eager(self.robot, *states)
 
     def pull(self, gradient: Tensor, *states: Tensor) -> tuple[Tensor, ...]:
-        """Return gradientᵀ times the Jacobian with respect to each state."""
+        """Return the product of gradientᵀ and the Jacobian with respect to each state."""
         if self.quantity == "forward_dynamics" and not torch.is_grad_enabled():
             jacobians = self._jacobians.run(*states)
             return (gradient[..., None, None, :] @ jacobians)[..., 0, :].unbind(-2)
         return torch.func.vjp(self.eager, *states)[1](gradient)
 
     def run(self, *states: Tensor) -> Tensor:
-        """Call the kernel on states of equal shape, without autograd."""
+        """Run the kernel on states of equal shape, without autograd."""
         batch = states[0].shape[:-1]
         values = {
             name: x.reshape((math.prod(batch), self.robot.nq)).contiguous()
@@ -93,7 +93,7 @@ class CompiledDynamics:
 
 
 class _Kernel(torch.autograd.Function):
-    """The kernel under autograd and torch.func, with the derivatives of the eager function."""
+    """The kernel as a function for autograd and torch.func, with the derivatives of the eager function."""
 
     @staticmethod
     def forward(compiled: CompiledDynamics, *states: Tensor) -> Tensor:
@@ -114,7 +114,7 @@ class _Kernel(torch.autograd.Function):
         states = ctx.saved_tensors
         pairs = zip(states, tangents, strict=True)
         directions = tuple(torch.zeros_like(x) if t is None else t for x, t in pairs)
-        # PyTorch does not nest forward mode, so J t is the derivative of Jᵀ u with respect to u.
+        # PyTorch cannot nest forward mode, so J t is computed as the derivative of Jᵀ u with respect to u.
         value, pull = torch.func.vjp(ctx.compiled.eager, *states)[:2]
         return torch.func.vjp(pull, torch.zeros_like(value))[1](directions)[0].contiguous()
 
@@ -130,18 +130,18 @@ class _Kernel(torch.autograd.Function):
 def compile_dynamics(robot: RobotModel, quantity: str = "forward_dynamics") -> CompiledDynamics:
     """Compile a function of `forcegp.dynamics` (or its derivatives) for one robot.
 
-    The first call runs the local C++ compiler (about a second for an arm, ten for a hand, minutes for a
-    hundred joints); later calls in any process read the kernel from the cache (`$FORCEGP_CACHE`, or `forcegp`
-    in the user's cache folder). For a robot on a CUDA device, NVRTC compiles the kernel in each process.
+    The first call runs the local C++ compiler, which takes about one second for an arm, ten for a hand, and
+    minutes for a hundred joints. Later calls in any process load the kernel from the cache (`$FORCEGP_CACHE`,
+    or `forcegp` in the user's cache folder). On a CUDA device, NVRTC compiles the kernel in each process.
 
     Args:
-        robot: the robot, with parameters that become constants.
+        robot: the robot, whose parameters become constants.
         quantity: `forward_dynamics`, `forward_dynamics_derivatives`, `inverse_dynamics`, `mass_matrix`,
             `bias_force` or `gravity_force`.
 
     Returns:
-        A function of the states accepted by the eager function. Derivatives are returned as one tensor
-        `(*batch, 3, nq, nq)`, with respect to q, q̇ and force.
+        A function of the same states as the eager function. Derivatives with respect to q, q̇ and force are
+        returned as one tensor `(*batch, 3, nq, nq)`.
 
     Example:
         >>> import torch, forcegp
@@ -152,7 +152,7 @@ def compile_dynamics(robot: RobotModel, quantity: str = "forward_dynamics") -> C
 
     Raises:
         UnknownNameError: the quantity does not exist.
-        ModelError: a parameter of the robot is being learned, or its precision is not supported.
+        ModelError: a parameter of the robot requires a gradient, or the robot's precision is not supported.
         MissingDependencyError: there is no compiler.
     """
     check_name("quantity to compile", quantity, QUANTITIES)

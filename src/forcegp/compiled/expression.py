@@ -1,7 +1,7 @@
 """Scalar expressions that fold constants and share equal subexpressions as they are built.
 
-They work in numpy object arrays: an algorithm on arrays of `Scalar` has the same code as on numbers, and
-records a straight-line program.
+They can be stored in numpy object arrays: code written for arrays of numbers also runs on arrays of `Scalar`,
+where it records a straight-line program.
 """
 
 from __future__ import annotations
@@ -13,43 +13,43 @@ from dataclasses import dataclass, field
 import numpy as np
 
 Node = tuple[str, object, object]
-"""Operation and operands: ("const", value, None), ("input", name, index), (op, left, right) by position."""
+"""Operation and operands: ("const", value, None), ("input", name, index), (op, left, right) as positions."""
 UNARY = ("exp", "tanh", "sqrt", "step")
-"""Functions of one operand; step is 1 above 0 and otherwise 0."""
+"""Functions of one operand; step is 1 for positive operands and 0 otherwise."""
 Tangents = dict[int, "Scalar"]
-"""Derivatives of a scalar by direction; missing ones are zero."""
+"""Derivatives of a scalar, keyed by direction; missing ones are zero."""
 
 
 @dataclass
 class Graph:
-    """Nodes of a program without duplicates, with operands before their use."""
+    """Nodes of a program without duplicates, each placed after its operands."""
 
     nodes: list[Node] = field(default_factory=list)
     _positions: dict[Node, int] = field(default_factory=dict)
 
     def scalar(self, node: Node) -> Scalar:
-        """Return the scalar computed by a node, reusing an equal node."""
+        """Return the scalar computed by a node, reusing an equal node if there is one."""
         position = self._positions.setdefault(node, len(self.nodes))
         if position == len(self.nodes):
             self.nodes.append(node)
         return Scalar(self, position)
 
     def constant(self, value: float) -> Scalar:
-        """Return a number."""
-        # −0.0 and 0.0 are one key; the sign of a zero never matters here.
+        """Return a constant scalar."""
+        # −0.0 and 0.0 share a key, since the sign of zero never matters here.
         return self.scalar(("const", float(value) + 0.0, None))
 
     def constants(self, values: object) -> np.ndarray:
-        """Return an array of numbers."""
+        """Return an array of constant scalars."""
         array = np.asarray(values, dtype=float)
         return np.array([self.constant(x) for x in array.flat], dtype=object).reshape(array.shape)
 
     def input(self, name: str, index: int) -> Scalar:
-        """Return the entry of an argument of the program."""
+        """Return an entry of an argument of the program."""
         return self.scalar(("input", name, index))
 
     def live(self, outputs: list[Scalar], known: Container[int] = ()) -> list[int]:
-        """Return the nodes that the outputs depend on, in order of computation, stopping at known nodes."""
+        """Return the nodes on which the outputs depend, in order of computation, stopping at known nodes."""
         needed, open_ = set(), [x.position for x in outputs]
         while open_:
             position = open_.pop()
@@ -61,7 +61,7 @@ class Graph:
         return sorted(needed)
 
     def tangents(self, outputs: list[Scalar], seeds: dict[int, Tangents]) -> list[Tangents]:
-        """Return the derivatives of the outputs by forward mode, from those of `seeds` by position.
+        """Return the derivatives of the outputs by forward mode, given those of `seeds`, keyed by position.
 
         A seed need not be an input; for example, the solution of an equation can be seeded with its
         derivative. A scalar without directions is treated as a constant.
@@ -73,7 +73,7 @@ class Graph:
         return [found[x.position] for x in outputs]
 
     def _tangents(self, position: int, found: dict[int, Tangents]) -> Tangents:
-        """Return the derivatives of one node from those of its operands."""
+        """Return the derivatives of one node, given those of its operands."""
         op, i, j = self.nodes[position]
         if op in ("const", "input", "step"):
             return {}
@@ -97,20 +97,20 @@ class Graph:
 
 @dataclass(frozen=True, slots=True, eq=False)
 class Scalar:
-    """A number in a program, represented by a position in its graph, with arithmetic operations."""
+    """A number in a program, represented by its position in the graph, with arithmetic operations."""
 
     graph: Graph
     position: int
 
     @property
     def value(self) -> float | None:
-        """Value if the scalar is a constant."""
+        """Value of the scalar if it is a constant, else `None`."""
         op, value, _ = self.graph.nodes[self.position]
         return value if op == "const" else None  # pyright: ignore[reportReturnType]
 
     @property
     def negated(self) -> Scalar | None:
-        """x if this is −x."""
+        """x if the scalar is −x, else `None`."""
         op, operand, _ = self.graph.nodes[self.position]
         return Scalar(self.graph, operand) if op == "neg" else None  # pyright: ignore[reportArgumentType]
 
@@ -121,7 +121,7 @@ class Scalar:
         return self.graph.scalar((op, self.position, other.position))
 
     def exp(self) -> Scalar:
-        """Return e^x."""
+        """Return the exponential."""
         return self._function("exp")
 
     def tanh(self) -> Scalar:
@@ -133,7 +133,7 @@ class Scalar:
         return self._function("sqrt")
 
     def step(self) -> Scalar:
-        """Return 1 above 0 and otherwise 0."""
+        """Return 1 if the scalar is positive and 0 otherwise."""
         return self._function("step")
 
     def _function(self, name: str) -> Scalar:

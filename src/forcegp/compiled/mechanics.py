@@ -1,4 +1,4 @@
-"""Terms of the equations of motion from one compiled call: M, Q_C, Q_G and moving points."""
+"""Terms of the equations of motion (M, Q_C, Q_G and moving points) from a single compiled call."""
 
 from __future__ import annotations
 
@@ -25,10 +25,10 @@ from forcegp.robot.model import BASE, RobotModel
 
 
 class CompiledMechanics:
-    """Mechanics of a robot and of some of its points on the CPU, as a compiled function of (q, q̇).
+    """Mechanics of a robot and of given points on it, as a compiled function of (q, q̇) on the CPU.
 
-    `batch` returns M, Q_C and Q_G, and for each point: axes of its frame `(3, 3)` and position in the world,
-    Jacobian J `(6, nq)` with [ω; ṗ] = J q̇, and bias acceleration J̇ q̇ `(6,)`.
+    `batch` returns M, Q_C and Q_G, and for each point the axes of its frame `(3, 3)` and its position in the
+    world, the Jacobian J `(6, nq)` with [ω; ṗ] = J q̇, and the bias acceleration J̇ q̇ `(6,)`.
 
     Raises:
         MissingDependencyError: there is no C++ compiler.
@@ -47,7 +47,7 @@ class CompiledMechanics:
         self._arrays, self._kernel, self._dtype = source.arrays, cpu_kernel(source.text), robot.dtype
 
     def batch(self, q: Tensor, qd: Tensor) -> list[Tensor]:
-        """Return the mechanics at states q, q̇ `(*batch, nq)`, without autograd."""
+        """Return the mechanics at the states q, q̇ `(*batch, nq)`, without autograd."""
         shape, q, qd = q.shape[:-1], q.reshape(-1, q.shape[-1]), qd.reshape(-1, qd.shape[-1])
         values = {"q": lambda: q, "qd": lambda: qd, "sin": lambda: torch.sin(q), "cos": lambda: torch.cos(q)}
         out = torch.empty(len(q), self._places[-1][0].stop, dtype=self._dtype)
@@ -67,7 +67,7 @@ def _forces(links: Links) -> list[np.ndarray]:
 
 
 def _point_blocks(links: Links, robot: RobotModel, index: int, point: np.ndarray) -> list[np.ndarray]:
-    """Return rotation and position in the world, Jacobian and bias acceleration of a point of a frame."""
+    """Return rotation and position in the world, Jacobian and bias acceleration of a point in a frame."""
     graph, parent, n = links.graph, robot.frame_parents[index], robot.nq
     zero = graph.constants(np.zeros(3))
     R, p, moves = graph.constants(numbers(robot.base_rotation)), zero, _Motion(zero, zero, zero, zero)

@@ -1,8 +1,8 @@
 """The dynamics of a robot expanded to scalars: the algorithms of `forcegp.dynamics`, link by link.
 
-The robot's parameters are numbers, so products with the zeros and ones of joint axes and placements vanish
-while the program is built. Poses, joint screws and inertias of the links are in world axes about the
-base origin.
+The robot's parameters are numbers, so products with the zeros and ones in joint axes and placements are
+eliminated while the program is built. Poses, joint screws and inertias of the links are expressed in world
+axes about the base origin.
 """
 
 from __future__ import annotations
@@ -19,12 +19,12 @@ from forcegp.robot.model import BASE, RobotModel
 
 
 def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """Return a × b of expressions."""
+    """Return the cross product a × b of two vectors of expressions."""
     return np.array([a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]])
 
 
 def skew(v: np.ndarray) -> np.ndarray:
-    """Return the cross-product matrix [v]× of expressions."""
+    """Return the cross-product matrix [v]× of a vector of expressions."""
     return np.array([[0.0, -v[2], v[1]], [v[2], 0.0, -v[0]], [-v[1], v[0], 0.0]])
 
 
@@ -33,8 +33,8 @@ class Links:
 
     Attributes:
         R, p: rotation and origin of each link.
-        z, l: angular and linear part of each joint screw.
-        c, mass: centre of mass and mass of each link; moment = m c.
+        z, l: angular and linear parts of each joint screw.
+        c, mass: centre of mass and mass of each link; `moment` is m c.
         I: inertia about the centre of mass; `inertia` is about the base origin.
     """
 
@@ -60,7 +60,7 @@ class Links:
         self.inertia = [I + _shift(*x) for I, *x in zip(self.I, self.c, self.moment, strict=True)]
 
     def _joint(self, robot: RobotModel, i: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the pose of a link in its parent link (Rodrigues' formula about a constant axis)."""
+        """Return the pose of link i in its parent link (Rodrigues' formula about a constant axis)."""
         graph, a, P = self.graph, numbers(robot.axis[i]), numbers(robot.placement_rotation[i])
         shift = graph.constants(numbers(robot.placement_position[i]))
         if robot.joint_types[i] == "prismatic":
@@ -74,7 +74,7 @@ class Links:
         return [self.graph.input(name, i) for i in range(len(self.parents))]
 
     def composite(self, values: list) -> list:
-        """Sum over the subtree of each link, including the link."""
+        """Sum the values over the subtree of each link, including the link itself."""
         total = list(values)
         for i in reversed(range(len(total))):
             if (parent := self.parents[i]) != BASE:
@@ -102,7 +102,7 @@ def congruent(R: np.ndarray, inertia: np.ndarray) -> np.ndarray:
 
 
 def _shift(c: np.ndarray, h: np.ndarray) -> np.ndarray:
-    """Return cᵀh 1 − c hᵀ with its six different entries computed once (h = m c)."""
+    """Return cᵀh 1 − c hᵀ with h = m c, computing each of its six distinct entries once."""
     diagonal = [c[1] * h[1] + c[2] * h[2], c[0] * h[0] + c[2] * h[2], c[0] * h[0] + c[1] * h[1]]
     rows = [[diagonal[r] if r == s else -(c[min(r, s)] * h[max(r, s)]) for s in range(3)] for r in range(3)]
     return np.array(rows, dtype=object)
@@ -110,7 +110,7 @@ def _shift(c: np.ndarray, h: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Program:
-    """A straight-line program with the arguments of the eager function and its result in row-major order."""
+    """A straight-line program with the eager function's arguments and its result in row-major order."""
 
     arguments: tuple[str, ...]
     shape: tuple[int, ...]
@@ -119,7 +119,7 @@ class Program:
 
 
 PARAMETERS = 10
-"""Inertial parameters of a link: m, m c and the inertia about its origin."""
+"""Number of inertial parameters of a link: m, m c, and the inertia about its origin."""
 _Inertia = tuple[float, np.ndarray, np.ndarray]
 """Mass, first moment and inertia about the base origin."""
 
@@ -134,7 +134,7 @@ class _Motion(NamedTuple):
 
 
 def _mass_matrix(links: Links) -> np.ndarray:
-    """Return M_ij = s_iᵀ I^c_j s_j with the composite inertias (composite rigid-body algorithm)."""
+    """Return M_ij = s_iᵀ I^c_j s_j from composite inertias (composite rigid-body algorithm)."""
     n = len(links.parents)
     M = links.graph.constants(np.zeros((n, n)))
     for j, composite in enumerate(_composites(links)):
@@ -157,7 +157,7 @@ def _composites(links: Links) -> list[_Inertia]:
 
 
 def _motion(links: Links, qd: list | None, qdd: list | None, gravity: bool) -> list[_Motion]:
-    """Return the motion of all links; gravity enters as an acceleration of the base."""
+    """Return the motion of all links; gravity is included as an acceleration of the base."""
     zero, motion = links.graph.constants(np.zeros(3)), []
     rest = _Motion(zero, zero, zero, -links.gravity if gravity else zero)
     for i, parent in enumerate(links.parents):
@@ -174,7 +174,7 @@ def _motion(links: Links, qd: list | None, qdd: list | None, gravity: bool) -> l
 
 
 def _link_forces(links: Links, motion: list[_Motion]) -> tuple[list, list]:
-    """Return torque and force on the subtree of each joint, by Newton-Euler about the centres of mass."""
+    """Return the torque and force on each joint's subtree, by Newton-Euler about the centres of mass."""
     torques, forces = [], []
     for (omega, v, alpha, a), c, I, mass in zip(motion, links.c, links.I, links.mass, strict=True):
         force = (a + cross(alpha, c) + cross(omega, v + cross(omega, c))) * mass
@@ -184,7 +184,7 @@ def _link_forces(links: Links, motion: list[_Motion]) -> tuple[list, list]:
 
 
 def _joint_force(links: Links, qd: list | None, qdd: list | None, gravity: bool) -> np.ndarray:
-    """Return the terms of M q̈ − Q_C − Q_G with given arguments (recursive Newton-Euler)."""
+    """Return the terms of M q̈ − Q_C − Q_G whose arguments are given (recursive Newton-Euler)."""
     torques, forces = _link_forces(links, _motion(links, qd, qdd, gravity))
     result = [z @ t + l @ f for z, l, t, f in zip(links.z, links.l, torques, forces, strict=True)]
     if qdd is not None:
@@ -193,7 +193,7 @@ def _joint_force(links: Links, qd: list | None, qdd: list | None, gravity: bool)
 
 
 def _solve(M: np.ndarray, rhs: np.ndarray) -> np.ndarray:
-    """Return M⁻¹ rhs by elimination from the leaves, which preserves branch sparsity (Featherstone, §6.5)."""
+    """Return M⁻¹ rhs by elimination from the leaves, which preserves sparsity (Featherstone, §6.5)."""
     M, x, n = M.copy(), rhs.copy(), len(rhs)
     inverse = [1.0 / M[0, 0]] * n
     for k in reversed(range(n)):
@@ -253,7 +253,7 @@ def _inverse_dynamics_derivatives(
 
 
 def _bend(motion: _Motion, screw: tuple, rate: tuple) -> tuple[np.ndarray, np.ndarray]:
-    """Return S̈ = a × S + V × Ṡ of one joint."""
+    """Return S̈ = a × S + V × Ṡ for one joint."""
     (omega, v, alpha, a), (z, l) = motion, screw
     return (
         cross(alpha, z) + cross(omega, rate[0]),
@@ -264,7 +264,7 @@ def _bend(motion: _Motion, screw: tuple, rate: tuple) -> tuple[np.ndarray, np.nd
 def _columns(
     motion: _Motion, screw: tuple, rate: tuple, spin, momentum, composite: _Inertia
 ) -> tuple[tuple, tuple]:
-    """Return 2B Ṡ + I S̈ and 2B S + 2 I Ṡ of one joint and its subtree."""
+    """Return 2B Ṡ + I S̈ and 2B S + 2 I Ṡ for one joint and its subtree."""
     bent, turned = _momentum(*composite, *_bend(motion, screw, rate)), _momentum(*composite, *rate)
     return (
         (spin @ rate[0] + bent[0], cross(rate[0], momentum) * 2.0 + bent[1]),
@@ -283,7 +283,7 @@ def _forward_dynamics_derivatives(links: Links) -> np.ndarray:
 
 
 def regressor_program(links: Links) -> Program:
-    """Return Y `(10 nq, nq)`, transpose of `identification.regressor`, from the motion of link origins."""
+    """Return Y `(10 nq, nq)`, the transposed `identification.regressor`, from the motion of link origins."""
     n = len(links.parents)
     Y = links.graph.constants(np.zeros((PARAMETERS * n, n)))
     motion = _motion(links, links.vector("qd"), links.vector("qdd"), gravity=True)
@@ -291,7 +291,7 @@ def regressor_program(links: Links) -> Program:
         origin = a + cross(alpha, p) + cross(omega, v + cross(omega, p))
         zero, axes = links.graph.constants(np.zeros(3)), [R[:, x] for x in range(3)]
         wrenches = [(zero, origin)]
-        # Moment and force about the link's origin: m, then m c along each axis, then I
+        # Moment and force about the link's origin, for m, then m c along each axis, then I
         wrenches += [(cross(e, origin), cross(alpha, e) + cross(omega, cross(omega, e))) for e in axes]
         for x in range(3):
             for y in range(x, 3):
@@ -320,7 +320,7 @@ QUANTITIES: dict[str, tuple[tuple[str, ...], Callable[[Links], np.ndarray]]] = {
 
 
 def trace(robot: RobotModel, quantity: str) -> Program:
-    """Record the program for one quantity in `QUANTITIES` and one robot."""
+    """Return the recorded program for one quantity in `QUANTITIES` of one robot."""
     arguments, algorithm = QUANTITIES[quantity]
     links = Links(robot)
     result = algorithm(links)

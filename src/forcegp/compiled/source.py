@@ -1,6 +1,6 @@
-"""C++ and CUDA source text of a straight-line program, and its compiled kernel.
+"""C++ and CUDA source code of a straight-line program, and its compiled kernel.
 
-Kernels are built from C++ on the CPU and by NVRTC on a GPU.
+Kernels are compiled from C++ for a CPU, and by NVRTC for a GPU.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from forcegp.errors import MissingDependencyError
 from forcegp.native import load_library
 
 LANES_BYTES = 64
-"""Vector width of a CPU kernel, which the compiler splits if the machine's vectors are narrower."""
+"""Vector width of a CPU kernel [bytes]; the compiler splits vectors if those of the machine are narrower."""
 CUDA_THREADS = 128
 
 _CPU = """\
@@ -71,20 +71,20 @@ extern "C" __global__ void kernel({parameters}, T* out, int batch) {{
 
 @dataclass(frozen=True)
 class Source:
-    """Source text, and the arrays read by its kernel: arguments of the quantity, "sin" or "cos" of q."""
+    """Source code, and the arrays that its kernel reads: arguments of the quantity, "sin" or "cos" of q."""
 
     text: str
     arrays: tuple[str, ...]
 
 
 def statements(program: Program, load: dict[tuple[str, int], str], store: str) -> str:
-    """Return one statement per live node, followed by stores, on vectors `V` of numbers `T`."""
+    """Return one statement per live node, followed by stores, for vectors `V` of numbers `T`."""
     nodes, lines = program.graph.nodes, []
     name: dict[int, str] = {}
     for position in program.graph.live(program.outputs):
         op, left, right = nodes[position]
         if op == "const":
-            # A scalar operand is spread over the lanes by the compiler; repr keeps every bit.
+            # The compiler broadcasts scalar operands to all lanes; repr is exact to the last bit.
             name[position] = f"T({left!r})"
             continue
         name[position] = f"x{position}"
@@ -99,14 +99,14 @@ def statements(program: Program, load: dict[tuple[str, int], str], store: str) -
 
 
 def _operation(op: str, left: str, right: str = "") -> str:
-    """Return the text of an operation; `step` and other functions exist in C only."""
+    """Return the source code of an operation; `step` and other functions exist only in C."""
     if op in UNARY:
         return f"{left} > 0.0" if op == "step" else f"{op}({left})"
     return f"{left} {op} {right}" if right else f"-{left}"
 
 
 def inputs_of(program: Program) -> tuple[tuple[str, ...], list[tuple[str, int]]]:
-    """Return the arrays to read, and the entries in use."""
+    """Return the arrays that the program reads, and the entries that it uses."""
     nodes = (program.graph.nodes[i] for i in program.graph.live(program.outputs))
     entries = sorted((str(name), int(index)) for op, name, index in nodes if op == "input")  # pyright: ignore[reportArgumentType]
     return tuple(sorted({name for name, _ in entries})), entries
@@ -117,7 +117,7 @@ def _type(dtype: torch.dtype) -> str:
 
 
 def cpu_source(program: Program, nq: int, dtype: torch.dtype) -> Source:
-    """Return C++ that computes a vector of samples at a time and distributes the batch over threads."""
+    """Return C++ code that computes a vector of samples at a time and distributes the batch over threads."""
     arrays, entries = inputs_of(program)
     load = "\n".join(
         f"    entry[{k}][lane] = in[{arrays.index(name)}][row * {nq} + {index}];"
@@ -140,14 +140,13 @@ def cpu_source(program: Program, nq: int, dtype: torch.dtype) -> Source:
 
 
 STATEMENTS = 500
-"""Number of statements per C function; compile time grows faster than linearly with it."""
+"""Maximum number of statements per C function, since compile time grows faster than linearly with it."""
 
 
 def c_function(name: str, program: Program) -> str:
-    """Return a static C99 function of one state with the arguments, sin q, cos q and the result as
-    parameters.
+    """Return a static C99 function of one state, with parameters for arguments, sin q, cos q and result.
 
-    A long program becomes several functions that pass intermediate values in an array.
+    A long program is split into several functions that pass intermediate values in an array.
     """
     names = (*program.arguments, "sin_q", "cos_q")
     entry = {"sin": "sin_q", "cos": "cos_q"}
@@ -203,7 +202,7 @@ def c_function(name: str, program: Program) -> str:
 
 
 def cuda_source(program: Program, nq: int, dtype: torch.dtype) -> Source:
-    """Return CUDA C++ that computes one sample per thread."""
+    """Return CUDA C++ code that computes one sample per thread."""
     arrays, entries = inputs_of(program)
     text = _CUDA.format(
         type=_type(dtype),
@@ -218,14 +217,14 @@ def cuda_source(program: Program, nq: int, dtype: torch.dtype) -> Source:
 
 
 Kernel = Callable[[Sequence[Tensor], Tensor], None]
-"""Function that reads contiguous arrays `(B, nq)` and fills the contiguous result `(B, …)`."""
+"""Function that reads contiguous arrays `(B, nq)` and fills a contiguous result `(B, …)`."""
 
 SAMPLES_PER_THREAD = 512
-"""Minimum number of samples per thread, to amortise its start-up."""
+"""Minimum number of samples per thread, to amortise thread start-up."""
 
 
 def cpu_kernel(text: str) -> Kernel:
-    """Return the kernel of a `cpu_source`, run on as many threads as `torch.get_num_threads()`."""
+    """Return the kernel compiled from a `cpu_source`, which runs on `torch.get_num_threads()` threads."""
     function = load_library(text).kernel
     function.restype = None
     function.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_long, ctypes.c_long]
@@ -240,10 +239,10 @@ def cpu_kernel(text: str) -> Kernel:
 
 
 def cuda_kernel(text: str) -> Kernel:
-    """Return the kernel of a `cuda_source`, compiled by NVRTC.
+    """Return the kernel that NVRTC compiles from a `cuda_source`.
 
     Raises:
-        MissingDependencyError: this PyTorch cannot compile a CUDA kernel at run time.
+        MissingDependencyError: the installed PyTorch cannot compile CUDA kernels at run time.
     """
     compile_kernel = getattr(torch.cuda, "_compile_kernel", None)
     if compile_kernel is None or not torch.cuda.is_available():

@@ -1,6 +1,6 @@
-"""Equations of motion with the robot's mechanics from a compiled kernel.
+"""Equations of motion in which a compiled kernel computes the robot's mechanics.
 
-For a few states, the overhead of tensor operations exceeds the computation many times. The kernel is built by
+For a few states, the overhead of tensor operations far exceeds the actual computation. The kernel is built by
 the local C++ compiler and cached on disk.
 """
 
@@ -24,19 +24,19 @@ from forcegp.robot.model import RobotModel
 from forcegp.types import JointVector
 
 POINT = 4
-"""Blocks of a point: rotation, position, Jacobian, bias acceleration."""
+"""Number of output blocks per point: rotation, position, Jacobian, and bias acceleration."""
 _KERNELS: WeakKeyDictionary[RobotModel, dict[tuple[Anchor, ...], CompiledMechanics | None]] = (
     WeakKeyDictionary()
 )
 _SYSTEMS: WeakKeyDictionary[ConstrainedSystem, ConstrainedSystem] = WeakKeyDictionary()
-"""Compiled systems, kept as long as the original ones."""
+"""Compiled systems, kept as long as the original systems exist."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class CompiledSystem(ConstrainedSystem):
-    """A constrained system whose equations of motion use a compiled kernel if no gradient is required.
+    """A constrained system with equations of motion from a compiled kernel if no gradient is required.
 
-    Created by `compiled_system`; the kernel also computes the motion of additional `points`.
+    It is created by `compiled_system`. The kernel also computes the motion of additional `points`.
     """
 
     points: tuple[Anchor, ...] = ()
@@ -50,7 +50,7 @@ class CompiledSystem(ConstrainedSystem):
         return _kernel(self.robot, self._anchors)
 
     def with_robot(self, robot: RobotModel) -> ConstrainedSystem:
-        """Return the same constraints on a robot with other parameters, without the kernel."""
+        """Return the same constraints on a robot with different parameters, without the kernel."""
         return ConstrainedSystem(robot, self.contacts, self.baumgarte)
 
     def equations(self, q: JointVector, qd: JointVector, active: Tensor | None = None) -> Equations:
@@ -71,9 +71,9 @@ class CompiledSystem(ConstrainedSystem):
 
 
 def compiled_system(system: ConstrainedSystem, *points: Anchor) -> ConstrainedSystem:
-    """Return the system with compiled equations of motion, for many evaluations of one robot.
+    """Return the system with compiled equations of motion, for repeated evaluations of the same robot.
 
-    The first call for a robot takes some seconds to compile; later calls in any process read the cache. The
+    The first call for a robot takes a few seconds to compile; later calls in any process read the cache. The
     system is returned unchanged if there is no compiler, or if the robot's parameters require gradients or
     are on a GPU. `points` are additional points for `Equations.point_motion`.
 
@@ -92,7 +92,7 @@ def compiled_system(system: ConstrainedSystem, *points: Anchor) -> ConstrainedSy
 
 
 def _anchors_of(system: ConstrainedSystem, points: Sequence[Anchor]) -> tuple[Anchor, ...]:
-    """Return the points used by constraints, and additional ones, without duplicates."""
+    """Return the points used by constraints and the additional points, without duplicates."""
     read = (anchor for contact in system.contacts for anchor in contact.anchors)
     return tuple(dict.fromkeys(map(_key, (*read, *points))))
 
@@ -103,7 +103,7 @@ def _key(anchor: Anchor) -> Anchor:
 
 
 def _kernel(robot: RobotModel, anchors: tuple[Anchor, ...]) -> CompiledMechanics | None:
-    """Return the kernel of a robot, cached as long as the robot; `None` if it cannot be compiled."""
+    """Return the kernel of a robot, cached as long as the robot exists; `None` if it cannot be compiled."""
     kept = _KERNELS.setdefault(robot, {})
     if anchors not in kept:
         known = robot.device.type == "cpu" and robot.dtype in (torch.float64, torch.float32)
@@ -120,6 +120,6 @@ def _traced(x: Tensor) -> bool:
         return True
     try:
         x.data_ptr()
-    except RuntimeError:  # A transform wraps its tensors, which have no storage of their own.
+    except RuntimeError:  # A transform wraps its tensors, which then have no storage of their own.
         return True
     return False

@@ -1,4 +1,4 @@
-"""Holonomic constraints c(q) = 0: a point in contact with a surface, and two coincident points.
+"""Holonomic constraints c(q) = 0: contact of a point with a surface, and connection of two points.
 
 Differentiating twice gives A q̈ = b with A = ∂c/∂q and b = −Ȧ q̇ (eq. 3).
 """
@@ -28,9 +28,9 @@ class ConstraintTerms(NamedTuple):
     Attributes:
         c: `(*batch, rows)` position-level error.
         A: `(*batch, rows, nq)` Jacobian of c.
-        b: `(*batch, rows)` with A q̈ = b, no stabilization.
+        b: `(*batch, rows)` with A q̈ = b, without stabilization.
         point: the contact point, for a contact with a surface.
-        holds: `(*batch, rows)` bool, rows that apply at this state; `None` for all.
+        holds: `(*batch, rows)` bool, rows that apply at this state; `None` means all.
     """
 
     c: Tensor
@@ -49,11 +49,11 @@ class Constraint(ABC):
     @property
     @abstractmethod
     def anchors(self) -> tuple[Anchor, ...]:
-        """Points of the robot that the constraint depends on, each with its frame."""
+        """Points on the robot on which the constraint depends, each with its frame."""
 
     @abstractmethod
     def terms_of(self, points: Sequence[PointMotion]) -> ConstraintTerms:
-        """Return c, A and b from the motion of the anchors."""
+        """Return c, A and b, computed from the motion of the anchors."""
 
     @abstractmethod
     def check(self, robot: RobotModel) -> None:
@@ -67,11 +67,11 @@ class Constraint(ABC):
 
 @dataclass(frozen=True)
 class SurfaceContact(Constraint):
-    """A point or a ball of the robot that slides on a surface, c(q) = c_surface(p(q)) − r.
+    """Contact of a point or a ball on the robot with a surface, c(q) = c_surface(p(q)) − r.
 
     A = ∇cᵀ J_p and b = −(∇cᵀ J̇_p q̇ + ṗᵀ ∇²c ṗ); the multiplier is the normal force if |∇c| = 1. A rounded
     tip is a ball of radius r around p. The contact point p − r n has the material velocity ṗ + ω × (−r n), so
-    J_E = J_p + r [n]ₓ J_ω. Friction at a rounded tip has the lever arm −r n; the normal force has none.
+    J_E = J_p + r [n]ₓ J_ω. At a rounded tip, friction has the lever arm −r n; the normal force has none.
 
     A contact that may stick has two additional rows, (t_1, t_2)ᵀ J_E q̇ = 0 in the tangent frame of the
     surface, which apply while the tangential speed of the contact point is below `stick_speed`. Their
@@ -79,12 +79,12 @@ class SurfaceContact(Constraint):
     exceeds the friction predicted by the model (`rollout/cone.py`).
 
     Args:
-        name: name of the contact, as in `contact.<name>` of a data set.
+        name: name of the contact, as in `contact.<name>` in a data set.
         frame: link or frame of the contact point.
-        point: coordinates in that frame [m]; for a rounded tip, those of its centre.
+        point: coordinates in that frame [m]; for a rounded tip, the coordinates of its centre.
         surface: the surface in the world frame.
         radius: radius r of a rounded tip [m]; 0 for a sharp tip.
-        stick_speed: tangential speed below which the contact point sticks [m/s]; `None` for a contact that
+        stick_speed: tangential speed below which the contact point sticks [m/s]; `None` if the contact
             always slides.
 
     Raises:
@@ -125,7 +125,7 @@ class SurfaceContact(Constraint):
 
     @property
     def center_surface(self) -> Surface:
-        """Surface on which `point` moves: that of the contact, raised by the radius of the tip."""
+        """Surface on which `point` moves: the contact surface, raised by the radius of the tip."""
         return self.surface.raised(self.radius) if self.radius else self.surface
 
     def check(self, robot: RobotModel) -> None:
@@ -160,7 +160,7 @@ class SurfaceContact(Constraint):
             bias = bias - self.radius * torch.linalg.cross(omega, turning)
         if self.stick_speed is None:
             return ConstraintTerms(c[..., None], A, b[..., None], touching)
-        # A = (∇c, t_1, t_2)ᵀ J_E; where the point rests, the tangent frame may be taken to stand still.
+        # A = (∇c, t_1, t_2)ᵀ J_E; while the point is at rest, the tangent frame is treated as constant.
         along, speed = tangent_frame(touching.unit_normal), touching.sliding[1].norm(dim=-1, keepdim=True)
         sticks = speed < self.stick_speed
         touching = dataclasses.replace(touching, sticks=sticks[..., 0])
@@ -172,12 +172,12 @@ class SurfaceContact(Constraint):
 
 @dataclass(frozen=True)
 class PointConnection(Constraint):
-    """Two coincident points, c(q) = p_1(q) − p_2(q), which close a kinematic loop.
+    """Connection of two points, c(q) = p_1(q) − p_2(q), which closes a kinematic loop.
 
     Args:
         name: name of the constraint.
-        frame, point: first frame, and point in its coordinates [m].
-        other_frame, other_point: second frame and point; `None` fixes the first point in the world.
+        frame, point: first frame, and a point in its coordinates [m].
+        other_frame, other_point: second frame and point; with the frame `None`, a point in the world.
     """
 
     name: str

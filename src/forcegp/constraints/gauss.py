@@ -1,15 +1,15 @@
 """Equations of motion under implicit constraints (Gauss; Udwadia and Kalaba): A, b → L, T, P, H, λ.
 
-M q̈ = Q̄ + Aᵀλ and A q̈ = b imply q̈ = L b + H Q̄ and λ = (A M⁻¹ Aᵀ)⁺(b − A M⁻¹ Q̄). With the Cholesky factor
-M = G Gᵀ and W = A G⁻ᵀ, L = G⁻ᵀ W⁺ and (A M⁻¹ Aᵀ)⁺ = W⁺ᵀ W⁺. The rank is determined from the singular values
-of W, since those of A M⁻¹ Aᵀ are their squares, which in single precision do not separate redundant
-constraints from rounding.
+M q̈ = Q̄ + Aᵀλ and A q̈ = b imply q̈ = L b + H Q̄ and λ = (A M⁻¹ Aᵀ)⁺(b − A M⁻¹ Q̄). With the Cholesky
+factorization M = G Gᵀ and W = A G⁻ᵀ, L = G⁻ᵀ W⁺ and (A M⁻¹ Aᵀ)⁺ = W⁺ᵀ W⁺. The rank is determined from the
+singular values of W. The singular values of A M⁻¹ Aᵀ are their squares, which in single precision do not
+separate redundant constraints from rounding errors.
 
-At fixed q̈ and λ, the derivatives of M q̈ − Q_C − Q_G − Q_D − Aᵀλ = Q and A q̈ = b leave the residuals
+At fixed q̈ and λ, differentiating M q̈ − Q_C − Q_G − Q_D − Aᵀλ = Q and A q̈ = b leaves the residuals
 r_f = ∂Q − ∂ID + ∂Q_D + ∂(Aᵀ)λ and r_c = ∂b − ∂A q̈, so ∂q̈ = H r_f + L r_c and
-∂λ = (A M⁻¹ Aᵀ)⁺(r_c − A M⁻¹ r_f). The derivatives of inverse dynamics are in closed form; those of the few
-constraint rows come from autograd. The pseudo-inverse itself is not differentiated, so redundant constraints
-of constant rank are handled correctly.
+∂λ = (A M⁻¹ Aᵀ)⁺(r_c − A M⁻¹ r_f). The derivatives of inverse dynamics have a closed form; those of the few
+constraint rows are computed by autograd. The pseudo-inverse itself is not differentiated, so redundant
+constraints of constant rank are handled correctly.
 """
 
 from __future__ import annotations
@@ -34,29 +34,29 @@ from forcegp.types import ConstraintInverse, ConstraintMatrix, ConstraintVector,
 RANK_TOLERANCE = 1e-5
 """Fraction of the largest singular value of A G⁻ᵀ, M = G Gᵀ, below which constraints are redundant."""
 ROUNDING = 1e3
-"""The same fraction in units of the precision's ε, used if larger: 1.2e-4 in single precision. Redundant
-    contacts of the bundled arms leave 2 ε; closed loops and ill-conditioned M leave more."""
+"""The same fraction in units of the machine precision ε, used if it is larger: 1.2e-4 in single precision.
+    Redundant contacts of the bundled arms leave 2 ε; closed loops and ill-conditioned M leave more."""
 
 
 def rank_tolerance(dtype: torch.dtype) -> float:
-    """Return the smallest ratio of singular values of A G⁻ᵀ that counts as an independent constraint."""
+    """Return the smallest singular value of A G⁻ᵀ, relative to the largest, of an independent constraint."""
     return max(RANK_TOLERANCE, ROUNDING * torch.finfo(dtype).eps)
 
 
 def nothing(dtype: torch.dtype) -> float:
-    """Return the size below which a row of A G⁻ᵀ counts as zero [1/√kg], since its point cannot move."""
+    """Return the norm below which a row of A G⁻ᵀ counts as zero [1/√kg] because its point cannot move."""
     return ROUNDING * torch.finfo(dtype).eps
 
 
 FACING_DOWN = 1e-6
-"""Value of 1 + n_z below which a normal counts as −e_z, for which the smallest rotation is not unique."""
+"""Value of 1 + n_z below which a normal is treated as −e_z, for which the smallest rotation is not unique."""
 
 
 def tangent_frame(n: Tensor) -> Tensor:
-    """Return two unit vectors along the surface at unit normals n `(*batch, 3)`, `(*batch, 3, 2)`.
+    """Return two unit tangents of the surface `(*batch, 3, 2)` for unit normals n `(*batch, 3)`.
 
-    The columns are R e_x and R e_y with R e_z = n and the smallest rotation R = 1 + [w]ₓ + [w]ₓ²/(1 + n_z),
-    w = e_z × n; at n = −e_z, half a turn about e_x.
+    The columns are R e_x and R e_y, where R = 1 + [w]ₓ + [w]ₓ²/(1 + n_z) with w = e_z × n is the smallest
+    rotation for which R e_z = n. At n = −e_z, R is half a turn about e_x.
     """
     x, y, z = n.unbind(-1)
     down = 1.0 + z < FACING_DOWN
@@ -68,13 +68,13 @@ def tangent_frame(n: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class ContactPoint:
-    """The point of the robot in contact with a surface; for a rounded tip, the current material point.
+    """The point on the robot that touches a surface; for a rounded tip, the current material point.
 
     Attributes:
-        position, velocity: `(*batch, 3)` in the world [m], [m/s].
-        jacobian: J_E `(*batch, 3, nq)`, world axes.
+        position, velocity: `(*batch, 3)` motion in the world [m], [m/s].
+        jacobian: J_E `(*batch, 3, nq)`, in world axes.
         normal: ∇c `(*batch, 3)` at the point.
-        sticks: `(*batch,)` bool, true if the point rests on the surface; `None` if the contact always slides.
+        sticks: `(*batch,)` bool, whether the point sticks to the surface; `None` if it always slides.
     """
 
     position: Tensor
@@ -90,13 +90,12 @@ class ContactPoint:
 
     @cached_property
     def sliding(self) -> tuple[Tensor, Tensor]:
-        """Jacobian (1 − n nᵀ) J_E `(*batch, 3, nq)` and velocity (1 − n nᵀ) ṗ `(*batch, 3)` along the
-        surface."""
+        """Tangential Jacobian (1 − n nᵀ) J_E `(*batch, 3, nq)` and velocity (1 − n nᵀ) ṗ `(*batch, 3)`."""
         n, J, v = self.unit_normal, self.jacobian, self.velocity
         return J - n[..., None] * (n[..., None, :] @ J), v - n * vecdot(n, v)[..., None]
 
     def directions(self, rows: int) -> Tensor:
-        """Return the directions of the multipliers `(*batch, 3, rows)`: ∇c, and tangents if it may stick."""
+        """Return the directions `(*batch, 3, rows)` of the multipliers: ∇c, and tangents if it may stick."""
         normal = self.normal[..., None]
         return normal if rows == 1 else torch.cat([normal, tangent_frame(self.unit_normal)], dim=-1)
 
@@ -108,14 +107,14 @@ class Equations:
     Attributes:
         M: `(*batch, nq, nq)` mass matrix.
         A: `(*batch, m, nq)`; rows of inactive contacts are zero.
-        b: `(*batch, m)` with A q̈ = b, Baumgarte terms included.
-        c, cd: `(*batch, m)` constraint error and its rate for all contacts, active or not.
-        Q_C, Q_G, Q_D: `(*batch, nq)` bias, gravity and dissipative joint force.
+        b: `(*batch, m)` with A q̈ = b, including Baumgarte terms.
+        c, cd: `(*batch, m)` constraint error and its rate for all contacts, whether active or not.
+        Q_C, Q_G, Q_D: `(*batch, nq)` bias force, gravity force and dissipative joint force.
         contact_points: contact point of each surface contact, by name.
         point_motion: function that returns the motion of a point `(frame, point)` at the states.
         links: function that returns the poses and the motion of the links at the states.
-        holds: `(*batch, m)` bool, rows of A that apply: those of closed contacts, including tangential rows
-            if they stick.
+        holds: `(*batch, m)` bool, rows of A that apply: those of closed contacts, including the tangential
+            rows of contacts that stick.
     """
 
     M: JointMatrix
@@ -160,7 +159,7 @@ class Equations:
 
     @cached_property
     def M_inv(self) -> JointMatrix:
-        """M⁻¹."""
+        """M⁻¹ `(*batch, nq, nq)`."""
         eye = torch.eye(self.M.shape[-1], dtype=self.M.dtype, device=self.M.device)
         return torch.cholesky_solve(eye.expand_as(self.M), self.M_cholesky)
 
@@ -171,14 +170,14 @@ class Equations:
 
     @cached_property
     def scaled_inverse(self) -> ConstraintInverse:
-        """W⁺ `(*batch, nq, m)`; the pseudo-inverse handles redundant and inactive rows."""
+        """W⁺ `(*batch, nq, m)`, a pseudo-inverse that handles redundant and inactive rows."""
         W = self.scaled_jacobian
         if W.shape[-2] == 0:
             return W.mT
         if W.shape[-2] == 1:
             # w⁺ = w/|w|²
             square = W.square().sum(-1, keepdim=True)
-            # The row of an inactive contact, or of a point that cannot move, is zero, and stays so.
+            # The row of an inactive contact, or of a point that cannot move, is zero and remains zero.
             return (W / square.masked_fill(square <= nothing(W.dtype) ** 2, torch.inf)).mT
         return torch.linalg.pinv(W, atol=nothing(W.dtype), rtol=rank_tolerance(W.dtype))
 
@@ -189,7 +188,7 @@ class Equations:
 
     @cached_property
     def rank(self) -> Tensor:
-        """`(*batch,)` number of independent active constraint rows."""
+        """Number of independent active constraint rows `(*batch,)`."""
         W = self.scaled_jacobian
         if W.shape[-2] <= 1:
             return (W.square().sum(-1) > nothing(W.dtype) ** 2).sum(-1)
@@ -197,9 +196,9 @@ class Equations:
 
     @cached_property
     def hidden(self) -> Tensor:
-        """Projector onto multipliers that do not affect the motion, Aᵀμ = 0 `(*batch, m, m)`.
+        """Projector `(*batch, m, m)` onto multipliers μ that do not affect the motion, Aᵀμ = 0.
 
-        It is 1 for points that cannot move, and a fraction for contacts that share their load.
+        It is 1 for a point that cannot move, and between 0 and 1 for contacts that share their load.
         """
         # R = 1 − W W⁺
         return torch.diag_embed(self.holds.to(self.M)) - self.scaled_jacobian @ self.scaled_inverse
@@ -211,7 +210,7 @@ class Equations:
 
     @cached_property
     def T(self) -> JointMatrix:
-        """The oblique projector T = I − L A on the null space of A (remark 1.3)."""
+        """The oblique projector T = I − L A onto the null space of A (remark 1.3)."""
         return torch.eye(self.M.shape[-1], dtype=self.M.dtype, device=self.M.device) - self.L @ self.A
 
     @property
@@ -221,12 +220,12 @@ class Equations:
 
     @cached_property
     def H(self) -> JointMatrix:
-        """Symmetric map H = M⁻¹P = T M⁻¹ = M⁻¹ − L A M⁻¹ from force to constrained acceleration."""
+        """Symmetric map H = M⁻¹P = T M⁻¹ = M⁻¹ − L A M⁻¹ from forces to constrained accelerations."""
         return self.M_inv - self.L @ self.M_inv_At.mT
 
     @property
     def Q_K(self) -> JointVector:
-        """Force Q_C + Q_G + Q_D computed from the robot file, without actuation."""
+        """Force Q_C + Q_G + Q_D computed from the robot file, excluding actuation."""
         return self.Q_C + self.Q_G + self.Q_D
 
     def free_acceleration(self, Q: JointVector) -> JointVector:
@@ -234,26 +233,26 @@ class Equations:
         return torch.cholesky_solve(Q[..., None], self.M_cholesky)[..., 0]
 
     def _gap(self, free: JointVector) -> ConstraintVector:
-        """Return b − A q̈′ `(*batch, m)`, the violation of the constraint by free motion."""
+        """Return b − A q̈′ `(*batch, m)`, by which free motion violates the constraint."""
         return self.b - (self.A @ free[..., None])[..., 0]
 
     def acceleration(self, Q_bar: JointVector) -> JointVector:
-        """Return q̈ = L b + H Q̄ (eq. 4), as the correction q̈′ + L(b − A q̈′) of the free acceleration.
+        """Return q̈ = L b + H Q̄ (eq. 4), computed from the free acceleration as q̈′ + L(b − A q̈′).
 
         Args:
-            Q_bar: `(*batch, nq)` all impressed generalized forces Q + Q_z [N m, N].
+            Q_bar: `(*batch, nq)` sum of all impressed generalized forces, Q + Q_z [N m, N].
         """
         free = self.free_acceleration(Q_bar)
         return free + (self.L @ self._gap(free)[..., None])[..., 0]
 
     def motion_under(self, Q_bar: JointVector) -> tuple[JointVector, ConstraintVector]:
-        """Return q̈ = q̈′ + M⁻¹Aᵀ λ and λ together, for a step of a rollout."""
+        """Return both q̈ = q̈′ + M⁻¹Aᵀ λ and λ, for a step of a rollout."""
         free = self.free_acceleration(Q_bar)
         multiplier = (self.constraint_inertia @ self._gap(free)[..., None])[..., 0]
         return free + (self.M_inv_At @ multiplier[..., None])[..., 0], multiplier
 
     def multiplier(self, Q_bar: JointVector) -> ConstraintVector:
-        """Return λ = (A M⁻¹ Aᵀ)⁺(b − A M⁻¹ Q̄) (eq. 16, with all impressed forces), `(*batch, m)`."""
+        """Return λ = (A M⁻¹ Aᵀ)⁺(b − A M⁻¹ Q̄) `(*batch, m)` (eq. 16 with all impressed forces)."""
         return (self.constraint_inertia @ self._gap(self.free_acceleration(Q_bar))[..., None])[..., 0]
 
     def constraint_force(self, Q_bar: JointVector) -> JointVector:
@@ -262,14 +261,14 @@ class Equations:
 
 
 class Linearization(NamedTuple):
-    """q̈ and λ at a state with their Jacobians, row = component of q̈ or λ.
+    """q̈ and λ at a state, and their Jacobians, with one row per component of q̈ or λ.
 
     Attributes:
         qdd: `(*batch, nq)` constrained acceleration.
         dq, dqd, dforce: `(*batch, nq, nq)` ∂q̈/∂q, ∂q̈/∂q̇ and ∂q̈/∂Q = H.
         multiplier: `(*batch, m)` λ.
-        multiplier_dq, multiplier_dqd, multiplier_dforce: `(*batch, m, nq)`; for redundant constraints, which
-            determine only Aᵀλ, the Jacobians of least norm.
+        multiplier_dq, multiplier_dqd, multiplier_dforce: `(*batch, m, nq)` Jacobians of λ, with minimum norm
+            for redundant constraints, which determine only Aᵀλ.
     """
 
     qdd: JointVector
@@ -290,7 +289,7 @@ def linearize(
     qd: JointVector,
     force: JointVector,
 ) -> Linearization:
-    """Linearize at states (q, q̇) with known equations of motion; `rows` returns A and b at states."""
+    """Linearize at states (q, q̇) with known equations of motion, where `rows` returns A and b at states."""
     with torch.no_grad():
         Q_bar = eom.Q_K + force
         qdd, multiplier = eom.acceleration(Q_bar), eom.multiplier(Q_bar)
@@ -311,7 +310,7 @@ def _residuals(
     qdd: Tensor,
     multiplier: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Return Jacobians of b − A q̈ `(*batch, m, 2 nq)` and of Aᵀλ + Q_D by (q, q̇), at fixed q̈ and λ."""
+    """Return the Jacobians of b − A q̈ `(*batch, m, 2 nq)` and Aᵀλ + Q_D in (q, q̇) at fixed q̈ and λ."""
     with torch.enable_grad():
         state = state.detach().clone().requires_grad_()
         q, qd = state.chunk(2, -1)

@@ -1,10 +1,10 @@
-"""Rigid surfaces as implicit functions c(p) of a point, zero on the surface and positive outside the solid.
+"""Rigid surfaces as implicit functions c(p) of a point: zero on the surface and positive outside the solid.
 
 The gradient points out of the solid, so a contact under pressure has a multiplier λ ≥ 0. Except for
 `ImplicitSurface`, c is the signed distance and the gradient is the unit normal.
 
 `SurfaceSchema` describes surfaces in files: scene files and saved models are validated against these classes,
-selected by the field `type`.
+which the field `type` selects.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from forcegp.types import Scalars, Vector3
 
 
 class Surface(ABC):
-    """A surface with the derivatives needed for a contact, batched over points in the world."""
+    """A surface with the derivatives that a contact needs, batched over points in the world."""
 
     @abstractmethod
     def value(self, p: Vector3) -> Scalars:
-        """Return c(p), `(*batch,)`, in metres for signed distances."""
+        """Return c(p), `(*batch,)`, in metres if c is a signed distance."""
 
     @abstractmethod
     def gradient(self, p: Vector3) -> Vector3:
@@ -64,7 +64,7 @@ def _unit(values: Sequence[float], what: str) -> tuple[float, ...]:
         raise ParameterError(
             f"{what} has no direction", expected="three finite numbers, not all zero", got=values
         )
-    # A unit vector is kept as it is, so that a surface that was saved is read back bit for bit.
+    # A unit vector is not changed, so that a saved surface is restored bit for bit.
     scale = 1.0 if abs(length - 1.0) <= 1e-15 else length
     return tuple(float(x) / scale for x in values)
 
@@ -80,7 +80,7 @@ class Plane(Surface):
     """The plane c(p) = n·p − offset.
 
     Args:
-        normal: direction out of the solid; scaled to unit length.
+        normal: direction out of the solid, which is scaled to unit length.
         offset: distance from the world origin along the normal [m].
 
     Example:
@@ -117,7 +117,7 @@ class Plane(Surface):
 
 
 class _Round(Surface):
-    """c(p) = |r| − radius, with r computed from p − center by `_across`, for contact from outside."""
+    """c(p) = |r| − radius for contact from outside, with r computed from p − center by `_across`."""
 
     center: Sequence[float]
     radius: float
@@ -182,7 +182,7 @@ class Cylinder(_Round):
 
     Args:
         center: a point on the axis [m].
-        axis: direction a of the axis; scaled to unit length.
+        axis: direction a of the axis, which is scaled to unit length.
         radius: radius [m].
 
     Example:
@@ -214,11 +214,11 @@ SurfaceSchema = Annotated[Plane | Sphere | Cylinder, Field(discriminator="type")
 
 @dataclass(frozen=True)
 class ImplicitSurface(Surface):
-    """Any smooth surface c(p), differentiated automatically.
+    """Any smooth surface c(p), with derivatives by automatic differentiation.
 
     Args:
-        function: function that maps one point `(3,)` to a scalar tensor, positive outside the solid and twice
-            differentiable by PyTorch. The multiplier is in newtons if |∇c| = 1.
+        function: function that maps one point `(3,)` to a scalar tensor. It must be positive outside the
+            solid and twice differentiable by PyTorch. The multiplier is in newtons if |∇c| = 1.
 
     Example:
         >>> import torch

@@ -1,4 +1,4 @@
-"""Constrained systems: a robot with constraints, their stabilization, and the equations of motion."""
+"""Constrained systems: a robot with constraints, their stabilization, and its equations of motion."""
 
 from __future__ import annotations
 
@@ -23,17 +23,17 @@ from forcegp.robot.model import RobotModel
 from forcegp.types import ConstraintVector, JointVector
 
 SQUARE, LINEAR = 20, 60
-"""Measured peak number of matrices and vectors over joints and constraint rows per state."""
+"""Measured peak number of matrices and vectors, over joints and constraint rows, per state."""
 CERTAIN = 0.25
-"""Fraction of the bound that all measured computations exceed."""
+"""Fraction of the memory bound that all measured computations exceed."""
 
 
 @dataclass(frozen=True)
 class Baumgarte:
-    """Baumgarte stabilization, which damps the constraint error by c̈ + 2ωξ ċ + ω² c = 0 (eq. 29).
+    """Baumgarte stabilization, which damps the constraint error according to c̈ + 2ωξ ċ + ω² c = 0 (eq. 29).
 
     The right-hand side becomes b̃ = b − 2ωξ A q̇ − ω² c. Equation (30) of the paper has the opposite signs,
-    with which the error grows.
+    with which the error would grow.
 
     Args:
         natural_frequency: natural frequency ω > 0 [rad/s].
@@ -100,7 +100,7 @@ class ConstrainedSystem:
             contact.check(self.robot)
 
     def __repr__(self) -> str:
-        """Return a one-line summary of robot and contacts, without numbers."""
+        """Return a one-line summary of the robot and the contacts, without values."""
         contacts = ", ".join(f"{type(contact).__name__} {contact.name!r}" for contact in self.contacts)
         rule = f"; {self.baumgarte}" if self.baumgarte is not None else ""
         return f"<ConstrainedSystem: {self.robot!r}; {contacts or 'no contacts'}{rule}>"
@@ -128,7 +128,7 @@ class ConstrainedSystem:
 
     @property
     def row_names(self) -> list[str]:
-        """Name of each constraint row: that of the constraint, numbered if it has several rows."""
+        """Name of each constraint row: the name of the constraint, numbered if it has several rows."""
         rows = ((c.name, c.rows, row + 1) for c in self.contacts for row in range(c.rows))
         return [name if count == 1 else f"{name} {row}" for name, count, row in rows]
 
@@ -143,44 +143,49 @@ class ConstrainedSystem:
         return self.contacts[self.contact_names.index(name)]
 
     @cached_property
-    def may_stick(self) -> list[tuple[int, SurfaceContact, slice]]:
-        """The contacts that may stick: index, contact and its two tangential rows."""
+    def rows(self) -> dict[str, slice]:
+        """Constraint rows of each constraint, by name."""
         ends = itertools.accumulate(contact.rows for contact in self.contacts)
+        return {c.name: slice(end - c.rows, end) for c, end in zip(self.contacts, ends, strict=True)}
+
+    @cached_property
+    def may_stick(self) -> list[tuple[int, SurfaceContact, slice]]:
+        """Contacts that may stick, each with its index and its two tangential rows."""
         return [
-            (k, contact, slice(end - 2, end))
-            for k, (contact, end) in enumerate(zip(self.contacts, ends, strict=True))
+            (k, contact, slice(rows.start + 1, rows.stop))
+            for k, (contact, rows) in enumerate(zip(self.contacts, self.rows.values(), strict=True))
             if isinstance(contact, SurfaceContact) and contact.stick_speed is not None
         ]
 
     @cached_property
     def can_open(self) -> Tensor:
-        """Mask `(n_contacts,)` of the constraints that are contacts with a surface."""
+        """Mask `(n_contacts,)` of the constraints that can open, which are contacts with a surface."""
         flags = [isinstance(contact, SurfaceContact) for contact in self.contacts]
         return torch.tensor(flags, dtype=torch.bool, device=self.robot.device)
 
     @property
     def state_bytes(self) -> int:
-        """Upper bound on the memory of the equations of motion at one state [bytes]."""
+        """Upper bound on the memory needed to evaluate the equations of motion at one state [bytes]."""
         width = self.robot.nq + self.m
         return 8 * (SQUARE * width**2 + LINEAR * width)
 
     def announce_states(self, states: int, copies: float, what: str) -> None:
-        """Warn about or reject work on many states at once; see `announce_memory`.
+        """Warn about or reject a computation on many states at once; see `announce_memory`.
 
-        `copies` is the peak memory in units of that of the equations of motion; `what` describes the work.
+        `copies` is its peak memory relative to that of the equations of motion; `what` describes it.
 
         Raises:
-            MemoryLimitError: the work needs more memory than is free.
+            MemoryLimitError: the computation needs more memory than is free.
         """
         needed = int(copies * states * self.state_bytes)
         announce_memory(needed, what, certain=int(CERTAIN * needed))
 
     def with_robot(self, robot: RobotModel) -> ConstrainedSystem:
-        """Return the same constraints on a robot with other parameters."""
+        """Return the same constraints on a robot with different parameters."""
         return dataclasses.replace(self, robot=robot)
 
     def with_stick_speeds(self, speeds: Mapping[str, float]) -> ConstrainedSystem:
-        """The same robot with contacts that stick below given speeds [m/s], unless they state one."""
+        """Return the system with contacts that stick below given speeds [m/s] unless they specify a speed."""
         contacts = [
             dataclasses.replace(each, stick_speed=speeds[each.name])
             if isinstance(each, SurfaceContact) and each.stick_speed is None and each.name in speeds
@@ -191,10 +196,10 @@ class ConstrainedSystem:
         return dataclasses.replace(self, contacts=contacts) if changed else self
 
     def active_rows(self, active: Tensor | None, batch: torch.Size) -> Tensor:
-        """Expand active contacts `(*batch, n_contacts)` bool to rows `(*batch, m)`; `None` activates all.
+        """Expand a mask of active contacts `(*batch, n_contacts)` to rows `(*batch, m)`; `None` means all.
 
         Raises:
-            ShapeError: the argument is not boolean, or does not match the contacts and the batch.
+            ShapeError: the mask is not boolean, or does not match the contacts and the batch shape.
         """
         n = len(self.contacts)
         if active is None:
@@ -248,7 +253,7 @@ class ConstrainedSystem:
         point_motion: Callable[[str, Sequence[float]], PointMotion],
         links: Callable[[], tuple[LinkPoses, LinkMotion]],
     ) -> Equations:
-        """Return the equations of motion from M, Q_C, Q_G, Q_D and the motion of the points."""
+        """Assemble the equations of motion from M, Q_C, Q_G, Q_D and the motion of the points."""
         terms = self._terms(point_motion)
         c, cd, A, b, holds = self._rows(q, qd, terms, active)
         touching = zip(self.contact_names, (term.point for term in terms), strict=True)
@@ -259,15 +264,15 @@ class ConstrainedSystem:
     def linearize(
         self, q: JointVector, qd: JointVector, force: JointVector, active: Tensor | None = None
     ) -> Linearization:
-        """Return the constrained acceleration and the multiplier, with Jacobians with respect to q, q̇
-        and force.
+        """Return the constrained acceleration and the multiplier, and their Jacobians with respect to q, q̇
+        and the force.
 
-        q̈(q, q̇, Q) = L b + H (Q_C + Q_G + Q_D + Q) with its exact derivatives, detached from the graph.
+        q̈(q, q̇, Q) = L b + H (Q_C + Q_G + Q_D + Q) and its exact derivatives are detached from the graph.
         If Q depends on the state, as learned forces do, add `dforce` times the derivative of Q.
 
         Args:
             q, qd: `(*batch, nq)` joint positions and velocities.
-            force: `(*batch, nq)` Q, the motor torques and all other forces beyond the robot file.
+            force: `(*batch, nq)` Q, the motor torques and all other forces that the robot file lacks.
             active: `(*batch, n_contacts)` bool, the closed contacts of each sample; by default all.
 
         Raises:
@@ -300,7 +305,7 @@ class ConstrainedSystem:
     def _moving(
         self, q: Tensor, qd: Tensor
     ) -> tuple[LinkPoses, LinkMotion, Callable[[str, Sequence[float]], PointMotion]]:
-        """Return the poses and velocities of the links, and the motion of their points."""
+        """Return the poses and velocities of the links, and a function for the motion of their points."""
         poses = kinematics.link_poses(self.robot, q)
         motion = kinematics.link_motion(self.robot, poses, qd)
         return poses, motion, partial(kinematics.point_motion, self.robot, poses, motion, qd)
@@ -312,7 +317,7 @@ class ConstrainedSystem:
     def _rows(
         self, q: Tensor, qd: Tensor, terms: Sequence[ConstraintTerms], active: Tensor | None
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Return c and ċ of all contacts, the stabilized A and b of the active ones, and which rows hold."""
+        """Return c and ċ of all contacts, A and stabilized b of active contacts, and a mask of their rows."""
         if len(terms) == 1:
             c, A, b = terms[0].c, terms[0].A, terms[0].b
         else:

@@ -1,7 +1,7 @@
 """Unilateral contact with a surface: opening, closing, impact and sliding friction.
 
-A closed contact opens when its multiplier would become negative. An open contact closes when c ≤ 0 and ċ < 0,
-with an inelastic impact. Other constraints, such as a connection of two points, never change.
+A closed contact opens when its multiplier would become negative. An open contact closes with an inelastic
+impact when c ≤ 0 and ċ < 0. Other constraints, such as a connection of two points, never open or close.
 """
 
 from __future__ import annotations
@@ -17,27 +17,27 @@ from forcegp.errors import NumericalError
 from forcegp.types import ActiveContacts, JointVector
 
 PULL = 1e-9
-"""A contact pulls if −λ exceeds this [N]; rounding must not open a contact without load."""
+"""Value of −λ above which a contact pulls [N]; rounding errors must not open a contact without load."""
 APPROACH = 1e-9
-"""A contact is approached if −ċ exceeds this [m/s]; after an impact, ċ is zero up to rounding."""
+"""Value of −ċ above which a contact closes [m/s]; after an impact, ċ is zero up to rounding errors."""
 
 POSITION_TOLERANCE = 1e-12
-"""Largest constraint error that counts as zero [m]; rounding in the kinematics of an arm leaves 1e-15."""
+"""Largest constraint error that counts as zero [m]; rounding errors in an arm's kinematics are near 1e-15."""
 ROUNDING = 100.0
-"""Constraint error due to rounding, in units of the precision's ε; only relevant in float32."""
+"""Constraint error due to rounding, in units of the machine precision ε; only relevant in float32."""
 MAX_ITERATIONS = 30
-"""Maximum number of Newton iterations; a state off by a centimetre needs four."""
+"""Maximum number of Newton iterations; a state that is a centimetre off the surface needs four."""
 MAX_STEP = 0.2
-"""Largest change of a joint in one iteration [rad, m], mainly for light wrist joints."""
+"""Largest change in a joint position in one iteration [rad, m]; it mainly limits lightweight wrist joints."""
 
 
 class Landing(NamedTuple):
     """State of the contacts at the start of a step, before forces are computed.
 
     Attributes:
-        closed: `(n_contacts,)` bool.
-        qd: `(nq,)` velocity, after the impact if there was one.
-        eom: the equations of motion with the closed contacts.
+        closed: `(n_contacts,)` bool, closed contacts.
+        qd: `(nq,)` velocity after the impact, if there was one.
+        eom: equations of motion with the closed contacts.
         impact: whether a contact has just closed.
     """
 
@@ -51,11 +51,11 @@ class ContactForces(NamedTuple):
     """Contacts and forces during a step.
 
     Attributes:
-        closed: `(n_contacts,)` bool.
-        c: `(m,)` constraint error, open or closed [m].
-        multiplier: λ `(m,)`, zero for open contacts.
-        Q: `(nq,)` Q_C + Q_G + Q_D + Q_u [N m].
-        Q_D, Q_I, Q_z: `(nq,)` joint friction, and normal and friction force of the contacts [N m].
+        closed: `(n_contacts,)` bool, closed contacts.
+        c: `(m,)` constraint error of all contacts, open or closed [m].
+        multiplier: `(m,)` λ, zero for open contacts.
+        Q: `(nq,)` joint force Q_C + Q_G + Q_D + Q_u [N m].
+        Q_D, Q_I, Q_z: `(nq,)` joint friction, and normal and friction forces of the contacts [N m].
     """
 
     closed: Tensor
@@ -68,13 +68,13 @@ class ContactForces(NamedTuple):
 
 
 def rows_of(system: ConstrainedSystem, active: Tensor) -> Tensor:
-    """Return the rows of the active contacts, `(*batch, m)` bool."""
+    """Return a mask `(*batch, m)` of the rows of the active contacts."""
     repeats = torch.tensor([contact.rows for contact in system.contacts], device=active.device)
     return active.repeat_interleave(repeats, dim=-1)
 
 
 def any_row(system: ConstrainedSystem, rows: Tensor) -> Tensor:
-    """Reduce rows `(*batch, m)` bool to constraints `(*batch, n_contacts)` with any row set."""
+    """Reduce a mask of rows `(*batch, m)` to the constraints `(*batch, n_contacts)` with any row set."""
     if system.m == len(system.contacts):
         return rows
     parts = rows.split([contact.rows for contact in system.contacts], dim=-1)
@@ -82,20 +82,19 @@ def any_row(system: ConstrainedSystem, rows: Tensor) -> Tensor:
 
 
 def normal_rows(system: ConstrainedSystem, rows: Tensor) -> Tensor:
-    """Select the first (normal) row of each contact: `(*batch, n_contacts)` from `(*batch, m)`."""
+    """Select the first (normal) row of each contact, `(*batch, n_contacts)`, from rows `(*batch, m)`."""
     if system.m == len(system.contacts):
         return rows
-    first = [sum(contact.rows for contact in system.contacts[:i]) for i in range(len(system.contacts))]
-    return rows[..., first]
+    return rows[..., [own.start for own in system.rows.values()]]
 
 
 def pulling(system: ConstrainedSystem, active: Tensor, multiplier: Tensor) -> Tensor:
-    """Return the closed contacts `(*batch, n_contacts)` that would pull, λ `(*batch, m)` < 0, and open."""
+    """Return a mask of the closed contacts that open because they would pull, λ `(*batch, m)` < 0."""
     return normal_rows(system, multiplier < -PULL) & system.can_open & active
 
 
 def reached(system: ConstrainedSystem, active: Tensor, c: Tensor, cd: Tensor) -> Tensor:
-    """Return the open contacts `(*batch, n_contacts)` that close, c ≤ 0 and ċ < 0."""
+    """Return a mask `(*batch, n_contacts)` of the open contacts that close, c ≤ 0 and ċ < 0."""
     return normal_rows(system, (c <= 0.0) & (cd < -APPROACH)) & system.can_open & ~active
 
 
@@ -110,10 +109,10 @@ def project_velocity(eom: Equations, qd: Tensor) -> Tensor:
 def project_state(
     system: ConstrainedSystem, q: JointVector, qd: JointVector, active: ActiveContacts | None = None
 ) -> tuple[JointVector, JointVector]:
-    """Project (q, q̇) `(*batch, nq)` onto the constraint manifold, in the metric of M.
+    """Project (q, q̇) `(*batch, nq)` onto the constraint manifold in the metric of M.
 
-    Newton's iteration q ← q − M⁻¹Aᵀ(A M⁻¹ Aᵀ)⁺ c moves along the directions of the constraint forces;
-    q̇ ← q̇ − L A q̇ is the nearest velocity on the manifold in the metric of the kinetic energy. The result
+    The Newton iteration q ← q − M⁻¹Aᵀ(A M⁻¹ Aᵀ)⁺ c moves along the directions of the constraint forces, and
+    q̇ ← q̇ − L A q̇ is the closest velocity on the manifold in the metric of the kinetic energy. The result
     satisfies |c(q)| ≤ 1e−12 m (1e−5 m in float32) and A q̇ = 0 for the `active` contacts
     `(*batch, n_contacts)`, by default all.
 
@@ -142,9 +141,9 @@ def project_state(
 def sliding_friction(
     system: ConstrainedSystem, eom: Equations, active: Tensor, viscous_friction: float
 ) -> Tensor:
-    """Return the friction of active contacts `(*batch, nq)`, Q_z = Σ J_Eᵀ F_z, F_z = −θ_v (I − n nᵀ) ṗ_E.
+    """Return the friction of active contacts, Q_z = Σ J_Eᵀ F_z `(*batch, nq)` with F_z = −θ_v (I − n nᵀ) ṗ_E.
 
-    `active` is `(*batch, n_contacts)` bool, `viscous_friction` θ_v [N s/m].
+    `active` is a mask `(*batch, n_contacts)`, and `viscous_friction` is θ_v [N s/m].
     """
     Q_z = 0.0 * eom.Q_C
     for i, contact in enumerate(system.contacts):
@@ -159,7 +158,7 @@ def sliding_friction(
 
 
 def land(system: ConstrainedSystem, q: Tensor, qd: Tensor, closed: Tensor) -> Landing:
-    """Close the contacts reached by one state `(nq,)`, with their impact."""
+    """Close the contacts that a state `(nq,)` has reached, and apply their impact."""
     eom = system.equations(q, qd, active=closed)
     new = reached(system, closed, eom.c, eom.cd)
     if not bool(new.any()):
@@ -177,10 +176,10 @@ def contact_forces(
     Q_u: Tensor,
     viscous_friction: float,
 ) -> ContactForces:
-    """Return the normal and friction force at a state `(nq,)` under the torque Q_u [N m], after opening
-    contacts that would pull.
+    """Return the normal and friction forces at a state `(nq,)` under the torque Q_u [N m].
 
-    `landing` holds the closed contacts and their equations of motion, `viscous_friction` is θ_v [N s/m].
+    Contacts that would pull are opened first. `landing` contains the closed contacts and their equations of
+    motion, and `viscous_friction` is θ_v [N s/m].
     """
     closed, eom = landing.closed, landing.eom
     # Q = Q_C + Q_G + Q_D + Q_u

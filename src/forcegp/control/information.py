@@ -1,14 +1,15 @@
-"""Information of a motion about the unknown forces of a robot.
+"""Information that a motion provides about the unknown forces of a robot.
 
-The torque is linear in the unknowns, τ = τ₀ + Φ(q, q̇, q̈) θ with θ ~ N(0, U Uᵀ). These are base parameters
-of the links; for each joint a function of its speed (viscous and dry friction and Gaussian bumps) and one of
-its position (bumps); and the inertia of drives, if a fit has learned it. After a motion x with noise Σ
+The torque is linear in the unknowns, τ = τ₀ + Φ(q, q̇, q̈) θ with θ ~ N(0, U Uᵀ). The unknowns are the base
+parameters of the links; for each joint, a function of its speed (viscous friction, dry friction and Gaussian
+bumps) and a function of its position (bumps); and drive inertia, if a fit has learned it. After a motion x
+with torque noise Σ,
 
     Cov θ = U (1 + Uᵀ G U)⁻¹ Uᵀ,    G = Σ_i Φ(x_i)ᵀ Σ⁻¹ Φ(x_i),
 
-over independent samples i. `A` is the geometric mean over joints of the standard deviation of the torque in a
-region, `D` the entropy of θ. Sources: Swevers et al., *Optimal robot excitation and identification*
-(IEEE T-RA 1997); Pukelsheim, *Optimal Design of Experiments* (1993).
+over independent samples i. Criterion `A` is the geometric mean over joints of the standard deviation of the
+torque in a region, and `D` is the entropy of θ. Sources: Swevers et al., *Optimal robot excitation and
+identification* (IEEE T-RA 1997); Pukelsheim, *Optimal Design of Experiments* (1993).
 """
 
 from __future__ import annotations
@@ -31,16 +32,16 @@ LOOK = 0.1
 NOISE = 0.01
 """Standard deviation of torque noise, relative to the root mean square torque in the region."""
 FRICTION, BUMP = 0.1, 0.03
-"""Prior standard deviations of friction and of each bump, relative to the same."""
+"""Prior standard deviations of friction and of each bump, relative to the same torque."""
 SPEEDS, PLACES = 7, 5
-"""Number of bumps over the range of speeds and of positions of a joint."""
+"""Number of bumps over the range of speeds, and over the range of positions, of a joint."""
 DRY = 0.02
-"""Speed scale on which dry friction changes sign, relative to the largest speed of a joint."""
+"""Speed scale on which dry friction changes sign, relative to the maximum speed of a joint."""
 
 States = tuple[Tensor, Tensor, Tensor]
 """Positions, velocities and accelerations `(n, nq)`."""
 Criterion = Callable[[Tensor, "Unknowns"], Tensor]
-"""An objective to minimise, as a function of the information G `(p, p)` of a motion."""
+"""Objective to minimise, as a function of the information matrix G `(p, p)` of a motion and the unknowns."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,12 +49,12 @@ class Unknowns:
     """Unknown forces of a robot before a motion.
 
     Attributes:
-        robot: robot with kinematics, gravity and drives, and links as prior mean.
+        robot: robot that defines kinematics, gravity and drives, and the prior mean of the links.
         base: combinations of the inertial parameters that affect the motion.
-        low, high, fastest: `(nq,)` range of positions and speeds spanned by the functions.
-        region: states `(m, nq)` at which to predict the torque.
-        noise: `(nq,)` standard deviation of a torque sample [N m, N].
-        root: U `(p, p)`: the covariance of θ before the motion is U Uᵀ.
+        low, high, fastest: `(nq,)` range of positions, and largest speeds, over which the functions extend.
+        region: states `(m, nq)` at which the torque is to be predicted.
+        noise: `(nq,)` standard deviation of the noise of a torque sample [N m, N].
+        root: U `(p, p)`, where U Uᵀ is the covariance of θ before the motion.
     """
 
     robot: RobotModel
@@ -75,13 +76,13 @@ class Unknowns:
         region: States,
         noise: Tensor | None = None,
     ) -> Unknowns:
-        """Return the unknown forces of a robot without data.
+        """Return the unknown forces of a robot before any data were recorded.
 
         Args:
             robot: robot from the file.
-            low, high, fastest, region: as for the class.
-            noise: torque noise; by default 1 % of each joint's torques in the region plus 0.1 % of the
-                largest.
+            low, high, fastest, region: see the attributes.
+            noise: torque noise; by default, 1 % of each joint's root mean square torque in the region, but at
+                least 0.1 % of the largest.
 
         Raises:
             ParameterError: the region is empty.
@@ -93,9 +94,8 @@ class Unknowns:
         functions = torque.new_tensor([FRICTION] * 2 + [BUMP] * (SPEEDS + PLACES))
         base = base_parameters(robot)
         # β = B π
-        links = torch.linalg.cholesky(
-            _squared(torch.from_numpy(base.combination) * InertialPrior().scale(robot))
-        )
+        B = torch.from_numpy(base.combination) * InertialPrior().scale(robot)
+        links = torch.linalg.cholesky(B @ B.mT)
         friction, drives = (torque[:, None] * functions).flatten().diag(), torch.zeros_like(torque).diag()
         root = torch.block_diag(links, friction, drives)
         noise = NOISE * torque if noise is None else noise
@@ -108,7 +108,7 @@ class Unknowns:
         return {"links": slice(0, links), "friction": slice(links, drives), "drives": slice(drives, None)}
 
     def basis(self, q: Tensor, qd: Tensor) -> Tensor:
-        """Return functions of each joint `(n, nq, k)`: scaled q̇ and tanh q̇, bumps over q̇ and over q."""
+        """Return the functions of each joint `(n, nq, k)`: scaled q̇ and tanh q̇, and bumps over q̇ and q."""
         u, place = qd / self.fastest, 2.0 * (q - self.low) / (self.high - self.low) - 1.0
         bumps = [
             torch.exp(-0.5 * ((x[..., None] - torch.linspace(-1.0, 1.0, k).to(x)) * (k - 1) / 2.0) ** 2)
@@ -117,44 +117,44 @@ class Unknowns:
         return torch.cat([u[..., None], torch.tanh(u / DRY)[..., None], *bumps], dim=-1)
 
     def columns(self, q: Tensor, qd: Tensor, qdd: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the regressor Y of the links and Φ `(n, nq, p)` of all parameters at states `(n, nq)`."""
+        """Return the regressor Y of the links, and Φ `(n, nq, p)` for all parameters, at states `(n, nq)`."""
         Y = regressor(self.robot, q, qd, qdd)
         functions = torch.diag_embed(self.basis(q, qd).movedim(-1, 1)).movedim(1, -1)
         parts = [Y[..., list(self.base.columns)], functions.flatten(-2), torch.diag_embed(qdd)]
         return Y, torch.cat(parts, dim=-1)
 
     def information(self, Phi: Tensor, seconds: float) -> Tensor:
-        """Return G `(p, p)` of a motion of given duration, from Φ at its states."""
+        """Return the information matrix G `(p, p)` of a motion of given duration from Φ at its states."""
         A = (Phi / self.noise[:, None]).flatten(0, 1)
         return A.mT @ A * (seconds / LOOK / len(Phi))
 
     @cached_property
     def wanted(self) -> Tensor:
-        """Mean of φᵀφ over the region for the row φ of each joint `(nq, p, p)`."""
+        """Mean of φᵀφ over the region `(nq, p, p)`, where φ is the row of Φ for a joint."""
         Phi = self.columns(*self.region)[1].movedim(1, 0)
         return Phi.mT @ Phi / Phi.shape[1]
 
     def covariance_root(self, G: Tensor) -> Tensor:
-        """Return R with R Rᵀ = Cov θ after a motion."""
+        """Return R such that R Rᵀ is the covariance of θ after a motion with information G."""
         eye = torch.eye(self.root.shape[1], dtype=G.dtype)
         L = torch.linalg.cholesky(eye + self.root.mT @ G @ self.root)
         return torch.linalg.solve_triangular(L, self.root.mT, upper=False).mT
 
     def without_bumps(self) -> Unknowns:
-        """Return the unknowns with viscous and dry friction as the only functions."""
+        """Return the unknowns with viscous and dry friction as the only functions of the joints."""
         known = torch.ones_like(self.root[:, 0])
         functions = known[self.parts["friction"]].view(self.robot.nq, -1)
         functions[:, 2:] = 0.0
         return replace(self, root=known[:, None] * self.root)
 
     def after(self, G: Tensor) -> Unknowns:
-        """Return the unknowns after a motion with information G."""
+        """Return the remaining unknowns after a motion with information G."""
         return replace(self, root=self.covariance_root(G))
 
     def torque_std(self) -> Mapping[str, Tensor]:
         """Return the root mean square of the torque standard deviation over the region, `(nq,)` [N m, N].
 
-        The keys are `all` parameters, and the links or the friction alone.
+        The keys are `all` for all parameters, and `links`, `friction` and `drives` for these alone.
         """
         Phi = self.columns(*self.region)[1]
         parts = {"all": slice(None), **self.parts}
@@ -162,23 +162,19 @@ class Unknowns:
         return {name: x.square().sum(-1).mean(0).sqrt() for name, x in spread.items()}
 
 
-def _squared(X: Tensor) -> Tensor:
-    return X @ X.mT
-
-
 def rigid_torque(robot: RobotModel, q: Tensor, qd: Tensor, qdd: Tensor, Y: Tensor | None = None) -> Tensor:
-    """Return the torque of a motion `(n, nq)` from the robot file, Y π + armature q̈ − Q_D [N m, N]."""
+    """Return the torque that a motion requires, Y π + armature q̈ − Q_D `(n, nq)` [N m, N]."""
     Y = regressor(robot, q, qd, qdd) if Y is None else Y
     return Y @ parameter_vector(robot) + robot.armature * qdd - damping_force(robot, qd)
 
 
 def a_optimal(G: Tensor, unknowns: Unknowns) -> Tensor:
-    """Return the mean over joints of the log torque deviation (root mean square over the region)."""
+    """Return the mean over joints of the log torque standard deviation (root mean square over the region)."""
     return _log_std(unknowns.covariance_root(G), unknowns)
 
 
 def v_optimal(G: Tensor, unknowns: Unknowns) -> Tensor:
-    """Return `a_optimal` for links, viscous and dry friction only, which least squares can identify."""
+    """Return `a_optimal` for only links, viscous and dry friction, which least squares can identify."""
     return _log_std(unknowns.without_bumps().covariance_root(G), unknowns)
 
 
@@ -187,7 +183,7 @@ def _log_std(R: Tensor, unknowns: Unknowns) -> Tensor:
 
 
 def d_optimal(G: Tensor, unknowns: Unknowns) -> Tensor:
-    """Return ½ log of det Cov θ relative to its prior, per parameter."""
+    """Return ½ log det Cov θ relative to the prior, per parameter."""
     eye = torch.eye(unknowns.root.shape[1], dtype=G.dtype)
     return -0.5 * torch.logdet(eye + unknowns.root.mT @ G @ unknowns.root) / len(eye)
 

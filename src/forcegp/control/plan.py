@@ -1,7 +1,7 @@
 """The plan of a motion: reference, posture, orientation and initial state, drawn before the simulation.
 
-`MotionConfig` defines path, speed, pressing force and control of the tool. Inverse kinematics finds the joint
-positions for a pose of the tool.
+`MotionConfig` defines the path, speed, pressing force and control of the tool. Inverse kinematics computes
+the joint positions for a pose of the tool.
 """
 
 from __future__ import annotations
@@ -42,23 +42,23 @@ def check_setting(name: str, valid: bool, expected: str, got: object) -> None:
 
 @dataclass(frozen=True)
 class MotionConfig:
-    """A random motion of the tool over a surface or in free space, by default the paper's task.
+    """A random motion of the tool over a surface or in free space; the defaults are the paper's task.
 
     Args:
         duration: duration of the motion [s].
         dt: sampling period of the motion and of the controller [s].
-        center: centre of the rectangle, moved onto the surface if there is a contact [m].
+        center: centre of the rectangle of waypoints, moved onto the surface if there is a contact [m].
         size: side lengths of the rectangle, ahead and across [m].
         travel_time: time between two waypoints [s].
         max_acceleration: maximum acceleration of the end-effector along a line [m/s²].
-        lift_probability: probability that a waypoint lies above the surface; 0 stays in contact.
+        lift_probability: probability that a waypoint is above the surface; with 0, the tool stays in contact.
         lift_height: range of heights of such a waypoint [m].
-        pressing_force: range of the force on the surface, drawn for each line [N].
+        pressing_force: range of the force on the surface, which is drawn for each line [N].
         elbow_swing: variation of the null-space posture between lines [rad].
-        tool_turn: rotation of the tool about the surface normal, for better reach [rad].
+        tool_turn: rotation of the tool about the surface normal, for better reachability [rad].
         gains: gains of the controller.
-        torque_limit: torque limits, one per joint [N m], or `None` for the limits of the robot.
-        frame, point: tool frame and point without contact; by default the last frame of the robot.
+        torque_limit: torque limits, one per joint [N m]; `None` means the limits of the robot.
+        frame, point: tool frame and point if there is no contact; by default, the last frame of the robot.
 
     Raises:
         ParameterError: a value is out of range; the message names it.
@@ -102,15 +102,15 @@ class MotionConfig:
 
 
 POSE_TOLERANCE = 1e-10
-"""Largest error of a component of a reached pose (metres, or the sine of an angle)."""
+"""Largest error in a component of a reached pose (metres, or the sine of an angle)."""
 ITERATIONS = 150
-"""Maximum number of steps from each start; successful ones need about thirty."""
+"""Maximum number of steps from each start; successful starts need about thirty."""
 MAX_STEP = 0.3
 """Largest rotation of a joint in one step [rad], within the range of the linear model of the pose."""
 DAMPING = 0.1
-"""Damping of least squares relative to the squared error; it vanishes as the pose is reached."""
+"""Damping of the least-squares steps relative to the squared error; it vanishes as the pose is reached."""
 LEANING = 0.1
-"""Fraction of the way to the preferred joint positions per step in the null space of the pose."""
+"""Fraction of the way to the preferred joint positions that a step covers in the null space of the pose."""
 
 
 def inverse_kinematics(
@@ -122,20 +122,20 @@ def inverse_kinematics(
     starts: Tensor,
     near: JointVector,
 ) -> JointVector:
-    """Return joint positions `(nq,)` at which a point of a frame has a pose, by damped least squares.
+    """Return joint positions `(nq,)` at which a point in a frame has a given pose, by damped least squares.
 
-    Each step is Jᵀ(J Jᵀ + μ I)⁻¹ e; the first half of the steps also move towards `near` `(nq,)` in the null
-    space of J, and the solution closest to `near` from all `starts` `(k, nq)` is returned. The pose in the
-    world is `(3,)` [m] and `(3, 3)`; with fewer than six joints, only the position is matched.
+    Each step is Jᵀ(J Jᵀ + μ I)⁻¹ e. The first half of the steps also move towards `near` `(nq,)` in the null
+    space of J. Of the solutions from all `starts` `(k, nq)`, the closest to `near` is returned. The pose in
+    the world is `(3,)` [m] and `(3, 3)`; with fewer than six joints, only the position is matched.
 
     Raises:
-        NumericalError: no start leads to the pose within the joint limits.
+        NumericalError: the pose is not reached from any start within the joint limits.
     """
     index, x = robot.frame_index(frame), kinematics.as_point(robot, point)
     q = starts.clamp(robot.lower, robot.upper)
     for k in range(ITERATIONS):
         error, J, _ = _pose_error(robot, q, index, x, position, rotation)
-        # Leaning against a joint limit would keep the pose from being reached, so the last steps do not.
+        # Leaning against a joint limit would prevent convergence to the pose, so the last steps do not lean.
         leaning = LEANING * (near - q) if k < ITERATIONS // 2 else torch.zeros_like(q)
         q = q + _damped_step(J, error, leaning).clamp(-MAX_STEP, MAX_STEP)
         q = q.clamp(robot.lower, robot.upper)
@@ -156,8 +156,8 @@ def _pose_error(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the error of pose `(k, 6)` or position `(k, 3)`, its Jacobian, and whether the axes agree.
 
-    The sine in the orientation error also vanishes after half a turn, for which the trace of the relative
-    rotation is −1 instead of 3.
+    The sine in the orientation error also vanishes at an error of half a turn, for which the trace of the
+    relative rotation is −1 instead of 3.
     """
     poses = kinematics.link_poses(robot, q)
     reached, origin = kinematics.pose_of_frame(robot, poses, index)
@@ -170,7 +170,7 @@ def _pose_error(
 
 
 def _damped_step(J: Tensor, error: Tensor, leaning: Tensor) -> Tensor:
-    """Return Jᵀ(J Jᵀ + μ I)⁻¹(e − J l) + l."""
+    """Return the step Jᵀ(J Jᵀ + μ I)⁻¹(e − J l) + l."""
     damping = DAMPING * (error * error).sum(-1) + torch.finfo(error.dtype).eps
     missing = (error - (J @ leaning[..., None])[..., 0])[..., None]
     damped = damping[..., None, None] * torch.eye(min(J.shape[-2:]), dtype=J.dtype)
@@ -180,10 +180,10 @@ def _damped_step(J: Tensor, error: Tensor, leaning: Tensor) -> Tensor:
 
 
 def tool_rotation(normal: Vector3, ahead: Vector3, tool_axis: Vector3) -> Rotation:
-    """Return the axes `(3, 3)` of a frame with `tool_axis` into the surface, after half a turn about the side
-    axis.
+    """Return the axes `(3, 3)` of a frame in which `tool_axis` points into the surface.
 
-    `normal` and `ahead` are the unit normal out of the surface and a unit tangent, `(3,)` each.
+    Half a turn about the side axis turns the tool down. `normal` and `ahead` are the unit normal out of the
+    surface and a unit tangent, `(3,)` each.
     """
     down = torch.stack([-ahead, torch.linalg.cross(normal, ahead), -normal], dim=-1)
     return down @ torch.from_numpy(turn_z(tool_axis.double().numpy()).T).to(down)
@@ -195,13 +195,13 @@ STARTS = 64
 
 @dataclass(frozen=True)
 class Plan:
-    """Reference of the controller.
+    """Reference for the controller.
 
     Attributes:
-        contacts: names of the tool's contacts, empty in free space.
+        contacts: names of the tool's contacts; empty in free space.
         frame, point: frame and point of the tool.
         reference: motion of the tool point.
-        targets: targets of the controller, `(n, …)`, one per sample.
+        targets: targets of the controller `(n, …)`, one per sample.
         start: `(nq,)` joint positions at the first waypoint.
     """
 
@@ -213,7 +213,7 @@ class Plan:
     start: Tensor
 
     def command(self, eom: Equations, q: Tensor, qd: Tensor, k: int | Tensor, gains: Gains) -> Tensor:
-        """Return the unlimited motor torque `(*batch, nq)` for the targets of samples `(*batch,)` [N m]."""
+        """Return the motor torque before limits, `(*batch, nq)` [N m], for the targets of samples k."""
         target = type(self.targets)(*(values[k] for values in self.targets))
         if isinstance(target, JointTarget):
             return joint_torque(eom, q, qd, target, gains)
@@ -221,7 +221,7 @@ class Plan:
         return control_torque(tool, eom, q, qd, target, self.press(eom), gains)
 
     def press(self, eom: Equations) -> Tensor:
-        """Return the sum of generalized unit normal forces on the tool, Σ Jᵀn/|n| `(*batch, nq)`."""
+        """Return the sum of the generalized unit normal forces on the tool, Σ Jᵀn/|n| `(*batch, nq)`."""
         total = 0.0 * eom.Q_C
         for name in self.contacts:
             at = eom.contact_points[name]
@@ -232,8 +232,8 @@ class Plan:
 def make_plan(system: ConstrainedSystem, config: MotionConfig, generator: torch.Generator) -> Plan:
     """Draw a motion of the tool over the surface of the system's first contact, or in free space.
 
-    The tool axis points from the origin of its frame to the centre of the frame's contacts. An arm with fewer
-    than six joints follows only the position.
+    The tool axis points from the origin of the tool frame to the centre of the frame's contacts. An arm with
+    fewer than six joints follows only the position.
 
     Raises:
         NumericalError: the centre of the rectangle or the first waypoint is out of reach.
@@ -257,12 +257,12 @@ def make_plan(system: ConstrainedSystem, config: MotionConfig, generator: torch.
     ahead = math.cos(config.tool_turn) * u + math.sin(config.tool_turn) * v
     rotation = tool_rotation(normal, ahead, _tool_axis(middle))
     draws = 2.0 * torch.rand(STARTS, robot.nq, dtype=torch.float64, generator=generator) - 1.0
-    # Furthest from the joint limits; zero where there are none.
+    # Joint positions furthest from the limits; zero for joints without limits.
     nearest = torch.nan_to_num(0.5 * (robot.lower + robot.upper), nan=0.0, posinf=0.0, neginf=0.0)
     starts = nearest + (torch.linspace(0.0, math.pi, STARTS)[:, None] * draws).to(robot.dtype)
     home = inverse_kinematics(robot, frame, point, chart.center, rotation, starts, nearest)
     start = inverse_kinematics(robot, frame, point, reference.waypoints[0], rotation, home[None], home)
-    # Along the null space of the tool's Jacobian, the elbow swings.
+    # The elbow swings along the null space of the tool's Jacobian.
     J = kinematics.frame_jacobian(robot, home, frame, point)[task_rows(robot.nq)]
     free = torch.linalg.svd(J)[2][len(J) :]
     swing = 2.0 * torch.rand(count - 1, len(free), dtype=torch.float64, generator=generator) - 1.0
@@ -279,7 +279,7 @@ def make_plan(system: ConstrainedSystem, config: MotionConfig, generator: torch.
 
 
 def joint_plan(system: ConstrainedSystem, config: MotionConfig, t: Tensor, motion: JointTarget) -> Plan:
-    """Return a plan that follows a joint motion `(n, nq)` at times t `(n,)` with linear interpolation."""
+    """Return a plan that follows a joint motion `(n, nq)` at times t `(n,)`, interpolated linearly."""
     robot = system.robot
     touching = [c for c in system.contacts if isinstance(c, SurfaceContact)]
     frame, point = (touching[0].frame, touching[0].point) if touching else (config.frame, config.point)
@@ -306,7 +306,7 @@ def _tool_axis(point: Tensor) -> Tensor:
 
 
 def _draw_push(reference: Reference, config: MotionConfig, generator: torch.Generator) -> Tensor:
-    """Draw the force into the surface `(n,)`, one value per line, zero on lines off the surface."""
+    """Draw the force into the surface `(n,)`: one value per line, and zero for lines off the surface."""
     low, high = config.pressing_force
     draws = torch.rand(len(reference.travel_time), dtype=torch.float64, generator=generator)
     return (low + (high - low) * draws).to(reference.t.dtype)[reference.segment] * reference.on_surface

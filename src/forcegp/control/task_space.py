@@ -1,4 +1,4 @@
-"""Task-space inverse dynamics control with null-space control of redundant degrees of freedom.
+"""Task-space inverse-dynamics control, with null-space control of redundant degrees of freedom.
 
 The task is the pose of the tool, or only its position for an arm with fewer than six joints. A redundant arm
 moves its elbow in the null space of the task Jacobian, which does not affect the error dynamics of the task
@@ -18,7 +18,7 @@ from forcegp.kinematics import PointMotion
 
 POSE_ROWS, POSITION_ROWS = 6, 3
 SINGULAR = 1e-3
-"""Smallest pivot of √(J Jᵀ), below which joint speeds exceed task speeds a thousandfold."""
+"""Smallest allowed pivot of √(J Jᵀ), below which joint speeds exceed task speeds a thousandfold."""
 
 
 @dataclass(frozen=True)
@@ -42,7 +42,7 @@ class Gains:
 
 
 class Target(NamedTuple):
-    """Target of the controller at an instant.
+    """Target of the controller at one instant.
 
     Attributes:
         position, velocity, acceleration: `(*batch, 3)` motion of the tool point [m], [m/s], [m/s²].
@@ -60,7 +60,7 @@ class Target(NamedTuple):
 
 
 class JointTarget(NamedTuple):
-    """Positions, velocities and accelerations of the joints at an instant, `(*batch, nq)`."""
+    """Target positions, velocities and accelerations of the joints at one instant, `(*batch, nq)` each."""
 
     q: Tensor
     qd: Tensor
@@ -68,14 +68,14 @@ class JointTarget(NamedTuple):
 
 
 def task_rows(nq: int) -> slice:
-    """Return the rows of [ω; ṗ] that an arm with nq joints can follow: all for six joints, ṗ for fewer."""
+    """Return the rows of [ω; ṗ] that an arm with nq joints can follow: all for six or more joints, else ṗ."""
     return slice(0 if nq >= POSE_ROWS else POSITION_ROWS, POSE_ROWS)
 
 
 def orientation_error(rotation: Tensor, target: Tensor) -> Tensor:
-    """Return e_O = ½ Σᵢ rᵢ × rᵢᵈ of axes `(*batch, 3, 3)`: sin(angle) times the rotation axis, `(*batch, 3)`.
+    """Return e_O = ½ Σᵢ rᵢ × rᵢᵈ `(*batch, 3)`, sin(angle) times the rotation axis, for frames' axes rᵢ.
 
-    The sum is the vector of the skew part of R_d Rᵀ, in world axes (Siciliano et al., eq. 3.98).
+    The sum is the vector of the skew-symmetric part of R_d Rᵀ, in world axes (Siciliano et al., eq. 3.98).
     """
     E = target @ rotation.mT
     skew = E - E.mT
@@ -83,7 +83,7 @@ def orientation_error(rotation: Tensor, target: Tensor) -> Tensor:
 
 
 def task_acceleration(tool: PointMotion, target: Target, gains: Gains) -> Tensor:
-    """Return [ω̇; p̈] `(*batch, 6)` for which both errors obey ë + k_D ė + k_P e = 0."""
+    """Return [ω̇; p̈] `(*batch, 6)` for which both errors satisfy ë + k_D ė + k_P e = 0."""
     omega, velocity = tool.twist[..., :3], tool.twist[..., 3:]
     turning = (
         gains.orientation_stiffness * orientation_error(tool.rotation, target.rotation)
@@ -101,8 +101,8 @@ def joint_acceleration(tool: PointMotion, task: Tensor, posture: Tensor) -> Tens
     """Return y = J⁺(a − J̇q̇) + (I − J⁺J) y₀, with the posture acceleration in the null space of the task.
 
     a `(*batch, 6)` is the task acceleration and y₀ `(*batch, nq)` the posture acceleration. J contains the
-    rows of the tool Jacobian that the arm can follow (`task_rows`), in the least-squares sense with fewer
-    joints.
+    rows of the tool Jacobian that the arm can follow (`task_rows`). If the arm has fewer joints than rows,
+    the task is followed in the least-squares sense.
 
     Raises:
         NumericalError: the arm is in a singular pose.
@@ -132,15 +132,15 @@ def control_torque(
     press: Tensor,
     gains: Gains,
 ) -> Tensor:
-    """Return the unlimited motor torque Q_u = M y − Q_K − Q_n F of inverse dynamics control [N m].
+    """Return the motor torque Q_u = M y − Q_K − Q_n F of inverse-dynamics control, before limits [N m].
 
     Args:
-        tool: the tool at the state.
-        eom: the equations of motion at the state; M and Q_K = Q_C + Q_G + Q_D are used.
+        tool: motion of the tool at the state.
+        eom: equations of motion at the state, of which M and Q_K = Q_C + Q_G + Q_D are used.
         q, qd: `(*batch, nq)` positions and velocities.
         target: desired motion, with `push` as F.
-        press: Q_n `(*batch, nq)`, Jᵀn for unit normal forces at the actual tool position, summed over its
-            contacts; a force along the normal of the reference would push the tool off a convex surface.
+        press: Q_n `(*batch, nq)`, Jᵀn of unit normal forces at the actual tool position, summed over its
+            contacts; a force along the normal at the reference would push the tool off a convex surface.
         gains: feedback gains.
 
     Raises:
@@ -152,6 +152,6 @@ def control_torque(
 
 
 def joint_torque(eom: Any, q: Tensor, qd: Tensor, target: JointTarget, gains: Gains) -> Tensor:
-    """Return the motor torque M (q̈_d + k_D ė + k_P e) − Q_K `(*batch, nq)`, with the position gains."""
+    """Return the motor torque M (q̈_d + k_D ė + k_P e) − Q_K `(*batch, nq)`, using the position gains."""
     y = target.qdd + gains.position_damping * (target.qd - qd) + gains.position_stiffness * (target.q - q)
     return (eom.M @ y[..., None])[..., 0] - eom.Q_K

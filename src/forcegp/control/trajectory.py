@@ -1,7 +1,7 @@
 """Reference motions of the end-effector: random points joined by straight lines (section 5.2 of the paper).
 
 Points are drawn in a chart (u, v, h), with u and v along the sides of a rectangle that touches the surface at
-its centre, and the height h above the surface. A line in the chart is traversed with a trapezoidal velocity
+its centre, and with height h above the surface. A line in the chart is traversed with a trapezoidal velocity
 profile (Siciliano et al., *Robotics*, section 4.2.1) and then mapped onto the surface.
 """
 
@@ -17,7 +17,7 @@ from forcegp.constraints.surface import Plane, Surface
 from forcegp.errors import ForceGPError
 
 PROJECTION_STEPS = 8
-"""Number of Newton steps onto a surface; one is exact for a signed distance, each more doubles the digits."""
+"""Number of Newton steps onto a surface; one is exact for a signed distance, else each doubles the digits."""
 
 
 class Trapezoid(NamedTuple):
@@ -36,7 +36,7 @@ class Trapezoid(NamedTuple):
     acceleration: Tensor
 
     def at(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return distance, speed and acceleration at time t since the segment began, held after its end."""
+        """Return distance, speed and acceleration at time t after the start; the motion ends at rest."""
         t = torch.minimum(t.clamp(min=0.0), self.travel_time)
         remaining = self.travel_time - t
         a, blend = self.acceleration, self.blend_time
@@ -53,10 +53,10 @@ class Trapezoid(NamedTuple):
 
 
 def trapezoid(length: Tensor, travel_time: float, max_acceleration: float) -> Trapezoid:
-    """Return the profiles for lengths d `(*batch,)` [m] and travel time T with the maximum acceleration a.
+    """Return the profiles for lengths d `(*batch,)` [m] with travel time T and maximum acceleration a.
 
-    The blend time is t_c = T/2 − ½ √(T² − 4 d/a). If the acceleration a is too small to cover d in T, the
-    `travel_time` of the result is 2 √(d/a). Source: Siciliano et al., eqs. 4.7 and 4.8.
+    The blend time is t_c = T/2 − ½ √(T² − 4 d/a). If the acceleration a is too small to cover d in time T,
+    the `travel_time` of the result is 2 √(d/a). Source: Siciliano et al., eqs. 4.7 and 4.8.
 
     Raises:
         ForceGPError: the time or the acceleration is not positive.
@@ -75,9 +75,9 @@ class Chart:
     """Coordinates (u, v, h) about a point: two along the surface, and the height above it.
 
     Args:
-        center: `(3,)` origin, on the surface if there is one [m].
-        axes: `(3, 3)` rows: directions of u, v, and the normal at the centre.
-        surface: the curved surface under u and v; `None` for a linear chart, on a plane and in free space.
+        center: `(3,)` origin, which is on the surface if there is one [m].
+        axes: `(3, 3)`, with the directions of u and v and the normal at the centre as rows.
+        surface: the curved surface under u and v; `None` for a linear chart (on a plane or in free space).
     """
 
     center: Tensor
@@ -108,7 +108,7 @@ class Chart:
         return foot + w[..., 2:] * normal
 
     def motion(self, w: Tensor, wd: Tensor, wdd: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return position, velocity and acceleration in the world of a motion in the chart, `(n, 3)` each."""
+        """Return the world position, velocity and acceleration of a motion in the chart, `(n, 3)` each."""
         if self.surface is None:
             return self.point(w), wd @ self.axes, wdd @ self.axes
 
@@ -125,7 +125,7 @@ class Chart:
 
 
 def project(surface: Surface, p: Tensor) -> Tensor:
-    """Return the point of a surface reached from p `(*batch, 3)` along the gradient, p ← p − c ∇c/|∇c|²."""
+    """Return the point on a surface reached from p `(*batch, 3)` along the gradient, p ← p − c ∇c/|∇c|²."""
     for _ in range(PROJECTION_STEPS):
         gradient = surface.gradient(p)
         p = p - (surface.value(p) / (gradient * gradient).sum(-1))[..., None] * gradient
@@ -143,7 +143,7 @@ class Reference:
         on_surface: `(n,)` bool, true if the line is on the surface.
         waypoints: `(segments + 1, 3)` end points of the lines, in the world [m].
         travel_time: `(segments,)` travel time of each line [s].
-        lengthened: number of segments slowed down to respect the maximum acceleration.
+        lengthened: number of lines whose travel time was increased to respect the maximum acceleration.
     """
 
     t: Tensor
@@ -164,7 +164,7 @@ def draw_waypoints(
     lift_probability: float,
     generator: torch.Generator,
 ) -> Tensor:
-    """Draw chart coordinates `(count, 3)` [m] uniformly in a rectangle, some lifted to a uniform height."""
+    """Draw chart coordinates `(count, 3)` [m] uniformly in a rectangle, and lift some to a random height."""
     draws = torch.rand(count, 4, dtype=torch.float64, generator=generator)
     across = (draws[:, :2] - 0.5) * torch.tensor(size, dtype=torch.float64)
     low, high = lift_height
@@ -175,10 +175,10 @@ def draw_waypoints(
 def straight_lines(
     chart: Chart, waypoints: Tensor, t: Tensor, travel_time: float, max_acceleration: float
 ) -> Reference:
-    """Return lines between waypoints `(k, 3)` of a chart with trapezoidal velocity, at times t `(n,)` ≥ 0.
+    """Return the motion along lines between waypoints `(k, 3)` of a chart at times t `(n,)` ≥ 0.
 
-    Speed and acceleration refer to the chart and, on a plane or in free space, also to the end-effector. The
-    last waypoint is held after the end; travel time and acceleration are as in `trapezoid`.
+    The velocity is trapezoidal, with travel time and acceleration as in `trapezoid`. Speed and acceleration
+    refer to the chart and, on a plane or in free space, also to the end-effector. The motion ends at rest.
     """
     lines = waypoints.diff(dim=0)
     length = torch.linalg.vector_norm(lines, dim=-1)

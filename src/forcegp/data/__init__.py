@@ -1,4 +1,4 @@
-"""Logged motion: data sets and their files, derivatives, noise, selection and splits."""
+"""Logged motion: data sets and their files, derivatives, noise, selection, and splits."""
 
 from forcegp.data.dataset import Dataset as Dataset
 from forcegp.data.dataset import NotLoggedError as NotLoggedError
@@ -13,6 +13,5 @@ from forcegp.data.selection import split_by_selection as split_by_selection
 from forcegp.data.selection import split_by_stretches as split_by_stretches
 from forcegp.data.selection import standardized as standardized
 from forcegp.data.selection import standardized_inputs as standardized_inputs
-from forcegp.data.selection import with_noise as with_noise
 from forcegp.data.selection import without_marked_impacts as without_marked_impacts
 from forcegp.data.stream import StreamedDataset as StreamedDataset

@@ -1,4 +1,4 @@
-"""Torques that clip at a limit of the amplifier."""
+"""Detection of torques that are clipped at a limit of the amplifier."""
 
 from __future__ import annotations
 
@@ -10,24 +10,24 @@ from forcegp.rows import Intervals, intervals
 Array = NDArray[np.float64]
 
 CLIPPED_RUN, OFTENER = 3, 5.0
-"""Successive rows at an extreme value that make a plateau; factor by which a clipped value occurs more
-often than its neighbours; at the peaks of a sine, 2.4."""
+"""Minimum number of successive rows at an extreme value that form a plateau, and factor by which a clipped
+value occurs more often than its neighbours (2.4 at the peaks of a sine)."""
 BAND = 0.03
-"""Part of the range of a torque that noise of a clipped one stays within."""
+"""Width of the band of a noisy clipped torque, as a fraction of the torque's range."""
 PLATEAUS, FLAT_ROWS, FLAT = 3, 10, 0.35
-"""Least plateaus of a noisy clipped torque while its joint moves, rows of each, and variance of steps over
-twice that of the values in their middle halves: 1 for white noise about a limit, 0.43 for the current of a
-real drive, 0.05 to 0.3 at smooth peaks."""
+"""Minimum number of plateaus of a noisy clipped torque while its joint moves, of rows in each, and minimum
+variance of steps over twice the variance of values in the middle halves of plateaus: 1 for white noise about
+a limit, 0.43 for the current of a real drive, and 0.05 to 0.3 at smooth peaks."""
 MOVES = 0.02
-"""Part of its largest speed from which a joint moves; the torque of one that rests is constant."""
+"""Fraction of its maximum speed above which a joint moves; the torque of a joint at rest is constant."""
 
 
 def clipped(tau: Array, qd: Array, usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
-    """Mask `(n, nq)` of unfiltered torques that stay at the largest or smallest value of their joint.
+    """Return a mask `(n, nq)` of unfiltered torques that stay at the maximum or minimum of their joint.
 
     Args:
-        tau, qd: torques and velocities `(n, nq)`, in order of time.
-        usable: rows that are looked at `(n,)`.
+        tau, qd: torques and velocities `(n, nq)`, in time order.
+        usable: mask of the rows to check `(n,)`.
     """
     found = np.zeros(tau.shape, bool)
     for j in range(tau.shape[1]):
@@ -41,7 +41,7 @@ def clipped(tau: Array, qd: Array, usable: NDArray[np.bool_]) -> NDArray[np.bool
 
 
 def limits_of(values: Array) -> tuple[float, float]:
-    """Value taken most often near the maximum, and near the minimum: a filter overshoots a limit."""
+    """Return the most frequent values near the maximum and minimum, which a filter's overshoot may exceed."""
     limits = []
     for extreme in (values.max(), values.min()):
         near, counts = np.unique(
@@ -53,19 +53,19 @@ def limits_of(values: Array) -> tuple[float, float]:
 
 
 def _plateaus(tau: Array, speed: Array, valid: NDArray[np.bool_], extreme: float) -> Intervals:
-    """Runs of rows in which the torque of a joint is clipped at an extreme value, exactly or up to noise."""
+    """Return the runs of rows in which a joint's torque is clipped at `extreme`, exactly or up to noise."""
     moves = speed > MOVES * speed[valid].max()
     usable, width = tau[valid], BAND * np.ptp(tau[valid])
     if extreme == 0.0:
         return ()
-    # A value that the column reaches far more often than its neighbourhood is a limit.
+    # A value that occurs far more often than neighbouring values is a limit.
     at = (tau == extreme) & valid
     near = np.abs(usable - extreme) <= width
     runs = tuple((a, b) for a, b in intervals(at) if b - a >= CLIPPED_RUN)
     others = (near.sum() - at.sum()) / max(len(np.unique(usable[near])) - 1, 1)
     if runs and at.sum() > OFTENER * max(others, 1.0):
         return runs
-    # With noise, a band of values, beside the next one of the same width.
+    # With noise, compare a band of values with the adjacent band of equal width.
     band = (np.abs(tau - extreme) <= width) & valid & moves
     beside = (np.abs(tau - extreme) > width) & (np.abs(tau - extreme) <= 2.0 * width) & valid & moves
     runs = tuple((a, b) for a, b in intervals(band) if b - a >= FLAT_ROWS)

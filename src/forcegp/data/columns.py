@@ -1,4 +1,4 @@
-"""The meaning of the columns of a log: `t`, `q.<joint>`, `contact.<name>`, `multiplier.<contact>`, …"""
+"""Interpretation of the columns of a log: `t`, `q.<joint>`, `contact.<name>`, `multiplier.<contact>`, …"""
 
 from __future__ import annotations
 
@@ -33,7 +33,7 @@ def unparse(data: Fields) -> tuple[Columns, DataHeader]:
 
 
 def parse(source: str, raw: Columns, header: DataHeader, method: SavitzkyGolay | None) -> Arrays:
-    """Return the arrays of a data set from file columns; a `DataError` names the nearest existing column."""
+    """Return a data set's arrays from file columns; a `DataError` suggests the nearest existing column."""
     joints = header.joint_names or tuple(name[2:] for name in raw if name.startswith("q."))
     if not joints:
         raise DataError(f"{source}: no column 'q.<joint>'", expected="one per joint", got=_listing(raw))
@@ -57,7 +57,7 @@ def parse(source: str, raw: Columns, header: DataHeader, method: SavitzkyGolay |
         )
     if method and absent:
         header = _fill_in(source, fields, absent, method, header)
-    # What a file without a header does not say, its columns do.
+    # Without a header in the file, the names follow from the columns.
     fields["header"] = header.model_copy(update={"joint_names": joints, "contact_names": contacts})
     return fields
 
@@ -130,7 +130,7 @@ def _segment(source: str, unread: Columns, n: int) -> NDArray[np.int64]:
 def _extras(
     source: str, unread: Columns, joints: Sequence[str], contacts: Sequence[str]
 ) -> tuple[dict[str, NDArray[np.float64]], dict[str, dict[str, NDArray[np.float64]]]]:
-    """Remove joint vectors and contact quantities from the remaining columns and return them."""
+    """Remove joint vectors and contact quantities from the unread columns, and return them."""
     extras: dict[str, NDArray[np.float64]] = {}
     contact_extras: dict[str, dict[str, NDArray[np.float64]]] = {}
     names = dict.fromkeys(column.split(".", 1)[0] for column in unread if "." in column)
@@ -150,7 +150,7 @@ def _extras(
 def _fill_in(
     source: str, fields: Arrays, absent: set[str], method: SavitzkyGolay, header: DataHeader
 ) -> DataHeader:
-    """Compute missing `qd` and `qdd`, and add the standard deviation of the computed q̈."""
+    """Compute `qd` and `qdd` if missing, and add the standard deviation of the computed q̈ to the header."""
     of, order = ("q", 2) if "qd" in absent else ("qd", 1)
 
     def derive(name: str, degree: int) -> tuple[NDArray[np.float64], NDArray[np.float64]]:

@@ -37,16 +37,16 @@ def _time(data: Fields) -> str:
 
 
 class NotLoggedError(DataError, AttributeError):
-    """A quantity that is not in the data set."""
+    """Raised if a quantity is not in the data set."""
 
 
 @dataclass(frozen=True, eq=False)
 class Dataset(Fields):
-    """Logged motion of a robot with `nq` joints, `n` samples; SI units, radians.
+    """Logged motion of a robot with `nq` joints and `n` samples, in SI units and radians.
 
     Args:
         t: `(n,)` time [s], strictly increasing within a segment unless `header.ordered` is false.
-        q, qd, qdd: `(n, nq)` joint positions, velocities, accelerations.
+        q, qd, qdd: `(n, nq)` joint positions, velocities and accelerations.
         tau: `(n, nq)` motor torque Q_u [N m, N].
         joint_names: the joints in column order.
         contact: name → `(n,)` bool, whether the contact is closed.
@@ -55,7 +55,7 @@ class Dataset(Fields):
         segment: `(n,)` trajectory number of each row; by default a single trajectory.
         header: noise, sampling period, robot, seed and provenance.
 
-    Extras are attributes too: `data.Q_z`, `data.multiplier["table"]`.
+    Extras are also available as attributes: `data.Q_z`, `data.multiplier["table"]`.
 
     Example:
         >>> import forcegp, torch
@@ -68,7 +68,7 @@ class Dataset(Fields):
         (2, 10, 40)
 
     Raises:
-        DataError: a shape, type, value or time is invalid; the message names column and row.
+        DataError: a shape, type, value or time is invalid; the message names the column and row.
     """
 
     def __post_init__(self) -> None:
@@ -81,7 +81,7 @@ class Dataset(Fields):
         fields.check_values(self)
 
     def __repr__(self) -> str:
-        """Return a summary: samples, joints, duration, contacts, and additional quantities."""
+        """Return a summary of samples, joints, duration, contacts and additional quantities."""
         robot = f" of {self.header.robot!r}" if self.header.robot else ""
         parts = [f"{len(self)} samples of {self.nq} joints"]
         if len(self):
@@ -106,9 +106,9 @@ class Dataset(Fields):
         )
 
     def __getitem__(self, rows: object) -> Dataset:
-        """Return the data set of some rows, given as a slice, a mask `(n,)` or indices in any order.
+        """Return the data set with only the given rows, as a slice, a mask `(n,)` or indices in any order.
 
-        For rows that are not in time order, `header.ordered` is false; they cannot be split into stretches.
+        If the rows are not in time order, `header.ordered` is false, and they cannot be split into stretches.
 
         Raises:
             DataError: a mask has the wrong length, or an index does not exist.
@@ -135,11 +135,11 @@ class Dataset(Fields):
 
     @property
     def contact_names(self) -> tuple[str, ...]:
-        """Names of the contacts, in order."""
+        """Names of the contacts, in column order."""
         return tuple(self.contact)
 
     def active(self, contacts: Sequence[str]) -> Tensor:
-        """Return the state of the named contacts, `(n, len(contacts))` bool, true if closed.
+        """Return whether each of the named contacts is closed, `(n, len(contacts))` bool.
 
         Raises:
             DataError: the state of a contact is not logged.
@@ -147,19 +147,19 @@ class Dataset(Fields):
         return fields.contact_table(self, contacts)
 
     def replace(self, **fields: object) -> Dataset:
-        """Return a data set with some fields changed."""
+        """Return a data set with the given fields changed."""
         return dataclasses.replace(self, **fields)  # pyright: ignore[reportArgumentType]
 
     def with_step(self, step: str) -> Dataset:
-        """Return the same data with one more line of provenance in the header."""
+        """Return the same data with another line of provenance in the header."""
         return self.replace(header=self.header.with_step(step))
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> Dataset:
-        """Return the same data on another device or in another precision."""
+        """Return the same data on a different device or in a different precision."""
         return self._map(lambda x: x.to(device=device, dtype=dtype if x.is_floating_point() else None))
 
     def select(self, joints: Sequence[str]) -> Dataset:
-        """Return the data set with only the given joints, in this order, such as `robot.joint_names`.
+        """Return the data set with only the given joints (such as `robot.joint_names`), in this order.
 
         Raises:
             UnknownNameError: a joint is not in the data set; the message suggests the nearest name.
@@ -173,26 +173,26 @@ class Dataset(Fields):
         return self.replace(**fields, extras=extras, joint_names=tuple(joints), header=header)
 
     def check_robot(self, robot: RobotModel) -> None:
-        """Check that the joints match those of the robot, in the same order.
+        """Check that the joints match those of the robot and are in the same order.
 
         Warns:
             RobotMismatchWarning: the robot's parameters differ from those of the logged robot.
 
         Raises:
-            DataError: joints are missing, unknown or in another order; the hint suggests a remedy.
+            DataError: joints are missing, unknown or in the wrong order; the hint suggests a remedy.
         """
         fields.check_robot(self, robot)
 
     def plot(
         self, quantity: str | None = None, *, joints: Sequence[str] | None = None, ax: Target = None
     ) -> list[Axes]:
-        """Plot the log over time, with shading for contact, and return the axes.
+        """Plot the log over time, with contact periods shaded, and return the axes.
 
         Args:
             quantity: a logged quantity, such as `"tau"` or `"multiplier"`, with one panel per joint or
-                contact; by default q, qd, tau and qdd, one panel each with all joints.
-            joints: names of the joints; by default all.
-            ax: matplotlib axes to draw on, one per panel; by default a new figure.
+                contact; by default q, qd, tau and qdd, each in one panel with all joints.
+            joints: names of the joints to plot; by default all.
+            ax: matplotlib axes to draw on, one per panel; by default, a new figure is created.
 
         Raises:
             ForceGPError: the quantity or joint does not exist, or the number of axes is wrong.
@@ -202,7 +202,7 @@ class Dataset(Fields):
         return plot(self, quantity, joints, ax)
 
     def _repr_html_(self) -> str:
-        """Return a table for notebooks with the range of motion of each joint."""
+        """Return an HTML table for notebooks with the range of motion of each joint."""
         names = {"q": "rad, m", "qd": "rad/s, m/s", "tau": "N m, N", "qdd": "rad/s², m/s²"}
         head = ("joint", *(f"{name} [{unit}]" for name, unit in names.items()))
         rows: list[tuple[object, ...]] = []
@@ -212,12 +212,12 @@ class Dataset(Fields):
         return html_table(repr(self).strip("<>"), head, rows, self.header.provenance)
 
     def _map(self, change: Callable[[Tensor], Tensor], **fields: object) -> Dataset:
-        """Apply the same change to every column."""
+        """Return the data set with the same change applied to every column."""
         return self.replace(**mapped([self], lambda values: change(values[0])), **fields)
 
     @staticmethod
     def concatenate(parts: Sequence[Dataset]) -> Dataset:
-        """Concatenate data sets, with separate segments.
+        """Concatenate data sets, keeping their segments separate.
 
         Raises:
             DataError: there are no parts, or their joints, contacts, extras, precision or device differ.
@@ -244,12 +244,12 @@ class Dataset(Fields):
         """Read a data set from Parquet or CSV (columns as in docs/formats.md).
 
         Args:
-            path: the file.
+            path: the file to read.
             differentiate: method for computing `qd` and `qdd` if they are missing.
             dtype, device: data type and device of the tensors.
 
         Raises:
-            DataError: the file is damaged or not a valid log; the message names file, column and row.
+            DataError: the file is damaged or is not a valid log; the message names the file, column and row.
         """
         raw, header = read_table(path)
         fields = parse(str(path), raw, header, differentiate)
@@ -257,10 +257,10 @@ class Dataset(Fields):
             return cls(**as_tensors(fields, dtype, torch.device(device)))
 
     def write(self, path: str | Path) -> None:
-        """Write to a Parquet file atomically.
+        """Write the data set to a Parquet file atomically.
 
         Raises:
-            DataError: the name does not end in `.parquet`.
+            DataError: the file name does not end in `.parquet`.
             OSError: the path cannot be written.
         """
         check_ending(path)

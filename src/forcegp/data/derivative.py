@@ -1,4 +1,4 @@
-"""Velocities and accelerations from logged positions or velocities, with their noise."""
+"""Velocities and accelerations computed from logged positions or velocities, with their noise."""
 
 from __future__ import annotations
 
@@ -13,20 +13,20 @@ from forcegp.robust import MAD_TO_STD
 from forcegp.rows import runs
 
 WINDOWS = (5, 7, 9, 11, 15, 21, 31, 41, 61, 81, 101, 121, 151, 201)
-"""Windows tried by cross-validation, in samples."""
+"""Window lengths tried by cross-validation, in samples."""
 UNIFORM_TOLERANCE = 0.02
-"""Largest relative deviation of a time step from the median, which allows for jitter but not for gaps."""
+"""Maximum relative deviation of a time step from the median, which allows for jitter but not for gaps."""
 
 
 @dataclass(frozen=True)
 class SavitzkyGolay:
-    """Differentiation of the polynomial fitted by least squares to a moving window.
+    """Differentiation of a polynomial fitted by least squares in a moving window.
 
-    A wider window reduces noise and increases bias; a higher order has the opposite effect. The noise of
-    neighbouring results is correlated over about one window, which a likelihood with white noise ignores.
+    A wider window reduces noise and increases bias; a higher order has the opposite effect. The noise of the
+    results is correlated over about one window, which a likelihood with white noise ignores.
 
     Args:
-        window: number of samples, odd.
+        window: number of samples, which must be odd.
         order: degree of the polynomial, at least 2 and less than `window`.
 
     Raises:
@@ -48,16 +48,16 @@ class SavitzkyGolay:
 def cross_validated_window(
     signals: Sequence[NDArray[np.float64]], order: int = 3, most: int | None = None
 ) -> int:
-    """Return the window that best predicts each sample of the noisiest signal from the others in the window.
+    """Return the window in which each sample of the noisiest signal is best predicted from the others.
 
-    If a sample has weight h in its own fit, its leave-one-out error is (x − x̂)/(1 − h). For each column, the
-    window with the least mean square error is determined, and the widest of these windows is returned, so
+    If a sample has weight h in its own fit, its leave-one-out error is (x − x̂)/(1 − h). The window with the
+    smallest mean squared error is determined for each column, and the widest of these windows is returned, so
     all signals have the same bandwidth.
 
     Args:
-        signals: logged values, `(n, d)` each, evenly spaced in time.
+        signals: logged values, each `(n, d)`, evenly spaced in time.
         order: degree of the polynomial.
-        most: maximum window; by default the number of samples.
+        most: maximum window length; by default the number of samples.
 
     Raises:
         DataError: a signal has fewer samples than the narrowest window.
@@ -94,13 +94,13 @@ def differentiate(
     method: SavitzkyGolay,
     degree: int,
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-    """Return the `degree`-th time derivative of x, and the standard deviation of its noise, `(n, d)` each.
+    """Return the `degree`-th time derivative of x and the standard deviation of its noise, each `(n, d)`.
 
-    The derivative is Σ_k w_k x_{i+k}, so white noise of standard deviation σ on x becomes σ |w|. σ is
-    estimated for each column from the median absolute residual of the fit; residuals have the standard
-    deviation σ √(1 − h) if a sample has weight h in its own fit. The outermost fits are used at the ends of
-    each segment, with larger noise. Time t `(n,)` [s] must be evenly spaced within each segment. Windows do
-    not cross segments.
+    The derivative is Σ_k w_k x_{i+k}, so white noise of standard deviation σ on x results in noise of σ |w|.
+    For each column, σ is estimated from the median absolute residual of the fit, whose standard deviation is
+    σ √(1 − h) if a sample has weight h in its own fit. At the ends of each segment, the outermost fits are
+    used, with larger noise. Time t `(n,)` [s] must be evenly spaced within each segment. Windows do not cross
+    segments.
 
     Raises:
         DataError: a segment is shorter than the window, or its time steps are uneven.
@@ -110,7 +110,7 @@ def differentiate(
     window, order = method.window, method.order
     result, gain = np.empty_like(x), np.empty((len(x), 1))
     half, residuals = window // 2, []
-    # Norm of the weights at each position of the window, per unit time step.
+    # Norm of the weights at each position in the window, for a unit time step.
     norms = [np.linalg.norm(savgol_coeffs(window, order, deriv=degree, pos=place)) for place in range(window)]
     for rows in runs(segment):
         dt = _time_step(t, rows, window)

@@ -1,4 +1,4 @@
-"""Header and columns of a data set, with checks of their validity and consistency."""
+"""Header and columns of a data set, and checks of their validity and consistency."""
 
 from __future__ import annotations
 
@@ -7,7 +7,9 @@ from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from typing import Any, ClassVar
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from pydantic import Field, NonNegativeFloat, PositiveFloat
 from torch import Tensor
 
@@ -23,19 +25,19 @@ class DataHeader(Header):
     Attributes:
         dt: sampling period [s].
         noise_std: standard deviation of the noise on q̈ [rad/s²].
-        filtered: whether a filter computed q̈, so its noise is correlated in time; otherwise `noise_std`
-            refers to white noise.
+        filtered: whether q̈ was computed by a filter, so that its noise is correlated in time; otherwise,
+            `noise_std` refers to white noise.
         filter_span: time span of the filter that computed q̈ [s]; noise further apart is uncorrelated.
         robot: name of the robot.
-        robot_fingerprint: `RobotModel.fingerprint` of the robot that moved.
-        seed: random seed used for the data.
+        robot_fingerprint: `RobotModel.fingerprint` of the logged robot.
+        seed: random seed used to generate the data.
         ordered: whether rows are in time order within each segment (false for selected points).
-        provenance: processing steps of the data, oldest first.
+        provenance: processing steps applied to the data, oldest first.
         derived: joint vectors computed by a filter.
-        imported: kind and message of each finding of the import, including doubts about the mapping.
-        unmeasured_torques: joints whose motor torque was not measured; the column is 0.
-        stick_speeds: speed below which a contact sticks, by its name [m/s]; others always slide.
-        joint_names, contact_names: in the order of the columns; empty if not logged.
+        imported: kind and message of each finding of the import, including warnings about the mapping.
+        unmeasured_torques: joints whose motor torque was not measured, so that the column is 0.
+        stick_speeds: speed below which a contact sticks [m/s], keyed by contact name; others always slide.
+        joint_names, contact_names: names in column order; empty if not logged.
     """
 
     FORMAT: ClassVar[str] = "forcegp-dataset"
@@ -62,17 +64,17 @@ class DataHeader(Header):
         """Second moment of the weights with which the filter averages q̈ over time [s²]; 0 if unknown.
 
         The second derivative of cubics fitted to positions over a span T is q̈ + T²/56 d²q̈/dt² + …, like an
-        average with variance T²/28; the first derivative of cubics fitted to q̇ has no such term.
+        average with variance T²/28. The first derivative of cubics fitted to q̇ has no such term.
         """
         return (self.filter_span or 0.0) ** 2 / 28.0 if {"qd", "qdd"} <= set(self.derived) else 0.0
 
     def with_step(self, step: str, **fields: object) -> DataHeader:
-        """Return the header with changed fields and another line of provenance."""
+        """Return the header with the given fields changed and another line of provenance."""
         return self.model_copy(update={"provenance": (*self.provenance, step), **fields})
 
 
 JOINT_VECTORS = ("q", "qd", "tau", "qdd")
-"""Joint vectors in every data set."""
+"""Joint vectors contained in every data set."""
 AXES = ("x", "y", "z")
 """Components of a Cartesian vector logged for a contact."""
 
@@ -106,7 +108,7 @@ def component_names(name: str, value: Tensor, joint_names: Sequence[str]) -> lis
 
 
 def named_columns(data: Fields) -> dict[str, Tensor]:
-    """Return all floating-point columns except time, by their name on disk; vectors are not split."""
+    """Return all floating-point columns except time, keyed by name on disk; vectors are not split."""
     named = {name: getattr(data, name) for name in JOINT_VECTORS} | dict(data.extras)
     for name, group in data.contact_extras.items():
         named |= {f"{name}.{contact}": value for contact, value in group.items()}
@@ -114,7 +116,7 @@ def named_columns(data: Fields) -> dict[str, Tensor]:
 
 
 def mapped(parts: Sequence[Fields], change: Callable[[list[Tensor]], Tensor]) -> dict[str, Any]:
-    """Combine data sets of equal layout by applying `change` to the tensors of each column."""
+    """Combine data sets with equal layouts by applying `change` to the tensors of each column."""
     first = parts[0]
     return {
         **{name: change([getattr(p, name) for p in parts]) for name in ("t", "segment", *JOINT_VECTORS)},
@@ -128,7 +130,7 @@ def mapped(parts: Sequence[Fields], change: Callable[[list[Tensor]], Tensor]) ->
 
 
 def check_tensors(data: Fields) -> None:
-    """Check that every column is a tensor and every group of columns a mapping."""
+    """Check that every column is a tensor and every group of columns is a mapping."""
     for name in ("contact", "extras", "contact_extras"):
         _check_kind(name, getattr(data, name), Mapping, "a mapping of names to tensors")
     for name, group in data.contact_extras.items():
@@ -151,7 +153,7 @@ def _check_kind(name: str, value: object, kind: type, expected: str, hint: str |
 
 
 def check_layout(data: Fields) -> None:
-    """Check shapes, types and device of the columns, and the names of joints and contacts."""
+    """Check the shapes, types and devices of the columns, and the names of joints and contacts."""
     n, nq = len(data.t) if data.t.ndim == 1 else -1, len(data.joint_names)
     if n < 0:
         raise DataError("column 't' has the wrong shape", expected="(n,)", got=tuple(data.t.shape))
@@ -186,7 +188,7 @@ def check_layout(data: Fields) -> None:
 
 
 def _check_names(data: Fields) -> None:
-    """Check that extras do not hide a field or each other, and have no dot in their name."""
+    """Check that extras do not hide a field or each other, and that their names contain no dots."""
     taken = set(vars(data))
     for name in (*data.extras, *data.contact_extras):
         if name in taken or "." in name or not name:
@@ -216,7 +218,7 @@ def _check_shape(name: str, value: Tensor, shape: tuple[int, ...], meaning: str)
 
 
 def check_values(data: Fields) -> None:
-    """Check that values are finite, except for undetermined predictions, and that time increases."""
+    """Check that values are finite (except undetermined predictions) and that time increases."""
     for name, value in (("t", data.t), *named_columns(data).items()):
         wrong = ~(value.abs() <= LOGGED_VALUE)
         if name.startswith("predicted_"):
@@ -235,7 +237,7 @@ def check_values(data: Fields) -> None:
 
 
 def check_time(data: Fields) -> None:
-    """Check that segments are contiguous with strictly increasing time; `DataError` names the row."""
+    """Check that segments are contiguous and time increases strictly; a `DataError` names the row."""
     t, segment = data.t, data.segment
     same = segment[1:] == segment[:-1]
     back = same & (t[1:] <= t[:-1])
@@ -279,15 +281,15 @@ def row_indices(rows: object, n: int, device: torch.device) -> Tensor:
 
 
 TURN, MOST_RADIANS = 6.3, 60.0
-"""Angle of one turn, and the largest plausible angle of a joint without limits [rad]."""
+"""Angle of one turn, and largest plausible angle of a joint without limits [rad]."""
 
 
 class RobotMismatchWarning(UserWarning):
-    """Warning that the data were logged on a robot with different parameters."""
+    """Warning that data were logged on a robot with different parameters."""
 
 
 def check_joints(have: Sequence[str], want: Sequence[str], robot: str) -> None:
-    """Check that the joints of a log are those of a robot, in its order."""
+    """Check that the joints of a log are those of the robot, in the same order."""
     if tuple(have) == tuple(want):
         return
     missing = [joint for joint in want if joint not in have]
@@ -303,13 +305,13 @@ def check_joints(have: Sequence[str], want: Sequence[str], robot: str) -> None:
 
 
 def lock_hint(joints: Sequence[str]) -> str:
-    """Return a hint to lock joints that are missing from a log, such as those of a gripper."""
+    """Return a hint to lock joints that a log does not contain, such as those of a gripper."""
     positions = ", ".join(f"{joint} = 0.0" for joint in joints)
     return f"if they did not move, lock them: locked_joints = {{ {positions} }} under [robot] in a scene file"
 
 
 def check_robot(data: Fields, robot: RobotModel) -> None:
-    """Check that joints match; warn about different robot parameters and angles that may be in degrees."""
+    """Check that joints match, and warn if robot parameters differ or angles may be in degrees."""
     check_joints(data.joint_names, robot.joint_names, robot.name)
     q, free = data.q.to(robot.lower) * robot.revolute, torch.full_like(robot.lower, MOST_RADIANS)
     low, high = (
@@ -347,6 +349,18 @@ def contact_table(data: Fields, contacts: Sequence[str]) -> Tensor:
     return torch.stack(closed, dim=-1) if closed else data.segment.new_zeros(len(data), 0).bool()
 
 
+def resolution(x: NDArray[Any]) -> NDArray[Any]:
+    """Return the step between the levels of each column with few distinct values, and zero for the others."""
+    steps = np.zeros(x.shape[1])
+    for j, levels in enumerate(map(np.unique, x.T)):
+        if 2 < len(levels) < 0.75 * len(x):
+            gaps = np.diff(levels)
+            # Rounding in the last digit can split one level into two; such gaps are not steps.
+            gaps = gaps[gaps > 1e-6 * gaps.max()]
+            steps[j] = np.median(gaps)
+    return steps
+
+
 def check_alike(parts: Sequence[Fields]) -> None:
     """Check that data sets have the same columns and can be concatenated."""
     if not parts:
@@ -373,13 +387,13 @@ def check_alike(parts: Sequence[Fields]) -> None:
 
 
 def common_stick_speeds(headers: Sequence[DataHeader]) -> dict[str, float]:
-    """Return the largest speed below which each contact sticks [m/s], by name."""
+    """Return the largest speed below which each contact sticks [m/s], keyed by contact name."""
     speeds = [pair for header in headers for pair in header.stick_speeds.items()]
     return dict(sorted(speeds, key=lambda pair: pair[1]))
 
 
 def common_header(headers: Sequence[DataHeader]) -> DataHeader:
-    """Return a header with the fields that agree; the others have their default values."""
+    """Return a header with the fields on which all headers agree; other fields have default values."""
     first = headers[0].model_dump()
     agreed = {name: v for name, v in first.items() if all(getattr(h, name) == v for h in headers)}
     steps = tuple(dict.fromkeys(step for header in headers for step in header.provenance))

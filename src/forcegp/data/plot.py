@@ -1,4 +1,4 @@
-"""Plots of a data set: all joints at a glance, or one quantity by joint or by contact."""
+"""Plots of a data set: an overview of all joints, or one quantity for each joint or contact."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ from forcegp.plots import (
 def plot(
     data: Fields, quantity: str | None = None, joints: Sequence[str] | None = None, ax: Target = None
 ) -> list[Axes]:
-    """Draw a data set; `Dataset.plot` documents the arguments."""
+    """Plot a data set; see `Dataset.plot` for the arguments."""
     wanted = chosen(joints, data.joint_names, "joint of the data set")
     if quantity is None:
         panels = _overview(data, wanted)
@@ -65,7 +65,7 @@ def _by_contact(data: Fields, quantity: str) -> list[Panel]:
 
 
 ALIASES = {"Q": "total_force", "Q_z": "contact_friction", "Q_I": "constraint_force", "F_I": "contact_force"}
-"""Quantities by the symbol of their logged column."""
+"""Names of quantities, keyed by the symbol of the logged column."""
 
 
 def _named(column: str) -> str:

@@ -1,8 +1,8 @@
-"""Preparation of a log for learning: selection of points, held-out stretches, impacts, and noise.
+"""Preparation of a log for learning: selection of points, held-out blocks, impacts, and noise.
 
 Farthest-point sampling selects a few points that cover the inputs of a log (section 5.3 of the paper). If
 training points come from the same stretches as the test rows, as in the paper, the test error measures
-interpolation; held-out stretches measure prediction of unseen motion.
+interpolation. Held-out blocks measure how well unseen motion is predicted.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ INPUTS = ("q", "qd", "tau")
 
 
 def standardized_inputs(data: Dataset) -> Float[Tensor, "n d"]:
-    """Return (q, q̇, τ) of each sample, standardized per column; constant columns become zero."""
+    """Return (q, q̇, τ) of each sample with standardized columns; constant columns become zero."""
     return standardized(torch.cat([getattr(data, name) for name in INPUTS], dim=-1))
 
 
@@ -43,17 +43,17 @@ def farthest_points(
     start: int | None = None,
     progress: Callable[[int], None] | None = None,
 ) -> Int[Tensor, " count"]:
-    """Return the indices of points, each the farthest from its predecessors in Euclidean distance.
+    """Select points such that each is the farthest from its predecessors, and return their indices.
 
-    i_{k+1} = argmax_i min_{j ≤ k} |x_i − x_{i_j}|. Ties go to the lowest index, so the result is
-    deterministic, and its first k entries are the result for k points. The cost is O(n d) per point and
-    O(n) memory.
+    i_{k+1} = argmax_i min_{j ≤ k} |x_i − x_{i_j}| in Euclidean distance. Ties go to the lowest index, so the
+    result is deterministic, and its first k entries are the result for k points. The cost is O(n d) per
+    point, and memory use is O(n).
 
     Args:
         x: `(n, d)` points.
         count: number of points to select.
-        start: the first point; by default the one closest to the mean.
-        progress: called after each point with the number selected so far.
+        start: index of the first point; by default, that of the point closest to the mean.
+        progress: called after each point with the number of points selected so far.
 
     Raises:
         DataError: there are fewer than `count` distinct points, or `start` is out of range.
@@ -82,7 +82,7 @@ def _check_count(count: int, n: int) -> None:
 
 
 def _distance(x: Tensor, point: Tensor) -> Tensor:
-    """Return |x_i − point| from differences, which are accurate for close points, unlike products."""
+    """Return |x_i − point| from differences, which, unlike products, are accurate for close points."""
     return torch.cdist(x, point[None], compute_mode="donot_use_mm_for_euclid_dist")[:, 0]
 
 
@@ -101,9 +101,9 @@ def select_points(
         data: the log.
         count: number of points.
         method: `"farthest"` (on standardized q, q̇, τ), `"even"` (evenly spaced rows, in order), or
-            `"random"` for comparison. Farthest points favour outliers in measured logs.
+            `"random"` for comparison. Farthest-point selection favours outliers in real logs.
         seed: seed for random selection.
-        candidates: row numbers to select from; by default all.
+        candidates: row numbers to select from; by default all rows.
         progress: called with the number of points selected so far.
 
     Raises:
@@ -123,7 +123,7 @@ def select_points(
 
 @dataclass(frozen=True, eq=False)
 class Split:
-    """Training rows in selection order, test rows in increasing order, and held-out row ranges."""
+    """Training rows in the order of selection, test rows in increasing order, and held-out row ranges."""
 
     train: Int[Tensor, " count"]
     test: Int[Tensor, " rest"]
@@ -145,7 +145,7 @@ def split_by_selection(
     seed: int = 0,
     progress: Callable[[int], None] | None = None,
 ) -> Split:
-    """Split a log as in the paper: select training points from the whole log and test on the rest."""
+    """Split a log as in the paper: select training points from the whole log, and test on the rest."""
     train = select_points(data, count, method=method, seed=seed, progress=progress)
     return Split(train, complement(train, len(data)))
 
@@ -161,21 +161,21 @@ def split_by_stretches(
     seed: int = 0,
     progress: Callable[[int], None] | None = None,
 ) -> Split:
-    """Hold out stretches of motion drawn at random, and select training points from the rest only.
+    """Hold out randomly drawn stretches of motion, and select training points only from the rest.
 
     Args:
         data: a log in time order.
         count: number of training points.
-        stretch: approximate duration of the equal stretches that each trajectory is divided into [s].
+        stretch: approximate duration of the equal stretches into which each trajectory is divided [s].
         fraction: fraction of the stretches to hold out.
-        margin: time around each held-out stretch without training points [s].
-        method: see `select_points`.
-        seed: seed for the held-out stretches and for random selection.
+        margin: duration before and after each held-out block that contains no training points [s].
+        method: selection method, as in `select_points`.
+        seed: seed for the held-out blocks and for random selection.
         progress: called with the number of points selected so far.
 
     Returns:
-        Training rows, all rows of the held-out stretches, and the stretches. Rows in a margin and unselected
-        rows outside the stretches belong to neither.
+        Training rows, all rows of the held-out blocks, and the stretches. Rows in a margin and unselected
+        rows outside the stretches are in neither set.
 
     Raises:
         DataError: the log is not in time order, is too short, or leaves too few points.
@@ -203,10 +203,10 @@ def split_by_stretches(
 
 
 def _stretches(data: Dataset, stretch: float) -> list[tuple[int, int]]:
-    """Return the row ranges of trajectories divided into parts of equal duration."""
+    """Divide the trajectories into parts of equal duration, and return their row ranges."""
     if not data.header.ordered:
         raise DataError(
-            "held-out stretches need a log in order of time",
+            "held-out blocks need a log in order of time",
             got="points in order of selection",
             hint="split the log before selecting points from it",
         )
@@ -226,11 +226,11 @@ def _stretches(data: Dataset, stretch: float) -> list[tuple[int, int]]:
 
 
 IMPACT = "impact"
-"""Name of the mask by contact, 1 near a switch, written by `forcegp import`."""
+"""Name of the masks that `forcegp import` writes for each contact; they are 1 near a contact change."""
 
 
 def without_marked_impacts(data: Dataset) -> Dataset:
-    """Return the rows not marked in any mask `impact.<contact>`; all rows if there are no masks."""
+    """Return the rows not marked in any mask `impact.<contact>`, or all rows if there are no masks."""
     marked = torch.zeros(len(data), dtype=torch.bool, device=data.t.device)
     for mask in data.contact_extras.get(IMPACT, {}).values():
         marked |= mask > 0.0
@@ -238,27 +238,3 @@ def without_marked_impacts(data: Dataset) -> Dataset:
     if count == 0:
         return data
     return data[torch.nonzero(~marked)[:, 0]].with_step(f"excluded {count} rows at impacts")
-
-
-def with_noise(data: Dataset, std: float, generator: torch.Generator) -> Dataset:
-    """Add Gaussian noise to q̈ and keep the noise-free value: q̈ = q̈_clean + std ε, ε ~ N(0, I).
-
-    If the data contain `qdd_clean`, the noise is added to it, so repeated calls do not accumulate.
-
-    Args:
-        data: the log.
-        std: standard deviation [rad/s², m/s²].
-        generator: source of the random numbers; its seed is recorded in the header.
-
-    Raises:
-        DataError: the standard deviation is negative or not finite.
-    """
-    if not 0.0 <= std < float("inf"):
-        raise DataError("the noise is invalid", expected="a finite standard deviation ≥ 0", got=std)
-    clean = data.extras.get("qdd_clean", data.qdd)
-    noise = torch.randn(clean.shape, dtype=clean.dtype, device=generator.device, generator=generator)
-    step = f"noise of standard deviation {std:g} on qdd, seed {generator.initial_seed()}"
-    derived = tuple(name for name in data.header.derived if name != "qdd")
-    header = data.header.with_step(step, noise_std=std, filtered=False, filter_span=None, derived=derived)
-    qdd, extras = clean + std * noise.to(clean.device), {**data.extras, "qdd_clean": clean}
-    return data.replace(qdd=qdd, extras=extras, header=header)

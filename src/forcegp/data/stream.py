@@ -1,4 +1,4 @@
-"""Long logs in Parquet files, read piece by piece; filter windows overlap neighbouring pieces."""
+"""Long logs in Parquet files, read piece by piece, with filter windows that extend into adjacent pieces."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Piece:
-    """Consecutive rows of a file from row `first`; `columns` starts `before` rows earlier."""
+    """Consecutive rows of a file, starting at row `first`; `columns` starts `before` rows earlier."""
 
     columns: Columns
     header: DataHeader
@@ -40,21 +40,21 @@ class Piece:
 
 
 def shape_of(path: Path) -> tuple[int, DataHeader]:
-    """Return the number of rows and header of a Parquet file."""
+    """Return the number of rows and the header of a Parquet file."""
     file = existing(path)
     if file.suffix.lower() != ".parquet":
         hint = "write the log as Parquet: Dataset.read(path).write('run.parquet')"
         raise DataError(f"{file}: only Parquet files are read piece by piece", got=file.suffix, hint=hint)
     with warnings.catch_warnings():
-        warnings.simplefilter("ignore")  # Columns that are left out are reported when they are read.
+        warnings.simplefilter("ignore")  # Ignored columns are reported when the file is read.
         with opened_parquet(file) as (parquet, _, header):
             return parquet.metadata.num_rows, header
 
 
 def pieces_of(path: Path, size: int, window: int, number: int) -> Iterator[Piece]:
-    """Yield the pieces of a file, `size` rows each, with `window` rows around them within their trajectories.
+    """Yield the pieces of a file, each with `size` rows and `window` rows around them in the same trajectory.
 
-    Trajectories are numbered from `number`. `DataError` if the file is damaged or a trajectory is not
+    Trajectories are numbered from `number`. Raise `DataError` if the file is damaged or a trajectory is not
     contiguous.
     """
     import pyarrow as pa
@@ -84,7 +84,7 @@ def _columns(file: Path, table: pa.Table) -> Columns:
 
 
 def _with_context(before: Columns, columns: Columns, after: Columns) -> tuple[Columns, int]:
-    """Return a piece with context rows from its first and last trajectory, and the number before it."""
+    """Return a piece with context rows of its first and last trajectory, and the number of rows before it."""
     own = columns["segment"]
     parts = [
         {name: values[part["segment"] == number] for name, values in part.items()}
@@ -103,7 +103,7 @@ class _Trajectories:
         self.raw, self.time, self.segments = np.nan, -np.inf, set[float]()
 
     def number(self, columns: Columns, ordered: bool) -> None:
-        """Renumber the segments of the next rows, continuing from the previous ones."""
+        """Renumber the segments of the next rows, continuing the numbering of previous rows."""
         raw, t = columns["segment"], columns.get("t")
         if ordered and t is not None and raw[0] == self.raw and t[0] <= self.time:
             raise DataError(
@@ -138,22 +138,22 @@ class _Trajectories:
 PIECE_ROWS = 8192
 """Number of rows read at a time."""
 Keep = Callable[[Dataset], Tensor]
-"""Row numbers of a piece to keep."""
+"""Function that returns the numbers of the rows to keep in a piece."""
 
 
 @dataclass(frozen=True)
 class StreamedDataset:
-    """A log of any length in one or several Parquet files, each with separate trajectories.
+    """A log of any length in one or more Parquet files, each with separate trajectories.
 
     Missing columns are computed as in `Dataset.read`; their noise is estimated piece by piece.
 
     Args:
-        paths: the files; their joints, contacts and additional columns must agree.
+        paths: the files, whose joints, contacts and additional columns must agree.
         differentiate: method for computing `qd` and `qdd` if they are missing.
         joints: joints to read, in this order; by default those of the files.
         dtype, device: data type and device of the tensors.
         distributed: whether the processes of `torch.distributed` share the pieces in a fit. Each process
-            makes the same call and obtains the same fit.
+            makes the same call and obtains the same result.
 
     Example:
         >>> import tempfile, torch
@@ -177,7 +177,7 @@ class StreamedDataset:
     def __post_init__(self) -> None:
         if not self.files:
             raise DataError("there are no files to read", expected="at least one Parquet file", got="none")
-        self._shapes  # noqa: B018  (damaged files are refused before any work)
+        self._shapes  # noqa: B018  (damaged files are rejected before any computation)
 
     @cached_property
     def files(self) -> tuple[Path, ...]:
@@ -196,7 +196,7 @@ class StreamedDataset:
 
     @cached_property
     def _shapes(self) -> tuple[tuple[int, DataHeader], ...]:
-        """Rows and header of each file."""
+        """Number of rows and header of each file."""
         return tuple(map(shape_of, self.files))
 
     def __len__(self) -> int:
@@ -210,12 +210,12 @@ class StreamedDataset:
 
     @cached_property
     def header(self) -> DataHeader:
-        """Common content of the headers of all files."""
+        """Header with the content common to all files."""
         headers = [header for _, header in self._shapes]
         return headers[0] if len(headers) == 1 else common_header(headers)
 
     def select(self, joints: Sequence[str]) -> StreamedDataset:
-        """Return the log with only the given joints, in this order."""
+        """Return the log with only the given joints, in the given order."""
         return dataclasses.replace(self, joints=tuple(joints))
 
     def pieces(self, start: int = 0, share: tuple[int, int] = (0, 1)) -> Iterator[Dataset]:
@@ -226,7 +226,7 @@ class StreamedDataset:
             share: (r, k) yields data only for piece r of every k; the others belong to other processes.
 
         Raises:
-            DataError: a file is damaged, is not a valid log, or has other columns than the first file.
+            DataError: a file is damaged, is not a valid log, or has different columns from the first file.
         """
         first, number, count = None, 0, 0
         window = self.differentiate.window if self.differentiate is not None else 0
@@ -242,10 +242,10 @@ class StreamedDataset:
             number += 1
 
     def _dataset(self, path: Path, piece: Piece, first: Dataset | None) -> Dataset:
-        """Return a piece as a data set with the same columns as the first one."""
+        """Return a piece as a data set with the same columns as the first piece."""
         source = str(path) if piece.first == 0 else f"{path} (rows counted from {piece.first - piece.before})"
         with warnings.catch_warnings():
-            if piece.first:  # One warning per file is enough.
+            if piece.first:  # One warning per file is sufficient.
                 warnings.simplefilter("ignore", IgnoredColumnsWarning)
             fields = parse(source, piece.columns, piece.header, self.differentiate)
         names = {name: fields["header"].__dict__[name] for name in ("joint_names", "contact_names")}
@@ -261,8 +261,8 @@ class StreamedDataset:
 
 
 def spaced_sample(pieces: Iterable[Dataset], count: int, keep: Keep | None = None) -> tuple[Dataset, int]:
-    """Return evenly spaced rows of a log of unknown length in one pass, `count` to twice as many if
-    available, and the number of all rows kept by `keep`; `DataError` without any piece.
+    """Return between `count` and 2 `count` evenly spaced rows (or all, if fewer) of a log of unknown length,
+    and the total number of rows kept by `keep`, in one pass; raise `DataError` if there are no pieces.
     """
     kept: list[tuple[Tensor, Dataset]] = []
     step, total = 1, 0
@@ -279,5 +279,5 @@ def spaced_sample(pieces: Iterable[Dataset], count: int, keep: Keep | None = Non
     if not kept:
         raise DataError("there are no samples to read", expected="at least one", got="none")
     parts = [data for _, data in kept]
-    segment = torch.cat([part.segment for part in parts])  # one may go on from a piece to the next
+    segment = torch.cat([part.segment for part in parts])  # a segment may extend over several pieces
     return Dataset.concatenate(parts).replace(segment=segment, header=parts[0].header), total

@@ -28,10 +28,10 @@ Columns = dict[str, NDArray[np.generic]]
 
 HEADER_KEY = b"forcegp"
 COPIES = 4
-"""Number of copies of a table in memory: the reader's columns, arrays, joined arrays, and tensors."""
+"""Number of copies of a table in memory: the reader's columns, arrays, concatenated arrays, and tensors."""
 
 GROUP_ROWS = 1 << 18
-"""Number of rows written at a time, which avoids a second copy of a long log in memory."""
+"""Number of rows to write at a time, which avoids a second copy of a long log in memory."""
 
 
 class IgnoredColumnsWarning(UserWarning):
@@ -45,7 +45,7 @@ def check_ending(path: str | Path) -> None:
 
 
 def write_parquet(path: str | Path, columns: Columns, header: DataHeader) -> None:
-    """Write columns and header to a Parquet file atomically; `OSError` if that fails."""
+    """Write columns and header to a Parquet file atomically; raise `OSError` if that fails."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -64,10 +64,10 @@ def write_parquet(path: str | Path, columns: Columns, header: DataHeader) -> Non
 def read_table(
     path: str | Path, *, missing: Literal["refuse", "nan"] = "refuse"
 ) -> tuple[Columns, DataHeader]:
-    """Return the numeric columns and the header (or its defaults) of a Parquet or CSV file.
+    """Return the numeric columns and the header (or a default header) of a Parquet or CSV file.
 
-    An empty value is an error, or NaN if `missing` is `"nan"`. A `DataError` states why a file cannot be
-    read.
+    Empty values are errors, or NaN if `missing` is `"nan"`. If the file cannot be read, a `DataError` states
+    the reason.
     """
     file = existing(path)
     readers = {".parquet": _read_parquet, ".csv": _read_csv}
@@ -79,7 +79,7 @@ def read_table(
 
 
 def existing(path: str | Path) -> Path:
-    """Return the path of an existing file; `DataError` with the nearest name as hint if it does not exist."""
+    """Return the path of an existing file, or raise a `DataError` that suggests the nearest name."""
     file = Path(path)
     with foreign(str(path), "a path"):
         if file.is_file():
@@ -93,7 +93,7 @@ def existing(path: str | Path) -> Path:
 
 
 def _read_parquet(file: Path) -> tuple[pa.Table, DataHeader]:
-    """Return the columns, after a check of their size in memory, which may exceed that of the file by far."""
+    """Return the columns after checking their size in memory, which may be far larger than the file."""
     with opened_parquet(file) as (parquet, usable, header):
         rows, columns = parquet.metadata.num_rows, len(usable)
         allowed = min(allowed_bytes(file.stat().st_size), limits.TABLE_BYTES)
@@ -110,12 +110,12 @@ def _read_parquet(file: Path) -> tuple[pa.Table, DataHeader]:
 
 @contextmanager
 def opened_parquet(file: Path) -> Iterator[tuple[pq.ParquetFile, list[str], DataHeader]]:
-    """Open a Parquet file; yield it with its numeric columns and header; `DataError` if it is no log."""
+    """Open a Parquet file and yield it with numeric columns and header; raise `DataError` if it is no log."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
     try:
-        # pre_buffer is off: a damaged offset must not make the reader ask for the whole address space.
+        # pre_buffer is off: a damaged offset must not make the reader request the whole address space.
         with pq.ParquetFile(file.absolute()) as parquet:  # Arrow expands a leading ~
             shape = parquet.metadata
             _check_count(file, shape.num_columns)
@@ -135,7 +135,7 @@ def _check_count(file: Path, columns: int) -> None:
 
 
 def _check_flat(file: Path, usable: list[str], paths: list[str]) -> None:
-    """Check that numeric columns contain no lists or structs, which their name would select as well."""
+    """Check that the names of numeric columns do not also select lists or structs."""
     names = set(usable)
     for path in (path for path in paths if path not in names):
         prefixes = accumulate(path.split("."), "{}.{}".format)
@@ -169,7 +169,7 @@ def _read_csv(file: Path) -> tuple[pa.Table, DataHeader]:
 
 
 def _usable(file: Path, schema: pa.Schema) -> list[str]:
-    """Return the names of the numeric columns; others cause a warning, and duplicate names an error."""
+    """Return the names of the numeric columns; warn about other columns, and reject duplicate names."""
     import pyarrow.types as kinds
 
     names = schema.names
@@ -181,7 +181,7 @@ def _usable(file: Path, schema: pa.Schema) -> list[str]:
     kept = (kinds.is_floating, kinds.is_integer, kinds.is_boolean)
     numeric = [field.name for field in schema if any(kind(field.type) for kind in kept)]
     ignored = sorted(set(names) - set(numeric), key=names.index)
-    # A text column that should be numbers is reported by name once it is missed; the rest is harmless.
+    # Text columns that should be numeric are reported by name when they are needed; others are harmless.
     if ignored:
         warnings.warn(
             f"{file}: non-numeric columns are ignored: {', '.join(ignored)}",
@@ -192,7 +192,7 @@ def _usable(file: Path, schema: pa.Schema) -> list[str]:
 
 
 def numeric(file: Path, name: str, column: pa.ChunkedArray, missing: str) -> NDArray[np.generic]:
-    """Return the values of a column; a missing value is a `DataError`, or NaN."""
+    """Return the values of a column; missing values raise `DataError`, or become NaN."""
     if column.null_count and missing == "refuse":
         row = int(np.flatnonzero(column.is_null().to_numpy())[0])
         raise DataError(

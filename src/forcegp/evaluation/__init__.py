@@ -1,4 +1,4 @@
-"""Quality of a model: errors and uncertainty by joint, comparison with trivial predictors, and a verdict."""
+"""Quality of a model: errors and uncertainty by joint, comparisons with trivial predictors, a verdict."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ from forcegp.models.base import FittedModel, Predictor
 __all__ = ["Evaluation", "evaluate"]
 
 GRAVITY_ALONE, LEAST_RESPONSE = 0.99, 0.5
-"""Fraction of torque due to gravity above which data test little else; least fraction of an added torque."""
+"""Fraction of torque due to gravity above which data are a weak test; minimum response to an added torque."""
 
 
 @dataclass(frozen=True)
@@ -45,25 +45,25 @@ class Evaluation:
     """Scores of a model's predictions on a data set.
 
     Attributes:
-        kind: kind of the model.
+        kind: type of the model.
         samples: number of predictions.
-        joint_names: joints in the order of the scores by joint.
-        noisy: errors against measured accelerations.
-        clean: errors against noise-free accelerations, `None` if they are not logged.
-        uncertainty: coverage and density, `None` without a covariance or with unknown noise.
+        joint_names: joints in the order used by the per-joint scores.
+        noisy: errors relative to the measured accelerations.
+        clean: errors relative to the noise-free accelerations, `None` if they are not logged.
+        uncertainty: coverage and density, `None` if there is no covariance or the noise is unknown.
         residual, residual_max: mean and largest |A q̈ − b| of the predicted mean over closed contacts
-            [m/s²], `None` without contacts.
-        noise_std: assumed noise of the measured accelerations, one per joint.
-        seconds_per_state: prediction time, including the covariance if there is one.
-        predictors: errors by joint of the model and of the trivial predictors.
+            [m/s²], `None` if no contact is closed.
+        noise_std: assumed standard deviation of the acceleration noise, one per joint.
+        seconds_per_state: prediction time per state, including the covariance if there is one.
+        predictors: per-joint errors of the model and of the trivial predictors.
         verdicts: comparison of the model with each trivial predictor; empty if there are too few samples.
-        multipliers: comparison of λ with logged values, for models of forces and logs that contain it.
-        sensed: the same with the log's force sensor as a measurement at each state, for models fitted to it.
-        gravity: fraction R² of the torque explained by gravity alone; close to 1, the log hardly tests a
-            model.
-        response: fraction by joint of an added torque that takes effect: 1 for a rigid robot, 0 for a model
-            that has learned the controller; `None` without free motion.
-        motion: open-loop motion, for models of forces and data in time order.
+        multipliers: comparison of λ with logged values, if the model predicts forces and the log contains λ.
+        sensed: the same for predictions that also use the force sensor at each state, if the fit included it.
+        gravity: fraction R² of the torque explained by gravity alone; if it is close to 1, the log is a weak
+            test of a model.
+        response: fraction of an added torque that takes effect, one per joint: 1 for a rigid robot, 0 for a
+            model that has learned the controller; `None` if there is no free motion.
+        motion: open-loop motion, if the model predicts forces and the data are in time order.
     """
 
     kind: str
@@ -86,7 +86,7 @@ class Evaluation:
 
     @property
     def verdict(self) -> str:
-        """Verdict in one sentence: explained torque beyond gravity, open-loop motion and contact force."""
+        """Verdict in one sentence on explained torque beyond gravity, open-loop motion and contact force."""
         parts, shares = [], {p.name: p.beyond_gravity for p in self.predictors}
         if (share := shares.pop("model", None)) is not None:
             others = [
@@ -111,19 +111,19 @@ class Evaluation:
 
     @property
     def poor(self) -> bool:
-        """Whether there are doubts, or the model explains no torque or less than the robot file."""
+        """Whether there are `doubts`, or the model explains no torque, or less torque than the robot file."""
         shares = {p.name: x for p in self.predictors if (x := p.beyond_gravity) is not None}
         model = shares.get("model", 1.0)
         return bool(self.doubts) or model <= 0.0 or model < shares.get("robot file", 0.0)
 
     @property
     def comparison(self) -> str:
-        """Whether the model is better than the trivial predictors in torque and in acceleration."""
+        """A sentence on whether the model beats the trivial predictors in both torque and acceleration."""
         return sentence(self.verdicts)
 
     @property
     def doubts(self) -> tuple[str, ...]:
-        """Reasons to doubt the scores."""
+        """Reasons why the scores may be misleading."""
         found = []
         if self.gravity is not None and self.gravity > GRAVITY_ALONE:
             share = f"{100.0 * self.gravity:.1f} %"
@@ -145,7 +145,7 @@ class Evaluation:
         return asdict(self) | said | {"verdict_texts": texts}
 
     def summary(self) -> dict[str, float | int | str | None]:
-        """Return the scores over all joints, by name."""
+        """Return the overall scores by name."""
         clean, spread = self.clean, self.uncertainty
         return {
             "kind": self.kind,
@@ -172,20 +172,20 @@ def evaluate(
     system: ConstrainedSystem | None = None,
     progress: Progress | None = None,
 ) -> Evaluation:
-    """Compare predicted accelerations with those of a data set and with trivial predictors.
+    """Compare predicted accelerations with those in a data set and with trivial predictors.
 
     Args:
         model: a fitted model.
-        data: states and measured accelerations, and noise-free ones as `qdd_clean` if known.
+        data: states and measured accelerations, and noise-free accelerations as `qdd_clean` if known.
         train: data for fitting the trivial predictors; by default, each half of `data` (in row order) is
-            predicted by those fitted to the other half.
+            predicted by predictors fitted to the other half.
         compare: whether to fit the trivial predictors.
-        system: robot and contacts for the constraint residual, the torque errors and the trivial
-            predictors; by default those of the model before learning.
-        progress: called with the number of states predicted and their total number.
+        system: robot and contacts used for the constraint residual, the torque errors and the trivial
+            predictors; by default, those of the model before learning.
+        progress: called with the number of states predicted so far and the total number.
 
     Raises:
-        ForceGPError: the data are empty, have other joints than the robot, or lack a contact.
+        ForceGPError: the data are empty, their joints differ from those of the robot, or they lack a contact.
     """
     if len(data) == 0:
         raise DataError("there is nothing to evaluate on", expected="at least one sample", got="none")
@@ -235,7 +235,7 @@ def _predictors(
     train: Dataset | None,
     rest: Tensor,
 ) -> tuple[PredictorScores, ...]:
-    """Return torque and acceleration errors by joint of the model and of the trivial predictors."""
+    """Return the per-joint torque and acceleration errors of the model and of the trivial predictors."""
     moving = moving_joints(data.qd)
 
     def score(name: str, error: Tensor, torque: Tensor, density: float | None) -> PredictorScores:
@@ -256,7 +256,7 @@ def _predictors(
 def _trivial(
     system: ConstrainedSystem, data: Dataset, train: Dataset | None
 ) -> dict[str, tuple[Tensor, Tensor, Tensor]]:
-    """Return errors, torque errors and standard deviations, `(n, nq)`, on data not used for training."""
+    """Return errors, torque errors and standard deviations `(n, nq)` on data not used for training."""
     half = len(data) // 2
     parts = [(train, data)] if train is not None else [(data[half:], data[:half]), (data[:half], data[half:])]
     errors: dict[str, list[tuple[Tensor, Tensor, Tensor]]] = {}

@@ -2,10 +2,10 @@
 
 Least squares identifies a rigid robot with physically consistent inertial parameters,
 τ = M q̈ − Q_C − Q_G − Q_D + Y(q, q̇, q̈) δπ + d q̇ + f tanh(q̇/v₀) + o + noise, where δπ corrects the
-inertial parameters of every link, and d, f, o are viscous friction, Coulomb friction and offset of every
-joint. A ridge keeps all unknowns near the robot file. Log-Cholesky coordinates keep every link physical
-(Rucker and Wensing 2022) and therefore the mass matrix positive definite. In contact, the equations are
-projected onto the directions without constraint force.
+inertial parameters of every link, and d, f, o are the viscous friction, Coulomb friction and offset of every
+joint. A ridge penalty keeps all unknowns close to the values in the robot file. Log-Cholesky coordinates keep
+every link physically consistent (Rucker and Wensing 2022) and therefore the mass matrix positive definite.
+In contact, the equations are projected onto the directions in which the constraint force has no component.
 """
 
 from __future__ import annotations
@@ -35,42 +35,42 @@ from forcegp.robot.model import RobotModel
 CHUNK_STATES = 1000
 """Number of states processed at a time."""
 MOST = 4000
-"""Maximum number of evenly spaced samples, some hundred equations per unknown."""
+"""Maximum number of evenly spaced samples, which gives a few hundred equations per unknown."""
 WIDE = 10.0
-"""Prior standard deviation of friction and offset, relative to the largest torque of the joint."""
+"""Prior standard deviation of friction and offsets, relative to the largest torque at the joint."""
 NOISE_PASSES, STEPS = 3, 30
-"""Number of noise re-estimations, and of least-squares steps in each."""
+"""Number of passes that re-estimate the noise, and maximum number of least-squares steps in each pass."""
 POINT = 1e-4
-"""Fraction of the largest mass, placed at 0.1 m to make a link without extent physical."""
+"""Fraction of the largest mass that is added at 0.1 m to give spatial extent to links that have none."""
 
 
 @dataclass(frozen=True)
 class LeastSquares:
-    """An identified robot with additional `friction` `(3 nq,)`: viscous, Coulomb and offsets, by joint."""
+    """An identified robot, and its `friction` `(3 nq,)`: viscous, Coulomb and offset terms of all joints."""
 
     system: ConstrainedSystem
     friction: Tensor
 
     @torch.no_grad()
     def predict(self, data: Dataset) -> Tensor:
-        """Return the accelerations `(n, nq)` under the logged torques, on the constraint."""
+        """Return the accelerations `(n, nq)` under the logged torques, subject to the constraint."""
         if len(data) > CHUNK_STATES:
             return torch.cat([self.predict(part) for part in data_chunks(data)])
         eom = self.system.equations(data.q, data.qd, data.active(self.system.contact_names))
         return eom.acceleration(eom.Q_K + data.tau - self.losses(data.qd))
 
     def losses(self, qd: Tensor) -> Tensor:
-        """Return the torque of the identified friction and offsets `(n, nq)` at velocities `(n, nq)`."""
+        """Return the torques `(n, nq)` due to the identified friction and offsets at velocities `(n, nq)`."""
         return (_friction_columns(self.system.robot, qd) @ self.friction[:, None])[..., 0]
 
 
 def data_chunks(data: Dataset) -> Iterator[Dataset]:
-    """Yield a data set in chunks of `CHUNK_STATES`, to bound memory."""
+    """Yield a data set in chunks of `CHUNK_STATES` samples, to limit memory use."""
     return (data[i : i + CHUNK_STATES] for i in range(0, len(data), CHUNK_STATES))
 
 
 def identify_rigid(system: ConstrainedSystem, train: Dataset) -> LeastSquares:
-    """Identify inertial parameters, friction and offsets; unexcited parameters stay as in the robot file."""
+    """Identify inertial parameters, friction and offsets; those not excited remain as in the robot file."""
     rows = torch.linspace(0, len(train) - 1, min(len(train), MOST)).round().long()
     train, robot = train[rows.unique()], system.robot
     prior = _prior_std(robot, train)
@@ -108,7 +108,7 @@ def _prior_std(robot: RobotModel, train: Dataset) -> Tensor:
 def _normal_equations(
     system: ConstrainedSystem, train: Dataset, prior: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return WᵀW `(nq, p, p)`, Wᵀy `(nq, p)`, yᵀy `(nq,)` by joint, with unknowns scaled by the prior."""
+    """Return WᵀW `(nq, p, p)`, Wᵀy `(nq, p)` and yᵀy `(nq,)` by joint, for unknowns scaled by the prior."""
     p, nq = len(prior), train.nq
     G, g, y2 = prior.new_zeros(nq, p, p), prior.new_zeros(nq, p), prior.new_zeros(nq)
     for part in data_chunks(train):
@@ -121,7 +121,7 @@ def _normal_equations(
 
 
 def _rows(system: ConstrainedSystem, data: Dataset) -> tuple[Tensor, Tensor]:
-    """Return the regressor `(n, nq, 13 nq)` and the torque not explained by the robot file `(n, nq)`."""
+    """Return the regressor `(n, nq, 13 nq)` and the torque `(n, nq)` that the robot file does not explain."""
     eom = system.equations(data.q, data.qd, data.active(system.contact_names))
     Y = regressor(system.robot, data.q, data.qd, data.qdd)
     W = torch.cat([Y, _friction_columns(system.robot, data.qd)], dim=-1)
@@ -133,7 +133,7 @@ def _rows(system: ConstrainedSystem, data: Dataset) -> tuple[Tensor, Tensor]:
 
 
 def without_constraint(system: ConstrainedSystem, data: Dataset, torque: Tensor) -> Tensor:
-    """Return N torque `(n, nq)`, computed in chunks."""
+    """Return the product of N and the torque, `(n, nq)`, computed in chunks."""
     parts = zip(data_chunks(data), torque.split(CHUNK_STATES), strict=True)
     return torch.cat([(free_directions(system, part) @ x[..., None])[..., 0] for part, x in parts])
 
@@ -148,7 +148,7 @@ def free_directions(system: ConstrainedSystem, data: Dataset) -> Tensor:
 
 
 def _start(robot: RobotModel) -> Tensor:
-    """Return the log-Cholesky coordinates of the robot file `(nq, 10)`, giving all bodies some extent."""
+    """Return the log-Cholesky coordinates `(nq, 10)` of the robot file, giving all bodies some extent."""
     J = pseudo_inertia_of(robot.mass, robot.com, robot.inertia)
     least = POINT * float(robot.mass.max()) * torch.tensor([MOMENT_ARM**2] * 3 + [1.0]).to(J)
     bad = torch.linalg.cholesky_ex(J - 1e-2 * torch.diag(least)).info != 0
@@ -162,7 +162,7 @@ def _minimise(
     like, n = friction, theta.numel()
     gram, right, prior, theta, friction = (x.double() for x in (gram, right, prior, theta, friction))
     centre, links = parameter_vector(robot).detach().double().reshape(-1, 10), prior.reshape(-1, 10)
-    # gram = C Cᵀ; its eigenvalues are 1 or more by the ridge, up to rounding
+    # gram = C Cᵀ; owing to the ridge, its eigenvalues are at least 1, up to rounding
     values, vectors = torch.linalg.eigh(gram)
     root = values.clamp(min=1.0).sqrt()
     C, target = vectors * root, (vectors.mT @ right) / root
@@ -184,7 +184,7 @@ def _minimise(
 
 
 def _parameters(theta: Tensor) -> Tensor:
-    """Return π `(..., 10)` of log-Cholesky coordinates `(..., 10)`."""
+    """Return the parameters π `(..., 10)` that correspond to log-Cholesky coordinates `(..., 10)`."""
     return inertial_parameters(*from_pseudo_inertia(from_log_cholesky(theta)))
 
 
@@ -197,10 +197,9 @@ class Baseline:
     """A trivial predictor of accelerations.
 
     Attributes:
-        name, system: name of the predictor, and robot with the mass matrix that converts its errors to
-            torques.
-        predict: function that returns the accelerations `(n, nq)` of a data set.
-        std: `(nq,)` root-mean-square error on its training data, used as its uncertainty.
+        name, system: name of the predictor, and the robot whose mass matrix converts its errors to torques.
+        predict: function that returns the predicted accelerations `(n, nq)` for a data set.
+        std: `(nq,)` root-mean-square error on the training data, used as the uncertainty.
     """
 
     name: str
@@ -210,7 +209,7 @@ class Baseline:
 
 
 def baselines(system: ConstrainedSystem, train: Dataset) -> list[Baseline]:
-    """Return the mean, robot file and least squares, fitted to at least `FEWEST_TRAINING` samples."""
+    """Return the mean, robot-file and least-squares baselines, for at least `FEWEST_TRAINING` samples."""
     mean, nothing = train.qdd.mean(0), train.qdd.new_zeros(3 * train.nq)
     identified = identify_rigid(system, train)
 
@@ -225,7 +224,7 @@ def baselines(system: ConstrainedSystem, train: Dataset) -> list[Baseline]:
 
 
 def as_torque(system: ConstrainedSystem, q: Tensor, error: Tensor) -> Tensor:
-    """Return the errors of acceleration as torques M(q)(predicted − measured q̈), `(n, nq)` [N m, N]."""
+    """Return acceleration errors as torques M(q)(predicted − measured q̈), `(n, nq)` [N m, N]."""
     pairs = zip(q.split(CHUNK_STATES), error.split(CHUNK_STATES), strict=True)
     with torch.no_grad():
         parts = [dynamics.mass_matrix(system.robot, at) @ e[..., None] for at, e in pairs]

@@ -1,4 +1,4 @@
-"""Predictions at all samples of a data set, in chunks to bound memory, and scores of the multiplier."""
+"""Predictions at all samples of a data set, in chunks to limit memory use, and scores of the multiplier."""
 
 from __future__ import annotations
 
@@ -25,12 +25,12 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Predicted:
-    """The predictions of a model at all samples of a data set.
+    """Acceleration predictions of a model at all samples of a data set.
 
     Attributes:
-        mean, variance: `(n, nq)`; no variance for models without a covariance.
-        noise_std: `(n, nq)` assumed noise of measured accelerations, including torque noise, if known.
-        residual: `(k,)` |A q̈ − b| for all rows of closed contacts.
+        mean, variance: `(n, nq)`; `variance` is `None` if the model provides no covariance.
+        noise_std: `(n, nq)` assumed noise in measured accelerations, including torque noise, or `None`.
+        residual: `(k,)` |A q̈ − b| for all constraint rows of closed contacts.
         seconds: computation time.
     """
 
@@ -42,13 +42,13 @@ class Predicted:
 
 
 Moments = tuple[Tensor, Tensor | None]
-"""Mean, and variance or standard deviation if available."""
+"""Mean, and the variance or standard deviation if available."""
 
 
 def in_chunks(
     predict: Callable[[Dataset], Moments], data: Dataset, progress: Progress | None = None
 ) -> Moments:
-    """Call `predict` for all samples, `CHUNK_STATES` at a time, and join the results."""
+    """Call `predict` on all samples, `CHUNK_STATES` at a time, and concatenate the results."""
     parts = []
     for first in range(0, len(data), CHUNK_STATES):
         parts.append(predict(data[first : first + CHUNK_STATES]))
@@ -61,14 +61,14 @@ def in_chunks(
 def predict_all(
     model: Predictor, data: Dataset, system: ConstrainedSystem, progress: Progress | None
 ) -> Predicted:
-    """Predict the accelerations of a data set, and their residual on the constraint of a system."""
+    """Predict the accelerations for a data set, and their residuals in the constraints of a system."""
     residuals, seconds = [], []
 
     def predict(part: Dataset) -> Moments:
         active, began = part.active(model.system.contact_names), time.perf_counter()
         predicted = model.predict(part.q, part.qd, part.tau, active=active)
         seconds.append(time.perf_counter() - began)
-        # |A q̈ − b| of the rows of closed contacts
+        # |A q̈ − b| in the rows of closed contacts
         closed, qdd = part.active(system.contact_names), predicted.mean
         eom = system.equations(part.q, part.qd, closed)
         residual = ((eom.A @ qdd[..., None])[..., 0] - eom.b).abs()
@@ -80,7 +80,7 @@ def predict_all(
 
 
 def _noise_std(model: Predictor, data: Dataset) -> Tensor | None:
-    """Return the acceleration noise `(n, nq)` assumed by the model, or that of the data."""
+    """Return the acceleration noise `(n, nq)` assumed by the model, or else that stated by the data."""
     if isinstance(model, StructuredFit):
         active = data.active(model.system.contact_names)
         return model.noise_variance(data.q, data.qd, data.tau, active=active).sqrt()
@@ -93,14 +93,14 @@ def _noise_std(model: Predictor, data: Dataset) -> Tensor | None:
 
 @dataclass(frozen=True)
 class MultiplierScore:
-    """The predicted multiplier λ of one contact against a logged one, over samples in contact.
+    """Comparison of the predicted multiplier λ of one contact with the logged one, over samples in contact.
 
     Attributes:
         contact: name of the contact.
         samples: number of samples in contact.
         bias, spread, level: mean and standard deviation of predicted minus logged λ, and mean logged λ [N].
-        correlation: correlation of predicted and logged λ, `None` if either is constant.
-        coverage: fraction of logged values within ±2σ, including torque noise; `None` without a covariance.
+        correlation: correlation of predicted and logged λ, or `None` if either is constant.
+        coverage: fraction of logged values within ±2σ, where σ includes torque noise; `None` if σ is unknown.
     """
 
     contact: str
@@ -120,7 +120,7 @@ class MultiplierScore:
 
 @torch.no_grad()
 def multiplier_scores(model: Predictor, data: Dataset) -> tuple[MultiplierScore, ...]:
-    """Compare λ with logged values of a simulator or sensor, for each contact with at least two samples."""
+    """Compare λ with values logged by a simulator or sensor, for each contact with at least two samples."""
     if not logged_forces(model, data):
         return ()
     return _scores(model, data, *in_chunks(lambda part: predicted_forces(model, part), data))
@@ -128,7 +128,7 @@ def multiplier_scores(model: Predictor, data: Dataset) -> tuple[MultiplierScore,
 
 @torch.no_grad()
 def predicted_forces(model: Predictor, data: Dataset) -> Moments:
-    """Return the normal force of each contact `(n, contacts)`, and its deviation with torque noise."""
+    """Return the normal force at each contact `(n, contacts)`, and its σ including torque noise."""
     states, active = (data.q, data.qd, data.tau), data.active(model.system.contact_names)
     predicted = model.predict(*states, "multiplier", active=active)
     mean, variance = predicted.mean, predicted.variance
@@ -139,7 +139,7 @@ def predicted_forces(model: Predictor, data: Dataset) -> Moments:
 
 
 def logged_forces(model: Predictor, data: Dataset) -> dict[str, Tensor]:
-    """Return the logged normal force `(n,)` of contacts closed in training, or the sensor force of one."""
+    """Return the logged normal forces `(n,)` at contacts closed in training, or else the sensor force."""
     never = model.result.never_closed if isinstance(model, StructuredFit) else ()
     names = [name for name in model.system.contact_names if name not in never]
     logged = data.contact_extras.get("multiplier", {})
@@ -151,7 +151,7 @@ def logged_forces(model: Predictor, data: Dataset) -> dict[str, Tensor]:
 
 @torch.no_grad()
 def sensed_scores(model: Predictor, data: Dataset) -> tuple[MultiplierScore, ...]:
-    """Return the scores with the log's force sensor as a measurement at each state, if it has one."""
+    """Return the scores of predictions that use the force sensor in the log, if any, at each state."""
     if not isinstance(model, StructuredFit) or "multiplier" not in model.noise:
         return ()
     if not has_sensor(data, model.system) or "multiplier" not in data.contact_extras:
@@ -165,7 +165,7 @@ def sensed_scores(model: Predictor, data: Dataset) -> tuple[MultiplierScore, ...
 
 
 def _scores(model: Predictor, data: Dataset, mean: Tensor, std: Tensor | None) -> tuple[MultiplierScore, ...]:
-    """Return the scores of λ `(n, contacts)` over the samples in which each contact is closed."""
+    """Return the scores of λ `(n, contacts)` over the samples at which each contact is closed."""
     names = model.system.contact_names
     scores, logged, active = [], logged_forces(model, data), data.active(names)
     for i, (name, rows) in enumerate(zip(names, active.T, strict=True)):

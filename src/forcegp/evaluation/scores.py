@@ -1,4 +1,4 @@
-"""Errors of predicted accelerations by joint, coverage and density of their uncertainty, and the verdict."""
+"""Errors of predicted accelerations by joint, coverage and density of their distribution, and the verdict."""
 
 from __future__ import annotations
 
@@ -11,11 +11,11 @@ import torch
 from torch import Tensor
 
 REST = 0.02
-"""A joint is at rest below this fraction of the 95 % quantile of its speed in the data, ..."""
+"""A joint is considered at rest below this fraction of the 95 % quantile of its speed in the data, ..."""
 SLOWEST = 5e-3
-"""... and always below this speed [rad/s, m/s], so noise of a joint at rest does not count as motion."""
+"""... and always below this speed [rad/s, m/s], so that noise at rest does not count as motion."""
 FEWEST = 10
-"""Minimum number of samples for an error in a condition."""
+"""Minimum number of samples required to compute an error in motion or at rest."""
 
 
 @dataclass(frozen=True)
@@ -25,7 +25,7 @@ class Errors:
     Attributes:
         mae: mean absolute error over samples and joints.
         rmse: root-mean-square error over samples and joints.
-        mae_by_joint, rmse_by_joint: the same, one per joint.
+        mae_by_joint, rmse_by_joint: the same errors for each joint.
     """
 
     mae: float
@@ -35,7 +35,7 @@ class Errors:
 
     @classmethod
     def of(cls, error: Tensor) -> Errors:
-        """Compute errors from differences `(n, nq)`."""
+        """Compute the errors from differences `(n, nq)`."""
         return cls(
             mae=float(error.abs().mean()),
             rmse=float((error**2).mean().sqrt()),
@@ -45,7 +45,7 @@ class Errors:
 
 
 ByJoint = tuple[float | None, ...]
-"""One value per joint, `None` if there are too few samples."""
+"""One value per joint; `None` if there are too few samples."""
 
 
 @dataclass(frozen=True)
@@ -54,8 +54,8 @@ class JointErrors:
 
     Attributes:
         all: error over all samples.
-        moving: error over the samples in which the joint moves.
-        rest: error over the samples in which the joint is at rest.
+        moving: error over the samples at which the joint moves.
+        rest: error over the samples at which the joint is at rest.
         normalised: `all` divided by the standard deviation of the measured quantity (nRMSE).
     """
 
@@ -66,12 +66,12 @@ class JointErrors:
 
     @property
     def in_motion(self) -> ByJoint:
-        """Error in motion, or over all samples for a joint that does not move in the data."""
+        """Error in motion, or the error over all samples if a joint hardly moves in the data."""
         return tuple(a if m is None else m for a, m in zip(self.all, self.moving, strict=True))
 
     @classmethod
     def of(cls, error: Tensor, measured: Tensor, moving: Tensor) -> JointErrors:
-        """Compute errors from differences, the measured quantity and motion flags, each `(n, nq)`."""
+        """Compute the errors from differences, the measured quantity and motion flags, each `(n, nq)`."""
         spread = measured.std(0, correction=0)
         total = _rmse(error, torch.ones_like(moving), fewest=1)
         pairs = zip(total, spread.tolist(), strict=True)
@@ -96,14 +96,14 @@ LEVELS = (0.5, 0.6, 0.7, 0.8, 0.9, 0.95, 0.99)
 
 @dataclass(frozen=True)
 class Uncertainty:
-    """Coverage and density of predicted accelerations.
+    """Coverage and density of the predictive distribution of accelerations.
 
     Attributes:
-        coverage_noisy: fraction of measured accelerations within ±2σ, including noise.
-        coverage_clean: fraction of noise-free accelerations within ±2σ, `None` if not logged.
+        coverage_noisy: fraction of measured accelerations within ±2σ, where σ includes the noise.
+        coverage_clean: fraction of noise-free accelerations within ±2σ; `None` if they are not logged.
         coverage_by_joint: `coverage_noisy` for each joint.
-        calibration: fraction of measured accelerations in the central interval of each level in `LEVELS`.
-        nlpd: mean negative log predictive density of a measured joint acceleration [nats].
+        calibration: fraction of measured accelerations in the central interval for each level in `LEVELS`.
+        nlpd: mean negative log predictive density of the measured joint accelerations [nats].
     """
 
     coverage_noisy: float
@@ -116,7 +116,7 @@ class Uncertainty:
     def of(
         cls, mean: Tensor, variance: Tensor, noise_std: Tensor, measured: Tensor, clean: Tensor | None
     ) -> Uncertainty:
-        """Compute scores from predictions and accelerations `(n, nq)` and the noise `(nq,)`."""
+        """Compute the scores from predictions and accelerations `(n, nq)`, and the noise `(nq,)`."""
         std = (variance + noise_std**2).sqrt()
         deviation = (measured - mean).abs() / std
         half_widths = {f"{level:g}": NormalDist().inv_cdf(0.5 + 0.5 * level) for level in LEVELS}
@@ -141,9 +141,9 @@ def share(inside: Tensor) -> float:
 
 
 TINY = 1e-12
-"""Errors below this count as equal, due to rounding of accelerations of order one."""
+"""Errors below this count as equal, since accelerations of order one have rounding errors."""
 EQUAL = 1e-9
-"""Tolerance within which error ratios count as one, due to rounding."""
+"""Tolerance within which an error ratio counts as one, to allow for rounding errors."""
 
 
 @dataclass(frozen=True)
@@ -152,11 +152,11 @@ class PredictorScores:
 
     Attributes:
         name: `model`, `mean`, `robot file` or `least squares`.
-        torque: error M(q)(predicted − measured q̈) with the mass matrix of the predictor's robot [N m, N].
-        acceleration: error of q̈ [rad/s², m/s²].
-        nlpd: mean negative log predictive density of a measured joint acceleration [nats]; a trivial
-            predictor has the constant uncertainty of its training error.
-        explained: R² by joint, the explained fraction of the torque beyond gravity.
+        torque: error M(q)(predicted − measured q̈), where M is that of the predictor's robot [N m, N].
+        acceleration: error in q̈ [rad/s², m/s²].
+        nlpd: mean negative log predictive density of the measured joint accelerations [nats]; the standard
+            deviation of a trivial predictor is constant and equal to its training error.
+        explained: R² of each joint, the explained fraction of the torque beyond gravity.
     """
 
     name: str
@@ -167,7 +167,7 @@ class PredictorScores:
 
     @property
     def beyond_gravity(self) -> float | None:
-        """Median over the joints of the explained fraction."""
+        """Explained fraction of the torque beyond gravity, median over the joints."""
         known = [share for share in self.explained if share is not None]
         return median(known) if known else None
 
@@ -177,10 +177,10 @@ class Verdict:
     """Comparison of a model with a trivial predictor.
 
     Attributes:
-        against: name of the predictor.
-        torque, acceleration: error of the model relative to the predictor (geometric mean over the joints,
-            samples in motion); below 1, the model is better.
-        worse: joints with a larger torque or acceleration error of the model, or `every joint`.
+        against: name of the trivial predictor.
+        torque, acceleration: ratio of the model's error to that of the predictor (geometric mean over the
+            joints, for samples in motion); the model is better if the ratio is below 1.
+        worse: joints at which the model has the larger torque or acceleration error, or `every joint`.
     """
 
     against: str
@@ -190,7 +190,7 @@ class Verdict:
 
     @property
     def better(self) -> bool:
-        """Whether the model is better in both torque and acceleration."""
+        """Whether the model has smaller errors in both torque and acceleration."""
         return max(self.torque, self.acceleration) < 1.0 - EQUAL
 
     def text(self) -> str:
@@ -201,7 +201,7 @@ class Verdict:
 
 
 def verdicts(scores: Sequence[PredictorScores], joint_names: Sequence[str]) -> tuple[Verdict, ...]:
-    """Compare the first predictor, the model, with each of the others."""
+    """Compare the first predictor, which is the model, with each of the others."""
     model, *others = scores
     result = []
     for other in others:
@@ -221,7 +221,7 @@ def _ratios(ours: JointErrors, theirs: JointErrors) -> list[float]:
 
 
 def sentence(comparisons: Sequence[Verdict]) -> str:
-    """Return the verdict in one sentence, or "" without a comparison."""
+    """Return the verdict in one sentence, or an empty string if there are no comparisons."""
     better = _listed([_noun(v.against) for v in comparisons if v.better])
     worse = _listed([_noun(v.against) for v in comparisons if not v.better])
     parts = [f"is better than {better}"] if better else []

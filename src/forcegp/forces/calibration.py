@@ -1,8 +1,8 @@
-"""Residual torques of a fit: their correlation in time, and their magnitude on held-out stretches.
+"""Residual torques of a fit: their autocorrelation, and their magnitude on held-out blocks of the log.
 
-Temperature, hysteresis and filters leave residuals that are correlated in time, which reduces the information
-in a log by the integrated autocorrelation time. The variance on new motions is measured on stretches of the
-training log that the posterior was not conditioned on.
+Temperature, hysteresis and filters leave residuals that are correlated in time, which divides the number of
+independent samples in a log by the integrated autocorrelation time. The variance on new motions is estimated
+from stretches of the training log that the posterior was not conditioned on.
 """
 
 from __future__ import annotations
@@ -15,6 +15,7 @@ import scipy
 import torch
 from torch import Tensor
 
+from forcegp.data.fields import resolution
 from forcegp.forces.measurements import Measurement, Training
 from forcegp.forces.noise import TORQUE_NOISE
 from forcegp.forces.posterior import (
@@ -26,29 +27,28 @@ from forcegp.forces.posterior import (
     trained_region,
 )
 from forcegp.forces.problem import UNSHOWN, Problem, force_posterior, typical
-from forcegp.forces.quantities import States, affine_map
-from forcegp.robust import resolution
+from forcegp.forces.quantities import affine_map
 
 STRETCHES = 8
 """Number of contiguous stretches into which a log of fewer than three segments is divided."""
 MOST_STRETCHES = 16
-"""Maximum number of stretches, each of which requires a posterior; further segments are combined."""
+"""Maximum number of stretches, each of which requires a posterior; several segments can share a stretch."""
 FEWEST = 50
-"""Minimum number of samples for calibration."""
+"""Minimum number of samples required for calibration."""
 SWEEPS, SETTLED = 20, 1e-3
-"""Maximum number of sweeps over the joints, and relative change of their noise at convergence."""
+"""Maximum number of sweeps over the joints, and relative change in their noise at convergence."""
 MOST_RESIDUALS = 16_000
-"""Maximum number of residuals for estimating correlation, in contiguous stretches of a longer log."""
+"""Maximum number of residuals used to estimate correlation; longer logs are reduced to some stretches."""
 CHUNK_STATES = 2000
-"""Number of states for which residuals are computed at a time, to bound memory."""
+"""Number of states for which residuals are computed at a time, to limit memory use."""
 NEGLIGIBLE = 0.05
-"""Autocorrelation below which estimates are noise."""
+"""Autocorrelation below which estimates are considered noise."""
 SIGNIFICANT = 2.0
-"""Number of standard errors from which the covariance of neighbours is significant."""
+"""Number of standard errors above which the covariance of neighbouring samples is significant."""
 REGIME = 0.25
-"""Fraction of the samples in the fastest or most loaded regime."""
+"""Fraction of the samples in the fastest or most heavily loaded regime."""
 PRIOR_SAMPLES = 4.0
-"""Weight of the prior in `growth`, as a number of independent samples."""
+"""Weight of the prior in `growth`, as an equivalent number of independent samples."""
 WINDOW, WINDOWS = 10.0, 20
 """Length of the windows of `correlation_times` in autocorrelation times, and their minimum number.
 """
@@ -57,12 +57,12 @@ WINDOW, WINDOWS = 10.0, 20
 def autocorrelation_time(x: Tensor, segment: Tensor, white: Tensor | float = 0.0) -> Tensor:
     """Return the integrated autocorrelation time of each column, 1 + 2 Σ ρ_k, in samples `(d,)`.
 
-    The sum ends when ρ falls below 0.05, and at half the longest segment. It is 1 for a column whose
-    neighbours have no significant covariance (two standard errors of that of white noise).
+    The sum ends when ρ falls below 0.05, or at half the longest segment. The result is 1 for a column whose
+    neighbouring samples have no significant covariance (at least two standard errors of that of white noise).
 
     Args:
         x: `(n, d)` zero-mean signals in time order.
-        white: variance of white noise in x, which is excluded.
+        white: variance of white noise in x, which is subtracted.
     """
     longest = int(segment.unique(return_counts=True)[1].max())
     variance, first = _variance_in_time(x, segment, white)
@@ -78,16 +78,16 @@ def autocorrelation_time(x: Tensor, segment: Tensor, white: Tensor | float = 0.0
 
 
 def correlation_times(x: Tensor, segment: Tensor, length: int, white: Tensor | float = 0.0) -> Tensor:
-    """Return the spectral density of each column at low frequencies over its variance, in samples `(d,)`.
+    """Return each column's spectral density at low frequencies divided by its variance, in samples `(d,)`.
 
     L · mean(x̄²) / (mean(x²) − white) over windows of L samples with means x̄ (batch means, Flegal and Jones
     2010). In contrast to `autocorrelation_time`, it includes the negative lobes of an oscillating residual,
-    such as noise of differentiated positions or the ringing of a gear, which hardly move a robot.
+    such as noise of differentiated positions or the ringing of a gear, which hardly moves a robot.
 
     Args:
-        x: `(n, d)` in the order of time, with mean zero.
+        x: `(n, d)` zero-mean signals in time order.
         length: window length L, several times the autocorrelation time.
-        white: variance of white noise in x, which is not counted.
+        white: variance of white noise in x, which is subtracted.
     """
     squares = []
     for s in segment.unique():
@@ -98,35 +98,29 @@ def correlation_times(x: Tensor, segment: Tensor, length: int, white: Tensor | f
 
 
 def _variance_in_time(x: Tensor, segment: Tensor, white: Tensor | float) -> tuple[Tensor, Tensor]:
-    """Return the variance without white noise `(d,)` and its lower bound, the covariance of neighbours."""
+    """Return the variance minus white noise `(d,)`, and its lower bound, the covariance of neighbours."""
     first = _covariance(x, segment, 1)
     return (x.square().mean(0) - white).clamp(min=1e-300).maximum(first), first
 
 
 def _covariance(x: Tensor, segment: Tensor, lag: int) -> Tensor:
-    """Return the mean product `(d,)` of samples in a segment separated by a lag."""
+    """Return the mean product `(d,)` of samples of the same segment that are separated by the given lag."""
     same = segment[:-lag] == segment[lag:]
     return ((x[:-lag] * x[lag:]) * same[:, None]).sum(0) / same.sum().clamp(min=1)
 
 
 def _motions(training: Training) -> list[int]:
-    """Return the measurements of accelerations, or of the joint forces from them and a force sensor."""
+    """Return the indices of measured accelerations, and of joint forces that include a force sensor."""
     return [i for i, quantity in enumerate(training.quantities) if quantity in ("qdd", "joint_force")]
-
-
-def _of_force(at: States, quantity: str) -> Tensor:
-    """Return the map from errors of a quantity to force errors `(n, nq, nq)`, M for accelerations."""
-    M = at.eom.M
-    return M if quantity == "qdd" else torch.eye(M.shape[-1], dtype=M.dtype, device=M.device).expand_as(M)
 
 
 def residual_times(
     problem: Problem, hyperparameters: Mapping[str, Tensor], training: Training
 ) -> tuple[float, Tensor | None]:
-    """Return κ ≤ 1, and `correlation_times` of joints `(nq,)` [s], `None` for too few samples.
+    """Return κ ≤ 1, and the `correlation_times` of the joints `(nq,)` [s] (`None` with too few samples).
 
-    κ = 1/τ̄, where τ̄ is the geometric mean over the joints of the autocorrelation time of torque noise in
-    the residuals of `training`: n samples contain as much information as n/τ̄ independent ones.
+    κ = 1/τ̄, where τ̄ is the autocorrelation time of torque noise in the residuals of `training`, averaged
+    geometrically over the joints: n samples contain as much information as n/τ̄ independent ones.
     """
     posterior = force_posterior(problem, hyperparameters)
     logs, times = [], []
@@ -153,7 +147,7 @@ def residual_times(
 
 
 def _some(n: int) -> Tensor:
-    """Return at most `MOST_RESIDUALS` of n rows in contiguous stretches, to keep neighbours together."""
+    """Return at most `MOST_RESIDUALS` of n rows, in contiguous stretches so that neighbours stay together."""
     if n <= MOST_RESIDUALS:
         return torch.arange(n)
     length = MOST_RESIDUALS // STRETCHES
@@ -168,11 +162,11 @@ def _torque_noise(
     m: Measurement,
     std: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Return the estimated torque noise of each joint relative to its standard deviation, and the
-    contribution of white acceleration noise to its variance, `(n, nq)` each.
+    """Return the estimated torque noise of each joint divided by its standard deviation, and the
+    contribution of white acceleration noise to its variance, each `(n, nq)`.
 
     Residuals are r = B ε + e with torque noise ε ~ N(0, S), B = H for accelerations, and white e ~ N(0, Σ),
-    which masks the correlation of ε and is smallest in E[ε | r] = G r.
+    which masks the correlation of ε and contributes least to E[ε | r] = G r.
     """
     system, force_noise = problem.system, problem.force_noise(hyperparameters)
     assert force_noise is not None
@@ -203,14 +197,14 @@ def calibrated_noise(problem: Problem, hyperparameters: Mapping[str, Tensor]) ->
 
 
 def held_out_torque_std(problem: Problem, hyperparameters: Mapping[str, Tensor], least: Tensor) -> Tensor:
-    """Return the torque noise `(nq,)` for which normalised errors on held-out stretches have unit variance.
+    """Return the torque noise `(nq,)` for which normalised errors on held-out blocks have unit variance.
 
     Each stretch is predicted from all others with the given hyperparameters. The force error computed from
-    accelerations is r = M(q̈ − E q̈) = P ε, with P = I in free motion. For joint i, s_i² solves mean(r_i² /
-    (Σ_k P_ik² s_k² + Var r_i)) = 1 over all samples with P_ii above one half.
+    accelerations is r = M(q̈ − E q̈) = P ε, where P = I in free motion. For joint i, s_i² solves
+    mean(r_i² / (Σ_k P_ik² s_k² + Var r_i)) = 1, averaged over all samples with P_ii above one half.
 
     Args:
-        least: the learned standard deviation, a lower bound.
+        least: the learned standard deviation, used as a lower bound.
     """
     parts = []
     for i in _motions(problem.training):
@@ -226,13 +220,13 @@ def held_out_torque_std(problem: Problem, hyperparameters: Mapping[str, Tensor],
 def growth(problem: Problem, hyperparameters: Mapping[str, Tensor], load: Tensor) -> Tensor:
     """Return the growth rate g `(nq,)` of torque standard deviations beyond the trained region.
 
-    The fastest and the most loaded quarter of the training samples are predicted from the rest. With
-    g = c · load, a common c for all joints, and the distance D beyond the region of the rest, c maximises the
-    posterior under r_i ~ N(0, V_i + Σ_k P_ik² (s_k² + g_k² D_k²)), tempered like the likelihood, and a scaled
-    inverse-χ² prior, which dominates if the log has only one regime.
+    The fastest quarter and the most heavily loaded quarter of the training samples are predicted from the
+    rest. Here g = c · load with a common c for all joints, and D is the distance beyond the region of the
+    rest. c maximises the posterior under r_i ~ N(0, V_i + Σ_k P_ik² (s_k² + g_k² D_k²)), tempered like the
+    likelihood, and a scaled inverse-χ² prior, which dominates if the log has only one regime.
 
     Args:
-        problem: the learned problem, with the power of its likelihood.
+        problem: the learned problem, including the exponent of its likelihood.
         hyperparameters: hyperparameters including the predicted torque noise.
         load: typical torque of each joint `(nq,)` [N m, N].
     """
@@ -266,7 +260,7 @@ def growth(problem: Problem, hyperparameters: Mapping[str, Tensor], load: Tensor
 
 
 def stretches(segment: Tensor) -> Tensor:
-    """Return the stretch index of each sample: its segment, or an eighth of the log with few segments."""
+    """Return the stretch index of each sample: its segment, or its eighth of a log with few segments."""
     _, own = segment.unique(return_inverse=True)
     if int(own.max()) + 1 >= 3:
         return own % MOST_STRETCHES
@@ -277,14 +271,16 @@ def stretches(segment: Tensor) -> Tensor:
 def _held_out(
     problem: Problem, hyperparameters: Mapping[str, Tensor], i: int, own: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return held-out torque residuals of measurement i, their noise-free variance, `(n, nq)`, and P."""
+    """Return held-out torque residuals of measurement i and their noise-free variance, `(n, nq)`, and P."""
     training, std = problem.training, problem.noise_at(hyperparameters, i)
     m, system = training.measurements[i][own], problem.system
     posterior = force_posterior(
         dataclasses.replace(problem, training=training.without(i, own)), hyperparameters
     )
     at = m.at(system)
-    z, M = affine_map(system, at, m.quantity), _of_force(at, m.quantity)
+    z, M = affine_map(system, at, m.quantity), at.eom.M
+    if m.quantity == "joint_force":
+        M = torch.eye(M.shape[-1], dtype=M.dtype, device=M.device).expand_as(M)
     P = M @ z.B_Q
     mean, covariance = posterior.read(system, at, z)
     residual = (M @ (m.values - mean)[..., None])[..., 0]
@@ -299,8 +295,8 @@ def unit_scales(r2: Tensor, V: Tensor, share: Tensor, least: Tensor) -> Tensor:
     """Solve mean(r_i² / (Σ_k share_ik s_k² + V_i)) = 1 for s, joint by joint.
 
     Args:
-        r2, V: `(n, nq)` squared errors, and their variance without noise.
-        share: `(n, nq, nq)` P_ik², the contribution of noise of joint k to the error of joint i.
+        r2, V: `(n, nq)` squared errors, and the part of their variance that is not noise.
+        share: `(n, nq, nq)` P_ik², the contribution of the noise of joint k to the error of joint i.
         least: `(nq,)` lower bounds.
     """
     s = least.clone()

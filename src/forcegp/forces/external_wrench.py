@@ -1,23 +1,23 @@
-"""External wrench on a robot frame, from the equations of motion beyond the learned forces.
+"""External wrench on a robot frame, estimated from the equations of motion with learned forces.
 
 An undeclared wrench w acts on a frame with Jacobian J:
 
     M q̈ = Q̄ + Aᵀλ + Jᵀ w,   Q̄ ~ N(E Q̄, S).
 
-S is the posterior covariance of the learned forces with torque noise.
+S is the posterior covariance of the learned forces, including torque noise.
 
 - **From accelerations** (`least_squares`): r = M q̈ − E Q̄ = Jᵀ w + e with Cov(e) = S + M Σ_q̈ Mᵀ and a prior
-  w ~ N(0, W), by generalized least squares: C = (J Cov(e)⁻¹ Jᵀ + W⁻¹)⁻¹, E w = C J Cov(e)⁻¹ r. In directions
-  without effect on the joints, the covariance is that of the prior.
+  w ~ N(0, W), solved by generalized least squares: C = (J Cov(e)⁻¹ Jᵀ + W⁻¹)⁻¹, E w = C J Cov(e)⁻¹ r.
+  Directions that have no effect on the joints retain the prior covariance.
 - **From momenta** (`observe`), without accelerations: p = M q̇ obeys ṗ = Q̄ − Q_C + ½ ∂(q̇ᵀM q̇)/∂q + Jᵀ w. A
-  Kalman filter estimates p, w, and the error of the learned forces, which has the correlation time of the
+  Kalman filter estimates p, w, and the error of the learned forces, whose correlation time is that of the
   torque residuals in the training log. The observer of De Luca and Mattone (*Sensorless robot collision
   detection and hybrid force/motion control*, ICRA 2005) is the steady-state filter without force errors.
-- **With an unknown lever** (`over_levers`): a moment about the point is a force times its distance. The
+- **With an unknown lever arm** (`over_levers`): a moment about the point is a force times its distance. The
   estimate is a mixture over priors with moments of several scales, weighted by their evidence at the sample.
   The evidence resolves directions that hardly affect the joints.
 
-The wrench acts from the environment on the robot. Multipliers of closed contacts are also unknown.
+The wrench is exerted by the environment on the robot. Multipliers of closed contacts are also unknown.
 """
 
 from __future__ import annotations
@@ -38,32 +38,31 @@ from forcegp.robot.model import RobotModel
 Array = NDArray[np.float64]
 
 FORCES, MOMENTS = ("fx", "fy", "fz"), ("mx", "my", "mz")
-"""Components of a wrench; moments are about the point."""
+"""Components of a wrench; moments are taken about the point."""
 AXES = (*FORCES, *MOMENTS)
 FORCE_STD, MOMENT_STD = 30.0, 5.0
-"""Prior standard deviation of each force [N] and moment [N m], large compared with pushes by hand."""
+"""Prior standard deviations of each force [N] and moment [N m], large compared with pushes by hand."""
 FORCE_CHANGE, MOMENT_CHANGE = 10.0, 1.0
-"""Standard deviations of their change within a second, in the momentum filter."""
+"""Standard deviations of their change within one second, for the momentum filter."""
 LEVERS = (1.0, 0.3, 0.1)
-"""Scales of moments relative to the prior, with equal prior probability."""
+"""Scales of moments relative to the prior, with equal prior probabilities."""
 MULTIPLIER_STD = 1e4
 """Large prior standard deviation of the multipliers of declared contacts [N]."""
 ROWS = {name: row for row, name in enumerate((*MOMENTS, *FORCES))}
-"""Row of each component in `frame_jacobian`, which has rotations first."""
+"""Row of each component in `frame_jacobian`, in which rotations come first."""
 
 
 @dataclass(frozen=True)
 class WrenchFrame:
-    """A frame on which an unknown wrench acts, and its nonzero components.
+    """A frame on which an unknown wrench acts, and the nonzero components of the wrench.
 
     Args:
         frame: frame of the robot.
         reference: axes of the components, `"world"` or `"local"` (those of the frame).
         axes: components in `AXES` to estimate, in this order; the others are zero.
-        point: point of application of the force and reference point of moments, in coordinates of the frame
-            [m].
-        prior_std: prior standard deviation of forces [N] and moments [N m].
-        change: standard deviation of the change of a force [N] and a moment [N m] within a second, for the
+        point: point of application of the force and reference point of moments, in frame coordinates [m].
+        prior_std: prior standard deviations of forces [N] and moments [N m].
+        change: standard deviations of the change in a force [N] and a moment [N m] within one second, for the
             momentum filter; larger values make it faster and noisier.
 
     Example:
@@ -72,7 +71,7 @@ class WrenchFrame:
 
     Raises:
         UnknownNameError: the reference or a component does not exist.
-        ParameterError: there is no component, a component is repeated, or a standard deviation is not
+        ParameterError: there are no components, a component is repeated, or a standard deviation is not
             positive and finite.
     """
 
@@ -104,7 +103,7 @@ class WrenchFrame:
 
     @property
     def changes(self) -> Tensor:
-        """Change of each component within a second `(k,)` [N, N m]."""
+        """Standard deviation of the change in each component within one second `(k,)` [N, N m]."""
         return self._each(self.change)
 
     def _each(self, pair: tuple[float, float]) -> Tensor:
@@ -113,7 +112,7 @@ class WrenchFrame:
 
     @property
     def levers(self) -> list[Tensor]:
-        """Factors on `prior` `(k,)` for each of `LEVERS`, if there are both forces and moments."""
+        """Factors `(k,)` on `prior` for each of `LEVERS`; only ones, unless there are forces and moments."""
         both = len({axis in FORCES for axis in self.axes}) == 2
         return [self._each((1.0, lever)) for lever in (LEVERS if both else (1.0,))]
 
@@ -155,7 +154,7 @@ def least_squares(J: Tensor, r: Tensor, S: Tensor, prior: Tensor) -> tuple[Tenso
 def over_levers(
     mean: Tensor, covariance: Tensor, prior: Tensor, levers: Sequence[Tensor]
 ) -> tuple[Tensor, Tensor]:
-    """Convert an estimate under w ~ N(0, diag prior²) to a mixture of priors W_s = diag (s prior)², s ≤ 1.
+    """Convert an estimate under w ~ N(0, diag prior²) to one under a mixture of W_s = diag (s prior)², s ≤ 1.
 
     C_s⁻¹ = C⁻¹ + W_s⁻¹ − W⁻¹ and m_s = C_s C⁻¹ m, with evidence ∝ (|C_s| / |W_s|)^½ exp(½ m_sᵀ C_s⁻¹ m_s).
 
@@ -187,7 +186,7 @@ def over_levers(
 
 
 def momentum_force(robot: RobotModel, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
-    """Return M `(n, nq, nq)` and ½ ∂(q̇ᵀM q̇)/∂q = Ṁ q̇ + Q_C `(n, nq)`, the contribution of inertia to ṗ."""
+    """Return M `(n, nq, nq)`, and ½ ∂(q̇ᵀM q̇)/∂q = Ṁ q̇ + Q_C `(n, nq)`, the contribution of inertia to ṗ."""
     with torch.enable_grad():
         x = q.detach().clone().requires_grad_()
         M = dynamics.mass_matrix(robot, x)
@@ -205,9 +204,9 @@ class MomentumLog:
         p: momentum M q̇ `(n, nq)`, with noise covariance `p_noise` `(n, nq, nq)`.
         u: `(n, nq)` mean of ṗ without the wrench.
         J: `(n, k, nq)` Jacobians of the unknown components.
-        prior, change: `(k,)` standard deviations of the components and of their change within a second.
+        prior, change: `(k,)` standard deviations of the components and of their change within one second.
         factor: `(n, nq, nq)` lower Cholesky factor of S.
-        correlation: `(nq,)` integral of the autocorrelation of the forces' error over all lags [s].
+        correlation: `(nq,)` integral of the autocorrelation of the force error over all lags [s].
     """
 
     t: Array
@@ -222,12 +221,12 @@ class MomentumLog:
 
 
 def observe(log: MomentumLog) -> tuple[Array, Array]:
-    """Filter the wrench of a trajectory causally; return mean `(n, k)` and covariance `(n, k, k)`.
+    """Filter the wrench along a trajectory causally; return its mean `(n, k)` and covariance `(n, k, k)`.
 
-    The state is x = (p, w, η): w is an Ornstein-Uhlenbeck process with the variance W of the prior and
-    changes of `change` within a second; S½ η is the error of the learned forces, with η of unit variance.
-    Over a step h, p⁺ = p + h (u + Jᵀ w + S½ η), w⁺ = φ w + √(1 − φ²) W½ ε, η⁺ = ψ η + √(1 − ψ²) ε, with φ =
-    exp(−h change²/2 W), and ψ = (c − h)/(c + h), which keeps the spectral density c of η at low frequencies.
+    The state is x = (p, w, η): w is an Ornstein-Uhlenbeck process that has the prior variance W and changes
+    by `change` within one second. S½ η is the error of the learned forces, where η has unit variance. Over
+    a step h, p⁺ = p + h (u + Jᵀ w + S½ η), w⁺ = φ w + √(1 − φ²) W½ ε, η⁺ = ψ η + √(1 − ψ²) ε, with φ =
+    exp(−h change²/2 W), and ψ = (c − h)/(c + h), which preserves the low-frequency spectral density c of η.
     """
     n, nq = log.p.shape
     k = len(log.prior)

@@ -1,12 +1,12 @@
 """Dry friction with memory in the torque residuals of a fit.
 
-Friction as a function of velocity jumps when a joint reverses. Real friction develops over a distance δ: in
-Dahl's model it is proportional to z, with dz/dt = q̇/δ − |q̇| z/δ (Dahl 1976, *Solid friction damping of
-mechanical vibrations*). Force priors depend only on the state, so near reversals they can be wrong by the
-full friction, which makes other learned forces less certain. For a log in time order, z can be computed from
-the velocities. The correction is a ridge regression of the torque residual on z for several δ, on functions
-of the velocity, and on the weight of the links. A joint is corrected only if the correction explains held-out
-stretches of the training log.
+Friction modelled as a function of velocity jumps when a joint reverses. Real friction develops over a
+distance δ: in Dahl's model it is proportional to z, with dz/dt = q̇/δ − |q̇| z/δ (Dahl 1976, *Solid friction
+damping of mechanical vibrations*). Force priors depend only on the state, so near reversals they can be wrong
+by the full friction, which makes other learned forces less certain. For a log in time order, z can be
+computed from the velocities. The correction is a ridge regression of the torque residual on z for several
+values of δ, on functions of the velocity, and on the gravity torques of the links. A joint is corrected only
+if the correction reduces the residual on held-out blocks of the training log.
 """
 
 from __future__ import annotations
@@ -35,25 +35,25 @@ from forcegp.robot.model import RobotModel
 
 MEMORY = f"{NOISE}.memory."
 WEIGHTS, SHARE, CORRELATION = (MEMORY + name for name in ("weights", "share", "correlation"))
-"""Names of the correction in the hyperparameters."""
+"""Names under which the correction is stored in the hyperparameters."""
 RIDGE = 1e-3
-"""Ridge for features of unit size, relative to the number of samples."""
+"""Ridge penalty for features of unit size, relative to the number of samples."""
 LONGEST_STEP = 0.05
-"""Longest time between training samples for interpolation of velocities [s]."""
+"""Longest time between training samples over which velocities are interpolated [s]."""
 LEAST_SHARE = 0.01
 """Lower bound on the remaining fraction of the variance."""
 
 
 def _features(robot: RobotModel, log: Measurement | Dataset) -> Tensor:
-    """Return features `(n, nq, f)`: bristles for all distances, memoryless friction, offset, and weight."""
+    """Return features `(n, nq, f)`: bristles for all distances, memoryless friction, offset, and gravity."""
     v = log.qd[..., None]
     friction = [bristles(log), *(torch.tanh(v / speed) for speed in SPEEDS), v, torch.ones_like(v)]
     return torch.cat([*friction, _weight(robot, log.q)], dim=-1)
 
 
 def _weight(robot: RobotModel, q: Tensor) -> Tensor:
-    """Return the gravity torque for errors of mass and first moment of each link, `(n, nq, 4 nq)` [N m, N],
-    of one standard deviation of `InertialPrior`.
+    """Return the gravity torque `(n, nq, 4 nq)` [N m, N] due to errors in the mass and first moment of each
+    link, each equal to one standard deviation of `InertialPrior`.
     """
     columns, zero = torch.arange(10 * robot.nq).view(-1, 10)[:, :4].flatten(), torch.zeros_like(q)
     Y = regressor(robot, q, zero, zero)[..., columns]
@@ -66,7 +66,7 @@ class FrictionMemory:
 
     Attributes:
         weights: weights of the features, `(nq, f)` [N m, N].
-        share: remaining fraction of the variance of torque noise and of static friction, `(nq, 2)`.
+        share: remaining fractions of the variances of torque noise and of static friction, `(nq, 2)`.
         correlation: integral of the autocorrelation of the residual over all lags, `(nq,)` [s].
     """
 
@@ -76,7 +76,7 @@ class FrictionMemory:
 
     @classmethod
     def of(cls, hyperparameters: Mapping[str, Tensor]) -> FrictionMemory | None:
-        """Return the correction learned by a fit, if its log determines it."""
+        """Return the correction learned by a fit, or `None` if the log was not sufficient to determine it."""
         if WEIGHTS not in hyperparameters:
             return None
         return cls(*(hyperparameters[name] for name in (WEIGHTS, SHARE, CORRELATION)))
@@ -90,11 +90,11 @@ class FrictionMemory:
 def memory_of(
     problem: Problem, hyperparameters: Mapping[str, Tensor], training: Training
 ) -> dict[str, Tensor]:
-    """Return the correction as hyperparameters, from samples in free motion; empty if these are not in time
-    order or too far apart.
+    """Return the correction learned from samples in free motion, as hyperparameters; empty if the samples are
+    too far apart or are not in time order.
 
     Args:
-        training: samples with the residuals to explain.
+        training: samples whose residuals are to be explained.
     """
     if not training.period:
         return {}
@@ -111,7 +111,7 @@ def memory_of(
         mean, S = posterior.read(problem.system, at, z)
         stick = stick_variance(hyperparameters, at)
         noise = torch.stack([torque.expand_as(stick), stick], dim=-1)
-        # Noise of q̈ in the residual: diag(M Σ Mᵀ)
+        # Contribution of the noise of q̈ to the residual: diag(M Σ Mᵀ)
         white = (M.square() @ std[rows].square()[..., None])[..., 0]
         residual = (M @ part.values[..., None])[..., 0] - mean
         parts.append((residual, white, S.diagonal(dim1=-2, dim2=-1), noise))
@@ -134,13 +134,13 @@ def learn_memory(
     """Learn the correction from training samples in free motion.
 
     Args:
-        residual: joint force not explained by the fit, M q̈ − E Q̄ `(n, nq)`.
-        white: contribution of acceleration noise to its variance, `(n, nq)`.
+        residual: joint force that the fit does not explain, M q̈ − E Q̄ `(n, nq)`.
+        white: contribution of acceleration noise to the variance of the residual, `(n, nq)`.
         forces: contribution of the learned forces, `(n, nq)`.
         noise: contributions of torque noise and of static friction, `(n, nq, 2)`.
 
     Returns:
-        The correction, or `None` if the samples are too far apart.
+        The correction, or `None` if the samples are too far apart or are not in time order.
     """
     steps = motion.t.diff()[motion.segment[1:] == motion.segment[:-1]]
     if not len(steps) or not 0.0 < float(steps.median()) <= LONGEST_STEP or float(steps.min()) <= 0.0:
@@ -160,12 +160,12 @@ def learn_memory(
     better = remaining.square().sum(0) < residual.square().sum(0)
     total, share = white + forces + noise.sum(-1), torch.ones_like(noise[0])
     for j in better.nonzero()[:, 0].tolist():
-        # r² − white − forces ≈ share · noise, with weights by the variance of r²
+        # r² − white − forces ≈ share · noise, weighted by the variance of r²
         rows = noise[:, j] / total[:, j, None]
         target = (remaining[:, j].square() - white[:, j] - forces[:, j]) / total[:, j]
         found = torch.from_numpy(scipy.optimize.nnls(rows.cpu().numpy(), target.cpu().numpy())[0])
         share[j] = found.to(share).clamp(min=LEAST_SHARE, max=1.0)
-        # A new motion is one more stretch, so its variance scatters as that of the stretches does.
+        # A new motion is like another stretch, so its variance scatters as much as theirs does.
         square = remaining[:, j].square() / (white[:, j] + forces[:, j] + noise[:, j] @ share[j])
         by_stretch = torch.stack([square[group == g].mean() for g in group.unique()])
         share[j] *= (by_stretch.mean() + by_stretch.std()).clamp(min=1.0)

@@ -1,22 +1,22 @@
-"""Inertia of a measured robot: that of its file, with drives that the file lacks, or identified inertia.
+"""Inertia of a real robot: that of its file, optionally with added drive inertia, or identified inertia.
 
-Held-out stretches of the log decide whether an estimate predicts torques better than the file
-(`inverse_dynamics.py`). With noisy accelerations, least squares underestimates inertia; with noisy torques in
-closed loop, the likelihood of accelerations given torques overestimates it. The equations of motion a little
-earlier and later are instruments without either bias. The unknowns are Gaussian around the robot file, each
-link stays physically consistent, and the inertia of a drive is not negative.
+Held-out blocks of the log decide whether an estimate predicts torques better than the robot file
+(`inverse_dynamics.py`). With noisy accelerations, least squares underestimates inertia. With noisy torques in
+closed loop, the likelihood of accelerations given torques overestimates it. The equations of motion slightly
+earlier and later are instruments that avoid both biases. The unknowns are Gaussian around the robot file,
+each link stays physically consistent, and drive inertia is nonnegative.
 
-Torque and motion are seldom read at the same instant, and milliseconds between them make the inertia of a
-light joint wrong. So a delay is a further unknown.
+Torque and motion are seldom read at the same instant, and a delay of milliseconds biases the inertia of a
+light joint, so the delay is an additional unknown.
 
-Torques alone do not suffice. In a closed loop the noise of the torque sensor exceeds the torque that
-accelerates a light joint; divided by the inertia of the file it predicts accelerations far larger than the
-measured ones. From ten times their mean square on, the drives get the inertia that maximises
+Torques alone are not sufficient. In closed loop, torque-sensor noise exceeds the torque that accelerates a
+light joint. Divided by the inertia in the file, it predicts accelerations far larger than the measured ones.
+If their mean square is ten times too large, the drives are assigned the inertia that maximises
 −½ Σ ε²/s² + v Σ log |M|, with the smallest v ≤ 1 at which accelerations are predicted as well as by their
-mean, as long as the error of no joint's torque on held-out stretches grows by more than 2 %.
+mean, provided that no joint's torque error on held-out blocks increases by more than 2 %.
 
-If an `InertialPrior` is given, the robot moves to the posterior mean of its inertial
-parameters: one Gauss–Newton step, physically consistent.
+If an `InertialPrior` is given, the inertial parameters of the robot are set to their posterior mean in one
+physically consistent Gauss–Newton step.
 """
 
 from __future__ import annotations
@@ -62,17 +62,17 @@ from forcegp.identification import regressor
 from forcegp.robot.model import RobotModel
 
 PASSES = 3
-"""Estimates of the unknowns, each with the noise that the one before left."""
+"""Number of successive estimates of the unknowns, each with the residual noise of the previous one."""
 WIDTHS = (0.0, 0.02, 0.05, 0.12)
-"""Standard deviations of averages over time that are tried [s]; the narrowest posterior is taken."""
+"""Standard deviations of the time averages to try [s]; the one with the narrowest posterior is used."""
 
 
 def rigid_robot(robot: RobotModel, rows: Rows) -> tuple[RobotModel, bool]:
-    """The robot that predicts held-out torques best, and whether its links were identified.
+    """Return the robot that best predicts held-out torques, and whether its links were identified.
 
-    Candidates are the file, the file with drives that it lacks, and physically consistent links with drives.
-    Each must be better by two standard errors over stretches of the log than those before it, and no joint's
-    held-out acceleration error may grow.
+    The candidates are the robot file, the file with added drive inertia, and physically consistent links with
+    drives. Each must outperform the previous ones by two standard errors over blocks of the log, and no
+    joint's held-out acceleration error may increase.
 
     Args:
         robot: robot from the file.
@@ -91,7 +91,7 @@ def rigid_robot(robot: RobotModel, rows: Rows) -> tuple[RobotModel, bool]:
     driving, everything = torch.cat([torch.arange(n), delay]), torch.arange(C.shape[-1])
 
     def compared(estimate: Estimate) -> Tensor:
-        """Return held-out errors per sample in units of their noise; averages hide sharp friction."""
+        """Return held-out errors of single samples in units of their noise; averages hide sharp friction."""
         return held_out(single.by_stretch, estimate, judged, found.by_stretch) / single.noise**2
 
     def estimated(kept: Tensor) -> Tensor:
@@ -117,10 +117,10 @@ def rigid_robot(robot: RobotModel, rows: Rows) -> tuple[RobotModel, bool]:
 def _consistent(
     robot: RobotModel, prior: InertialPrior, found: _Regression, size: Tensor
 ) -> tuple[RobotModel, Tensor]:
-    """The robot with consistent links and drives that are not negative, and the unknowns.
+    """Return the robot with physically consistent links and nonnegative drive inertia, and the unknowns.
 
-    Links are moved without knowledge of the drives, which adapt to them; a drive that would be negative then
-    is left out.
+    The links are updated with the drives marginalised, and the drives then adapt to them. Drives that would
+    become negative are removed.
 
     Args:
         size: unit of the inertia of each drive `(nq,)`.
@@ -142,20 +142,20 @@ def _consistent(
 
 
 def with_delay(rows: Rows, columns: Tensor) -> Tensor:
-    """Columns of inertial parameters and, last, of the delay s of the torque: τ(t + s) ≈ τ(t) + s dτ/dt."""
+    """Append a column for the delay s of the torque: τ(t + s) ≈ τ(t) + s dτ/dt."""
     return torch.cat([columns, LATE * rows.rate[..., None]], dim=-1)
 
 
 @dataclass(frozen=True)
 class _Regression:
-    """Unknowns by instrumental variables, with the noise `(nq,)` and the power κ that they leave."""
+    """Regression with instrumental variables, with its residual noise `(nq,)` and likelihood exponent κ."""
 
     by_stretch: NormalEquations
     noise: Tensor
     power: float
 
     def normal(self, given: NormalEquations | None = None) -> tuple[Tensor, Tensor]:
-        """Linear term κ h and precision κ H + 1 of the unknowns, without directions of negative H."""
+        """Return linear term κ h and precision κ H + 1 of the unknowns, ignoring directions of negative H."""
         H, h = (given or self.by_stretch.total()).quadratic(self.noise)
         values, vectors = torch.linalg.eigh(0.5 * (H + H.mT))
         shown = vectors * (values > 0.0)
@@ -164,10 +164,10 @@ class _Regression:
         return self.power * shown @ (vectors.mT @ h), precision + eye
 
     def estimate(self, given: NormalEquations, kept: Tensor, n: int, known: Tensor | None = None) -> Tensor:
-        """Most probable unknowns among those that are kept; the first n, drives, are not negative.
+        """Return the most probable unknowns with indices `kept`; the first n are drives and nonnegative.
 
         Args:
-            known: values of the others, zero by default.
+            known: values of the other unknowns, zero by default.
         """
         h, precision = self.normal(given)
         known = torch.zeros_like(h) if known is None else known
@@ -181,17 +181,17 @@ class _Regression:
 
 
 def _marginal(precision: Tensor, kept: Tensor, others: Tensor) -> Tensor:
-    """Precision of some unknowns without knowledge of others: a Schur complement."""
+    """Return the precision of the kept unknowns with the others marginalised (a Schur complement)."""
     across = precision[kept][:, others]
     return precision[kept][:, kept] - across @ torch.linalg.solve(precision[others][:, others], across.mT)
 
 
 def _over_widths(rows: Rows, inertial: Tensor, M: Tensor) -> Iterator[_Regression]:
-    """Regressions on equations that are averaged over time, by the width of the average.
+    """Yield a regression on equations averaged over time for each width of the average.
 
     Args:
         inertial: columns of drives and links `(n, nq, p)`.
-        M: mass matrix of the file.
+        M: mass matrix of the robot file.
     """
     accelerating, n = (M @ rows.qdd[..., None])[..., 0], M.shape[-1]
     for width in WIDTHS if rows.step else WIDTHS[:1]:
@@ -212,32 +212,32 @@ def _over_widths(rows: Rows, inertial: Tensor, M: Tensor) -> Iterator[_Regressio
 
 
 def _power(rows: Rows, left: Tensor) -> float:
-    """Return κ = 1/τ̄ of what nothing explains, as in `residual_times`."""
+    """Return κ = 1/τ̄ of the unexplained residual, as in `residual_times`."""
     times = autocorrelation_time(left[: rows.leading], rows.segment[: rows.leading])
     return min(1.0, math.exp(-float(times.log().mean())))
 
 
 def _is_better(after: Tensor, before: Tensor) -> bool:
-    """Return whether errors `(groups, nq)` are significantly smaller, in the mean of the joints."""
+    """Return whether errors `(groups, nq)`, averaged over the joints, are significantly smaller."""
     return is_less((after - before).mean(-1))
 
 
 VOLUME_STATES = 100
-"""States that log |M|, or the volume of the noise, is averaged over."""
+"""Number of states over which log |M|, or the volume of the noise, is averaged."""
 FAR_LARGER = 10.0
-"""Mean squared error of accelerations over that of their mean from which drives are damped."""
+"""Mean squared acceleration error, relative to that of the mean, above which drive inertia is raised."""
 NEGLIGIBLE = 0.02
-"""Inertia of a drive over its joint's that is left out: a gain of the torque sensor explains as much."""
+"""Ratio of drive to joint inertia below which it is neglected: a gain error of the sensor can explain it."""
 WEIGHTS = tuple(2.0 ** (-k / 2) for k in range(20, -1, -1))
-"""Weights v of the volume, from 1/1024 to 1."""
+"""Weights v of the volume term, from 1/1024 to 1."""
 
 
 @dataclass(frozen=True)
 class Inertia:
-    """Inertia that the log determines.
+    """Inertia determined from a log.
 
     Attributes:
-        robot: that of the file, with the identified inertia.
+        robot: robot from the file, with the identified inertia.
         identified: whether inertial parameters of links were identified, so that some uncertainty remains.
         doubts: warnings for the user.
     """
@@ -251,13 +251,13 @@ class Inertia:
 def inertia_of(
     system: ConstrainedSystem, friction: JointFrictionPrior, mean: ForceMean, training: Training
 ) -> Inertia:
-    """Identify the inertia of a measured robot from samples in free motion.
+    """Identify the inertia of a real robot from samples in free motion.
 
     Args:
         system: robot and contacts of the robot file.
-        friction: inputs of the friction of a joint.
-        mean: prior mean of Q, with the motor torque.
-        training: samples in motion, `LEAST` of them free.
+        friction: prior that defines the features of joint friction.
+        mean: prior mean of Q, including the motor torque.
+        training: samples in motion, at least `LEAST` of them in free motion.
     """
     robot = system.robot
     rows = free_rows(system, friction, mean, training)
@@ -274,7 +274,7 @@ def inertia_of(
 
 
 def _told(robot: RobotModel, armature: Tensor) -> tuple[str, ...]:
-    """Return the message on drives with identified inertia `(nq,)`."""
+    """Return the message about drives with identified inertia `(nq,)`, if any."""
     pairs = zip(robot.joint_names, armature.tolist(), strict=True)
     found = ", ".join(f"{name} {a:.2g}" for name, a in pairs if a > 0.0)
     lacks = "the drives have inertia that the robot file lacks [kg m², kg for sliding joints]"
@@ -282,13 +282,13 @@ def _told(robot: RobotModel, armature: Tensor) -> tuple[str, ...]:
 
 
 def _noise(every: NormalEquations) -> Tensor:
-    """Return the root mean square of the torque that the file and friction leave `(nq,)`."""
+    """Return the root mean square of the torque that the robot file and friction do not explain `(nq,)`."""
     none = every.gram.new_zeros(every.unknowns)
     return every.error(none, every.friction(none)).clamp(min=1e-300).sqrt()
 
 
 def _excess(rows: Rows, every: NormalEquations, M: Tensor, armature: Tensor) -> float:
-    """Return the log ratio of the squared acceleration error to the mean square, mean over joints."""
+    """Return the log ratio of mean squared acceleration error to acceleration variance, mean over joints."""
     friction = every.friction(armature)
     left = rows.slides * (rows.residual - armature * rows.qdd - (rows.friction * friction).sum(-1))
     missed = torch.linalg.solve(M + torch.diag(armature), left[..., None])[..., 0]
@@ -297,15 +297,14 @@ def _excess(rows: Rows, every: NormalEquations, M: Tensor, armature: Tensor) -> 
 
 
 def _damped(rows: Rows, M: Tensor, found: Tensor) -> Tensor:
-    """Return the inertia of drives beyond the file's `(nq,)`, raised where accelerations are below the noise
-    of torques.
+    """Return the drive inertia in addition to the file's `(nq,)`, raised if torque noise hides accelerations.
 
-    They are if torques and friction with memory predict them far worse than their mean does: what that
-    friction explains is no noise. Drives are then raised until both are equal.
+    This is the case if torques predict accelerations far worse than their mean does, even with friction with
+    memory (which is not noise). Drive inertia is then raised until both predict them equally well.
 
     Args:
-        M: mass matrix of the file at the samples.
-        found: inertia of drives identified from torques.
+        M: mass matrix of the robot file at the samples.
+        found: drive inertia identified from torques.
     """
     remembering, C = rows.with_memory(), torch.diag_embed(rows.qdd)
     if _excess(remembering, sums(remembering, C).total(), M, found) <= math.log(FAR_LARGER):
@@ -324,7 +323,7 @@ def _damped(rows: Rows, M: Tensor, found: Tensor) -> Tensor:
 
 
 def _drives(given: NormalEquations, noise: Tensor, M: Tensor, weight: float) -> Tensor:
-    """Return a ≥ 0 that minimises ½ Σ ε²/s² − v Σ log |M + diag a|, both over all samples."""
+    """Return the a ≥ 0 that minimises ½ Σ ε²/s² − v Σ log |M + diag a| over all samples."""
     H, h = given.quadratic(noise)
     n, M = float(given.count.max()), M[:: max(1, len(M) // VOLUME_STATES)]
     scale = M.diagonal(dim1=-2, dim2=-1).mean(0)
@@ -346,7 +345,7 @@ def _drives(given: NormalEquations, noise: Tensor, M: Tensor, weight: float) -> 
 
 @torch.no_grad()
 def with_updated_robot(problem: Problem, values: Mapping[str, Tensor]) -> Problem:
-    """Return the problem at the posterior mean of inertial parameters (a Gauss–Newton step)."""
+    """Return the problem at the posterior mean of the inertial parameters (one Gauss–Newton step)."""
     for p, prior in enumerate(problem.priors):
         moves = prior.name not in problem.pinned and problem.parameters is None
         if isinstance(prior, InertialPrior) and moves and not prior.drives:
@@ -356,7 +355,7 @@ def with_updated_robot(problem: Problem, values: Mapping[str, Tensor]) -> Proble
             precision = latent_precision(posterior, features, p, problem.system.robot)
             volume = _log_volume(problem, values)
             robot, moved = prior.updated(problem.system.robot, mean, precision, volume)
-            # The prior keeps the scale of the file's parameters, not that of the updated ones.
+            # The prior keeps the scale of the parameters in the file, not of the updated ones.
             return dataclasses.replace(
                 problem,
                 system=problem.system.with_robot(robot),
@@ -369,8 +368,8 @@ def with_updated_robot(problem: Problem, values: Mapping[str, Tensor]) -> Proble
 def _log_volume(problem: Problem, values: Mapping[str, Tensor]) -> Callable[[RobotModel], Tensor]:
     """Return κ Σ_i log |M (Σ_τ + M Σ_q̈ Mᵀ)^−½| at the samples in free motion, as a function of the robot.
 
-    With it, the density of the torque's error is that of the acceleration's. Without it, a robot that has
-    next to no inertia explains small torques best, whatever it does to the accelerations.
+    This term converts the density of the torque error to that of the acceleration error. Without it, a robot
+    with almost no inertia would best explain small torques, regardless of the resulting accelerations.
     """
     terms = []
     std = problem.system.robot.mass.new_zeros(problem.system.robot.nq)
@@ -400,7 +399,7 @@ def _log_volume(problem: Problem, values: Mapping[str, Tensor]) -> Callable[[Rob
 
 
 def one_row(posterior: ForcePosterior, problem: Problem) -> list[dict[str, Tensor]]:
-    """Return the kernel inputs of every prior at the first sample, since constants do not vary."""
+    """Return the kernel inputs of every prior at the first sample, which is enough for constants."""
     m = problem.training.measurements[0]
     at = m[torch.zeros(1, dtype=torch.int64, device=m.q.device)].at(problem.system)
     return [posterior.process.features(p, problem.system, at) for p in range(len(problem.priors))]
@@ -409,7 +408,7 @@ def one_row(posterior: ForcePosterior, problem: Problem) -> list[dict[str, Tenso
 def latent_precision(
     posterior: ForcePosterior, features: list[dict[str, Tensor]], p: int, robot: RobotModel
 ) -> Tensor:
-    """Return the inverse posterior covariance of the components of prior p, all others marginalised."""
+    """Return the inverse posterior covariance of the components of prior p, with all others marginalised."""
     widths = [prior.outputs(robot) for prior in posterior.priors]
     eye = torch.eye(widths[p], dtype=robot.dtype, device=robot.device)
     operators = [eye[None] if q == p else eye.new_zeros(1, widths[p], w) for q, w in enumerate(widths)]

@@ -1,12 +1,12 @@
-"""Inverse dynamics of a measured robot as a linear regression, with held-out stretches of the log.
+"""Inverse dynamics of a real robot as a linear regression, validated on held-out blocks of the log.
 
-In free motion τ + Q_C + Q_G + Q_D − M₀ q̈ = C δ + Φ w + ε, with separate friction Φ w of each joint. Each
-column of C is the torque of one unknown: the inertia of a drive, or an inertial parameter of a link.
+In free motion, r = τ + Q_C + Q_G + Q_D − M₀ q̈ = C δ + Φ w + ε, with separate friction Φ w for each joint.
+Each column of C is the torque due to one unknown: the inertia of a drive or an inertial parameter of a link.
 
-Because of the noise of the accelerations in C, least squares underestimates inertia. So each sample has a
-partner at a time lag beyond the correlation of the noise, and its columns C′ serve as instruments, C′ᵀ(C δ +
-Φ w − r) = 0, and errors are judged by the product ε ε′, in which noise vanishes in expectation (Söderström
-and Stoica, *Instrumental Variable Methods for System Identification*, 1983).
+Because C contains the noise of the accelerations, least squares underestimates inertia. Each sample therefore
+has a partner at a time lag beyond the correlation time of the noise. The partner's columns C′ serve as
+instruments, C′ᵀ(C δ + Φ w − r) = 0, and errors are assessed by the product ε ε′, in which noise vanishes in
+expectation (Söderström and Stoica, *Instrumental Variable Methods for System Identification*, 1983).
 """
 
 from __future__ import annotations
@@ -27,31 +27,31 @@ from forcegp.forces.priors.base import ForceMean
 from forcegp.forces.priors.joint import JointFrictionPrior
 
 LEAST, MOST = 200, 4000
-"""Samples in free motion needed at least, and used at most, evenly spaced."""
+"""Minimum number of samples required in free motion, and maximum number used, evenly spaced."""
 SCATTER = 4.0
-"""Ratio of mean squares of the torque at rest and in motion from which a joint sticks at rest."""
+"""Ratio of mean squares of the torque residual at rest and in motion above which a joint is sticking."""
 NOISY = (1.0, 2.0, 4.0)
-"""Speeds that a joint at rest may seem to have, over the one of the sharpest dry friction."""
+"""Apparent speeds of a joint at rest, relative to the speed of the sharpest dry friction."""
 MOVES = 0.1
-"""Share of the samples in which a joint moves at least, for its sticking to count."""
+"""Minimum fraction of samples in which a joint must move for sticking to be detected."""
 RIDGE = 1e-8
-"""Of the scaled friction columns, relative to the number of samples."""
+"""Ridge penalty for scaled friction columns, relative to the number of samples."""
 SIGNIFICANT = 2.0
-"""Standard errors, over stretches, beyond which a difference counts."""
+"""Number of standard errors over stretches above which a difference is significant."""
 APART = 0.05
-"""Time between a sample and its partner [s], where no filter of accelerations spans more."""
+"""Time between a sample and its partner [s], unless the filter of the accelerations spans more."""
 DISTANCES = (0.01, 0.03, 0.1)
 """Distances over which friction with memory develops [rad, m]."""
 REACH = 3.0
-"""Standard deviations after which Gaussian weights end."""
+"""Number of standard deviations at which Gaussian weights are truncated."""
 LEAST_SQUARE = 1e-300
-"""Mean square of a joint that does not move in a stretch, which has no error."""
+"""Lower bound on mean squares, for joints that do not move during a stretch and thus have no error."""
 TOLERATED = 0.02
-"""Relative increase of the held-out error of a joint that is tolerated."""
+"""Tolerated relative increase in the held-out error of a joint."""
 LATE = 0.01
-"""Standard deviation a priori of the time between torque and motion [s]."""
+"""Prior standard deviation of the delay between torque and motion [s]."""
 COHERENT = 0.9
-"""Autocorrelation that the velocities of the two have at least, the median of the joints."""
+"""Minimum autocorrelation of the velocities of a sample and its partner, as the median over the joints."""
 
 
 @dataclass(frozen=True)
@@ -59,16 +59,16 @@ class Rows:
     """Samples in free motion.
 
     Attributes:
-        q, qd, qdd: `(n, nq)`.
+        q, qd, qdd: `(n, nq)` positions, velocities and accelerations.
         residual: torque that the robot file does not explain `(n, nq)`.
-        friction: Φ, features of the friction of each joint and its offset `(n, nq, f)`.
-        slides: `(n, nq)` bool, joints that move; the torque of a joint that sticks is uninformative.
-        group: stretch of each sample `(n,)`, from 0 without gaps.
-        segment: `(n,)`.
-        partner: index of each sample's partner `(n,)`; its own index if there is none.
-        memory: friction with memory, further features `(n, nq, k)`.
-        rate: derivative of the torque in time `(n, nq)`.
-        step: time between neighbours [s]; 0 if they are not in order.
+        friction: Φ, features of the friction and offset of each joint `(n, nq, f)`.
+        slides: `(n, nq)` bool, moving joints; the torque of a sticking joint is uninformative.
+        group: stretch of each sample `(n,)`, numbered from 0 without gaps.
+        segment: trajectory of each sample `(n,)`.
+        partner: index of each sample's partner `(n,)`, or its own index if it has none.
+        memory: additional features for friction with memory `(n, nq, k)`.
+        rate: time derivative of the torque `(n, nq)`.
+        step: time between neighbouring samples [s]; 0 if they are not in time order.
         filter_variance: variance of the weights with which a filter averaged q̈ over time [s²].
     """
 
@@ -87,21 +87,21 @@ class Rows:
     filter_variance: float = 0.0
 
     def with_memory(self) -> Rows:
-        """Return the samples with all features of friction in Φ."""
+        """Return the samples with the features of friction with memory included in Φ."""
         return dataclasses.replace(self, friction=torch.cat([self.friction, self.memory], dim=-1))
 
     @property
     def leading(self) -> int:
-        """Return the number of samples before their partners, in the order of the log."""
+        """Return the number of samples that precede the partners; they are in the order of the log."""
         paired = int(self.partner[0]) > 0
         return len(self.partner) // 2 if paired else len(self.partner)
 
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Σ ZᵀX `(..., nq, p + f, p + f)`, Σ Zᵀr, Σ r² and the numbers of samples, by joint.
+    """Σ ZᵀX `(..., nq, p + f, p + f)`, Σ Zᵀr, Σ r² and the number of samples, for each joint.
 
-    X = (C, Φ), and Z = X or (C′, Φ) with instruments. In sums of products r², XᵀX and Xᵀr are r r′,
+    X = (C, Φ), and Z = X or, with instruments, (C′, Φ). For `products`, r², XᵀX and Xᵀr are replaced by r r′,
     ½ (XᵀX′ + X′ᵀX) and ½ (Xᵀr′ + X′ᵀr).
     """
 
@@ -112,15 +112,15 @@ class NormalEquations:
     unknowns: int
 
     def total(self) -> NormalEquations:
-        """Return the sum over all stretches."""
+        """Return the equations summed over all blocks."""
         return self._each(lambda x: x.sum(0))
 
     def of(self, g: int) -> NormalEquations:
-        """Return one stretch."""
+        """Return the equations of stretch g."""
         return self._each(lambda x: x[g])
 
     def without(self, g: int) -> NormalEquations:
-        """Return all stretches but one."""
+        """Return the equations summed over all blocks except g."""
         return self._each(lambda x: x.sum(0) - x[g])
 
     def _each(self, part: Callable[[Tensor], Tensor]) -> NormalEquations:
@@ -129,7 +129,7 @@ class NormalEquations:
         )
 
     def friction(self, delta: Tensor) -> Tensor:
-        """Return the friction weights w `(nq, f)` that fit the residual at δ."""
+        """Return the friction weights w `(nq, f)` that best fit the residual at δ."""
         p = self.unknowns
         right = self.right[:, p:] - self.gram[:, p:, :p] @ delta
         return torch.linalg.solve(self._stiff(), right[..., None])[..., 0]
@@ -140,8 +140,8 @@ class NormalEquations:
         return self.gram[:, p:, p:] + RIDGE * self.count[:, None, None] * eye
 
     def quadratic(self, noise: Tensor) -> tuple[Tensor, Tensor]:
-        """Return H and h of H δ = h, with optimal friction; of Σ_j |ε_j|²/s_j² without instruments."""
-        # Friction eliminated, by Schur complement: H_j = G_δδ − G_δf (G_ff + D)⁻¹ G_fδ, H = Σ_j H_j/s_j²
+        """Return H and h of H δ = h with optimal friction; without instruments, δ minimises Σ |ε_j|²/s_j²."""
+        # Friction is eliminated by a Schur complement: H_j = G_δδ − G_δf (G_ff + D)⁻¹ G_fδ, H = Σ_j H_j/s_j²
         p = self.unknowns
         friction = torch.cat([self.gram[:, p:, :p], self.right[:, p:, None]], dim=-1)
         reduced = torch.cat([self.gram[:, :p, :p], self.right[:, :p, None]], dim=-1)
@@ -151,20 +151,20 @@ class NormalEquations:
         return torch.einsum("j,jpq->pq", weight, H), weight @ h
 
     def error(self, delta: Tensor, friction: Tensor) -> Tensor:
-        """Return the mean of ε², or of ε ε′, `(nq,)`."""
+        """Return the mean of ε² `(nq,)`, or of ε ε′ for `products`."""
         x = torch.cat([delta.expand(len(friction), -1), friction], dim=-1)
         fitted = 2.0 * (x * self.right).sum(-1) - torch.einsum("jp,jpq,jq->j", x, self.gram, x)
         return (self.square - fitted) / self.count
 
 
 Estimate = Callable[[NormalEquations], Tensor]
-"""δ from sums."""
+"""Function that estimates δ from normal equations."""
 
 
 def free_rows(
     system: ConstrainedSystem, prior: JointFrictionPrior, mean: ForceMean, training: Training
 ) -> Rows:
-    """Return the samples in free motion and their partners, at least `LEAST` per measurement."""
+    """Return samples in free motion and the samples matched to them, of the first measurement with enough."""
     motions = (m for m in training.measurements if m.quantity == "qdd")
     free = ((m, (~m.active.any(-1)).nonzero()[:, 0]) for m in motions)
     m = next(m[rows] for m, rows in free if len(rows) >= LEAST)
@@ -186,22 +186,22 @@ def free_rows(
 
 
 def _in_time(m: Measurement | Dataset) -> Tensor:
-    """Return the indices of samples in the order of segment and time."""
+    """Return the indices that sort the samples by segment, then by time."""
     order = torch.argsort(m.t, stable=True)
     return order[torch.argsort(m.segment[order], stable=True)]
 
 
 def bristles(m: Measurement | Dataset) -> Tensor:
-    """Return z of Dahl's friction model dz/dt = q̇/δ − |q̇| z/δ for some distances δ, `(n, nq, k)`.
+    """Return z of Dahl's friction model dz/dt = q̇/δ − |q̇| z/δ for each δ in `DISTANCES`, `(n, nq, k)`.
 
-    Within δ of a reversal this friction is a spring, and its torque is about proportional to −q̈: without
-    these columns it resembles negative inertia.
+    Within δ of a reversal, this friction acts like a spring, and its torque is roughly proportional to −q̈.
+    Without these columns, it would resemble negative inertia.
     """
     order = _in_time(m)
     t, qd, segment = m.t[order], m.qd[order], m.segment[order]
-    # Velocities, unlike positions, are no noisier in a log of a higher rate.
+    # Unlike position differences, velocities are not noisier at a higher sampling rate.
     step = (t.diff(prepend=t[:1])[:, None] * 0.5 * (qd + qd.roll(1, 0)))[..., None]
-    # z⁺ = a z + b with a = exp(−|Δq|/δ), b = (1 − a) sgn Δq; composed over 1, 2, 4, … steps.
+    # z⁺ = a z + b with a = exp(−|Δq|/δ), b = (1 − a) sgn Δq, composed over 1, 2, 4, … steps
     a = torch.exp(-step.abs() / qd.new_tensor(DISTANCES))
     b = (1.0 - a) * step.sign()
     starts = segment.diff(prepend=segment[:1] - 1) != 0
@@ -217,9 +217,9 @@ def bristles(m: Measurement | Dataset) -> Tensor:
 
 
 def torque_rate(m: Measurement) -> Tensor:
-    """Derivative of the torque in time, from differences over `LATE` to either side `(n, nq)`.
+    """Return the time derivative of the torque, from differences over `LATE` on either side `(n, nq)`.
 
-    It is the effect of a small delay between torque and motion.
+    A small delay between torque and motion changes the torque in proportion to this derivative.
     """
     order = _in_time(m)
     t, tau, segment = m.t[order], m.tau[order], m.segment[order]
@@ -239,10 +239,10 @@ def torque_rate(m: Measurement) -> Tensor:
 
 
 def partners(m: Measurement, filter_span: float = 0.0) -> Tensor:
-    """Return the index of the sample `APART` later in the same trajectory, or −1, `(n,)`.
+    """Return the index of the sample `APART` later in the same trajectory, or −1 if there is none, `(n,)`.
 
-    The lag is shorter if velocities would change too much, but never shorter than the span of the log's
-    filter [s], within which noise is correlated.
+    The lag is reduced if velocities would change too much, but not below the span of the log's filter [s],
+    within which noise is correlated.
     """
     later = torch.full((len(m.t),), -1, device=m.t.device)
     order = _in_time(m)
@@ -282,15 +282,16 @@ def _rows(
 
 
 def sliding(speed: Tensor, slowest: float, Phi: Tensor, residual: Tensor) -> Tensor:
-    """`(n, nq)` bool, without the samples of joints that stick: slow ones, whose torque then scatters more.
+    """Return which joints move, `(n, nq)` bool; if a joint sticks, its torque scatters more at low speed.
 
-    Noise of velocities hides that a joint rests, so the bound of slow is the one with the largest ratio.
+    Velocity noise hides that a joint is at rest, so the speed limit is the one with the largest ratio of
+    scatter at low speed to scatter in motion.
 
     Args:
         speed: |q̇| `(n, nq)`.
-        slowest: sharpest dry friction [rad/s, m/s].
+        slowest: speed of the sharpest dry friction [rad/s, m/s].
         Phi: features of friction `(n, nq, f)`.
-        residual: `(n, nq)` torque that the robot of the file leaves.
+        residual: `(n, nq)` torque that the robot file does not explain.
     """
     slides, ratio = torch.ones_like(speed, dtype=torch.bool), torch.full_like(speed[0], SCATTER)
     for bound in (slowest * factor for factor in NOISY):
@@ -310,18 +311,19 @@ def sliding(speed: Tensor, slowest: float, Phi: Tensor, residual: Tensor) -> Ten
 
 
 def averaged(rows: Rows, columns: Tensor, inertial: Tensor, width: float) -> tuple[Rows, Tensor]:
-    """Return equations averaged over time with Gaussian weights, as sums of equations are valid.
+    """Return equations averaged over time with Gaussian weights; sums of valid equations remain valid.
 
-    Noise of differentiated positions has high frequencies, the motion low ones. And a filter has averaged the
-    accelerations, so that the other terms are averaged by its variance more.
+    Noise of differentiated positions has high frequencies, whereas motion has low ones. Since a filter has
+    already averaged the accelerations, the variance of its weights is added when averaging the other terms.
 
     Args:
         columns: C `(n, nq, p)`.
-        inertial: M₀ q̈ `(n, nq)`, a part of the residual.
+        inertial: M₀ q̈ `(n, nq)`, which is part of the residual.
         width: standard deviation of the weights [s].
 
     Returns:
-        Samples in motion around which all those of the average are of one stretch, and their columns.
+        The averaged samples, which count as moving only if the whole window does so within one stretch, and
+        their columns.
     """
     stds = [x / rows.step for x in (width, math.hypot(width, math.sqrt(rows.filter_variance)))]
     reach, stride = math.ceil(REACH * stds[1]), max(1, int(0.5 * stds[0]))
@@ -361,33 +363,33 @@ def averaged(rows: Rows, columns: Tensor, inertial: Tensor, width: float) -> tup
 
 
 def sums(rows: Rows, columns: Tensor) -> NormalEquations:
-    """Return `NormalEquations` for each stretch, with C `(n, nq, p)`."""
+    """Return the `NormalEquations` of each stretch for the columns C `(n, nq, p)`."""
     X, r = _equations(rows, columns)
     return _by_stretch(rows, X, X, r, r)
 
 
 def instrumental(rows: Rows, columns: Tensor) -> NormalEquations:
-    """Return the equations with partners as instruments; velocities and friction count as exact."""
+    """Return the equations with partners as instruments; velocities and friction are considered exact."""
     X, r = _equations(rows, columns, paired=True)
     p = columns.shape[-1]
     return _by_stretch(rows, torch.cat([X[rows.partner][..., :p], X[..., p:]], dim=-1), X, r, r)
 
 
 def products(rows: Rows, columns: Tensor) -> NormalEquations:
-    """Return `NormalEquations` of products with the partners."""
+    """Return the `NormalEquations` of products with the partners."""
     X, r = _equations(rows, columns, paired=True)
     return _by_stretch(rows, X[rows.partner], X, r[rows.partner], r)
 
 
 def _equations(rows: Rows, columns: Tensor, paired: bool = False) -> tuple[Tensor, Tensor]:
-    """Return X and r of joints that move, at the partner too if samples are paired; else zero."""
+    """Return X and r, set to zero for joints that stick (at the sample or, if `paired`, at its partner)."""
     slides = rows.slides & rows.slides[rows.partner] if paired else rows.slides
     X = torch.cat([columns, rows.friction], dim=-1)
     return X * slides[..., None], rows.residual * slides
 
 
 def _by_stretch(rows: Rows, Z: Tensor, X: Tensor, s: Tensor, r: Tensor) -> NormalEquations:
-    """Return Σ ZᵀX, Σ Zᵀr and Σ s r; X holds a column of ones, which is zero for what does not count."""
+    """Return Σ ZᵀX, Σ Zᵀr and Σ s r; X includes a column of ones, which is zero for ignored samples."""
     groups = []
     for g in range(int(rows.group.max()) + 1):
         inside = rows.group == g
@@ -405,13 +407,13 @@ def held_out(
     judged: NormalEquations | None = None,
     source: NormalEquations | None = None,
 ) -> Tensor:
-    """Return the mean squares of torque errors on stretches held out from δ and friction, `(groups, nq)`.
+    """Return mean squared torque errors on blocks held out from estimating δ and w, `(groups, nq)`.
 
     Args:
-        by_stretch: the sums to estimate friction from.
-        estimate: δ from all stretches but one.
-        judged: the sums to compute errors from, such as `products`; by default the same.
-        source: the sums to estimate δ from, such as averaged equations; by default those of friction.
+        by_stretch: equations from which friction is estimated.
+        estimate: function that estimates δ from all blocks except one.
+        judged: equations from which errors are computed, such as `products`; by default `by_stretch`.
+        source: equations from which δ is estimated, such as averaged ones; by default `by_stretch`.
     """
     errors = []
     for g in range(len(by_stretch.gram)):
@@ -424,7 +426,7 @@ def held_out(
 def acceleration_errors(
     rows: Rows, by_stretch: NormalEquations, columns: Tensor, delta: Tensor, M: Tensor
 ) -> Tensor:
-    """Return mean square acceleration errors at δ, with held-out friction, `(groups, nq)`."""
+    """Return the mean squared acceleration errors at δ, with held-out friction, `(groups, nq)`."""
     residual, errors = rows.residual - columns @ delta, []
     for g in range(len(by_stretch.gram)):
         inside = rows.group == g
@@ -435,12 +437,12 @@ def acceleration_errors(
 
 
 def log_ratio(after: Tensor, before: Tensor) -> Tensor:
-    """Return the log ratio of root mean squares; zero for a joint at rest during a stretch."""
+    """Return the log ratio of root mean squares, which is zero for a joint at rest during a stretch."""
     return 0.5 * (after.clamp(min=LEAST_SQUARE) / before.clamp(min=LEAST_SQUARE)).log()
 
 
 def is_harmless(after: Tensor, before: Tensor) -> bool:
-    """Return whether no joint's error grows beyond the tolerance."""
+    """Return whether no joint's error increases by more than the tolerance."""
     return bool((log_ratio(after, before).mean(0) <= TOLERATED).all())
 
 

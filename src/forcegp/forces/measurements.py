@@ -1,7 +1,7 @@
 """Measured quantities at states, from the columns of a log to the data of a posterior.
 
-In contact A q̈ = b. If a measurement violates it by far more than the usual noise (an impact, a wrong flag),
-the contact does not persist, and the whole acceleration is unusable.
+In contact, A q̈ = b. If a measurement violates this by far more than the usual noise (because of an impact or
+a wrong contact flag), the contact does not persist, and the whole acceleration is unusable.
 """
 
 from __future__ import annotations
@@ -30,10 +30,10 @@ class Measurement:
     """Values of one quantity at states.
 
     Attributes:
-        quantity: name, as in `QUANTITIES`.
+        quantity: name of the quantity, as in `QUANTITIES`.
         q, qd, tau: `(n, nq)` states.
-        active: `(n, n_contacts)` bool.
-        values: `(n, d)`.
+        active: `(n, n_contacts)` bool, closed contacts.
+        values: `(n, d)` measured values.
         segment: `(n,)` trajectory of each sample; one trajectory by default.
         t: `(n,)` time of each sample [s]; zero by default.
         tau_std: `(n, nq)` standard deviation of each torque beyond the usual noise [N m, N]; `None` for zero.
@@ -63,11 +63,11 @@ class Measurement:
 
     @property
     def tensors(self) -> tuple[Tensor, ...]:
-        """Return q, q̇, τ, the closed contacts, and the values."""
+        """Return q, q̇, τ, the closed contacts and the measured values."""
         return (*self.states, self.values)
 
     def at(self, system: ConstrainedSystem) -> States:
-        """Return the equations of motion at the states, with the measured acceleration if there is one."""
+        """Return the states with their equations of motion, and the measured accelerations if available."""
         time = torch.stack([self.t, self.segment.to(self.t)], dim=-1)
         return states(system, *self.states, qdd=self.values if self.quantity == "qdd" else None, time=time)
 
@@ -79,7 +79,7 @@ class Measurement:
         return ((x ^ (x >> 32)) * odd).sum(-1)
 
     def __getitem__(self, rows: Tensor) -> Measurement:
-        """Return the values at some of the states."""
+        """Return the values at the given rows."""
         tau_std = None if self.tau_std is None else self.tau_std[rows]
         parts = (part[rows] for part in (*self.tensors, self.segment, self.t))
         return Measurement(self.quantity, *parts, tau_std=tau_std)
@@ -93,13 +93,13 @@ class Training:
         measurements: the values.
         noise_std: standard deviation of each measurement, `(d,)` or `(n, d)`.
         scales: standardization of the inputs of each prior.
-        part_of: number of all samples to condition on; 0 if these are all.
-        period: sampling period of the log [s]; 0 if its rows are not in order.
+        part_of: total number of samples to condition on, if these are only some of them; otherwise 0.
+        period: sampling period of the log [s]; 0 if its rows are not in time order.
         filter_span: time span of the filter that computed the accelerations [s]; 0 if unknown.
-        filter_variance: variance of its weights over time [s²], as in `DataHeader`.
-        weights: of the samples of each measurement `(n,)`, divisors of their noise variance; `None` for one.
-        slopes: G = dz/d(q, q̇) `(n, d, 2 nq)` of each measurement with learned forces, `None` for a quantity
-            without; `None` for those of the robot file (`forces/noise.py`).
+        filter_variance: variance of the filter's weights over time [s²], as in `DataHeader`.
+        weights: weights `(n,)` that divide the noise variance of each sample, per measurement; `None` for 1.
+        slopes: G = dz/d(q, q̇) `(n, d, 2 nq)` of each measurement under the learned forces (`None` for a
+            quantity that has none), or `None` to use those of the robot file (`forces/noise.py`).
     """
 
     measurements: tuple[Measurement, ...]
@@ -119,11 +119,11 @@ class Training:
 
     @property
     def all_samples(self) -> int:
-        """Return the number of all samples to condition on."""
+        """Return the total number of samples to condition on."""
         return self.part_of or self.samples
 
     def pieces(self, samples: int) -> Iterator[Training]:
-        """Yield the same samples in pieces of about this many, each with its share of every measurement."""
+        """Yield the samples in pieces of about this many, with the same share of each measurement in each."""
         count = max(1, math.ceil(self.samples / samples))
         parts = [torch.arange(len(m.q), device=m.q.device).tensor_split(count) for m in self.measurements]
         yield from (self.of_rows(rows) for rows in zip(*parts, strict=True))
@@ -135,13 +135,13 @@ class Training:
 
     @property
     def free_motions(self) -> int:
-        """Return the largest number of accelerations in free motion of any measurement."""
+        """Return the largest number of free-motion accelerations in any measurement."""
         free = [int((~m.active.any(-1)).sum()) for m in self.measurements if m.quantity == "qdd"]
         return max(free, default=0)
 
     @property
     def digests(self) -> Tensor:
-        """Return a hash of each sample of all measurements."""
+        """Return the hashes of the samples of all measurements."""
         return torch.cat([m.digests for m in self.measurements])
 
     def never_closed(self, system: ConstrainedSystem) -> tuple[str, ...]:
@@ -150,7 +150,7 @@ class Training:
         return tuple(name for name, seen in zip(system.contact_names, closed, strict=True) if not seen)
 
     def thinned(self, samples: int) -> Training:
-        """Return about this many samples, the farthest points of the states of each measurement."""
+        """Return about this many samples, chosen by farthest-point sampling of each measurement's states."""
         share = samples / self.samples
         return self.of_rows([_spread(m, math.ceil(share * len(m.q))) for m in self.measurements])
 
@@ -160,13 +160,13 @@ class Training:
         return self.of_rows([torch.arange(0, len(m.q), step, device=m.q.device) for m in self.measurements])
 
     def without(self, measurement: int, rows: Tensor) -> Training:
-        """Return all samples but some rows of one measurement."""
+        """Return all samples except the given rows of one measurement."""
         kept = [torch.ones(len(m.q), dtype=torch.bool, device=m.q.device) for m in self.measurements]
         kept[measurement][rows] = False
         return self.of_rows([mask.nonzero()[:, 0] for mask in kept])
 
     def of_rows(self, rows: Sequence[Tensor]) -> Training:
-        """Return some rows of each measurement."""
+        """Return the given rows of each measurement."""
         return dataclasses.replace(
             self,
             part_of=0,
@@ -180,7 +180,7 @@ class Training:
         )
 
     def joined(self, more: Training, noise_std: Sequence[Tensor]) -> Training:
-        """Return these and further measurements with their noise and the slopes of both."""
+        """Return the union of these and additional measurements with the given noise, including slopes."""
         weights, slopes = tuple(torch.ones_like(m.t) for m in more.measurements), more.slopes or ()
         return dataclasses.replace(
             self,
@@ -191,26 +191,26 @@ class Training:
         )
 
     def moving(self, speed: float) -> Training:
-        """Return the samples in which a joint moves faster than a speed [rad/s, m/s]."""
+        """Return the samples in which any joint moves faster than the given speed [rad/s, m/s]."""
         fast = [(m.qd.abs().amax(-1) > speed).nonzero()[:, 0] for m in self.measurements]
         return self.of_rows(fast)
 
 
 def _spread(m: Measurement, count: int) -> Tensor:
-    """Return the rows of distinct states that are far from each other, at most `count`."""
+    """Return at most `count` rows whose states are distinct and far from each other."""
     x = standardized(torch.cat([m.q, m.qd, m.tau], dim=-1))
     return farthest_points(x, min(count, len(x.unique(dim=0))))
 
 
 FAR = 6.0
-"""Robust standard deviations of A q̈ − b beyond which a sample is not in persistent contact."""
+"""Number of robust standard deviations of A q̈ − b above which a sample is not in persistent contact."""
 
 
 def without_impacts(training: Training, system: ConstrainedSystem) -> tuple[Training, int]:
-    """Return the samples without impacts, and how many were left out.
+    """Return the samples without impacts, and the number of samples removed.
 
     Args:
-        training: measured accelerations among others.
+        training: measurements, of which only accelerations are checked.
     """
     if not system.m:
         return training, 0
@@ -224,7 +224,7 @@ def without_impacts(training: Training, system: ConstrainedSystem) -> tuple[Trai
 
 
 def _persists(system: ConstrainedSystem, m: Measurement, std: Tensor) -> Tensor:
-    """Return whether |A q̈ − b| of each sample is within the usual, `(n,)` bool; free motion always is."""
+    """Return whether |A q̈ − b| is in the usual range for each sample, `(n,)` bool; true in free motion."""
     eom = system.equations(m.q, m.qd, m.active)
     violation = (eom.A @ m.values[..., None])[..., 0] - eom.b
     noise = (eom.A.square() @ std.expand_as(m.values)[..., None].square())[..., 0].sqrt()
@@ -241,11 +241,11 @@ def _persists(system: ConstrainedSystem, m: Measurement, std: Tensor) -> Tensor:
 
 NoiseStd = float | Sequence[float] | Tensor
 DEFAULT_NOISE_STD = 0.1
-"""Noise of accelerations where neither the caller nor the log states it, as in the paper [rad/s², m/s²]."""
+"""Acceleration noise used if neither the caller nor the log provides it, as in the paper [rad/s², m/s²]."""
 
 
 def plain(noise: NoiseStd | str | None) -> Any:
-    """Return a noise as JSON-compatible values."""
+    """Return a noise specification as JSON-compatible values."""
     if noise is None or isinstance(noise, str):
         return noise
     values = torch.as_tensor(noise, dtype=torch.float64).tolist()
@@ -254,14 +254,14 @@ def plain(noise: NoiseStd | str | None) -> Any:
 
 @dataclass(frozen=True)
 class Observation:
-    """A data set as measurements of one quantity.
+    """A data set that provides measurements of one quantity.
 
     Args:
         data: states, contacts and measured values.
         quantity: the measured quantity: `qdd` (in contact or free), `multiplier`, `contact_force`,
             `constraint_force`, `joint_force`, `contact_friction` or `total_force`.
         noise_std: standard deviation of the measurement: one number, one per component, or `(n, d)`. For
-            `qdd`, the default is that of the model, else the `qdd_std` of the log, else that of its header.
+            `qdd`, the default is the value in the model, else the log's `qdd_std`, else that in its header.
 
     Example:
         >>> import forcegp, torch
@@ -283,7 +283,7 @@ def observations_of(data: Dataset | Sequence[Observation]) -> Sequence[Observati
     """Return a data set as measurements of accelerations, or the given measurements.
 
     Raises:
-        ModelError: there are none, or the argument has another type.
+        ModelError: there are no measurements, or the argument has the wrong type.
     """
     observations = [Observation(data)] if isinstance(data, Dataset) else data
     if not isinstance(observations, Sequence) or not all(isinstance(o, Observation) for o in observations):
@@ -300,7 +300,7 @@ def observations_of(data: Dataset | Sequence[Observation]) -> Sequence[Observati
 
 
 def states_noise(observations: Sequence[Observation]) -> bool:
-    """Return whether the data state the noise of their accelerations."""
+    """Return whether the data specify the noise of their accelerations."""
     return all(
         o.noise_std is not None or o.data.header.noise_std is not None or "qdd_std" in o.data.extras
         for o in observations
@@ -309,7 +309,7 @@ def states_noise(observations: Sequence[Observation]) -> bool:
 
 @torch.no_grad()
 def unmeasured_forces(system: ConstrainedSystem, observations: Sequence[Observation]) -> dict[str, float]:
-    """Return the RMS of M q̈ − Q_C − Q_G of joints without a logged torque, by name [N m, N]."""
+    """Return the RMS of M q̈ − Q_C − Q_G for joints without a logged torque, keyed by joint name [N m, N]."""
     sizes: dict[str, float] = {}
     for data in (o.data for o in observations if o.data.header.unmeasured_torques):
         eom = system.equations(data.q, data.qd, contact_table(data, system.contact_names))
@@ -347,7 +347,7 @@ COLUMNS: Mapping[str, Callable[[Dataset, ConstrainedSystem], Tensor]] = {
     "contact_friction": lambda data, _: data.Q_z,
     "total_force": lambda data, _: data.Q + data.Q_z,
 }
-"""Columns of each quantity that can be measured."""
+"""Function that returns the columns of each measurable quantity."""
 
 
 def measurement_of(
@@ -357,15 +357,14 @@ def measurement_of(
 
     Raises:
         UnknownNameError: the quantity cannot be measured, or a contact is not logged.
-        ModelError: the noise is not positive, or not given for a quantity other than qdd.
-        DataError: the data's joints are not the robot's.
+        ModelError: the noise is not positive, or is not given for a quantity other than qdd.
+        DataError: the joints of the data are not those of the robot.
     """
     data, quantity = observation.data, observation.quantity
     if quantity not in QUANTITIES or quantity not in COLUMNS:
         raise UnknownNameError("measured quantity", quantity, COLUMNS)
-    names = system.contact_names
     check_robot(data, system.robot)
-    active = contact_table(data, names)
+    active = contact_table(data, system.contact_names)
     if not len(data.q):
         raise ModelError("there are no samples to learn from", expected="at least one sample", got="none")
     values = COLUMNS[quantity](data, system)
@@ -376,7 +375,7 @@ def measurement_of(
 
 
 def _noise_of(observation: Observation, default: NoiseStd | None) -> NoiseStd:
-    """Return the noise stated by the observation, model, log (`qdd_std`) or header, in this order."""
+    """Return the noise given by the observation, model, log (`qdd_std`) or header, in that order."""
     data = observation.data
     if observation.noise_std is not None:
         return observation.noise_std
@@ -390,7 +389,7 @@ def _noise_of(observation: Observation, default: NoiseStd | None) -> NoiseStd:
 
 
 def _checked_noise(noise: NoiseStd, quantity: str, values: Tensor) -> Tensor:
-    """Return a noise as a tensor `(d,)` or `(n, d)`."""
+    """Return the noise as a tensor `(d,)` or `(n, d)`, after checking it."""
     if isinstance(noise, float) and 0.0 < noise < math.inf:
         return values.new_full(values.shape[-1:], noise)
     try:
@@ -419,12 +418,12 @@ def training_of(
     """Return the measurements with their noise and input scales.
 
     Args:
-        noise_std: standard deviation of accelerations without a stated noise.
-        kept: earlier scales to keep, by name of the prior.
-        standardize: whether to standardize the inputs of kernels.
+        noise_std: standard deviation of accelerations whose noise is not given.
+        kept: existing scales to keep, keyed by prior name.
+        standardize: whether to standardize kernel inputs.
 
     Raises:
-        ModelError, DataError: there are no data, or they do not fit the system.
+        ModelError, DataError: there are no data, or they do not match the system.
     """
     observations = observations_of(data)
     pairs = [measurement_of(o, system, noise_std) for o in observations]
@@ -446,7 +445,7 @@ def scaled(
     kept: Mapping[str, Standardization],
     standardize: bool = True,
 ) -> Training:
-    """Return the training data with the input scales of priors; the arguments are those of `training_of`."""
+    """Return the training data with input scales for the given priors; arguments are as in `training_of`."""
     new = [prior for prior in priors if prior.name not in kept]
     at = [m.at(system) for m in training.measurements] if new else []
     scales = dict(kept)
@@ -458,7 +457,7 @@ def scaled(
 
 
 def _period(data: Dataset) -> float:
-    """Return the median time step within the trajectories of a log in order; 0 otherwise [s]."""
+    """Return the median time step within the trajectories of a log [s]; 0 if it is not in time order."""
     if not data.header.ordered or len(data.t) < 2:
         return 0.0
     steps = data.t.diff()[data.segment[1:] == data.segment[:-1]]

@@ -1,10 +1,10 @@
 """Measurement noise of a log: accelerations, motor torques, and the state.
 
-**Noise of the state**, to first order. At a measured state x + δ, with δ ~ N(0, Σ_x), the model predicts
-z(x + δ) ≈ z(x) + G δ, so a sample's rows have the additional noise G Σ_x Gᵀ, with G = ∂z/∂(q, q̇) (McHutchon
-and Rasmussen, *Gaussian process training with input noise*, 2011). G is that of the robot file's equations of
-motion under the measured torque, or, once forces have been learned, that of q̈ = L b + H F̄ with their
-posterior mean F̄ (`forces/noise_learning.py`).
+**State noise**, to first order. At a measured state x + δ, with δ ~ N(0, Σ_x), the model predicts
+z(x + δ) ≈ z(x) + G δ with G = ∂z/∂(q, q̇), so a sample's rows have additional noise of covariance G Σ_x Gᵀ
+(McHutchon and Rasmussen, *Gaussian process training with input noise*, 2011). G is computed from the robot
+file's equations of motion under the measured torque, or, once forces have been learned, from q̈ = L b + H F̄
+with their posterior mean F̄ (`forces/noise_learning.py`).
 """
 
 from __future__ import annotations
@@ -33,18 +33,18 @@ class Noise:
     """Noise of measured accelerations, motor torques and states.
 
     Args:
-        acceleration: standard deviation of measured accelerations [rad/s², m/s²], one or one per joint; by
-            default the value in the log (`qdd_std` by sample, else its header), else 0.1.
-        learn: whether it is a hyperparameter, starting at this value.
-        torque: standard deviation of the motor torque's white noise [N m, N], one or one per joint;
-            `"learn"`, `None` for none, or `"auto"`: learned with the priors of measured robots.
+        acceleration: standard deviation of measured accelerations [rad/s², m/s²], one number or one per
+            joint; by default the value in the log (`qdd_std` of each sample, else its header), else 0.1.
+        learn: whether the acceleration noise is learned, starting from `acceleration`.
+        torque: standard deviation of the motor torque's white noise [N m, N], one number or one per joint;
+            `"learn"`, `None` for no noise, or `"auto"` to learn it with the priors for real robots.
         state: standard deviations of the white noise of measured q and q̇ [rad, rad/s], each one number or
-            one per joint; `None` for none. It counts to first order (`forces/noise.py`).
+            one per joint; `None` for no noise. It is propagated to first order (`forces/noise.py`).
         degrees_of_freedom: ν > 2 of a Student t distribution of each sample's noise, such as 4, for logs with
             impacts and other outliers; `None` for Gaussian noise (`forces/noise_learning.py`).
-        external: standard deviation of an unknown force on some joints, by name [N m, N]: of a joint without
-            a torque sensor, or one that somebody moves by hand. Joints without a logged torque get the size
-            of the force that moves them.
+        external: standard deviation of unknown forces [N m, N], keyed by joint name, for example for a joint
+            that has no torque sensor or is moved by hand. For joints without a logged torque, the default is
+            the size of the force that moves them.
 
     Example:
         >>> Noise(0.1, torque="learn").learns_torque
@@ -86,16 +86,16 @@ class Noise:
 
     @classmethod
     def of(cls, noise: NoiseStd | Noise | None) -> Noise:
-        """Return the given `Noise`, or one of accelerations alone."""
+        """Return the given `Noise`, or one with the given acceleration noise."""
         return noise if isinstance(noise, cls) else cls(noise)  # pyright: ignore[reportArgumentType]
 
     @property
     def learns_torque(self) -> bool:
-        """Whether the noise of the motor torque is learned."""
+        """Whether motor torque noise is learned."""
         return self.torque == "learn" if isinstance(self.torque, str) else False
 
     def for_priors(self, priors: Sequence[ForcePrior]) -> Noise:
-        """Return the noise with `torque="auto"` resolved: learned with the priors of measured robots."""
+        """Return the noise with `torque="auto"` resolved: learned with the priors for real robots."""
         if not isinstance(self.torque, str) or self.torque != "auto":
             return self
         measured = any(isinstance(prior, JointFrictionPrior | InertialPrior) for prior in priors)
@@ -103,11 +103,11 @@ class Noise:
 
 
 TORQUE_NOISE = f"{NOISE}.torque.log_noise_std"
-"""Name of the learned noise of the motor torque."""
+"""Name of the learned motor torque noise."""
 
 
 def initial_torque_noise(residual: Tensor) -> dict[str, Tensor]:
-    """Return the initial torque noise from the RMS of unexplained torque `(nq,)` [N m, N]."""
+    """Return the initial torque noise, given the RMS of the unexplained torque `(nq,)` [N m, N]."""
     std = (0.5 * residual).clamp(min=1e-4).log().double()
     return {
         TORQUE_NOISE: std,
@@ -117,7 +117,7 @@ def initial_torque_noise(residual: Tensor) -> dict[str, Tensor]:
 
 
 def external_std(external: Mapping[str, float] | None, robot: RobotModel) -> Tensor | None:
-    """Return the standard deviation of unknown forces on the joints `(nq,)`, or `None`.
+    """Return the standard deviation of unknown forces on the joints `(nq,)`, or `None` if there are none.
 
     Raises:
         UnknownNameError: the robot has no such joint.
@@ -131,19 +131,19 @@ def external_std(external: Mapping[str, float] | None, robot: RobotModel) -> Ten
 
 
 ForceNoise = Callable[[States], Tensor]
-"""Variance of the white noise on the joint force at states, `(n, nq)`."""
+"""Function that returns the variance of the white noise on the joint force at states, `(n, nq)`."""
 
 
 @dataclass(frozen=True, eq=False)
 class SampleNoise:
-    """Noise of the samples of one measurement, a sum of independent terms: (diag σ² + Σ_k N_k N_kᵀ)/w.
+    """Noise of the samples in one measurement, a sum of independent terms: (diag σ² + Σ_k N_k N_kᵀ)/w.
 
     Attributes:
         std: σ of each component, `(d,)` or `(n, d)`.
         force: Σ_τ, the variance of the joint force.
-        torque: `(n, nq)` standard deviation of single torques beside it.
-        state: G Σ_x½ `(n, d, 2 nq)`, factor of the noise of the state.
-        weight: w of each sample `(n,)`; `None` for one.
+        torque: `(n, nq)` standard deviation of individual torques in addition to Σ_τ.
+        state: G Σ_x½ `(n, d, 2 nq)`, factor of the state noise.
+        weight: w of each sample `(n,)`; `None` for unit weights.
     """
 
     std: Tensor
@@ -153,7 +153,7 @@ class SampleNoise:
     torque: Tensor | None = None
 
     def factors(self, at: States, z: AffineMap) -> list[Tensor]:
-        """Return the terms N_k `(n, d, ·)` in addition to σ, for the quantity measured."""
+        """Return the terms N_k `(n, d, ·)` other than σ, for the measured quantity."""
         # N = (G Σ_x½, B_Q Σ_τ½)
         terms = [] if self.state is None else [self.state]
         if self.torque is not None:
@@ -161,12 +161,12 @@ class SampleNoise:
         return terms if self.force is None else [*terms, z.B_Q * self.force(at).sqrt()[:, None, :]]
 
     def covariance(self, at: States, z: AffineMap) -> Tensor:
-        """Return Σ_y + B_Q Σ_τ B_Qᵀ + G Σ_x Gᵀ of each sample `(n, d, d)`, without its weight."""
+        """Return Σ_y + B_Q Σ_τ B_Qᵀ + G Σ_x Gᵀ of each sample `(n, d, d)`, not divided by its weight."""
         white = torch.diag_embed(self.std.square().expand_as(z.o))
         return sum((N @ N.mT for N in self.factors(at, z)), start=white)
 
     def __getitem__(self, rows: Tensor) -> SampleNoise:
-        """Return the noise of some of the samples."""
+        """Return the noise of the given samples."""
         std = self.std if self.std.ndim == 1 else self.std[rows]
         parts = (None if x is None else x[rows] for x in (self.state, self.weight, self.torque))
         return SampleNoise(std, self.force, *parts)
@@ -175,7 +175,7 @@ class SampleNoise:
 def state_jacobian(
     system: ConstrainedSystem, m: Measurement, force: ForceField | None = None
 ) -> Tensor | None:
-    """Return G = dz/d(q, q̇) `(n, d, 2 nq)` of accelerations or multipliers, else `None`.
+    """Return G = dz/d(q, q̇) `(n, d, 2 nq)` of accelerations or multipliers, and `None` for other quantities.
 
     Args:
         force: all impressed forces; by default those of the robot file and the measured torque.
@@ -191,16 +191,16 @@ def state_jacobian(
 
 
 def learned_slopes(training: Training, system: ConstrainedSystem, force: ForceField) -> Training:
-    """Return the training data with G of a force field at each sample."""
+    """Return the training data with G computed for a force field at each sample."""
     slopes = tuple(state_jacobian(system, m, force) for m in training.measurements)
     return dataclasses.replace(training, slopes=slopes)
 
 
 def state_std_of(given: Sequence[NoiseStd] | None, robot: RobotModel) -> Tensor | None:
-    """Return the standard deviation of q and q̇ as one vector `(2 nq,)`, or `None`.
+    """Return the standard deviations of q and q̇ as one vector `(2 nq,)`, or `None` if none are given.
 
     Raises:
-        ModelError: these are no two standard deviations, each one number or one per joint, 0 or above.
+        ModelError: `given` is not two standard deviations ≥ 0, each one number or one per joint.
     """
     if given is None:
         return None

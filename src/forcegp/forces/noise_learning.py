@@ -1,6 +1,6 @@
 """Noise that depends on the learned forces: slopes that propagate state noise, and sample weights.
 
-Both alternate with the hyperparameters (`solve` in `models/structured_learning.py`).
+Both are updated in alternation with the hyperparameters (`solve` in `models/structured_learning.py`).
 
 **Slopes.** The first fit propagates state noise through the equations of motion of the robot file
 (`noise.py`), which lack the unknown forces: a spring of 100 N m/rad turns noise of 1 mrad into 0.1 N m.
@@ -9,19 +9,19 @@ posterior mean F̄ is computed at each sample, and hyperparameters are relearned
 
     cov(y_i) = Σ_y + G_i Σ_x G_iᵀ,   G_i = ∂(L b + H F̄)/∂(q, q̇) + H ∂F̄/∂(q, q̇),
 
-where the first derivative is at fixed F̄; likewise for multipliers. The posterior mean can be worse than the
-robot file, for example far from other samples, so new slopes are accepted only if the evidence of the
-training data, with the weak priors, increases.
+where the first derivative is taken at fixed F̄; likewise for multipliers. The posterior mean can be worse than
+the robot file, for example far from other samples, so new slopes are accepted only if they increase the
+evidence of the training data, including the weak priors.
 
 **Weights.** Impacts, dropped packets and gear shocks violate the equations of motion for a few samples, which
 would dominate a Gaussian likelihood. With y_i | w_i ~ N(E y_i, Σ_i/w_i) and w_i ~ Γ(ν/2, ν/2), the noise of
-sample i, d numbers that share one w_i, has a t distribution with ν degrees of freedom. Given the weights,
-everything is Gaussian, so inference stays exact. Expectation maximisation alternates learning with
+sample i, whose d components share one w_i, has a t distribution with ν degrees of freedom. Given the weights,
+all distributions are Gaussian, so inference stays exact. Expectation maximisation alternates learning with
 
     w_i = (ν + d) / (ν + E[r_iᵀ Σ_i⁻¹ r_i]),
 
-where r_i is the residual under the posterior. Samples far outside the noise have almost no weight (Lange,
-Little and Taylor, *Robust statistical modeling using the t distribution*, 1989).
+where r_i is the residual under the posterior. Samples with residuals far above the noise have almost no
+weight (Lange, Little and Taylor, *Robust statistical modeling using the t distribution*, 1989).
 """
 
 from __future__ import annotations
@@ -41,11 +41,11 @@ from forcegp.forces.search import Search
 from forcegp.gp.optimise import Learned, Progress
 
 STEPS = 5
-"""Number of weight updates at given hyperparameters, each of which needs a posterior."""
+"""Number of weight updates at given hyperparameters, each of which requires a posterior."""
 CHUNK_STATES = 1024
 """Number of samples for which residuals are computed at a time."""
 IGNORED = 0.1
-"""Weight below which a sample counts as ignored."""
+"""Weight below which a sample is considered ignored."""
 
 
 def with_learned_slopes(
@@ -53,8 +53,8 @@ def with_learned_slopes(
 ) -> tuple[Problem, Learned, tuple[str, ...]]:
     """Return the problem with slopes of its learned forces, the resulting hyperparameters, and warnings.
 
-    Nothing changes if the evidence does not increase, or if the slopes cannot be computed or used, for
-    example for a force that is not computed with tensors.
+    The problem and the hyperparameters are unchanged if the evidence does not increase, or if the slopes
+    cannot be computed or used, for example because a force is not computed with tensors.
 
     Args:
         problem: problem with exact inference and state noise.
@@ -98,7 +98,7 @@ def left_out(problem: Problem) -> int:
 def _weights(
     problem: Problem, posterior: ForcePosterior, values: Mapping[str, Tensor], i: int, degrees: float
 ) -> Tensor:
-    """Return the weights of the samples of a measurement `(n,)`."""
+    """Return the weights of the samples in measurement i `(n,)`."""
     m, system, weights = problem.training.measurements[i], problem.system_at(values), []
     noise = problem.sample_noise(values, system, i)
     for first in range(0, len(m.q), CHUNK_STATES):

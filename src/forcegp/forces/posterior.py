@@ -1,12 +1,12 @@
 """Prior and posterior (eqs. 22 to 25) of the impressed forces, and functions drawn from the posterior.
 
-Q̄ = m + Σ_p E_p f_p with f_p ~ GP(0, k_p), plus Coulomb friction of contacts, proportional to the multiplier.
+Q̄ = m + Σ_p E_p f_p with f_p ~ GP(0, k_p), plus contact friction proportional to the multiplier.
 Every quantity z = B_Q Q + B_z Q_z + o is an affine map of the latent forces f_p and is determined by their
 posterior. Each function drawn from the posterior is a deterministic force field that can be integrated.
 
 Accelerations in contact depend only on Q + Q_z (remark 3.3). The two are distinguished by their directions
 (Q_z acts only in contact, along the tangent), by their inputs, and by measurements of either. Their posterior
-correlation measures the separation: at −1, only the sum is identifiable; at 0, they are separated.
+correlation measures how well they are separated: at −1, only the sum is identifiable; at 0, each of them is.
 
 **Forces that are not functions of the state.** At rest, joint friction balances the other forces. A joint
 that hardly moves therefore has an additional unknown force of variance σ_s² e^{−(q̇/v_s)²}. Beyond the
@@ -42,28 +42,28 @@ STICKING = 0.02
 """Initial value of v_s [rad/s, m/s]."""
 REGION = f"{NOISE}.region."
 LOW, HIGH, SPREAD, GROWTH = (REGION + name for name in ("low", "high", "spread", "growth"))
-"""Names of the trained region: limits and standard deviation of the speed and torque of each joint `(2, nq)`,
-and g `(nq,)` [N m, N]."""
+"""Names under which the trained region is stored: lower and upper limits and standard deviation of the speed
+and torque of each joint `(2, nq)`, and g `(nq,)` [N m, N]."""
 OUTERMOST, WIDEST = 0.01, 0.16
-"""Least and largest fraction of the training samples beyond either limit of the region; the largest is one
-standard deviation of a Gaussian. With fewer than 100 independent samples, one of them lies beyond."""
+"""Smallest and largest fraction of the training samples beyond either limit of the region. The largest
+corresponds to one Gaussian standard deviation. Of fewer than 100 independent samples, one lies beyond."""
 RELATIVE = 0.05
 """Prior growth g relative to the typical load of a joint: torque constants and load-dependent friction are
     uncertain by about 5 %."""
 FAR_BEYOND = 3.0
-"""Distance beyond the trained region from which predictions warn."""
+"""Distance beyond the trained region above which predictions emit a warning."""
 
 
 @dataclass(frozen=True, eq=False)
 class ForceProcess:
-    """Priors on forces with learned parameters of their operators.
+    """Force priors, with the learned parameters of their operators.
 
     Attributes:
         priors, scales: force priors and the standardization of their inputs.
         mean: prior mean of Q.
         coulomb: contact friction proportional to the multiplier.
-        pinned: values `(components,)` of constant latent forces contained in the robot, by number of the
-            prior; their prior mean is minus this value, and their posterior mean is zero.
+        pinned: values `(components,)` of constant latent forces already contained in the robot, keyed by the
+            index of the prior. Their prior mean is minus this value, and their posterior mean is zero.
     """
 
     priors: tuple[ForcePrior, ...]
@@ -73,18 +73,18 @@ class ForceProcess:
     pinned: Mapping[int, Tensor] = field(default_factory=dict)
 
     def features(self, p: int, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
-        """Return the standardized kernel inputs of prior p at states."""
+        """Return the standardized kernel inputs of prior p at the given states."""
         return self.scales[p].apply(self.priors[p].features(system, at))
 
     def coupled(self, system: ConstrainedSystem, at: States, z: AffineMap) -> AffineMap:
-        """Add Coulomb friction of contacts to the affine map of a quantity."""
+        """Add Coulomb friction at the contacts to the affine map of a quantity."""
         return coupled(system, at, z, self.coulomb)
 
     def rows(self, system: ConstrainedSystem, at: States, z: AffineMap) -> Block:
         """Express a quantity as rows of the latent forces.
 
         Args:
-            z: the quantity, with Coulomb friction of contacts.
+            z: the quantity, including Coulomb friction at the contacts.
 
         Returns:
             Kernel inputs and operators B(x) E(x) of each prior, with o(x) + B(x) m(x) as target.
@@ -94,7 +94,7 @@ class ForceProcess:
         by_target = {CONTACT: z.B_z, CONSTRAINT: z.B_N}
         features, operators = [], []
         for p, prior in enumerate(self.priors):
-            # W = B E (eq. 12), with E the identity for a prior per joint
+            # W = B E (eq. 12), where E is the identity for a prior per joint
             features.append(self.features(p, system, at))
             B = by_target.get(prior.target, z.B_Q)
             if B is None:
@@ -105,15 +105,15 @@ class ForceProcess:
 
 
 LatentPosterior = ExactPosterior | SparsePosterior
-"""Latent processes conditioned on rows, exactly or with inducing points."""
+"""Latent processes conditioned on rows, either exactly or with inducing points."""
 
 
 @dataclass(frozen=True, eq=False)
 class ForcePosterior:
-    """Latent forces conditioned on data, which do not depend on the constraint at prediction.
+    """Latent forces conditioned on data, independent of the constraint used for prediction.
 
     Attributes:
-        process: prior of the forces.
+        process: prior on the forces.
         latent: conditioned latent processes.
     """
 
@@ -126,26 +126,26 @@ class ForcePosterior:
         return self.process.priors
 
     def shift(self, p: int, features: Features) -> Tensor | float:
-        """Return the shift from samples of latent force p to the predicted mean."""
+        """Return the shift that centres samples of latent force p on the predicted mean."""
         if not self.process.pinned:
             return 0.0
         return self.means.latent_mean(p, features) - self.latent.latent_mean(p, features)
 
     @cached_property
     def means(self) -> LatentPosterior:
-        """Processes for means, given the forces contained in the robot."""
+        """Processes used for means, conditioned on the forces already contained in the robot."""
         means = self.latent
         for p, value in self.process.pinned.items():
             means = means.knowing(p, {"one": value.new_zeros(1, 1)}, value)
         return means
 
     def __call__(self, system: ConstrainedSystem, at: States) -> Tensor:
-        """Return the posterior mean of Q̄ = Σ E f + m, `(n, nq)`, the force field for rollouts."""
+        """Return the posterior mean of Q̄ = Σ E f + m, `(n, nq)`, which is the force field for rollouts."""
         force = self.unknown_force(system, at, range(len(self.priors))) + self.process.mean(system, at)
         return with_coulomb(system, at, force, self.process.coulomb)
 
     def unknown_force(self, system: ConstrainedSystem, at: States, priors: Iterable[int]) -> Tensor | float:
-        """Return the posterior mean of Σ E f over some priors, `(n, nq)`, without Coulomb friction."""
+        """Return the posterior mean of Σ E f over the given priors, `(n, nq)`, without Coulomb friction."""
         # Σ_p E_p μ_p
         force: Tensor | float = 0.0
         for p in (p for p in priors if self.means.measured[p]):
@@ -157,19 +157,19 @@ class ForcePosterior:
         """Express a quantity at n states as rows of the processes, with its prior mean as target.
 
         Args:
-            z: the quantity, without Coulomb friction of contacts.
+            z: the quantity, without Coulomb friction at the contacts.
         """
         # W = B E, target o + B m (eqs. 12 and 15)
         return self.process.rows(system, at, self.process.coupled(system, at, z))
 
     def read(self, system: ConstrainedSystem, at: States, z: AffineMap) -> tuple[Tensor, Tensor]:
-        """Return posterior mean `(n, d)` and covariance `(n, d, d)` of a quantity, excluding noise."""
+        """Return the posterior mean `(n, d)` and covariance `(n, d, d)` of a quantity, excluding noise."""
         # o + B (m + Σ E μ), and W Cov(f) Wᵀ (eqs. 23 to 25)
         rows = self.rows(system, at, z)
         return rows.target + self.means.mean(rows), self.latent.covariance(rows)
 
     def read_mean(self, system: ConstrainedSystem, at: States, z: AffineMap) -> Tensor:
-        """Return the posterior mean o + B(m + Σ E f) of a quantity at states, `(n, d)`."""
+        """Return the posterior mean o + B (m + Σ E μ) of a quantity at the given states, `(n, d)`."""
         rows = self.rows(system, at, z)
         return rows.target + self.means.mean(rows)
 
@@ -185,15 +185,15 @@ def stick_variance(tensors: Mapping[str, Tensor], at: States) -> Tensor:
 def trained_region(
     qd: Tensor, tau: Tensor, load: Tensor, hidden: Tensor | None = None, independent: float = math.inf
 ) -> dict[str, Tensor]:
-    """Return the region of the training samples `(n, nq)`, with the names `LOW`, `HIGH` and `SPREAD`.
+    """Return the region of the training samples `(n, nq)` under the names `LOW`, `HIGH` and `SPREAD`.
 
     Args:
-        qd, tau: velocities and torques of samples in motion.
+        qd, tau: velocities and torques of the samples in motion.
         load: typical torque of each joint `(nq,)`, a fraction of which is the lower bound on the standard
             deviation of the torque.
-        hidden: `(nq,)` bool, joints with torques that do not affect accelerations; their region is one
-            standard deviation around the mean.
-        independent: number of independent samples, one of which lies beyond each end.
+        hidden: `(nq,)` bool, joints whose torques do not affect accelerations. Their torque region extends
+            one standard deviation to either side of the mean.
+        independent: number of independent samples, one of which lies beyond each limit.
     """
     x = torch.stack([qd, tau], dim=1)
     share = min(max(OUTERMOST, 1.0 / independent), WIDEST)
@@ -207,7 +207,7 @@ def trained_region(
 
 
 def distance_beyond(tensors: Mapping[str, Tensor], qd: Tensor, tau: Tensor) -> Tensor:
-    """Return D `(*batch, nq)` in training standard deviations; zero inside, or without, a trained region."""
+    """Return D `(*batch, nq)` in training standard deviations; zero inside the region or if there is none."""
     if LOW not in tensors:
         return torch.zeros_like(qd)
     x = torch.stack([qd, tau], dim=-2)
@@ -233,13 +233,13 @@ def warnings_beyond(distance: Tensor, joints: Sequence[str]) -> tuple[str, ...]:
 
 
 def hidden_variance(tensors: Mapping[str, Tensor], at: States, external: Tensor | None) -> Tensor:
-    """Return the variance `(n, nq)` of static friction and of unknown forces with given deviation `(nq,)`."""
+    """Return the variance `(n, nq)` of static friction plus unknown forces of std `external` `(nq,)`."""
     variance = stick_variance(tensors, at)
     return variance if external is None else variance + external**2
 
 
 def unknown_variance(tensors: Mapping[str, Tensor], at: States, external: Tensor | None) -> Tensor:
-    """Return the additional variance of predicted forces `(n, nq)`: hidden forces, and g² D²."""
+    """Return the additional variance of predicted forces `(n, nq)`: `hidden_variance` and g² D²."""
     variance = hidden_variance(tensors, at, external)
     if GROWTH not in tensors:
         return variance
@@ -268,10 +268,10 @@ class ForceSamples:
         return self.functions.count
 
     def __call__(self, system: ConstrainedSystem, at: States) -> Tensor:
-        """Return Q̄ = Q + Q_z of one sample per trajectory, the force field for rollouts.
+        """Return Q̄ = Q + Q_z with one sample per trajectory, which is the force field for rollouts.
 
         Args:
-            at: samples × k states, with the s-th run of k states for sample s.
+            at: samples × k states; the s-th run of k states belongs to sample s.
 
         Returns:
             `(samples · k, nq)` [N m, N].
@@ -282,7 +282,7 @@ class ForceSamples:
         return with_coulomb(system, at, Q_bar, self.posterior.process.coulomb)
 
     def unknown_force(self, system: ConstrainedSystem, at: States, priors: Iterable[int]) -> Tensor | float:
-        """Return Σ E f over some priors, without contact Coulomb friction."""
+        """Return Σ E f over the given priors, without Coulomb friction at the contacts."""
         unknown: Tensor | float = 0.0
         runs = len(at.q) // self.count
         step = max(1, CHUNK_STATES // max(runs, 1))
@@ -321,20 +321,20 @@ def draw_samples(
 CORRELATION_STATES = 50
 """Number of training states at which the correlation of Q and Q_z is evaluated after a fit."""
 FAR = 0.02
-"""Distance from its surface from which a closed contact is doubtful [m]."""
+"""Distance from its surface above which a closed contact is questionable [m]."""
 UNDETERMINED = 10.0
-"""Relative standard deviation of the multiplier from which a fit warns."""
+"""Relative standard deviation of the multiplier above which a fit emits a warning."""
 MISSED = 2.0
-"""Root mean square residual, in units of the noise, from which a fit warns."""
+"""Root mean square residual, in units of the noise, above which a fit emits a warning."""
 LARGE_JITTER = 0.01
-"""Jitter, relative to unit noise, from which a fit warns; the noise increases by half of it."""
+"""Jitter, relative to unit noise, from which a fit emits a warning; it raises the noise by half its size."""
 
 
 def force_correlation(posterior: ForcePosterior, system: ConstrainedSystem, at: States) -> Tensor:
     """Return the posterior correlation of Q and Q_z at each state and joint, `(n, nq)`; 0 if one is certain.
 
-    corr_i = Cov(Q_i, Q_z,i) / √(Var Q_i Var Q_z,i). The part of Q along the constraint, which does not affect
-    accelerations, is excluded.
+    corr_i = Cov(Q_i, Q_z,i) / √(Var Q_i Var Q_z,i), excluding the part of Q along the constraint, which does
+    not affect accelerations.
     """
     z = affine_map(system, at, ("joint_force", "contact_friction"))
     rows = posterior.rows(system, at, z)
@@ -352,11 +352,11 @@ def force_correlation(posterior: ForcePosterior, system: ConstrainedSystem, at: 
 def doubts_of(
     posterior: ForcePosterior, system: ConstrainedSystem, training: Training, power: float
 ) -> tuple[float | None, tuple[str, ...]]:
-    """Return doubts about a posterior with a tempered likelihood, at training states in contact and overall.
+    """Return warnings about a posterior, with the likelihood tempered by `power`, at training states.
 
     Returns:
-        Mean correlation of Q and Q_z over some of these states, if both have priors, and warnings, each with
-        a remedy.
+        The mean correlation of Q and Q_z over training states in contact, or `None` unless both have priors,
+        and the warnings, each with a suggested remedy.
     """
     few = training.evenly(min(CORRELATION_STATES, training.samples)).measurements if training.samples else ()
     # Elsewhere Q_z is zero, and there is no multiplier.

@@ -1,7 +1,7 @@
 """The learning problem of force priors: its rows, their likelihood, and the forces conditioned on them.
 
-Conditioning is exact, or sparse through the features and inducing points of the priors. Sparse conditioning
-goes piece by piece: it sums over samples, and the sums determine the posterior.
+Conditioning is either exact or, with features and inducing points of the priors, sparse. Sparse conditioning
+proceeds piece by piece: it accumulates sums over the samples, and these sums determine the posterior.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError
 from forcegp.forces.measurements import Training
 from forcegp.forces.noise import TORQUE_NOISE, ForceNoise, SampleNoise, state_jacobian
-from forcegp.forces.posterior import ForcePosterior, ForceProcess, hidden_variance
+from forcegp.forces.posterior import ForcePosterior, ForceProcess, hidden_variance, trained_region
 from forcegp.forces.priors.base import ANALYTICAL, MIXING, NOISE, RESERVED, ForceMean, ForcePrior
 from forcegp.forces.priors.contact import CoulombErrorPrior, CoulombFriction, coulomb_of
 from forcegp.forces.projection import WhitenedRows, combine, whiten
@@ -34,35 +34,38 @@ from forcegp.gp.sums import Sums, accumulate, add_over_processes, reduce_sums
 
 Tensors = dict[str, Tensor]
 OWN = tuple(name + "." for name in RESERVED)
-"""Prefixes of what is learned besides the hyperparameters of the priors."""
+"""Prefixes of learned parameters other than the hyperparameters of the priors."""
 MIXED = "." + MIXING
-"""End of the names of what operators learn."""
+"""Suffix of the names of learned operator parameters."""
 SHOWN = 10.0
-"""Independent samples with accelerations sensitive to a joint's torque, from which its noise is learned."""
+"""Independent samples with accelerations sensitive to a joint's torque that are needed to learn its noise."""
 UNSHOWN = 0.1
-"""Part of its load by which the torque of a joint, with its friction, is uncertain where nothing shows
-it, and how that grows with each training standard deviation beyond; 0.08 on a real iiwa 14."""
+"""Uncertainty of a joint's torque and friction, as a fraction of its load, if no measurement is sensitive to
+them, and its growth per training standard deviation beyond the trained region; 0.08 on a real iiwa 14."""
+
+REGION_STATES = 10_000
+"""Maximum number of training states for the trained region."""
 
 
 def kernel_parameters(tensors: Mapping[str, Tensor]) -> Tensors:
-    """Return the hyperparameters of the priors among learned tensors."""
+    """Return the hyperparameters of the priors from the learned tensors."""
     return {key: x for key, x in tensors.items() if not key.startswith(OWN) and not key.endswith(MIXED)}
 
 
 def analytical_parameters(tensors: Mapping[str, Tensor]) -> Tensors:
-    """Return the analytical parameters θ_A among learned tensors, by their name in the module."""
+    """Return the analytical parameters θ_A from the learned tensors, keyed by their names in the module."""
     prefix = ANALYTICAL + "."
     return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
 
 
 def noise_key(measurement: int) -> str:
-    """Return the name of the learned noise of a measurement."""
+    """Return the name of the learned noise of the measurement with the given index."""
     return f"{NOISE}.{measurement}.log_noise_std"
 
 
 @dataclass(frozen=True)
 class Problem:
-    """Parts of the likelihood of force priors.
+    """The components of the likelihood of force priors.
 
     Attributes:
         system: robot and contacts, with fixed parameters unless θ_A is learned.
@@ -71,13 +74,13 @@ class Problem:
         training: measurements, noise and input scales.
         parameters: module with a `forward()` that returns the robot at θ_A, or `None`.
         torque_std: standard deviation of the white noise of the motor torque, `(nq,)`, unless it is learned.
-        power: exponent κ of the likelihood; below 1 for correlated samples.
+        power: exponent κ of the likelihood; below 1 if samples are correlated.
         correlation: correlation time of the noise of each torque, `(nq,)` [s]; `None` if unknown.
-        pinned: by prior, value `(components,)` of a latent force that the robot contains: its prior mean is
-            minus this value, its posterior mean zero, and the others are conditioned on that.
+        pinned: values `(components,)` of latent forces already contained in the robot, keyed by prior. Their
+            prior mean is minus this value, their posterior mean zero; other forces are conditioned on them.
         inducing: inducing inputs of each prior, for sparse inference; `None` for exact inference.
-        state_std: standard deviation of the noise of q and q̇, `(2 nq,)`, or `None` for none.
-        external_std: standard deviation of unknown forces on the joints `(nq,)`, or `None` for none.
+        state_std: standard deviation of the noise of q and q̇, `(2 nq,)`, or `None` if there is none.
+        external_std: standard deviation of unknown forces on the joints `(nq,)`, or `None` if there are none.
     """
 
     system: ConstrainedSystem
@@ -94,18 +97,14 @@ class Problem:
     external_std: Tensor | None = None
 
     def system_at(self, tensors: Mapping[str, Tensor]) -> ConstrainedSystem:
-        """Return the system with the robot at the analytical parameters among the tensors."""
+        """Return the system, with its robot evaluated at the analytical parameters in the tensors."""
         own = {} if self.parameters is None else analytical_parameters(tensors)
         if self.parameters is None or not own:
             return self.system
         return self.system.with_robot(torch.func.functional_call(self.parameters, own, ()))
 
-    def priors_at(self, tensors: Mapping[str, Tensor]) -> tuple[ForcePrior, ...]:
-        """Return the priors with learned parameters of their operators."""
-        return tuple(prior.with_parameters(sub(tensors, prior.name)) for prior in self.priors)
-
     def noise_at(self, tensors: Mapping[str, Tensor], measurement: int) -> Tensor:
-        """Return the noise of a measurement, `(d,)` or `(n, d)`; noise by sample is scaled."""
+        """Return the noise of a measurement, `(d,)` or `(n, d)`; learned noise scales per-sample noise."""
         std = self.training.noise_std[measurement]
         learned = tensors.get(noise_key(measurement))
         if learned is None:
@@ -113,18 +112,18 @@ class Problem:
         return learned.exp() if std.ndim == 1 else std * (learned.exp() / typical(std))
 
     def coulomb(self, tensors: Mapping[str, Tensor]) -> tuple[CoulombFriction, ...]:
-        """Return Coulomb friction of contacts, at its initial value if it is not among the tensors."""
+        """Return Coulomb friction at the contacts, with initial values for missing parameters."""
         return coulomb_of(self.priors, tensors, self.system.robot.mass) if self.has_coulomb else ()
 
     @property
     def has_coulomb(self) -> bool:
-        """Whether a prior is coupled with Coulomb friction proportional to the multiplier."""
+        """Whether any prior is coupled with Coulomb friction proportional to the multiplier."""
         return any(prior.coupled for prior in self.priors)
 
     def with_coulomb_errors(self, tensors: Mapping[str, Tensor]) -> tuple[Problem, Tensors]:
-        """Return the problem with the error of learned Coulomb friction as a further force, and its tensors.
+        """Return the problem and tensors with the error of learned Coulomb friction as an additional force.
 
-        Used for conditioning, not for learning.
+        The result is used for conditioning, not for learning.
         """
         friction = self.coulomb(tensors)
         priors = tuple(CoulombErrorPrior(f.contact, friction) for f in friction)
@@ -139,7 +138,7 @@ class Problem:
         ), {**tensors, **{f"{prior.name}.log_scale": one[0] for prior in priors}}
 
     def force_noise(self, tensors: Mapping[str, Tensor]) -> ForceNoise | None:
-        """Return the variance of the white noise on the joint force, or `None` for none."""
+        """Return the variance of the white noise on the joint force, or `None` if there is none."""
         learned = tensors.get(TORQUE_NOISE)
         std = self.torque_std if learned is None else learned.exp()
         if std is None and self.external_std is None:
@@ -148,7 +147,7 @@ class Problem:
         return lambda at: white + hidden_variance(tensors, at, self.external_std)
 
     def state_factor(self, system: ConstrainedSystem, measurement: int) -> Tensor | None:
-        """Return G Σ_x½ `(n, d, 2 nq)` of a measurement, or `None` without noise of the state."""
+        """Return G Σ_x½ `(n, d, 2 nq)` of a measurement, or `None` if there is no state noise."""
         if self.state_std is None:
             return None
         m, slopes = self.training.measurements[measurement], self.training.slopes
@@ -156,17 +155,16 @@ class Problem:
         return None if G is None else G * self.state_std
 
     def process_at(self, tensors: Mapping[str, Tensor]) -> ForceProcess:
-        """Return the forces a priori, with learned operators and Coulomb friction."""
+        """Return the prior on the forces, with learned operators and Coulomb friction."""
         names = [prior.name for prior in self.priors]
         pinned = {names.index(name): value for name, value in self.pinned.items()}
-        return ForceProcess(
-            self.priors_at(tensors), self.training.scales, self.mean, self.coulomb(tensors), pinned
-        )
+        priors = tuple(prior.with_parameters(sub(tensors, prior.name)) for prior in self.priors)
+        return ForceProcess(priors, self.training.scales, self.mean, self.coulomb(tensors), pinned)
 
     def sample_noise(
         self, tensors: Mapping[str, Tensor], system: ConstrainedSystem, measurement: int
     ) -> SampleNoise:
-        """Return the noise of the samples of a measurement."""
+        """Return the noise of the samples in a measurement."""
         weights = self.training.weights
         return SampleNoise(
             self.noise_at(tensors, measurement),
@@ -177,7 +175,7 @@ class Problem:
         )
 
     def rows(self, tensors: Mapping[str, Tensor]) -> WhitenedRows:
-        """Return the whitened rows at the noise and analytical parameters among the tensors."""
+        """Return the whitened rows, evaluated at the noise and analytical parameters in the tensors."""
         system, process = self.system_at(tensors), self.process_at(tensors)
         return combine(
             [
@@ -188,12 +186,12 @@ class Problem:
 
     @cached_property
     def fixed_rows(self) -> WhitenedRows:
-        """Return the rows at the given noise and robot."""
+        """Return the rows evaluated with the given noise and robot."""
         return self.rows({})
 
     @torch.no_grad()
     def torque_residual(self) -> Tensor:
-        """Return the RMS of M times acceleration residuals and of force residuals `(nq,)` [N m, N]."""
+        """Return the RMS of force residuals and of M times acceleration residuals, `(nq,)` [N m, N]."""
         squares = [torch.zeros_like(self.system.robot.mass)[None]]
         for m in self.training.measurements:
             at = m.at(self.system)
@@ -207,14 +205,14 @@ class Problem:
 
     @torch.no_grad()
     def hidden_torque(self) -> Tensor:
-        """Return σ of torques that hardly affect accelerations, 0 for other joints `(nq,)`.
+        """Return σ `(nq,)` of torques that hardly affect accelerations, and 0 for other joints.
 
-        In contact, a force along the constraint changes no acceleration. A joint that acts along the
-        constraint has P_ii near zero, and neither its noise nor its friction can be distinguished from those
-        of other joints. The upper bound is the residual of its acceleration at such samples beyond unknown
-        forces e of stated size, s² = Σ (r_i² − Σ_k H_ik² Var e_k) / Σ H_ii². The lower bound is `UNSHOWN` of
-        the load of such joints. It applies to joints with P_ii below one half at most samples and above it at
-        fewer than `SHOWN` independent ones, unless forces were measured too.
+        In contact, a force along the constraint does not change the accelerations. A joint that acts along
+        the constraint has P_ii near zero, and neither its noise nor its friction can be distinguished from
+        those of other joints. The estimate is the residual of its acceleration at such samples in excess of
+        unknown forces e of given size, s² = Σ (r_i² − Σ_k H_ik² Var e_k) / Σ H_ii², but at least `UNSHOWN`
+        times the load of such joints. It applies to joints with P_ii below one half at most samples and above
+        it at fewer than `SHOWN` independent samples, unless forces were also measured.
         """
         if set(self.training.quantities) != {"qdd"}:
             return torch.zeros_like(self.system.robot.mass)
@@ -239,19 +237,27 @@ class Problem:
 
     @torch.no_grad()
     def typical_load(self) -> Tensor:
-        """Return the RMS of the torques on each joint (motor, weight, bias) `(nq,)` [N m, N]."""
+        """Return the RMS of the torques on each joint (motor, gravity, bias), `(nq,)` [N m, N]."""
         states = [m.at(self.system) for m in self.training.measurements]
         squares = [at.tau**2 + at.eom.Q_G**2 + at.eom.Q_C**2 for at in states]
         return torch.cat(squares).mean(0).sqrt()
 
+    @cached_property
+    @torch.no_grad()
+    def region(self) -> dict[str, Tensor]:
+        """Region of speeds and torques of the training data, from `REGION_STATES` of them at most."""
+        training = self.training.evenly(REGION_STATES)
+        qd, tau = (torch.cat([getattr(m, name) for m in training.measurements]) for name in ("qd", "tau"))
+        return trained_region(qd, tau, dataclasses.replace(self, training=training).typical_load())
+
     def negative_log_likelihood(self, params: Tensors, rows: WhitenedRows) -> Tensor:
-        """Return the negative log likelihood of the rows, if sparse of the weights of features."""
+        """Return the negative log likelihood of the rows, in weight space if sparse and priors are finite."""
         exact = self.inducing is None or not is_finite(self.priors)
         of = negative_log_likelihood if exact else negative_log_likelihood_of_weights
         return of(self.priors, params, rows.blocks) + rows.constant
 
     def rows_for(self, tensors: Tensors, held: Tensors) -> WhitenedRows:
-        """Return the rows at learned and fixed tensors, cached if none of them changes the rows."""
+        """Return the rows for the learned and fixed tensors; cached if the rows do not depend on them."""
         keys = [*tensors, *held]
         own = any(key.startswith(OWN) or key.endswith(MIXED) for key in keys)
         return self.rows({**held, **tensors}) if own else self.fixed_rows
@@ -263,16 +269,16 @@ def typical(std: Tensor) -> Tensor:
 
 
 PIECE_SAMPLES = 8192
-"""Samples whose equations of motion are held at a time."""
+"""Number of samples for which equations of motion are kept in memory at a time."""
 
 
 @dataclass(frozen=True, eq=False)
 class Totals:
-    """State of sparse conditioning after some pieces.
+    """State of sparse conditioning after a number of pieces.
 
     Attributes:
-        sums: over the whitened rows.
-        constant: part of the negative log likelihood independent of the latent forces `()`.
+        sums: sums over the whitened rows.
+        constant: part of the negative log likelihood that is independent of the latent forces `()`.
         samples: number of samples `()`.
         pieces: number of pieces.
     """
@@ -284,18 +290,18 @@ class Totals:
 
     @classmethod
     def zero(cls, problem: Problem, basis: LatentBasis) -> Totals:
-        """Return the totals of no samples."""
+        """Return totals over zero samples."""
         like = next(iter(basis.params.values()))
         return cls(Sums.zero(basis, like), like.new_zeros(()), like.new_zeros(()), 0)
 
     def over_processes(self) -> Totals:
-        """Add the totals of all processes of `torch.distributed`; each process gets the same result."""
+        """Sum the totals over all `torch.distributed` processes; each process receives the same result."""
         constant, samples = add_over_processes(torch.stack([self.constant, self.samples])).unbind()
         return Totals(reduce_sums(self.sums), constant, samples, self.pieces)
 
 
 def basis_of(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> LatentBasis:
-    """Return the basis functions of a problem with inducing points.
+    """Return the basis functions of a problem that has inducing points.
 
     Raises:
         ModelError: inference is exact.
@@ -315,12 +321,12 @@ def total_over(
     begin: Totals | None = None,
     after: Callable[[Totals], None] = lambda _: None,
 ) -> Totals:
-    """Return the sum over pieces of a log, in memory that does not depend on their number.
+    """Return the totals over the pieces of a log, using an amount of memory independent of their number.
 
     Args:
-        problem: robot, priors and noise; its own training data are not read.
+        problem: robot, priors and noise; its own training data are not used.
         pieces: the samples; may be a generator.
-        begin: totals of the pieces before.
+        begin: totals over earlier pieces.
         after: called after each piece.
     """
     total = begin or Totals.zero(problem, basis)
@@ -340,10 +346,10 @@ def total_over(
 def posterior_of(
     problem: Problem, hyperparameters: Mapping[str, Tensor], basis: LatentBasis, total: Totals
 ) -> ForcePosterior:
-    """Return the forces conditioned on the samples of totals.
+    """Return the forces conditioned on the samples that the totals contain.
 
     Raises:
-        NumericalError: the sums are not finite, or the noise is negligible beside the prior.
+        NumericalError: the sums are not finite, or the noise is negligible compared with the prior.
     """
     # A = I + Σ V S Vᵀ, w ~ N(A⁻¹v, A⁻¹)
     latent = SparsePosterior.of(basis, total.sums)
@@ -352,11 +358,11 @@ def posterior_of(
 
 
 EXACT_SAMPLES = 1000
-"""Samples up to which inference is exact by default."""
+"""Number of samples up to which inference is exact by default."""
 
 
 def require_double(system: ConstrainedSystem) -> None:
-    """Refuse a robot in single precision, since rounding makes its covariance matrices indefinite.
+    """Reject robots in single precision, for which rounding makes covariance matrices indefinite.
 
     Raises:
         ModelError: the robot is not float64.
@@ -371,15 +377,15 @@ def require_double(system: ConstrainedSystem) -> None:
 
 
 def is_finite(priors: Sequence[ForcePrior]) -> bool:
-    """Return whether all priors are a finite number of features, so that sparse inference is exact."""
+    """Return whether all priors have finitely many features, so that sparse inference is exact."""
     return all(prior.kernel.is_finite for prior in priors)
 
 
 def is_sparse(inference: str, priors: Sequence[ForcePrior], samples: int) -> bool:
-    """Return whether inference is sparse: on request, for finite priors, and beyond `EXACT_SAMPLES`.
+    """Return whether inference is sparse: on request, and by default for finite priors or many samples.
 
     Raises:
-        ModelError: sparse inference with a force that is a function of time.
+        ModelError: sparse inference is requested, but a force is a function of time.
     """
     if any(prior.in_time for prior in priors):
         if inference == "sparse":
@@ -395,11 +401,11 @@ def is_sparse(inference: str, priors: Sequence[ForcePrior], samples: int) -> boo
 
 @torch.no_grad()
 def with_inducing(problem: Problem, hyperparameters: Mapping[str, Tensor], limit: int = LIMIT) -> Problem:
-    """Return the problem with inducing points, chosen from its data by conditional variance.
+    """Return the problem with inducing points chosen from its data by conditional variance.
 
     Args:
-        problem: with the samples to condition on.
-        limit: maximum number of inducing points of one prior.
+        problem: problem with the samples to condition on.
+        limit: maximum number of inducing points per prior.
     """
     training = problem.training
     few = dataclasses.replace(problem, training=training.evenly(CANDIDATES))
@@ -415,7 +421,7 @@ def with_inducing(problem: Problem, hyperparameters: Mapping[str, Tensor], limit
 
 
 def without_inducing(problem: Problem) -> Problem:
-    """Return the problem for priors that are finite features, which need no inducing points."""
+    """Return the problem for sparse inference with finitely many features, without inducing points."""
     block = dataclasses.replace(problem, training=problem.training.evenly(1)).fixed_rows.blocks[0]
     empty = tuple({name: x[:0] for name, x in features.items()} for features in block.features)
     return dataclasses.replace(problem, inducing=empty)
@@ -434,7 +440,7 @@ def force_posterior(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> 
 def forces_and_constant(
     problem: Problem, hyperparameters: Mapping[str, Tensor]
 ) -> tuple[ForcePosterior, Tensor]:
-    """Return the forces given the data of a problem, and the likelihood's part without them.
+    """Return the forces conditioned on a problem's data, and the likelihood term that is independent of them.
 
     Raises:
         ModelError: exact inference does not fit into memory.
@@ -455,7 +461,7 @@ def lost_by_inducing(posterior: ForcePosterior) -> tuple[dict[str, Any], tuple[s
     """Return the kind of inference of a posterior, and the information lost by inducing points.
 
     Returns:
-        The fields of `FitResult`, and a warning if the points miss much of the information in the data.
+        Fields of `FitResult`, and a warning if the inducing points lose much of the information in the data.
     """
     if not isinstance(posterior.latent, SparsePosterior):
         return {"inference": "exact"}, ()

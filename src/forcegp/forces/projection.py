@@ -1,12 +1,12 @@
 """Measurements as rows with unit white noise, with the directions fixed by the constraint projected out.
 
-If q̈ is measured in contact, A q̈ = b fixes the part of q̈ in the range of Aᵀ to prior mean plus white noise.
-With an orthonormal basis U of the null space of A (after scaling by the noise), Uᵀ q̈ contains the whole
-Gaussian process in nq − rank A rows per sample, and the likelihood splits exactly into the two parts.
+If q̈ is measured in contact, A q̈ = b determines the part of q̈ in the range of Aᵀ up to white noise. With an
+orthonormal basis U of the null space of A (after scaling by the noise), Uᵀ q̈ contains the whole Gaussian
+process in nq − rank A rows per sample, and the likelihood splits exactly into the two parts.
 
 Motor torque noise is white noise on the joint force. It affects the rows of a sample through the same
-operator as the force. They have the covariance I + N Nᵀ with N = B Σ_τ½ and are whitened by its Cholesky
-factor. State noise affects the rows, to first order, through the Jacobian of the measured quantity.
+operator as the force, so their noise has covariance I + N Nᵀ with N = B Σ_τ½. They are whitened by its
+Cholesky factor. State noise affects the rows, to first order, through the Jacobian of the measured quantity.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ class WhitenedRows:
 
     Attributes:
         blocks: rows explained by the latent forces.
-        rest: function that returns the negative log likelihood of the remainder; not needed for an update.
+        rest: function that returns the negative log likelihood of the remainder, which updates do not need.
     """
 
     blocks: list[Block]
@@ -42,14 +42,14 @@ class WhitenedRows:
 
     @cached_property
     def constant(self) -> Tensor:
-        """Negative log likelihood of the remainder, with the normalisation of the noise `()`."""
+        """Negative log likelihood of the remainder, including the normalisation of the noise `()`."""
         return self.rest()
 
     def tempered(self, power: float) -> WhitenedRows:
-        """Return the rows of the likelihood to a power κ: noise variances over κ, normalisations times κ.
+        """Return the rows of the likelihood raised to the power κ.
 
-        With noise correlated over τ samples, n samples contain the information of n/τ; κ = 1/τ accounts for
-        this.
+        Noise variances are divided by κ and normalisations multiplied by κ. If noise is correlated over τ
+        samples, n samples contain as much information as n/τ independent ones, hence κ = 1/τ.
         """
         if power == 1.0:
             return self
@@ -80,14 +80,14 @@ class _NullSpaceBasis(torch.autograd.Function):
 
 
 def null_space_basis(A: Tensor, rank: int) -> Tensor:
-    """Return the orthonormal basis U of the null space of matrices of equal rank, A U = 0, UᵀU = I.
+    """Return an orthonormal basis U of the null space of matrices of equal rank, A U = 0, UᵀU = I.
 
     The basis is defined up to a rotation U R, so only functions that do not depend on R have a derivative;
     for these, dU = −A⁺ dA U.
 
     Args:
         A: `(*batch, m, n)`.
-        rank: the rank of every matrix of the batch.
+        rank: the rank of every matrix in the batch.
 
     Returns:
         `(*batch, n, n − rank)`.
@@ -99,11 +99,11 @@ def null_space_basis(A: Tensor, rank: int) -> Tensor:
 
 
 def _independent(A: Tensor, rank: int) -> tuple[Tensor, Tensor | None]:
-    """Return independent rows, as many as the rank in the equations of motion, and their combinations C of
-    the rows of A; `None` for all rows.
+    """Return `rank` independent rows C A, and C; return A and `None` if all rows are independent.
 
-    With another rank, A⁺ would amplify contradictions between nearly redundant rows. Fixed combinations of
-    consistent rows have the same solutions, and hence derivatives, as all rows.
+    The rank is that of the equations of motion: with a different one, A⁺ would amplify contradictions between
+    nearly redundant rows. Fixed combinations of consistent rows have the same solutions as all rows, and
+    hence the same derivatives.
     """
     if rank == A.shape[-2]:
         return A, None
@@ -112,7 +112,7 @@ def _independent(A: Tensor, rank: int) -> tuple[Tensor, Tensor | None]:
 
 
 def _by_rank(rank: Tensor) -> list[tuple[int, Tensor | slice]]:
-    """Return the samples of each rank, or a slice of all samples without a copy if the rank is equal."""
+    """Return the samples of each rank; if all ranks are equal, as a slice, which avoids a copy."""
     if not len(rank):
         return []
     low, high = (int(value) for value in rank.aminmax())
@@ -129,8 +129,8 @@ class _Rows:
     Attributes:
         features: kernel inputs of each prior.
         widths: number of columns of each operator.
-        rows: concatenated operators, residual, and noise factor N `(n, r, ·)`; the noise of the rows has the
-            covariance 1 + N Nᵀ.
+        rows: concatenated operators, residual, and noise factor N `(n, r, ·)`; the noise of the rows has
+            covariance I + N Nᵀ.
     """
 
     features: tuple[Features, ...]
@@ -138,7 +138,7 @@ class _Rows:
     rows: Tensor
 
     def of(self, index: Tensor | slice, U: Tensor) -> _Rows:
-        """Return Uᵀ times the rows of some samples, or of all samples if `own` is a slice."""
+        """Return Uᵀ times the rows of the given samples, or of all samples if `index` is a slice."""
         if isinstance(index, slice):
             return _Rows(self.features, self.widths, U.mT @ self.rows)
         features = tuple({name: x[index] for name, x in f.items()} for f in self.features)
@@ -147,14 +147,14 @@ class _Rows:
     def whitened(self, weight: Tensor | None) -> tuple[Block, Tensor]:
         """Return the rows divided by the factor of I + N Nᵀ, and the log determinant of the factors.
 
-        Weighted samples have a different noise variance.
+        A weight divides the noise variance of a sample.
         """
         signal = sum(self.widths) + 1
         rows, N = self.rows.tensor_split([signal], dim=-1)
         log_determinant = rows.new_zeros(())
         if N.shape[-1]:
-            # I + N Nᵀ = C Cᵀ, by QR of (I, N)ᵀ instead of Cholesky: noise of 0.05 N m at a wrist of
-            # 10⁻³ kg m² is 50 rad/s², and squares of such ratios lose all digits.
+            # I + N Nᵀ = C Cᵀ, by QR of (I, N)ᵀ instead of Cholesky: noise of 0.05 N m at a wrist with an
+            # inertia of 10⁻³ kg m² is 50 rad/s², and squaring such ratios loses all digits.
             eye = torch.eye(N.shape[1], dtype=N.dtype, device=N.device).expand(len(N), -1, -1)
             C = torch.linalg.qr(torch.cat([eye, N.mT], dim=1)).R.mT
             # C⁻¹ (W, y), ½ log|I + N Nᵀ| = Σ log |C_ii|
@@ -170,7 +170,7 @@ class _Rows:
 def whiten(
     system: ConstrainedSystem, process: ForceProcess, measurement: Measurement, noise: SampleNoise
 ) -> WhitenedRows:
-    """Return the rows of one measurement with unit white noise, without noise-free directions."""
+    """Return the rows of one measurement with unit white noise, without the directions that A q̈ = b fixes."""
     # z = B_Q Q + B_z Q_z + o (eqs. 19 and 20)
     at, std = measurement.at(system), noise.std.expand_as(measurement.values)
     z = process.coupled(system, at, affine_map(system, at, measurement.quantity))
@@ -188,7 +188,7 @@ def whiten(
         )
         / std[..., None],
     )
-    # Noise of the state reaches the directions that the constraint fixes too, so their rows contain it.
+    # State noise also affects the directions fixed by the constraint, so these are not projected out.
     if measurement.quantity == "qdd" and system.m > 0 and noise.state is None:
         return _without_fixed(everything, at.eom, measurement.values, std, noise.weight)
     block, log_determinant = everything.whitened(noise.weight)
@@ -209,7 +209,7 @@ def _without_fixed(
         log_determinants.append(log_determinant)
 
     def constant() -> Tensor:
-        # What this function keeps alive is small beside the equations of motion.
+        # The tensors kept alive by this closure are small compared with the equations of motion.
         violated = (A @ values[..., None])[..., 0] - b
         weights = torch.ones_like(violated[:, 0]) if weight is None else weight
         fixed = [_fixed(scaled[index], rank, violated[index], weights[index]) for rank, index in groups]
@@ -219,13 +219,13 @@ def _without_fixed(
 
 
 def _log_scale(std: Tensor, weight: Tensor | None) -> Tensor:
-    """Return the sum of log standard deviations over weighted samples `()`."""
+    """Return the sum of the log standard deviations over all samples, including their weights `()`."""
     total = std.log().sum()
     return total if weight is None else total - 0.5 * std.shape[-1] * weight.log().sum()
 
 
 def _fixed(A: Tensor, rank: int, violated: Tensor, weight: Tensor) -> Tensor:
-    """Return the negative log likelihood of the directions fixed by the constraint `()`, from the violation
+    """Return the negative log likelihood `()` of the directions fixed by the constraint, given the violation
     A q̈ − b."""
     # ½ w |(A σ)⁺ (A q̈ − b)|² + ½ rank A log 2π
     rows, C = _independent(A, rank)

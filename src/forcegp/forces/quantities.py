@@ -3,9 +3,9 @@
 The operators follow from M q̈ = Q̄ + Aᵀλ and A q̈ = b (eqs. 19 to 25 with two corrections: the operator
 from force to λ is −Lᵀ, and λ depends on all impressed forces Q + Q_z).
 
-`linearize_field` differentiates q̈ and λ under a force field with respect to state and torque. A system
-linearized at a fixed force (`constraints/gauss.py`) omits the change of the force. With F = Q̄ − Q_C − Q_G −
-Q_D, the part of the impressed forces that is not in the robot file,
+`linearize_field` differentiates q̈ and λ under a force field with respect to state and torque. Linearizing a
+system at a fixed force (`constraints/gauss.py`) neglects the change in the force. With F = Q̄ − Q_C − Q_G −
+Q_D, the part of the impressed forces that the robot file does not contain,
 
     dq̈/dx = ∂q̈/∂x + H ∂F/∂x,   dλ/dx = ∂λ/∂x − Lᵀ ∂F/∂x   for x = q, q̇, τ.
 
@@ -34,7 +34,7 @@ class States:
         q, qd, tau: `(n, nq)` positions, velocities and motor torques.
         active: `(n, n_contacts)` bool, closed contacts.
         eom: equations of motion at these states.
-        qdd: `(n, nq)` measured acceleration, if known.
+        qdd: `(n, nq)` measured accelerations, if known.
         slip: `(n, nq)` sliding direction of each joint, which replaces the smooth tanh(q̇/v₀) in dry
             friction.
         time: `(n, 2)` time [s] and trajectory number, for states in a training log.
@@ -64,11 +64,11 @@ def states(
 
 
 ForceField = Callable[[ConstrainedSystem, States], Tensor]
-"""Function that returns the impressed force Q̄ at states, `(n, nq)`; batched functions split the n rows."""
+"""Function that returns the impressed force Q̄ at states, `(n, nq)`; k samples share the n rows equally."""
 
 
 class FlatStates(NamedTuple):
-    """Flattened states of any batch shape.
+    """States of any batch shape, flattened.
 
     Attributes:
         q, qd, tau: `(n, nq)` positions, velocities and motor torques.
@@ -83,7 +83,7 @@ class FlatStates(NamedTuple):
     batch: torch.Size
 
     def rows(self, index: slice) -> FlatStates:
-        """Return some of the states."""
+        """Return the states in the given slice."""
         return FlatStates(self.q[index], self.qd[index], self.tau[index], self.active[index], self.batch)
 
     def with_equations(self, system: ConstrainedSystem) -> States:
@@ -95,8 +95,7 @@ class FlatStates(NamedTuple):
 def flat_states(
     system: ConstrainedSystem, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor | None
 ) -> FlatStates:
-    """Broadcast states `(*batch, nq)` against each other and flatten them; by default all contacts are
-    closed.
+    """Broadcast states `(*batch, nq)` against each other and flatten them; contacts are closed by default.
 
     Raises:
         ShapeError: an argument does not match the system, or is not finite.
@@ -125,8 +124,8 @@ def flat_states(
 def states_at(
     system: ConstrainedSystem, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor | None
 ) -> tuple[States, torch.Size]:
-    """Return the states `(*batch, nq)` as a list with their equations of motion, and the batch; errors as of
-    `flat_states`."""
+    """Return the flattened states with their equations of motion, and the batch shape; raise the same errors
+    as `flat_states`."""
     flat = flat_states(system, q, qd, tau, active)
     return flat.with_equations(system), flat.batch
 
@@ -137,8 +136,8 @@ class AffineMap(NamedTuple):
     Attributes:
         B_Q: `(n, d, nq)` operator on the joint force Q.
         B_z: `(n, d, nq)` operator on the dissipative contact force Q_z.
-        B_N: `(n, d, nq)` operator on the part of Q in the range of Aᵀ, equal to B_Q, or `None` for q̈, since
-            H Aᵀ = 0.
+        B_N: `(n, d, nq)` operator on the part of Q in the range of Aᵀ. It equals B_Q, except for q̈, for which
+            it is `None` since H Aᵀ = 0.
         o: `(n, d)` offset.
     """
 
@@ -149,7 +148,7 @@ class AffineMap(NamedTuple):
 
 
 def _identity(at: States) -> tuple[Tensor, Tensor, Tensor]:
-    """Return I, 0 and the offset 0 in joint space."""
+    """Return the identity, a zero operator and a zero offset in joint space."""
     eye = torch.eye(at.q.shape[-1], dtype=at.q.dtype, device=at.q.device).expand(len(at.q), -1, -1)
     return eye, torch.zeros_like(eye), torch.zeros_like(at.q)
 
@@ -190,13 +189,12 @@ def _contact_force(system: ConstrainedSystem, at: States) -> AffineMap:
 
 
 def _directions(system: ConstrainedSystem, at: States) -> Tensor:
-    """Return N with F_I = N λ `(n, 3 k, m)`, which contains the directions of each surface contact."""
-    blocks, first = [at.q.new_zeros(len(at.q), 0, system.m)], 0
-    for contact in system.contacts:
-        if contact.name in at.eom.contact_points:
-            own = at.eom.contact_points[contact.name].directions(contact.rows)
-            blocks.append(torch.nn.functional.pad(own, (first, system.m - first - contact.rows)))
-        first += contact.rows
+    """Return N `(n, 3 k, m)` with F_I = N λ, which contains the directions of each surface contact."""
+    blocks = [at.q.new_zeros(len(at.q), 0, system.m)]
+    for name, rows in system.rows.items():
+        if name in at.eom.contact_points:
+            own = at.eom.contact_points[name].directions(rows.stop - rows.start)
+            blocks.append(torch.nn.functional.pad(own, (rows.start, system.m - rows.stop)))
     return torch.cat(blocks, dim=1)
 
 
@@ -228,13 +226,13 @@ QUANTITIES: dict[str, Callable[[ConstrainedSystem, States], AffineMap]] = {
     "joint_force": _joint_force,
     "contact_friction": _contact_friction,
 }
-"""Quantities that can be measured and predicted, by name."""
+"""Quantities that can be measured and predicted, keyed by name."""
 
 
 def affine_maps(
     system: ConstrainedSystem, at: States, quantity: str | Sequence[str]
 ) -> tuple[AffineMap, dict[str, slice]]:
-    """Return the affine map of one quantity or several stacked ones, and the rows of each.
+    """Return the affine map of one quantity, or of several quantities stacked, and the rows of each.
 
     Raises:
         UnknownNameError: a quantity does not exist.
@@ -258,13 +256,13 @@ def affine_maps(
 
 
 ROUNDED = 1e-6
-"""Tolerance for entries of the projector on hidden multipliers that equal 0 or 1 up to rounding."""
+"""Tolerance for entries of the projector on hidden multipliers that equal 0 or 1 up to rounding error."""
 OPEN = (
     "contact {} is never closed in the training data: its force is not determined",
     "the point of contact {} cannot move against it: its force is not determined",
     "contacts {} hold the robot in the same direction: only the sum of their forces is determined",
 )
-"""Contact forces that motion does not determine."""
+"""Messages about contact forces that motion does not determine."""
 
 
 class Hidden(NamedTuple):
@@ -272,9 +270,9 @@ class Hidden(NamedTuple):
 
     Attributes:
         whole: `(n, d)` bool, undetermined components.
-        shared: `(n, d, d)` C R Cᵀ, the load sharing of contacts, with the projector R onto Aᵀμ = 0.
+        shared: `(n, d, d)` C R Cᵀ, the load sharing between contacts, where R projects onto Aᵀμ = 0.
         seen: `(n,)` number of directions of the shared load that motion determines.
-        doubts: descriptions of undetermined components.
+        doubts: warnings that describe the undetermined components.
     """
 
     whole: Tensor
@@ -283,8 +281,8 @@ class Hidden(NamedTuple):
     doubts: tuple[str, ...]
 
     def applied(self, mean: Tensor, covariance: Tensor | None) -> tuple[Tensor, Tensor | None]:
-        """Return mean `(n, d)` and covariance with NaN for undetermined components; undetermined directions
-        have the mean square of the determined ones as variance.
+        """Return the mean `(n, d)` and covariance, with NaN for undetermined components. The variance of
+        undetermined directions is the mean square of the components in determined directions.
         """
         if covariance is not None:
             square = mean.square() + covariance.diagonal(dim1=-2, dim2=-1)
@@ -298,14 +296,14 @@ class Hidden(NamedTuple):
 def hidden_forces(
     system: ConstrainedSystem, at: States, parts: Mapping[str, slice], never: Sequence[str] = ()
 ) -> Hidden | None:
-    """Return the undetermined parts of some quantities; `None` if all are determined.
+    """Return the undetermined parts of the given quantities, or `None` if everything is determined.
 
     Args:
         parts: rows of each quantity, from `affine_maps`.
         never: contacts that are never closed in the training data.
 
     Raises:
-        ModelError: all requested quantities are forces of such contacts.
+        ModelError: all requested quantities are forces at contacts that are never closed.
     """
     names = [c.name for c in system.contacts for _ in range(c.rows)]
     if not names or not {"multiplier", "contact_force", "constraint_force"} & set(parts):
@@ -345,12 +343,12 @@ def hidden_forces(
 
 
 def affine_map(system: ConstrainedSystem, at: States, quantity: str | Sequence[str]) -> AffineMap:
-    """Return the affine map of one quantity or several stacked ones; errors as in `affine_maps`."""
+    """Return the affine map of one quantity or several stacked; raise the same errors as `affine_maps`."""
     return affine_maps(system, at, quantity)[0]
 
 
 class ForceLinearization(NamedTuple):
-    """q̈ and λ at a state with their Jacobians, row = component of q̈ or λ.
+    """q̈ and λ at a state, and their Jacobians, with one row per component of q̈ or λ.
 
     Attributes:
         qdd: `(*batch, nq)` acceleration [rad/s², m/s²].
@@ -382,7 +380,7 @@ def linearize_field(
     Args:
         force: function that returns the impressed force Q̄ at states, `(n, nq)`.
         q, qd, tau: `(*batch, nq)` states.
-        active: `(*batch, n_contacts)` bool, the closed contacts; by default all.
+        active: `(*batch, n_contacts)` bool, closed contacts; by default all.
 
     Raises:
         ShapeError: an argument does not match the system.

@@ -1,10 +1,10 @@
 """Search for hyperparameters by L-BFGS: initial values, bounds, weak priors, warm starts, restarts.
 
-Inputs are standardized, so a length-scale of about the square root of their number relates typical samples. A
-log-normal prior around this initial value, with different widths on either side, keeps the length-scales of
-irrelevant inputs from drifting to infinity (four e-folds above), and penalises length-scales so short that a
-force could fit the noise (one e-fold below). The initial standard deviation of a force is the root mean
-square of the force that explains the training residuals by least squares.
+Inputs are standardized, so with a length-scale of about the square root of their number, typical samples are
+correlated. A log-normal prior around this initial value keeps the length-scales of irrelevant inputs from
+drifting to infinity (its width above is four e-folds) and penalises length-scales so short that a force could
+fit the noise (its width below is one e-fold). The initial standard deviation of a force is the root mean
+square of the force that best explains the training residuals in the least-squares sense.
 """
 
 from __future__ import annotations
@@ -35,13 +35,13 @@ LIMITS = {
     "log_smoothing": (math.log(1e-4), math.log(0.1)),
     MIXING: (-10.0, 10.0),
 }
-"""Bounds of hyperparameters with an absolute scale."""
+"""Bounds on hyperparameters that have an absolute scale."""
 REACH = {"log_lengthscale": (4.0, 8.0)}
-"""Range of the others below and above their initial value, in e-folds; `FAR` if not listed. An input with a
-length-scale 8 e-folds above its start no longer matters."""
+"""Range of the other hyperparameters below and above their initial values, in e-folds; `FAR` if not listed.
+An input whose length-scale is 8 e-folds above its initial value no longer matters."""
 FAR = (7.0, 7.0)
 AT_BOUND = 1e-6
-"""Distance from a bound, in e-folds, within which learning counts as ended at the bound."""
+"""Distance from a bound, in e-folds, within which a learned value is considered to be at the bound."""
 WIDTH = {
     "log_coefficient": (2.0, 1.0),
     "log_smoothing": (2.0, 1.0),
@@ -54,13 +54,13 @@ WIDTH = {
 }
 """Standard deviations of log-normal priors below and above the initial value, in e-folds (default 3)."""
 START_SAMPLES = 5000
-"""Maximum number of evenly spaced samples for computing initial values."""
+"""Maximum number of evenly spaced samples used to compute initial values."""
 FRICTION_SAMPLES = 200
-"""Maximum number of evenly spaced samples for selecting the initial Coulomb friction."""
+"""Maximum number of evenly spaced samples used to select the initial Coulomb friction."""
 COEFFICIENTS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
 """Friction coefficients to try."""
 PARALLEL = 1e-9
-"""One minus the mean cosine below which two directions count as equal."""
+"""Two directions are considered equal if one minus their mean cosine is below this value."""
 
 
 def initial(problem: Problem, learn_noise: bool, learn_torque_noise: bool = False) -> Tensors:
@@ -92,7 +92,7 @@ def initial(problem: Problem, learn_noise: bool, learn_torque_noise: bool = Fals
 def _with_friction(problem: Problem, noise: Tensors) -> Tensors:
     """Return the most likely Coulomb friction coefficient, and hyperparameters of the remaining forces.
 
-    From a poor coefficient, learning may attribute all friction to a function of the state, a local optimum.
+    From a poor coefficient, learning may reach a local optimum in which friction is a function of the state.
     """
     few = dataclasses.replace(problem, training=problem.training.evenly(FRICTION_SAMPLES), inducing=None)
     like = problem.system.robot.mass
@@ -123,13 +123,13 @@ def _with_friction(problem: Problem, noise: Tensors) -> Tensors:
 def initial_hyperparameters(
     priors: Sequence[ForcePrior], blocks: Sequence[Block], beyond_noise: bool = False
 ) -> dict[str, Tensor]:
-    """Return the initial log-hyperparameters, by `<prior>.<name>`.
+    """Return the initial log-hyperparameters, keyed by `<prior>.<name>`.
 
     Args:
         beyond_noise: whether to subtract the contribution of noise, for example if unknown forces are given.
     """
     params: dict[str, Tensor] = {}
-    # Some priors share the hyperparameters of another one.
+    # Some priors share the hyperparameters of another prior.
     for p, prior in [(p, prior) for p, prior in enumerate(priors) if prior.prefix == prior.name]:
         widths = {name: x.shape[-1] for name, x in blocks[0].features[p].items()}
         scale = _force_scale(p, blocks, prior.commensurate, beyond_noise)
@@ -141,8 +141,8 @@ def initial_hyperparameters(
 def _force_scale(p: int, blocks: Sequence[Block], commensurate: bool, beyond_noise: bool) -> Tensor:
     """Return the root mean square of the least-squares force of prior p, `(components,)`.
 
-    Rows determine only the sum of components along one direction. The least norm divides it evenly if all
-    have the same unit. Viscous and dry friction have different units, so each starts as if it were alone.
+    The rows determine only the sum of components along one direction. If all have the same unit, the
+    least-norm solution divides it evenly. Viscous and dry friction have different units and start separately.
     """
     operators = [block.operators[p] for block in blocks]
     each = torch.arange(operators[0].shape[-1], device=operators[0].device)
@@ -162,32 +162,32 @@ def _force_scale(p: int, blocks: Sequence[Block], commensurate: bool, beyond_noi
 
 
 def _first_parallel(operators: Sequence[Tensor]) -> Tensor:
-    """Return, for each component, the first one with the same direction at every sample, `(components,)`."""
+    """Return, for each component, the first with the same direction at every sample, `(components,)`."""
     along = most = torch.zeros_like(operators[0][0].mT @ operators[0][0])
     for W in operators:
         size = W.square().sum(1).sqrt()
         along = along + (W.mT @ W).abs().sum(0)
         most = most + (size[:, :, None] * size[:, None, :]).sum(0)
-    # |w_k·w_l| ≤ |w_k||w_l|, with equality at every sample where the sums are equal.
+    # |w_k·w_l| ≤ |w_k||w_l|: if the sums are equal, so are the two sides at every sample.
     parallel = ((along >= (1.0 - PARALLEL) * most) & (most > 0.0)).fill_diagonal_(True)
     return parallel.to(torch.uint8).argmax(0)
 
 
 def limits_of(params: Parameters) -> dict[str, tuple[float, float]]:
-    """Return the bounds of hyperparameters with an absolute scale."""
+    """Return the bounds on those hyperparameters that have an absolute scale."""
     return {key: LIMITS[_kind(key)] for key in params if _kind(key) in LIMITS}
 
 
 def box_around(
     start: Parameters, begin: Parameters | None = None
 ) -> dict[str, tuple[float | Tensor, float | Tensor]]:
-    """Return the box of each hyperparameter for the optimiser.
+    """Return the bounds on each hyperparameter for the optimiser.
 
-    Far from the initial values, double precision does not resolve the likelihood, for example for forces a
+    Far from the initial values, double precision cannot resolve the likelihood, for example if forces are a
     million times the noise.
 
     Args:
-        begin: other initial values that the box must contain.
+        begin: other initial values that must lie within the bounds.
     """
     box: dict[str, tuple[float | Tensor, float | Tensor]] = {}
     for key, x in start.items():
@@ -201,7 +201,7 @@ def doubts_at_bounds(tensors: Mapping[str, Tensor], box: Bounds) -> tuple[str, .
     """Return warnings if learning ended at a bound.
 
     A force may vanish and an input may be irrelevant, but noise at a bound, or a force at its upper bound, is
-    doubtful.
+    questionable.
     """
     doubts = []
     for key, (low, high) in box.items():
@@ -220,12 +220,12 @@ def doubts_at_bounds(tensors: Mapping[str, Tensor], box: Bounds) -> tuple[str, .
 
 
 def _kind(key: str) -> str:
-    """Return the kind of a hyperparameter, the last part of its name."""
+    """Return the kind of hyperparameter, which is the last part of its name."""
     return key.rsplit(".", 1)[-1]
 
 
 def negative_log_prior(params: Parameters, start: Mapping[str, Tensor]) -> Tensor | float:
-    """Return Σ ½ ((θ − θ_start)/width)², the weak prior on log-hyperparameters up to a constant."""
+    """Return Σ ½ ((θ − θ_start)/width)², the negative log of the weak priors up to a constant."""
     total: Tensor | float = 0.0
     for key, value in params.items():
         below, above = WIDTH.get(_kind(key), (3.0, 3.0))
@@ -235,10 +235,10 @@ def negative_log_prior(params: Parameters, start: Mapping[str, Tensor]) -> Tenso
 
 
 def checked_start(values: Mapping[str, Tensor], start: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Check given initial values against the default ones.
+    """Check the given initial values against the defaults, and return them.
 
     Raises:
-        ModelError: a value is missing, or has another shape.
+        ModelError: a value is missing or has the wrong shape.
     """
     for key, value in start.items():
         got = values[key].shape if key in values else None
@@ -253,7 +253,7 @@ def checked_start(values: Mapping[str, Tensor], start: Mapping[str, Tensor]) -> 
 
 
 def random_starts(start: Mapping[str, Tensor], restarts: int, seed: int) -> Iterator[dict[str, Tensor]]:
-    """Yield the initial values, followed by a random start around them per restart."""
+    """Yield the initial values, followed by random values around them, one set per restart."""
     generator = torch.Generator().manual_seed(seed)
     yield dict(start)
     for _ in range(restarts):
@@ -266,7 +266,7 @@ def random_starts(start: Mapping[str, Tensor], restarts: int, seed: int) -> Iter
 
 
 def warm_start_sizes(samples: int, first: int | None) -> list[int]:
-    """Return the numbers of samples of the warm start, doubling up to half of all samples."""
+    """Return the numbers of samples used for warm starts, doubling until half of all samples is reached."""
     sizes: list[int] = []
     size = first
     while size is not None and samples > 2 * size:
@@ -280,9 +280,9 @@ class Search:
     """Search for hyperparameters.
 
     Attributes:
-        start: default initial values, and centre of the weak priors.
+        start: default initial values, which are also the centres of the weak priors.
         held: values that are not learned.
-        options: optimiser and its limits.
+        options: options of the optimiser, such as its limits.
         recorded: function that wraps the objective, such as `Checkpoint.recorded`.
     """
 
@@ -297,11 +297,11 @@ class Search:
         progress: Progress | None = None,
         begin: Mapping[str, Tensor] | None = None,
     ) -> Learned:
-        """Learn, initially from a part of a large data set, and from several starts if requested.
+        """Learn, starting with a subset of a large data set, and from several initial values if requested.
 
         Args:
             progress: called after each evaluation on all data.
-            begin: initial values on all data, instead of warm starts and restarts.
+            begin: initial values for learning from all data, used in place of warm starts and restarts.
 
         Raises:
             ModelError: `begin` does not match the learned parameters.
@@ -320,14 +320,14 @@ class Search:
         return {**self.held, **learned.tensors}
 
     def objective(self, problem: Problem, tensors: Tensors) -> Tensor:
-        """Return −κ log p(y | θ) − log p(θ), exact or a bound, with weak priors around the start if any."""
+        """Return −κ log p(y | θ) − log p(θ), exact or as a bound; p(θ) are the weak priors, if enabled."""
         hyper = {key: v for key, v in tensors.items() if not key.startswith(ANALYTICAL + ".")}
         weak = negative_log_prior(hyper, self.start) if self.options.hyperpriors else 0.0
         rows = problem.rows_for(tensors, self.held)
         return problem.negative_log_likelihood(kernel_parameters({**self.held, **tensors}), rows) + weak
 
     def _warmed(self, problem: Problem, cold: Tensors) -> Tensors:
-        """Return the start on all data: the result of fewer samples, unless the cold start is better."""
+        """Return initial values for all data: those learned from fewer samples, unless `cold` is better."""
         first = cold
         for samples in warm_start_sizes(problem.training.samples, self.options.warm_start):
             small = dataclasses.replace(problem, training=problem.training.thinned(samples))
@@ -348,7 +348,7 @@ class Search:
         if problem.has_coulomb:
             limits = limits_of(self.start)
             bounds |= below_jamming(problem.system, problem.training.measurements, problem.priors, limits)
-        # The tolerance is relative to the objective, so the part that no hyperparameter changes is left out.
+        # The tolerance is relative to the objective, so its part that is independent of θ is left out.
         constant = float(problem.fixed_rows.constant)
 
         def objective(tensors: Tensors) -> Tensor:
@@ -359,8 +359,8 @@ class Search:
             progress(evaluations, value + constant, best)
 
         report = None if progress is None else whole
-        # The entries of a mixing matrix are not logarithms. With Coulomb friction, either rule ends in the
-        # better optimum on some logs (benchmarks/notes/inference.md), so its first step is not limited.
+        # The entries of a mixing matrix are not logarithms. With Coulomb friction, neither rule leads to the
+        # better optimum on all logs (benchmarks/notes/inference.md), so the first step is not limited.
         free = problem.has_coulomb or any(_kind(key) == MIXING for key in hyper)
         step = math.inf if free else FIRST_STEP
         learned = minimise(self.recorded(objective), begin, self.options, analytical, bounds, report, step)

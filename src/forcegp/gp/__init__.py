@@ -1,1 +1,1 @@
-"""Gaussian processes of latent components: kernels, likelihoods, exact and sparse posteriors, draws."""
+"""Gaussian processes for latent components: kernels, likelihoods, exact and sparse posteriors, samples."""

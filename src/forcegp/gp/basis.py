@@ -1,9 +1,9 @@
 """Basis functions of latent components: whitened covariances with inducing points, and exact features.
 
-A sum of linear kernels and of products of linear kernels is exactly k(x, x′) = φ(x)ᵀφ(x′), with a few
-features φ. The rest, every product with a stationary factor, is approximated with inducing points Z. With
-the truncated square root R of the inverse of their covariance, R Rᵀ = K_zz⁺, V(x) = Rᵀk(Z, x) are features
-with a standard normal prior on their weights, and V(x)ᵀV(x′) = k(x, Z) K_zz⁺ k(Z, x′).
+A sum of linear kernels and of products of linear kernels equals k(x, x′) = φ(x)ᵀφ(x′) exactly, with a few
+features φ. The rest, that is, every product with a stationary factor, is approximated with inducing points Z.
+Given the truncated square root R of the inverse of their covariance, R Rᵀ = K_zz⁺, the features
+V(x) = Rᵀk(Z, x) have weights with a standard normal prior, and V(x)ᵀV(x′) = k(x, Z) K_zz⁺ k(Z, x′).
 """
 
 from __future__ import annotations
@@ -21,25 +21,25 @@ from forcegp.gp.features import Block, FeatureMap, Features, points
 from forcegp.gp.kernels import Constant, Kernel, Linear, Parameters, Process, Product, Sum, sides, sub
 
 EXACT: tuple[type[Kernel], ...] = (Linear, Constant)
-"""Kernels without factors for which `draw` returns all features, regardless of the requested number."""
+"""Elementary kernels for which `draw` returns all features, regardless of the requested number."""
 
 
 @dataclass(frozen=True)
 class KernelPart:
-    """A kernel composed of factors of another kernel, with their log-hyperparameters."""
+    """A kernel composed of factors of another kernel, with its log-hyperparameters."""
 
     kernel: Kernel
     params: Parameters
 
     def features(self, x: Features) -> FeatureMap:
-        """Return the features φ of a finite part, with which φ(x)ᵀφ(x′) equals the kernel exactly."""
-        # Such a draw takes no random number, so any generator does.
+        """Return the features φ of a finite part, for which φ(x)ᵀφ(x′) equals the kernel exactly."""
+        # This draw uses no random numbers, so any generator can be passed.
         return self.kernel.draw(self.params, x, 1, torch.Generator())
 
 
 @dataclass(frozen=True)
 class KernelSplit:
-    """A kernel as the sum of a finite part, sums and products of linear kernels, and the rest."""
+    """A kernel as the sum of a finite part (sums and products of linear kernels) and the rest."""
 
     finite: KernelPart | None
     rest: KernelPart | None
@@ -52,7 +52,7 @@ def split(kernel: Kernel, params: Parameters) -> KernelSplit:
 
 
 def _terms(part: KernelPart) -> tuple[list[KernelPart], list[KernelPart]]:
-    """Return the terms with and without a finite number of features."""
+    """Return the terms with finitely many features, and the other terms."""
     kernel = part.kernel
     if isinstance(kernel, EXACT):
         return [part], []
@@ -83,7 +83,7 @@ class ProcessBasis:
     """Basis functions of the components of one process.
 
     Attributes:
-        kernel: covariance of a component.
+        kernel: covariance of each component.
         params: log-hyperparameters of the kernel.
         components: number of components.
         inducing: kernel inputs of the inducing points, empty if only the finite part has features.
@@ -98,19 +98,19 @@ class ProcessBasis:
 
     @cached_property
     def split(self) -> KernelSplit:
-        """Finite part and rest of the kernel."""
+        """The finite part and the rest of the kernel."""
         return split(self.kernel, self.params)
 
     @cached_property
     def roots(self) -> Tensor:
-        """R of each component, padded with zero columns `(components, m, most kept)`."""
+        """R of each component, padded with zero columns to equal width `(components, m, width)`."""
         kept = [spectrum.root for spectrum in self.spectra]
         most = max(R.shape[1] for R in kept)
         return torch.stack([torch.nn.functional.pad(R, (0, most - R.shape[1])) for R in kept])
 
     @cached_property
     def to_inducing(self) -> Callable[[Features], Tensor] | None:
-        """x ↦ k(x, Z) `(components, n, m)` of the kernel's rest; `None` without inducing points."""
+        """Function x ↦ k(x, Z) `(components, n, m)` of the kernel's rest; `None` without inducing points."""
         rest = self.split.rest
         if rest is None or not points(self.inducing):
             return None
@@ -118,7 +118,7 @@ class ProcessBasis:
 
     @cached_property
     def finite(self) -> FeatureMap | None:
-        """The exact features of the finite part; `None` without one."""
+        """The exact features of the finite part, or `None` if there is none."""
         return None if self.split.finite is None else self.split.finite.features(self.inducing)
 
     @cached_property
@@ -128,7 +128,7 @@ class ProcessBasis:
 
     @cached_property
     def used(self) -> Tensor:
-        """Mask of the values that are basis functions, not padding, `(components, width)`."""
+        """Mask of the values that are basis functions and not padding, `(components, width)`."""
         width = (self.roots.shape[-1] if self.spectra else 0) + self.finite_size
         used = torch.ones(self.components, width, dtype=torch.bool)
         for k, spectrum in enumerate(self.spectra):
@@ -137,12 +137,12 @@ class ProcessBasis:
 
     @cached_property
     def columns(self) -> Tensor:
-        """Positions of the basis functions in the values of all components."""
+        """Positions of the basis functions among the values of all components."""
         device = next(iter(self.inducing.values())).device
         return self.used.reshape(-1).nonzero()[:, 0].to(device)
 
     def values(self, features: Features) -> tuple[Tensor, Tensor]:
-        """Return V(x) padded with zeros `(components, n, width)`, and |V|² by inducing points."""
+        """Return V(x), padded with zeros `(components, n, width)`, and |V|² due to the inducing points."""
         if self.to_inducing is None:
             none = next(iter(features.values())).new_zeros(self.components, points(features), 0)
             return none if self.finite is None else self.finite.basis(features), none.sum(-1)
@@ -158,7 +158,7 @@ class ProcessBasis:
 
         Args:
             W: operators `(n, d, components)`.
-            values: V at the samples, from `values`.
+            values: V at the samples, as returned by `values`.
         """
         # Φ_i = W_i V_iᵀ
         whole = W[..., None] * values.transpose(0, 1)[:, None]
@@ -167,7 +167,7 @@ class ProcessBasis:
 
     @cached_property
     def _filled(self) -> bool:
-        """Whether all values are basis functions."""
+        """Whether there is no padding, so that all values are basis functions."""
         return bool(self.used.all())
 
     def fold(self, weights: Tensor) -> tuple[Tensor, Tensor]:
@@ -177,7 +177,7 @@ class ProcessBasis:
             weights: weights of the process's basis functions `(Σ sizes, s)`.
 
         Returns:
-            `(components, m, s)` and `(components, features, s)`.
+            Weights `(components, m, s)` and `(components, features, s)`.
         """
         filled = weights.new_zeros(self.used.numel(), weights.shape[1])
         filled[self.columns] = weights
@@ -191,30 +191,30 @@ class ProcessBasis:
         """Return k(x, x) of the whole kernel `(components, n)`.
 
         Args:
-            values: V(x), from `values`.
+            values: V(x), as returned by `values`.
         """
         # k(x, x) = k_rest(x, x) + |φ(x)|²
         exact = values[..., values.shape[-1] - self.finite_size :]
         return self.rest_variance(features) + torch.linalg.vecdot(exact, exact)
 
     def missed(self, variance: Tensor, explained: Tensor) -> Tensor:
-        """Return k(x, x) − |V(x)|² ≥ 0 of the approximated part, `(components, n)`.
+        """Return the residual variance k(x, x) − |V(x)|² ≥ 0 of the approximated part, `(components, n)`.
 
-        Negative values are rounding errors, and below `SMALLEST_FRACTION` of the variance if the posterior is
-        resolved.
+        Negative values are due to rounding error. If the posterior is resolved, they are smaller than
+        `SMALLEST_FRACTION` times the variance.
         """
         return (variance - explained).clamp(min=0.0)
 
     @cached_property
     def rest_variance(self) -> Callable[[Features], Tensor]:
-        """x ↦ prior variance `(components, n)` of the part that inducing points approximate."""
+        """Function x ↦ prior variance `(components, n)` of the part approximated with inducing points."""
         rest = self.split.rest
         if rest is None:
             return lambda x: next(iter(x.values())).new_zeros(self.components, points(x))
         return rest.kernel.variance(rest.params)
 
     def evaluate(self, features: Features) -> tuple[Tensor, Tensor, Tensor]:
-        """Return basis functions at n samples `(n, Σ sizes)`, and their part of `LatentBasis.evaluate`."""
+        """Return the part of `LatentBasis.evaluate` for this process, with V `(n, Σ sizes)`."""
         values, explained = self.values(features)
         V = values.transpose(0, 1).reshape(points(features), -1).index_select(1, self.columns)
         prior = self.rest_variance(features)
@@ -223,12 +223,12 @@ class ProcessBasis:
 
 @dataclass(frozen=True, eq=False)
 class LatentBasis:
-    """Basis functions of every component of every process, side by side.
+    """Basis functions of all components of all processes, concatenated.
 
     Attributes:
         processes: the processes.
         params: all log-hyperparameters.
-        parts: basis for each process.
+        parts: basis of each process.
     """
 
     processes: tuple[Process, ...]
@@ -237,14 +237,14 @@ class LatentBasis:
 
     @cached_property
     def columns(self) -> tuple[slice, ...]:
-        """Basis functions of each component, for the components of all processes in order."""
+        """Basis functions of each component, in the order of the processes."""
         sizes = [size for part in self.parts for size in part.used.sum(-1).tolist()]
         ends = torch.tensor([0, *sizes]).cumsum(0).tolist()
         return tuple(slice(a, b) for a, b in pairwise(ends))
 
     @cached_property
     def components(self) -> tuple[slice, ...]:
-        """The components of each process among all of them."""
+        """Positions of each process's components among all components."""
         ends = torch.tensor([0, *(part.components for part in self.parts)]).cumsum(0).tolist()
         return tuple(slice(a, b) for a, b in pairwise(ends))
 
@@ -254,9 +254,9 @@ class LatentBasis:
         return self.columns[-1].stop
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the inducing points and eigenvectors, by name.
+        """Return the inducing points and eigenvectors, keyed by name.
 
-        Eigenvectors are stored with the sums, since recomputed ones may differ in sign or rotation.
+        Eigenvectors are stored with the sums, since recomputed ones may differ in sign or by a rotation.
         """
         tensors: dict[str, Tensor] = {}
         for p, part in enumerate(self.parts):
@@ -288,12 +288,12 @@ class LatentBasis:
         return cls(tuple(processes), dict(params), tuple(parts))
 
     def of_process(self, p: int) -> slice:
-        """Return the basis functions of process p."""
+        """Return the positions of the basis functions of process p."""
         slices = self.columns[self.components[p]]
         return slice(slices[0].start, slices[-1].stop)
 
     def rows(self, block: Block) -> Tensor:
-        """Return the rows of samples in terms of the basis functions, Φ `(n r, size)`."""
+        """Return the rows of a block in terms of the basis functions, Φ `(n r, size)`."""
         each = zip(self.parts, block.operators, block.features, strict=True)
         return torch.cat([part.rows(W, part.values(x)[0]) for part, W, x in each], dim=-1)
 
@@ -304,8 +304,8 @@ class LatentBasis:
             features: kernel inputs of each process.
 
         Returns:
-            V `(n, size)`; by component `(n, components)` the prior variance of the kernels' rest, and
-            the part of it that is missed, k(x, x) − |V(x)|².
+            V `(n, size)`, and for each component `(n, components)` the prior variance of the kernel's rest
+            and its residual variance k(x, x) − |V(x)|².
         """
         parts = [part.evaluate(x) for part, x in zip(self.parts, features, strict=True)]
         V, prior, missed = (torch.cat(columns, dim=-1) for columns in zip(*parts, strict=True))
@@ -321,7 +321,7 @@ def latent_basis(
     """Return the basis functions of processes with given inducing points.
 
     Args:
-        inducing: kernel inputs of the inducing points of each process, of any number including zero.
+        inducing: kernel inputs of any number of inducing points (including none) for each process.
         components: number of components of each process.
     """
     parts = []

@@ -1,7 +1,7 @@
-"""Functions drawn from a posterior, cheap to evaluate anywhere (pathwise conditioning, Wilson et al. 2020).
+"""Functions drawn from a posterior, cheap to evaluate anywhere (pathwise conditioning; Wilson et al. 2020).
 
-A function from the prior, composed of random features, is corrected by the data. Each sample is a
-deterministic function, so a trajectory integrated under it obeys Newton's equations and the constraint.
+A function drawn from the prior, composed of random features, is corrected by the data. Each sample is a
+deterministic function, so a trajectory integrated under it satisfies Newton's equations and the constraint.
 
 A sparse posterior applies Matheron's rule to the inducing points, at a cost that does not depend on the
 number of samples: f(x) = f_prior(x) + V(x)ᵀ(w − Rᵀf_prior(Z)) with weights w ~ N(A⁻¹v, A⁻¹), and φ(x)ᵀw for
@@ -24,19 +24,19 @@ from forcegp.gp.features import Basis, Block, FeatureMap, Features, stacked
 from forcegp.gp.kernels import Kernel, Linear, Parameters, Process, Product, Stationary, Sum, sub
 
 FEATURES = 1024
-"""Random features per component; the error in the covariance of prior draws is about 1/√FEATURES."""
+"""Number of random features per component; prior draws have a covariance error of about 1/√FEATURES."""
 UNMEASURED = 4
-"""Factor by which a process has fewer features if no row depends on it and no data correct its draws."""
+"""Factor by which the number of features is reduced if no row depends on a process, so no data correct it."""
 
 
 class FoldedSamples(NamedTuple):
-    """Samples of one process as weights of k(x, Z), of exact features, and of random ones.
+    """Samples of one process as weights of k(x, Z), of exact features, and of random features.
 
     Attributes:
-        on_kernel: `(components, m, samples)`.
-        on_features: `(components, features, samples)`.
-        missed: random features of what the inducing points miss, if any, with weights `(components, features,
-            samples)`.
+        on_kernel: weights of k(x, Z) `(components, m, samples)`.
+        on_features: weights of the exact features `(components, features, samples)`.
+        missed: random features for the residual that the inducing points do not represent, if any, and their
+            weights `(components, features, samples)`.
     """
 
     on_kernel: Tensor
@@ -49,9 +49,9 @@ class FunctionSamples:
     """Samples of latent processes, f_s(x) = Σ_t φ_t(x) w_ts.
 
     Attributes:
-        bases: bases of each process, functions of its standardized features.
+        bases: bases of each process, as functions of its standardized features.
         weights: weights for each process and basis, `(components, terms, samples)`.
-        folded: the same for each process by kernel and features, if they come from basis functions.
+        folded: for a sparse posterior, these samples as one `FoldedSamples` per process.
     """
 
     bases: tuple[tuple[Basis, ...], ...]
@@ -62,7 +62,7 @@ class FunctionSamples:
     def of(
         cls, terms: Sequence[Sequence[tuple[Basis, Tensor]]], folded: tuple[FoldedSamples, ...] | None = None
     ) -> FunctionSamples:
-        """Construct from the terms of each process, functions with their weights."""
+        """Construct from the terms of each process, that is, functions and their weights."""
         bases = tuple(tuple(basis for basis, _ in process_terms) for process_terms in terms)
         return cls(bases, tuple(tuple(w for _, w in process_terms) for process_terms in terms), folded)
 
@@ -72,19 +72,19 @@ class FunctionSamples:
         return self.weights[0][0].shape[-1]
 
     def latent(self, p: int, features: Features) -> Tensor:
-        """Return process p at its standardized inputs at n states, `(samples, n, components)`."""
+        """Return process p at n states, given its standardized inputs, `(samples, n, components)`."""
         # f_s(x) = Σ_t φ_t(x) w_ts
         terms = zip(self.bases[p], self.weights[p], strict=True)
         return torch.stack([basis(features) @ w for basis, w in terms]).sum(0).permute(2, 1, 0)
 
     @cached_property
     def _weights_by_sample(self) -> list[list[Tensor]]:
-        """By process and basis, `(samples, components, terms)`."""
+        """Weights `(samples, components, terms)` for each process and basis."""
         return [[w.permute(2, 0, 1).contiguous() for w in weights] for weights in self.weights]
 
     def by_runs(self, p: int, features: Features, samples: range, runs: int) -> Tensor:
-        """Return the values of process p from some samples, each at separate runs of states: `(samples ·
-        runs, components)`."""
+        """Return the given samples of process p, each at its own run of states, `(samples · runs,
+        components)`."""
         parts = []
         for basis, w in zip(self.bases[p], self._weights_by_sample[p], strict=True):
             phi, w_runs = basis(features).unflatten(1, (len(samples), runs)), w[samples.start : samples.stop]
@@ -107,10 +107,10 @@ def draw_priors(
     """Draw functions from the priors and evaluate them at the rows.
 
     Args:
-        processes, params, blocks: as given to `gram`.
-        measured: whether any row depends on each process.
+        processes, params, blocks: as for `gram`.
+        measured: for each process, whether any row depends on it.
         generator: source of randomness, on the CPU.
-        features: random features per component.
+        features: number of random features per component.
 
     Returns:
         The functions of each process with their weights, and W f(X) at the rows `(rows, samples)`.
@@ -137,12 +137,12 @@ def draw_priors(
 def kernel_terms(kernel: Kernel, params: Parameters, X: Features, w: Tensor) -> list[tuple[Basis, Tensor]]:
     """Return k(x, X) w as a sum of functions of x, each with weights.
 
-    Terms with a finite number of features are folded into weights of these. A stationary term with
-    length-scales shared by all components is evaluated once for all of them, as is a product of such terms.
+    Terms with finitely many features are converted to weights of these features. A stationary term whose
+    length-scales are shared by all components is evaluated only once, as is a product of such terms.
 
     Args:
         X: n points.
-        w: `(k, n, samples)`.
+        w: weights `(k, n, samples)`.
 
     Returns:
         Functions `(k or 1, ·, terms)`, each with weights `(k, terms, samples)`.
@@ -166,7 +166,7 @@ def _common(
     kernel: Kernel, params: Parameters, X: Features
 ) -> tuple[Callable[[Features], list[Tensor]], list[Tensor]] | None:
     """Return a kernel as Σ_t a_t g_t, with functions g_t(x, X) `(1, ·, n)` common to all components and
-    factors a_t `(k,)`; `None` if components differ by more than factors.
+    factors a_t `(k,)`, or `None` if components differ by more than constant factors.
     """
     if isinstance(kernel, Stationary) and len(params["log_lengthscale"]) == 1:
         g = kernel.towards({**params, "log_std": torch.zeros_like(params["log_std"][:1])}, X)
@@ -178,7 +178,7 @@ def _common(
 
         def functions(x: Features) -> list[Tensor]:
             line = stacked(x, kernel.inputs) @ to
-            # Components that have inputs of their own have a line each.
+            # Components with separate inputs have one line each.
             lines = line if line.ndim == 3 else line[None]
             return [lines, lines.new_ones(1, 1, 1).expand_as(lines)]
 
@@ -195,20 +195,20 @@ def _common(
 
 
 MISSED_FEATURES = 256
-"""Random features per component. Only the part missed by the inducing points is drawn from them; its
-    covariance errs by about 1/√MISSED_FEATURES of its scale, and that of the rest not at all.
+"""Number of random features per component. They represent only the residual of the inducing points, whose
+    covariance has a relative error of about 1/√MISSED_FEATURES; the other part is exact.
 """
 
 
 def draw_functions(
     basis: LatentBasis, weights: Tensor, generator: torch.Generator, features: int
 ) -> FunctionSamples:
-    """Return functions with given weights of the basis functions, drawing the missed part from the prior.
+    """Return functions with the given weights of the basis functions; the residual is drawn from the prior.
 
     Args:
-        weights: drawn from their posterior `(size, samples)`.
+        weights: weights drawn from their posterior `(size, samples)`.
         generator: source of randomness, on the CPU.
-        features: random features of each component's prior.
+        features: number of random features for the prior of each component.
     """
     folded = [
         _folded(part, weights[basis.of_process(p)], generator, features) for p, part in enumerate(basis.parts)
@@ -218,7 +218,7 @@ def draw_functions(
 
 
 def _folded(part: ProcessBasis, weights: Tensor, generator: torch.Generator, features: int) -> FoldedSamples:
-    """Return the samples of one process with given weights of its basis functions."""
+    """Return the samples of one process with the given weights of its basis functions."""
     on_kernel, on_features = part.fold(weights)
     rest = part.split.rest
     if rest is None:
@@ -235,7 +235,7 @@ def _folded(part: ProcessBasis, weights: Tensor, generator: torch.Generator, fea
 
 
 def _terms(part: ProcessBasis, samples: FoldedSamples) -> list[tuple[Basis, Tensor]]:
-    """Return the functions of a process to be summed, with their weights."""
+    """Return the functions whose sum is the process, with their weights."""
     terms: list[tuple[Basis, Tensor]] = []
     rest = part.split.rest
     if samples.missed is not None:

@@ -1,6 +1,6 @@
 """Exact posterior of latent processes given whitened rows (eqs. 11 and 22 to 24).
 
-Memory grows with the square of the number of rows; fits that exceed memory are rejected in advance.
+Memory use grows with the square of the number of rows. Fits that would exceed the memory are rejected.
 """
 
 from __future__ import annotations
@@ -28,13 +28,13 @@ from forcegp.gp.likelihood import Conditioned, add_rows, condition, cross_gram, 
 from forcegp.resources import announce_memory, free_memory
 
 MATRICES_TO_LEARN = 3.0
-"""Number of square matrices over all rows in memory during learning: the covariance, its factor, a copy."""
+"""Number of square matrices over all rows in memory while learning: the covariance, its factor and a copy."""
 MATRICES_TO_CONDITION = 2.0
-"""The same during conditioning: the covariance and its factor."""
+"""Number of such matrices in memory while conditioning: the covariance and its factor."""
 SHARE = 0.8
 """Fraction of the free memory that exact inference may use."""
 CHUNK_COLUMNS = 700
-"""Number of columns of the triangular solve in memory at a time."""
+"""Number of columns per triangular solve, to limit memory use."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,11 +59,11 @@ class ExactPosterior:
 
         Raises:
             NumericalError: the covariance of the rows is not positive definite, or its noise is below
-                rounding.
+                rounding error.
         """
         fitted = condition(processes, params, blocks)
         if len(fitted.L):
-            # K_ii + 1 is the square of a row of the factor.
+            # K_ii + 1 is the squared norm of a row of the factor.
             require_resolved_noise(torch.linalg.vecdot(fitted.L, fitted.L).max())
         result = cls(tuple(processes), params, blocks, fitted.alpha)
         result.__dict__["conditioned"] = fitted
@@ -87,7 +87,7 @@ class ExactPosterior:
         return self.conditioned.jitter
 
     def updated(self, blocks: Sequence[Block]) -> ExactPosterior:
-        """Condition on r additional rows in O(r n²), compared with O((n + r)³) for a refit.
+        """Condition on r additional rows in O(r n²), compared with O((n + r)³) for refactorising.
 
         Raises:
             ModelError: exact inference does not fit into memory.
@@ -104,7 +104,7 @@ class ExactPosterior:
         return result
 
     def knowing(self, p: int, features: Features, value: Tensor) -> ExactPosterior:
-        """Return the posterior given the value `(components,)` of a constant process p, with zero mean."""
+        """Return the posterior given the value `(components,)` of a constant process p, which gets mean 0."""
         # y ← y − W_p f_p, with W_p ← 0
         blocks = [
             Block(
@@ -118,12 +118,12 @@ class ExactPosterior:
 
     @cached_property
     def measured(self) -> tuple[bool, ...]:
-        """Whether any row depends on each process; the data do not affect the others."""
+        """For each process, whether any row depends on it; the data do not affect the others."""
         return tuple(map(any, self._depends))
 
     @cached_property
     def _depends(self) -> list[list[bool]]:
-        """By process and block, whether any row depends on the process."""
+        """For each process and block, whether any row depends on the process."""
         return [[bool(b.operators[p].any()) for b in self.blocks] for p in range(len(self.processes))]
 
     @cached_property
@@ -133,11 +133,11 @@ class ExactPosterior:
 
     @cached_property
     def _weights(self) -> list[list[Tensor]]:
-        """By process and block, `(components, n, 1)`: the mean is k(x, X) times these weights."""
+        """Weights `(components, n, 1)` by process and block; the mean is the sum of k(x, X) times weights."""
         return self.weights_of(self.alpha[:, None])
 
     def weights_of(self, rows: Tensor) -> list[list[Tensor]]:
-        """Apply Wᵀ to vectors over the rows `(rows, s)`, by process and block `(components, n, s)`."""
+        """Apply Wᵀ to vectors over the rows `(rows, s)`; return `(components, n, s)` by process and block."""
         weights: list[list[Tensor]] = [[] for _ in self.processes]
         first = 0
         for block in self.blocks:
@@ -149,14 +149,14 @@ class ExactPosterior:
 
     @cached_property
     def kernels_to_data(self) -> list[list[Callable[[Features], Tensor]]]:
-        """By process and block, x ↦ k(x, X)."""
+        """Function x ↦ k(x, X) for each process and block."""
         return [
             [process.kernel.towards(self._process_params[p], block.features[p]) for block in self.blocks]
             for p, process in enumerate(self.processes)
         ]
 
     def latent_mean(self, p: int, features: Features) -> Tensor:
-        """Return the posterior mean of process p at standardized features, `(n, components)`."""
+        """Return the posterior mean of process p, given its standardized features, `(n, components)`."""
         if not self.measured[p]:
             x, components = next(iter(features.values())), self.blocks[0].operators[p].shape[-1]
             return x.new_zeros(len(x), components)
@@ -172,13 +172,13 @@ class ExactPosterior:
         return rows_mean(self.latent_mean, block)
 
     def covariance(self, block: Block) -> Tensor:
-        """Return the posterior covariance of the rows of each sample of a block, `(n, d, d)`, without noise.
+        """Return the posterior covariance `(n, d, d)` of the rows of each sample of a block, excluding noise.
 
         Raises:
             NumericalError: rounding errors dominate a variance.
         """
         n, d = block.target.shape
-        if d == 0:  # such as the multiplier of a system without contacts
+        if d == 0:  # for example, the multiplier of a system without contacts
             return block.target.new_zeros(n, 0, 0)
         parts = [block.target.new_zeros(0, d, d)]
         for chunk in chunked([block], max(1, CHUNK_COLUMNS // d)):
@@ -210,16 +210,16 @@ class ExactPosterior:
 
     @property
     def log_likelihood(self) -> float:
-        """log p(y) of the rows without their constant, −½ yᵀ(K + I)⁻¹y − ½ log|K + I| − ½ n log 2π."""
+        """log p(y) without the constant of the rows, −½ yᵀ(K + I)⁻¹y − ½ log|K + I| − ½ n log 2π."""
         return -float(self.conditioned.negative_log_likelihood(target_of(self.blocks)))
 
     def draw(self, count: int, generator: torch.Generator, features: int = FEATURES) -> FunctionSamples:
-        """Draw functions from the posterior by Matheron's rule: f(x) + k(x, X) WᵀΣ⁻¹(y − W f(X) − ε), Σ = K +
-        I.
+        """Draw functions from the posterior by Matheron's rule: f(x) + k(x, X) WᵀΣ⁻¹(y − W f(X) − ε) with
+        Σ = K + I.
 
         Args:
             generator: source of randomness, on the CPU.
-            features: random features per component.
+            features: number of random features per component.
         """
         terms, at_rows = draw_priors(
             self.processes, self.params, self.blocks, self.measured, count, generator, features
@@ -237,7 +237,7 @@ class ExactPosterior:
 
 
 def exact_bytes(blocks: Sequence[Block], learning: bool = True) -> int:
-    """Return the peak memory of exact inference on whitened rows [bytes].
+    """Return the peak memory needed for exact inference on whitened rows [bytes].
 
     Args:
         learning: whether hyperparameters are learned.
@@ -257,7 +257,7 @@ def require_exact_fits(blocks: Sequence[Block], learning: bool = True, available
         available: usable memory [bytes]; by default `SHARE` of the free memory.
 
     Raises:
-        ModelError: inference needs more memory.
+        ModelError: inference needs more memory than is available.
     """
     free = free_memory()
     allowed = (None if free is None else int(SHARE * free)) if available is None else available

@@ -1,7 +1,7 @@
-// Upper factor R of a positive definite matrix, with a few rows Phi added: R'^T R' = R^T R + Phi^T Phi.
+// Update of the upper factor R of a positive definite matrix for a few added rows: R'^T R' = R^T R + Phi^T Phi.
 //
-// Householder reflections of (R_j, x_1, ..., x_r) turn the added rows x into zeros, column by column. All of a
-// column's work is one pass over row j of R and the added rows, which stay in the cache.
+// Householder reflections of (R_j, x_1, ..., x_r) set the added rows x to zero, column by column. Each column
+// takes one pass over row j of R and the added rows, which stay in the cache.
 
 #include <algorithm>
 #include <cmath>
@@ -45,7 +45,7 @@ void add_rows(const double* R, double* result, double* X, Index n) {
 
 }  // namespace
 
-// R and the result (n, n), Phi (rows, n), all by rows; Phi is spent.
+// R and the result are (n, n), Phi is (rows, n), all row-major. Phi is overwritten.
 extern "C" void extend(const double* R, double* result, double* Phi, Index n, Index rows) {
     constexpr decltype(&add_rows<1>) of[GROUP] = {add_rows<1>, add_rows<2>, add_rows<3>, add_rows<4>,
                                                   add_rows<5>, add_rows<6>, add_rows<7>, add_rows<8>};

@@ -1,8 +1,8 @@
 """Named kernel inputs, rows of samples, and feature maps φ(x) of kernels and random functions.
 
-With unit noise variance, entries of the covariance K of whitened rows have errors of about ε K_ii with ε =
-2.2e-16. The relative errors of standard deviations are therefore about ε K_ii, or ε/r if data reduce a prior
-variance to a fraction r: 0.1 % at K_ii = 1e12 and 0.5 % at r = 1e-13, compared with 80-bit arithmetic.
+With unit noise variance, entries of the covariance K of whitened rows have rounding errors of about ε K_ii
+with ε = 2.2e-16. The relative errors of standard deviations are therefore about ε K_ii, or ε/r if data reduce
+a prior variance to a fraction r: 0.1 % at K_ii = 1e12, 0.5 % at r = 1e-13, compared with 80-bit arithmetic.
 """
 
 from __future__ import annotations
@@ -17,19 +17,19 @@ from torch import Tensor
 from forcegp.errors import NumericalError, UnknownNameError
 
 FLOOR = 0.01
-"""Smallest scale of a column, relative to the typical one of its input. It is below that of a motion through
-the workspace gives (0.034 for the torque of an arm's joint 5), and above what drift gives."""
+"""Smallest scale of a column, relative to the typical scale of its input. It is below the value for motions
+through the workspace (0.034 for the torque of an arm's joint 5), and above that caused by drift."""
 PRIOR_TO_NOISE = 1e6
-"""Largest standard deviation of the prior of a row, in units of its noise."""
+"""Largest prior standard deviation of a row, in units of its noise."""
 SMALLEST_FRACTION = 1e-13
-"""Smallest ratio of posterior to prior variance that is resolved."""
+"""Smallest ratio of posterior to prior variance that double precision resolves."""
 
 Features = Mapping[str, Tensor]
-"""Named kernel inputs: `(n, w)`, shared by all components, or `(n, k, w)`, one row for each component."""
+"""Named kernel inputs: `(n, w)` if shared by all components, or `(n, k, w)` with one row per component."""
 
 
 def stacked(x: Features, inputs: tuple[str, ...] | None) -> Tensor:
-    """Concatenate the named features, `(n, w)`, or `(k, n, w)` if components have different inputs.
+    """Concatenate the named features to `(n, w)`, or to `(k, n, w)` if components have different inputs.
 
     Raises:
         UnknownNameError: a feature is missing.
@@ -52,10 +52,10 @@ class Standardization:
 
     A column that hardly varies does not determine a scale. Scales are therefore at least `FLOOR` times the
     root mean square of the standard deviations of all columns of the input. The columns of a vector share
-    this mean, so the result depends little on the orientation of the axes. Features with a meaningful zero,
-    such as velocities, are scaled but not shifted.
+    this root mean square as their scale, so results hardly depend on the orientation of the axes. Features
+    with a meaningful zero, such as velocities, are scaled but not shifted.
 
-    Columns that are constant up to rounding keep the scale 1, or that of their vector, and are listed in
+    Columns that are constant up to rounding error have scale 1, or that of their vector, and are listed in
     `constant`.
     """
 
@@ -71,7 +71,7 @@ class Standardization:
 
         Args:
             features: named inputs `(n, w)`.
-            vectors: inputs that are vectors, with columns as components.
+            vectors: names of the inputs that are vectors, whose columns are components.
             centred: whether to subtract the mean.
         """
         mean = {name: x.mean(0) if centred else torch.zeros_like(x[0]) for name, x in features.items()}
@@ -103,7 +103,7 @@ class Block:
     """Samples with the same number of rows.
 
     Attributes:
-        features: standardized kernel inputs of each prior, `(n, w)` by name.
+        features: standardized kernel inputs `(n, w)` of each prior, keyed by name.
         operators: W for each prior, `(n, r, components)`.
         target: whitened residual `(n, r)`.
     """
@@ -119,7 +119,7 @@ class Block:
 
 
 def points(features: Features) -> int:
-    """Return the number of inputs in a dictionary of features."""
+    """Return the number of points in a dictionary of features."""
     return len(next(iter(features.values())))
 
 
@@ -136,7 +136,7 @@ def chunked(blocks: Iterable[Block], samples: int) -> Iterator[Block]:
 
 
 def rows_of(block: Block, index: slice | Tensor) -> Block:
-    """Return some of the samples of a block."""
+    """Return the given samples of a block."""
     return Block(
         tuple({name: x[index] for name, x in f.items()} for f in block.features),
         tuple(W[index] for W in block.operators),
@@ -148,8 +148,8 @@ def rows_mean(latent_mean: Callable[[int, Features], Tensor], block: Block) -> T
     """Return the mean Σ_p W_p μ_p of the rows of each sample of a block, `(n, d)` (eq. 23).
 
     Args:
-        latent_mean: μ_p of process p at kernel inputs, `(n, components)`.
-        block: samples; the targets are not read.
+        latent_mean: function that returns μ_p of process p at kernel inputs, `(n, components)`.
+        block: samples; their targets are not used.
     """
     mean = torch.zeros_like(block.target)
     for p, (W, x) in enumerate(zip(block.operators, block.features, strict=True)):
@@ -158,17 +158,17 @@ def rows_mean(latent_mean: Callable[[int, Features], Tensor], block: Block) -> T
 
 
 Basis = Callable[[Features], Tensor]
-"""x ↦ φ(x) `(k, n, f)`, or `(1, n, f)` if they are common to all components."""
+"""Function x ↦ φ(x) `(k, n, f)`, or `(1, n, f)` if the features are common to all components."""
 
 
 @dataclass(frozen=True, eq=False)
 class FeatureTerm:
-    """Features a_kf φ_f(x) of k components, often with common functions φ.
+    """Features a_kf φ_f(x) of k components, often with functions φ common to all components.
 
     Attributes:
         values: φ.
         scale: a `(k, f)`.
-        waves: inputs, frequencies and phases, if φ is cos(ωᵀx + φ) as in `fourier_features`.
+        waves: inputs, frequencies and phases if the functions are cosines, as in `fourier_features`.
     """
 
     values: Basis
@@ -178,7 +178,7 @@ class FeatureTerm:
 
 @dataclass(frozen=True, eq=False)
 class FeatureMap:
-    """Concatenated terms φ(x) with E[φ(x)ᵀφ(x′)] = k(x, x′): f(x) = φ(x)ᵀw with w ~ N(0, I).
+    """Concatenated terms φ(x) with E[φ(x)ᵀφ(x′)] = k(x, x′), where f(x) = φ(x)ᵀw and w ~ N(0, I).
 
     Attributes:
         terms: groups of features.
@@ -192,13 +192,13 @@ class FeatureMap:
         return parts[0] if len(parts) == 1 else torch.cat(parts, dim=-1)
 
     def weighted(self, weights: Tensor) -> list[tuple[Basis, Tensor]]:
-        """Return φ(x)ᵀw as functions with weights, for `w` of shape `(k, features, samples)`."""
+        """Return φ(x)ᵀw as functions with weights, given w `(k, features, samples)`."""
         parts = weights.split([term.scale.shape[-1] for term in self.terms], dim=1)
         pairs = zip(self.terms, parts, strict=True)
         return [(term.values, term.scale[..., None] * w) for term, w in pairs]
 
     def joined(self) -> FeatureTerm:
-        """Join all features into one term."""
+        """Combine all features into one term."""
         if len(self.terms) == 1:
             return self.terms[0]
 
@@ -210,17 +210,21 @@ class FeatureMap:
         return FeatureTerm(values, torch.cat([term.scale for term in self.terms], dim=-1))
 
     def __add__(self, other: FeatureMap) -> FeatureMap:
-        """Return the features of both, for the sum of two kernels."""
+        """Return the features of both maps, for the sum of two kernels."""
         return FeatureMap((*self.terms, *other.terms))
 
     def __mul__(self, other: FeatureMap) -> FeatureMap:
         """Return all pairs of features, for the product of two kernels."""
         a, b = self.joined(), other.joined()
         scale = (a.scale[:, :, None] * b.scale[:, None, :]).flatten(-2)
-        return FeatureMap((FeatureTerm(lambda x: _all_pairs(a.values(x), b.values(x)), scale),))
+
+        def products(x: Features) -> Tensor:
+            return (a.values(x)[..., :, None] * b.values(x)[..., None, :]).flatten(-2)
+
+        return FeatureMap((FeatureTerm(products, scale),))
 
     def paired(self, other: FeatureMap, count: int, generator: torch.Generator) -> FeatureMap:
-        """Return `count` random pairs of features, for the product of two kernels with many features each."""
+        """Return `count` random pairs of features, for the product of two kernels that have many features."""
         a, b = self.joined(), other.joined()
         sizes = a.scale.shape[-1], b.scale.shape[-1]
         pairs = torch.Generator().manual_seed(int(torch.randint(2**31, (1,), generator=generator)))
@@ -230,7 +234,7 @@ class FeatureMap:
 
 
 def require_resolved_noise(prior: Tensor) -> None:
-    """Reject a prior so large that double precision does not resolve the noise.
+    """Reject a prior whose variance is so large that double precision cannot resolve the noise.
 
     Args:
         prior: prior variance of a row, in units of the noise variance `()`.
@@ -249,7 +253,7 @@ def require_resolved_noise(prior: Tensor) -> None:
 
 
 def require_resolved_variance(covariance: Tensor, prior: Tensor) -> Tensor:
-    """Return a posterior covariance `(n, d, d)` if all its variances are resolved.
+    """Return a posterior covariance `(n, d, d)` after checking that all of its variances are resolved.
 
     Args:
         covariance: covariance of the rows of each sample.
@@ -274,13 +278,13 @@ def require_resolved_variance(covariance: Tensor, prior: Tensor) -> Tensor:
 
 
 def fourier_features(inputs: tuple[str, ...] | None, omega: Tensor, phase: Tensor, std: Tensor) -> FeatureMap:
-    """Return σ √(2/F) cos(ωᵀx + φ): random Fourier features of a stationary kernel.
+    """Return the random Fourier features σ √(2/F) cos(ωᵀx + φ) of a stationary kernel.
 
     Args:
         inputs: names of the inputs; `None` for all.
-        omega: frequencies `(k, F, w)`, or `(1, F, w)` if they are common to all components.
-        phase: `(k, F)` or `(1, F)`.
-        std: σ `(k,)`.
+        omega: frequencies ω `(k, F, w)`, or `(1, F, w)` if they are common to all components.
+        phase: phases φ `(k, F)` or `(1, F)`.
+        std: standard deviations σ `(k,)`.
     """
     count = phase.shape[-1]
     scale = (math.sqrt(2.0 / count) * std)[:, None].expand(-1, count)
@@ -290,10 +294,10 @@ def fourier_features(inputs: tuple[str, ...] | None, omega: Tensor, phase: Tenso
 
 
 def linear_features(x: Features, inputs: tuple[str, ...] | None, slope: Tensor, bias: Tensor) -> FeatureMap:
-    """Return the features of the linear kernel, slopes and a bias.
+    """Return the features of the linear kernel, which are slopes and a bias.
 
     Args:
-        x: kernel inputs; only their widths are used.
+        x: kernel inputs, of which only the widths are used.
         inputs: names of the inputs; `None` for all.
         slope: standard deviation of each slope `(k, w)`, or of all slopes `(k, 1)`.
         bias: standard deviation of the bias `(k,)`.
@@ -312,8 +316,3 @@ def linear_features(x: Features, inputs: tuple[str, ...] | None, slope: Tensor, 
 def constant_features(std: Tensor) -> FeatureMap:
     """Return one constant feature per component, with standard deviations `(k,)`."""
     return FeatureMap((FeatureTerm(lambda x: std.new_ones(1, stacked(x, None).shape[-2], 1), std[:, None]),))
-
-
-def _all_pairs(a: Tensor, b: Tensor) -> Tensor:
-    """Return all products a_i b_j of features `(k, n, f)` and `(k, n, g)`, `(k, n, f g)`."""
-    return (a[..., :, None] * b[..., None, :]).flatten(-2)

@@ -1,8 +1,8 @@
-"""Selection of inducing points from the data by greedy conditional variance.
+"""Greedy selection of inducing points from the data by conditional variance.
 
-Each step adds the sample with the largest missed variance, Σ_k S_kk Var(f_k(x) | f(Z)), the trace term of the
-collapsed bound (pivoted partial Cholesky factorisation; Burt, Rasmussen & van der Wilk 2020). Weights S = WᵀW
-convert it to units of the noise variance.
+Each step adds the sample with the largest residual variance Σ_k S_kk Var(f_k(x) | f(Z)), which is the trace
+term of the collapsed bound (pivoted partial Cholesky factorisation; Burt, Rasmussen & van der Wilk 2020). The
+weights S = WᵀW convert it to units of the noise variance.
 """
 
 from __future__ import annotations
@@ -22,12 +22,12 @@ CANDIDATES = 4000
 """Number of samples from which points are selected."""
 
 LIMIT = 100
-"""Maximum number of inducing points of a process."""
+"""Maximum number of inducing points per process."""
 
 SHARE = 0.02
-"""Missed variance of all rows at which selection stops, as a fraction of their posterior variance. In units
+"""Residual variance of all rows at which selection stops, as a fraction of their posterior variance. In units
     of the noise variance, M basis functions learned from noisy rows have a total posterior variance of at
-    most M over all rows; the missed variance should be small compared with it.
+    most M over all rows; the residual variance should be small compared with it.
 """
 
 
@@ -37,7 +37,7 @@ class Selection:
 
     Attributes:
         points: kernel inputs of the points.
-        missed: missed prior variance of a row for 0, 1, … points, on average over the candidates, in units
+        missed: residual prior variance of a row given 0, 1, … points, averaged over the candidates, in units
             of the noise variance `(points + 1,)`.
     """
 
@@ -54,14 +54,14 @@ def select_inducing(
     limit: int = LIMIT,
     share: float = SHARE,
 ) -> list[Selection]:
-    """Select inducing points for each process from the samples of blocks.
+    """Select inducing points for each process from the samples in the blocks.
 
-    A process that affects no row, or that has a finite number of features, has no inducing points.
+    Processes that affect no row, or that have finitely many features, get no inducing points.
 
     Args:
-        rows: total number of rows to condition on; by default those of the blocks.
-        limit: maximum number of points of a process.
-        share: missed variance of all rows at which to stop, as a fraction of their posterior variance.
+        rows: total number of rows to condition on; by default, the number of rows in the blocks.
+        limit: maximum number of points per process.
+        share: residual variance of all rows at which to stop, as a fraction of their posterior variance.
     """
     candidate_rows = sum(block.rows for block in blocks)
     tolerance = share / (candidate_rows if rows is None else rows)
@@ -76,7 +76,7 @@ def select_inducing(
 
 
 def _greedy(rest: KernelPart | None, x: Features, weight: Tensor, limit: int, tolerance: float) -> Selection:
-    """Compute the pivoted partial Cholesky factorisation of every component with common pivots."""
+    """Compute a pivoted partial Cholesky factorisation of every component, with common pivots."""
     none = Selection({name: value[:0] for name, value in x.items()}, weight.new_zeros(1))
     if rest is None or not bool(weight.any()):
         return none
@@ -93,7 +93,7 @@ def _greedy(rest: KernelPart | None, x: Features, weight: Tensor, limit: int, to
         # ℓ = (k(X, x_i) − Lᵀ L_i) / √d_i
         so_far = columns[:, : len(kept)]
         k = k - (so_far[..., i, None].mT @ so_far)[:, 0]
-        # A component that the points know here already gains nothing from another one.
+        # A component that is already determined here gains nothing from a further point.
         fresh = residual[:, i] > TRUNCATION * prior[:, i]
         if not bool(fresh.any()):
             break

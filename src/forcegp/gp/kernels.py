@@ -1,8 +1,8 @@
 """Covariance functions of independent latent outputs, as frozen descriptions with a dictionary of parameters.
 
-A kernel describes `k` independent outputs at once; its covariance is `(k, n, n')`. Inputs are standardized
-named features, `{"q": (n, w), "qd": (n, w), …}`; a kernel reads those listed in `inputs`, or all.
-Hyperparameters are logarithms in a flat dictionary, so one optimiser handles every kernel.
+A kernel describes `k` independent outputs at once; its covariance has shape `(k, n, n')`. Inputs are
+standardized named features, `{"q": (n, w), "qd": (n, w), …}`, of which a kernel uses those listed in
+`inputs`, or all. Hyperparameters are logarithms in a flat dictionary, so one optimiser handles every kernel.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ Parameters = Mapping[str, Tensor]
 Initial = dict[str, Tensor]
 
 LARGEST_EXPONENT = 300.0
-"""Bound on exponents; exp(−300) is far below rounding and far above denormal numbers, which are slow."""
+"""Bound on exponents; exp(−300) is far below rounding error but far above slow denormal numbers."""
 LINEAR_PAIRS = 8
-"""Divisor of the number of random features of a factor for each linear factor of the other one."""
+"""Divisor of the number of random features of a factor, per linear factor of the other side of a product."""
 
 
 def sub(params: Parameters, prefix: str) -> dict[str, Tensor]:
-    """Return the entries `prefix.*`, without the prefix."""
+    """Return the entries `prefix.*`, with the prefix removed from their names."""
     return {key[len(prefix) + 1 :]: value for key, value in params.items() if key.startswith(prefix + ".")}
 
 
@@ -46,7 +46,7 @@ class Kernel(ABC):
     """Covariance function of `k` independent outputs."""
 
     is_finite: bool = False
-    """Whether k(x, x′) = φ(x)ᵀφ(x′) with a finite number of features φ."""
+    """Whether k(x, x′) = φ(x)ᵀφ(x′) with finitely many features φ."""
 
     @abstractmethod
     def initial(self, outputs: int, widths: Mapping[str, int], log_std: Tensor | float = 0.0) -> Initial:
@@ -54,13 +54,13 @@ class Kernel(ABC):
 
         Args:
             outputs: number of outputs.
-            widths: columns of each feature.
+            widths: number of columns of each feature.
             log_std: logarithm of the standard deviation of the functions, one value or one per output.
         """
 
     @abstractmethod
     def towards(self, params: Parameters, x2: Features) -> Callable[[Features], Tensor]:
-        """Return the function x ↦ k(x, x′) `(k, n, n')` for fixed x′, precomputing the terms of x′."""
+        """Return the function x ↦ k(x, x′) `(k, n, n')` for fixed x′, with terms in x′ precomputed."""
 
     def covariance(self, params: Parameters, x1: Features, x2: Features) -> Tensor:
         """Return k(x, x′) `(k, n, n')`."""
@@ -68,7 +68,7 @@ class Kernel(ABC):
 
     @abstractmethod
     def variance(self, params: Parameters) -> Callable[[Features], Tensor]:
-        """Return the function x ↦ k(x, x) `(k, n)`, precomputing the terms of the hyperparameters."""
+        """Return the function x ↦ k(x, x) `(k, n)`, with terms in the hyperparameters precomputed."""
 
     def diagonal(self, params: Parameters, x: Features) -> Tensor:
         """Return k(x, x) `(k, n)`."""
@@ -76,13 +76,13 @@ class Kernel(ABC):
 
     @abstractmethod
     def draw(self, params: Parameters, x: Features, features: int, generator: torch.Generator) -> FeatureMap:
-        """Draw functions from the prior as `features` random features per output.
+        """Draw `features` random features per output, which represent functions from the prior.
 
-        Linear kernels and constants have exact features, whose number is fixed.
+        Linear and constant kernels have exact features, whose number is fixed.
 
         Args:
             params: log-hyperparameters.
-            x: any inputs; only their widths are used.
+            x: any inputs, of which only the widths are used.
             features: number of random features.
             generator: source of randomness, on the CPU.
         """
@@ -101,11 +101,11 @@ def sides(left: Parameters, right: Parameters) -> Initial:
 
 
 def width_of(inputs: tuple[str, ...] | None, widths: Mapping[str, int]) -> int:
-    """Return the number of columns that a kernel reads.
+    """Return the number of input columns that a kernel uses.
 
     Raises:
         UnknownNameError: an input is missing.
-        ModelError: there is no input.
+        ModelError: there are no inputs.
     """
     names = tuple(widths) if inputs is None else inputs
     for name in names:
@@ -121,9 +121,9 @@ class Linear(Kernel):
     """k = s² Σ_d σ_d² x_d x′_d + σ_0²: functions that are linear in the inputs.
 
     Two options reduce the number of hyperparameters. With `ard=False`, all inputs have the same σ, so
-    learning cannot set single slopes to zero. With `shared=True`, all outputs share the σ_d, with separate s
-    and σ_0. With `offset`, σ_0 is a learned fraction of the root mean square σ_d, with this initial value,
-    shared by all outputs, since the constant of a single output does not determine σ_0.
+    learning cannot set individual slopes to zero. With `shared=True`, all outputs share the σ_d but have
+    separate s and σ_0. If `offset` is given, σ_0 is a learned fraction of the root mean square of the σ_d,
+    initially `offset`. All outputs share it, since the constant of a single output does not determine σ_0.
     """
 
     inputs: tuple[str, ...] | None = None
@@ -135,7 +135,7 @@ class Linear(Kernel):
 
     def initial(self, outputs: int, widths: Mapping[str, int], log_std: Tensor | float = 0.0) -> Initial:
         width = width_of(self.inputs, widths)
-        # Standardized inputs have unit variance: every column and the bias get the same share.
+        # Standardized inputs have unit variance, so all columns and the bias get the same share.
         bias = 1.0 if self.offset is None else self.offset**2
         share = torch.zeros(outputs, dtype=torch.float64) + log_std - 0.5 * math.log(width + bias)
         columns = width if self.ard else 1
@@ -172,7 +172,7 @@ class Linear(Kernel):
 
 @dataclass(frozen=True)
 class Constant(Kernel):
-    """k = s²: constants, with one standard deviation s (initially 1) for each `group` of outputs."""
+    """k = s²: constants, with one standard deviation s (initially 1) per `group` of outputs."""
 
     group: int = 1
 
@@ -199,10 +199,10 @@ class Constant(Kernel):
 
 @dataclass(frozen=True)
 class Stationary(Kernel):
-    """σ² g(r) of the scaled distance r² = Σ_d (x_d − x′_d)² / ℓ_d² (automatic relevance determination).
+    """k = σ² g(r) with scaled distance r² = Σ_d (x_d − x′_d)² / ℓ_d² (automatic relevance determination).
 
-    With `shared=True`, all outputs share the length-scales but not σ, which leaves fewer hyperparameters and
-    a single distance to compute.
+    With `shared=True`, all outputs share the length-scales but not σ, so there are fewer hyperparameters and
+    only one distance to compute.
     """
 
     inputs: tuple[str, ...] | None = None
@@ -244,7 +244,7 @@ class Stationary(Kernel):
 
     def draw(self, params: Parameters, x: Features, features: int, generator: torch.Generator) -> FeatureMap:
         lengthscale = params["log_lengthscale"].exp()
-        # ω ~ p(ω)/ℓ, φ ~ U(0, 2π); components that share length-scales share ω, with independent weights.
+        # ω ~ p(ω)/ℓ, φ ~ U(0, 2π); components that share length-scales share ω but not the weights.
         k, width = lengthscale.shape
         omega = self.frequencies((k, features, width), generator).to(lengthscale) / lengthscale[:, None, :]
         phase = 2.0 * math.pi * torch.rand(k, features, dtype=torch.float64, generator=generator)
@@ -253,7 +253,7 @@ class Stationary(Kernel):
 
 @dataclass(frozen=True)
 class SquaredExponential(Stationary):
-    """k = σ² exp(−r²/2), with a length-scale for each input and, unless shared, each output (eq. 31)."""
+    """k = σ² exp(−r²/2) with one length-scale per input and, unless shared, per output (eq. 31)."""
 
     def profile(self, r2: Tensor) -> Tensor:
         return torch.exp((-0.5 * r2).clamp(-LARGEST_EXPONENT, 0.0))
@@ -266,7 +266,7 @@ class _Matern(Stationary):
     degrees: int
 
     def _radius(self, r2: Tensor) -> Tensor:
-        # The floor keeps the derivative of the square root finite where two inputs coincide.
+        # The lower bound keeps the derivative of the square root finite if two inputs coincide.
         return (self.degrees * r2.clamp(min=1e-30)).sqrt().clamp(max=LARGEST_EXPONENT)
 
     def frequencies(self, shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
@@ -311,7 +311,7 @@ class Sum(Kernel):
 
     @staticmethod
     def combined(left: Tensor, right: Tensor) -> Tensor:
-        """Combine the covariances of both sides."""
+        """Combine the covariances of the two sides."""
         return left + right
 
     @property
@@ -319,7 +319,7 @@ class Sum(Kernel):
         return self.left.is_finite and self.right.is_finite
 
     def parts(self, params: Parameters) -> tuple[tuple[Kernel, Initial], tuple[Kernel, Initial]]:
-        """Return both kernels, with their hyperparameters."""
+        """Return both kernels with their hyperparameters."""
         return (self.left, sub(params, "left")), (self.right, sub(params, "right"))
 
     def towards(self, params: Parameters, x2: Features) -> Callable[[Features], Tensor]:
@@ -337,7 +337,7 @@ class Sum(Kernel):
 
 @dataclass(frozen=True)
 class Product(Sum):
-    """k = k_1 k_2; the second factor initially has unit size."""
+    """k = k_1 k_2; the second factor initially has unit standard deviation."""
 
     def initial(self, outputs: int, widths: Mapping[str, int], log_std: Tensor | float = 0.0) -> Initial:
         return sides(self.left.initial(outputs, widths, log_std), self.right.initial(outputs, widths))
@@ -347,8 +347,8 @@ class Product(Sum):
         return left * right
 
     def draw(self, params: Parameters, x: Features, features: int, generator: torch.Generator) -> FeatureMap:
-        # A sum is multiplied out: its terms have features of unequal number and size, and those of a term
-        # with few would seldom be drawn among those of the other.
+        # Sums are expanded: their terms have features of unequal number and size, and those of a term with
+        # few features would seldom be selected among those of the other terms.
         for side, other in (("left", "right"), ("right", "left")):
             inner = getattr(self, side)
             if isinstance(inner, Sum) and not isinstance(inner, Product):
@@ -360,14 +360,14 @@ class Product(Sum):
                 )
                 return next(terms) + next(terms)
         linear = max(_linear_factors(self.left), _linear_factors(self.right))
-        # A linear factor has few features and all of them matter, so the other one is given fewer.
+        # A linear factor has few features, all of which matter, so the other factor is given fewer.
         few = max(1, features // (LINEAR_PAIRS * linear)) if linear else features
         left, right = (kernel.draw(theta, x, few, generator) for kernel, theta in self.parts(params))
         return left * right if linear else left.paired(right, features, generator)
 
 
 def _linear_factors(kernel: Kernel) -> int:
-    """Return the number of factors of a linear kernel or product of linear kernels; 0 for any other."""
+    """Return the number of factors of a linear kernel or product of linear kernels; 0 for other kernels."""
     if isinstance(kernel, Product):
         left, right = _linear_factors(kernel.left), _linear_factors(kernel.right)
         return left + right if left and right else 0
@@ -385,7 +385,7 @@ class Process(Protocol):
 
     @property
     def prefix(self) -> str:
-        """Prefix of the hyperparameters; that of another process if they are shared."""
+        """Prefix of the hyperparameters; if they are shared, that of another process."""
         ...
 
 
@@ -399,7 +399,7 @@ class OrnsteinUhlenbeck(Kernel):
     B.28).
 
     Args:
-        time: initial value of T [s].
+        time: initial value of the correlation time T [s].
 
     Example:
         >>> import torch
@@ -443,8 +443,8 @@ class OrnsteinUhlenbeck(Kernel):
         return lambda x: variance.expand(-1, points(x))
 
     def draw(self, params: Parameters, x: Features, features: int, generator: torch.Generator) -> FeatureMap:
-        # The spectral density is a Cauchy density. Over uniform frequencies u, the mean of cos(u(s − s′)) is
-        # zero for whole numbers s ≠ s′, so that trajectories are independent.
+        # The spectral density is a Cauchy density. Averaged over uniform frequencies u, cos(u(s − s′)) is
+        # zero for integers s ≠ s′, so trajectories are independent.
         rate = torch.exp(-params["log_time"])
         uniform = torch.rand(len(rate), features, 3, dtype=torch.float64, generator=generator).to(rate)
         in_time = torch.tan(math.pi * (uniform[..., 0] - 0.5)) * rate[:, None]

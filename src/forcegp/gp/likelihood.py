@@ -1,11 +1,11 @@
 """The covariance of whitened rows (eq. 10) and their likelihood, with closed-form gradients.
 
-A block holds `n` samples with `r` rows each. Between two samples the covariance of their rows is
-Σ_k W[i,:,k] k_k(x_i, x_j) W[j,:,k]ᵀ, summed over the components k of every prior: the block-by-block
-form of H k_Q Hᵀ (eq. 32, figure 1) for any operator W. Rows are ordered by block, sample, row.
+A block contains `n` samples with `r` rows each. The covariance between the rows of two samples is
+Σ_k W[i,:,k] k_k(x_i, x_j) W[j,:,k]ᵀ, summed over the components k of every prior: the block-wise
+form of H k_Q Hᵀ (eq. 32, figure 1) for any operator W. Rows are ordered by block, sample, and row.
 
-Processes with a finite number of features have few weights and many rows, so their likelihood is computed
-from the weights (Rasmussen and Williams, *Gaussian Processes for Machine Learning*, section 2.1).
+Processes with finitely many features have few weights and many rows, so their likelihood is computed in
+weight space (Rasmussen and Williams, *Gaussian Processes for Machine Learning*, section 2.1).
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ from forcegp.gp.kernels import Parameters, Process, sub
 from forcegp.resources import threads_of_pytorch
 
 CHUNK_ELEMENTS = 400_000
-"""Size of the intermediate arrays for a chunk of samples, which should fit into the processor cache."""
+"""Size of intermediate arrays for a chunk of samples, chosen to fit into the processor cache."""
 
 
 Place = tuple[Any, ...]
 """("param", name), ("feature", block, process, name), ("operator", block, process) or ("target", block)."""
 
 Gradient = dict[Place, Tensor]
-"""Derivatives by place."""
+"""Derivatives, keyed by place."""
 
 
 def offsets(blocks: Sequence[Block]) -> list[int]:
-    """Return the first row of each block, and the number of rows."""
+    """Return the index of the first row of each block, followed by the total number of rows."""
     starts = [0]
     for block in blocks:
         starts.append(starts[-1] + block.rows)
@@ -54,7 +54,7 @@ def _chunks(n: int, size: int) -> Iterator[tuple[int, int]]:
 
 
 def add_rows(out: Tensor, W1: Tensor, k: Tensor, W2: Tensor, lower: bool = False) -> None:
-    """Add Σ_k W1 k W2ᵀ to `out`, chunk by chunk; only up to the diagonal if `lower`."""
+    """Add Σ_k W1 k W2ᵀ to `out`, chunk by chunk; if `lower`, only up to the diagonal."""
     r = W1.shape[1]
     W2k = W2.permute(2, 0, 1)
     for i, j in _chunks(len(W1), W2.numel()):
@@ -89,7 +89,7 @@ def cross_gram(
 ) -> Tensor:
     """Return the covariance between the rows of two lists of blocks, `(rows1, rows2)` (eqs. 10, 13 and 19).
 
-    Without a second list, return the covariance of the first with itself; only the lower triangle is valid.
+    If the second list is omitted, it equals the first, and only the lower triangle of the result is valid.
     """
     lower, blocks2 = blocks2 is None, blocks1 if blocks2 is None else blocks2
     starts1, starts2 = offsets(blocks1), offsets(blocks2)
@@ -105,7 +105,7 @@ def cross_gram(
 
 
 def gram(priors: Sequence[Process], params: Parameters, blocks: Sequence[Block]) -> Tensor:
-    """Return the covariance of the rows with unit white noise, `(rows, rows)`; lower triangle only."""
+    """Return the covariance of the rows including unit white noise, `(rows, rows)`; lower triangle only."""
     # Σ = K + I (eq. 10)
     K = cross_gram(priors, params, blocks)
     K.diagonal().add_(1.0)
@@ -120,16 +120,16 @@ def gram_gradient(
     alpha: Tensor,
     deep: bool,
 ) -> Gradient:
-    """Return the derivatives of F = ½ log|Σ| + ½ yᵀΣ⁻¹y, Σ = K + I, in closed form.
+    """Return the derivatives of F = ½ log|Σ| + ½ yᵀΣ⁻¹y with Σ = K + I, in closed form.
 
     With G = Σ⁻¹ − ααᵀ, ∂F/∂Σ = ½ G, and the derivative with respect to the kernel between samples i and j is
     ½ W_iᵀ G_ij W_j; only the kernels themselves are differentiated automatically.
 
     Args:
         priors, params, blocks: as for `gram`.
-        K_inv: Σ⁻¹ `(rows, rows)`; the lower triangle is read.
+        K_inv: Σ⁻¹ `(rows, rows)`, of which only the lower triangle is used.
         alpha: Σ⁻¹ y `(rows,)`.
-        deep: whether to differentiate also with respect to targets, operators and features.
+        deep: whether to also differentiate with respect to targets, operators and features.
     """
     rows = [slice(*pair) for pair in pairwise(offsets(blocks))]
     total: Gradient = {}
@@ -150,7 +150,7 @@ def gram_gradient(
             g == h,
             (total["operator", g, p], total["operator", h, p]) if deep else None,
         )
-        # ∂F/∂θ = Σ_ij ∂F/∂k_ij ∂k_ij/∂θ, and alike for kernel inputs
+        # ∂F/∂θ = Σ_ij ∂F/∂k_ij ∂k_ij/∂θ, and likewise for kernel inputs
         grads = torch.autograd.grad(k, list(leaves.values()), dk, allow_unused=True)
         for (kind, key), grad in zip(leaves, grads, strict=True):
             where = ("feature", g if kind == "one" else h, p, key)
@@ -163,7 +163,7 @@ def gram_gradient(
 def _kernel_with_leaves(
     prior: Process, process_params: Parameters, f1: Features, f2: Features, with_features: bool
 ) -> tuple[dict[tuple[str, str], Tensor], Tensor]:
-    """Return the kernel matrix with a graph to new leaves for its parameters and optionally its inputs."""
+    """Return new leaves for the kernel's parameters and optionally its inputs, and the kernel matrix."""
     leaves = {("param", key): value.detach().requires_grad_() for key, value in process_params.items()}
     one: Mapping[str, Tensor] = f1
     two: Mapping[str, Tensor] = f2
@@ -184,9 +184,9 @@ def _kernel_gradient(
     lower: bool,
     into: tuple[Tensor, Tensor] | None,
 ) -> Tensor:
-    """Return the derivative by the kernel matrix `(components, n, n')`; add those by the operators to `into`.
+    """Return ∂F/∂k `(components, n, n')`, and add the derivatives with respect to the operators to `into`.
 
-    On a diagonal block, the lower triangle has the weight of both triangles.
+    On a diagonal block, the lower triangle also accounts for the upper triangle.
     """
     W1, W2 = operators
     r, s = W1.shape[1], W2.shape[1]
@@ -253,10 +253,10 @@ def condition(priors: Sequence[Process], params: Parameters, blocks: Sequence[Bl
 def negative_log_likelihood(priors: Sequence[Process], params: Parameters, blocks: Sequence[Block]) -> Tensor:
     """Return the negative log marginal likelihood of whitened rows, differentiable in all its inputs.
 
-    Value and gradient are computed from one factorisation.
+    Value and gradient are computed from the same factorisation.
 
     Returns:
-        The scalar.
+        The negative log marginal likelihood `()`.
 
     Raises:
         NumericalError: the covariance is not positive definite.
@@ -272,7 +272,7 @@ def negative_log_likelihood(priors: Sequence[Process], params: Parameters, block
 
 
 class _OfRows(torch.autograd.Function):
-    """Computes the gradient together with the value, from shared intermediate results."""
+    """Negative log likelihood that computes value and gradient together, from shared intermediate results."""
 
     @staticmethod
     def forward(ctx: Any, rows: tuple[Any, Any, Any], places: list[Place], *tensors: Tensor) -> Tensor:
@@ -297,12 +297,12 @@ class _OfRows(torch.autograd.Function):
 
 
 def cholesky_inverse_(L: Tensor) -> Tensor:
-    """Return (L Lᵀ)⁻¹ in place of the factor L (LAPACK potri); only the lower triangle is defined."""
+    """Overwrite the factor L with (L Lᵀ)⁻¹ (LAPACK potri) and return it; only its lower triangle is valid."""
     if L.device.type != "cpu":
         return torch.cholesky_inverse(L)
     if L.shape[0] == 0:
         return L
-    # Σ⁻¹ = L⁻ᵀ L⁻¹; a row-major lower triangle is the upper one in LAPACK's column-major order.
+    # Σ⁻¹ = L⁻ᵀ L⁻¹; a row-major lower triangle is an upper triangle in LAPACK's column-major order.
     array = L.numpy().T
     (potri,) = scipy.linalg.lapack.get_lapack_funcs(("potri",), (array,))
     with threads_of_pytorch():
@@ -315,7 +315,7 @@ def cholesky_inverse_(L: Tensor) -> Tensor:
 
 
 class _OfWeights(torch.autograd.Function):
-    """−log N(y; 0, I + Φ Φᵀ) with its derivatives."""
+    """Negative log likelihood −log N(y; 0, I + Φ Φᵀ), with its derivatives."""
 
     @staticmethod
     def forward(ctx: Any, Phi: Tensor, y: Tensor) -> Tensor:
@@ -336,7 +336,7 @@ class _OfWeights(torch.autograd.Function):
 def negative_log_likelihood_of_weights(
     processes: Sequence[Process], params: Parameters, blocks: Sequence[Block]
 ) -> Tensor:
-    """Return `negative_log_likelihood` for finitely many features, at a cost linear in the rows.
+    """Return `negative_log_likelihood` for finitely many features, at a cost linear in the number of rows.
 
     The rows are Φ w + ε with w ~ N(0, I), and Φ_i = W_i φ(x_i)ᵀ.
 

@@ -1,4 +1,4 @@
-"""Minimisation of a differentiable objective over named tensors, by L-BFGS or by ADAM as in the paper."""
+"""Minimisation of a differentiable objective over named tensors, by L-BFGS or, as in the paper, by ADAM."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from forcegp.errors import ModelError, NumericalError, check_name
 
 Objective = Callable[[dict[str, Tensor]], Tensor]
 Progress = Callable[[int, float, dict[str, Tensor]], None]
-"""Called after each evaluation with the number of evaluations, the objective, and the best tensors so far."""
+"""Function called after each evaluation with the number of evaluations, objective and best tensors so far."""
 FitProgress = Callable[[int, int, float], None]
-"""Called with the number of evaluations, its maximum, and the objective."""
+"""Function called with the number of evaluations, their maximum number, and the objective."""
 Bounds = Mapping[str, tuple[float | Tensor, float | Tensor]]
-"""Box for each tensor: a lower and an upper bound for all its entries, or for each entry."""
+"""Lower and upper bounds on each tensor, common to all its entries or separate for each entry."""
 
 OPTIMIZERS = ("lbfgs", "adam")
 FIRST_STEP = 2.0
-"""Largest change of an entry in the first step of L-BFGS in a box; two e-folds for logarithms."""
+"""Largest change in an entry in the first step of L-BFGS with bounds; two e-folds for logarithms."""
 STOPPED = ("converged", "stopped at the iteration limit", "the line search found no smaller objective")
 
 
@@ -36,17 +36,17 @@ class LearningOptions:
     Args:
         optimizer: `"lbfgs"` or `"adam"`.
         max_evaluations: maximum number of evaluations of the objective.
-        tolerance: relative change of the objective below which L-BFGS stops. ADAM stops if it does not
-            improve by this much within `patience` evaluations.
+        tolerance: relative change in the objective below which L-BFGS stops. ADAM stops if the objective does
+            not improve by this much within `patience` evaluations.
         learning_rate: learning rate of ADAM for the hyperparameters θ_M.
         analytical_learning_rate: learning rate of ADAM for the analytical parameters θ_A.
         patience: number of evaluations without improvement after which ADAM stops.
         warm_start: number of samples to learn from first, if there are more than twice as many; it is
-            doubled until all are used. `None` learns from all samples from the start.
+            doubled until all are used. If `None`, all samples are used from the start.
         restarts: number of additional random starts; the best result is kept.
         seed: seed for the random starts.
-        hyperpriors: whether hyperparameters have weak log-normal priors around their initial values
-            (maximum a posteriori), or none, as in the paper (maximum likelihood).
+        hyperpriors: whether hyperparameters have weak log-normal priors around their initial values (maximum
+            a posteriori). If not, learning maximises the likelihood, as in the paper.
 
     Example:
         >>> LearningOptions(max_evaluations=50).optimizer
@@ -81,12 +81,12 @@ class Learned:
     Attributes:
         tensors: the best tensors found.
         value: objective at these tensors.
-        converged: whether the tolerance was reached within the allowed evaluations.
+        converged: whether the tolerance was reached within the allowed number of evaluations.
         evaluations: number of evaluations.
-        seconds: duration of learning.
+        seconds: duration of learning [s].
         message: reason for stopping.
         history: objective at each evaluation.
-        doubts: doubts about the result, each with a remedy.
+        doubts: warnings about the result, each with a suggested remedy.
     """
 
     tensors: dict[str, Tensor]
@@ -100,7 +100,7 @@ class Learned:
 
     @property
     def outcome(self) -> dict[str, Any]:
-        """The result of learning as fields of `FitResult`."""
+        """Result of learning as fields of `FitResult`."""
         return {
             "converged": self.converged,
             "evaluations": self.evaluations,
@@ -112,18 +112,18 @@ class Learned:
 
 
 def reported(progress: FitProgress | None, most: int, before: int = 0) -> Progress | None:
-    """Adapt a progress function to an optimisation that follows `before` evaluations."""
+    """Adapt a progress function to an optimisation that starts after `before` evaluations."""
     if progress is None:
         return None
     return lambda evaluations, value, _: progress(before + evaluations, most, value)
 
 
 class _SpentError(Exception):
-    """Raised when the allowed evaluations are used up."""
+    """Raised when the allowed number of evaluations is exhausted."""
 
 
 class _Recorder:
-    """Evaluates the objective and its gradient, and stores the best point."""
+    """Evaluates the objective and its gradient, and keeps the best point."""
 
     def __init__(self, objective: Objective, start: Mapping[str, Tensor], progress: Progress | None) -> None:
         self.objective, self.progress = objective, progress
@@ -156,13 +156,13 @@ def minimise(
     """Minimise an objective over tensors.
 
     Args:
-        objective: maps the tensors to a scalar, differentiably.
+        objective: differentiable function that maps the tensors to a scalar.
         analytical: names of the analytical parameters θ_A, which have a separate ADAM optimiser.
-        bounds: box for each tensor, used by L-BFGS.
-        first_step: largest change of an entry in the first step of L-BFGS in a box.
+        bounds: bounds on each tensor, used by L-BFGS.
+        first_step: largest change in an entry in the first step of L-BFGS with bounds.
 
     Raises:
-        NumericalError: the objective is not finite at the start.
+        NumericalError: the objective is not finite at the initial values.
     """
     began = time.perf_counter()
     recorder = _Recorder(objective, start, progress)
@@ -186,7 +186,7 @@ def _lbfgs(
     first_step: float,
 ) -> tuple[bool, str]:
     def function(x: np.ndarray) -> tuple[float, np.ndarray]:
-        # SciPy counts between iterations only, so a line search would go on beyond the limit.
+        # SciPy counts only between iterations, so a line search could exceed the limit.
         if len(recorder.history) >= options.max_evaluations:
             raise _SpentError
         value, grads = recorder(_unflattened(x, start))
@@ -199,8 +199,8 @@ def _lbfgs(
     steepest = np.abs(first[1]).max(initial=0.0)
     if not np.isfinite(first[0]) or not np.isfinite(steepest):
         return False, "not finite at the start"
-    # In a box, L-BFGS-B's first step is the whole gradient, to the corners of the box where that is steep. In
-    # units of √(first step ÷ gradient) the gradient is that step.
+    # With bounds, L-BFGS-B's first step is the whole gradient, which ends at the bounds if it is steep. In
+    # units of √(first step ÷ gradient), the gradient equals the first step.
     unit = min(1.0, math.sqrt(first_step / max(steepest, 1e-300)))
 
     def scaled(u: np.ndarray) -> tuple[float, np.ndarray]:
@@ -224,12 +224,12 @@ def _lbfgs(
 
 
 def _flattened(tensors: Iterable[Tensor]) -> np.ndarray:
-    """Concatenate all entries into one vector."""
+    """Concatenate all entries of the tensors into one vector."""
     return torch.cat([x.detach().reshape(-1) for x in tensors]).cpu().double().numpy()
 
 
 def _unflattened(x: np.ndarray, like: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Split a vector into tensors with the names, shapes and types of others."""
+    """Split a vector into tensors with the names, shapes and types of `like`."""
     first, tensors = next(iter(like.values())), {}
     flat = torch.as_tensor(x, dtype=first.dtype, device=first.device)
     for key, value in like.items():

@@ -1,12 +1,12 @@
 """Sparse posterior over latent components, computed from two sums over samples.
 
-With A = I + Σ V_i S_i V_iᵀ and v = Σ V_i W_iᵀ y_i, the latent mean is V_*ᵀA⁻¹v and the latent covariance
+With A = I + Σ V_i S_i V_iᵀ and v = Σ V_i W_iᵀ y_i, the latent mean is V_*ᵀA⁻¹v, and the latent covariance is
 k_** − V_*ᵀV_* + V_*ᵀA⁻¹V_* (Titsias 2009; Hensman et al. 2013). The cost of a prediction does not depend on
 the number of samples.
 
-Weights of basis functions may drift, so some components change while others do not. A drifting weight is an
-Ornstein–Uhlenbeck process with its prior as stationary distribution, w′ = ρ w + √(1 − ρ²) ξ, ξ ~ N(0, I). In
-information form, with A = I + G, v, drifting weights p and other weights o,
+Weights of basis functions may drift, so that some components change while others do not. A drifting weight is
+an Ornstein–Uhlenbeck process whose stationary distribution is the prior, w′ = ρ w + √(1 − ρ²) ξ, ξ ~ N(0, I).
+In information form, with A = I + G, v, drifting weights p and other weights o,
 
     S = A_pp + ρ²a I,  a = 1/(1 − ρ²),
     A′_oo = A_oo − A_op S⁻¹ A_po,  A′_op = ρa A_op S⁻¹,  A′_pp = a I − ρ²a² S⁻¹,
@@ -40,12 +40,12 @@ from forcegp.gp.sums import Moments, Sums, accumulate, add_rows
 
 
 def drifted(sums: Sums, weights: Tensor, factor: float) -> Sums:
-    """Return the sums after some weights have drifted; predictions of the others do not change.
+    """Return the sums after the given weights have drifted; predictions from other weights do not change.
 
     Args:
         sums: sums over the samples so far.
         weights: positions of the drifting weights `(k,)`.
-        factor: correlation ρ with the previous weights: 1 keeps them, 0 resets them to their prior.
+        factor: correlation ρ with the previous weights; 1 keeps them, and 0 resets them to their prior.
 
     Raises:
         ModelError: the factor is not between 0 and 1.
@@ -73,18 +73,18 @@ def drifted(sums: Sums, weights: Tensor, factor: float) -> Sums:
 
 
 MISSED = 0.1
-"""Missed variance, as a fraction of the posterior variance, above which more points would help."""
+"""Residual variance, as a fraction of the posterior variance, from which more inducing points would help."""
 
 
 @dataclass(frozen=True)
 class Diagnostics:
-    """Variance that a sparse posterior misses due to its inducing points.
+    """Variance that the inducing points of a sparse posterior do not represent.
 
     Attributes:
         size: number of basis functions.
-        learned: number of basis functions that the rows determine, tr A⁻¹G: the total posterior variance of
-            all rows in units of the noise variance.
-        missed: total prior variance of all rows that the points miss, in the same units.
+        learned: effective number of basis functions determined by the data, tr A⁻¹G, which is the total
+            posterior variance of all rows in units of the noise variance.
+        missed: total residual prior variance of all rows, in the same units.
     """
 
     size: int
@@ -93,26 +93,26 @@ class Diagnostics:
 
     @property
     def more_points_would_help(self) -> bool:
-        """Whether the points miss at least a tenth of the posterior variance."""
+        """Whether the residual variance is at least a tenth of the posterior variance."""
         return self.missed > MISSED * self.learned
 
 
 MOMENTS = tuple(field.name for field in fields(Moments))
-"""Names of the sums in saved posteriors."""
+"""Names of the sums in a saved posterior."""
 CHUNK_PREDICTIONS = 256
 """Number of samples for which covariances are computed at a time."""
 
 UPDATE_FRACTION = 0.25
-"""Number of new rows, relative to the basis functions, above which the factor is recomputed."""
+"""Number of new rows, relative to that of basis functions, above which the factor is recomputed."""
 
 
 @dataclass(frozen=True, eq=False)
 class SparsePosterior:
-    """Latent components conditioned on any number of samples through a basis.
+    """Latent components conditioned on any number of samples through basis functions.
 
     Attributes:
         basis: basis functions.
-        moments: sums over the samples except for G, which follows from the factor.
+        moments: sums over the samples, except G, which follows from the factor.
         L: lower Cholesky factor of A = I + G.
         jitter: jitter added to the diagonal, usually 0.0.
     """
@@ -138,11 +138,11 @@ class SparsePosterior:
         return result
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return all tensors to save, by name, except processes and hyperparameters."""
+        """Return all tensors to be saved, keyed by name, except those of processes and hyperparameters."""
         tensors = {f"moments.{name}": getattr(self.moments, name) for name in MOMENTS}
         tensors |= {"L": self.L, "jitter": torch.tensor(self.jitter, dtype=torch.float64)}
         tensors |= self.basis.tensors()
-        # A copy of its own for each, as files do not keep views.
+        # Each tensor is copied, since files do not store views.
         return {name: x.detach().clone(memory_format=torch.contiguous_format) for name, x in tensors.items()}
 
     @classmethod
@@ -152,7 +152,7 @@ class SparsePosterior:
         """Restore a posterior from `tensors`.
 
         Raises:
-            ModelError: a tensor is missing, or does not fit the processes.
+            ModelError: a tensor is missing or does not match the processes.
         """
         try:
             basis = LatentBasis.of_tensors(processes, params, tensors)
@@ -167,23 +167,23 @@ class SparsePosterior:
                 expected=f"{basis.size} basis functions of {len(processes)} processes",
                 got=f"{len(moments.v)} of {len(moments.prior)}",
             )
-        # Files are row-major; the factor is kept column-major, as LAPACK returns it.
+        # Files are row-major; the factor is column-major, as LAPACK returns it.
         return cls(basis, moments, L.mT.contiguous().mT, jitter)
 
     @cached_property
     def sums(self) -> Sums:
-        """All sums over the samples, with G from the factor if samples were added to it."""
+        """All sums over the samples; G is recovered from the factor if samples were added to that."""
         eye = torch.eye(len(self.L), dtype=self.L.dtype, device=self.L.device)
         return Sums(**vars(self.moments), G=self.L @ self.L.mT - (1.0 + self.jitter) * eye)
 
     @cached_property
     def weights(self) -> Tensor:
-        """A⁻¹v, the posterior mean of the basis functions' weights `(size,)`."""
+        """Posterior mean A⁻¹v of the weights of the basis functions `(size,)`."""
         return torch.cholesky_solve(self.moments.v[:, None], self.L)[:, 0]
 
     @property
     def log_likelihood(self) -> float:
-        """Collapsed lower bound on log p(y), at most that of exact inference (Titsias 2009)."""
+        """Collapsed lower bound on the log p(y) of exact inference (Titsias 2009)."""
         # F = −½ [Σ y² − vᵀA⁻¹v + log|A| + rows log 2π + Σ tr W(k − VᵀV)Wᵀ], log|A| = 2 Σ log L_ii
         moments = self.moments
         fit = moments.yy - moments.v @ self.weights
@@ -200,7 +200,7 @@ class SparsePosterior:
 
     @cached_property
     def measured(self) -> tuple[bool, ...]:
-        """Whether each process affects any row; the samples do not affect the others."""
+        """For each process, whether it affects any row; the samples do not affect the others."""
         # The factor of A = I + G is that of the identity where G is zero.
         diagonal = self.L.diagonal().abs()
         slices = (self.basis.of_process(p) for p in range(len(self.basis.parts)))
@@ -208,7 +208,7 @@ class SparsePosterior:
 
     @cached_property
     def folded(self) -> list[tuple[Tensor, Tensor]]:
-        """Posterior mean of each process as weights of k(x, Z) and of the exact features."""
+        """Posterior mean of each process, as weights of k(x, Z) and of the exact features."""
         basis, weights = self.basis, self.weights[:, None]
         return [part.fold(weights[basis.of_process(p)]) for p, part in enumerate(basis.parts)]
 
@@ -231,14 +231,14 @@ class SparsePosterior:
     def knowing(self, p: int, features: Features, value: Tensor) -> SparsePosterior:
         """Return the posterior given the value `(components,)` of a constant process p with finite features.
 
-        The mean of process p becomes zero, since its value is now part of the prior mean.
+        The mean of process p becomes zero, since the value is now part of the prior mean.
         """
         part, own = self.basis.parts[p], self.basis.of_process(p)
         eye = torch.eye(part.components, dtype=value.dtype, device=value.device)
         # f_p = Φ w_p
         Phi = part.rows(eye[None], part.values(features)[0])
         weights = torch.linalg.lstsq(Phi, value[:, None]).solution[:, 0]
-        # v_o ← v_o − G_op w_p, without the rows of w_p; A = I + G = L Lᵀ
+        # v_o ← v_o − G_op w_p, with the rows of w_p removed; A = I + G = L Lᵀ
         G = self.L @ self.L.mT - torch.eye(len(self.L), dtype=self.L.dtype, device=self.L.device)
         v = self.moments.v - G[:, own] @ weights
         G[own], G[:, own], v[own] = 0.0, 0.0, 0.0
@@ -246,9 +246,9 @@ class SparsePosterior:
 
     @cached_property
     def _inverse_factor(self) -> list[Tensor]:
-        """L⁻ᵀ by process, with a block of rows for each component `(components, width, size)`.
+        """L⁻ᵀ for each process, with one block of rows per component `(components, width, size)`.
 
-        The basis functions of a component involve only its rows. With L⁻ᵀ available, the other rows can be
+        The basis functions of a component involve only its own rows. With L⁻ᵀ, the other rows can be
         skipped, unlike in a triangular solve.
         """
         eye = torch.eye(len(self.L), dtype=self.L.dtype, device=self.L.device)
@@ -261,8 +261,8 @@ class SparsePosterior:
         return blocks
 
     def _latent(self, features: Sequence[Features]) -> tuple[Tensor, Tensor, Tensor]:
-        """Return, for all components at each sample, T with the covariance T Tᵀ explained by the basis
-        `(n, components, size)`; the variance that it misses and that of the prior `(n, components)`."""
+        """Return T `(n, components, size)`, where T Tᵀ is the covariance that the basis explains, and the
+        residual variance and prior variance of all components `(n, components)`."""
         T, missed, prior = [], [], []
         for part, inverse, x in zip(self.basis.parts, self._inverse_factor, features, strict=True):
             # T = Vᵀ L⁻ᵀ, so that T Tᵀ = Vᵀ A⁻¹ V
@@ -273,10 +273,10 @@ class SparsePosterior:
         return torch.cat(T).transpose(0, 1), torch.cat(missed).mT, torch.cat(prior).mT
 
     def covariance(self, block: Block) -> Tensor:
-        """Return the posterior covariance `(n, d, d)` of the rows of each sample, without noise.
+        """Return the posterior covariance `(n, d, d)` of the rows of each sample, excluding noise.
 
         Args:
-            block: kernel inputs and operators of each process; the targets are not read.
+            block: kernel inputs and operators of each process; the targets are not used.
 
         Raises:
             NumericalError: rounding errors dominate a variance.
@@ -294,7 +294,7 @@ class SparsePosterior:
         return 0.5 * (covariance + covariance.mT)
 
     def require_resolved(self) -> None:
-        """Reject a prior so large that double precision does not resolve the noise.
+        """Reject a prior whose variance is so large that double precision cannot resolve the noise.
 
         Raises:
             NumericalError: the prior of the approximated part is too large.
@@ -304,7 +304,7 @@ class SparsePosterior:
 
     @cached_property
     def diagnostics(self) -> Diagnostics:
-        """Variance determined by the samples, and variance missed by the inducing points."""
+        """Variance determined by the samples, and residual variance of the inducing points."""
         # tr A⁻¹G = size − tr A⁻¹ = size − |L⁻ᵀ|²
         inverse = sum((block**2).sum() for block in self._inverse_factor)
         size = self.basis.size
@@ -317,7 +317,7 @@ class SparsePosterior:
 
         Args:
             generator: source of randomness, on the CPU.
-            features: random features per component.
+            features: number of random features per component.
         """
         # w = m + L⁻ᵀ ξ ~ N(A⁻¹v, A⁻¹)
         m = self.weights[:, None]
@@ -326,7 +326,7 @@ class SparsePosterior:
         return draw_functions(self.basis, weights, generator, features)
 
     def updated(self, blocks: Sequence[Block]) -> SparsePosterior:
-        """Condition on additional samples, at a cost that does not depend on the number of previous ones.
+        """Condition on additional samples, at a cost that does not depend on the number of previous samples.
 
         Raises:
             NumericalError: the factorisation fails.
@@ -339,7 +339,7 @@ class SparsePosterior:
         return SparsePosterior(self.basis, moments, extended(self.L, Phi), self.jitter)
 
     def forgetting(self, factor: float) -> SparsePosterior:
-        """Scale the weight of all samples so far by `factor`; 0 restores the prior.
+        """Scale the weight of all previous samples by `factor`; 0 restores the prior.
 
         Raises:
             ModelError: the factor is not between 0 and 1.
@@ -347,7 +347,7 @@ class SparsePosterior:
         return SparsePosterior.of(self.basis, self.sums.scaled(factor))
 
     def drifting(self, factor: float, processes: Sequence[int]) -> SparsePosterior:
-        """Let the weights of some processes drift towards their prior; others do not change.
+        """Let the weights of the given processes drift towards their prior; the others do not change.
 
         Raises:
             ModelError: the factor is not between 0 and 1.

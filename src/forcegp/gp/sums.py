@@ -1,14 +1,14 @@
-"""The two sums over samples of a sparse posterior, which can be streamed, added and discounted.
+"""The two sums over samples that determine a sparse posterior, which can be streamed, added and discounted.
 
 Whitened rows y_i = W_i f(x_i) + ε enter only through S_i = W_iᵀW_i and c_i = W_iᵀy_i: G = Σ V_i S_i V_iᵀ and
 v = Σ V_i c_i, where V_i contains the basis functions of each component at sample i.
 
-Processes of `torch.distributed` (gloo on CPUs, NCCL on GPUs) sum over separate samples with common inducing
-points and hyperparameters.
+With `torch.distributed` (gloo on CPUs, NCCL on GPUs), each process sums over different samples, with common
+inducing points and hyperparameters.
 
     torchrun --standalone --nproc-per-node 2 script.py
 
-The script starts with `dist.init_process_group("gloo")`.
+The script must first call `dist.init_process_group("gloo")`.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from forcegp.gp.features import Block, Features, chunked
 from forcegp.gp.kernels import Parameters
 
 CHUNK_SAMPLES = 1024
-"""Number of samples for which basis functions are in memory at a time."""
+"""Number of samples for which basis functions are kept in memory at a time."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -39,8 +39,8 @@ class Moments:
         v: Σ V Wᵀy `(size,)`.
         yy: Σ y² `()`.
         rows: number of rows, reduced by forgetting `()`.
-        prior: Σ tr W k Wᵀ for the part of each process approximated by inducing points `(processes,)`.
-        missed: the part of it missed by the basis, Σ tr W (k − VᵀV) Wᵀ `(processes,)`.
+        prior: Σ tr W k Wᵀ for the part of each process approximated with inducing points `(processes,)`.
+        missed: its residual with respect to the basis, Σ tr W (k − VᵀV) Wᵀ `(processes,)`.
     """
 
     v: Tensor
@@ -67,12 +67,12 @@ class Sums(Moments):
 
     @classmethod
     def zero(cls, basis: LatentBasis, like: Tensor) -> Sums:
-        """Return the sums over no samples."""
+        """Return sums over zero samples."""
         n, p = basis.size, len(basis.parts)
         return cls(*(like.new_zeros(shape) for shape in ((n,), (), (), (p,), (p,), (n, n))))
 
     def __add__(self, other: Sums) -> Sums:
-        """Return the sums over the samples of both.
+        """Return the sums over the samples of both operands.
 
         Raises:
             ModelError: the sums belong to bases of different sizes.
@@ -81,10 +81,10 @@ class Sums(Moments):
         return Sums(*(a + b for a, b in zip(self.tensors, other.tensors, strict=True)))
 
     def __sub__(self, other: Sums) -> Sums:
-        """Return the sums without the samples of the other, which must be a subset.
+        """Return the sums without the samples of `other`, which must be a subset.
 
         Raises:
-            ModelError: the sums belong to bases of different sizes, or the other has more rows.
+            ModelError: the sums belong to bases of different sizes, or `other` has more rows.
         """
         self._check(other)
         if float(other.rows) > float(self.rows):
@@ -117,7 +117,7 @@ class Sums(Moments):
 
 @torch.no_grad()
 def accumulate(basis: LatentBasis, blocks: Iterable[Block], chunk: int = CHUNK_SAMPLES) -> Sums:
-    """Sum over the samples of blocks, in memory that does not depend on their number.
+    """Sum over the samples in the blocks, using an amount of memory independent of their number.
 
     Args:
         blocks: whitened rows; may be a generator.
@@ -162,16 +162,16 @@ def _add(basis: LatentBasis, block: Block, into: Sums) -> None:
 
 
 def _by_process(basis: LatentBasis, S_kk: Tensor, variance: Tensor) -> Tensor:
-    """Return Σ S_kk var_k of each process, `(processes,)`, with S_kk and variances `(n, k)`."""
+    """Return Σ S_kk var_k of each process `(processes,)`, given S_kk and variances `(n, k)`."""
     traces = (S_kk * variance).sum(0)
     return torch.stack([traces[components].sum() for components in basis.components])
 
 
 @torch.no_grad()
 def add_rows(basis: LatentBasis, moments: Moments, blocks: Sequence[Block]) -> tuple[Moments, Tensor]:
-    """Return the moments with a few more samples, and the new rows in terms of the basis functions.
+    """Return the moments with a few samples added, and the new rows in terms of the basis functions.
 
-    The rows are formed explicitly, which is faster than `accumulate` for a few samples.
+    The rows are formed explicitly, which is faster than `accumulate` for a small number of samples.
 
     Returns:
         The new moments, and Φ with rows W_i V_iᵀ `(rows, size)`.
@@ -198,7 +198,7 @@ def add_rows(basis: LatentBasis, moments: Moments, blocks: Sequence[Block]) -> t
 
 
 def _runs(columns: list[slice]) -> list[slice]:
-    """Join neighbouring slices."""
+    """Merge adjacent slices."""
     runs: list[slice] = []
     for part in columns:
         if runs and runs[-1].stop == part.start:
@@ -208,30 +208,13 @@ def _runs(columns: list[slice]) -> list[slice]:
     return runs
 
 
-def shard(samples: int, rank: int, processes: int) -> slice:
-    """Return the samples of one process; all processes have contiguous runs of equal length to within one.
-
-    Example:
-        >>> [shard(7, rank, 3) for rank in range(3)]
-        [slice(0, 3, None), slice(3, 5, None), slice(5, 7, None)]
-
-    Raises:
-        ModelError: the process does not exist.
-    """
-    if not 0 <= rank < processes:
-        raise ModelError("no such process", expected=f"a rank from 0 to {processes - 1}", got=rank)
-    size, more = divmod(samples, processes)
-    first = rank * size + min(rank, more)
-    return slice(first, first + size + (rank < more))
-
-
 def reduce_sums(sums: Sums) -> Sums:
     """Add the sums of all processes; each process obtains the same result.
 
-    All must use the basis from `share_basis`, since eigenvectors are defined only up to sign and rotation.
+    All must use the basis from `share_basis`, since eigenvectors are unique only up to sign and rotation.
 
     Raises:
-        ModelError: no group of processes has been initialised.
+        ModelError: no process group has been initialised.
     """
     flat = add_over_processes(torch.cat([part.reshape(-1) for part in sums.tensors]))
     pieces = flat.split([part.numel() for part in sums.tensors])
@@ -247,10 +230,10 @@ def add_over_processes(x: Tensor) -> Tensor:
 
 
 def require_agreement(what: str, *values: int, hint: str | None = None) -> None:
-    """Check that numbers agree in all processes; an error is raised in all of them or in none.
+    """Check that the values agree across all processes; the error is raised in all of them or in none.
 
     Raises:
-        ModelError: the numbers differ, or no group of processes has been initialised.
+        ModelError: the values differ, or no process group has been initialised.
     """
     own = torch.tensor(values, dtype=torch.int64)
     with _processes():
@@ -263,10 +246,10 @@ def require_agreement(what: str, *values: int, hint: str | None = None) -> None:
 
 
 def share_basis(basis: LatentBasis) -> LatentBasis:
-    """Send the basis of the first process to all others, which must have a basis of the same shapes.
+    """Send the basis of the first process to all others, whose bases must have the same shapes.
 
     Raises:
-        ModelError: no group of processes has been initialised.
+        ModelError: no process group has been initialised.
     """
     dropped = [s.dropped for part in basis.parts for s in part.spectra]
     counts = iter(_broadcast(torch.tensor(dropped)).tolist())
@@ -293,7 +276,7 @@ def _broadcast(x: Tensor) -> Tensor:
 
 @contextmanager
 def _processes() -> Iterator[None]:
-    """Exchange data with the other processes; `ModelError` without them, or if one is lost."""
+    """Exchange data with the other processes; raise `ModelError` if there are none or if one is lost."""
     if not (dist.is_available() and dist.is_initialized()):
         raise ModelError(
             "no group of processes has been initialised",

@@ -1,6 +1,6 @@
-"""Logs of other programs: readers, mappings of columns, clocks, units, derivatives, contact.
+"""Import of logs from other programs: readers, column mappings, clocks, units, derivatives and contacts.
 
-`read_log` reads a log file of any format as a data set of a robot.
+`read_log` reads a log file of any supported format as a data set for a robot.
 """
 
 from __future__ import annotations
@@ -41,12 +41,12 @@ __all__ = [
 ]
 
 NUMBERS = 16
-"""Upper bound on the numbers of one joint in one row that are held at a time; ten were measured."""
+"""Upper bound on the count of numbers held in memory per joint and row; ten were measured."""
 
 
 @dataclass(frozen=True)
 class Imported:
-    """A data set, the report of its import, and the evidence for each detected contact."""
+    """An imported data set, the report of the import, and the evidence for each detected contact."""
 
     data: Dataset
     report: ImportReport
@@ -58,21 +58,21 @@ def read_log(
     scene: Scene | ConstrainedSystem | RobotModel | str | Path,
     mapping: Mapping | str | Path | None = None,
 ) -> Dataset:
-    """Read a log of any known format as a data set of a robot; see `import_log`.
+    """Read a log of any supported format as a data set for a robot; see also `import_log`.
 
     Args:
-        path: the log, a file or a folder.
+        path: the log, which is a file or a folder.
         scene: a scene or its file, a system, or a robot.
-        mapping: a mapping of the columns, its file, or the name of a bundled one. Without it, the columns
-            must have the names of a data set or of ROS joint states.
+        mapping: a mapping of the columns, its file, or the name of a bundled mapping. By default, columns
+            must be named as in a data set or in ROS joint states.
 
     Returns:
-        The log in SI units, in the robot's joint order.
+        The log in SI units and in the robot's joint order.
 
     Raises:
-        DataError: the log cannot be read or used; names column and rows.
-        MappingError: the mapping is not valid or does not fit the log.
-        MissingDependencyError: the format's reader is not installed.
+        DataError: the log cannot be read or used; the message names the column and the rows.
+        MappingError: the mapping is invalid or does not match the log.
+        MissingDependencyError: the reader for the format is not installed.
 
     >>> import tempfile
     >>> file = Path(tempfile.mkdtemp()) / "run.csv"
@@ -101,7 +101,7 @@ def import_log(
     progress: Callable[[int, int], None] | None = None,
     displaced: bool = False,
 ) -> Imported:
-    """Read a log like `read_log`, with a report; `displaced` accepts a tip that slides off its surface."""
+    """Read a log as in `read_log`, with a report; if `displaced`, the tip may slide away from its surface."""
     system = system_of(scene)
     robot = system.robot
     log_mapping = default_mapping(path, system) if mapping is None else mapping
@@ -128,7 +128,7 @@ def import_log(
 
 
 def system_of(scene: Scene | ConstrainedSystem | RobotModel | str | Path) -> ConstrainedSystem:
-    """Return the robot with its contacts, from any accepted form."""
+    """Convert a scene, its file or name, or a robot to a system of a robot with its contacts."""
     if isinstance(scene, ConstrainedSystem):
         return scene
     if isinstance(scene, RobotModel):
@@ -139,7 +139,7 @@ def system_of(scene: Scene | ConstrainedSystem | RobotModel | str | Path) -> Con
 def _contacts(
     signals: Signals, system: ConstrainedSystem, mapping: Mapping, report: ImportReport, displaced: bool
 ) -> list[Evidence]:
-    """Find the state of each contact; for λ, compute accelerations across the switches first."""
+    """Find the state of each contact; to detect it by λ, first compute accelerations across the switches."""
     if not any(section.source == "multiplier" for section in mapping.sections.contact.values()):
         return detect(signals, system, mapping, report, displaced)
     copies = {name: value.copy() for name, value in signals.vectors.items()}
@@ -155,7 +155,7 @@ def _contacts(
 
 
 def _find_clipped(signals: Signals, mapping: Mapping) -> None:
-    """Mark torques that clip, before a filter smooths their plateaus, as the vector `clipped`."""
+    """Mark clipped torques in the vector `clipped`, before a filter smooths their plateaus."""
     speed = np.gradient(signals.vectors["q"], axis=0) if len(signals) > 1 else signals.vectors["q"]
     if mapping.sections.torque.clipped != "keep":
         usable = np.ones(len(signals), dtype=bool)
@@ -165,10 +165,10 @@ def _find_clipped(signals: Signals, mapping: Mapping) -> None:
 def _treat_clipped(
     signals: Signals, std: Array | None, mapping: Mapping, report: ImportReport
 ) -> Array | None:
-    """Drop rows with clipped torques, or give these torques their own size as noise, as `tau_std`; returns σ
-    of q̈ of the rows that are left.
+    """Drop rows with clipped torques, or set the noise `tau_std` of these torques to their magnitude; return
+    σ of q̈ in the remaining rows.
 
-    A filter carries a clipped torque to the rows within half its window.
+    A filter spreads a clipped torque to the rows within half its window.
     """
     if "clipped" not in signals.vectors or not (mask := signals.vectors.pop("clipped")).any():
         return std
@@ -190,7 +190,7 @@ def _treat_clipped(
 def _dataset(
     signals: Signals, std: Array | None, mapping: Mapping, system: ConstrainedSystem, report: ImportReport
 ) -> Dataset:
-    """Return the data set of finished signals."""
+    """Return the data set made from processed signals."""
     robot = system.robot
     settings = mapping.sections.derivatives
     dt = usual_step(signals.t)

@@ -1,13 +1,13 @@
-"""Intervals in which a contact is closed, from its distance, a measured force or λ.
+"""Detection of the intervals in which a contact is closed, from its distance, a measured force or λ.
 
-A force-torque sensor's reading becomes force and moment of the environment at the contact, in the world. The
-sensor sits in a frame of the robot, at p_S with rotation R. With f and m its reading of the action of
-environment and gravity on the robot, the tool's weight m_T g at its centre of mass p_T is subtracted, and the
-moment refers to the contact point p_C:
+The reading of a force-torque sensor is converted to the force and moment that the environment exerts at the
+contact, in world coordinates. The sensor is located at p_S in a frame of the robot, with rotation R. Its
+reading f, m is the action of the environment and gravity on the robot. The weight m_T g of the tool, which
+acts at its centre of mass p_T, is subtracted, and the moment is taken about the contact point p_C:
 
     F = R f − m_T g,   M = R m − (p_T − p_S) × m_T g − (p_C − p_S) × F.
 
-The tool's inertial force m_T p̈_T is neglected: it is small for light tools and slow motion.
+The inertial force m_T p̈_T of the tool is neglected, since it is small for light tools and slow motion.
 """
 
 from __future__ import annotations
@@ -31,11 +31,11 @@ from forcegp.robust import level_and_spread, level_of
 from forcegp.rows import runs
 
 CHUNK = 1 << 12
-"""Rows that are computed at a time."""
+"""Number of rows processed at a time."""
 
 
 def _rowwise(signals: Signals, names: Sequence[str], function: Callable[..., torch.Tensor]) -> Array:
-    """Return a function of some vectors of the log, block by block of its rows."""
+    """Evaluate a function of the named vectors of a log, in blocks of rows."""
     blocks = []
     for start in range(0, len(signals), CHUNK):
         rows = slice(start, start + CHUNK)
@@ -51,7 +51,7 @@ def _tip(system: ConstrainedSystem, contact: SurfaceContact, q: torch.Tensor) ->
 def _wrench(
     robot: RobotModel, mapping: Mapping, q: torch.Tensor, reading: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return force, moment about the sensor, and its position `(n, 3)` in the world, without the tool."""
+    """Return the force and moment at the sensor without the tool's weight, and its position, in the world."""
     section = mapping.sections.wrench
     assert section is not None
     if section.frame == GROUND:
@@ -91,7 +91,7 @@ def per_contact(signals: Signals, system: ConstrainedSystem, mapping: Mapping) -
 
 
 def multiplier(signals: Signals, system: ConstrainedSystem, contact: SurfaceContact) -> Array:
-    """Return λ = (A M⁻¹Aᵀ)⁺ A (q̈ − M⁻¹Q) `(n,)` at a contact [N], about zero in free motion."""
+    """Return λ = (A M⁻¹Aᵀ)⁺ A (q̈ − M⁻¹Q) `(n,)` at a contact [N], which is close to zero in free motion."""
     alone = ConstrainedSystem(system.robot, [contact])
 
     def value(q: torch.Tensor, qd: torch.Tensor, qdd: torch.Tensor, tau: torch.Tensor) -> torch.Tensor:
@@ -105,7 +105,7 @@ def multiplier(signals: Signals, system: ConstrainedSystem, contact: SurfaceCont
 def _evidence(
     signals: Signals, system: ConstrainedSystem, mapping: Mapping, contact: SurfaceContact, source: str
 ) -> Array:
-    """Return the signal that decides on a contact, `(n,)`: c(q) [m], the sensor's n·F [N], or λ [N]."""
+    """Return the signal `(n,)` from which a contact is detected: c(q) [m], the sensor's n·F [N], or λ [N]."""
 
     def normal_force(q: torch.Tensor, reading: torch.Tensor) -> torch.Tensor:
         force = _wrench(system.robot, mapping, q, reading)[0]
@@ -119,29 +119,29 @@ def _evidence(
 
 
 SEPARATION, RELEASE_STD, RELEASE = 6.0, 4.0, 0.01
-"""Least distance between the two levels of force, in standard deviations of the open one; a contact counts as
-closed from where the force leaves the open level by so many of them, and by this share of the distance."""
+"""Minimum difference between the force levels of open and closed contact, in standard deviations of the open
+level; minimum margin above the open level in closed intervals, in the same unit and as a fraction of it."""
 TOUCHING, DISTANCE_STD, SMALLEST_DISTANCE = 1e-3, 6.0, 1e-6
-"""A contact is closed up to so many deviations of the distances of the closed contact above their median, at
-least for rounding and at most [m], unless the mapping says otherwise."""
+"""Largest distance in contact [m]; margin above the median distance of the closed contact, in standard
+deviations and at least, to allow for rounding [m]; a mapping may override the result."""
 TOUCHED, LEVEL, INSIDE = 0.02, 0.2, 0.95
-"""Share of rows on the surface from which a contact is where the scene says; shares of moving rows at one
-distance, and of rows inside the solid, from which it is not."""
+"""Fraction of rows on the surface above which the surface is where the scene states; fractions of moving rows
+at a common distance, and of rows inside the solid, above which it is not."""
 SLIDING, TRIED_ROWS = 0.01, 500
-"""Speed from which a tip moves [m/s], and rows on which exchanged joints are tried."""
+"""Speed above which a tip moves [m/s], and maximum number of rows on which swapped joints are tried."""
 ELSEWHERE = (
     "see where it slides with --fit-surface plane (or sphere), and correct the scene; "
     'for free motion, set source = "never" under [contact.{}]'
 )
 BINS = 512
-"""Bins of the histogram that the two levels are told apart in."""
+"""Number of bins of the histogram in which the two levels are separated."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """Evidence for the state of a contact [N, m]: closed from `threshold` on, extended to `release` on either
-    side; median and deviation in each state, NaN if it does not occur; first and last time of each closed
-    interval [s]; and the number of short intervals merged with their neighbours.
+    """Evidence for the state of a contact [N, m]. The contact is closed above `threshold`, and intervals are
+    extended to `release` on either side. Levels and spreads are NaN for a state that does not occur. For each
+    closed interval, the first and last time are given [s]. `merged` counts intervals that were too short.
     """
 
     contact: str
@@ -175,10 +175,10 @@ def detect(
     report: ImportReport,
     displaced: bool = False,
 ) -> list[Evidence]:
-    """Set `signals.contact` for every contact of the scene, and return the evidence for those detected.
+    """Set `signals.contact` for every contact in the scene, and return the evidence for detected contacts.
 
-    Contacts found from λ need `qd` and `qdd`. A tip that slides off its surface is an error, unless
-    `displaced`.
+    Detection by λ requires `qd` and `qdd`. A tip that slides at a distance from its surface is an error
+    unless `displaced` is set.
     """
     sections = mapping.sections.contact
     for name in sections:
@@ -222,7 +222,7 @@ def _misplaced(
     displaced: bool,
     report: ImportReport,
 ) -> float:
-    """Return the distance [m] from the surface at which the tip slides if `displaced`; else raise."""
+    """Return the distance [m] from the surface at which the tip slides if `displaced`; otherwise raise."""
     p, name = _rowwise(signals, ("q",), lambda q: _tip(system, contact, q)), contact.name
     moves = np.linalg.norm(np.gradient(p, axis=0), axis=1) > SLIDING * np.median(np.diff(signals.t))
     level, (middle, spread) = level_of(c[moves], TOUCHING, LEVEL), level_and_spread(1e3 * c)
@@ -246,7 +246,7 @@ def _misplaced(
 
 
 def exchanged_joints(system: ConstrainedSystem, contact: SurfaceContact, q: Array) -> tuple[int, ...]:
-    """Return the two joints that move the tip onto its surface in some of the rows when exchanged, if any."""
+    """Return the two joints, if any, whose exchange moves the tip onto its surface in enough rows."""
     q = q[:: max(1, len(q) // TRIED_ROWS)]
     for pair in combinations(range(q.shape[1]) if len(q) else (), 2):
         order = np.arange(q.shape[1])
@@ -275,10 +275,10 @@ def _detect(
 
 
 def touching(distance: Array) -> float:
-    """Return the distance up to which a contact is closed [m], at most `TOUCHING`.
+    """Return the distance up to which a contact counts as closed [m], at most `TOUCHING`.
 
-    Most rows within this distance belong to the closed contact: the threshold, their median plus
-    `DISTANCE_STD` deviations, separates them from approach and departure.
+    Most rows within `TOUCHING` belong to the closed contact. The threshold, their median plus `DISTANCE_STD`
+    standard deviations, separates them from approach and departure.
 
     >>> touching(np.array([0.0, 0.001, -0.001, 0.0, 0.002, 0.9, 30.0]) * 1e-3) < 1e-5
     True
@@ -289,10 +289,11 @@ def touching(distance: Array) -> float:
 
 
 def force_levels(values: Array, name: str, section: ContactStateSection) -> tuple[float, float]:
-    """Return the force that closes a contact, and the lower force to which its interval extends [N].
+    """Return the force above which a contact is closed, and the lower force to which intervals extend [N].
 
-    The first separates the forces into the two groups with the least variance (Otsu 1979); the second lies
-    `RELEASE_STD` deviations above the median of the open group. `DataError` if the groups are not distinct.
+    The first separates the forces into the two groups with the least variance (Otsu 1979). The second exceeds
+    the median of the open group by `RELEASE_STD` standard deviations, or by a fraction `RELEASE` of the
+    difference if that is larger. Raise `DataError` if the groups are not distinct.
     """
     if section.threshold is not None:
         return section.threshold, section.release or 0.5 * section.threshold
@@ -317,7 +318,7 @@ def force_levels(values: Array, name: str, section: ContactStateSection) -> tupl
 
 
 def hysteresis(values: Array, high: float, low: float, segment: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return the stretches above `low` that reach `high`.
+    """Return the mask of all stretches above `low` that reach `high`.
 
     >>> hysteresis(np.array([0.0, 2, 5, 2, 0, 2, 0]), 4.0, 1.0, np.zeros(7, dtype=np.int64)).astype(int)
     array([0, 1, 1, 1, 0, 0, 0])
@@ -329,7 +330,7 @@ def hysteresis(values: Array, high: float, low: float, segment: NDArray[np.int64
 
 
 def _merge_short(closed: NDArray[np.bool_], signals: Signals, shortest: float) -> int:
-    """Merge intervals shorter than `shortest` [s] into the state on both sides."""
+    """Merge intervals shorter than `shortest` [s] with their neighbours, and return their number."""
     count = 0
     for trajectory in signals.runs():
         t, state = signals.t[trajectory], closed[trajectory]

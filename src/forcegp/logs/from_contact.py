@@ -1,13 +1,13 @@
-"""Joints whose motion follows from a closed contact, and speeds below which the tip of a contact sticks.
+"""Motion of unlogged joints that follows from a closed contact, and speeds below which a contact sticks.
 
-**A joint without a column.** A closed contact has c(q) = 0, A q̇ = 0 and A q̈ = b. With the unknown joints u
-and the logged ones o, q_u solves c(q_o, q_u) = 0 by Gauss-Newton, and
+**Joints without a column.** A closed contact satisfies c(q) = 0, A q̇ = 0 and A q̈ = b. Let u denote the
+unknown joints and o the logged joints. Then q_u is found by solving c(q_o, q_u) = 0 by Gauss-Newton, and
 
     q̇_u = −A_u⁺ A_o q̇_o,   q̈_u = A_u⁺ (b − A_o q̈_o).
 
-**Sticking.** The logarithm of the speed of a touching point that now sticks and now slides has two modes. The
-tip sticks below the valley between them: where it creeps by some mm/s too, as in MuJoCo. A sliding tip that
-turns round has slow rows, but no mode of them.
+**Sticking.** If a contact point sometimes sticks and sometimes slides, the logarithm of its speed has two
+modes. The tip sticks below the valley between them, even if it creeps by a few mm/s, as in MuJoCo. A sliding
+tip that reverses is slow in a few rows, but these do not form a mode.
 """
 
 from __future__ import annotations
@@ -28,26 +28,26 @@ from forcegp.logs.mapping import Mapping
 from forcegp.logs.table import Array, ImportReport, Signals
 
 STEPS, SOLVED = 50, 1e-9
-"""Most Gauss-Newton steps, and the constraint error that they leave, in m."""
+"""Maximum number of Gauss-Newton steps, and largest accepted constraint error [m]."""
 UNMOVED = 1e-6
-"""Smallest singular value of A_u over the largest of A at which a contact determines its joints."""
+"""Ratio of the smallest singular value of A_u to the largest of A above which contacts determine joints."""
 BINS, SMOOTH = 10, 1.5
-"""Bins in a decade of speeds, and the standard deviation that smooths them in bins."""
+"""Number of bins per decade of speed, and standard deviation of the smoothing kernel, in bins."""
 VALLEY, SHARE = 0.5, 0.1
-"""Height of a valley over that of the lower mode beside it, and least share of the rows on either side: a tip
-that only pauses where it turns round slides."""
+"""Maximum height of a valley relative to the lower of the two modes, and minimum fraction of rows on either
+side, since a tip that pauses only when it reverses does not stick."""
 SLOWEST = 1e-6
-"""Speeds below count as this [m/s]."""
+"""Lower bound to which speeds are clamped [m/s]."""
 
 
 def derive_joints(
     signals: Signals, system: ConstrainedSystem, mapping: Mapping, report: ImportReport
 ) -> None:
-    """Fill in position, and velocity and acceleration if logged, of the joints of `from_contact`; rows with
-    an open contact are dropped.
+    """Fill in positions, and velocities and accelerations if logged, of the joints listed in `from_contact`;
+    drop rows in which the contact is open.
 
     Raises:
-        MappingError: no such contact, or its state is not known without the position.
+        MappingError: the contact does not exist, or its state cannot be determined without the position.
         DataError: a contact does not determine its joints.
     """
     asked = mapping.sections.position.from_contact
@@ -82,7 +82,7 @@ def derive_joints(
 def _solve(
     system: ConstrainedSystem, vectors: dict[str, Tensor], u: list[int], joints: tuple[str, ...]
 ) -> dict[str, Tensor]:
-    """q, q̇ and q̈ `(n, nq)`, as far as logged, with the joints u that hold the contacts closed."""
+    """Return q, q̇ and q̈ `(n, nq)`, as far as logged, with the joints u that keep the contacts closed."""
     robot, q = system.robot, vectors["q"].clone()
     zero = torch.zeros_like(q)
     middle = 0.5 * (robot.lower + robot.upper)
@@ -120,7 +120,7 @@ def _solve(
 def stick_speeds(
     signals: Signals, system: ConstrainedSystem, mapping: Mapping, report: ImportReport
 ) -> dict[str, float]:
-    """Speed below which a contact with a surface sticks [m/s], by name, from the mapping or the log."""
+    """Return the speed below which each surface contact sticks [m/s], given by the mapping or the log."""
     speeds: dict[str, float] = {}
     for contact in system.contacts:
         section, closed = mapping.sections.contact.get(contact.name), signals.contact.get(contact.name)
@@ -147,10 +147,10 @@ def stick_speeds(
 
 
 def resting_speed(speed: Array) -> float | None:
-    """Speed that separates a tip's rows at rest from those in motion, `None` where it never rests.
+    """Return the speed that separates rows at rest from rows in motion, or `None` if the tip never rests.
 
     Args:
-        speed: of the touching point along the surface `(n,)` [m/s].
+        speed: speed of the contact point along the surface `(n,)` [m/s].
 
     >>> creeps, slides = np.geomspace(1e-4, 3e-3, 100), np.geomspace(0.05, 0.2, 300)
     >>> 3e-3 < resting_speed(np.concatenate([creeps, slides])) < 0.05
@@ -167,18 +167,18 @@ def resting_speed(speed: Array) -> float | None:
     below = (np.cumsum(rows) - 0.5 * rows) / len(x)
     depth[(below < SHARE) | (below > 1.0 - SHARE)] = 1.0
     if depth.min() <= VALLEY:
-        # The middle of the deepest bins: an empty valley has several.
+        # Take the middle of the deepest bins, since an empty valley has several.
         deepest = np.flatnonzero(depth <= depth.min() + 1e-12)
         return float(10.0 ** (0.5 * (edges[deepest[0]] + edges[deepest[-1] + 1])))
     return SLIDING if np.median(speed) < SLIDING else None
 
 
 def dividing_speed(speed: Array, sticks: NDArray[np.bool_]) -> float | None:
-    """The speed that separates rows marked as sticking from the others with the fewest errors."""
+    """Return the speed that separates rows marked as sticking from the other rows with the fewest errors."""
     if not sticks.any():
         return None
     order = np.argsort(speed)
-    # Errors of a threshold above the first k rows: sliding ones among them, sticking ones beyond.
+    # The errors for a threshold above the k slowest rows are sliding rows below and sticking rows above it.
     slide = np.concatenate([[0], np.cumsum(~sticks[order])])
     wrong = slide + sticks.sum() - (np.arange(len(slide)) - slide)
     k, ranked = int(np.argmin(wrong)), np.append(speed[order], 2.0 * speed.max())

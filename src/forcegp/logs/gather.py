@@ -1,9 +1,9 @@
-"""From a table and its mapping to quantities in SI units, in the robot's joint order.
+"""Conversion of a mapped table to quantities in SI units and in the robot's joint order.
 
-Motor side and joint side, currents and torques, signs and offsets are one factor per joint. A reading r is
-y = s k (r − o): o the reading at zero, in the unit of the column; s = ±1; and k the unit, times the
-torque constant K_t for a current. Through a gear of ratio N, a motor turns N times as fast as its joint, and
-the joint torque is N times the motor torque: q = q_m / N, τ = N τ_m.
+A reading r is converted to y = s k (r − o), with one set of numbers per joint: o is the reading at zero, in
+the unit of the column; s = ±1; and k is the unit, multiplied by the torque constant K_t for a current. With a
+gear of ratio N, a motor turns N times as fast as its joint, and the joint torque is N times the motor torque:
+q = q_m / N, τ = N τ_m.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from forcegp.logs.table import Array, ImportReport, LogTable, Progress, Signals,
 from forcegp.rows import describe, numbered
 
 CLOSED, STICKS = "contact ", "sticks "
-"""Before the name of a contact: vectors of `Signals` with the flag of its state."""
+"""Prefixes of the contact name for vectors in `Signals` that contain flags of the contact's state."""
 
 
 def gather(
@@ -33,7 +33,7 @@ def gather(
     progress: Progress | None = None,
     rows: int | None = None,
 ) -> Signals:
-    """Read the mapped columns of a log onto one clock, at most `rows` rows if the format allows it."""
+    """Read the mapped columns of a log onto a common clock, and at most `rows` rows if the format permits."""
     sections = mapping.sections
     needed = {sections.time.column, sections.time.segment or sections.time.column}
     for name in SYMBOLS:
@@ -50,7 +50,7 @@ def gather(
 
 
 class _Gathering:
-    """The columns of a table while they are taken out of it."""
+    """Extraction of the mapped columns from a table."""
 
     def __init__(
         self, table: LogTable, mapping: Mapping, joints: tuple[str, ...], report: ImportReport
@@ -60,7 +60,7 @@ class _Gathering:
         self.reference = table.stream_of(position[0], mapping.sections.position.stream)
 
     def run(self) -> Signals:
-        """Return the quantities, those of the reference stream first."""
+        """Return the quantities, with those of other streams interpolated onto the reference stream."""
         quantities = [name for name in SYMBOLS if self.mapping.quantity(name) is not None]
         vectors = {SYMBOLS[name]: self._vector(name) for name in quantities}
         if self.mapping.sections.wrench is not None:
@@ -80,7 +80,7 @@ class _Gathering:
         return self.table.stream_of(column, stream.name).columns[column]
 
     def _vector(self, name: str) -> tuple[Stream, Array]:
-        """Return a joint vector in SI units on the joint side, 0 for joints that the log does not have."""
+        """Return a joint vector in SI units on the joint side, with zeros for joints that are not logged."""
         joints = self.mapping.measured(name, self.joints)
 
         def numbers(key: str) -> Array:
@@ -92,7 +92,7 @@ class _Gathering:
         if not columns:
             raise self.mapping.error((name, "unmeasured"), "no joint is left", expected="some joints")
         stream = self.table.stream_of(columns[0], section.stream)
-        # s k, to SI on the joint side, and o in the unit of the column.
+        # The factor s k converts to SI units on the joint side; o is in the unit of the column.
         scale, offset = numbers("sign") * units.QUANTITY[name][section.unit], numbers("offset")
         if section.side == "motor":
             scale *= numbers("gear_ratio") ** (1.0 if name == "torque" else -1.0)
@@ -104,11 +104,11 @@ class _Gathering:
             np.subtract(self._take(stream, column), offset[i], out=own)
             own *= scale[i]
             if isinstance(stream.columns, dict) and len(stream.columns) > 1:
-                del stream.columns[column]  # memory holds it once
+                del stream.columns[column]  # hold only one copy in memory
         return stream, result
 
     def _wrench(self) -> tuple[Stream, Array]:
-        """Return force and moment `(n, 6)` in SI units without offsets; zero if not measured."""
+        """Return force and moment `(n, 6)` in SI units without offsets; components not measured are zero."""
         section = self.mapping.sections.wrench
         assert section is not None
         stream = self.table.stream_of(section.force[0], section.stream)
@@ -121,7 +121,7 @@ class _Gathering:
         return stream, result
 
     def _flags(self) -> dict[str, tuple[Stream, Array]]:
-        """Flags of contacts that are closed or stick, by `CLOSED` or `STICKS` and the name."""
+        """Return flags of closed and of sticking contacts, keyed by `CLOSED` or `STICKS` and the name."""
         flags = {}
         for name, section in self.mapping.sections.contact.items():
             closed = section.column if section.source == "column" else None
@@ -147,7 +147,7 @@ class _Gathering:
         return holder.columns[self.time.column] * units.TIME[self.time.unit]
 
     def _reference(self, vectors: dict[str, Array]) -> Signals:
-        """Return the stream of the positions: complete rows, cropped, cut into trajectories."""
+        """Return the complete, cropped rows of the stream that contains the positions, with trajectories."""
         t = self._stamps(self.reference)
         self.report.rows_read = len(t)
         segment = np.zeros(len(t), dtype=np.int64)

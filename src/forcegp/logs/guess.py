@@ -1,7 +1,7 @@
-"""`--guess`: a mapping proposed from headings, magnitudes and the robot's own dynamics.
+"""`--guess`: a mapping proposed on the basis of headings, magnitudes and the robot's dynamics.
 
 Units and signs are inferred by comparing the logged velocity with the derivative of the position, and the
-logged torque with the inverse dynamics of the scene's robot. Uncertain entries are marked CHECK.
+logged torque with the inverse dynamics of the robot in the scene. Uncertain entries are marked CHECK.
 """
 
 from __future__ import annotations
@@ -33,17 +33,17 @@ from forcegp.robust import level_and_spread
 from forcegp.rows import runs
 
 ROWS, TRIED_ROWS = 100_000, 3000
-"""Rows that are looked at; rows on which the inverse dynamics are evaluated."""
+"""Maximum number of rows read; maximum number of rows on which the inverse dynamics are evaluated."""
 LEAST_DEGREES = 3.2
-"""Largest position [°] below which an arm in degrees would hardly move."""
+"""If no position exceeds this value, the unit is not degrees, since the arm would hardly move [°]."""
 CLEARER, NEAR = 1.5, 1.3
-"""A unit is certain if the torque fits so much better in it; a ratio is that of a unit within this factor."""
+"""Factor by which torques must fit better for a unit to be certain; tolerance for the ratio of two units."""
 TRAJECTORY, LEAST_FORCE = 10, 1.0
-"""Windows have at most one in so many samples; a contact that is always closed presses with more [N]."""
+"""Minimum ratio of trajectory to filter window; minimum force of a contact that is always closed [N]."""
 
 
 def guess_mapping(path: str | Path, system: ConstrainedSystem, progress: Progress | None = None) -> Draft:
-    """Propose a mapping for a log, or raise `MappingError` without time, positions or torques."""
+    """Propose a mapping for a log; raise `MappingError` if time, positions or torques are not recognised."""
     table = read(path, rows=ROWS, progress=progress)
     draft = Draft(str(path))
     with foreign(str(path), "a log that can be imported"):
@@ -63,7 +63,7 @@ def guess_mapping(path: str | Path, system: ConstrainedSystem, progress: Progres
 
 
 def _try(path: str | Path, draft: Draft, system: ConstrainedSystem, possible: list[str]) -> None:
-    """Read the log with the draft, and find units and the sign of the torque from its values."""
+    """Read the log according to the draft, and infer units and the sign of the torque from its values."""
     for quantity, family in draft.families.items():
         family.unit = family.unit or units.SI[quantity]
     fits = {}
@@ -71,7 +71,7 @@ def _try(path: str | Path, draft: Draft, system: ConstrainedSystem, possible: li
         draft.families["position"].unit = unit
         _, correlation = torque_slopes(_signals(path, draft, system, without="velocity"), system)
         fits[unit] = float((correlation**2).mean())
-    # A later unit has to fit clearly better than the first.
+    # The second unit must fit clearly better than the first.
     best = max(fits, key=lambda unit: fits[unit] * (CLEARER if unit == possible[0] else 1.0))
     draft.families["position"].unit = best
     if len(fits) > 1:
@@ -86,7 +86,7 @@ def _try(path: str | Path, draft: Draft, system: ConstrainedSystem, possible: li
 
 
 def _window(draft: Draft, trial: Signals) -> None:
-    """Return a filter window that suits the noise of positions and velocities in the longest trajectory."""
+    """Choose a filter window that suits the noise in positions and velocities of the longest trajectory."""
     rows = max(runs(trial.segment), key=lambda rows: rows.stop - rows.start)
     names = ["q", *(["qd"] if "velocity" in draft.families else [])]
     samples, most = [trial.vectors[name][rows] for name in names], (rows.stop - rows.start) // TRAJECTORY
@@ -98,7 +98,7 @@ def _window(draft: Draft, trial: Signals) -> None:
 
 
 def _signals(path: str | Path, draft: Draft, system: ConstrainedSystem, without: str = "") -> Signals:
-    """Return the log by the draft, `without` one quantity, with accelerations; incomplete rows left out."""
+    """Return the complete rows of a log according to the draft `without` a quantity, with accelerations."""
     families = {name: family for name, family in draft.families.items() if name != without}
     further = {name: table for name, table in draft.further.items() if not name.startswith("contact")}
     toml = replace(draft, time=draft.time | {"missing": "drop"}, families=families, further=further).toml()
@@ -111,7 +111,7 @@ def _signals(path: str | Path, draft: Draft, system: ConstrainedSystem, without:
 
 
 def _velocity_unit(draft: Draft, trial: Signals) -> None:
-    """Find unit and sign of the velocity from its slope over the derivative of the position."""
+    """Infer the unit and sign of the velocity from its slope over the derivative of the position."""
     family = draft.families["velocity"]
     q, qd = trial.vectors["q"], trial.vectors["qd"]
     inner = np.flatnonzero(trial.segment[2:] == trial.segment[:-2]) + 1
@@ -138,7 +138,7 @@ def _velocity_unit(draft: Draft, trial: Signals) -> None:
 
 
 def _signs(slopes: Array, clear: np.ndarray, joints: tuple[str, ...]) -> float | dict[str, float]:
-    """Return one sign for all joints, or one for each where they differ."""
+    """Return one sign for all joints, or one per joint if they differ."""
     negative = slopes[clear] < 0.0
     if negative.all() and clear.any():
         return -1.0
@@ -148,7 +148,7 @@ def _signs(slopes: Array, clear: np.ndarray, joints: tuple[str, ...]) -> float |
 
 
 def _torque(draft: Draft, trial: Signals, system: ConstrainedSystem) -> None:
-    """Compare the logged torque with that of the rigid body, friction and a constant per joint."""
+    """Infer the sign and unit of the torque by comparing it with the inverse dynamics."""
     family = draft.families["torque"]
     slopes, correlation = torque_slopes(trial, system)
     clear = np.abs(correlation) > 0.5
@@ -178,8 +178,8 @@ def _torque(draft: Draft, trial: Signals, system: ConstrainedSystem) -> None:
 def torque_slopes(trial: Signals, system: ConstrainedSystem) -> tuple[Array, Array]:
     """Return the slope and partial correlation of the logged torque over the inverse dynamics, `(nq,)` each.
 
-    τ_log = k τ_rigid + v q̇ + f sign(q̇) + Aᵀλ + const by least squares, joint by joint, with a constant λ of
-    each contact; the correlation is that of the residuals of both sides after the other terms.
+    For each joint, τ_log = k τ_rigid + v q̇ + f sign(q̇) + Aᵀλ + const is fitted by least squares, with a
+    constant λ for each contact. The partial correlation is between τ_log and τ_rigid given the other terms.
     """
     nq = system.robot.nq
     rows = np.linspace(0, len(trial) - 1, min(TRIED_ROWS, len(trial))).astype(int)
@@ -202,7 +202,7 @@ def torque_slopes(trial: Signals, system: ConstrainedSystem) -> tuple[Array, Arr
 def propose_contacts(
     log: LogTable, draft: Draft, system: ConstrainedSystem, signals: Callable[[], Signals]
 ) -> None:
-    """Propose in a draft a source for the state of each contact of the scene, from `signals`."""
+    """Add to a draft a proposed source for the state of each contact in the scene, based on `signals`."""
     named = [(c, x) for s in log.streams for c, x in s.columns.items() if "contact" in c.lower()]
     flags = [name for name, x in named if np.isin(x, (0.0, 1.0)).all()]
     in_order = flags if len(system.contacts) in (1, len(flags)) else []
@@ -223,7 +223,7 @@ def propose_contacts(
 
 
 def _state(values: Array, name: str) -> tuple[str, str]:
-    """Return whether λ of the rigid body shows two states, or which one it shows."""
+    """Return the source of a contact's state according to λ of the rigid body, and the reason."""
     middle, spread = level_and_spread(values)
     try:
         high, low = force_levels(values, name, ContactStateSection(source="multiplier"))

@@ -1,4 +1,4 @@
-"""Interpretation of headings: the time column, families of columns with one member per joint, units, sensors.
+"""Interpretation of headings: time column, families with one column per joint, units, and sensors.
 
 Columns without headings are identified by their values.
 """
@@ -20,9 +20,9 @@ from forcegp.robot import RobotModel
 from forcegp.robust import robust_std
 
 WORDS: dict[str, list[str]] = units.VOCABULARY["words"]
-"""Words for each quantity, in search order."""
+"""Words for each quantity, in the order of search."""
 MEASURED, COMMANDED = (units.VOCABULARY["columns"][kind] for kind in ("measured", "commanded"))
-"""Words for measured columns, and for columns to ignore, such as commands."""
+"""Words for measured columns, and for columns to avoid, such as commands."""
 _TIME = re.compile(
     r"^(.*[ _./])?(t|mt|time|times|timestamp|stamp|clock|sec|secs|seconds|ms|millis|zeit)([ _./\[(].*)?$"
 )
@@ -32,7 +32,7 @@ _SEGMENTS = ("segment", "episode_index", "episode", "trial", "run")
 
 
 def tokens(name: str) -> list[str]:
-    """Return the words of a heading, in lower case; derivatives of q are one word.
+    """Return the words of a heading in lower case; a derivative of q is one word.
 
     >>> tokens("actualJointPos_3 [deg]")
     ['actual', 'joint', 'pos', '3', 'deg']
@@ -47,7 +47,7 @@ def tokens(name: str) -> list[str]:
 
 
 def declared_unit(name: str, stream: Stream) -> str | None:
-    """Return the unit declared by a heading or the line below it, or `None`."""
+    """Return the unit declared in a heading or in the line below it, or `None`."""
     if name in stream.units:
         return units.spelled(stream.units[name])
     found = (units.spelled(match[1] or match[2] or "") for match in _DECLARED.finditer(name))
@@ -55,7 +55,7 @@ def declared_unit(name: str, stream: Stream) -> str | None:
 
 
 def find_time(table: LogTable, draft: Draft) -> Stream:
-    """Return the stream with the joint columns, and add its time column to the draft."""
+    """Return the stream that contains the joint columns, and add its time column to the draft."""
     stream = max(table.streams, key=lambda s: (len(s.columns), len(s)))
     candidates = []
     for name, values in stream.columns.items():
@@ -78,7 +78,7 @@ def find_time(table: LogTable, draft: Draft) -> Stream:
     if unit in units.TIME:
         text = f"the unit {unit} is declared; steps are {step:.6g} {unit}"
     else:
-        # Robots are logged at 10 Hz to 10 kHz, so the step alone tells s, ms, µs and ns apart.
+        # Robots are logged at 10 Hz to 10 kHz, so the step alone distinguishes s, ms, µs and ns.
         unit = "s" if step <= 0.1 else "ms" if step <= 100.0 else "us" if step <= 1e5 else "ns"
         text, doubt = f"steps of {step:.6g} were interpreted as {unit}", unit != "s"
     draft.say("time", text, doubt)
@@ -93,7 +93,7 @@ def find_time(table: LogTable, draft: Draft) -> Stream:
 
 
 def find_families(stream: Stream, robot: RobotModel, draft: Draft) -> None:
-    """Find the columns of each quantity, and the names of the joints in the log."""
+    """Find the columns of each quantity, and the joint names used in the log."""
     families = _families(stream, robot)
     if not any(re.search("[A-Za-z]", name) for name in stream.columns):
         find_by_values(stream, robot.joint_names, draft)
@@ -124,7 +124,7 @@ def find_families(stream: Stream, robot: RobotModel, draft: Draft) -> None:
 
 
 def _families(stream: Stream, robot: RobotModel) -> list[Family]:
-    """Return the columns that differ in a joint name, a number, or the part after the first dot."""
+    """Return groups of columns that differ in a joint name, a number, or the part after the first dot."""
     groups: dict[str, dict[str, str]] = {}
     names = sorted(robot.joint_names, key=len, reverse=True)
     for column in stream.columns:
@@ -149,7 +149,7 @@ def _families(stream: Stream, robot: RobotModel) -> list[Family]:
 
 
 def _rate(family: Family, quantity: str) -> float:
-    """Return a score for the agreement of a family's name with a quantity, 0 for none."""
+    """Return a score for how well the name of a family matches a quantity, or 0 if it does not."""
     words = tokens(family.pattern.replace("{joint}", " "))
     meant = (other for other in WORDS if any(word in WORDS[other] for word in words))
     if next(meant, None) != quantity:
@@ -159,19 +159,19 @@ def _rate(family: Family, quantity: str) -> float:
 
 
 def _match_joints(robot: RobotModel, draft: Draft) -> None:
-    """Find the names of the joints in the log from the names of the positions."""
+    """Match the robot's joints to the names that the log uses for its positions."""
     names = list(draft.families["position"].columns)
     if all(name.isdigit() for name in names):
         draft.say("joints", "the log numbers its joints; they were numbered from base to tip", doubt=True)
         draft.joints = dict(zip(robot.joint_names, sorted(names, key=int), strict=True))
     elif set(names) != set(robot.joint_names):
         likeness = np.array([[_likeness(j, name) for name in names] for j in robot.joint_names])
-        # Among names that are equally alike, the order of the log decides; the user confirms it.
+        # Among equally similar names, the order in the log decides; the user is asked to check it.
         likeness += 0.3 * np.eye(len(names))
         rows, columns = linear_sum_assignment(-likeness)
         draft.joints = {robot.joint_names[i]: names[k] for i, k in zip(rows, columns, strict=True)}
         draft.say("joints", "the names were matched by similarity", doubt=True)
-    # Numbered families that call the joints otherwise than the positions do get a column per joint.
+    # Numbered families whose joint names differ from those of the positions get one column per joint.
     for quantity, family in list(draft.families.items()):
         if set(family.columns) == set(names):
             continue
@@ -193,7 +193,7 @@ def _likeness(joint: str, name: str) -> float:
 
 
 def find_wrench(table: LogTable, robot: RobotModel, draft: Draft) -> None:
-    """Find the columns of a force-torque sensor: `force.x`, `Fx`, `f_x`, …"""
+    """Find the columns of a force-torque sensor, such as `force.x`, `Fx` or `f_x`."""
     for stream in table.streams:
         columns: dict[tuple[int, str], str] = {}
         for column in stream.columns:
@@ -218,7 +218,7 @@ RELATED = 0.95
 
 
 def find_by_values(stream: Stream, joints: tuple[str, ...], draft: Draft) -> None:
-    """Propose families without headings: blocks with one column per joint, one the rate of another."""
+    """Propose families without headings: blocks of one column per joint, some of them rates of others."""
     nq = len(joints)
     names = [name for name in stream.columns if name != draft.time["column"]]
     blocks = [names[k : k + nq] for k in range(0, len(names) - nq + 1, nq)]
@@ -243,7 +243,7 @@ def find_by_values(stream: Stream, joints: tuple[str, ...], draft: Draft) -> Non
 
 
 def _is_rate(t: np.ndarray, x: np.ndarray, v: np.ndarray) -> bool:
-    """Return whether v is proportional to the rate of change of x in every column."""
+    """Return whether v is correlated with the rate of change of x in every column."""
     step = np.diff(t)[:, None]
     rate, mean = np.diff(x, axis=0), 0.5 * (v[1:] + v[:-1]) * step
     good = (step[:, 0] > 0.0) & np.isfinite(rate).all(axis=1) & np.isfinite(mean).all(axis=1)

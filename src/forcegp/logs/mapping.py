@@ -1,8 +1,8 @@
-"""Mapping files: the columns of a log for each quantity and joint, in TOML (docs/import.md).
+"""Mapping files in TOML, which assign the columns of a log to quantities and joints (see docs/import.md).
 
-`[joints]` contains the log's name of each joint, which is inserted into columns such as `"q_{joint}"`. A data
-set, and ROS joint states with the robot's names, need no file. A draft is a proposed mapping: its tables, and
-comments on uncertain entries.
+`[joints]` contains the name of each joint in the log, which is inserted into columns such as `"q_{joint}"`.
+Data sets, and ROS joint states with the robot's joint names, need no mapping file. A draft is a proposed
+mapping with comments on uncertain entries.
 """
 
 from __future__ import annotations
@@ -28,15 +28,15 @@ from forcegp.scene.document import Document, Key
 from forcegp.scene.sections import Section
 
 CHECK = "# CHECK: "
-"""Start of a comment on what the user must check."""
+"""Start of a comment on an entry that the user must check."""
 CURRENT = {"side": "motor", "gear_ratio": 1.0, "torque_constant": 1.0}
-"""What a current needs beside its unit."""
+"""Keys that a current requires in addition to its unit."""
 
 
 @dataclass
 class Family:
-    """Columns of one quantity by the text in place of `{joint}` in their common pattern, or `by_joint` of the
-    robot if that text differs from that of the positions; `declared` if the log states their unit.
+    """Columns of one quantity, keyed by the text that replaces `{joint}` in their common pattern. `by_joint`
+    is used if that text differs from that of the positions. `declared` is true if the log states the unit.
     """
 
     pattern: str
@@ -48,7 +48,7 @@ class Family:
     by_joint: dict[str, str] = field(default_factory=dict)
 
     def table(self) -> dict[str, Any]:
-        """Return the keys of the mapping."""
+        """Return the table of the mapping."""
         columns = {"columns": self.by_joint} if self.by_joint else {"column": self.pattern}
         sign = None if self.sign == 1.0 else self.sign
         current = CURRENT if self.unit in ("A", "mA") else {}
@@ -57,8 +57,8 @@ class Family:
 
 @dataclass
 class Draft:
-    """A proposed mapping: tables (keys with `None` are omitted), families of columns by quantity, comments
-    above each table, entries for the user to check, and the window of the derivatives.
+    """A proposed mapping: tables (keys with value `None` are omitted), families of columns by quantity,
+    comments placed above each table, entries for the user to check, and the filter window for derivatives.
     """
 
     source: str
@@ -71,13 +71,13 @@ class Draft:
     window: int = 11
 
     def say(self, table: str, sentence: str, doubt: bool = False) -> None:
-        """Comment on a table; list a doubt at the top as well."""
+        """Add a comment to a table; if `doubt` is set, mark it CHECK and add it to `doubts`."""
         self.comments.setdefault(table, []).append((CHECK[2:] if doubt else "") + sentence)
         if doubt:
             self.doubts.append(sentence)
 
     def toml(self) -> str:
-        """Return the mapping file."""
+        """Return the text of the mapping file."""
         lines = [f"# Mapping of {_plain(self.source)}, proposed from its headings and values."]
         lines += ["# Check it, above all the lines marked CHECK, and import with --mapping.", ""]
         quantities = {name: family.table() for name, family in self.families.items()}
@@ -95,12 +95,12 @@ class Draft:
 
 
 def _plain(text: str) -> str:
-    """Return one line without control characters, as TOML's comments demand."""
+    """Return text as one line without control characters, as required in TOML comments."""
     return "".join(c if c.isprintable() else " " for c in text)
 
 
 def quoted(name: str) -> str:
-    """Return a name as a key of TOML."""
+    """Return a name as a TOML key, in quotation marks if necessary."""
     return name if name.replace("_", "").replace("-", "").isalnum() and name.isascii() else json.dumps(name)
 
 
@@ -111,9 +111,9 @@ def _value(value: object) -> str:
 
 
 SYMBOLS = {"position": "q", "velocity": "qd", "acceleration": "qdd", "torque": "tau"}
-"""Quantity of a mapping → name in a data set."""
+"""Names of the mapped quantities in a data set."""
 PerJoint = float | dict[str, float]
-"""One number for all joints, or one for each by name."""
+"""One number for all joints, or one number for each joint name."""
 
 
 class TimeSection(Section):
@@ -132,7 +132,7 @@ class TimeSection(Section):
 
 
 class QuantitySection(Section):
-    """`[position]`, `[velocity]`, `[acceleration]`: the columns of a joint vector, with units and signs."""
+    """`[position]`, `[velocity]`, `[acceleration]`: the columns, units and signs of a joint vector."""
 
     column: str | None = None
     columns: dict[str, str] = Field(default_factory=dict)
@@ -145,8 +145,8 @@ class QuantitySection(Section):
 
 
 class TorqueSection(QuantitySection):
-    """`[torque]`: a torque, or a current with the torque constant of the motor [N m/A]; joints without either
-    are `unmeasured`. Rows with `clipped` torques get the noise that these have, or are dropped."""
+    """`[torque]`: a torque, or a current and the torque constant of the motor [N m/A]; joints without either
+    are listed as `unmeasured`. Rows with `clipped` torques are kept, given large noise, or dropped."""
 
     torque_constant: PerJoint | None = None
     unmeasured: tuple[str, ...] = ()
@@ -154,7 +154,7 @@ class TorqueSection(QuantitySection):
 
 
 class PositionSection(QuantitySection):
-    """`[position]`; `from_contact` names the closed contact that determines a joint without a column."""
+    """`[position]`: `from_contact` names the closed contact that determines a joint without a column."""
 
     from_contact: dict[str, str] = Field(default_factory=dict)
 
@@ -166,7 +166,7 @@ GROUND = "ground"
 class WrenchSection(Section):
     """`[wrench]`: a force-torque sensor, or a load cell with one column that measures along `axis`.
 
-    A sensor on the ground has `position` [m] and `rpy` [rad] in the world.
+    For a sensor on the ground, `position` [m] and `rpy` [rad] are given in the world.
     """
 
     force: tuple[str, ...] = Field(min_length=1, max_length=3)
@@ -186,7 +186,7 @@ class WrenchSection(Section):
 
 
 class ContactStateSection(Section):
-    """`[contact.<name>]`: source of the state of a contact of the scene."""
+    """`[contact.<name>]`: source of the state of a contact in the scene."""
 
     source: Literal["column", "wrench", "multiplier", "distance", "always", "never"]
     column: str | None = None
@@ -199,7 +199,7 @@ class ContactStateSection(Section):
 
 
 class DerivativesSection(Section):
-    """`[derivatives]`: computation of missing velocities and accelerations."""
+    """`[derivatives]`: settings for computing missing velocities and accelerations."""
 
     method: Literal["savitzky_golay", "smoother"] = "savitzky_golay"
     source: Literal["position", "velocity"] | None = None
@@ -224,12 +224,12 @@ class MappingSections(Section):
 
 
 BUNDLED = ("double_pendulum_csv", "iiwa14_txt", "ros_joint_states", "ur3_bag", "ur3_mat")
-"""Mappings that come with the library: those of published logs, and of ROS topics with the robot's names."""
+"""Mappings included in the library: for published logs, and for ROS topics with the robot's joint names."""
 
 
 @dataclass(frozen=True)
 class Mapping:
-    """A validated mapping file: its tables, the document for messages, and remaining CHECK marks."""
+    """A validated mapping file: its tables, the document for error messages, and remaining CHECK comments."""
 
     sections: MappingSections
     document: Document
@@ -240,15 +240,15 @@ class Mapping:
         return getattr(self.sections, name)
 
     def measured(self, name: str, joints: Sequence[str]) -> list[str]:
-        """Return the joints with a logged quantity: all except those with `unmeasured` torque or with motion
-        derived from a contact."""
+        """Return the joints for which a quantity is logged: all except those with an `unmeasured` torque, or
+        with motion derived from a contact."""
         name, key = ("torque", "unmeasured") if name == "torque" else ("position", "from_contact")
         lacking = getattr(self.quantity(name), key)
         self._check_joints((name, key), lacking, joints)
         return [joint for joint in joints if joint not in lacking]
 
     def columns_of(self, name: str, joints: Sequence[str]) -> list[str]:
-        """Return the log's column of a quantity for each joint of the robot that has it."""
+        """Return the column of a quantity in the log for each joint for which it is logged."""
         section = self.quantity(name)
         assert section is not None
         self._check_joints(("joints",), self.sections.joints, joints)
@@ -269,7 +269,7 @@ class Mapping:
         return columns
 
     def per_joint(self, name: str, key: str, joints: Sequence[str]) -> NDArray[np.float64]:
-        """Return the numbers `(nq,)` of a key with one value for all joints or one per joint."""
+        """Return the values `(nq,)` of a key that has one value for all joints or one per joint."""
         value: PerJoint = getattr(self.quantity(name), key)
         if not isinstance(value, dict):
             return np.full(len(joints), float(value))
@@ -282,7 +282,7 @@ class Mapping:
     def error(
         self, key: Key, message: str, expected: object = None, got: object = None, hint: str | None = None
     ) -> MappingError:
-        """Return an error at a key of the file."""
+        """Return an error that refers to a key in the file."""
         place = self.document.place(key)
         return MappingError(f"{place}: {message}", expected=expected, got=got, hint=hint)
 
@@ -294,10 +294,10 @@ class Mapping:
 
 
 def load_mapping(source: str | Path) -> Mapping:
-    """Read a mapping file by its path, or a bundled one by name.
+    """Read a mapping file by path, or a bundled mapping by name.
 
     Raises:
-        MappingError: the mapping does not exist or is invalid; the message gives file, line and key.
+        MappingError: the mapping does not exist or is invalid; the message names the file, line and key.
 
     >>> load_mapping("ros_joint_states").sections.torque.unit
     'Nm'
@@ -312,7 +312,7 @@ def load_mapping(source: str | Path) -> Mapping:
 
 
 def parse_mapping(content: bytes, source: str) -> Mapping:
-    """Return a mapping from the bytes of its file; a `MappingError` gives file, line and key."""
+    """Parse the bytes of a mapping file; a `MappingError` names the line and key of an invalid entry."""
     document = Document(content, source, MappingError)
     lines = content.decode().splitlines()
     doubts = tuple(line[len(CHECK) :] for line in lines if line.startswith(CHECK))
@@ -322,7 +322,7 @@ def parse_mapping(content: bytes, source: str) -> Mapping:
 
 
 def _check(mapping: Mapping) -> None:
-    """Check units, and keys that need each other."""
+    """Check units, and keys that depend on each other."""
     sections = mapping.sections
     for name in SYMBOLS:
         if (section := mapping.quantity(name)) is not None:
@@ -375,7 +375,7 @@ def _check_quantity(mapping: Mapping, name: str, section: QuantitySection) -> No
 
 
 def default_mapping(path: str | Path, system: ConstrainedSystem) -> Mapping:
-    """Return the mapping of a log with unambiguous names, or raise `MappingError` with a hint."""
+    """Return the mapping for a log whose column names are unambiguous; otherwise, raise `MappingError`."""
     table, robot = read(path, rows=1), system.robot
     names, joints = set(table.names), robot.joint_names
     logged = {n: s for n, s in SYMBOLS.items() if names >= {f"{s}.{joint}" for joint in joints}}

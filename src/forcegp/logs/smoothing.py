@@ -1,10 +1,10 @@
-"""Computation of missing velocities and accelerations by trajectory, never across a contact switch.
+"""Computation of missing velocities and accelerations within each trajectory, never across a contact switch.
 
-The Kalman smoother of a joint returns position, velocity and acceleration with error bars. Its model is
+For each joint, the Kalman smoother returns position, velocity and acceleration with error bars. Its model is
 constant jerk disturbed by white snap of intensity s, measured with white noise of deviation σ: x = (q, q̇,
-q̈, q⃛), dx = F x dt + e₄ √s dw, y = q + ε. In the scaled state z = (q, h q̇, h² q̈, h³ q⃛), h the time step,
-transition and noise are constant matrices: z⁺ = A z + w, A_ij = 1/(j−i)!, Cov(w)_ij = ρ σ² W_ij with ρ = s
-h⁷/σ² and W_ij = 1/((3−i)! (3−j)! (7−i−j)), i, j from 0. ρ is learned by evidence, σ in closed form (Rauch,
+q̈, q⃛), dx = F x dt + e₄ √s dw, y = q + ε. For the scaled state z = (q, h q̇, h² q̈, h³ q⃛) with time step h,
+transition and noise matrices are constant: z⁺ = A z + w, A_ij = 1/(j−i)!, Cov(w)_ij = ρ σ² W_ij with ρ = s
+h⁷/σ² and W_ij = 1/((3−i)! (3−j)! (7−i−j)), i, j from 0. ρ maximises the evidence; σ has a closed form (Rauch,
 Tung and Striebel 1965; Särkkä, Bayesian Filtering and Smoothing, 2013, ch. 8 and 12).
 """
 
@@ -28,10 +28,9 @@ from forcegp.rows import runs
 STATES, SHORTEST = 4, 8
 """Size of the state, from position to jerk, and minimum number of rows per piece."""
 LEARNED_ROWS, LOG_RHO = 2000, (-30.0, 8.0)
-"""Number of rows (of the longest pieces) for learning ρ, and range of log ρ, from parabola to no smoothing.
-"""
+"""Number of rows (of the longest pieces) used to learn ρ, and range of log ρ, from cubics to no smoothing."""
 DIFFUSE, SETTLED = 1e8, 1e-10
-"""Uninformative prior variance of the first scaled state [σ²]; change of a stationary covariance."""
+"""Uninformative prior variance of the first scaled state [σ²]; relative change of a stationary covariance."""
 
 A = np.array([[1.0 / factorial(j - i) if j >= i else 0.0 for j in range(STATES)] for i in range(STATES)])
 TAYLOR = np.array([1.0 / factorial(3 - i) for i in range(STATES)])
@@ -40,7 +39,7 @@ W = np.outer(TAYLOR, TAYLOR) / (7.0 - np.add.outer(np.arange(STATES), np.arange(
 
 @dataclass(frozen=True)
 class Smoothed:
-    """Estimates of a joint `(n,)`, another column after the same filter, and σ of the measured position."""
+    """Estimates for a joint `(n,)`, a second column after the same filter, and σ of measured positions."""
 
     position: Array
     velocity: Array
@@ -51,10 +50,10 @@ class Smoothed:
 
 
 def smooth(t: Array, q: Array, piece: NDArray[np.int64], also: Array | None = None) -> Smoothed:
-    """Smooth the positions q of a joint, piece by piece, with common ρ and σ.
+    """Smooth the positions q of a joint piece by piece, using the same ρ and σ for all pieces.
 
-    All arguments are `(n,)`: evenly spaced time within each piece [s], the piece number of each row (pieces
-    have at least `SHORTEST` rows), and `also`, another quantity to filter in the same way.
+    All arguments have shape `(n,)`: time, evenly spaced within each piece [s]; positions; the piece number of
+    each row (pieces have at least `SHORTEST` rows); and `also`, a second quantity to filter in the same way.
 
     >>> t = np.arange(400) * 0.01
     >>> noise = 1e-3 * np.random.default_rng(0).standard_normal(400)
@@ -80,7 +79,7 @@ def smooth(t: Array, q: Array, piece: NDArray[np.int64], also: Array | None = No
 
 
 def learn(q: Array, stretches: list[slice]) -> tuple[float, float]:
-    """Return ρ and σ (in the unit of q) with the largest evidence on the longest pieces of q `(n,)`."""
+    """Return ρ and σ (in the unit of q) that maximise the evidence on the longest pieces of q `(n,)`."""
     chosen, remaining = [], LEARNED_ROWS
     for rows in sorted(stretches, key=lambda s: s.start - s.stop):
         chosen.append(q[rows][:remaining])
@@ -101,7 +100,7 @@ def learn(q: Array, stretches: list[slice]) -> tuple[float, float]:
 
 
 def _forward(n: int, rho: float) -> tuple[Array, Array, Array, Array]:
-    """Return the gains, innovation variances, and predicted and filtered covariances of n rows."""
+    """Return the gains, innovation variances, and predicted and filtered covariances for n rows."""
     gain, innovation = np.empty((n, STATES)), np.empty(n)
     predicted, filtered = np.empty((n, STATES, STATES)), np.empty((n, STATES, STATES))
     P = DIFFUSE * np.eye(STATES)
@@ -138,7 +137,7 @@ def _gains(n: int, rho: float) -> tuple[Array, Array, Array]:
 
 
 def _ahead(y: Array, gain: Array) -> tuple[Array, Array]:
-    """Return the innovations `(n,)` of the rows and the predicted scaled states `(n, 4)`."""
+    """Return the innovations `(n,)` and the predicted scaled states `(n, 4)` of all rows."""
     e, ahead = np.empty(len(y)), np.empty((len(y), STATES))
     z = np.array([y[0], *[0.0] * (STATES - 1)])
     for k in range(len(y)):
@@ -157,7 +156,7 @@ def _run(y: Array, gain: Array, back: Array) -> Array:
 
 
 def add_derivatives(signals: Signals, settings: DerivativesSection, report: ImportReport) -> Array | None:
-    """Compute missing `qd` and `qdd` piece by piece between contact switches, and filter the torque alike.
+    """Compute missing `qd` and `qdd` piece by piece between contact switches, and filter the torque as well.
 
     Return σ of the computed q̈ `(n, nq)`, or `None` if q̈ is logged.
     """
@@ -177,7 +176,7 @@ def add_derivatives(signals: Signals, settings: DerivativesSection, report: Impo
 
 
 def _pieces(signals: Signals, least: int, report: ImportReport) -> NDArray[np.int64]:
-    """Return the piece number of each row; pieces too short for the filter are dropped."""
+    """Drop pieces that are too short for the filter, and return the piece number of each remaining row."""
     lengths = np.array([rows.stop - rows.start for rows in signals.runs(*signals.contact.values())], int)
     length = np.repeat(lengths, lengths)
     if not (keep := length >= least).any():
@@ -194,7 +193,7 @@ def _pieces(signals: Signals, least: int, report: ImportReport) -> NDArray[np.in
 
 
 def _filter(signals: Signals, piece: NDArray[np.int64], settings: DerivativesSection) -> Array | None:
-    """Return the derivatives of the polynomials fitted to a moving window (Savitzky and Golay)."""
+    """Compute derivatives of polynomials fitted to a moving window (Savitzky and Golay); return σ of q̈."""
     from scipy.signal import savgol_filter
 
     method, vectors = SavitzkyGolay(settings.window, settings.order), signals.vectors
@@ -212,7 +211,7 @@ def _filter(signals: Signals, piece: NDArray[np.int64], settings: DerivativesSec
 
 
 def _smooth(signals: Signals, piece: NDArray[np.int64], settings: DerivativesSection) -> Array | None:
-    """Apply the Kalman smoother joint by joint, also to the torque, and return means and error bars."""
+    """Apply the Kalman smoother to each joint, and to the torque if requested; return σ of q̈."""
     vectors, missing = signals.vectors, {"qd", "qdd"} - set(signals.vectors)
     filtered, std = "qdd" in missing and settings.filter_torque, np.empty_like(vectors["q"])
     for name in missing:

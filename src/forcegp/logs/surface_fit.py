@@ -1,5 +1,5 @@
-"""Fit of a plane or sphere to the path of the tip, with error bars that account for residuals correlated in
-time.
+"""Fit of a plane or a sphere to the path of the tip, with error bars that account for residuals that are
+correlated in time.
 
 The tip is a point, or a ball of known or unknown radius.
 """
@@ -25,12 +25,12 @@ from forcegp.robust import robust_std
 LEAST_POINTS, ROUNDING = 20, 1e-9
 """Minimum number of points for a fit, and minimum scale of their residuals."""
 OUTLIER_STD = 4.0
-"""Number of deviations beyond which residuals are outliers."""
+"""Number of standard deviations beyond which residuals are outliers."""
 
 
 @dataclass(frozen=True)
 class Solution:
-    """Parameters, covariance, residuals of the used rows, number of independent residuals, and outliers."""
+    """Parameters, covariance, residuals of the rows used, their effective number, and number of outliers."""
 
     x: Array
     covariance: Array
@@ -40,7 +40,7 @@ class Solution:
 
 
 def robust_least_squares(residual: Callable[[Array], Array], start: Array) -> Solution:
-    """Minimise squared residuals `(n,)` over parameters `(k,)`, leaving out the outliers of a robust fit."""
+    """Minimise squared residuals `(n,)` over parameters `(k,)`, excluding the outliers of a robust fit."""
     robust = start
     for _ in range(2):
         scale = max(float(robust_std(residual(robust))), ROUNDING)
@@ -59,26 +59,26 @@ def robust_least_squares(residual: Callable[[Array], Array], start: Array) -> So
 
 
 LEAST_RADIUS_STD = 4.0
-"""Number of standard deviations from which a fitted radius is significant."""
+"""Number of standard deviations above which a fitted radius is significant."""
 
 
 @dataclass(frozen=True)
 class Tip:
-    """A ball of radius r [m], fitted if `None`, with unit vectors `(n, 3)` to points of the path, or zero."""
+    """A ball of radius r [m] (`None`: to be fitted), and unit vectors `(n, 3)` along the tool, or zeros."""
 
     axes: Array
     radius: float | None
 
     def start(self, *x: float) -> Array:
-        """Return the initial parameters, with those of a surface first."""
+        """Return the initial parameters, beginning with those of the surface."""
         return np.array([*x, 0.0] if self.radius is None else x)
 
     def of(self, x: Array) -> float:
-        """Return the radius for parameters."""
+        """Return the radius given the parameters."""
         return float(x[-1]) if self.radius is None else self.radius
 
     def std(self, solution: Solution) -> dict[str, float]:
-        """Return the error bar of a fitted radius; `DataError` if tip orientations do not determine it."""
+        """Return the error bar of a fitted radius; raise `DataError` if the path does not determine it."""
         if self.radius is not None:
             return {}
         radius, std = self.of(solution.x), float(np.sqrt(solution.covariance[-1, -1]))
@@ -95,7 +95,7 @@ class Tip:
 def tip_of(
     system: ConstrainedSystem, contact: SurfaceContact, q: torch.Tensor, radius: float | Literal["fit"] | None
 ) -> Tip:
-    """Return the tip in contact at positions `(n, nq)`: that in the scene, or a ball ending at its point."""
+    """Return the tip at positions `(n, nq)`: that of the scene, or a ball that ends at the contact point."""
     if radius is None:
         return Tip(np.zeros((len(q), 3)), contact.radius)
     point = torch.tensor(tuple(contact.point), dtype=q.dtype)
@@ -111,17 +111,17 @@ def tip_of(
 
 
 MOST_POINTS = 20_000
-"""Maximum number of fitted points; for a longer path, every k-th point is used."""
+"""Maximum number of points in a fit; for a longer path, every k-th point is used."""
 LEAST_WIDTH, LARGEST_TILT = 10.0, 0.2
-"""For a plane: minimum width of a path in residual deviations, and largest tilt deviation [rad]."""
+"""For a plane: minimum width of the path relative to the residuals, and largest σ of the tilt [rad]."""
 
 
 @dataclass(frozen=True)
 class SurfaceFit:
-    """A fitted surface, with the radius of the tip [m] and standard deviations.
+    """A fitted surface, the radius of the tip [m], and standard deviations.
 
-    The standard deviations are `offset` [m] (at the middle of the path) and `tilt` [rad] of a plane, `center`
-    [m] (the largest of three) and `radius` [m] of a sphere, and `tip_radius` [m] if fitted.
+    The standard deviations are `offset` [m] (at the middle of the path) and `tilt` [rad] for a plane,
+    `center` [m] (the largest of three) and `radius` [m] for a sphere, and `tip_radius` [m] if fitted.
     """
 
     contact: str
@@ -131,7 +131,7 @@ class SurfaceFit:
     tip_radius: float = 0.0
 
     def toml(self) -> str:
-        """Return the surface as a line of a scene file, with its error bars in a comment."""
+        """Return the surface as a line for a scene file, with error bars in a comment."""
         bars = ", ".join(
             f"{name} ± {np.degrees(v):.2g}°" if name == "tilt" else f"{name} ± {1e3 * v:.2g} mm"
             for name, v in self.std.items()
@@ -155,13 +155,13 @@ def fit_surface(
 ) -> SurfaceFit:
     """Fit a surface to the path of the contact point while a contact is closed.
 
-    The squared signed distances are minimised without outliers of a robust fit. Error bars account for
-    residuals that are correlated in time. A ball of `tip_radius` [m] or `"fit"` ends at the point in the
-    scene; by default, the tip is that of the scene.
+    Squared signed distances are minimised, excluding outliers of a robust fit. Error bars account for
+    residuals that are correlated in time. If `tip_radius` is given ([m] or `"fit"`), the tip is a ball that
+    ends at the contact point of the scene; by default, the tip is that of the scene.
 
     Raises:
-        DataError: the scene has another tip, the contact is closed in too few rows, or the path is too
-            straight or too short.
+        DataError: the tip in the scene already has a radius or lacks an axis, the contact is closed in too
+            few rows, or the path is too straight or too short.
         UnknownNameError: the contact does not exist.
     """
     touching = system.contact(contact)
@@ -180,9 +180,9 @@ def fit_surface(
 
 
 def _plane(contact: str, points: Array, towards: Array, tip: Tip) -> SurfaceFit:
-    """Return n = n₀ + a u + b v, scaled to one, through the middle of the path moved by e along n.
+    """Fit a plane with unit normal n ∝ n₀ + a u + b v through the middle of the path, shifted by e along n.
 
-    The ball's centre p − r a is at n·(p − r a) − r = offset.
+    The centre p − r a of the ball satisfies n·(p − r a) − r = offset.
     """
     middle = points.mean(axis=0)
     centered = points - middle
@@ -214,7 +214,7 @@ def _plane(contact: str, points: Array, towards: Array, tip: Tip) -> SurfaceFit:
 
 
 def _sphere(contact: str, points: Array, towards: Array, tip: Tip) -> SurfaceFit:
-    """Return |p − r a − center| = radius + r; starts from the linear fit |p|² = 2 p·center + const."""
+    """Fit |p − r a − center| = radius + r, starting from the linear fit |p|² = 2 p·center + const."""
     middle = points.mean(axis=0)
     centered = points - middle
     design = np.column_stack([2.0 * centered, np.ones(len(points))])

@@ -1,4 +1,4 @@
-"""Units in logs, as factors to SI units and radians."""
+"""Units used in logs, as conversion factors to SI units and radians."""
 
 from __future__ import annotations
 
@@ -8,20 +8,20 @@ from importlib.resources import files
 from forcegp.scene.document import tomllib
 
 VOCABULARY = tomllib.loads((files("forcegp.logs") / "vocabulary.toml").read_text(encoding="utf-8"))
-"""Words in headings, and units with their spellings."""
+"""Words used in headings, and spellings of units."""
 _SPELLINGS = {text: unit for unit, texts in VOCABULARY["spellings"].items() for text in texts}
 _UNITS: dict[str, dict[str, float]] = VOCABULARY["units"]
 TIME, VELOCITY, TORQUE, CURRENT, FORCE = (
     _UNITS[name] for name in ("time", "velocity", "torque", "current", "force")
 )
 QUANTITY: Mapping[str, Mapping[str, float]] = {**_UNITS, "torque": {**TORQUE, **CURRENT}}
-"""Units of each quantity of a mapping → factor to SI; currents are in ampere."""
+"""Factors that convert the units of each mapped quantity to SI units; currents are converted to ampere."""
 SI = {name: next(iter(_UNITS[name])) for name in ("position", "velocity", "acceleration", "torque")}
-"""Default unit of each joint vector of a revolute joint."""
+"""Default unit of each joint vector for a revolute joint."""
 
 
 def spelled(text: str) -> str | None:
-    """Return the canonical name of a unit in common notation, or `None` if it is unknown.
+    """Return the canonical name of a unit given in common notation, or `None` if it is unknown.
 
     >>> spelled("[deg/sec]"), spelled("Seconds"), spelled("furlong")
     ('deg/s', 's', None)

@@ -1,4 +1,4 @@
-"""Models of forward dynamics: specification, fitting, prediction, and saved files."""
+"""Models of forward dynamics: specifications, fitting, predictions, and saved files."""
 
 from forcegp.models.load import register
 

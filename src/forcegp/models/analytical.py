@@ -1,6 +1,6 @@
-"""The analytical model: the equations of motion with learned robot parameters, and no contact friction.
+"""The analytical model: the equations of motion with learned robot parameters and without contact friction.
 
-q̈ = L b + H(Q_C + Q_G + Q_D + Q_u) (eqs. 2 and 4, with Q_z = 0), trained by mean squared error.
+q̈ = L b + H(Q_C + Q_G + Q_D + Q_u) (eqs. 2 and 4, with Q_z = 0), trained by minimising the mean squared error.
 """
 
 from __future__ import annotations
@@ -15,9 +15,9 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
-from forcegp.errors import ForceGPError, ModelError
+from forcegp.errors import ModelError
 from forcegp.files import Record
-from forcegp.forces.measurements import Measurement, Observation, measurement_of
+from forcegp.forces.measurements import Observation, measurement_of
 from forcegp.forces.priors.joint import AnalyticalMean
 from forcegp.forces.quantities import FlatStates, ForceField, affine_maps, hidden_forces
 from forcegp.gp.optimise import LearningOptions
@@ -28,7 +28,7 @@ from forcegp.models.prediction import Answer, Query
 from forcegp.robot.parameters import AnalyticalParameters
 from forcegp.storage.model_file import ModelHeader
 from forcegp.storage.options import Window
-from forcegp.storage.system import pack_system, robot_tensors, take, take_robot
+from forcegp.storage.system import pack_system, take, take_robot
 
 KIND = "analytical"
 LearnedParameters = Mapping[str, Sequence[str] | Literal["all"]]
@@ -38,7 +38,7 @@ ADAM = BatchOptions(epochs=30, batch=128, learning_rate=0.05, patience=10)
 
 
 class AnalyticalSettings(Window):
-    """Saved settings of an analytical model; the robot is the learned one."""
+    """Saved settings of an analytical model; the robot in the file has the learned parameters."""
 
     analytical_parameters: dict[str, tuple[str, ...]]
     seed: int
@@ -47,13 +47,13 @@ class AnalyticalSettings(Window):
 class AnalyticalModel(Model["AnalyticalFit"]):
     """The constrained equations of motion with robot parameters θ_A learned from accelerations.
 
-    `nominal()` predicts with the parameters from the robot file. Learned parameters stay physically
-    consistent, since θ_A are coordinates of physical bodies only.
+    `nominal()` predicts with the parameters from the robot file. Learned parameters are always physically
+    consistent, since θ_A can only describe physical bodies.
 
     Args:
         system: robot and contacts.
         analytical_parameters: parameters to learn, as joint names by quantity (see `AnalyticalParameters`).
-        window: window of initial values around the parameters in the file.
+        window: window, around the parameters in the file, for random initial values.
         seed: seed for the initial values.
 
     Raises:
@@ -87,13 +87,13 @@ class AnalyticalModel(Model["AnalyticalFit"]):
 
         Args:
             data: states and measured accelerations.
-            options: by default, ADAM on batches with early stopping; `LearningOptions` minimise over all
-                samples at once by L-BFGS or ADAM.
+            options: by default, ADAM on batches with early stopping is used; with `LearningOptions`, the loss
+                over all samples is minimised by L-BFGS or ADAM.
             progress: called after each epoch or evaluation.
             checkpoint: see `Model.fit`.
 
         Raises:
-            ModelError, DataError: the data do not match the model.
+            ModelError, DataError: the data are incompatible with the model.
         """
         measured, _ = measurement_of(Observation(data, noise_std=1.0), self.system)
         generator = torch.Generator().manual_seed(self.seed)
@@ -102,8 +102,12 @@ class AnalyticalModel(Model["AnalyticalFit"]):
         start = {name: value.detach().clone() for name, value in theta.named_parameters()}
 
         def loss(tensors: Mapping[str, Tensor], rows: Tensor) -> Tensor:
-            robot = torch.func.functional_call(theta, dict(tensors), ())
-            return _mean_squared_error(self.system.with_robot(robot), measured, rows)
+            system, part = (
+                self.system.with_robot(torch.func.functional_call(theta, dict(tensors), ())),
+                measured[rows],
+            )
+            eom = system.equations(part.q, part.qd, part.active)
+            return ((eom.acceleration(eom.Q_K + part.tau) - part.values) ** 2).mean()
 
         record, robot = pack_system(self.system)
         key = (self.seed, record, *robot.values(), *measured.tensors)
@@ -114,7 +118,7 @@ class AnalyticalModel(Model["AnalyticalFit"]):
         return AnalyticalFit(system, theta, self.window, self.seed, FitResult(**learned.outcome))
 
     def nominal(self) -> AnalyticalFit:
-        """Return the equations of motion with the parameters from the robot file, without learning."""
+        """Return the equations of motion with the parameters from the robot file; nothing is learned."""
         result = FitResult(True, 0, 0.0, 0.0, message="parameters of the robot file, nothing learned")
         return AnalyticalFit(self.system, self.parameters, self.window, self.seed, result)
 
@@ -126,7 +130,7 @@ class AnalyticalFit(FittedModel):
     Attributes:
         system: robot and contacts.
         parameters: learned coordinates.
-        window, seed: window and seed of the initial values.
+        window, seed: window and seed for the initial values.
         result: result of the fit.
     """
 
@@ -140,7 +144,7 @@ class AnalyticalFit(FittedModel):
 
     @property
     def specified(self) -> ConstrainedSystem:
-        """System with the initial robot."""
+        """System before the fit, with the initial robot."""
         return self.system.with_robot(self.parameters.start)
 
     def described(self) -> list[tuple[str, object]]:
@@ -157,7 +161,7 @@ class AnalyticalFit(FittedModel):
         return (hidden.applied(mean, None)[0], None, None, ~hidden.whole), parts, hidden.doubts
 
     def force_field(self) -> ForceField:
-        """Return Q_C + Q_G + Q_D + Q_u at states."""
+        """Return the force field Q_C + Q_G + Q_D + Q_u."""
         return AnalyticalMean()
 
     @classmethod
@@ -167,10 +171,8 @@ class AnalyticalFit(FittedModel):
         settings = header.settings_as(AnalyticalSettings, source)
         original = system.with_robot(take_robot(tensors, "start.", system.robot, source))
         window = Window(relative=settings.relative, length=settings.length, angle=settings.angle)
-        try:
+        with ModelError.within(f"{source}: field 'settings.analytical_parameters'"):
             model = AnalyticalModel(original, settings.analytical_parameters, window, settings.seed)
-        except ForceGPError as cause:
-            raise ModelError.at(f"{source}: field 'settings.analytical_parameters'", cause) from cause
         theta = model.parameters
         state = {
             name: take(tensors, name, tuple(old.shape), old.dtype, source)
@@ -183,10 +185,5 @@ class AnalyticalFit(FittedModel):
     def record(self) -> tuple[Record, dict[str, Tensor]]:
         theta = self.parameters
         settings = AnalyticalSettings(**dict(self.window), analytical_parameters=theta.joints, seed=self.seed)
-        start = {f"start.{name}": getattr(theta.start, name) for name in robot_tensors(theta.start)}
+        start = {f"start.{name}": value for name, value in theta.start.tensors.items()}
         return settings, dict(theta.state_dict()) | start
-
-
-def _mean_squared_error(system: ConstrainedSystem, measured: Measurement, rows: Tensor) -> Tensor:
-    eom = system.equations(measured.q[rows], measured.qd[rows], measured.active[rows])
-    return ((eom.acceleration(eom.Q_K + measured.tau[rows]) - measured.values[rows]) ** 2).mean()

@@ -1,6 +1,6 @@
 """Models of forward dynamics: specifications, and fitted models for prediction.
 
-`AccelerationFit` is the base of models of accelerations only, which have no contacts or forces.
+`AccelerationFit` is the base class of models that predict only accelerations, without contacts or forces.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from forcegp.storage.model_file import ModelHeader, write_model
 
 
 class FittedModel(Predictor):
-    """Immutable model with learned parameters."""
+    """An immutable model with learned parameters."""
 
     result: FitResult
     """Result of the fit."""
 
     def __repr__(self) -> str:
-        """Return a one-line summary of robot, contacts and fit."""
+        """Return a one-line summary of the robot, the contacts and the fit."""
         return model_line(type(self).__name__, self.system, self.result)
 
     def _repr_html_(self) -> str:
@@ -39,7 +39,7 @@ class FittedModel(Predictor):
         return fit_table(repr(self), self.result, self.described())
 
     def described(self) -> list[tuple[str, object]]:
-        """Return the learned values, by name, for tables."""
+        """Return the names and values of learned parameters, for tables."""
         return []
 
     @classmethod
@@ -50,13 +50,13 @@ class FittedModel(Predictor):
         """Restore a saved model.
 
         Args:
-            header: header of the file, with settings from `record`.
+            header: header of the file, with the settings from `record`.
             tensors: tensors from `record`.
             system: robot and contacts.
             source: name of the file, for messages.
 
         Raises:
-            ModelError: a tensor or setting is missing or invalid; the message names file and field.
+            ModelError: a tensor or setting is missing or invalid; the message names the file and the field.
         """
 
     @abstractmethod
@@ -71,7 +71,7 @@ F = TypeVar("F", bound=FittedModel)
 
 
 class Model(ABC, Generic[F]):
-    """Immutable specification of a model; `fit` learns from data and returns a fitted model."""
+    """An immutable specification of a model; `fit` learns from data and returns a fitted model."""
 
     kind: str
     """Name of the model class in saved files."""
@@ -87,12 +87,12 @@ class Model(ABC, Generic[F]):
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> None:
-            """Raise `AttributeError`, which says how to get the fit that has the attribute."""
+            """Raise `AttributeError` with a hint if the fitted model has the attribute."""
             hint = "; call fit = model.fit(data), which has it" if hasattr(FittedModel, name) else ""
             raise AttributeError(f"a {type(self).__name__} has no attribute {name!r}{hint}")
 
     def __repr__(self) -> str:
-        """Return a one-line summary of robot and contacts."""
+        """Return a one-line summary of the robot and the contacts."""
         return model_line(type(self).__name__, self.system, None)
 
     def _repr_html_(self) -> str:
@@ -116,7 +116,7 @@ class Model(ABC, Generic[F]):
         Args:
             data: states and measurements.
             progress: called during the fit.
-            checkpoint: file that records a long fit. With an existing file, the fit resumes and produces a
+            checkpoint: file that records a long fit. If it exists, the fit resumes from it and produces a
                 bit-identical result. Remove the file once the fitted model is saved.
 
         Returns:
@@ -125,7 +125,7 @@ class Model(ABC, Generic[F]):
 
 
 class AccelerationFit(FittedModel):
-    """Predictor of the accelerations of one system, without forces or contacts."""
+    """A model that predicts only the accelerations of one system, without forces or contacts."""
 
     def at(self, flat: FlatStates, query: Query) -> Answer:
         if query.quantity != "qdd":
@@ -146,4 +146,4 @@ class AccelerationFit(FittedModel):
 
     @abstractmethod
     def accelerations(self, at: FlatStates, variance: bool) -> tuple[Tensor, Tensor | None]:
-        """Return mean `(n, nq)` at states and, if requested and available, variance `(n, nq)`."""
+        """Return the mean `(n, nq)` at n states and, if requested and available, the variance `(n, nq)`."""

@@ -1,15 +1,15 @@
-"""The robot identified by a fit, expressed in parameters of robot files, with samples.
+"""The robot identified by a fit, expressed in the parameters of robot files, and posterior samples of it.
 
-Links have the identified inertia. Robot files only support joint friction d q̇ + f sign q̇; d and f are
-fitted to the learned friction Q_D(q̇) over the trained speeds by least squares with an offset,
+Links have the identified inertia. Robot files only support joint friction of the form d q̇ + f sign q̇, so d
+and f are fitted to the learned friction Q_D(q̇) over the trained speeds by least squares with an offset,
 
-    min Σ_v (Q_D(v) + d v + f sign v − c)²,   d, f ≥ 0,
+    min Σ_v (Q_D(v) + d v + f sign v − c)²,   d, f ≥ 0.
 
-averaged over poses if friction depends on the load. The residual and the offset c are losses. Logs seldom
-separate an offset from the weight of links, so if zero is within 2σ of an offset, all other parameters are
-conditioned on c = 0. URDF does not support armature a, so drive inertia is added to the links as far as
-physically possible. Samples are computed in the same way from functions drawn from the posterior, with
-inertial parameters π + S δ (`forces/priors/inertial.py`).
+If friction depends on the load, Q_D is averaged over poses. The residual and the offset c are lost. Logs
+rarely separate an offset from the gravity force of the links, so if an offset is within 2σ of zero, all other
+parameters are conditioned on c = 0. URDF does not support armature a, so drive inertia is added to the links
+as far as physically possible. Samples are computed in the same way from functions drawn from the posterior,
+with inertial parameters π + S δ (`forces/priors/inertial.py`).
 """
 
 from __future__ import annotations
@@ -40,27 +40,27 @@ from forcegp.robot.model import RobotModel
 from forcegp.robot.write_back import is_mjcf, write_robot
 
 SPEEDS, POSES = 20, 20
-"""Number of speeds in each direction, and of poses, at which friction is evaluated."""
+"""Number of speeds in each direction, and number of poses, at which friction is evaluated."""
 SLOWEST = 0.05
-"""Smallest of these speeds relative to the largest trained one; dry friction is smooth below it."""
+"""Smallest of these speeds relative to the largest trained speed; below it, dry friction is smooth."""
 UNTRAINED = 1.0
-"""Largest speed if the trained speeds are unknown [rad/s, m/s]."""
+"""Largest speed that is assumed if the trained speeds are unknown [rad/s, m/s]."""
 DRAWS = 400
-"""Number of function samples for computing standard deviations."""
+"""Number of function samples from which standard deviations are computed."""
 OPEN = 2.0
-"""Number of standard deviations from zero up to which an offset is undetermined."""
+"""Number of standard deviations from zero within which an offset counts as undetermined."""
 DETERMINED = 0.5
-"""Fraction of the prior standard deviation, or of its magnitude, below which a parameter is determined."""
+"""Standard deviation below which a parameter is determined, relative to the prior's or to the magnitude."""
 SMALLEST = 1e-2
-"""ε, the smallest eigenvalue of a link's pseudo-inertia in units of the identified one."""
+"""Smallest eigenvalue ε of a link's pseudo-inertia relative to the identified pseudo-inertia."""
 ROUNDS, RELAXATION = 300, 1.6
-"""Parameters of the search for the nearest physical bodies."""
+"""Number of iterations and over-relaxation of the search for the closest physical bodies."""
 STATES, RATE = 400, 4.0
-"""Number of random states for adding drive inertia to links, and ratio of acceleration to speed [1/s]."""
+"""Number of random states used to add drive inertia to links, and ratio of acceleration to speed [1/s]."""
 WANTED = 0.01
 """Target relative torque error ε."""
 MOMENTS = ("mass", "mass·x", "mass·y", "mass·z", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
-"""The inertial parameters of a link, about its origin [kg, kg m, kg m²]."""
+"""Inertial parameters of a link about its origin [kg, kg m, kg m²]."""
 FIGURES = ("damping", "friction", *MOMENTS, "armature")
 """Names of the parameters of a joint."""
 
@@ -70,10 +70,10 @@ class Parameter:
     """A parameter of the robot.
 
     Attributes:
-        element: joint of the parameter; inertia refers to the link that it moves.
+        element: joint to which the parameter belongs; inertia is that of the link moved by the joint.
         name: name of the parameter.
         file, estimate, std: value in the file, estimate and standard deviation, in SI units.
-        determined: whether the data determine the parameter beyond the prior.
+        determined: whether the data determine the parameter more precisely than the prior.
     """
 
     element: str
@@ -89,11 +89,11 @@ class Calibration:
     """The robot identified by a fit.
 
     Attributes:
-        robot: robot with identified inertia, and friction in the form of robot files.
+        robot: robot with identified inertia, and friction in the form that robot files support.
         parameters: changed parameters and their values in the file, with standard deviations.
         speeds, friction, friction_std: `(k, nq)` the learned friction of each joint over its trained speeds
             [rad/s, m/s], [N m, N].
-        left: `(nq,)` root mean square of the friction not explained by d q̇ + f sign q̇ [N m, N].
+        left: `(nq,)` root mean square of the friction that d q̇ + f sign q̇ does not explain [N m, N].
         offset: `(nq,)` additional constant force [N m, N].
     """
 
@@ -119,15 +119,15 @@ class Calibration:
 
 @torch.no_grad()
 def calibrated(fit: StructuredFit, *, draws: int = DRAWS, seed: int = 0) -> Calibration:
-    """Return the robot with identified inertia, payload, and friction in the form of robot files.
+    """Return the robot with the identified inertia and payload, and with friction as robot files support it.
 
     Args:
         fit: fit with an analytical mean.
-        draws: number of function samples for standard deviations.
+        draws: number of function samples from which standard deviations are computed.
         seed: seed for these samples and for the poses over which friction is averaged.
 
     Returns:
-        Robot, parameters with standard deviations, and losses.
+        The robot, its parameters with standard deviations, and the losses.
 
     Raises:
         ModelError: the fit has no analytical mean.
@@ -148,8 +148,8 @@ def calibrated(fit: StructuredFit, *, draws: int = DRAWS, seed: int = 0) -> Cali
 def sampled_robots(fit: StructuredFit, samples: int, *, seed: int = 0) -> list[RobotModel]:
     """Draw physically consistent robots from the joint posterior of inertia, drives, payload and friction.
 
-    Samples with unphysical links are replaced by the nearest robot in the metric of the posterior
-    (eigenvalues of pseudo-inertias relative to the identified ones are at least ε = 0.01).
+    A sample with unphysical links is replaced by the closest physical robot in the metric of the posterior
+    (with eigenvalues of pseudo-inertias, relative to the identified ones, of at least ε = 0.01).
 
     Args:
         fit: fit with an analytical mean.
@@ -174,18 +174,18 @@ def write_calibrated(
     seed: int = 0,
     locked_joints: Mapping[str, float] | None = None,
 ) -> Calibration:
-    """Write a copy of the robot file with identified parameters, a report, and sampled robots.
+    """Write a copy of the robot file with the identified parameters, a report, and sampled robots.
 
-    In addition to `calibrated.urdf`, it writes `calibrated.report.json`, with parameters, losses and full
-    friction curves, and `calibrated.sample_000.urdf` and so on.
+    Next to `calibrated.urdf`, for example, it writes `calibrated.report.json`, with parameters, losses and
+    complete friction curves, and the samples `calibrated.sample_000.urdf` and so on.
 
     Args:
         fit: fit with an analytical mean.
         source: robot file, or name of a bundled robot.
         out: path of the edited copy.
-        samples: number of robots drawn from the posterior.
+        samples: number of robots to draw from the posterior.
         seed: random seed.
-        locked_joints: as for `load_robot`.
+        locked_joints: see `load_robot`.
 
     Raises:
         RobotFileError: the file does not match the robot, or cannot represent a change.
@@ -223,14 +223,14 @@ def write_calibrated(
 
 @torch.no_grad()
 def unknowns_after(fit: StructuredFit, unknowns: Unknowns, *, draws: int = DRAWS, seed: int = 0) -> Unknowns:
-    """Return the unknowns for planning another motion, from the covariance of functions drawn from a fit.
+    """Return the unknowns for planning the next motion, from the covariance of functions drawn from a fit.
 
-    Base parameters, payload and friction over speed have the posterior covariance; parameters without a prior
-    in the fit keep that of `unknowns`. The noise is at least the torque noise of the fit.
+    Base parameters, payload and friction over speed have the posterior covariance. Parameters that have no
+    prior in the fit keep their covariance from `unknowns`. The noise is at least the torque noise of the fit.
 
     Args:
         fit: fit with an analytical mean.
-        unknowns: unknowns of the robot without data.
+        unknowns: unknowns of the robot before any data were recorded.
         draws: number of function samples.
         seed: seed for these samples.
 
@@ -273,19 +273,19 @@ def unknowns_after(fit: StructuredFit, unknowns: Unknowns, *, draws: int = DRAWS
 
 
 JITTER = 1e-6
-"""Jitter of the covariance relative to the prior variances."""
+"""Jitter added to the covariance, relative to the prior variances."""
 Curve = tuple[Tensor, Tensor, Tensor]
-"""Friction over speeds `(k, nq)`, its residual after fitting d q̇ + f sign q̇, and the offset `(nq,)`."""
+"""Friction at given speeds `(k, nq)`, its residual after fitting d q̇ + f sign q̇, and the offset `(nq,)`."""
 
 
 @dataclass(frozen=True, eq=False)
 class _Reader:
-    """Computes robots from the posterior of a fit.
+    """Computation of robots from the posterior of a fit.
 
     Attributes:
         fit: the fit.
         speeds: `(k, nq)` speeds at which friction is evaluated.
-        at: states of all poses at these speeds.
+        at: states with all poses and these speeds.
         seed: random seed.
     """
 
@@ -332,7 +332,7 @@ class _Reader:
         return None
 
     def robots(self, draws: int) -> list[tuple[RobotModel, Curve]]:
-        """Return the robots of the posterior mean and of function samples, each with its friction."""
+        """Return the robots for the posterior mean and for function samples, each with its friction curve."""
         drawn = self.fit.force_samples(draws, torch.Generator().manual_seed(self.seed))
         assert isinstance(drawn, ForceSamples)
         curves = torch.stack(list(self._curves(drawn)))
@@ -348,11 +348,11 @@ class _Reader:
         return [self._robot(curve.view_as(self.speeds), delta, load) for curve, delta, load in rows]
 
     def _consistent(self, values: Tensor, first: int) -> Tensor:
-        """Return mean and samples `(1 + samples, d)` with the most probable physically consistent links.
+        """Return the mean and samples `(1 + samples, d)` with the most probable physically consistent links.
 
-        Solves min_x ½ (x − x₀)ᵀ Σ⁻¹ (x − x₀) with the sample covariance Σ over the entries x ≥ −1 + ε of
-        J₀^-½ ΔJ J₀^-½ of each link by ADMM; links are in the columns from `first` on. Other columns follow
-        from their covariance with the links. A link that is unphysical in the file does not change.
+        Minimises ½ (x − x₀)ᵀ Σ⁻¹ (x − x₀), with the sample covariance Σ, over the entries x of J₀^-½ ΔJ J₀^-½
+        ≥ −1 + ε of each link by ADMM. The links start at column `first`; other columns are adjusted according
+        to their covariance with the links. A link that is unphysical in the file does not change.
         Source: Boyd et al., *Distributed optimization and statistical learning via ADMM* (2011), section 5.
         """
         if self.scale is None:
@@ -390,12 +390,12 @@ class _Reader:
         return moved
 
     def _offsets(self, curves: Tensor) -> Tensor:
-        """Return the offset of each curve by least squares `(1 + samples, nq)`."""
+        """Return the offset of each curve `(1 + samples, nq)`, computed by least squares."""
         columns = torch.stack([self.speeds, self.speeds.sign(), torch.ones_like(self.speeds)], dim=-1)
         return (torch.linalg.pinv(columns.movedim(1, 0)) @ curves.movedim(-1, 1)[..., None])[..., 2, 0]
 
     def _kept(self) -> Tensor:
-        """Return the friction at the identified inertia, relative to that of the posterior mean of both."""
+        """Return the friction at the identified inertia minus the friction at the joint posterior mean."""
         fit, at, force = self.fit, self.at, torch.zeros_like(self.at.q)
         for p, prior in enumerate(fit.force_priors):
             if isinstance(prior, JointFrictionPrior) and fit.posterior.process.pinned:
@@ -404,7 +404,7 @@ class _Reader:
         return self._over_poses(force)
 
     def _curves(self, drawn: ForceSamples) -> Iterator[Tensor]:
-        """Yield the friction Q_D over speeds `(k, nq)` of posterior mean and samples, averaged over poses."""
+        """Yield the friction Q_D `(k, nq)` of the posterior mean and of each sample, averaged over poses."""
         fit, at = self.fit, self.at
         priors = [p for p, prior in enumerate(fit.force_priors) if isinstance(prior, JointFrictionPrior)]
         known = dynamics.damping_force(fit.system.robot, at.qd)
@@ -422,7 +422,7 @@ class _Reader:
         return force.unflatten(0, (POSES, len(self.speeds))).mean(0)
 
     def _constants(self, drawn: ForceSamples, kind: type) -> Tensor:
-        """Return mean and samples of the constants `(1 + samples, components)` of the first such prior."""
+        """Return mean and samples of the constants of the first matching prior, `(1 + samples, d)`."""
         for p, prior in enumerate(self.fit.force_priors):
             if isinstance(prior, kind):
                 one = {name: x[:1] for name, x in self._features(p).items()}
@@ -436,7 +436,7 @@ class _Reader:
         return self.fit.posterior.process.features(p, self.fit.system, self.at)
 
     def _robot(self, curve: Tensor, delta: Tensor, load: Tensor) -> tuple[RobotModel, Curve]:
-        """Return the robot with a friction curve, deviations δ of inertial parameters, and a payload."""
+        """Return the robot for a friction curve, deviations δ of inertial parameters, and a payload."""
         robot = self.fit.system.robot
         damping, friction, left, offset = _projected(self.speeds, curve)
         robot = robot.replace(damping=damping, friction=friction, stribeck=0.0 * friction)
@@ -453,14 +453,14 @@ class _Reader:
 
 
 def _without_offsets(offset: Tensor, mean: Tensor, values: Tensor) -> Tensor:
-    """Return mean and samples of values `(1 + samples, d)`, conditioned on zero for undetermined offsets.
+    """Return the mean and samples of values `(1 + samples, d)`, given that undetermined offsets are zero.
 
     With sample covariances, E[z | c = 0] = z − Cov(z, c) Cov(c)⁻¹ c.
 
     Args:
-        offset: offsets at the identified inertia and of samples around it, `(1 + samples, nq)`.
+        offset: offsets at the identified inertia, and of samples around it, `(1 + samples, nq)`.
         mean: `(nq,)` posterior mean of the offsets, which is compared with zero.
-        values: values to condition.
+        values: values to condition on c = 0.
     """
     c = offset[:, mean.abs() <= OPEN * offset[1:].std(0)]
     around = c[1:] - c[1:].mean(0)
@@ -483,14 +483,14 @@ def _projected(speeds: Tensor, curve: Tensor) -> tuple[Tensor, Tensor, Tensor, T
 
 
 def _moved(robot: RobotModel, change: Tensor) -> RobotModel:
-    """Return the robot with inertial parameters π + change `(nq, 10)`."""
+    """Return the robot with the inertial parameters π + change `(nq, 10)`."""
     J = pseudo_inertia(robot.mass, robot.com, robot.inertia)
     mass, com, inertia = from_pseudo_inertia(J + _pseudo(change))
     return robot.replace(mass=mass, com=com, inertia=inertia)
 
 
 def _pseudo(pi: Tensor) -> Tensor:
-    """Return J of inertial parameters `(nq, 10)`, linear in them: Σ = ½ tr(I_o) 1 − I_o."""
+    """Return J for inertial parameters `(nq, 10)`, in which it is linear, with Σ = ½ tr(I_o) 1 − I_o."""
     I = pi[:, [4, 5, 6, 5, 7, 8, 6, 8, 9]].unflatten(-1, (3, 3))
     Sigma = 0.5 * I.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None] * torch.eye(3).to(I) - I
     top = torch.cat([Sigma, pi[:, 1:4, None]], dim=-1)
@@ -498,15 +498,15 @@ def _pseudo(pi: Tensor) -> Tensor:
 
 
 def without_armature(robot: RobotModel, fastest: Tensor) -> RobotModel:
-    """Return the robot with the inertia of its drives added to the links as far as physically possible.
+    """Return the robot with its drive inertia added to the links as far as physically possible.
 
-    Over n random states, it minimises the square of each joint's error of τ over the torque itself:
+    Over n random states, the squared relative torque error of each joint is minimised:
 
         min_δ ½ n Σ_j E(Y_j S δ − a_j q̈_j)² / (ε² E τ_j²), with the divergence of `InertialPrior.updated`.
 
     Args:
-        robot: with armature a.
-        fastest: speeds of these states `(nq,)`, reached in a quarter of a second [rad/s, m/s].
+        robot: robot with armature a.
+        fastest: `(nq,)` largest speeds of these states, reached in a quarter of a second [rad/s, m/s].
     """
     held, errors = robot.replace(armature=torch.zeros_like(robot.armature)), InertialPrior()
     generator = torch.Generator().manual_seed(0)
@@ -523,7 +523,7 @@ def without_armature(robot: RobotModel, fastest: Tensor) -> RobotModel:
 
 
 def _figures(robot: RobotModel) -> Tensor:
-    """Return the parameters of each joint that a fit may change `(nq, 13)`, in the order of `FIGURES`."""
+    """Return the parameters of each joint that a fit can change `(nq, 13)`, in the order of `FIGURES`."""
     friction = torch.stack([robot.damping, robot.friction], dim=-1)
     links = inertial_parameters(robot.mass, robot.com, robot.inertia)
     return torch.cat([friction, links, robot.armature[:, None]], dim=-1)
@@ -532,7 +532,7 @@ def _figures(robot: RobotModel) -> Tensor:
 def _parameters(
     file: RobotModel, robot: RobotModel, samples: list[RobotModel], scale: Tensor | None
 ) -> tuple[Parameter, ...]:
-    """Return all parameters that a fit may change, with standard deviations over samples."""
+    """Return all parameters that a fit can change, with their standard deviations over samples."""
     before, after = _figures(file), _figures(robot)
     std, prior = torch.stack([_figures(each) for each in samples]).std(0), after.abs()
     if scale is not None:

@@ -1,4 +1,4 @@
-"""Models defined by the table `[model]` of a scene or of a separate file (docs/formats.md)."""
+"""Models defined by the table `[model]` in a scene or in a separate file (docs/formats.md)."""
 
 from __future__ import annotations
 
@@ -33,9 +33,9 @@ from forcegp.storage.descriptions import decode
 DEFAULT = "sgp"
 """Name of the default model."""
 COMMON = ("name", "noise", "seed", "learning")
-"""Keys of `[model]` accepted for every model, even if the model ignores them."""
+"""Keys of `[model]` that are accepted for every model, even if the model ignores them."""
 ARGUMENTS = {"priors": "force_priors"}
-"""Keys named differently from the argument of the model class."""
+"""Keys with a name that differs from the argument of the model class."""
 Options = LearningOptions | BatchOptions
 
 
@@ -46,8 +46,8 @@ class Configured:
     Attributes:
         name: name of the model.
         model: the model.
-        options: learning options; `None` for the default.
-        sensor_noise_std: standard deviation of the force sensor, if it is an additional measurement [N].
+        options: learning options; `None` means the default.
+        sensor_noise_std: noise of the force sensor, if it is used as an additional measurement [N].
     """
 
     name: str
@@ -56,7 +56,7 @@ class Configured:
     sensor_noise_std: float | None = None
 
     def fit(self, data: Dataset, *, progress: FitProgress | None = None, **settings: Any) -> FittedModel:
-        """Fit the model to data with its options, and to the force sensor if requested."""
+        """Fit the model to data with its options, using the force sensor if `sensor_noise_std` is given."""
         if self.options is not None:
             settings["options"] = self.options
         if self.sensor_noise_std is not None and isinstance(self.model, StructuredGP):
@@ -76,12 +76,12 @@ def configured(
     """Create the model defined by a table `[model]`.
 
     Args:
-        table: table of a scene, or from `load_model_table`.
+        table: table from a scene or from `load_model_table`.
         system: robot and contacts.
         name, noise_std, seed: values that override those in the table.
 
     Raises:
-        SceneError: a value is invalid for the model or the system; the message names file, line and key.
+        SceneError: a value is invalid for the model or the system; the message gives the file, line and key.
         UnknownNameError: `name` is not a model.
 
     Example:
@@ -103,14 +103,14 @@ def configured(
 
 
 def keys_of(kind: type[Model[Any]]) -> tuple[str, ...]:
-    """Return the keys of `[model]` for a model class: its constructor arguments and the common keys."""
+    """Return the keys of `[model]` for a model class: the common keys and its constructor arguments."""
     keys = {argument: key for key, argument in ARGUMENTS.items()}
     own = [keys.get(name, name) for name in signature(kind).parameters if name not in ("system", *COMMON)]
     return (*COMMON, *own, *(("sensor_noise_std",) if kind is StructuredGP else ()))
 
 
 def _arguments(table: ModelTable, system: ConstrainedSystem, name: str) -> dict[str, Any]:
-    """Return the arguments of the model's class from the keys in the file."""
+    """Return the arguments for the model class that the keys in the file define."""
     made, at = MODELS[name].made, table.document.at
     given, arguments = table.section.given(), dict[str, Any]()
     for key, value in given.items():
@@ -128,7 +128,7 @@ def _arguments(table: ModelTable, system: ConstrainedSystem, name: str) -> dict[
 
 
 def _noise(section: NoiseSection, acceleration: NoiseStd | None) -> NoiseStd | Noise | None:
-    """Return the noise in `[model]`, a number or a table; `acceleration` overrides the acceleration noise."""
+    """Return the noise defined in `[model]`, with the acceleration noise overridden by `acceleration`."""
     given = section.given() | ({} if acceleration is None else {"acceleration": acceleration})
     if set(given) <= {"acceleration"}:
         return given.get("acceleration")
@@ -138,7 +138,7 @@ def _noise(section: NoiseSection, acceleration: NoiseStd | None) -> NoiseStd | N
 
 
 def _priors(table: ModelTable, written: Sequence[dict[str, Any]]) -> tuple[ForcePrior, ...]:
-    """Return the priors of `[[model.priors]]`."""
+    """Return the priors defined in `[[model.priors]]`."""
     priors = []
     for i, described in enumerate(written):
         key = ("model", "priors", i)
@@ -155,7 +155,7 @@ def _priors(table: ModelTable, written: Sequence[dict[str, Any]]) -> tuple[Force
 
 
 def _learning(table: ModelTable, model: Model[Any]) -> Options | None:
-    """Return the options in `[model.learning]`, with the defaults of the model."""
+    """Return the options defined in `[model.learning]`, completed by the defaults of the model."""
     given: dict[str, Any] = table.section.learning.given()
     if not given:
         return None
@@ -170,7 +170,7 @@ def _learning(table: ModelTable, model: Model[Any]) -> Options | None:
 
 
 def _default(model: Model[Any], given: Mapping[str, Any]) -> Options:
-    """Return the default options of a model; an analytical model accepts both classes."""
+    """Return the default options of a model; for an analytical model, the given keys select their class."""
     if isinstance(model, NeuralNetwork):
         return DEEP if len(model.hidden) > 2 else SHALLOW
     if isinstance(model, AnalyticalModel) and not {"optimizer", "max_evaluations"} & set(given):
@@ -181,7 +181,7 @@ def _default(model: Model[Any], given: Mapping[str, Any]) -> Options:
 
 
 def _check_key(table: ModelTable, key: tuple[str, ...], known: Sequence[str], what: str) -> None:
-    """Raise `SceneError` where a key is not one of those that are known."""
+    """Raise `SceneError` if a key is not one of the known keys."""
     if key[-1] in known:
         return
     near = near_names(key[-1], known)

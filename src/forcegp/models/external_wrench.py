@@ -1,4 +1,4 @@
-"""Estimation of external wrenches from a log with a fitted model, and contact detection."""
+"""Estimation of external wrenches from a log using a fitted model, and contact detection."""
 
 from __future__ import annotations
 
@@ -35,12 +35,12 @@ from forcegp.robust import MAD_TO_STD
 
 METHODS = ("acceleration", "momentum")
 LEAST_NOISE = 1e-9
-"""Minimum velocity noise, above rounding [rad/s, m/s]."""
+"""Minimum velocity noise, above rounding errors [rad/s, m/s]."""
 THRESHOLD = 5.0
 """Number of standard deviations beyond which a contact is detected."""
 
 BLOCK, LEAST_BLOCKS = 0.5, 20
-"""Length of the blocks whose largest d² are independent [s], and how many a tail is read off."""
+"""Length of blocks with independent maxima of d² [s], and minimum number of blocks for estimating a tail."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -48,7 +48,7 @@ class ExternalWrench(Prediction):
     """External wrench at each sample of a log, with `mean` `(n, k)` and `covariance` `(n, k, k)`.
 
     The covariance includes the uncertainty of the learned forces, the noise of torques and motion, and the
-    prior on the wrench. In directions without effect on the joints, it equals that of the prior.
+    prior on the wrench. In directions that have no effect on the joints, it equals the prior covariance.
 
     Attributes:
         frame: frame and estimated components.
@@ -60,13 +60,13 @@ class ExternalWrench(Prediction):
         """Return whether a wrench acts at each sample, `(n,)` bool.
 
         Without a wrench, d² = ŵᵀ C⁻¹ ŵ is at most a χ² variable with k degrees of freedom. A contact is
-        detected if d² exceeds `limit` and the χ² quantile that corresponds to a Gaussian beyond ± `threshold`
-        standard deviations in `hold` consecutive samples.
+        detected if, in `hold` consecutive samples, d² exceeds both `limit` and the χ² quantile at which the
+        tail probability is that of a Gaussian beyond ± `threshold` standard deviations.
 
         Args:
             threshold: threshold [σ]; `false_alarm_rate(threshold)` is the false alarm probability per sample.
             hold: number of consecutive samples, including the current one.
-            limit: smallest d², such as `exceeded_once_in` of an estimate in free motion.
+            limit: lower bound on d², such as `exceeded_once_in` of an estimate from free motion.
 
         Raises:
             ParameterError: the threshold is not positive, or `hold` is below one.
@@ -84,20 +84,21 @@ class ExternalWrench(Prediction):
         return held
 
     def exceeded_once_in(self, seconds: float, t: Tensor) -> float:
-        """d² that a log of free motion, such as that of training, exceeds about once in a time.
+        """Return the value that d² exceeds about once in a given time of free motion.
 
-        Errors of friction last, and have heavier tails than a Gaussian. The largest values of d² in blocks of
-        `BLOCK` are independent; above their median u, P(d² > u + x) = ½ exp(−x/β).
+        Call this on the estimate from a log of free motion, such as the training log. Friction errors persist
+        and have heavier tails than a Gaussian. The maxima of d² over blocks of `BLOCK` seconds are treated as
+        independent; above their median u, P(d² > u + x) = ½ exp(−x/β).
 
         Args:
-            seconds: time in free motion with one false alarm [s].
+            seconds: time of free motion in which one false alarm is expected [s].
             t: times of this estimate `(n,)` [s], in order within each trajectory.
 
         Example:
             `wrench.detect(limit=fit.external_wrench(train, "tool").exceeded_once_in(600.0, train.t))`
 
         Raises:
-            DataError: the log has less than `LEAST_BLOCKS` blocks.
+            DataError: the log has fewer than `LEAST_BLOCKS` blocks.
         """
         numbers = torch.div(t, BLOCK, rounding_mode="floor").unique_consecutive(return_inverse=True)[1]
         largest = t.new_zeros(int(numbers[-1]) + 1).scatter_reduce(0, numbers, self.distance_squared, "amax")
@@ -157,7 +158,7 @@ def external_wrench(
     method: str,
     external: Mapping[str, float] | None = None,
 ) -> ExternalWrench:
-    """Return the external wrench at the samples of a log; see `StructuredFit.external_wrench`."""
+    """Return the external wrench at each sample of a log; see `StructuredFit.external_wrench`."""
     check_name("method of estimating a wrench", method, METHODS)
     reading = Reading.of(fit, data, frame, external)
     if method == "acceleration":
@@ -180,8 +181,8 @@ def external_wrench(
 
 
 class JointForces(NamedTuple):
-    """Mean of Q̄ `(n, nq)` at n states, its covariance with torque noise `(n, nq, nq)`, the equations of
-    motion, J `(n, k, nq)` for the wrench and multipliers, and their prior `(k,)`."""
+    """Mean of Q̄ `(n, nq)` at n states, its covariance including torque noise `(n, nq, nq)`, the equations of
+    motion, J `(n, k, nq)` for the wrench and multipliers, and their prior standard deviations `(k,)`."""
 
     mean: Tensor
     covariance: Tensor
@@ -195,9 +196,9 @@ class Reading:
     """A log prepared for wrench estimation.
 
     Attributes:
-        fit, data, frame: learned forces, log, and estimated components.
-        memory: friction with memory, for logs in time order.
-        remembered: force of this friction `(n, nq)`, or zero.
+        fit, data, frame: learned forces, log, and frame with the components to estimate.
+        memory: friction with memory, if the log is in time order.
+        remembered: force due to this friction `(n, nq)`, or zero.
         external: standard deviation of other unknown forces on the joints `(nq,)`, or `None`.
     """
 
@@ -212,13 +213,13 @@ class Reading:
     def of(
         cls, fit: LearnedForces, data: Dataset, frame: WrenchFrame, external: Mapping[str, float] | None
     ) -> Reading:
-        """Prepare a log, with friction with memory learned from the training log."""
+        """Prepare a log, including any friction with memory that was learned from the training log."""
         memory = FrictionMemory.of(fit.hyperparameters) if data.header.ordered else None
         force = torch.zeros_like(data.q) if memory is None else memory.force(fit.system.robot, data)
         return cls(fit, data, frame, memory, force, external_std(external, fit.system.robot))
 
     def forces(self, rows: Tensor, qdd: Tensor) -> JointForces:
-        """Return the forces at some rows, including inertia errors at given accelerations `(n, nq)`."""
+        """Return the forces at the given rows, including inertia errors at accelerations qdd `(n, nq)`."""
         data, fit, system = self.data[rows], self.fit, self.fit.system
         active = data.active(system.contact_names)
         at, _ = states_at(system, data.q, data.qd, data.tau, active)
@@ -232,7 +233,7 @@ class Reading:
         torque = torch.zeros_like(stick) if fit.torque_std is None else fit.torque_std.square() + 0.0 * stick
         noise = torch.stack([torque, stick], dim=-1)
         noise = noise if self.memory is None else noise * self.memory.share
-        # Multipliers of closed contacts are further unknowns; rows of open ones are zero.
+        # Multipliers of closed contacts are additional unknowns; the rows of open contacts are zero.
         A = at.eom.A
         prior = torch.cat([self.frame.prior.to(data.q), data.q.new_full((A.shape[-2],), MULTIPLIER_STD)])
         J = torch.cat([self.frame.jacobian(system.robot, data.q), A], dim=-2)
@@ -240,7 +241,7 @@ class Reading:
         return JointForces(mean + self.remembered[rows], S, at.eom, J, prior)
 
     def from_accelerations(self) -> tuple[Tensor, Tensor]:
-        """Estimate mean and covariance by generalized least squares."""
+        """Estimate the mean and covariance by generalized least squares."""
         stated, parts = self.data.extras.get("qdd_std"), []
         learned = self.fit.noise.get("qdd", self.data.q.new_zeros(self.data.nq))
         for rows in torch.arange(len(self.data)).split(CHUNK):
@@ -254,7 +255,7 @@ class Reading:
         return torch.cat(mean), torch.cat(covariance)
 
     def from_momenta(self) -> tuple[Tensor, Tensor]:
-        """Estimate mean and covariance with the momentum filter, for each trajectory."""
+        """Estimate the mean and covariance of each trajectory with the momentum filter."""
         if not self.data.header.ordered:
             raise DataError("the momentum filter needs a log in time order", got="points in another order")
         correlation = self.fit.problem.correlation if self.memory is None else self.memory.correlation
@@ -277,7 +278,7 @@ class Reading:
         robot, columns, prior = self.fit.system.robot, [], self.frame.prior
         for rows in trajectory.split(CHUNK):
             q, qd = self.data.q[rows], self.data.qd[rows]
-            # Without accelerations, errors of the inertia count by their weight.
+            # Without accelerations, only the gravity forces due to inertia errors are included.
             forces = self.forces(rows, torch.zeros_like(q))
             prior = forces.prior
             M, added = momentum_force(robot, q, qd)
@@ -296,7 +297,7 @@ def velocity_noise(data: Dataset) -> Tensor:
     """Return `white_noise_std` of the joint velocities `(nq,)` in an evenly sampled log in time order.
 
     Raises:
-        DataError: there are no five consecutive samples.
+        DataError: no trajectory has five consecutive samples.
     """
     whole = data.segment[4:] == data.segment[:-4]
     if not bool(whole.any()):
@@ -308,8 +309,8 @@ def white_noise_std(x: Tensor, whole: Tensor) -> Tensor:
     """Return the standard deviation σ `(d,)` of the white noise in each column of a smooth signal `(n, d)`.
 
     The deviation from the cubic through the neighbours, x_i − (−x_{i−2} + 4 x_{i−1} + 4 x_{i+1} − x_{i+2})/6,
-    has the variance 35/18 σ²; its median absolute value is robust to jumps. `whole` `(n − 4,)` bool marks the
-    first of five consecutive samples.
+    has variance 35/18 σ²; its median absolute value is robust to jumps. `whole` `(n − 4,)` bool marks the
+    first of every five samples that are consecutive.
     """
     a, b, middle, c, d = (x[k : len(x) - 4 + k][whole] for k in range(5))
     departure = middle - (4.0 * (b + c) - a - d) / 6.0

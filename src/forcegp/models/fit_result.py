@@ -1,4 +1,4 @@
-"""Result of a fit, and display of models as one line or as a table in notebooks."""
+"""Result of a fit, and display of models as a line of text or as a table in notebooks."""
 
 from __future__ import annotations
 
@@ -12,22 +12,22 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.notebook import html_table
 
 COVERED = 0.8
-"""Held-out ±2σ coverage below which a fit warns, lower than with half the correct standard deviation."""
+"""Held-out ±2σ coverage below which a fit issues a warning; it results if σ is 36 % too small."""
 
 
 @dataclass(frozen=True)
 class Compared:
-    """A set of force priors in the comparison on held-out stretches of the training log.
+    """Score of a set of force priors in the comparison on held-out blocks of the training log.
 
     Attributes:
         name: name of the set.
         log_density: mean log predictive density of held-out samples [nats per sample]; `None` if it was not
             computed.
-        behind: difference to the best set [nats per sample].
-        standard_error: standard error of this difference.
+        behind: deficit relative to the best set [nats per sample].
+        standard_error: standard error of this deficit.
         chosen: whether this set was selected.
-        note: reason why a set was not tested, or not on all stretches.
-        coverage: fraction of held-out values within ±2σ, 0.95 for correct error bars.
+        note: reason why the set was not tested on any or on all stretches.
+        coverage: fraction of held-out values within ±2σ; 0.95 for correct error bars.
     """
 
     name: str
@@ -40,11 +40,11 @@ class Compared:
 
     @property
     def doubt(self) -> str:
-        """Warning if held-out coverage is far too low, otherwise empty."""
+        """Warning if the held-out coverage is far too low, otherwise an empty string."""
         if self.coverage is None or self.coverage >= COVERED:
             return ""
         return (
-            f"the model misses held-out stretches of this log: ±2σ coverage is {self.coverage:.0%} instead "
+            f"the model misses held-out blocks of this log: ±2σ coverage is {self.coverage:.0%} instead "
             "of 95%; check the log and the robot file (`forcegp check`)"
         )
 
@@ -58,32 +58,32 @@ class Compared:
 
 @dataclass(frozen=True)
 class FitResult:
-    """Result of a fit; saved files contain everything but the history.
+    """Result of a fit; saved files contain all fields except the history.
 
     Attributes:
         converged: whether the optimiser reached its tolerance.
         evaluations: number of evaluations of the objective.
         seconds: duration of the fit.
         objective: final value (mean squared error, or negative log posterior of the hyperparameters).
-        log_marginal_likelihood: log marginal likelihood of the training data, `None` for models without one.
-        jitter: jitter added to the diagonal of the covariance, relative to unit noise; the effective noise is
-            √(1 + jitter) times the given noise.
-        constant_inputs: inputs that do not vary in the training data and were not scaled.
+        log_marginal_likelihood: log marginal likelihood of the training data; `None` for models without one.
+        jitter: jitter added to the diagonal of the covariance, in units of the noise variance; the effective
+            noise is √(1 + jitter) times the given noise.
+        constant_inputs: inputs that are constant in the training data and were therefore not scaled.
         message: reason why the optimiser stopped.
         history: the objective at each evaluation.
         force_correlation: mean posterior correlation of the joint force Q and the contact force Q_z at
-            training states. Near −1, only their sum is identifiable; near 0, both are. `None` without priors
-            on both.
-        warnings: doubts about the fit, each with a remedy.
+            training states. Near −1, only their sum is identifiable; near 0, both are. `None` unless there
+            are priors on both.
+        warnings: warnings about the fit, each with a suggested remedy.
         inference: `"exact"` or `"sparse"`, for models that support both.
-        samples: number of samples that the model is conditioned on.
-        learned_on: number of samples used to learn hyperparameters.
-        basis_functions: size of a sparse posterior.
-        determined: number of basis functions that the data determine.
-        missed: total prior variance of all rows missed by the inducing points, in units of the noise
+        samples: number of samples on which the model is conditioned.
+        learned_on: number of samples used to learn the hyperparameters.
+        basis_functions: number of basis functions of a sparse posterior.
+        determined: effective number of basis functions that are determined by the data.
+        missed: total residual prior variance of all rows given the inducing points, in units of the noise
             variance; `determined` is the total posterior variance in the same units.
         more_points_would_help: whether `missed` is at least a tenth of `determined`.
-        comparison: the compared sets of force priors; empty if the priors were given.
+        comparison: scores of the compared sets of force priors; empty if the priors were specified.
         never_closed: contacts that are never closed in the training data; their forces are undetermined.
     """
 
@@ -110,7 +110,7 @@ class FitResult:
 
 
 def model_line(kind: str, system: ConstrainedSystem, result: FitResult | None) -> str:
-    """Return a line with robot, contacts and the result of the fit, if any."""
+    """Return a line of text with the robot, the contacts and the result of the fit, if any."""
     robot = system.robot
     contacts = f", contact {', '.join(system.contact_names)}" if system.contacts else ""
     outcome = "" if result is None else f"; {_outcome(result)}"

@@ -1,14 +1,14 @@
 """Tracking of forces that change abruptly, such as a payload that is picked up.
 
-A fading memory loses a payload while the arm rests, and is slow to detect a new one. Earlier samples are
-therefore forgotten if, for new samples D,
+Exponential forgetting discards the payload estimate while the arm is at rest, and is slow to detect a new
+payload. Earlier samples are therefore forgotten only if, for new samples D,
 
     p(D | payload drawn again from its prior) · p(change) > p(D | payload unchanged).
 
-Both are marginal likelihoods, computed from the posterior before and after the update.
+Both densities are marginal likelihoods, computed from the posterior before and after the update.
 
-The force of a payload is accurate to first order around the known payload of its prior. After a change, the
-prior is linearized around the current estimate, as in an extended Kalman filter.
+The force due to a payload is accurate to first order around the known payload in its prior. After a change,
+the prior is linearized around the current estimate, as in an extended Kalman filter.
 """
 
 from __future__ import annotations
@@ -35,8 +35,8 @@ class Followed:
 
     Attributes:
         fit: the fit with the new samples.
-        changed: whether the forces were relearned.
-        log_odds: log odds of a change versus no change, after the new samples.
+        changed: whether a change was detected, so that the forces were relearned.
+        log_odds: log odds of a change versus no change, given the new samples.
     """
 
     fit: StructuredFit
@@ -48,13 +48,13 @@ class Followed:
 def follow(
     fit: StructuredFit, data: Dataset, priors: Sequence[str], *, factor: float = 1.0, change: float = CHANGE
 ) -> Followed:
-    """Add samples to a fit, and relearn the forces of some priors if the samples contradict them.
+    """Add samples to a fit, and relearn the forces of the given priors if the samples contradict them.
 
     Args:
         fit: fit with sparse inference.
         data: a few new samples, such as 0.05 s of data.
         priors: names of the priors on forces that may change, such as `payload`.
-        factor: correlation of these forces with those at the previous call, for additional slow drift.
+        factor: correlation of these forces with those at the previous call, to allow for slow drift as well.
         change: prior probability of a change between two calls.
 
     Raises:
@@ -67,13 +67,13 @@ def follow(
     continued = aged.update(data)
     forgotten = aged.forget(0.0, priors=priors)
     restarted = forgotten.update(data)
-    # log p of the rows, up to what both hypotheses share
+    # log p of the rows, up to terms common to both hypotheses
     evidence = [fit.posterior.latent.log_likelihood for fit in (restarted, forgotten, continued, aged)]
     gain = evidence[0] - evidence[1] - (evidence[2] - evidence[3])
     log_odds = gain + math.log(change) - math.log1p(-change)
     changed = log_odds > 0.0
     if changed:
-        # The first estimate is that of accelerations without the new payload, so it is made once more.
+        # The first estimate assumes accelerations without the new payload, so it is repeated.
         restarted = _knowing(forgotten, restarted, priors).update(data)
     result = restarted if changed else continued
     return Followed(_knowing(result, result, priors, begin=changed), changed, log_odds)
@@ -88,7 +88,7 @@ def _knowing(
         fit: fit with the priors to replace.
         estimate: fit with the estimated payloads.
         priors: names of the tracked priors.
-        begin: whether to replace also priors without a known payload.
+        begin: whether to replace priors without a known payload as well.
     """
     one = {"one": torch.zeros(1, 1, dtype=torch.float64)}
     updated_priors = tuple(

@@ -1,4 +1,4 @@
-"""Gaussian-process baseline with one process per joint acceleration and without mechanics.
+"""Gaussian-process baseline with one process per joint acceleration and no knowledge of mechanics.
 
 q̈_j ~ GP(0, k_j(x, x′)) with x = (q, q̇, τ) and squared-exponential k_j (section 5.4 of the paper).
 """
@@ -17,7 +17,7 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
-from forcegp.errors import ForceGPError, ModelError
+from forcegp.errors import ModelError
 from forcegp.files import Record
 from forcegp.forces.measurements import NoiseStd, Observation, measurement_of, plain
 from forcegp.forces.noise import Noise
@@ -39,7 +39,7 @@ from forcegp.storage.system import take
 
 KIND = "independent_gp"
 LEARNING = 6
-"""Measured number of matrices over the samples for learning a joint, besides the factors of all joints."""
+"""Measured number of `(n, n)` matrices for learning one joint, in addition to the factors of all joints."""
 
 
 @dataclass(frozen=True)
@@ -59,10 +59,9 @@ class IndependentTraining:
     scale: Standardization
 
     def processes(self) -> list[tuple[JointForcePrior, Block, Tensor]]:
-        """Return, for each joint, its process, its accelerations in units of the noise, and Σ log of the
-        noise.
+        """Return, for each joint, its process, its accelerations in units of the noise, and Σ log σ.
 
-        The likelihood uses only name and kernel of a process.
+        The likelihood only uses the name and the kernel of a process.
         """
         inputs, noise = self.scale.apply(self.features), self.noise_std.expand_as(self.qdd)
         columns = enumerate(zip(self.qdd.split(1, dim=1), noise.split(1, dim=1), strict=True))
@@ -76,7 +75,7 @@ class IndependentTraining:
         ]
 
     def announce(self, copies: int) -> None:
-        """Warn about the memory of the matrices of all joints."""
+        """Warn if the matrices of all joints need much memory."""
         n, nq = self.qdd.shape
         announce_memory(8 * (2 * nq + copies) * n**2, f"independent Gaussian processes on {n:,} samples")
 
@@ -94,12 +93,12 @@ class IndependentGP(Model["IndependentFit"]):
 
     Args:
         system: robot and contacts; contacts are used for evaluation only, not for learning.
-        noise: standard deviation of measured accelerations [rad/s², m/s²], one or one per joint; by
-            default the value in the log, or 0.1.
-        standardize: whether to standardize the inputs, which the paper does not.
+        noise: standard deviation of measured accelerations [rad/s², m/s²], one value or one per joint; by
+            default, the value in the log, or 0.1.
+        standardize: whether to standardize the inputs (the paper does not).
 
     Raises:
-        ModelError: the robot is not float64, or `noise` specifies more than acceleration noise.
+        ModelError: the robot is not in float64, or `noise` specifies more than acceleration noise.
     """
 
     kind = KIND
@@ -132,12 +131,12 @@ class IndependentGP(Model["IndependentFit"]):
 
         Args:
             data: states and measured accelerations.
-            options: optimiser and its limits, for each joint.
-            progress: called after each evaluation, counting those of all joints.
+            options: optimiser and its limits, which apply to each joint.
+            progress: called after each evaluation; evaluations are counted over all joints.
             checkpoint: see `Model.fit`.
 
         Raises:
-            ModelError, DataError: the data do not fit the model.
+            ModelError, DataError: the data are incompatible with the model.
             NumericalError: the likelihood cannot be computed.
         """
         options = options or LearningOptions()
@@ -163,7 +162,7 @@ class IndependentGP(Model["IndependentFit"]):
         return fitted(self, training, hyperparameters, parts)
 
     def training(self, features: dict[str, Tensor], qdd: Tensor, noise_std: Tensor) -> IndependentTraining:
-        """Return the training data with their standardization."""
+        """Return the training data with the standardization of their inputs."""
         scaled = Standardization.of if self.options.standardize else Standardization.none
         return IndependentTraining(features, qdd, noise_std, scaled(features))
 
@@ -175,7 +174,7 @@ def _objective(
     centre: Mapping[str, Tensor],
     theta: dict[str, Tensor],
 ) -> Tensor:
-    """Return the negative log posterior of a joint's hyperparameters, with weak priors if any."""
+    """Return the negative log posterior of a joint's hyperparameters, with weak priors around `centre`."""
     value = negative_log_likelihood([prior], theta, [block]) + constant
     return value + negative_log_prior(theta, centre) if centre else value
 
@@ -186,7 +185,7 @@ def fitted(
     hyperparameters: dict[str, Tensor],
     parts: Sequence[Learned] = (),
 ) -> IndependentFit:
-    """Condition on training data at given hyperparameters.
+    """Condition the processes on training data at given hyperparameters.
 
     Raises:
         NumericalError: a covariance is not positive definite.
@@ -218,7 +217,7 @@ class IndependentFit(AccelerationFit):
     Attributes:
         system: robot and contacts.
         specification: specification of the model.
-        training: data that the processes are conditioned on.
+        training: data on which the processes are conditioned.
         hyperparameters: log-hyperparameters of all processes.
         posteriors: posterior for each joint.
         result: result of the fit.
@@ -265,10 +264,8 @@ class IndependentFit(AccelerationFit):
             for name, value in prior.kernel.initial(1, dict.fromkeys(features, nq)).items()
         }
         training.announce(0)
-        try:
+        with ModelError.within(f"{source}: the training data"):
             return fitted(model, training, hyperparameters)
-        except ForceGPError as cause:
-            raise ModelError.at(f"{source}: the training data", cause) from cause
 
     def record(self) -> tuple[Record, dict[str, Tensor]]:
         model = self.specification

@@ -20,11 +20,10 @@ from forcegp.storage.model_file import (
     ModelHeader,
     model_bytes,
     model_path,
-    model_tensors,
     parse_model,
     read_model,
 )
-from forcegp.storage.system import unpack_system
+from forcegp.storage.system import PREFIX, unpack_system
 
 KINDS: dict[str, type[FittedModel]] = {
     kind.kind: kind for kind in (AnalyticalFit, NetworkFit, IndependentFit, StructuredFit)
@@ -33,12 +32,12 @@ KINDS: dict[str, type[FittedModel]] = {
 
 
 def load_model(path: str | Path, *, system: ConstrainedSystem | None = None) -> FittedModel:
-    """Load a saved model, which reproduces predictions bit for bit.
+    """Load a saved model; its predictions are bit-identical to those before saving.
 
     Args:
         path: the file; `.safetensors` is added if missing.
-        system: system with constraints defined in Python (such as an `ImplicitSurface`); robot and other
-            constraints are read from the file.
+        system: system with the constraints defined in Python (such as an `ImplicitSurface`), if any; the
+            robot and all other constraints are read from the file.
 
     Example:
         >>> import forcegp, torch
@@ -55,8 +54,8 @@ def load_model(path: str | Path, *, system: ConstrainedSystem | None = None) -> 
         'analytical'
 
     Raises:
-        ModelError: there is no model, it is damaged, or a constraint must be passed.
-        UnknownNameError: this release does not know the kind of model.
+        ModelError: there is no model, it is damaged, or a constraint must be passed by `system`.
+        UnknownNameError: this release does not support this kind of model.
     """
     return _restored(*read_model(path), str(model_path(path)), system)
 
@@ -74,11 +73,12 @@ def model_of_bytes(data: bytes) -> FittedModel:
 def _restored(
     header: ModelHeader, tensors: Mapping[str, Tensor], source: str, system: ConstrainedSystem | None = None
 ) -> FittedModel:
-    """Restore a model from header and tensors."""
+    """Restore a model from its header and tensors."""
     check_name(f"kind of models in {source}", header.kind, KINDS)
+    own = {name: value for name, value in tensors.items() if not name.startswith(PREFIX)}
     try:
         model_system = unpack_system(header.system, tensors, source, system)
-        return KINDS[header.kind].restored(header, model_tensors(tensors), model_system, source)
+        return KINDS[header.kind].restored(header, own, model_system, source)
     except ForceGPError:
         raise
     except (ArithmeticError, LookupError, RuntimeError, TypeError, ValueError) as cause:

@@ -1,4 +1,4 @@
-"""Minimisation of a mean over samples, by ADAM on batches with early stopping or over all samples."""
+"""Minimisation of a mean loss, either by ADAM on batches with early stopping or over all samples at once."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from forcegp.gp.optimise import FitProgress, Learned, LearningOptions, minimise,
 from forcegp.storage.checkpoint import Checkpoint, Evaluations
 
 HISTORY = "history"
-"""Name of the tensor with one entry per epoch, the only one of variable length."""
+"""Name of the tensor with one entry per epoch, the only tensor of variable length."""
 Loss = Callable[[Mapping[str, Tensor], Tensor], Tensor]
-"""Function that maps tensors and row numbers `(k,)` to the mean squared error of these rows."""
+"""Function that maps tensors and row numbers `(k,)` to the mean squared error over these rows."""
 
 
 @dataclass(frozen=True)
@@ -64,24 +64,24 @@ def train(
     checkpoint: str | Path | None = None,
     key: Iterable[object] = (),
 ) -> Learned:
-    """Minimise a mean over samples.
+    """Minimise a mean loss over samples.
 
     Args:
-        loss: mean squared error over rows, differentiable in the tensors.
+        loss: mean squared error over rows, differentiable with respect to the tensors.
         start: initial tensors by name.
         samples: number of rows.
-        options: training on batches, which returns the best epoch on the held-out samples, or on all samples
-            at once.
+        options: options for training on batches, which returns the best epoch on the held-out samples, or
+            for training on all samples at once.
         generator: source of randomness for the held-out part and the order of rows.
         progress: called after each epoch or evaluation with its number, their maximum number, and the loss.
-        checkpoint: file for the state of training, from which it resumes.
+        checkpoint: file with the state of training, from which training resumes.
         key: identifier of the loss for the checkpoint.
 
     Returns:
         The tensors, their loss, and one entry per epoch or evaluation as history.
 
     Raises:
-        ModelError: there are too few samples to hold any out, or the checkpoint belongs to another fit.
+        ModelError: there are too few samples to hold any out, or the checkpoint belongs to a different fit.
         NumericalError: the loss is not finite.
     """
     key = (options, *key, *(part for pair in start.items() for part in pair))
@@ -135,7 +135,7 @@ def _on_batches(
 
 @dataclass
 class _State:
-    """Complete state of training."""
+    """Complete state of training on batches."""
 
     weights: dict[str, Tensor]
     optimizer: torch.optim.Adam
@@ -164,7 +164,7 @@ class _State:
         return len(self.history) - 1 - self.history.index(self.value) if self.history else 0
 
     def note(self, held_out: float) -> None:
-        """Record the end of an epoch.
+        """Record the held-out loss at the end of an epoch.
 
         Raises:
             NumericalError: the loss is not finite.
@@ -179,7 +179,7 @@ class _State:
         self.history.append(held_out)
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return the state by name."""
+        """Return the tensors of the state by name."""
         tensors = {HISTORY: torch.tensor(self.history, dtype=torch.float64)}
         tensors["generator"] = self.generator.get_state()
         for name, x in self.weights.items():
@@ -204,7 +204,7 @@ class _State:
 
 
 FLAT = 0.05
-"""Relative change of the held-out loss over the last tenth of the epochs that counts as zero."""
+"""Relative decrease in held-out loss over the last tenth of the epochs below which training has converged."""
 
 
 def _flat(history: list[float]) -> bool:

@@ -1,4 +1,4 @@
-"""Neural-network baseline: sigmoid layers from (q, q̇, τ) to q̈, without mechanics (section 5.4)."""
+"""Neural-network baseline: sigmoid layers from (q, q̇, τ) to q̈, without knowledge of mechanics (sec. 5.4)."""
 
 from __future__ import annotations
 
@@ -38,7 +38,7 @@ class NetworkSettings(Record):
 
 
 class NeuralNetwork(Model["NetworkFit"]):
-    """A feed-forward network with sigmoid layers on standardized (q, q̇, τ), trained by mean squared error.
+    """A feed-forward network with sigmoid layers on standardized (q, q̇, τ), trained on mean squared error.
 
     The network does not use contacts as inputs and does not predict covariances.
 
@@ -73,7 +73,7 @@ class NeuralNetwork(Model["NetworkFit"]):
 
         Args:
             data: states and measured accelerations.
-            options: training options; by default `SHALLOW` or `DEEP`.
+            options: training options; by default, `SHALLOW` or `DEEP`.
             progress: called after each epoch.
             checkpoint: see `Model.fit`.
 
@@ -82,7 +82,7 @@ class NeuralNetwork(Model["NetworkFit"]):
             standardized accelerations as `objective`.
 
         Raises:
-            ModelError, DataError: the data do not fit the model.
+            ModelError, DataError: the data are incompatible with the model.
             NumericalError: training diverges.
         """
         measured, _ = measurement_of(Observation(data, noise_std=1.0), self.system)
@@ -141,7 +141,7 @@ class NetworkFit(AccelerationFit):
         widths = [3 * robot.nq, *settings.hidden, robot.nq]
         state = {}
         for layer, (before, after) in enumerate(pairwise(widths)):
-            # Shapes are checked before a network of them is made.
+            # Shapes are checked before the network is allocated.
             for name, shape in (("weight", (after, before)), ("bias", (after,))):
                 key = f"{2 * layer}.{name}"
                 state[key] = take(tensors, f"network.{key}", shape, robot.dtype, source)
@@ -168,7 +168,7 @@ class NetworkFit(AccelerationFit):
 
 
 def _network(system: ConstrainedSystem, hidden: tuple[int, ...]) -> nn.Sequential:
-    """Return the layers with uninitialised weights."""
+    """Return the layers of the network, before `_initialise`."""
     robot = system.robot
     widths = [3 * robot.nq, *hidden]
     layers: list[nn.Module] = []
@@ -179,11 +179,11 @@ def _network(system: ConstrainedSystem, hidden: tuple[int, ...]) -> nn.Sequentia
 
 
 SIGMOID_GAIN = 4.0
-"""Inverse slope of the sigmoid at 0, which preserves the variance of the signal between layers."""
+"""Gain that preserves the variance of the signal between layers: the inverse slope of the sigmoid at 0."""
 
 
 def _initialise(network: nn.Sequential, generator: torch.Generator) -> None:
-    """Initialise Glorot-normal weights, scaled for sigmoid layers, and zero biases."""
+    """Draw Glorot-normal weights, scaled for sigmoid layers, and set the biases to zero."""
     for layer in network:
         if isinstance(layer, nn.Linear):
             std = (2.0 / (layer.in_features + layer.out_features)) ** 0.5
@@ -195,5 +195,5 @@ def _initialise(network: nn.Sequential, generator: torch.Generator) -> None:
 
 
 def _stacked(scale: Standardization, states: dict[str, Tensor]) -> Tensor:
-    """Concatenate the standardized inputs, `(n, 3 nq)`."""
+    """Return the standardized inputs concatenated, `(n, 3 nq)`."""
     return torch.cat(list(scale.apply(states).values()), dim=-1)

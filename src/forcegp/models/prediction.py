@@ -1,4 +1,4 @@
-"""Predictors and predicted quantities with uncertainty, with scores and plots."""
+"""Predictors, and predicted quantities with their uncertainty, scores and plots."""
 
 from __future__ import annotations
 
@@ -33,13 +33,13 @@ CHUNK = 2000
 CHECKED = 1 << 16
 """Number of covariances checked at a time."""
 MOST_SAMPLES = 2000
-"""Maximum number of samples in a plot; more are indistinguishable."""
+"""Maximum number of samples in a plot; more would be indistinguishable."""
 
 
 NEGATIVE = 0.01
-"""Fraction of the variances below which a negative eigenvalue counts as rounding."""
+"""Magnitude, relative to the variances, below which a negative eigenvalue counts as a rounding error."""
 ROUNDING = 1e-12
-"""Smallest variance used for scaling, as a fraction of the largest variance of a sample."""
+"""Smallest variance used for scaling, relative to the largest variance of a sample."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -50,14 +50,14 @@ class Prediction:
         mean: `(*batch, d)` mean.
         covariance: `(*batch, d, d)` covariance of the noise-free quantity, unless noise was requested; `None`
             if the model does not provide it or it was not requested.
-        parts: slice of each quantity, if several were requested.
-        beyond: `(*batch, nq)` distance of the speed and torque of each joint beyond the training data, in
-            training standard deviations; `None` if the model does not provide it.
+        parts: slice of each requested quantity.
+        beyond: `(*batch, nq)` distance by which the speed and torque of each joint exceed the training data,
+            in standard deviations of these data; `None` if the model does not provide it.
         joint_names: joints in the order of `beyond`.
-        determined: `(*batch, d)` bool, components determined by data and motion; the others are NaN. `None`
-            if all are determined.
+        determined: `(*batch, d)` bool, components determined by the data and the motion; the others are NaN.
+            `None` if all are determined.
         doubts: descriptions of undetermined components.
-        checked: whether the maker has checked mean and covariance, as C code does.
+        checked: whether the mean and covariance were checked before, as the C code does.
     """
 
     mean: Tensor
@@ -85,7 +85,7 @@ class Prediction:
                 both = self.determined[..., None] & self.determined[..., None, :]
                 covariance = covariance.where(both, 0.0)
         for name, value in (("mean", mean), ("covariance", covariance)):
-            # A sum is finite only if all numbers are.
+            # A sum is finite only if all its terms are.
             if value is None or math.isfinite(float(value.sum())):
                 continue
             wrong = sum(int((~torch.isfinite(piece)).sum()) for piece in value.reshape(-1).split(1 << 20))
@@ -102,18 +102,18 @@ class Prediction:
 
     @property
     def variance(self) -> Tensor | None:
-        """Variance `(*batch, d)`, the diagonal of the covariance."""
+        """Variances `(*batch, d)`, the diagonal of the covariance."""
         return None if self.covariance is None else self.covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0)
 
     @property
     def std(self) -> Tensor | None:
-        """Standard deviation `(*batch, d)`."""
+        """Standard deviations `(*batch, d)`."""
         variance = self.variance
         return None if variance is None else variance.sqrt()
 
     @property
     def warnings(self) -> tuple[str, ...]:
-        """Doubts about the prediction: undetermined components, and states far beyond the training data."""
+        """Warnings about undetermined components, and about states far beyond the training data."""
         beyond = () if self.beyond is None else warnings_beyond(self.beyond, self.joint_names)
         return (*self.doubts, *beyond)
 
@@ -133,13 +133,13 @@ class Prediction:
     ) -> list[Axes]:
         """Plot the mean with a band of ±2 standard deviations, one panel per component.
 
-        `model.plot(data)` does the same with the names, times and measurements of a data set.
+        `model.plot(data)` does the same with the names, times and measurements from a data set.
 
         Args:
-            t: `(n,)` time of each sample [s]; by default, samples are numbered.
+            t: `(n,)` time of each sample [s]; by default, the number of the sample is used.
             measured: `(n, d)` measured values for comparison.
             names: names of the components.
-            ax: matplotlib axes to draw on, one per panel; by default a new figure.
+            ax: matplotlib axes to draw on, one per panel; by default, a new figure is created.
 
         Returns:
             The axes, one per panel.
@@ -173,7 +173,7 @@ class Prediction:
         return axes
 
     def panel(self, i: int, name: str, label: str, true: Tensor | None) -> Panel:
-        """Return a panel for component i with its measured values, if any."""
+        """Return a panel for component i, with its measured values if there are any."""
         from forcegp.plots import MEASURED, PREDICTED, Curve, Panel
 
         curves = [] if true is None else [Curve(true[:, i], "measured", MEASURED, width=0.7)]
@@ -191,14 +191,14 @@ class Query(NamedTuple):
 
 
 Answer = tuple[tuple[Tensor | None, ...], dict[str, slice], tuple[str, ...]]
-"""Mean `(n, d)`, covariance `(n, d, d)`, distance beyond the trained region `(n, nq)`, determined components
-    `(n, d)`, the slice of each quantity, and descriptions of undetermined components."""
+"""Mean `(n, d)`, covariance `(n, d, d)`, distance beyond the trained region `(n, nq)`, mask of determined
+    components `(n, d)`; slice of each quantity; and descriptions of undetermined components."""
 
 
 def in_pieces(
     at: FlatStates, read: Callable[[FlatStates], tuple[Tensor | None, ...]]
 ) -> tuple[Tensor | None, ...]:
-    """Evaluate `read` on `CHUNK` states at a time, with memory for the result and one piece."""
+    """Evaluate `read` on `CHUNK` states at a time, so that only the result and one piece are in memory."""
     whole, n = list[Tensor | None](), len(at.q)
     for first in range(0, max(n, 1), CHUNK):
         piece = read(at.rows(slice(first, first + CHUNK)))
@@ -221,7 +221,7 @@ def measured(system: ConstrainedSystem, data: Dataset, quantity: str) -> Tensor:
 
 
 def component_names(system: ConstrainedSystem, quantity: str) -> list[str]:
-    """Return the names of the components of a quantity: joints, contacts, or axes of a contact force."""
+    """Return the names of a quantity's components: joints, constraint rows, or axes of contact forces."""
     if quantity == "contact_force":
         contacts = [c.name for c in system.contacts if isinstance(c, SurfaceContact)]
         return [f"{name} {axis}" for name in contacts for axis in AXES]
@@ -229,10 +229,10 @@ def component_names(system: ConstrainedSystem, quantity: str) -> list[str]:
 
 
 class Predictor(ForwardModel):
-    """A predictor of the forward dynamics (q, q̇, τ) ↦ q̈."""
+    """A model that predicts the forward dynamics (q, q̇, τ) ↦ q̈."""
 
     has_noise: bool = False
-    """Whether the predictor can predict measurements including their noise."""
+    """Whether predictions can include the noise of measurements."""
 
     @torch.no_grad()
     def predict(
@@ -247,7 +247,7 @@ class Predictor(ForwardModel):
         system: ConstrainedSystem | None = None,
         noise: bool = False,
     ) -> Prediction:
-        """Predict mean and covariance of a quantity, for a `StructuredGP` from its posterior (eqs. 22 to 25).
+        """Predict the mean and covariance of a quantity; for `StructuredGP`, from the posterior (eqs. 22–25).
 
         Args:
             q, qd, tau: `(*batch, nq)` states.
@@ -255,20 +255,20 @@ class Predictor(ForwardModel):
                 distribution.
             active: `(*batch, n_contacts)` bool, the closed contacts; by default all.
             covariance: whether to compute the covariance, which costs more than the mean.
-            system: another system, such as one with another surface or none, for models with forces. On the
-                system of the fit, contacts that are never closed in the training data have undetermined
-                forces.
-            noise: whether the covariance includes the noise of torque and sensor.
+            system: a different system, such as one with a different surface or none, for models with forces.
+                On the system of the fit, the forces of contacts that are never closed in the training data
+                are undetermined.
+            noise: whether the covariance includes the noise of torques and sensors.
 
         Returns:
-            Mean `(*batch, d)` and, if the model has one, covariance `(*batch, d, d)`, without measurement
-            noise by default.
+            The mean `(*batch, d)` and, if the model provides it, the covariance `(*batch, d, d)`, by default
+            without measurement noise.
 
         Raises:
             UnknownNameError: the quantity does not exist.
             ShapeError: a state or `active` does not match the system.
             ModelError: all requested forces belong to contacts that are never closed in the training data, or
-                a model of accelerations only does not support the quantity, system or noise.
+                the model predicts only accelerations and does not support the quantity, system or noise.
         """
         if noise and not self.has_noise:
             raise ModelError(f"a {self.kind!r} model has no noise of measurements", hint="use StructuredGP")
@@ -293,7 +293,7 @@ class Predictor(ForwardModel):
 
     @property
     def specified(self) -> ConstrainedSystem:
-        """System before the fit, with the robot from the file if the fit keeps it."""
+        """System before the fit, with the robot from the file if the fit retains it."""
         return self.system
 
     def linearize(
@@ -305,12 +305,12 @@ class Predictor(ForwardModel):
         active: Tensor | None = None,
         system: ConstrainedSystem | None = None,
     ) -> ForceLinearization:
-        """Return the mean acceleration and multiplier with their Jacobians with respect to q, q̇ and τ.
+        """Return the mean acceleration and multiplier, and their Jacobians with respect to q, q̇ and τ.
 
         Args:
             q, qd, tau: `(*batch, nq)` states.
             active: `(*batch, n_contacts)` bool, the closed contacts; by default all.
-            system: another system for the prediction.
+            system: a different system for the prediction.
 
         Raises:
             ModelError: the model has no forces.
@@ -338,7 +338,7 @@ class Predictor(ForwardModel):
         Args:
             q0, qd0: `(*batch, nq)` initial states.
             tau: motor torque over time: a log, an array `(samples, nq)` or `(*batch, samples, nq)` with
-                its period in `options`, or a feedback law of (t, q, q̇).
+                its sampling period in `options`, or a feedback law as a function of (t, q, q̇).
             duration: simulated time [s].
             samples: number of function samples to integrate in addition to the mean.
             **settings: `options`, `seed`, `active`, `system` and `progress` for `rollout_model`.
@@ -348,17 +348,17 @@ class Predictor(ForwardModel):
     def score(self, data: Dataset, quantity: str = "qdd") -> float:
         """Return the coefficient of determination R² of the predicted mean on a data set, as in scikit-learn.
 
-        R² = 1 − Σ(measured − predicted)² / Σ(measured − mean)², averaged over the components: 1 is perfect, 0
-        is as good as the mean of the data, and negative values are worse. Unlike `forcegp.evaluate`, it
-        ignores the uncertainty.
+        R² = 1 − Σ(measured − predicted)² / Σ(measured − mean)², averaged over the components. A value of 1 is
+        perfect, 0 is as good as predicting the mean of the data, and negative values are worse. Unlike
+        `forcegp.evaluate`, the score ignores the uncertainty.
 
         Args:
             data: logged states and measured values.
             quantity: quantity to predict, which the data set must contain.
 
         Raises:
-            UnknownNameError, NotLoggedError: the quantity is unknown or not logged.
-            DataError: the joints differ from those of the robot, or the quantity does not vary.
+            UnknownNameError, NotLoggedError: the quantity is unknown or was not logged.
+            DataError: the joints differ from those of the robot, or the quantity is constant.
         """
         data.check_robot(self.specified.robot)
         if len(data) < 2:
@@ -380,13 +380,13 @@ class Predictor(ForwardModel):
         ax: Target = None,
         **settings: Any,
     ) -> list[Axes]:
-        """Plot a predicted quantity with ±2 standard deviations and the measured one, if it is logged.
+        """Plot a predicted quantity with ±2 standard deviations, and the measured values if they were logged.
 
         Args:
-            data: logged states; for a long log, every k-th row is predicted and plotted.
+            data: logged states; for a long log, only every k-th row is predicted and plotted.
             quantity: quantity to predict.
             joints: names of joints or contacts to plot; by default all.
-            ax: matplotlib axes to draw on, one per panel; by default a new figure.
+            ax: matplotlib axes to draw on, one per panel; by default, a new figure is created.
             **settings: other arguments of `predict`, such as `noise=True` for a band that includes noise.
 
         Returns:
@@ -416,7 +416,7 @@ class Predictor(ForwardModel):
         return draw_panels(panels, time, [data.contact[c] for c in system.contact_names], ax)
 
     def _at_logged(self, data: Dataset, quantity: str, **settings: Any) -> Prediction:
-        """Predict at logged states, with contacts closed as logged."""
+        """Predict a quantity at the logged states and contacts."""
         active = data.active((settings.get("system") or self.system).contact_names)
         return self.predict(data.q, data.qd, data.tau, quantity, active=active, **settings)
 
@@ -434,14 +434,13 @@ class Predictor(ForwardModel):
 
 
 def require_semidefinite(covariance: Tensor) -> None:
-    """Reject covariances with a clearly negative eigenvalue, for variables scaled by their standard
-    deviation.
+    """Reject covariances that, scaled to unit variances, have a clearly negative eigenvalue.
 
     Args:
         covariance: `(*batch, d, d)` covariances.
 
     Raises:
-        NumericalError: a variance or an eigenvalue is below −`NEGATIVE`.
+        NumericalError: a scaled variance or eigenvalue is below −`NEGATIVE`.
     """
     variance = covariance.diagonal(dim1=-2, dim2=-1)
     if not variance.numel():

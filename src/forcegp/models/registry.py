@@ -1,4 +1,4 @@
-"""Models by the short names used on the command line and in reports."""
+"""Models by the short names that are used on the command line and in reports."""
 
 from __future__ import annotations
 
@@ -29,9 +29,9 @@ class Entry:
         made: class of the model.
         description: one-line description for help texts and the report.
         options: arguments for the class.
-        priors: function that returns force priors for a system, mean and kernel, unless the class selects
-            them.
-        kernel: kernel of these priors, if not the default.
+        priors: function that returns the force priors for a system, mean and kernel; `None` if the class
+            selects them.
+        kernel: kernel for these priors; `None` means the default.
     """
 
     made: type[Any]
@@ -40,14 +40,9 @@ class Entry:
     priors: Callable[[ConstrainedSystem, Any, Kernel | None], Sequence[ForcePrior]] | None = None
     kernel: Kernel | None = None
 
-    @property
-    def kind(self) -> str:
-        """Kind of the model as in saved files."""
-        return self.made.kind
-
 
 def _contact(system: ConstrainedSystem, mean: Any, kernel: Kernel | None) -> Sequence[ForcePrior]:
-    """Return priors on contact friction only, for any mean."""
+    """Return priors on contact friction only, whatever the mean."""
     return contact_priors(system, kernel)
 
 
@@ -94,7 +89,7 @@ def create(
     Args:
         name: a key of `MODELS`.
         system: robot and contacts.
-        noise: noise of measured accelerations, if the model uses it; by default the value in the log.
+        noise: noise of measured accelerations, if the model uses it; by default, the value in the log.
         seed: seed for random initial values, if the model uses them.
         options: other arguments of the model class.
 

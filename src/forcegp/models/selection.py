@@ -1,15 +1,15 @@
-"""Selection of a set of force priors on a log.
+"""Selection of a set of force priors by cross-validation on a log.
 
 Each candidate, a set in `SETS` with or without identification of the inertia, is trained on one half of the
-log and tested on the other, and vice versa. Each half consists of contiguous stretches, since with
-neighbouring samples any set would look good. The score is the mean log predictive density of the
+log and tested on the other, and vice versa. Each half consists of contiguous stretches, since any set would
+score well if training and test samples were neighbours. The score is the mean log predictive density of the
 measurements, including noise,
 
     S = 1/N Σ_i log N(y_i; E z(x_i), Var z(x_i) + Σ),
 
-and candidates are compared by differences of S over blocks of rows, which have a standard error. The simplest
-candidate within one standard error of the best is selected. No candidate depends on the motor torque, since
-in closed loop such a residual learns to cancel it and appears to have the best density.
+and candidates are compared by the differences of S over blocks of rows, from which a standard error follows.
+The simplest candidate within one standard error of the best is selected. No candidate depends on the motor
+torque, since in closed loop such a residual learns to cancel the torque and appears to have the best density.
 """
 
 from __future__ import annotations
@@ -44,15 +44,15 @@ from forcegp.models.structured_learning import (
 FEWEST = 100
 """Number of samples below which the set `FEW` is used."""
 HALVES, STRETCHES, BLOCKS = 2, 4, 8
-"""Number of halves of the log, of alternating stretches, and of blocks of rows for comparison in a half."""
+"""Number of halves of the log, of alternating stretches, and of blocks of rows compared in each half."""
 ROWS = 400
-"""Number of evenly spaced rows of a half for conditioning and for testing a candidate."""
+"""Number of evenly spaced rows of each half on which a candidate is conditioned or tested."""
 LEARN_ROWS = 150
-"""Number of rows for learning hyperparameters if a prior does not have finitely many features."""
+"""Number of rows for learning hyperparameters if a prior has infinitely many features."""
 QUICK = LearningOptions(tolerance=1e-5, max_evaluations=150)
-"""Learning options for candidates, with a loose tolerance since their scores differ clearly."""
+"""Learning options for candidates; the tolerance can be loose since their scores differ clearly."""
 DROPPED = 2.0
-"""Number of standard errors behind the best from which a candidate is not tried on the second half."""
+"""Number of standard errors behind the best beyond which a candidate is not tried on the second half."""
 
 
 @dataclass(frozen=True)
@@ -64,12 +64,12 @@ class Candidate:
 
     @property
     def name(self) -> str:
-        """Name in the table of the comparison."""
+        """Name of the candidate in the comparison table."""
         return f"{self.set.name}, inertia identified" if self.inertia else self.set.name
 
 
 def candidates_of(spec: Specification) -> list[Candidate]:
-    """Return the candidates, simplest first; with unknown joint forces, only those with torque noise."""
+    """Return the candidates, simplest first; if joint forces are unknown, only those with torque noise."""
     candidates = []
     sets = [each for each in SETS.values() if each.fits(spec.system)]
     for chosen in sets if not spec.noise.external else [each for each in sets if each.has_joint_friction]:
@@ -86,7 +86,7 @@ def candidates_of(spec: Specification) -> list[Candidate]:
 
 
 def without_comparison(spec: Specification, note: str) -> tuple[Specification, tuple[Compared, ...]]:
-    """Return the specification with the set for few samples, and a comparison table with this choice."""
+    """Return the specification with the set for small data sets, and a table that contains only this set."""
     spec = spec.with_options(inertia=spec.options.inertia or "auto")
     return spec.with_set(FEW), (Compared(FEW.name, chosen=True, note=note),)
 
@@ -97,11 +97,11 @@ def with_priors(
     learn: Sequence[str] | None = None,
     progress: FitProgress | None = None,
 ) -> tuple[Specification, tuple[Compared, ...]]:
-    """Return the specification with automatically selected priors, and the comparison.
+    """Return the specification with automatically selected priors, and the comparison table.
 
     Args:
         spec: the model, with the noise for these data.
-        data: the log, or its rows in memory.
+        data: the log, or those of its rows that are in memory.
         learn: parts to learn, if not all.
         progress: called after each candidate with the number of completed candidates, their total, and NaN.
     """
@@ -132,14 +132,14 @@ def with_priors(
 
 @dataclass
 class Trial:
-    """Scores of a candidate so far.
+    """The scores of a candidate so far.
 
     Attributes:
         candidate: the tested candidate.
-        scores: scores on each half, by block.
-        coverage: fraction of measured values within ±2σ on each half.
+        scores: score of each block, by half.
+        coverage: fraction of measured values within ±2σ, by half.
         begin: hyperparameters learned on the first half.
-        inertia_found: whether an inertia other than that of the robot file was found.
+        inertia_found: whether an inertia different from that of the robot file was found.
         note: reason why the candidate was dropped.
     """
 
@@ -174,7 +174,7 @@ def _score(
         inertia = Inertia(robot)
     trial.inertia_found |= inertia.robot is not robot
     if candidate.inertia and inertia.robot is robot:
-        # The same model as without the question.
+        # The model is the same as without identification.
         for other in trials:
             same = other.candidate == Candidate(candidate.set) and not other.note
             if same and len(other.scores) == len(trial.scores) + 1:
@@ -192,7 +192,7 @@ def _score(
 
 
 def _drop(trials: Sequence[Trial]) -> None:
-    """Drop candidates far behind the best."""
+    """Drop the candidates that are far behind the best."""
     blocks = [(trial, torch.cat(trial.scores)) for trial in trials if not trial.note]
     best = max((own for _, own in blocks), key=lambda x: float(x.mean()), default=torch.empty(0))
     for trial, own in blocks:
@@ -204,7 +204,7 @@ def _drop(trials: Sequence[Trial]) -> None:
 def _result(spec: Specification, trials: Sequence[Trial]) -> tuple[Specification, tuple[Compared, ...]]:
     """Return the specification with the selected set, and the comparison table."""
     found = any(trial.inertia_found for trial in trials)
-    # Without another inertia, a candidate with the question about it is the one without.
+    # If no different inertia was found, a candidate with identification equals the one without.
     shown = [t for t in trials if not t.candidate.inertia or spec.options.inertia == "auto" or found]
     whole = [(trial, torch.cat(trial.scores)) for trial in shown if not trial.note]
     if not whole:
@@ -219,7 +219,7 @@ def _result(spec: Specification, trials: Sequence[Trial]) -> tuple[Specification
 
 
 def halves_of(q: Tensor, qd: Tensor, in_order: bool) -> Tensor:
-    """Return the half of each row `(n,)`: alternating stretches in time or along a state direction."""
+    """Assign rows to halves `(n,)`, in alternating stretches of time or along a direction in state space."""
     n = len(q)
     rank = torch.arange(n, device=q.device)
     if not in_order:
@@ -234,11 +234,11 @@ def halves_of(q: Tensor, qd: Tensor, in_order: bool) -> Tensor:
 def trained(
     spec: Specification, inertia: Inertia, train: Training, begin: Mapping[str, Tensor] | None
 ) -> StructuredFit:
-    """Return a candidate conditioned on `ROWS` rows of a half.
+    """Return a candidate conditioned on `ROWS` rows of one half of the data.
 
     Args:
         spec: specification with the priors of the candidate.
-        inertia: inertia of the robot to learn with.
+        inertia: robot inertia to use in learning.
     """
     spec, pinned = identified(spec, train) if inertia.identified else (spec, {})
     rows = scaled(train.evenly(ROWS), spec.system, spec.priors, {}, spec.options.standardize)
@@ -255,8 +255,9 @@ def trained(
 
 @torch.no_grad()
 def log_density(fit: StructuredFit, test: Training) -> tuple[Tensor, float]:
-    """Return log N(y_i; E z, Var z + Σ) of each sample `(n,)`, for accelerations or else all measured values,
-    and the fraction within ±2σ.
+    """Return log N(y_i; E z, Var z + Σ) of each sample `(n,)` and the fraction of values within ±2σ.
+
+    If accelerations were measured, other measurements are ignored.
 
     Raises:
         NumericalError: a covariance is not positive definite.
@@ -277,11 +278,11 @@ def log_density(fit: StructuredFit, test: Training) -> tuple[Tensor, float]:
 
 
 def blocks_of(density: Tensor) -> Tensor:
-    """Return means over contiguous blocks of rows `(BLOCKS,)`."""
+    """Return the means over contiguous blocks of rows `(BLOCKS,)`."""
     return torch.stack([part.mean() for part in density.tensor_split(BLOCKS)])
 
 
 def difference(best: Tensor, own: Tensor) -> tuple[float, float]:
-    """Return the difference of a score to the best, with its standard error, from blocks `(k,)` of each."""
+    """Return how far a score is behind the best, and the standard error, from blocks `(k,)` of both."""
     behind = best - own
     return float(behind.mean()), float(behind.std() / math.sqrt(len(behind)))

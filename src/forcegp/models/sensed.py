@@ -1,8 +1,8 @@
-"""The force sensor of a log as a measurement of the normal force λ in addition to accelerations.
+"""Use of a logged force sensor as a measurement of the normal force λ in addition to accelerations.
 
-A model is fitted to both. At a state with a sensor reading, the reading is an additional measurement of λ: λ̂
-= (λ_m/w² + s/σ²) / (1/w² + 1/σ²), with the model's λ_m ± w, in which w includes motor torque noise, and the
-sensor's s ± σ. The two errors are independent.
+A model is fitted to both. At a state with a sensor reading s ± σ, the reading is combined with the model's
+prediction λ_m ± w, where w includes motor torque noise: λ̂ = (λ_m/w² + s/σ²) / (1/w² + 1/σ²). The two errors
+are independent.
 """
 
 from __future__ import annotations
@@ -15,29 +15,26 @@ from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.data import Dataset
 from forcegp.errors import ModelError
 from forcegp.forces.measurements import Observation
-from forcegp.forces.quantities import states_at
 from forcegp.models.external_wrench import white_noise_std
 from forcegp.models.structured_fit import StructuredFit
 
 SENSOR = "F_sensor"
 """Name of the force on the robot at a contact [N], as written by `forcegp import`."""
-LEAST_FORCE = 1e-3
-"""Minimum noise of a sensed joint force, relative to its magnitude."""
 TINY = 1e-12
 """Smallest variance of a predicted force [N²]."""
 
 
 def with_sensor(data: Dataset, system: ConstrainedSystem, noise_std: float) -> list[Observation]:
-    """Return the accelerations of a log, and the sensor's normal force λ = n·F while the contact is closed.
+    """Return the accelerations of a log, and the sensed normal force λ = n·F while the contact is closed.
 
     Args:
         data: a log with `F_sensor`.
         system: robot with a single surface contact.
-        noise_std: standard deviation of the normal force due to the sensor and unmeasured forces, such as the
-            inertial force of the tool [N].
+        noise_std: standard deviation of the errors in the normal force that are caused by the sensor and by
+            unmeasured forces, such as the inertial force of the tool [N].
 
     Raises:
-        ModelError: there is no sensor, no row in contact, or more than one contact.
+        ModelError: the log has no sensor or no row in contact, or the system has more than one contact.
     """
     contact = _contact(system)
     closed = data.active([contact.name])[:, 0]
@@ -53,46 +50,8 @@ def with_sensor(data: Dataset, system: ConstrainedSystem, noise_std: float) -> l
     return [Observation(data), Observation(sensed, "multiplier", noise_std)]
 
 
-@torch.no_grad()
-def with_sensed_forces(data: Dataset, system: ConstrainedSystem, force_std: float) -> list[Observation]:
-    """Return joint forces computed from a force sensor and the accelerations, Q̄ = M q̈ − J_Eᵀ F.
-
-    Both contain the same torque errors, which two separate measurements would count twice. Fit these forces
-    without the contact, `StructuredGP(ConstrainedSystem(system.robot), …)`, since its force is measured. A
-    joint without a measured torque has an unknown force of the magnitude of Q̄ − Q_C − Q_G − Q_D.
-
-    Args:
-        data: a log with `F_sensor`; no force acts while the contact is open.
-        system: robot with a single surface contact.
-        force_std: standard deviation of each force component [N].
-
-    Raises:
-        ModelError: the log has no sensor force, or the system does not have exactly one contact.
-    """
-    contact = _contact(system)
-    if not has_sensor(data, system):
-        raise ModelError(
-            f"the log has no sensor force at contact {contact.name!r}",
-            expected=f"columns {SENSOR}.{contact.name}.x, .y, .z",
-        )
-    closed = data.active([contact.name])
-    at, _ = states_at(system, data.q, data.qd, data.tau, closed)
-    J, M = at.eom.contact_points[contact.name].jacobian, at.eom.M
-    F = data.contact_extras[SENSOR][contact.name] * closed
-    Q = (M @ data.qdd[..., None])[..., 0] - (J.mT @ F[..., None])[..., 0]
-    qdd_std = torch.full_like(Q, data.header.noise_std or 0.0)
-    qdd_std = data.extras.get("qdd_std", qdd_std)
-    # Σ = σ² J_EᵀJ_E + M Σ_q̈ M
-    variance = force_std**2 * J.square().sum(-2) * closed + (M.square() @ qdd_std[..., None] ** 2)[..., 0]
-    unknown = (Q - at.eom.Q_K).square().mean(0)
-    unmeasured = [name in data.header.unmeasured_torques for name in data.joint_names]
-    variance = variance + unknown * torch.tensor(unmeasured, device=Q.device)
-    std = (variance + (LEAST_FORCE * Q.square().mean(0).sqrt()) ** 2).sqrt()
-    return [Observation(data.replace(extras={**data.extras, "Q": Q}), "joint_force", std)]
-
-
 def _contact(system: ConstrainedSystem) -> SurfaceContact:
-    """Return the contact that a sensor measures."""
+    """Return the contact at which the sensor measures the force."""
     contact = system.contacts[0] if len(system.contacts) == 1 else None
     if not isinstance(contact, SurfaceContact):
         raise ModelError(
@@ -109,7 +68,7 @@ def has_sensor(data: Dataset, system: ConstrainedSystem) -> bool:
 
 
 def sensed_force(data: Dataset, system: ConstrainedSystem) -> Tensor:
-    """Return the normal force n·F of the sensor `(n,)` [N].
+    """Return the normal force n·F measured by the sensor, `(n,)` [N].
 
     Raises:
         ModelError: the system has more than one contact, or none with a surface.
@@ -121,14 +80,14 @@ def sensed_force(data: Dataset, system: ConstrainedSystem) -> Tensor:
 
 
 def sensor_noise_std(data: Dataset, system: ConstrainedSystem) -> float:
-    """Estimate the standard deviation of the white noise of the sensor's normal force from the log [N].
+    """Estimate, from a log, the standard deviation of the white noise in the sensed normal force [N].
 
     Args:
         data: a log in time order, with `F_sensor`.
         system: robot with a single surface contact.
 
     Raises:
-        ModelError: there are no five consecutive rows in contact.
+        ModelError: the log does not have five consecutive rows in contact.
     """
     closed, force = data.active([_contact(system).name])[:, 0], sensed_force(data, system)
     steps = data.t.diff()
@@ -144,10 +103,10 @@ def sensor_noise_std(data: Dataset, system: ConstrainedSystem) -> float:
 
 @torch.no_grad()
 def force_from_sensor(fit: StructuredFit, data: Dataset) -> tuple[Tensor, Tensor]:
-    """Return mean and standard deviation `(n,)` [N] of λ, with the sensor reading as a measurement.
+    """Return the mean and standard deviation `(n,)` [N] of λ given the sensor readings.
 
     Args:
-        fit: model fitted to the accelerations and the sensor (`with_sensor`).
+        fit: model fitted to the accelerations and the sensor (see `with_sensor`).
         data: states with `F_sensor`.
 
     Raises:

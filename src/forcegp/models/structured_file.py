@@ -1,7 +1,7 @@
 """Structured Gaussian processes in saved files.
 
-An exact posterior is saved with its data, a sparse one with its sums over them. The options are those of
-`StructuredOptions`, and priors are written field by field.
+An exact posterior is saved with its data, and a sparse one with its sums over the data. The options are those
+of `StructuredOptions`, and priors are written field by field.
 """
 
 from __future__ import annotations
@@ -16,7 +16,7 @@ from pydantic import Field, NonNegativeFloat, PositiveFloat, field_serializer
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.errors import ForceGPError, ModelError
+from forcegp.errors import ModelError
 from forcegp.files import Record
 from forcegp.forces.measurements import Measurement, Training, plain
 from forcegp.forces.noise import Noise
@@ -44,10 +44,10 @@ from forcegp.robot.parameters import AnalyticalParameters
 from forcegp.storage.descriptions import decode, encode
 from forcegp.storage.model_file import ModelHeader
 from forcegp.storage.options import StructuredOptions
-from forcegp.storage.system import robot_tensors, take_robot
+from forcegp.storage.system import take_robot
 
 Stated = NonNegativeFloat | tuple[NonNegativeFloat, ...]
-"""Noise that may be zero, as one number or one per joint."""
+"""Noise that may be zero, given as one number or one per joint."""
 CLASSES: dict[str, type] = {
     "squared_exponential": kernels.SquaredExponential,
     "matern32": kernels.Matern32,
@@ -69,16 +69,16 @@ CLASSES: dict[str, type] = {
     "contact": ContactForcePrior,
     "sliding_friction": SlidingFrictionPrior,
 }
-"""Classes that can be saved, by their name in the file."""
+"""Classes that can be saved, by their names in the file."""
 COLUMNS = ("q", "qd", "tau", "active", "values")
 """Saved parts of each measurement."""
 IN_TIME = ("segment", "t")
-"""Additional saved parts if a prior depends on time or recording."""
+"""Additional parts that are saved if a prior depends on the time or the recording."""
 NOT_REAL = (
     (re.compile(r"data\.\d+\.active"), torch.bool),
     (re.compile(r"added|data\.\d+\.segment|sparse\..*\.(components|dropped)"), torch.int64),
 )
-"""Names of the tensors that do not contain real numbers, with their type."""
+"""Name patterns of the tensors that do not contain real numbers, and their types."""
 Parts = tuple[
     Specification, Problem, dict[str, Tensor], ForcePosterior, FitResult, ConstrainedSystem, dict[str, Tensor]
 ]
@@ -111,7 +111,7 @@ class StructuredSettings(StructuredOptions):
 
     @field_serializer("result")
     def _saved(self, result: FitResult) -> dict[str, Any]:
-        """Return the result without the long history and the constant inputs, which are in the scales."""
+        """Return the result without the long history and the constant inputs, which the scales contain."""
         left_out = ("history", "constant_inputs")
         return {name: x for name, x in dataclasses.asdict(result).items() if name not in left_out}
 
@@ -126,7 +126,7 @@ def pack(
     """Convert a fit to settings and tensors.
 
     Args:
-        problem: problem with the data of the posterior.
+        problem: problem with the data on which the posterior is conditioned.
 
     Raises:
         ModelError: a prior or kernel is defined in Python.
@@ -140,7 +140,7 @@ def pack(
         tensors["torque_correlation"] = problem.correlation
     tensors |= _conditioned_on(spec, problem.training, posterior)
     start = own.start if own is not None else spec.system.robot
-    tensors |= {f"start.{name}": getattr(start, name) for name in robot_tensors(start)}
+    tensors |= {f"start.{name}": value for name, value in start.tensors.items()}
     for prior, scale in zip(spec.priors, problem.training.scales, strict=True):
         tensors |= {f"scale.{prior.name}.mean.{key}": value for key, value in scale.mean.items()}
         tensors |= {f"scale.{prior.name}.std.{key}": value for key, value in scale.std.items()}
@@ -162,7 +162,7 @@ def pack(
 
 
 def _conditioned_on(spec: Specification, training: Training, posterior: ForcePosterior) -> dict[str, Tensor]:
-    """Return the data of an exact posterior, or the sums over them of a sparse one."""
+    """Return the data of an exact posterior, or the sums over the data of a sparse posterior."""
     latent = posterior.latent
     if not isinstance(latent, ExactPosterior):
         return {f"sparse.{name}": value for name, value in latent.tensors().items()}
@@ -199,7 +199,7 @@ def unpack(
     """Restore the fields of a fit from `pack`.
 
     Raises:
-        ModelError: a tensor or setting is missing or invalid; the message names file and field.
+        ModelError: a tensor or setting is missing or invalid; the message names the file and the field.
     """
     settings = header.settings_as(StructuredSettings, source)
     spec = _specification(settings, tensors, system, source)
@@ -225,10 +225,8 @@ def _specification(
     original, parameters = take_robot(tensors, "start.", system.robot, source), None
     system = system.with_robot(original)
     if settings.analytical_parameters is not None:
-        try:
+        with ModelError.within(f"{source}: field 'settings.analytical_parameters'"):
             parameters = AnalyticalParameters(original, settings.analytical_parameters)
-        except ForceGPError as cause:
-            raise ModelError.at(f"{source}: field 'settings.analytical_parameters'", cause) from cause
     return Specification(
         system,
         AnalyticalMean(settings.mean),
@@ -240,7 +238,7 @@ def _specification(
 
 
 def _check_types(tensors: Mapping[str, Tensor]) -> None:
-    """Raise `ValueError` if a tensor does not contain real numbers, or contacts are not flags."""
+    """Raise `ValueError` if a tensor does not contain real numbers or have its type in `NOT_REAL`."""
     for name, value in tensors.items():
         dtype = next((dtype for names, dtype in NOT_REAL if names.fullmatch(name)), None)
         if not value.is_floating_point() if dtype is None else value.dtype != dtype:
@@ -278,7 +276,7 @@ def _training(settings: StructuredSettings, spec: Specification, tensors: Mappin
 
 
 def _check_hyperparameters(spec: Specification, training: Training, hyper: Mapping[str, Tensor]) -> None:
-    """Raise `ValueError` or `KeyError` if hyperparameters do not match the kernels."""
+    """Raise `ValueError` or `KeyError` if the hyperparameters do not match the kernels."""
     for prior, scale in zip(spec.priors, training.scales, strict=True):
         widths = {name: x.shape[-1] for name, x in scale.mean.items()}
         expected = prior.kernel.initial(prior.outputs(spec.system.robot), widths)
@@ -297,9 +295,9 @@ def _restored(
     settings: StructuredSettings,
     system: ConstrainedSystem,
 ) -> Parts:
-    """Restore the fit with its weights; factorisation is deferred until a covariance is needed."""
+    """Restore the fit with its weights; matrices are factorised only when a covariance is needed."""
     correlation = tensors.get("torque_correlation")
-    if correlation is None and settings.correlation_time > 0.0:  # older models have one for all joints
+    if correlation is None and settings.correlation_time > 0.0:  # older models have one time for all joints
         correlation = torch.full_like(system.robot.mass, settings.correlation_time)
     problem = dataclasses.replace(
         spec.problem(training),
@@ -317,7 +315,7 @@ def _restored(
 def _in_order(problem: Problem, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
     """Return the tensors with the inputs of each kernel in the order defined by its prior.
 
-    A kernel that reads all inputs uses their order, which files do not preserve.
+    A kernel on all inputs depends on their order, which files do not preserve.
     """
     system = problem.system
     rest = torch.zeros(1, system.robot.nq, dtype=system.robot.dtype, device=system.robot.device)
@@ -329,7 +327,7 @@ def _in_order(problem: Problem, tensors: Mapping[str, Tensor]) -> dict[str, Tens
 
 
 def _posterior(problem: Problem, hyper: dict[str, Tensor], tensors: Mapping[str, Tensor]) -> ForcePosterior:
-    """Restore the posterior with its weights or sums."""
+    """Restore the posterior from its weights or sums."""
     params, process = kernel_parameters(hyper), problem.process_at(hyper)
     if "alpha" not in tensors:
         kept = _in_order(problem, _below(tensors, "sparse."))

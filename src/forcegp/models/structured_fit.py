@@ -1,4 +1,4 @@
-"""Fitted structured Gaussian processes: forces conditioned on data, which determine every quantity."""
+"""Fitted structured Gaussian processes: forces conditioned on data, from which all quantities follow."""
 
 from __future__ import annotations
 
@@ -20,6 +20,7 @@ from forcegp.forces.external_wrench import WrenchFrame
 from forcegp.forces.measurements import Observation, Training
 from forcegp.forces.noise import TORQUE_NOISE, learned_slopes
 from forcegp.forces.posterior import (
+    GROWTH,
     LOW,
     ForcePosterior,
     distance_beyond,
@@ -58,7 +59,7 @@ from forcegp.storage.model_file import ModelHeader
 
 KIND = "structured_gp"
 JOINED = 256
-"""Number of updates after which the digests of their samples are joined."""
+"""Number of updates after which the digests of their samples are merged."""
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -72,8 +73,8 @@ class StructuredFit(FittedModel):
         posterior: posterior over latent forces.
         result: result of the fit.
         system: robot and contacts, with learned parameters.
-        noise: standard deviation of a measurement for each measured quantity, `(d,)`.
-        added: digests of samples of a sparse posterior that `forget` can remove.
+        noise: standard deviation `(d,)` of the measurements of each measured quantity.
+        added: digests of the samples that `forget` can remove from a sparse posterior.
     """
 
     specification: Specification
@@ -100,12 +101,12 @@ class StructuredFit(FittedModel):
 
     @property
     def training(self) -> Training:
-        """Data that the posterior is conditioned on."""
+        """Data on which the posterior is conditioned."""
         return self.problem.training
 
     @property
     def force_priors(self) -> tuple[ForcePrior, ...]:
-        """Priors on the unknown forces, including those selected on the data."""
+        """Priors on the unknown forces, including automatically selected priors."""
         return self.posterior.priors
 
     def at(self, flat: FlatStates, query: Query) -> Answer:
@@ -113,7 +114,7 @@ class StructuredFit(FittedModel):
         unseen = self.result.never_closed if query.system is None else ()
         at = flat.with_equations(system)
         if query.covariance and any(isinstance(prior, InertialPrior) for prior in self.posterior.priors):
-            # Errors of the inertia are multiplied by the predicted acceleration.
+            # Inertia errors are multiplied by the predicted acceleration.
             qdd = self.posterior.read_mean(system, at, affine_map(system, at, "qdd"))
             at = dataclasses.replace(at, qdd=qdd)
         z, parts = affine_maps(system, at, query.quantity)
@@ -129,7 +130,7 @@ class StructuredFit(FittedModel):
     def _read(
         self, system: ConstrainedSystem, at: States, z: AffineMap, parts: Mapping[str, slice], noise: bool
     ) -> tuple[Tensor, Tensor]:
-        """Return mean and covariance of quantities, including unknown forces and, if requested, noise."""
+        """Return the mean and covariance of quantities, including unknown forces and, if requested, noise."""
         mean, spread = self.posterior.read(system, at, z)
         z = self.posterior.process.coupled(system, at, z)
         spread = spread + _carried(z, unknown_variance(self.hyperparameters, at, self.problem.external_std))
@@ -144,25 +145,25 @@ class StructuredFit(FittedModel):
         external: Mapping[str, float] | None = None,
         **components: Any,
     ) -> ExternalWrench:
-        """Estimate the wrench of the environment on a frame, beyond the learned forces and the closed
+        """Estimate the wrench that the environment exerts on a frame, besides learned forces and closed
         contacts.
 
-        M q̈ = Q̄ + Aᵀλ + Jᵀ w (`forces/external_wrench.py`). With `method="acceleration"`, each sample is
-        estimated separately by generalized least squares. With `method="momentum"`, a causal Kalman filter
-        runs over each trajectory and needs no accelerations. For logs in time order, the learned forces
-        include friction with memory.
+        In M q̈ = Q̄ + Aᵀλ + Jᵀ w (`forces/external_wrench.py`), with `method="acceleration"`, w is estimated
+        separately for each sample by generalized least squares. With `method="momentum"`, a causal Kalman
+        filter runs over each trajectory and needs no accelerations. For logs in time order, the learned
+        forces include friction with memory.
 
         Args:
             data: a log, in time order for the momentum filter.
             frame: frame of the robot.
             method: `"acceleration"` or `"momentum"`.
-            external: standard deviation of unknown joint forces that are absent from the training log, such
-                as a pushing hand, by joint name [N m, N].
+            external: standard deviation of unknown joint forces that did not act in the training log, such as
+                those of a hand that pushes the arm, by joint name [N m, N].
             **components: `reference` (`"world"` or `"local"` axes), `axes` (some of `fx`, `fy`, `fz`, `mx`,
                 `my`, `mz`; the others are zero), `point`, `prior_std` and `change` for `WrenchFrame`.
 
         Returns:
-            Mean `(n, k)` and covariance `(n, k, k)` [N, N m], with `detect` for contacts.
+            The mean `(n, k)` and covariance `(n, k, k)` [N, N m], with the method `detect` for contacts.
 
         Raises:
             UnknownNameError: the frame, reference, component or method does not exist.
@@ -184,14 +185,16 @@ class StructuredFit(FittedModel):
     ) -> ExportedModel:
         if functions is not None and functions < 1:
             raise ModelError("a posterior has one function at least", expected="1 or more", got=functions)
-        parts = self.system, self.posterior, self.hyperparameters, self.noise, self.torque_std
+        tensors = {**self.hyperparameters, **self._region}
+        parts = self.system, self.posterior, tensors, self.noise, self.torque_std
         learned, std = self.hyperparameters.get(TORQUE_NOISE), self.problem.torque_std
         std = learned.exp() if learned is not None else 0.0 if std is None else std
         variance = torch.zeros_like(self.system.robot.mass) + std**2
         moving = self.specification.noise.learns_torque
-        # Noise of the state makes the rows of a sample depend on the slopes of the learned forces.
+        # With state noise, the rows of a sample depend on the slopes of the learned forces.
         sampling = None if self.problem.state_std is not None else (variance, self.problem.power, moving)
-        return ExportedModel(*parts, self.problem.external_std, functions, sampling, wrench, dtype)
+        never = self.result.never_closed
+        return ExportedModel(*parts, self.problem.external_std, functions, sampling, wrench, dtype, never)
 
     def export(
         self,
@@ -206,24 +209,24 @@ class StructuredFit(FittedModel):
         """Export the fit as C99 code that needs only libm, with a test program, or its mean as a CasADi
         function.
 
-        The code maps (q, q̇, τ, closed contacts) to mean and covariance of every quantity, and to Jacobians
-        of the mean. The CasADi function returns the mean, with exact derivatives of any order.
+        The code maps (q, q̇, τ, closed contacts) to the mean and covariance of every quantity, and to the
+        Jacobians of the mean. The CasADi function returns the mean, with exact derivatives of any order.
 
         Args:
             path: folder to create.
             language: `"c"`, `"casadi"`, or `"torch"` for mean and covariance as a `torch.export` program.
             name: name of the files, and prefix of all names in them.
-            functions: number r of basis functions for a reduced covariance; `None` for all.
-            wrench: frame and components of an external wrench, estimated from accelerations beside the state.
+            functions: number r of basis functions for a reduced covariance; `None` uses all.
+            wrench: frame and components of an external wrench to estimate from the state and accelerations.
             dtype: precision of the C code, `torch.float64` or `torch.float32`.
 
         Returns:
-            The folder, the growth of error bars by a reduced covariance, and errors by single precision, at
-            training states.
+            The folder and, at training states, the growth of error bars caused by a reduced covariance and
+            the errors caused by single precision.
 
         Raises:
             ModelError: a prior, kernel or contact cannot be exported to C, or the posterior is too large.
-            NumericalError: single precision does not resolve a variance.
+            NumericalError: single precision cannot resolve a variance.
             UnknownNameError, ParameterError: the language or frame does not exist, or the name is not a C
                 identifier.
             DestinationError: the folder cannot be written, or contains other files.
@@ -237,47 +240,54 @@ class StructuredFit(FittedModel):
         """Compile the fit to a fast predictor in C with the local compiler.
 
         Args:
-            functions: number r of basis functions for a reduced covariance, which can only be wider; `None`
-                for all.
-            wrench: frame and components of `external_wrench`.
+            functions: number r of basis functions for a reduced-rank covariance, which can only be larger;
+                `None` uses all.
+            wrench: frame and components to estimate by `external_wrench`.
 
         Raises:
             ModelError: a prior, kernel or contact cannot be exported to C, or the posterior is too large.
-            UnknownNameError: no such frame.
+            UnknownNameError: the frame does not exist.
             MissingDependencyError: there is no C++ compiler.
         """
         return CompiledFit(self._exported(functions, wrench))
 
     def beyond(self, qd: Tensor, tau: Tensor) -> Tensor | None:
         """Return the distance of the speed and torque of each joint beyond the training data, in training
-        standard deviations `(*batch, nq)`; `None` if no torque noise was learned.
+        standard deviations `(*batch, nq)`; `None` for a model from a file without the trained region.
         """
-        return distance_beyond(self.hyperparameters, qd, tau) if LOW in self.hyperparameters else None
+        region = self._region
+        return distance_beyond(region, qd, tau) if LOW in region else None
+
+    @property
+    def _region(self) -> Mapping[str, Tensor]:
+        """Return the trained region: that of the calibrated noise or, without it, of the training data."""
+        calibrated = GROWTH in self.hyperparameters or not self.training.samples
+        return self.hyperparameters if calibrated else self.problem.region
 
     def force_field(self) -> ForceField:
-        """Return the posterior mean of Q̄ = Q + Q_z, `(n, nq)` at states."""
+        """Return the posterior mean of Q̄ = Q + Q_z as a force field."""
         return self.posterior
 
     def force_samples(self, samples: int, generator: torch.Generator) -> ForceField:
-        """Return a force field of functions drawn from the posterior."""
+        """Return functions drawn from the posterior as a force field."""
         return draw_samples(self.posterior, samples, generator)
 
     def compiled_motion(self, system: ConstrainedSystem, force: ForceField) -> CompiledMotion | None:
-        """Return C code for the motion under the posterior mean or function samples."""
+        """Return C code for the motion under the posterior mean or under function samples."""
         model = dataclasses.replace(self._exported(None), system=system, functions=0)
         return compiled_motion(model, force, self.specified)
 
     def condition(
         self, data: Dataset | Sequence[Observation], hyperparameters: Mapping[str, Tensor] | None = None
     ) -> StructuredFit:
-        """Condition on other data, with the same hyperparameters and input scales.
+        """Condition the forces on different data, with the same hyperparameters and input scales.
 
         Args:
             data: data to condition on.
-            hyperparameters: other hyperparameters to use.
+            hyperparameters: hyperparameters to use instead of those of the fit.
 
         Raises:
-            ModelError: the data do not fit the model.
+            ModelError: the data are incompatible with the model.
         """
         spec = self.specification
         training, doubts = training_for(spec, self.problem, data, learned=())
@@ -304,7 +314,7 @@ class StructuredFit(FittedModel):
             data: additional measurements of the same quantities.
 
         Raises:
-            ModelError: the data contain other quantities.
+            ModelError: the data contain different quantities.
         """
         measurements, _ = training_for(self.specification, self.problem, data, learned=(), fewest=0)
         if measurements.quantities != tuple(self.noise):
@@ -330,13 +340,13 @@ class StructuredFit(FittedModel):
         return dataclasses.replace(updated, problem=whole)
 
     def _with_slopes(self, measurements: Training) -> Training:
-        """Return other measurements with the slopes of the learned forces, if the fit has them."""
+        """Return the measurements with the slopes of the learned forces, if the fit uses slopes."""
         if self.training.slopes is None:
             return measurements
         return learned_slopes(measurements, self.system, self.posterior)
 
     def _problem_of(self, measurements: Training) -> Problem:
-        """Return the problem with other measurements and the learned robot with compiled mechanics."""
+        """Return the problem with the given measurements and the learned robot, using compiled mechanics."""
         system = compiled_system(self.system)
         problem = dataclasses.replace(self.problem, training=measurements, system=system, parameters=None)
         return problem.with_coulomb_errors(self.hyperparameters)[0]
@@ -344,13 +354,13 @@ class StructuredFit(FittedModel):
     def forget(
         self, what: float | Dataset | Sequence[Observation], priors: Sequence[str] | None = None
     ) -> StructuredFit:
-        """Remove some samples, or discount all samples so far.
+        """Remove given samples, or reduce the weight of all previous samples.
 
         Args:
-            what: a factor between 0 and 1 that multiplies the weight of all samples so far, such as
-                exp(−Δt/T) for a memory of T seconds, or samples of the fit to remove.
-            priors: names of priors, such as a payload, to which forgetting is limited: their forces drift
-                towards the prior, with the factor as correlation with the previous forces.
+            what: a factor between 0 and 1 that multiplies the weight of all previous samples, such as
+                exp(−Δt/T) for a memory of T seconds, or samples to remove from the fit.
+            priors: names of priors, such as a payload, to which forgetting is limited. Their forces drift
+                towards the prior, and the factor is their correlation with the previous forces.
 
         Raises:
             ModelError: inference is exact, the factor is out of range, or samples to remove were never added,
@@ -383,7 +393,7 @@ class StructuredFit(FittedModel):
     def _with(
         self, latent: ExactPosterior | SparsePosterior, added: tuple[Tensor, ...] = ()
     ) -> StructuredFit:
-        """Return the fit with another posterior, which can forget the samples `added`."""
+        """Return the fit with a new posterior, which can forget the samples `added`."""
         posterior = dataclasses.replace(self.posterior, latent=latent)
         return dataclasses.replace(self, posterior=posterior, added=added)
 
@@ -395,15 +405,14 @@ class StructuredFit(FittedModel):
         return cls(*unpack(header, tensors, system, source), added)
 
     def record(self) -> tuple[Record, dict[str, Tensor]]:
-        settings, tensors = pack(
-            self.specification, self.problem, self.hyperparameters, self.posterior, self.result
-        )
+        values = {**self.hyperparameters, **self._region}
+        settings, tensors = pack(self.specification, self.problem, values, self.posterior, self.result)
         tensors |= {"added": torch.cat(self.added)} if self.added else {}
         return settings, tensors | {f"noise_std.{name}": std for name, std in self.noise.items()}
 
     @property
     def torque_std(self) -> Tensor | None:
-        """Standard deviation of the motor torque noise `(nq,)`, or `None` without noise."""
+        """Standard deviation of the motor torque noise `(nq,)`, or `None` if there is no torque noise."""
         learned = self.hyperparameters.get(TORQUE_NOISE)
         if self.problem.torque_std is not None:
             return self.problem.torque_std
@@ -416,9 +425,9 @@ class StructuredFit(FittedModel):
 
     @property
     def disturbance(self) -> Disturbance | None:
-        """Torque noise as s √T (standard deviation s, correlation time T), and unknown forces of given size.
+        """Torque noise as s √T (standard deviation s, correlation time T), and the size of unknown forces.
 
-        Over times longer than T, the noise acts like white noise with this root of a spectral density.
+        Over times longer than T, the noise acts like white noise with spectral density s² T.
         """
         none, density = torch.zeros_like(self.system.robot.mass[:1]).expand(self.system.robot.nq), None
         if self.torque_std is not None and self.problem.correlation is not None:
@@ -451,12 +460,12 @@ class StructuredFit(FittedModel):
         *,
         sensor: bool = True,
     ) -> Tensor:
-        """Return the additional variance of a measurement of a quantity, `(*batch, d)`.
+        """Return the variance that noise adds to measurements of a quantity, `(*batch, d)`.
 
         Args:
             q, qd, tau: `(*batch, nq)` states.
-            quantity: the measured quantity; torque noise affects every quantity, and sensor noise is known
-                for quantities used in training.
+            quantity: the measured quantity. Torque noise affects every quantity; sensor noise is known only
+                for quantities that were used in training.
             active: `(*batch, n_contacts)` bool, closed contacts; by default all.
             sensor: whether to include sensor noise.
         """
@@ -473,10 +482,10 @@ class StructuredFit(FittedModel):
 
 
 def _without(added: tuple[Tensor, ...], removed: Tensor) -> tuple[Tensor, ...]:
-    """Return the digests of samples without some of them.
+    """Return the digests of samples without those of removed samples.
 
     Raises:
-        ModelError: a sample to remove is not among them.
+        ModelError: a removed sample is not among them.
     """
     values, counts = torch.cat([*added, removed]).unique(return_counts=True)
     _, own = torch.cat([values, removed]).unique(return_counts=True)
@@ -490,7 +499,7 @@ def _without(added: tuple[Tensor, ...], removed: Tensor) -> tuple[Tensor, ...]:
 
 
 def _carried(z: AffineMap, variance: Tensor) -> Tensor:
-    """Return B Σ Bᵀ of white noise on the joint force, `(n, d, d)`."""
+    """Return the covariance B Σ Bᵀ `(n, d, d)` caused by white noise on the joint force."""
     return (z.B_Q * variance[..., None, :]) @ z.B_Q.mT
 
 
@@ -504,11 +513,11 @@ def conditioned(
     learned_on: int | None = None,
     forces: tuple[ForcePosterior, Tensor] | None = None,
 ) -> StructuredFit:
-    """Condition forces on the data of a problem at given hyperparameters.
+    """Condition the forces on the data of a problem at given hyperparameters.
 
     Args:
         learned_on: number of samples used for learning.
-        forces: result of conditioning, if the data of the problem are only a part of the log.
+        forces: result of conditioning, if the problem contains only part of the log.
 
     Raises:
         NumericalError: the covariance of the data is not positive definite.

@@ -1,8 +1,8 @@
 """Gaussian-process priors on forces, mapped to accelerations and multipliers by known mechanics.
 
-q̈ ~ GP(L b + H m_Q, H k_Q Hᵀ) (eq. 15), and likewise for every other quantity (eqs. 19 to 25). `fit` learns
-(`structured_learning.solve`) and conditions (`structured_fit.conditioned`); the covariance in equation 10 is
-computed by `gram` in `gp/likelihood.py`.
+q̈ ~ GP(L b + H m_Q, H k_Q Hᵀ) (eq. 15), and similarly for every other quantity (eqs. 19 to 25). `fit` learns
+the hyperparameters (`structured_learning.solve`) and conditions on the data (`structured_fit.conditioned`);
+`gram` in `gp/likelihood.py` computes the covariance in equation 10.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ from forcegp.models.structured_stream import Pass, Sample, sample_of
 from forcegp.storage.options import StructuredOptions
 
 FIT_COPIES = 3.0
-"""Memory of a fit besides its inference matrices, in units of that of the equations of motion."""
+"""Memory of a fit in addition to its inference matrices, relative to that of the equations of motion."""
 
 
 class StructuredGP(Model[StructuredFit]):
@@ -40,25 +40,25 @@ class StructuredGP(Model[StructuredFit]):
 
     Args:
         system: robot and contacts.
-        mean: `"analytical"`, `"zero"`, or an `AnalyticalMean` with some of its terms.
+        mean: `"analytical"`, `"zero"`, or an `AnalyticalMean` with a subset of its terms.
         force_priors: priors on the unknown forces, the name of a set in `SETS` (`"sliding"`, `"friction"`,
             `"friction+residual"`), or `"auto"`. With `"auto"` and the analytical mean, the set is selected on
-            held-out stretches of the training log (`models/selection.py`); `fit.result.comparison` contains
+            held-out blocks of the training log (`models/selection.py`); `fit.result.comparison` contains
             the scores. Logs of fewer than 100 samples, and fits with `learn=`, use `"friction"`. If the mean
             does not include the motor torque, `"auto"` means `default_priors`: a `JointForcePrior` and, in
             contact, its `NormalForcePrior`, which only affects multipliers.
-        noise: standard deviation of measured accelerations [rad/s², m/s²], one or one per joint, or a
-            `Noise`, which includes the noise of torques and states; by default the value in the log, or 0.1.
+        noise: standard deviation of measured accelerations [rad/s², m/s²], one value or one per joint, or a
+            `Noise`, which includes the noise of torques and states; by default, the value in the log, or 0.1.
         analytical_parameters: a module with a `forward()` method that returns the robot with learned
-            analytical parameters θ_A; `None` keeps the robot unchanged.
+            analytical parameters θ_A; `None` leaves the robot unchanged.
         inference: `"exact"`, `"sparse"` or `"auto"`.
         inducing_points: maximum number of inducing points per prior; fewer are used if they suffice, and the
-            result of the fit reports if more would help.
+            result of the fit indicates whether more would help.
         inertia: `"file"` keeps the inertia of the robot; `"auto"` identifies links and drives if held-out
             stretches of the log favour it (`forces/inertia.py`), which requires a `JointFrictionPrior` and a
-            mean with the motor torque. `None` is `"auto"` for automatically selected priors, and otherwise
-            `"file"`.
-        standardize: whether to standardize kernel inputs, which the paper does not.
+            mean that includes the motor torque. `None` means `"auto"` for automatically selected priors, and
+            `"file"` otherwise.
+        standardize: whether to standardize kernel inputs (the paper does not).
 
     Example:
         >>> import forcegp, torch
@@ -72,7 +72,7 @@ class StructuredGP(Model[StructuredFit]):
         torch.Size([20, 2])
 
     Raises:
-        ModelError, UnknownNameError: the priors do not match the system, or the robot is not float64.
+        ModelError, UnknownNameError: the priors do not match the system, or the robot is not in float64.
     """
 
     kind = KIND
@@ -127,29 +127,30 @@ class StructuredGP(Model[StructuredFit]):
         progress: FitProgress | None = None,
         checkpoint: str | Path | None = None,
     ) -> StructuredFit:
-        """Learn hyperparameters (and analytical parameters) by maximum a posteriori, then condition on the
-        data.
+        """Learn the hyperparameters (and analytical parameters) by maximum a posteriori estimation, and
+        condition the forces on the data.
 
         Args:
             data: measured accelerations, any mixture of measurements, or a streamed log, which needs a
                 constant amount of memory.
             learn: parts to learn: names of priors, `"noise"`, `"analytical_parameters"`. Other parts keep the
-                values (and input scales) of the fit `after`, or the initial values. By default all; an empty
-                list only conditions.
-            after: an earlier fit of this model, for example to other or fewer data. It provides the values of
-                parts that are not learned and, without `learn`, the initial values.
+                values (and input scales) of the fit `after`, or the initial values. By default, all parts are
+                learned; with an empty list, the forces are only conditioned.
+            after: an earlier fit of this model, for example to different or fewer data. It provides the
+                values of parts that are not learned and, without `learn`, the initial values.
             options: optimiser and its limits; by default L-BFGS, with a tolerance of 1e-9 if θ_A is learned.
             progress: called after each evaluation; for a streamed log also after each piece, with the number
                 of samples so far, their total, and NaN.
             checkpoint: file that records the evaluations of a long fit, with a second file for the sums over
-                a streamed log. With existing files, the fit resumes and produces a bit-identical result.
+                a streamed log. If the files exist, the fit resumes and produces a bit-identical result.
                 Remove them once the fitted model is saved.
 
         Returns:
             The fitted model. Repeated fits are bit-identical.
 
         Raises:
-            ModelError, DataError, UnknownNameError: data, earlier fit, or checkpoint do not match the model.
+            ModelError, DataError, UnknownNameError: the data, the earlier fit, `learn` or the checkpoint do
+                not match the model.
             NumericalError: the likelihood cannot be computed.
         """
         spec = self.specification if after is None else self._continued(after)
@@ -185,7 +186,7 @@ class StructuredGP(Model[StructuredFit]):
         return dataclasses.replace(fit, result=result)
 
     def _without_effect(self, fit: StructuredFit) -> Iterator[str]:
-        """Yield the given options that had no effect on a fit."""
+        """Yield a warning for each given option that had no effect on a fit."""
         points = [x for Z in fit.problem.inducing or () for x in Z.values()]
         if self._params["inducing_points"] != LIMIT and not any(map(len, points)):
             how = "exact inference" if fit.problem.inducing is None else "priors with finitely many features"
@@ -196,10 +197,10 @@ class StructuredGP(Model[StructuredFit]):
             yield f'inertia="auto" has no effect: the model lacks {lacks}'
 
     def _continued(self, after: StructuredFit) -> Specification:
-        """Return this model with the priors of an earlier fit, including automatically selected ones.
+        """Return this model with the priors of an earlier fit, including automatically selected priors.
 
         Raises:
-            ModelError: the fit belongs to a model with other priors or contacts.
+            ModelError: the fit belongs to a model with different priors or contacts.
         """
         spec = self.specification
         own = () if self.specification.automatic else tuple(prior.name for prior in self.force_priors)

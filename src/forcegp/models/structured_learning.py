@@ -1,14 +1,15 @@
 """Parts of a structured Gaussian process, and the steps of learning.
 
-1. Samples at rest only bound the friction, and impacts violate the equations of motion, so measured robots
-   learn from motion without impacts.
-2. Hyperparameters are learned from a part of a long log, or from all of a short one.
-3. Residuals that are correlated in time temper the likelihood, unless a `DisturbancePrior` explains them;
-   they also determine slopes and weights (`forces/noise_learning.py`), and hyperparameters are learned again.
+1. Samples at rest only provide a bound on friction, and impacts violate the equations of motion, so only
+   samples in motion and without impacts are used if torque noise is learned.
+2. Hyperparameters are learned from part of a long log, or from all of a short log.
+3. If residuals are correlated in time, the likelihood is tempered, unless a `DisturbancePrior` explains them.
+   Residuals also determine slopes and weights (`forces/noise_learning.py`), after which hyperparameters are
+   learned again.
 4. Inertial parameters move to their posterior mean in one physically consistent Gauss–Newton step.
-5. Torque noise is increased to that on held-out stretches of the training log, and its growth beyond the
-   trained speeds and torques is learned from held-out regimes; dry friction with memory is learned from
-   the residuals of logs in order of time.
+5. Torque noise is increased to the level on held-out blocks of the training log, and its growth beyond the
+   trained speeds and torques is learned from held-out regimes. Dry friction with memory is learned from the
+   residuals of logs in time order.
 6. The posterior is conditioned on all samples.
 """
 
@@ -58,20 +59,20 @@ from forcegp.storage.options import StructuredOptions
 from forcegp.storage.system import pack_system
 
 OPTIONS, WITH_PARAMETERS = LearningOptions(), LearningOptions(tolerance=1e-9)
-"""Default options, and those for learning θ_A, in which L-BFGS stalls for a step or two."""
+"""Default options, and options for learning θ_A, for which L-BFGS may stall for a step or two."""
 LEARN_SAMPLES = 800
-"""Number of samples for learning hyperparameters if priors have finitely many features."""
+"""Number of samples for learning hyperparameters if all priors have finitely many features."""
 LEARN_SAMPLES_INDUCING = 400
-"""Number of samples for exact learning of hyperparameters if a longer log needs sparse inference."""
+"""Number of samples for learning hyperparameters by exact inference if the log needs sparse inference."""
 REST_SPEED = 0.01
 """Largest joint speed of a sample at rest [rad/s, m/s]."""
 FEWEST_MOVING = 20
-"""Number of samples in motion below which samples at rest are kept."""
+"""Number of samples in motion below which samples at rest are also kept."""
 FIRST_POWER = 0.25
-"""Power of the likelihood before the correlation of the residuals is known."""
+"""Exponent of the tempered likelihood before the correlation of the residuals is known."""
 
 ROUNDS = 3
-"""Number of times that hyperparameters are relearned after updates from the residuals."""
+"""Maximum number of times that hyperparameters are relearned after updates based on the residuals."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +85,7 @@ class Specification:
         priors: priors on the unknown forces.
         noise: noise of measured accelerations, torques and states.
         analytical_parameters: module with a `forward()` that returns the robot at θ_A, or `None`.
-        automatic: whether the priors are selected from `SETS` on the data.
+        automatic: whether the priors are selected from `SETS` based on the data.
         options: options with plain values.
     """
 
@@ -97,11 +98,11 @@ class Specification:
     options: StructuredOptions = field(default_factory=StructuredOptions)
 
     def for_data(self, data: Dataset | Sequence[Observation]) -> Specification:
-        """Return the specification with the noise resolved for given data.
+        """Return the specification with the noise resolved for the given data.
 
-        Unless it is given, acceleration noise is learned together with torque noise, or to compare sets of
-        priors. Joints without a measured torque have an unknown force. Contacts stick below the speeds in the
-        log's header.
+        Unless it is given, acceleration noise is learned if torque noise is learned or sets of priors are
+        compared. Joints without a measured torque have an unknown force. Contacts stick below the speeds
+        specified in the header of the log.
         """
         observations, noise = observations_of(data), self.noise
         system = self.system.with_stick_speeds(common_stick_speeds([o.data.header for o in observations]))
@@ -114,18 +115,18 @@ class Specification:
         return dataclasses.replace(self, system=system, noise=noise)
 
     def with_options(self, **changed: Any) -> Specification:
-        """Return the specification with other options."""
+        """Return the specification with changed options."""
         return dataclasses.replace(self, options=self.options.model_copy(update=changed))
 
     def with_set(self, chosen: PriorSet) -> Specification:
-        """Return the specification with a set of priors and its torque noise."""
+        """Return the specification with a given set of priors and the torque noise for this set."""
         priors, noise = chosen.priors(self.system), self.noise
         if isinstance(noise.torque, str) and noise.torque == "auto":
             noise = noise.for_priors(priors)
         return dataclasses.replace(self, priors=priors, noise=noise, automatic=False)
 
     def inertia_of(self, training: Training) -> Inertia:
-        """Return the robot identified from the training samples, if requested."""
+        """Return the inertia identified from the training samples, or, if not requested, that of the file."""
         friction = next((prior for prior in self.priors if isinstance(prior, JointFrictionPrior)), None)
         asks = (
             self.options.inertia == "auto"
@@ -141,11 +142,11 @@ class Specification:
     def problem(
         self, training: Training, robot: RobotModel | None = None, pinned: Mapping[str, Tensor] | None = None
     ) -> Problem:
-        """Return the learning problem of training data.
+        """Return the learning problem for training data.
 
         Args:
-            robot: robot used for learning, if different from that of the file.
-            pinned: values of forces that this robot contains, by prior.
+            robot: robot used for learning, if it differs from that of the file.
+            pinned: values, by prior, of the forces that are included in this robot.
         """
         system = self.system if robot in (None, self.system.robot) else self.system.with_robot(robot)
         noise, robot, std = self.noise, self.system.robot, None
@@ -165,7 +166,7 @@ class Specification:
 
 
 def _unchecked_masses(training: Training) -> tuple[str, ...]:
-    """Return a warning for a log in contact without free motion or a measured force."""
+    """Return a warning if the log has contact but too little free motion and no measured force."""
     closed = sum(int(m.active.any(-1).sum()) for m in training.measurements)
     if not closed or set(training.quantities) != {"qdd"}:
         return ()
@@ -177,21 +178,21 @@ def _unchecked_masses(training: Training) -> tuple[str, ...]:
 
 
 def constant_inputs(problem: Problem) -> tuple[str, ...]:
-    """Return the inputs of priors that do not vary in the training data."""
+    """Return the inputs of priors that are constant in the training data."""
     pairs = zip(problem.priors, problem.training.scales, strict=True)
     return tuple(f"{prior.name}.{name}" for prior, scale in pairs for name in scale.constant)
 
 
 @dataclass(frozen=True)
 class Lesson:
-    """Result of learning, and the problem for conditioning the posterior.
+    """Result of learning, and the problem on which the posterior is conditioned.
 
     Attributes:
-        problem: all samples, the updated robot, and the noise.
+        problem: problem with all samples, the updated robot, and the noise.
         hyperparameters: learned and fixed hyperparameters.
         learned: result of the optimisation.
         learned_on: number of samples used for learning.
-        warnings: doubts about the result.
+        warnings: warnings about the result.
     """
 
     problem: Problem
@@ -208,14 +209,14 @@ def problem_for(
     chosen: Sequence[str] | None,
     part_of: int = 0,
 ) -> tuple[Specification, Problem, tuple[str, ...]]:
-    """Return the learning problem of a first fit to data, or of one after an earlier fit.
+    """Return the learning problem for a first fit to data, or for a fit after an earlier one.
 
     Args:
-        part_of: number of samples to condition on, if the data are only a part of them.
+        part_of: total number of samples to condition on, if the data are only a part of them.
 
     Returns:
-        The model, with a prior on remaining errors if a first fit identifies the robot; the problem; and
-        doubts about the samples and the robot.
+        The model, with a prior on the remaining inertia errors if a first fit identifies the robot; the
+        problem; and warnings about the samples and the robot.
     """
     training, doubts = training_for(spec, before, data, chosen)
     robot, pinned = spec.system.robot, dict[str, Tensor]()
@@ -231,7 +232,7 @@ def problem_for(
 
 
 def identified(spec: Specification, training: Training) -> tuple[Specification, dict[str, Tensor]]:
-    """Return the model of a robot with identified inertia and zero-mean remaining errors."""
+    """Return the model for a robot with identified inertia, in which the remaining errors have zero mean."""
     robot = spec.system.robot
     q = torch.cat([m.q for m in training.evenly(VOLUME_STATES).measurements])
     size = mass_matrix(robot, q).diagonal(dim1=-2, dim2=-1).mean(0)
@@ -247,10 +248,10 @@ def training_for(
     learned: Sequence[str] | None,
     fewest: int = FEWEST_MOVING,
 ) -> tuple[Training, tuple[str, ...]]:
-    """Return the training data, with doubts about them.
+    """Return the training data, and warnings about them.
 
-    Priors that are not learned (`None`: all are) keep the scales of their inputs. Samples at rest are kept if
-    fewer than `fewest` samples are in motion.
+    Priors that are not `learned` (`None` means all are) keep the scales of their inputs. Samples at rest are
+    kept if fewer than `fewest` samples are in motion.
     """
     kept = {}
     if before is not None and learned is not None:
@@ -263,10 +264,10 @@ def training_for(
 
 
 def check_learned(spec: Specification, learn: Iterable[str]) -> None:
-    """Check the names of learned parts, which are prefixes of their tensors.
+    """Check the names of the parts to learn, which are prefixes of the names of their tensors.
 
     Raises:
-        UnknownNameError: a name is not a prior or another learnable part.
+        UnknownNameError: a name is neither a prior nor another learnable part.
     """
     names = (*(prior.name for prior in spec.priors), NOISE, ANALYTICAL, COULOMB)
     for name in learn:
@@ -280,9 +281,9 @@ def search_of(
     chosen: Sequence[str] | None,
     options: LearningOptions | None,
 ) -> Search:
-    """Return the learned parts of a problem, their initial values, and parts with a known value.
+    """Return the search for the learned parts of a problem, with initial values and the values of held parts.
 
-    The scale of a force contained in the robot is not learned.
+    The scale of a force that is included in the robot is not learned.
     """
     options = options or (OPTIONS if spec.analytical_parameters is None else WITH_PARAMETERS)
     start = initial(problem, spec.noise.learn, spec.noise.learns_torque)
@@ -292,7 +293,7 @@ def search_of(
         current |= {key: value for key, value in known.items() if key.startswith((REGION, MEMORY))}
 
     def is_held(name: str) -> bool:
-        # Residuals of a robot that contains a force do not reveal the scale of that force.
+        # If the robot includes a force, the scale of that force cannot be learned from the residuals.
         return name in problem.pinned or (chosen is not None and name not in chosen)
 
     held = {key: value for key, value in current.items() if is_held(key.split(".")[0])}
@@ -302,7 +303,7 @@ def search_of(
 def in_motion(
     system: ConstrainedSystem, training: Training, fewest: int = FEWEST_MOVING
 ) -> tuple[Training, tuple[str, ...]]:
-    """Return the samples in motion, without impacts, and doubts about them."""
+    """Return the samples in motion and without impacts, and warnings about them."""
     moving = training.moving(REST_SPEED)
     if moving.samples < fewest:
         return training, (
@@ -317,14 +318,14 @@ def in_motion(
 
 
 def subset(spec: Specification, problem: Problem) -> Problem:
-    """Return the problem restricted to the samples for learning hyperparameters."""
+    """Return the problem restricted to the samples from which hyperparameters are learned."""
     training = problem.training
     if not is_sparse(spec.options.inference, problem.priors, training.all_samples):
         return problem
     finite = is_finite(problem.priors)
     most = LEARN_SAMPLES if finite else LEARN_SAMPLES_INDUCING
     if training.samples > most:
-        # Neighbours in time show how long residuals are correlated; elsewhere samples far apart say most.
+        # Neighbours in time determine the correlation of residuals; otherwise distant samples are better.
         training = training.evenly(most) if spec.noise.learns_torque else training.thinned(most)
     problem = dataclasses.replace(problem, training=training)
     return without_inducing(problem) if finite else problem
@@ -339,13 +340,13 @@ def learned(
     begin: Mapping[str, Tensor] | None,
     neighbours: Training | None,
 ) -> Lesson:
-    """Learn the free parts of a search, and record the evaluations.
+    """Learn the free parameters of a search, and record the evaluations.
 
     Args:
         file: record of the evaluations, from which learning resumes with a bit-identical result.
 
     Raises:
-        ModelError: the file belongs to another fit.
+        ModelError: the file belongs to a different fit.
     """
     if not search.start:
         return Lesson(prepared(spec, problem, search.held), search.held)
@@ -363,7 +364,7 @@ def learned(
 
 
 def _with_memory(lesson: Lesson, neighbours: Training | None) -> Lesson:
-    """Add friction with memory to the result, if the log has free motion."""
+    """Add friction with memory to the result if the log has enough free motion."""
     training = neighbours or lesson.problem.training
     if training.free_motions < LEAST:
         return lesson
@@ -372,7 +373,7 @@ def _with_memory(lesson: Lesson, neighbours: Training | None) -> Lesson:
 
 
 def identity(problem: Problem) -> tuple[object, ...]:
-    """Return the mean, priors, data, noise and system of a problem, for the keys of checkpoints."""
+    """Return the mean, priors, data, noise and system of a problem, as part of a checkpoint key."""
     training, (record, robot) = problem.training, pack_system(problem.system)
     data = (value for m in training.measurements for value in m.tensors)
     priors = [(type(prior).__name__, prior) for prior in problem.priors]
@@ -382,7 +383,7 @@ def identity(problem: Problem) -> tuple[object, ...]:
 def _key(
     spec: Specification, problem: Problem, search: Search, begin: Mapping[str, Tensor] | None
 ) -> tuple[object, ...]:
-    """Return an identifier for learning some tensors of a problem with these options."""
+    """Return an identifier for a search on a problem with these options."""
     named = [pair for group in (search.start, search.held, begin or {}) for pair in group.items()]
     sides = [side for scale in problem.training.scales for side in (scale.mean, scale.std)]
     stated = problem.state_std, problem.torque_std, problem.external_std
@@ -402,13 +403,13 @@ def solve(
     begin: Mapping[str, Tensor] | None = None,
     neighbours: Training | None = None,
 ) -> Lesson:
-    """Learn the free parts of a search, then prepare the problem for conditioning.
+    """Learn the free parameters of a search, and prepare the problem for conditioning.
 
-    The residuals determine the power of the likelihood, slopes that propagate state noise, and weights of the
-    samples. Whenever these change, hyperparameters are relearned, at most `ROUNDS` times.
+    The residuals determine the exponent of the (tempered) likelihood, the slopes that propagate state noise,
+    and the sample weights. Whenever these change, hyperparameters are relearned, at most `ROUNDS` times.
 
     Args:
-        neighbours: samples at the rate of the log, if the problem contains only a part of it.
+        neighbours: samples at the sampling rate of the log, if the problem contains only part of the log.
     """
     part = subset(spec, problem)
     if part.inducing is None:
@@ -452,10 +453,10 @@ def solve(
 
 
 def _at_the_rate_of_the_log(part: Problem, values: Mapping[str, Tensor], training: Training) -> Problem:
-    """Return the problem with the correlation of its residuals among all samples.
+    """Return the problem with the correlation of its residuals at the sampling rate of the log.
 
-    Neighbours in the whole log are closer in time than in the part used for learning. For a streamed log, a
-    few contiguous stretches are used.
+    Neighbouring samples are closer in time in the whole log than in the part used for learning. For a
+    streamed log, a few contiguous stretches are used.
     """
     power, correlation = residual_times(part, values, training)
     if part.training.measurements is training.measurements:
@@ -465,9 +466,9 @@ def _at_the_rate_of_the_log(part: Problem, values: Mapping[str, Tensor], trainin
 
 
 def prepared(spec: Specification, problem: Problem, values: Mapping[str, Tensor]) -> Problem:
-    """Return the problem with its inference and sample weights for heavy-tailed noise."""
+    """Return the problem with its inference method and, for heavy-tailed noise, its sample weights."""
     if is_sparse(spec.options.inference, problem.priors, problem.training.all_samples):
-        # Sums over samples have the slopes of the robot file.
+        # Sums over samples use the slopes of the model in the robot file.
         problem = dataclasses.replace(problem, training=dataclasses.replace(problem.training, slopes=None))
         if is_finite(problem.priors):
             problem = without_inducing(problem)

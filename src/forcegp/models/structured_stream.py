@@ -1,7 +1,7 @@
 """Fitting of a structured Gaussian process to a streamed log.
 
-A first pass draws a sample, which determines input scales, hyperparameters and inducing points; a second pass
-computes the sums over all samples.
+A first pass draws a sample, from which input scales, hyperparameters and inducing points are determined. A
+second pass computes the sums over all samples.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ from forcegp.models.structured_learning import FEWEST_MOVING, REST_SPEED, Specif
 from forcegp.storage.checkpoint import Checkpoint, beside
 
 SAMPLE_ROWS = 20_000
-"""Number of evenly spaced rows for learning; fewer than twice as many are in memory."""
+"""Number of evenly spaced rows for learning; fewer than twice this number are in memory."""
 
 
 @dataclass(frozen=True)
 class Sample:
-    """Part of a streamed log kept by one pass, or all of a log in memory.
+    """The part of a streamed log that one pass keeps, or all of a log in memory.
 
     Attributes:
         data: the samples, evenly spaced for a streamed log.
-        count: total number of samples to condition on; 0 if these are all.
+        count: total number of samples to condition on; 0 if `data` contains all of them.
         log: streamed log, if any.
-        stretches: a few contiguous stretches of it, used for the correlation time of residuals.
+        stretches: a few contiguous stretches of the log, for estimating the correlation time of residuals.
         moving: whether samples at rest are ignored.
     """
 
@@ -60,7 +60,7 @@ class Sample:
             training: the sample, with the input scales to keep.
 
         Returns:
-            The training data, or `None` if the sample is the whole log or the model does not need them.
+            The training data, or `None` if the sample is the whole log or the model does not need neighbours.
         """
         if self.stretches is None or not spec.noise.learns_torque or len(self.data) == self.count:
             return None
@@ -70,11 +70,11 @@ class Sample:
 
 @torch.no_grad()
 def sample_of(spec: Specification, data: StreamedDataset) -> Sample:
-    """Return the training sample: evenly spaced samples of a log, in motion if the model requires it.
+    """Return evenly spaced samples of a log for training, restricted to motion if the model requires it.
 
     Raises:
         DataError: a file is damaged or contains no samples.
-        ModelError: processes read different logs, or exact inference is requested for a streamed log.
+        ModelError: the processes read different logs, or exact inference is requested for a streamed log.
     """
     if data.distributed:
         require_agreement("the log", data.digest, len(data), hint="pass the same files to each")
@@ -88,7 +88,7 @@ def sample_of(spec: Specification, data: StreamedDataset) -> Sample:
 
 
 def _rows_of(log: StreamedDataset, keep: Keep | None) -> tuple[Dataset, Dataset, int]:
-    """Return evenly spaced relevant rows, contiguous stretches of them, and their total number."""
+    """Return evenly spaced rows to keep, contiguous stretches of such rows, and their total number."""
     stretches: list[Dataset] = []
     rows, count = spaced_sample(_with_stretches(log, stretches, keep), SAMPLE_ROWS, keep)
     return rows, Dataset.concatenate(stretches), count
@@ -105,7 +105,7 @@ def _with_stretches(stream: StreamedDataset, parts: list[Dataset], keep: Keep | 
 
 
 def _check_inference(spec: Specification, count: int, held: int) -> None:
-    """Raise `ModelError` if exact inference is needed for more samples than are in memory."""
+    """Raise `ModelError` if the model needs all samples in memory but only `held` samples are."""
     if spec.noise.degrees_of_freedom is not None and count > held:
         raise ModelError(
             "heavy-tailed noise needs a weight for every sample, which a streamed log does not have",
@@ -123,7 +123,7 @@ def _check_inference(spec: Specification, count: int, held: int) -> None:
 
 
 def kept_scales(priors: Sequence[ForcePrior], training: Training) -> dict[str, Standardization]:
-    """Return the input scales of training data by prior."""
+    """Return the input scales of the training data by prior."""
     return {prior.name: scale for prior, scale in zip(priors, training.scales, strict=True)}
 
 
@@ -157,7 +157,7 @@ class Pass:
         """Return the forces conditioned on the whole log, and the part of the likelihood independent of them.
 
         Raises:
-            ModelError: the checkpoint belongs to another fit.
+            ModelError: the checkpoint belongs to a different fit.
             NumericalError: the sums are not finite.
         """
         basis, begin = basis_of(problem, hyperparameters), None
@@ -171,7 +171,7 @@ class Pass:
             except ModelError as cause:
                 refused = cause
             if self.log.distributed:
-                # Where one process stops, the others must not wait for it.
+                # If one process stops, the others must not wait for it.
                 hint = "resume with the original number of processes, or remove all parts of the checkpoint"
                 require_agreement("their parts of the checkpoint", 2 if refused else bool(kept), hint=hint)
             if refused is not None:
@@ -196,7 +196,7 @@ class Pass:
         return posterior_of(problem, hyperparameters, basis, total), total.constant
 
     def _pieces(self, problem: Problem, start: int) -> Iterator[Training]:
-        """Yield the samples of this process by piece; pieces of other processes are empty."""
+        """Yield the samples of this process piece by piece; pieces of other processes are empty."""
         rank, processes = (dist.get_rank(), dist.get_world_size()) if self.log.distributed else (0, 1)
         kept = kept_scales(problem.priors, problem.training)
         for piece in self.log.pieces(start, (rank, processes)):
@@ -213,7 +213,7 @@ class Pass:
         return path.with_name(f"{path.name}.{dist.get_rank()}") if self.log.distributed else path
 
     def _key(self, problem: Problem, hyperparameters: Mapping[str, Tensor]) -> str:
-        """Return an identifier for the sums over a log with a basis, a system and noise."""
+        """Return an identifier for the sums over a log for a given basis, system and noise."""
         files = [(path.name, path.stat().st_size) for path in self.log.files]
         points = [x for Z in problem.inducing or () for x in Z.values()]
         named = [part for pair in sorted(hyperparameters.items()) for part in pair]
@@ -223,7 +223,7 @@ class Pass:
 
 
 def _tensors(basis: LatentBasis, total: Totals) -> dict[str, Tensor]:
-    """Return the results of a pass so far, by name."""
+    """Return the intermediate results of a pass by name."""
     tensors = {f"basis.{name}": value for name, value in basis.tensors().items()}
     tensors |= {f"sums.{i}": value for i, value in enumerate(total.sums.tensors)}
     counts = {"constant": total.constant, "samples": total.samples, "pieces": torch.tensor(total.pieces)}
@@ -231,7 +231,7 @@ def _tensors(basis: LatentBasis, total: Totals) -> dict[str, Tensor]:
 
 
 def _restored(basis: LatentBasis, tensors: Mapping[str, Tensor]) -> tuple[LatentBasis, Totals]:
-    """Restore basis and totals from `_tensors`, with kernel inputs in the order of the prior."""
+    """Restore the basis and totals from `_tensors`, with kernel inputs in the order of the prior."""
     own = LatentBasis.of_tensors(basis.processes, basis.params, sub(tensors, "basis"))
     sums = Sums(*(tensors[f"sums.{i}"] for i in range(len(fields(Sums)))))
     return own, Totals(sums, tensors["constant"], tensors["samples"], int(tensors["pieces"]))

@@ -1,4 +1,4 @@
-"""HTML pages and their plots, with functions for building custom pages."""
+"""HTML reports and their plots, and functions for building custom pages."""
 
 from forcegp.report.check import write_check
 from forcegp.report.page import (

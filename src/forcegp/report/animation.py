@@ -1,4 +1,4 @@
-"""Animations of the arm, drawn by a script in the page."""
+"""Animations of the arm, drawn by a script embedded in the page."""
 
 from __future__ import annotations
 
@@ -16,21 +16,21 @@ from forcegp import kinematics
 from forcegp.robot.model import BASE, RobotModel
 
 FRAMES_PER_SECOND = 20
-"""Frame rate of an animation."""
+"""Frame rate of animations [1/s]."""
 
 
 def animation(content: Mapping[str, object], label: str) -> Markup:
     """Return a canvas with a slider, a play button and a checkbox for each arm.
 
     Args:
-        content: input for `templates/animation.js`: `times` of the frames [s]; `bodies`, points of an arm;
-            `films`, arms with `label`, `colour`, `dash` and flat `points` (frames, bodies, 3) [m].
-            Optional: convex `solids` with `colour`, `opacity`, flat `points` [m] and `link`, their column in
-            `poses` (frames, links, 12); `paths` with `colour`, `width` and `points`;
+        content: input to `templates/animation.js`: the `times` of the frames [s]; `bodies`, the number of
+            points per arm; `films`, the arms, with `label`, `colour`, `dash` and flattened `points` (frames,
+            bodies, 3) [m]. Optional: convex `solids` with `colour`, `opacity`, flattened `points` [m] and
+            `link`, their column in `poses` (frames, links, 12); `paths` with `colour`, `width` and `points`;
             `forces` with `start`, `tip` and `bar` in each frame; `texts` for each frame.
-        label: text alternative of the canvas.
+        label: text alternative for the canvas.
     """
-    # "</" would end the script element, even inside a string.
+    # "</" would end the script element, even within a string.
     text = json.dumps(content, allow_nan=False, separators=(",", ":")).replace("</", "<\\/")
     return Markup(
         '<figure class="animation"><canvas width="920" height="560" role="img" '
@@ -42,7 +42,7 @@ def animation(content: Mapping[str, object], label: str) -> Markup:
 
 
 def animation_source() -> str:
-    """Return the hash of the animation script for a content security policy."""
+    """Return the hash of the animation script, for use in a content security policy."""
     digest = hashlib.sha256(_script().encode()).digest()
     return "sha256-" + base64.b64encode(digest).decode()
 
@@ -52,7 +52,7 @@ def _script() -> str:
 
 
 def arm_points(robot: RobotModel, q: Tensor, frame: str, point: Sequence[float]) -> Tensor:
-    """Return base, link origins along the chain, and tip in the world, `(frames, points, 3)` [m]."""
+    """Return the base, the link origins along the chain, and the tip, `(frames, points, 3)` [m]."""
     poses = kinematics.link_poses(robot, q)
     joint = robot.frame_parents[robot.frame_index(frame)]
     chain: list[int] = []
@@ -66,5 +66,5 @@ def arm_points(robot: RobotModel, q: Tensor, frame: str, point: Sequence[float])
 
 
 def rounded(points: Tensor) -> list[float]:
-    """Return points as flat coordinates [m], rounded to 10 µm."""
+    """Return points as a flat list of coordinates [m], rounded to 10 µm."""
     return [round(x, 5) for x in points.detach().flatten().tolist()]

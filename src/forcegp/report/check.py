@@ -1,4 +1,4 @@
-"""Page of a checked log: the verdict, and each finding with a plot of its columns and rows."""
+"""Page on a checked log: the verdict, and each finding with a plot of the affected columns and rows."""
 
 from __future__ import annotations
 
@@ -22,26 +22,26 @@ from forcegp.rows import describe
 
 COLOURS = {"error": "#a1121f", "warning": "#d08c00", "note": "#0072b2"}
 POINTS = 1500
-"""Maximum number of points in a curve; more are indistinguishable on a page."""
+"""Maximum number of points in a curve; more could not be distinguished on a page."""
 CONTEXT = 3.0
-"""Number of rows shown, relative to the length of the interval."""
+"""Number of surrounding rows shown, relative to the length of the interval."""
 LEAST_ROWS = 200
 JOINTS, FEW = 7, 3
-"""Number of joints shown for a finding that names joints, and for one that does not."""
+"""Maximum number of joints shown for a finding that names joints, and for one that does not."""
 SIZE = (12.0, 1.35)
-"""Width of a plot and height of a panel [inch]."""
+"""Width of a plot and height of each panel [inch]."""
 
 Paint = Callable[[Axes, Log, slice, int], None]
 
 
 def _axis(log: Log) -> tuple[Array, str]:
-    """Return the time from the first row [s], or row numbers if it is not monotonic, and the axis label."""
+    """Return the time since the first row [s] (row numbers if it is not monotonic) and the axis label."""
     runs = bool(log.header.ordered and np.isfinite(log.t).all() and (np.diff(log.t) >= 0.0).all())
     return (log.t - log.t[0], "time [s]") if runs and len(log) else (np.arange(float(len(log))), "row")
 
 
 def draw_overview(report: Report, log: Log) -> Picture:
-    """Draw a lane for each finding with its time intervals."""
+    """Draw the time intervals of each finding in a separate lane."""
     x, name = _axis(log)
 
     def paint(figure: Figure) -> None:
@@ -61,7 +61,7 @@ def draw_overview(report: Report, log: Log) -> Picture:
 
 
 def picture_of(finding: Finding, system: ConstrainedSystem, log: Log) -> Picture | None:
-    """Return the plot of a finding, by its family; `None` for findings of an import."""
+    """Return the plot for a finding, chosen by its family, or `None` for findings about the import."""
     rows, family = _window(finding, log), KINDS[finding.kind].family
     if family == "import":
         return None
@@ -85,13 +85,13 @@ def picture_of(finding: Finding, system: ConstrainedSystem, log: Log) -> Picture
         joints, paint, quantity = [0], _steps, "time step"
     elif family == "noise":
         paint, quantity = _acceleration, "qdd"
-    if whole and paint.__name__ == "rates":  # a whole log would hide how two curves differ
+    if whole and paint.__name__ == "rates":  # plotting the whole log would hide how the two curves differ
         rows = slice(rows.start, rows.start + max(LEAST_ROWS, len(log) // 20))
     return _panels(finding, system, log, rows, joints, paint, quantity)
 
 
 def _window(finding: Finding, log: Log) -> slice:
-    """Return the first interval with some context, or the whole log."""
+    """Return the rows of the first interval with some context, or all rows if there is no interval."""
     start, stop = finding.intervals[0] if finding.intervals else (0, len(log))
     margin = max(LEAST_ROWS, round(CONTEXT * (stop - start))) // 2
     return slice(max(start - margin, 0), min(stop + margin, len(log)))
@@ -112,7 +112,7 @@ def _panels(
     paint: Paint,
     quantity: str,
 ) -> Picture:
-    """Return one panel per joint, with the rows of the finding shaded."""
+    """Return a plot with one panel per joint, in which the rows of the finding are shaded."""
 
     def fill(figure: Figure) -> None:
         panels = figure.subplots(len(joints), 1, sharex=True, squeeze=False)[:, 0]
@@ -142,7 +142,7 @@ def _shade(axes: Axes, finding: Finding, rows: slice, log: Log) -> None:
 
 
 def _line(axes: Axes, log: Log, rows: slice, y: Array, colour: str = INK, name: str | None = None) -> None:
-    """Draw a curve over time, thinned to the extremes of each bin."""
+    """Draw a curve over time; a long one is reduced to the minimum and maximum in each bin."""
     x = _axis(log)[0][rows]
     if len(y) > POINTS:
         width = -(-len(y) // (POINTS // 2))
@@ -168,7 +168,7 @@ def _acceleration(axes: Axes, log: Log, rows: slice, j: int) -> None:
 
 
 def _rates(value: str, rate: str) -> Paint:
-    """Return panels with a logged rate and the rate of change of its value."""
+    """Return a function that plots a logged rate and the numerical derivative of the logged value."""
 
     def rates(axes: Axes, log: Log, rows: slice, j: int) -> None:
         with np.errstate(all="ignore"):
@@ -181,7 +181,7 @@ def _rates(value: str, rate: str) -> Paint:
 
 
 def _torque(system: ConstrainedSystem, log: Log, rows: slice) -> Paint:
-    """Return panels with the logged torque and the torque computed from the robot file."""
+    """Return a function that plots the logged torque and the torque computed from the robot file."""
     q, qd, qdd = (torch.from_numpy(np.ascontiguousarray(x[rows])) for x in (log.q, log.qd, log.qdd))
     robot = system.robot.to("cpu", torch.float64)
     with torch.no_grad():
@@ -196,7 +196,7 @@ def _torque(system: ConstrainedSystem, log: Log, rows: slice) -> Paint:
 
 
 def _contact(finding: Finding, system: ConstrainedSystem, log: Log, rows: slice) -> Picture:
-    """Return a panel with the distance of the tip from the surface and the contact label."""
+    """Return a plot of the distance of the tip from the surface, highlighting rows labelled as closed."""
     contact = system.contact(finding.contact or "")
     c = tip_path(system, contact, log).c if isinstance(contact, SurfaceContact) else np.full(len(log), np.nan)
 
@@ -216,7 +216,7 @@ def _contact(finding: Finding, system: ConstrainedSystem, log: Log, rows: slice)
 
 
 def write_check(path: Path, title: str, report: Report, system: ConstrainedSystem, log: Log) -> Path:
-    """Write the page of a checked log as a self-contained HTML file with a title."""
+    """Write the page on a checked log as a self-contained HTML file."""
     log, everything = of_robot(log, system.robot), ((0, report.samples),)
     sections = [
         {

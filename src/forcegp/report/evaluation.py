@@ -1,4 +1,4 @@
-"""Page of an evaluated model: verdict, errors by joint, calibration, and predictions over time."""
+"""Page on an evaluated model: the verdict, errors by joint, calibration, and predictions over time."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ def write_evaluation(
     window: WindowData,
     comparison: Sequence[Compared] = (),
 ) -> Path:
-    """Write the page of a model, with its plots and their data, and return its path.
+    """Write the page on a model together with its plots and their data, and return the path of the page.
 
-    `model`, `data` and `fitted_to` are file names shown on the page; without the last, the trivial predictors
-    were fitted to halves of the data. `comparison` contains the compared sets of force priors.
+    `model`, `data` and `fitted_to` are file names shown on the page. If `fitted_to` is `None`, the trivial
+    predictors were fitted to halves of the data. `comparison` contains the sets of force priors compared.
     """
     drawn = {"Predictions": draw_predictions(window), "Errors": draw_errors(window)}
     pictures = [dataclasses.replace(picture, title=title) for title, picture in drawn.items()]
@@ -41,7 +41,7 @@ def write_evaluation(
     for name, picture in named:
         write_text(folder / name, picture.svg)
     write_text(folder / WINDOW, window.to_json())
-    # A folder that is called `model` adds nothing.
+    # The name `model` would add no information to the title.
     name = "" if Path(model).name.lower() in ("", "model") else f" “{Path(model).name}”"
     page = render(
         "evaluation.html.j2",
@@ -87,7 +87,7 @@ def _blocks(window: WindowData, pictures: list[Picture], force: Picture | None) 
 
 
 def draw_calibration(evaluation: Evaluation) -> Picture:
-    """Plot the coverage over the nominal probability."""
+    """Plot the coverage against the nominal probability."""
     shares = evaluation.uncertainty.calibration if evaluation.uncertainty else {}
     levels = {float(level): share for level, share in shares.items()}
 
@@ -105,7 +105,7 @@ def draw_calibration(evaluation: Evaluation) -> Picture:
 
 
 def error_tables(evaluation: Evaluation) -> tuple[Table, ...]:
-    """Return the torque and acceleration errors by joint with trivial predictors; worse values are red."""
+    """Return tables of torque and acceleration errors by joint; red: worse than a trivial predictor."""
     units = {"torque": "[N m, N]", "acceleration": "[rad/s², m/s²]"}
     tables = []
     for unit, names in units.items() if evaluation.predictors else ():
@@ -125,7 +125,7 @@ def error_tables(evaluation: Evaluation) -> tuple[Table, ...]:
 
 
 def uncertainty_tables(evaluation: Evaluation) -> tuple[Table, ...]:
-    """Return coverage by joint, densities of model and trivial predictors, and λ against the sensor."""
+    """Return tables of coverage by joint, log densities of all predictors, and λ compared with the log."""
     tables = []
     if evaluation.uncertainty is not None:
         shares = zip(evaluation.joint_names, evaluation.uncertainty.coverage_by_joint, strict=True)
@@ -149,7 +149,7 @@ def uncertainty_tables(evaluation: Evaluation) -> tuple[Table, ...]:
 
 
 def score_table(evaluation: Evaluation) -> Table:
-    """Return the scores over all joints, with units."""
+    """Return a table of the overall scores, with units."""
     scores = evaluation.summary()
     rows = tuple(
         (name, cell(scores[key])) for key, name in NAMES["scores"].items() if scores[key] is not None
@@ -158,11 +158,11 @@ def score_table(evaluation: Evaluation) -> Table:
 
 
 def comparison_tables(comparison: Sequence[Compared]) -> tuple[Table, ...]:
-    """Return the compared sets of force priors; none if the priors were given."""
+    """Return a table of the sets of force priors compared, or no table if the priors were given."""
     rows = tuple(
         tuple(cell(x, 3) for x in (each.name, each.log_density, each.behind, each.standard_error, note))
         for each in comparison
         for note in [", ".join(part for part in ("chosen" if each.chosen else "", each.note) if part)]
     )
-    caption = "Force priors, compared on held-out stretches of the training log [nats per sample]"
+    caption = "Force priors, compared on held-out blocks of the training log [nats per sample]"
     return (Table(caption, ("set", "log density", "behind", "standard error", ""), rows),) if rows else ()

@@ -1,4 +1,4 @@
-"""Style of plots (colours, names and sizes), and pages as single HTML files with SVG plots and tables."""
+"""Style of plots (colours, names and sizes), and rendering of single HTML files with SVG plots and tables."""
 
 from __future__ import annotations
 
@@ -19,12 +19,12 @@ from forcegp.scene.document import tomllib
 
 TEMPLATES = Path(__file__).parent / "templates"
 STYLE = TEMPLATES / "forcegp.mplstyle"
-"""Fonts, sizes and lines of plots."""
+"""Style sheet for the fonts, sizes and lines of plots."""
 NAMES = tomllib.loads((TEMPLATES / "names.toml").read_text(encoding="utf-8"))
 COLOURS, DASHES, KINDS, LABELS = (NAMES[table] for table in ("colours", "dashes", "kinds", "labels"))
-"""Line colours and dashes of models, and labels of saved model kinds and of models."""
+"""Line colours and dashes of models, labels for the kinds of saved models, and labels for models."""
 OTHER = "#0072b2"
-"""Colour of other models; not black, which is used for measurements."""
+"""Colour of all other models; black is reserved for measurements."""
 INK = "#222222"
 AXES = ("#0072b2", "#d55e00", "#007a5e")
 """Colours of the Cartesian axes x, y, z."""
@@ -32,7 +32,7 @@ AXES = ("#0072b2", "#d55e00", "#007a5e")
 
 @dataclass(frozen=True)
 class Picture:
-    """A plot as SVG text; `alt` is its text alternative."""
+    """A plot as SVG text; `alt` is the text alternative."""
 
     svg: str
     alt: str
@@ -40,7 +40,7 @@ class Picture:
 
     @property
     def uri(self) -> str:
-        """The plot as a data URI."""
+        """Data URI of the plot."""
         return "data:image/svg+xml;base64," + base64.b64encode(self.svg.encode()).decode()
 
 
@@ -55,12 +55,12 @@ def colour(model: str) -> str:
 
 
 def line(model: str) -> str | tuple[float, tuple[float, ...]]:
-    """Return the line style of a model, for curves of several models in one panel."""
+    """Return the line style that distinguishes a model in a panel with several models."""
     return (0.0, DASHES[model]) if model in DASHES else "-"
 
 
 def draw(paint: Callable[[Figure], None], size: tuple[float, float], alt: str, title: str = "") -> Picture:
-    """Draw a plot of given size [inch] as SVG in the project style, without changing global settings."""
+    """Draw a plot of the given size [inch] as SVG in the project style, without changing global settings."""
     buffer = io.StringIO()
     with matplotlib.rc_context({"svg.hashsalt": "forcegp"}, fname=STYLE):
         figure = Figure(figsize=size)
@@ -71,21 +71,21 @@ def draw(paint: Callable[[Figure], None], size: tuple[float, float], alt: str, t
 
 Series = list[float]
 DIGITS = 7
-"""Significant digits in series that are only plotted."""
+"""Number of significant digits kept in series that are only plotted."""
 
 
 def series(values: Tensor) -> Series:
-    """Convert a tensor `(n,)` to numbers rounded to the resolution of a plot."""
+    """Convert a tensor `(n,)` to a list of numbers, rounded to `DIGITS` significant digits."""
     return [float(f"{value:.{DIGITS}g}") for value in values.detach().cpu().tolist()]
 
 
 def columns(values: Tensor) -> list[Series]:
-    """Convert a tensor `(n, d)` to d series."""
+    """Convert a tensor `(n, d)` to d series of length n."""
     return [series(column) for column in values.unbind(-1)]
 
 
 def as_tensor(values: Series | list[Series]) -> Tensor:
-    """Convert series `(n,)` or `(d, n)` to a tensor."""
+    """Convert one series to a tensor `(n,)`, or d series to a tensor `(d, n)`."""
     return torch.tensor(values, dtype=torch.float64)
 
 
@@ -94,7 +94,7 @@ NONE = "–"
 
 @dataclass(frozen=True)
 class Table:
-    """A table as text; the first column names the rows, and `bad` lists `(row, column)` of red cells."""
+    """A table of text; the first column names the rows, and `bad` lists the `(row, column)` of red cells."""
 
     caption: str
     head: tuple[str, ...]
@@ -103,13 +103,13 @@ class Table:
 
 
 def cell(value: object, digits: int = 4) -> str:
-    """Format a value as text: floats with significant digits, a dash for a missing value."""
+    """Format a value as text: floats with the given number of significant digits, `None` as a dash."""
     return NONE if value is None else text(value, digits)
 
 
 @dataclass(frozen=True)
 class PictureBlock:
-    """Plots with a common heading and caption, across the page if `wide`; `source` is their data file."""
+    """Plots with a common heading and caption, full width if `wide`; `source` is the file of their data."""
 
     heading: str
     caption: str
@@ -119,7 +119,7 @@ class PictureBlock:
 
 
 def render(template: str, package: str = "forcegp.report", **values: object) -> str:
-    """Render a template from `templates/` of the package or of this one; a missing value is an error."""
+    """Render a template from `templates/` in the given package or in this one; missing values are errors."""
     packages = dict.fromkeys((package, "forcegp.report"))
     environment = jinja2.Environment(
         loader=jinja2.ChoiceLoader([jinja2.PackageLoader(name) for name in packages]),

@@ -1,4 +1,4 @@
-"""Predicted trajectories compared with the logged one: data, plots, table and animation."""
+"""Comparison of predicted trajectories with the logged one: data, plots, table and animation."""
 
 from __future__ import annotations
 
@@ -34,29 +34,29 @@ from forcegp.rollout.comparison import HORIZONS, LEVEL, Comparison
 
 
 class Band(Record):
-    """Bounds of a central band over function samples."""
+    """Lower and upper bounds of a central band over function samples."""
 
     lower: Series
     upper: Series
 
 
 class ModelPath(Record):
-    """First predicted trajectory of a model, up to its divergence.
+    """First trajectory predicted by a model, up to the point where it diverges.
 
     Attributes:
         model: name of the model.
-        tip: x, y and z of the tip [m].
-        tip_bands: bands of x, y and z over samples; empty without samples.
+        tip: x, y and z coordinates of the tip [m].
+        tip_bands: bands for x, y and z over function samples; empty if there are no samples.
         tip_error: distance from the logged tip, median over the starts [m].
-        drift: constraint error c(q) [m]; empty without contacts.
-        multiplier: λ [N]; empty for models without forces.
-        multiplier_band: band of λ over samples.
-        lost: fraction of samples that have lost contact by each time; empty without samples.
-        errors: tip error after each horizon, median over the starts [m]; `None` if over half diverged.
-        coverage: fraction of logged tip coordinates within the band; `None` without samples.
-        inflation: factor on the band, calibrated on another motion; `None` without one.
-        calibrated_coverage: coverage of the band scaled by this factor.
-        worst_drift: largest constraint error of mean and samples over all starts [m].
+        drift: constraint error c(q) [m]; empty if there are no contacts.
+        multiplier: λ [N]; empty if the model predicts no forces.
+        multiplier_band: band for λ over samples.
+        lost: fraction of samples that have lost contact by each time; empty if there are no samples.
+        errors: tip error after each horizon, median over the starts [m]; `None` if more than half diverged.
+        coverage: fraction of logged tip coordinates within the bands; `None` if there are no samples.
+        inflation: factor by which the bands are widened, calibrated on a different motion, or `None`.
+        calibrated_coverage: coverage of the bands widened by this factor.
+        worst_drift: largest constraint error of the mean and the samples over all starts [m].
         diverged_at: time of the first divergence [s].
     """
 
@@ -77,7 +77,7 @@ class ModelPath(Record):
 
 
 class Film(Record):
-    """Points of an arm for an animation, frames × points × 3, flattened [m]; `label` names the model."""
+    """Points of an arm in an animation, flattened from (frames, points, 3) [m]; `label` names the model."""
 
     label: str
     points: Series
@@ -88,12 +88,12 @@ class RolloutData(Header):
 
     Attributes:
         t: time since the start [s].
-        tip, multiplier: logged x, y, z of the tip [m]; λ of the first contact [N], empty if not logged.
-        starts: number of starts for the medians.
-        band_starts, band_seconds, level: starts, duration and nominal coverage of the bands.
-        horizons: times of `ModelPath.errors` [s].
-        models: trajectories by model.
-        frame_times, bodies, films: animation times [s], points of the arm, and arms (the logged one first).
+        tip, multiplier: logged x, y, z of the tip [m], and λ of the first contact [N], empty if not logged.
+        starts: number of starts over which medians are taken.
+        band_starts, band_seconds, level: number of starts, duration and nominal coverage of the bands.
+        horizons: times at which `ModelPath.errors` are given [s].
+        models: the trajectory of each model.
+        frame_times, bodies, films: animation times [s], points per arm, and the arms (the logged one first).
     """
 
     FORMAT: ClassVar[str] = "forcegp-rollout"
@@ -115,7 +115,7 @@ class RolloutData(Header):
 
 
 def rollout_data(comparison: Comparison, calibration: Comparison | None = None) -> RolloutData:
-    """Return the data of the section, with curves from the first start and bands scaled by `calibration`."""
+    """Return the data to plot: curves from the first start, and the band widening found on `calibration`."""
     horizons = [h for h in HORIZONS if h <= float(comparison.t[-1]) * (1.0 + 1e-9)]
     stride = max(1, round(1.0 / (FRAMES_PER_SECOND * float(comparison.t[1] - comparison.t[0]))))
     tip = comparison.frame, comparison.point
@@ -175,7 +175,7 @@ def _model_path(
 
 
 def _bands(rolled, values: Tensor, n: int) -> list[Band]:
-    """Return bands of each component of samples `(S, T, d)` over the first n times, up to divergence."""
+    """Return a band for each component of samples `(S, T, d)`, over the first n times or up to divergence."""
     band = rolled.bands(values[:, :n], LEVEL)
     last = _sound(band.lower)
     pairs = zip(band.lower[:last].T, band.upper[:last].T, strict=True)
@@ -183,7 +183,7 @@ def _bands(rolled, values: Tensor, n: int) -> list[Band]:
 
 
 def _sound(q: Tensor) -> int:
-    """Return the number of leading times with a finite state `(T, nq)`."""
+    """Return the number of time steps at which the state `(T, nq)` is finite."""
     return int(torch.isfinite(q).all(-1).sum())
 
 
@@ -207,7 +207,7 @@ PAGE, DATA = "rollout.html", "rollout.json"
 
 
 def draw_tip(data: RolloutData) -> Picture:
-    """Plot the position of the tip by axis, logged and predicted, for the duration of the bands."""
+    """Plot the logged and predicted position of the tip along each axis, for the duration of the bands."""
 
     def paint(figure: Figure) -> None:
         for axis, axes in enumerate(figure.subplots(3, 1, sharex=True)):
@@ -229,7 +229,7 @@ def draw_tip(data: RolloutData) -> Picture:
 def _draw_logarithmic(
     data: RolloutData, curves: list[tuple[ModelPath, Series]], least: float, name: str, alt: str, title: str
 ) -> Picture:
-    """Plot magnitudes on a logarithmic scale, without the first one, which is zero."""
+    """Plot magnitudes on a logarithmic scale, omitting the first one, which is zero."""
 
     def paint(figure: Figure) -> None:
         axes = figure.subplots()
@@ -245,7 +245,7 @@ def _draw_logarithmic(
 
 
 def draw_contact_force(data: RolloutData) -> Picture:
-    """Plot the multiplier along predicted trajectories with its band, and the probability of lost contact."""
+    """Plot the multiplier and its band along predicted trajectories, and the probability of lost contact."""
     paths = [path for path in data.models if path.multiplier]
     losing = [path for path in paths if any(path.lost)]
 
@@ -271,7 +271,7 @@ def draw_contact_force(data: RolloutData) -> Picture:
 
 
 def _curve(axes: Axes, data: RolloutData, path: ModelPath, values: Series, band: Band | None = None) -> None:
-    """Draw values of a model over time in its style, with their band."""
+    """Draw the values of a model and their band over time, in the style of the model."""
     style = {"color": colour(path.model), "linestyle": line(path.model)}
     if band is not None:
         t = data.t[: len(band.lower)]
@@ -284,7 +284,7 @@ def _starts(number: int) -> str:
 
 
 def rollout_pictures(data: RolloutData) -> tuple[Picture, ...]:
-    """Return the plots of the section that have data."""
+    """Return those plots of the section for which there are data."""
     log = "logarithmic scale, one curve per model."
     errors = [(path, path.tip_error) for path in data.models]
     alt = f"Tip error over time, median over {_starts(data.starts)}, {log}"
@@ -298,7 +298,7 @@ def rollout_pictures(data: RolloutData) -> tuple[Picture, ...]:
 
 
 def rollout_table(data: RolloutData) -> Table:
-    """Return the tip errors at the horizons, coverage of the bands and largest drift."""
+    """Return a table of the tip errors at the horizons, the coverage of the bands and the largest drift."""
     after = (f"after {h:g} s [mm]" for h in data.horizons)
     head = ("model", *after, "in band", "in widened band", "largest |c(q)| [m]")
     rows = []
@@ -314,14 +314,14 @@ def rollout_table(data: RolloutData) -> Table:
         caption += (
             f"; fraction of logged tip positions inside the {data.level:.0%} bands over function samples "
             f"({_starts(data.band_starts)}, {data.band_seconds:.3g} s), and inside the bands widened by the "
-            "factor calibrated on held-out stretches of the training run"
+            "factor calibrated on held-out blocks of the training run"
         )
     return Table(caption, head, tuple(rows))
 
 
 @dataclass(frozen=True)
 class RolloutSection:
-    """Plots, table and animation of trajectories; `script` is the script hash for the security policy."""
+    """Plots, table and animation of trajectories; `script` is the hash of the script (`animation_source`)."""
 
     block: PictureBlock
     table: Table
@@ -330,7 +330,7 @@ class RolloutSection:
 
 
 def rollout_section(data: RolloutData, source: str = DATA) -> RolloutSection:
-    """Return the section on trajectories; `source` is the data file next to the page."""
+    """Return the section on trajectories; `source` names the data file next to the page."""
     band = f" with the band that contains {data.level:.0%} of the function samples"
     sampled = any(path.tip_bands for path in data.models)
     why = " The curve follows the mean force. It may leave the band, since motion is nonlinear in the force."
@@ -345,7 +345,7 @@ def rollout_section(data: RolloutData, source: str = DATA) -> RolloutSection:
 
 
 def write_rollouts(folder: Path, title: str, data: RolloutData) -> Path:
-    """Write the page on trajectories, its plots and their data to a folder; return the path of the page."""
+    """Write the page on trajectories, its plots and their data to a folder, and return the page's path."""
     section = rollout_section(data)
     for i, picture in enumerate(section.block.pictures):
         write_text(folder / f"rollout-{i + 1}.svg", picture.svg)

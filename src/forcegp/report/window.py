@@ -1,4 +1,4 @@
-"""Predicted accelerations of all joints over a few seconds, and their errors."""
+"""Plots of predicted accelerations, their errors and contact forces over a few seconds."""
 
 from __future__ import annotations
 
@@ -17,14 +17,14 @@ from forcegp.models.structured_fit import StructuredFit
 from forcegp.report.page import INK, Picture, Series, as_tensor, colour, columns, draw, label, series
 
 WIDTH, WIDE, ROW, MARGIN = 4.1, 12.0, 0.92, 0.75
-"""Width of a plot by joint and of a plot across the page, height of a row and of the margins [inch]."""
+"""Widths of a normal and a full-width plot, height of a row, and total height of the margins [inch]."""
 OUTSIDE, ROOM = 0.005, 0.25
-"""Fraction of outer values that axes may clip on either side, and relative margin around the others."""
+"""Fraction of extreme values that axes may clip on either side, and relative margin around the others."""
 GREY = "#9a9a9a"
 
 
 class ForceWindow(Record):
-    """Normal force of a contact over a window [N]; `logged` and `std` are optional."""
+    """Normal force at a contact over a time window [N]; `logged` and `std` are optional."""
 
     contact: str
     closed: list[bool]
@@ -36,8 +36,8 @@ class ForceWindow(Record):
 class WindowData(Header):
     """Predictions of a model over a time window, by joint [rad/s²]; `clean` and `std` are optional.
 
-    `forces` contains the closed contacts, for models of forces; `noise_std` is the standard deviation of the
-    noise on the accelerations [rad/s²]; `t` is the time from the first sample [s].
+    If the model predicts forces and a contact closes, `forces` contains all contacts. `noise_std` is the
+    standard deviation of the acceleration noise [rad/s²], and `t` is the time since the first sample [s].
     """
 
     FORMAT: ClassVar[str] = "forcegp-window"
@@ -60,12 +60,12 @@ class WindowData(Header):
 
     @property
     def seconds(self) -> float:
-        """Length of the window [s]."""
+        """Duration of the window [s]."""
         return self.t[-1] - self.t[0]
 
 
 def opening(data: Dataset, seconds: float) -> Dataset:
-    """Return the first seconds of the first trajectory of a data set, sorted by time."""
+    """Return the first `seconds` of the first trajectory in a data set, sorted by time."""
     rows = (data.segment == data.segment[0]).nonzero()[:, 0]
     rows = rows[data.t[rows].argsort()]
     return data[rows[data.t[rows] <= data.t[rows[0]] + seconds]]
@@ -73,17 +73,17 @@ def opening(data: Dataset, seconds: float) -> Dataset:
 
 @torch.no_grad()
 def predicted_window(model: Predictor, data: Dataset, name: str) -> WindowData:
-    """Return the predictions at the samples of a window, sorted by time; `name` labels the model."""
+    """Return the predictions for a window of samples sorted by time; `name` identifies the model."""
     predicted = model.predict(data.q, data.qd, data.tau, active=data.active(model.system.contact_names))
     clean, variance = data.extras.get("qdd_clean"), predicted.variance
     if variance is not None and isinstance(model, StructuredFit) and model.torque_std is not None:
-        # Where the noise of the torque is known, a measurement scatters by it around what is predicted.
+        # If the torque noise is known, measurements scatter around the prediction accordingly.
         active = data.active(model.system.contact_names)
         variance = variance + model.noise_variance(data.q, data.qd, data.tau, active=active)
     return WindowData(
         model=name,
         noise_std=data.header.noise_std,
-        # Measured logs count seconds from 1970, of which a series would keep too few digits.
+        # Measured logs may count seconds since 1970, for which a series keeps too few digits.
         t=series(data.t - data.t[0]),
         joint_names=list(data.joint_names),
         measured=columns(data.qdd),
@@ -113,7 +113,7 @@ def _forces(model: Predictor, data: Dataset) -> tuple[ForceWindow, ...]:
 
 
 def draw_forces(window: WindowData) -> Picture:
-    """Plot the predicted normal force of each closed contact with ±2σ, and the logged one."""
+    """Plot the predicted normal force at each contact with its ±2σ band, and the logged force."""
 
     def paint(figure: Figure) -> None:
         panels = figure.subplots(len(window.forces), 1, sharex=True, squeeze=False)[:, 0]
@@ -139,7 +139,7 @@ def draw_forces(window: WindowData) -> Picture:
 
 
 def _robust_limits(axes: Axes, values: Tensor) -> None:
-    """Set axis limits that contain all but the outermost `OUTSIDE` of the values, with a margin."""
+    """Set axis limits that include a margin but exclude a fraction `OUTSIDE` of the values on either side."""
     values = values[values.isfinite()]
     if len(values):
         low, high = values.quantile(torch.tensor([OUTSIDE, 1.0 - OUTSIDE], dtype=values.dtype)).tolist()
@@ -148,14 +148,14 @@ def _robust_limits(axes: Axes, values: Tensor) -> None:
 
 
 def draw_predictions(window: WindowData) -> Picture:
-    """Plot measured and predicted accelerations, one row per joint, with bands of ±2 standard deviations."""
+    """Plot measured accelerations and predicted ones with ±2σ bands, in one row per joint."""
     band = ", with the ±2σ band," if window.std else ""
     alt = f"accelerations of {{}}; measured in black, predicted{band} in colour."
     return _draw(window, torch.zeros(len(window.t), dtype=torch.float64), alt)
 
 
 def draw_errors(window: WindowData, limit: float | None = None) -> Picture:
-    """Plot prediction errors by joint within ±`limit` [rad/s²], or with a separate scale for each row."""
+    """Plot prediction errors by joint within ±`limit` [rad/s²]; by default, each row has its own scale."""
     error = window.error.abs()
     alt = (
         f"error of the predicted accelerations of {{}}, mean magnitude {error.mean():.2g}, "
@@ -199,4 +199,4 @@ def _rows(figure: Figure, window: WindowData, centre: Tensor, limit: float | Non
     handles, names = rows[0].get_legend_handles_labels()
     legend = figure.legend(handles, names, loc="outside upper center", ncols=len(names))
     for shown_line in legend.get_lines():
-        shown_line.set_linewidth(1.6)  # a hairline of the plot would look grey
+        shown_line.set_linewidth(1.6)  # the thin line used in the plot would look grey

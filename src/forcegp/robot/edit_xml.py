@@ -1,7 +1,7 @@
-"""In-place editing of XML documents, which changes only the edited attributes and elements.
+"""In-place editing of XML documents that changes only the edited attributes and elements.
 
-XML writers drop comments, attribute order or indentation. This editor locates start tags and attribute values
-in the text, and replaces only these spans.
+XML writers lose comments, attribute order or indentation. This editor locates start tags and attribute values
+in the text and replaces only these spans.
 """
 
 from __future__ import annotations
@@ -21,9 +21,9 @@ _TAG_NAME = re.compile(rb"<[^\s/>]+")
 
 @dataclass(eq=False)
 class Span:
-    """An element of the text: the end of its name (`head`) and of its start tag (`close`), whether it is
-    `<tag/>`, the indentation of its line, and for each attribute the start and end of its quoted value and
-    the start of the attribute including the preceding space.
+    """An element of the text: the ends of its name (`head`) and of its start tag (`close`), whether it is
+    written as `<tag/>`, the indentation of its line, and for each attribute the start and end of its quoted
+    value and the start of the attribute including the preceding space.
     """
 
     tag: str
@@ -36,7 +36,7 @@ class Span:
     children: list[Span] = field(default_factory=list)
 
     def find(self, tag: str) -> Span | None:
-        """Return the first child with a tag."""
+        """Return the first child with the given tag, or `None` if there is none."""
         return next((child for child in self.children if child.tag == tag), None)
 
     def iter(self) -> Iterator[Span]:
@@ -47,11 +47,11 @@ class Span:
 
 
 class EditableXml:
-    """An XML document with attributes that can be changed in place.
+    """An XML document whose attributes can be changed in place.
 
     Args:
         data: the document.
-        label: name of the file in messages.
+        label: name of the file for messages.
 
     Raises:
         RobotFileError: the document is not well-formed UTF-8, or is rejected by `safety.parse_xml`.
@@ -100,7 +100,7 @@ class EditableXml:
         )
 
     def set(self, element: Span, name: str, text: str) -> None:
-        """Set an attribute; a new attribute is added after the others."""
+        """Set an attribute; new attributes are added after the existing ones."""
         quoted = quoteattr(text).encode()
         if name in element.values:
             first, last, _ = element.values[name]
@@ -117,7 +117,7 @@ class EditableXml:
             self._edits.append((before, last, b""))
 
     def add_child(self, element: Span, tag: str, attributes: dict[str, str], inside: str = "") -> None:
-        """Insert an element as the first child; `inside` is its content, as empty tags."""
+        """Insert an element as the first child; `inside` is its content in the form of empty tags."""
         text = "".join(f" {name}={quoteattr(value)}" for name, value in attributes.items())
         child = f"<{tag}{text}>{inside}</{tag}>" if inside else f"<{tag}{text}/>"
         step = element.children[0].indent if element.children else element.indent + b"  "
@@ -130,7 +130,7 @@ class EditableXml:
             self._edits.append((element.close, element.close, added))
 
     def written(self) -> bytes:
-        """Return the document with all changes."""
+        """Return the document with all changes applied."""
         parts, at = [], 0
         for first, last, text in sorted(self._edits, key=lambda edit: edit[:2]):
             parts += [self._data[at:first], text]

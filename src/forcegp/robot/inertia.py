@@ -1,4 +1,4 @@
-"""Inertial parameters of a rigid body in coordinates that are always physical.
+"""Inertial parameters of a rigid body in coordinates whose values are always physically consistent.
 
 A body has the ten parameters π = (m, m c, I_o), with I_o about the link origin. They correspond to a mass
 distribution if and only if the pseudo-inertia J = [[Σ, m c], [m cᵀ, m]], Σ = ½ tr(I_o) 1 − I_o, is positive
@@ -22,8 +22,8 @@ InertialParameters = Float[Tensor, "*batch 10"]
 def pseudo_inertia(mass: Scalars, com: Vector3, inertia: Rotation) -> PseudoInertia:
     """Return J = [[Σ, m c], [m cᵀ, m]] `(*batch, 4, 4)` with Σ = ½ tr(I_c) 1 − I_c + m c cᵀ.
 
-    J > 0 if the parameters are physical. `com` is the centre of mass in the link frame [m], and `inertia` the
-    inertia about it in link axes [kg m²].
+    J > 0 if the parameters are physical. `com` is the centre of mass in the link frame [m], and `inertia` is
+    the inertia about it in link axes [kg m²].
     """
     eye = torch.eye(3, dtype=inertia.dtype, device=inertia.device)
     half_trace = 0.5 * inertia.diagonal(dim1=-2, dim2=-1).sum(-1)
@@ -35,7 +35,7 @@ def pseudo_inertia(mass: Scalars, com: Vector3, inertia: Rotation) -> PseudoIner
 
 
 def from_pseudo_inertia(J: PseudoInertia) -> tuple[Scalars, Vector3, Rotation]:
-    """Return mass, centre of mass and inertia about it of a pseudo-inertia (inverse of `pseudo_inertia`)."""
+    """Return the mass, centre of mass and inertia about it from J (the inverse of `pseudo_inertia`)."""
     mass = J[..., 3, 3]
     com = J[..., :3, 3] / mass[..., None]
     Sigma = J[..., :3, :3] - mass[..., None, None] * com[..., :, None] * com[..., None, :]
@@ -61,7 +61,7 @@ def from_log_cholesky(theta: InertialParameters) -> PseudoInertia:
 
 
 def log_cholesky(J: PseudoInertia) -> InertialParameters:
-    """Return θ `(*batch, 10)` of J (inverse of `from_log_cholesky`); `InertiaError` unless J > 0."""
+    """Return θ `(*batch, 10)` of J (inverse of `from_log_cholesky`); raise `InertiaError` unless J > 0."""
     # An upper factor is the lower factor of the matrix with rows and columns reversed.
     lower, info = torch.linalg.cholesky_ex(J.flip(-1, -2))
     if bool((info != 0).any()):

@@ -1,6 +1,6 @@
-"""`load_robot`: a robot model from a bundled name, a URDF file or an MJCF file.
+"""`load_robot`: load a robot model from a bundled name, a URDF file or an MJCF file.
 
-The ordered tree of links and joints becomes the robot model, with fixed joints merged into the links.
+The ordered tree of links and joints becomes the robot model, with links merged across fixed joints.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ from forcegp.robot.urdf import read_urdf
 FRICTION_VELOCITY = 0.1
 """Default speed scale of Coulomb friction [rad/s, m/s], which robot files do not specify."""
 SINGULAR = 1e-12
-"""Eigenvalue of the scaled mass matrix below which it counts as singular in double precision."""
+"""Eigenvalue of the scaled mass matrix below which the matrix is considered singular in double precision."""
 LIMB_JOINTS, WALKING_JOINTS, BODY_MASS = 2, 6, 1.0
-"""Number of joints from which a chain counts as a limb, and joints and base mass [kg] from which a robot
-may walk: a hand is lighter."""
+"""Minimum number of joints in a limb, and minimum number of joints and base mass [kg] of a robot that might
+walk (hands are lighter)."""
 OF_JOINTS = ("axis", "damping", "friction", "armature", "lower", "upper", "velocity_limit", "effort_limit")
 """Joint attributes copied unchanged from the file."""
 
 
 @dataclass(frozen=True)
 class _Placed:
-    """Moving joints, and for each link of the file its moving joint and the pose in that joint's link."""
+    """Moving joints, and for each link of the file its moving joint and its pose in that joint's link."""
 
     moving: list[Joint]
     parents: list[int]
@@ -50,7 +50,7 @@ class _Placed:
 
 
 def robot_of(tree: Tree, world: Mapping[str, np.ndarray]) -> RobotModel:
-    """Build the robot from a tree; typed errors for ambiguous frames and motion without inertia."""
+    """Build the robot from a tree; raise typed errors for ambiguous frames and motion without inertia."""
     remarks, placed = list(tree.remarks), _place(tree.joints)
     bodies = _merge(tree, placed)
     remarks += _held_base(tree, placed)
@@ -99,7 +99,7 @@ def _place(joints: tuple[Joint, ...]) -> _Placed:
 
 
 def _held_base(tree: Tree, placed: _Placed) -> list[str]:
-    """Return a remark if a fixed base with mass carries several limbs, like that of a walking robot."""
+    """Return a note if a fixed base with mass carries several limbs, like that of a walking robot."""
     limb: list[int] = []
     for i, parent in enumerate(placed.parents):
         limb.append(i if parent == BASE else limb[parent])
@@ -115,7 +115,7 @@ def _held_base(tree: Tree, placed: _Placed) -> list[str]:
 
 
 def _merge(tree: Tree, placed: _Placed) -> list[Inertial]:
-    """Return the mass, centre of mass and inertia of each moving link, including the links fixed to it."""
+    """Return the mass, centre of mass and inertia of each moving link, including links fixed to it."""
     parts: list[list[Inertial]] = [[] for _ in placed.moving]
     for link in tree.links:
         index, T = placed.links[link.name]
@@ -136,7 +136,7 @@ def _sum(bodies: list[Inertial]) -> Inertial:
 
 
 def _check_mass_matrix(tree: Tree, placed: _Placed, bodies: list[Inertial]) -> None:
-    """Reject a robot that can move without kinetic energy, tested in a generic configuration."""
+    """Reject robots that can move without kinetic energy, as tested in a generic configuration."""
     M = _mass_matrix(placed, bodies) + np.diag([joint.armature for joint in placed.moving])
     scale = np.sqrt(np.diag(M))
     if scale.min() > 0.0:
@@ -165,7 +165,7 @@ def _mass_matrix(placed: _Placed, bodies: list[Inertial]) -> np.ndarray:
     for i, joint in enumerate(placed.moving):
         parent = placed.parents[i]
         start = placed.placements[i] if parent == BASE else poses[parent] @ placed.placements[i]
-        # The golden ratio spreads the joint positions, so that no axes line up by chance.
+        # The golden ratio spreads the joint positions, so that no axes are aligned by coincidence.
         poses.append(start @ joint_motion(joint.kind, joint.axis, 0.3 + (0.618034 * (i + 1)) % 1.0))
         axes[i], origins[i] = start[:3, :3] @ joint.axis, start[:3, 3]
         moves[i] = moves[parent] if parent != BASE else False
@@ -208,16 +208,16 @@ def load_robot(
     dtype: torch.dtype = torch.float64,
     device: torch.device | str = "cpu",
 ) -> RobotModel:
-    """Load a robot model by bundled name, or from a URDF or MJCF file.
+    """Load a bundled robot model by name, or a model from a URDF or MJCF file.
 
-    A usable but doubtful file causes a `RobotFileWarning`, which is also listed in `robot.remarks`.
+    A usable but questionable file triggers a `RobotFileWarning`, which is also listed in `robot.remarks`.
 
     Args:
         source: `"kuka_iiwa"`, `"kuka_iiwa14"`, `"franka_panda"`, `"ur5"`, `"double_pendulum"`, or the path
             of a file.
         base_position: position of the root link in the world [m].
         base_rpy: roll, pitch and yaw of the root link about the world axes [rad].
-        gravity: gravitational acceleration in the world [m/s²]; that in an MJCF file is ignored.
+        gravity: gravitational acceleration in the world [m/s²]; the value in an MJCF file is ignored.
         locked_joints: positions [rad, m] of joints to treat as fixed, such as those of a gripper.
         dtype: floating-point type of all constants.
         device: device of all constants.
@@ -232,7 +232,7 @@ def load_robot(
 
     Raises:
         UnknownNameError: the bundled robot or a joint to lock does not exist.
-        RobotFileError: the file cannot be read or is not a valid robot; the message names link or joint.
+        RobotFileError: the file cannot be read or is not a valid robot; the message names the link or joint.
         UnsupportedRobotError: a joint is a floating, planar, ball or mimic joint; the hint is to lock it.
         MissingDependencyError: the file is MJCF and MuJoCo is not installed.
         InertiaError: the inertia of a link is not physical.
@@ -244,12 +244,14 @@ def load_robot(
         "base_position": _vector(base_position, "base_position"),
         "gravity": _vector(gravity, "gravity"),
     }
-    return robot_of(checked(lock_joints(_read(source), locked_joints or {})), world).to(device, dtype)
+    path = robot_path(source)
+    tree = checked(lock_joints(read_tree(read_bytes(path), path), locked_joints or {}))
+    return robot_of(tree, world).to(device, dtype)
 
 
 def robot_path(source: str | Path) -> Path:
-    """Return the file of a bundled robot or a path; `UnknownNameError` if there is neither."""
-    path = Path(os.path.expanduser(source))  # an unknown user is left as it is
+    """Return the file for a bundled robot name or a path; raise `UnknownNameError` if neither exists."""
+    path = Path(os.path.expanduser(source))  # an unknown user name is left unchanged
     if str(source) in BUNDLED:
         return Path(__file__).parent / "bundled" / f"{source}.urdf"
     if not path.suffix and path.name == str(source):
@@ -257,13 +259,8 @@ def robot_path(source: str | Path) -> Path:
     return path
 
 
-def _read(source: str | Path) -> Tree:
-    path = robot_path(source)
-    return read_tree(read_bytes(path), path)
-
-
 def read_tree(data: bytes, path: Path) -> Tree:
-    """Return links and joints of a URDF or MJCF document from `path`; `RobotFileError` if it is invalid."""
+    """Return links and joints of a URDF or MJCF document from `path`; raise `RobotFileError` if invalid."""
     root = parse_xml(data, str(path))
     if root.tag == "robot":
         return read_urdf(root, str(path))

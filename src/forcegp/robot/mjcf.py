@@ -1,6 +1,6 @@
-"""Reading of MJCF files, which are reduced to the mechanics and compiled by MuJoCo.
+"""Reading of MJCF files, which are reduced to their mechanics and compiled by MuJoCo.
 
-This module is imported only to read MJCF files, since it needs the optional package `mujoco`.
+This module is imported only for reading MJCF files, since it needs the optional package `mujoco`.
 """
 
 from __future__ import annotations
@@ -31,8 +31,8 @@ _KINDS: dict[int, JointKind] = {
 def read_mjcf(root: Element, path: Path) -> Tree:
     """Return the links and joints of a `<mujoco>` document.
 
-    Bodies become links, bodies and sites become frames, and massless links separate several joints of a body.
-    Typed errors quote MuJoCo's compiler, or name unsupported or unphysical elements.
+    Bodies become links, bodies and sites become frames, and multiple joints of a body are separated by
+    massless links. Typed errors quote MuJoCo's compiler, or name unsupported or unphysical elements.
     """
     document, coupled, remarks = reduce_mjcf(root, path)
     with _warnings_of_mujoco(str(path), remarks):
@@ -63,10 +63,10 @@ _HANDLER = threading.RLock()
 
 @contextmanager
 def _warnings_of_mujoco(label: str, remarks: list[str]) -> Iterator[None]:
-    """Collect MuJoCo's warnings, which would otherwise go to a log file in the working folder.
+    """Collect MuJoCo's warnings, which would otherwise be written to a log file in the working directory.
 
-    The handler is global to the process. One reader at a time replaces and restores it, and warnings of other
-    threads are passed on.
+    The handler is global to the process. Only one reader at a time replaces and restores it; warnings from
+    other threads are passed on.
     """
     thread = threading.get_ident()
     with _HANDLER:
@@ -96,7 +96,7 @@ def _compile(document: Element, label: str) -> Any:
 
 
 def _pose(position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
-    # MuJoCo puts the real part first, SciPy last.
+    # MuJoCo puts the real part of a quaternion first, SciPy last.
     return transform(Rotation.from_quat(np.roll(quaternion, -1)).as_matrix(), position)
 
 
@@ -111,7 +111,7 @@ def _inertial(model: Any, b: int) -> Inertial | None:
 def _chain(
     model: Any, b: int, names: list[str], joint_names: list[str], coupled: dict[str, Coupling], label: str
 ) -> list[Joint]:
-    """Return the joints of body b in order, each at its anchor, and the fixed joint to the body frame."""
+    """Return the joints of body b in order, each at its anchor, followed by the fixed joint to its frame."""
     parent, placement = names[model.body_parentid[b]], _pose(model.body_pos[b], model.body_quat[b])
     chain: list[Joint] = []
     anchor = np.zeros(3)
@@ -126,7 +126,7 @@ def _chain(
 
 
 def _joint(model: Any, j: int, name: str, body: str, follows: Coupling | None, label: str) -> Joint:
-    """Return a joint of a body, placed at zero position, before its links are assigned."""
+    """Return joint j of a body, placed at zero joint position, before its links are assigned."""
     kind, dof = _KINDS.get(int(model.jnt_type[j])), model.jnt_dofadr[j]
     if kind is None:
         word = "free (floating)" if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE else "ball"
@@ -162,7 +162,7 @@ def _joint(model: Any, j: int, name: str, body: str, follows: Coupling | None, l
 
 
 def _effort(model: Any, j: int) -> float:
-    """Return the largest force allowed by the joint, its actuators, and the control range of a motor."""
+    """Return the largest force that the joint, its actuators, and the control range of motors allow."""
     effort = float(np.abs(model.jnt_actfrcrange[j]).max()) if model.jnt_actfrclimited[j] else np.inf
     of_joint = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
     efforts = []

@@ -1,8 +1,7 @@
-"""MJCF documents reduced to their mechanics, before MuJoCo's compiler reads them.
+"""Reduction of MJCF documents to their mechanics, before MuJoCo's compiler reads them.
 
 Bodies, joints, sites, inertias and defaults are kept. Elements for visuals, sensors, actuation or collisions
-are dropped, so meshes and textures are never opened. Unsupported elements that affect the motion raise
-errors.
+are dropped, so meshes and textures are never opened. Unsupported elements that affect motion cause errors.
 """
 
 from __future__ import annotations
@@ -32,7 +31,7 @@ _WORDS = ("name", "class", "childclass", "user", "joint1", "joint2")
 
 
 class Coupling(NamedTuple):
-    """Joint followed by a coupled joint, and the linear part of the relation."""
+    """The joint that a coupled joint follows, and the linear part of the relation."""
 
     leader: str
     multiplier: float
@@ -40,8 +39,8 @@ class Coupling(NamedTuple):
 
 
 def reduce_mjcf(root: Element, path: Path) -> tuple[Element, dict[str, Coupling], list[str]]:
-    """Return the reduced document of a file with included files from its folder, couplings by name of the
-    constrained joint, and remarks; typed errors name invalid or unsupported elements.
+    """Return the reduced document with included files from its folder, couplings keyed by the name of the
+    constrained joint, and notes; raise typed errors that name invalid or unsupported elements.
     """
     _expand_includes(root, path)
     document = Element("mujoco", model=root.get("model", path.stem))
@@ -74,7 +73,7 @@ def reduce_mjcf(root: Element, path: Path) -> tuple[Element, dict[str, Coupling]
 
 
 def _expand_includes(root: Element, path: Path) -> None:
-    """Insert included files, each at most once, and only from within the folder of the robot file."""
+    """Insert included files, each at most once and only from within the robot file's folder."""
     folder = path.resolve().parent
     included = {path.resolve()}
     stack = [root]
@@ -137,7 +136,7 @@ def _without(element: Element, names: tuple[str, ...]) -> dict[str, str]:
 
 
 def _copy_actuators(section: Element) -> Element:
-    """Copy the limits of joint actuators; the name states whether the control is the force."""
+    """Copy the limits of joint actuators; the name of a copy indicates whether its control is a force."""
     copy = Element("actuator")
     for i, actuator in enumerate(section):
         if actuator.tag in _ACTUATORS and actuator.get("joint"):
@@ -148,7 +147,7 @@ def _copy_actuators(section: Element) -> Element:
 
 
 def _parts(body: Element) -> Iterator[Element]:
-    """Yield the elements of a body, including those within frames but not those of child bodies."""
+    """Yield the elements of a body, including those within frames but excluding those of child bodies."""
     for child in body:
         yield child
         if child.tag == "frame":
@@ -216,7 +215,7 @@ def _couplings(equality: Element, path: Path) -> dict[str, Coupling]:
 
 
 def _check_numbers(document: Element, path: Path) -> None:
-    """Reject NaN, infinite and implausibly large numbers, which MuJoCo's compiler accepts."""
+    """Reject NaN, infinite and implausibly large numbers, which MuJoCo's compiler would accept."""
     for element in document.iter():
         for attribute, text in element.attrib.items():
             if attribute in _WORDS or element.tag == "mujoco":

@@ -1,9 +1,9 @@
-"""The frozen description of a robot as a tree of one-degree-of-freedom joints with rigid links.
+"""The frozen description of a robot as a tree of rigid links and joints with one degree of freedom each.
 
-Joint `i` moves link `i`. Its frame is at `placement` in the frame of its parent link; the link frame is the
-joint frame after the motion. All inertial parameters of link `i` are in the axes of link frame `i`, with the
-inertia about the centre of mass. Links connected by fixed joints are merged; their frames remain available by
-name.
+Joint `i` moves link `i`. The joint frame has the pose `placement` in the frame of the parent link; the link
+frame is the joint frame after the motion. All inertial parameters of link `i` are expressed in the axes of
+link frame `i`, with the inertia about the centre of mass. Links connected by fixed joints are merged; their
+frames remain available by name.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from forcegp.notebook import html_table
 
 JointType = Literal["revolute", "prismatic"]
 BASE = -1
-"""Joint index that stands for the fixed base."""
+"""Joint index that denotes the fixed base."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,15 +31,15 @@ class RobotModel:
 
     Args:
         name: name of the robot.
-        joint_names: the moving joints, parents before children.
+        joint_names: the moving joints, with parents before children.
         joint_types: `"revolute"` or `"prismatic"`, one per joint (continuous joints are revolute).
         parents: index of the parent joint of each joint, −1 for the base.
-        placement_rotation: `(nq, 3, 3)` joint frame in the parent link frame at q = 0.
-        placement_position: `(nq, 3)` [m].
+        placement_rotation: `(nq, 3, 3)` orientation of the joint frame in the parent link frame at q = 0.
+        placement_position: `(nq, 3)` position of the joint frame in the parent link frame [m].
         axis: `(nq, 3)` unit joint axis in the joint frame.
-        mass: `(nq,)` [kg].
+        mass: `(nq,)` link mass [kg].
         com: `(nq, 3)` centre of mass in the link frame [m].
-        inertia: `(nq, 3, 3)` rotational inertia about the centre of mass, link axes [kg m²].
+        inertia: `(nq, 3, 3)` rotational inertia about the centre of mass, in link axes [kg m²].
         damping: `(nq,)` viscous joint friction [N m s/rad, N s/m].
         friction: `(nq,)` Coulomb joint friction [N m, N].
         stribeck: `(nq,)` static friction above the Coulomb level [N m, N].
@@ -47,13 +47,13 @@ class RobotModel:
         friction_velocity: `(nq,)` speed scale on which Coulomb friction changes sign [rad/s, m/s].
         armature: `(nq,)` inertia of the drive, reflected to the joint [kg m², kg].
         lower, upper: `(nq,)` joint limits [rad, m], infinite if absent.
-        velocity_limit, effort_limit: `(nq,)` [rad/s, m/s], [N m, N], infinite if absent.
-        frame_names: every link and fixed frame of the file.
+        velocity_limit, effort_limit: `(nq,)` limits [rad/s, m/s] and [N m, N], infinite if absent.
+        frame_names: names of all links and fixed frames in the file.
         frame_parents: index of the joint that moves each frame, −1 for the base.
-        frame_rotation, frame_position: `(nf, 3, 3)`, `(nf, 3)` pose in the link frame of that joint.
-        base_rotation, base_position: pose of the base in the world `(3, 3)`, `(3,)` [m].
+        frame_rotation, frame_position: pose `(nf, 3, 3)`, `(nf, 3)` [m] in the link frame of that joint.
+        base_rotation, base_position: pose `(3, 3)`, `(3,)` [m] of the base in the world.
         gravity: `(3,)` gravitational acceleration in the world [m/s²].
-        remarks: doubtful properties of the file, one sentence each.
+        remarks: notes on questionable properties of the file, one sentence each.
     """
 
     name: str
@@ -86,7 +86,7 @@ class RobotModel:
     remarks: tuple[str, ...] = ()
 
     def __repr__(self) -> str:
-        """Return a one-line summary without numbers."""
+        """Return a one-line summary without the values of the tensors."""
         moving = self.joint_types.count("prismatic")
         kinds = f", {moving} of them prismatic" if moving else ""
         mass = float(self.mass.detach().sum())
@@ -94,7 +94,7 @@ class RobotModel:
         return f"<RobotModel {self.name!r}: {self.nq} joints{kinds}; {mass:.4g} kg; {kind} on {self.device}>"
 
     def _repr_html_(self) -> str:
-        """Return a table of the joints for notebooks."""
+        """Return an HTML table of the joints for notebooks."""
         head = ("joint", "type", "parent", "lower", "upper", "mass [kg]", "damping", "friction")
         numbers = torch.stack([self.lower, self.upper, self.mass, self.damping, self.friction], dim=1)
         parents = ["base" if parent == BASE else self.joint_names[parent] for parent in self.parents]
@@ -109,17 +109,17 @@ class RobotModel:
 
     @property
     def dtype(self) -> torch.dtype:
-        """Floating-point type of every constant."""
+        """Floating-point type of all constants."""
         return self.axis.dtype
 
     @property
     def device(self) -> torch.device:
-        """Device of every constant."""
+        """Device of all constants."""
         return self.axis.device
 
     @cached_property
     def levels(self) -> tuple[tuple[int, ...], ...]:
-        """Joints by depth in the tree, the base's children first."""
+        """Joints at each depth of the tree, starting with the children of the base."""
         depth: list[int] = []
         for parent in self.parents:
             depth.append(0 if parent == BASE else depth[parent] + 1)
@@ -128,7 +128,7 @@ class RobotModel:
 
     @cached_property
     def ancestors(self) -> Tensor:
-        """E `(nq, nq)`: E[i, j] = 1 if joint j moves link i."""
+        """Matrix E `(nq, nq)` with E[i, j] = 1 if joint j moves link i, else 0."""
         E = torch.eye(self.nq, dtype=self.dtype, device=self.device)
         for i, parent in enumerate(self.parents):
             if parent != BASE:
@@ -137,15 +137,15 @@ class RobotModel:
 
     @cached_property
     def revolute(self) -> Tensor:
-        """`(nq,)` 1 for revolute joints, 0 for prismatic ones."""
+        """Mask `(nq,)` that is 1 for revolute joints and 0 for prismatic ones."""
         flags = [float(kind == "revolute") for kind in self.joint_types]
         return torch.tensor(flags, dtype=self.dtype, device=self.device)
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 of joint names, kinematics and inertial parameters: equal for equal robots."""
+        """SHA-256 hash of joint names, kinematics and inertial parameters; equal robots have equal hashes."""
         digest = hashlib.sha256(repr((self.joint_names, self.joint_types, self.parents)).encode())
-        for name, value in self._tensors.items():
+        for name, value in self.tensors.items():
             digest.update(name.encode())
             digest.update(value.detach().to("cpu", torch.float64).contiguous().numpy().tobytes())
         return digest.hexdigest()[:16]
@@ -153,16 +153,16 @@ class RobotModel:
     @property
     def learned(self) -> tuple[str, ...]:
         """Names of the constants that require a gradient."""
-        return tuple(name for name, x in self._tensors.items() if x.requires_grad)
+        return tuple(name for name, x in self.tensors.items() if x.requires_grad)
 
     @property
-    def _tensors(self) -> dict[str, Tensor]:
+    def tensors(self) -> dict[str, Tensor]:
         """Every constant that is a tensor, by name."""
         values = ((field.name, getattr(self, field.name)) for field in dataclasses.fields(self))
         return {name: value for name, value in values if isinstance(value, Tensor)}
 
     def frame_index(self, frame: str) -> int:
-        """Return the index of a named frame; an `UnknownNameError` lists the frames and the nearest one."""
+        """Return the index of a named frame; an `UnknownNameError` suggests the closest name."""
         check_name(f"frame of robot {self.name!r}", frame, self.frame_names)
         return self.frame_names.index(frame)
 
@@ -172,15 +172,15 @@ class RobotModel:
         return self.joint_names.index(joint)
 
     def to(self, device: torch.device | str | None = None, dtype: torch.dtype | None = None) -> RobotModel:
-        """Return the same robot with its constants on another device or in another precision."""
-        return self.replace(**{name: x.to(device=device, dtype=dtype) for name, x in self._tensors.items()})
+        """Return the same robot with its constants on a different device or in a different precision."""
+        return self.replace(**{name: x.to(device=device, dtype=dtype) for name, x in self.tensors.items()})
 
     def replace(self, **fields: object) -> RobotModel:
-        """Return a robot with some fields changed, such as `robot.replace(mass=mass)`.
+        """Return a robot with the given fields changed, as in `robot.replace(mass=mass)`.
 
         Raises:
             UnknownNameError: a field does not exist.
-            ShapeError: a tensor has a different shape than the one it replaces.
+            ShapeError: a tensor has a different shape from the one it replaces.
             ParameterError: gravity or a mass is not finite.
         """
         names = [field.name for field in dataclasses.fields(self)]
@@ -195,7 +195,7 @@ class RobotModel:
         return dataclasses.replace(self, **fields)  # pyright: ignore[reportArgumentType]
 
     def check_state(self, **states: Tensor) -> None:
-        """Raise `ShapeError` unless arguments end in `nq` and have the robot's dtype and device."""
+        """Raise `ShapeError` unless arguments have last dimension `nq` and the robot's dtype and device."""
         for name, value in states.items():
             if not isinstance(value, Tensor):
                 raise ShapeError(

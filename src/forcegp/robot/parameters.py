@@ -8,7 +8,7 @@
 | `offset`            | rotation vector and translation [m] of j's placement                | 6      |
 | `damping`, `friction`, `stribeck`, `stribeck_velocity`, `friction_velocity`, `armature` | log | 1 each |
 
-All values of the coordinates describe a physical robot if the initial robot is physical.
+If the initial robot is physical, the robot is physical for all values of the coordinates.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ POSITIVE = (
 )  # fmt: skip
 QUANTITIES = ("inertia", "com", "offset", *POSITIVE)
 SMALLEST = 1e-3
-"""Initial value of a friction or drive parameter that is zero in the robot, since its logarithm is learned.
+"""Initial value of friction and drive parameters that are zero in the robot, since logarithms are learned.
 """
 
 
@@ -41,8 +41,8 @@ class AnalyticalParameters(nn.Module):
 
     Args:
         robot: robot with the initial values and the parameters that are not learned.
-        learn: joint names by quantity, or `"all"`, such as `{"mass": ["joint_7"], "damping": "all"}`. For
-            inertia, mass and centre of mass, a joint name refers to the link that the joint moves.
+        learn: joint names (or `"all"`) for each quantity, as in `{"mass": ["joint_7"], "damping": "all"}`.
+            For inertia, mass and centre of mass, a joint name refers to the link that the joint moves.
 
     Example:
         >>> import torch, forcegp
@@ -54,7 +54,7 @@ class AnalyticalParameters(nn.Module):
 
     Raises:
         UnknownNameError: a quantity or a joint does not exist.
-        ModelError: no parameter is selected, or the inertia of a link is selected twice.
+        ModelError: no parameters are selected, or the inertia of a link is selected twice.
         InertiaError: `inertia` is learned for a link with unphysical inertia.
     """
 
@@ -86,9 +86,9 @@ class AnalyticalParameters(nn.Module):
         length: float = 0.0,
         angle: float = 0.0,
     ) -> None:
-        """Draw all coordinates uniformly from a window around the initial robot.
+        """Draw all coordinates uniformly from intervals around the initial robot.
 
-        The half widths are `relative` for logarithms (a factor of up to e^{±relative}), `length` for centres
+        The half-widths are `relative` for logarithms (a factor of up to e^{±relative}), `length` for centres
         of mass and translations [m], and `angle` for rotations [rad].
         """
         for quantity, x in self.coordinates.items():

@@ -1,4 +1,4 @@
-"""Safe parsing of XML from untrusted files, without entities and with bounds on size and depth."""
+"""Safe parsing of XML from untrusted files, with entities rejected and size and depth bounded."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ MAX_BYTES = 8 * 2**20
 MAX_ELEMENTS = 20_000
 MAX_DEPTH = 128
 MAX_NUMBER = 1e12
-"""Bound on lengths, masses and moments, which prevents overflow of their products."""
+"""Bound on lengths, masses and moments, which prevents overflow in their products."""
 
 
 class _BoundedBuilder(TreeBuilder):
-    """A tree builder that rejects files that are too large or too deep."""
+    """A tree builder that rejects files that are too large or too deeply nested."""
 
     def __init__(self, label: str) -> None:
         super().__init__()
@@ -49,7 +49,7 @@ class _BoundedBuilder(TreeBuilder):
 
 
 def read_bytes(path: Path) -> bytes:
-    """Return the content of a regular file of at most `MAX_BYTES`; `RobotFileError` otherwise."""
+    """Return the content of a regular file of at most `MAX_BYTES`; raise `RobotFileError` otherwise."""
     try:
         if not path.is_file():
             kind = "a folder" if path.is_dir() else "something else" if path.exists() else "no such file"
@@ -69,7 +69,7 @@ def read_bytes(path: Path) -> bytes:
 
 
 def parse_xml(data: bytes, label: str) -> Element:
-    """Parse an XML document; `RobotFileError` if it is malformed, hostile, too large or too deep."""
+    """Parse an XML document; raise `RobotFileError` if it is malformed, malicious, or too large or deep."""
     parser = DefusedXMLParser(
         target=_BoundedBuilder(label), forbid_dtd=True, forbid_entities=True, forbid_external=True
     )
@@ -101,7 +101,7 @@ def parse_xml(data: bytes, label: str) -> Element:
 
 
 def xacro_error(label: str, got: str) -> RobotFileError:
-    """Return the error for a file with unexpanded xacro macros."""
+    """Return the error for a file that contains unexpanded xacro macros."""
     return RobotFileError(
         f"{label}: the file has xacro macros that are not expanded",
         expected="plain URDF",
@@ -113,7 +113,7 @@ def xacro_error(label: str, got: str) -> RobotFileError:
 def parse_numbers(
     text: str, where: str, count: int, *, infinite: bool = False, error: type[RobotFileError] = RobotFileError
 ) -> list[float]:
-    """Parse `count` finite numbers of an attribute, or also ±∞ if `infinite`; an `error` names `where`."""
+    """Parse the `count` finite numbers (±∞ if `infinite`) in an attribute; an `error` names `where`."""
     expected = f"{count} finite number{'s' if count > 1 else ''}"
     try:
         values = [float(word) for word in text.split()]

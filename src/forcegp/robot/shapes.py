@@ -1,10 +1,9 @@
-"""Convex shapes of a robot for display and collisions, from its URDF file or as rods between its joints."""
+"""Convex shapes of a robot for display and collision, from its URDF file or as rods between its joints."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from importlib.resources import files
 from pathlib import Path
 from xml.etree.ElementTree import Element
 
@@ -13,38 +12,38 @@ from numpy.typing import NDArray
 from scipy.spatial import ConvexHull, QhullError
 from scipy.spatial.transform import Rotation
 
-from forcegp.robot.load import BUNDLED
+from forcegp.robot.load import BUNDLED, robot_path
 from forcegp.robot.model import RobotModel
 from forcegp.robot.safety import parse_numbers, parse_xml, read_bytes
 
 Array = NDArray[np.float64]
 MESHES = (".stl", ".obj", ".ply", ".glb")
-"""Supported mesh formats; parts in other formats are omitted."""
+"""Supported mesh formats; parts in other formats are skipped."""
 MESH_BYTES = 1 << 25
 MESH_CORNERS = 200
-"""Maximum number of corners of the convex hull of a mesh."""
+"""Maximum number of vertices of the convex hull of a mesh."""
 LEAST = 1e-3
 """Minimum length of a rod [m]."""
 SIZES = {"box": {"size": 3}, "cylinder": {"radius": 1, "length": 1}, "sphere": {"radius": 1}}
-"""Attributes of shapes in a URDF file, with the number of their values."""
+"""Attributes of the shapes in a URDF file, with the number of values in each."""
 
 
 @dataclass(frozen=True)
 class Shape:
-    """A convex part of the link moved by joint `link` (−1: base), with corners `(k, 3)` in its frame [m]."""
+    """A convex part of the link moved by joint `link` (−1: base), with vertices `(k, 3)` in its frame [m]."""
 
     link: int
     points: Array
 
 
 def box(x: float, y: float, z: float) -> Array:
-    """Return the corners `(8, 3)` of a box centred at the origin from its side lengths [m]."""
+    """Return the vertices `(8, 3)` of a box centred at the origin, given its side lengths [m]."""
     signs = np.stack(np.meshgrid(*3 * [[-0.5, 0.5]], indexing="ij"), axis=-1)
     return signs.reshape(-1, 3) * [x, y, z]
 
 
 def cylinder(radius: float, length: float, corners: int = 24) -> Array:
-    """Return the corners `(2 corners, 3)` of a cylinder along z centred at the origin [m]."""
+    """Return the vertices `(2 corners, 3)` of a cylinder along z, centred at the origin [m]."""
     angle = np.linspace(0.0, 2.0 * np.pi, corners, endpoint=False)
     ring = np.stack([radius * np.cos(angle), radius * np.sin(angle), 0.0 * angle], axis=-1)
     half = np.array([0.0, 0.0, 0.5 * length])
@@ -52,7 +51,7 @@ def cylinder(radius: float, length: float, corners: int = 24) -> Array:
 
 
 def sphere(radius: float) -> Array:
-    """Return the corners `(k, 3)` of a sphere centred at the origin [m]."""
+    """Return the vertices `(k, 3)` of a sphere centred at the origin [m]."""
     angles = np.linspace(-0.5 * np.pi, 0.5 * np.pi, 13)
     return np.concatenate([cylinder(radius * np.cos(a), 2.0 * radius * np.sin(a), 24)[:24] for a in angles])
 
@@ -69,28 +68,24 @@ def turn_z(direction: Array) -> Array:
 def shapes_of(
     robot: RobotModel, source: str | Path | None = None, elements: Sequence[str] = ("visual",)
 ) -> list[Shape]:
-    """Return the parts of a robot from its file or a bundled one, or rods between its joints without URDF.
+    """Return the parts of a robot from its own or a bundled URDF file, or rods between its joints.
 
-    By default, the file of a bundled robot with the same name and frames is used. The first of `elements`
-    (`"visual"`, `"collision"`) that the file contains is used.
+    By default, the file of a bundled robot with the same name and frames is used. From the file, the first of
+    `elements` (`"visual"`, `"collision"`) that it contains is used.
 
     Raises:
         RobotFileError: the shapes in the file are invalid.
     """
-    name = str(source) if source is not None else robot.name
-    if name in BUNDLED:
-        path = Path(str(files("forcegp.robot") / "bundled" / f"{name}.urdf"))
-    elif source is None:
+    if source is None and robot.name not in BUNDLED:
         return rods(robot)
-    else:
-        path = Path(source)
+    path = robot_path(robot.name if source is None else source)
     root = parse_xml(read_bytes(path), str(path))
     found = (_parts(root, path, robot, element) for element in elements if root.tag == "robot")
     return next(filter(None, found), None) or rods(robot)
 
 
 def rods(robot: RobotModel) -> list[Shape]:
-    """Return rods to each joint and to the last frame of each link."""
+    """Return rods to each joint, and to the last frame of each link."""
     place, at = robot.placement_position.detach().cpu().numpy(), robot.frame_position.detach().cpu().numpy()
     ends = list(zip(robot.parents, place, strict=True))
     for link in range(robot.nq):
@@ -106,7 +101,7 @@ def rods(robot: RobotModel) -> list[Shape]:
 
 
 def _parts(root: Element, path: Path, robot: RobotModel, element: str) -> list[Shape]:
-    """Return the visual or collision elements of those links of a URDF document that are robot frames."""
+    """Return the visual or collision elements of the links in a URDF document that are robot frames."""
     parts = []
     for link in root.findall("link"):
         name = link.get("name", "")
@@ -123,7 +118,7 @@ def _parts(root: Element, path: Path, robot: RobotModel, element: str) -> list[S
 
 
 def _corners(part: Element, where: str, folder: Path) -> Array | None:
-    """Return the corners of a part in the frame of its link; `None` if it cannot be displayed."""
+    """Return the vertices of a part in the frame of its link, or `None` if it cannot be displayed."""
     origin, geometry = part.find("origin"), part.find("geometry")
     if geometry is None or not len(geometry):
         return None
@@ -147,19 +142,19 @@ def _corners(part: Element, where: str, folder: Path) -> Array | None:
 
 
 def _hull(file: Path) -> Array:
-    """Return the corners of the convex hull of a mesh, thinned to `MESH_CORNERS`."""
+    """Return the vertices of the convex hull of a mesh, reduced to at most `MESH_CORNERS`."""
     import trimesh
 
     points = np.asarray(trimesh.load(str(file), force="mesh").vertices, dtype=np.float64)  # pyright: ignore
     try:
         corners = points[ConvexHull(points).vertices]
-    except (QhullError, ValueError):  # flat, or fewer than four points
+    except (QhullError, ValueError):  # flat, or with fewer than four points
         corners = points
     return corners[:: -(-len(corners) // MESH_CORNERS) or 1]
 
 
 def _mesh_file(name: str, folder: Path) -> Path | None:
-    """Return a mesh named in a robot file, only from its folder or the package; `None` if not found."""
+    """Return a mesh file named in a robot file, if it is in the file's folder or package, else `None`."""
     package, _, rest = name.removeprefix("package://").partition("/")
     if name.startswith("package://"):
         roots = [parent / package for parent in (folder, *folder.resolve().parents)] + [folder]

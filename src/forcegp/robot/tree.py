@@ -1,4 +1,4 @@
-"""Common tree of links and joints for URDF and MJCF files, and its checks."""
+"""Tree of links and joints, common to URDF and MJCF files, and its validation."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ JointKind = Literal["revolute", "prismatic", "fixed"]
 
 @dataclass(frozen=True)
 class Inertial:
-    """Mass [kg], centre of mass [m] and inertia about it [kg m²], in the axes of the link."""
+    """Mass [kg], centre of mass [m] and inertia about it [kg m²], expressed in link axes."""
 
     mass: float
     com: np.ndarray
@@ -40,7 +40,7 @@ class Joint:
 
     Attributes:
         refused: reason why the joint must be locked, or "".
-        follows: the joint mimicked by this one, with multiplier and offset.
+        follows: the joint that this one mimics, with multiplier and offset.
     """
 
     name: str
@@ -62,7 +62,7 @@ class Joint:
 
 @dataclass(frozen=True)
 class Site:
-    """A named frame fixed in a link."""
+    """A named frame fixed to a link."""
 
     name: str
     link: str
@@ -71,7 +71,7 @@ class Site:
 
 @dataclass(frozen=True)
 class Tree:
-    """All links, joints and sites of a file; `label` is the file name for messages."""
+    """All links, joints and sites in a file; `label` is the file name for messages."""
 
     name: str
     label: str
@@ -89,21 +89,21 @@ def transform(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
 
 
 def joint_motion(kind: JointKind, axis: np.ndarray, q: float) -> np.ndarray:
-    """Return the pose of a link in its joint frame at joint position q."""
+    """Return the pose `(4, 4)` of a link in its joint frame at joint position q."""
     if kind == "prismatic":
         return transform(np.eye(3), q * axis)
     return transform(scipy.spatial.transform.Rotation.from_rotvec(q * axis).as_matrix(), np.zeros(3))
 
 
 def lock_joints(tree: Tree, locked: Mapping[str, float]) -> Tree:
-    """Return the tree with joints and their followers locked [rad, m]; typed errors for invalid names."""
+    """Lock the given joints [rad, m] and the joints that mimic them; raise typed errors for invalid names."""
     names = [joint.name for joint in tree.joints if joint.kind != "fixed"]
     for name, q in locked.items():
         check_name(f"joint of {tree.label} to lock", name, names)
         if not np.isfinite(q):
             raise RobotFileError(f"{tree.label}: joint {name!r} cannot be locked", expected="a number", got=q)
 
-    # q = multiplier · leader + offset; a follower may lead another joint.
+    # q = multiplier · leader + offset; a follower may itself be the leader of another joint.
     held = {name: float(q) for name, q in locked.items()}
     followers = [(joint.name, *joint.follows) for joint in tree.joints if joint.follows is not None]
     for _, (name, leader, multiplier, offset) in product(followers, followers):
@@ -121,11 +121,11 @@ def lock_joints(tree: Tree, locked: Mapping[str, float]) -> Tree:
 
 MAX_JOINTS = 500
 ROUNDING = 1e-6
-"""Relative error of principal moments due to rounding in files."""
+"""Relative error in principal moments due to rounding in files."""
 
 
 def checked(tree: Tree) -> Tree:
-    """Validate a tree and sort its joints depth first, with siblings in file order."""
+    """Validate a tree, and sort its joints depth-first with siblings in file order."""
     _check_names(tree)
     root = _root(tree)
     children: dict[str, list[Joint]] = {}
@@ -152,7 +152,7 @@ def checked(tree: Tree) -> Tree:
 
 
 def _check_inertia(tree: Tree, joints: list[Joint]) -> list[str]:
-    """Check the inertia of each link; invalid inertia of a link that never moves only causes a remark."""
+    """Check the inertia of each link; for a link that never moves, invalid inertia only causes a note."""
     moving: set[str] = set()
     for joint in joints:
         if joint.kind != "fixed" or joint.parent in moving:
@@ -189,7 +189,7 @@ def inertia_error(body: Inertial) -> str:
 
 
 def inertia_doubt(body: Inertial) -> str:
-    """Return the reason why the parameters are only approximately physical, such as rounding, or ""."""
+    """Return the reason why the parameters are only approximately physical (such as rounding), or ""."""
     low, mid, high = np.linalg.eigvalsh(body.inertia)
     if body.mass == 0.0 and high > 0.0:
         return f"it has a rotational inertia of {high:.4g} kg m² but no mass"
@@ -271,7 +271,7 @@ def _check_kinds(tree: Tree) -> None:
 
 
 def _lock(tree: Tree, refused: list[Joint]) -> dict[str, float]:
-    """Return positions for locking the refused joints and the joints that they follow."""
+    """Return positions at which to lock the unsupported joints and the joints that they follow."""
     joints = {joint.name: joint for joint in tree.joints if joint.kind != "fixed"}
     lock: dict[str, float] = {}
     for joint in refused:

@@ -1,9 +1,9 @@
 """Writing of robot parameters into a copy of the URDF or MJCF file.
 
 Only changed attributes are edited (`edit_xml.py`); meshes, comments, order and formatting are preserved. A
-link of the robot may consist of several links in the file that are fixed to each other. The heaviest of them
-that stays physically consistent takes the whole change J − J₀ of the pseudo-inertia. Otherwise, each changes
-by J_k ← E J_k Eᵀ, where E satisfies E J₀ Eᵀ = J. The text is read back and compared before it is written.
+link of the robot may consist of several links in the file that are fixed to each other. The heaviest of those
+that stay physically consistent takes the whole change J − J₀ in pseudo-inertia. If none does, each changes to
+E J_k Eᵀ, where E satisfies E J₀ Eᵀ = J. The edited text is read back and compared before it is written.
 """
 
 from __future__ import annotations
@@ -36,15 +36,15 @@ from forcegp.robot.tree import (
 )
 
 CHANGED = 1e-6
-"""Relative change of a parameter below which the text in the file is preserved."""
+"""Relative change in a parameter below which the text in the file is preserved."""
 SAME = 1e-6
-"""Relative tolerance for the parameters read back from a written file."""
+"""Relative tolerance for parameters read back from a written file."""
 ORIENTATIONS = ("axisangle", "euler", "xyaxes", "zaxis")
-"""Orientation attributes of an inertial frame in MJCF other than a quaternion."""
+"""Attributes for the orientation of an inertial frame in MJCF, other than a quaternion."""
 
 
 class Change(NamedTuple):
-    """A changed parameter, such as `mass` or `damping`, of a link or joint, with its values in SI units."""
+    """A changed parameter of a link or joint, such as `mass` or `damping`, with its values in SI units."""
 
     element: str
     figure: str
@@ -54,7 +54,7 @@ class Change(NamedTuple):
 
 @dataclass(frozen=True)
 class WrittenRobot:
-    """Changed parameters, and descriptions of parameters that the format cannot represent."""
+    """The changed parameters, and descriptions of parameters that the format cannot represent."""
 
     changes: tuple[Change, ...]
     losses: tuple[str, ...]
@@ -67,16 +67,16 @@ def write_robot(
     *,
     locked_joints: Mapping[str, float] | None = None,
 ) -> WrittenRobot:
-    """Write masses, inertias, damping, friction and armature of a robot into a copy of its file.
+    """Write the masses, inertias, damping, friction and armature of a robot into a copy of its file.
 
     Args:
-        robot: robot with the parameters to write, and the links and joints of the file.
+        robot: robot with the parameters to write, and with the links and joints of the file.
         source: URDF or MJCF file of the robot, or a bundled name.
         out: path of the edited copy; it may be `source` itself.
         locked_joints: as for `load_robot`.
 
     Returns:
-        Changed parameters, and parameters that the format cannot represent.
+        The changed parameters, and the parameters that the format cannot represent.
 
     Raises:
         RobotFileError: the joints differ from those in the file, an element to change is in an included file,
@@ -124,7 +124,7 @@ def _world(robot: RobotModel) -> dict[str, np.ndarray]:
 
 
 def _joint_changes(writer: _Urdf | _Mjcf, robot: RobotModel, file: RobotModel) -> list[Change]:
-    """Write the changed parameters of joints."""
+    """Write changed joint parameters, and return the changes."""
     changes = []
     for i, joint in enumerate(robot.joint_names):
         values = {}
@@ -139,7 +139,7 @@ def _joint_changes(writer: _Urdf | _Mjcf, robot: RobotModel, file: RobotModel) -
 
 
 def _link_changes(writer: _Urdf | _Mjcf, tree: Tree, robot: RobotModel, file: RobotModel) -> list[Change]:
-    """Write the changed inertia of links."""
+    """Write changed link inertias, and return the changes."""
     old = {link.name: link.inertial for link in tree.links}
     J_old = pseudo_inertia(file.mass, file.com, file.inertia)
     J_new = pseudo_inertia(robot.mass, robot.com, robot.inertia)
@@ -166,7 +166,7 @@ _PLACES = (0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)
 
 
 class _Part(NamedTuple):
-    """A file link in a robot link: pose T and pseudo-inertia J `(4, 4)` in it, and if a body defines J."""
+    """A file link in a robot link: pose and pseudo-inertia J `(4, 4)` in it, and whether J is physical."""
 
     name: str
     pose: Tensor
@@ -175,7 +175,7 @@ class _Part(NamedTuple):
 
 
 def _parts(file: RobotModel, i: int, old: Mapping[str, Inertial | None]) -> list[_Part]:
-    """Return the links of the file that make up link i, the heaviest first."""
+    """Return the links of the file that make up link i, heaviest first."""
     frames = zip(file.frame_names, file.frame_parents, file.frame_rotation, file.frame_position, strict=True)
     parts = []
     for name, parent, R, p in frames:
@@ -190,14 +190,14 @@ def _parts(file: RobotModel, i: int, old: Mapping[str, Inertial | None]) -> list
 
 
 def _shared(parts: list[_Part], J_old: Tensor, J_new: Tensor, joint: str) -> dict[str, Inertial]:
-    """Return the new inertias of links fixed to each other: one takes the change, or all take a share."""
+    """Return new inertias of links fixed to each other; one takes the whole change, or all take a share."""
     for part in parts:
         body = _body(part.pose, part.J + J_new - J_old)
         if body is not None and not inertia_error(body) and not (part.sound and inertia_doubt(body)):
             return {part.name: body}
     values, vectors = torch.linalg.eigh(J_old)
     if float(values[0]) > 0.0:
-        # E = J₀^-½ (J₀^½ J J₀^½)^½ J₀^-½, so that E J₀ Eᵀ = J, and E J_k Eᵀ > 0 with J_k
+        # E = J₀^-½ (J₀^½ J J₀^½)^½ J₀^-½, so that E J₀ Eᵀ = J, and E J_k Eᵀ > 0 if J_k > 0
         root = vectors @ torch.diag(values.sqrt()) @ vectors.mT
         inverse = vectors @ torch.diag(values.rsqrt()) @ vectors.mT
         inner, axes = torch.linalg.eigh(root @ J_new @ root)
@@ -214,7 +214,7 @@ def _shared(parts: list[_Part], J_old: Tensor, J_new: Tensor, joint: str) -> dic
 
 
 def _body(pose: Tensor, J: Tensor) -> Inertial | None:
-    """Return mass, centre of mass and inertia in the axes of a link; `None` without mass."""
+    """Return the mass, centre of mass and inertia in the axes of a link, or `None` if it has no mass."""
     back = torch.linalg.inv(pose)
     if float(J[3, 3]) <= 0.0:
         return None
@@ -234,7 +234,7 @@ def _losses(robot: RobotModel, figures: Mapping[str, str]) -> tuple[str, ...]:
 
 
 def _check(robot: RobotModel, read: RobotModel, writer: _Urdf | _Mjcf) -> None:
-    """Compare a robot with the one read from the written text; `RobotFileError` if they differ."""
+    """Compare a robot with the one read from the written text; raise `RobotFileError` if they differ."""
     for figure in ("mass", "com", "inertia", *writer.figures):
         wanted, got = getattr(robot, figure), getattr(read, figure)
         error = (wanted - got).abs().flatten(1).amax(-1) if wanted.ndim > 1 else (wanted - got).abs()
@@ -352,7 +352,7 @@ class _Mjcf:
 
 
 def _principal(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Return the principal moments and right-handed principal axes of an inertia."""
+    """Return the principal moments and right-handed principal axes of an inertia matrix."""
     moments, axes = np.linalg.eigh(inertia)
     moments, axes = moments[::-1], axes[:, ::-1]
     if np.linalg.det(axes) < 0.0:

@@ -1,4 +1,4 @@
-"""Forward simulation: trajectories on a surface with uncertainty and intermittent contacts."""
+"""Forward simulation of trajectories on a surface, with uncertainty and intermittent contacts."""
 
 from forcegp.forces.quantities import ForceField
 from forcegp.rollout.comparison import Comparison, beside_log, compare, widening

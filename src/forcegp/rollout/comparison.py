@@ -1,6 +1,6 @@
-"""Comparison of predicted and logged trajectories: tip error over time, drift, coverage of the bands.
+"""Comparison of predicted and logged trajectories: tip error over time, drift, and coverage of the bands.
 
-Split-conformal widening scales bands to their nominal coverage.
+Split-conformal widening scales the bands so that they have their nominal coverage.
 """
 
 from __future__ import annotations
@@ -24,23 +24,23 @@ from forcegp.rollout.trajectory import Bands, Rollout
 
 
 def widening(values: Tensor, band: Bands, level: float) -> float:
-    """Return the factor on the half-widths of bands for a coverage `level` of exchangeable trajectories.
+    """Return the factor by which the half-widths of bands must be scaled to reach a coverage `level`.
 
     The score of a trajectory is the factor for which a fraction `level` of its values is inside the band,
     computed from the ratios |value − median| / (half-width on that side). The result is the ⌈(n + 1)
-    level⌉-th smallest of n scores. For another exchangeable trajectory, a fraction `level` of the values is
-    then inside with probability at least `level`, however wrong the model is (Lei, G'Sell, Rinaldo,
-    Tibshirani, Wasserman, *Distribution-free predictive inference for regression*, JASA 113, 2018, section
-    2.2).
+    level⌉-th smallest of n scores. For a further trajectory exchangeable with these, a fraction `level` of
+    the values is then inside the band with probability at least `level`, however wrong the model is (Lei,
+    G'Sell, Rinaldo, Tibshirani, Wasserman, *Distribution-free predictive inference for regression*, JASA 113,
+    2018, section 2.2).
 
     Args:
-        values: `(n, …)` observed values of n trajectories, NaN if missing.
-        band: the band of each value.
+        values: `(n, …)` observed values of n trajectories; missing values are NaN.
+        band: the band for each value.
         level: nominal coverage, between 0 and 1.
 
     Returns:
-        The factor; infinite with too few trajectories (at least 9 for a level of 0.9) or samples of the
-        model.
+        The factor; infinite if there are too few trajectories (a level of 0.9 needs at least 9) or too few
+        samples of the model.
 
     Example:
         >>> bands = Bands(torch.tensor([-1.0]), torch.tensor([1.0]), torch.tensor([0.0]))
@@ -56,22 +56,22 @@ def widening(values: Tensor, band: Bands, level: float) -> float:
 
 
 HORIZONS = (0.5, 1.0, 2.0, 5.0, 10.0)
-"""Times at which tip errors are reported [s]."""
+"""Times after the start at which tip errors are reported [s]."""
 LEVEL = 0.9
-"""Fraction of the samples inside a band."""
+"""Default fraction of the samples that are inside a band."""
 
 
 @dataclass(frozen=True, eq=False)
 class Comparison:
-    """Open-loop predictions of several models from the same logged states, under the logged torques.
+    """Open-loop predictions of several models from the same logged states under the logged torques.
 
     Attributes:
-        system: robot and contacts as logged.
-        frame, point: frame and coordinates of the tip.
+        system: robot and contacts of the log.
+        frame, point: frame of the tip, and its coordinates in that frame.
         t: `(T,)` time since the start [s].
         q: `(k, T, nq)` logged joint positions.
         multiplier: `(k, T, n_contacts)` logged λ [N], or `None`.
-        predicted: rollouts by model, batch `(k,)`.
+        predicted: rollouts with batch shape `(k,)`, by model.
     """
 
     system: ConstrainedSystem
@@ -88,22 +88,22 @@ class Comparison:
         return kinematics.point_position(self.system.robot, self.q, self.frame, tuple(self.point))
 
     def predicted_tip(self, model: str) -> Tensor:
-        """Return the predicted position of the tip `(k, T, 3)` [m]; NaN after a divergence."""
+        """Return the predicted position of the tip `(k, T, 3)` [m], which is NaN after a divergence."""
         return self._whole(self.predicted[model].tip(self.frame, self.point))
 
     def sampled_tip(self, model: str) -> Tensor:
-        """Return the tip of each function sample, `(S, k, T, 3)` [m]."""
+        """Return the tip position in each function sample, `(S, k, T, 3)` [m]."""
         return self._whole(self.predicted[model].need_samples().tip(self.frame, self.point))
 
     def tip_error(self, model: str) -> Tensor:
-        """Return the distance between predicted and logged tip, `(k, T)` [m]; infinite after a divergence."""
+        """Return the distance between predicted and logged tip `(k, T)` [m], infinite after a divergence."""
         return (self.predicted_tip(model) - self.tip).norm(dim=-1).nan_to_num(torch.inf)
 
     def error_at(self, model: str, horizon: float) -> float:
-        """Return the median over the starts of the tip error after a time [m].
+        """Return the tip error after `horizon` seconds, as a median over the starts [m].
 
         Raises:
-            DataError: the comparison is shorter than this time.
+            DataError: the comparison ends earlier.
         """
         if horizon > float(self.t[-1]) * (1.0 + 1e-9):
             raise DataError("the comparison ends earlier", expected=f"{horizon} s", got=float(self.t[-1]))
@@ -114,8 +114,8 @@ class Comparison:
         """Return the fraction of tip coordinates inside the band, over all starts and all times except the
         first.
 
-        `level` is the fraction of samples inside the band, and `inflation` a factor on its half-widths. On a
-        surface, only tangential coordinates count, since the constraint fixes the normal one.
+        The band contains a fraction `level` of the samples; its half-widths are multiplied by `inflation`. On
+        a surface, only tangential coordinates are counted, since the constraint fixes the normal one.
         """
         logged, band = self._tip_along(model, level)
         band = band.widened(inflation)
@@ -123,18 +123,18 @@ class Comparison:
         return float(inside.to(self.q.dtype).mean())
 
     def inflation(self, model: str, level: float = LEVEL) -> float:
-        """Return the factor on the bands that covers a fraction `level` of tip coordinates (`widening`)."""
+        """Return the factor for bands that cover a fraction `level` of tip coordinates (see `widening`)."""
         return widening(*self._tip_along(model, level), level)
 
     def _tip_along(self, model: str, level: float) -> tuple[Tensor, Bands]:
-        """Return the logged tip coordinates `(k, T − 1, d)`, along the surface if any, and their bands."""
+        """Return the logged tip coordinates `(k, T − 1, d)`, along any surface, and their predicted bands."""
         along = self._tangents()
         sampled = (self.sampled_tip(model)[..., None, :] @ along)[..., 0, :]
         logged = (self.tip[..., None, :] @ along)[..., 0, :]
         return logged[:, 1:], self.predicted[model].bands(sampled[:, :, 1:], level)
 
     def _tangents(self) -> Tensor:
-        """Return orthonormal directions along the surface at the logged tip `(k, T, 3, 2)`, or all axes."""
+        """Return two orthonormal surface tangents at the logged tip `(k, T, 3, 2)`, or all three axes."""
         contact = _tip_contact(self.system)
         if contact is None or contact.frame != self.frame:
             return torch.eye(3, dtype=self.q.dtype).expand(*self.q.shape[:-1], 3, 3)
@@ -142,7 +142,7 @@ class Comparison:
         return torch.linalg.svd(normal[..., None, :]).Vh.mT[..., 1:]
 
     def _whole(self, values: Tensor) -> Tensor:
-        """Extend values to the full duration, with NaN after all trajectories have diverged."""
+        """Extend values to the full duration, with NaN after the divergence of all trajectories."""
         missing = len(self.t) - values.shape[-2]
         return torch.nn.functional.pad(values, (0, 0, 0, missing), value=torch.nan)
 
@@ -152,7 +152,7 @@ def _tip_contact(system: ConstrainedSystem) -> SurfaceContact | None:
 
 
 def tip_of(system: ConstrainedSystem) -> tuple[str, Sequence[float]]:
-    """Return frame and point of the first surface contact, or the origin of the last frame."""
+    """Return the frame and point of the first surface contact, or the origin of the last frame."""
     contact = _tip_contact(system)
     return (contact.frame, contact.point) if contact else (system.robot.frame_names[-1], (0.0, 0.0, 0.0))
 
@@ -174,10 +174,10 @@ def compare(
         models: fitted models by name.
         data: a log in time order.
         duration: duration of each trajectory [s].
-        starts: number of evenly spaced starts, or the rows to start from.
+        starts: number of evenly spaced starts, or the row numbers of the starts.
         samples: number of function samples, for models that support them.
-        system: robot and contacts of the log; by default those of the first model.
-        options: options for the rollouts; by default, diverging rollouts are kept up to their divergence.
+        system: robot and contacts of the log; by default, those of the first model.
+        options: options for the rollouts; by default, diverged rollouts are kept up to their divergence.
         progress: called during the rollouts.
 
     Raises:
@@ -201,7 +201,7 @@ def compare(
 
 
 def beside_log(name: str, predicted: Rollout, log: Dataset, dt: float) -> Comparison:
-    """Return a log and a rollout from its first row, both with the period dt [s]."""
+    """Return a comparison of a log with a rollout from its first row, both with the period dt [s]."""
     rows = torch.arange(len(log))[None]
     return _beside(predicted.system, log, rows, dt, {name: predicted[None]})
 
@@ -222,7 +222,7 @@ def _period(data: Dataset) -> float:
 
 
 def _starts(data: Dataset, steps: int, starts: int | Tensor) -> Tensor:
-    """Return start rows `(count,)`, given or evenly spaced, that are followed by `steps` rows."""
+    """Return the given or evenly spaced start rows `(count,)`, each of which is followed by `steps` rows."""
     count = starts if isinstance(starts, int) else len(starts)
     fits = torch.arange(max(len(data) - steps, 0))
     fits = fits[data.segment[fits] == data.segment[fits + steps]]

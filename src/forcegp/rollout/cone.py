@@ -1,9 +1,9 @@
-"""Sticking contacts in a rollout: the friction cone that ends sticking, and the arrest of sliding.
+"""Sticking contacts in a rollout: the friction cone that limits sticking, and the arrest of sliding contacts.
 
-A contact sticks if the required tangential force λ_t is within its friction cone. The model defines the cone:
-the contact slides along d = −λ_t/|λ_t| if the model's friction at a velocity v d does not stop it,
-dᵀ(A_t q̈ − b_t) > 0, with v above `stick_speed` and above the speed scale of smoothed friction.
-Within a step, friction can stop a sliding contact but not reverse it.
+A contact sticks if the required tangential force λ_t is within its friction cone, which the model defines.
+The contact slides along d = −λ_t/|λ_t| if the model's friction at a velocity v d does not stop it,
+dᵀ(A_t q̈ − b_t) > 0, where v exceeds `stick_speed` and the speed scale of smoothed friction.
+Within a step, friction can stop a sliding contact but not reverse its motion.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from forcegp.forces.quantities import States
 
 
 def sticking_contacts(system: ConstrainedSystem, at: States, among: Container[str]) -> Tensor:
-    """Return which of the named contacts are closed and stick, `(n, n_contacts)` bool."""
+    """Return a mask `(n, n_contacts)` of the named contacts that are closed and stick."""
     sticks = torch.zeros_like(at.active)
     for k, contact, _ in system.may_stick:
         rests = at.eom.contact_points[contact.name].sticks
@@ -35,11 +35,11 @@ def sticking_contacts(system: ConstrainedSystem, at: States, among: Container[st
 def sliding_away(
     system: ConstrainedSystem, at: States, multiplier: Tensor, slides: Tensor, speeds: Mapping[str, float]
 ) -> States:
-    """Return the states at which sticking contacts start to slide.
+    """Return the states with given sticking contacts made to slide.
 
     Args:
-        multiplier: multipliers λ `(n, m)` for sticking.
-        slides: `(n, n_contacts)` bool, true for sliding contacts.
+        multiplier: multipliers λ `(n, m)` while the contacts stick.
+        slides: `(n, n_contacts)` bool, contacts that start to slide.
         speeds: sliding speed of each contact, by name [m/s].
     """
     eom, points = at.eom, dict(at.eom.contact_points)
@@ -59,7 +59,7 @@ def sliding_away(
 
 
 def accelerating(system: ConstrainedSystem, at: States, multiplier: Tensor, qdd: Tensor) -> Tensor:
-    """Return a mask `(n, n_contacts)` of the contacts that accelerate against the holding force."""
+    """Return a mask `(n, n_contacts)` of the contacts that accelerate against the force that held them."""
     away = torch.zeros_like(at.active)
     # −λ_tᵀ(A_t q̈ − b_t) > 0
     held = multiplier * ((at.eom.A @ qdd[..., None])[..., 0] - at.eom.b)
@@ -78,12 +78,12 @@ def arrested(
 ) -> Tensor:
     """Return the velocity `(n, nq)` after a step, stopping contacts that friction would otherwise reverse.
 
-    The impulse is that of an impact on the tangential rows, q̇ ← q̇ − L A q̇.
+    They are stopped by an inelastic impact on the tangential rows, q̇ ← q̇ − L A q̇.
 
     Args:
         rough: contacts with friction.
-        before, after: the equations of motion at both ends of the step.
-        closed: `(n, n_contacts)` bool, contacts that are closed at both.
+        before, after: the equations of motion at the start and at the end of the step.
+        closed: `(n, n_contacts)` bool, contacts that are closed at both times.
         qd: `(n, nq)` velocity after the step.
     """
     A, stops = after.A, torch.zeros_like(closed[:, :1])

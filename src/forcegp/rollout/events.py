@@ -1,7 +1,7 @@
 """Times at which contacts open and close, located within a step.
 
-A closed contact opens when λ falls to zero, and an open contact closes when c does; the mechanics are those
-of `constraints/unilateral.py`. The probability of losing contact at a state is computed from the posterior
+A closed contact opens when λ falls to zero, and an open contact closes when c falls to zero, as described in
+`constraints/unilateral.py`. The probability that contact is lost at a state is computed from the posterior
 over the multiplier.
 """
 
@@ -18,11 +18,11 @@ from forcegp.rollout.inputs import ForwardModel
 from forcegp.rollout.law import Instant, RolloutProblem, State, Step
 
 MAX_EVENTS = 8
-"""Maximum number of events within a step; a contact that bounces to rest has infinitely many."""
+"""Maximum number of events within a step; a contact that bounces to rest would have infinitely many."""
 LOCATION = 1e-9
-"""Value of λ [N] or c [m], relative to the start of the step, at which an event counts as located."""
+"""Magnitude of λ or c, relative to its value at the start of the step, at which an event is located."""
 MAX_TRIALS = 40
-"""Maximum number of trials to locate an event; regula falsi with halving (Illinois) needs about eight."""
+"""Maximum number of trials to locate an event; the Illinois variant of regula falsi needs about eight."""
 
 
 class ContactEvent(NamedTuple):
@@ -42,7 +42,7 @@ class ContactEvent(NamedTuple):
 
 
 def _signal(problem: RolloutProblem, state: State, now: Instant) -> tuple[Tensor, Tensor]:
-    """Return the signals that cross zero at the next event, and whether they have, `(n, n_contacts)`."""
+    """Return the signals `(n, n_contacts)` that cross zero at the next event, and whether they have."""
     system, active = problem.system, state.active
     crossed = pulling(system, active, now.multiplier) | reached(system, active, now.c, now.cd)
     signal = torch.where(rows_of(system, active), now.multiplier, now.c)
@@ -50,7 +50,7 @@ def _signal(problem: RolloutProblem, state: State, now: Instant) -> tuple[Tensor
 
 
 def switch(problem: RolloutProblem, state: State, crossed: Tensor) -> State:
-    """Open and close contacts with crossed signals `(n, n_contacts)`, with impacts for those that close."""
+    """Open or close the contacts whose signals have crossed `(n, n_contacts)`, with impacts on closing."""
     active = state.active ^ crossed
     landing = (crossed & active).any(-1)
     if not bool(landing.any()):
@@ -60,9 +60,9 @@ def switch(problem: RolloutProblem, state: State, crossed: Tensor) -> State:
 
 
 def settle(problem: RolloutProblem, state: State, end: Tensor) -> tuple[State, Instant, list[ContactEvent]]:
-    """Return the state at the start of a step, after opening pulling contacts and closing reached ones.
+    """Return the state at the start of a step, after contacts that pull are opened and those reached closed.
 
-    The torque may jump at the start of a step, and λ with it.
+    The torque, and therefore λ, may jump at the start of a step.
     """
     now = problem.evaluate(state, end)
     events: list[ContactEvent] = []
@@ -111,7 +111,7 @@ def _locate(
     signal: Tensor,
     crossed: Tensor,
 ) -> Tensor:
-    """Return the fraction `(n, 1)` of the step until the first signal crosses zero; 1 without events."""
+    """Return the fraction `(n, 1)` of the step at which the first signal crosses zero; 1 if none does."""
 
     def smallest(values: Tensor) -> Tensor:
         return torch.where(crossed, values, torch.inf).amin(-1, keepdim=True)
@@ -130,7 +130,7 @@ def _locate(
         if bool(done.all()):
             break
         below = g < 0.0
-        # Illinois: halve the value at an end that stays twice in a row, or it would stay for ever.
+        # Illinois: halve the value at an end that is retained twice in a row, or it would stay forever.
         g_low = torch.where(below, torch.where(moved == 1.0, 0.5 * g_low, g_low), g)
         g_high = torch.where(below, g, torch.where(moved == -1.0, 0.5 * g_high, g_high))
         low, high = torch.where(below, low, fraction), torch.where(below, fraction, high)
@@ -149,10 +149,10 @@ def _listed(problem: RolloutProblem, state: State, crossed: Tensor) -> list[Cont
 def contact_loss_probability(
     model: ForwardModel, q: Tensor, qd: Tensor, tau: Tensor, *, active: Tensor | None = None
 ) -> Tensor:
-    """Return the probability `(*batch, m)` that λ < 0 at states `(*batch, nq)` and the contact opens.
+    """Return the probability `(*batch, m)` that λ < 0 at states `(*batch, nq)`, so that the contact opens.
 
     P(λ < 0) = Φ(−μ/σ) for the multiplier's posterior N(μ, σ²), and 1 for an open contact. `active`
-    `(*batch, n_contacts)` are the closed contacts, by default all.
+    `(*batch, n_contacts)` bool selects the closed contacts, by default all.
 
     Raises:
         ModelError: the model does not predict the variance of the multiplier.

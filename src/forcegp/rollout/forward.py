@@ -1,4 +1,4 @@
-"""Long-term predictions: integrate a model, or any force law, from initial states (section 4)."""
+"""Long-term predictions: integration of a model, or of any force law, from initial states (section 4)."""
 
 from __future__ import annotations
 
@@ -21,18 +21,18 @@ from forcegp.rollout.law import ForceLaw, Law, RolloutProblem, State, law_of
 from forcegp.rollout.trajectory import FIELDS, DivergedError, Rollout
 
 STEP = 1.0 / 240.0
-"""Step of a rollout under a feedback law in continuous time [s]."""
+"""Step size of a rollout under a feedback law in continuous time [s]."""
 CLOSED = 5e-4
-"""A contact that can open is initially closed if its error is below this [m]: more than the drift of a logged
-contact, less than a distance that would count as off the surface.
+"""Constraint error below which a contact that can open is initially closed [m]: larger than the drift of a
+logged contact, but smaller than a distance at which the tip would be considered off the surface.
 """
 STEPS_PER_STATE = 4
-"""Number of recorded steps that need as much memory as the equations of motion of one state (measured)."""
+"""Number of recorded steps that need as much memory as the equations of motion at one state (measured)."""
 FEW = 8
-"""Number of trajectories up to which one thread is used, since more are slower on small tensors."""
+"""Number of trajectories up to which one thread is used, since more threads are slower on small tensors."""
 
 COMPILED_STEPS = 1000
-"""Number of steps from which compiled mechanics save more time than compilation takes."""
+"""Number of steps from which compiled mechanics save more time than their compilation takes."""
 STABILIZATIONS = ("none", "baumgarte", "projection")
 ON_DIVERGENCE = ("raise", "keep")
 
@@ -42,22 +42,22 @@ class RolloutOptions:
     """Options for a rollout.
 
     Args:
-        dt: step size, output period, and sampling period of torques passed as an array [s]. By default the
+        dt: step size, output period, and sampling period of torques passed as an array [s]. By default, the
             sampling period of a log or controller, and 1/240 s for a feedback law; an array requires `dt`.
-        method: `semi_implicit_euler` (the step of the simulators), `rk4`, or SciPy's `rk45` and `dop853`,
+        method: `semi_implicit_euler` (the method of the simulators), `rk4`, or SciPy's `rk45` and `dop853`,
             which are adaptive within each step.
-        stabilization: `none`, `baumgarte` (the terms of the system, or the default ones), custom
+        stabilization: `none`, `baumgarte` (the terms of the system, or the default terms), custom
             `Baumgarte` terms, or `projection` of q and q̇ onto the manifold after each step.
         unilateral: whether contacts with a surface open when they would pull, and can close again.
         interpolation: interpolation of a torque array between samples, `hold` or `linear`.
         speed_limit: joint speed above which a trajectory counts as diverged [rad/s, m/s].
         torque_noise: whether each function sample has independent torque noise, if the model has learned the
-            noise of logged torques, and independent unknown forces, if their size is given (constant over a
-            trajectory).
+            noise of logged torques, and independent unknown forces, constant over a trajectory, if their size
+            is given.
         sticking: whether dry joint friction (from the robot file, or from a prior such as
-            `JointFrictionPrior`) holds a joint at rest while the net force is within its limit; otherwise
-            friction is a smooth function of the velocity, and joints creep.
-        on_divergence: `raise` a `DivergedError` that contains the trajectories, or `keep` them.
+            `JointFrictionPrior`) holds a joint at rest while the net force is within the friction limit. If
+            not, friction is a smooth function of the velocity, and joints creep.
+        on_divergence: `raise` a `DivergedError` that contains the trajectories, or `keep` the trajectories.
 
     Example:
         >>> RolloutOptions(method="rk4", stabilization="projection", dt=0.002).method
@@ -91,7 +91,7 @@ class RolloutOptions:
             check_name("stabilization", self.stabilization, STABILIZATIONS)
 
     def stabilized(self, system: ConstrainedSystem) -> ConstrainedSystem:
-        """Return the system with the stabilization of the rollout on the right-hand side."""
+        """Return the system with the stabilization terms of the rollout on the right-hand side."""
         terms = self.stabilization if isinstance(self.stabilization, Baumgarte) else None
         if self.stabilization == "baumgarte":
             terms = system.baumgarte or Baumgarte()
@@ -122,18 +122,18 @@ def rollout(
         law: function that returns the acceleration.
         system: robot and contacts.
         q0, qd0: `(*batch, nq)` initial states.
-        tau: motor torque Q_u over time (a log, or an array with its period in `options`), or a function of
-            (t, q, q̇).
+        tau: motor torque Q_u over time (a log, or an array with its sampling period in `options`), or as a
+            function of (t, q, q̇).
         duration: simulated time [s], rounded to whole steps.
         active: `(*batch, n_contacts)` bool, initially closed contacts; by default all or, if contacts can
-            open, those on a surface.
-        options: step, method, stabilization.
+            open, those that touch their surface.
+        options: options such as step size, method and stabilization.
         progress: called after each step.
 
     Raises:
         DivergedError: a trajectory diverged; the error contains the result.
         ShapeError: an argument does not match the robot.
-        ModelError: contacts can open but the law has no multiplier, or the period of the torques is missing.
+        ModelError: contacts can open but the law has no multiplier, or the torques have no sampling period.
     """
     options = options or DEFAULT
     batch = torch.broadcast_shapes(q0.shape[:-1], qd0.shape[:-1])
@@ -154,20 +154,21 @@ def rollout_model(
     options: RolloutOptions | None = None,
     progress: Progress | None = None,
 ) -> Rollout:
-    """Return the mean motion of a model, and motions under functions drawn from its posterior.
+    """Return the mean motion of a model, and its motions under functions drawn from the posterior.
 
-    Each sample is a deterministic force function, so its trajectories obey the constraint and Newton's
-    equations. With learned torque noise, samples have independent noise (`RolloutOptions.torque_noise`).
+    Each sample is a deterministic force function, so its trajectories satisfy the constraint and Newton's
+    equations. If the model includes learned torque noise, independent noise is added to each sample
+    (`RolloutOptions.torque_noise`).
 
     Args:
         model: a fitted model.
         q0, qd0, tau, duration, active, options, progress: see `rollout`.
-        samples: number S of function samples; all are integrated together.
+        samples: number S of function samples, which are integrated together.
         seed: seed for the samples.
-        system: another system, for example with another surface or other robot parameters.
+        system: a different system, for example with a different surface or different robot parameters.
 
     Returns:
-        The mean motion, with the trajectories of the samples, batch `(S, *batch)`, as `samples`.
+        The mean motion; its attribute `samples` contains the sampled trajectories, batch `(S, *batch)`.
 
     Raises:
         DivergedError: a trajectory diverged; the error contains the result.
@@ -201,9 +202,9 @@ def replayed(
     options: RolloutOptions,
     progress: Progress | None = None,
 ) -> Rollout:
-    """Simulate a model from the first state of a logged trajectory under its torques, up to its end.
+    """Simulate a model from the first state of a logged trajectory, under its torques and up to its end.
 
-    Batch, samples and options are as in `rollout_model`.
+    The other arguments are those of `rollout_model`.
     """
     duration = min(seconds, float(log.t[-1] - log.t[0]))
     active, how = log.active(model.system.contact_names)[0], {"options": options, "progress": progress}
@@ -225,7 +226,7 @@ def _run(
     noise: tuple[Disturbance, torch.Generator] | None = None,
     model: ForwardModel | None = None,
 ) -> Rollout:
-    """Flatten the batch, integrate, and restore the shape of the batch."""
+    """Flatten the batch, integrate, and restore the batch shape."""
     n, system = whole.numel(), options.stabilized(system)
     system.robot.check_state(q0=start[0], qd0=start[1])
     unilateral = options.unilateral and len(system.contacts) > 0
@@ -280,14 +281,14 @@ def _initial(
 
 
 def _touching(system: ConstrainedSystem, q: Tensor, qd: Tensor) -> Tensor:
-    """Return the contacts that are on their surface or cannot open, `(n, n_contacts)`."""
+    """Return a mask `(n, n_contacts)` of the contacts that touch their surface or cannot open."""
     with torch.no_grad():
         is_open = any_row(system, system.equations(q, qd).c.abs() > CLOSED)
     return ~(is_open & system.can_open)
 
 
 def share_of(progress: Progress | None, part: int, parts: int) -> Progress | None:
-    """Adapt a progress function to one of several runs of equal length."""
+    """Adapt a progress function for use in one of several runs of equal length."""
     if progress is None:
         return None
     return lambda done, total: progress(part * total + done, parts * total)

@@ -1,4 +1,4 @@
-"""Inputs to a rollout: a model, and motor torques as an array, a log, a feedback law or a controller."""
+"""Inputs to a rollout: a model, and motor torques from an array, a log, a feedback law or a controller."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any, NamedTuple, Protocol, runtime_checkable
+from typing import Any, NamedTuple
 
 import torch
 from torch import Tensor
@@ -20,20 +20,14 @@ from forcegp.forces.quantities import ForceField
 
 INTERPOLATIONS = ("hold", "linear")
 EDGE = 1e-6
-"""Fraction of a sampling period within which a time counts as a sampling time, to allow for rounding."""
+"""Fraction of a sampling period within which a time counts as a sampling time, in view of rounding errors."""
 EVEN = 0.02
-"""Largest relative deviation of a step from the sampling period in a replayed log."""
+"""Largest relative deviation of a time step from the sampling period in a log that is replayed."""
 
 
-@runtime_checkable
-class CompiledMotion(Protocol):
-    """Function that computes the motion of trajectories, without gradients."""
-
-    def __call__(
-        self, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor, h: Tensor, sticking: bool
-    ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Return q̈, λ, constraint error and rate, and joints held by friction over steps h `(n, 1)`."""
-        ...
+CompiledMotion = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor, bool], tuple[Tensor, ...]]
+"""From q, q̇, τ, closed contacts, step lengths h `(n, 1)` and whether joints stick: q̈, λ, constraint error and
+rate, and the joints held by friction, without gradients."""
 
 
 class ForwardModel(ABC):
@@ -45,14 +39,14 @@ class ForwardModel(ABC):
     """Whether `force_samples` draws functions from a posterior over forces."""
 
     system: ConstrainedSystem
-    """Robot and contacts that predictions refer to."""
+    """Robot and contacts to which predictions refer."""
 
     def force_field(self) -> ForceField | None:
-        """Return the mean impressed force Q̄ `(n, nq)` at states; `None` for models of accelerations only."""
+        """Return the mean impressed force Q̄ as a force field; `None` if only accelerations are modelled."""
         return None
 
     def force_samples(self, samples: int, generator: torch.Generator) -> ForceField:
-        """Return a force field of functions drawn from the posterior, all evaluated at once.
+        """Return a force field with functions drawn from the posterior, which are evaluated together.
 
         Args:
             samples: number S of functions.
@@ -69,12 +63,12 @@ class ForwardModel(ABC):
         )
 
     def compiled_motion(self, system: ConstrainedSystem, force: ForceField) -> CompiledMotion | None:
-        """Return C code for the motion under the mean force or its samples; `None` if unavailable."""
+        """Return C code for the motion under the mean force or its samples, or `None` if unavailable."""
         return None
 
     @property
     def disturbance(self) -> Disturbance | None:
-        """Additional random forces in rollouts of function samples, or `None`."""
+        """Additional random forces in the rollouts of function samples, or `None`."""
         return None
 
     @abstractmethod
@@ -92,12 +86,12 @@ class ForwardModel(ABC):
 
 
 class Disturbance(NamedTuple):
-    """Additional random forces in rollouts of function samples.
+    """Additional random forces in the rollouts of function samples.
 
     Attributes:
         density: square root of the spectral density of the torque noise `(nq,)` [N m √s, N √s].
-        constant: standard deviation of an unknown force on each joint `(nq,)` [N m, N], constant over the
-            trajectory, since its variation is unknown.
+        constant: standard deviation `(nq,)` of an unknown force on each joint [N m, N]. The force is constant
+            over the trajectory, since its variation is unknown.
     """
 
     density: Tensor
@@ -110,7 +104,7 @@ class Reached:
 
     Attributes:
         system: robot and contacts.
-        q, qd: `(n, nq)`.
+        q, qd: `(n, nq)` positions and velocities.
         active: `(n, n_contacts)` bool, closed contacts.
     """
 
@@ -135,24 +129,24 @@ class Inputs(ABC):
 
     @abstractmethod
     def torque(self, t: Tensor, end: Tensor, at: Reached) -> Tensor:
-        """Return Q_u `(n, nq)` [N m].
+        """Return the motor torque Q_u `(n, nq)` [N m].
 
         Args:
             t: `(n, 1)` time [s].
-            end: `(n, 1)` end of the current step; at t = end, a torque that jumps has the value before the
-                jump.
-            at: state with its equations of motion.
+            end: `(n, 1)` end of the current step [s]; if the torque jumps at t = end, the value before the
+                jump is returned.
+            at: current states with their equations of motion.
         """
 
 
 Torque = Tensor | Dataset | Inputs | Callable[[Tensor, Tensor, Tensor], Tensor]
-"""An array over time `(samples, nq)` or `(*batch, samples, nq)`, a log, inputs, or a function of (t, q, q̇).
-"""
+"""An array over time `(samples, nq)` or `(*batch, samples, nq)`, a log, `Inputs`, or a function of
+(t, q, q̇)."""
 
 
 @dataclass(frozen=True)
 class Sampled(Inputs):
-    """Torques `(n or 1, samples, nq)` with a period dt [s], held or interpolated; the last one is held."""
+    """Torques `(n or 1, samples, nq)` with period dt [s], held or interpolated; the last torque is held."""
 
     values: Tensor
     dt: float
@@ -181,7 +175,7 @@ class Sampled(Inputs):
 
 @dataclass(frozen=True)
 class Feedback(Inputs):
-    """A feedback law `(t, q, qd)` → τ, of tensors `(n, 1)`, `(n, nq)`, `(n, nq)`."""
+    """A feedback law that maps tensors `t` `(n, 1)`, `q` `(n, nq)` and `qd` `(n, nq)` to τ `(n, nq)`."""
 
     function: Callable[[Tensor, Tensor, Tensor], Tensor]
 
@@ -191,7 +185,7 @@ class Feedback(Inputs):
 
 @dataclass(frozen=True)
 class Disturbed(Inputs):
-    """Inputs with noise `(n, steps, nq)` [N m], each value held for dt [s]."""
+    """Inputs with additive noise `(n, steps, nq)` [N m], in which each value is held for dt [s]."""
 
     inputs: Inputs
     noise: Tensor
@@ -218,10 +212,10 @@ class Disturbed(Inputs):
 
 @dataclass(frozen=True)
 class TaskSpaceControl(Inputs):
-    """The simulator's task-space controller, which tracks a plan with period dt [s].
+    """The simulator's task-space controller, which tracks a plan with sampling period dt [s].
 
-    The controller uses the analytical mechanics of `system`; `limit` `(nq,)` contains torque limits [N m], by
-    default those of the robot.
+    The controller uses the analytical mechanics of `system`. `limit` `(nq,)` contains the torque limits
+    [N m], by default those of the robot.
     """
 
     system: ConstrainedSystem
@@ -247,10 +241,10 @@ class TaskSpaceControl(Inputs):
 def inputs_of(
     tau: Torque, batch: torch.Size, rows: int, dt: float | None, interpolation: str = "hold"
 ) -> Inputs:
-    """Return the inputs defined by `tau` for `rows` trajectories, a multiple of the batch of initial states.
+    """Return the inputs defined by `tau` for `rows` trajectories, a multiple of the batch size.
 
-    `tau` is `(*batch, samples, nq)` or `(samples, nq)` with a period dt [s], a log, a feedback law of (t, q,
-    q̇), or inputs; a single sample is a constant torque. `interpolation` is `"hold"` or `"linear"`.
+    `tau` is an array `(*batch, samples, nq)` or `(samples, nq)` with period dt [s], a log, a feedback law of
+    (t, q, q̇), or `Inputs`. A single sample is a constant torque. `interpolation` is `"hold"` or `"linear"`.
 
     Raises:
         UnknownNameError: the interpolation is unknown.
@@ -288,10 +282,10 @@ def inputs_of(
 
 
 def sampling_period(log: Dataset) -> float:
-    """Return the sampling period of a log of one trajectory [s], from its time column.
+    """Return the sampling period of a log with one trajectory [s], computed from its time column.
 
     Raises:
-        DataError: rows are out of order or selected, or the log has several trajectories or gaps.
+        DataError: the rows are out of order or a selection, or the log has several trajectories or gaps.
     """
     steps = log.t.diff()
     period = float(log.t[-1] - log.t[0]) / max(len(steps), 1)

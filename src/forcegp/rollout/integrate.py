@@ -1,6 +1,6 @@
 """Integration of a rollout over time: the methods for one step, and the loop over all steps.
 
-The methods are semi-implicit Euler, fourth-order Runge-Kutta, and SciPy's adaptive methods with error
+The methods are semi-implicit Euler, fourth-order Runge-Kutta, and the adaptive methods of SciPy with error
 control.
 """
 
@@ -25,17 +25,17 @@ Progress = Callable[[int, int], None]
 
 RELATIVE_TOLERANCE = 1e-9
 ABSOLUTE_TOLERANCE = 1e-11
-"""Error of an adaptive step in position [rad] and velocity [rad/s], well below the error of any model."""
+"""Tolerances of an adaptive step in position [rad] and velocity [rad/s], well below any model error."""
 
 
 def semi_implicit_euler(problem: RolloutProblem, state: State, first: Instant, h: Tensor) -> State:
-    """Return the first-order step of the simulators, q̇⁺ = q̇ + h q̈, q⁺ = q + h q̇⁺."""
+    """Return the state after the first-order step used by simulators, q̇⁺ = q̇ + h q̈, q⁺ = q + h q̇⁺."""
     qd = state.qd + h * first.qdd
     return State(state.t + h, state.q + h * qd, qd, state.active)
 
 
 def runge_kutta_4(problem: RolloutProblem, state: State, first: Instant, h: Tensor) -> State:
-    """Return a step of the classical fourth-order Runge-Kutta method."""
+    """Return the state after a step of the classical fourth-order Runge-Kutta method."""
     t, q, qd, active = state
     end, half = t + h, 0.5 * h
     qd2 = qd + half * first.qdd
@@ -50,10 +50,10 @@ def runge_kutta_4(problem: RolloutProblem, state: State, first: Instant, h: Tens
 
 
 def adaptive(method: str) -> Step:
-    """Return a step of an adaptive method of `scipy.integrate` with error control.
+    """Return a step function that uses an adaptive method of `scipy.integrate` with error control.
 
-    All rows share the internal steps; time runs from 0 to 1 within the step, which may differ in length by
-    row.
+    All rows share the internal steps. Time is normalised to run from 0 to 1, since the rows may have steps of
+    different length.
     """
 
     def step(problem: RolloutProblem, state: State, first: Instant, h: Tensor) -> State:
@@ -94,7 +94,7 @@ METHODS: dict[str, Step] = {
 
 @dataclass
 class _Record:
-    """Recorded states at output times."""
+    """States and events recorded so far."""
 
     states: list[State] = field(default_factory=list)
     motions: list[Instant] = field(default_factory=list)
@@ -102,7 +102,7 @@ class _Record:
     diverged: list[Divergence] = field(default_factory=list)
 
     def write(self, state: State, now: Instant, alive: Tensor) -> None:
-        """Record a state, with NaN in the dropped rows `(n,)`."""
+        """Record a state, with NaN in rows that are no longer `alive` `(n,)`."""
         if not bool(alive.all()):
             rows = alive[:, None]
             now = Instant(*(torch.where(rows, x, torch.nan) for x in now[:-1]))  # pyright: ignore[reportArgumentType]
@@ -112,7 +112,7 @@ class _Record:
         self.motions.append(now)
 
     def note(self, events: list[ContactEvent], alive: Tensor) -> None:
-        """Record the events of trajectories that continue."""
+        """Record the events of trajectories that are still `alive`."""
         self.events += [event for event in events if bool(alive[event.row])]
 
 
@@ -129,14 +129,15 @@ def integrate(
 ) -> Rollout:
     """Integrate n trajectories over steps of dt [s], dropping those that diverge.
 
-    `project` moves position and velocity onto the manifold after each step; a joint faster than `speed_limit`
-    [rad/s, m/s] counts as diverged. The result, batch `(n,)`, is shorter if all trajectories diverge.
+    If `project` is true, position and velocity are projected onto the manifold after each step. A trajectory
+    with a joint faster than `speed_limit` [rad/s, m/s] counts as diverged. The result has batch shape `(n,)`
+    and is shorter if all trajectories diverge.
     """
     record, state, step = _Record(), start, _stopping(step)
     alive = torch.ones(len(start.q), dtype=torch.bool, device=start.q.device)
     h = torch.full_like(start.t, dt)
     for k in range(steps + 1):
-        # Times are multiples of dt: rounding that adds up would read the inputs one sample late.
+        # Times are exact multiples of dt: with accumulated rounding errors, inputs would be one sample late.
         state = state._replace(t=torch.full_like(start.t, k * dt))
         try:
             if problem.unilateral:
@@ -168,7 +169,7 @@ def integrate(
 
 
 def _stopping(step: Step) -> Step:
-    """Wrap a method so that contacts and joints stopped by friction are at rest after the step."""
+    """Wrap a step function so that contacts and joints stopped by friction are at rest after the step."""
 
     def stopped(problem: RolloutProblem, state: State, first: Instant, h: Tensor) -> State:
         reached = problem.stopped(state, step(problem, state, first, h))
@@ -184,9 +185,9 @@ def _stopping(step: Step) -> Step:
 
 
 def _braked(problem: RolloutProblem, state: State, held: Tensor) -> State:
-    """Return the state after the friction impulse that stops joints.
+    """Return the state after the friction impulse that stops the `held` joints.
 
-    The impulse also changes the speed of other joints; stopping a joint alone could add kinetic energy.
+    The impulse also changes the speed of other joints, since stopping a joint alone could add kinetic energy.
     """
     G = problem.system.equations(state.q, state.qd, state.active).H
     eye = torch.eye(G.shape[-1], dtype=G.dtype, device=G.device)

@@ -1,22 +1,22 @@
 """The right-hand side of a rollout: states, laws for the acceleration, and sticking joints.
 
-Dry friction is within ±F if a joint is at rest, and −F sign(q̇) if it slides. Equations of motion smooth it
-to −F tanh(q̇/v₀) for learning and differentiation; a rollout uses the original law. Let Q(s) be the force
-with the direction s of dry friction instead of tanh(q̇/v₀) for each joint. Then
+Dry friction is within ±F if a joint is at rest, and equals −F sign(q̇) if it slides. For learning and
+differentiation, the equations of motion smooth it to −F tanh(q̇/v₀); a rollout uses the original law. Let Q(s)
+be the force in which the direction s of dry friction replaces tanh(q̇/v₀) for each joint. Then
 
     Q = ½ (Q(1) + Q(−1)) − F s,   F = ½ (Q(−1) − Q(1)).
 
 Over a step h, dry joint friction p changes the velocity to q̇⁺ = q̇ + h (q̈₀ + G p), where q̈₀ is the
-frictionless acceleration. It satisfies |p_i| ≤ F_i, and p_i = −F_i sign(q̇⁺_i) if the joint slides (Stewart
-and Trinkle, *An implicit time-stepping scheme for rigid body dynamics with inelastic collisions and Coulomb
-friction*, 1996). In contact G = H, so the contact force depends on the friction of sticking joints. Block
-principal pivoting solves this complementarity problem exactly (Júdice and Pires, *A block principal pivoting
-algorithm for large-scale strictly monotone linear complementarity problems*, 1994): guess the sticking
-joints, solve for their friction, and exchange those that contradict the guess.
+frictionless acceleration. Friction satisfies |p_i| ≤ F_i, and p_i = −F_i sign(q̇⁺_i) if the joint slides
+(Stewart and Trinkle, *An implicit time-stepping scheme for rigid body dynamics with inelastic collisions and
+Coulomb friction*, 1996). In contact, G = H, so the contact force depends on the friction of sticking joints.
+Block principal pivoting solves this complementarity problem exactly (Júdice and Pires, *A block principal
+pivoting algorithm for large-scale strictly monotone linear complementarity problems*, 1994): it guesses which
+joints stick, solves for their friction, and exchanges the joints that contradict the guess.
 
-If h G_ii D_i > 1 for a light joint with viscous friction D, an explicit step reverses its motion, and above 2
-it is unstable. Viscous friction is then evaluated at the end of the step, q̈ = q̈₀ + G (p − h D q̈), as in
-MuJoCo's Euler integrator, and otherwise at the start.
+If h G_ii D_i > 1 for a light joint with viscous friction D, an explicit step reverses the joint's motion, and
+above 2, it is unstable. Viscous friction is then evaluated at the end of the step instead of the start, q̈ =
+q̈₀ + G (p − h D q̈), as in MuJoCo's Euler integrator.
 """
 
 from __future__ import annotations
@@ -42,26 +42,25 @@ from forcegp.rollout.cone import accelerating, arrested, sliding_away, sticking_
 from forcegp.rollout.inputs import CompiledMotion, ForwardModel, Inputs, Reached
 
 REGULARIZATION = 1e-10
-"""Compliance of sticking, relative to that of a free joint. It makes friction unique even if more joints
-    stick than can move in contact; joints creep by this fraction of the frictionless motion."""
+"""Compliance of sticking joints, relative to free joints. It makes friction unique even if more joints stick
+    than can move in contact. Joints creep by this fraction of the frictionless motion."""
 CONTRADICTION = 1e-9
-"""Relative threshold for forces beyond their limit and velocities against the direction of friction.
-"""
+"""Relative tolerance for forces beyond their limit and for motion against the direction of sliding."""
 BLOCK_TRIALS = 5
-"""Number of block exchanges without improvement before single exchanges."""
+"""Number of block exchanges without improvement before joints are exchanged one at a time."""
 MAX_EXCHANGES = 300
 """Maximum number of exchanges; arms need fewer than ten."""
 INSTANT = 1e-12
-"""Shortest step [s], over which every moving joint slides."""
+"""Step size that stands for an instant [s], over which every moving joint slides."""
 STILL = 1e-8
-"""Speed up to which a joint is at rest [rad/s, m/s]; sticking joints creep by rounding."""
+"""Speed up to which a joint counts as at rest [rad/s, m/s]; sticking joints creep due to rounding errors."""
 SMOOTH = 0.02
-"""Speed scale of learned "friction" that drives a joint, which cannot stick [rad/s, m/s].
+"""Speed scale on which learned "friction" that drives a joint, and so cannot stick, is smoothed [rad/s, m/s].
 """
 SATURATED = 10.0
-"""Speed, relative to the speed scale of smoothed Coulomb friction, from which a contact slides."""
+"""Speed, relative to the scale of smoothed Coulomb friction, above which a contact slides."""
 NUDGE = 1e-4
-"""Change of speed for computing the slope of friction [rad/s, m/s]."""
+"""Change in speed for computing the slope of friction [rad/s, m/s]."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,8 +70,8 @@ class DryFriction:
     Attributes:
         Q_bar: `(n, nq)` all other impressed forces [N m, N].
         limit: `(n, nq)` largest magnitude F ≥ 0 of dry friction [N m, N].
-        response: `(n, nq, nq)` ∂Q̄/∂Q with Coulomb friction of contacts; `None` for the identity.
-        damping: `(n, nq)` damping D = −∂Q_i/∂q̇_i ≥ 0 of the other joint friction [N m s/rad, N s/m].
+        response: `(n, nq, nq)` ∂Q̄/∂Q including Coulomb friction of contacts; `None` means the identity.
+        damping: `(n, nq)` damping D = −∂Q_i/∂q̇_i ≥ 0 of the remaining joint friction [N m s/rad, N s/m].
     """
 
     Q_bar: Tensor
@@ -82,16 +81,16 @@ class DryFriction:
 
 
 def posterior_of(force: ForceField) -> ForcePosterior | None:
-    """Return the posterior of a force field that is its mean or a sample, if any."""
+    """Return the posterior if a force field is a posterior mean or a set of samples, otherwise `None`."""
     force = force.posterior if isinstance(force, ForceSamples) else force
     return force if isinstance(force, ForcePosterior) else None
 
 
 def split(system: ConstrainedSystem, at: States, force: ForceField) -> DryFriction:
-    """Evaluate a force field at states, separating the dry friction of joints.
+    """Evaluate a force field at states, and separate the dry friction of joints.
 
     Args:
-        force: force field Q̄: a posterior mean, samples, or a prior mean.
+        force: force field Q̄, which is a posterior mean, posterior samples, or a prior mean.
 
     Example:
         >>> import torch, forcegp
@@ -117,7 +116,7 @@ def split(system: ConstrainedSystem, at: States, force: ForceField) -> DryFricti
         force = mean(system, moved)
         return force if unknown is None else force + unknown.unknown_force(system, moved, sticking)
 
-    # Only friction is read at another speed: all else that depends on it stands in the equations of motion.
+    # Only friction uses the changed speed; the other terms are taken from the equations of motion.
     forward, backward = sliding(1.0), sliding(-1.0)
     damping = ((forward - sliding(1.0, NUDGE)) / NUDGE).clamp(min=0.0)
     limit = 0.5 * (backward - forward)
@@ -134,7 +133,7 @@ class Stuck(NamedTuple):
     Attributes:
         force: p `(n, nq)` [N m, N].
         held: `(n, nq)` bool, joints at rest at the end of the step.
-        stopping: `(n, nq)` acceleration that brings a joint to rest at the end of the step.
+        stopping: `(n, nq)` accelerations that bring the joints to rest at the end of the step.
     """
 
     force: Tensor
@@ -143,13 +142,13 @@ class Stuck(NamedTuple):
 
 
 def overshooting(G: Tensor, damping: Tensor, h: Tensor) -> Tensor | None:
-    """Return D `(n, nq)` at states with h G_ii D_i > 1 for a joint, otherwise 0; `None` if there are none."""
+    """Return D `(n, nq)` at states with h G_ii D_i > 1 for a joint, and 0 at others; `None` if all are 0."""
     rows = (h * G.diagonal(dim1=-2, dim2=-1) * damping > 1.0).any(-1, keepdim=True)
     return torch.where(rows, damping, 0.0) if bool(rows.any()) else None
 
 
 def at_the_end(qdd: Tensor, G: Tensor, damping: Tensor, h: Tensor) -> tuple[Tensor, Tensor]:
-    """Return (1 + h G D)⁻¹ q̈₀ and (1 + h G D)⁻¹ G, acceleration and response with D at the end of the step.
+    """Return (1 + h G D)⁻¹ q̈₀ and (1 + h G D)⁻¹ G, the motion with damping evaluated at the end of the step.
 
     Example:
         >>> import torch
@@ -164,19 +163,19 @@ def at_the_end(qdd: Tensor, G: Tensor, damping: Tensor, h: Tensor) -> tuple[Tens
 
 
 def compliance_of(G: Tensor) -> Tensor:
-    """Return the acceleration per force of each joint, G_ii `(n, nq)`, at least 1/1000 of the largest."""
+    """Return the acceleration per force of each joint, G_ii `(n, nq)`, but at least 1/1000 of the largest."""
     diagonal = G.diagonal(dim1=-2, dim2=-1)
     return diagonal.clamp(min=1e-3 * diagonal.amax(-1, keepdim=True))
 
 
 def dry_friction_force(qdd: Tensor, G: Tensor, limit: Tensor, qd: Tensor, h: Tensor) -> Stuck:
-    """Return the dry friction of joints over a step h `(n, 1)` [s], 0 for an instant, from q̇ `(n, nq)`.
+    """Return the dry friction of joints over a step h `(n, 1)` [s] (0 for an instant) from q̇ `(n, nq)`.
 
-    `qdd` is the frictionless acceleration, `G` `(n, nq, nq)` the acceleration per friction (H or M⁻¹), and
-    `limit` `(n, nq)` the largest magnitude F ≥ 0 [N m, N].
+    `qdd` is the frictionless acceleration, `G` `(n, nq, nq)` the acceleration per unit friction (H or M⁻¹),
+    and `limit` `(n, nq)` the largest magnitude F ≥ 0 of friction [N m, N].
 
     Raises:
-        NumericalError: there is no solution, since G is not positive definite.
+        NumericalError: there is no solution because G is not positive definite.
 
     Example:
         >>> import torch
@@ -191,7 +190,7 @@ def dry_friction_force(qdd: Tensor, G: Tensor, limit: Tensor, qd: Tensor, h: Ten
     slack_force = CONTRADICTION * (limit + (free / compliance).abs())
     slack_motion = CONTRADICTION * (free.abs() + compliance * limit)
     eye = torch.eye(G.shape[-1], dtype=G.dtype, device=G.device).expand_as(G)
-    # 0 for a joint that sticks, ±1 for one that slides.
+    # 0 for joints that stick, ±1 for joints that slide.
     direction = torch.where(limit > 0.0, 0.0, free.sign())
     fewest = torch.full((len(G),), G.shape[-1] + 1, device=G.device)
     trials = torch.full_like(fewest, BLOCK_TRIALS)
@@ -222,16 +221,16 @@ def dry_friction_force(qdd: Tensor, G: Tensor, limit: Tensor, qd: Tensor, h: Ten
 
 
 class Law(ABC):
-    """Deterministic law for the acceleration of a constrained system."""
+    """A deterministic law for the acceleration of a constrained system."""
 
     has_multiplier: bool
 
     @abstractmethod
     def motion(self, system: ConstrainedSystem, at: States) -> tuple[Tensor, Tensor]:
-        """Return q̈ `(n, nq)` and λ `(n, m)` at states; NaN if the law has no forces."""
+        """Return q̈ `(n, nq)` and λ `(n, m)` at states; λ is NaN if the law has no forces."""
 
     def dry_friction(self, system: ConstrainedSystem) -> Callable[[States], DryFriction] | None:
-        """Return the force at states with dry joint friction separated; `None` without such friction."""
+        """Return a function that separates dry joint friction from the force, or `None` if there is none."""
         return None
 
     @property
@@ -240,13 +239,13 @@ class Law(ABC):
         return {}
 
     def knows_friction(self, system: ConstrainedSystem, at: States) -> bool:
-        """Return whether the contact friction at sliding states is determined, so sticking can end."""
+        """Return whether contact friction is determined at sliding states, so that sticking can end."""
         return False
 
 
 @dataclass(frozen=True)
 class ForceLaw(Law):
-    """Law q̈ = L b + H Q̄ and λ = (A M⁻¹ Aᵀ)⁺(b − A M⁻¹ Q̄) for a force field (eqs. 4 and 16)."""
+    """The law q̈ = L b + H Q̄ and λ = (A M⁻¹ Aᵀ)⁺(b − A M⁻¹ Q̄) for a force field (eqs. 4 and 16)."""
 
     force: ForceField
     has_multiplier: bool = True
@@ -283,7 +282,7 @@ class ForceLaw(Law):
 
 @dataclass(frozen=True)
 class AccelerationLaw(Law):
-    """Law with q̈ predicted by a model, which need not obey the constraint."""
+    """A law in which a model predicts q̈, which need not satisfy the constraint."""
 
     model: ForwardModel
     has_multiplier: bool = False
@@ -294,10 +293,10 @@ class AccelerationLaw(Law):
 
 
 def law_of(model: ForwardModel, system: ConstrainedSystem | None = None) -> Law:
-    """Return the law of a model's mean motion, from its force field if any, otherwise from its accelerations.
+    """Return the law for a model's mean motion, using its force field if it has one, or its accelerations.
 
     Raises:
-        ModelError: a model of accelerations only cannot predict the motion of another system.
+        ModelError: a model that predicts only accelerations cannot predict the motion of a different system.
     """
     trained, force = model.system, model.force_field()
     if force is not None:
@@ -319,7 +318,7 @@ def _described(system: ConstrainedSystem) -> str:
 
 
 class State(NamedTuple):
-    """States of n trajectories, with times that may differ due to events within a step.
+    """States of n trajectories; their times can differ because of events within a step.
 
     Attributes:
         t: `(n, 1)` time [s].
@@ -333,7 +332,7 @@ class State(NamedTuple):
     active: Tensor
 
     def where(self, rows: Tensor, other: State) -> State:
-        """Return this state in the given rows `(n,)`, and another state in the others."""
+        """Return this state in the given rows `(n,)`, and the `other` state in all others."""
         return State(*(torch.where(rows[:, None], a, b) for a, b in zip(self, other, strict=True)))
 
 
@@ -343,7 +342,7 @@ class Instant(NamedTuple):
     Attributes:
         tau, qdd: `(n, nq)` motor torque and acceleration.
         multiplier, c, cd: `(n, m)` λ, constraint error and its rate.
-        held: `(n, nq)` joints at rest by the end of the step; `None` without dry friction.
+        held: `(n, nq)` bool, joints at rest at the end of the step; `None` without dry friction.
     """
 
     tau: Tensor
@@ -358,8 +357,8 @@ class Instant(NamedTuple):
 class RolloutProblem:
     """q̈ = law(q, q̇, τ(t, q, q̇)) on a constrained system with the stabilization of the rollout.
 
-    With `unilateral`, contacts with a surface can open and close; with `sticking`, dry friction can hold
-    joints. `compiled` computes the same motion in C, used if no gradient is required.
+    If `unilateral` is true, contacts with a surface can open and close; if `sticking` is true, dry friction
+    can hold joints. `compiled` computes the same motion in C and is used if no gradient is required.
     """
 
     system: ConstrainedSystem
@@ -373,14 +372,14 @@ class RolloutProblem:
 
     @cached_property
     def rough(self) -> Mapping[str, float]:
-        """Contacts with friction that may stick, with the speed above which each slides."""
+        """Contacts with friction that may stick, and the speed above which each slides [m/s]."""
         speeds = {contact.name: contact.stick_speed or 0.0 for _, contact, _ in self.system.may_stick}
         known = self.law.rough if speeds else {}
         return {name: max(speeds[name], known[name]) for name in speeds if name in known}
 
     @cached_property
     def dry_friction(self) -> Callable[[States], DryFriction] | None:
-        """Force at a state with dry joint friction separated; `None` without dry friction."""
+        """Function that separates dry joint friction from the force; `None` without dry friction."""
         return self.law.dry_friction(self.system) if self.sticking else None
 
     def evaluate(self, state: State, end: Tensor) -> Instant:
@@ -406,7 +405,7 @@ class RolloutProblem:
         return self._instant(sliding_away(self.system, at, now.multiplier, slides, rough), h)
 
     def stopped(self, before: State, after: State) -> State:
-        """Return the state after a step, with contacts stopped by friction in this step at rest."""
+        """Return the state after a step, in which contacts that friction has stopped are at rest."""
         if not self.rough:
             return after
         first, last = (self.system.equations(x.q, x.qd, x.active) for x in (before, after))
@@ -414,7 +413,7 @@ class RolloutProblem:
         return after._replace(qd=arrested(self.system, self.rough, first, last, closed, after.qd))
 
     def _instant(self, at: States, h: Tensor) -> Instant:
-        """Return the motion at states, over a step h `(n, 1)` [s]."""
+        """Return the motion at states, with friction for a step h `(n, 1)` [s]."""
         eom, tau = at.eom, at.tau
         if self.dry_friction is None:
             qdd, multiplier = self.law.motion(self.system, at)
@@ -430,9 +429,9 @@ class RolloutProblem:
             force = force - h * damping * (free + (G @ force[..., None])[..., 0])
         impressed = force if dry.response is None else (dry.response @ force[..., None])[..., 0]
         qdd, multiplier = eom.motion_under(dry.Q_bar + impressed)
-        qdd = torch.where(held, stopping, qdd)  # the same but for rounding
+        qdd = torch.where(held, stopping, qdd)  # equal up to rounding errors
         return Instant(tau, qdd, multiplier, eom.c, eom.cd, held)
 
 
 Step = Callable[[RolloutProblem, State, Instant, Tensor], State]
-"""Function that advances a state with known motion by steps h `(n, 1)` [s]."""
+"""Function that advances a state with known motion by step sizes h `(n, 1)` [s]."""

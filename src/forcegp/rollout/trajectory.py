@@ -1,4 +1,4 @@
-"""The result of a rollout: trajectories, drift, multipliers, contacts, and bands over samples."""
+"""The result of a rollout: trajectories, drift, multipliers, contacts, and bands of the samples."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ class Divergence(NamedTuple):
     """A trajectory that was dropped because it diverged.
 
     Attributes:
-        t: time of its last trustworthy state [s].
+        t: time of the last trustworthy state [s].
         row: index of the trajectory in the flattened batch.
         q, qd: state at that time.
-        reason: reason for rejecting the next state.
+        reason: reason why the next state was rejected.
     """
 
     t: float
@@ -45,7 +45,7 @@ class Divergence(NamedTuple):
 
 
 class DivergedError(NumericalError):
-    """Error of a rollout with a diverged trajectory; `rollout` contains the result."""
+    """Raised if a trajectory of a rollout diverged; the attribute `rollout` contains the result."""
 
     def __init__(self, diverged: Sequence[Divergence], rows: int, rollout: Rollout) -> None:
         self.rollout = rollout
@@ -64,7 +64,7 @@ class Bands(NamedTuple):
 
     Attributes:
         lower, upper: bounds of the central band.
-        median: median.
+        median: median of the samples.
     """
 
     lower: Tensor
@@ -79,18 +79,18 @@ class Bands(NamedTuple):
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Rollout:
-    """Trajectories from a batch of initial states at T times, with NaN after a divergence.
+    """Trajectories from a batch of initial states at T times, filled with NaN after a divergence.
 
     Attributes:
         system: robot and contacts, with the stabilization of the rollout.
         t: `(T,)` time [s].
         q, qd, qdd, tau: `(*batch, T, nq)` positions, velocities, accelerations and motor torques.
-        multiplier: λ `(*batch, T, m)` [N]; NaN if the model has no forces.
+        multiplier: `(*batch, T, m)` λ [N]; NaN if the model has no forces.
         c, cd: `(*batch, T, m)` constraint error and its rate for all contacts, open or closed [m], [m/s].
         active: `(*batch, T, n_contacts)` bool, closed contacts.
-        events: openings and closings of contacts.
-        diverged: dropped trajectories.
-        samples: trajectories of function samples, batch `(S, *batch)`.
+        events: times at which contacts opened or closed.
+        diverged: trajectories that were dropped.
+        samples: trajectories of function samples, with batch shape `(S, *batch)`.
     """
 
     system: ConstrainedSystem
@@ -108,7 +108,7 @@ class Rollout:
     samples: Rollout | None = None
 
     def __repr__(self) -> str:
-        """Return a one-line summary of length, batch, samples and events, without numbers."""
+        """Return a one-line summary of duration, batch, samples and events, without values."""
         n = self.rows
         what = "one trajectory" if n == 1 else f"{n} trajectories"
         span = float(self.t[-1] - self.t[0]) if len(self.t) else 0.0
@@ -132,7 +132,7 @@ class Rollout:
             quantity: `q`, `qd`, `qdd`, `tau`, `multiplier`, `c` or `cd`.
             log: logged motion from the same start, for comparison.
             joints: names of joints or contacts; by default all.
-            ax: matplotlib axes to draw on, one per panel; by default a new figure.
+            ax: matplotlib axes to draw on, one per panel; by default, a new figure is created.
 
         Raises:
             UnknownNameError: the quantity or joint does not exist.
@@ -166,7 +166,7 @@ class Rollout:
 
     @property
     def batch(self) -> torch.Size:
-        """Shape of the batch."""
+        """Batch shape."""
         return self.q.shape[:-2]
 
     @property
@@ -176,19 +176,19 @@ class Rollout:
 
     @property
     def drift(self) -> Tensor:
-        """`(*batch, T, m)` c(q) of closed contacts, 0 for open ones [m]."""
+        """Constraint error c(q) of closed contacts, and 0 for open contacts, `(*batch, T, m)` [m]."""
         rows = self.system.active_rows(self.active, self.active.shape[:-1])
         return torch.where(rows, self.c, 0.0)
 
     def tip(self, frame: str, point: Sequence[float] = (0.0, 0.0, 0.0)) -> Tensor:
-        """Return the world position `(*batch, T, 3)` of a point in a frame [m]; NaN after a divergence."""
+        """Return the world position `(*batch, T, 3)` [m] of a point in a frame, NaN after a divergence."""
         return kinematics.point_position(self.system.robot, self.q, frame, tuple(point))
 
     def bands(self, values: Tensor, level: float = 0.9) -> Bands:
         """Return the central band of a quantity over function samples.
 
         Args:
-            values: `(S, …)` values such as `rollout.samples.multiplier`; NaN in diverged samples is ignored.
+            values: `(S, …)` values such as `rollout.samples.multiplier`; NaN of diverged samples is ignored.
             level: fraction of the samples inside the band, between 0 and 1.
         """
         tail = 0.5 * (1.0 - level)
@@ -206,8 +206,9 @@ class Rollout:
         return self.samples
 
     def contact_lost(self) -> Tensor:
-        """Return the fraction of samples in which a contact has opened by each time, `(*batch, T,
-        n_contacts)`.
+        """Return the fraction of samples in which each contact has opened by each time.
+
+        The result has shape `(*batch, T, n_contacts)`.
 
         Raises:
             ModelError: the rollout has no samples.
@@ -216,7 +217,7 @@ class Rollout:
         return lost.to(self.q.dtype).mean(0)
 
     def __getitem__(self, index: object) -> Rollout:
-        """Return the trajectories of some members of the batch; events keep their row in the full batch."""
+        """Return the trajectories of selected batch members; events keep their row in the full batch."""
         chosen = {name: getattr(self, name)[index] for name in FIELDS}
         places = index if isinstance(index, tuple) else (index,)
         samples = None if self.samples is None else self.samples[(slice(None), *places)]
@@ -224,7 +225,7 @@ class Rollout:
 
 
 def _spread(path: Rollout, quantity: str) -> Tensor | None:
-    """Return the standard deviation `(T, d)` over function samples, at least one of them finite."""
+    """Return the standard deviation `(T, d)` over finite function samples, or `None` without samples."""
     if path.samples is None:
         return None
     values = getattr(path.samples, quantity).reshape(-1, len(path.t), getattr(path, quantity).shape[-1])

@@ -1,4 +1,4 @@
-"""Scene files."""
+"""Loading of scene files and model tables."""
 
 from forcegp.scene.load import BUNDLED, ModelTable, Scene, default_model_table, load_model_table, load_scene
 

@@ -1,4 +1,4 @@
-"""Validation of TOML files against a schema, with errors that name the file, the line and the key."""
+"""Validation of TOML files against a schema. Errors name the file, the line and the key."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ _TOKEN = re.compile(rf"({_NAME})|(\.)|[^\S\n]+|(.|\n)")
 
 
 class Document:
-    """A parsed TOML file with the line of each key; errors are of class `error` and name `source`."""
+    """A parsed TOML file that records the line of each key. Errors are of class `error` and name `source`."""
 
     def __init__(self, content: bytes, source: str, error: type[ForceGPError] = SceneError) -> None:
         self.source, self.error = source, error
@@ -58,24 +58,24 @@ class Document:
         self._lines = _lines_of_keys(text)
 
     def validated(self, schema: type[Schema]) -> Schema:
-        """Convert the content to a pydantic model; the first error is raised with its line and key."""
+        """Convert the content to a pydantic model, or raise the first error with its line and key."""
         # In JSON mode, strict validation accepts a list for a tuple and an integer for a float.
         try:
             return schema.model_validate_json(json.dumps(self.data, default=str))
         except RecursionError as error:
             raise self.error(f"{self.source}: nested too deeply") from error
         except ValidationError as error:
-            # A misspelt key is also a missing one: the spelling is what has to be corrected.
+            # A misspelt key also counts as missing, and it is the spelling that has to be corrected.
             errors = sorted(error.errors(), key=lambda item: item["type"] not in _UNKNOWN_KEY)
             raise self._error(schema, errors[0]) from error
 
     def at(self, key: Key, make: Callable[..., T], *args: object, **options: object) -> T:
-        """Return `make(*args, **options)`, reporting errors at a key of this file."""
+        """Return `make(*args, **options)`; errors are reported with the location of a key in this file."""
         with self.error.within(self.place(key)):
             return make(*args, **options)
 
     def place(self, key: Key) -> str:
-        """Return `file:line: key` of a key, or of the nearest enclosing key in the file."""
+        """Return `file:line: key` for a key, or for the nearest enclosing key in the file."""
         prefix: Key = ()
         value: Any = self.data
         for part in key:
@@ -88,12 +88,12 @@ class Document:
         return f"{where}: {dotted(prefix)}" if prefix else where
 
     def _error(self, schema: type[BaseModel], error: ErrorDetails) -> ForceGPError:
-        """Return the message of a validation error."""
+        """Return the error to raise for a validation error of pydantic."""
         key, kind, context = error["loc"], error["type"], error.get("ctx", {})
         place, last = self.place(key), str(key[-1]) if key else ""
         if isinstance(cause := context.get("error"), ForceGPError):
             return self.error.at(self.place(self._named(key, cause.message)), cause)
-        if kind == "json_invalid":  # well-formed, as it was just written, but too deep for the validator
+        if kind == "json_invalid":  # well-formed JSON, but nested too deeply for the validator
             return self.error(f"{self.source}: nested too deeply", got=context.get("error"))
         if kind in _UNKNOWN_KEY:
             allowed = list(dict.fromkeys(name for t in _tables_at(schema, key[:-1]) for name in _hints(t)))
@@ -115,7 +115,7 @@ class Document:
         return self.error(f"{place}: {error['msg'][0].lower()}{error['msg'][1:]}", got=repr(error["input"]))
 
     def _named(self, key: Key, message: str) -> Key:
-        """Return the key within a table that is named in a message, or the table."""
+        """Return the key of the table entry that is named in a message, or else the key of the table."""
         table: Any = self.data
         for part in key:
             members: Any = dict(enumerate(table)) if isinstance(table, list) else table
@@ -126,7 +126,7 @@ class Document:
 
 
 def _check_keys(text: str, source: str, error: type[ForceGPError]) -> None:
-    """Check the number of keys and of the parts of each, for which parsers take quadratic time."""
+    """Check the number of keys and the number of parts of each key, in which parsing time is quadratic."""
     keys = text.count("=") + len(_BRACKET.findall(text))
     if keys > SCENE_KEYS:
         raise error(f"{source}: too many keys and tables", expected=f"at most {SCENE_KEYS}", got=keys)
@@ -175,7 +175,7 @@ def _tables_in(annotation: Any) -> list[type]:
 
 
 def dotted(key: Key) -> str:
-    """Return a key in dotted notation: `contact[0].surface`."""
+    """Return a key in dotted notation, such as `contact[0].surface`."""
     return "".join(f"[{part}]" if isinstance(part, int) else f".{part}" for part in key).lstrip(".")
 
 
@@ -184,7 +184,7 @@ def _split(name: str) -> Key:
 
 
 def _lines_of_keys(text: str) -> dict[Key, int]:
-    """Return the line of each table and key; keys in an inline table have the line of the table."""
+    """Return the line of each table and key; keys of an inline table are assigned the line of that table."""
     lines: dict[Key, int] = {}
     counts: dict[Key, int] = {}
     table: Key = ()
@@ -196,7 +196,7 @@ def _lines_of_keys(text: str) -> dict[Key, int]:
             lines.setdefault(name, number)
         elif match := _TABLE.match(line):
             name = _split(match[1])
-            # A table below an array of tables belongs to the latest of them.
+            # A table nested in an array of tables belongs to the last element of the array.
             outer = next((name[:n] for n in range(len(name), 0, -1) if name[:n] in counts), None)
             table = (*outer, counts[outer], *name[len(outer) :]) if outer else name
         elif match := _KEY.match(line):

@@ -1,4 +1,4 @@
-"""Scene files in TOML: a robot, its contacts and their simulation (format in docs/formats.md)."""
+"""Scene files in TOML, which describe a robot, its contacts and a simulation (see docs/formats.md)."""
 
 from __future__ import annotations
 
@@ -20,12 +20,12 @@ from forcegp.simulate.config import SimulationConfig
 
 FOLDER = Path(str(files("forcegp.scene") / "bundled"))
 BUNDLED = tuple(sorted(path.stem for path in FOLDER.glob("*.toml")))
-"""Bundled scenes; `kuka_plane` is the paper's task."""
+"""Names of the bundled scenes; `kuka_plane` is the task in the paper."""
 
 
 @dataclass(frozen=True)
 class ModelTable:
-    """The table `[model]` of a file for `forcegp.models.configured`, and the file name for messages."""
+    """The table `[model]` for `forcegp.models.configured`, and the file that error messages refer to."""
 
     section: ModelSection
     document: Document
@@ -33,7 +33,7 @@ class ModelTable:
 
 @dataclass(frozen=True)
 class Scene:
-    """A validated scene file; relative paths start at `folder`."""
+    """A validated scene file; its paths are relative to `folder`."""
 
     sections: SceneSections
     document: Document
@@ -41,7 +41,7 @@ class Scene:
 
     @property
     def simulation(self) -> SimulationConfig:
-        """Settings for simulating the scene."""
+        """Settings of the simulation."""
         return self.sections.simulation
 
     @property
@@ -49,12 +49,16 @@ class Scene:
         """Settings of the model to fit."""
         return ModelTable(self.sections.model, self.document)
 
+    @property
+    def robot_source(self) -> str | Path:
+        """Name of the bundled robot, or path of the robot file."""
+        named = self.sections.robot.model
+        return named if named in BUNDLED_ROBOTS else self.folder / named
+
     def robot(self, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> RobotModel:
-        """Return the robot; a `SceneError` names the key and line."""
-        section = self.sections.robot
-        bundled = section.model in BUNDLED_ROBOTS
-        source = section.model if bundled else self.folder / section.model
-        if not bundled and not is_file(Path(source)):
+        """Return the robot; a `SceneError` names the key and line of an invalid entry."""
+        section, source = self.sections.robot, self.robot_source
+        if isinstance(source, Path) and not is_file(source):
             raise SceneError(
                 f"{self.document.place(('robot', 'model'))}: no such robot",
                 expected=f"a URDF or MJCF file, or one of {', '.join(BUNDLED_ROBOTS)}",
@@ -67,7 +71,7 @@ class Scene:
     def system(
         self, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu"
     ) -> ConstrainedSystem:
-        """Return the robot with its contacts; a `SceneError` names the key and line."""
+        """Return the robot with its contacts; a `SceneError` names the key and line of an invalid entry."""
         robot, sections, at = self.robot(dtype, device), self.sections, self.document.at
         tables = [(("contact", i), table) for i, table in enumerate(sections.contact)]
         tables += [(("connection", i), table) for i, table in enumerate(sections.connection)]
@@ -80,14 +84,14 @@ class Scene:
 def load_scene(source: str | Path) -> Scene:
     """Read a scene file by path, or by name if it is one of the `BUNDLED` scenes.
 
-    No other file is read.
+    The robot file is not read yet.
 
     Example:
         >>> load_scene("kuka_plane").system().contact_names
         ('table',)
 
     Raises:
-        SceneError: the scene does not exist or is invalid; the message names file, line and key.
+        SceneError: the scene does not exist or is invalid; the message names the file, line and key.
     """
     bundled = str(source) in BUNDLED
     path = FOLDER / f"{source}.toml" if bundled else Path(source)
@@ -105,12 +109,12 @@ def load_scene(source: str | Path) -> Scene:
 
 
 def default_model_table() -> ModelTable:
-    """Return the default table `[model]`."""
+    """Return a table `[model]` that contains only default values."""
     return ModelTable(ModelSection(), Document(b"", "default model"))
 
 
 def load_model_table(path: str | Path) -> ModelTable:
-    """Read a TOML file that contains only the table `[model]`; a `SceneError` names file, line and key."""
+    """Read a TOML file that contains only the table `[model]`; raise `SceneError` if it is invalid."""
     if not is_file(Path(path)):
         raise SceneError(f"{path}: no such model file", expected="a TOML file with a table [model]")
     document = Document(Path(path).read_bytes(), str(path))

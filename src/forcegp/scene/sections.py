@@ -1,7 +1,7 @@
-"""Tables of a scene file.
+"""Schemas of the tables in a scene file.
 
-Keys are parameters of the class of the table, or fields of saved models. Missing keys of `[model]` have the
-default values of the model.
+The keys are constructor parameters of the class that a table describes, or fields of saved models. Keys that
+are missing in `[model]` take the default values of the model.
 """
 
 from __future__ import annotations
@@ -26,13 +26,13 @@ class Section(Record, strict=True):
 
 
 State = NonNegativeFloat | tuple[NonNegativeFloat, ...]
-"""Noise of positions or velocities, as one number or one per joint."""
+"""Standard deviation of the noise in positions or velocities: a single number, or one number per joint."""
 
 
 class LearningSection(Section):
     """`[model.learning]`: fields of `LearningOptions`, or of `BatchOptions` for models trained on batches.
 
-    `warm_start = false` learns from all samples from the start.
+    If `warm_start = false`, all samples are used from the start.
     """
 
     optimizer: Literal["lbfgs", "adam"] = "lbfgs"
@@ -51,7 +51,7 @@ class LearningSection(Section):
 
 
 class NoiseSection(Section):
-    """`[model.noise]`: fields of `Noise`; `torque = "none"` for exact torques."""
+    """`[model.noise]`: fields of `Noise`; `torque = "none"` means that torques are exact."""
 
     acceleration: NonNegativeFloat | tuple[NonNegativeFloat, ...] | None = None
     learn: bool = False
@@ -62,7 +62,7 @@ class NoiseSection(Section):
 
 
 class ModelSection(Section, StructuredOptions):
-    """`[model]`: options of models, and additional keys for `forcegp.models.configured`."""
+    """`[model]`: options of models, and the additional keys used by `forcegp.models.configured`."""
 
     name: str | None = None
     noise: NoiseSection = NoiseSection()
@@ -78,12 +78,12 @@ class ModelSection(Section, StructuredOptions):
     @field_validator("noise", mode="before")
     @classmethod
     def _of_accelerations(cls, value: object) -> object:
-        """Interpret a number or a list of numbers as the noise of accelerations."""
+        """Interpret a number or a list of numbers as the noise in the accelerations."""
         return _tuples({"acceleration": value} if isinstance(value, int | float | list) else value)
 
 
 def _tuples(value: Any) -> Any:
-    """Convert lists to tuples, as required by strict validation after a Python validator."""
+    """Convert lists to tuples, because strict validation after a Python validator rejects lists."""
     if isinstance(value, dict):
         return {key: _tuples(part) for key, part in value.items()}
     return tuple(map(_tuples, value)) if isinstance(value, list) else value
@@ -96,7 +96,7 @@ class ModelFile(Section):
 
 
 class RobotSection(Section):
-    """`[robot]`: see `forcegp.load_robot`; a path is relative to the scene file."""
+    """`[robot]`: arguments of `forcegp.load_robot`; a path is relative to the folder of the scene file."""
 
     model: str
     base_position: Point = (0.0, 0.0, 0.0)
@@ -106,11 +106,11 @@ class RobotSection(Section):
 
 
 class ContactSection(ContactFields, strict=True):
-    """`[[contact]]`: a point of the robot, or a ball of given `radius` around it, and a surface."""
+    """`[[contact]]`: a point on the robot, or a ball of the given `radius` around it, and a surface."""
 
 
 class ConnectionSection(ConnectionFields, strict=True):
-    """`[[connection]]`: two coincident points; without `other_frame`, the second is fixed in the world."""
+    """`[[connection]]`: two coincident points, the second fixed in the world if `other_frame` is omitted."""
 
 
 class SceneSections(Section):

@@ -1,4 +1,4 @@
-"""Simulation of a robot in free motion or contact with a physics engine."""
+"""Simulation of a robot, in free motion or in contact, with a physics engine."""
 
 from forcegp.control.task_space import Gains
 from forcegp.control.trajectory import Reference

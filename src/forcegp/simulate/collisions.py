@@ -1,7 +1,7 @@
 """Distances between robot links, contact surfaces and boxes, computed by MuJoCo.
 
-The parts of the links (`robot/shapes.py`) and the surroundings are convex solids. Pairs that overlap in most
-positions, such as neighbouring links, are ignored.
+The parts of the links (`robot/shapes.py`) and the surroundings are convex solids. Pairs of bodies that
+overlap in most positions, such as neighbouring links, are ignored.
 """
 
 from __future__ import annotations
@@ -20,23 +20,23 @@ from forcegp.simulate.urdf import link_name, write_urdf
 from forcegp.types import Array
 
 POSITIONS, MOST = 200, 0.5
-"""Number of random positions, and the fraction of overlaps above which a pair is ignored."""
+"""Number of random positions, and fraction of overlaps in these positions above which a pair is ignored."""
 TIP = 0.005
 """Tip radius for point contacts [m]."""
 SURROUNDINGS = "surroundings"
 
 
 class Collisions:
-    """Collisions of parts of a robot with each other or with their surroundings, with a clearance.
+    """Collisions of the parts of a robot with each other and with their surroundings, given a clearance.
 
     Args:
         system: robot, and contacts with surfaces to avoid.
         shapes: convex parts of the robot.
-        boxes: `(k, 6)` centres and side lengths of boxes aligned with the world axes [m].
+        boxes: `(k, 6)` centres and side lengths of boxes that are aligned with the world axes [m].
         clearance: minimum distance [m].
 
     Raises:
-        ParameterError: a box is not six finite numbers with positive sides.
+        ParameterError: a box does not consist of six finite numbers with positive side lengths.
         ForceGPError: the surface of a contact has no geometry in MuJoCo.
         MissingDependencyError: MuJoCo is not installed.
     """
@@ -51,7 +51,7 @@ class Collisions:
         self._mujoco = mujoco = optional_module("mujoco", "Checking a motion for collisions")
         self.boxes, self.clearance = _checked(boxes), clearance
         spec, robot = mujoco.MjSpec.from_string(write_urdf(system.robot)), system.robot
-        spec.compiler.fusestatic = False  # or the surroundings become part of the base
+        spec.compiler.fusestatic = False  # otherwise, the surroundings become part of the base
         common = {"contype": 1, "conaffinity": 1, "condim": 1, "margin": clearance, "mass": 0.0}
         for k, shape in enumerate(shapes):
             mesh = spec.add_mesh(name=f"mesh_{k}")
@@ -68,7 +68,7 @@ class Collisions:
             body = spec.worldbody if link == BASE else spec.body(link_name(robot, link))
             body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0], pos=position, **common)
         self._model = model = spec.compile()
-        # Further contacts of a pair have distances that are approximate.
+        # The distances of additional contacts of a pair are only approximate.
         model.opt.disableflags |= getattr(mujoco.mjtDisableBit, "mjDSBL_MULTICCD", 0)
         self._data = mujoco.MjData(model)
         self._dof = np.array([model.joint(name).dofadr[0] for name in robot.joint_names])
@@ -83,7 +83,7 @@ class Collisions:
         self._left_out |= self._always_touching(robot)
 
     def pairs(self, q: Array) -> dict[str, float]:
-        """Return pairs of bodies closer than the clearance at a position `(nq,)`, with their distance [m]."""
+        """Return the pairs of bodies closer than the clearance at q `(nq,)`, with their distances [m]."""
         found: dict[str, float] = {}
         for k, pair in self._near(q):
             name = f"{self._names[pair[0]]} and {self._names[pair[1]]}"
@@ -91,7 +91,7 @@ class Collisions:
         return found
 
     def depth(self, q: Array) -> Array:
-        """Return the violation `(n,)` of the clearance at positions `(n, nq)` [m], 0 if there is none."""
+        """Return by how much the clearance is violated at positions `(n, nq)`, `(n,)` [m]; 0 if it is not."""
         return np.array(
             [
                 max((self.clearance - self._data.contact.dist[k] for k, _ in self._near(x)), default=0.0)
@@ -100,7 +100,7 @@ class Collisions:
         )
 
     def penalty(self, q: Array, margin: float) -> tuple[float, Array]:
-        """Return Σ (1 − distance/margin)² over positions `(n, nq)` and closer pairs, and its gradient."""
+        """Return Σ (1 − distance/margin)² over positions `(n, nq)` and close pairs, and its gradient."""
         self._model.geom_margin[:] = margin
         value, gradient, model, data = 0.0, np.zeros_like(q), self._model, self._data
         jacobian = np.zeros((2, 3, model.nv))
@@ -118,7 +118,7 @@ class Collisions:
         return value, gradient
 
     def _near(self, q: Array, distance: float | None = None, jacobians: bool = False) -> list[Any]:
-        """Return the index of each contact closer than a distance, and its bodies in MuJoCo's order."""
+        """Return the index of each contact closer than a given distance, and its bodies in MuJoCo's order."""
         data, model = self._data, self._model
         data.qpos[self._dof] = q
         self._mujoco.mj_kinematics(model, data)

@@ -1,4 +1,4 @@
-"""Settings of a simulation: motion and simulated world."""
+"""Settings of a simulation: the motion and the simulated world."""
 
 from __future__ import annotations
 
@@ -9,23 +9,23 @@ from forcegp.control.plan import NOT_NEGATIVE, MotionConfig, check_setting
 
 CONTACTS = ("rigid", "solver")
 LONGEST_STEP = 5e-4
-"""Longest step of the contact solver [s]; a contact of the default stiffness takes eight such steps."""
+"""Longest step of the contact solver [s], an eighth of the default time constant of a contact."""
 WHOLE = 1e-6
-"""Tolerance for a ratio that should be an integer."""
+"""Tolerance for ratios that should be integers."""
 
 
 @dataclass(frozen=True)
 class ContactSolver:
-    """Settings for MuJoCo's contact solver: dry friction in joints and contact, and a rounded tip.
+    """Settings for MuJoCo's contact solver: dry friction in joints and contacts, and a rounded tip.
 
     Args:
-        friction: Coulomb friction coefficient μ between tool and surface.
+        friction: Coulomb friction coefficient μ between the tool and the surface.
         tip_radius: radius [m] of a spherical tip ending at the contact point, if the contact has no radius.
         joint_friction: additional Coulomb friction of each joint [N m]; empty for none.
-        joint_damping: additional viscous friction of each joint [N m s/rad]; empty for none.
-        stiffness_time: time constant of the contact's restoring force [s]; shorter is stiffer.
-        step: engine step, which must divide the sampling period [s]; by default the longest step up to
-            `LONGEST_STEP`.
+        joint_damping: additional viscous friction coefficient of each joint [N m s/rad]; empty for none.
+        stiffness_time: time constant of the contact's restoring force [s]; a shorter time is stiffer.
+        step: step size of the engine, which must divide the sampling period [s]; by default, the longest such
+            step up to `LONGEST_STEP`.
 
     Raises:
         ParameterError: a value is out of range; the message names it.
@@ -50,7 +50,7 @@ class ContactSolver:
         check_setting("friction", 0.0 <= self.friction < float("inf"), NOT_NEGATIVE, self.friction)
 
     def substeps(self, dt: float) -> int:
-        """Return the engine steps per period dt [s]; `ParameterError` unless it is a multiple of `step`."""
+        """Return the engine steps per period dt [s]; raise `ParameterError` unless `step` divides dt."""
         if self.step is None:
             return math.ceil(dt / LONGEST_STEP - WHOLE)
         steps = dt / self.step
@@ -61,12 +61,12 @@ class ContactSolver:
 
 @dataclass(frozen=True)
 class Sensors:
-    """Imperfect sensors, which provide values for controller and log. By default, sensors are perfect.
+    """Imperfect sensors, which provide the values for the controller and the log; perfect by default.
 
     Args:
         encoder_resolution: resolution of the measured joint positions [rad, m].
-        velocity_noise: standard deviation of the noise on q̇ [rad/s, m/s].
-        torque_noise: standard deviation of the noise on the logged torque [N m, N].
+        velocity_noise: standard deviation of the noise in q̇ [rad/s, m/s].
+        torque_noise: standard deviation of the noise in the logged torque [N m, N].
         torque_delay: delay of the logged torque relative to the motion [s], rounded to whole samples.
 
     Raises:
@@ -87,15 +87,15 @@ class Sensors:
 class SimulationConfig(MotionConfig):
     """Settings of a simulation; the defaults are the paper's task on the bundled arm.
 
-    In addition to the settings of the motion (`MotionConfig`):
+    The following settings are added to those of the motion (`MotionConfig`).
 
     Args:
         seed: seed for the waypoints, the postures and the noise.
         engine: `"pybullet"`, `"mujoco"` or `"auto"`.
-        contact: `"rigid"` computes contact forces with the library's equations of motion, `"solver"` with
-            MuJoCo's contact solver, an independent reference.
+        contact: `"rigid"` computes contact forces with the library's equations of motion, and `"solver"` with
+            MuJoCo's contact solver, which is an independent reference.
         viscous_friction: θ_v in F_z = −θ_v ṗ_E, tangential to the surface, for rigid contact [N s/m].
-        noise_std: standard deviation of the noise on q̈ [rad/s²].
+        noise_std: standard deviation of the noise in q̈ [rad/s²].
         solver: friction and geometry for `contact="solver"`.
         sensors: resolution, noise and delay of the measurements for `contact="solver"`.
 

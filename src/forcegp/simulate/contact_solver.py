@@ -1,4 +1,4 @@
-"""MuJoCo with its contact solver, which models contact and dry friction independently of this library."""
+"""MuJoCo with its own contact solver, which models contact and dry friction independently of this library."""
 
 from __future__ import annotations
 
@@ -17,11 +17,11 @@ from forcegp.simulate.engines import NEEDS_MUJOCO, MuJoCoWorld
 from forcegp.simulate.urdf import link_name, write_urdf
 
 CYLINDER_LENGTH = 100.0
-"""Half length of the cylinder that represents an infinite one [m]."""
+"""Half-length of the cylinder that represents an infinite cylinder [m]."""
 IMPEDANCE = [0.01, 0.95, 0.0002, 0.5, 2.0]
-"""MuJoCo's impedance, which grows from almost zero within 0.2 mm to avoid force jumps."""
+"""Parameters of MuJoCo's impedance, which grows from almost zero within 0.2 mm to avoid force jumps."""
 SOLVED = 1e-15
-"""Solver tolerance at which forces and acceleration obey Newton's equation up to rounding."""
+"""Solver tolerance at which forces and accelerations satisfy Newton's equations up to rounding errors."""
 NO_FORCE = 1e-9
 """Normal force below which a contact counts as open [N]."""
 
@@ -31,10 +31,10 @@ class SolvedForces(NamedTuple):
 
     Attributes:
         qdd: `(nq,)` acceleration [rad/s², m/s²].
-        Q: `(nq,)` joint forces other than contact: Q_C + Q_G + Q_u and joint friction [N m].
-        Q_I, Q_z: `(nq,)` generalized normal and friction force of the contacts [N m].
-        multiplier: `(n_contacts,)` normal force [N].
-        F_I, F_z: `(n_contacts, 3)` normal and friction force on the tip, world axes [N].
+        Q: `(nq,)` joint forces other than contact forces: Q_C + Q_G + Q_u and joint friction [N m].
+        Q_I, Q_z: `(nq,)` generalized normal and friction forces of the contacts [N m].
+        multiplier: `(n_contacts,)` normal forces [N].
+        F_I, F_z: `(n_contacts, 3)` normal and friction forces on the tip, in world axes [N].
     """
 
     qdd: np.ndarray
@@ -47,13 +47,14 @@ class SolvedForces(NamedTuple):
 
 
 class ContactSolverEngine(MuJoCoWorld):
-    """A robot in a MuJoCo world with solid surfaces and rounded tips, driven by motor torques only.
+    """A robot in a MuJoCo world with solid surfaces and rounded tips, driven only by motor torques.
 
-    Each contact needs a plane, a sphere or a cylinder; torques are held for the sampling period dt [s].
+    The surface of each contact must be a plane, a sphere or a cylinder. Torques are held for the sampling
+    period dt [s].
 
     Raises:
         MissingDependencyError: MuJoCo is not installed.
-        ForceGPError: a constraint has no geometry, or friction is given for a wrong number of joints.
+        ForceGPError: a constraint has no geometry, or friction is given for the wrong number of joints.
         UnsupportedRobotError: the robot file declares Stribeck friction, which MuJoCo does not model.
     """
 
@@ -78,9 +79,9 @@ class ContactSolverEngine(MuJoCoWorld):
     def forces(self, torque: np.ndarray) -> SolvedForces:
         """Return the acceleration and forces at the current state under a motor torque `(nq,)` [N m].
 
-        The engine evaluates viscous friction at the end of the step, (M + h D) q̈ = Q(q, q̇), which differs
-        considerably from M⁻¹Q for light joints. q̈ and the friction are those of the step, in which the
-        velocity changes by h q̈.
+        The engine evaluates viscous friction at the end of the step, (M + h D) q̈ = Q(q, q̇). For light joints,
+        the result differs considerably from M⁻¹Q. The returned q̈ and friction are those of the step, in which
+        the velocity changes by h q̈.
         """
         data, dof = self._data, self._dof
         data.qfrc_applied[dof] = torque
@@ -96,11 +97,11 @@ class ContactSolverEngine(MuJoCoWorld):
         return SolvedForces(qdd[dof], others, Q_I, Q_z, np.linalg.norm(F_I, axis=-1), F_I, F_z)
 
     def step(self) -> None:
-        """Advance by the sampling period under the torque last passed to `forces`."""
+        """Advance by one sampling period under the torque that was last passed to `forces`."""
         self._mujoco.mj_step(self.model, self._data, self._substeps)
 
     def _contact_force(self, surface: int, tip: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return normal and friction force on a tip, generalized `(2, nq)` and Cartesian `(2, 3)`."""
+        """Return the normal and friction forces on a tip, generalized `(2, nq)` and Cartesian `(2, 3)`."""
         model, data = self.model, self._data
         Q, F = np.zeros((2, len(self._dof))), np.zeros((2, 3))
         wrench, jacobian = np.zeros(6), np.zeros((3, model.nv))
@@ -108,7 +109,7 @@ class ContactSolverEngine(MuJoCoWorld):
             contact = data.contact[i]
             if {contact.geom1, contact.geom2} != {surface, tip}:
                 continue
-            # MuJoCo gives the force on its second geometry, in axes whose first is the normal towards it.
+            # MuJoCo returns the force on its second geometry; the first axis is the normal towards it.
             sign = 1.0 if contact.geom2 == tip else -1.0
             self._mujoco.mj_contactForce(model, data, i, wrench)
             axes = sign * contact.frame.reshape(3, 3)
@@ -157,9 +158,10 @@ def _per_joint(robot: RobotModel, solver: ContactSolver, name: str) -> np.ndarra
 
 
 def tip_of(robot: RobotModel, contact: SurfaceContact, radius: float) -> tuple[int, np.ndarray, float]:
-    """Return the link of the tip, the centre of the tip in link coordinates, and its radius.
+    """Return the link of the tip, the centre of the tip in link coordinates, and the radius of the tip.
 
-    For a point contact, the tip is a sphere that ends at the point, on the line from the origin of the frame.
+    For a point contact, the tip is a sphere that ends at the point and is centred on the line to the frame's
+    origin.
     """
     index = robot.frame_index(contact.frame)
     center = np.array(contact.point, dtype=float)
@@ -173,11 +175,11 @@ def tip_of(robot: RobotModel, contact: SurfaceContact, radius: float) -> tuple[i
 
 
 def geometry_of(mujoco: Any, contact: SurfaceContact) -> dict[str, Any]:
-    """Return the type, size and pose of the geometry of a surface."""
+    """Return the type, size and pose of the MuJoCo geometry of a contact surface."""
     surface, geom = contact.surface, mujoco.mjtGeom
 
     def along(axis: Sequence[float]) -> np.ndarray:
-        """Return the quaternion (w, x, y, z) of a rotation from z to an axis."""
+        """Return the quaternion (w, x, y, z) of a rotation that turns z into an axis."""
         return Rotation.from_matrix(turn_z(np.array(axis))).as_quat()[[3, 0, 1, 2]]
 
     if isinstance(surface, Plane):

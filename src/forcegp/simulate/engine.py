@@ -18,9 +18,9 @@ from forcegp.types import JointMatrix, JointVector
 class Engine(Protocol):
     """A physics engine with one robot under gravity and no other forces.
 
-    One step is semi-implicit Euler: q̇ₖ₊₁ = q̇ₖ + dt q̈(qₖ, q̇ₖ), qₖ₊₁ = qₖ + dt q̇ₖ₊₁, so the acceleration
-    during a step is (q̇ₖ₊₁ − q̇ₖ)/dt. Contacts, collisions, joint limits, motors and damping are off; all
-    forces except gravity are passed to `step`.
+    A step uses the semi-implicit Euler method, q̇ₖ₊₁ = q̇ₖ + dt q̈(qₖ, q̇ₖ) and qₖ₊₁ = qₖ + dt q̇ₖ₊₁, so the
+    acceleration during a step is (q̇ₖ₊₁ − q̇ₖ)/dt. Contacts, collisions, joint limits, motors and damping are
+    disabled; all forces except gravity are passed to `step`.
     """
 
     @property
@@ -34,7 +34,7 @@ class Engine(Protocol):
         ...
 
     def reset(self, q: JointVector, qd: JointVector) -> None:
-        """Set position q and velocity qd, `(nq,)` each."""
+        """Set the positions q and velocities qd, `(nq,)` each."""
         ...
 
     def state(self) -> tuple[JointVector, JointVector]:
@@ -42,15 +42,15 @@ class Engine(Protocol):
         ...
 
     def step(self, force: JointVector) -> None:
-        """Advance by dt under the generalized force `(nq,)` [N m], without gravity and bias forces."""
+        """Advance by dt under a generalized force `(nq,)` [N m] that excludes gravity and bias forces."""
         ...
 
     def mass_matrix(self, q: JointVector) -> JointMatrix:
-        """Return M(q) `(nq, nq)` computed by the engine."""
+        """Return M(q) `(nq, nq)`, computed by the engine."""
         ...
 
     def inverse_dynamics(self, q: JointVector, qd: JointVector, qdd: JointVector) -> JointVector:
-        """Return M q̈ − Q_C − Q_G `(nq,)` computed by the engine."""
+        """Return M q̈ − Q_C − Q_G `(nq,)`, computed by the engine."""
         ...
 
     def close(self) -> None:
@@ -63,13 +63,13 @@ class EngineCheck:
     """Largest differences between an engine and the library at random states.
 
     Attributes:
-        engine: name and version.
-        states: number of states compared.
+        engine: name and version of the engine.
+        states: number of compared states.
         mass_matrix: difference in the mass matrix [kg m²].
         inverse_dynamics: difference in inverse dynamics [N m].
-        free_acceleration: difference over one step under a random force [rad/s²].
-        constrained_acceleration: difference over one step with constraint force and joint friction [rad/s²].
-        largest_acceleration: largest acceleration in all steps, for scale [rad/s²].
+        free_acceleration: difference in acceleration over one step under a random force [rad/s²].
+        constrained_acceleration: the same with additional constraint force and joint friction [rad/s²].
+        largest_acceleration: largest acceleration in any step, as a reference for scale [rad/s²].
     """
 
     engine: str
@@ -125,7 +125,7 @@ def check_engine(
 
 
 def _step(engine: Engine, q: Tensor, qd: Tensor, force: Tensor) -> Tensor:
-    """Return the accelerations of one step from each state."""
+    """Return the accelerations over one step from each state."""
     accelerations = []
     for state in zip(q, qd, force, strict=True):
         engine.reset(state[0], state[1])

@@ -1,4 +1,4 @@
-"""PyBullet and MuJoCo as physics engines, without any forces other than the applied ones."""
+"""PyBullet and MuJoCo as physics engines in which only gravity and the applied forces act."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ from forcegp.types import JointMatrix, JointVector
 
 NEEDS_MUJOCO = "the engine 'mujoco'"
 MAX_JOINT_VELOCITY = 1e6
-"""Joint velocity limit for Bullet, which by default clamps at 100 rad/s, an unwanted force."""
+"""Joint velocity limit for Bullet, which by default clamps at 100 rad/s and so adds an unwanted force."""
 
 
 class PyBulletEngine(Engine):
-    """A robot in a separate PyBullet world with a step dt [s].
+    """A robot in a separate PyBullet world with step size dt [s].
 
     Raises:
         MissingDependencyError: PyBullet is not installed.
@@ -49,7 +49,7 @@ class PyBulletEngine(Engine):
                     hint='use the engine "mujoco"',
                 )
         self._robot, self._dt = robot, dt
-        # The constructor of a client passes options, and PyBullet prints a line where there are any.
+        # The constructor of a client passes options, and PyBullet prints a line if there are any.
         self._bullet: Any = BulletClient.__new__(BulletClient)
         vars(self._bullet).update(_shapes={}, _pid=os.getpid(), _client=pybullet.connect(pybullet.DIRECT))
         self._bullet.setTimeStep(dt)
@@ -59,7 +59,7 @@ class PyBulletEngine(Engine):
         info = (self._bullet.getJointInfo(self._body, i) for i in range(count))
         index = {entry[1].decode(): entry[0] for entry in info}
         self._joints = [index[name] for name in robot.joint_names]
-        # PyBullet's vectors list joints by their index.
+        # PyBullet's vectors are ordered by joint index.
         self._order = np.argsort(np.argsort(self._joints)).tolist()
         self._silence()
 
@@ -117,7 +117,7 @@ class PyBulletEngine(Engine):
 
 
 class MuJoCoWorld:
-    """A robot in a compiled MuJoCo model with its joint names, gravity and drive inertia."""
+    """A robot in a compiled MuJoCo model, which has its joint names and receives its gravity and armature."""
 
     def __init__(self, robot: RobotModel, model: Any, dt: float) -> None:
         self._mujoco, self._robot, self.model = optional_module("mujoco", NEEDS_MUJOCO), robot, model
@@ -133,7 +133,7 @@ class MuJoCoWorld:
         return f"mujoco {self._mujoco.__version__}"
 
     def reset(self, q: JointVector, qd: JointVector) -> None:
-        """Set position q and velocity qd, `(nq,)` each."""
+        """Set the positions q and velocities qd, `(nq,)` each."""
         self._set(self._data, q, qd)
 
     def state(self) -> tuple[JointVector, JointVector]:
@@ -141,7 +141,7 @@ class MuJoCoWorld:
         return self._tensor(self._data.qpos[self._dof]), self._tensor(self._data.qvel[self._dof])
 
     def close(self) -> None:
-        """Release the engine's resources; MuJoCo holds none."""
+        """Release the engine's resources, of which MuJoCo has none."""
 
     def _set(self, data: Any, q: JointVector, qd: JointVector) -> None:
         data.qpos[self._dof] = q.numpy()
@@ -151,7 +151,7 @@ class MuJoCoWorld:
         return torch.tensor(values, dtype=self._robot.dtype)
 
     def _mass_matrix(self, data: Any) -> np.ndarray:
-        """Return M `(nv, nv)` at a state with updated positions; `mj_fullM` differs between versions."""
+        """Return M `(nv, nv)` after positions were updated; `mj_fullM` differs between versions of MuJoCo."""
         M = np.zeros((self.model.nv, self.model.nv))
         for column, unit in zip(M, np.eye(self.model.nv), strict=True):
             self._mujoco.mj_mulM(self.model, data, column, unit)
@@ -159,7 +159,7 @@ class MuJoCoWorld:
 
 
 class MuJoCoEngine(MuJoCoWorld, Engine):
-    """A robot in a separate MuJoCo world with a step dt [s].
+    """A robot in a separate MuJoCo world with step size dt [s].
 
     Raises:
         MissingDependencyError: MuJoCo is not installed.
@@ -201,8 +201,8 @@ def make_engine(robot: RobotModel, dt: float, name: str = "auto") -> Engine:
 
     Args:
         robot: the robot.
-        dt: step [s].
-        name: `"pybullet"`, `"mujoco"`, or `"auto"` for PyBullet if it is installed, else MuJoCo.
+        dt: step size [s].
+        name: `"pybullet"`, `"mujoco"`, or `"auto"` for PyBullet if it is installed and MuJoCo otherwise.
 
     Example:
         >>> import torch, forcegp

@@ -1,11 +1,11 @@
-"""Planning of collision-free motions within limits that best identify the unknown forces.
+"""Planning of collision-free motions, within limits, that best identify the unknown forces.
 
-Joints follow uniform cubic B-splines that start and end at rest in the same position. Splines stay in the
-convex hull of their control points, so bounds on the control points and their differences guarantee the
-limits on position, velocity and acceleration at all times. L-BFGS minimises an information criterion
-(`control/information.py`) with squared hinges for all limits and the clearance, from random starts within all
-limits. The result is verified at 1 kHz; times of violations are added to the nodes of the hinges, and finally
-the motion is scaled towards its start.
+Joints follow uniform cubic B-splines that start and end at rest in the same position. A spline stays in the
+convex hull of its control points, so bounds on the control points and their differences guarantee the limits
+on position, velocity and acceleration at all times. From random starts within all limits, L-BFGS minimises an
+information criterion (`control/information.py`) plus squared hinges for all limits and the clearance. The
+result is verified at 1 kHz; the times of violations are added to the nodes of the hinges. Finally, the motion
+is scaled towards its start until all limits are satisfied.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from scipy.interpolate import BSpline
 from scipy.optimize import minimize
 from torch import Tensor
 
@@ -33,19 +34,19 @@ from forcegp.simulate.collisions import Collisions
 from forcegp.types import Array
 
 KNOT, NODE, FINE = 0.5, 0.1, 0.001
-"""Time between control points, between nodes of the objective, and between verified instants [s]."""
+"""Time between control points, between nodes of the objective, and between verified times [s]."""
 SINES, SLOWEST, QUICKEST = 6, 0.05, 0.6
-"""Number of sines in a random start, and the range of their frequencies [Hz]."""
+"""Number of sine functions in a random start, and the range of their frequencies [Hz]."""
 STEEP = 5.0
-"""Initial weight of the squared hinges, doubled in each failed round."""
+"""Initial weight of the squared hinges, which is doubled after each round that violates a limit."""
 INSIDE = 0.97
-"""Fraction of a limit above which a hinge is active; for the clearance, its inverse."""
+"""Fraction of a limit above which its hinge is active."""
 KEEP = 1.5
-"""Distance below which a hinge is active, relative to the clearance."""
+"""Distance, relative to the clearance, below which the hinge for the clearance is active."""
 ROUNDS, STEPS, REPAIRS = 4, 150, 30
-"""Number of verification rounds, and of evaluations in the first round and in later ones."""
+"""Number of verification rounds, and of evaluations in the first round and in later rounds."""
 SHARES = (1.0, 0.98, 0.95, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1, 0.05)
-"""Scales of a motion, tried until all limits are satisfied."""
+"""Scales of a motion, which are tried in order until all limits are satisfied."""
 REGION = 300
 """Number of states in the default region."""
 CHUNK = 3000
@@ -60,7 +61,7 @@ class Limits:
 
     Attributes:
         low, high: position limits [rad, m].
-        velocity, acceleration, torque: maximum magnitudes.
+        velocity, acceleration, torque: maximum magnitudes for each joint.
     """
 
     low: Tensor
@@ -79,17 +80,17 @@ class Limits:
         torque: Sequence[float] = (),
         share: float = 0.9,
     ) -> Limits:
-        """Return a fraction of the limits of a robot.
+        """Return the limits for a motion as a fraction of the limits of a robot.
 
         Args:
-            robot: robot with the limits that are not given.
-            velocity, acceleration, torque: one number for all joints or one per joint. By default, velocity
+            robot: robot that defines the limits that are not given.
+            velocity, acceleration, torque: one number for all joints, or one per joint. By default, velocity
                 and torque from the file, and accelerations that reach the velocity in a quarter of a second.
-            share: fraction of the velocity, acceleration and torque limits; the rest is reserved for the
-                controller.
+            share: fraction of the velocity, acceleration and torque limits to use; the rest is reserved for
+                the controller.
 
         Raises:
-            ParameterError: a limit is missing or not positive; the message names joint and option.
+            ParameterError: a limit is missing or not positive; the message names the joint and the option.
         """
         if not 0.0 < share <= 1.0:
             raise ParameterError(
@@ -101,9 +102,19 @@ class Limits:
         low, high = robot.lower.clamp(min=-torch.pi), robot.upper.clamp(max=torch.pi)
         return cls(low, high, share * speed, share * rate, share * effort)
 
+    def shares(self, q: Tensor, qd: Tensor, qdd: Tensor, torque: Tensor) -> dict[str, Tensor]:
+        """Return the signed fractions of the limits in use, `(n, nq)` each."""
+        middle, half = 0.5 * (self.low + self.high), 0.5 * (self.high - self.low)
+        return {
+            "position": (q - middle) / half,
+            "velocity": qd / self.velocity,
+            "acceleration": qdd / self.acceleration,
+            "torque": torque / self.torque,
+        }
+
 
 def _given(robot: RobotModel, name: str, values: Sequence[float], default: Tensor) -> Tensor:
-    """Return the limits of all joints, given or from the robot."""
+    """Return the limits of all joints, either the given values or those of the robot."""
     option = f"give --{name}, as one number or one per joint"
     if len(values) not in (0, 1, robot.nq):
         raise ParameterError(
@@ -124,7 +135,7 @@ def _given(robot: RobotModel, name: str, values: Sequence[float], default: Tenso
 
 
 def random_states(robot: RobotModel, limits: Limits, count: int = REGION, seed: int = 0) -> States:
-    """Draw states uniformly within the limits; those that need too much torque are slowed down."""
+    """Draw states uniformly within the limits, and slow down those that need too much torque."""
     share = torch.rand(3, count, robot.nq, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
     q = limits.low + share[0] * (limits.high - limits.low)
     qd, qdd = (
@@ -138,14 +149,14 @@ def random_states(robot: RobotModel, limits: Limits, count: int = REGION, seed: 
 
 @dataclass(frozen=True, eq=False)
 class Excitation:
-    """A motion that excites a robot.
+    """A motion that excites a robot for identification.
 
     Attributes:
         motion: positions, velocities, accelerations, and the torque according to the robot file.
         limits: limits of the motion.
-        used: largest used fraction of each limit at 1 kHz, by name; `clearance_m` is the smallest distance.
-        before, after: unknowns before recording the motion, and expected unknowns afterwards.
-        criterion: objective for each random start; the first one was selected.
+        used: largest used fraction of each limit, verified at 1 kHz, by name; `clearance_m` is the clearance.
+        before, after: unknowns before the motion is recorded, and expected unknowns afterwards.
+        criterion: objective for each random start, of which the first was selected.
     """
 
     motion: Dataset
@@ -156,7 +167,7 @@ class Excitation:
     criterion: tuple[float, ...]
 
     def write(self, path: str | Path) -> None:
-        """Write the motion as CSV with columns t, q.<joint>, qd., qdd. and tau., or as a Parquet data set.
+        """Write the motion as CSV with the columns t, q.<joint>, qd., qdd. and tau., or as Parquet.
 
         Raises:
             DataError: the name does not end in `.csv` or `.parquet`.
@@ -173,7 +184,7 @@ class Excitation:
 
 
 class Spline:
-    """Motions that start and end at rest at `start` `(nq,)`, defined by free control points."""
+    """Motions that start and end at rest in the position `start` `(nq,)`, defined by free control points."""
 
     def __init__(self, start: Array, seconds: float) -> None:
         self.start, self.seconds = start, seconds
@@ -181,29 +192,20 @@ class Spline:
         self.h, self.free = seconds / self.spans, self.spans - 3
 
     def at(self, t: Array) -> tuple[Array, Array, Array]:
-        """Return matrices `(n, free)` from control points (relative to the start) to q, q̇, q̈ at times."""
-        s = np.clip(np.floor(t / self.h).astype(int), 0, self.spans - 1)
-        u, h = t / self.h - s, self.h
-        v = 1.0 - u
-        weights = (
-            (v**3 / 6, (3 * u**3 - 6 * u**2 + 4) / 6, (3 * v**3 - 6 * v**2 + 4) / 6, u**3 / 6),
-            (-(v**2) / 2 / h, (3 * u**2 - 4 * u) / 2 / h, -(3 * v**2 - 4 * v) / 2 / h, u**2 / 2 / h),
-            (v / h**2, (3 * u - 2) / h**2, (3 * v - 2) / h**2, u / h**2),
-        )
-        found = np.zeros((3, len(t), self.free + 6))
-        for matrix, columns in zip(found, weights, strict=True):
-            for k, column in enumerate(columns):
-                matrix[np.arange(len(t)), s + k] = column
-        return found[0][:, 3:-3], found[1][:, 3:-3], found[2][:, 3:-3]
+        """Return the matrices `(n, free)` that map control points, relative to the start, to q, q̇ and q̈."""
+        knots = self.h * np.arange(-3, self.spans + 4)
+        spline = BSpline(knots, np.eye(self.free + 6), 3)
+        q, qd, qdd = (spline(t, order)[:, 3:-3] for order in range(3))
+        return q, qd, qdd
 
     def differences(self, x: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the control points of velocity and acceleration."""
+        """Return the control points of the velocity and of the acceleration."""
         zero = x.new_zeros(3, x.shape[1])
         first = torch.cat([zero, x, zero]).diff(dim=0) / self.h
         return first, first.diff(dim=0) / self.h
 
     def random(self, limits: Limits, random: np.random.Generator) -> Array:
-        """Draw control points `(free, nq)` of a sum of sines within the kinematic limits."""
+        """Draw control points `(free, nq)` for a sum of sine functions within the kinematic limits."""
         t = np.arange(1, self.free + 1)[:, None, None] * self.h
         shape = (1, len(self.start), SINES)
         w, phase = (
@@ -222,12 +224,12 @@ class Spline:
 
 
 class Search:
-    """Objective of a motion as a function of its control points.
+    """Objective for a motion as a function of its control points.
 
     Args:
-        spline, limits, collisions: spline, limits and collisions of the motion.
+        spline, limits, collisions: spline and limits of the motion, and collisions to avoid.
         unknowns: the unknown forces to identify.
-        criterion: objective of the information.
+        criterion: objective as a function of the information.
     """
 
     def __init__(
@@ -241,7 +243,7 @@ class Search:
         self.look(np.zeros(0))
 
     def look(self, times: Array) -> None:
-        """Apply the hinges at additional times."""
+        """Apply the hinges at additional times as well."""
         self.extra = np.union1d(self.extra, times)
         self.matrices = [
             torch.from_numpy(m) for m in self.spline.at(np.concatenate([self.nodes, self.extra]))
@@ -253,9 +255,9 @@ class Search:
         return torch.from_numpy(self.spline.start) + q, qd, qdd
 
     def scaled(self) -> Tensor:
-        """Return scales C `(nq, free, free)` of control points C_j w_j, with similar hinge curvatures in w.
+        """Return scales C `(nq, free, free)` for control points C_j w_j, so that hinges curve similarly in w.
 
-        C Cᵀ = (4/r² + D₁ᵀD₁/v² + D₂ᵀD₂/a²)⁻¹ with differences D, range r and limits v and a.
+        C Cᵀ = (4/r² + D₁ᵀD₁/v² + D₂ᵀD₂/a²)⁻¹ with difference operators D, range r, and limits v and a.
         """
         limits, eye = self.limits, torch.eye(self.spline.free, dtype=torch.float64)
         D1, D2 = self.spline.differences(eye)
@@ -267,7 +269,7 @@ class Search:
         return torch.linalg.solve_triangular(L, eye.expand_as(L), upper=False).mT
 
     def __call__(self, flat: Array) -> tuple[float, Array]:
-        """Return the sum of criterion and hinges, and its gradient, at scaled control points w."""
+        """Return the sum of the criterion and the hinges, and its gradient, at scaled control points w."""
         limits, n = self.limits, len(self.nodes)
         w = torch.tensor(flat.reshape(len(self.spline.start), -1), requires_grad=True)
         x = (self.scale @ w[..., None])[..., 0].mT
@@ -292,7 +294,7 @@ class Search:
         return torch.linalg.solve(self.scale, torch.from_numpy(x).mT[..., None]).numpy().ravel()
 
     def minimised(self, x: Array, steps: int) -> tuple[Array, float]:
-        """Minimise the objective, and return the control points and the objective."""
+        """Minimise the objective, and return the control points and the value of the objective."""
         options = {"maxfun": steps, "maxiter": steps, "maxcor": 20}
         found = minimize(self, self.flat(x), jac=True, method="L-BFGS-B", options=options)
         w = torch.from_numpy(found.x.reshape(len(self.spline.start), -1))
@@ -300,22 +302,16 @@ class Search:
 
     @torch.no_grad()
     def used(self, x: Array, step: float) -> tuple[dict[str, float], Array]:
-        """Return the largest fractions of limits at multiples of `step`, missing clearance, and times."""
+        """Return the largest used fraction of each limit at multiples of `step`, and times of violations."""
         t = np.linspace(0.0, self.spline.seconds, round(self.spline.seconds / step) + 1)
         worst: dict[str, float] = {}
         where, limits, near = [], self.limits, self.collisions
-        middle, half = 0.5 * (limits.low + limits.high), 0.5 * (limits.high - limits.low)
         for rows in np.split(t, range(CHUNK, len(t), CHUNK)):
             q, qd, qdd = (torch.from_numpy(m @ x) for m in self.spline.at(rows))
             q = q + torch.from_numpy(self.spline.start)
             torque = rigid_torque(self.unknowns.robot, q, qd, qdd)
-            shares = {
-                "position": (q - middle) / half,
-                "velocity": qd / limits.velocity,
-                "acceleration": qdd / limits.acceleration,
-                "torque": torque / limits.torque,
-                "clearance": 1.0 + torch.from_numpy(near.depth(q.numpy()))[:, None] / near.clearance,
-            }
+            shares = limits.shares(q, qd, qdd, torque)
+            shares["clearance"] = 1.0 + torch.from_numpy(near.depth(q.numpy()))[:, None] / near.clearance
             found = {name: share.abs().amax(-1).numpy() for name, share in shares.items()}
             worst = {name: max(worst.get(name, 0.0), float(share.max())) for name, share in found.items()}
             where.append(rows[np.max(list(found.values()), axis=0) > 1.0 + TOLERANCE])
@@ -344,7 +340,7 @@ class Search:
 def _start_of(
     start: Sequence[float] | None, robot: RobotModel, limits: Limits, collisions: Collisions
 ) -> Array:
-    """Return the given position, or the collision-free one closest to the middle of the limits.
+    """Return the given start, or the collision-free position closest to the middle of the limits.
 
     Raises:
         ParameterError: the start does not match the robot, exceeds its limits, or is in collision.
@@ -401,15 +397,15 @@ def excite(
     Args:
         system: robot, and contacts with surfaces to avoid.
         seconds: duration [s].
-        limits: limits of the motion; by default `Limits.of(robot)`.
-        unknowns: unknown forces before the motion; by default all, as in `Unknowns.of`.
-        collisions: collisions to avoid; by default the robot's shapes and the surfaces of the contacts.
-        start: `(nq,)` initial and final position; by default a collision-free one near the middle.
-        criterion: `"A"`, standard deviation of the torque in the region of `unknowns`; `"V"`, the same with
-            only link inertia, viscous and dry friction unknown; `"D"`, determinant of the covariance; or a
-            function of the information.
+        limits: limits of the motion; by default, `Limits.of(robot)`.
+        unknowns: unknown forces before the motion; by default, all unknowns of `Unknowns.of`.
+        collisions: collisions to avoid; by default, those of the robot's shapes and of the contact surfaces.
+        start: `(nq,)` initial and final position; by default, a collision-free position near the middle.
+        criterion: `"A"`, the standard deviation of the torque in the region of `unknowns`; `"V"`, the same if
+            only link inertia, viscous and dry friction are unknown; `"D"`, the determinant of the covariance;
+            or a function of the information.
         rate: sampling rate of the result [Hz].
-        restarts: number of optimised random starts, the best of four times as many.
+        restarts: number of random starts to optimise, which are the best of four times as many.
         seed: seed for the random starts.
         progress: called with the number of completed rounds and their total.
 
@@ -421,8 +417,8 @@ def excite(
         401
 
     Raises:
-        ParameterError: limits are missing, the start is in collision or beyond limits, or an option is out of
-            range.
+        ParameterError: limits are missing, the start is in collision or exceeds the limits, or an option is
+            out of range.
         NumericalError: no motion from the start satisfies the limits.
         MissingDependencyError: MuJoCo is not installed.
     """
@@ -449,7 +445,7 @@ def excite(
 def _searched(
     search: Search, restarts: int, random: np.random.Generator, progress: Progress
 ) -> tuple[tuple[float, ...], Array, dict[str, float]]:
-    """Optimise the random starts; return objectives (best first), control points, and used limits."""
+    """Optimise random starts; return the objectives (best first), control points and used limits."""
     rounds = restarts + ROUNDS
     drawn = (search.spline.random(search.limits, random) for _ in range(4 * restarts))
     starts = [search.shrunk(x, NODE)[0] for x in drawn]

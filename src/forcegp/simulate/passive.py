@@ -1,4 +1,4 @@
-"""Learned forces as a MuJoCo callback for passive forces in any simulation."""
+"""Learned forces as a MuJoCo callback for passive forces, for use in any simulation."""
 
 from __future__ import annotations
 
@@ -16,17 +16,17 @@ from forcegp.resources import one_thread
 
 
 class PassiveForces:
-    """A force field as `mjcb_passive`, which adds Q̄ − Q_C − Q_G − Q_u to `qfrc_passive`.
+    """A force field as the callback `mjcb_passive`, which adds Q̄ − Q_C − Q_G − Q_u to `qfrc_passive`.
 
     If the MuJoCo model has the masses and drives of the fitted robot (`fit.system.robot`), its acceleration
-    is M⁻¹Q̄, the prediction of the fit. Q̄ includes joint friction, so `installed` temporarily removes
-    damping and friction loss from the model. Learned contact friction is not applied, since the engine models
-    it. Q_u consists of `qfrc_applied` and the last actuator forces.
+    is M⁻¹Q̄, as predicted by the fit. Q̄ includes joint friction, so `installed` temporarily removes damping
+    and friction loss from the model. Learned contact friction is not applied, since the engine models contact
+    friction itself. Q_u is the sum of `qfrc_applied` and the last actuator forces.
 
     Args:
         system: system with the fitted robot.
         field: `fit.force_field()`, or a posterior sample, `fit.force_samples(1, generator)`.
-        joint_names: names of the joints in the MuJoCo model; by default the robot's.
+        joint_names: names of the joints in the MuJoCo model; by default, those of the robot.
 
     Raises:
         ModelError: the number of names differs from the number of joints.
@@ -55,7 +55,7 @@ class PassiveForces:
 
     @torch.no_grad()
     def force(self, q: np.ndarray, qd: np.ndarray, tau: np.ndarray) -> np.ndarray:
-        """Return the force `(nq,)` at a state `(nq,)` [N m, N]."""
+        """Return the force to add at a state, `(nq,)` [N m, N]."""
         q_, qd_, tau_ = (torch.tensor(x, dtype=self.system.robot.dtype)[None] for x in (q, qd, tau))
         open_ = torch.zeros(1, len(self.system.contacts), dtype=torch.bool)
         with one_thread():
@@ -64,7 +64,7 @@ class PassiveForces:
         return force[0].double().numpy()
 
     def _places(self, model: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Return the indices of the joints' degrees of freedom and positions in a model."""
+        """Return the indices, in a model, of the joints' degrees of freedom and positions."""
         known = [model.joint(k).name for k in range(model.njnt)]
         for name in self.joint_names:
             check_name("joint of the MuJoCo model", name, known)

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import itertools
 from dataclasses import dataclass, field
 
 import torch
@@ -17,7 +16,7 @@ from forcegp.data.fields import DataHeader
 from forcegp.simulate.config import SimulationConfig
 
 CHUNK = 8192
-"""Number of states with equations of motion in memory at a time."""
+"""Number of states whose equations of motion are in memory at a time."""
 
 
 @dataclass(frozen=True)
@@ -25,11 +24,11 @@ class RunLog:
     """Quantities recorded at every step.
 
     Attributes:
-        q, qd, qdd, tau, Q, Q_I, Q_z: `(n, nq)`; qdd is the noise-free acceleration of the engine.
+        q, qd, qdd, tau, Q, Q_I, Q_z: `(n, nq)` motion and forces; qdd is the engine's noise-free value.
         multiplier, c: `(n, m)` multipliers and constraint errors.
-        contact, saturated: closed contacts `(n, n_contacts)` and reached torque limits `(n,)`, bool.
-        contact_forces: `F_I`, `F_z` → contact → `(n, 3)`, if the engine's solver computed them [N].
-        measured: sensor values of `q`, `qd`, `tau`, if the sensors are imperfect.
+        contact, saturated: bool, closed contacts `(n, n_contacts)`, and samples at a torque limit `(n,)`.
+        contact_forces: forces `(n, 3)` [N] by name (`F_I`, `F_z`) and contact, if the engine computed them.
+        measured: sensor values of `q`, `qd` and `tau`, if the sensors are imperfect.
     """
 
     q: Tensor
@@ -59,13 +58,13 @@ class RunLog:
         return RunLog(q, qd, qdd, tau, Q, Q_I, Q_z, columns(m), columns(m), contact, saturated)
 
     def write(self, k: int, **values: Tensor) -> None:
-        """Write values of row k, by column."""
+        """Write the values of row k, a mapping from columns to values."""
         for name, value in values.items():
             getattr(self, name)[k] = value
 
 
 def noise(like: Tensor, generator: torch.Generator) -> Tensor:
-    """Draw white noise of unit variance, in double precision for any type."""
+    """Draw white noise of unit variance in double precision, and convert it to the type of `like`."""
     return torch.randn(like.shape, dtype=torch.float64, generator=generator).to(like.dtype)
 
 
@@ -80,7 +79,7 @@ class SimulationResult:
         c: `(n, m)` constraint error [m].
         saturated: number of samples at a torque limit.
         beyond_limits: number of samples with a joint outside its limits.
-        acceleration_mismatch: largest difference between the accelerations of engine and library [rad/s²].
+        acceleration_mismatch: largest difference in acceleration between engine and library [rad/s²].
         engine: name and version of the engine.
     """
 
@@ -96,7 +95,7 @@ class SimulationResult:
     engine: str
 
     def summary(self) -> dict[str, float | int | str]:
-        """Return statistics of the run, by name with units."""
+        """Return statistics of the run; their names include the units."""
         touching = torch.stack(list(self.data.contact.values()), dim=-1) if self.data.contact else None
         figures: dict[str, float | int | str] = {
             "engine": self.engine,
@@ -182,10 +181,9 @@ def _dataset(
         joint_names=robot.joint_names,
         contact_names=names,
     )
-    ends = itertools.accumulate(contact.rows for contact in system.contacts)
     multipliers = {
-        contact.name: log.multiplier[:, end - contact.rows]
-        for contact, end in zip(system.contacts, ends, strict=True)
+        contact.name: log.multiplier[:, system.rows[contact.name].start]
+        for contact in system.contacts
         if isinstance(contact, SurfaceContact)
     }
     clean = {f"{name}_clean": getattr(log, name) for name in ("qdd", *log.measured)}

@@ -1,7 +1,7 @@
-"""Simulated runs: plan a motion, execute it in a physics engine, and log it.
+"""Simulated runs: a motion is planned, executed in a physics engine, and logged.
 
-Contact forces are computed with the library's equations of motion, or by MuJoCo's solver with simulated
-sensors.
+Contact forces are computed either from the library's equations of motion, or by MuJoCo's solver, with
+simulated sensors.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ from forcegp.simulate.passive import PassiveForces
 from forcegp.simulate.result import RunLog, SimulationResult, make_result, noise
 
 RUNAWAY_SPEED = 50.0
-"""Joint speed [rad/s] beyond that of any planned motion."""
+"""Joint speed that no planned motion reaches, so that the simulation has diverged [rad/s]."""
 PROGRESS_STRIDE = 24
-"""Number of steps between calls of the progress function, a tenth of a second at 240 Hz."""
+"""Number of steps between calls of the progress function: a tenth of a second at 240 Hz."""
 
 Progress = Callable[[int, int], None]
 """Called with the number of completed steps and their total number."""
 
 
 def _torque_limit(system: ConstrainedSystem, config: MotionConfig) -> Tensor:
-    """Return the torque limits `(nq,)` [N m] from the settings or the robot."""
+    """Return the torque limits `(nq,)` [N m] in the settings, or those of the robot."""
     robot = system.robot
     if config.torque_limit is None:
         return robot.effort_limit
@@ -51,7 +51,7 @@ def _check_speed(t: float, q: Tensor, qd: Tensor) -> None:
     """Stop a run that diverges.
 
     Raises:
-        NumericalError: a joint is too fast, or the state is not finite; the message names time and state.
+        NumericalError: a joint is too fast, or the state is not finite; the message gives the time and state.
     """
     if not (bool(q.isfinite().all()) and float(qd.abs().max()) < RUNAWAY_SPEED):
         raise NumericalError(
@@ -75,7 +75,7 @@ def _follow_with_solver(
     generator: torch.Generator,
     progress: Progress | None,
 ) -> RunLog:
-    """Step the engine through the plan, controlled by sensor values."""
+    """Step the engine through the plan, with a controller that uses sensor values."""
     log, sensors, limit = RunLog.empty(config.steps, system), config.sensors, _torque_limit(system, config)
     seen = compiled_system(system, (plan.frame, plan.point))
     measured = {"q": torch.zeros_like(log.q), "qd": torch.zeros_like(log.qd)}
@@ -104,7 +104,7 @@ def _follow_with_solver(
         for name, F in (("F_I", F_I), ("F_z", F_z))
         if system.contacts
     }
-    # The torque is logged late by whole samples, the first one repeated, and noisy.
+    # The logged torque is delayed by whole samples, with the first value repeated, and noise is added.
     late = (torch.arange(len(log.tau)) - round(sensors.torque_delay / config.dt)).clamp(min=0)
     measured["tau"] = log.tau[late] + sensors.torque_noise * noise(log.tau, generator)
     measured = {} if sensors == Sensors() else measured
@@ -128,17 +128,17 @@ def simulate(
     The engine moves the robot under Q_u + Q_D + Q_I + Q_z: the motor torque of a task-space controller, joint
     friction, the normal force from the constrained equations of motion with Baumgarte terms, and viscous
     contact friction (section 5 of the paper). A contact opens when its multiplier would become negative, and
-    closes with an inelastic impact. The run is computed on the CPU.
+    closes with an inelastic impact. The simulation runs on the CPU.
 
     Args:
-        system: robot and contacts; without contacts, the motion is free.
+        system: robot and contacts; if there are no contacts, the motion is free.
         config: settings of the simulation.
-        motion: joint motion to follow instead of a random tool motion, for the configured duration.
-        forces: learned joint forces that replace the robot's friction, for `contact = "solver"`.
-        progress: called every few steps and after the last one.
+        motion: joint motion to follow, for the configured duration, instead of a random tool motion.
+        forces: learned joint forces that replace the robot's friction if `contact = "solver"`.
+        progress: called every few steps and after the last step.
 
     Returns:
-        The data set with the reference, the actual motion of the tool and statistics of the run.
+        The data set, with the reference, the actual motion of the tool, and statistics of the run.
 
     Example:
         >>> import forcegp
@@ -148,7 +148,7 @@ def simulate(
         24
 
     Raises:
-        NumericalError: the motion cannot be reached, or the run diverges (the message names time and state).
+        NumericalError: the motion is out of reach, or the run diverges (the message gives time and state).
         MissingDependencyError: the engine is not installed.
         MemoryLimitError: the log needs more memory than is free.
     """
@@ -189,7 +189,7 @@ def _follow(
     system = compiled_system(system, (plan.frame, plan.point))
     engine.reset(plan.start, torch.zeros_like(plan.start))
     q, qd = engine.state()
-    # Inverse kinematics puts the tool on the surface, up to rounding.
+    # Inverse kinematics places the tool on the surface, up to rounding errors.
     closed = ~any_row(system, system.equations(q, qd).c.abs() > ON_SURFACE)
     for k in range(config.steps):
         _check_speed(k * config.dt, q, qd)

@@ -1,1 +1,1 @@
-"""Models and systems in files: safetensors with a versioned header, TOML and JSON."""
+"""Storage of models and systems in safetensors files with a versioned header, TOML and JSON."""

@@ -1,4 +1,4 @@
-"""The state of a long fit on disk, from which an interrupted fit resumes with a bit-identical result."""
+"""State of a long fit, saved to disk so that an interrupted fit can resume with a bit-identical result."""
 
 from __future__ import annotations
 
@@ -22,21 +22,21 @@ from forcegp.gp.optimise import Objective
 from forcegp.limits import CHECKPOINT_BYTES, CHECKPOINT_VALUE, LOGGED_VALUE
 
 INTERVAL = 10.0
-"""Minimum time between two writes [s]."""
+"""Minimum time between periodic writes [s]."""
 NAMES = ("positions", "objectives", "gradients")
 SUFFIX = ".sums"
-"""Suffix added to the name of the learning checkpoint."""
+"""Suffix appended to the file name of the learning checkpoint."""
 
 
 def beside(checkpoint: str | Path) -> Path:
-    """Return the file of sums that belongs to a learning checkpoint."""
+    """Return the path of the file of sums that belongs to a learning checkpoint."""
     path = Path(checkpoint)
     return path.with_name(path.name + SUFFIX)
 
 
 @dataclass
 class Checkpoint:
-    """A safetensors file from which a long fit resumes; `key` (`key_of`) identifies the fit."""
+    """A safetensors file from which a long fit resumes; `key` (see `key_of`) identifies the fit."""
 
     path: Path
     key: str
@@ -44,11 +44,11 @@ class Checkpoint:
 
     @staticmethod
     def key_of(*values: object) -> str:
-        """Return a short digest of settings, tensors, and the release of this library."""
+        """Return a short hash of settings, tensors and the release of this library."""
         digest = hashlib.sha256(version("forcegp").encode())
         for value in values:
             if isinstance(value, Tensor):
-                # Type and shape of a tensor tell it from another with the same bytes.
+                # The type and shape distinguish tensors that consist of the same bytes.
                 digest.update(f"{value.dtype}{tuple(value.shape)}".encode())
                 flat = value.detach().cpu().contiguous().flatten().view(torch.uint8)
                 digest.update(flat.numpy().tobytes())
@@ -57,14 +57,14 @@ class Checkpoint:
         return digest.hexdigest()[:16]
 
     def read(self, like: Mapping[str, Tensor], growing: Container[str] = ()) -> dict[str, Tensor]:
-        """Return the tensors in the file, empty if there is no file.
+        """Return the tensors in the file, or an empty dictionary if there is no file.
 
         Args:
             like: tensors with the names, types and shapes of those in the file.
-            growing: names of tensors of variable length.
+            growing: names of tensors with variable length.
 
         Raises:
-            ModelError: the file is damaged, not finite, or belongs to another fit.
+            ModelError: the file is damaged, contains non-finite values, or belongs to a different fit.
         """
         if not self.path.exists():
             return {}
@@ -86,12 +86,12 @@ class Checkpoint:
         return {name: tensors[name] for name in like}
 
     def write_now_and_then(self, tensors: Callable[[], Mapping[str, Tensor]]) -> None:
-        """Write tensors if the last write was long ago."""
+        """Write the tensors if at least `INTERVAL` has passed since the last write."""
         if time.monotonic() - self._written >= INTERVAL:
             self.write(tensors())
 
     def write(self, tensors: Mapping[str, Tensor]) -> None:
-        """Write tensors atomically; `DestinationError` if the path cannot be written."""
+        """Write tensors atomically; raise `DestinationError` if the path is not writable."""
         copies = {name: x.detach().to("cpu", copy=True).contiguous() for name, x in tensors.items()}
         with atomic_file(self.path) as temporary:
             temporary.write_bytes(safetensors.torch.save(copies, {"key": self.key}))
@@ -103,11 +103,11 @@ class Evaluations:
     """Record of all evaluations of an objective (position, value and gradient) in a checkpoint.
 
     A resumed fit replays the optimiser on the recorded values and is therefore bit-identical to an
-    uninterrupted fit. If the optimiser requests another point (on another machine or library release), the
-    rest of the record is discarded and recomputed.
+    uninterrupted fit. If the optimiser requests a different point (for example, on another machine or with
+    another library release), the rest of the record is discarded and recomputed.
 
     Args:
-        checkpoint: file of the record, or `None`.
+        checkpoint: file for the record, or `None` to record nothing.
     """
 
     checkpoint: Checkpoint | None
@@ -116,7 +116,7 @@ class Evaluations:
 
     @classmethod
     def resumed(cls, path: str | Path | None, start: Mapping[str, Tensor], *key: object) -> Evaluations:
-        """Return the evaluations in a file, if any; `key` identifies the fit from `start`."""
+        """Load the evaluations in a file, if any; `key` identifies the fit that begins at `start`."""
         if path is None:
             return cls(None)
         result = cls(Checkpoint(Path(path), Checkpoint.key_of(*key)))
@@ -124,7 +124,7 @@ class Evaluations:
         return result
 
     def read(self, start: Mapping[str, Tensor]) -> int:
-        """Load the evaluations in the file, if there is one, and return their number."""
+        """Load the evaluations from the file, if it exists, and return their number."""
         assert self.checkpoint is not None
         size = sum(value.numel() for value in start.values())
         rows = torch.zeros(0, size, dtype=torch.float64)
@@ -144,7 +144,7 @@ class Evaluations:
         return lengths.pop()
 
     def recorded(self, objective: Objective) -> Objective:
-        """Wrap an objective to use recorded evaluations and to record new ones."""
+        """Wrap an objective so that it uses recorded evaluations and records new ones."""
         checkpoint = self.checkpoint
         if checkpoint is None:
             return objective
@@ -168,7 +168,7 @@ class Evaluations:
         return again
 
     def write(self) -> None:
-        """Write all evaluations so far, up to the first non-finite one."""
+        """Write all evaluations made so far, up to the first non-finite one."""
         if self.checkpoint is not None and self._finite():
             self.checkpoint.write(self._tensors())
 
@@ -183,7 +183,7 @@ class Evaluations:
 
 
 def _layout(tensors: Mapping[str, Tensor], growing: Container[str]) -> dict[str, tuple[object, ...]]:
-    """Return type and shape of tensors by name, without the length of growing ones."""
+    """Return the type and shape of each tensor by name, omitting the lengths of tensors in `growing`."""
     return {name: (x.dtype, x.ndim, *x.shape[1 if name in growing else 0 :]) for name, x in tensors.items()}
 
 
@@ -204,7 +204,7 @@ def _evaluated(
 
 
 class _StoredGradient(torch.autograd.Function):
-    """Value with a known gradient."""
+    """A value whose gradient is known."""
 
     @staticmethod
     def forward(ctx: Any, value: Tensor, gradient: Tensor, *tensors: Tensor) -> Tensor:
@@ -226,7 +226,7 @@ def _read(path: Path) -> tuple[dict[str, Tensor], str | None]:
             data = file.read(CHECKPOINT_BYTES + 1)
         if len(data) > CHECKPOINT_BYTES:
             raise ModelError(f"{path}: too large for a checkpoint", got=f"> {CHECKPOINT_BYTES} bytes")
-        # Of one content: a library that opens the file twice may see two versions of it.
+        # Read once: a library that opens the file twice may see two different versions of it.
         tensors = safetensors.torch.load(data)
         header = json.loads(data[8 : 8 + int.from_bytes(data[:8], "little")])
         return tensors, header.get("__metadata__", {}).get("key")

@@ -1,8 +1,8 @@
 """Conversion of frozen descriptions, such as kernels and force priors, to JSON and back.
 
 Only classes in a given table are written and read, field by field. A description that contains Python code
-(an operator, a function) has no JSON form and is rejected. Reading checks names and types and does not run
-code.
+(an operator or a function) has no JSON form and is rejected. Reading checks names and types and does not
+execute code.
 """
 
 from __future__ import annotations
@@ -16,15 +16,15 @@ from pydantic import ConfigDict, TypeAdapter, ValidationError
 from forcegp.errors import ModelError, check_name, near_names
 
 Classes = Mapping[str, type]
-"""Classes that may be written and read, by their name in the file."""
+"""Classes that may be written and read, keyed by their names in the file."""
 
 MAX_DEPTH = 40
-"""Maximum nesting depth; a sum of many kernels has one level per term."""
+"""Maximum nesting depth; a sum of kernels has one level per term."""
 _CHECK = ConfigDict(arbitrary_types_allowed=True, strict=True, allow_inf_nan=False)
 
 
 def encode(value: Any, classes: Classes) -> Any:
-    """Return a description as JSON-compatible values; `ModelError` for a class without a JSON form."""
+    """Return a description as JSON-compatible values; raise `ModelError` if a class has no JSON form."""
     names = {kind: name for name, kind in classes.items()}
     if type(value) in names:
         members = {field.name: encode(getattr(value, field.name), classes) for field in _written(value)}
@@ -40,7 +40,7 @@ def encode(value: Any, classes: Classes) -> Any:
 
 
 def decode(json: Any, classes: Classes, place: str, depth: int = 0, *, whole: bool = True) -> Any:
-    """Restore a description from `encode`, with defaults for missing fields unless `whole`.
+    """Restore a description returned by `encode`; missing fields take their defaults unless `whole` is set.
 
     Raises:
         ForceGPError: a field is missing, unknown or of the wrong type, or a class is unknown; the message
@@ -69,7 +69,7 @@ def decode(json: Any, classes: Classes, place: str, depth: int = 0, *, whole: bo
 
 
 def _written(kind: Any) -> list[Field[Any]]:
-    """Return the fields that define a description, without those added by learning."""
+    """Return the fields that define a description, excluding those added by learning."""
     return [field for field in fields(kind) if field.init]
 
 

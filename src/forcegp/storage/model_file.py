@@ -1,8 +1,8 @@
-"""Saved models: one safetensors file with a versioned header in its metadata and a hash of all its content.
+"""Saved models: one safetensors file whose metadata hold a versioned header and a hash of the whole file.
 
-The hash is the SHA-256 of the file with 64 zeros in place of the hash, so any changed bit in header or
-tensors is detected. A single `os.replace` replaces the file, so a reader sees the old model or the new one.
-Tensors are checked once, when the file is read.
+The hash is the SHA-256 of the file with 64 zeros in place of the hash, so any changed bit in the header or
+the tensors is detected. The file is replaced by a single `os.replace`, so a reader sees either the old model
+or the new one. Tensors are checked once, when the file is read.
 """
 
 from __future__ import annotations
@@ -24,18 +24,18 @@ from forcegp.errors import ModelError
 from forcegp.files import Header, M, Record, atomic_file, validated
 from forcegp.limits import HEADER_BYTES, MODEL_BYTES, TENSORS
 from forcegp.resources import announce_memory
-from forcegp.storage.system import MAY_BE_INFINITE, PREFIX, pack_system
+from forcegp.storage.system import MAY_BE_INFINITE, pack_system
 
 TYPES = (torch.float64, torch.float32, torch.int64, torch.bool)
-"""Data types of tensors in a model."""
+"""Data types allowed for the tensors of a model."""
 
 _MAY_BE_INFINITE = re.compile(rf"(system|start)\.({'|'.join(MAY_BE_INFINITE)})")
 _POSITIVE = re.compile(r"(data\.\d+|training)\.noise_std|std\.[^.]+|scale\..+\.std\.[^.]+")
-"""Names of positive tensors: standard deviations of the noise and scales of inputs."""
+"""Names of tensors that must be positive: standard deviations of the noise and of scaled inputs."""
 
 
 def check_tensors(tensors: Mapping[str, Tensor], source: str) -> None:
-    """Check number, types and values of tensors (such as positive standard deviations), but not shapes."""
+    """Check the number, types and values of tensors, for example that standard deviations are positive."""
     if len(tensors) > TENSORS:
         raise ModelError(f"{source}: too many tensors", expected=f"at most {TENSORS}", got=len(tensors))
     for name, value in tensors.items():
@@ -57,14 +57,14 @@ def check_tensors(tensors: Mapping[str, Tensor], source: str) -> None:
 
 SUFFIX = ".safetensors"
 HEADER = "forcegp"
-"""Metadata key for the hash and the JSON header."""
+"""Metadata key under which the hash and the JSON header are stored."""
 NO_HASH = "0" * 64
 COPIES = 3
-"""Number of copies of a model in memory: the bytes of its file, and tensors before and after alignment."""
+"""Copies of a model in memory during reading: the file content, and tensors before and after alignment."""
 
 
 class ModelHeader(Header):
-    """Header of a saved model: `Model.kind`, its settings, and its system as returned by `pack_system`."""
+    """Header of a saved model: its `Model.kind`, settings, and system (as returned by `pack_system`)."""
 
     FORMAT: ClassVar[str] = "forcegp-model"
     VERSION: ClassVar[int] = 3
@@ -74,12 +74,12 @@ class ModelHeader(Header):
     system: dict[str, Any]
 
     def settings_as(self, kind: type[M], source: str) -> M:
-        """Validate the settings of a saved model; a `ModelError` names file and field."""
+        """Validate the settings of a saved model; if invalid, a `ModelError` names the file and the field."""
         return validated(kind, self.settings, source, ModelError, ("settings",))
 
 
 def model_path(path: str | Path) -> Path:
-    """Return the path of a model with the suffix `.safetensors`."""
+    """Return the path of a model, with the suffix `.safetensors` appended if it is missing."""
     path = Path(path)
     if not path.name:
         raise ModelError("the path of a model has no name", expected="a file", got=repr(str(path)))
@@ -104,14 +104,14 @@ def write_model(
     settings: Record,
     tensors: Mapping[str, Tensor],
 ) -> None:
-    """Write a model file atomically; `DestinationError` if it cannot be written."""
+    """Write a model file atomically; raise `DestinationError` if the path is not writable."""
     data = model_bytes(kind, system, settings, tensors)
     with atomic_file(model_path(path)) as temporary:
         temporary.write_bytes(data)
 
 
 def read_model(path: str | Path) -> tuple[ModelHeader, dict[str, Tensor]]:
-    """Return header and tensors of a saved model and its system; `ModelError` if damaged or missing."""
+    """Return the header and tensors of a saved model; raise `ModelError` if it is damaged or missing."""
     file = model_path(path)
     try:
         if not file.is_file():
@@ -130,7 +130,7 @@ def read_model(path: str | Path) -> tuple[ModelHeader, dict[str, Tensor]]:
 
 
 def parse_model(data: bytes, source: str) -> tuple[ModelHeader, dict[str, Tensor]]:
-    """Return header and tensors from the content of a model file; `ModelError` if it is no valid model."""
+    """Return the header and tensors in the content of a model file; raise `ModelError` if it is invalid."""
     stated, _, text = _metadata(data, source).partition("\n")
     digest = _digest(data, stated)
     if digest != stated:
@@ -151,7 +151,7 @@ def parse_model(data: bytes, source: str) -> tuple[ModelHeader, dict[str, Tensor
 
 
 def _metadata(data: bytes, source: str) -> str:
-    """Return hash and header of a model from the metadata of a safetensors file."""
+    """Return the hash and the header of a model from the metadata of a safetensors file."""
     size = int.from_bytes(data[:8], "little")
     try:
         if not 0 < size <= min(len(data) - 8, HEADER_BYTES):
@@ -179,10 +179,5 @@ def _digest(data: bytes, stated: str) -> str:
 
 
 def _entry(digest: str) -> bytes:
-    """Return the hash entry in the header, which is unique since quotes in other entries are escaped."""
+    """Return the hash entry of the header, which is unique because quotes in other entries are escaped."""
     return f'"{HEADER}":"{digest}'.encode()
-
-
-def model_tensors(tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the tensors of the model without those of its system."""
-    return {name: value for name, value in tensors.items() if not name.startswith(PREFIX)}

@@ -1,4 +1,4 @@
-"""Options of models, shared by constructors, the table `[model]` of scenes, and saved files."""
+"""Options of models, shared by constructors, the table `[model]` of scene files, and saved models."""
 
 from __future__ import annotations
 
@@ -17,13 +17,13 @@ O = TypeVar("O", bound="KernelOptions")
 
 
 class Window(Record):
-    """Window of initial values around the parameters in the robot file.
+    """Window from which initial values are drawn, centred on the parameters in the robot file.
 
     Attributes:
-        relative: half width for logarithms of masses, moments and friction; 0.5 corresponds to a factor of
-            0.37 to 2.7 for the mass of a link, and of 0.61 to 1.65 for friction.
-        length: half width for centres of mass and other lengths [m].
-        angle: half width for rotations [rad].
+        relative: half-width for logarithms of masses, moments and friction; 0.5 corresponds to a factor
+            between 0.37 and 2.7 for the mass of a link, and between 0.61 and 1.65 for friction.
+        length: half-width for centres of mass and other lengths [m].
+        angle: half-width for rotations [rad].
     """
 
     relative: Width = 0.5
@@ -32,20 +32,20 @@ class Window(Record):
 
 
 class KernelOptions(Record):
-    """Options of models with kernels on the states.
+    """Options of models whose kernels depend on the state.
 
     Attributes:
-        standardize: whether to standardize kernel inputs, which the paper does not.
+        standardize: whether to standardize kernel inputs (the paper does not).
     """
 
     standardize: bool = True
 
     @classmethod
     def of(cls: type[O], values: Mapping[str, Any]) -> O:
-        """Select the fields from named values and check their types.
+        """Return the options contained in a mapping, after checking their types.
 
         Raises:
-            UnknownNameError: a value is not one of the valid names for the field.
+            UnknownNameError: a value is not one of the names allowed for its field.
             ModelError: a value is invalid.
         """
         known = {name: values[name] for name in cls.model_fields if name in values}
@@ -61,16 +61,16 @@ class KernelOptions(Record):
 
 
 class StructuredOptions(KernelOptions):
-    """Options of `StructuredGP` that are plain values.
+    """Options of `StructuredGP` with plain values.
 
-    Each field is also an argument of the constructor, a key of `[model]` and a setting of saved models. Only
-    the signature of the constructor repeats the fields.
+    Each field is also a constructor argument, a key of `[model]` and a setting of saved models. The fields
+    are repeated only in the constructor signature.
 
     Attributes:
-        inference: type of inference; `"auto"` depends on the number of samples.
+        inference: type of inference; `"auto"` chooses it according to the number of samples.
         inducing_points: maximum number of inducing points per prior.
-        inertia: `"file"`, or `"auto"` to identify the inertia if the log supports it; `None` is `"auto"` for
-            automatically selected priors, and otherwise `"file"`.
+        inertia: `"file"`, or `"auto"` to identify the inertia if the log supports it; `None` means `"auto"`
+            if priors are selected automatically, and `"file"` otherwise.
     """
 
     inference: Literal["auto", "exact", "sparse"] = "auto"

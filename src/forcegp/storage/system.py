@@ -1,8 +1,8 @@
-"""Storage of a constrained system as JSON and tensors, which makes a saved model self-contained.
+"""Storage of a constrained system as JSON and tensors, so that a saved model is self-contained.
 
 The robot is saved as the tensors of `RobotModel`, bit for bit. Constraints that the user defines in Python
-(an `ImplicitSurface`, a subclass of `Constraint`) cannot be saved. The file contains placeholders, and the
-caller passes a system with these constraints when reading.
+(an `ImplicitSurface` or a subclass of `Constraint`) cannot be saved. The file contains placeholders for them,
+and the caller supplies a system with these constraints when the file is read.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from forcegp.files import Record, validated
 from forcegp.robot.model import RobotModel
 
 SURFACES = get_args(get_args(SurfaceSchema)[0])
-"""Surfaces that can be saved."""
+"""Classes of surfaces that can be saved."""
 
 
 def _floats(value: object) -> object:
@@ -54,7 +54,7 @@ class RobotRecord(Record):
 
 
 class ContactFields(Record):
-    """A point of the robot, or a ball of given `radius` around it, that may be in contact with a surface."""
+    """A point on the robot, or a ball of the given `radius` around it, that may touch a surface."""
 
     name: str
     frame: str
@@ -70,7 +70,7 @@ class ContactFields(Record):
 
 
 class ConnectionFields(Record):
-    """Two coincident points; without `other_frame`, the second is fixed in the world."""
+    """Two coincident points, the second fixed in the world if `other_frame` is `None`."""
 
     name: str
     frame: str
@@ -96,7 +96,7 @@ class PointConnectionRecord(ConnectionFields):
 
 
 class UnsavedRecord(Record):
-    """Placeholder for a constraint defined in Python code."""
+    """Placeholder for a constraint that is defined in Python code."""
 
     type: Literal["unsaved"] = "unsaved"
     name: str
@@ -125,7 +125,7 @@ def _record(contact: Constraint) -> ConstraintRecord:
 
 
 PREFIX = "system."
-"""Name prefix of the robot's tensors."""
+"""Prefix of the names of the robot's tensors."""
 SHAPES: dict[str, tuple[str | int, ...]] = {
     "placement_rotation": ("nq", 3, 3),
     "placement_position": ("nq", 3),
@@ -138,20 +138,20 @@ SHAPES: dict[str, tuple[str | int, ...]] = {
     "base_position": (3,),
     "gravity": (3,),
 }
-"""Shapes of a robot's tensors that do not have one number per joint."""
+"""Shapes of those robot tensors that do not consist of one number per joint."""
 MAY_BE_INFINITE = ("lower", "upper", "velocity_limit", "effort_limit")
 
 
 def pack_system(system: ConstrainedSystem) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Return a system as a JSON object, and CPU copies of the tensors of its robot (`system.<field>`)."""
+    """Return a system as a JSON object, and CPU copies of its robot's tensors (named `system.<field>`)."""
     record = SystemRecord(
         robot=RobotRecord.model_validate(system.robot),
         contacts=tuple(map(_record, system.contacts)),
         baumgarte=system.baumgarte,
     )
     tensors = {
-        PREFIX + name: getattr(system.robot, name).detach().to("cpu", copy=True).contiguous()
-        for name in robot_tensors(system.robot)
+        PREFIX + name: x.detach().to("cpu", copy=True).contiguous()
+        for name, x in system.robot.tensors.items()
     }
     return record.model_dump(mode="json"), tensors
 
@@ -162,10 +162,10 @@ def unpack_system(
     source: str,
     fallback: ConstrainedSystem | None = None,
 ) -> ConstrainedSystem:
-    """Restore a system from `pack_system`, with constraints that cannot be saved taken from `fallback`.
+    """Restore a system returned by `pack_system`; constraints that cannot be saved are taken from `fallback`.
 
     Raises:
-        ModelError: a field or tensor is missing or invalid, or an unsaved constraint is missing.
+        ModelError: a field or tensor is missing or invalid, or `fallback` lacks an unsaved constraint.
     """
     record = validated(SystemRecord, dict(json), source, ModelError, ("system",))
     robot = _robot(record.robot, tensors, source)
@@ -223,7 +223,7 @@ def take(
     *,
     finite: bool = True,
 ) -> Tensor:
-    """Return a tensor of a saved model; `ModelError` unless it is finite and has the shape (`None`: any)."""
+    """Return a saved tensor; raise `ModelError` unless it is finite and has the given shape (`None`: any)."""
     if name not in tensors:
         raise ModelError(f"{source}: tensor {name!r} is missing")
     value = tensors[name]
@@ -238,17 +238,10 @@ def take(
     return value
 
 
-def robot_tensors(robot: RobotModel) -> list[str]:
-    """Return the names of the fields of a robot that are tensors."""
-    names = [field.name for field in dataclasses.fields(robot)]
-    return [name for name in names if isinstance(getattr(robot, name), Tensor)]
-
-
 def take_robot(tensors: Mapping[str, Tensor], prefix: str, like: RobotModel, source: str) -> RobotModel:
-    """Return a robot with tensors named `<prefix><field>`, checked by `take`, and other fields copied."""
+    """Return a robot built from the tensors `<prefix><field>`, checked by `take`; copy all other fields."""
     fields = {}
-    for name in robot_tensors(like):
-        value, finite = getattr(like, name), name not in MAY_BE_INFINITE
-        shape = tuple(value.shape)
+    for name, value in like.tensors.items():
+        shape, finite = tuple(value.shape), name not in MAY_BE_INFINITE
         fields[name] = take(tensors, prefix + name, shape, value.dtype, source, finite=finite)
     return like.replace(**fields)

@@ -1,1 +1,1 @@
-"""3D view of a robot, its surfaces, contact forces and predicted paths in the browser."""
+"""3D view in the browser, showing a robot, its surfaces, contact forces and predicted paths."""

@@ -1,4 +1,4 @@
-"""Page of an exciting motion with a 3D view, its limits, and the expected information."""
+"""Page that shows an exciting motion in a 3D view, its use of the limits, and the expected information."""
 
 from __future__ import annotations
 
@@ -20,19 +20,13 @@ from forcegp.view.motion import MEAN, Motion, Path3D, pictures, tip_path
 from forcegp.view.page import SURFACE, content_of, solid
 
 MOST = 1500
-"""Number of instants in a curve."""
+"""Maximum number of points in a curve."""
 
 
 def draw_limits(result: Excitation) -> Picture:
-    """Plot position, velocity, acceleration and torque of each joint as fractions of their limits."""
-    limits, motion = result.limits, result.motion[:: -(-len(result.motion) // MOST)]
-    middle, half = 0.5 * (limits.low + limits.high), 0.5 * (limits.high - limits.low)
-    curves = {
-        "position": (motion.q - middle) / half,
-        "velocity": motion.qd / limits.velocity,
-        "acceleration": motion.qdd / limits.acceleration,
-        "torque": motion.tau / limits.torque,
-    }
+    """Plot the position, velocity, acceleration and torque of each joint as fractions of their limits."""
+    motion = result.motion[:: -(-len(result.motion) // MOST)]
+    curves = result.limits.shares(motion.q, motion.qd, motion.qdd, motion.tau)
 
     def paint(figure: Figure) -> None:
         for axes, (name, values) in zip(figure.subplots(4, 1, sharex=True), curves.items(), strict=True):
@@ -50,7 +44,7 @@ def draw_limits(result: Excitation) -> Picture:
 
 
 def expected_table(result: Excitation) -> Table:
-    """Return a table of the standard deviation of the torque in the region, before and after the log."""
+    """Return a table of the expected torque standard deviation in the region, before and after the motion."""
     head = ["joint"]
     columns: list[list[float]] = []
     for part in ("all", "links", "friction"):
@@ -72,7 +66,7 @@ def write_excitation(
     boxes: Array = np.zeros((0, 6)),  # noqa: B008
     title: str = "forcegp",
 ) -> Path:
-    """Write the page of a motion as one self-contained HTML file."""
+    """Write the page for an exciting motion as a single self-contained HTML file."""
     motion = result.motion
     rows = pictures(motion.t)
     paths = [Path3D(MEAN, tip_path(system, motion.q[rows]))]

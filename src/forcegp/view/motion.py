@@ -28,9 +28,9 @@ LOGGED, MEAN, SAMPLE = "logged", "predicted", "sampled"
 
 @dataclass(frozen=True)
 class Force:
-    """Normal force of a contact in each frame, with its point of application `(k, 3)` [m] and normal.
+    """Normal force of a contact in each frame, its point of application `(k, 3)` [m] and the surface normal.
 
-    `value` `(k,)` [N] is NaN if the contact is open; `std` is 0 if unknown.
+    `value` `(k,)` [N] is NaN while the contact is open; `std` is 0 if unknown.
     """
 
     contact: str
@@ -42,7 +42,7 @@ class Force:
 
 @dataclass(frozen=True)
 class Path3D:
-    """Path of the tip `(n, 3)` [m]; its kind is `logged`, `predicted` or `sampled`."""
+    """Path of the tip `(n, 3)` [m]; `kind` is `"logged"`, `"predicted"` or `"sampled"`."""
 
     kind: str
     points: Array
@@ -60,14 +60,14 @@ class Motion:
 
 
 def at_rest(system: ConstrainedSystem) -> Motion:
-    """Return a motionless robot at q = 0, or at the nearest position within its limits."""
+    """Return the robot at rest at q = 0, or at the nearest position within its limits."""
     robot = system.robot
     q = torch.zeros(1, robot.nq, dtype=robot.dtype).clamp(robot.lower.cpu(), robot.upper.cpu())
     return Motion(system, np.zeros(1), q)
 
 
 def of_log(system: ConstrainedSystem, data: Dataset, model: Predictor | None = None) -> Motion:
-    """Return the logged motion, with a predicted or logged force; `DataError` if joints do not match."""
+    """Return the logged motion with predicted or logged forces; raise `DataError` if the joints differ."""
     data = data.select(system.robot.joint_names)
     if not len(data):
         raise DataError("there is no motion to display", expected="one row or more", got="none")
@@ -78,7 +78,7 @@ def of_log(system: ConstrainedSystem, data: Dataset, model: Predictor | None = N
 
 
 def with_rollout(motion: Motion, path: Rollout) -> Motion:
-    """Add the paths of a rollout to a motion: the mean and one per function sample."""
+    """Add the tip paths of a rollout to a motion: one for the mean and one for each function sample."""
     paths = [Path3D(MEAN, tip_path(motion.system, path.q.reshape(-1, path.q.shape[-1])))]
     if path.samples is not None:
         sampled = path.samples.q.reshape(-1, *path.samples.q.shape[-2:])
@@ -87,27 +87,27 @@ def with_rollout(motion: Motion, path: Rollout) -> Motion:
 
 
 def sampled_rollout(model: Predictor, data: Dataset, samples: int, seconds: float) -> Rollout:
-    """Simulate a model under the logged torques from the first state of a trajectory."""
+    """Simulate a model from the first state of a trajectory, applying the logged torques."""
     options = RolloutOptions(sampling_period(data), on_divergence="keep")
     return replayed(model, data, samples if model.has_function_samples else 0, seconds, options=options)
 
 
 def tip_path(system: ConstrainedSystem, q: Tensor) -> Array:
-    """Return the positions of the tip `(n, 3)`, up to the divergence of a trajectory [m]."""
+    """Return the positions of the tip `(n, 3)` [m], up to the point where a trajectory diverges."""
     sound = int(torch.isfinite(q).all(-1).long().cumprod(0).sum())
     frame, point = tip_of(system)
     return as_array(kinematics.point_position(system.robot, q[:sound], frame, tuple(point)))
 
 
 def pictures(t: Tensor) -> Tensor:
-    """Return the displayed rows: the last row before the time of each frame."""
+    """Return the indices of the rows to display: for each frame, the last row logged up to its time."""
     period = 1.0 / FRAMES_PER_SECOND
     times = torch.arange(float(t[0]), float(t[-1]) + 0.5 * period, period, dtype=t.dtype)
     return torch.unique((torch.searchsorted(t.contiguous(), times, right=True) - 1).clamp(0, len(t) - 1))
 
 
 def _forces(system: ConstrainedSystem, data: Dataset, model: Predictor | None) -> list[Force]:
-    """Return the normal force of each contact with a surface."""
+    """Return the normal force at each contact with a surface."""
     if not system.contacts:
         return []
     active = data.active(system.contact_names)
@@ -118,14 +118,13 @@ def _forces(system: ConstrainedSystem, data: Dataset, model: Predictor | None) -
     if model is not None and model.force_field() is not None and never != set(system.contact_names):
         prediction = model.predict(data.q, data.qd, data.tau, "multiplier", active=active)
         value, std = prediction.mean, prediction.std
-    forces, row, logged = [], 0, data.contact_extras.get("multiplier", {})
+    forces, logged = [], data.contact_extras.get("multiplier", {})
     for i, contact in enumerate(system.contacts):
-        point = eom.contact_points.get(contact.name)
+        point, row = eom.contact_points.get(contact.name), system.rows[contact.name].start
         multiplier = logged.get(contact.name) if value is None else value[:, row]
         if point is not None and multiplier is not None:
             spread = torch.zeros_like(multiplier) if std is None else std[:, row]
             shown = torch.where(active[:, i], multiplier, torch.nan)
             parts = (point.position, point.normal, shown, spread)
             forces.append(Force(contact.name, *(as_array(x) for x in parts)))
-        row += contact.rows
     return forces

@@ -1,4 +1,4 @@
-"""The 3D view as a self-contained HTML file, or served to a browser on this computer."""
+"""The 3D view, written as a self-contained HTML file or served to a browser on this computer."""
 
 from __future__ import annotations
 
@@ -24,19 +24,19 @@ from forcegp.view.motion import LOGGED, MEAN, Force, Motion
 
 ROBOT, BASE_COLOUR, SURFACE = "#607d96", "#464e56", "#e2cd96"
 OPACITY = 0.45
-"""Opacity of the solids, which keeps a force inside the tool visible."""
+"""Opacity of the solids, chosen so that a force drawn inside the tool remains visible."""
 PATHS = {LOGGED: ("#222222", 2.0), MEAN: ("#0072b2", 2.0)}
 SAMPLED = ("#82b9dc", 1.0)
 ARROW = 0.3
 """Length of the longest arrow [m]."""
 MARGIN = 0.15
-"""Margin of a surface around the path of the tip [m]."""
+"""Margin by which a drawn surface extends beyond the path of the tip [m]."""
 LOCAL, PORT = "127.0.0.1", 8080
 """Address of the server, accessible from this computer only."""
 
 
 def content_of(motion: Motion, shapes: Sequence[Shape]) -> dict[str, Any]:
-    """Return a motion as input for `report.animation`: robot, surfaces, paths, and forces with labels."""
+    """Return a motion as input to `report.animation`: the robot, surfaces, paths, and labelled forces."""
     system, frames = motion.system, range(len(motion.t))
     robot, poses = system.robot, kinematics.link_poses(system.robot, motion.q)
     R = torch.cat([robot.base_rotation.expand(len(frames), 1, 3, 3), poses.rotation], dim=1)
@@ -65,7 +65,7 @@ def content_of(motion: Motion, shapes: Sequence[Shape]) -> dict[str, Any]:
 
 
 def solid(points: Array, colour: str, link: int | None) -> dict[str, Any]:
-    """Return a convex solid for an animation, with corners in the frame of a link or the world."""
+    """Return a convex solid for an animation, with its corners given in the frame of a link or the world."""
     style = {"colour": colour, "opacity": OPACITY, "link": link}
     return {"points": rounded(torch.from_numpy(points)), **style}
 
@@ -78,7 +78,7 @@ def _around(motion: Motion, contact: str, tip: Array) -> Array:
 
 
 def _patch(surface: Surface, points: Array) -> Array:
-    """Return the corners of a plane patch below the points, a sphere, or a cylinder along the points."""
+    """Return the corners of a planar patch below the points, a sphere, or a cylinder along the points."""
     if isinstance(surface, Plane):
         R = turn_z(np.asarray(surface.normal))
         local = points @ R
@@ -119,22 +119,22 @@ def force_text(force: Force, k: int) -> str:
 
 
 def view_page(motion: Motion, shapes: Sequence[Shape], title: str) -> str:
-    """Return the self-contained HTML of a motion."""
+    """Return a motion as self-contained HTML."""
     label = "The robot moving, with its surfaces, contact forces and paths of the tip"
     drawn = animation(content_of(motion, shapes), label)
     return render("view.html.j2", title=title, animation=drawn, script=animation_source())
 
 
 def write_view(path: str | Path, motion: Motion, shapes: Sequence[Shape], title: str = "forcegp") -> Path:
-    """Write a motion as one self-contained HTML file."""
+    """Write a motion as a single self-contained HTML file."""
     write_text(path, view_page(motion, shapes, title))
     return Path(path)
 
 
 def serve(page: str, port: int = PORT, say: Callable[[str], None] = print) -> None:
-    """Serve a page to a browser on this computer until interrupted; `say` receives its address.
+    """Serve a page to a browser on this computer until interrupted; `say` is called with its address.
 
-    Other users of the computer cannot guess the address, and requests for other host names are rejected.
+    Other users of the computer cannot guess the address, and requests that name other hosts are rejected.
     """
     path = f"/{secrets.token_urlsafe(16)}"
 

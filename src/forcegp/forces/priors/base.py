@@ -1,6 +1,6 @@
-"""Gaussian-process priors on unknown forces, defined by direction, inputs and kernel.
+"""Gaussian-process priors on unknown forces, each defined by a direction, inputs and a kernel.
 
-`OperatorForcePrior` is a prior on any force with a user-defined operator.
+`OperatorForcePrior` is a prior on an arbitrary force with a user-defined operator.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ JOINT, CONTACT, CONSTRAINT = "joint", "contact", "constraint"
     constraint (the range of Aᵀ), which does not affect accelerations in contact."""
 NOISE, ANALYTICAL, COULOMB = "noise", "analytical_parameters", "coulomb"
 RESERVED = (NOISE, ANALYTICAL, COULOMB)
-"""Prefixes of other learned parameters besides the hyperparameters of priors."""
+"""Prefixes of learned parameters other than the hyperparameters of the priors."""
 
 MIXING = "mixing"
 """Suffix of the names of learned operator parameters."""
@@ -36,7 +36,7 @@ class ForcePrior(ABC):
 
     The generalized force is E(x) f(x); `target` is the part of Q̄ to which it belongs: Q, Q_z, or Q along the
     constraint. A subclass has a `name`, a `kernel` and a `target`, and implements `outputs`, `features` and
-    `operator`; classes listed in `CLASSES` of `models/structured_file.py` can be saved.
+    `operator`. Only classes listed in `CLASSES` of `models/structured_file.py` can be saved.
     """
 
     name: str
@@ -45,11 +45,11 @@ class ForcePrior(ABC):
     coupled: bool = False
     """Whether the prior includes Coulomb friction proportional to the multiplier."""
     vectors: tuple[str, ...] = ()
-    """Vector inputs, standardized by one scale so that results do not depend on the axes."""
+    """Vector inputs, standardized by a common scale so that results do not depend on the axes."""
     commensurate: bool = True
     """Whether all components of f have the same unit."""
     sticks: bool = False
-    """Whether the force includes dry joint friction, which `States.slip` separates."""
+    """Whether the force includes dry joint friction, which `States.slip` makes separable."""
     in_time: bool = False
     """Whether the force is a function of time, which correlates the samples of a trajectory."""
     scaled: bool = True
@@ -77,11 +77,11 @@ class ForcePrior(ABC):
         """Return E(x) `(n, nq, outputs)`."""
 
     def initial_parameters(self, robot: RobotModel) -> dict[str, Tensor]:
-        """Initial values of learned parameters of the operator E, by name; empty for most priors."""
+        """Return initial values of the learned parameters of E, keyed by name; empty for most priors."""
         return {}
 
     def with_parameters(self, params: Mapping[str, Tensor]) -> ForcePrior:
-        """Return the prior with learned parameters of its operator (see `initial_parameters`)."""
+        """Return the prior with the given learned parameters of its operator (see `initial_parameters`)."""
         return self
 
     def check(self, system: ConstrainedSystem) -> None:  # noqa: B027  (most priors fit every system)
@@ -92,7 +92,7 @@ def check_inputs(name: str, inputs: tuple[str, ...], valid: tuple[str, ...]) -> 
     """Check the inputs of a force.
 
     Raises:
-        ModelError: there is no input.
+        ModelError: there are no inputs.
         UnknownNameError: an input is unknown.
     """
     if not inputs:
@@ -102,11 +102,11 @@ def check_inputs(name: str, inputs: tuple[str, ...], valid: tuple[str, ...]) -> 
 
 
 def check_priors(priors: tuple[ForcePrior, ...], system: ConstrainedSystem) -> None:
-    """Check that priors match a system and have distinct names, the prefixes of their hyperparameters.
+    """Check that priors match a system and have distinct names, which are prefixes of their hyperparameters.
 
     Raises:
-        ModelError: there is no prior, two priors share a name, a name is not one word, or a prior shares the
-            hyperparameters of a missing one.
+        ModelError: there are no priors, two priors share a name, a name is not one word, or a prior shares
+            the hyperparameters of a missing prior.
         UnknownNameError: a prior names a contact that the system does not have.
     """
     names = [prior.name for prior in priors]
@@ -130,7 +130,7 @@ def check_priors(priors: tuple[ForcePrior, ...], system: ConstrainedSystem) -> N
 
 @dataclass(frozen=True)
 class OperatorForcePrior(ForcePrior):
-    """A prior on any force with a user-defined operator ("any analytical tensor of appropriate size").
+    """A prior on a force with a user-defined operator ("any analytical tensor of appropriate size").
 
     Args:
         name: prefix of the hyperparameters.

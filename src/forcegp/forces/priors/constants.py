@@ -10,19 +10,20 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError
 from forcegp.forces.priors.base import JOINT, ForcePrior
+from forcegp.forces.priors.joint import ConstantForcePrior
 from forcegp.forces.quantities import States
 from forcegp.gp.kernels import Constant, Kernel
 from forcegp.robot.model import RobotModel
 
 
 @dataclass(frozen=True)
-class DrivePrior(ForcePrior):
+class DrivePrior(ConstantForcePrior):
     """A prior on relative errors s δ_i of drive constants (torque constant times gear ratio).
 
     Q_i = s τ_i δ_i with δ_i ~ N(0, 1). Logged currents are converted to torques with nominal drive constants
-    (`torque_constant`, `gear_ratio` in a mapping); the true constants are (1 + s δ_i) times these. Motion
-    depends only on the ratio of drive constants to inertia, so provide known masses, or record a known
-    payload.
+    (`torque_constant` and `gear_ratio` in a mapping); the true constants are (1 + s δ_i) times these. Motion
+    depends only on the ratio of drive constants to inertia, so specify known masses or record a log with a
+    known payload.
 
     Args:
         std: relative standard deviation s of the drive constants.
@@ -54,9 +55,6 @@ class DrivePrior(ForcePrior):
     def outputs(self, robot: RobotModel) -> int:
         return robot.nq
 
-    def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
-        return {"one": torch.zeros_like(at.q[:, :1])}
-
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
         return self.std * torch.diag_embed(at.tau)
 
@@ -69,7 +67,7 @@ class PerRecording(ForcePrior):
     use the constants of the last recording.
 
     Args:
-        prior: prior on the force in each recording, which provides the name of the hyperparameters.
+        prior: prior on the force in each recording, which also provides the names of the hyperparameters.
         starts: first segment of each recording, as in `Dataset.segment`.
 
     Example:
@@ -79,7 +77,7 @@ class PerRecording(ForcePrior):
         8
 
     Raises:
-        ModelError: the starts are not increasing, or the prior is not a prior on constants.
+        ModelError: the starts are not increasing, or `prior` is not a prior on constants.
     """
 
     prior: ForcePrior

@@ -1,14 +1,14 @@
 """Forces at a surface contact: tangential, normal, and Coulomb friction proportional to the multiplier.
 
 Contact forces do not depend on world axes: tangential vectors have two coordinates in a tangent frame of
-the surface. The frame at normal n is (R e_x, R e_y), with the smallest rotation R that takes e_z
+the surface. The frame at normal n is (R e_x, R e_y), where R is the smallest rotation that maps e_z
 to n. Forces learned on one surface therefore transfer to a raised, tilted or curved one. A force normal to
-the surface changes no acceleration.
+the surface does not change the accelerations.
 
-Friction proportional to the normal force couples force and multiplier. With one contact, u = −J_Eᵀ s(v) and
-g = Lᵀ u, the equations λ = λ_K − Lᵀ Q_z and Q_z = μ λ u have the solution λ = λ_K / (1 + μ g), where λ_K is
-the multiplier without friction. Latent functions must enter the force linearly, but μ does not, so the
-operator is the secant at a given μ̂, u λ_K / (1 + μ̂ g).
+Friction proportional to the normal force couples force and multiplier. For a single contact with
+u = −J_Eᵀ s(v) and g = Lᵀ u, the equations λ = λ_K − Lᵀ Q_z and Q_z = μ λ u have the solution
+λ = λ_K / (1 + μ g), where λ_K is the multiplier without friction. Latent functions must enter the force
+linearly, but μ does not, so the operator is the secant u λ_K / (1 + μ̂ g) at a given μ̂.
 
 A learned coefficient is coupled exactly. Let Q_z = Q_z′ + U λ, where a contact with friction coefficient μ
 has the column μ u, and let λ₀ = (A M⁻¹ Aᵀ)⁺ b − Lᵀ (Q + Q_z′) be the multiplier without this friction. Then
@@ -18,9 +18,9 @@ map of the forces, with operators and offset B_Q, B_z, o replaced by
     B_Q − G Lᵀ,  B_z − G Lᵀ,  o + G (A M⁻¹ Aᵀ)⁺ b   with   G = B_z U (I + LᵀU)⁻¹.
 
 Learned μ and ε are uncertain. To first order in their errors δ, friction at fixed λ changes by
-∂(μ u λ)/∂(log μ, log ε) δ, a contact force to which λ responds as to any other. Hence δ is another latent
-force; the posterior over all of them is a Laplace approximation that marginalises δ, and the variance of
-every quantity z contains (∂z/∂δ)² Var δ.
+∂(μ u λ)/∂(log μ, log ε) δ, a contact force to which λ responds as to any other. Hence δ is an additional
+latent force. The joint posterior of all latent forces is a Laplace approximation that marginalises δ, and the
+variance of every quantity z includes (∂z/∂δ)² Var δ.
 """
 
 from __future__ import annotations
@@ -41,14 +41,14 @@ from forcegp.constraints.gauss import ContactPoint, tangent_frame
 from forcegp.errors import ModelError
 from forcegp.forces.measurements import Measurement
 from forcegp.forces.priors.base import CONSTRAINT, CONTACT, COULOMB, ForcePrior, check_inputs
-from forcegp.forces.priors.joint import JointForcePrior
+from forcegp.forces.priors.joint import ConstantForcePrior, JointForcePrior
 from forcegp.forces.quantities import AffineMap, States
 from forcegp.gp.kernels import Constant, Kernel, SquaredExponential
 from forcegp.robot.model import RobotModel
 
 WIDTHS = {"position": 2, "velocity": 2, "speed": 1}
-"""Columns of each input: tangential coordinates of the contact point [m] and of its velocity [m/s], and how
-fast it slides [m/s].
+"""Number of columns of each input: tangential coordinates of the contact point [m] and of its velocity [m/s],
+and sliding speed [m/s].
 """
 TERMS = ("viscous", "dry", "coulomb", "stribeck", "torsion")
 """Friction terms in the order of the components of the latent function."""
@@ -99,7 +99,7 @@ class SurfaceForcePrior(ForcePrior):
         """Return E(x) `(n, nq, outputs)` while the contact is closed and slides."""
 
     def _touching(self, system: ConstrainedSystem, at: States) -> ContactPoint:
-        """Return the contact point; raise the errors of `check` if the contact has none."""
+        """Return the contact point; if the contact has none, raise the errors of `check`."""
         if self.contact not in at.eom.contact_points:
             self.check(system)
         return at.eom.contact_points[self.contact]
@@ -115,9 +115,9 @@ def _along(point: ContactPoint, name: str) -> Tensor:
 
 @dataclass(frozen=True)
 class ContactForcePrior(SurfaceForcePrior):
-    """A prior on the dissipative force F_z at a contact, F_z = t_1 f_1 + t_2 f_2 along the surface.
+    """A prior on the dissipative force at a contact along the surface, F_z = t_1 f_1 + t_2 f_2.
 
-    E = J_Eᵀ (t_1, t_2) while the contact is closed, and otherwise 0; t_1 and t_2 span the tangent plane at
+    E = J_Eᵀ (t_1, t_2) while the contact is closed, and 0 otherwise; t_1 and t_2 span the tangent plane at
     the contact point (`tangent_frame`).
 
     Args:
@@ -150,14 +150,14 @@ class SlidingFrictionPrior(SurfaceForcePrior):
     F_z = −θ_v v − (θ_d + λ (μ + μ_s e^{−|v|²/v_s²})) s(v), and the moment −θ_t λ s(ω_n) n about the normal.
 
     The unknowns are the scalar functions listed in `terms`: `viscous` θ_v [N s/m], `dry` θ_d [N], `coulomb`
-    μ, `stribeck` μ_s, `torsion` θ_t [m]. They need fewer samples than the components of a force. By default
+    μ, `stribeck` μ_s, `torsion` θ_t [m]. They need fewer samples than the components of a force. By default,
     they depend on the sliding speed, so they transfer to surfaces of any position, tilt and shape.
 
-    λ = max(λ_K, 0) / (1 + μ̂ g) with the multiplier λ_K of the analytical forces Q_K + τ without friction and
-    g = −Lᵀ J_Eᵀ s(v). This is exact for a single contact with friction −μ̂ λ s(v). Otherwise it neglects
-    second-order terms: μ (μ − μ̂), μ times any other friction of the contact, and μ times unknown joint
-    forces or the friction of other contacts. If unknown joint forces are large, prefer `dry`, or learn them
-    as analytical parameters.
+    λ = max(λ_K, 0) / (1 + μ̂ g), where λ_K is the multiplier under the analytical forces Q_K + τ without
+    friction, and g = −Lᵀ J_Eᵀ s(v). This is exact for a single contact with friction −μ̂ λ s(v). Otherwise, it
+    neglects second-order terms: μ (μ − μ̂), μ times any other friction of the contact, and μ times unknown
+    joint forces or the friction of other contacts. If unknown joint forces are large, prefer `dry`, or learn
+    them as analytical parameters.
 
     Args:
         contact: name of a surface contact of the system.
@@ -168,7 +168,7 @@ class SlidingFrictionPrior(SurfaceForcePrior):
         terms: friction terms.
         friction_coefficient: friction coefficient μ̂.
         stribeck_speed: Stribeck speed v_s [m/s].
-        torsion_smoothing: angular velocity about the normal below which torsional friction is smooth [rad/s].
+        torsion_smoothing: angular speed about the normal below which torsional friction is smoothed [rad/s].
         coupled: whether the mechanics include, in addition to `terms`, Coulomb friction −μ λ s(v) with a
             constant μ, which is learned together with its ε (`forces/priors/contact.py`).
 
@@ -230,13 +230,13 @@ class SlidingFrictionPrior(SurfaceForcePrior):
         return torch.stack([columns[term] for term in self.terms], dim=-1)
 
     def _load(self, system: ConstrainedSystem, at: States, u: Tensor) -> Tensor:
-        """Return the multiplier of the analytical forces with the friction μ̂ λ u, `(n, 1)`.
+        """Return the multiplier under the analytical forces and the friction μ̂ λ u, `(n, 1)`.
 
         Raises:
-            ModelError: the contact jams with this friction.
+            ModelError: this friction jams the contact.
         """
         contact = system.contact_names.index(self.contact)
-        row = sum(c.rows for c in system.contacts[:contact])
+        row = system.rows[self.contact].start
         free = at.eom.multiplier(at.eom.Q_K + at.tau)[:, row].clamp(min=0.0)
         gain = 1.0 + self.friction_coefficient * (at.eom.L[..., row] * u).sum(-1)
         if bool((gain[at.active[:, contact]] <= 0.0).any()):
@@ -247,7 +247,7 @@ class SlidingFrictionPrior(SurfaceForcePrior):
         return (free / gain)[:, None]
 
     def _spin(self, system: ConstrainedSystem, at: States) -> Tensor:
-        """Return the generalized force of a unit moment against the rotation about the normal, `(n, nq)`."""
+        """Return the generalized force of a unit moment that opposes rotation about the normal, `(n, nq)`."""
         contact = system.contact(self.contact)
         assert isinstance(contact, SurfaceContact)
         index, origin = (
@@ -262,14 +262,14 @@ class SlidingFrictionPrior(SurfaceForcePrior):
 
 @dataclass(frozen=True)
 class NormalForcePrior(ForcePrior):
-    """A joint force along the constraint, E = Aᵀ Lᵀ = I − P, without effect on accelerations in contact.
+    """A joint force along the constraint, E = Aᵀ Lᵀ = I − P, which does not affect accelerations in contact.
 
-    Since H Aᵀ = 0, a force Aᵀ g(x) changes the multiplier by −g(x) but no acceleration. A joint force prior
-    alone is overconfident along the normal. This independent process, with the hyperparameters of the joint
-    force prior, retains the uncertainty of that part unless, for example, a force sensor reduces it.
+    Since H Aᵀ = 0, a force Aᵀ g(x) changes the multiplier by −g(x) but not the accelerations. A joint force
+    prior alone is overconfident along the normal. This independent process shares its hyperparameters but
+    retains the uncertainty along the normal until a force sensor, for example, reduces it.
 
     Args:
-        like: the joint force prior that provides kernel, inputs and hyperparameters.
+        like: the joint force prior that provides the kernel, inputs and hyperparameters.
 
     Example:
         >>> from forcegp import JointForcePrior
@@ -299,20 +299,20 @@ class NormalForcePrior(ForcePrior):
 
 
 SHARP = 1e-6
-"""Smoothing speed small enough for friction to have its full magnitude [m/s]."""
+"""Smoothing speed that is small enough for friction to have its full magnitude [m/s]."""
 
 
 FRICTION_COEFFICIENT = 0.2
 """Initial value of a learned friction coefficient."""
 NEARLY_JAMMED = 0.95
-"""Largest friction coefficient relative to the one at which the contact jams."""
+"""Largest friction coefficient, relative to that at which the contact jams."""
 LEARNED = 2
-"""Number of learned friction parameters of a contact, μ and ε."""
+"""Number of learned friction parameters per contact, μ and ε."""
 
 
 @dataclass(frozen=True, eq=False)
 class CoulombFriction:
-    """Coulomb friction −μ λ s(v) of a surface contact, s(v) = v / √(|v|² + ε²).
+    """Coulomb friction −μ λ s(v) at a surface contact, with s(v) = v / √(|v|² + ε²).
 
     Attributes:
         contact: name of the contact.
@@ -331,7 +331,7 @@ def coulomb_keys(contact: str) -> tuple[str, str]:
 
 
 def initial_coulomb(priors: Iterable[ForcePrior], like: Tensor) -> dict[str, Tensor]:
-    """Start of learning friction, for contacts whose prior is coupled with the multiplier."""
+    """Return initial values of learned friction for contacts whose prior is coupled with the multiplier."""
     start = {}
     for prior in _coupled_priors(priors):
         coefficient, smoothing = coulomb_keys(prior.contact)
@@ -343,7 +343,7 @@ def initial_coulomb(priors: Iterable[ForcePrior], like: Tensor) -> dict[str, Ten
 def coulomb_of(
     priors: Sequence[ForcePrior], tensors: Mapping[str, Tensor], like: Tensor
 ) -> tuple[CoulombFriction, ...]:
-    """Return the friction from learned tensors, or its initial value."""
+    """Return contact friction with learned parameters, or with initial values if they are not learned."""
     values = initial_coulomb(priors, like) | dict(tensors)
     return tuple(
         CoulombFriction(prior.contact, *(values[key].exp() for key in coulomb_keys(prior.contact)))
@@ -356,10 +356,10 @@ def _coupled_priors(priors: Iterable[ForcePrior]) -> list[SlidingFrictionPrior]:
 
 
 @dataclass(frozen=True, eq=False)
-class CoulombErrorPrior(ForcePrior):
-    """Q_z = λ̂ ∂(μ u)/∂(log μ, log ε) δ, δ ~ N(0, 1): remaining uncertainty of a contact's friction.
+class CoulombErrorPrior(ConstantForcePrior):
+    """Remaining uncertainty of a contact's friction, Q_z = λ̂ ∂(μ u)/∂(log μ, log ε) δ with δ ~ N(0, 1).
 
-    λ̂ is the multiplier of the analytical forces with the learned friction. One e-fold is about the width of
+    λ̂ is the multiplier under the analytical forces and the learned friction. One e-fold is about the width of
     the weak priors on μ and ε (`forces/search.py`).
 
     Attributes:
@@ -379,9 +379,6 @@ class CoulombErrorPrior(ForcePrior):
     def outputs(self, robot: RobotModel) -> int:
         return LEARNED
 
-    def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
-        return {"one": torch.zeros_like(at.q[:, :1])}
-
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
         if self.contact not in system.contact_names:
             return at.q.new_zeros(*at.q.shape, LEARNED)
@@ -392,7 +389,7 @@ class CoulombErrorPrior(ForcePrior):
         )
         # μ λ̂, with λ̂ under Q_C + Q_G + Q_D + Q_u and all friction
         Q_bar = with_coulomb(system, at, at.eom.Q_K + at.tau, self.friction)
-        load = law.coefficient * at.eom.multiplier(Q_bar)[:, _row(system, self.contact)]
+        load = law.coefficient * at.eom.multiplier(Q_bar)[:, system.rows[self.contact].start]
         # ∂(μ u)/∂log μ = μ u, ∂s/∂log ε = −s ε²/(|v|² + ε²)
         fading = law.smoothing**2 / (v.square().sum(-1) + law.smoothing**2)
         return torch.stack([load, -load * fading], dim=-1)[:, None, :] * u[..., None]
@@ -410,10 +407,10 @@ def against_sliding(at: States, contact: str, smoothing: Tensor | float) -> Tens
 def coupled(
     system: ConstrainedSystem, at: States, z: AffineMap, friction: Sequence[CoulombFriction]
 ) -> AffineMap:
-    """Return the affine map of a quantity with Coulomb friction of contacts.
+    """Return the affine map of a quantity including Coulomb friction at the contacts.
 
     Args:
-        system: robot and contacts; friction of other contacts is ignored.
+        system: robot and contacts; friction of contacts that it does not have is ignored.
         z: the quantity without this friction.
         friction: Coulomb friction of contacts.
     """
@@ -430,7 +427,7 @@ def coupled(
 def with_coulomb(
     system: ConstrainedSystem, at: States, Q_bar: Tensor, friction: Sequence[CoulombFriction]
 ) -> Tensor:
-    """Add Coulomb friction to impressed forces Q̄ `(n, nq)`."""
+    """Add Coulomb friction at the contacts to impressed forces Q̄ `(n, nq)`."""
     gain = _gain(system, at, friction)
     if gain is None:
         return Q_bar
@@ -441,7 +438,7 @@ def with_coulomb(
 def coulomb_response(
     system: ConstrainedSystem, at: States, friction: Sequence[CoulombFriction]
 ) -> Tensor | None:
-    """Return ∂Q̄/∂Q = I − G Lᵀ `(n, nq, nq)`, the effect of joint forces on contact load; `None` for I."""
+    """Return ∂Q̄/∂Q = I − G Lᵀ `(n, nq, nq)`, the friction response to joint forces; `None` if it is I."""
     gain = _gain(system, at, friction)
     if gain is None:
         return None
@@ -455,12 +452,16 @@ def below_jamming(
     priors: Iterable[ForcePrior],
     bounds: Mapping[str, tuple[float, float]],
 ) -> dict[str, tuple[float, float]]:
-    """Return bounds that exclude jamming, 1 + μ Lᵀu > 0, at all training states with sliding."""
+    """Return bounds that exclude jamming at all sliding training states, such that 1 + μ Lᵀu > 0."""
     changed = dict(bounds)
     for prior in _coupled_priors(priors):
-        key, row = coulomb_keys(prior.contact)[0], _row(system, prior.contact)
+        key, row = coulomb_keys(prior.contact)[0], system.rows[prior.contact].start
         if key in changed:
-            gains = [_drag(m.at(system), prior.contact, row) for m in measurements]
+            # Lᵀu, the load relief by a unit friction force
+            states = (m.at(system) for m in measurements)
+            gains = [
+                (at.eom.L[..., row] * against_sliding(at, prior.contact, SHARP)).sum(-1) for at in states
+            ]
             # 1 + μ Lᵀu > 0, so μ < −1/Lᵀu wherever Lᵀu < 0
             worst = float(torch.cat(gains).min())
             low, high = changed[key]
@@ -469,18 +470,8 @@ def below_jamming(
     return changed
 
 
-def _drag(at: States, contact: str, row: int) -> Tensor:
-    """Return Lᵀu of a contact `(n,)`, the load relief by a unit friction force, negative for an increase."""
-    return (at.eom.L[..., row] * against_sliding(at, contact, SHARP)).sum(-1)
-
-
-def _row(system: ConstrainedSystem, contact: str) -> int:
-    """Return the row of a contact among the multipliers."""
-    return sum(c.rows for c in system.contacts[: system.contact_names.index(contact)])
-
-
 def _gain(system: ConstrainedSystem, at: States, friction: Sequence[CoulombFriction]) -> Tensor | None:
-    """Return U (I + LᵀU)⁻¹ `(n, nq, m)`, from frictionless multiplier to friction, or `None`."""
+    """Return U (I + LᵀU)⁻¹ `(n, nq, m)`, which maps the frictionless multiplier to friction, or `None`."""
     present = {f.contact: f for f in friction if f.contact in system.contact_names}
     if not present:
         return None

@@ -2,10 +2,10 @@
 
 Inverse dynamics is linear in the inertial parameters π: with π = π₀ + δ, M₀ q̈ − Q_C,0 − Q_G,0 + Y(q, q̇,
 q̈) δ = Q is an identity at the measured acceleration. Hence δ acts like a joint force −Y δ with a constant
-latent δ ~ N(0, S²), and least-squares identification with a ridge towards the file is a special case. A
-prediction uses the robot with the updated parameters; the remaining uncertainty acts through Y at the
-predicted acceleration. An unknown mass attached to a link is treated in the same way with the columns Y_k of
-that link for mass and first moment (Atkeson, An, Hollerbach 1986).
+latent δ ~ N(0, S²). Least-squares identification with a ridge penalty towards the file is a special case. A
+prediction uses the robot with the updated parameters, and the remaining uncertainty acts through Y at the
+predicted acceleration. An unknown mass attached to link k is treated in the same way, with the columns Y_k
+for the mass and first moment of that link (Atkeson, An, Hollerbach 1986).
 """
 
 from __future__ import annotations
@@ -20,7 +20,8 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError, check_name
-from forcegp.forces.priors.base import JOINT, ForcePrior
+from forcegp.forces.priors.base import JOINT
+from forcegp.forces.priors.joint import ConstantForcePrior
 from forcegp.forces.quantities import States
 from forcegp.gp.kernels import Constant, Kernel
 from forcegp.gp.optimise import LearningOptions, minimise
@@ -35,11 +36,11 @@ from forcegp.robot.inertia import (
 from forcegp.robot.model import RobotModel
 
 PER_LINK = 10
-"""Number of parameters per link: m, m c and the inertia about the link origin."""
+"""Number of parameters per link: m, m c, and the inertia about the link origin."""
 
 
 @dataclass(frozen=True)
-class InertialPrior(ForcePrior):
+class InertialPrior(ConstantForcePrior):
     """A prior on errors of inertial parameters, with one learned scale s_k (initially 1) per link k.
 
     Q = −[Y(q, q̇, q̈), diag q̈] S δ with δ ~ N(0, diag(s_k²)). Without `drives`, Q = −Y S δ.
@@ -47,12 +48,12 @@ class InertialPrior(ForcePrior):
     Args:
         mass: relative standard deviation of each link's mass.
         length: standard deviation of the first moment divided by the mass [m].
-        inertia: relative standard deviation of each link's moments of inertia, and standard deviation of
-            products I_ab relative to √(I_aa I_bb).
+        inertia: relative standard deviation of each link's moments of inertia, and standard deviation of the
+            products of inertia I_ab relative to √(I_aa I_bb).
         kernel: covariance of the constants.
         name: prefix of the hyperparameters.
         scales: scales S `(10 nq,)`; by default those of the robot.
-        drives: standard deviation of the inertia of each joint's drive [kg m², kg]; by default all are known.
+        drives: standard deviation of each joint's drive inertia [kg m², kg]; by default all are known.
 
     Example:
         >>> import torch, forcegp
@@ -71,25 +72,22 @@ class InertialPrior(ForcePrior):
     drives: tuple[float, ...] = ()
 
     def around(self, robot: RobotModel) -> InertialPrior:
-        """Return the prior with the scale fixed to that of this robot."""
+        """Return the prior with its scales fixed to those of the given robot."""
         return dataclasses.replace(self, scales=tuple(self.scale(robot)[: PER_LINK * robot.nq].tolist()))
 
     def with_drives(self, std: Tensor) -> InertialPrior:
-        """Return the prior with unknown inertia of drives, with standard deviation `(nq,)`.
+        """Return the prior with unknown drive inertia of standard deviation `(nq,)`.
 
-        Motion hardly distinguishes drive inertia from that of the moved links. If the drives were treated as
-        known, their errors would be attributed to the links, with too small a standard deviation.
+        Motion hardly distinguishes drive inertia from the inertia of the moved links. If the drives were
+        treated as known, their errors would be attributed to the links, with too small a standard deviation.
         """
         return dataclasses.replace(self, drives=tuple(std.tolist()), kernel=Constant())
 
     def outputs(self, robot: RobotModel) -> int:
         return PER_LINK * robot.nq + len(self.drives)
 
-    def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
-        return {"one": torch.zeros_like(at.q[:, :1])}
-
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
-        # A state without a measured acceleration has the one that the analytical model predicts.
+        # Without a measured acceleration, that of the analytical model is used.
         qdd = at.qdd
         if qdd is None:
             qdd = at.eom.acceleration(at.eom.Q_K + at.tau)
@@ -99,7 +97,7 @@ class InertialPrior(ForcePrior):
         return -columns * self.scale(system.robot)
 
     def scale(self, robot: RobotModel) -> Tensor:
-        """Return S `(10 nq,)`, or `(11 nq,)` with drives: standard deviations before scales are learned."""
+        """Return S, standard deviations before scales are learned: `(10 nq,)`, or `(11 nq,)` with drives."""
         if self.scales is not None:
             return robot.mass.new_tensor((*self.scales, *self.drives))
         m, J = robot.mass[:, None], inertial_parameters(robot.mass, robot.com, robot.inertia)
@@ -117,22 +115,22 @@ class InertialPrior(ForcePrior):
         precision: Tensor,
         log_volume: Callable[[RobotModel], Tensor] = lambda _: torch.zeros(()),
     ) -> tuple[RobotModel, Tensor]:
-        """Return the physically consistent robot that is most probable given δ ~ N(mean, precision⁻¹).
+        """Return the most probable physically consistent robot given δ ~ N(mean, precision⁻¹).
 
         The objective ½ (δ − mean)ᵀ precision (δ − mean) + γ Σ_k [tr(J₀⁻¹J) − log |J₀⁻¹J| − 4] − V(δ) is
-        minimised over the log-Cholesky coordinates of the pseudo-inertias J of the links. The second term
-        (the divergence of Lee, Wensing and Park, 2019, with weight γ = 0.01) keeps the inertia of links that
-        the log does not determine from vanishing.
+        minimised over the log-Cholesky coordinates of the links' pseudo-inertias J. The second term (the
+        divergence of Lee, Wensing and Park, 2019, with weight γ = 0.01) keeps the inertia of links that the
+        log does not determine from vanishing.
 
         Args:
-            robot: with π₀.
+            robot: robot with π₀.
             mean: mean of δ, `(10 nq,)`.
             precision: precision of δ, `(10 nq, 10 nq)`.
-            log_volume: V, converts the density of a torque to that of an acceleration.
+            log_volume: V, which converts the density of torques to that of accelerations.
 
         Returns:
-            The robot, and the δ that it contains `(10 nq,)`. Links that are not physically consistent in the
-            file stay as they are.
+            The robot, and the δ `(10 nq,)` that it contains. Links that are not physically consistent in the
+            file remain unchanged.
         """
         J0 = pseudo_inertia(robot.mass, robot.com, robot.inertia)
         sound = torch.linalg.eigvalsh(J0)[:, 0] > 0.0
@@ -181,34 +179,34 @@ CONSISTENT = LearningOptions(tolerance=1e-12, max_evaluations=500)
 
 PER_PAYLOAD = len(PARAMETER_NAMES)
 MASS_AND_MOMENT = 4
-"""Mass and first moment, which weight determines and acceleration noise does not bias."""
+"""Number of entries for mass and first moment, which gravity determines without bias from noisy q̈."""
 FARTHEST = 3.0
 """Largest distance of a point mass from the origin of its link, in standard lengths."""
 
 
 @dataclass(frozen=True)
-class PayloadPrior(ForcePrior):
+class PayloadPrior(ConstantForcePrior):
     """A prior on a point mass on a link, Q = −Y_k(q, q̇, q̈) S δ with δ ~ N(0, s² I).
 
     q̈ is the acceleration of the arm with the payload `known` (by default none). The force is exact for this
     payload and accurate to first order for others; `around` linearizes at the current estimate.
 
-    With `update` and `forget`, the prior tracks a payload that is picked up or put down. A log without
-    payload would set its scale to zero, so keep the scale while learning other priors: `model.fit(data,
-    learn=["joint"])`.
+    With `update` and `forget`, the prior tracks a payload that is picked up or put down. Fitting to a log
+    without a payload would set its scale to zero, so fix the scale while learning other priors:
+    `model.fit(data, learn=["joint"])`.
 
     Args:
-        joint: joint that moves the link with the payload; by default the last one.
+        joint: joint that moves the link carrying the payload; by default the last one.
         mass: standard deviation of the mass [kg].
         length: standard deviation of the first moment divided by that of the mass [m].
         kernel: covariance of the constants.
         name: prefix of the hyperparameters.
         known: mass [kg] and first moment [kg m] of the payload at which the acceleration is computed.
-        measured: whether to use the measured acceleration if available, which is exact for any payload but
-            noisy; the noise biases the payload towards zero if the arm hardly accelerates.
+        measured: whether to use the measured acceleration if available. The force is then exact for any
+            payload, but noise biases the estimate towards zero if the arm hardly accelerates.
 
     Raises:
-        ModelError: the known payload does not consist of a mass and a moment.
+        ModelError: the known payload does not consist of a mass and a first moment.
     """
 
     joint: str | None = None
@@ -231,9 +229,6 @@ class PayloadPrior(ForcePrior):
     def outputs(self, robot: RobotModel) -> int:
         return MASS_AND_MOMENT
 
-    def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
-        return {"one": at.q.new_zeros(len(at.q), 1)}
-
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
         qdd = at.qdd
         if qdd is None or not self.measured:
@@ -246,18 +241,18 @@ class PayloadPrior(ForcePrior):
         return -Y * self.units(at.q)
 
     def around(self, mean: Tensor) -> PayloadPrior:
-        """Return the prior with the acceleration of the arm with the estimated payload.
+        """Return the prior with the acceleration computed for the arm with the estimated payload.
 
         Args:
-            mean: mean of the latent constants `(4,)`; no payload is assumed unless it is a point mass near
-                the link.
+            mean: mean of the latent constants `(4,)`. Unless they describe a point mass near the link, no
+                payload is assumed.
         """
         mass, *moment = (mean * self.units(mean)).tolist()
         near = mass > 0.0 and math.hypot(*moment) <= FARTHEST * self.length * mass
         return dataclasses.replace(self, known=(mass, *moment) if near else ())
 
     def units(self, like: Tensor) -> Tensor:
-        """Return mass and first moment per unit of the latent constants, `(4,)`."""
+        """Return the mass and first moment per unit of the latent constants, `(4,)`."""
         return like.new_tensor([self.mass, *3 * [self.mass * self.length]])
 
     def loaded(self, robot: RobotModel) -> RobotModel:

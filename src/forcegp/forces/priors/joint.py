@@ -1,14 +1,14 @@
 """Priors on the joint force Q: its mean from the robot file, and priors on the remainder.
 
-- `JointForcePrior`: any force, with one process per joint.
+- `JointForcePrior`: an arbitrary force, with one process per joint.
 - `JointFrictionPrior`: friction missing from the robot file (viscous, Coulomb, a transition between the two,
-  and a part that grows with the load) and the offset of the torque sensor. The friction of a joint depends
-  only on the velocity of that joint, so the prior extrapolates to new motions of other joints. It does not
+  and a part that increases with the load) and the offset of the torque sensor. The friction of a joint
+  depends only on that joint's velocity, so the prior extrapolates to new motions of other joints. It does not
   depend on τ, since in closed loop the most likely force would cancel torque-sensor noise.
 - `DisturbancePrior`: slowly varying torques (temperature, hysteresis), which functions of the state would
   overfit and white noise would underestimate.
 - `CoregionalPrior`: common causes of several joint forces, such as a cable or a contact missing from the
-  scene; independent processes must learn such a force once per joint.
+  scene, which independent processes would have to learn separately for each joint.
 """
 
 from __future__ import annotations
@@ -33,9 +33,16 @@ TERMS = ("bias", "gravity", "friction", "actuation")
 """Known parts of Q: Q_C, Q_G, Q_D and Q_u."""
 
 
+class ConstantForcePrior(ForcePrior):
+    """A prior on constants, whose kernel has no inputs."""
+
+    def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
+        return {"one": at.q.new_zeros(len(at.q), 1)}
+
+
 @dataclass(frozen=True)
 class AnalyticalMean:
-    """Prior mean m(x; θ_A) = Q_K, the sum of some of Q_C, Q_G, Q_D and Q_u.
+    """Prior mean m(x; θ_A) = Q_K, the sum of selected terms among Q_C, Q_G, Q_D and Q_u.
 
     Args:
         terms: known terms from `bias`, `gravity`, `friction`, `actuation`; empty for the zero mean.
@@ -46,7 +53,7 @@ class AnalyticalMean:
 
     Raises:
         UnknownNameError: a term does not exist.
-        ModelError: a term is named twice.
+        ModelError: a term is listed twice.
     """
 
     terms: tuple[str, ...] = TERMS
@@ -58,7 +65,7 @@ class AnalyticalMean:
                 raise ModelError(f"term {term!r} of the analytical mean is named twice", got=self.terms)
 
     def __call__(self, system: ConstrainedSystem, at: States) -> Tensor:
-        """Return the mean of Q at states, `(n, nq)` [N m, N]."""
+        """Return the mean of Q at the given states, `(n, nq)` [N m, N]."""
         Q_D = at.eom.Q_D if at.slip is None else damping_force(system.robot, at.qd, at.slip)
         known = {"bias": at.eom.Q_C, "gravity": at.eom.Q_G, "friction": Q_D, "actuation": at.tau}
         return sum((known[term] for term in self.terms), start=torch.zeros_like(at.q))
@@ -78,7 +85,7 @@ def mean_of(mean: str | AnalyticalMean) -> AnalyticalMean:
 
 
 class PerJointPrior(ForcePrior):
-    """A prior on a force per joint, E = I; subclasses may have another operator."""
+    """A prior on one force per joint, E = I; subclasses may have a different operator."""
 
     per_joint = True
 
@@ -131,23 +138,23 @@ class JointForcePrior(PerJointPrior):
 
 
 SPEEDS = (0.02, 0.1, 0.5)
-"""Saturation velocities of the Coulomb features [rad/s, m/s]: a sharp step and two slower transitions.
+"""Saturation velocities of the Coulomb features [rad/s, m/s]: a sharp step and two more gradual transitions.
 """
 OFFSET = 0.3
-"""Initial standard deviation of an offset relative to that of a friction weight."""
+"""Initial standard deviation of an offset, relative to that of a friction weight."""
 
 
 @dataclass(frozen=True)
 class JointFrictionPrior(PerJointPrior):
-    """A prior on viscous, Coulomb and load-dependent friction and an offset of each joint.
+    """A prior on the viscous, Coulomb and load-dependent friction and the offset of each joint.
 
     Q_i = w_i·φ(q̇_i) + c_i with φ = (q̇_i, tanh(q̇_i/v_1), tanh(q̇_i/v_2), …, |Q_G,i| tanh(q̇_i/v_1)). The
-    weights w_i and the offset c_i are Gaussian and marginalised. Three scales are learned: the friction of
-    each joint, the relevance of each feature, and the offsets relative to friction; the last two are shared
-    by all joints. A joint that moved in one direction only does not separate offset and friction, but the
-    other joints indicate which is likely. With a separate standard deviation for each weight, learning would
-    set most of them to zero and be overconfident on new motions. A kernel with a smooth part, such as
-    `Linear(shared=True, offset=0.3) + SquaredExponential(("velocity",))`, adds a smooth remainder.
+    weights w_i and the offset c_i are Gaussian and marginalised. Three kinds of scales are learned: the
+    friction of each joint, the relevance of each feature, and the offsets relative to friction; the last two
+    are shared by all joints. If a joint moved in only one direction, its offset and friction cannot be
+    separated, but the other joints indicate which is likely. With a separate standard deviation for each
+    weight, learning would set most of them to zero and be overconfident on new motions. A kernel such as
+    `Linear(shared=True, offset=0.3) + SquaredExponential(("velocity",))` adds a smooth remainder.
 
     Args:
         kernel: covariance of each component; by default linear in the features.
@@ -185,7 +192,7 @@ class JointFrictionPrior(PerJointPrior):
 
     @property
     def sharpest(self) -> int:
-        """Index of the Coulomb feature for the dry friction of a sticking joint."""
+        """Index of the Coulomb feature that represents the dry friction of a sticking joint."""
         return self.speeds.index(min(self.speeds))
 
     def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
@@ -205,11 +212,11 @@ NEW_MOTION = -1.0
 
 @dataclass(frozen=True)
 class DisturbancePrior(PerJointPrior):
-    """A prior on slow disturbances Q_i = d_i(t), with an Ornstein–Uhlenbeck process for each joint.
+    """A prior on slow disturbances Q_i = d_i(t), with one Ornstein–Uhlenbeck process per joint.
 
     The processes are independent between trajectories; their standard deviations σ_i and correlation times
-    T_i are learned. They cannot be predicted on new motions, where they add σ_i² to the variance of the joint
-    force and zero to the mean. Inference is exact, since sparse inference assumes independent samples.
+    T_i are learned. On new motions, they cannot be predicted, and they add σ_i² to the variance of the joint
+    force but nothing to its mean. Inference is exact, since sparse inference assumes independent samples.
 
     Args:
         kernel: covariance over time.
@@ -239,10 +246,10 @@ class CoregionalPrior(ForcePrior):
     """A prior on joint forces with common causes, with covariance k(x, x′) (W Wᵀ + diag κ) between joints.
 
     Q_i = Σ_r W_ir g_r(x) + h_i(x). The causes g_r and the remainders h_i are independent processes with the
-    same length-scales, W has a column for each cause, and κ is the variance of the remainders (the intrinsic
+    same length-scales, W has one column per cause, and κ is the variance of the remainders (the intrinsic
     coregionalisation model; Álvarez, Rosasco and Lawrence, *Kernels for vector-valued functions*, 2012,
-    section 4.2). All are learned; the length of a column of W is the standard deviation of its cause. With
-    separate length-scales, the kernel describes the linear model of coregionalisation.
+    section 4.2). All of these are learned; the norm of a column of W is the standard deviation of its cause.
+    With separate length-scales, the kernel describes the linear model of coregionalisation.
 
     Args:
         kernel: covariance of each process.
@@ -279,7 +286,7 @@ class CoregionalPrior(ForcePrior):
         return {name: getattr(at, name) for name in self.inputs}
 
     def initial_parameters(self, robot: RobotModel) -> dict[str, Tensor]:
-        """Return the columns of a cosine transform, starting with the sum of all joints."""
+        """Return the columns of a cosine transform, starting with equal weights for all joints."""
         i, r = torch.arange(robot.nq) + 0.5, torch.arange(self.causes)
         return {MIXING: torch.cos(math.pi / robot.nq * i[:, None] * r).to(robot.mass)}
 
@@ -293,7 +300,7 @@ class CoregionalPrior(ForcePrior):
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
         robot = system.robot
         W = self.initial_parameters(robot)[MIXING] if self._mixing is None else self._mixing
-        # Unit columns: their length is the standard deviation of the cause.
+        # Columns of unit length: the standard deviation of a cause is a separate factor.
         columns = W / W.norm(dim=0).clamp(min=1e-12)
         eye = torch.eye(robot.nq, dtype=at.q.dtype, device=at.q.device)
         return torch.cat([columns.to(at.q), eye], dim=-1).expand(len(at.q), -1, -1)

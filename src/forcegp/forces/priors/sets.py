@@ -1,4 +1,4 @@
-"""Named sets of force priors: the candidates of automatic selection, and those of the paper."""
+"""Named sets of force priors: the candidates for automatic selection, and those of the paper."""
 
 from __future__ import annotations
 
@@ -13,23 +13,23 @@ from forcegp.forces.priors.joint import AnalyticalMean, JointForcePrior, JointFr
 from forcegp.gp.kernels import Kernel, Linear, SquaredExponential
 
 PAPER = SquaredExponential()
-"""The paper's kernel of a joint force (eq. 31)."""
+"""The paper's kernel for a joint force (eq. 31)."""
 ANGLES, RATES = SquaredExponential(("q",), shared=True), Linear(("qd",), shared=True)
-"""Kernel on the configuration, and kernel linear in the joint velocities."""
+"""Kernel on the configuration, and linear kernel on the joint velocities."""
 WHOLE = Linear(("tau",)) + ANGLES + RATES * RATES * ANGLES + SquaredExponential(("qd",), shared=True)
-"""Kernel of a force that includes the motor torque (linear), weight (depends on the configuration), bias and
-    damping (quadratic and linear in the velocity), and any joint friction."""
+"""Kernel for a force that includes the motor torque (linear), gravity (a function of the configuration), bias
+    and damping (quadratic and linear in the velocity), and any joint friction."""
 REMAINING = RATES * ANGLES + SquaredExponential(shared=True)
-"""Kernel of a force without the motor torque: configuration-dependent damping, and anything else."""
+"""Kernel for a force without the motor torque: configuration-dependent damping and an arbitrary remainder."""
 STATE_RESIDUAL = SquaredExponential(("q", "qd"), shared=True)
-"""Kernel of a residual force besides friction. It does not depend on the motor torque, since in closed loop
-    such a residual learns to cancel it."""
+"""Kernel for a residual force in addition to friction. It does not depend on the motor torque because, in
+    closed loop, such a residual would learn to cancel it."""
 
 
 def default_priors(
     system: ConstrainedSystem, mean: str | AnalyticalMean = "analytical", kernel: Kernel | None = None
 ) -> tuple[ForcePrior, ...]:
-    """Return a joint force prior and, with contacts, a prior on the part that accelerations do not determine.
+    """Return a joint force prior and, for contacts, a prior on the part that accelerations do not determine.
 
     If the mean includes the motor torque, each surface contact also has a `SlidingFrictionPrior`; otherwise
     its friction would be attributed to the joints, and predictions in free motion would be overconfident.
@@ -54,7 +54,7 @@ def default_priors(
 
 
 def friction_priors(system: ConstrainedSystem) -> tuple[ForcePrior, ...]:
-    """Return priors on the friction of each joint and Coulomb friction of each surface contact.
+    """Return priors on the friction of each joint and on the Coulomb friction of each surface contact.
 
     None of the priors depends on the motor torque.
 
@@ -72,7 +72,7 @@ def friction_priors(system: ConstrainedSystem) -> tuple[ForcePrior, ...]:
 
 
 def friction_and_residual_priors(system: ConstrainedSystem) -> tuple[ForcePrior, ...]:
-    """Return `friction_priors` and a prior on any joint force that depends on (q, q̇)."""
+    """Return `friction_priors` and a prior on an arbitrary joint force that depends on (q, q̇)."""
     residual = JointForcePrior(STATE_RESIDUAL, inputs=("q", "qd"))
     normal = (NormalForcePrior(residual),) if system.m else ()
     return (*friction_priors(system), residual, *normal)
@@ -84,10 +84,10 @@ class PriorSet:
 
     Attributes:
         name: name of the set.
-        description: the modelled forces.
+        description: description of the modelled forces.
         priors: function that returns the priors for a system.
-        has_joint_friction: whether joint friction and torque noise are modelled, which identification of
-            inertia requires.
+        has_joint_friction: whether joint friction and torque noise are modelled, as is required for
+            identifying inertia.
         needs_surface: whether the set requires a surface contact.
     """
 
@@ -98,15 +98,15 @@ class PriorSet:
     needs_surface: bool = False
 
     def fits(self, system: ConstrainedSystem) -> bool:
-        """Return whether the set applies to this system."""
+        """Return whether the set is applicable to the given system."""
         return not self.needs_surface or bool(_surfaces(system))
 
 
 def contact_priors(system: ConstrainedSystem, kernel: Kernel | None = None) -> tuple[ForcePrior, ...]:
-    """Return a prior on the friction of each surface contact, or a joint force prior without such contacts.
+    """Return priors on the friction of each surface contact, or a joint force prior if there are none.
 
     Args:
-        kernel: covariance of each Cartesian component of any tangential force; by default the force is
+        kernel: covariance of each component of an arbitrary tangential force; by default, the force is
             friction that opposes sliding.
 
     Example:
@@ -140,13 +140,13 @@ SETS: dict[str, PriorSet] = {
 }
 """Sets for automatic selection with the analytical mean, simplest first."""
 FEW = SETS["friction"]
-"""Set used for few samples."""
+"""The set used if there are few samples."""
 
 
 def priors_of(
     system: ConstrainedSystem, mean: AnalyticalMean, force_priors: str | Sequence[ForcePrior]
 ) -> tuple[ForcePrior, ...]:
-    """Return the given force priors, or those of a named set; for `"auto"`, those for few samples.
+    """Return the given force priors, or those of a named set; `"auto"` selects the set for small data sets.
 
     Raises:
         UnknownNameError: the set does not exist.

@@ -1,4 +1,4 @@
-"""Detection of log formats by the first bytes, then by name; formats that can run code are rejected."""
+"""Detection of log formats by the first bytes, then by file name; formats that can run code are rejected."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ _READERS = {
     "lerobot": ("LeRobot data set", "parquet.read_lerobot"),
 }
 FORMATS = {kind: name for kind, (name, _) in _READERS.items()}
-"""Supported formats, with their names in messages."""
+"""Supported formats, and their names in messages."""
 
 _MAGIC = (
     (b"PAR1", "parquet"),
@@ -49,8 +49,8 @@ def read(
 ) -> LogTable:
     """Read a log (a file or a folder) of any supported format.
 
-    Columns are read if `wanted`, and rows up to `rows` if the format supports it; `progress` receives the
-    completed and total counts.
+    Only columns for which `wanted` returns true are read, and at most `rows` rows if the format supports it.
+    `progress` is called with the completed and total work.
 
     Raises:
         DataError: the file does not exist, is damaged or too large, or its format is unsupported or unsafe.
@@ -71,7 +71,7 @@ def read(
 
 
 def format_of(path: Path) -> str:
-    """Return the key in `FORMATS` of a log."""
+    """Return the key of a log's format in `FORMATS`."""
     if path.is_dir():
         return _format_of_folder(path)
     if not path.is_file():

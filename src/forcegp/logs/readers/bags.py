@@ -1,10 +1,9 @@
-"""ROS 1 and ROS 2 bags and MCAP files: joint states and wrenches as columns, without a ROS installation.
+"""Reader of ROS 1 and ROS 2 bags and MCAP files, which needs no ROS installation.
 
-Columns of a joint state: `position.<joint>`, `velocity.<joint>`, `effort.<joint>`. Columns of a wrench:
-`force.x` to `torque.z`. Both have `header`, the stamp of the driver [s], and `receive`, the time of recording
-[s], each relative to the earliest one in the log, since float64 does not resolve nanoseconds since 1970.
-
-Message layouts are those of the ROS distributions; definitions stored in a bag are not compiled.
+Joint states become the columns `position.<joint>`, `velocity.<joint>` and `effort.<joint>`, and wrenches the
+columns `force.x` to `torque.z`. Both also have `header`, the time stamp of the driver [s], and `receive`, the
+time of recording [s], each relative to the earliest one in the log, since float64 cannot resolve nanoseconds
+since 1970. Message layouts are those of the ROS distributions; definitions stored in a bag are not compiled.
 """
 
 from __future__ import annotations
@@ -29,13 +28,13 @@ JOINT_STATE = "sensor_msgs/msg/JointState"
 WRENCH = "geometry_msgs/msg/WrenchStamped"
 KINDS = (JOINT_STATE, WRENCH)  # that are read
 UNITS = {"position": "rad", "velocity": "rad/s", "effort": "Nm", "force": "N", "torque": "Nm"}
-"""Units of a joint state (REP 103) and of a wrench."""
+"""Units in joint states (REP 103) and wrenches."""
 CLOCKS = ("header", "receive")
-"""Time columns of every topic."""
+"""Time columns of each topic."""
 
 Decode = Callable[[bytes], Any]
 Found = tuple[str, str, str, int, bytes, int]
-"""Topic, type, encoding, recording time [ns] and content of a message, and the amount read so far."""
+"""Topic, type, encoding, recording time [ns] and content of a message, and the amount of data read so far."""
 
 
 def canonical(kind: str) -> str:
@@ -50,7 +49,7 @@ def canonical(kind: str) -> str:
 
 @cache
 def decoder(kind: str, encoding: str) -> Decode:
-    """Return a decoder for messages of a type in `KINDS`, in the encoding `ros1` or `cdr`."""
+    """Return a decoder for messages of a type in `KINDS` with the encoding `ros1` or `cdr`."""
     typesys = optional_module("rosbags.typesys", "Reading ROS messages", "import")
     first = encoding == "ros1"
     store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC if first else typesys.Stores.ROS2_HUMBLE)
@@ -60,7 +59,7 @@ def decoder(kind: str, encoding: str) -> Decode:
 
 @dataclass
 class Messages:
-    """Messages of a topic with the same columns, their time stamps and recording times [ns]."""
+    """Messages of a topic that have the same columns, with their time stamps and recording times [ns]."""
 
     topic: str
     columns: tuple[str, ...]
@@ -68,7 +67,7 @@ class Messages:
     stamps: list[tuple[int, int]] = field(default_factory=list)
 
     def stream(self, name: str, origin: np.ndarray, wanted: Wanted) -> Stream:
-        """Return the requested numeric columns, with times from `origin` [ns]."""
+        """Return the requested columns, with times [s] relative to `origin` [ns]."""
         stamps = (np.array(self.stamps, dtype=np.int64) - origin) * 1e-9
         order = np.argsort(stamps[:, 1], kind="stable")
         columns: dict[str, Column] = dict(zip(CLOCKS, np.ascontiguousarray(stamps[order].T), strict=True))
@@ -81,7 +80,7 @@ class Messages:
 
 @dataclass
 class Collector:
-    """Collects the messages of a bag in one stream per topic and set of joints."""
+    """Collects the messages in a bag, in one stream for each topic and set of joints."""
 
     source: str
     unpacking: Unpacking
@@ -101,7 +100,7 @@ class Collector:
                 return
 
     def _add(self, topic: str, kind: str, receive_ns: int, raw: bytes, decode: Decode) -> None:
-        """Add a message; `DataError` if it is too large, or its arrays do not match its joint names."""
+        """Add a message; raise `DataError` if it is too large, or its arrays do not match its joint names."""
         check_count(self.source, "bytes in one message", len(raw), limits.MESSAGE_BYTES)
         message = decode(raw)
         if kind == JOINT_STATE:
@@ -118,7 +117,7 @@ class Collector:
         check_count(self.source, "streams", len(self._streams), limits.LOG_STREAMS)
 
     def table(self, format_: str, topics: dict[str, str], wanted: Wanted) -> LogTable:
-        """Return the log with the requested columns; `topics` are all topics of the bag with their types."""
+        """Return the log with the requested columns; `topics` maps all topics in the bag to their types."""
         if not self._streams:
             listing = ", ".join(f"{topic} ({kind})" for topic, kind in topics.items())
             text, got = f"{self.source}: no messages of a supported type", listing[:600] or "no topics"
@@ -138,7 +137,7 @@ class Collector:
 
 
 def _joint_state(source: str, topic: str, message: Any) -> dict[str, float]:
-    """Return position, velocity and effort of each joint by column, NaN for empty quantities."""
+    """Return the position, velocity and effort of each joint by column, with NaN for empty quantities."""
     names = tuple(str(name)[: limits.LOG_NAME] for name in message.name)
     if not names or len(set(names)) < len(names):
         raise DataError(f"{source}: a joint state on {topic} has no joint names, or one twice", got=names[:8])
@@ -154,7 +153,7 @@ def _joint_state(source: str, topic: str, message: Any) -> dict[str, float]:
 
 
 def read_bag(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read the joint states and wrenches of a bag of ROS 1 or ROS 2, or of an MCAP file."""
+    """Read the joint states and wrenches in a ROS 1 bag, a ROS 2 bag or an MCAP file."""
     files = _files(path) if path.is_dir() else [path]
     unpacking = Unpacking(str(path), sum(file.stat().st_size for file in files))
     collector, topics = Collector(str(path), unpacking), dict[str, str]()
@@ -179,7 +178,7 @@ def read_bag(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress
 
 
 def _messages(bag: Any, encoding: str, unpacking: Unpacking) -> Iterator[Found]:
-    """Yield the messages of supported types from a ROS 1 or ROS 2 bag."""
+    """Yield the messages of supported types in a ROS 1 or ROS 2 bag."""
     check_count(unpacking.source, "topics", len(bag.connections), limits.LOG_STREAMS)
     check_count(unpacking.source, "messages", bag.message_count, limits.LOG_MESSAGES)
     used = [c for c in bag.connections if canonical(c.msgtype) in KINDS]
@@ -190,7 +189,7 @@ def _messages(bag: Any, encoding: str, unpacking: Unpacking) -> Iterator[Found]:
 
 
 def _files(path: Path) -> list[Path]:
-    """Return the files of a bag folder without its description; `DataError` if they are compressed."""
+    """Return the files in a bag folder except its description; raise `DataError` if they are compressed."""
     description = path / "metadata.yaml"
     files = within(path, sorted(file for file in path.iterdir() if file.is_file()))
     check_count(str(description), "bytes", description.stat().st_size, limits.LISTING_BYTES)
@@ -203,7 +202,7 @@ def _files(path: Path) -> list[Path]:
 
 
 def _mcap_messages(path: Path, unpacking: Unpacking, topics: dict[str, str]) -> Iterator[Found]:
-    """Yield the messages of an MCAP file in file order, and add its topics with their types."""
+    """Yield the messages in an MCAP file in file order, and add its topics and their types to `topics`."""
     records = optional_module("mcap.records", "Reading MCAP files", "import")
     schemas, channels = {}, {}
     with path.open("rb") as file:
@@ -221,7 +220,7 @@ def _mcap_messages(path: Path, unpacking: Unpacking, topics: dict[str, str]) -> 
 
 
 def _mcap_records(file: io.BufferedReader, unpacking: Unpacking) -> Iterator[Any]:
-    """Yield the records of an MCAP file in file order, unpacking one chunk at a time, record by record."""
+    """Yield the records in an MCAP file in file order, unpacking one chunk at a time."""
     records = optional_module("mcap.records", "Reading MCAP files", "import")
     streams = optional_module("mcap.stream_reader", "Reading MCAP files", "import")
     reader = streams.StreamReader(file, emit_chunks=True, record_size_limit=limits.RECORD_BYTES)

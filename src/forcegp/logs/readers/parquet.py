@@ -1,6 +1,6 @@
-"""Parquet tables, with vectors in one column or one column per number, and LeRobot data sets.
+"""Readers of Parquet tables, with vectors in list columns or in separate columns, and of LeRobot data sets.
 
-A LeRobot data set, version 2.1 or 3, is a folder with `meta/info.json` and Parquet files of episodes.
+A LeRobot data set (version 2.1 or 3) is a folder with `meta/info.json` and the Parquet files of its episodes.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ BATCH_ROWS = 1 << 16
 
 
 def read_parquet(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read the columns of numbers, flags and times; a list column becomes `name[0]`, `name[1]`, …"""
+    """Read the columns that contain numbers, flags and times; list columns become `name[0]`, `name[1]`, …"""
     remarks: list[str] = []
     with guards.foreign(str(path), "Parquet"):
         columns = read_columns([path], wanted, rows, remarks, progress)
@@ -36,7 +36,7 @@ def read_parquet(path: Path, *, wanted: Wanted, rows: int | None, progress: Prog
 def read_columns(
     paths: list[Path], wanted: Wanted, rows: int | None, remarks: list[str], progress: Progress | None
 ) -> dict[str, Column]:
-    """Return concatenated columns of files, lists by name or `name[i]`; `remarks` lists omitted columns."""
+    """Return the concatenated columns of files, with lists as `name[i]`; add omitted columns to `remarks`."""
     import pyarrow.parquet as pq
 
     chunks: dict[str, list[Column]] = {}
@@ -70,7 +70,7 @@ def read_columns(
 
 
 def _check(path: Path, file: object, names: set[str]) -> int:
-    """Return the number of rows of a file after a check of the declared size of its columns."""
+    """Return the number of rows in a file after checking the declared size of its columns."""
     shape = file.metadata  # pyright: ignore[reportAttributeAccessIssue]
     guards.check_count(str(path), "columns", shape.num_columns, limits.COLUMNS)
     groups = [shape.row_group(i) for i in range(shape.num_row_groups)]
@@ -129,11 +129,11 @@ def _expand(source: str, name: str, values: pa.Array) -> dict[str, Column]:
 
 
 MAX_INFO_BYTES = 4 << 20
-"""Size of the description of a data set."""
+"""Maximum size of the description of a data set."""
 
 
 def read_lerobot(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read the numbers of all episodes, with the names in `meta/info.json`: `observation.state.<motor>`."""
+    """Read the numbers in all episodes, named as in `meta/info.json`, such as `observation.state.<motor>`."""
     listed = path / "meta" / "info.json", *sorted((path / "data").rglob("*.parquet"))
     description, *files = within(path, listed)
     guards.check_count(str(description), "bytes", description.stat().st_size, MAX_INFO_BYTES)
@@ -160,7 +160,7 @@ def read_lerobot(path: Path, *, wanted: Wanted, rows: int | None, progress: Prog
 
 
 def _motors(description: Any) -> list[str]:
-    """Return the names of the values of a feature, a list or a list under one key such as `motors`."""
+    """Return the names of a feature's values, given as a list, possibly under a key such as `motors`."""
     names = description.get("names") if isinstance(description, dict) else None
     if isinstance(names, dict) and len(names) == 1:
         names = next(iter(names.values()))

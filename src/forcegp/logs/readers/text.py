@@ -1,8 +1,8 @@
-"""CSV and text tables with any separator, decimal mark and heading, read in blocks, and folders of such
+"""Readers of CSV and text tables with any separator, decimal mark and headings, and of folders of such
 files.
 
-The format of a table is inferred from its first lines. In a folder, each file contains one quantity: `q.txt`,
-…
+The format of a table is inferred from its first lines. In a folder, each file contains one quantity, such as
+`q.txt`.
 """
 
 from __future__ import annotations
@@ -26,10 +26,10 @@ if TYPE_CHECKING:
 
 
 SAMPLE_BYTES, SAMPLE_LINES = 1 << 18, 200
-"""Size of the inspected part of a file, and number of lines of numbers that must agree."""
+"""Size of the part of a file that is inspected, and number of data lines that must agree in format."""
 
 SEPARATORS = (";", "\t", ",", "|", " ")
-"""Candidates; a space stands for any run of blanks."""
+"""Candidate separators; a space stands for any run of blanks."""
 MISSING = ("", "nan", "NaN", "NAN", "null", "NULL", "NA", "N/A", "None", "-nan", "#N/A")
 """Fields that mark a missing value."""
 
@@ -41,8 +41,8 @@ _UNIT = re.compile(r"^[\[(]?\s*([A-Za-zµ°%][\w°²^/*·. -]{0,15}|-|1)?\s*[\])
 
 @dataclass(frozen=True)
 class Dialect:
-    """Format of a text table from `first_line` on: columns are `number`, `bool`, `date`, `text` or
-    `empty`."""
+    """Format of a text table that begins at `first_line`; columns are of type `number`, `bool`, `date`,
+    `text` or `empty`."""
 
     encoding: str
     separator: str
@@ -71,7 +71,7 @@ def sniff(path: Path) -> Dialect:
 
 
 def split(line: str, separator: str) -> list[str]:
-    """Split a line into fields without surrounding blanks and quotation marks.
+    """Split a line into fields, removing surrounding blanks and quotation marks.
 
     >>> split("a;  b ;", ";")
     ['a', 'b', '']
@@ -105,7 +105,7 @@ def _decode(path: Path, head: bytes) -> tuple[str, str]:
 
 
 def _try(lines: list[str], separator: str, decimal: str) -> tuple[float, str, str, int]:
-    """Return the score of a separator and a decimal mark: number times fraction of fields with a value."""
+    """Return the score of a separator and a decimal mark: the number times the fraction of valid fields."""
     kept = [(i, split(line, separator)) for i, line in enumerate(lines) if line.strip()]
     first = next((i for i, fields in kept if _numeric(fields, decimal)), None)
     if first is None:
@@ -119,7 +119,7 @@ def _try(lines: list[str], separator: str, decimal: str) -> tuple[float, str, st
 
 
 def _numeric(fields: list[str], decimal: str) -> bool:
-    """Return whether a line contains values: at least one number, and text only in a minority of fields."""
+    """Return whether a line contains values, that is, numbers or dates in more than half of its fields."""
     if fields and fields[0].startswith(("#", "%", "//")):
         return False
     kinds = [kind for kind in (kind_of(f, decimal) for f in fields) if kind != "empty"]
@@ -153,14 +153,14 @@ def _dialect(
 
 
 BLOCK_BYTES = 4 << 20
-"""Size of the text parsed at a time."""
+"""Size of the blocks in which text is parsed."""
 
 _BLANKS = re.compile(rb"[ \t]+")
 _EDGES = re.compile(rb"(?m)^ | (?=\r?$)")
 
 
 def read_text(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read a text table; text columns are omitted with a remark."""
+    """Read a text table; text columns are skipped with a note."""
     dialect = sniff(path)
     kinds = {n: kind for n, kind in zip(dialect.names, dialect.kinds, strict=True) if wanted(n)}
     remarks = [f"column {n!r} contains text and was ignored" for n, kind in kinds.items() if kind == "text"]
@@ -184,7 +184,7 @@ def read_text(path: Path, *, wanted: Wanted, rows: int | None, progress: Progres
 
 
 def _batches(source: _Blocks, dialect: Dialect, kinds: dict[str, str]) -> Iterator[pa.RecordBatch]:
-    """Yield batches of rows of the selected columns."""
+    """Yield batches of rows with the selected columns."""
     import pyarrow as pa
     from pyarrow import csv
 
@@ -209,7 +209,7 @@ def _batches(source: _Blocks, dialect: Dialect, kinds: dict[str, str]) -> Iterat
 
 
 def _numbers(values: pa.Array, kind: str) -> Column:
-    """Convert a column to float64: dates to seconds since the epoch, true and false to 1 and 0."""
+    """Convert a column to float64: dates to seconds since 2020, true and false to 1 and 0."""
     import pyarrow as pa
     import pyarrow.compute as pc
 
@@ -221,11 +221,11 @@ def _numbers(values: pa.Array, kind: str) -> Column:
 
 
 DATE_ORIGIN_NS = 1_577_836_800_000_000_000
-"""2020-01-01 in nanoseconds since the epoch, the origin of times given as dates."""
+"""Origin of times given as dates: 2020-01-01 in nanoseconds since the epoch."""
 
 
 class _Blocks(io.RawIOBase):
-    """A binary file for the parser, which counts the bytes read and collapses runs of blanks."""
+    """A binary file passed to the parser, which counts the bytes read and collapses runs of blanks."""
 
     def __init__(self, file: IO[bytes], dialect: Dialect, size: int, progress: Progress | None) -> None:
         self._file, self._size, self._progress = file, size, progress
@@ -252,11 +252,11 @@ class _Blocks(io.RawIOBase):
 
 
 ENDINGS = (".txt", ".csv", ".tsv", ".dat", ".asc")
-"""Suffixes of the files to read; others in the folder are ignored."""
+"""Suffixes of the files to read; other files in the folder are ignored."""
 
 
 def read_folder(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read the tables of a folder as `file[i]` or `file.heading`; tables of equal length form one stream."""
+    """Read the tables in a folder as `file[i]` or `file.heading`; tables of equal length form one stream."""
 
     def in_file(file: Path, column: str) -> str:
         return f"{file.stem}[{column}]" if column.isdigit() else f"{file.stem}.{column}"

@@ -1,3 +1,3 @@
-"""A fitted model as plain C: its numbers, the source text, the written folder, and the compiled predictor in
-Python.
+"""Export of a fitted model to plain C: its numbers, its source text, the folder that is written, and the
+compiled predictor in Python.
 """

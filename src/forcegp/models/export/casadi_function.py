@@ -8,9 +8,8 @@ from pathlib import Path
 from typing import Any
 
 from forcegp.compiled.expression import Graph, Scalar
-from forcegp.destination import write_or_keep
+from forcegp.destination import folder_or_keep
 from forcegp.errors import optional_module
-from forcegp.files import written_folder
 from forcegp.models.export.mean import ARGUMENTS, DIFFERENTIATED, LearnedMotion
 from forcegp.models.export.model import ExportedModel
 from forcegp.models.export.source import template
@@ -25,13 +24,13 @@ OPERATORS = {
 
 
 def casadi_function(model: ExportedModel, name: str = "forcegp") -> Any:
-    """Return a `casadi.Function` from (q, q̇, τ, closed) to the mean of each of `DIFFERENTIATED`.
+    """Return a `casadi.Function` from (q, q̇, τ, closed) to the mean of each quantity in `DIFFERENTIATED`.
 
-    `closed` is 1 for each closed contact, and 0 for an open one. The closed contacts must
-    be independent of each other.
+    `closed` is 1 for each closed contact and 0 for each open contact. The closed contacts must be independent
+    of each other.
 
     Raises:
-        ModelError: a part of the model cannot be exported; names it.
+        ModelError: a part of the model cannot be exported; the message names it.
         MissingDependencyError: CasADi is not installed.
     """
     ca: Any = optional_module("casadi", "a CasADi function")
@@ -47,7 +46,7 @@ def casadi_function(model: ExportedModel, name: str = "forcegp") -> Any:
 
 
 def _vector(ca: Any, graph: Graph, given: Mapping[str, Any], outputs: Iterable[Scalar]) -> Any:
-    """Return the scalars as one CasADi vector."""
+    """Return the output scalars as one CasADi vector."""
     outputs, values = list(outputs), dict[int, Any]()
     functions = {"step": lambda x: x > 0.0, "exp": ca.exp, "tanh": ca.tanh, "sqrt": ca.sqrt} | OPERATORS
     for position in graph.live(outputs):
@@ -62,16 +61,14 @@ def _vector(ca: Any, graph: Graph, given: Mapping[str, Any], outputs: Iterable[S
 
 
 def write_casadi(model: ExportedModel, path: Path, name: str) -> None:
-    """Write the function to a folder, with a README; errors as in `casadi_function`."""
+    """Write the function and a README to a folder; raises the same errors as `casadi_function`."""
     function = casadi_function(model, name)
     names = {"joints": model.system.robot.joint_names, "contacts": model.system.contact_names or ("none",)}
     fields: dict[str, object] = {"name": name, "robot": model.system.robot.name}
     fields |= {key: ", ".join(x) for key, x in names.items()}
 
-    def write(folder: Path) -> None:
-        with written_folder(folder) as temporary:
-            function.save(str(temporary / f"{name}.casadi"))
-            text = template("casadi.md.in", fields)
-            (temporary / "README.md").write_text(text, encoding="utf-8")
+    def fill(folder: Path) -> None:
+        function.save(str(folder / f"{name}.casadi"))
+        (folder / "README.md").write_text(template("casadi.md.in", fields), encoding="utf-8")
 
-    write_or_keep(write, path)
+    folder_or_keep(fill, path)

@@ -1,4 +1,4 @@
-/* ---- sums of products; eight partial sums each, so that compilers use vector registers ---- */
+/* ---- sums of products, each computed as eight partial sums so that compilers use vector registers ---- */
 
 static double dot(const double *restrict a, const double *restrict b, int n) {
   double lanes[8] = {0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0}, sum = 0.0;
@@ -10,7 +10,7 @@ static double dot(const double *restrict a, const double *restrict b, int n) {
   return sum;
 }
 
-/* y = x^T C, for C of n rows and m columns */
+/* y = x^T C for C with n rows and m columns */
 static void combine(const double *restrict C, const double *restrict x, int n, int m, double *restrict y) {
   int i = 0;
   for (int c = 0; c < m; ++c) y[c] = 0.0;
@@ -27,26 +27,27 @@ static void combine(const double *restrict C, const double *restrict x, int n, i
 /* ---- the constrained equations of motion, M qdd = Q + Q_z + A^T lambda and A qdd = b ---- */
 
 typedef struct {
-  double position[3], velocity[3], jacobian[3][NQ]; /* of the material point that touches */
-  double normal[3], tangent[2][3];                  /* of the surface there */
+  double position[3], velocity[3], jacobian[3][NQ]; /* of the material contact point */
+  double normal[3], tangent[2][3];                  /* of the surface at this point */
   double sliding[3], sliding_jacobian[3][NQ];       /* velocity and Jacobian along the surface */
   double turning[NQ];                               /* n^T J_omega */
-  double A[NQ], b, c;                               /* A qdd = b while it is closed; c is its error */
+  double A[NQ], b, c;                               /* A qdd = b while the contact is closed; c is its error */
 } touching;
 
 typedef struct {
   double M[NQ][NQ], Q_C[NQ], Q_G[NQ], Q_D[NQ]; /* mass matrix; bias, gravity and damping force */
   double A[SOME(ROWS)][NQ], b[SOME(ROWS)];     /* rows of open contacts are zero */
-  double M_inv[NQ][NQ], H[NQ][NQ];             /* H = M^-1 - L A M^-1, from force to acceleration */
+  double M_inv[NQ][NQ], H[NQ][NQ];             /* H = M^-1 - L A M^-1 maps forces to accelerations */
   double L[NQ][SOME(ROWS)];                    /* L = M^-1 A^T (A M^-1 A^T)^+ */
   double S[SOME(ROWS)][SOME(ROWS)];            /* (A M^-1 A^T)^+ */
+  double hidden[SOME(ROWS)][SOME(ROWS)];       /* projector on multipliers that move nothing, A^T mu = 0 */
   double qdd[NQ], load[SOME(ROWS)];            /* qdd and lambda of the analytical forces */
   int closed[SOME(CONTACTS)];
   touching contact[SOME(CONTACTS)];
   double x[SOME(INPUTS)], phi[SOME(FEATURES)]; /* standardized inputs and features of the priors */
 } equations;
 
-/* the lower Cholesky factor of M = G G^T `(n, n)`, and K = G^-1; 0 unless M is positive definite */
+/* the lower Cholesky factor G of M = G G^T `(n, n)`, and K = G^-1; returns 0 unless M is positive definite */
 static int inverse_factor(const double *restrict M, int n, double *restrict G, double *restrict K) {
   for (int i = 0; i < n; ++i)
     for (int j = 0; j <= i; ++j) {
@@ -65,8 +66,9 @@ static int inverse_factor(const double *restrict M, int n, double *restrict G, d
 }
 
 #if CONTACTS > 0
-/* P = W^+ `(NQ, ROWS)` by one-sided Jacobi rotations of the rows; small singular values count as zero */
-static void pseudo_inverse(double *restrict W, double *restrict P) {
+/* P = W^+ `(NQ, ROWS)` by one-sided Jacobi rotations of the rows, and R = 1 - W W^+; small singular values count as
+ * zero */
+static void pseudo_inverse(double *restrict W, double *restrict P, double (*restrict R)[ROWS]) {
   double V[ROWS * ROWS], square[ROWS], most = 0.0;
   for (int r = 0; r < ROWS * ROWS; ++r) V[r] = r % (ROWS + 1) == 0 ? 1.0 : 0.0;
   for (int sweep = 0; sweep < 30; ++sweep) {
@@ -99,10 +101,16 @@ static void pseudo_inverse(double *restrict W, double *restrict P) {
         if (square[r] > RANK_TOLERANCE * RANK_TOLERANCE * most) sum += W[r * NQ + j] / square[r] * V[s * ROWS + r];
       P[j * ROWS + s] = sum;
     }
+  for (int r = 0; r < ROWS; ++r)
+    for (int s = 0; s < ROWS; ++s) {
+      R[r][s] = 0.0;
+      for (int i = 0; i < ROWS; ++i)
+        if (!(square[i] > RANK_TOLERANCE * RANK_TOLERANCE * most)) R[r][s] += V[r * ROWS + i] * V[s * ROWS + i];
+    }
 }
 #endif
 
-/* qdd and lambda of impressed forces Q: qdd = M^-1 Q + L (b - A M^-1 Q), lambda = S (b - A M^-1 Q) */
+/* qdd and lambda under impressed forces Q: qdd = M^-1 Q + L (b - A M^-1 Q), lambda = S (b - A M^-1 Q) */
 static void motion_under(const equations *restrict e, const double *restrict Q, double *restrict qdd,
                          double *restrict multiplier) {
   double free[NQ], gap[SOME(ROWS)] = {0.0};
@@ -146,7 +154,9 @@ static int assemble(const double *restrict q, const double *restrict qd, const d
     for (int r = 0; r < ROWS; ++r) combine(&e->M_inv[0][0], e->A[r], NQ, NQ, along[r]);
     for (int r = 0; r < ROWS; ++r)
       for (int i = 0; i < NQ; ++i) W[r * NQ + i] = dot(K + i * NQ, e->A[r], i + 1);
-    pseudo_inverse(W, P);
+    pseudo_inverse(W, P, e->hidden);
+    for (int r = 0; r < ROWS; ++r)
+      if (!e->closed[r]) e->hidden[r][r] = 0.0;
     for (int r = 0; r < ROWS; ++r)
       for (int s = 0; s < ROWS; ++s) {
         double sum = 0.0;
@@ -168,7 +178,7 @@ static int assemble(const double *restrict q, const double *restrict qd, const d
   return 1;
 }
 
-/* ---- friction -mu lambda s(v) of contacts, s(v) = v / sqrt(|v|^2 + eps^2), which goes with lambda ---- */
+/* ---- contact friction -mu lambda s(v) with s(v) = v / sqrt(|v|^2 + eps^2), proportional to lambda ---- */
 
 #if COULOMB > 0
 /* u = -J_E^T s(v), the generalized force of a unit friction force */
@@ -180,7 +190,7 @@ static void against_sliding(const touching *at, double smoothing, double *u) {
   }
 }
 
-/* gain = U (I + L^T U)^-1 `(NQ, ROWS)`, from the multiplier without friction to the friction */
+/* gain = U (I + L^T U)^-1 `(NQ, ROWS)`, which maps the multiplier without friction to the friction */
 static int friction_gain(const equations *e, double *restrict gain) {
   double U[ROWS][NQ], X[ROWS][ROWS + NQ];
   memset(U, 0, sizeof U);
@@ -220,8 +230,8 @@ static int friction_gain(const equations *e, double *restrict gain) {
 typedef struct {
   double B_Q[SIZE_OF_ALL][NQ]; /* on the joint force Q */
   double B_z[SIZE_OF_ALL][NQ]; /* on the friction Q_z of contacts */
-  double B_N[SIZE_OF_ALL][NQ]; /* on the part of Q along the constraint, which moves nothing */
-  double B_F[SIZE_OF_ALL][NQ]; /* on the friction of the joints alone */
+  double B_N[SIZE_OF_ALL][NQ]; /* on the part of Q along the constraint, which does not affect the motion */
+  double B_F[SIZE_OF_ALL][NQ]; /* on the joint friction alone */
   double o[SIZE_OF_ALL];
 } affine;
 
@@ -231,7 +241,7 @@ int forcegp_size(unsigned quantities) {
   return size;
 }
 
-/* the rows of the requested quantities; the bits are those of the header, in this order */
+/* the rows of the requested quantities, in the order of their bits in the header */
 static int maps(const equations *restrict e, const double *restrict gain, unsigned wanted, affine *restrict z) {
   const int size = forcegp_size(wanted);
   double lambda_0[SOME(ROWS)]; /* (A M^-1 A^T)^+ b */
@@ -287,13 +297,13 @@ static int maps(const equations *restrict e, const double *restrict gain, unsign
 /* ---- the latent forces f of the priors, Q = m + sum of E f ---- */
 
 typedef struct {
-  double mean[COMPONENTS], prior[COMPONENTS]; /* posterior mean of f; variance before the data */
+  double mean[COMPONENTS], prior[COMPONENTS]; /* posterior mean of f, and its prior variance */
   double rest[COMPONENTS];                    /* diagonal part D of the posterior covariance */
   double E[COMPONENTS][NQ];                   /* generalized force of each f */
   double T[COMPONENTS][RANK];                 /* the covariance is D + T T^T or, with SIGN -1, D - T T^T */
-  const forcegp_learned *learned;             /* what was learned online, if anything */
-  const double *folded;                       /* weights of kernels and features, if not those of the mean */
-  double *functions;                          /* where whitened functions go, if nothing else is asked for */
+  const forcegp_learned *learned;             /* the online state, or NULL */
+  const double *folded;                       /* weights of kernels and features; NULL means those of the mean */
+  double *functions;                          /* output for the whitened functions, or NULL */
 } latent;
 
 /* row = V^T C, the functions V of a component in the columns from `first` on */
@@ -302,7 +312,7 @@ static void root_row(const double *restrict C, const double *restrict V, int n, 
   combine(C, V, n, RANK - first, row + first);
 }
 
-/* posterior of component k, from its functions V: m covariances k(x, Z) of the prior variance `variance`, and
+/* posterior of component k from its functions V: m covariances k(x, Z), with prior variance `variance`, and
  * features phi(x) */
 static void component(const double *restrict V, int m, int features, double variance, const double *restrict weights,
                       const double *restrict whitening, int kept, const double *restrict C, int first, int spread,
@@ -314,7 +324,7 @@ static void component(const double *restrict V, int m, int features, double vari
   f->prior[k] = variance + more;
   f->rest[k] = SIGN > 0.0 ? variance : variance + more;
   if (!spread) return;
-  if (whitening) { /* D = k - |R^T k(Z, x)|^2, what the support points miss */
+  if (whitening) { /* D = k - |R^T k(Z, x)|^2, the residual variance given the support points */
     combine(whitening, V, m, kept, white);
     memcpy(white + kept, V + m, sizeof(double) * features);
     f->rest[k] = fmax(variance - dot(white, white, kept), 0.0);
@@ -331,15 +341,15 @@ static void component(const double *restrict V, int m, int features, double vari
   root_row(C, functions, m + features, first, f->T[k]);
 }
 
-/* HELPERS: each of these is written where a prior uses it */
+/* HELPERS: each is included only if a prior uses it */
 
-/* E = 1 of a force of each joint */
+/* E = 1 for a force on each joint */
 static void identity(int count, double (*restrict E)[NQ]) {
   for (int k = 0; k < count; ++k)
     for (int j = 0; j < NQ; ++j) E[k][j] = j == k ? 1.0 : 0.0;
 }
 
-/* E = A^T L^T of a joint force along the constraint */
+/* E = A^T L^T for a joint force along the constraint */
 static void along_constraint(const equations *restrict e, double (*restrict E)[NQ]) {
   for (int k = 0; k < NQ; ++k)
     for (int j = 0; j < NQ; ++j) {
@@ -348,7 +358,7 @@ static void along_constraint(const equations *restrict e, double (*restrict E)[N
     }
 }
 
-/* E = J_E^T (t_1, t_2) of any force along the surface */
+/* E = J_E^T (t_1, t_2) for any force along the surface */
 static void tangential(const equations *restrict e, int c, double (*restrict E)[NQ]) {
   const touching *at = &e->contact[c];
   memset(E, 0, sizeof(double[2][NQ]));
@@ -357,8 +367,8 @@ static void tangential(const equations *restrict e, int c, double (*restrict E)[
       for (int j = 0; j < NQ; ++j) E[t][j] += at->tangent[t][x] * at->jacobian[x][j];
 }
 
-/* E of friction that opposes sliding: viscous, dry, and in proportion to the multiplier Coulomb's, Stribeck's
- * and torsion; 0 if the contact jams with the friction coefficient mu */
+/* E for friction that opposes sliding: viscous and dry friction, and, in proportion to the multiplier, Coulomb,
+ * Stribeck and torsional friction; returns 0 if the contact jams with the friction coefficient mu */
 static int against(const equations *restrict e, const double *restrict qd, int c, const int *restrict terms, int count,
                    double smoothing, double mu, double stribeck_speed, double torsion_smoothing, double (*restrict E)[NQ]) {
   enum { VISCOUS, DRY, COULOMBS, STRIBECKS, TORSION };
@@ -374,7 +384,7 @@ static int against(const equations *restrict e, const double *restrict qd, int c
     for (int x = 0; x < 3; ++x) push[j] -= at->sliding_jacobian[x][j] * at->sliding[x];
     relief += mu * e->L[j][c] * push[j] / size;
   }
-  load = fmax(e->load[c], 0.0) / relief; /* lambda of the analytical forces with the friction mu lambda s */
+  load = fmax(e->load[c], 0.0) / relief; /* lambda under the analytical forces with friction mu lambda s */
   for (int k = 0; k < count; ++k) {
     loaded |= terms[k] >= COULOMBS;
     for (int j = 0; j < NQ; ++j) {
@@ -389,7 +399,7 @@ static int against(const equations *restrict e, const double *restrict qd, int c
   return !loaded || relief > 0.0;
 }
 
-/* E = d(mu u)/d(log mu, log eps) lambda, with the multiplier of the analytical forces and this friction */
+/* E = d(mu u)/d(log mu, log eps) lambda, with the multiplier under the analytical forces and this friction */
 static void friction_error(const equations *restrict e, const double *restrict tau, const double *restrict gain, int c,
                            double mu, double smoothing, double (*restrict E)[NQ]) {
   const touching *at = &e->contact[c];
@@ -405,7 +415,7 @@ static void friction_error(const equations *restrict e, const double *restrict t
   }
 }
 
-/* u_j = |x - z_j|^2 of scaled inputs x and m support points, one input after the other */
+/* u_j = |x - z_j|^2 for scaled inputs x and m support points, computed input by input */
 static void squares(const double *restrict x, const double *restrict Z, int width, int m, double *restrict u) {
   for (int j = 0; j < m; ++j) u[j] = 0.0;
   for (int d = 0; d < width; ++d)
@@ -420,7 +430,7 @@ static void squaredexponential(double *restrict u, int m) {
   for (int j = 0; j < m; ++j) u[j] = exp(-0.5 * fmin(u[j], 600.0));
 }
 
-/* the slope of a profile by r^2 */
+/* the derivative of a profile with respect to r^2 */
 static void squaredexponential_slope(double *restrict u, int m) {
   for (int j = 0; j < m; ++j) u[j] = -0.5 * exp(-0.5 * fmin(u[j], 600.0));
 }
@@ -433,7 +443,7 @@ static void matern52_slope(double *restrict u, int m) {
   for (int j = 0; j < m; ++j) u[j] = sqrt(5.0 * u[j]), u[j] = -5.0 / 6.0 * (1.0 + u[j]) * exp(-fmin(u[j], 300.0));
 }
 
-/* df/dx of f = sum of h_j |x - z_j|^2 or, of a linear kernel, of h_j x^T z_j */
+/* df/dx for f = sum of h_j |x - z_j|^2 or, for a linear kernel, f = sum of h_j x^T z_j */
 static void pull(const double *restrict Z, const double *restrict x, const double *restrict scale,
                  const int *restrict column, int width, int m, const double *restrict h, int stationary,
                  double *restrict slope) {
@@ -458,7 +468,7 @@ static void matern52(double *restrict u, int m) {
 /* PRIORS */
 
 #if defined INERTIAL || defined PAYLOAD
-/* E = -[Y(q, qdd, qd), diag qdd] S of errors of some inertial parameters of links, and of drives behind them */
+/* E = -[Y(q, qdd, qd), diag qdd] S for errors of inertial parameters of links, followed by those of drives */
 static void inertial(const double *restrict q, const double *restrict qd, const double *restrict qdd, int start, int column,
                      int count, const double *restrict scale, latent *restrict f) {
   double sine[NQ], cosine[NQ], Y[10 * NQ + NQ][NQ] = {{0.0}};
@@ -469,7 +479,7 @@ static void inertial(const double *restrict q, const double *restrict qd, const 
 }
 #endif
 
-/* E of errors of the inertia at the acceleration qdd or, with NULL, at that of the analytical forces */
+/* E for inertia errors at the acceleration qdd or, with NULL, at the acceleration under the analytical forces */
 static void inertial_errors(const double *q, const double *qd, const equations *e, const double *qdd, latent *f) {
   (void)q, (void)qd, (void)e, (void)qdd, (void)f;
 #ifdef PAYLOAD
@@ -480,7 +490,7 @@ static void inertial_errors(const double *q, const double *qd, const equations *
 #endif
 }
 
-/* ---- reading quantities off the posterior of the forces ---- */
+/* ---- computing quantities from the posterior of the forces ---- */
 
 /* z = o + B_Q (m + sum of E f) + B_z ... */
 static void read_mean(const affine *restrict z, const latent *restrict f, const double *restrict prior_mean, int size,
@@ -498,7 +508,7 @@ static void read_mean(const affine *restrict z, const latent *restrict f, const 
               dot(z->B_N[a], force[CONSTRAINT], NQ) + dot(z->B_F[a], force[JOINT_FRICTION], NQ);
 }
 
-/* W = B E, from the latent forces to quantities */
+/* W = B E, which maps the latent forces to quantities */
 static void operators(const affine *restrict z, const latent *restrict f, int size, double (*restrict W)[COMPONENTS]) {
   for (int a = 0; a < size; ++a)
     for (int k = 0; k < COMPONENTS; ++k) {
@@ -507,7 +517,7 @@ static void operators(const affine *restrict z, const latent *restrict f, int si
     }
 }
 
-/* W D W^T + W T T^T W^T with W = B E, and the variance of unknown forces; 0 if a variance is rounding */
+/* W D W^T + W T T^T W^T with W = B E, plus the variance of unknown forces; 0 if a variance is below rounding error */
 static int read_covariance(const affine *restrict z, const latent *restrict f, const double *restrict unknown,
                            int size, double *restrict covariance) {
   double root[SIZE_OF_ALL][RANK], W[SIZE_OF_ALL][COMPONENTS], scaled[COMPONENTS];
@@ -535,7 +545,7 @@ static void expected_force(const equations *restrict e, const double *restrict t
     m[i] = MEAN_TERMS[0] * e->Q_C[i] + MEAN_TERMS[1] * e->Q_G[i] + MEAN_TERMS[2] * e->Q_D[i] + MEAN_TERMS[3] * tau[i];
 }
 
-/* how far speed and torque lie beyond those of the training data, in their standard deviations */
+/* distance by which speed and torque exceed the training data, in standard deviations of these data */
 static void distance(const double *restrict qd, const double *restrict tau, double *restrict beyond) {
   for (int i = 0; i < NQ; ++i) {
     const double v = fmax(fmax(LOW[0][i] - qd[i], qd[i] - HIGH[0][i]), 0.0) / SPREAD[0][i];
@@ -564,7 +574,7 @@ typedef struct {
   double gain[NQ * SOME(ROWS)], prior_mean[NQ], far[NQ];
 } situation;
 
-/* errors of the inertia are multiplied by the acceleration qdd; see `inertial_errors` */
+/* inertia errors are multiplied by the acceleration qdd; see `inertial_errors` */
 static int evaluate(const forcegp_learned *learned, const double *q, const double *qd, const double *tau,
                     const unsigned char *closed, const double *qdd, int spread, situation *s) {
   int status = prepare(q, qd, tau, closed, &s->e, s->gain);
@@ -580,7 +590,7 @@ static int evaluate(const forcegp_learned *learned, const double *q, const doubl
   return 0;
 }
 
-/* variance of forces beside the learned ones: of joints that stick, beyond the trained region, and noise of the torques */
+/* variance of forces other than the learned ones: of sticking joints, beyond the trained region, and torque noise */
 static void unknown_forces(const double *qd, const double *far, int noise, double *unknown) {
   for (int i = 0; i < NQ; ++i) {
     const double slow = qd[i] / STICK_SPEED[i], grown = GROWTH[i] * far[i];
@@ -589,7 +599,7 @@ static void unknown_forces(const double *qd, const double *far, int noise, doubl
   }
 }
 
-/* whether no eigenvalue is clearly negative, of variables in units of their standard deviation */
+/* whether no eigenvalue is clearly negative when variables are scaled by their standard deviations */
 static int semidefinite(const double *restrict covariance, int n) {
   double G[SIZE_OF_ALL * SIZE_OF_ALL], scale[SIZE_OF_ALL], most = 0.0;
   for (int i = 0; i < n; ++i) most = fmax(most, covariance[i * n + i]);
@@ -607,37 +617,88 @@ static int semidefinite(const double *restrict covariance, int n) {
 }
 
 static int all_finite(const double *x, int n) {
-  double sum = 0.0; /* 0 x is not a number unless x is finite */
+  double sum = 0.0; /* 0 x is NaN unless x is finite */
   for (int i = 0; i < n; ++i) sum += 0.0 * x[i];
   return sum == 0.0;
 }
 
-static int predict(const forcegp_learned *learned, const double *q, const double *qd, const double *tau,
-                   const unsigned char *closed, unsigned quantities, int noise, double *mean, double *covariance,
-                   double *beyond) {
-  situation s;
+/* Forces of contacts that are never closed in the data, or that cannot move, become NaN; loads that contacts share get
+ * the mean square of those that motion determines as variance. As in `hidden_forces` of forcegp */
+static int undetermined(const situation *restrict s, unsigned wanted, int size, double *restrict mean,
+                        double *restrict covariance) {
+#if CONTACTS > 0
+  double share[SIZE_OF_ALL], square = 0.0, seen = 0.0;
+  int owner[SIZE_OF_ALL], lost[SIZE_OF_ALL], whole[ROWS], shared[ROWS], never = 0, found = 0, row = 0;
+  for (int r = 0; r < ROWS; ++r) {
+    const double part = s->e.hidden[r][r];
+    int unseen = NEVER_CLOSED[r];
+#if ONLINE
+    unseen &= !(s->f.learned && s->f.learned->touched[r] > 0.0);
+#endif
+    whole[r] = unseen || part > 1.0 - HIDDEN, shared[r] = !(part > 1.0 - HIDDEN) && part > HIDDEN;
+    never |= unseen, found |= whole[r] | shared[r];
+    if (shared[r]) seen += (1.0 - part) * (!!(wanted & FORCEGP_MULTIPLIER) + !!(wanted & FORCEGP_CONTACT_FORCE));
+  }
+  if (!found) return 0;
+  found = 0;
+  for (int bit = 0; bit < QUANTITIES; ++bit)
+    for (int i = 0; wanted >> bit & 1u && i < SIZES[bit]; ++i, ++row) {
+      const unsigned what = 1u << bit;
+      const int r = what == FORCEGP_MULTIPLIER ? i : what == FORCEGP_CONTACT_FORCE ? i / 3 : -1;
+      owner[row] = r < 0 ? 0 : r, share[row] = 0.0;
+      lost[row] = r < 0 ? what == FORCEGP_CONSTRAINT_FORCE && never : whole[r];
+      if (r >= 0 && shared[r]) share[row] = what == FORCEGP_MULTIPLIER ? 1.0 : s->e.contact[r].normal[i % 3];
+      found |= lost[row] || share[row] != 0.0;
+      if (covariance && share[row] != 0.0) square += mean[row] * mean[row] + covariance[row * size + row];
+    }
+  for (int a = 0; a < size; ++a) {
+    for (int b = 0; covariance && b < size; ++b) {
+      covariance[a * size + b] += square / fmax(seen, HIDDEN) * share[a] * share[b] * s->e.hidden[owner[a]][owner[b]];
+      if (lost[a] || lost[b]) covariance[a * size + b] = NAN;
+    }
+    if (lost[a]) mean[a] = NAN;
+  }
+  return found ? FORCEGP_UNDETERMINED : 0;
+#else
+  (void)s, (void)wanted, (void)size, (void)mean, (void)covariance;
+  return 0;
+#endif
+}
+
+/* mean and covariance, of undetermined forces too */
+static int posterior(const forcegp_learned *learned, const double *q, const double *qd, const double *tau,
+                     const unsigned char *closed, unsigned quantities, int noise, double *mean, double *covariance,
+                     double *beyond, situation *s) {
   affine z;
   double unknown[NQ], qdd[NQ];
-  int size, resolved, status = evaluate(learned, q, qd, tau, closed, NULL, covariance != NULL, &s);
+  int size, resolved, status = evaluate(learned, q, qd, tau, closed, NULL, covariance != NULL, s);
   if (status) return status;
-  if (beyond) memcpy(beyond, s.far, sizeof s.far);
+  if (beyond) memcpy(beyond, s->far, sizeof s->far);
   if (INERTIA_LEARNED && covariance) { /* at the predicted acceleration */
-    maps(&s.e, s.gain, FORCEGP_QDD, &z);
-    read_mean(&z, &s.f, s.prior_mean, NQ, qdd);
-    inertial_errors(q, qd, &s.e, qdd, &s.f);
+    maps(&s->e, s->gain, FORCEGP_QDD, &z);
+    read_mean(&z, &s->f, s->prior_mean, NQ, qdd);
+    inertial_errors(q, qd, &s->e, qdd, &s->f);
   }
-  size = maps(&s.e, s.gain, quantities, &z);
-  read_mean(&z, &s.f, s.prior_mean, size, mean);
+  size = maps(&s->e, s->gain, quantities, &z);
+  read_mean(&z, &s->f, s->prior_mean, size, mean);
   if (!all_finite(mean, size)) return FORCEGP_OVERFLOW;
   if (!covariance) return 0;
-  unknown_forces(qd, s.far, noise, unknown);
-  resolved = read_covariance(&z, &s.f, unknown, size, covariance);
+  unknown_forces(qd, s->far, noise, unknown);
+  resolved = read_covariance(&z, &s->f, unknown, size, covariance);
   if (noise)
     for (int bit = 0, row = 0; bit < QUANTITIES; ++bit)
       for (int i = 0; quantities >> bit & 1u && i < SIZES[bit]; ++i, ++row)
         covariance[row * size + row] += SENSOR_VARIANCE[bit] ? SENSOR_VARIANCE[bit][i] : 0.0;
   if (!all_finite(covariance, size * size)) return FORCEGP_OVERFLOW;
   return resolved && semidefinite(covariance, size) ? 0 : FORCEGP_UNRESOLVED;
+}
+
+static int predict(const forcegp_learned *learned, const double *q, const double *qd, const double *tau,
+                   const unsigned char *closed, unsigned quantities, int noise, double *mean, double *covariance,
+                   double *beyond) {
+  situation s;
+  const int status = posterior(learned, q, qd, tau, closed, quantities, noise, mean, covariance, beyond, &s);
+  return status ? status : undetermined(&s, quantities, forcegp_size(quantities), mean, covariance);
 }
 
 int forcegp_equations(const double *q, const double *qd, double *M, double *A) {
@@ -664,7 +725,7 @@ int forcegp_predict_learned(const forcegp_learned *learned, long count, const do
     const int status = predict(learned, q + i * NQ, qd + i * NQ, tau + i * NQ, closed ? closed + i * CONTACTS : NULL,
                                quantities, noise, mean + i * d, covariance ? covariance + i * d * d : NULL,
                                beyond ? beyond + i * NQ : NULL);
-    worst = worst ? worst : status;
+    if (status && (!worst || worst == FORCEGP_UNDETERMINED)) worst = status;
   }
   return worst;
 }

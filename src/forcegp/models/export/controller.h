@@ -1,7 +1,7 @@
 /* Forces and accelerations of a robot with learned forces, written by forcegp.
  *
  * M qdd = Q + Q_z + A^T lambda and A qdd = b. All units are SI, angles in radians, vectors in world axes.
- * No function allocates, none has state of its own: they are reentrant, and their run time is bounded.
+ * No function allocates memory or has state of its own. All are reentrant, and their run time is bounded.
  *
  * Joints, in order: @joints@
  * Contacts, in order: @touching@
@@ -16,46 +16,49 @@ extern "C" {
 #define FORCEGP_JOINTS @nq@
 #define FORCEGP_CONTACTS @contacts@
 
-/* Quantities; join them by |. They lie in this order in mean and covariance. */
+/* Quantities, to be combined by |. Mean and covariance contain them in this order. */
 @bits@
 
-/* What is returned other than 0 */
+/* Error codes; 0 means success */
 #define FORCEGP_NOT_FINITE 1  /* a state is not finite; nothing is written */
 #define FORCEGP_JAMMED 2      /* friction of a contact would press harder than it opposes */
-#define FORCEGP_UNRESOLVED 3  /* a variance is rounding, or a covariance has a negative eigenvalue */
+#define FORCEGP_UNRESOLVED 3  /* a variance is below rounding error, or a covariance has a negative eigenvalue */
 #define FORCEGP_NO_INERTIA 4  /* the mass matrix is not positive definite */
-#define FORCEGP_NO_JACOBIAN 5 /* not of this quantity, or the closed contacts are not independent */
+#define FORCEGP_NO_JACOBIAN 5 /* the quantity has no Jacobian, or the closed contacts are not independent */
 #define FORCEGP_OVERFLOW 9    /* a result is not finite */
+#define FORCEGP_UNDETERMINED 11 /* all is written, but some forces of contacts are not determined: those of contacts
+                                 * that are never closed in the data or cannot move are NaN, and shared loads wide */
 
-/* Number d of components of quantities. */
+/* Number d of components of the given quantities. */
 int forcegp_size(unsigned quantities);
 
 /* Posterior mean and covariance of quantities at one state.
  *
  * q, qd, tau   FORCEGP_JOINTS positions, velocities and motor torques
- * closed       FORCEGP_CONTACTS flags of the closed contacts; NULL for all
+ * closed       FORCEGP_CONTACTS flags of the closed contacts; NULL means all
  * quantities   such as FORCEGP_QDD | FORCEGP_MULTIPLIER
- * noise        whether the covariance is that of a measurement, noise of torque and sensor included
+ * noise        whether the covariance is that of a measurement, including the noise of torques and sensors
  * mean         d numbers
- * covariance   d x d numbers, row by row; NULL if it is not needed, which costs less
- * beyond       FORCEGP_JOINTS distances of speed and torque from those of the training data, in their
- *              standard deviations, 0 inside; beyond 3 error bars are a guess. NULL if not needed
+ * covariance   d x d numbers, row by row; NULL if it is not needed, which takes less time
+ * beyond       FORCEGP_JOINTS distances by which speeds and torques exceed the training data, in standard
+ *              deviations of these data, 0 inside; above 3, error bars are a guess. NULL if not needed
  */
 int forcegp_predict(const double *q, const double *qd, const double *tau, const unsigned char *closed,
                     unsigned quantities, int noise, double *mean, double *covariance, double *beyond);
 
-/* The same at `count` states, from what was learned online, or, with NULL, in the fit; returns the first error. */
+/* The same at `count` states, from what was learned online, or, with NULL, in the fit; returns the first error, if there is
+ * none FORCEGP_UNDETERMINED where it holds for a state. */
 typedef struct forcegp_learned forcegp_learned;
 int forcegp_predict_learned(const forcegp_learned *learned, long count, const double *q, const double *qd,
                             const double *tau, const unsigned char *closed, unsigned quantities, int noise, double *mean,
                             double *covariance, double *beyond);
 
-@online@@wrench@/* Mass matrix M and, of all contacts, the rows of A; these are the Jacobian of a tool in three planes through it. */
+@online@@wrench@/* Mass matrix M, and the rows of A for all contacts; three planes through a tool give its Jacobian. */
 int forcegp_equations(const double *q, const double *qd, double *M, double *A);
 
-/* Posterior mean and its Jacobian: of qdd, multiplier, contact force and joint friction.
+/* Posterior mean and its Jacobian: of qdd, multiplier, contact force and joint friction, undetermined ones included.
  *
- * jacobian     d x 3 FORCEGP_JOINTS numbers, row by row: derivatives by q, then by qd, then by tau
+ * jacobian     d x 3 FORCEGP_JOINTS numbers, row by row: derivatives with respect to q, then qd, then tau
  */
 int forcegp_jacobian(const double *q, const double *qd, const double *tau, const unsigned char *closed,
                      unsigned quantities, double *mean, double *jacobian);

@@ -1,4 +1,4 @@
-"""The folder of an exported model: C code with its test program and CMakeLists.txt, or a CasADi function."""
+"""The folder of an exported model: C code with a test program and CMakeLists.txt, or a CasADi function."""
 
 from __future__ import annotations
 
@@ -12,37 +12,36 @@ from torch import Tensor
 
 from forcegp.data import Dataset
 from forcegp.data.fields import DataHeader
-from forcegp.destination import check_destination, write_or_keep
+from forcegp.destination import check_destination, folder_or_keep
 from forcegp.errors import ParameterError, check_name
-from forcegp.files import written_folder
 from forcegp.forces.measurements import Training
 from forcegp.forces.posterior import HIGH, LOW
+from forcegp.forces.quantities import FlatStates
 from forcegp.models.export.casadi_function import write_casadi
 from forcegp.models.export.library import CompiledFit
 from forcegp.models.export.model import ExportedModel
 from forcegp.models.export.source import READ, c_source, template
-from forcegp.models.export.torch_program import write_torch
 from forcegp.models.external_wrench import LearnedForces, external_wrench
-from forcegp.models.prediction import Predictor
+from forcegp.models.prediction import Predictor, Query
 
 LANGUAGES = ("c", "casadi", "torch")
 STATES, LOSS_STATES = 16, 200
-"""States of the test program, and those at which the loss of a reduced posterior is measured."""
+"""Number of states in the test program, and number at which the loss of a reduced posterior is measured."""
 TOLERANCE, ZERO = 1e-10, 1e-5
-"""Largest difference from Python in units of max(|mean|, σ), or `ZERO` of the largest one of a state."""
+"""Largest difference from Python, relative to max(|mean|, σ), or to `ZERO` times its maximum at a state."""
 
 
 @dataclass(frozen=True)
 class Export:
-    """Files of an export.
+    """The files of an export, and their errors.
 
     Attributes:
-        folder: its path.
-        functions: number of functions of the covariance.
-        widest, wider: growth of σ of q̈ and λ by a reduced covariance, the largest and the median one, as
-            fractions, at training states or, if a saved fit has none, at random ones.
-        rounding: largest error by single precision of means of q̈ and λ in units of max(|mean|, σ), and of σ
-            as a fraction, at these states; zero in double precision.
+        folder: path of the folder.
+        functions: number of basis functions of the covariance.
+        widest, wider: largest and median relative growth of σ of q̈ and λ caused by a reduced covariance, at
+            training states or, if a saved fit has none, at random states.
+        rounding: largest errors caused by single precision at these states: of the means of q̈ and λ, in
+            units of max(|mean|, σ), and of σ, as a fraction; zero in double precision.
     """
 
     folder: Path
@@ -55,29 +54,21 @@ class Export:
 def write_export(
     model: ExportedModel, fit: Predictor, training: Training, path: str | Path, language: str, name: str
 ) -> Export:
-    """Write a model to a folder; arguments and errors as in `StructuredFit.export`."""
+    """Write a model to a folder; see `StructuredFit.export` for the arguments and errors."""
     check_name("language of an export", language, LANGUAGES)
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,40}", name):
         raise ParameterError(
             f"{name!r} cannot be the prefix of C functions",
             expected="lower-case letters, digits and underscores, a letter first",
         )
-    own = (
-        f"{name}.h",
-        f"{name}.c",
-        f"test_{name}.c",
-        "CMakeLists.txt",
-        "README.md",
-        "build",
-        f"{name}.casadi",
-        f"{name}.pt2",
-    )
+    own = [f"{name}{suffix}" for suffix in (".h", ".c", ".casadi", ".pt2")]
+    own += [f"test_{name}.c", "CMakeLists.txt", "README.md", "build"]
     check_destination(path, folder=True, own_files=own)
-    if language == "casadi":
-        write_casadi(model, Path(path), name)
-        return Export(Path(path), model.parts()[0].rank)
-    if language == "torch":
-        write_torch(fit, Path(path), name)
+    if language != "c":
+        if language == "casadi":
+            write_casadi(model, Path(path), name)
+        else:
+            write_torch(fit, Path(path), name)
         return Export(Path(path), model.parts()[0].rank)
     header, source = c_source(model, name)
     exact = dataclasses.replace(model, dtype=torch.float64)
@@ -103,20 +94,19 @@ def write_export(
     texts = {f"{name}.h": header, f"{name}.c": source, f"test_{name}.c": template("test.c", fields)}
     texts |= {file: template(f"{file}.in", fields) for file in ("CMakeLists.txt", "README.md")}
 
-    def write(folder: Path) -> None:
-        with written_folder(folder) as temporary:
-            for file, text in texts.items():
-                (temporary / file).write_text(text, encoding="utf-8")
+    def fill(folder: Path) -> None:
+        for file, text in texts.items():
+            (folder / file).write_text(text, encoding="utf-8")
 
-    write_or_keep(write, path)
+    folder_or_keep(fill, path)
     return result
 
 
 def rounding_of(model: ExportedModel, training: Training) -> tuple[float, float]:
-    """Error of means and of σ of q̈ and λ by single precision; see `Export.rounding`.
+    """Return the errors of the means and σ of q̈ and λ caused by single precision; see `Export.rounding`.
 
     Raises:
-        NumericalError: single precision does not resolve a variance.
+        NumericalError: single precision cannot resolve a variance.
     """
     if model.dtype == torch.float64:
         return 0.0, 0.0
@@ -127,13 +117,14 @@ def rounding_of(model: ExportedModel, training: Training) -> tuple[float, float]
     )
     assert coarse.std is not None and fine.std is not None
     size = fine.mean.abs().maximum(fine.std)
-    size = size.maximum(ZERO * size.amax(-1, keepdim=True))
-    in_std = (coarse.std / fine.std - 1.0).abs()[fine.std > ZERO * fine.std.amax()]
-    return float(((coarse.mean - fine.mean).abs() / size).max()), float(in_std.max())
+    size = size.maximum(ZERO * size.nan_to_num().amax(-1, keepdim=True))
+    in_mean = ((coarse.mean - fine.mean).abs() / size)[~size.isnan()]
+    in_std = (coarse.std / fine.std - 1.0).abs()[fine.std > ZERO * fine.std.nan_to_num().amax()]
+    return float(in_mean.max()), float(in_std.max())
 
 
 def loss_of(model: ExportedModel, fit: Predictor, training: Training) -> tuple[float, float]:
-    """Return how much σ of q̈ and λ grows with a reduced covariance, at training or random states."""
+    """Return the largest and median growth of σ of q̈ and λ caused by a reduced covariance."""
     if model.functions is None:
         return 0.0, 0.0
     states = states_of(model, training)
@@ -143,12 +134,12 @@ def loss_of(model: ExportedModel, fit: Predictor, training: Training) -> tuple[f
     ]
     small, whole = (x.covariance.diagonal(dim1=-2, dim2=-1).sqrt() for x in read if x.covariance is not None)
     # Nothing is lost of structural zeros, such as λ of an open contact.
-    growth = (small / whole - 1.0)[whole > ZERO * whole.amax()]
+    growth = (small / whole - 1.0)[whole > ZERO * whole.nan_to_num().amax()]
     return float(growth.max()), float(growth.median())
 
 
 def states_of(model: ExportedModel, training: Training) -> tuple[Tensor, ...]:
-    """q, q̇, τ and closed contacts of training states, or random ones if none are kept."""
+    """Return q, q̇, τ and closed contacts at training states, or at random states if none were kept."""
     if not training.samples:
         return random_states(model, LOSS_STATES)
     few = training.evenly(LOSS_STATES).measurements
@@ -156,7 +147,10 @@ def states_of(model: ExportedModel, training: Training) -> tuple[Tensor, ...]:
 
 
 def random_states(model: ExportedModel, count: int) -> tuple[Tensor, ...]:
-    """Return random q, q̇, τ and closed contacts within joint limits and the trained region, if known."""
+    """Return random q, q̇, τ and closed contacts within joint limits and the trained region, if known.
+
+    At least one direction of motion is free.
+    """
     robot, random = model.system.robot, torch.Generator().manual_seed(0)
     one = torch.ones(robot.nq, dtype=torch.float64)
     limits = [
@@ -168,11 +162,13 @@ def random_states(model: ExportedModel, count: int) -> tuple[Tensor, ...]:
         limits[1:] = zip(model.tensors[LOW], model.tensors[HIGH], strict=True)
     shares = torch.rand(3, count, robot.nq, dtype=torch.float64, generator=random)
     state = [low + share * (high - low) for (low, high), share in zip(limits, shares, strict=True)]
-    return *state, torch.rand(count, len(model.system.contacts), generator=random) < 0.7
+    closed = torch.rand(count, len(model.system.contacts), generator=random) < 0.7
+    # Accelerations of an arm that contacts hold completely are rounding.
+    return *state, closed & (closed.cumsum(-1) < robot.nq)
 
 
 def _reference(model: ExportedModel, fit: Predictor, name: str) -> str:
-    """Return C tables of states, and Python's mean, covariance and Jacobians at these states."""
+    """Return C tables of states and of the mean, covariance and Jacobians that Python computes at them."""
     q, qd, tau, active = random_states(model, STATES)
     read = fit.predict(q, qd, tau, list(READ[:-1]), active=active)  # pyright: ignore[reportArgumentType]
     assert read.covariance is not None
@@ -190,7 +186,7 @@ def _reference(model: ExportedModel, fit: Predictor, name: str) -> str:
     tables["slopes"] = torch.cat(both, dim=1)
     lines.append(f"enum {{ SLOPES = {tables['slopes'].shape[1]} }};")
     if model.wrench is not None:
-        # Accelerations that errors of the model explain: rounding counts for more the stronger the wrench is.
+        # The accelerations are within the model's errors, since rounding errors grow with the wrench.
         std = read.covariance.diagonal(dim1=-2, dim2=-1).clamp(min=0.0).sqrt()
         far = torch.linspace(-2.0, 2.0, len(q), dtype=q.dtype)[:, None]
         qdd = (read.mean + far * std)[:, read.parts["qdd"]]
@@ -203,6 +199,31 @@ def _reference(model: ExportedModel, fit: Predictor, name: str) -> str:
         tables |= {"qdd": qdd, "wrench": found.mean, "wrench_covariance": found.covariance.flatten(1)}
     for key, x in {**tables, "closed": flags}.items():
         kind = {"closed": "unsigned char"}.get(key, real if key in ("q", "qd", "tau", "qdd") else "double")
-        rows = ",\n  ".join("{" + ", ".join(map(repr, row)) + "}" for row in x.tolist())
+        rows = ",\n  ".join("{" + ", ".join(map(repr, row)) + "}" for row in x.tolist()).replace("nan", "NAN")
         lines.append(f"static const {kind} {key}[STATES][{x.shape[1]}] = {{{rows}}};")
     return "\n".join(lines)
+
+
+class _Posterior(torch.nn.Module):
+    def __init__(self, fit: Predictor) -> None:
+        super().__init__()
+        self.fit = fit
+
+    def forward(self, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor) -> tuple[Tensor | None, ...]:
+        flat, query = (
+            FlatStates(q, qd, tau, active, q.shape[:-1]),
+            Query(("qdd", "multiplier"), None, True, False),
+        )
+        return self.fit.at(flat, query)[0][:3]
+
+
+@torch.no_grad()
+def write_torch(fit: Predictor, path: Path, name: str) -> None:
+    """Write the program from q, q̇, τ `(1, nq)` and closed contacts `(1, n_contacts)` to mean, covariance and
+    distance from the training data; it raises no errors."""
+    system = fit.system
+    state = [torch.zeros(1, system.robot.nq, dtype=system.robot.dtype) for _ in range(3)]
+    closed = torch.ones(1, len(system.contacts), dtype=torch.bool)
+    program = torch.export.export(_Posterior(fit), (*state, closed), strict=False)
+
+    folder_or_keep(lambda folder: torch.export.save(program, str(folder / f"{name}.pt2")), path)

@@ -1,28 +1,18 @@
 /* ---- Jacobians of the mean ---- */
 
-/* whether the closed contacts are independent: the trace of the projector A L is their number */
-static int independent(const equations *restrict e) {
-  double missing = 0.0;
-  for (int r = 0; r < ROWS; ++r) {
-    missing += e->closed[r];
-    for (int i = 0; i < NQ; ++i) missing -= e->A[r][i] * e->L[i][r];
-  }
-  return missing < 0.5;
-}
-
 int forcegp_jacobian(const double *q, const double *qd, const double *tau, const unsigned char *closed,
                      unsigned quantities, double *mean, double *jacobian) {
   double sine[NQ], cosine[NQ], shut[SOME(ROWS)], f[SOME(SUPPORTED)], slope[SOME(SLOPES)], out[SIZE_OF_ALL * 3 * NQ];
   const double *row = out;
-  equations e;
-  const int status = forcegp_predict(q, qd, tau, closed, quantities, 0, mean, NULL, NULL);
+  double hidden = 0.0;
+  situation s;
+  const int status = posterior(NULL, q, qd, tau, closed, quantities, 0, mean, NULL, NULL, &s);
   if (status) return status;
-  if (quantities & ~DIFFERENTIATED) return FORCEGP_NO_JACOBIAN;
-  assemble(q, qd, tau, closed, &e);
-  if (!independent(&e)) return FORCEGP_NO_JACOBIAN;
+  for (int r = 0; r < ROWS; ++r) hidden += s.e.hidden[r][r]; /* not zero if closed contacts are not independent */
+  if (hidden > HIDDEN || quantities & ~DIFFERENTIATED) return FORCEGP_NO_JACOBIAN;
   for (int i = 0; i < NQ; ++i) sine[i] = sin(q[i]), cosine[i] = cos(q[i]);
-  for (int r = 0; r < ROWS; ++r) shut[r] = e.closed[r];
-  all_slopes(&e, f, slope);
+  for (int r = 0; r < ROWS; ++r) shut[r] = s.e.closed[r];
+  all_slopes(&s.e, f, slope);
   slopes_of_mean(q, qd, tau, shut, f, slope, sine, cosine, out);
   for (int bit = 0; bit < QUANTITIES; ++bit) {
     const long size = 3 * NQ * SIZES[bit];

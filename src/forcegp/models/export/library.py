@@ -1,11 +1,12 @@
-"""A fitted model that predicts with its exported C code, compiled by the machine's compiler and cached on
-disk.
+"""A fitted model that predicts with its exported C code, which is compiled by the local compiler and cached
+on disk.
 """
 
 from __future__ import annotations
 
 import copy
 import ctypes
+import dataclasses
 from collections.abc import Sequence
 from functools import cached_property
 from pathlib import Path
@@ -17,16 +18,17 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ForceGPError, ModelError, NumericalError, ShapeError, check_name
 from forcegp.forces.posterior import LOW
-from forcegp.forces.quantities import ForceField, ForceLinearization, flat_states
+from forcegp.forces.quantities import FlatStates, ForceField, ForceLinearization, flat_states, hidden_forces
 from forcegp.models.export.mean import DIFFERENTIATED
 from forcegp.models.export.model import ExportedModel
 from forcegp.models.export.source import READ, c_source
 from forcegp.models.external_wrench import ExternalWrench
-from forcegp.models.prediction import Prediction, Predictor
+from forcegp.models.prediction import Prediction, Predictor, in_pieces
 from forcegp.native import load_library
 
 NAME = "forcegp"
 NOT_FINITE, JAMMED, UNRESOLVED, NO_INERTIA, NO_JACOBIAN, AT_REST, NO_NOISE, OVERFLOW = 1, 2, 3, 4, 5, 6, 7, 9
+UNDETERMINED = 11
 """What the C code returns other than 0."""
 MESSAGES = {
     JAMMED: "friction of a contact would press harder than it opposes",
@@ -46,13 +48,13 @@ FUNCTIONS = {
     "forget": [ctypes.c_double, ctypes.c_int],
     "drift": [ctypes.c_int, ctypes.c_double],
 }
-"""Arguments after a pointer to what was learned online; all but the first are for models that learn."""
+"""Arguments after the pointer to the online state; all functions but the first require online learning."""
 
 
 class CompiledFit(Predictor):
-    """A fit that predicts with its C code: the results of `StructuredFit.predict`, in microseconds.
+    """A fit that predicts in C: it computes the results of `StructuredFit.predict` in microseconds.
 
-    Made by `StructuredFit.compiled`; `library` has the functions of the C header, named `forcegp_…`."""
+    It is created by `StructuredFit.compiled`; `library` has the functions of the C header, `forcegp_…`."""
 
     kind = "compiled"
 
@@ -72,7 +74,7 @@ class CompiledFit(Predictor):
         self._known: dict[str | tuple[str, ...], _Rows] = {}
 
     def save(self, path: str | Path) -> None:
-        """Raise an error: save the fit itself.
+        """Raise an error, since the fit itself must be saved instead.
 
         Raises:
             ModelError: always.
@@ -80,7 +82,7 @@ class CompiledFit(Predictor):
         raise ModelError("a compiled fit cannot be saved", hint="save the fit, or call fit.export(path)")
 
     def force_field(self) -> ForceField:
-        """Return the posterior mean of Q̄ = Q + Q_z, `(n, nq)` at states, in PyTorch."""
+        """Return the posterior mean of Q̄ = Q + Q_z as a force field in PyTorch."""
         if self._learned is not None:
             raise ModelError("what was learned in C has no force field in PyTorch", hint="update the fit")
         return self.model.posterior
@@ -96,18 +98,18 @@ class CompiledFit(Predictor):
         active: Tensor | None = None,
         noise_std: Tensor | None = None,
     ) -> CompiledFit:
-        """Add samples one after the other, as in `StructuredFit.update`.
+        """Add samples one after the other, with the result of `StructuredFit.update`.
 
         Args:
             q, qd, tau: `(*batch, nq)` states.
             measured: `(*batch, d)` values at these states.
             quantity: the measured quantity.
             active: `(*batch, n_contacts)` bool, closed contacts; by default all.
-            noise_std: standard deviation of the values `(d,)`; by default that of the fit.
+            noise_std: standard deviation of the values `(d,)`; by default, that of the fit.
 
         Raises:
             ModelError: the model cannot learn in C, or the noise of the quantity is unknown.
-            ShapeError: an argument does not fit the system, or is not finite.
+            ShapeError: an argument has the wrong shape for the system, or is not finite.
             UnknownNameError: the quantity does not exist.
         """
         read = self._read(quantity)
@@ -128,14 +130,14 @@ class CompiledFit(Predictor):
     def forget(
         self, factor: float, priors: Sequence[str] | None = None, *, budget: int = 2**30
     ) -> CompiledFit:
-        """Discount all samples so far, as in `StructuredFit.forget`.
+        """Reduce the weight of all previous samples, as in `StructuredFit.forget`.
 
         Args:
-            factor: multiplies the weight of all samples so far; with `priors`, the correlation of their
-                forces with the previous ones.
-            priors: names of the priors; their forces drift towards the prior, and no samples are discounted.
-            budget: number of weights with renewed prior, at the cost of a row each; the others wait for the
-                next calls. Default all.
+            factor: factor on the weight of all previous samples; with `priors`, the correlation of their
+                forces with the previous forces.
+            priors: names of priors whose forces drift towards the prior; samples then keep their weight.
+            budget: number of weights whose prior is renewed, each at the cost of one row; the others are
+                renewed in later calls. By default, all are renewed.
 
         Raises:
             ModelError: the model cannot learn in C, or the factor is out of range.
@@ -154,7 +156,7 @@ class CompiledFit(Predictor):
         return newer
 
     def _copy(self) -> CompiledFit:
-        """Return the fit with its own copy of what it has learned."""
+        """Return a copy of the fit with its own online state."""
         newer, learned = copy.copy(self), self._begun if self._learned is None else self._learned
         newer._learned = learned.clone()
         newer._memory = newer._learned.data_ptr()
@@ -162,7 +164,7 @@ class CompiledFit(Predictor):
 
     @cached_property
     def _begun(self) -> Tensor:
-        """Return the learned state of the fit as the numbers of a `forcegp_learned`."""
+        """Return the initial online state, with the values of a `forcegp_learned`."""
         if not self.model.online:
             raise ModelError(
                 "this fit cannot learn online in C",
@@ -171,7 +173,8 @@ class CompiledFit(Predictor):
             )
         parts = self.model.parts()
         n, folded = parts[0].rank, sum(part.weights.numel() for part in parts)
-        begun = torch.empty(2 * n + folded + n * (n + 1) // 2 + 1, dtype=torch.float64)
+        contacts = max(len(self.system.contacts), 1)
+        begun = torch.empty(2 * n + folded + n * (n + 1) // 2 + contacts + 1, dtype=torch.float64)
         self.library.forcegp_begin(begun.data_ptr())
         return begun
 
@@ -190,10 +193,10 @@ class CompiledFit(Predictor):
         """Return the posterior mean and covariance of a quantity, as in `StructuredFit.predict`.
 
         Arguments and errors are those of that method. `quantity` may also be `"joint_friction"`, the friction
-        of the joints, including that of the robot file [N m, N].
+        of the joints, including the friction in the robot file [N m, N].
 
         Raises:
-            ModelError: another `system` than that of the fit, or a contact that jams by friction.
+            ModelError: `system` is not the system of the fit, or friction jams a contact.
         """
         if system is not None and system is not self.system:
             raise ModelError("a compiled fit predicts on its own system", hint="use the predict of the fit")
@@ -204,14 +207,36 @@ class CompiledFit(Predictor):
         spread = new(*batch, read.size, read.size) if covariance else None
         pointers = [None if x is None else x.data_ptr() for x in (*arrays, mean, spread, beyond)]
         status = self._many(self._memory, batch.numel(), *pointers[:4], read.bits, noise, *pointers[4:])
-        if status:
+        if status not in (0, UNDETERMINED):
             raise self._error(status, q, qd, tau, active)
         if read.order is not None:
             mean = mean[..., read.order]
             spread = None if spread is None else spread[..., read.order, :][..., read.order]
         joints = self.system.robot.joint_names
         far = beyond if LOW in self.model.tensors else None
-        return Prediction(mean, spread, read.parts, far, joints, checked=True)
+        result = Prediction(mean, spread, read.parts, far, joints, checked=True)
+        return self._doubted(result, flat_states(self.system, q, qd, tau, active)) if status else result
+
+    def _doubted(self, prediction: Prediction, flat: FlatStates) -> Prediction:
+        """Return a prediction with descriptions of its undetermined components.
+
+        Raises:
+            ModelError: all requested quantities are forces of contacts that are never closed in the data.
+        """
+        names, doubts = self.system.contact_names, dict[str, None]()
+        closed = self._learned[-1 - len(names) : -1] if self._learned is not None else torch.zeros(len(names))
+        never = [name for name, own in zip(names, closed, strict=True) if own == 0.0]
+        never = [name for name in never if name in self.model.never_closed]
+
+        def read(piece: FlatStates) -> tuple[Tensor | None, ...]:
+            at = piece.with_equations(self.system)
+            hidden = hidden_forces(self.system, at, prediction.parts, never)
+            doubts.update(dict.fromkeys(() if hidden is None else hidden.doubts))
+            return ()
+
+        in_pieces(flat, read)
+        known = ~prediction.mean.isnan()
+        return dataclasses.replace(prediction, determined=known, doubts=tuple(doubts), checked=True)
 
     def jacobian(
         self,
@@ -231,7 +256,7 @@ class CompiledFit(Predictor):
 
         Raises:
             UnknownNameError: the quantity does not exist.
-            ModelError: a contact that jams by friction, or a fit updated in C.
+            ModelError: friction jams a contact, or the fit was updated in C.
             NumericalError: closed contacts are not independent.
         """
         if self._learned is not None:
@@ -262,19 +287,19 @@ class CompiledFit(Predictor):
         active: Tensor | None = None,
         qdd_std: Tensor | None = None,
     ) -> ExternalWrench:
-        """Wrench of the environment on the frame passed to `compiled(wrench=...)`, each state on its own.
+        """Estimate, separately for each state, the external wrench on the frame of `compiled(wrench=...)`.
 
-        The result is that of `StructuredFit.external_wrench` on samples in any order: friction with memory of
-        a log in order of time is not tracked.
+        The result is that of `StructuredFit.external_wrench` for samples in any order: friction with memory,
+        which needs a log in time order, is not tracked.
 
         Args:
             q, qd, tau, qdd: `(*batch, nq)` states with measured accelerations.
-            active: `(*batch, n_contacts)` bool, which contacts are closed; default all.
-            qdd_std: noise of the accelerations `(nq,)`; default that of the fit.
+            active: `(*batch, n_contacts)` bool, closed contacts; by default all.
+            qdd_std: standard deviation of the accelerations `(nq,)`; by default, that of the fit.
 
         Raises:
-            ModelError: the fit was compiled without a wrench, or a contact jams by friction.
-            ShapeError: an argument does not fit the system, or is not finite.
+            ModelError: the fit was compiled without a wrench, or friction jams a contact.
+            ShapeError: an argument has the wrong shape for the system, or is not finite.
         """
         mean, covariance, beyond, _ = self._wrench(q, qd, tau, qdd, active, qdd_std, False)
         frame, joints = self.model.wrench, self.system.robot.joint_names
@@ -293,7 +318,7 @@ class CompiledFit(Predictor):
         active: Tensor | None = None,
         qdd_std: Tensor | None = None,
     ) -> WrenchJacobian:
-        """The mean of `external_wrench` and its Jacobian by q, q̇, τ and q̈, by fourth-order differences.
+        """Return the mean of `external_wrench` and its Jacobian by fourth-order finite differences.
 
         Arguments and errors are those of `external_wrench`.
         """
@@ -310,7 +335,7 @@ class CompiledFit(Predictor):
         qdd_std: Tensor | None,
         differentiate: bool,
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Mean, covariance, distance from the training data, and slopes `(*batch, k, 4, nq)`."""
+        """Return mean, covariance, distance beyond the training data, and slopes `(*batch, k, 4, nq)`."""
         if self.model.wrench is None:
             raise ModelError(
                 "this fit was compiled without an external wrench",
@@ -344,7 +369,7 @@ class CompiledFit(Predictor):
         active: Tensor | None = None,
         system: ConstrainedSystem | None = None,
     ) -> ForceLinearization:
-        """Return mean acceleration and multiplier and their Jacobians, as `StructuredFit.linearize`."""
+        """Return the mean acceleration and multiplier and their Jacobians; see `StructuredFit.linearize`."""
         if system is not None and system is not self.system:
             raise ModelError("a compiled fit predicts on its own system", hint="use that of the fit")
         found = self.jacobian(q, qd, tau, ["qdd", "multiplier"], active=active)
@@ -356,7 +381,7 @@ class CompiledFit(Predictor):
     def _states(
         self, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor | None
     ) -> tuple[tuple[Tensor | None, ...], torch.Size]:
-        """Return the arrays of states for the C code, and the batch."""
+        """Return the arrays of states for the C code, and the batch shape."""
         if active is None and self._plain(q, qd, tau):
             return (q, qd, tau, None), q.shape[:-1]
         *given, batch = flat_states(self.system, q, qd, tau, active)
@@ -364,16 +389,16 @@ class CompiledFit(Predictor):
         return tuple(x.contiguous() for x in given), batch
 
     def _new(self, *shape: int) -> Tensor:
-        """A new array in the precision of the C code."""
+        """Return a new array in the precision of the C code."""
         return torch.empty(shape, dtype=self.model.dtype)
 
     def _error(self, status: int, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor | None) -> ForceGPError:
-        """Return the error reported by the C code; raise and name the state if it is not finite."""
+        """Return the error reported by the C code, or raise an error that names a non-finite state."""
         flat_states(self.system, q, qd, tau, active)
         return KINDS.get(status, NumericalError)(MESSAGES[status])
 
     def _plain(self, *states: Tensor) -> bool:
-        """Return whether states can be read where they are."""
+        """Return whether the C code can read the states without copying them."""
         q, known = states[0], all(isinstance(x, Tensor) for x in states)
         kinds = {(x.shape, x.dtype, x.device.type, x.is_contiguous()) for x in states if known}
         return (
@@ -384,7 +409,7 @@ class CompiledFit(Predictor):
         )
 
     def _read(self, quantity: str | tuple[str, ...]) -> _Rows:
-        """Return the rows of requested quantities, and their place in the C code."""
+        """Return the rows of the requested quantities, and their order in the C code."""
         if quantity in self._known:
             return self._known[quantity]
         names = [quantity] if isinstance(quantity, str) else list(dict.fromkeys(quantity))
@@ -404,12 +429,12 @@ class CompiledFit(Predictor):
 
 
 class MeanJacobian(NamedTuple):
-    """The mean of quantities with its Jacobian; row = component.
+    """The mean of quantities and its Jacobian, with one row per component.
 
     Attributes:
-        mean: `(*batch, d)`.
+        mean: `(*batch, d)` mean.
         dq, dqd, dtau: `(*batch, d, nq)` derivatives with respect to q, q̇ and τ.
-        parts: the slice of each quantity.
+        parts: slice of each quantity.
     """
 
     mean: Tensor
@@ -420,10 +445,10 @@ class MeanJacobian(NamedTuple):
 
 
 class WrenchJacobian(NamedTuple):
-    """The mean of an external wrench with its Jacobian; row = component.
+    """The mean of an external wrench and its Jacobian, with one row per component.
 
     Attributes:
-        mean: `(*batch, k)`.
+        mean: `(*batch, k)` mean.
         dq, dqd, dtau, dqdd: `(*batch, k, nq)` derivatives with respect to q, q̇, τ and q̈.
     """
 
@@ -435,7 +460,7 @@ class WrenchJacobian(NamedTuple):
 
 
 class _Rows(NamedTuple):
-    """Bits and number of components of quantities, the slice of each, and their order if C has another."""
+    """Bits, number of components and slices of quantities, and their order if it differs from that in C."""
 
     bits: int
     size: int

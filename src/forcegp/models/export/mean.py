@@ -1,13 +1,13 @@
-"""The posterior mean of a fit in scalars, the source of its C code, its Jacobians and its CasADi function.
+"""The posterior mean of a fit in scalars, from which its C code, Jacobians and CasADi function are derived.
 
-All terms of the state alone form a straight-line program: mechanics, touching points, inputs and features of
-the priors. The functions of the priors that have support points are loops, and enter as inputs f with their
-slopes ∂f/∂x. A motion M q̈ = Q + (A + U)ᵀ λ, A q̈ = b with friction U λ proportional to the multiplier is
-differentiated implicitly: at fixed q̈ and λ the equations change by dR and dg, and
+All terms that depend only on the state form a straight-line program: mechanics, contact points, and inputs
+and features of the priors. Functions with support points are evaluated in loops; they enter as inputs f, with
+their slopes ∂f/∂x. A motion M q̈ = Q + (A + U)ᵀ λ, A q̈ = b, with friction U λ proportional to the multiplier,
+is differentiated implicitly: at fixed q̈ and λ, the equations change by dR and dg, and
 
     (I + LᵀU) dλ = (A M⁻¹ Aᵀ)⁻¹ dg − Lᵀ dR,   dq̈ = M⁻¹ (dR + (Aᵀ + U) dλ),
 
-where the mechanics in dR are the closed-form derivatives of inverse dynamics. Contacts must be independent.
+where the mechanics in dR are closed-form derivatives of inverse dynamics. The contacts must be independent.
 """
 
 from __future__ import annotations
@@ -44,14 +44,14 @@ from forcegp.gp.features import stacked
 from forcegp.models.export.model import ExportedModel, Functions, row_of
 
 DIFFERENTIATED = ("qdd", "multiplier", "contact_force", "joint_friction")
-"""The quantities whose mean has Jacobians and a CasADi form."""
+"""Quantities for which the mean has Jacobians and a CasADi form."""
 ARGUMENTS = ("q", "qd", "tau", "closed")
 REST = 1e-30
-"""Square of a sliding speed, or of a distance, below which its root has no slope."""
+"""Squared sliding speed, or squared distance, below which its root has no slope."""
 
 
 def _matern(square: Scalar, more: float) -> Scalar:
-    """Return (1 + r + more r²) e^{−r}; the root has a slope at a support point too."""
+    """Return (1 + r + more r²) e^{−r}, with a root that can be differentiated at a support point as well."""
     r = (square + REST).sqrt()
     return (r + 1.0 + square * more) * (-r).exp()
 
@@ -61,15 +61,15 @@ PROFILES = {
     kernels.Matern32: lambda square: _matern(square * 3.0, 0.0),
     kernels.Matern52: lambda square: _matern(square * 5.0, 1.0 / 3.0),
 }
-"""Stationary kernels by the square of the distance."""
+"""Stationary kernels as functions of the squared distance."""
 
 
 Scalars = Any
-"""A numpy array of scalars."""
+"""A NumPy array of scalars."""
 
 
 class Touching(NamedTuple):
-    """A contact, in the order of `touching` of `controller.c`."""
+    """A contact, with its fields in the order of `touching` in `controller.c`."""
 
     position: Scalars
     velocity: Scalars
@@ -85,12 +85,12 @@ class Touching(NamedTuple):
 
 
 class Mean:
-    """Scalars of the mean of an exported model.
+    """The scalars that define the mean of an exported model.
 
     Attributes:
-        M, Q_C, Q_G, Q_D: mass matrix, bias, gravity and damping force.
-        touching: each contact, as if it were closed.
-        A, b: rows of the contacts, zero for open contacts.
+        M, Q_C, Q_G, Q_D: mass matrix, bias force, gravity force and damping force.
+        touching: each contact, computed as if it were closed.
+        A, b: constraint rows of the contacts, zero for open contacts.
         x: standardized inputs of each prior, `(1 or components, width)`.
         phi: features of each component of each prior.
     """
@@ -113,16 +113,16 @@ class Mean:
         self.phi = [self._all_features(p, x) for p, x in enumerate(self.x)]
 
     def program(self, outputs: Iterable[Scalar], arguments: Sequence[str]) -> Program:
-        """Return a program with these arguments."""
+        """Return a program with the given outputs and arguments."""
         outputs = list(outputs)
         return Program(tuple(arguments), (len(outputs),), self.graph, outputs)
 
     def zeros(self, *shape: int) -> Scalars:
-        """Return zeros."""
+        """Return an array of zeros."""
         return self.graph.constants(np.zeros(shape))
 
     def sliding(self) -> tuple[list[int], list[Scalar]]:
-        """Return priors of joints that can stick; and, of those sliding along `slip`, Q_D and features."""
+        """Return the priors of joints that can stick; and Q_D, inputs and features for given `slip`."""
         slip = [self.graph.input("slip", i) for i in range(self.robot.nq)]
         priors = [p for p, part in enumerate(self.parts) if part.prior.sticks]
         x = [self._inputs(p, slip) for p in priors]
@@ -132,7 +132,7 @@ class Mean:
         return priors, outputs
 
     def wrench_jacobian(self, frame: WrenchFrame) -> Program:
-        """J of the components of a wrench on a frame, by q; see `WrenchFrame.jacobian`."""
+        """Return a program from q to J for the components of a wrench; see `WrenchFrame.jacobian`."""
         index, point = self.robot.frame_index(frame.frame), np.array(frame.point, dtype=float)
         rotation, _, J, _ = _point_blocks(self.links, self.robot, index, point)
         if frame.reference == "local":
@@ -140,7 +140,7 @@ class Mean:
         return self.program(J[[ROWS[axis] for axis in frame.axes]].flat, ARGUMENTS[:1])
 
     def _all_features(self, p: int, x: Scalars) -> list[list[Scalar]]:
-        """Return φ of each component of a prior at its inputs."""
+        """Return the features φ of each component of a prior at its inputs."""
         part = self.parts[p]
         return [
             [] if part.finite is None else self._features(p, part.finite, k, x[k if len(x) > 1 else 0])
@@ -148,7 +148,7 @@ class Mean:
         ]
 
     def _damping(self, slip: Sequence[Scalar] | None) -> Scalars:
-        """Return Q_D of the robot file: viscous, Coulomb, Stribeck; `slip` replaces tanh(q̇/v₀)."""
+        """Return the viscous, Coulomb and Stribeck friction of the robot file; `slip` replaces tanh(q̇/v₀)."""
         names = ("damping", "friction", "friction_velocity", "stribeck", "stribeck_velocity")
         force, columns = [], (numbers(getattr(self.robot, x)) for x in names)
         for i, (v, d, c, v_c, s, v_s) in enumerate(zip(self.qd, *columns, strict=True)):
@@ -185,7 +185,7 @@ class Mean:
         )
 
     def _surface(self, surface: object, p: Scalars, v: Scalars) -> tuple[Scalars, Scalar, Scalar]:
-        """Return the normal, signed distance c and vᵀ (∇²c) v of a point at velocity v."""
+        """Return the normal, the signed distance c and vᵀ (∇²c) v at a point p with velocity v."""
         constants = self.graph.constants
         if isinstance(surface, Plane):
             n = constants(surface.normal)
@@ -201,14 +201,14 @@ class Mean:
         return n, length - float(surface.radius), (v @ v - along * along) / length
 
     def _tangents(self, n: Scalars) -> Scalars:
-        """Return R e_x and R e_y of the smallest rotation with R e_z = n; a fixed frame where n is −e_z."""
+        """Return R e_x and R e_y for the smallest rotation with R e_z = n, or a fixed frame if n is −e_z."""
         up = (n[2] + (1.0 - FACING_DOWN)).step()
         share = up / (n[2] * up + 1.0)
         x, y, both = 1.0 - n[0] * n[0] * share, up * 2.0 - 1.0 - n[1] * n[1] * share, -(n[0] * n[1] * share)
         return np.array([[x, both, -n[0]], [both, y, -n[1]]], dtype=object)
 
     def _inputs(self, p: int, slip: Sequence[Scalar] | None) -> Scalars:
-        """Return the standardized inputs x, one row for all components if they share them."""
+        """Return the standardized inputs x, with a single row if all components share them."""
         part, scales = self.parts[p], self.model.posterior.process.scales[p]
         shared = all(x.ndim == 2 for x in part.support.values())
         rows: list[list[Scalar]] = []
@@ -223,7 +223,7 @@ class Mean:
         return np.array(rows, dtype=object)
 
     def _raw_inputs(self, prior: ForcePrior, slip: Sequence[Scalar] | None) -> dict[str, list[Scalar]]:
-        """Return the inputs by name; of joint friction, one for each joint."""
+        """Return the inputs by name; joint friction has one input per joint."""
         if isinstance(prior, contact.NormalForcePrior):
             return self._raw_inputs(prior.like, slip)
         if isinstance(prior, JointFrictionPrior):
@@ -253,7 +253,7 @@ class Mean:
         return raw
 
     def _features(self, p: int, part: KernelPart, k: int, x: Scalars) -> list[Scalar]:
-        """Return φ(x) of component k."""
+        """Return the features φ(x) of component k."""
         kernel, params = part.kernel, part.params
         if isinstance(kernel, kernels.Linear):
             columns = self.parts[p].columns(kernel.inputs)
@@ -268,7 +268,7 @@ class Mean:
         return [a * b for a in left for b in right] if product else left + right
 
     def _covariances(self, p: int, part: KernelPart, k: int) -> list[Scalar]:
-        """Return k(x, z_j) of component k and the support points of a prior."""
+        """Return k(x, z_j) of component k for all support points z_j of a prior."""
         kernel, params, support = part.kernel, part.params, self.parts[p].support
         if isinstance(kernel, kernels.Sum):
             left, right = (self._covariances(p, KernelPart(*side), k) for side in kernel.parts(params))
@@ -291,18 +291,19 @@ class Mean:
 
 
 class Motion(NamedTuple):
-    """q̈ and λ of impressed forces."""
+    """The motion q̈ and multipliers λ under given impressed forces."""
 
     qdd: Scalars
     multiplier: Scalars
 
 
 class LearnedMotion(Mean):
-    """The mean of quantities, from values f of the functions with support points and, for Jacobians, slopes.
+    """The mean of quantities, given values f (and, for Jacobians, slopes) of functions with support points.
 
     Args:
-        model, parts: the model.
-        differentiate: whether derivatives by q, q̇ and τ, the directions 0 to 3 nq − 1, are carried along.
+        model, parts: the model, and the functions of its priors.
+        differentiate: whether to compute derivatives as well, with respect to q, q̇ and τ (directions 0 to
+            3 nq − 1).
     """
 
     def __init__(self, model: ExportedModel, parts: Sequence[Functions], differentiate: bool) -> None:
@@ -327,7 +328,7 @@ class LearnedMotion(Mean):
         return np.array([[t.get(d, zero) for d in directions] for t in found], dtype=object)
 
     def quantities(self) -> dict[str, Scalars]:
-        """Return the posterior mean of each of `DIFFERENTIATED`."""
+        """Return the posterior mean of each quantity in `DIFFERENTIATED`."""
         Q, Q_z, Q_F = self._forces_of_priors()
         motion = self._motion(Q + Q_z, self._mean_terms, self.U)
         normals = [at.normal * l for at, l in zip(self.touching, motion.multiplier, strict=True)]
@@ -362,13 +363,13 @@ class LearnedMotion(Mean):
         U: Scalars | None = None,
         pulled: bool = True,
     ) -> Motion:
-        """Return the motion M q̈ = Q_C + Q_G + rest + (A + U)ᵀ λ, A q̈ = b with its derivatives.
+        """Return the motion M q̈ = Q_C + Q_G + rest + (A + U)ᵀ λ, A q̈ = b, and its derivatives.
 
         Args:
-            rest: impressed forces beside Q_C and Q_G.
-            terms: which of Q_C and Q_G act.
-            U: friction per multiplier.
-            pulled: whether A q̈ is b, and not 0.
+            rest: impressed forces other than Q_C and Q_G.
+            terms: terms that determine which of Q_C and Q_G act.
+            U: friction per unit of the multiplier.
+            pulled: whether A q̈ is b instead of 0.
         """
         M_inv, S, L = self._inverses
         zero, m = self.zeros(self.robot.nq), len(self.names)
@@ -401,7 +402,7 @@ class LearnedMotion(Mean):
         return motion
 
     def _forces_of_priors(self) -> tuple[Scalars, Scalars, Scalars]:
-        """Return Q beside Q_C and Q_G, Q_z and the learned friction of the joints."""
+        """Return Q without Q_C and Q_G, Q_z, and the learned friction of the joints."""
         n, terms = self.robot.nq, self._mean_terms
         Q, Q_z, Q_F = self.zeros(n), self.zeros(n), self.zeros(n)
         Q = Q + (self.Q_D if "friction" in terms else Q) + (self.tau if "actuation" in terms else Q)
@@ -430,8 +431,8 @@ class LearnedMotion(Mean):
         return Q, Q_z, Q_F
 
     def _latent(self, p: int, first: int, slope: int) -> Scalars:
-        """Return f of a prior: its features, and what has support points, as an input with its slopes by x if
-        derivatives are carried along."""
+        """Return the latent force f of a prior. With derivatives, the part with support points is an input
+        that has slopes with respect to x."""
         part, forces = self.parts[p], []
         for k, phi in enumerate(self.phi[p]):
             weights = part.weights[k, part.size :].tolist()
@@ -450,12 +451,12 @@ class LearnedMotion(Mean):
         return np.array(forces, dtype=object)
 
     def _against(self, c: int, smoothing: float) -> Scalars:
-        """Return u = −J_Eᵀ s(v), the generalized force of a unit friction force."""
+        """Return u = −J_Eᵀ s(v), the generalized force due to a unit friction force."""
         at = self.touching[c]
         return -(at.sliding_jacobian.T @ at.sliding) / (at.sliding @ at.sliding + smoothing**2).sqrt()
 
     def _contact_operator(self, prior: ForcePrior) -> Scalars:
-        """Return E of a force at a contact, `(nq, components)`; see `forces/priors/contact.py`."""
+        """Return the operator E of a contact force, `(nq, components)`; see `forces/priors/contact.py`."""
         assert isinstance(prior, contact.CoulombErrorPrior | contact.SurfaceForcePrior)
         c = self.names.index(prior.contact)
         at, closed = self.touching[c], self.closed[c]
@@ -471,7 +472,7 @@ class LearnedMotion(Mean):
         u = self._against(c, prior.smoothing)
         columns = {"viscous": -(at.sliding_jacobian.T @ at.sliding), "dry": u}
         if set(prior.terms) & set(contact.LOADED):
-            # The multiplier of the analytical forces with the friction μ̂ λ u of this contact
+            # The multiplier under the analytical forces, with friction μ̂ λ u at this contact
             U = self.zeros(*self.U.shape)
             U[:, c] = u * prior.friction_coefficient
             free = self._motion(self.Q_D + self.tau, TERMS, U).multiplier[c]
@@ -484,7 +485,7 @@ class LearnedMotion(Mean):
         return np.stack([columns[term] * closed for term in prior.terms], axis=1)
 
     def _inertial_force(self, errors: Scalars, drives: Scalars) -> Scalars:
-        """Return [Y(q, q̇, q̈), diag q̈] δ at the analytical q̈ for errors of links `(nq, 10)` and drives."""
+        """Return [Y(q, q̇, q̈), diag q̈] δ at the analytical q̈ for errors δ of links `(nq, 10)` and drives."""
         links, qdd = self.links, self._motion(self.Q_D + self.tau, TERMS).qdd
         motion = _motion(links, list(self.qd), list(qdd), gravity=True)
         torques, forces = [], []
@@ -503,12 +504,12 @@ class LearnedMotion(Mean):
 
 
 def _times(K: Scalars, x: Scalars, zero: Scalars) -> Scalars:
-    """Return K x, zero where there is no x."""
+    """Return K x, or zero if x is empty."""
     return K @ x if len(x) else zero
 
 
 def _eliminated(K: Scalars, rhs: Scalars) -> Scalars:
-    """Return K⁻¹ rhs by elimination without pivots."""
+    """Return K⁻¹ rhs by elimination without pivoting."""
     K, x, n = K.copy(), rhs.copy(), len(rhs)
     for k in range(n):
         for i in range(k + 1, n):

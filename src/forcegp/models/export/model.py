@@ -1,12 +1,12 @@
-"""The numbers of a fitted model that its C code contains: functions of each prior, and their posterior.
+"""The numbers of a fitted model that its C code contains: the functions of each prior, and their posterior.
 
-The posterior covariance of the latent forces f is D ± T Tᵀ, with a diagonal D and rows T = V(x)ᵀ C of each
-component. V are its functions: covariances k(x, X) with support points, and the features φ(x) of the finite
-part of its kernel. For a posterior over basis functions with weights of precision A = L Lᵀ, C = L⁻ᵀ and D is
-what the points miss; V is whitened then. For an exact one with Σ = L Lᵀ, C = Wᵀ L⁻ᵀ, D = k(x, x), with the
-sign −. A posterior reduced to r functions has D = k(x, x) and the sign − too: A⁻¹ = I − U (1 − Λ⁻¹) Uᵀ with
-the r largest eigenvalues Λ of A, or Σ⁻¹ = U Λ⁻¹ Uᵀ with those of Σ. These are the directions that the rows of
-the training states determine best. The reduction only widens the error bars and does not change the mean.
+The posterior covariance of the latent forces f is D ± T Tᵀ, with diagonal D and a row V(x)ᵀ C in T for each
+component. The functions V are covariances k(x, X) with support points, and features φ(x) of the finite part
+of the kernel. For a posterior over basis functions, whose weights have precision A = L Lᵀ, V is whitened,
+C = L⁻ᵀ, and D is the residual variance given the support points. For an exact posterior with Σ = L Lᵀ,
+C = Wᵀ L⁻ᵀ, D = k(x, x), and the sign is −. A posterior reduced to r functions also has D = k(x, x) and the
+sign −: A⁻¹ = I − U (1 − Λ⁻¹) Uᵀ with the r largest eigenvalues Λ of A, or Σ⁻¹ = U Λ⁻¹ Uᵀ with those of Σ.
+The training data determine these directions best. A reduction only widens error bars; the mean is unchanged.
 """
 
 from __future__ import annotations
@@ -35,22 +35,31 @@ PRIORS = (joint.JointForcePrior, joint.JointFrictionPrior, InertialPrior, Payloa
 PRIORS += (contact.NormalForcePrior, contact.SlidingFrictionPrior, contact.ContactForcePrior)
 PRIORS += (contact.CoulombErrorPrior,)
 KERNELS = (Linear, Constant, SquaredExponential, Matern32, Matern52)
+WHY = {
+    "DisturbancePrior": "its force depends on time",
+    "CoregionalPrior": "its components share functions",
+    "OperatorForcePrior": "its operator is Python code",
+    "PayloadPrior": "it has a known payload, and the code has the mechanics of the bare arm only",
+    "ImplicitSurface": "it is Python code",
+}
+"""Reasons, by type; others have no C form yet."""
 LARGEST = 1700
-"""Functions of a posterior that is not reduced; some 30 MB of text, which takes a compiler half a minute."""
+"""Maximum number of functions of a posterior that is not reduced: about 30 MB of text, which a compiler
+translates in half a minute."""
 
 
 @dataclass(frozen=True, eq=False)
 class Functions:
-    """The functions V of one prior and their posterior.
+    """The functions V of one prior, and their posterior.
 
     Attributes:
         prior: the force prior.
-        rest, finite: the part of its kernel that has support points, and that with features, if any.
+        rest, finite: the parts of its kernel with support points and with features; `None` if absent.
         support: standardized inputs of the m support points.
-        weights: weights of k(x, X) and φ, whose sum is the posterior mean `(components, m + features)`.
-        whitening: factor of k(x, X) in T, a matrix `(m, kept)` for each component, or `None`.
-        roots: C of each component, `(functions, rank − first)`.
-        first: first column that is not zero, by component.
+        weights: weights `(components, m + features)` of k(x, X) and φ in the posterior mean.
+        whitening: factor that whitens k(x, X), a matrix `(m, kept)` for each component, or `None`.
+        roots: matrix C of each component, `(functions, rank − first)`.
+        first: first nonzero column, by component.
     """
 
     prior: ForcePrior
@@ -78,7 +87,7 @@ class Functions:
         return 0 if self.rest is None else points(self.support)
 
     def columns(self, names: Sequence[str] | None) -> list[int]:
-        """Return the columns of named inputs, or of all."""
+        """Return the columns of the named inputs, or of all inputs."""
         widths = {name: x.shape[-1] for name, x in self.support.items()}
         starts = dict(zip(widths, accumulate(widths.values(), initial=0), strict=False))
         return [
@@ -92,15 +101,16 @@ class ExportedModel:
 
     Attributes:
         system: robot and contacts.
-        posterior: over latent forces.
+        posterior: posterior over latent forces.
         tensors: all hyperparameters.
-        noise: standard deviation of a measurement of each measured quantity.
-        torque_std, external_std: of the motor torques' noise and of unknown forces on joints, or `None`.
-        functions: number r of functions of a reduced covariance; `None` for all, 0 for the mean alone.
-        sampling: of a sample learned online, the variance of the motor torques' noise `(nq,)`, the power κ of
-            its likelihood, and whether it must be in motion; `None` for a model that cannot.
-        wrench: frame and components of an external wrench that is estimated, or `None`.
+        noise: standard deviation of the measurements of each measured quantity.
+        torque_std, external_std: standard deviations of torque noise and of unknown joint forces, or `None`.
+        functions: number r of functions of a reduced covariance; `None` means all, and 0 only the mean.
+        sampling: for samples learned online, the variance of the torque noise `(nq,)`, the exponent κ of the
+            likelihood, and whether samples must be in motion; `None` if the model cannot learn online.
+        wrench: frame and components of an external wrench to estimate, or `None`.
         dtype: precision of the C code.
+        never_closed: contacts that are never closed in the training data.
     """
 
     system: ConstrainedSystem
@@ -113,18 +123,19 @@ class ExportedModel:
     sampling: tuple[Tensor, float, bool] | None = None
     wrench: WrenchFrame | None = None
     dtype: torch.dtype = torch.float64
+    never_closed: tuple[str, ...] = ()
 
     @property
     def online(self) -> bool:
-        """Whether it can learn online: it has basis functions and its full covariance."""
+        """Whether the model can learn online, which requires basis functions with their full covariance."""
         return self.sign > 0 and not self.posterior.process.pinned and self.sampling is not None
 
     def check(self) -> None:
         """Check that all parts of the model have a C form.
 
         Raises:
-            ModelError: a prior, kernel, contact or mean has none, or the posterior is too large; names it.
-            UnknownNameError: no such frame of the external wrench.
+            ModelError: a prior, kernel, contact or mean has no C form, or the posterior is too large.
+            UnknownNameError: the frame of the external wrench does not exist.
         """
         if self.dtype not in (torch.float64, torch.float32):
             raise ModelError("invalid precision of C code", expected="float64 or float32", got=self.dtype)
@@ -159,11 +170,11 @@ class ExportedModel:
 
     @property
     def sign(self) -> int:
-        """Return the sign of T Tᵀ in the covariance."""
+        """Sign of T Tᵀ in the covariance."""
         return 1 if isinstance(self.posterior.latent, SparsePosterior) and self.functions is None else -1
 
     def parts(self) -> list[Functions]:
-        """Return the functions of each prior with their posterior."""
+        """Return the functions of each prior, and their posterior."""
         if isinstance(self.posterior.latent, SparsePosterior):
             return self._of_basis(self.posterior.latent)
         return self._of_rows(self.posterior.latent)
@@ -228,7 +239,7 @@ class ExportedModel:
 
 
 def row_of(x: Tensor, k: int) -> Tensor:
-    """Return the row of component k, or the common one."""
+    """Return the row of component k, or the row shared by all components."""
     return x[k if len(x) > 1 else 0]
 
 
@@ -245,8 +256,10 @@ def _check_kernel(name: str, kernel: Kernel) -> None:
 
 
 def _no_c(what: str, name: str, thing: object, expected: str) -> ModelError:
+    kinds = [kind.__name__ for kind in type(thing).__mro__]
+    why = next((WHY[kind] for kind in kinds if kind in WHY), "its type has no C form")
     return ModelError(
-        f"the {what} {name!r} cannot be exported as C",
+        f"the {what} {name!r} cannot be exported as C: {why}",
         expected=expected,
         got=type(thing).__name__,
         hint="predict in Python, or leave it out of the model",

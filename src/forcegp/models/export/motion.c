@@ -1,19 +1,19 @@
-/* ---- motions of trajectories, where dry friction can hold joints; the method is that of `rollout/law.py` ---- */
+/* ---- motion of trajectories in which dry friction can hold joints, by the method of `rollout/law.py` ---- */
 
 #define FORCEGP_NO_FRICTION @no_friction@
 enum { PRIORS = @priors@, MOST_WAVES = @waves@, MAX_EXCHANGES = @max_exchanges@, BLOCK_TRIALS = @block_trials@ };
 static const double REGULARIZATION = @regularization@, CONTRADICTION = @contradiction@, INSTANT = @instant@;
 static const double STILL = @still@, SMOOTH = @smooth@, NUDGE = @nudge@;
 static const int STICKS[] = {@sticks@}, FIRST[] = {@first@};
-static const int X[PRIORS][3] = {@inputs@}; /* place, rows and width of the inputs of each prior */
+static const int X[PRIORS][3] = {@inputs@}; /* position, rows and width of the inputs of each prior */
 
-/* random features of one prior, and their weights in one sample: waves of the frequencies turn `(rows, width, n)` */
+/* random features of one prior, and their weights in one sample: waves with frequencies turn `(rows, width, n)` */
 typedef struct {
   const double *turn, *phase, *weights;
   long rows, n;
 } waves;
 
-/* B = A^-1 B by elimination with pivots; A is lost */
+/* B = A^-1 B by elimination with pivoting; A is overwritten */
 static void solve(double (*restrict A)[NQ], double (*restrict B)[NQ + 1], int columns) {
   for (int i = 0; i < NQ; ++i) {
     int pivot = i;
@@ -39,7 +39,7 @@ static void solve(double (*restrict A)[NQ], double (*restrict B)[NQ + 1], int co
     }
 }
 
-/* friction p of joints over a step by block principal pivoting, and the joints that it holds; 0 without a solution */
+/* friction p of joints over a step by block principal pivoting, and the joints that it holds; 0 if there is no solution */
 static int dry_friction(const double *restrict qdd, double (*restrict G)[NQ], const double *restrict limit,
                         const double *restrict stopping, double *restrict force, unsigned char *restrict held) {
   double free[NQ], compliance[NQ], most = 0.0, direction[NQ];
@@ -78,7 +78,7 @@ static int dry_friction(const double *restrict qdd, double (*restrict G)[NQ], co
   return 0;
 }
 
-/* add what the support points miss, drawn from the prior: f = sum of w cos(omega^T x + phase) */
+/* add the residual given the support points, drawn from the prior: f = sum of w cos(omega^T x + phase) */
 static void add_waves(const waves *w, const equations *e, long sample, int sticking, latent *f) {
   for (int p = 0; w && p < PRIORS; ++p) {
     const int components = FIRST[p + 1] - FIRST[p];
@@ -95,7 +95,7 @@ static void add_waves(const waves *w, const equations *e, long sample, int stick
   }
 }
 
-/* friction of joints that slide in a direction, and faster by `more` than they do */
+/* friction of joints that slide in a given direction, at a speed increased by `more` */
 static int slide(const double *q, const double *qd, const double *tau, const waves *w, long sample, double way, double more,
                  const double *gain, equations *e, latent *f, double *force) {
   double slip[NQ], speed[NQ], sine[NQ], cosine[NQ], out[@outputs@];
@@ -166,7 +166,7 @@ static int motion(const double *folded, const waves *w, long sample, const doubl
   return 0;
 }
 
-/* the motions of `count` states, `run` of each sample, over steps h; NaN where a state is not finite. Returns the first
+/* the motion at `count` states, `run` for each sample, over steps h; NaN if a state is not finite. Returns the first
  * other error */
 #ifdef __cplusplus
 extern "C"

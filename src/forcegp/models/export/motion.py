@@ -1,4 +1,4 @@
-"""The motion of trajectories under a posterior mean, or under functions drawn from it, by C code."""
+"""C code for the motion of trajectories under a posterior mean, or under functions drawn from a posterior."""
 
 from __future__ import annotations
 
@@ -22,13 +22,13 @@ POINTER, LONG = ctypes.c_void_p, ctypes.c_long
 
 
 class Waves(ctypes.Structure):
-    """Random features of one prior, and their weights in each sample; see `motion.c`."""
+    """Random features of one prior, and their weights in each function sample; see `motion.c`."""
 
     _fields_ = [("turn", POINTER), ("phase", POINTER), ("weights", POINTER), ("rows", LONG), ("n", LONG)]
 
 
 class CompiledMotion:
-    """q̈ and λ of trajectories, with dry friction that holds joints, as `RolloutProblem` has them."""
+    """A function for q̈ and λ of trajectories, with joints held by dry friction, as in `RolloutProblem`."""
 
     def __init__(self, model: ExportedModel, samples: ForceSamples | None) -> None:
         header, source = c_source(model, "forcegp", rollout=True)
@@ -42,7 +42,7 @@ class CompiledMotion:
             self._folded, self._waves = self._functions(model, samples)
 
     def _functions(self, model: ExportedModel, samples: ForceSamples) -> tuple[Tensor, ctypes.Array[Waves]]:
-        """Return weights of all function samples, a row each, and what support points do not cover."""
+        """Return the weights of all function samples, one row each, and the waves for the basis residual."""
         posterior, parts = samples.posterior, model.parts()
         assert samples.functions.folded is not None
         rows, waves = [], (Waves * len(parts))()
@@ -50,7 +50,7 @@ class CompiledMotion:
             weights = torch.cat([drawn.on_kernel, drawn.on_features], dim=1)
             if posterior.process.pinned:
                 assert isinstance(posterior.latent, SparsePosterior)
-                # Samples are of the latent posterior, shifted to the mean that robots contain.
+                # Samples of the latent posterior are shifted to the mean given the forces in the robot.
                 weights = (
                     weights + (part.weights - torch.cat(posterior.latent.folded[p], 1)[..., 0])[..., None]
                 )
@@ -95,7 +95,7 @@ class CompiledMotion:
 def compiled_motion(
     model: ExportedModel, force: ForceField, trained: ConstrainedSystem
 ) -> CompiledMotion | None:
-    """Return the motion of a model by C code, or `None` if a part or function sample has no C form."""
+    """Return the motion of a model in C code, or `None` if a part or a function sample has no C form."""
     system, samples = model.system, force if isinstance(force, ForceSamples) else None
     if system.contact_names != trained.contact_names or system.robot.learned:
         return None
@@ -109,7 +109,7 @@ def compiled_motion(
 
 
 def _folds(samples: ForceSamples) -> bool:
-    """Return whether functions are weights of basis functions and of waves."""
+    """Return whether all functions are weighted sums of basis functions and waves."""
     folded = samples.functions.folded
     return folded is not None and all(
         x.missed is None

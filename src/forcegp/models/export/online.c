@@ -4,9 +4,9 @@
  * variance change it to A'^-1 = (A + Phi^T Phi)^-1. Reflections that carry (X, p) to (X', 0), column by column p of
  * Phi K^T, keep K triangular: with g = X^-1 p and gamma^2 = 1 + g^T g, and (Y, c) of the same columns,
  *   c' = (c - Y g) / gamma,  Y' = Y + (c - Y g / (gamma + 1)) g^T / gamma.
- * In the end X X^T = noise + Phi A^-1 Phi^T and Y X^T = A^-1 Phi^T, so w' = w + Y X^-1 (y - Phi w). */
+ * Finally, X X^T = noise + Phi A^-1 Phi^T and Y X^T = A^-1 Phi^T, so w' = w + Y X^-1 (y - Phi w). */
 
-/* weights of k(x, Z) and phi(x), from those of the whitened functions */
+/* weights of k(x, Z) and phi(x), computed from those of the whitened functions */
 static int fold(forcegp_learned *s) {
   for (int k = 0; k < COMPONENTS; ++k) {
     const double *w = s->weights + FUNCTION[k];
@@ -108,7 +108,11 @@ int forcegp_update(forcegp_learned *s, const double *q, const double *qd, const 
     for (int a = 0; a < size; ++a) p[a] = z.B_Q[a][i] * torque / std[a] / TEMPERING;
     grow(X_inv, p, 0, g);
   }
+  for (int k = 0; k < GROUP; ++k)
+    if (!isfinite(dot(Phi[k], Phi[k], RANK) + y[k] * y[k])) return FORCEGP_OVERFLOW;
   learn_rows(s, Phi, y, X_inv, 0);
+  for (int r = 0; r < ROWS; ++r)
+    if (e.closed[r]) s->touched[r] = 1.0;
   return fold(s);
 }
 
@@ -116,7 +120,7 @@ int forcegp_forget(forcegp_learned *s, double factor, int budget) {
   if (!(factor > 0.0 && factor <= 1.0)) return FORCEGP_OUT_OF_RANGE;
   for (long i = 0; factor < 1.0 && i < (long)RANK * (RANK + 1) / 2; ++i) s->root[i] /= sqrt(factor);
   for (int i = 0; i < RANK; ++i) s->faded[i] = 1.0 - factor * (1.0 - s->faded[i]);
-  /* the prior is no sample: its precision of `budget` weights returns to one, of the others later */
+  /* the prior must not fade: its precision returns to one, now for `budget` weights, for the others later */
   for (int done = 0; done < budget && done < RANK;) {
     double Phi[GROUP][RANK] = {{0.0}}, zero[GROUP] = {0.0}, X_inv[GROUP][GROUP] = {{0.0}};
     const int first = s->next;

@@ -1,6 +1,6 @@
 """C99 source text of a fitted model: its numbers, its straight-line mechanics, and the code of its priors.
 
-Code that does not depend on the model is in `controller.c`.
+`controller.c` contains the code that does not depend on the model.
 """
 
 from __future__ import annotations
@@ -25,7 +25,7 @@ from forcegp.forces.priors import contact
 from forcegp.forces.priors.base import CONSTRAINT, CONTACT, JOINT
 from forcegp.forces.priors.inertial import PER_PAYLOAD, InertialPrior, PayloadPrior
 from forcegp.forces.priors.joint import TERMS, JointFrictionPrior
-from forcegp.forces.quantities import QUANTITIES
+from forcegp.forces.quantities import QUANTITIES, ROUNDED
 from forcegp.gp import kernels
 from forcegp.gp.basis import KernelPart
 from forcegp.gp.draws import MISSED_FEATURES
@@ -38,7 +38,7 @@ from forcegp.models.structured_learning import REST_SPEED
 from forcegp.rollout import law
 
 NO_FRICTION = 10
-"""What C code returns if no dry friction solves the problem of `rollout/law.py`."""
+"""Error code of the C code if no dry friction solves the problem in `rollout/law.py`."""
 LAW = (
     "REGULARIZATION",
     "CONTRADICTION",
@@ -50,9 +50,9 @@ LAW = (
     "NUDGE",
 )
 READ = (*QUANTITIES, "joint_friction")
-"""The quantities of the C code, in the order of its bits; the last one is not in `QUANTITIES`."""
+"""Quantities of the C code, in the order of their bits; only the last is not in `QUANTITIES`."""
 STEPS = 2e-5, 1e-3
-"""Of differences of the fourth order by q and q̇, and by τ and q̈: friction changes within 0.01 rad/s."""
+"""Steps of fourth-order differences in q and q̇, and in τ and q̈; friction changes within 0.01 rad/s."""
 TARGETS = (JOINT, CONTACT, CONSTRAINT)
 GIVEN = """const double *restrict q, const double *restrict qd, const double *restrict tau,
     const equations *restrict e, const double *restrict gain, int spread, latent *restrict f"""
@@ -60,10 +60,10 @@ SLOPES = "const equations *restrict e, double *restrict f, double *restrict slop
 
 
 def c_source(model: ExportedModel, name: str, rollout: bool = False) -> tuple[str, str]:
-    """Return the header and source text, with Jacobians or, for a rollout, with the motions of trajectories.
+    """Return the header and the source text, with Jacobians or, for a rollout, the motion of trajectories.
 
     Raises:
-        ModelError: a part of the model has no C form; names it.
+        ModelError: a part of the model has no C form; the message names it.
     """
     model.check()
     before, _, rest = template("controller.c").partition("/* HELPERS")
@@ -114,7 +114,7 @@ NUMBER = re.compile(r"/\*.*?\*/|(?<![\w.])(?:\d+\.\d*(?:e[+-]?\d+)?|\d+e[+-]?\d+
 
 
 def in_single_precision(text: str) -> str:
-    """Return the C text with float in place of double; `tgmath.h` chooses the functions."""
+    """Return the C text with `float` in place of `double`; `tgmath.h` selects the functions."""
     largest = torch.finfo(torch.float32).max
 
     def literal(match: re.Match[str]) -> str:
@@ -127,7 +127,7 @@ def in_single_precision(text: str) -> str:
 
 
 def template(name: str, fields: Mapping[str, object] | None = None) -> str:
-    """Return a template file with each `@field@` filled in."""
+    """Return the text of a template file with each `@field@` filled in."""
     text = files("forcegp.models.export").joinpath(name).read_text(encoding="utf-8")
     for field, value in (fields or {}).items():
         text = text.replace(f"@{field}@", str(value))
@@ -135,7 +135,7 @@ def template(name: str, fields: Mapping[str, object] | None = None) -> str:
 
 
 def _comment(text: str) -> str:
-    """Return names made safe for a comment in C code, since a model file must not end the comment."""
+    """Return names sanitized for a C comment, since a name in a model file must not end the comment."""
     return re.sub(r"[^\w ,.+-]", "_", text)
 
 
@@ -145,7 +145,7 @@ def _called(text: str) -> str:
 
 
 def _programs(mean: LearnedMotion, rollout: bool) -> list[str]:
-    """Return the programs: mechanics with contacts; forward dynamics; Y; Jacobians or sliding friction."""
+    """Return the code of mechanics with contacts, forward dynamics, Y, and Jacobians or sliding friction."""
     robot = mean.robot
     blocks = [mean.M, mean.Q_C, mean.Q_G, mean.Q_D, *(x for at in mean.touching for x in at), *mean.x]
     outputs = [x for block in blocks for x in block.flat]
@@ -168,7 +168,7 @@ def _programs(mean: LearnedMotion, rollout: bool) -> list[str]:
 
 
 class Writer:
-    """Writes the code of priors, and in `lines` the tables that it reads."""
+    """Writer of the code of priors; `lines` contains the tables that this code reads."""
 
     def __init__(self, model: ExportedModel, rollout: bool) -> None:
         self.model, self.parts, self.lines, self.rollout = model, model.parts(), list[str](), rollout
@@ -181,7 +181,7 @@ class Writer:
         self._wrench()
 
     def array(self, values: Tensor | Iterable[float], name: str = "", kind: str = "double") -> str:
-        """Return a constant array, and its name."""
+        """Add a constant array, unless it exists, and return its name."""
         x = values if isinstance(values, Tensor) else torch.tensor(list(values), dtype=torch.float64)
         rows = x.detach().double().reshape(-1, x.shape[-1] if x.ndim else 1).tolist() or [[0.0]]
         texts = [", ".join(repr(v) if kind == "double" else str(int(v)) for v in row) for row in rows]
@@ -228,10 +228,13 @@ class Writer:
             "NEGATIVE": repr(NEGATIVE),
             "ROUNDING": repr(ROUNDING),
             "RANK_TOLERANCE": repr(rank_tolerance(self.model.dtype)),
+            "HIDDEN": repr(ROUNDED),
         }
         self.lines += [f"#define {name} {value}" for name, value in defined.items()]
         self.lines.append("enum { JOINT, CONTACT, CONSTRAINT, JOINT_FRICTION };")
         self.array(sizes, "SIZES", "int")
+        if contacts:
+            self.array([c.name in self.model.never_closed for c in contacts], "NEVER_CLOSED", "int")
         self.array(accumulate((len(w) for x in self.parts for w in x.weights), initial=0), "FOLDED", "int")
         owners = [part.prior for part in self.parts for _ in range(part.components)]
         self.array([TARGETS.index(prior.target) for prior in owners], "TARGET", "int")
@@ -255,7 +258,7 @@ class Writer:
             self.array([float(x.smoothing) for x in process.coulomb], "COULOMB_SMOOTHING")
 
     def _noise(self) -> None:
-        """Add variances besides those of the learned forces, and the trained region."""
+        """Add the variances that the learned forces do not include, and the trained region."""
         nq, values = self.model.system.robot.nq, self.model.tensors
         zero, far = torch.zeros(nq, dtype=torch.float64), torch.full((2, nq), 1e300, dtype=torch.float64)
         for key, name, default in ((LOW, "LOW", -far), (HIGH, "HIGH", far), (SPREAD, "SPREAD", far)):
@@ -289,7 +292,7 @@ class Writer:
         self.lines.append(f"static const double TEMPERING = {power**0.5!r};")
 
     def _wrench(self) -> None:
-        """Add the priors of an external wrench and of the multipliers beside it."""
+        """Add the priors of an external wrench and of the multipliers that are estimated with it."""
         frame, rows = self.model.wrench, len(self.model.system.contacts)
         if frame is None or self.rollout:
             return
@@ -300,7 +303,7 @@ class Writer:
         self.lines.append("static const double STATE_STEP = {!r}, FORCE_STEP = {!r};".format(*STEPS))
 
     def wrench_header(self) -> str:
-        """The part of the header on an external wrench, if there is one."""
+        """Return the part of the header for an external wrench, if there is one."""
         frame = self.model.wrench
         if frame is None:
             return ""
@@ -309,14 +312,15 @@ class Writer:
         return template("wrench.h", fields | at)
 
     def online_header(self) -> str:
-        """Return the part of the header on learning online, if the model supports it."""
+        """Return the part of the header for learning online, if the model supports it."""
         names = ", ".join(f"{p} {_comment(part.prior.name)}" for p, part in enumerate(self.parts))
         folded = sum(part.weights.numel() for part in self.parts)
         fields = {"functions": self.parts[0].rank, "folded": folded, "priors": names}
+        fields["contacts"] = max(len(self.model.system.contacts), 1)
         return template("online.h", fields) if self.model.online else ""
 
     def priors(self) -> list[str]:
-        """Return a function for each prior, and one that calls all of them."""
+        """Return a C function for each prior, and one that calls all of them."""
         texts, calls = [], []
         for p, part in enumerate(self.parts):
             body = [*self._operator(part, self.starts[p]), *self._functions(p, part)]
@@ -336,7 +340,7 @@ class Writer:
         return [*texts, f"static int sticking_forces({GIVEN}) {{\n{unread}{chosen}  return 0;\n}}\n"]
 
     def sticking(self) -> dict[str, object]:
-        """Return the tables of `motion.c` on friction of joints that stick: components, inputs, features."""
+        """Return the `motion.c` tables for the friction of sticking joints: components, inputs, features."""
         (priors, outputs), x, phi = self.mean.sliding(), self.mean.x, self.mean.phi
         sizes = [sum(map(len, features)) for features in phi]
         places = [("x", sum(each.size for each in x[:p]), x[p].size) for p in priors]
@@ -361,7 +365,7 @@ class Writer:
         }
 
     def _operator(self, part: Functions, start: int) -> list[str]:
-        """Return the code of E(x), from f to generalized forces; for inertial errors see `controller.c`."""
+        """Return the code of E(x), from f to generalized forces; for inertial errors, see `controller.c`."""
         prior, E = part.prior, f"f->E + {start}"
         if isinstance(prior, InertialPrior | PayloadPrior):
             return []
@@ -384,7 +388,7 @@ class Writer:
         return [f"  if (! {called}) return 1;"]
 
     def _functions(self, p: int, part: Functions) -> list[str]:
-        """Return the code of the functions V of each component, and of their posterior."""
+        """Return the code of the functions V of each component and of their posterior."""
         before = self.mean.phi[:p]
         lines, m, first = [], part.size, sum(len(phi) for features in before for phi in features)
         kernel = KernelCode(self, p, lines, f"e->x + {sum(x.size for x in self.mean.x[:p])}")
@@ -405,7 +409,7 @@ class Writer:
         return lines
 
     def _slopes(self) -> list[str]:
-        """Return, for each prior with support points, its share of the mean of f and its derivatives by x."""
+        """Return code for the part of the mean of f with support points, and for its derivatives in x."""
         texts, calls, first, start = [], "", 0, 0
         for p, part in enumerate(self.parts):
             if not part.size or part.rest is None:
@@ -426,8 +430,8 @@ class Writer:
 
 
 class Leaf(NamedTuple):
-    """A kernel of support points in C: its array `u`, their table, its inputs with their factors, its factor,
-    and the array that it is added to.
+    """A kernel with support points in C: its array `u`, the table of support points, the columns and factors
+    of its inputs, its own factor `size`, and its bias.
     """
 
     u: str
@@ -439,7 +443,7 @@ class Leaf(NamedTuple):
 
 
 class KernelCode:
-    """C code of the kernel of one prior; terms of a leaf are computed once before use."""
+    """C code for the kernel of one prior; the terms of a leaf are computed once before they are used."""
 
     def __init__(self, writer: Writer, p: int, lines: list[str], x: str, differentiate: bool = False) -> None:
         self.writer, self.part, self.lines = writer, writer.parts[p], lines
@@ -450,7 +454,7 @@ class KernelCode:
         lines.append(f"  const double *const x = {x};\n  (void)x;")
 
     def covariance(self, part: KernelPart, k: int) -> tuple[str, str]:
-        """Return k(x, z_j) and k(x, x) of component k."""
+        """Return C expressions for k(x, z_j) and k(x, x) of component k."""
         kernel, params = part.kernel, part.params
         if isinstance(kernel, kernels.Sum):
             (a, aa), (b, bb) = (self.covariance(KernelPart(*side), k) for side in kernel.parts(params))
@@ -469,7 +473,7 @@ class KernelCode:
         )
 
     def slopes(self, part: KernelPart, k: int, value: str, f: str, slope: str) -> list[str]:
-        """Return the code of f = Σ w_j k(x, z_j) of component k, and of ∂f/∂x."""
+        """Return the code of f = Σ w_j k(x, z_j) and ∂f/∂x for component k."""
         m, w = self.part.size, self.writer.array(self.part.weights[k])
         lines = [f"  {{\n    double h[{m}];\n    for (int j = 0; j < {m}; ++j) h[j] = {value};"]
         lines.append(f"    *({f}) = dot(h, {w}, {m});")
@@ -482,7 +486,7 @@ class KernelCode:
         return [*lines, "  }"]
 
     def _leaves(self, part: KernelPart, k: int, factor: str) -> Iterable[tuple[Leaf, bool, str]]:
-        """Yield the leaves of a kernel that depend on x, each with what it is multiplied by."""
+        """Yield the leaves of a kernel that depend on x, each with the factor by which it is multiplied."""
         if isinstance(part.kernel, kernels.Sum):
             sides = [KernelPart(*side) for side in part.kernel.parts(part.params)]
             for side, other in zip(sides, sides[::-1], strict=True):
@@ -493,7 +497,7 @@ class KernelCode:
             yield self._leaf(part, k), isinstance(part.kernel, kernels.Stationary), factor
 
     def _leaf(self, part: KernelPart, k: int) -> Leaf:
-        """Return a local array over the support points: xᵀz_j, or a profile of |x − z_j|."""
+        """Return a local array over the support points, which contains xᵀz_j or a profile of |x − z_j|."""
         kernel, params = part.kernel, part.params
         if isinstance(kernel, kernels.Linear):
             # k = Σ_d (s σ_d)² x_d x′_d + σ_0²
@@ -517,12 +521,12 @@ class KernelCode:
         return self._known[key]._replace(size=size, bias=bias)
 
     def _x(self, leaf: Leaf, k: int) -> list[str]:
-        """Return the inputs of a leaf, each with its factor."""
+        """Return the inputs of a leaf, each multiplied by its factor."""
         first = 0 if self.shared else k * self._width
         return [f"{s!r} * x[{first + c}]" for c, s in zip(leaf.columns, leaf.scale, strict=True)]
 
     def _array(self, leaf: Leaf, kind: str, k: int) -> list[str]:
-        """Return the code that computes a leaf."""
+        """Return the code that computes the array of a leaf."""
         u, m, x = leaf.u, self.part.size, self._x(leaf, k)
         if not m:
             return []

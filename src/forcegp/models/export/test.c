@@ -1,19 +1,21 @@
-/* Compares @name@.c with the values of forcegp; 0 if all agree. */
+/* Compares @name@.c with the values computed by forcegp; returns 0 if all agree. */
 #include <math.h>
 #include <stdio.h>
 #include "@name@.h"
 
 @tables@
 
-/* a reduced covariance may be wider, never narrower */
-static double differs(double ours, double theirs, double scale) {
-  return REDUCED && ours > theirs ? 0.0 : fabs(ours - theirs) / scale;
+/* the largest difference so far; a reduced covariance may be wider, never narrower, and NaN stands for what is not
+ * determined */
+static double worse(double most, double ours, double theirs, double scale, int reduced) {
+  if (isnan(ours) != isnan(theirs)) return INFINITY;
+  return reduced && ours > theirs ? most : fmax(most, fabs(ours - theirs) / scale);
 }
 
 static double in_mean = 0.0, in_covariance = 0.0;
 
-/* largest difference of a mean in units of max(|mean|, std), and of its covariance; what is below ZERO of the largest
- * component is compared with that */
+/* largest difference in the mean, in units of max(|mean|, std), and in its covariance; these units are at least ZERO
+ * times those of the largest component */
 static void compare(int n, const @real@ *m, const @real@ *C, const double *mean, const double *covariance) {
   double std[D + 6], size[D + 6], most = 0.0, widest = 0.0;
   for (int a = 0; a < n; ++a) {
@@ -22,10 +24,10 @@ static void compare(int n, const @real@ *m, const @real@ *C, const double *mean,
   }
   for (int a = 0; a < n; ++a) std[a] = fmax(std[a], ZERO * widest), size[a] = fmax(size[a], ZERO * most);
   for (int a = 0; a < n; ++a) {
-    in_mean = fmax(in_mean, fabs(m[a] - mean[a]) / size[a]);
+    in_mean = worse(in_mean, m[a], mean[a], size[a], 0);
     for (int b = 0; b < n; ++b)
       if (a == b || !REDUCED)
-        in_covariance = fmax(in_covariance, differs(C[a * n + b], covariance[a * n + b], std[a] * std[b]));
+        in_covariance = worse(in_covariance, C[a * n + b], covariance[a * n + b], std[a] * std[b], REDUCED);
   }
 }
 
@@ -37,6 +39,7 @@ int main(void) {
     double most = 0.0;
     const int second = @name@_jacobian(q[i], qd[i], tau[i], closed[i], @NAME@_QDD | @NAME@_MULTIPLIER, m, J);
     int status = @name@_predict(q[i], qd[i], tau[i], closed[i], WANTED, 0, m, C, beyond);
+    if (status == @NAME@_UNDETERMINED) status = 0;
     if (status == 0) compare(D, m, C, mean[i], covariance[i]);
 #ifdef @NAME@_WRENCH
     if (status == 0)

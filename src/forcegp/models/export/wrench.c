@@ -1,13 +1,13 @@
 /* ---- the external wrench w, from accelerations ----
  *
- * r = M qdd - E Q = J^T w + e with the prior w ~ N(0, W) and the covariance of the forces, of torques that were measured and
- * of qdd as Cov e = S, by generalized least squares: Cov w = (J S^-1 J^T + W^-1)^-1, E w = Cov w J S^-1 r. Multipliers of
- * contacts are further unknowns, with rows of A in J. Moments may be small beside forces: the result is a mixture of
- * estimates with priors `LEVERS` times as wide, weighted by their evidence. */
+ * r = M qdd - E Q = J^T w + e with the prior w ~ N(0, W) and the covariance S = Cov e of the forces, the measured torques
+ * and qdd. By generalized least squares, Cov w = (J S^-1 J^T + W^-1)^-1 and E w = Cov w J S^-1 r. Multipliers of contacts
+ * are additional unknowns, with rows of A in J. Since moments may be small compared with forces, the result is a mixture
+ * of estimates with priors `LEVERS` times as wide, weighted by their evidence. */
 
 enum { UNKNOWNS = FORCEGP_WRENCH + ROWS };
 
-/* K = G^-1 and V = K^T K = M^-1, of the lower Cholesky factor M = G G^T; 0 unless M is positive definite */
+/* K = G^-1 and V = K^T K = M^-1, with the lower Cholesky factor G of M = G G^T; 0 unless M is positive definite */
 static int inverse(const double *restrict M, int n, double *restrict K, double *restrict V) {
   double G[MOST_UNKNOWNS * MOST_UNKNOWNS];
   if (!inverse_factor(M, n, G, K)) return 0;
@@ -19,7 +19,7 @@ static int inverse(const double *restrict M, int n, double *restrict K, double *
   return 1;
 }
 
-/* mean and covariance C of the mixture, in units of the prior, from those of the widest prior: C_s^-1 = C^-1 + s^-2 - 1,
+/* mean and covariance C of the mixture, in units of the prior, given those for the widest prior: C_s^-1 = C^-1 + s^-2 - 1,
  * m_s = C_s C^-1 m, weights |C_s|^1/2 / s exp(m_s^T C_s^-1 m_s / 2) */
 static int over_levers(double *restrict mean, double *restrict C) {
   enum { K = FORCEGP_WRENCH };
@@ -105,7 +105,7 @@ int forcegp_external_wrench(const forcegp_learned *learned, long count, const do
     const double *given[4] = {q + n * NQ, qd + n * NQ, tau + n * NQ, qdd + n * NQ};
     int status = estimate(learned, given[0], given[1], given[2], given[3], shut, qdd_std, mean + n * K,
                           covariance ? covariance + n * K * K : NULL, beyond ? beyond + n * NQ : NULL);
-    for (int c = 0; jacobian && !status && c < 4 * NQ; ++c) { /* differences of the fourth order */
+    for (int c = 0; jacobian && !status && c < 4 * NQ; ++c) { /* fourth-order differences */
       static const double times[4] = {-2.0, -1.0, 1.0, 2.0}, weight[4] = {1.0 / 12.0, -2.0 / 3.0, 2.0 / 3.0, -1.0 / 12.0};
       const double step = c < 2 * NQ ? STATE_STEP : FORCE_STEP;
       double *column = jacobian + n * K * 4 * NQ + c;
