@@ -27,7 +27,7 @@ from forcegp.forces.external_wrench import (
 )
 from forcegp.forces.friction_memory import FrictionMemory
 from forcegp.forces.noise import external_std
-from forcegp.forces.posterior import ForcePosterior, distance_beyond, stick_variance, unknown_variance
+from forcegp.forces.posterior import ForcePosterior, stick_variance, unknown_variance
 from forcegp.forces.problem import Problem
 from forcegp.forces.quantities import affine_map, states_at
 from forcegp.models.prediction import CHUNK, Prediction
@@ -148,6 +148,7 @@ class LearnedForces(Protocol):
     def torque_std(self) -> Tensor | None: ...
     @property
     def problem(self) -> Problem: ...
+    def beyond(self, qd: Tensor, tau: Tensor) -> Tensor | None: ...
 
 
 @torch.no_grad()
@@ -174,7 +175,7 @@ def external_wrench(
         mean,
         covariance,
         {"external_wrench": slice(0, k)},
-        distance_beyond(fit.hyperparameters, data.qd, data.tau),
+        fit.beyond(data.qd, data.tau),
         fit.system.robot.joint_names,
         frame,
     )
