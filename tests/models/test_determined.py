@@ -215,3 +215,25 @@ def test_planes_that_cannot_both_be_touched_and_angles_in_degrees_are_said(data:
     with warnings.catch_warnings():
         warnings.simplefilter("error", RobotMismatchWarning)
         fitted(SYSTEM, data)
+
+
+def test_an_arm_that_contacts_hold_at_every_joint_is_a_typed_error() -> None:
+    robot = forcegp.load_robot("double_pendulum")
+    q = torch.tensor([0.4, 0.8], dtype=torch.float64)
+    R, p = forcegp.kinematics.frame_pose(robot, q, robot.frame_names[-1])
+    grip = (0.0, 0.0, 0.3)
+    pin = PointConnection("pin", robot.frame_names[-1], grip, None, (R @ q.new_tensor(grip) + p).tolist())
+    n = 30
+    noise = torch.randn(2, n, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    held = forcegp.Dataset(
+        t=0.01 * torch.arange(n, dtype=torch.float64),
+        q=q.expand(n, 2),
+        qd=torch.zeros(n, 2, dtype=torch.float64),
+        tau=noise[0],
+        qdd=1e-3 * noise[1],
+        joint_names=robot.joint_names,
+        contact={"pin": torch.ones(n, dtype=torch.bool)},
+    )
+    system = forcegp.ConstrainedSystem(robot, (pin,))
+    with pytest.raises(ModelError, match="contacts that hold all joints"):
+        forcegp.StructuredGP(system, "analytical", "friction").fit(held)

@@ -127,7 +127,17 @@ def initial_hyperparameters(
 
     Args:
         beyond_noise: whether to subtract the contribution of noise, for example if unknown forces are given.
+
+    Raises:
+        ModelError: contacts hold all joints in every sample, so that no measurement depends on a force.
     """
+    if not any(block.target.shape[-1] for block in blocks):
+        raise ModelError(
+            "no measurement depends on a force",
+            expected="a direction in which the robot can move",
+            got="contacts that hold all joints in every sample",
+            hint="add samples in which these contacts are open",
+        )
     params: dict[str, Tensor] = {}
     # Some priors share the hyperparameters of another prior.
     for p, prior in [(p, prior) for p, prior in enumerate(priors) if prior.prefix == prior.name]:
