@@ -284,8 +284,10 @@ def touching(distance: Array) -> float:
     True
     """
     near = distance[np.abs(distance) <= TOUCHING]
+    if not len(near):
+        return TOUCHING
     level, spread = level_and_spread(near)
-    return min(TOUCHING, level + max(DISTANCE_STD * spread, SMALLEST_DISTANCE)) if len(near) else TOUCHING
+    return min(TOUCHING, level + max(DISTANCE_STD * spread, SMALLEST_DISTANCE))
 
 
 def force_levels(values: Array, name: str, section: ContactStateSection) -> tuple[float, float]:

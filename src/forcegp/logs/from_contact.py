@@ -72,8 +72,8 @@ def derive_joints(
     unknown = [signals.joint_names.index(joint) for joint in asked]
     contacts = map(system.contact, dict.fromkeys(asked.values()))
     slides = [replace(c, stick_speed=None) if isinstance(c, SurfaceContact) else c for c in contacts]
-    logged = {"q", "qd", "qdd"} & {*signals.vectors}
-    vectors = {name: torch.from_numpy(signals.vectors[name]) for name in logged}
+    logged = {name: signals.vectors[name] for name in ("q", "qd", "qdd") if name in signals.vectors}
+    vectors = {name: torch.from_numpy(value) for name, value in logged.items()}
     solved = _solve(replace(system, contacts=slides), vectors, unknown, tuple(asked))
     signals.vectors |= {name: value.numpy() for name, value in solved.items()}
     report.steps.append("; ".join(f"{joint} follows from contact {name!r}" for joint, name in asked.items()))
