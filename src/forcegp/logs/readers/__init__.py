@@ -123,8 +123,8 @@ def _format_of_zip(path: Path) -> str:
 
 
 def _unsafe(path: Path, what: str) -> DataError:
-    text = f"{path}: refused, because reading {what} can run code in it"
-    return DataError(text, expected=", ".join(FORMATS.values()), hint="save the arrays as Parquet, CSV or .npz")
+    text, formats = f"{path}: refused, because reading {what} can run code in it", ", ".join(FORMATS.values())
+    return DataError(text, expected=formats, hint="save the arrays as Parquet, CSV or .npz")
 
 
 def _unknown(path: Path, got: str) -> DataError:
