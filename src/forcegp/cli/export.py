@@ -62,7 +62,7 @@ def export(
     URDF, MJCF: a copy of the robot file in which only inertia, damping and friction are replaced by their
     identified values; a report with standard deviations and losses; and robots drawn from the posterior.
 
-    [bold]Examples[/bold]
+    **Examples**
 
     forcegp export --model model --to c --out controller/
 

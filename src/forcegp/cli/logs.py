@@ -50,7 +50,7 @@ def import_(
     A mapping file in TOML assigns columns to joints and states their units, signs and frames; --guess
     proposes one.
 
-    [bold]Examples[/bold]
+    **Examples**
 
     forcegp import run.csv --scene my_scene.toml --guess mapping.toml
 
@@ -160,7 +160,7 @@ def check(
     The last line is the verdict. The exit code is 0 if a model can be fitted, 1 if a finding makes a fit
     worthless, and 2 if the scene or the log cannot be read.
 
-    [bold]Examples[/bold]
+    **Examples**
 
     forcegp check --scene kuka_plane --data run.parquet
 
@@ -248,7 +248,7 @@ def select(
     and torques. They are deterministic and in order of selection, so the first k rows are the selection of k
     points.
 
-    [bold]Examples[/bold]
+    **Examples**
 
     forcegp select run.parquet -n 1000 --out train.parquet --rest test.parquet
 

@@ -45,7 +45,7 @@ def rollout(
     standard deviation over samples as q_std), rollout.html with plots and an animation of the arm, the plots
     as SVG files, and their data as rollout.json.
 
-    [bold]Examples[/bold]
+    **Examples**
 
     forcegp rollout --model model --data test.parquet --out rollout/ --duration 2
 
@@ -202,7 +202,7 @@ def simulate(
     If a model is given, MuJoCo simulates the fitted robot with the learned joint forces, which replace joint
     friction, and computes the contact forces itself.
 
-    [bold]Examples[/bold]
+    **Examples**
 
     forcegp simulate --scene kuka_plane --out run.parquet
 
