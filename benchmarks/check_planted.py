@@ -491,7 +491,7 @@ def first_line(
     first = report.findings[0]
     return {
         "kinds": list(first.kinds),
-        "joints": list(first.joints),
+        "joints": [joint for one in (first, *first.alternatives) for joint in one.joints],
         "line": first.message,
         "all": [f.kind for f in report.findings],
     }

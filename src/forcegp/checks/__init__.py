@@ -25,6 +25,13 @@ OF_CONTACTS = frozenset({"contact", "contact force"})
 """Checks of contacts, which are skipped if there are no contacts."""
 OF_TIME = frozenset({"order of time", "held rows", "gaps", "jitter", "sampling period", "standing channels"})
 """Checks that require rows in time order."""
+IMPORTED = {
+    "doubt": "import-doubt",
+    "faster than its source": "rows-held",
+    "gap": "time-gap",
+    "uneven": "time-jitter",
+}
+"""Kinds of findings made during import that are reported as a finding other than `import-found`."""
 Check = Callable[[ConstrainedSystem, Log], Outcome]
 Progress = Callable[[int, int], None]
 
@@ -40,10 +47,13 @@ def check_robot(system: ConstrainedSystem, log: Log) -> Outcome:
 
 def check_import(system: ConstrainedSystem, log: Log) -> Outcome:
     """Return the findings made during import, except those on contacts, which are checked separately."""
-    doubts = [text for kind, text in log.header.imported if kind == "doubt"]
-    others = [text for kind, text in log.header.imported if kind not in ("doubt", "contact")]
-    pairs = ("import-doubt", doubts), ("import-found", others)
-    return [log.finding(kind, "; ".join(texts)) for kind, texts in pairs if texts], log
+    texts: dict[str, list[str]] = {}
+    for kind, text in log.header.imported:
+        if kind != "contact":
+            texts.setdefault(IMPORTED.get(kind, "import-found"), []).append(text)
+    findings = [log.finding(kind, "; ".join(several)) for kind, several in texts.items()]
+    # What most rows repeat is the clock of the logger, at which nothing can be differentiated.
+    return [replace(f, weight="error") if f.kind == "rows-held" else f for f in findings], log
 
 
 CHECKS: tuple[tuple[str, Check], ...] = (
@@ -136,6 +146,13 @@ def check(system: ConstrainedSystem, data: Dataset | Log, *, progress: Progress 
             skipped |= {other: "no row is usable" for other, _ in CHECKS[done + 1 :]}
             break
     order = list(KINDS)
-    # Findings that affect most of the log come before those that affect only a few rows.
-    findings.sort(key=lambda f: (SEVERITIES.index(f.severity), 2 * f.rows < samples, order.index(f.kind)))
+
+    def rank(f: Finding) -> tuple[float, ...]:
+        # A few odd rows come after what affects the whole log, and of what a fit learns the largest is first.
+        family = KINDS[f.kind].family
+        isolated = family in ("clock", "values") and 2 * f.rows < samples
+        place = order.index("torque-offset" if family == "learned" else f.kind)
+        return SEVERITIES.index(f.severity), isolated, place, -float(f.evidence.get("largest_torque", 0.0))
+
+    findings.sort(key=rank)
     return Report(tuple(findings), samples, system.robot.joint_names, skipped)

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 
 from forcegp import kinematics
-from forcegp.checks.finding import Finding
+from forcegp.checks.finding import Finding, with_alternatives
 from forcegp.checks.fit import BLOCKS, CHUNK, blocks_of, labelled_contacts, residual, tensors, unmeasured
 from forcegp.checks.log import Array, Log, Outcome, evenly
 from forcegp.constraints import ConstrainedSystem, Plane, SurfaceContact
@@ -258,8 +258,27 @@ def check_forces(system: ConstrainedSystem, log: Log) -> Outcome:
         findings += _directions(finding, tip_path(system, contact, log, rows).v)
         rows = evenly(rows, FORCE_ROWS)
         path = tip_path(system, contact, log, rows)
-        force = _force(replace(system, contacts=[contact]), log, rows, path)
-        findings += _pulls(finding, path, force) or (_friction(finding, path, force) if log.nq > 3 else [])
+        one = replace(system, contacts=[contact])
+        force = _force(one, log, rows, path)
+        if pulls := _pulls(finding, path, force):
+            # Up to three torques cannot contradict the force that they are taken for.
+            flipped = (
+                (j, np.where(np.arange(log.nq) == j, -1.0, 1.0)) for j in range(log.nq * (log.nq <= 3))
+            )
+            others = ((j, log.replace(tau=log.tau * sign)) for j, sign in flipped)
+            text = "the torque of {} has the opposite sign"
+            findings += [
+                with_alternatives(
+                    pulls[0],
+                    [
+                        log.finding("torque-sign", text.format(log.joint_names[j]), (log.joint_names[j],))
+                        for j, other in others
+                        if np.median((_force(one, other, rows, path) * path.normal).sum(axis=1)) > 0.0
+                    ],
+                )
+            ]
+        elif log.nq > 3:
+            findings += _friction(finding, path, force)
     return findings, log
 
 

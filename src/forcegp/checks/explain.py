@@ -13,7 +13,7 @@ from functools import cached_property, partial
 import numpy as np
 
 from forcegp.checks import hypotheses
-from forcegp.checks.finding import TESTS, Finding
+from forcegp.checks.finding import Finding, with_alternatives
 from forcegp.checks.fit import TorqueFit, TorqueProblem, cross_validate, gain_of, pooled_gain_of, score_of
 from forcegp.checks.hypotheses import Hypothesis, corrected
 from forcegp.checks.log import Array, Log
@@ -28,8 +28,6 @@ SIGNIFICANT = 4.0
 """Standard errors by which the held-out score must drop; about a hundred hypotheses are compared."""
 SHARE, SAME = 0.03, 1e-3
 """Fraction of the best drop that a simpler hypothesis may lack; tolerance within which errors are equal."""
-DETERMINED = 3.0
-"""A gain counts as determined if it exceeds this many standard errors."""
 MATERIAL, MATERIAL_EACH = 0.15, 0.05
 """Minimum drop in Σ_j log error that is material: in total (14 % at one joint), and per affected joint."""
 
@@ -86,6 +84,11 @@ class Explanation:
         nuisance = np.concatenate([self.problem.nuisance, *columns], axis=-1)
         return replace(self, problem=replace(self.problem, nuisance=nuisance))
 
+    def without(self, columns: list[int]) -> Explanation:
+        """Return the explanation without the given nuisance columns."""
+        keep = np.setdiff1d(np.arange(self.problem.nuisance.shape[-1]), columns)
+        return replace(self, problem=replace(self.problem, nuisance=self.problem.nuisance[..., keep]))
+
     def with_(self, hypothesis: Hypothesis) -> TorqueFit:
         """Fit the parameters of a hypothesis in addition to those already in the model."""
         gains = hypothesis.joints if hypothesis.name == "gains" else ()
@@ -113,6 +116,7 @@ def _round(model: Explanation) -> Explanation | None:
     fits = ((h, fit) for h, fit in fits if hypotheses.plausible(system, h, fit))
     tried = [(h, fit) for h, fit in fits if not leaves_surface(system, log, corrected(log, h, fit.theta))]
     good = [(h, fit) for h, fit in tried if significant(fit.shares, null.shares, len(h.joints) or log.nq)]
+    good = [(h, fit) for h, fit in good if not h.name.endswith("order") or _helps_each(h, fit, null)]
     if not good:
         return None
     best = min((fit for _, fit in good), key=lambda fit: fit.score.mean())
@@ -131,6 +135,12 @@ def _round(model: Explanation) -> Explanation | None:
     alternatives = alternatives_of(system, (chosen, fit), tried, null)
     finding = with_alternatives(finding, [hypotheses.finding_of(system, log, *pair) for pair in alternatives])
     return _accepted(model, chosen, fit.theta, finding)
+
+
+def _helps_each(exchange: Hypothesis, fit: TorqueFit, null: TorqueFit) -> bool:
+    """Return whether an exchange of two joints lowers the typical error of both."""
+    better, worse = (np.median(one.shares[:, list(exchange.joints)], axis=0) for one in (fit, null))
+    return bool((better < worse).all())
 
 
 def _accepted(model: Explanation, hypothesis: Hypothesis, theta: Array, finding: Finding) -> Explanation:
@@ -222,7 +232,7 @@ def _currents(model: Explanation) -> Iterator[Tried]:
     log, rows, nq = model.log, model.rows, model.log.nq
     fit = model.with_(hypotheses.current_hypothesis(log, rows, model.problem, tuple(range(nq))))
     gains = 1.0 + fit.theta[:nq]
-    determined = np.flatnonzero(np.abs(gains) > DETERMINED * fit.spread[:nq])
+    determined = np.flatnonzero(np.abs(gains) > fit.spread[:nq])
     # A current has the sign of its torque, so gains of both signs have another cause.
     if 2 * len(determined) > nq and (gains[determined] > 0.0).all():
         joints = tuple(determined.tolist())
@@ -272,17 +282,3 @@ def _possible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit)
     masses = system.robot.mass.numpy()
     fitted = masses + fit.theta[: 10 * system.robot.nq : 10]
     return bool(np.where(masses > 0.0, fitted > 0.0, fitted >= -SMALL_MASS * masses.sum()).all())
-
-
-def with_alternatives(finding: Finding, others: Iterable[Finding]) -> Finding:
-    """Return the finding with its alternatives, if any, and a test that distinguishes them."""
-    alternatives: list[Finding] = []
-    for other in others:
-        alike = (f for f in (finding, *alternatives) if f.kind == other.kind)
-        if not any({*f.joints} & {*other.joints} or not other.joints for f in alike):
-            alternatives.append(other)
-    if not alternatives:
-        return finding
-    message = "; or ".join(one.message for one in (finding, *alternatives))
-    test = next(TESTS[kind] for kind in TESTS if kind in {finding.kind, *(f.kind for f in alternatives)})
-    return replace(finding, message=message, alternatives=tuple(alternatives), told_apart_by=test)

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from typing import Any, Literal, SupportsFloat
 
@@ -108,6 +108,20 @@ class Finding:
             "evidence": {name: float(value) for name, value in self.evidence.items()},
             "alternatives": [other.to_dict() for other in self.alternatives],
         }
+
+
+def with_alternatives(finding: Finding, others: Iterable[Finding]) -> Finding:
+    """Return the finding with its alternatives, if any, and a test that distinguishes them."""
+    alternatives: list[Finding] = []
+    for other in others:
+        alike = (f for f in (finding, *alternatives) if f.kind == other.kind)
+        if not any({*f.joints} & {*other.joints} or not other.joints for f in alike):
+            alternatives.append(other)
+    if not alternatives:
+        return finding
+    message = "; or ".join(one.message for one in (finding, *alternatives))
+    test = next(TESTS[kind] for kind in TESTS if kind in {finding.kind, *(f.kind for f in alternatives)})
+    return replace(finding, message=message, alternatives=tuple(alternatives), told_apart_by=test)
 
 
 def at_rows(

@@ -21,7 +21,7 @@ from forcegp.checks.fit import (
     takes_friction_out,
     tensors,
 )
-from forcegp.checks.log import Array, Log, displacement
+from forcegp.checks.log import Array, Log, displacement, force_unit
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.identification import MASS_SHARE, MOMENT_ARM, regressor
 from forcegp.robot.model import RobotModel
@@ -33,8 +33,9 @@ TOOL_MASS = 5.0
 RISES = (0.3, 2.0, 10.0)
 """Factors by which the slope of dry friction near rest may differ from that declared: its shape is rarely
 known, and friction in MuJoCo rises more gently."""
-SLOW, GRAVITY = 0.01, 10.0
-"""Sliding speed below which dry friction of contacts is smoothed [m/s]; possible error in gravity [m/s²]."""
+SLOW, GRAVITY, LARGEST_DRIFT = 0.01, 10.0, 100.0
+"""Sliding speed below which dry friction of contacts is smoothed [m/s]; possible error in gravity [m/s²];
+possible drift of a torque sensor [N m, N]."""
 
 
 @dataclass(frozen=True)
@@ -146,6 +147,7 @@ def continuous(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterato
     for j in range(log.nq):
         yield gain_hypothesis(log, rows, (j,))
         yield encoder_hypothesis(system, log, rows, j)
+        yield drift_hypothesis(log, rows, j)
     yield from robot_hypotheses(system, log, rows)
 
 
@@ -153,6 +155,19 @@ def gain_hypothesis(log: Log, rows: np.ndarray, joints: tuple[int, ...]) -> Hypo
     """Return the hypothesis that the torques of the given joints must be scaled: u − τ = g τ."""
     columns = _diagonal(log.tau[rows])[..., list(joints)]
     return Hypothesis("gains", len(joints), unchanged, columns, np.full(len(joints), 100.0), joints)
+
+
+def drift_hypothesis(log: Log, rows: np.ndarray, j: int) -> Hypothesis:
+    """Return the hypothesis that the torque of joint j drifts over the log: u − τ = −θ s with |s| ≤ 1/2."""
+    column = np.zeros((len(rows), log.nq, 1))
+    column[:, j, 0] = -_elapsed(log)[rows]
+    return Hypothesis("drift", 1, unchanged, column, np.full(1, LARGEST_DRIFT), (j,))
+
+
+def _elapsed(log: Log) -> Array:
+    """Return the time from the middle of the log as a fraction of its duration `(n,)`."""
+    t = log.t[log.usable]
+    return (log.t - 0.5 * (t.min() + t.max())) / max(np.ptp(t), 1e-12)
 
 
 def current_hypothesis(
@@ -250,8 +265,11 @@ def plausible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit)
         # No place on earth has another size of gravity: such a fit has masses or gains that are wrong.
         same = abs(size - 1.0) <= SAME_GRAVITY[angle > TILT]
         return bool(size < WEIGHTLESS) or (angle > SMALL_TILT and same)
+    if hypothesis.name == "drift":
+        return bool(abs(fit.theta[0]) > SIGNIFICANT * fit.spread[0])
     if hypothesis.name == "payload":
-        return bool(fit.theta[0] > SIGNIFICANT * fit.spread[0])
+        known = abs(fit.theta[0]) > SIGNIFICANT * fit.spread[0]
+        return bool(known and fit.theta[0] > -float(system.robot.mass[-1]))
     return True
 
 
@@ -262,6 +280,10 @@ def corrected(log: Log, hypothesis: Hypothesis, theta: Array) -> Log:
         tau = log.tau.copy()
         # r = u − τ = g τ: the right torque is (1 + g) τ.
         tau[:, joints] *= 1.0 + theta[: len(joints)]
+        return log.replace(tau=tau)
+    if hypothesis.name == "drift":
+        tau = log.tau.copy()
+        tau[:, joints] -= theta[:1] * _elapsed(log)[:, None]
         return log.replace(tau=tau)
     if hypothesis.name == "encoder-offset":
         q = log.q.copy()
@@ -295,9 +317,17 @@ def finding_of(
         added = displacement(system.robot, hypothesis.joints[0], float(theta[0]))
         text = f"{listed} fits with {added} added to its position, ± {spread[0]:.4f}"
         evidence = {"add_rad": float(theta[0])}
+    elif name == "drift":
+        unit = force_unit(system.robot, hypothesis.joints[0])
+        name, text = (
+            "torque-offset",
+            f"the logged torque of {listed} drifts by {theta[0]:+.3g} ± {spread[0]:.2g} {unit}",
+        )
+        evidence = {f"drift {listed}": theta[0], "largest_torque": 0.5 * abs(theta[0])}
     elif name == "payload":
         name, names = "payload-missing", (log.joint_names[-1],)
-        text = f"the torque fits with {theta[0]:.3g} ± {spread[0]:.2g} kg more on the last link"
+        more = "more" if theta[0] > 0.0 else "less"
+        text = f"the torque fits with {abs(theta[0]):.3g} ± {spread[0]:.2g} kg {more} on the last link"
         evidence = {"mass_kg": float(theta[0]), "spread_kg": spread[0]}
     else:
         text = "the torque fits better with other masses and centres of mass than those of the robot file"

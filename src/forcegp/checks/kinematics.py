@@ -184,9 +184,9 @@ def _late(log: Log, level: Match) -> list[Finding]:
     square, change = (misfit**2).sum(axis=0), (level.change**2).sum(axis=0)
     delay = (misfit * step).sum(axis=0) / np.maximum((step**2).sum(axis=0), 1e-300)
     persists = (misfit[1:] * misfit[:-1]).sum(axis=0) > PERSISTS * square
-    late = level.moving & persists & (square > LATE**2 * change) & (delay > log.dt)
-    shown = ", ".join(f"{1e3 * x:.2g} ms" for x in delay[late])
-    return log.on_joints("velocity-delay", late, f"qd of {{}} is {shown} behind the rate of change of q")
+    late = level.moving & persists & (square > LATE**2 * change) & (np.abs(delay) > log.dt)
+    shown = ", ".join(f"{1e3 * abs(x):.2g} ms {'behind' if x > 0 else 'ahead of'}" for x in delay[late])
+    return log.on_joints("velocity-delay", late, f"qd of {{}} is {shown} the rate of change of q")
 
 
 def _velocity_findings(log: Log, level: Match, wrong: np.ndarray) -> tuple[list[Finding], Array]:

@@ -9,8 +9,8 @@ import numpy as np
 from forcegp.checks import hypotheses
 from forcegp.checks.excitation import check_visibility, still_joints
 from forcegp.checks.explain import Explanation, explain
-from forcegp.checks.finding import Finding, NotJudgedError
-from forcegp.checks.fit import FLOOR, cross_validate, gain_of, robust_parameters, unmeasured
+from forcegp.checks.finding import Finding, NotJudgedError, with_alternatives
+from forcegp.checks.fit import FLOOR, TorqueFit, gain_of, robust_parameters, unmeasured
 from forcegp.checks.log import Array, Log, Outcome, force_unit, position_unit, smoothed
 from forcegp.constraints import ConstrainedSystem
 from forcegp.robot.model import RobotModel
@@ -30,8 +30,6 @@ DISTURBANCE, LOUD = 5.0, 4.0
 residual exceeds the 90 % quantile by this factor."""
 MOVING, VISIBLE = 0.05, 0.1
 """Fraction of its largest speed above which an arm moves; fraction of the torque that disturbances exceed."""
-RIVALS = {"gravity": "a tilt of the base", "masses": "other masses", "gains": "a wrong gain"}
-"""Faults that may look like a constant torque, by hypothesis."""
 ONE_SIGMA = 84.13
 """Percentile of a normal distribution at one standard deviation above the mean."""
 
@@ -92,14 +90,10 @@ def _without_torque(log: Log) -> list[Finding]:
     return [replace(finding, weight="error" if still.all() else "warning") for finding in findings]
 
 
-def _matters(explanation: Explanation, j: int, columns: list[int]) -> bool:
-    """Return whether omitting the given nuisance columns raises the error of joint j significantly."""
-    problem = explanation.problem
-    keep = np.setdiff1d(np.arange(problem.nuisance.shape[-1]), columns)
-    less = replace(problem, nuisance=problem.nuisance[..., keep])
-    without = cross_validate(less, explanation.columns, explanation.prior)
-    floor = FLOOR * problem.size[j] / problem.scale[j]
-    gain, error = gain_of(*(np.log(np.hypot(fit.error[:, j], floor)) for fit in (explanation.fit, without)))
+def _worse(explanation: Explanation, other: TorqueFit, j: int) -> bool:
+    """Return whether another fit has a significantly larger error at joint j."""
+    floor = FLOOR * explanation.problem.size[j] / explanation.problem.scale[j]
+    gain, error = gain_of(*(np.log(np.hypot(fit.error[:, j], floor)) for fit in (explanation.fit, other)))
     return gain > MATERIAL and gain > SIGNIFICANT * error
 
 
@@ -138,13 +132,14 @@ def _friction(robot: RobotModel, explanation: Explanation) -> list[Finding]:
     damping, declared = robot.damping.numpy(), robot.friction.numpy()
     resists = ((viscous + damping) * speeds + coulomb + declared > 0.0).all(axis=0)
     spread = explanation.fit.nuisance_spread
-    significant = np.array([_matters(explanation, j, [j, nq + j]) for j in range(nq)])
+    significant = np.array([_worse(explanation, explanation.without([j, nq + j]).fit, j) for j in range(nq)])
     # Within the rise of declared friction, whose law is rarely known, a slow joint shows nothing beyond it.
     rising = (speeds[1] <= robot.friction_velocity.numpy()) & (declared > 0.0)
     significant &= resists & ~still_joints(log) & ~rising
     findings = []
     for hit, word in ((significant & (power > 0.0), "more"), (significant & (power <= 0.0), "less")):
-        evidence, parts = {}, []
+        largest = (np.abs(viscous) * speeds[1] + np.abs(coulomb))[hit].max(initial=0.0)
+        evidence, parts = {"largest_torque": largest}, []
         for j in np.flatnonzero(hit):
             unit, name, sizes = force_unit(robot, j), log.joint_names[j], []
             units = f"{unit} s/{position_unit(robot, j)}", unit
@@ -163,17 +158,23 @@ def _offsets(system: ConstrainedSystem, explanation: Explanation) -> list[Findin
     log, nq, rows = explanation.log, explanation.log.nq, explanation.rows
     offset = -explanation.fit.nuisance[2 * nq : 3 * nq]
     known = np.abs(offset) > explanation.fit.nuisance_spread[2 * nq : 3 * nq]
-    off = {j: log.joint_names[j] for j in range(nq) if known[j] and _matters(explanation, j, [2 * nq + j])}
+    less = {j: explanation.without([2 * nq + j]) for j in np.flatnonzero(known).tolist()}
+    off = {j: log.joint_names[j] for j, one in less.items() if _worse(explanation, one.fit, j)}
     if not off:
         return []
     listed = ", ".join(f"{joint} {offset[j]:+.3g} {force_unit(system.robot, j)}" for j, joint in off.items())
     evidence = {f"offset {joint}": offset[j] for j, joint in off.items()}
+    evidence["largest_torque"] = max(abs(offset[j]) for j in off)
+    text, names = f"the logged torque is off by a constant: {listed}", tuple(off.values())
     tried = *hypotheses.robot_hypotheses(system, log, rows), hypotheses.gain_hypothesis(log, rows, tuple(off))
-    beside = {RIVALS[h.name]: explanation.beside(h) for h in tried if h.name in RIVALS}
-    others = [w for w, one in beside.items() if not any(_matters(one, j, [2 * nq + j]) for j in off)]
-    or_else = f"; in this motion, {', '.join(others)} would look the same" if others else ""
-    text = f"the logged torque is off by a constant: {listed}{or_else}"
-    return [log.finding("torque-offset", text, tuple(off.values()), **evidence)]
+    without = explanation.without([2 * nq + j for j in off])
+    fits = ((h, without.with_(h)) for h in tried if h.name not in explanation.robot)
+    rivals = [
+        hypotheses.finding_of(system, log, h, fit)
+        for h, fit in fits
+        if hypotheses.plausible(system, h, fit) and not any(_worse(explanation, fit, j) for j in off)
+    ]
+    return [with_alternatives(log.finding("torque-offset", text, names, **evidence), rivals)]
 
 
 def _unexplained(explanation: Explanation) -> list[Finding]:
@@ -199,7 +200,8 @@ def _disturbances(system: ConstrainedSystem, explanation: Explanation) -> tuple[
     dry = system.robot.friction.numpy() - explanation.fit.nuisance[log.nq : 2 * log.nq]
     slowest = minimum_filter1d(np.abs(log.qd[rows]), 2 * width + 1, axis=0)
     friction = np.maximum(dry, 0.0) * (slowest < system.robot.friction_velocity.numpy())
-    visible = np.asarray((np.abs(trace) > VISIBLE * explanation.problem.size + friction).any(axis=1))
+    size = np.maximum(explanation.problem.size, FLOOR * explanation.problem.size.max())
+    visible = np.asarray((np.abs(trace) > VISIBLE * size + friction).any(axis=1))
     bad = _stands_out(log, rows, level)
     spans = intervals(bad, join=width)
     spans = tuple((a, b) for a, b in spans if b - a >= width and visible[a:b].mean() > 0.5)

@@ -98,8 +98,10 @@ def find_held(signals: Signals, drop: bool, report: ImportReport) -> None:
     held = np.append(False, np.diff(signals.segment) == 0) & _repeats(signals, "q", "tau")
     if held.any():
         done = "were dropped" if drop else 'are kept; held = "drop" under [time] drops them'
-        message = f"{held.sum()} rows repeat the values of the previous row and {done}"
-        report.find("held", message, signals.row[held])
+        share = f"{held.sum()} rows ({100 * held.mean():.2g} %)"
+        message = f"{share} repeat the values of the previous row and {done}"
+        kind = "faster than its source" if 2 * held.sum() > len(held) and not drop else "held"
+        report.find(kind, message, signals.row[held])
         if drop:
             signals.keep(~held)
 

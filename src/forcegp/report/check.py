@@ -65,13 +65,13 @@ def picture_of(finding: Finding, system: ConstrainedSystem, log: Log) -> Picture
     rows, family = _window(finding, log), KINDS[finding.kind].family
     if family == "import":
         return None
-    if family == "contact" and finding.contact is not None:
+    if family.startswith("contact") and finding.contact is not None:
         return _contact(finding, system, log, rows)
     joints = [log.joint_names.index(name) for name in finding.joints][:JOINTS] or _largest(log)
     column = next((name for name in ("tau", "qdd", "qd", "q") if f"{name}." in finding.message), None)
     whole = rows.stop - rows.start > 0.9 * len(log)
     paint, quantity = _column(column or "q"), column or "q"
-    if family in ("torque", "mechanics"):
+    if family in ("torque", "mechanics", "learned"):
         paint, quantity = _torque(system, log, rows), "tau"
     elif finding.kind in ("torque-saturated", "torque-limit"):
         paint, quantity = _column("tau"), "tau"
