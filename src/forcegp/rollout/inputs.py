@@ -42,8 +42,7 @@ class ForwardModel(ABC):
     """The robot and contacts to which predictions refer."""
 
     def force_field(self) -> ForceField | None:
-        """Return the mean impressed force Q̄ as a force field, or `None` if the model has only accelerations.
-        """
+        """Return the mean impressed force Q̄ as a force field, or `None` if the model has no forces."""
         return None
 
     def force_samples(self, samples: int, generator: torch.Generator) -> ForceField:
