@@ -87,7 +87,7 @@ def _written(
     test: forcegp.Dataset,
     names: tuple[str, str, str | None],
 ) -> dict[str, object]:
-    """Write the page and its data, and return their paths; `names` are the file names shown on the page."""
+    """Write the page and its data, and return their paths. `names` are the file names shown on the page."""
     from forcegp.destination import folder_or_keep
     from forcegp.files import write_json
     from forcegp.report.evaluation import PAGE, write_evaluation

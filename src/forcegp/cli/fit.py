@@ -88,7 +88,7 @@ def fit(
 
 
 def _figures(result: FitResult, as_json: bool) -> dict[str, object]:
-    """Return the fields of the result by name; for text output, omit empty fields and printed warnings."""
+    """Return the fields of the result by name. For text output, omit empty fields and printed warnings."""
     figures = {name: value for name, value in asdict(result).items() if name != "history"}
     if as_json:
         return figures

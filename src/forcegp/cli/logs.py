@@ -90,7 +90,7 @@ def _guess(log: Path, system: forcegp.ConstrainedSystem, out: Path) -> dict[str,
 
 
 def _summary(imported: Imported) -> dict[str, object]:
-    """Return the numbers of rows and trajectories and the period, and then findings and processing steps."""
+    """Return the numbers of rows and trajectories and the period, then findings and processing steps."""
     data, report = imported.data, imported.report
     rows, segments = f"{len(data)} from {report.rows_read} logged", int(data.segment[-1]) + 1
     result: dict[str, object] = {"rows": rows, "segments": segments, "period_s": data.header.dt}

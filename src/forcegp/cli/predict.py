@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from forcegp.models.base import Predictor
 
 PER_CONTACT = ("multiplier", "contact_force")
-"""Quantities with one value or one vector per contact; all others have one component per joint."""
+"""Quantities with one value or one vector per contact. All others have one component per joint."""
 WRENCH = "external_wrench"
 """Wrench on a frame, saved as the force and moment of a contact named after the frame."""
 
@@ -129,7 +129,7 @@ def _with_wrench(
 ) -> tuple[forcegp.Dataset, dict[str, object]]:
     """Add the external wrench on a frame, and the detected contact, as a contact named after the frame.
 
-    Return the data set, and a summary with the fraction of samples in contact.
+    Return the data set and a summary with the fraction of samples in contact.
     """
     from forcegp.models.structured_fit import StructuredFit
 

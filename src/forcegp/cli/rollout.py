@@ -112,7 +112,7 @@ def _say_contact(log: forcegp.Dataset, unilateral: bool) -> None:
 
 
 def _stretch(data: forcegp.Dataset, start: int, duration: float | None) -> forcegp.Dataset:
-    """Return the rows from `start` until the end of the trajectory or of the duration."""
+    """Return the rows from `start` to the end of the trajectory or of the duration."""
     from forcegp.data.derivative import UNIFORM_TOLERANCE
 
     stretch = trajectory_from(data, start, "rollout")
@@ -128,7 +128,7 @@ def _stretch(data: forcegp.Dataset, start: int, duration: float | None) -> force
 
 
 def _spread(q: Tensor) -> Tensor:
-    """Return the standard deviation over samples `(S, T, nq)`, as long as two have not diverged."""
+    """Return the standard deviation over samples `(S, T, nq)`, as long as at least two have not diverged."""
     import numpy as np
     import torch
 

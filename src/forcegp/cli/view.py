@@ -90,7 +90,7 @@ def view(
 
 
 def _target(target: str) -> tuple[forcegp.ConstrainedSystem, FittedModel | None, list[Shape]]:
-    """Return the system, the model (if the target is a model), and the shapes of the robot."""
+    """Return the system, the model if the target is a model, and the shapes of the robot."""
     from forcegp.robot.shapes import shapes_of
     from forcegp.storage.model_file import model_path
 
@@ -103,7 +103,7 @@ def _target(target: str) -> tuple[forcegp.ConstrainedSystem, FittedModel | None,
 
 
 def _stretch(log: Path, system: forcegp.ConstrainedSystem, start: int, seconds: float) -> forcegp.Dataset:
-    """Return the rows of a trajectory from `start` until the first gap or the end of the given duration."""
+    """Return the rows of a trajectory from `start` to the first gap or to the end of the given duration."""
     stretch = trajectory_from(read_data(log, system.robot), start, "view")
     steps = stretch.t.diff()
     gaps = (steps > 1.5 * steps.median()).nonzero() if len(steps) > 0 else steps  # left by `forcegp select`

@@ -111,8 +111,7 @@ class StructuredSettings(StructuredOptions):
 
     @field_serializer("result")
     def _saved(self, result: FitResult) -> dict[str, Any]:
-        """Return the result without the long history, and without constant inputs, which are in the scales.
-        """
+        """Return the result without its history and without constant inputs, which the scales contain."""
         left_out = ("history", "constant_inputs")
         return {name: x for name, x in dataclasses.asdict(result).items() if name not in left_out}
 

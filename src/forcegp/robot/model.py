@@ -195,8 +195,7 @@ class RobotModel:
         return dataclasses.replace(self, **fields)  # pyright: ignore[reportArgumentType]
 
     def check_state(self, **states: Tensor) -> None:
-        """Raise `ShapeError` unless arguments have last dimension `nq` and the dtype and device of the robot.
-        """
+        """Raise `ShapeError` unless arguments have last dimension `nq` and the robot's dtype and device."""
         for name, value in states.items():
             if not isinstance(value, Tensor):
                 raise ShapeError(

@@ -160,8 +160,7 @@ def _unit(axis: np.ndarray, where: str) -> np.ndarray:
 
 
 def _limits(limit: dict[str, Any], kind: str, where: str) -> dict[str, float]:
-    """Return position, effort and velocity limits. Missing or zero effort and velocity limits are infinite.
-    """
+    """Return the limits of a joint. Missing or zero effort and velocity limits become infinite."""
     effort, velocity = (limit.get(name) or np.inf for name in ("effort", "velocity"))
     if min(effort, velocity) < 0.0:
         raise RobotFileError(

@@ -368,8 +368,7 @@ class CompiledFit(Predictor):
         active: Tensor | None = None,
         system: ConstrainedSystem | None = None,
     ) -> ForceLinearization:
-        """Return the mean acceleration and multiplier with their Jacobians, as in `StructuredFit.linearize`.
-        """
+        """Return mean acceleration, multiplier and Jacobians, as in `StructuredFit.linearize`."""
         if system is not None and system is not self.system:
             raise ModelError("a compiled fit predicts on its own system", hint="use that of the fit")
         found = self.jacobian(q, qd, tau, ["qdd", "multiplier"], active=active)

@@ -484,8 +484,7 @@ class LearnedMotion(Mean):
         return np.stack([columns[term] * closed for term in prior.terms], axis=1)
 
     def _inertial_force(self, errors: Scalars, drives: Scalars) -> Scalars:
-        """Return [Y(q, q̇, q̈), diag q̈] δ at the analytical q̈ for errors δ of links `(nq, 10)` and drives.
-        """
+        """Return [Y(q, q̇, q̈), diag q̈] δ at the analytical q̈, for errors δ of links and drives."""
         links, qdd = self.links, self._motion(self.Q_D + self.tau, TERMS).qdd
         motion = _motion(links, list(self.qd), list(qdd), gravity=True)
         torques, forces = [], []
