@@ -48,9 +48,8 @@ def spikes(x: Array) -> tuple[Array, Array]:
     """Return how far each value, and its neighbours, deviate from the cubic through the four neighbours.
 
     e_i = x_i − (−x_{i−2} + 4 x_{i−1} + 4 x_{i+1} − x_{i+2})/6. The second result is the deviation among the
-    neighbours alone, without x_i. A kink in the motion increases both results, a spike only the first. Values
-    must be evenly sampled, with shape `(n, d)` and n ≥ 7. Both results are zero in the three rows at either
-    end.
+    neighbours alone. A kink in the motion increases both results, a spike only the first. Values must be
+    evenly sampled, with shape `(n, d)` and n ≥ 7. Both are zero in the three rows at either end.
     """
     from scipy.ndimage import correlate1d
 

@@ -167,8 +167,7 @@ def _treat_clipped(
 ) -> Array | None:
     """Drop rows with clipped torques, or set their noise `tau_std` to their magnitude.
 
-    A filter spreads a clipped torque to the rows within half its window. Return σ of q̈ in the remaining
-    rows.
+    Filters spread a clipped torque over half their window. Return σ of q̈ in the remaining rows.
     """
     if "clipped" not in signals.vectors or not (mask := signals.vectors.pop("clipped")).any():
         return std

@@ -36,8 +36,7 @@ CURRENT = {"side": "motor", "gear_ratio": 1.0, "torque_constant": 1.0}
 @dataclass
 class Family:
     """Columns of one quantity, keyed by the text that replaces `{joint}` in their common pattern. `by_joint`
-    is used if that text differs from the text in position columns. `declared` is true if the log states the
-    unit.
+    is used if that text differs from that of the positions. `declared` is true if the log states the unit.
     """
 
     pattern: str

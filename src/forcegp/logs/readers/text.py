@@ -40,8 +40,8 @@ _UNIT = re.compile(r"^[\[(]?\s*([A-Za-zµ°%][\w°²^/*·. -]{0,15}|-|1)?\s*[\])
 
 @dataclass(frozen=True)
 class Dialect:
-    """Format of a text table that begins at `first_line`. Each column has the type `number`, `bool`, `date`,
-    `text` or `empty`."""
+    """Format of a text table from `first_line` on. Columns are of type `number`, `bool`, `date`, `text` or
+    `empty`."""
 
     encoding: str
     separator: str
