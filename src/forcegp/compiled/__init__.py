@@ -31,8 +31,7 @@ class CompiledDynamics:
     """A robot quantity, such as the mass matrix, compiled as a function of joint-space arguments.
 
     Call it like the eager function of the same name, but without the robot. Derivatives of any order are
-    those of the eager function. First derivatives of forward dynamics use a kernel that is built on first
-    use.
+    those of the eager function. First derivatives of forward dynamics have a kernel, built on first use.
     """
 
     def __init__(self, robot: RobotModel, quantity: str) -> None:
@@ -131,10 +130,9 @@ class _Kernel(torch.autograd.Function):
 def compile_dynamics(robot: RobotModel, quantity: str = "forward_dynamics") -> CompiledDynamics:
     """Compile a function of `forcegp.dynamics`, or the function of its derivatives, for one robot.
 
-    The first call runs the local C++ compiler. This takes about one second for an arm, ten seconds for a
-    hand, and minutes for a hundred joints. Later calls in any process load the kernel from the cache
-    (`$FORCEGP_CACHE`, or `forcegp` in the user's cache folder). On a CUDA device, NVRTC compiles the kernel
-    in each process.
+    The first call runs the local C++ compiler. This takes about one second for an arm, ten for a hand, and
+    minutes for a hundred joints. Later calls in any process load the kernel from the cache (`$FORCEGP_CACHE`,
+    or `forcegp` in the user's cache folder). On a CUDA device, NVRTC compiles the kernel in each process.
 
     Args:
         robot: the robot. Its parameters become constants.

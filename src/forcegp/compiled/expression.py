@@ -61,8 +61,7 @@ class Graph:
         return sorted(needed)
 
     def tangents(self, outputs: list[Scalar], seeds: dict[int, Tangents]) -> list[Tangents]:
-        """Return the derivatives of the outputs by forward mode, given the derivatives of `seeds` by
-        position.
+        """Return the derivatives of the outputs by forward mode, given those of `seeds`, keyed by position.
 
         A seed need not be an input. For example, the solution of an equation can be seeded with its
         derivative. A scalar without directions is treated as a constant.

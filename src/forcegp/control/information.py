@@ -81,8 +81,8 @@ class Unknowns:
         Args:
             robot: the robot from the file.
             low, high, fastest, region: see the attributes.
-            noise: torque noise. The default is 1 % of each joint's RMS torque in the region, but at least 0.1
-                % of the largest.
+            noise: torque noise. The default is 1 % of each joint's RMS torque in the region, at least 0.1 %
+                of the largest.
 
         Raises:
             ParameterError: the region is empty.

@@ -2,8 +2,7 @@
 
 Points are drawn in a chart (u, v, h). The coordinates u and v run along the sides of a rectangle that touches
 the surface at its centre, and h is the height above the surface. A line in the chart is traversed with a
-trapezoidal velocity profile (Siciliano et al., *Robotics*, section 4.2.1), and is then mapped onto the
-surface.
+trapezoidal velocity profile (Siciliano et al., *Robotics*, section 4.2.1) and mapped onto the surface.
 """
 
 from __future__ import annotations
@@ -78,8 +77,7 @@ class Chart:
     Args:
         center: origin, `(3,)` [m], which is on the surface if there is one.
         axes: matrix `(3, 3)` with the directions of u and v and the normal at the centre as its rows.
-        surface: the curved surface under u and v, or `None` for a plane or free space, where the chart is
-            linear.
+        surface: the curved surface under u and v, or `None` for a linear chart (a plane or free space).
     """
 
     center: Tensor
@@ -180,8 +178,7 @@ def straight_lines(
     """Return the motion along lines between waypoints `(k, 3)` of a chart at times t `(n,)` ≥ 0.
 
     The velocity is trapezoidal, with travel time and acceleration as in `trapezoid`. Speed and acceleration
-    refer to the chart. On a plane or in free space, they also refer to the end-effector. The motion ends at
-    rest.
+    refer to the chart, and on a plane or in free space also to the end-effector. The motion ends at rest.
     """
     lines = waypoints.diff(dim=0)
     length = torch.linalg.vector_norm(lines, dim=-1)

@@ -51,8 +51,7 @@ class Dataset(Fields):
         joint_names: names of the joints in column order.
         contact: mask `(n,)` of the rows in which a contact is closed, keyed by contact.
         extras: additional joint vectors `(n, nq)`, keyed by name: `qdd_clean`, `Q`, `Q_z`, `Q_I`, …
-        contact_extras: contact quantities `(n,)` or `(n, 3)`, keyed by name and contact: `multiplier`, `F_I`,
-            …
+        contact_extras: contact quantities `(n,)`, `(n, 3)`, keyed by name and contact: `multiplier`, `F_I`, …
         segment: trajectory number of each row, `(n,)`. By default, there is a single trajectory.
         header: noise, sampling period, robot, seed and provenance.
 

@@ -23,8 +23,7 @@ class SavitzkyGolay:
     """Differentiation of a polynomial fitted by least squares in a moving window.
 
     A wider window reduces the noise and increases the bias. A higher order has the opposite effect. The noise
-    of the results is correlated over about one window. A likelihood with white noise ignores this
-    correlation.
+    of the results is correlated over about one window, which a likelihood with white noise ignores.
 
     Args:
         window: number of samples, which must be odd.

@@ -66,8 +66,7 @@ def read_table(
 ) -> tuple[Columns, DataHeader]:
     """Return the numeric columns and the header (or a default header) of a Parquet or CSV file.
 
-    Empty values are errors, or NaN if `missing` is `"nan"`. If the file cannot be read, a `DataError` states
-    the reason.
+    Empty values are errors, or NaN if `missing` is `"nan"`. Unreadable files raise `DataError`.
     """
     file = existing(path)
     readers = {".parquet": _read_parquet, ".csv": _read_csv}

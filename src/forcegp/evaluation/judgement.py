@@ -1,9 +1,8 @@
 """Criteria for a good model: non-gravitational torque, open-loop motion, and response to a torque.
 
-The torque error is that of inverse dynamics, M(q)(predicted − measured q̈), with the mass matrix of the
-predictor's robot. The explained fraction of the non-gravitational torque is R² = 1 − Σ (N M Δq̈)² / Σ (N (τ −
-τ_g))². Here, τ_g is gravity plus a constant, fitted to the torques, and N = 1 − A⁺A removes constraint
-forces.
+The torque error is M(q)(predicted − measured q̈), with the mass matrix of the predictor's robot. The
+explained fraction of the non-gravitational torque is R² = 1 − Σ (N M Δq̈)² / Σ (N (τ − τ_g))². Here, τ_g is
+gravity plus a constant, fitted to the torques, and N = 1 − A⁺A removes constraint forces.
 """
 
 from __future__ import annotations

@@ -197,8 +197,7 @@ class Baseline:
     """A trivial predictor of accelerations.
 
     Attributes:
-        name, system: the name of the predictor, and the robot with the mass matrix that converts its errors
-            to torques.
+        name, system: name of the predictor, and the robot with the mass matrix for its torque errors.
         predict: a function that returns the predicted accelerations `(n, nq)` for a data set.
         std: RMS error on the training data, which is used as the uncertainty, `(nq,)`.
     """

@@ -85,8 +85,7 @@ class AnalyticalModel(Model["AnalyticalFit"]):
         progress: FitProgress | None = None,
         checkpoint: str | Path | None = None,
     ) -> AnalyticalFit:
-        """Minimise the mean squared error of the accelerations, starting from random parameters in the
-        window.
+        """Minimise the mean squared acceleration error, starting from random parameters in the window.
 
         Args:
             data: states and measured accelerations.

@@ -62,12 +62,10 @@ class ExternalWrench(Prediction):
 
         Without a wrench, d² = ŵᵀ C⁻¹ ŵ is at most a χ² variable with k degrees of freedom. A contact is
         detected if, in `hold` consecutive samples, d² exceeds both `limit` and a quantile of this
-        distribution. The quantile has the tail probability of a Gaussian beyond ± `threshold` standard
-        deviations.
+        distribution. Its tail probability is that of a Gaussian beyond ± `threshold` σ.
 
         Args:
-            threshold: threshold [σ]. `false_alarm_rate(threshold)` is the probability of a false alarm per
-                sample.
+            threshold: threshold [σ]. The probability of a false alarm is `false_alarm_rate(threshold)`.
             hold: number of consecutive samples, including the current sample.
             limit: lower limit for d², such as that of `exceeded_once_in`.
 

@@ -21,8 +21,8 @@ class Compared:
 
     Attributes:
         name: name of the set.
-        log_density: mean log predictive density of held-out samples [nats per sample], or `None` if it was
-            not computed.
+        log_density: mean log predictive density of held-out samples [nats per sample], or `None` if not
+            computed.
         behind: deficit relative to the best set [nats per sample].
         standard_error: standard error of this deficit.
         chosen: whether this set was selected.
@@ -64,10 +64,8 @@ class FitResult:
         converged: whether the optimiser reached its tolerance.
         evaluations: number of evaluations of the objective.
         seconds: duration of the fit.
-        objective: final value of the objective, which is the mean squared error or the negative log posterior
-            of the hyperparameters.
-        log_marginal_likelihood: log marginal likelihood of the training data, or `None` if the model has
-            none.
+        objective: final mean squared error, or negative log posterior of the hyperparameters.
+        log_marginal_likelihood: log marginal likelihood of the training data, `None` for models without one.
         jitter: jitter added to the diagonal of the covariance, in units of the noise variance. The effective
             noise is √(1 + jitter) times the given noise.
         constant_inputs: inputs that are constant in the training data and therefore are not scaled.

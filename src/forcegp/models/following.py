@@ -54,8 +54,8 @@ def follow(
         fit: a fit with sparse inference.
         data: a few new samples, for example over 0.05 s.
         priors: names of the priors whose forces may change, such as `payload`.
-        factor: correlation of these forces with the forces at the previous call. A factor below 1 also allows
-            for slow drift.
+        factor: correlation of these forces with those at the previous call. A factor below 1 allows for
+            drift.
         change: prior probability of a change between two calls.
 
     Raises:

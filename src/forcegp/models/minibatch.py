@@ -73,8 +73,7 @@ def train(
         options: options for training on batches or on all samples at once. Training on batches returns the
             tensors of the epoch with the smallest held-out loss.
         generator: random generator that selects the held-out samples and the order of the rows.
-        progress: a function called after each epoch or evaluation with its number, the maximum number, and
-            the loss.
+        progress: a function called after each epoch or evaluation with its number, the maximum, and the loss.
         checkpoint: a file that contains the state of training. If the file exists, training resumes from it.
         key: identifier of the loss for the checkpoint.
 

@@ -38,8 +38,7 @@ class NetworkSettings(Record):
 
 
 class NeuralNetwork(Model["NetworkFit"]):
-    """A feed-forward network with sigmoid layers on standardized (q, q̇, τ), trained on the mean squared
-    error.
+    """A feed-forward network of sigmoid layers on standardized (q, q̇, τ), trained on mean squared error.
 
     The network does not use contacts as inputs and does not predict covariances.
 

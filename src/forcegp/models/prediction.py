@@ -73,8 +73,7 @@ class Prediction:
         """Reject non-finite numbers and invalid covariances.
 
         Raises:
-            NumericalError: a determined mean or covariance is not finite, or an eigenvalue is clearly
-                negative.
+            NumericalError: a determined value is not finite, or an eigenvalue is clearly negative.
         """
         if checked:
             return
@@ -251,7 +250,7 @@ class Predictor(ForwardModel):
 
         Args:
             q, qd, tau: `(*batch, nq)` states.
-            quantity: a name in `QUANTITIES`. For models with forces, several names give the joint
+            quantity: a name in `QUANTITIES`. If the model has forces, several names give their joint
                 distribution.
             active: mask `(*batch, n_contacts)` of closed contacts. By default, all contacts are closed.
             covariance: whether to compute the covariance, which is more expensive than the mean.

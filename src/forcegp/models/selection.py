@@ -103,8 +103,7 @@ def with_priors(
         spec: the model with the noise for these data.
         data: the log, or the rows of the log that are in memory.
         learn: the parts to learn. By default, all parts are learned.
-        progress: a function called after each candidate with the number of completed candidates, the total
-            number, and NaN.
+        progress: a function called after each candidate with the number completed, the total number, and NaN.
     """
     if learn is not None:
         return without_comparison(spec, "not everything is learned")

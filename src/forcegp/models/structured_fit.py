@@ -226,7 +226,7 @@ class StructuredFit(FittedModel):
         Raises:
             ModelError: a prior, kernel or contact cannot be exported to C, or the posterior is too large.
             NumericalError: single precision cannot resolve a variance.
-            UnknownNameError, ParameterError: the language or frame does not exist, or the name is not a C
+            UnknownNameError, ParameterError: the language or frame is unknown, or the name is no C
                 identifier.
             DestinationError: the folder cannot be written, or contains other files.
             MissingDependencyError: CasADi is not installed.

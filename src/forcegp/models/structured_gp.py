@@ -48,8 +48,7 @@ class StructuredGP(Model[StructuredFit]):
             mean does not include the motor torque, `"auto"` selects `default_priors`: a `JointForcePrior`
             and, in contact, a `NormalForcePrior` that affects only multipliers.
         noise: standard deviation of measured accelerations [rad/s², m/s²], as one value or one per joint, or
-            a `Noise` that includes the noise of torques and states. The default is the value in the log, or
-            0.1.
+            a `Noise` for accelerations, torques and states. The default is the value in the log, or 0.1.
         analytical_parameters: a module with a `forward()` method that returns the robot with learned
             analytical parameters θ_A. `None` leaves the robot unchanged.
         inference: `"exact"`, `"sparse"` or `"auto"`.
@@ -135,11 +134,10 @@ class StructuredGP(Model[StructuredFit]):
                 log requires a constant amount of memory.
             learn: the parts to learn, which are names of priors, `"noise"` or `"analytical_parameters"`.
                 Other parts keep the values and input scales of the fit `after`, or their initial values. By
-                default, all parts are learned. With an empty list, the forces are only conditioned on the
-                data.
+                default, all parts are learned. With an empty list, the forces are only conditioned.
             after: an earlier fit of this model, for example to fewer data. It provides the values of parts
                 that are not learned. If `learn` is not given, it provides the initial values.
-            options: the optimiser and its limits. The default is L-BFGS, with a tolerance of 1e-9 if θ_A is
+            options: the optimiser and its limits. The default is L-BFGS, with tolerance 1e-9 if θ_A is
                 learned.
             progress: a function called after each evaluation. For a streamed log, it is also called after
                 each piece with the number of processed samples, the total number, and NaN.

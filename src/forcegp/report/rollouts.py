@@ -93,8 +93,7 @@ class RolloutData(Header):
         band_starts, band_seconds, level: number of starts, duration and nominal coverage of the bands.
         horizons: times at which `ModelPath.errors` are given [s].
         models: the trajectory of each model.
-        frame_times, bodies, films: animation times [s], points per arm, and the arms, with the logged arm
-            first.
+        frame_times, bodies, films: animation times [s], points per arm, and the arms (the logged arm first).
     """
 
     FORMAT: ClassVar[str] = "forcegp-rollout"

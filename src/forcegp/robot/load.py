@@ -213,8 +213,8 @@ def load_robot(
     A usable but questionable file triggers a `RobotFileWarning`, which `robot.remarks` also lists.
 
     Args:
-        source: `"kuka_iiwa"`, `"kuka_iiwa14"`, `"franka_panda"`, `"ur5"`, `"double_pendulum"`, or the path
-            of a file.
+        source: `"kuka_iiwa"`, `"kuka_iiwa14"`, `"franka_panda"`, `"ur5"`, `"double_pendulum"`, or a file
+            path.
         base_position: position of the root link in the world [m].
         base_rpy: roll, pitch and yaw of the root link about the world axes [rad].
         gravity: gravitational acceleration in the world [m/s²]. The value in an MJCF file is ignored.

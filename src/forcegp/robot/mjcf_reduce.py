@@ -1,8 +1,7 @@
 """Reduction of MJCF documents to their mechanics, before MuJoCo compiles them.
 
 Bodies, joints, sites, inertias and defaults are kept. Elements for visuals, sensors, actuation or collisions
-are dropped, so that meshes and textures are never opened. Unsupported elements that affect the motion cause
-errors.
+are dropped, so meshes and textures are never opened. Unsupported elements that affect motion cause errors.
 """
 
 from __future__ import annotations

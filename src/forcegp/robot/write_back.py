@@ -3,8 +3,7 @@
 Only changed attributes are edited (`edit_xml.py`). Meshes, comments, order and formatting are preserved. A
 link of the robot may consist of several links in the file that are fixed to each other. Of those that stay
 physically consistent, the heaviest takes the whole change J − J₀ in pseudo-inertia. If none stays consistent,
-each J_k changes to E J_k Eᵀ, where E satisfies E J₀ Eᵀ = J. The edited text is read back and compared before
-it is written.
+each J_k changes to E J_k Eᵀ, where E satisfies E J₀ Eᵀ = J. The edited text is checked before it is written.
 """
 
 from __future__ import annotations

@@ -43,8 +43,7 @@ class RolloutOptions:
 
     Args:
         dt: step size, output period, and sampling period of torques passed as an array [s]. The default is
-            the sampling period of a log or controller, and 1/240 s for a feedback law. An array requires
-            `dt`.
+            the period of a log or controller, and 1/240 s for a feedback law. An array requires `dt`.
         method: `semi_implicit_euler` (the method of the simulators), `rk4`, or SciPy's adaptive `rk45` and
             `dop853`, which choose their steps within each output period.
         stabilization: `none`, `baumgarte` (the terms of the system, or default terms), custom `Baumgarte`
@@ -169,8 +168,7 @@ def rollout_model(
         system: a different system, for example with a different surface or different robot parameters.
 
     Returns:
-        The mean motion. Its attribute `samples` contains the sampled trajectories with batch shape `(S,
-            *batch)`.
+        The mean motion. Its `samples` are the sampled trajectories, with batch shape `(S, *batch)`.
 
     Raises:
         DivergedError: a trajectory diverged. The error contains the result.

@@ -133,15 +133,14 @@ class Inputs(ABC):
 
         Args:
             t: time, `(n, 1)` [s].
-            end: end of the current step, `(n, 1)` [s]. If the torque jumps at t = end, the value before the
+            end: end of the current step, `(n, 1)` [s]. If the torque jumps at `end`, the value before the
                 jump is returned.
             at: the current states with their equations of motion.
         """
 
 
 Torque = Tensor | Dataset | Inputs | Callable[[Tensor, Tensor, Tensor], Tensor]
-"""An array over time with shape `(samples, nq)` or `(*batch, samples, nq)`, a log, `Inputs`, or a function of
-(t, q, q̇)."""
+"""An array `(samples, nq)` or `(*batch, samples, nq)`, a log, `Inputs`, or a function of (t, q, q̇)."""
 
 
 @dataclass(frozen=True)

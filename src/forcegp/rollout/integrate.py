@@ -51,8 +51,7 @@ def runge_kutta_4(problem: RolloutProblem, state: State, first: Instant, h: Tens
 def adaptive(method: str) -> Step:
     """Return a step function that uses an adaptive method of `scipy.integrate`.
 
-    All rows share the internal steps. Time is normalised to run from 0 to 1, since the rows may have steps of
-    different lengths.
+    All rows share the internal steps. Time runs from 0 to 1, since the rows may have different step lengths.
     """
 
     def step(problem: RolloutProblem, state: State, first: Instant, h: Tensor) -> State:

@@ -11,9 +11,8 @@ frictionless acceleration. Friction satisfies |p_i| ≤ F_i, and p_i = −F_i si
 (Stewart and Trinkle, *An implicit time-stepping scheme for rigid body dynamics with inelastic collisions and
 Coulomb friction*, 1996). In contact, G = H, so that the contact force depends on the friction of sticking
 joints. Block principal pivoting solves this complementarity problem exactly (Júdice and Pires, *A block
-principal pivoting algorithm for large-scale strictly monotone linear complementarity problems*, 1994). The
-algorithm guesses which joints stick, solves for their friction, and exchanges the joints that contradict the
-guess.
+principal pivoting algorithm for large-scale strictly monotone linear complementarity problems*, 1994). It
+guesses which joints stick, solves for their friction, and exchanges joints that contradict the guess.
 
 Let D be the viscous friction of a joint with low inertia. If h G_ii D_i > 1, an explicit step reverses the
 motion of the joint, and above 2 it is unstable. Viscous friction is then evaluated at the end of the step
@@ -56,8 +55,7 @@ INSTANT = 1e-12
 STILL = 1e-8
 """Speed up to which a joint counts as at rest [rad/s, m/s]. Sticking joints creep due to rounding errors."""
 SMOOTH = 0.02
-"""Speed scale for smoothing learned "friction" that drives a joint and therefore cannot stick [rad/s,
-m/s]."""
+"""Speed scale for smoothing learned "friction" that drives a joint, and so cannot stick [rad/s, m/s]."""
 SATURATED = 10.0
 """Speed, relative to the scale of smoothed Coulomb friction, above which a contact slides."""
 NUDGE = 1e-4
@@ -343,8 +341,7 @@ class Instant(NamedTuple):
     Attributes:
         tau, qdd: motor torque and acceleration, `(n, nq)`.
         multiplier, c, cd: λ, the constraint error and its rate, `(n, m)`.
-        held: mask `(n, nq)` of the joints at rest at the end of the step, or `None` if there is no dry
-            friction.
+        held: mask `(n, nq)` of joints at rest at the end of the step, `None` without dry friction.
     """
 
     tau: Tensor
@@ -357,8 +354,7 @@ class Instant(NamedTuple):
 
 @dataclass(frozen=True)
 class RolloutProblem:
-    """The equations q̈ = law(q, q̇, τ(t, q, q̇)) on a constrained system with the stabilization of the
-    rollout.
+    """The equations q̈ = law(q, q̇, τ(t, q, q̇)) on a constrained system with the rollout's stabilization.
 
     If `unilateral` is true, contacts with a surface can open and close. If `sticking` is true, dry friction
     can hold joints. If no gradient is required, `compiled` computes the motion in C.

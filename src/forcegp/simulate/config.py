@@ -20,8 +20,7 @@ class ContactSolver:
 
     Args:
         friction: Coulomb friction coefficient μ between the tool and the surface.
-        tip_radius: radius [m] of a spherical tip that ends at the contact point, if the contact has no
-            radius.
+        tip_radius: radius [m] of a sphere that ends at the contact point, if the contact has no radius.
         joint_friction: additional Coulomb friction of each joint [N m], or empty for none.
         joint_damping: additional viscous friction coefficient of each joint [N m s/rad], or empty for none.
         stiffness_time: time constant of the contact's restoring force [s]. A shorter time is stiffer.
@@ -62,8 +61,7 @@ class ContactSolver:
 
 @dataclass(frozen=True)
 class Sensors:
-    """Imperfect sensors, which provide the values for the controller and the log. They are perfect by
-    default.
+    """Sensors, perfect by default, which provide the values for the controller and the log.
 
     Args:
         encoder_resolution: resolution of the measured joint positions [rad, m].

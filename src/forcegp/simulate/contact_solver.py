@@ -49,8 +49,7 @@ class SolvedForces(NamedTuple):
 class ContactSolverEngine(MuJoCoWorld):
     """A robot in a MuJoCo world with solid surfaces and rounded tips, driven only by motor torques.
 
-    The surface of each contact must be a plane, a sphere or a cylinder. Torques are held for the sampling
-    period dt [s].
+    Contact surfaces must be planes, spheres or cylinders. Torques are held for the sampling period dt [s].
 
     Raises:
         MissingDependencyError: MuJoCo is not installed.

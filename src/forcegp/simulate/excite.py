@@ -86,8 +86,7 @@ class Limits:
             robot: the robot, which defines the limits that are not given.
             velocity, acceleration, torque: one number for all joints, or one per joint. By default, velocity
                 and torque limits are those in the file, and accelerations reach the velocity limit in 0.25 s.
-            share: fraction of the velocity, acceleration and torque limits to use. The rest is reserved for
-                the controller.
+            share: fraction of these limits to use. The rest is reserved for the controller.
 
         Raises:
             ParameterError: a limit is missing or not positive. The message names the joint and the option.
@@ -154,8 +153,7 @@ class Excitation:
     Attributes:
         motion: positions, velocities, accelerations, and the torque according to the robot file.
         limits: the limits of the motion.
-        used: largest used fraction of each limit, verified at 1 kHz, keyed by name. `clearance_m` is the
-            clearance.
+        used: largest used fraction of each limit by name, verified at 1 kHz, and the clearance `clearance_m`.
         before, after: the unknowns before the motion is recorded, and the expected unknowns afterwards.
         criterion: the objective for each random start. The first start was selected.
     """
@@ -256,8 +254,7 @@ class Search:
         return torch.from_numpy(self.spline.start) + q, qd, qdd
 
     def scaled(self) -> Tensor:
-        """Return scales C `(nq, free, free)` for control points C_j w_j such that hinges curve similarly in
-        w.
+        """Return scales C `(nq, free, free)` for control points C_j w_j, so that hinges curve similarly in w.
 
         C Cᵀ = (4/r² + D₁ᵀD₁/v² + D₂ᵀD₂/a²)⁻¹ with difference operators D, range r, and limits v and a.
         """
@@ -419,8 +416,7 @@ def excite(
         401
 
     Raises:
-        ParameterError: limits are missing, the start is in collision or exceeds the limits, or an option is
-            out of range.
+        ParameterError: limits are missing, the start is invalid, or an option is out of range.
         NumericalError: no motion from the start satisfies the limits.
         MissingDependencyError: MuJoCo is not installed.
     """

@@ -19,10 +19,9 @@ class PassiveForces:
     """A force field as the callback `mjcb_passive`, which adds Q̄ − Q_C − Q_G − Q_u to `qfrc_passive`.
 
     If the MuJoCo model has the masses and drives of the fitted robot (`fit.system.robot`), its acceleration
-    is M⁻¹Q̄, as predicted by the fit. Q̄ includes joint friction. While the callback is installed,
-    `installed` therefore removes damping and friction loss from the model. Learned contact friction is not
-    applied, since the engine models contact friction itself. Q_u is the sum of `qfrc_applied` and the last
-    actuator forces.
+    is M⁻¹Q̄, as predicted by the fit. Q̄ includes joint friction, so `installed` temporarily removes damping
+    and friction loss from the model. Learned contact friction is not applied, since the engine models contact
+    friction itself. Q_u is the sum of `qfrc_applied` and the last actuator forces.
 
     Args:
         system: the system with the fitted robot.

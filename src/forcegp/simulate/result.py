@@ -26,10 +26,9 @@ class RunLog:
     Attributes:
         q, qd, qdd, tau, Q, Q_I, Q_z: motion and forces, `(n, nq)`. `qdd` is noise-free.
         multiplier, c: multipliers and constraint errors, `(n, m)`.
-        contact, saturated: masks of closed contacts, `(n, n_contacts)`, and of samples at a torque limit,
+        contact, saturated: masks of closed contacts `(n, n_contacts)` and of samples at a torque limit
             `(n,)`.
-        contact_forces: forces `(n, 3)` [N] if the engine computed them, keyed by name (`F_I`, `F_z`) and
-            contact.
+        contact_forces: forces `(n, 3)` [N] from the engine, keyed by name (`F_I`, `F_z`) and contact, if any.
         measured: sensor values of `q`, `qd` and `tau` if the sensors are imperfect.
     """
 

@@ -1,7 +1,6 @@
 """Simulated runs in which a motion is planned, executed in a physics engine, and logged.
 
-Contact forces are computed from the library's equations of motion, or by MuJoCo's solver with simulated
-sensors.
+Contact forces come from the library's equations of motion, or from MuJoCo's solver and simulated sensors.
 """
 
 from __future__ import annotations

@@ -1,8 +1,8 @@
 """Conversion of frozen descriptions, such as kernels and force priors, to JSON and back.
 
 Only classes in a given table are written and read, field by field. A description that contains Python code
-(an operator or a function) has no JSON form and is rejected. Reading checks names and types, and does not
-execute code.
+(an operator or a function) has no JSON form and is rejected. Reading checks names and types, and executes no
+code.
 """
 
 from __future__ import annotations

@@ -26,8 +26,7 @@ OPERATORS = {
 def casadi_function(model: ExportedModel, name: str = "forcegp") -> Any:
     """Return a `casadi.Function` from (q, q̇, τ, closed) to the mean of each quantity in `DIFFERENTIATED`.
 
-    `closed` is 1 for each closed contact and 0 for each open contact. Closed contacts must be independent of
-    each other.
+    `closed` is 1 for each closed contact and 0 for each open contact. Closed contacts must be independent.
 
     Raises:
         ModelError: a part of the model cannot be exported; the message names it.

@@ -52,8 +52,7 @@ FUNCTIONS = {
 class CompiledFit(Predictor):
     """A fit that evaluates `StructuredFit.predict` in C within microseconds.
 
-    Use `StructuredFit.compiled` to create it. `library` provides the functions of the C header,
-    `forcegp_…`."""
+    It is created by `StructuredFit.compiled`. `library` has the functions of the C header, `forcegp_…`."""
 
     kind = "compiled"
 

@@ -1,12 +1,12 @@
 """The numbers of a fitted model that its C code contains: the functions of each prior and the posterior.
 
-The posterior covariance of the latent forces f is D ± T Tᵀ, where D is diagonal, and T has a row V(x)ᵀ C for
-each component. The functions V are covariances k(x, X) with support points, and features φ(x) of the finite
-part of the kernel. For a posterior over basis functions with weights of precision A = L Lᵀ, V is whitened, C
-= L⁻ᵀ, and D is the residual variance given the support points. For an exact posterior with Σ = L Lᵀ, C = Wᵀ
+The posterior covariance of the latent forces f is D ± T Tᵀ, with diagonal D and a row V(x)ᵀ C in T for each
+component. The functions V are covariances k(x, X) with support points, and features φ(x) of the finite part
+of the kernel. For a posterior over basis functions with weights of precision A = L Lᵀ, V is whitened, C =
+L⁻ᵀ, and D is the residual variance given the support points. For an exact posterior with Σ = L Lᵀ, C = Wᵀ
 L⁻ᵀ, D = k(x, x), and the sign is −. A posterior reduced to r functions also has D = k(x, x) and the sign −.
 It uses A⁻¹ = I − U (1 − Λ⁻¹) Uᵀ with the r largest eigenvalues Λ of A, or Σ⁻¹ = U Λ⁻¹ Uᵀ with those of Σ. The
-training data determine these directions best. The reduction can only widen error bars, and the mean is
+training data determine these directions best. A reduction only widens error bars and leaves the mean
 unchanged.
 """
 
