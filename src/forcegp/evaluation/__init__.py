@@ -59,7 +59,7 @@ class Evaluation:
         verdicts: comparison of the model with each trivial predictor, empty if there are too few samples.
         multipliers: comparison of λ with logged values if the model predicts forces and the log contains λ.
         sensed: the same comparison for predictions that use the force sensor, if the fit included the sensor.
-        gravity: fraction R² of the torque that gravity alone explains. If it is near 1, the log is a weak test.
+        gravity: fraction R² of the torque that gravity alone explains. If near 1, the log is a weak test.
         response: fraction of an added torque that takes effect at each joint. It is 1 for a rigid robot, and
             0 for a model that has learned the controller. It is `None` if there is no free motion.
         motion: open-loop motion if the model predicts forces and the data are in time order.
