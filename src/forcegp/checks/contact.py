@@ -147,7 +147,7 @@ def _placement(contact: SurfaceContact, path: Path, closed: np.ndarray) -> tuple
 
 
 def fit_surface(contact: SurfaceContact, path: Path, closed: np.ndarray) -> tuple[float, Array, Array]:
-    """Fit a surface without outliers; return its offset [m], slope (3,) and the distances (n,) from it."""
+    """Fit a surface, ignoring outliers; return offset [m], slope (3,) and the distances (n,) from it."""
     offset = float(np.median(path.c[closed]))
     if not isinstance(contact.surface, Plane):
         return offset, np.zeros(3), np.full(len(path.c), offset)

@@ -63,7 +63,7 @@ def check_motion(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_excitation(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find base parameters that the log does not determine, and suggest motion that would determine them."""
+    """Find base parameters that the log does not determine, and the motion that would determine them."""
     rows = log.rows(ROWS)
     if len(rows) < 50 or still_joints(log).all():
         return [], log
@@ -157,7 +157,7 @@ def check_visibility(system: ConstrainedSystem, explanation: Explanation) -> lis
 
 
 def force_of(explanation: Explanation, fault: Fault) -> float:
-    """Return the RMS tip force [N] that a unit fault mimics after a fit, or 0 if contact is too short."""
+    """Return the RMS tip force [N] that a unit fault mimics after a fit, or 0 without enough contact."""
     problem = replace(explanation.problem, r=fault.column)
     J = problem.J[:, : problem.J.shape[1] - len(unmeasured(explanation.log))]
     touching = (J != 0.0).any(axis=(1, 2))

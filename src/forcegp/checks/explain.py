@@ -78,7 +78,7 @@ class Explanation:
         return result
 
     def beside(self, hypothesis: Hypothesis) -> Explanation:
-        """Return the explanation with the parameters of a hypothesis placed before its own."""
+        """Return the explanation with the parameters of a hypothesis placed before the existing ones."""
         assert hypothesis.columns is not None and hypothesis.prior is not None
         columns = np.concatenate([hypothesis.columns, self.columns], axis=-1)
         return replace(self, columns=columns, prior=np.concatenate([hypothesis.prior, self.prior]))
@@ -233,7 +233,7 @@ def _currents(model: Explanation) -> Iterator[Tried]:
 
 
 def significant(better: Array, worse: Array, concerned: int) -> bool:
-    """Return whether a decrease in the score is material and significant, from errors (blocks, nq)."""
+    """Return whether a decrease in the score is material and significant, given errors (blocks, nq)."""
     least = max(MATERIAL, MATERIAL_EACH * concerned)
     gains = gain_of(score_of(better), score_of(worse)), pooled_gain_of(better, worse)
     # A drop that only quiet blocks show is an artefact of them: the other mean must bear it out.

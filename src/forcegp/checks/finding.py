@@ -19,7 +19,7 @@ Severity = Literal["note", "warning", "error"]
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of finding: its family, default severity, title and remedy."""
+    """A kind of finding with its family, default severity, title and remedy."""
 
     family: str
     severity: Severity

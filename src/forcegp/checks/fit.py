@@ -39,7 +39,7 @@ def residual(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> tuple[Arr
 
 
 def labelled_contacts(system: ConstrainedSystem, log: Log) -> list[Constraint]:
-    """Return the contacts with a logged state."""
+    """Return the contacts for which the state is logged."""
     return [c for c in system.contacts if c.name in log.contact]
 
 
@@ -73,7 +73,7 @@ def _contact_jacobian(system: ConstrainedSystem, log: Log, rows: np.ndarray, q: 
 
 
 def projector(J: Array, scale: Array) -> Array:
-    """Return the projector (n, nq, nq) that removes torques r/scale which contact forces can produce."""
+    """Return the projector (n, nq, nq) that removes torques r/scale that contact forces can produce."""
     J = J * (1.0 / scale)
     eye = np.broadcast_to(np.eye(J.shape[-1]), (len(J), *2 * (J.shape[-1],))).copy()
     touching = (J != 0.0).any(axis=(1, 2))
@@ -115,7 +115,7 @@ class TorqueFit:
     """A hypothesis that was fitted to a log and tested on held-out blocks.
 
     `error` and `shares`, both (blocks, nq), are RMS held-out residuals relative to `scale` and to `size`.
-    `theta` and `nuisance`, both (p,), are parameters; `spread` contains their jackknife standard errors.
+    `theta` and `nuisance`, both (p,), are parameters. `spread` contains their jackknife standard errors.
     """
 
     error: Array
@@ -212,7 +212,7 @@ def _held_out(A: Array, y: Array, weight: Array, Z: Array | None = None) -> tupl
 
 
 def held_out(problem: TorqueProblem, columns: Array, prior: Array) -> Array:
-    """Return the held-out residuals relative to the torque, shape (n, nq). They are linear in `problem.r`."""
+    """Return the held-out residuals (n, nq) relative to the torque. They are linear in `problem.r`."""
     A, y, _, weight = _equations(problem, columns, prior)
     return _held_out(A, y, weight)[0] * problem.scale / problem.size
 

@@ -43,8 +43,8 @@ class Hypothesis:
 
     `change` corrects the log under this hypothesis, except for the effects of its parameters. `size` is the
     number of parameters, not counting discrete choices. `columns` (n, nq, p) are the torques added to r per
-    unit of each parameter, and `prior` (p,) their prior standard deviations. `instruments` have the shape of
-    `columns` and allow for errors in them. `shift` is a delay of the torque in samples.
+    unit of each parameter, and `prior` (p,) contains their prior standard deviations. `instruments` have the
+    shape of `columns` and allow for errors in them. `shift` is a delay of the torque in samples.
     """
 
     name: str
@@ -88,7 +88,7 @@ def shape_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Arra
 
 
 def contact_friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
-    """Return the friction columns Jᵀv and Jᵀv/|v| for each contact that slides at velocity v, (n, nq, p)."""
+    """Return friction columns Jᵀv and Jᵀv/|v| (n, nq, p) for each contact that slides at velocity v."""
     (q,), columns = tensors(log, rows, "q"), [np.zeros((len(rows), log.nq, 0))]
     for contact in [] if takes_friction_out(system, log) else labelled_contacts(system, log):
         if isinstance(contact, SurfaceContact):
@@ -234,7 +234,7 @@ DISCRETE = {
 
 
 def plausible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit) -> bool:
-    """Return whether the parameters are physically plausible. A tool must have positive mass, for example."""
+    """Return whether the parameters are physically plausible. For example, tool mass must be positive."""
     if hypothesis.name == "encoder-offset":
         least = max(SMALL_ANGLE, SIGNIFICANT * fit.spread[0])
         return bool(least < abs(fit.theta[0]) <= LARGEST_ANGLE)

@@ -49,8 +49,8 @@ UNIT_TOLERANCE = 0.1
 
 @dataclass(frozen=True)
 class Match:
-    """Changes of a column and integrals of its rate over windows, shape (w, nq). Both are zero in windows
-    with an impact, except in `whole`. `low` and `high` bound the slopes between them.
+    """Changes of a column, and integrals of its rate, over windows (w, nq). Both are zero in windows with an
+    impact, except in `whole`. `low` and `high` bound the slopes between them.
     """
 
     change: Array

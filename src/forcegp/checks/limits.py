@@ -29,7 +29,7 @@ def _limits(system: ConstrainedSystem) -> dict[str, tuple[Array, Array]]:
 
 
 def check_degrees(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find angles in degrees. They exceed the joint ranges, but match ranges and torques once converted."""
+    """Find angles in degrees, which exceed the joint ranges but match ranges and torques if converted."""
     low, high = _limits(system)["q"]
     turning = system.robot.revolute.cpu().numpy() > 0.0
     low, high = np.where(np.isfinite(low), low, -TURN), np.where(np.isfinite(high), high, TURN)

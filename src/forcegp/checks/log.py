@@ -45,7 +45,7 @@ deviation to that of the deviation at x = 0, for white noise."""
 
 
 def spikes(x: Array) -> tuple[Array, Array]:
-    """Return how far each value, and its neighbours, deviate from the cubic through the four neighbours.
+    """Return each value's deviation from the cubic through its four neighbours, and the neighbours' own.
 
     e_i = x_i − (−x_{i−2} + 4 x_{i−1} + 4 x_{i+1} − x_{i+2})/6. The second result is the deviation among the
     neighbours alone. A kink in the motion increases both results, a spike only the first. Values must be
@@ -120,7 +120,7 @@ class Log:
         return Finding(kind, text, self.all_rows, joints, evidence=evidence)
 
     def on_joints(self, kind: str, mask: Array, text: str, **evidence: Any) -> list[Finding]:
-        """Return a list with one finding on the joints in a mask, or an empty list; names replace `{}`."""
+        """Return one finding on the joints in a mask, with their names in place of `{}`, or no finding."""
         joints = self.named(mask)
         return [self.finding(kind, text.format(", ".join(joints)), joints, **evidence)] if joints else []
 
@@ -148,7 +148,7 @@ class Log:
         return self.finite if self.masked is None else self.finite & ~self.masked
 
     def reach(self, name: str) -> Array:
-        """Return the range (nq,) of each joint's values in a column, without the most extreme values."""
+        """Return the range (nq,) of a column for each joint, excluding the most extreme values."""
         return np.ptp(np.percentile(getattr(self, name)[self.usable], (0.5, 99.5), axis=0), axis=0)
 
     @cached_property
@@ -158,7 +158,7 @@ class Log:
 
     @cached_property
     def dt(self) -> float:
-        """Median of the positive time steps [s]; NaN if there are none."""
+        """Median of the positive time steps [s], or NaN if there are none."""
         forward = self.steps[self.steps > 0.0]
         return float(np.median(forward)) if len(forward) else float("nan")
 

@@ -244,7 +244,7 @@ def _upper_spread(level: Array) -> float:
 
 
 def residual_trace(explanation: Explanation, rows: np.ndarray) -> Array:
-    """Return the residual torque at the given rows, shape (n, nq) [N m, N]. It excludes contact forces."""
+    """Return the residual torque (n, nq) at the given rows [N m, N]. It excludes contact forces."""
     system, log = explanation.system, explanation.log
     parts, coefficients = [], robust_parameters(explanation.problem, explanation.columns, explanation.prior)
     for index in np.array_split(rows, max(1, len(rows) // 2048)):

@@ -19,7 +19,7 @@ from forcegp.rows import describe, intervals
 
 
 def check_order(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find time stamps that repeat or run backward within a segment."""
+    """Find time stamps that repeat or go backward within a segment."""
     repeated, backward = (np.append(False, wrong) for wrong in (log.steps == 0.0, log.steps < 0.0))
     findings = at_rows(repeated, "time-repeated", "time repeats in", steps=repeated.sum())
     findings += at_rows(backward, "time-backward", "time runs backward in", steps=backward.sum())
@@ -27,7 +27,7 @@ def check_order(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_gaps(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find missing samples, which leave a time step longer than clock jitter can explain."""
+    """Find missing samples, indicated by time steps longer than clock jitter can explain."""
     with np.errstate(invalid="ignore"):
         gaps = log.steps > log.longest_step
     if log.masked is not None:

@@ -101,7 +101,7 @@ def import_log(
     progress: Callable[[int, int], None] | None = None,
     displaced: bool = False,
 ) -> Imported:
-    """Read a log as in `read_log`, and report the import; `displaced` accepts a tip off its surface."""
+    """Read a log as in `read_log`, and report the import. If `displaced`, accept a displaced surface."""
     system = system_of(scene)
     robot = system.robot
     log_mapping = default_mapping(path, system) if mapping is None else mapping
@@ -128,7 +128,7 @@ def import_log(
 
 
 def system_of(scene: Scene | ConstrainedSystem | RobotModel | str | Path) -> ConstrainedSystem:
-    """Convert a scene, a scene file or name, or a robot to a system of a robot with its contacts."""
+    """Convert a scene (or its file or name) or a robot to a system of a robot with its contacts."""
     if isinstance(scene, ConstrainedSystem):
         return scene
     if isinstance(scene, RobotModel):

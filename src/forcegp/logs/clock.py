@@ -105,7 +105,7 @@ def find_held(signals: Signals, drop: bool, report: ImportReport) -> None:
 def join_stream(
     signals: Signals, name: str, t: Array, values: Array, gap: float | None, report: ImportReport
 ) -> None:
-    """Add a vector interpolated from a stream with time stamps t (k,); drop rows outside its time range."""
+    """Interpolate a vector from a stream with time stamps t (k,), and drop rows outside its range."""
     back = np.flatnonzero(np.diff(t) <= 0.0)
     if len(back):
         text = f"the stream of {name} has a clock that does not increase in row {back[0] + 1}"
@@ -138,7 +138,7 @@ SMOOTH = ("q", "qd")
 
 
 def onto(t: Array, values: Array, at: Array, cubic: bool = False) -> Array:
-    """Interpolate values (n, d), given at the times t, at the times `at`, linearly or by a cubic spline."""
+    """Interpolate values (n, d) from times t to times `at`, linearly or by a cubic spline."""
     from scipy.interpolate import CubicSpline, make_interp_spline
 
     return CubicSpline(t, values)(at) if cubic and len(t) >= 4 else make_interp_spline(t, values, k=1)(at)

@@ -141,7 +141,7 @@ BINS = 512
 class Evidence:
     """Evidence for the state of a contact, in N or m. The contact is closed above `threshold`, and intervals
     are extended to `release` on either side. Levels and spreads are NaN for a state that does not occur.
-    Closed intervals have a first and a last time [s]. `merged` counts intervals that were too short.
+    Closed intervals are given by first and last times [s]. `merged` counts intervals that were too short.
     """
 
     contact: str

@@ -174,7 +174,7 @@ def resting_speed(speed: Array) -> float | None:
 
 
 def dividing_speed(speed: Array, sticks: NDArray[np.bool_]) -> float | None:
-    """Return the speed that separates rows marked as sticking from the others with the fewest errors."""
+    """Return the speed that separates sticking from other rows with the fewest errors."""
     if not sticks.any():
         return None
     order = np.argsort(speed)

@@ -60,7 +60,7 @@ class _Gathering:
         self.reference = table.stream_of(position[0], mapping.sections.position.stream)
 
     def run(self) -> Signals:
-        """Return the quantities. Those of other streams are interpolated onto the reference stream."""
+        """Return the quantities, interpolating those of other streams onto the reference stream."""
         quantities = [name for name in SYMBOLS if self.mapping.quantity(name) is not None]
         vectors = {SYMBOLS[name]: self._vector(name) for name in quantities}
         if self.mapping.sections.wrench is not None:

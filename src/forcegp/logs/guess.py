@@ -43,7 +43,7 @@ TRAJECTORY, LEAST_FORCE = 10, 1.0
 
 
 def guess_mapping(path: str | Path, system: ConstrainedSystem, progress: Progress | None = None) -> Draft:
-    """Propose a mapping for a log; raise `MappingError` if time, positions or torques are not recognised."""
+    """Propose a mapping for a log; raise `MappingError` if time, position or torque is not recognised."""
     table = read(path, rows=ROWS, progress=progress)
     draft = Draft(str(path))
     with foreign(str(path), "a log that can be imported"):
@@ -176,7 +176,7 @@ def _torque(draft: Draft, trial: Signals, system: ConstrainedSystem) -> None:
 
 
 def torque_slopes(trial: Signals, system: ConstrainedSystem) -> tuple[Array, Array]:
-    """Return slope and partial correlation (nq,) of the logged torque with respect to inverse dynamics.
+    """Return the slope (nq,) of the logged torque over inverse dynamics, and the partial correlation (nq,).
 
     For each joint, τ_log = k τ_rigid + v q̇ + f sign(q̇) + Aᵀλ + const is fitted by least squares, with a
     constant λ for each contact. The partial correlation is that of τ_log and τ_rigid given the other terms.

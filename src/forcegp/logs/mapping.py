@@ -312,7 +312,7 @@ def load_mapping(source: str | Path) -> Mapping:
 
 
 def parse_mapping(content: bytes, source: str) -> Mapping:
-    """Parse the bytes of a mapping file; raise a `MappingError` that gives the line and key if invalid."""
+    """Parse the bytes of a mapping file; raise a `MappingError` that names the line and key if invalid."""
     document = Document(content, source, MappingError)
     lines = content.decode().splitlines()
     doubts = tuple(line[len(CHECK) :] for line in lines if line.startswith(CHECK))

@@ -229,7 +229,7 @@ def _smooth(signals: Signals, piece: NDArray[np.int64], settings: DerivativesSec
 
 
 def impact_mask(signals: Signals, margin: float) -> dict[str, Array]:
-    """For each contact, mark rows within `margin` [s] of a switch (impact, one-sided fit) by 1."""
+    """Return a mask for each contact that is 1 within `margin` [s] of a switch, and 0 elsewhere."""
     masks = {}
     for name, closed in signals.contact.items():
         masks[name] = np.zeros(len(signals))

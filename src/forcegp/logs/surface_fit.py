@@ -29,7 +29,7 @@ OUTLIER_STD = 4.0
 
 @dataclass(frozen=True)
 class Solution:
-    """Parameters, covariance, residuals of the rows used, effective number of rows, number of outliers."""
+    """Parameters, covariance, residuals, effective number of rows, and number of outliers of a fit."""
 
     x: Array
     covariance: Array

@@ -17,7 +17,7 @@ from forcegp.rows import numbered, runs
 
 
 def check_values(source: str, rows: int, columns: int) -> None:
-    """Raise `DataError` if a table is too wide or too large; warn if it needs much memory."""
+    """Raise `DataError` if a table is too wide or too large; warn if it needs a lot of memory."""
     check_count(source, "columns", columns, limits.COLUMNS)
     check_count(source, f"numbers ({rows:,} rows × {columns} columns)", rows * columns, limits.LOG_VALUES)
     announce_memory(2 * 8 * rows * columns, f"reading {source}")  # once as in the file, once as float64
@@ -177,7 +177,7 @@ class ImportFinding:
 
 @dataclass
 class ImportReport:
-    """Findings and actions in order. `rows_read` is the length of the stream that defines the clock."""
+    """Findings and actions of an import. `rows_read` is the length of the stream that defines the clock."""
 
     source: str
     format: str = ""

@@ -199,7 +199,7 @@ class _Reader:
         return element
 
     def matrix(self, element: _Element, what: str, field: str = "", depth: int = 0) -> Iterator[Variable]:
-        """Yield a variable or a field of a struct. If it is itself a struct, yield all its fields."""
+        """Yield a variable or a field of a struct. If the field is itself a struct, yield all its fields."""
         if element.kind != MATRIX:
             raise self.damaged(what, f"an element of type {element.kind}")
         if depth > limits.GROUP_DEPTH:

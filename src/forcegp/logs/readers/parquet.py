@@ -37,7 +37,7 @@ def read_parquet(path: Path, *, wanted: Wanted, rows: int | None, progress: Prog
 def read_columns(
     paths: list[Path], wanted: Wanted, rows: int | None, remarks: list[str], progress: Progress | None
 ) -> dict[str, Column]:
-    """Return the joined columns of files, with lists as `name[i]`; list omitted columns in `remarks`."""
+    """Return the joined columns of files, with lists as `name[i]`, and note omitted ones in `remarks`."""
     import pyarrow.parquet as pq
 
     chunks: dict[str, list[Column]] = {}
