@@ -38,7 +38,7 @@ def printable(text: object) -> str:
 
 
 def warn(text: object) -> None:
-    """Print a warning on stderr."""
+    """Print a warning to stderr."""
     typer.secho("warning: ", fg="yellow", nl=False, err=True)
     typer.echo(printable(text), err=True)
 

@@ -31,7 +31,7 @@ class CompiledDynamics:
     """A robot quantity, such as the mass matrix, compiled as a function of joint-space arguments.
 
     Call it like the eager function of the same name, but without the robot. Derivatives of any order are
-    those of the eager function. First derivatives of forward dynamics have a kernel, built on first use.
+    those of the eager function. First derivatives of forward dynamics use a kernel built on first use.
     """
 
     def __init__(self, robot: RobotModel, quantity: str) -> None:

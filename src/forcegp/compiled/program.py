@@ -320,7 +320,7 @@ QUANTITIES: dict[str, tuple[tuple[str, ...], Callable[[Links], np.ndarray]]] = {
 
 
 def trace(robot: RobotModel, quantity: str) -> Program:
-    """Return the recorded program for one quantity in `QUANTITIES` of one robot."""
+    """Return the recorded program for one robot and one quantity in `QUANTITIES`."""
     arguments, algorithm = QUANTITIES[quantity]
     links = Links(robot)
     result = algorithm(links)

@@ -71,7 +71,7 @@ extern "C" __global__ void kernel({parameters}, T* out, int batch) {{
 
 @dataclass(frozen=True)
 class Source:
-    """Source code, and the arrays that its kernel reads: arguments of the quantity, "sin" or "cos" of q."""
+    """Source code, and the arrays that its kernel reads: arguments of the quantity, sin q and cos q."""
 
     text: str
     arrays: tuple[str, ...]

@@ -122,7 +122,7 @@ def inverse_kinematics(
     starts: Tensor,
     near: JointVector,
 ) -> JointVector:
-    """Return joint positions `(nq,)` at which a point in a frame has a given pose, by damped least squares.
+    """Find joint positions `(nq,)` at which a point in a frame has a given pose, by damped least squares.
 
     Each step is Jᵀ(J Jᵀ + μ I)⁻¹ e. The first half of the steps also move towards `near` `(nq,)` in the null
     space of J. Of the solutions from all `starts` `(k, nq)`, the closest to `near` is returned. The pose in

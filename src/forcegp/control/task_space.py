@@ -75,7 +75,7 @@ def task_rows(nq: int) -> slice:
 def orientation_error(rotation: Tensor, target: Tensor) -> Tensor:
     """Return e_O = ½ Σᵢ rᵢ × rᵢᵈ, sin(angle) times the rotation axis, for frames with axes rᵢ and rᵢᵈ.
 
-    It is the vector `(*batch, 3)` of the skew part of R_d Rᵀ in world axes (Siciliano et al., eq. 3.98).
+    It is the axial vector `(*batch, 3)` of the skew part of R_d Rᵀ in world axes (Siciliano, eq. 3.98).
     """
     E = target @ rotation.mT
     skew = E - E.mT

@@ -102,7 +102,7 @@ def select_points(
         count: number of points.
         method: `"farthest"` (on standardized q, q̇, τ), `"even"` (evenly spaced rows, in order), or
             `"random"` for comparison. Farthest-point selection favours outliers in real logs.
-        seed: random seed for random selection.
+        seed: random seed for `method="random"`.
         candidates: row numbers to select from. The default is all rows.
         progress: a function called with the number of points selected so far.
 

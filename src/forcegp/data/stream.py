@@ -54,7 +54,7 @@ def shape_of(path: Path) -> tuple[int, DataHeader]:
 def pieces_of(path: Path, size: int, window: int, number: int) -> Iterator[Piece]:
     """Yield the pieces of a file, each with `size` rows and `window` rows around them in the same trajectory.
 
-    Trajectories are numbered from `number`. A damaged file or a divided trajectory raises `DataError`.
+    Trajectories are numbered from `number`. A damaged file or a non-contiguous trajectory raises `DataError`.
     """
     import pyarrow as pa
 

@@ -85,7 +85,7 @@ class Evaluation:
 
     @property
     def verdict(self) -> str:
-        """One-sentence verdict on non-gravitational torque, open-loop motion and contact force."""
+        """One-sentence verdict on non-gravitational torque, open-loop motion and contact forces."""
         parts, shares = [], {p.name: p.beyond_gravity for p in self.predictors}
         if (share := shares.pop("model", None)) is not None:
             others = [

@@ -197,7 +197,8 @@ class Baseline:
     """A trivial predictor of accelerations.
 
     Attributes:
-        name, system: name of the predictor, and the robot with the mass matrix for its torque errors.
+        name: name of the predictor. system: the robot with the mass matrix that converts its errors to
+            torques.
         predict: a function that returns the predicted accelerations `(n, nq)` for a data set.
         std: RMS error on the training data, which is used as the uncertainty, `(nq,)`.
     """

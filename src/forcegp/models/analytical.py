@@ -89,8 +89,8 @@ class AnalyticalModel(Model["AnalyticalFit"]):
 
         Args:
             data: states and measured accelerations.
-            options: learning options. `BatchOptions`, the default, train with ADAM on batches and stop early.
-                `LearningOptions` minimise the loss over all samples with L-BFGS or ADAM.
+            options: learning options. `BatchOptions` (the default) select ADAM on batches with early
+                stopping. `LearningOptions` select L-BFGS or ADAM on all samples.
             progress: a function called after each epoch or evaluation.
             checkpoint: see `Model.fit`.
 
@@ -146,7 +146,7 @@ class AnalyticalFit(FittedModel):
 
     @property
     def specified(self) -> ConstrainedSystem:
-        """System before the fit, which contains the initial robot."""
+        """System before the fit, with the initial parameters of the robot."""
         return self.system.with_robot(self.parameters.start)
 
     def described(self) -> list[tuple[str, object]]:

@@ -149,7 +149,7 @@ def sampled_robots(fit: StructuredFit, samples: int, *, seed: int = 0) -> list[R
     """Draw physically consistent robots from the joint posterior of inertia, drives, payload and friction.
 
     A sample with unphysical links is replaced by the closest physical robot in the metric of the posterior.
-    The eigenvalues of its pseudo-inertias, relative to the identified ones, are at least ε = 0.01.
+    Relative to the identified pseudo-inertias, the new ones have eigenvalues of at least ε = 0.01.
 
     Args:
         fit: a fit with an analytical mean.
@@ -500,7 +500,7 @@ def _pseudo(pi: Tensor) -> Tensor:
 def without_armature(robot: RobotModel, fastest: Tensor) -> RobotModel:
     """Return the robot with its drive inertia added to the links as far as physically possible.
 
-    The squared relative torque error of each joint is minimised over n random states:
+    The relative torque errors of the joints are minimised over n random states:
 
         min_δ ½ n Σ_j E(Y_j S δ − a_j q̈_j)² / (ε² E τ_j²), with the divergence of `InertialPrior.updated`.
 

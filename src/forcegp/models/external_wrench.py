@@ -58,11 +58,11 @@ class ExternalWrench(Prediction):
     frame: WrenchFrame | None = None
 
     def detect(self, threshold: float = THRESHOLD, hold: int = 1, limit: float = 0.0) -> Tensor:
-        """Return whether a wrench acts at each sample, `(n,)` bool.
+        """Return whether a wrench acts at each sample, as a mask `(n,)`.
 
         Without a wrench, d² = ŵᵀ C⁻¹ ŵ is at most a χ² variable with k degrees of freedom. A contact is
         detected if, in `hold` consecutive samples, d² exceeds both `limit` and a quantile of this
-        distribution. Its tail probability is that of a Gaussian beyond ± `threshold` σ.
+        distribution. The quantile has the tail probability of a Gaussian beyond ± `threshold` σ.
 
         Args:
             threshold: threshold [σ]. The probability of a false alarm is `false_alarm_rate(threshold)`.
@@ -124,7 +124,7 @@ class ExternalWrench(Prediction):
 
 
 def false_alarm_rate(threshold: float) -> float:
-    """Return the probability that a Gaussian variable is beyond ± `threshold` standard deviations.
+    """Return the probability that a Gaussian deviates by more than `threshold` standard deviations.
 
     Example:
         >>> round(false_alarm_rate(2.0), 4)
@@ -135,7 +135,7 @@ def false_alarm_rate(threshold: float) -> float:
 
 @runtime_checkable
 class LearnedForces(Protocol):
-    """Learned forces of a fit: their posterior, the noise, and the robot."""
+    """The learned forces of a fit, with their posterior, the noise and the robot."""
 
     @property
     def system(self) -> ConstrainedSystem: ...
@@ -296,7 +296,7 @@ class Reading:
 
 
 def velocity_noise(data: Dataset) -> Tensor:
-    """Return the white-noise standard deviation `(nq,)` of the velocities in an evenly sampled log.
+    """Return the standard deviation `(nq,)` of white velocity noise in an evenly sampled log.
 
     Raises:
         DataError: no trajectory has five consecutive samples.

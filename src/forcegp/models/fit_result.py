@@ -65,7 +65,7 @@ class FitResult:
         evaluations: number of evaluations of the objective.
         seconds: duration of the fit.
         objective: final mean squared error, or negative log posterior of the hyperparameters.
-        log_marginal_likelihood: log marginal likelihood of the training data, `None` for models without one.
+        log_marginal_likelihood: log marginal likelihood of the training data, or `None` if undefined.
         jitter: jitter added to the diagonal of the covariance, in units of the noise variance. The effective
             noise is √(1 + jitter) times the given noise.
         constant_inputs: inputs that are constant in the training data and therefore are not scaled.

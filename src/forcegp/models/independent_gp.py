@@ -59,7 +59,7 @@ class IndependentTraining:
     scale: Standardization
 
     def processes(self) -> list[tuple[JointForcePrior, Block, Tensor]]:
-        """Return, for each joint, its process, its accelerations in units of the noise, and Σ log σ.
+        """Return the process, the accelerations in units of the noise, and Σ log σ for each joint.
 
         The likelihood uses only the name and the kernel of a process.
         """
@@ -75,7 +75,7 @@ class IndependentTraining:
         ]
 
     def announce(self, copies: int) -> None:
-        """Warn if the matrices of all joints need much memory."""
+        """Warn if the matrices of all joints need a lot of memory."""
         n, nq = self.qdd.shape
         announce_memory(8 * (2 * nq + copies) * n**2, f"independent Gaussian processes on {n:,} samples")
 

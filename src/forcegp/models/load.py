@@ -32,7 +32,7 @@ KINDS: dict[str, type[FittedModel]] = {
 
 
 def load_model(path: str | Path, *, system: ConstrainedSystem | None = None) -> FittedModel:
-    """Load a saved model, which gives bit-identical predictions.
+    """Load a saved model. Its predictions are bit-identical to those before saving.
 
     Args:
         path: the file. The suffix `.safetensors` is added if it is missing.

@@ -73,7 +73,7 @@ def train(
         options: options for training on batches or on all samples at once. Training on batches returns the
             tensors of the epoch with the smallest held-out loss.
         generator: random generator that selects the held-out samples and the order of the rows.
-        progress: a function called after each epoch or evaluation with its number, the maximum, and the loss.
+        progress: a function called after each epoch or evaluation with its number, the maximum and the loss.
         checkpoint: a file that contains the state of training. If the file exists, training resumes from it.
         key: identifier of the loss for the checkpoint.
 
@@ -155,7 +155,7 @@ class _State:
 
     @property
     def value(self) -> float:
-        """Smallest held-out loss up to now."""
+        """Smallest held-out loss so far."""
         return min(self.history, default=math.inf)
 
     @property

@@ -197,7 +197,7 @@ Answer = tuple[tuple[Tensor | None, ...], dict[str, slice], tuple[str, ...]]
 def in_pieces(
     at: FlatStates, read: Callable[[FlatStates], tuple[Tensor | None, ...]]
 ) -> tuple[Tensor | None, ...]:
-    """Evaluate `read` on `CHUNK` states at a time, which keeps only the result and one piece in memory."""
+    """Evaluate `read` on `CHUNK` states at a time to keep only the result and one piece in memory."""
     whole, n = list[Tensor | None](), len(at.q)
     for first in range(0, max(n, 1), CHUNK):
         piece = read(at.rows(slice(first, first + CHUNK)))
@@ -254,7 +254,7 @@ class Predictor(ForwardModel):
                 distribution.
             active: mask `(*batch, n_contacts)` of closed contacts. By default, all contacts are closed.
             covariance: whether to compute the covariance, which is more expensive than the mean.
-            system: a different system, such as one with a different surface. The model must have forces. On
+            system: a different system, such as one with a different surface, if the model predicts forces. On
                 the system of the fit, forces of contacts that are never closed in training are undetermined.
             noise: whether to include the noise of torques and sensors in the covariance.
 
@@ -307,10 +307,10 @@ class Predictor(ForwardModel):
         Args:
             q, qd, tau: `(*batch, nq)` states.
             active: mask `(*batch, n_contacts)` of closed contacts. By default, all contacts are closed.
-            system: a different system to predict.
+            system: a different system for which to predict the motion.
 
         Raises:
-            ModelError: the model has no forces.
+            ModelError: the model does not predict forces.
             ShapeError: an argument does not match the system.
         """
         force = self.force_field()
@@ -346,7 +346,7 @@ class Predictor(ForwardModel):
         """Return the coefficient of determination R² of the predicted mean on a data set, as in scikit-learn.
 
         R² = 1 − Σ(measured − predicted)² / Σ(measured − mean)², averaged over the components. A perfect
-        prediction scores 1, and the mean of the data scores 0. Negative values are worse. Unlike
+        prediction scores 1. Predicting the mean of the data scores 0, and negative scores are worse. Unlike
         `forcegp.evaluate`, the score ignores the uncertainty.
 
         Args:

@@ -69,7 +69,7 @@ class Candidate:
 
 
 def candidates_of(spec: Specification) -> list[Candidate]:
-    """Return the candidates, simplest first. If joint forces are unknown, all of them have torque noise."""
+    """Return the candidates, simplest first. All include torque noise if joint forces are unknown."""
     candidates = []
     sets = [each for each in SETS.values() if each.fits(spec.system)]
     for chosen in sets if not spec.noise.external else [each for each in sets if each.has_joint_friction]:
@@ -257,7 +257,7 @@ def trained(
 def log_density(fit: StructuredFit, test: Training) -> tuple[Tensor, float]:
     """Return log N(y_i; E z, Var z + Σ) of each sample `(n,)`, and the fraction of values within ±2σ.
 
-    Measured accelerations take precedence over other measurements, which are then ignored.
+    If accelerations were measured, other measurements are ignored.
 
     Raises:
         NumericalError: a covariance is not positive definite.

@@ -162,7 +162,7 @@ class StructuredFit(FittedModel):
                 The axes are a subset of `fx`, `fy`, `fz`, `mx`, `my` and `mz`. The other components are zero.
 
         Returns:
-            The mean `(n, k)` and covariance `(n, k, k)` [N, N m]. Its method `detect` detects contacts.
+            An `ExternalWrench` with a mean `(n, k)` and a covariance `(n, k, k)` [N, N m].
 
         Raises:
             UnknownNameError: the frame, reference, component or method does not exist.
@@ -226,7 +226,7 @@ class StructuredFit(FittedModel):
         Raises:
             ModelError: a prior, kernel or contact cannot be exported to C, or the posterior is too large.
             NumericalError: single precision cannot resolve a variance.
-            UnknownNameError, ParameterError: the language or frame is unknown, or the name is no C
+            UnknownNameError, ParameterError: the language or frame is unknown, or the name is not a C
                 identifier.
             DestinationError: the folder cannot be written, or contains other files.
             MissingDependencyError: CasADi is not installed.
@@ -251,8 +251,8 @@ class StructuredFit(FittedModel):
         return CompiledFit(self._exported(functions, wrench))
 
     def beyond(self, qd: Tensor, tau: Tensor) -> Tensor | None:
-        """Return the distance of speeds and torques beyond the training data, `(*batch, nq)`, in standard
-        deviations of these data, or `None` if the model file does not contain the trained region.
+        """Return how far speeds and torques exceed the training data, `(*batch, nq)`, in standard deviations
+        of these data. The result is `None` if the model file does not contain the trained region.
         """
         region = self._region
         return distance_beyond(region, qd, tau) if LOW in region else None
@@ -356,8 +356,8 @@ class StructuredFit(FittedModel):
         """Remove given samples, or reduce the weight of all previous samples.
 
         Args:
-            what: samples to remove from the fit, or a factor between 0 and 1 on the weight of all previous
-                samples. For a memory of T seconds, the factor is exp(−Δt/T).
+            what: samples to remove from the fit, or a factor between 0 and 1 by which the weight of all
+                previous samples is multiplied. For a memory of T seconds, the factor is exp(−Δt/T).
             priors: names of the priors to which forgetting is limited, such as a payload. Their forces drift
                 towards the prior, and the factor is the correlation of these forces with the previous ones.
 

@@ -178,7 +178,7 @@ def _unchecked_masses(training: Training) -> tuple[str, ...]:
 
 
 def constant_inputs(problem: Problem) -> tuple[str, ...]:
-    """Return the inputs of priors that are constant in the training data."""
+    """Return the inputs that are constant in the training data, for each prior."""
     pairs = zip(problem.priors, problem.training.scales, strict=True)
     return tuple(f"{prior.name}.{name}" for prior, scale in pairs for name in scale.constant)
 
@@ -232,7 +232,7 @@ def problem_for(
 
 
 def identified(spec: Specification, training: Training) -> tuple[Specification, dict[str, Tensor]]:
-    """Return the model for a robot with identified inertia. Its remaining inertia errors have zero mean."""
+    """Return the model for the robot with identified inertia and with inertia errors of zero mean."""
     robot = spec.system.robot
     q = torch.cat([m.q for m in training.evenly(VOLUME_STATES).measurements])
     size = mass_matrix(robot, q).diagonal(dim1=-2, dim2=-1).mean(0)

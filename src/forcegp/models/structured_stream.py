@@ -70,7 +70,7 @@ class Sample:
 
 @torch.no_grad()
 def sample_of(spec: Specification, data: StreamedDataset) -> Sample:
-    """Return evenly spaced samples of a log for training, only those in motion if the model requires it.
+    """Return evenly spaced training samples of a log, restricted to motion if the model requires it.
 
     Raises:
         DataError: a file is damaged or contains no samples.
@@ -154,7 +154,7 @@ class Pass:
     def forces(
         self, problem: Problem, hyperparameters: Mapping[str, Tensor]
     ) -> tuple[ForcePosterior, Tensor]:
-        """Return the forces conditioned on the whole log, and the part of the likelihood independent of them.
+        """Return the forces conditioned on the whole log, and the part of the likelihood without them.
 
         Raises:
             ModelError: the checkpoint belongs to a different fit.

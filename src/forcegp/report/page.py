@@ -109,7 +109,7 @@ def cell(value: object, digits: int = 4) -> str:
 
 @dataclass(frozen=True)
 class PictureBlock:
-    """Plots with a common heading and caption, full width if `wide`. `source` is the file with their data."""
+    """Plots with a common heading and caption, in full width if `wide`. `source` is their data file."""
 
     heading: str
     caption: str
@@ -119,7 +119,7 @@ class PictureBlock:
 
 
 def render(template: str, package: str = "forcegp.report", **values: object) -> str:
-    """Render a template from `templates/` in a package or in this one. Missing values are errors."""
+    """Render a template from `templates/` in the given or this package. Missing values are errors."""
     packages = dict.fromkeys((package, "forcegp.report"))
     environment = jinja2.Environment(
         loader=jinja2.ChoiceLoader([jinja2.PackageLoader(name) for name in packages]),

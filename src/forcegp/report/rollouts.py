@@ -115,7 +115,7 @@ class RolloutData(Header):
 
 
 def rollout_data(comparison: Comparison, calibration: Comparison | None = None) -> RolloutData:
-    """Return the data to plot. Curves are those from the first start, and `calibration` widens the bands."""
+    """Return the data to plot, with curves from the first start, and bands widened using `calibration`."""
     horizons = [h for h in HORIZONS if h <= float(comparison.t[-1]) * (1.0 + 1e-9)]
     stride = max(1, round(1.0 / (FRAMES_PER_SECOND * float(comparison.t[1] - comparison.t[0]))))
     tip = comparison.frame, comparison.point
@@ -284,7 +284,7 @@ def _starts(number: int) -> str:
 
 
 def rollout_pictures(data: RolloutData) -> tuple[Picture, ...]:
-    """Return the plots of the section for which there are data."""
+    """Return all plots of the section for which data exist."""
     log = "logarithmic scale, one curve per model."
     errors = [(path, path.tip_error) for path in data.models]
     alt = f"Tip error over time, median over {_starts(data.starts)}, {log}"

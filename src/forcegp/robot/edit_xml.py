@@ -22,8 +22,9 @@ _TAG_NAME = re.compile(rb"<[^\s/>]+")
 @dataclass(eq=False)
 class Span:
     """An element in the text of a document: the end of its name (`head`), the end of its start tag (`close`),
-    whether it is written as `<tag/>`, the indentation of its line, and its attributes. Each attribute has the
-    start and end of its quoted value, and its own start including the preceding space.
+    whether it is written as `<tag/>`, the indentation of its line, and its attributes. For each attribute, it
+    contains the start and end of the quoted value, and the start of the attribute including the preceding
+    space.
     """
 
     tag: str

@@ -35,7 +35,7 @@ def pseudo_inertia(mass: Scalars, com: Vector3, inertia: Rotation) -> PseudoIner
 
 
 def from_pseudo_inertia(J: PseudoInertia) -> tuple[Scalars, Vector3, Rotation]:
-    """Return the mass, centre of mass and inertia about it from J, as the inverse of `pseudo_inertia`."""
+    """Return the mass, centre of mass and inertia about it from J (the inverse of `pseudo_inertia`)."""
     mass = J[..., 3, 3]
     com = J[..., :3, 3] / mass[..., None]
     Sigma = J[..., :3, :3] - mass[..., None, None] * com[..., :, None] * com[..., None, :]
@@ -61,7 +61,7 @@ def from_log_cholesky(theta: InertialParameters) -> PseudoInertia:
 
 
 def log_cholesky(J: PseudoInertia) -> InertialParameters:
-    """Return θ `(*batch, 10)` of J, the inverse of `from_log_cholesky`; raise `InertiaError` unless J > 0."""
+    """Return θ `(*batch, 10)` from J (inverse of `from_log_cholesky`); raise `InertiaError` unless J > 0."""
     # An upper factor is the lower factor of the matrix with rows and columns reversed.
     lower, info = torch.linalg.cholesky_ex(J.flip(-1, -2))
     if bool((info != 0).any()):

@@ -233,7 +233,7 @@ def load_robot(
     Raises:
         UnknownNameError: the bundled robot or a joint to lock does not exist.
         RobotFileError: the file cannot be read or is invalid. The message names the link or joint.
-        UnsupportedRobotError: a joint is floating, planar, ball or mimic. The hint is to lock it.
+        UnsupportedRobotError: a joint is a floating, planar, ball or mimic joint. The hint is to lock it.
         MissingDependencyError: the file is MJCF and MuJoCo is not installed.
         InertiaError: the inertia of a link is not physical.
         ShapeError: base_position, base_rpy or gravity is not a vector of three finite numbers.

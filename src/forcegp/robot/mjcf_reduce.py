@@ -39,7 +39,7 @@ class Coupling(NamedTuple):
 
 
 def reduce_mjcf(root: Element, path: Path) -> tuple[Element, dict[str, Coupling], list[str]]:
-    """Return the reduced document with files included from its folder, the couplings by the name of the
+    """Return the reduced document with files included from its folder, the couplings keyed by the name of the
     constrained joint, and notes. Raise typed errors that name invalid or unsupported elements.
     """
     _expand_includes(root, path)

@@ -113,7 +113,7 @@ def xacro_error(label: str, got: str) -> RobotFileError:
 def parse_numbers(
     text: str, where: str, count: int, *, infinite: bool = False, error: type[RobotFileError] = RobotFileError
 ) -> list[float]:
-    """Parse an attribute with `count` finite numbers (or ±∞ if `infinite`); an `error` names `where`."""
+    """Parse an attribute with `count` finite numbers (or ±∞ if `infinite`); raise `error` if invalid."""
     expected = f"{count} finite number{'s' if count > 1 else ''}"
     try:
         values = [float(word) for word in text.split()]

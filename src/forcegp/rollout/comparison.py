@@ -96,11 +96,11 @@ class Comparison:
         return self._whole(self.predicted[model].need_samples().tip(self.frame, self.point))
 
     def tip_error(self, model: str) -> Tensor:
-        """Return the distance between predicted and logged tip, `(k, T)` [m], infinite after a divergence."""
+        """Return the distance between the predicted and logged tip, `(k, T)` [m], ∞ after a divergence."""
         return (self.predicted_tip(model) - self.tip).norm(dim=-1).nan_to_num(torch.inf)
 
     def error_at(self, model: str, horizon: float) -> float:
-        """Return the median of the tip errors after `horizon` seconds over all starts [m].
+        """Return the tip error after `horizon` seconds, as the median over all starts [m].
 
         Raises:
             DataError: the comparison ends earlier.
@@ -111,7 +111,7 @@ class Comparison:
         return float(self.tip_error(model)[:, step].median())
 
     def coverage(self, model: str, level: float = LEVEL, inflation: float = 1.0) -> float:
-        """Return the fraction of tip coordinates inside the band, over all starts and all later times.
+        """Return the fraction of tip coordinates inside the band, excluding the initial coordinates.
 
         The band contains a fraction `level` of the samples. Its half-widths are multiplied by `inflation`. On
         a surface, only tangential coordinates are counted, since the constraint fixes the normal coordinate.

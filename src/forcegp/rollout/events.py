@@ -60,7 +60,7 @@ def switch(problem: RolloutProblem, state: State, crossed: Tensor) -> State:
 
 
 def settle(problem: RolloutProblem, state: State, end: Tensor) -> tuple[State, Instant, list[ContactEvent]]:
-    """Return the state at the start of a step, after pulling contacts open and reached contacts close.
+    """Open contacts that pull, close contacts that touch, and return the state at the start of a step.
 
     The torque, and therefore λ, may jump at the start of a step.
     """

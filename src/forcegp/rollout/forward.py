@@ -53,7 +53,7 @@ class RolloutOptions:
         speed_limit: joint speed above which a trajectory counts as diverged [rad/s, m/s].
         torque_noise: whether each function sample has independent torque noise and independent unknown
             forces. The noise requires a model that has learned the noise of logged torques. The unknown
-            forces require a given size, and are constant over a trajectory.
+            forces are constant over a trajectory, and are used if their size is given.
         sticking: whether dry joint friction, from the robot file or from a prior such as
             `JointFrictionPrior`, holds a joint at rest while the net force is within the friction limit.
             Otherwise, friction is a smooth function of the velocity, and joints creep.
@@ -119,7 +119,7 @@ def rollout(
     the parameters of the robot, provided that no contact opens or closes.
 
     Args:
-        law: a law that returns the acceleration.
+        law: the law that gives the acceleration.
         system: the robot and its contacts.
         q0, qd0: `(*batch, nq)` initial states.
         tau: motor torque Q_u. It is a log, an array over time with its sampling period in `options`, or a

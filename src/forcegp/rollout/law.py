@@ -404,7 +404,7 @@ class RolloutProblem:
         return self._instant(sliding_away(self.system, at, now.multiplier, slides, rough), h)
 
     def stopped(self, before: State, after: State) -> State:
-        """Return the state after a step, with contacts that friction has stopped at rest."""
+        """Return the state after a step, in which contacts that friction has stopped are at rest."""
         if not self.rough:
             return after
         first, last = (self.system.equations(x.q, x.qd, x.active) for x in (before, after))

@@ -71,7 +71,7 @@ class Scene:
     def system(
         self, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu"
     ) -> ConstrainedSystem:
-        """Return the robot with its contacts; raise a `SceneError` that names the line of a bad entry."""
+        """Return the robot with its contacts; raise a `SceneError` that locates an invalid entry."""
         robot, sections, at = self.robot(dtype, device), self.sections, self.document.at
         tables = [(("contact", i), table) for i, table in enumerate(sections.contact)]
         tables += [(("connection", i), table) for i, table in enumerate(sections.connection)]

@@ -110,7 +110,7 @@ class ContactSection(ContactFields, strict=True):
 
 
 class ConnectionSection(ConnectionFields, strict=True):
-    """`[[connection]]`: two coincident points, the second fixed in the world without `other_frame`."""
+    """`[[connection]]`: two coincident points. Without `other_frame`, the second is fixed in the world."""
 
 
 class SceneSections(Section):

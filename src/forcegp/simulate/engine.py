@@ -16,7 +16,7 @@ from forcegp.types import JointMatrix, JointVector
 
 @runtime_checkable
 class Engine(Protocol):
-    """A physics engine with one robot on which no forces act except gravity.
+    """A physics engine with one robot and no forces other than gravity.
 
     A step uses the semi-implicit Euler method, q̇ₖ₊₁ = q̇ₖ + dt q̈(qₖ, q̇ₖ) and qₖ₊₁ = qₖ + dt q̇ₖ₊₁. The
     acceleration during a step is therefore (q̇ₖ₊₁ − q̇ₖ)/dt. Contacts, collisions, joint limits, motors and

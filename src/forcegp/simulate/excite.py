@@ -301,7 +301,7 @@ class Search:
 
     @torch.no_grad()
     def used(self, x: Array, step: float) -> tuple[dict[str, float], Array]:
-        """Return the largest used fraction of each limit at multiples of `step`, and when it is violated."""
+        """Return the largest used fraction of each limit at multiples of `step`, and violation times."""
         t = np.linspace(0.0, self.spline.seconds, round(self.spline.seconds / step) + 1)
         worst: dict[str, float] = {}
         where, limits, near = [], self.limits, self.collisions
@@ -401,8 +401,8 @@ def excite(
         collisions: collisions to avoid. The default is those of the robot's shapes and the contact surfaces.
         start: initial and final position, `(nq,)`. The default is a collision-free position near the middle.
         criterion: `"A"`, the standard deviation of the torque in the region of `unknowns`; `"V"`, the same if
-            only link inertia, viscous and dry friction are unknown; `"D"`, the determinant of the covariance;
-            or a function of the information.
+            only link inertia and viscous and dry friction are unknown; `"D"`, the determinant of the
+            covariance; or a function of the information.
         rate: sampling rate of the result [Hz].
         restarts: number of random starts to optimise. They are the best of four times as many.
         seed: random seed for the starts.

@@ -101,7 +101,7 @@ def tip_path(system: ConstrainedSystem, q: Tensor) -> Array:
 
 
 def pictures(t: Tensor) -> Tensor:
-    """Return the indices of the rows to display, which are the last rows logged up to each frame's time."""
+    """Return the indices of the rows to display: for each frame, the last row logged up to its time."""
     period = 1.0 / FRAMES_PER_SECOND
     times = torch.arange(float(t[0]), float(t[-1]) + 0.5 * period, period, dtype=t.dtype)
     return torch.unique((torch.searchsorted(t.contiguous(), times, right=True) - 1).clamp(0, len(t) - 1))

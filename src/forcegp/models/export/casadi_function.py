@@ -24,7 +24,7 @@ OPERATORS = {
 
 
 def casadi_function(model: ExportedModel, name: str = "forcegp") -> Any:
-    """Return a `casadi.Function` from (q, q̇, τ, closed) to the mean of each quantity in `DIFFERENTIATED`.
+    """Return a `casadi.Function` that maps (q, q̇, τ, closed) to the means of `DIFFERENTIATED` quantities.
 
     `closed` is 1 for each closed contact and 0 for each open contact. Closed contacts must be independent.
 

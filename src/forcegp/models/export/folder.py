@@ -55,7 +55,7 @@ class Export:
 def write_export(
     model: ExportedModel, fit: Predictor, training: Training, path: str | Path, language: str, name: str
 ) -> Export:
-    """Write a model to a folder, with the arguments and errors of `StructuredFit.export`."""
+    """Write a model to a folder. The arguments and errors are those of `StructuredFit.export`."""
     check_name("language of an export", language, LANGUAGES)
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,40}", name):
         raise ParameterError(
@@ -220,8 +220,8 @@ class _Posterior(torch.nn.Module):
 
 @torch.no_grad()
 def write_torch(fit: Predictor, path: Path, name: str) -> None:
-    """Write the program from q, q̇, τ `(1, nq)` and closed contacts `(1, n_contacts)` to mean, covariance and
-    distance from the training data. The program raises no errors."""
+    """Write the program that maps q, q̇, τ `(1, nq)` and closed contacts `(1, n_contacts)` to the mean, the
+    covariance and the distance from the training data. The program raises no errors."""
     system = fit.system
     state = [torch.zeros(1, system.robot.nq, dtype=system.robot.dtype) for _ in range(3)]
     closed = torch.ones(1, len(system.contacts), dtype=torch.bool)

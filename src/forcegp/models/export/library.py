@@ -134,8 +134,8 @@ class CompiledFit(Predictor):
             factor: factor on the weight of all previous samples. If `priors` is given, it is the correlation
                 of their forces with the previous forces.
             priors: names of priors whose forces drift towards the prior. Samples then keep their weight.
-            budget: number of weights to renew the prior of, each at the cost of one row. The others are
-                renewed in later calls. By default, all are renewed.
+            budget: number of weights for which the prior is renewed, each at the cost of one row. The others
+                are renewed in later calls. By default, all are renewed.
 
         Raises:
             ModelError: the model cannot learn in C, or the factor is out of range.
@@ -367,7 +367,7 @@ class CompiledFit(Predictor):
         active: Tensor | None = None,
         system: ConstrainedSystem | None = None,
     ) -> ForceLinearization:
-        """Return mean acceleration, multiplier and Jacobians, as in `StructuredFit.linearize`."""
+        """Return the mean acceleration and multiplier with their Jacobians (see `StructuredFit`)."""
         if system is not None and system is not self.system:
             raise ModelError("a compiled fit predicts on its own system", hint="use that of the fit")
         found = self.jacobian(q, qd, tau, ["qdd", "multiplier"], active=active)

@@ -122,7 +122,7 @@ class Mean:
         return self.graph.constants(np.zeros(shape))
 
     def sliding(self) -> tuple[list[int], list[Scalar]]:
-        """Return the priors of joints that can stick, and Q_D, inputs and features for given `slip`."""
+        """Return the priors of joints that can stick, and Q_D, the inputs and the features for a `slip`."""
         slip = [self.graph.input("slip", i) for i in range(self.robot.nq)]
         priors = [p for p, part in enumerate(self.parts) if part.prior.sticks]
         x = [self._inputs(p, slip) for p in priors]

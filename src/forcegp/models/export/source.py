@@ -168,7 +168,7 @@ def _programs(mean: LearnedMotion, rollout: bool) -> list[str]:
 
 
 class Writer:
-    """Writer of the code of priors. `lines` contains the tables that this code reads."""
+    """Writer of the code for the priors. `lines` contains the tables that this code reads."""
 
     def __init__(self, model: ExportedModel, rollout: bool) -> None:
         self.model, self.parts, self.lines, self.rollout = model, model.parts(), list[str](), rollout
@@ -181,7 +181,7 @@ class Writer:
         self._wrench()
 
     def array(self, values: Tensor | Iterable[float], name: str = "", kind: str = "double") -> str:
-        """Add a constant array if it does not exist, and return its name."""
+        """Add a constant array unless it already exists, and return its name."""
         x = values if isinstance(values, Tensor) else torch.tensor(list(values), dtype=torch.float64)
         rows = x.detach().double().reshape(-1, x.shape[-1] if x.ndim else 1).tolist() or [[0.0]]
         texts = [", ".join(repr(v) if kind == "double" else str(int(v)) for v in row) for row in rows]
