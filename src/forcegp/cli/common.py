@@ -53,7 +53,7 @@ def progress_bar(description: str, total: int) -> Iterator[Advance]:
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"))
     times = (TimeElapsedColumn(), TimeRemainingColumn(), TextColumn("{task.fields[note]}"))
     console = Console(stderr=True)
-    # No bar is shown in a file or a pipe, which it would only fill.
+    # No bar is shown if the output is a file or a pipe.
     with Progress(*columns, *times, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(escape(printable(description)), total=total, note="")
         yield lambda done, total=None, note="": bar.update(task, completed=done, total=total, note=note)

@@ -50,7 +50,7 @@ def fit(
     """Fit a model of the forward dynamics to logged motion.
 
     The table \\[model] in the scene or in --config defines priors, kernels, noise, robot parameters and
-    learning; command-line options override it.
+    learning. Command-line options override its entries.
 
     For structured models, Parquet logs are read piece by piece if they have more than 100,000 rows or consist
     of several files.

@@ -68,7 +68,7 @@ def predict(
 
     The output is the data set with the additional column predicted_<quantity> and, for models with
     uncertainty, predicted_<quantity>_std. The standard deviation includes the noise of the motor torque and
-    of the sensor. With --no-noise, which is the default in Python, it does not.
+    of the sensor. With --no-noise (the default in Python), it excludes this noise.
 
     [bold]Examples[/bold]
 

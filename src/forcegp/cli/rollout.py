@@ -41,9 +41,9 @@ def rollout(
 ) -> None:
     """Simulate motion with a model, starting from a logged state and applying the logged torques.
 
-    The output folder contains rollout.parquet (the predicted motion, the logged motion as q_logged, and the
-    standard deviation over samples as q_std), rollout.html with plots and an animation of the arm, the plots
-    as SVG files, and their data as rollout.json.
+    The output folder contains rollout.parquet with the predicted motion, the logged motion as q_logged, and
+    the standard deviation over samples as q_std. The page rollout.html shows plots and an animation of the
+    arm. The plots are also written as SVG files, and their data as rollout.json.
 
     [bold]Examples[/bold]
 
@@ -200,7 +200,7 @@ def simulate(
     """Simulate and log the robot of a scene while it slides over a surface or follows a given motion.
 
     If a model is given, MuJoCo simulates the fitted robot with the learned joint forces, which replace joint
-    friction, and computes the contact forces itself.
+    friction. MuJoCo computes the contact forces itself.
 
     [bold]Examples[/bold]
 

@@ -46,9 +46,9 @@ def view(
 ) -> None:
     """View a robot, its surfaces, contact forces and predicted paths in 3D.
 
-    Given a model and a log, the view shows the logged motion, the predicted contact force as an arrow with a
-    bar of ±2 standard deviations at its head, and the tip paths predicted from the first state. Given a scene
-    and a log, it shows the logged force instead. Without a log, the robot does not move.
+    Given a model and a log, the view shows the logged motion, the predicted contact force, and the tip paths
+    predicted from the first state. The force is an arrow with a bar of ±2 standard deviations at its head.
+    Given a scene and a log, the view shows the logged force instead. Without a log, the robot does not move.
 
     The page is accessible from this computer only. With --out, it is written as one HTML file that works
     offline.

@@ -30,7 +30,7 @@ def standardized_inputs(data: Dataset) -> Float[Tensor, "n d"]:
 def standardized(x: Float[Tensor, "n d"]) -> Float[Tensor, "n d"]:
     """Scale columns to zero mean and unit variance. Constant columns become zero."""
     centred = x - x.mean(0)
-    # Rounding leaves a constant column a spread of some units in the last place.
+    # Due to rounding, a constant column may vary by a few units in the last place.
     noise = x.abs().amax(0) * torch.finfo(x.dtype).eps * 16.0
     spread = centred.square().mean(0).sqrt()
     return torch.where(spread > noise, centred / spread.where(spread > noise, 1.0), 0.0)

@@ -174,7 +174,7 @@ def _score(
         inertia = Inertia(robot)
     trial.inertia_found |= inertia.robot is not robot
     if candidate.inertia and inertia.robot is robot:
-        # The model is the same as without identification.
+        # The model is the same as that without identification.
         for other in trials:
             same = other.candidate == Candidate(candidate.set) and not other.note
             if same and len(other.scores) == len(trial.scores) + 1:

@@ -83,7 +83,7 @@ def predicted_window(model: Predictor, data: Dataset, name: str) -> WindowData:
     return WindowData(
         model=name,
         noise_std=data.header.noise_std,
-        # Measured logs may count seconds since 1970, for which a series keeps too few digits.
+        # Logs of real robots may count seconds since 1970, for which a series keeps too few digits.
         t=series(data.t - data.t[0]),
         joint_names=list(data.joint_names),
         measured=columns(data.qdd),

@@ -134,7 +134,7 @@ def loss_of(model: ExportedModel, fit: Predictor, training: Training) -> tuple[f
         for x in (CompiledFit(model), fit)
     ]
     small, whole = (x.covariance.diagonal(dim1=-2, dim2=-1).sqrt() for x in read if x.covariance is not None)
-    # Nothing is lost of structural zeros, such as λ of an open contact.
+    # Structural zeros, such as λ of an open contact, have no error bars that could grow.
     growth = (small / whole - 1.0)[whole > ZERO * whole.nan_to_num().amax()]
     return float(growth.max()), float(growth.median())
 
@@ -164,7 +164,7 @@ def random_states(model: ExportedModel, count: int) -> tuple[Tensor, ...]:
     shares = torch.rand(3, count, robot.nq, dtype=torch.float64, generator=random)
     state = [low + share * (high - low) for (low, high), share in zip(limits, shares, strict=True)]
     closed = torch.rand(count, len(model.system.contacts), generator=random) < 0.7
-    # Accelerations of an arm that contacts hold completely are rounding.
+    # If contacts hold the arm completely, its accelerations are only rounding errors.
     return *state, closed & (closed.cumsum(-1) < robot.nq)
 
 
