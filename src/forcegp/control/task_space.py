@@ -68,7 +68,7 @@ class JointTarget(NamedTuple):
 
 
 def task_rows(nq: int) -> slice:
-    """Return the rows of [ω; ṗ] that an arm with nq joints can follow: all for six or more joints, else ṗ."""
+    """Return the rows of [ω; ṗ] that an arm with nq joints can follow: all if nq ≥ 6, otherwise only ṗ."""
     return slice(0 if nq >= POSE_ROWS else POSITION_ROWS, POSE_ROWS)
 
 

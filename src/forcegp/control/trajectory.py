@@ -17,7 +17,7 @@ from forcegp.constraints.surface import Plane, Surface
 from forcegp.errors import ForceGPError
 
 PROJECTION_STEPS = 8
-"""Number of Newton steps onto a surface. One is exact for a signed distance; others double the digits."""
+"""Number of Newton steps onto a surface. One is exact for a signed distance. Others double the digits."""
 
 
 class Trapezoid(NamedTuple):

@@ -77,7 +77,7 @@ def beyond_gravity(system: ConstrainedSystem, data: Dataset) -> tuple[Tensor, fl
 
 
 def explained(error: Tensor, rest: Tensor) -> tuple[float | None, ...]:
-    """Return R² of each joint from errors and non-gravitational torques `(n, nq)`; `None` if `FAINT`."""
+    """Return R² of each joint from errors and non-gravitational torques `(n, nq)`, or `None` if `FAINT`."""
     left, whole = (error**2).sum(0), (rest**2).sum(0)
     shares, seen = (1.0 - left / whole).tolist(), (whole > FAINT**2 * whole.max()).tolist()
     return tuple(share if clear else None for share, clear in zip(shares, seen, strict=True))
@@ -109,7 +109,7 @@ def torque_response(model: FittedModel, data: Dataset) -> tuple[float, ...] | No
 
 @torch.no_grad()
 def open_loop(model: FittedModel, system: ConstrainedSystem, data: Dataset) -> Motion | None:
-    """Simulate a model and the robot file in open loop; `None` if the data are too short or unordered."""
+    """Simulate a model and the robot file in open loop; return `None` for short or unordered data."""
     if model.force_field() is None or not data.header.ordered or len(data) < 2:
         return None
     dt = data.header.dt or float((data.t[1:] - data.t[:-1]).median())

@@ -70,7 +70,7 @@ def data_chunks(data: Dataset) -> Iterator[Dataset]:
 
 
 def identify_rigid(system: ConstrainedSystem, train: Dataset) -> LeastSquares:
-    """Identify inertia, friction and offsets; those that are not excited remain as in the robot file."""
+    """Identify inertia, friction and offsets. Those that are not excited keep their values in the file."""
     rows = torch.linspace(0, len(train) - 1, min(len(train), MOST)).round().long()
     train, robot = train[rows.unique()], system.robot
     prior = _prior_std(robot, train)

@@ -70,7 +70,7 @@ def read_log(
         The log in SI units and in the robot's joint order.
 
     Raises:
-        DataError: the log cannot be read or used; the message names the column and the rows.
+        DataError: the log cannot be read or used. The message names the column and the rows.
         MappingError: the mapping is invalid or does not match the log.
         MissingDependencyError: the reader for the format is not installed.
 

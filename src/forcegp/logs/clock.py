@@ -61,7 +61,7 @@ def split_trajectories(signals: Signals, gap: float | None, report: ImportReport
     clock restarts, or after a step longer than `gap` [s], which is `GAP_STEPS` usual steps by default.
 
     Raises:
-        DataError: time runs backward without a restart; the message lists the rows.
+        DataError: time runs backward without a restart. The message lists the rows.
     """
     t = signals.t
     step = usual_step(t)

@@ -297,7 +297,7 @@ def load_mapping(source: str | Path) -> Mapping:
     """Read a mapping file, or a bundled mapping by name.
 
     Raises:
-        MappingError: the mapping does not exist or is invalid; the message names the file, line and key.
+        MappingError: the mapping does not exist or is invalid. The message names the file, line and key.
 
     >>> load_mapping("ros_joint_states").sections.torque.unit
     'Nm'

@@ -56,7 +56,7 @@ class FittedModel(Predictor):
             source: name of the file, used in messages.
 
         Raises:
-            ModelError: a tensor or setting is missing or invalid; the message names the file and the field.
+            ModelError: a tensor or setting is missing or invalid. The message names the file and the field.
         """
 
     @abstractmethod
@@ -100,7 +100,7 @@ class Model(ABC, Generic[F]):
         return fit_table(repr(self), None, list(self.get_params().items()))
 
     def get_params(self) -> dict[str, Any]:
-        """Return the arguments of the constructor; `type(model)(**model.get_params())` is a copy."""
+        """Return the arguments of the constructor. `type(model)(**model.get_params())` is a copy."""
         return dict(self._params)
 
     @abstractmethod

@@ -93,8 +93,8 @@ class Calibration:
         parameters: the changed parameters with their values in the file and their standard deviations.
         speeds, friction, friction_std: speeds [rad/s, m/s], learned friction of each joint and its standard
             deviation [N m, N], each `(k, nq)`.
-        left: `(nq,)` RMS friction that d q̇ + f sign q̇ does not explain [N m, N].
-        offset: `(nq,)` additional constant force [N m, N].
+        left: RMS friction that d q̇ + f sign q̇ does not explain, `(nq,)` [N m, N].
+        offset: additional constant force, `(nq,)` [N m, N].
     """
 
     robot: RobotModel
@@ -322,7 +322,7 @@ class _Reader:
 
     @property
     def scale(self) -> Tensor | None:
-        """Prior standard deviations of links and drives `(nq, 11)`; `None` if inertia was not identified."""
+        """Prior standard deviations of links and drives `(nq, 11)`, or `None` without identified inertia."""
         robot = self.fit.system.robot
         for prior in self.fit.force_priors:
             if isinstance(prior, InertialPrior):

@@ -81,7 +81,7 @@ def configured(
         name, noise_std, seed: values that override the values in the table.
 
     Raises:
-        SceneError: a value is invalid for the model or the system; the message gives the file, line and key.
+        SceneError: a value is invalid for the model or the system. The message gives the file, line and key.
         UnknownNameError: `name` is not a model.
 
     Example:

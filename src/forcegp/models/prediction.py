@@ -249,7 +249,7 @@ class Predictor(ForwardModel):
         """Predict the mean and covariance of a quantity. `StructuredGP` uses the posterior (eqs. 22–25).
 
         Args:
-            q, qd, tau: `(*batch, nq)` states.
+            q, qd, tau: states, `(*batch, nq)`.
             quantity: a name in `QUANTITIES`. If the model has forces, several names give their joint
                 distribution.
             active: mask `(*batch, n_contacts)` of closed contacts. By default, all contacts are closed.
@@ -305,7 +305,7 @@ class Predictor(ForwardModel):
         """Return the mean acceleration and multiplier, and their Jacobians with respect to q, q̇ and τ.
 
         Args:
-            q, qd, tau: `(*batch, nq)` states.
+            q, qd, tau: states, `(*batch, nq)`.
             active: mask `(*batch, n_contacts)` of closed contacts. By default, all contacts are closed.
             system: a different system for which to predict the motion.
 
@@ -333,7 +333,7 @@ class Predictor(ForwardModel):
         """Predict trajectories from initial states (section 4), as in `forcegp.rollout.rollout_model`.
 
         Args:
-            q0, qd0: `(*batch, nq)` initial states.
+            q0, qd0: initial states, `(*batch, nq)`.
             tau: motor torque over time. It is a log, a function of (t, q, q̇), or an array `(samples, nq)` or
                 `(*batch, samples, nq)`. The sampling period of an array is set in `options`.
             duration: simulated time [s].
@@ -434,7 +434,7 @@ def require_semidefinite(covariance: Tensor) -> None:
     """Reject covariances with a clearly negative eigenvalue after scaling to unit variances.
 
     Args:
-        covariance: `(*batch, d, d)` covariances.
+        covariance: covariances, `(*batch, d, d)`.
 
     Raises:
         NumericalError: a scaled variance or eigenvalue is below −`NEGATIVE`.

@@ -199,7 +199,7 @@ def unpack(
     """Restore the fields of a fit from the output of `pack`.
 
     Raises:
-        ModelError: a tensor or setting is missing or invalid; the message names the file and the field.
+        ModelError: a tensor or setting is missing or invalid. The message names the file and the field.
     """
     settings = header.settings_as(StructuredSettings, source)
     spec = _specification(settings, tensors, system, source)

@@ -462,7 +462,7 @@ class StructuredFit(FittedModel):
         """Return the variance that noise adds to measurements of a quantity, `(*batch, d)`.
 
         Args:
-            q, qd, tau: `(*batch, nq)` states.
+            q, qd, tau: states, `(*batch, nq)`.
             quantity: the measured quantity. Torque noise affects every quantity. Sensor noise is known only
                 for quantities that were used in training.
             active: mask `(*batch, n_contacts)` of closed contacts. By default, all contacts are closed.

@@ -121,7 +121,7 @@ def rollout(
     Args:
         law: the law that gives the acceleration.
         system: the robot and its contacts.
-        q0, qd0: `(*batch, nq)` initial states.
+        q0, qd0: initial states, `(*batch, nq)`.
         tau: motor torque Q_u. It is a log, an array over time with its sampling period in `options`, or a
             function of (t, q, q̇).
         duration: simulated time [s], rounded to whole steps.

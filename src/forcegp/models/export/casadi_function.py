@@ -29,7 +29,7 @@ def casadi_function(model: ExportedModel, name: str = "forcegp") -> Any:
     `closed` is 1 for each closed contact and 0 for each open contact. Closed contacts must be independent.
 
     Raises:
-        ModelError: a part of the model cannot be exported; the message names it.
+        ModelError: a part of the model cannot be exported. The message names it.
         MissingDependencyError: CasADi is not installed.
     """
     ca: Any = optional_module("casadi", "a CasADi function")

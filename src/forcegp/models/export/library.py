@@ -99,7 +99,7 @@ class CompiledFit(Predictor):
         """Add samples one after the other, with the same result as `StructuredFit.update`.
 
         Args:
-            q, qd, tau: `(*batch, nq)` states.
+            q, qd, tau: states, `(*batch, nq)`.
             measured: measured values at these states, `(*batch, d)`.
             quantity: the measured quantity.
             active: mask `(*batch, n_contacts)` of closed contacts. By default, all contacts are closed.
@@ -248,7 +248,7 @@ class CompiledFit(Predictor):
         """Return the posterior mean of quantities and its Jacobian with respect to q, q̇ and τ.
 
         Args:
-            q, qd, tau: `(*batch, nq)` states.
+            q, qd, tau: states, `(*batch, nq)`.
             quantity: `"qdd"`, `"multiplier"`, `"contact_force"` or `"joint_friction"`, or several of them.
             active: mask `(*batch, n_contacts)` of closed contacts. By default, all contacts are closed.
 
@@ -291,7 +291,7 @@ class CompiledFit(Predictor):
         requires a log in time order and is not tracked.
 
         Args:
-            q, qd, tau, qdd: `(*batch, nq)` states with measured accelerations.
+            q, qd, tau, qdd: states with measured accelerations, `(*batch, nq)`.
             active: mask `(*batch, n_contacts)` of closed contacts. By default, all contacts are closed.
             qdd_std: standard deviation of the acceleration noise `(nq,)`. The default is that of the fit.
 

@@ -63,7 +63,7 @@ def c_source(model: ExportedModel, name: str, rollout: bool = False) -> tuple[st
     """Return the header and the source text, with Jacobians or, for a rollout, the motion of trajectories.
 
     Raises:
-        ModelError: a part of the model has no C form; the message names it.
+        ModelError: a part of the model has no C form. The message names it.
     """
     model.check()
     before, _, rest = template("controller.c").partition("/* HELPERS")
