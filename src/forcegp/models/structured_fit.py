@@ -158,8 +158,9 @@ class StructuredFit(FittedModel):
             method: `"acceleration"` or `"momentum"`.
             external: standard deviations [N m, N], by joint name, of unknown joint forces that did not act in
                 the training log, such as those of a hand that pushes the arm.
-            **components: arguments of `WrenchFrame`: `reference`, `axes`, `point`, `prior_std` and `change`.
-                The axes are a subset of `fx`, `fy`, `fz`, `mx`, `my` and `mz`. The other components are zero.
+            **components: the arguments `reference` (`"world"` or `"local"`), `axes` (some of `fx`, `fy`,
+                `fz`, `mx`, `my` and `mz`), `point`, `prior_std` and `change` of `WrenchFrame`. Components
+                that are not in `axes` are zero.
 
         Returns:
             An `ExternalWrench` with a mean `(n, k)` and a covariance `(n, k, k)` [N, N m].

@@ -154,7 +154,7 @@ class Pass:
     def forces(
         self, problem: Problem, hyperparameters: Mapping[str, Tensor]
     ) -> tuple[ForcePosterior, Tensor]:
-        """Return the forces conditioned on the whole log, and the part of the likelihood without them.
+        """Return the forces conditioned on the whole log, and the likelihood terms independent of them.
 
         Raises:
             ModelError: the checkpoint belongs to a different fit.

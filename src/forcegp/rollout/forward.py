@@ -125,8 +125,8 @@ def rollout(
         tau: motor torque Q_u. It is a log, an array over time with its sampling period in `options`, or a
             function of (t, q, q̇).
         duration: simulated time [s], rounded to whole steps.
-        active: mask `(*batch, n_contacts)` of initially closed contacts. By default, all contacts are closed.
-            If contacts can open, those that touch their surface are closed.
+        active: mask `(*batch, n_contacts)` of initially closed contacts. By default, all contacts are closed
+            or, if contacts can open, those that touch their surface.
         options: options such as step size, method and stabilization.
         progress: a function called after each step.
 
