@@ -1,4 +1,4 @@
-"""Checks of the torque: faults that explain it, and then friction, offsets and disturbances."""
+"""Checks of the torque for faults that explain it, and for friction, offsets and disturbances."""
 
 from __future__ import annotations
 
@@ -22,20 +22,20 @@ LEAST_ROWS = 200
 SIGNIFICANT, MATERIAL = 3.0, 0.1
 """Standard errors over blocks, and drop in a joint's log error, above which friction or offsets count."""
 SPEEDS, UNEXPLAINED = (25.0, 95.0), 0.5
-"""Percentiles of speed at which friction must oppose motion; RMS fraction of unexplained torque allowed."""
+"""Percentiles of speed at which friction must oppose motion; accepted RMS fraction of unexplained torque."""
 TRACE_ROWS, DISTURBANCE_SECONDS = 20_000, 0.1
-"""Maximum number of rows for inspecting the residual over time; duration over which it is averaged [s]."""
+"""Maximum number of rows in the trace of the residual; duration over which the residual is averaged [s]."""
 DISTURBANCE, LOUD = 5.0, 4.0
-"""A stretch stands out if its log residual exceeds the median by this many robust standard deviations, or its
-residual exceeds the 90 % quantile by this factor."""
+"""A period stands out if its log residual exceeds the median by this many robust standard deviations, or if
+its residual exceeds the 90 % quantile by this factor."""
 MOVING, VISIBLE = 0.05, 0.1
-"""Fraction of its largest speed above which an arm moves; fraction of the torque that disturbances exceed."""
+"""Fraction of its maximum speed above which an arm moves; fraction of torque that a disturbance exceeds."""
 ONE_SIGMA = 84.13
 """Percentile of a normal distribution at one standard deviation above the mean."""
 
 
 def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Check signs, order, gains and delays of torques, gravity, payload, masses, friction and offsets."""
+    """Check the torques for wrong signs, order, gains and delays, and the robot file for wrong parameters."""
     if len(log.rows(LEAST_ROWS)) < LEAST_ROWS:
         raise NotJudgedError(f"fewer than {LEAST_ROWS} usable rows")
     passive = _without_torque(log)
@@ -98,7 +98,7 @@ def _worse(explanation: Explanation, other: TorqueFit, j: int) -> bool:
 
 
 def _determined(robot: RobotModel, explanation: Explanation) -> Explanation:
-    """Return the explanation with friction set to 0 if it would drive a joint, or is smaller than its σ."""
+    """Set friction to 0 if it would drive a joint, or if it is smaller than its standard deviation."""
     declared = np.concatenate([robot.damping.numpy(), robot.friction.numpy()])
     for _ in range(robot.nq):
         fit = explanation.fit
@@ -113,7 +113,7 @@ def _determined(robot: RobotModel, explanation: Explanation) -> Explanation:
 
 
 def _confounded(explanation: Explanation) -> list[Finding]:
-    """Return the faults found; currents become warnings if masses are wrong, since gains depend on masses."""
+    """Return the findings. Currents become warnings if masses are wrong, since gains depend on masses."""
     findings = list(explanation.findings)
     for k, finding in enumerate(findings if "masses" in explanation.robot else ()):
         if finding.kind == "torque-current" and "masses-mismatch" not in finding.kinds:
@@ -186,7 +186,7 @@ def _unexplained(explanation: Explanation) -> list[Finding]:
 
 
 def _disturbances(system: ConstrainedSystem, explanation: Explanation) -> tuple[list[Finding], np.ndarray]:
-    """Find stretches in which far more torque than usual is unexplained; also mask the rows around them."""
+    """Find periods with far more unexplained torque than usual, and mask the rows around them."""
     from scipy.ndimage import minimum_filter1d
 
     log, rows = explanation.log, explanation.log.rows(TRACE_ROWS)
@@ -221,7 +221,7 @@ def _disturbances(system: ConstrainedSystem, explanation: Explanation) -> tuple[
 
 
 def _stands_out(log: Log, rows: np.ndarray, level: Array) -> np.ndarray:
-    """Return the mask `(n,)` of rows with a larger residual than usual for the same contact state."""
+    """Return a mask (n,) of rows with a larger residual than usual for the same contact state."""
     # An arm at rest leaves little unexplained; it says nothing of one that moves.
     speed = np.abs(log.qd[rows]).max(axis=1)
     moving, bad = speed >= MOVING * np.percentile(speed, 99), np.zeros(len(rows), bool)
@@ -246,7 +246,7 @@ def _upper_spread(level: Array) -> float:
 
 
 def residual_trace(explanation: Explanation, rows: np.ndarray) -> Array:
-    """Return the residual torque, excluding contact forces, at the given rows, `(n, nq)` [N m, N]."""
+    """Return the residual torque (n, nq) at the given rows [N m, N]. It excludes contact forces."""
     system, log = explanation.system, explanation.log
     parts, coefficients = [], robust_parameters(explanation.problem, explanation.columns, explanation.prior)
     for index in np.array_split(rows, max(1, len(rows) // 2048)):

@@ -22,20 +22,20 @@ from forcegp.rows import describe
 
 COLOURS = {"error": "#a1121f", "warning": "#d08c00", "note": "#0072b2"}
 POINTS = 1500
-"""Maximum number of points in a curve; more could not be distinguished on a page."""
+"""Maximum number of points in a curve. More could not be distinguished on a page."""
 CONTEXT = 3.0
 """Number of surrounding rows shown, relative to the length of the interval."""
 LEAST_ROWS = 200
 JOINTS, FEW = 7, 3
-"""Maximum number of joints shown for a finding that names joints, and for one that does not."""
+"""Maximum number of joints shown for a finding that names joints, and for one that names none."""
 SIZE = (12.0, 1.35)
-"""Width of a plot and height of each panel [inch]."""
+"""Width of a plot, and height of each panel [inch]."""
 
 Paint = Callable[[Axes, Log, slice, int], None]
 
 
 def _axis(log: Log) -> tuple[Array, str]:
-    """Return the time since the first row [s] (row numbers if it is not monotonic) and the axis label."""
+    """Return the time since the first row [s], or row numbers if it is not monotonic, and the axis label."""
     runs = bool(log.header.ordered and np.isfinite(log.t).all() and (np.diff(log.t) >= 0.0).all())
     return (log.t - log.t[0], "time [s]") if runs and len(log) else (np.arange(float(len(log))), "row")
 
@@ -142,7 +142,7 @@ def _shade(axes: Axes, finding: Finding, rows: slice, log: Log) -> None:
 
 
 def _line(axes: Axes, log: Log, rows: slice, y: Array, colour: str = INK, name: str | None = None) -> None:
-    """Draw a curve over time; a long one is reduced to the minimum and maximum in each bin."""
+    """Draw a curve over time. A long curve is reduced to the minimum and maximum in each bin."""
     x = _axis(log)[0][rows]
     if len(y) > POINTS:
         width = -(-len(y) // (POINTS // 2))
