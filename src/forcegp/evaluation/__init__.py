@@ -110,7 +110,7 @@ class Evaluation:
 
     @property
     def poor(self) -> bool:
-        """Whether there are `doubts`, or the model explains no torque, or less torque than the robot file."""
+        """Whether there are `doubts`, or the model explains no torque or less than the robot file does."""
         shares = {p.name: x for p in self.predictors if (x := p.beyond_gravity) is not None}
         model = shares.get("model", 1.0)
         return bool(self.doubts) or model <= 0.0 or model < shares.get("robot file", 0.0)
