@@ -29,7 +29,7 @@ class MemoryNeedWarning(UserWarning):
 
 
 def free_memory() -> int | None:
-    """Return the memory available without swapping within the container's limit [bytes]; `None` if
+    """Return the memory available without swapping, up to the container's limit [bytes]; `None` if
     unknown.
     """
     limits = [value for value in (_available(), _container_memory()) if value is not None]
@@ -37,8 +37,7 @@ def free_memory() -> int | None:
 
 
 def announce_memory(needed: int, what: str, *, certain: int | None = None) -> None:
-    """Warn if a computation needs most of the free memory; raise `MemoryLimitError` if it exceeds that
-    memory.
+    """Warn if a computation needs most of the free memory; raise `MemoryLimitError` if it needs more.
 
     Call this function before the allocation, with an upper bound `needed` [bytes] and, if that is rough, also
     a lower bound `certain`. `what` is the subject of the message, such as "the covariance of 20,000 points".
