@@ -46,8 +46,8 @@ LOW, HIGH, SPREAD, GROWTH = (REGION + name for name in ("low", "high", "spread",
 the speed and torque of each joint, each `(2, nq)`, and g `(nq,)` [N m, N]."""
 OUTERMOST, WIDEST = 0.01, 0.16
 """Smallest and largest fraction of the training samples beyond each limit of the region. The largest
-corresponds to one standard deviation of a Gaussian. If fewer than 100 samples are independent, one lies
-beyond each limit.
+corresponds to one standard deviation of a Gaussian. If fewer than 100 samples are independent, it is one of
+them.
 """
 RELATIVE = 0.05
 """Prior ratio of the growth rate g to the typical load of a joint; torque constants and load-dependent
@@ -65,7 +65,8 @@ class ForceProcess:
         mean: prior mean of Q.
         coulomb: contact friction proportional to the multiplier.
         pinned: values `(components,)` of constant latent forces that the robot already includes, keyed by the
-            index of the prior. Their prior mean is minus this value, and their posterior mean is zero.
+            index of the prior. The prior mean of such a force is minus its value, and the posterior mean is
+            zero.
     """
 
     priors: tuple[ForcePrior, ...]

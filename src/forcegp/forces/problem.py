@@ -197,7 +197,7 @@ class Problem:
 
     @torch.no_grad()
     def torque_residual(self) -> Tensor:
-        """Return the RMS `(nq,)` of force residuals and of acceleration residuals multiplied by M [N m,
+        """Return the RMS `(nq,)` of the force residuals and of M times the acceleration residuals [N m,
         N].
         """
         squares = [torch.zeros_like(self.system.robot.mass)[None]]
