@@ -20,9 +20,7 @@ _SMALL = 4096
 
 
 def batch_last(x: Tensor, tail: int) -> Tensor:
-    """Convert a tensor `(*batch, *tail)` to a contiguous tensor `(*tail, B)`; `tail` counts the
-    dimensions.
-    """
+    """Convert `(*batch, *tail)` to a contiguous tensor `(*tail, B)`; `tail` is a number of dimensions."""
     shape = x.shape[x.ndim - tail :]
     flat = x.reshape((math.prod(x.shape[: x.ndim - tail]), *shape))
     return flat.movedim(0, -1).contiguous()

@@ -21,9 +21,7 @@ from forcegp.types import JointMatrix, JointVector
 
 
 class InverseDynamicsDerivatives(NamedTuple):
-    """Jacobians ∂ID/∂q, ∂ID/∂q̇ and ∂ID/∂q̈ = M, each `(*batch, nq, nq)`, with one row per force
-    component.
-    """
+    """Jacobians ∂ID/∂q, ∂ID/∂q̇ and ∂ID/∂q̈ = M, each `(*batch, nq, nq)`, with one row per joint."""
 
     dq: JointMatrix
     dqd: JointMatrix

@@ -72,9 +72,7 @@ def momentum(links: LinkInertia, w: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
 def link_force(
     links: LinkInertia, motion: LinkMotion, alpha: Tensor, acceleration: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return the torque and force I a + V ×* I V for link velocity V and acceleration a, each `(3, nq,
-    B)`.
-    """
+    """Return the torque and force I a + V ×* I V for velocity V and acceleration a, each `(3, nq, B)`."""
     n, l = momentum(links, motion.omega, motion.velocity)
     torque, force = momentum(links, alpha, acceleration)
     torque = torque + cross(motion.omega, n) + cross(motion.velocity, l)

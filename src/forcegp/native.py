@@ -2,8 +2,7 @@
 
 Compiled kernels are stored in a folder that only its owner can write to, and are checked before they run.
 Kernels are named `<key>-<SHA-256 of the file>.so`. The key identifies the source, and the digest verifies
-that the file is complete. The folder (mode 0700) and its files (mode 0600) are private regardless of the
-umask.
+that the file is complete. The folder (0700) and its files (0600) are private regardless of the umask.
 """
 
 from __future__ import annotations
@@ -131,9 +130,7 @@ def cache_directory() -> Path:
 
 
 def private_folder(folder: Path) -> Path:
-    """Return a folder that is private to its owner; raise `MissingDependencyError` if others can replace
-    it.
-    """
+    """Return a private folder; raise `MissingDependencyError` if other users can replace it."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     with contextlib.suppress(FileExistsError):
         folder.mkdir(mode=0o700)

@@ -29,9 +29,7 @@ class MemoryNeedWarning(UserWarning):
 
 
 def free_memory() -> int | None:
-    """Return the memory available without swapping, up to the container's limit [bytes]; `None` if
-    unknown.
-    """
+    """Return the memory available without swapping within the container's limit [bytes], or `None`."""
     limits = [value for value in (_available(), _container_memory()) if value is not None]
     return min(limits) if limits else None
 

@@ -84,12 +84,10 @@ class SurfaceContact(Constraint):
         point: coordinates of the point in that frame [m], or those of the centre of a rounded tip.
         surface: the surface in the world frame.
         radius: radius r of a rounded tip [m]; 0 for a sharp tip.
-        stick_speed: tangential speed below which the contact point sticks [m/s]; `None` for a contact that
-            always slides.
+        stick_speed: tangential speed below which the contact point sticks [m/s]; `None` if it always slides.
 
     Raises:
-        ParameterError: the radius is negative, the surface function is not a signed distance, or the speed is
-            not positive.
+        ParameterError: the radius is negative, c is not a signed distance, or the speed is not positive.
 
     Example:
         >>> from forcegp import Plane

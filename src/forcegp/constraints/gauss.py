@@ -95,9 +95,7 @@ class ContactPoint:
         return J - n[..., None] * (n[..., None, :] @ J), v - n * vecdot(n, v)[..., None]
 
     def directions(self, rows: int) -> Tensor:
-        """Return the multiplier directions `(*batch, 3, rows)`: ∇c, and the tangents if the point may
-        stick.
-        """
+        """Return the multiplier directions `(*batch, 3, rows)`: ∇c, and tangents if the point may stick."""
         normal = self.normal[..., None]
         return normal if rows == 1 else torch.cat([normal, tangent_frame(self.unit_normal)], dim=-1)
 
@@ -200,8 +198,7 @@ class Equations:
     def hidden(self) -> Tensor:
         """Projector `(*batch, m, m)` onto multipliers μ that do not affect the motion, Aᵀμ = 0.
 
-        Diagonal entries are 1 for points that cannot move, and between 0 and 1 for contacts that share a
-        load.
+        Diagonal entries are 1 for fixed points, and between 0 and 1 for contacts that share a load.
         """
         # R = 1 − W W⁺
         return torch.diag_embed(self.holds.to(self.M)) - self.scaled_jacobian @ self.scaled_inverse

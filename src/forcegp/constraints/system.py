@@ -128,9 +128,7 @@ class ConstrainedSystem:
 
     @property
     def row_names(self) -> list[str]:
-        """Name of each constraint row: that of the constraint, numbered if the constraint has several
-        rows.
-        """
+        """Name of each constraint row: the name of the constraint, numbered if there are several rows."""
         rows = ((c.name, c.rows, row + 1) for c in self.contacts for row in range(c.rows))
         return [name if count == 1 else f"{name} {row}" for name, count, row in rows]
 
@@ -306,9 +304,7 @@ class ConstrainedSystem:
     def _moving(
         self, q: Tensor, qd: Tensor
     ) -> tuple[LinkPoses, LinkMotion, Callable[[str, Sequence[float]], PointMotion]]:
-        """Return the poses and velocities of the links, and a function that computes the motion of a
-        point.
-        """
+        """Return the poses and motion of the links, and a function that computes the motion of a point."""
         poses = kinematics.link_poses(self.robot, q)
         motion = kinematics.link_motion(self.robot, poses, qd)
         return poses, motion, partial(kinematics.point_motion, self.robot, poses, motion, qd)
@@ -320,9 +316,7 @@ class ConstrainedSystem:
     def _rows(
         self, q: Tensor, qd: Tensor, terms: Sequence[ConstraintTerms], active: Tensor | None
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Return c and ċ of all contacts, A and stabilized b of active contacts, and a mask of active
-        rows.
-        """
+        """Return c and ċ of all contacts, and A, stabilized b and the row mask of active contacts."""
         if len(terms) == 1:
             c, A, b = terms[0].c, terms[0].A, terms[0].b
         else:

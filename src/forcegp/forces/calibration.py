@@ -56,9 +56,8 @@ WINDOW, WINDOWS = 10.0, 20
 def autocorrelation_time(x: Tensor, segment: Tensor, white: Tensor | float = 0.0) -> Tensor:
     """Return the integrated autocorrelation time 1 + 2 Σ ρ_k of each column, in samples `(d,)`.
 
-    The sum ends when ρ falls below 0.05, or at half the length of the longest segment. The result is 1 for a
-    column if the covariance of neighbouring samples is not significant (below two standard errors of white
-    noise).
+    The sum ends when ρ falls below 0.05, or at half the length of the longest segment. The result is 1 if the
+    covariance of neighbouring samples is not significant (below two standard errors).
 
     Args:
         x: `(n, d)` zero-mean signals in time order.

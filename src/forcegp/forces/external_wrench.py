@@ -117,8 +117,7 @@ class WrenchFrame:
         return [self._each((1.0, lever)) for lever in (LEVERS if both else (1.0,))]
 
     def jacobian(self, robot: RobotModel, q: Tensor) -> Tensor:
-        """Return J `(*batch, k, nq)` of the components at q `(*batch, nq)`, such that the joint force is Jᵀ
-        w.
+        """Return J `(*batch, k, nq)` at q `(*batch, nq)`, such that the joint force is Jᵀ w.
 
         Raises:
             UnknownNameError: the frame does not exist.

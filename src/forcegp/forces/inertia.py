@@ -155,9 +155,7 @@ class _Regression:
     power: float
 
     def normal(self, given: NormalEquations | None = None) -> tuple[Tensor, Tensor]:
-        """Return the linear term κ h and precision κ H + 1 of the unknowns, without directions of negative
-        H.
-        """
+        """Return the linear term κ h and precision κ H + 1, ignoring directions of negative H."""
         H, h = (given or self.by_stretch.total()).quadratic(self.noise)
         values, vectors = torch.linalg.eigh(0.5 * (H + H.mT))
         shown = vectors * (values > 0.0)
@@ -229,9 +227,7 @@ VOLUME_STATES = 100
 FAR_LARGER = 10.0
 """Mean squared acceleration error, relative to that of the mean, above which drive inertia is increased."""
 NEGLIGIBLE = 0.02
-"""Ratio of drive to joint inertia below which drives are neglected, since sensor gain errors can explain
-them.
-"""
+"""Ratio of drive to joint inertia below which drives are neglected; a sensor gain error can explain them."""
 WEIGHTS = tuple(2.0 ** (-k / 2) for k in range(20, -1, -1))
 """Weights v of the volume term, from 1/1024 to 1."""
 
@@ -301,11 +297,10 @@ def _excess(rows: Rows, every: NormalEquations, M: Tensor, armature: Tensor) -> 
 
 
 def _damped(rows: Rows, M: Tensor, found: Tensor) -> Tensor:
-    """Return the drive inertia `(nq,)` to add to the robot file, increased if torque noise hides
-    accelerations.
+    """Return the drive inertia `(nq,)` to add to the robot file.
 
-    It does if torques predict accelerations far worse than the mean acceleration does, even with friction
-    with memory included. Drive inertia is then increased until both predict equally well.
+    If torques predict accelerations far worse than the mean acceleration does, even with friction with memory
+    included, drive inertia is increased until both predict equally well.
 
     Args:
         M: mass matrix of the robot file at the samples.
@@ -371,11 +366,10 @@ def with_updated_robot(problem: Problem, values: Mapping[str, Tensor]) -> Proble
 
 
 def _log_volume(problem: Problem, values: Mapping[str, Tensor]) -> Callable[[RobotModel], Tensor]:
-    """Return the function that maps a robot to κ Σ_i log |M (Σ_τ + M Σ_q̈ Mᵀ)^−½| over samples in free
-    motion.
+    """Return robot ↦ κ Σ_i log |M (Σ_τ + M Σ_q̈ Mᵀ)^−½| over the samples in free motion.
 
-    It converts the density of the torque error to that of the acceleration error. Otherwise, a robot with
-    almost no inertia would best explain small torques, whatever the resulting accelerations.
+    This term converts the density of the torque error to that of the acceleration error. Without it, a robot
+    with almost no inertia would best explain small torques, whatever the resulting accelerations.
     """
     terms = []
     std = problem.system.robot.mass.new_zeros(problem.system.robot.nq)

@@ -45,9 +45,8 @@ LOW, HIGH, SPREAD, GROWTH = (REGION + name for name in ("low", "high", "spread",
 """Names under which the trained region is stored: the lower limits, upper limits and standard deviations of
 the speed and torque of each joint, each `(2, nq)`, and g `(nq,)` [N m, N]."""
 OUTERMOST, WIDEST = 0.01, 0.16
-"""Smallest and largest fraction of the training samples beyond each limit of the region. The largest
-corresponds to one standard deviation of a Gaussian. If fewer than 100 samples are independent, it is one of
-them.
+"""Smallest and largest fraction of the training samples beyond each limit of the region. The largest is the
+tail of a Gaussian beyond one standard deviation. At least one independent sample is beyond.
 """
 RELATIVE = 0.05
 """Prior ratio of the growth rate g to the typical load of a joint; torque constants and load-dependent
@@ -64,9 +63,8 @@ class ForceProcess:
         priors, scales: force priors, and the standardization of their inputs.
         mean: prior mean of Q.
         coulomb: contact friction proportional to the multiplier.
-        pinned: values `(components,)` of constant latent forces that the robot already includes, keyed by the
-            index of the prior. The prior mean of such a force is minus its value, and the posterior mean is
-            zero.
+        pinned: values `(components,)` of constant latent forces that the robot already includes, keyed by
+            prior index. The prior mean of such a force is minus its value, and the posterior mean is zero.
     """
 
     priors: tuple[ForcePrior, ...]
@@ -334,11 +332,10 @@ LARGE_JITTER = 0.01
 
 
 def force_correlation(posterior: ForcePosterior, system: ConstrainedSystem, at: States) -> Tensor:
-    """Return the posterior correlation `(n, nq)` of Q and Q_z at each state and joint; 0 if either is
+    """Return the posterior correlation `(n, nq)` of Q and Q_z for each state and joint; 0 if either is
     certain.
 
-    corr_i = Cov(Q_i, Q_z,i) / √(Var Q_i Var Q_z,i). It excludes the part of Q along the constraint, which
-    does not affect accelerations.
+    corr_i = Cov(Q_i, Q_z,i) / √(Var Q_i Var Q_z,i), excluding the part of Q along the constraint.
     """
     z = affine_map(system, at, ("joint_force", "contact_friction"))
     rows = posterior.rows(system, at, z)

@@ -38,13 +38,10 @@ OWN = tuple(name + "." for name in RESERVED)
 MIXED = "." + MIXING
 """Suffix of the names of learned operator parameters."""
 SHOWN = 10.0
-"""Number of independent samples, with accelerations sensitive to a joint's torque, needed to learn its
-noise.
-"""
+"""Number of independent samples, with accelerations sensitive to a torque, needed to learn torque noise."""
 UNSHOWN = 0.1
 """Uncertainty of a joint's torque and friction, relative to the load, if no measurement is sensitive to them.
-It is also the relative growth per training standard deviation outside the trained region; 0.08 for a real
-iiwa."""
+It is also the growth per training standard deviation outside the trained region; 0.08 for a real iiwa 14."""
 
 REGION_STATES = 10_000
 """Maximum number of training states used to compute the trained region."""
@@ -80,7 +77,7 @@ class Problem:
         power: exponent κ of the likelihood, which is below 1 if samples are correlated.
         correlation: correlation time `(nq,)` of the noise of each torque [s]; `None` if unknown.
         pinned: values `(components,)` of latent forces that the robot already includes, keyed by prior. Their
-            prior mean is minus this value, and their posterior mean is zero. Other forces are conditioned on
+            prior mean is minus this value, their posterior mean is 0, and other forces are conditioned on
             them.
         inducing: inducing inputs of each prior, for sparse inference; `None` for exact inference.
         state_std: standard deviation of the noise of q and q̇, `(2 nq,)`, or `None` if there is none.
@@ -108,9 +105,7 @@ class Problem:
         return self.system.with_robot(torch.func.functional_call(self.parameters, own, ()))
 
     def noise_at(self, tensors: Mapping[str, Tensor], measurement: int) -> Tensor:
-        """Return the noise of a measurement, `(d,)` or `(n, d)`; per-sample noise is scaled by learned
-        noise.
-        """
+        """Return the noise `(d,)` or `(n, d)` of a measurement; learned noise scales per-sample noise."""
         std = self.training.noise_std[measurement]
         learned = tensors.get(noise_key(measurement))
         if learned is None:
@@ -197,9 +192,7 @@ class Problem:
 
     @torch.no_grad()
     def torque_residual(self) -> Tensor:
-        """Return the RMS `(nq,)` of the force residuals and of M times the acceleration residuals [N m,
-        N].
-        """
+        """Return the RMS `(nq,)` of force residuals and of M times acceleration residuals [N m, N]."""
         squares = [torch.zeros_like(self.system.robot.mass)[None]]
         for m in self.training.measurements:
             at = m.at(self.system)
@@ -213,7 +206,7 @@ class Problem:
 
     @torch.no_grad()
     def hidden_torque(self) -> Tensor:
-        """Return the standard deviation σ `(nq,)` of torques that hardly affect accelerations; 0 for other
+        """Return the standard deviation `(nq,)` of torques that hardly affect accelerations; 0 for other
         joints.
 
         In contact, a force along the constraint does not change the accelerations. For a joint that acts

@@ -225,8 +225,7 @@ def _log_scale(std: Tensor, weight: Tensor | None) -> Tensor:
 
 
 def _fixed(A: Tensor, rank: int, violated: Tensor, weight: Tensor) -> Tensor:
-    """Return the negative log likelihood `()` of the violation A q̈ − b, in the directions fixed by A q̈ =
-    b."""
+    """Return the negative log likelihood `()` of the constraint violation A q̈ − b."""
     # ½ w |(A σ)⁺ (A q̈ − b)|² + ½ rank A log 2π
     rows, C = _independent(A, rank)
     pinv = torch.linalg.pinv(rows) if C is None else torch.linalg.pinv(rows) @ C

@@ -123,8 +123,7 @@ def flat_states(
 def states_at(
     system: ConstrainedSystem, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor | None
 ) -> tuple[States, torch.Size]:
-    """Return flattened states with equations of motion, and the batch shape; for errors, see
-    `flat_states`."""
+    """Return flattened states with equations of motion, and the batch shape; see `flat_states`."""
     flat = flat_states(system, q, qd, tau, active)
     return flat.with_equations(system), flat.batch
 

@@ -92,8 +92,7 @@ def initial(problem: Problem, learn_noise: bool, learn_torque_noise: bool = Fals
 def _with_friction(problem: Problem, noise: Tensors) -> Tensors:
     """Return the most likely Coulomb friction coefficient, and hyperparameters of the remaining forces.
 
-    From a poor initial coefficient, learning may reach a local optimum at which friction depends on the
-    state.
+    From a poor coefficient, learning may reach a local optimum in which friction depends on the state.
     """
     few = dataclasses.replace(problem, training=problem.training.evenly(FRICTION_SAMPLES), inducing=None)
     like = problem.system.robot.mass
@@ -153,8 +152,7 @@ def _force_scale(p: int, blocks: Sequence[Block], commensurate: bool, beyond_noi
     """Return the root mean square `(components,)` of the least-squares force of prior p.
 
     The rows determine only the sum of components with the same direction, which the minimum-norm solution
-    divides evenly. Components with different units, such as viscous and dry friction, are initialised
-    separately.
+    divides evenly. Components with different units, such as viscous and dry friction, are fitted separately.
     """
     operators = [block.operators[p] for block in blocks]
     each = torch.arange(operators[0].shape[-1], device=operators[0].device)
@@ -212,8 +210,7 @@ def box_around(
 def doubts_at_bounds(tensors: Mapping[str, Tensor], box: Bounds) -> tuple[str, ...]:
     """Return warnings about hyperparameters for which learning ended at a bound.
 
-    Forces may vanish and inputs may be irrelevant, but noise at a bound or a force at its upper bound is
-    questionable.
+    Noise at any bound is questionable, and so is a force at its upper bound.
     """
     doubts = []
     for key, (low, high) in box.items():
@@ -309,8 +306,7 @@ class Search:
         progress: Progress | None = None,
         begin: Mapping[str, Tensor] | None = None,
     ) -> Learned:
-        """Learn the hyperparameters, starting with a subset if the data set is large, and restarting on
-        request.
+        """Learn the hyperparameters, with warm starts and restarts as requested by the options.
 
         Args:
             progress: called after each evaluation on all data.

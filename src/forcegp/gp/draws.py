@@ -83,8 +83,7 @@ class FunctionSamples:
         return [[w.permute(2, 0, 1).contiguous() for w in weights] for weights in self.weights]
 
     def by_runs(self, p: int, features: Features, samples: range, runs: int) -> Tensor:
-        """Evaluate the given samples of process p, each at a separate run of states, `(samples · runs,
-        components)`."""
+        """Evaluate samples of process p, each at a separate run of states, `(samples · runs, components)`."""
         parts = []
         for basis, w in zip(self.bases[p], self._weights_by_sample[p], strict=True):
             phi, w_runs = basis(features).unflatten(1, (len(samples), runs)), w[samples.start : samples.stop]

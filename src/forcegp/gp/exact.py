@@ -58,8 +58,7 @@ class ExactPosterior:
         """Condition on rows.
 
         Raises:
-            NumericalError: the covariance of the rows is not positive definite, or its noise is below
-                rounding error.
+            NumericalError: the covariance of the rows is indefinite, or the noise is below rounding error.
         """
         fitted = condition(processes, params, blocks)
         if len(fitted.L):
@@ -133,9 +132,7 @@ class ExactPosterior:
 
     @cached_property
     def _weights(self) -> list[list[Tensor]]:
-        """Weights `(components, n, 1)` for each process and block, by which k(x, X) is multiplied in the
-        mean.
-        """
+        """Weights `(components, n, 1)` for each process and block; the mean is the sum of k(x, X) weights."""
         return self.weights_of(self.alpha[:, None])
 
     def weights_of(self, rows: Tensor) -> list[list[Tensor]]:

@@ -1,9 +1,9 @@
 """Named kernel inputs, rows of samples, and feature maps φ(x) of kernels and random functions.
 
-The noise variance is 1, and entries of the covariance K of whitened rows have rounding errors of about ε K_ii
-with ε = 2.2e-16. The relative errors of standard deviations are therefore about ε K_ii, or ε/r if data reduce
-a prior variance to a fraction r. Compared with 80-bit arithmetic, they are 0.1 % at K_ii = 1e12 and 0.5 % at
-r = 1e-13.
+With unit noise variance, entries of the covariance K of whitened rows have rounding errors of about ε K_ii
+with ε = 2.2e-16. Standard deviations therefore have relative errors of about ε K_ii, or ε/r if data reduce a
+prior variance to a fraction r. Compared with 80-bit arithmetic, they are 0.1 % at K_ii = 1e12 and 0.5 % at r
+= 1e-13.
 """
 
 from __future__ import annotations
@@ -56,8 +56,8 @@ class Standardization:
     common scale of the columns of a vector, so results hardly depend on the orientation of the axes. Features
     with a meaningful zero, such as velocities, are scaled but not shifted.
 
-    Columns that are constant up to rounding error are listed in `constant`. Their scale is 1, or that of
-    their vector.
+    Columns that are constant up to rounding error are listed in `constant`; their scale is 1 or their
+    vector's.
     """
 
     mean: Mapping[str, Tensor]

@@ -32,9 +32,7 @@ Parameters = Mapping[str, Tensor]
 Initial = dict[str, Tensor]
 
 LARGEST_EXPONENT = 300.0
-"""Bound on exponents; exp(−300) is far below rounding error but not a denormal number, which would be
-slow.
-"""
+"""Bound on exponents; exp(−300) is far below rounding error but far above (slow) denormal numbers."""
 LINEAR_PAIRS = 8
 """Divisor of the number of random features of a kernel, for each linear kernel that it is multiplied by."""
 

@@ -127,8 +127,8 @@ class SparsePosterior:
         """Factorise A = I + G.
 
         Raises:
-            NumericalError: A is not positive definite, for example because samples were removed that had not
-                been added.
+            NumericalError: A is not positive definite, for example after removing samples that were not
+                added.
         """
         # A = I + G = L Lᵀ
         A = sums.G + torch.eye(len(sums.G), dtype=sums.G.dtype, device=sums.G.device)

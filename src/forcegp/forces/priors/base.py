@@ -45,9 +45,7 @@ class ForcePrior(ABC):
     coupled: bool = False
     """Whether the prior includes Coulomb friction proportional to the multiplier."""
     vectors: tuple[str, ...] = ()
-    """Names of vector inputs, which are standardized with a common scale so that results do not depend on the
-    axes.
-    """
+    """Vector inputs, which have a common scale so that results do not depend on the axes."""
     commensurate: bool = True
     """Whether all components of f have the same physical unit."""
     sticks: bool = False
@@ -138,11 +136,9 @@ class OperatorForcePrior(ForcePrior):
         name: prefix of the hyperparameters.
         size: number of components of f.
         operator_function: function that maps `(system, states)` to E(x) `(n, nq, size)`.
-        feature_function: function that maps `(system, states)` to named inputs `(n, w)`; by default, q, q̇
-            and τ.
+        feature_function: function that maps `(system, states)` to named inputs `(n, w)`; default q, q̇, τ.
         kernel: covariance of each component.
-        target: `joint` for a force in Q, `contact` for one in Q_z, or `constraint` for Q along the
-            constraint.
+        target: `joint` for Q, `contact` for Q_z, or `constraint` for Q along the constraint.
 
     Example:
         >>> import torch, forcegp

@@ -21,9 +21,9 @@ class DrivePrior(ConstantForcePrior):
     """A prior on relative errors s δ_i of drive constants (torque constant times gear ratio).
 
     Q_i = s τ_i δ_i with δ_i ~ N(0, 1). Logged currents are converted to torques with nominal drive constants
-    (`torque_constant` and `gear_ratio` in a mapping). The true constants are larger by the factor 1 + s δ_i.
-    Since motion depends only on the ratio of drive constants to inertia, specify known masses or record a log
-    with a known payload.
+    (`torque_constant` and `gear_ratio` in a mapping). The true constants are 1 + s δ_i times the nominal
+    ones. Since motion depends only on the ratio of drive constants to inertia, specify known masses or record
+    a log with a known payload.
 
     Args:
         std: relative standard deviation s of the drive constants.

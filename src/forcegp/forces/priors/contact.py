@@ -106,9 +106,7 @@ class SurfaceForcePrior(ForcePrior):
 
 
 def _along(point: ContactPoint, name: str) -> Tensor:
-    """Return an input on the surface: `position` or `velocity` in the tangent frame, or the sliding
-    `speed`.
-    """
+    """Return an input on the surface: the tangential `position` or `velocity`, or the sliding `speed`."""
     if name == "speed":
         # The floor keeps the derivative of the root finite at rest.
         return point.sliding[1].square().sum(-1, keepdim=True).clamp(min=1e-30).sqrt()
@@ -149,13 +147,11 @@ class ContactForcePrior(SurfaceForcePrior):
 class SlidingFrictionPrior(SurfaceForcePrior):
     """A prior on friction that opposes sliding, with v = (1 − n nᵀ) ṗ_E and s(v) = v / √(|v|² + ε²).
 
-    The force is F_z = −θ_v v − (θ_d + λ (μ + μ_s e^{−|v|²/v_s²})) s(v), and the moment about the normal is
-    −θ_t λ s(ω_n) n.
+    F_z = −θ_v v − (θ_d + λ (μ + μ_s e^{−|v|²/v_s²})) s(v). The moment about the normal is −θ_t λ s(ω_n) n.
 
     The unknowns are the scalar functions listed in `terms`: `viscous` θ_v [N s/m], `dry` θ_d [N], `coulomb`
-    μ, `stribeck` μ_s and `torsion` θ_t [m]. Learning them requires fewer samples than learning the components
-    of a force. By default, they depend on the sliding speed and therefore transfer to surfaces with any
-    position, tilt and shape.
+    μ, `stribeck` μ_s and `torsion` θ_t [m]. They require fewer samples than the components of a force. By
+    default, they depend on the sliding speed, so they transfer to surfaces with any position, tilt and shape.
 
     λ = max(λ_K, 0) / (1 + μ̂ g), where λ_K is the frictionless multiplier under the analytical forces Q_K +
     τ, and g = −Lᵀ J_Eᵀ s(v). This is exact for a single contact with friction −μ̂ λ s(v). In all other cases,
@@ -270,8 +266,7 @@ class NormalForcePrior(ForcePrior):
 
     E = Aᵀ Lᵀ = I − P. Since H Aᵀ = 0, a force Aᵀ g(x) changes the multiplier by −g(x) but does not change the
     accelerations. A joint force prior alone is overconfident along the normal. This prior adds an independent
-    process with the same hyperparameters, so that the force along the normal remains uncertain unless it is
-    measured, for example by a force sensor.
+    process with the same hyperparameters, so the normal force remains uncertain unless it is measured.
 
     Args:
         like: the joint force prior that provides the kernel, inputs and hyperparameters.
@@ -348,9 +343,7 @@ def initial_coulomb(priors: Iterable[ForcePrior], like: Tensor) -> dict[str, Ten
 def coulomb_of(
     priors: Sequence[ForcePrior], tensors: Mapping[str, Tensor], like: Tensor
 ) -> tuple[CoulombFriction, ...]:
-    """Return contact friction with learned parameters, or with initial values if there are no learned
-    ones.
-    """
+    """Return contact friction with learned parameters, or with initial values if they are missing."""
     values = initial_coulomb(priors, like) | dict(tensors)
     return tuple(
         CoulombFriction(prior.contact, *(values[key].exp() for key in coulomb_keys(prior.contact)))
@@ -478,9 +471,7 @@ def below_jamming(
 
 
 def _gain(system: ConstrainedSystem, at: States, friction: Sequence[CoulombFriction]) -> Tensor | None:
-    """Return U (I + LᵀU)⁻¹ `(n, nq, m)`, which maps the frictionless multiplier to friction; `None` if
-    zero.
-    """
+    """Return U (I + LᵀU)⁻¹ `(n, nq, m)`, which maps the frictionless multiplier to friction, or `None`."""
     present = {f.contact: f for f in friction if f.contact in system.contact_names}
     if not present:
         return None

@@ -97,9 +97,7 @@ class InertialPrior(ConstantForcePrior):
         return -columns * self.scale(system.robot)
 
     def scale(self, robot: RobotModel) -> Tensor:
-        """Return the standard deviations S before scales are learned: `(10 nq,)`, or `(11 nq,)` with
-        drives.
-        """
+        """Return the standard deviations S without learned scales: `(10 nq,)`, or `(11 nq,)` with drives."""
         if self.scales is not None:
             return robot.mass.new_tensor((*self.scales, *self.drives))
         m, J = robot.mass[:, None], inertial_parameters(robot.mass, robot.com, robot.inertia)

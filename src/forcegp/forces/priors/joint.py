@@ -149,12 +149,11 @@ class JointFrictionPrior(PerJointPrior):
 
     Q_i = w_i·φ(q̇_i) + c_i with φ = (q̇_i, tanh(q̇_i/v_1), tanh(q̇_i/v_2), …, |Q_G,i| tanh(q̇_i/v_1)). The
     weights w_i and the offset c_i are Gaussian and are marginalised. Three kinds of scales are learned: the
-    size of the friction of each joint, the relevance of each feature, and the size of offsets relative to
-    friction. All joints share the last two. If a joint moved in only one direction, its offset and friction
-    cannot be separated, but the other joints indicate which is likely. With a separate standard deviation for
-    each weight, learning would set most of them to zero, and the model would be overconfident on new motions.
-    A kernel such as `Linear(shared=True, offset=0.3) + SquaredExponential(("velocity",))` adds a smooth
-    remainder.
+    friction of each joint, the relevance of each feature, and the ratio of offsets to friction. All joints
+    share the last two. If a joint moved in only one direction, its offset and friction cannot be separated,
+    but the other joints indicate which is likely. With a separate standard deviation for each weight,
+    learning would set most of them to zero, and the model would be overconfident on new motions. A kernel
+    such as `Linear(shared=True, offset=0.3) + SquaredExponential(("velocity",))` adds a smooth remainder.
 
     Args:
         kernel: covariance of each component; by default linear in the features.
@@ -216,8 +215,7 @@ class DisturbancePrior(PerJointPrior):
 
     Different trajectories have independent disturbances. The standard deviations σ_i and correlation times
     T_i are learned. Disturbances cannot be predicted on new motions, so they add σ_i² to the variance of the
-    joint force but nothing to its mean. Inference must be exact, since sparse inference assumes independent
-    samples.
+    joint force. Inference must be exact, since sparse inference assumes independent samples.
 
     Args:
         kernel: covariance over time.
@@ -250,8 +248,7 @@ class CoregionalPrior(ForcePrior):
     same length-scales, W has one column per cause, and κ is the variance of the remainders. This is the
     intrinsic coregionalisation model (Álvarez, Rosasco and Lawrence, *Kernels for vector-valued functions*,
     2012, section 4.2). All of these parameters are learned. The norm of a column of W is the standard
-    deviation of the cause. With separate length-scales, the prior becomes the linear model of
-    coregionalisation.
+    deviation of the cause.
 
     Args:
         kernel: covariance of each process.

@@ -20,9 +20,7 @@ WHOLE = Linear(("tau",)) + ANGLES + RATES * RATES * ANGLES + SquaredExponential(
 """Kernel for a force that includes the motor torque (linear), gravity (a function of the configuration), bias
 and damping forces (quadratic and linear in the velocity), and any joint friction."""
 REMAINING = RATES * ANGLES + SquaredExponential(shared=True)
-"""Kernel for a force that excludes the motor torque: configuration-dependent damping and an arbitrary
-remainder.
-"""
+"""Kernel for a force without the motor torque: configuration-dependent damping and an arbitrary remainder."""
 STATE_RESIDUAL = SquaredExponential(("q", "qd"), shared=True)
 """Kernel for a residual force in addition to friction. It does not depend on the motor torque, because in
 closed loop the residual would learn to cancel this torque."""
