@@ -20,7 +20,7 @@ _SMALL = 4096
 
 
 def batch_last(x: Tensor, tail: int) -> Tensor:
-    """Convert `(*batch, *tail)` to a contiguous tensor `(*tail, B)`; `tail` is a number of dimensions."""
+    """Convert a tensor `(*batch, *tail)` with `tail` trailing dimensions to a contiguous `(*tail, B)`."""
     shape = x.shape[x.ndim - tail :]
     flat = x.reshape((math.prod(x.shape[: x.ndim - tail]), *shape))
     return flat.movedim(0, -1).contiguous()

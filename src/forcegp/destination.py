@@ -18,10 +18,10 @@ PROBE_BYTES = 1 << 16
 
 
 def check_destination(path: str | Path, *, folder: bool = False, own_files: Iterable[str] = ()) -> None:
-    """Check before a long computation that a file or folder can be written, leaving no files behind.
+    """Check, before a long computation, that a file or folder can be written.
 
-    A folder may replace an empty folder, or one whose files all match the patterns `own_files`. If no
-    patterns are given, it may replace any folder.
+    The check leaves no files behind. A folder may replace an empty folder, or one whose files all match the
+    patterns `own_files`. If no patterns are given, it may replace any folder.
 
     Raises:
         DestinationError: a file would replace a folder or vice versa, the folder contains other files, the
@@ -40,7 +40,7 @@ def check_destination(path: str | Path, *, folder: bool = False, own_files: Iter
 
 
 def write_or_keep(write: Callable[[Path], object], path: str | Path) -> None:
-    """Call `write(path)`. If it fails, write to a different path, named in the raised `DestinationError`."""
+    """Call `write(path)`. If this fails, write to a different path and name it in a `DestinationError`."""
     target = Path(path)
     try:
         write(target)

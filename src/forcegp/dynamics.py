@@ -47,7 +47,7 @@ def link_inertia(robot: RobotModel, poses: LinkPoses) -> LinkInertia:
 
 
 def mass_matrix_of(robot: RobotModel, poses: LinkPoses, links: LinkInertia) -> Tensor:
-    """Return M `(nq, nq, B)`: s_iᵀ I^c_j s_j for ancestors i of j, where I^c = Eᵀ I, plus the armature."""
+    """Return M `(nq, nq, B)`, with M_ij = s_iᵀ (Eᵀ I)_j s_j for ancestors i of j, plus the armature."""
     E, S, L = robot.ancestors, poses.angular, poses.linear
     whole = LinkInertia(E.mT @ links.mass, sum_over(E.mT, links.moment), sum_over(E.mT, links.inertia))
     angular, linear = momentum(whole, S, L)
@@ -103,7 +103,7 @@ def known_terms(
 def accelerations(
     robot: RobotModel, poses: LinkPoses, motion: LinkMotion, qdd: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return the spatial accelerations `(3, nq, B)` of the links for q̈ `(nq, B)`, with −g at the base."""
+    """Return the spatial accelerations `(3, nq, B)` of links for q̈ `(nq, B)` and base acceleration −g."""
     E = robot.ancestors
     linear = motion.acceleration + sum_over(E, poses.linear * qdd) - robot.gravity[:, None, None]
     return motion.alpha + sum_over(E, poses.angular * qdd), linear

@@ -23,7 +23,7 @@ from forcegp.errors import DataError, ForceGPError, optional_module
 
 
 def check_count(source: str, what: str, count: int, most: int) -> None:
-    """Raise `DataError` if a log declares more than `most` items. `what` is the plural noun for these items.
+    """Raise `DataError` if a log declares more than `most` items. `what` names the items in the plural.
 
     >>> check_count("run.csv", "columns", 12, limits.COLUMNS)
     """
@@ -37,7 +37,7 @@ def check_count(source: str, what: str, count: int, most: int) -> None:
 
 
 def check_expansion(source: str, size: int, file: int, free: int | None = None) -> None:
-    """Raise `DataError` if the declared `size` of the content far exceeds the size `file` of the file."""
+    """Raise `DataError` if the declared `size` of the content far exceeds `file`, the size of the file."""
     allowed = allowed_bytes(file, free)
     if size > allowed:
         raise DataError(

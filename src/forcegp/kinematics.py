@@ -44,12 +44,12 @@ class LinkPoses:
 
     @property
     def rotation(self) -> Tensor:
-        """Link axes `(*batch, nq, 3, 3)`."""
+        """Orientations of the links `(*batch, nq, 3, 3)`."""
         return batch_first(self.R, self.batch).movedim(-1, -3)
 
     @property
     def position(self) -> Tensor:
-        """Link origins `(*batch, nq, 3)` [m]."""
+        """Origins of the links `(*batch, nq, 3)` [m]."""
         return batch_first(self.p, self.batch).mT
 
 

@@ -176,7 +176,7 @@ def _untrusted(folder: Path, place: Path, got: str) -> MissingDependencyError:
 
 
 def find(folder: Path, key: str) -> Path | None:
-    """Return a trusted kernel with the given key, if any, and delete incomplete or foreign ones."""
+    """Return a trusted kernel with the given key, if any, and delete untrusted kernels with this key."""
     for path in sorted(folder.glob(f"{key}-*.so")):
         if _trusted(path):
             return path

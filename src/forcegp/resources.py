@@ -29,13 +29,13 @@ class MemoryNeedWarning(UserWarning):
 
 
 def free_memory() -> int | None:
-    """Return the memory available without swapping within the container's limit [bytes], or `None`."""
+    """Return the memory available to this process without swapping [bytes]; `None` if unknown."""
     limits = [value for value in (_available(), _container_memory()) if value is not None]
     return min(limits) if limits else None
 
 
 def announce_memory(needed: int, what: str, *, certain: int | None = None) -> None:
-    """Warn if a computation needs most of the free memory; raise `MemoryLimitError` if it needs more.
+    """Warn about high memory use, and raise `MemoryLimitError` if there is not enough free memory.
 
     Call this function before the allocation, with an upper bound `needed` [bytes] and, if that is rough, also
     a lower bound `certain`. `what` is the subject of the message, such as "the covariance of 20,000 points".

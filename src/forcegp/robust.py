@@ -12,9 +12,7 @@ MAD_TO_STD = 1.4826
 
 
 def robust_std(x: NDArray[Any]) -> NDArray[Any]:
-    """Return the median absolute deviation of x, scaled to the standard deviation of a normal
-    distribution.
-    """
+    """Return the median absolute deviation, scaled to the standard deviation of a normal distribution."""
     return np.asarray(MAD_TO_STD * np.median(np.abs(x - np.median(x, axis=0)), axis=0))
 
 

@@ -58,7 +58,7 @@ def fits_of(
 
 
 def run_fit(fit: SweptFit, out: str) -> dict[str, Any]:
-    """Simulate, fit and score on one thread. If an earlier run has written scores, return those instead."""
+    """Run a fit on one thread and return its scores, or return the scores saved by an earlier run."""
     folder = Path(out) / fit.name
     if (folder / SCORE).is_file():
         return json.loads((folder / SCORE).read_text(encoding="utf-8"))

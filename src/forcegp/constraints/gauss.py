@@ -246,7 +246,7 @@ class Equations:
         return free + (self.L @ self._gap(free)[..., None])[..., 0]
 
     def motion_under(self, Q_bar: JointVector) -> tuple[JointVector, ConstraintVector]:
-        """Return q̈ = q̈′ + M⁻¹Aᵀ λ and λ for one step of a rollout."""
+        """Return the acceleration q̈ = q̈′ + M⁻¹Aᵀ λ and the multiplier λ for one step of a rollout."""
         free = self.free_acceleration(Q_bar)
         multiplier = (self.constraint_inertia @ self._gap(free)[..., None])[..., 0]
         return free + (self.M_inv_At @ multiplier[..., None])[..., 0], multiplier

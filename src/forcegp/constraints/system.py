@@ -172,7 +172,7 @@ class ConstrainedSystem:
     def announce_states(self, states: int, copies: float, what: str) -> None:
         """Warn about or reject a computation at many states at once (see `announce_memory`).
 
-        `copies` is its peak memory relative to that of the equations of motion; `what` is its description.
+        `copies` is the peak memory relative to that of the equations of motion; `what` names the computation.
 
         Raises:
             MemoryLimitError: the computation needs more memory than is free.
@@ -223,7 +223,7 @@ class ConstrainedSystem:
 
         Args:
             q, qd: `(*batch, nq)` joint positions and velocities.
-            active: `(*batch, n_contacts)` bool, the closed contacts of each sample; by default all.
+            active: `(*batch, n_contacts)` bool, the closed contacts of each sample; all by default.
 
         Example:
             >>> import torch, forcegp
@@ -264,15 +264,16 @@ class ConstrainedSystem:
     def linearize(
         self, q: JointVector, qd: JointVector, force: JointVector, active: Tensor | None = None
     ) -> Linearization:
-        """Return the constrained acceleration, the multiplier, and their Jacobians in q, q̇ and the force.
+        """Return the constrained acceleration and the multiplier, with their Jacobians.
 
-        q̈(q, q̇, Q) = L b + H (Q_C + Q_G + Q_D + Q) and its exact derivatives are detached from the autograd
-        graph. If Q depends on the state, as learned forces do, add `dforce` times the derivative of Q.
+        The acceleration is q̈(q, q̇, Q) = L b + H (Q_C + Q_G + Q_D + Q). The exact derivatives with respect
+        to q, q̇ and Q are detached from the autograd graph. If Q depends on the state, as learned forces do,
+        add `dforce` times the derivative of Q.
 
         Args:
             q, qd: `(*batch, nq)` joint positions and velocities.
             force: `(*batch, nq)` sum Q of the motor torques and all forces missing from the robot file.
-            active: `(*batch, n_contacts)` bool, the closed contacts of each sample; by default all.
+            active: `(*batch, n_contacts)` bool, the closed contacts of each sample; all by default.
 
         Raises:
             ShapeError: an argument has the wrong shape, dtype or device.

@@ -112,7 +112,7 @@ def project_state(
     """Project (q, q̇) `(*batch, nq)` onto the constraint manifold in the metric of M.
 
     The Newton iteration q ← q − M⁻¹Aᵀ(A M⁻¹ Aᵀ)⁺ c moves along the directions of the constraint forces. The
-    projected velocity q̇ − L A q̇ is the closest admissible one in the kinetic-energy metric. The result
+    projected q̇ − L A q̇ is the closest admissible velocity in the kinetic-energy metric. The result
     satisfies |c(q)| ≤ 1e−12 m (1e−5 m in float32) and A q̇ = 0 for the `active` contacts `(*batch,
     n_contacts)` (all by default).
 

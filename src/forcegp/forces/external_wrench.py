@@ -154,7 +154,7 @@ def least_squares(J: Tensor, r: Tensor, S: Tensor, prior: Tensor) -> tuple[Tenso
 def over_levers(
     mean: Tensor, covariance: Tensor, prior: Tensor, levers: Sequence[Tensor]
 ) -> tuple[Tensor, Tensor]:
-    """Convert an estimate for w ~ N(0, diag prior²) to a mixture for the priors W_s = diag (s prior)², s ≤ 1.
+    """Convert an estimate for w ~ N(0, diag prior²) to one for a mixture of W_s = diag (s prior)², s ≤ 1.
 
     C_s⁻¹ = C⁻¹ + W_s⁻¹ − W⁻¹, m_s = C_s C⁻¹ m, and the evidence is ∝ (|C_s| / |W_s|)^½ exp(½ m_sᵀ C_s⁻¹ m_s).
 
@@ -224,9 +224,9 @@ def observe(log: MomentumLog) -> tuple[Array, Array]:
     """Return the causally filtered mean `(n, k)` and covariance `(n, k, k)` of the wrench along a trajectory.
 
     The state is x = (p, w, η). The wrench w is an Ornstein-Uhlenbeck process with prior variance W that
-    changes by `change` within one second. The learned forces have the error S½ η, where η has unit variance.
-    In a step h, p⁺ = p + h (u + Jᵀ w + S½ η), w⁺ = φ w + √(1 − φ²) W½ ε and η⁺ = ψ η + √(1 − ψ²) ε. φ =
-    exp(−h change²/2 W), and ψ = (c − h)/(c + h) preserves the low-frequency spectral density c of η.
+    changes by about `change` within one second. The learned forces have the error S½ η, where η has unit
+    variance. In a step h, p⁺ = p + h (u + Jᵀ w + S½ η), w⁺ = φ w + √(1 − φ²) W½ ε and η⁺ = ψ η + √(1 − ψ²) ε.
+    Here φ = exp(−h change²/2 W), and ψ = (c − h)/(c + h) preserves the low-frequency spectral density c of η.
     """
     n, nq = log.p.shape
     k = len(log.prior)

@@ -66,7 +66,7 @@ class FrictionMemory:
 
     Attributes:
         weights: weights of the features, `(nq, f)` [N m, N].
-        share: fractions `(nq, 2)` of the torque noise and static friction variances that remain.
+        share: remaining fractions `(nq, 2)` of the variances of torque noise and static friction.
         correlation: integral `(nq,)` of the autocorrelation of the residual over all lags [s].
     """
 
@@ -90,8 +90,9 @@ class FrictionMemory:
 def memory_of(
     problem: Problem, hyperparameters: Mapping[str, Tensor], training: Training
 ) -> dict[str, Tensor]:
-    """Return hyperparameters of the correction learned from samples in free motion, which are empty if the
-    samples are too far apart or not in time order.
+    """Learn the correction from samples in free motion and return it as hyperparameters.
+
+    The result is empty if the samples are too far apart or not in time order.
 
     Args:
         training: samples whose residuals the correction explains.

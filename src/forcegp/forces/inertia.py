@@ -70,9 +70,9 @@ WIDTHS = (0.0, 0.02, 0.05, 0.12)
 def rigid_robot(robot: RobotModel, rows: Rows) -> tuple[RobotModel, bool]:
     """Return the robot that best predicts held-out torques, and whether its links were identified.
 
-    The candidates are the robot file, the robot file with added drive inertia, and a robot with physically
-    consistent identified links and drives. Each candidate must outperform the previous ones by two standard
-    errors over blocks of the log. The held-out acceleration error of no joint may increase.
+    The candidates are the robot file, the robot file with added drive inertia, and a robot with identified,
+    physically consistent links and drives. Each candidate must outperform the previous ones by two standard
+    errors over blocks of the log, without increasing the held-out acceleration error of any joint.
 
     Args:
         robot: robot from the robot file.

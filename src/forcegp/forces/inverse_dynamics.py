@@ -92,7 +92,7 @@ class Rows:
 
     @property
     def leading(self) -> int:
-        """Return the number of samples that precede those kept only as partners, in the order of the log."""
+        """Return the number of leading samples; all later samples are kept only as partners."""
         paired = int(self.partner[0]) > 0
         return len(self.partner) // 2 if paired else len(self.partner)
 
@@ -442,7 +442,7 @@ def log_ratio(after: Tensor, before: Tensor) -> Tensor:
 
 
 def is_harmless(after: Tensor, before: Tensor) -> bool:
-    """Return whether the error of every joint increases by at most the tolerance."""
+    """Return whether the error of every joint stays within the tolerance."""
     return bool((log_ratio(after, before).mean(0) <= TOLERATED).all())
 
 

@@ -123,7 +123,7 @@ class Training:
         return self.part_of or self.samples
 
     def pieces(self, samples: int) -> Iterator[Training]:
-        """Yield pieces of about the given size, each with the same fraction of every measurement."""
+        """Yield pieces of about `samples` samples, each with the same fraction of every measurement."""
         count = max(1, math.ceil(self.samples / samples))
         parts = [torch.arange(len(m.q), device=m.q.device).tensor_split(count) for m in self.measurements]
         yield from (self.of_rows(rows) for rows in zip(*parts, strict=True))
@@ -135,7 +135,7 @@ class Training:
 
     @property
     def free_motions(self) -> int:
-        """Return the number of accelerations in free motion in the measurement that has most of them."""
+        """Return the largest number of accelerations in free motion in any one measurement."""
         free = [int((~m.active.any(-1)).sum()) for m in self.measurements if m.quantity == "qdd"]
         return max(free, default=0)
 
@@ -150,12 +150,12 @@ class Training:
         return tuple(name for name, seen in zip(system.contact_names, closed, strict=True) if not seen)
 
     def thinned(self, samples: int) -> Training:
-        """Return about this many samples, chosen by farthest-point sampling of each measurement's states."""
+        """Select about `samples` samples by farthest-point sampling of the states of each measurement."""
         share = samples / self.samples
         return self.of_rows([_spread(m, math.ceil(share * len(m.q))) for m in self.measurements])
 
     def evenly(self, samples: int) -> Training:
-        """Return at most this many evenly spaced samples."""
+        """Select at most `samples` evenly spaced samples."""
         step = max(1, math.ceil(self.samples / samples))
         return self.of_rows([torch.arange(0, len(m.q), step, device=m.q.device) for m in self.measurements])
 
@@ -180,7 +180,7 @@ class Training:
         )
 
     def joined(self, more: Training, noise_std: Sequence[Tensor]) -> Training:
-        """Add measurements with the given noise and slopes."""
+        """Add other measurements, with their noise and slopes."""
         weights, slopes = tuple(torch.ones_like(m.t) for m in more.measurements), more.slopes or ()
         return dataclasses.replace(
             self,
@@ -358,7 +358,7 @@ def measurement_of(
     Raises:
         UnknownNameError: the quantity cannot be measured, or a contact is not logged.
         ModelError: the noise is not positive, or it is missing for a quantity other than qdd.
-        DataError: the data have other joints than the robot.
+        DataError: the joints in the data differ from those of the robot.
     """
     data, quantity = observation.data, observation.quantity
     if quantity not in QUANTITIES or quantity not in COLUMNS:

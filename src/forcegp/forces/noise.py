@@ -95,7 +95,7 @@ class Noise:
         return self.torque == "learn" if isinstance(self.torque, str) else False
 
     def for_priors(self, priors: Sequence[ForcePrior]) -> Noise:
-        """Replace `torque="auto"`: torque noise is learned only with friction or inertial priors."""
+        """Resolve `torque="auto"`. Torque noise is learned if there are friction or inertial priors."""
         if not isinstance(self.torque, str) or self.torque != "auto":
             return self
         measured = any(isinstance(prior, JointFrictionPrior | InertialPrior) for prior in priors)
@@ -120,7 +120,7 @@ def external_std(external: Mapping[str, float] | None, robot: RobotModel) -> Ten
     """Return the standard deviation of unknown forces on the joints `(nq,)`, or `None` if there are none.
 
     Raises:
-        UnknownNameError: the robot does not have a named joint.
+        UnknownNameError: a joint does not exist.
     """
     for joint in external or {}:
         if joint not in robot.joint_names:

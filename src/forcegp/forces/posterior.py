@@ -46,7 +46,7 @@ LOW, HIGH, SPREAD, GROWTH = (REGION + name for name in ("low", "high", "spread",
 the speed and torque of each joint, each `(2, nq)`, and g `(nq,)` [N m, N]."""
 OUTERMOST, WIDEST = 0.01, 0.16
 """Smallest and largest fraction of the training samples beyond each limit of the region. The largest is the
-tail of a Gaussian beyond one standard deviation. At least one independent sample is beyond.
+tail of a Gaussian beyond one standard deviation. At least one independent sample lies beyond.
 """
 RELATIVE = 0.05
 """Prior ratio of the growth rate g to the typical load of a joint; torque constants and load-dependent
@@ -208,7 +208,7 @@ def trained_region(
 
 
 def distance_beyond(tensors: Mapping[str, Tensor], qd: Tensor, tau: Tensor) -> Tensor:
-    """Return the distance D `(*batch, nq)` in training standard deviations; 0 inside or without a region."""
+    """Return the distance D `(*batch, nq)` from the trained region, in training standard deviations."""
     if LOW not in tensors:
         return torch.zeros_like(qd)
     x = torch.stack([qd, tau], dim=-2)
@@ -332,10 +332,10 @@ LARGE_JITTER = 0.01
 
 
 def force_correlation(posterior: ForcePosterior, system: ConstrainedSystem, at: States) -> Tensor:
-    """Return the posterior correlation `(n, nq)` of Q and Q_z for each state and joint; 0 if either is
-    certain.
+    """Return the posterior correlation of Q and Q_z for each state and joint, `(n, nq)`.
 
-    corr_i = Cov(Q_i, Q_z,i) / √(Var Q_i Var Q_z,i), excluding the part of Q along the constraint.
+    corr_i = Cov(Q_i, Q_z,i) / √(Var Q_i Var Q_z,i), excluding the part of Q along the constraint; 0 if either
+    variance is zero.
     """
     z = affine_map(system, at, ("joint_force", "contact_friction"))
     rows = posterior.rows(system, at, z)

@@ -48,12 +48,12 @@ REGION_STATES = 10_000
 
 
 def kernel_parameters(tensors: Mapping[str, Tensor]) -> Tensors:
-    """Return the hyperparameters of the priors from the learned tensors."""
+    """Extract the hyperparameters of the priors from the learned tensors."""
     return {key: x for key, x in tensors.items() if not key.startswith(OWN) and not key.endswith(MIXED)}
 
 
 def analytical_parameters(tensors: Mapping[str, Tensor]) -> Tensors:
-    """Return the analytical parameters θ_A from the learned tensors, keyed by their names in the module."""
+    """Extract the analytical parameters θ_A from the learned tensors, keyed by their names in the module."""
     prefix = ANALYTICAL + "."
     return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
 
@@ -122,9 +122,9 @@ class Problem:
         return any(prior.coupled for prior in self.priors)
 
     def with_coulomb_errors(self, tensors: Mapping[str, Tensor]) -> tuple[Problem, Tensors]:
-        """Return the problem and tensors with the error of learned Coulomb friction as an additional force.
+        """Add the error of learned Coulomb friction as a force to the problem and the tensors.
 
-        They are used for conditioning, but not for learning.
+        The result is used for conditioning, but not for learning.
         """
         friction = self.coulomb(tensors)
         priors = tuple(CoulombErrorPrior(f.contact, friction) for f in friction)
@@ -206,8 +206,7 @@ class Problem:
 
     @torch.no_grad()
     def hidden_torque(self) -> Tensor:
-        """Return the standard deviation `(nq,)` of torques that hardly affect accelerations; 0 for other
-        joints.
+        """Return the standard deviation `(nq,)` of torques that hardly affect accelerations, otherwise 0.
 
         In contact, a force along the constraint does not change the accelerations. For a joint that acts
         along the constraint, P_ii is near zero, and its noise and friction cannot be distinguished from those
@@ -253,13 +252,13 @@ class Problem:
         return trained_region(qd, tau, dataclasses.replace(self, training=training).typical_load())
 
     def negative_log_likelihood(self, params: Tensors, rows: WhitenedRows) -> Tensor:
-        """Return the negative log likelihood of the rows, in weight space if finite priors permit it."""
+        """Return the negative log likelihood of the rows, computed in weight space if possible."""
         exact = self.inducing is None or not is_finite(self.priors)
         of = negative_log_likelihood if exact else negative_log_likelihood_of_weights
         return of(self.priors, params, rows.blocks) + rows.constant
 
     def rows_for(self, tensors: Tensors, held: Tensors) -> WhitenedRows:
-        """Return the rows for given tensors, which are cached if they do not depend on learned tensors."""
+        """Return the rows for given tensors. They are cached if they do not depend on the tensors."""
         keys = [*tensors, *held]
         own = any(key.startswith(OWN) or key.endswith(MIXED) for key in keys)
         return self.rows({**held, **tensors}) if own else self.fixed_rows
@@ -276,7 +275,7 @@ PIECE_SAMPLES = 8192
 
 @dataclass(frozen=True, eq=False)
 class Totals:
-    """State of sparse conditioning after a number of pieces of the log.
+    """State of sparse conditioning after part of the log has been processed.
 
     Attributes:
         sums: sums over the whitened rows.
@@ -292,7 +291,7 @@ class Totals:
 
     @classmethod
     def zero(cls, problem: Problem, basis: LatentBasis) -> Totals:
-        """Return totals over zero samples."""
+        """Return the totals of an empty log."""
         like = next(iter(basis.params.values()))
         return cls(Sums.zero(basis, like), like.new_zeros(()), like.new_zeros(()), 0)
 
@@ -384,7 +383,7 @@ def is_finite(priors: Sequence[ForcePrior]) -> bool:
 
 
 def is_sparse(inference: str, priors: Sequence[ForcePrior], samples: int) -> bool:
-    """Return whether inference is sparse. By default, it is for finite priors or many samples.
+    """Return whether inference is sparse. By default, it is sparse for finite priors and large data sets.
 
     Raises:
         ModelError: sparse inference is requested, but a force is a function of time.

@@ -123,7 +123,7 @@ def flat_states(
 def states_at(
     system: ConstrainedSystem, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor | None
 ) -> tuple[States, torch.Size]:
-    """Return flattened states with equations of motion, and the batch shape; see `flat_states`."""
+    """Return flattened states with equations of motion, and the batch shape (see `flat_states`)."""
     flat = flat_states(system, q, qd, tau, active)
     return flat.with_equations(system), flat.batch
 
@@ -341,7 +341,7 @@ def hidden_forces(
 
 
 def affine_map(system: ConstrainedSystem, at: States, quantity: str | Sequence[str]) -> AffineMap:
-    """Return the affine map of one or several stacked quantities; the errors are those of `affine_maps`."""
+    """Return the affine map of one or several stacked quantities (see `affine_maps`)."""
     return affine_maps(system, at, quantity)[0]
 
 

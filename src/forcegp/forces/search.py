@@ -208,9 +208,9 @@ def box_around(
 
 
 def doubts_at_bounds(tensors: Mapping[str, Tensor], box: Bounds) -> tuple[str, ...]:
-    """Return warnings about hyperparameters for which learning ended at a bound.
+    """Return warnings about hyperparameters that ended at a bound.
 
-    Noise at any bound is questionable, and so is a force at its upper bound.
+    Noise at either bound and forces at the upper bound are questionable.
     """
     doubts = []
     for key, (low, high) in box.items():

@@ -110,7 +110,7 @@ class ProcessBasis:
 
     @cached_property
     def to_inducing(self) -> Callable[[Features], Tensor] | None:
-        """Function x ↦ k(x, Z) `(components, n, m)` of the rest; `None` if there are no inducing points."""
+        """Function x ↦ k(x, Z) `(components, n, m)` for the rest; `None` if there are no inducing points."""
         rest = self.split.rest
         if rest is None or not points(self.inducing):
             return None

@@ -83,7 +83,7 @@ class FunctionSamples:
         return [[w.permute(2, 0, 1).contiguous() for w in weights] for weights in self.weights]
 
     def by_runs(self, p: int, features: Features, samples: range, runs: int) -> Tensor:
-        """Evaluate samples of process p, each at a separate run of states, `(samples · runs, components)`."""
+        """Evaluate samples of process p, each at its own run of states, `(samples · runs, components)`."""
         parts = []
         for basis, w in zip(self.bases[p], self._weights_by_sample[p], strict=True):
             phi, w_runs = basis(features).unflatten(1, (len(samples), runs)), w[samples.start : samples.stop]
@@ -107,7 +107,7 @@ def draw_priors(
 
     Args:
         processes, params, blocks: as for `gram`.
-        measured: whether any row depends on each process.
+        measured: for each process, whether any row depends on it.
         generator: source of randomness, on the CPU.
         features: number of random features per component.
 

@@ -58,7 +58,7 @@ class ExactPosterior:
         """Condition on rows.
 
         Raises:
-            NumericalError: the covariance of the rows is indefinite, or the noise is below rounding error.
+            NumericalError: the covariance is not positive definite, or the noise is below rounding error.
         """
         fitted = condition(processes, params, blocks)
         if len(fitted.L):
@@ -117,7 +117,7 @@ class ExactPosterior:
 
     @cached_property
     def measured(self) -> tuple[bool, ...]:
-        """Whether any row depends on each process. Processes that affect no row keep their prior."""
+        """Flags of the processes that affect at least one row. All other processes keep their prior."""
         return tuple(map(any, self._depends))
 
     @cached_property
@@ -132,7 +132,7 @@ class ExactPosterior:
 
     @cached_property
     def _weights(self) -> list[list[Tensor]]:
-        """Weights `(components, n, 1)` for each process and block; the mean is the sum of k(x, X) weights."""
+        """Weights `(components, n, 1)` for each process and block; products with k(x, X) sum to the mean."""
         return self.weights_of(self.alpha[:, None])
 
     def weights_of(self, rows: Tensor) -> list[list[Tensor]]:
@@ -213,8 +213,9 @@ class ExactPosterior:
         return -float(self.conditioned.negative_log_likelihood(target_of(self.blocks)))
 
     def draw(self, count: int, generator: torch.Generator, features: int = FEATURES) -> FunctionSamples:
-        """Draw f(x) + k(x, X) WᵀΣ⁻¹(y − W f(X) − ε) from the posterior (Matheron's rule), with f drawn from
-        the prior, ε ~ N(0, I) and Σ = K + I.
+        """Draw functions f(x) + k(x, X) WᵀΣ⁻¹(y − W f(X) − ε) from the posterior (Matheron's rule).
+
+        Here f is drawn from the prior, ε ~ N(0, I) and Σ = K + I.
 
         Args:
             generator: source of randomness, on the CPU.

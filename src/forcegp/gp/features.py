@@ -2,8 +2,7 @@
 
 With unit noise variance, entries of the covariance K of whitened rows have rounding errors of about ε K_ii
 with ε = 2.2e-16. Standard deviations therefore have relative errors of about ε K_ii, or ε/r if data reduce a
-prior variance to a fraction r. Compared with 80-bit arithmetic, they are 0.1 % at K_ii = 1e12 and 0.5 % at r
-= 1e-13.
+prior variance to a fraction r. In 80-bit comparisons, they are 0.1 % at K_ii = 1e12 and 0.5 % at r = 1e-13.
 """
 
 from __future__ import annotations
@@ -56,8 +55,7 @@ class Standardization:
     common scale of the columns of a vector, so results hardly depend on the orientation of the axes. Features
     with a meaningful zero, such as velocities, are scaled but not shifted.
 
-    Columns that are constant up to rounding error are listed in `constant`; their scale is 1 or their
-    vector's.
+    Columns that are constant up to rounding error have scale 1 (or that of their vector); see `constant`.
     """
 
     mean: Mapping[str, Tensor]

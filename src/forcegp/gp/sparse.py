@@ -200,7 +200,7 @@ class SparsePosterior:
 
     @cached_property
     def measured(self) -> tuple[bool, ...]:
-        """Whether each process affects any row. Processes that affect no row keep their prior."""
+        """Flags of the processes that affect at least one row. All other processes keep their prior."""
         # The factor of A = I + G is that of the identity where G is zero.
         diagonal = self.L.diagonal().abs()
         slices = (self.basis.of_process(p) for p in range(len(self.basis.parts)))

@@ -33,7 +33,7 @@ CHUNK_SAMPLES = 1024
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """Those sums over the samples that require little memory.
+    """All sums over the samples except the large matrix G.
 
     Attributes:
         v: Σ V Wᵀy `(size,)`.
@@ -67,7 +67,7 @@ class Sums(Moments):
 
     @classmethod
     def zero(cls, basis: LatentBasis, like: Tensor) -> Sums:
-        """Return sums over zero samples."""
+        """Return the sums of an empty data set."""
         n, p = basis.size, len(basis.parts)
         return cls(*(like.new_zeros(shape) for shape in ((n,), (), (), (p,), (p,), (n, n))))
 

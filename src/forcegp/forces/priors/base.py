@@ -61,7 +61,7 @@ class ForcePrior(ABC):
 
     @property
     def prefix(self) -> str:
-        """Prefix of the hyperparameters; if they are shared, the name of the other prior."""
+        """Prefix of the hyperparameters. Priors with the same prefix share their hyperparameters."""
         return self.name
 
     @abstractmethod

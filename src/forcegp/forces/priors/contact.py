@@ -123,9 +123,8 @@ class ContactForcePrior(SurfaceForcePrior):
     Args:
         contact: name of a surface contact of the system.
         kernel: covariance of each component.
-        inputs: inputs of the force, chosen from the `position`, `velocity` and `speed` of the contact point
-            along the surface.
-        name: prefix of the hyperparameters; by default the name of the contact.
+        inputs: inputs of the force, chosen from the tangential `position`, `velocity` and `speed`.
+        name: prefix of the hyperparameters; defaults to the name of the contact.
 
     Example:
         >>> ContactForcePrior("table").target
@@ -155,7 +154,7 @@ class SlidingFrictionPrior(SurfaceForcePrior):
 
     λ = max(λ_K, 0) / (1 + μ̂ g), where λ_K is the frictionless multiplier under the analytical forces Q_K +
     τ, and g = −Lᵀ J_Eᵀ s(v). This is exact for a single contact with friction −μ̂ λ s(v). In all other cases,
-    it neglects second-order terms: μ (μ − μ̂), and the products of μ with other friction at the contact,
+    second-order terms are neglected: μ (μ − μ̂), and the products of μ with other friction at the contact,
     friction at other contacts, and unknown joint forces. If unknown joint forces are large, use `dry`, or
     learn these forces as analytical parameters.
 
@@ -163,7 +162,7 @@ class SlidingFrictionPrior(SurfaceForcePrior):
         contact: name of a surface contact of the system.
         kernel: covariance of each unknown.
         inputs: inputs of the functions, chosen from `position`, `velocity` and `speed`.
-        name: prefix of the hyperparameters; by default the name of the contact.
+        name: prefix of the hyperparameters; defaults to the name of the contact.
         smoothing: smoothing speed ε [m/s].
         terms: friction terms.
         friction_coefficient: friction coefficient μ̂.
@@ -357,7 +356,7 @@ def _coupled_priors(priors: Iterable[ForcePrior]) -> list[SlidingFrictionPrior]:
 
 @dataclass(frozen=True, eq=False)
 class CoulombErrorPrior(ConstantForcePrior):
-    """Prior on the error of learned friction, Q_z = λ̂ ∂(μ u)/∂(log μ, log ε) δ with δ ~ N(0, 1).
+    """A prior on the error of learned friction, Q_z = λ̂ ∂(μ u)/∂(log μ, log ε) δ with δ ~ N(0, 1).
 
     λ̂ is the multiplier under the analytical forces and the learned friction. The unit standard deviation of
     δ is about the width of the weak priors on log μ and log ε (`forces/search.py`).

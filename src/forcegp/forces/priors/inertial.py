@@ -192,7 +192,7 @@ class PayloadPrior(ConstantForcePrior):
     for this payload and accurate to first order for others. `around` linearizes at the current estimate.
 
     With `update` and `forget`, a model tracks a payload that is picked up or put down. Fitting to a log
-    without a payload would set the scale s to zero, so fix it while learning other priors: `model.fit(data,
+    without a payload would set the scale s to zero. To keep it, list the other priors: `model.fit(data,
     learn=["joint"])`.
 
     Args:

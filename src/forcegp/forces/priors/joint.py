@@ -156,7 +156,7 @@ class JointFrictionPrior(PerJointPrior):
     such as `Linear(shared=True, offset=0.3) + SquaredExponential(("velocity",))` adds a smooth remainder.
 
     Args:
-        kernel: covariance of each component; by default linear in the features.
+        kernel: covariance of each component; linear in the features by default.
         speeds: saturation speeds v_1, v_2, … [rad/s, m/s].
         load: whether to include the load-dependent feature |Q_G,i| tanh(q̇_i/v_1).
         name: prefix of the hyperparameters.

@@ -72,7 +72,7 @@ def friction_priors(system: ConstrainedSystem) -> tuple[ForcePrior, ...]:
 
 
 def friction_and_residual_priors(system: ConstrainedSystem) -> tuple[ForcePrior, ...]:
-    """Return `friction_priors` and a prior on an arbitrary joint force that depends on (q, q̇)."""
+    """Return `friction_priors` together with a prior on an arbitrary joint force that depends on (q, q̇)."""
     residual = JointForcePrior(STATE_RESIDUAL, inputs=("q", "qd"))
     normal = (NormalForcePrior(residual),) if system.m else ()
     return (*friction_priors(system), residual, *normal)
