@@ -208,8 +208,8 @@ def atomic_file(path: str | Path, mode: int = 0o666) -> Iterator[Path]:
 def written_folder(path: str | Path) -> Iterator[Path]:
     """Yield a temporary folder whose files are moved to the target folder if the block ends without an error.
 
-    Each file atomically replaces the file with the same name, in the order of writing, so the last file
-    exists only if all others do. All other files in the target folder are deleted.
+    Files atomically replace those with the same name, in the order of writing, so the last file exists only
+    if all others do. All other files in the target folder are deleted. Symbolic links are followed.
 
     Yields:
         The temporary folder.

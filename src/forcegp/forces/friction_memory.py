@@ -166,7 +166,7 @@ def learn_memory(
         target = (remaining[:, j].square() - white[:, j] - forces[:, j]) / total[:, j]
         found = torch.from_numpy(scipy.optimize.nnls(rows.cpu().numpy(), target.cpu().numpy())[0])
         share[j] = found.to(share).clamp(min=LEAST_SHARE, max=1.0)
-        # A new motion is like another stretch, so its variance scatters as much as theirs does.
+        # A new motion is like another block, so its variance scatters as much as theirs does.
         square = remaining[:, j].square() / (white[:, j] + forces[:, j] + noise[:, j] @ share[j])
         by_stretch = torch.stack([square[group == g].mean() for g in group.unique()])
         share[j] *= (by_stretch.mean() + by_stretch.std()).clamp(min=1.0)
