@@ -12,7 +12,7 @@ light joint. The delay is therefore an additional unknown.
 Torques alone are not sufficient. In closed loop, torque-sensor noise exceeds the torque that accelerates a
 light joint. Divided by the inertia in the file, this noise predicts accelerations far larger than the
 measured ones. If the mean squared error is ten times the variance of the accelerations, the drive inertia is
-set to the maximum of −½ Σ ε²/s² + v Σ log |M|. v ≤ 1 is the smallest value for which the accelerations are
+set to the maximum of −½ Σ ε²/s² + v Σ log |M|. Here v ≤ 1 is the smallest value for which accelerations are
 predicted as well as by their mean. No joint's torque error on held-out blocks may increase by more than 2 %.
 
 If an `InertialPrior` is given, the inertial parameters of the robot are set to their posterior mean in one

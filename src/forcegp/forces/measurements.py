@@ -1,4 +1,4 @@
-"""Conversion of the columns of a log to measured quantities at states, which a posterior is conditioned on.
+"""Measured quantities at states, converted from the columns of a log and used to condition a posterior.
 
 In contact, A q̈ = b. If a measurement violates this equation by far more than the usual noise, because of an
 impact or an incorrect contact flag, the contact does not persist and the acceleration is unusable.

@@ -6,7 +6,7 @@ theirs. Each function drawn from the posterior is a deterministic force field th
 
 Accelerations in contact depend only on Q + Q_z (remark 3.3). The two are distinguished by their directions
 (Q_z acts only in contact, and tangentially), by their inputs, and by measurements of either force. Their
-posterior correlation measures this: at −1, only the sum is identifiable; at 0, both are.
+posterior correlation is −1 if only the sum is identifiable, and 0 if both are.
 
 **Forces that are not functions of the state.** At rest, joint friction balances the other forces. An
 additional unknown force with variance σ_s² e^{−(q̇/v_s)²} therefore acts on joints that hardly move. Beyond

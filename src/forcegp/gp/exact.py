@@ -1,6 +1,6 @@
 """Exact posterior of latent processes given whitened rows (eqs. 11 and 22 to 24).
 
-Memory use grows with the square of the number of rows. Fits that do not fit into memory are rejected.
+Memory use grows with the square of the number of rows. Fits that exceed the available memory are rejected.
 """
 
 from __future__ import annotations

@@ -2,7 +2,7 @@
 
 A block contains `n` samples with `r` rows each. The covariance between the rows of two samples is Σ_k
 W[i,:,k] k_k(x_i, x_j) W[j,:,k]ᵀ, summed over the components k of every prior. This is the block-wise form of
-H k_Q Hᵀ (eq. 32, figure 1) for any operator W. Rows are ordered by block, then by sample.
+H k_Q Hᵀ (eq. 32, figure 1) for any operator W. Rows are ordered by block, sample and row.
 
 Processes with finitely many features have far fewer weights than rows, so their likelihood is computed in
 weight space (Rasmussen and Williams, *Gaussian Processes for Machine Learning*, section 2.1).
