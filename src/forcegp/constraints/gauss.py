@@ -110,7 +110,7 @@ class Equations:
         b: `(*batch, m)` right-hand side of A q̈ = b, including Baumgarte terms.
         c, cd: `(*batch, m)` constraint error and its rate for all contacts, whether active or not.
         Q_C, Q_G, Q_D: `(*batch, nq)` bias force, gravity force and dissipative joint force.
-        contact_points: contact point of each surface contact, by name.
+        contact_points: contact point of each surface contact, keyed by name.
         point_motion: function that returns the motion of a point, given as `(frame, point)`, at the states.
         links: function that returns the poses and the motion of the links at the states.
         holds: `(*batch, m)` bool, rows of A that apply, namely those of closed contacts, including the

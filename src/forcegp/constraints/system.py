@@ -133,7 +133,7 @@ class ConstrainedSystem:
         return [name if count == 1 else f"{name} {row}" for name, count, row in rows]
 
     def contact(self, name: str) -> Constraint:
-        """Return a constraint by name.
+        """Return the constraint with the given name.
 
         Raises:
            UnknownNameError: the contact does not exist.
@@ -144,7 +144,7 @@ class ConstrainedSystem:
 
     @cached_property
     def rows(self) -> dict[str, slice]:
-        """Constraint rows of each constraint, by name."""
+        """Constraint rows of each constraint, keyed by name."""
         ends = itertools.accumulate(contact.rows for contact in self.contacts)
         return {c.name: slice(end - c.rows, end) for c, end in zip(self.contacts, ends, strict=True)}
 

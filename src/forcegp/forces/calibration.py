@@ -81,7 +81,7 @@ def correlation_times(x: Tensor, segment: Tensor, length: int, white: Tensor | f
 
     The ratio is L · mean(x̄²) / (mean(x²) − white), where x̄ are the means over windows of L samples (batch
     means, Flegal and Jones 2010). Unlike `autocorrelation_time`, it includes the negative lobes of
-    oscillating residuals that hardly move a robot, such as the noise of differentiated positions.
+    oscillating residuals that barely move a robot, such as the noise of differentiated positions.
 
     Args:
         x: `(n, d)` zero-mean signals in time order.

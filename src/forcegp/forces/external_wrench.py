@@ -15,7 +15,7 @@ S is the posterior covariance of the learned forces, including torque noise.
   detection and hybrid force/motion control*, ICRA 2005) is the steady-state filter without force errors.
 - **With an unknown lever arm** (`over_levers`): a moment about the point is the product of a force and a
   distance. The estimate is a mixture over priors whose moments have different scales, weighted by their
-  evidence at the sample. The evidence resolves directions that hardly affect the joints.
+  evidence at the sample. The evidence resolves directions that have little effect on the joints.
 
 The wrench is exerted by the environment on the robot. The multipliers of closed contacts are also unknown.
 """

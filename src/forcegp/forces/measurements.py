@@ -309,7 +309,7 @@ def states_noise(observations: Sequence[Observation]) -> bool:
 
 @torch.no_grad()
 def unmeasured_forces(system: ConstrainedSystem, observations: Sequence[Observation]) -> dict[str, float]:
-    """Return the RMS of M q̈ − Q_C − Q_G for each joint without a logged torque, by joint name [N m, N]."""
+    """Return the RMS of M q̈ − Q_C − Q_G for joints without a logged torque, keyed by joint name [N m, N]."""
     sizes: dict[str, float] = {}
     for data in (o.data for o in observations if o.data.header.unmeasured_torques):
         eom = system.equations(data.q, data.qd, contact_table(data, system.contact_names))

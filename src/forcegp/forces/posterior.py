@@ -9,7 +9,7 @@ Accelerations in contact depend only on Q + Q_z (remark 3.3). The two are distin
 posterior correlation is −1 if only the sum is identifiable, and 0 if both are.
 
 **Forces that are not functions of the state.** At rest, joint friction balances the other forces. An
-additional unknown force with variance σ_s² e^{−(q̇/v_s)²} therefore acts on joints that hardly move. Beyond
+additional unknown force with variance σ_s² e^{−(q̇/v_s)²} therefore acts on joints that barely move. Beyond
 the trained range of speeds and torques, joint forces have an additional standard deviation g D, where D is
 the distance from that range in training standard deviations, and g is estimated by `calibration.growth`.
 """
@@ -404,7 +404,7 @@ def doubts_of(
 
 
 def _on_multiplier(mean: Tensor, variance: Tensor) -> tuple[str, ...]:
-    """Return a warning if the data hardly determine the multiplier."""
+    """Return a warning if the multiplier is poorly determined by the data."""
     size, spread = float(mean.abs().median()), float(variance.sqrt().median())
     if spread <= UNDETERMINED * max(size, 1e-12):
         return ()

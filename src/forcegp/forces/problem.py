@@ -206,7 +206,7 @@ class Problem:
 
     @torch.no_grad()
     def hidden_torque(self) -> Tensor:
-        """Return the standard deviation `(nq,)` of torques that hardly affect accelerations, otherwise 0.
+        """Return the standard deviation `(nq,)` of torques with little effect on accelerations, otherwise 0.
 
         In contact, a force along the constraint does not change the accelerations. For a joint that acts
         along the constraint, P_ii is near zero, and its noise and friction cannot be distinguished from those

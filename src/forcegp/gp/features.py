@@ -50,9 +50,9 @@ def stacked(x: Features, inputs: tuple[str, ...] | None) -> Tensor:
 class Standardization:
     """Shift and scale of each named input, x ↦ (x − mean)/std, determined from training data.
 
-    The scale of a column that hardly varies is not meaningful. Scales are therefore at least `FLOOR` times
-    the root mean square of the standard deviations of all columns of the input. This root mean square is the
-    common scale of the columns of a vector, so results hardly depend on the orientation of the axes. Features
+    The scale of a nearly constant column is not meaningful. Scales are therefore at least `FLOOR` times the
+    root mean square of the standard deviations of all columns of the input. This root mean square is the
+    common scale of the columns of a vector, so results barely depend on the orientation of the axes. Features
     with a meaningful zero, such as velocities, are scaled but not shifted.
 
     Columns that are constant up to rounding error have scale 1 (or that of their vector); see `constant`.

@@ -78,7 +78,7 @@ class InertialPrior(ConstantForcePrior):
     def with_drives(self, std: Tensor) -> InertialPrior:
         """Return the prior with uncertain drive inertia, given the standard deviation of each joint `(nq,)`.
 
-        The motion hardly distinguishes drive inertia from link inertia. If drive inertia were treated as
+        Drive inertia and link inertia have similar effects on the motion. If drive inertia were treated as
         known, its errors would be attributed to the links, with too small a standard deviation.
         """
         return dataclasses.replace(self, drives=tuple(std.tolist()), kernel=Constant())
@@ -203,7 +203,7 @@ class PayloadPrior(ConstantForcePrior):
         name: prefix of the hyperparameters.
         known: mass [kg] and first moment [kg m] of the payload with which the acceleration is computed.
         measured: whether to use the measured acceleration, if available. The force is then exact for any
-            payload, but noise biases the estimate towards zero if the arm hardly accelerates.
+            payload, but noise biases the estimate towards zero if the accelerations are small.
 
     Raises:
         ModelError: `known` does not consist of a mass and a first moment.

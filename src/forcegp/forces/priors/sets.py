@@ -29,7 +29,7 @@ closed loop the residual would learn to cancel this torque."""
 def default_priors(
     system: ConstrainedSystem, mean: str | AnalyticalMean = "analytical", kernel: Kernel | None = None
 ) -> tuple[ForcePrior, ...]:
-    """Return a joint force prior and, for contacts, a prior on the part that accelerations do not determine.
+    """Return a joint force prior and, for contacts, a prior on the part not identifiable from accelerations.
 
     If the mean includes the motor torque, each surface contact also has a `SlidingFrictionPrior`. Otherwise,
     contact friction would be attributed to the joints, and predictions in free motion would be overconfident.
