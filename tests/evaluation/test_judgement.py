@@ -74,7 +74,7 @@ def test_a_model_that_has_learned_the_controller_is_named() -> None:
     assert weak == any("learned the controller" in doubt for doubt in found.doubts)
     assert found.predictors[0].explained == () and "explains" not in found.verdict
     cancelled = replace(found, response=(0.02, 0.97))
-    assert "shoulder 0.02 of 1" in cancelled.doubts[-1] and "elbow" not in cancelled.doubts[-1]
+    assert "(expected: 1): shoulder 0.02." in cancelled.doubts[-1] and "elbow" not in cancelled.doubts[-1]
 
 
 def test_a_joint_that_bears_next_to_nothing_does_not_count() -> None:

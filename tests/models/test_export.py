@@ -649,7 +649,7 @@ def test_a_contact_that_jams_is_an_error_in_both() -> None:
     object.__setattr__(process, "priors", (process.priors[0], jammed))
     state, _ = states(fit)
     for predictor in (fit, fit.compiled()):
-        with pytest.raises(ModelError, match=r"jams|press harder"):
+        with pytest.raises(ModelError, match="jams"):
             predictor.predict(*state)
 
 

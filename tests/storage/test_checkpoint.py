@@ -133,7 +133,7 @@ def test_other_shapes_types_and_keys_are_refused(fresh: Callable[[], Evaluations
         with pytest.raises(ModelError, match="belongs to a different fit"):
             saved.read(START)
     written(saved, positions=torch.zeros(3, 4, dtype=torch.float64))
-    with pytest.raises(ModelError, match="another length"):
+    with pytest.raises(ModelError, match="their number differs"):
         saved.read(START)
     written(saved, key="other")
     with pytest.raises(ModelError, match="belongs to a different fit"):

@@ -136,7 +136,7 @@ class Evaluation:
                 for j, x in zip(self.joint_names, self.response, strict=True)
                 if x < LEAST_RESPONSE
             ]
-            text = f"An added torque has only part of its expected effect: {', '.join(weak)}."
+            text = f"An added torque has too small an effect (expected: 1): {', '.join(weak)}."
             found.append(f"{text} The model has learned the controller, not the arm.")
         return tuple(found)
 
