@@ -92,9 +92,7 @@ def export(
     written = fit.export(out, language=to, name=name, functions=functions, wrench=wrench, dtype=dtype)
     lost = {"widest": written.widest, "wider": written.wider} if functions is not None else {}
     if float32:
-        lost |= dict(
-            zip(("rounding error of the mean", "rounding error of σ"), written.rounding, strict=True)
-        )
+        lost |= dict(zip(("rounding of the mean", "rounding of σ"), written.rounding, strict=True))
     show({"folder": str(out), "functions": written.functions, **lost}, as_json)
 
 
