@@ -41,6 +41,12 @@ def intervals(mask: NDArray[np.bool_], join: int = 0) -> Intervals:
     return tuple(joined)
 
 
+def repeats(*columns: NDArray[Any]) -> NDArray[np.bool_]:
+    """Return the mask (n,) of rows in which all columns (n, d) repeat the values of the previous row."""
+    differs = [np.diff(values, axis=0).any(axis=1) for values in columns]
+    return np.append(False, ~np.any(differs, axis=0))
+
+
 def numbered(rows: NDArray[np.int64]) -> Intervals:
     """Return the intervals of consecutive row numbers.
 

@@ -11,7 +11,7 @@ import torch
 
 from forcegp import kinematics
 from forcegp.checks.finding import Finding, with_alternatives
-from forcegp.checks.fit import BLOCKS, CHUNK, blocks_of, labelled_contacts, residual, tensors, unmeasured
+from forcegp.checks.fit import BLOCKS, CHUNK, blocks_of, labelled_contacts, residual
 from forcegp.checks.log import Array, Log, Outcome, evenly
 from forcegp.constraints import ConstrainedSystem, Plane, SurfaceContact
 from forcegp.logs.contact import LEVEL, TOUCHING
@@ -71,7 +71,7 @@ def tip_path(
     parts = np.array_split(np.arange(len(log)) if rows is None else rows, -(-len(log) // CHUNK))
     paths = []
     with torch.no_grad():
-        for q, qd in (tensors(log, part, "q", "qd") for part in parts):
+        for q, qd in (log.tensors(part, "q", "qd") for part in parts):
             p = kinematics.point_position(system.robot, q, contact.frame, contact.point)
             v = kinematics.point_velocity(system.robot, q, qd, contact.frame, contact.point)
             paths.append((contact.center_surface.value(p), p, v, contact.surface.gradient(p)))
@@ -259,21 +259,13 @@ def check_forces(system: ConstrainedSystem, log: Log) -> Outcome:
         force = _force(one, log, rows, path)
         if pulls := _pulls(finding, path, force):
             # Up to three torques cannot contradict the force that they are taken for.
-            flipped = (
-                (j, np.where(np.arange(log.nq) == j, -1.0, 1.0)) for j in range(log.nq * (log.nq <= 3))
-            )
-            others = ((j, log.replace(tau=log.tau * sign)) for j, sign in flipped)
-            text = "the torque of {} has the opposite sign"
-            findings += [
-                with_alternatives(
-                    pulls[0],
-                    [
-                        log.finding("torque-sign", text.format(log.joint_names[j]), (log.joint_names[j],))
-                        for j, other in others
-                        if np.median((_force(one, other, rows, path) * path.normal).sum(axis=1)) > 0.0
-                    ],
-                )
-            ]
+            others = []
+            for j, name in enumerate(log.joint_names if log.nq <= 3 else ()):
+                flipped = _force(one, log.changed(("tau",), flip=(j,)), rows, path)
+                if np.median((flipped * path.normal).sum(axis=1)) > 0.0:
+                    text = f"the torque of {name} has the opposite sign"
+                    others.append(log.finding("torque-sign", text, (name,)))
+            findings.append(with_alternatives(pulls[0], others))
         elif log.nq > 3:
             findings += _friction(finding, path, force)
     return findings, log
@@ -283,7 +275,7 @@ def _force(system: ConstrainedSystem, log: Log, rows: np.ndarray, path: Path) ->
     """Return the force F (n, 3) that best fits r = Jᵀ F, or its normal part with up to three joints."""
     r, J = residual(system, log, rows)
     if log.nq <= 3:
-        A = J[:, 0] * ~np.isin(np.arange(log.nq), unmeasured(log))
+        A = J[:, 0] * ~np.isin(np.arange(log.nq), log.unmeasured)
         size = np.maximum((A * A).sum(axis=1), 1e-12)
         return ((A * r).sum(axis=1) / size)[:, None] * path.normal
     gram = J @ J.transpose(0, 2, 1)

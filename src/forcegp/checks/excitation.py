@@ -16,7 +16,7 @@ import torch
 
 from forcegp.checks.explain import Explanation, significant
 from forcegp.checks.finding import Finding
-from forcegp.checks.fit import BLOCKS, blocks_of, cross_validate, held_out, residual, tensors, unmeasured
+from forcegp.checks.fit import BLOCKS, blocks_of, cross_validate, held_out, residual
 from forcegp.checks.hypotheses import encoder_hypothesis, inertial_spread, robot_columns
 from forcegp.checks.log import Array, Log, Outcome, position_unit
 from forcegp.constraints import ConstrainedSystem
@@ -93,7 +93,7 @@ def _sharpness(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> tuple[A
     base = base_parameters(robot)
     columns = np.array(base.columns)
     with torch.no_grad():
-        Y = regressor(robot, *tensors(log, rows, "q", "qd", "qdd"))[..., list(base.columns)].numpy()
+        Y = regressor(robot, *log.tensors(rows, "q", "qd", "qdd"))[..., list(base.columns)].numpy()
     tau = np.sqrt((log.tau[rows] ** 2).mean(axis=0))
     noise = np.maximum(0.01 * tau, 1e-3 * tau.max()) + 1e-12
     A = (Y / noise[:, None]).reshape(-1, len(columns)) * inertial_spread(robot)[columns]
@@ -159,7 +159,7 @@ def check_visibility(system: ConstrainedSystem, explanation: Explanation) -> lis
 def force_of(explanation: Explanation, fault: Fault) -> float:
     """Return the RMS tip force [N] that a unit fault mimics after a fit, or 0 without enough contact."""
     problem = replace(explanation.problem, r=fault.column)
-    J = problem.J[:, : problem.J.shape[1] - len(unmeasured(explanation.log))]
+    J = problem.J[:, : problem.J.shape[1] - len(explanation.log.unmeasured)]
     touching = (J != 0.0).any(axis=(1, 2))
     if touching.sum() < LEAST_TOUCHING:
         return 0.0

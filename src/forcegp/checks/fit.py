@@ -21,17 +21,12 @@ CHUNK = 8192
 """Number of rows for which the dynamics are held in memory at a time."""
 
 
-def tensors(log: Log, rows: np.ndarray, *names: str) -> list[Tensor]:
-    """Return the selected rows of the named columns as tensors."""
-    return [torch.from_numpy(np.ascontiguousarray(getattr(log, name)[rows])) for name in names]
-
-
 def residual(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> tuple[Array, Array]:
     """Return the unexplained torque r (n, nq) [N m, N] and J (n, k, nq), which is zero for open contacts."""
     robot, r, J = system.robot, [], []
     with torch.no_grad():
         for part in np.array_split(rows, max(1, -(-len(rows) // CHUNK))):
-            q, qd, qdd, tau = tensors(log, part, "q", "qd", "qdd", "tau")
+            q, qd, qdd, tau = log.tensors(part, "q", "qd", "qdd", "tau")
             needed = dynamics.inverse_dynamics(robot, q, qd, qdd) - dynamics.damping_force(robot, qd)
             r.append((needed - tau).numpy())
             J.append(_contact_jacobian(system, log, part, q, qd))
@@ -48,18 +43,13 @@ def takes_friction_out(system: ConstrainedSystem, log: Log) -> bool:
     return 3 * len(labelled_contacts(system, log)) < log.nq
 
 
-def unmeasured(log: Log) -> list[int]:
-    """Return the indices of the joints whose torque is not measured according to the header."""
-    return [j for j, name in enumerate(log.joint_names) if name in log.header.unmeasured_torques]
-
-
 def _contact_jacobian(system: ConstrainedSystem, log: Log, rows: np.ndarray, q: Tensor, qd: Tensor) -> Array:
     """Return J for all components of the contact forces, or only for the normals if no torque would remain.
 
     Additional rows represent unmeasured torques, which may have any value.
     """
     contacts, whole = labelled_contacts(system, log), takes_friction_out(system, log)
-    free = np.broadcast_to(np.eye(log.nq)[unmeasured(log)], (len(rows), len(unmeasured(log)), log.nq))
+    free = np.broadcast_to(np.eye(log.nq)[log.unmeasured], (len(rows), len(log.unmeasured), log.nq))
     if not contacts or not len(rows):
         return free
     parts = []

@@ -9,13 +9,14 @@ force within the window.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from forcegp.checks.finding import Finding
@@ -128,9 +129,24 @@ class Log:
         """Return the names of the joints selected by a mask."""
         return tuple(self.joint_names[j] for j in np.flatnonzero(joints))
 
+    @property
+    def unmeasured(self) -> list[int]:
+        """Indices of the joints whose torque is not measured according to the header."""
+        return [j for j, name in enumerate(self.joint_names) if name in self.header.unmeasured_torques]
+
+    def tensors(self, rows: NDArray[np.int64], *names: str) -> list[torch.Tensor]:
+        """Return the given rows of the named columns as tensors."""
+        return [torch.from_numpy(np.ascontiguousarray(getattr(self, name)[rows])) for name in names]
+
     def replace(self, **fields: Any) -> Log:
         """Return the log with the given fields replaced."""
         return dataclasses.replace(self, **fields)
+
+    def changed(self, names: Sequence[str], *, order: Sequence[int] = (), flip: Sequence[int] = ()) -> Log:
+        """Return the log with two joints swapped, or the signs of joints flipped, in the named columns."""
+        index, sign = np.arange(self.nq), np.ones(self.nq)
+        index[list(order)], sign[list(flip)] = order[::-1], -1.0
+        return self.replace(**{name: getattr(self, name)[:, index] * sign for name in names})
 
     def mask(self, rows: NDArray[np.bool_]) -> Log:
         """Return the log with additional rows masked."""

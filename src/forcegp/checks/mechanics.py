@@ -10,7 +10,7 @@ from forcegp.checks import hypotheses
 from forcegp.checks.excitation import check_visibility, still_joints
 from forcegp.checks.explain import Explanation, explain
 from forcegp.checks.finding import Finding, NotJudgedError, with_alternatives
-from forcegp.checks.fit import FLOOR, TorqueFit, gain_of, robust_parameters, unmeasured
+from forcegp.checks.fit import FLOOR, TorqueFit, gain_of, robust_parameters
 from forcegp.checks.log import Array, Log, Outcome, force_unit, position_unit, smoothed
 from forcegp.constraints import ConstrainedSystem
 from forcegp.robot.model import RobotModel
@@ -46,9 +46,7 @@ def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
         inner = f"rows that lie {max(hypotheses.LAGS)} from the ends of a stretch"
         raise NotJudgedError(f"fewer than {LEAST_ROWS} {inner}")
     explanation = explain(system, smooth)
-    disturbed, rows = [], np.zeros(len(log), bool)
-    if log.header.ordered:
-        disturbed, rows = _disturbances(system, explanation)
+    disturbed, rows = _disturbances(system, explanation) if log.header.ordered else ([], np.zeros(0, bool))
     if disturbed and _enough(smooth.mask(rows)):
         # What happened in these rows must pass neither for friction nor for a mass.
         explanation = explain(system, smooth.mask(rows))
@@ -82,7 +80,7 @@ def _without_torque(log: Log) -> list[Finding]:
     """Find torques that are constant although the joint moves."""
     rows = log.usable
     still = (np.ptp(log.tau[rows], axis=0) == 0.0) & (np.ptp(log.q[rows], axis=0) > 0.0)
-    still[unmeasured(log)] = False
+    still[log.unmeasured] = False
     zero = still & (log.tau[rows] == 0.0).all(axis=0)
     word = "zero" if zero[still].all() else "constant"
     findings = log.on_joints("torque-zero", still, f"the torque of {{}} is {word} throughout")
@@ -106,9 +104,7 @@ def _determined(robot: RobotModel, explanation: Explanation) -> Explanation:
         wrong = (change != 0.0) & ((change + declared < -spread) | (np.abs(change) <= spread))
         if not wrong.any():
             break
-        nuisance = explanation.problem.nuisance.copy()
-        nuisance[..., np.flatnonzero(wrong)] = 0.0
-        explanation = replace(explanation, problem=replace(explanation.problem, nuisance=nuisance))
+        explanation = explanation.without(np.flatnonzero(wrong).tolist())
     return explanation
 
 

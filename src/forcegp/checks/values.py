@@ -8,14 +8,13 @@ import torch
 from forcegp import dynamics
 from forcegp.checks.excitation import still_joints
 from forcegp.checks.finding import Finding, at_rows
-from forcegp.checks.fit import tensors
 from forcegp.checks.log import DEPARTURE, Array, Log, Outcome, spikes
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data.clipped import limits_of
 from forcegp.data.derivative import UNIFORM_TOLERANCE
 from forcegp.data.fields import JOINT_VECTORS, resolution
 from forcegp.robust import robust_std
-from forcegp.rows import describe, intervals
+from forcegp.rows import describe, intervals, repeats
 
 
 def check_order(system: ConstrainedSystem, log: Log) -> Outcome:
@@ -28,8 +27,7 @@ def check_order(system: ConstrainedSystem, log: Log) -> Outcome:
 
 def check_gaps(system: ConstrainedSystem, log: Log) -> Outcome:
     """Find missing samples, indicated by time steps longer than clock jitter can explain."""
-    with np.errstate(invalid="ignore"):
-        gaps = log.steps > log.longest_step
+    gaps = log.steps > log.longest_step
     if log.masked is not None:
         # The step after a wrong time stamp is long because of that stamp.
         gaps &= ~log.masked[:-1]
@@ -45,8 +43,7 @@ def check_gaps(system: ConstrainedSystem, log: Log) -> Outcome:
 
 def check_jitter(system: ConstrainedSystem, log: Log) -> Outcome:
     """Find time steps that are too uneven for filters that assume even sampling."""
-    with np.errstate(invalid="ignore"):
-        regular = log.steps[(log.steps > 0.0) & (log.steps <= log.longest_step)]
+    regular = log.steps[(log.steps > 0.0) & (log.steps <= log.longest_step)]
     spread = float(robust_std(regular) / log.dt) if len(regular) > 1 else 0.0
     text = f"the time steps vary by {100 * spread:.2g} % around {log.dt:.4g} s"
     jitter = log.finding("time-jitter", text, relative_spread=spread, period_s=log.dt)
@@ -102,9 +99,8 @@ def check_finite(system: ConstrainedSystem, log: Log) -> Outcome:
 
 def check_held(system: ConstrainedSystem, log: Log) -> Outcome:
     """Find rows in which all channels repeat their values while the arm moves."""
-    differs = np.any([np.diff(value, axis=0).any(axis=1) for value in logged(log).values()], axis=0)
-    moving = np.abs(log.qd).max(axis=1)[1:] > 0.0
-    held = np.append(False, ~differs & moving & (np.diff(log.segment) == 0))
+    held = repeats(*logged(log).values()) & np.append(False, np.diff(log.segment) == 0)
+    held &= np.abs(log.qd).max(axis=1) > 0.0
     if held.sum() < HELD_RUN:
         return [], log
     text = f"{int(held.sum())} rows ({100 * held.mean():.2g} %) repeat the one before:"
@@ -211,7 +207,7 @@ def _driven(system: ConstrainedSystem, log: Log, departure: Array, outlier: np.n
     step, driven = np.maximum(step[:-1], step[1:]), np.zeros_like(outlier)
     rows = np.flatnonzero(outlier.any(axis=1))
     if len(rows):
-        M = dynamics.mass_matrix(system.robot, tensors(log, rows, "q")[0])
+        M = dynamics.mass_matrix(system.robot, log.tensors(rows, "q")[0])
         inverse = torch.linalg.inv(M).diagonal(dim1=-2, dim2=-1).detach().numpy()
         driven[rows] = step[rows] * inverse > DRIVEN * np.abs(departure[rows])
     return driven
@@ -272,8 +268,7 @@ def _jumps(log: Log, value: str, derivative: str) -> tuple[np.ndarray, tuple[str
         surplus[s][1:] = np.diff(x[s], axis=0) - mean * np.diff(log.t[s])[:, None]
     rounding = np.finfo(float).eps * np.abs(x[usable]).max()
     scale = robust_std(surplus[usable]) + resolution(x[usable]) + rounding
-    change = np.zeros_like(x)
-    change[1:] = np.abs(np.diff(x, axis=0))
+    change = np.abs(np.diff(x, axis=0, prepend=x[:1]))
     fastest = float(np.percentile(np.abs(rate[usable]), 99.9)) * log.dt
     big = (np.abs(surplus) > JUMP * scale) & (np.abs(surplus) > FASTEST * fastest)
     # Where the column itself does not change faster than usual, its rate is at fault, not the position.

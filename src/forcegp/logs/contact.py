@@ -133,8 +133,6 @@ ELSEWHERE = (
     "see where it slides with --fit-surface plane (or sphere), and correct the scene; "
     'for free motion, set source = "never" under [contact.{}]'
 )
-BINS = 512
-"""Number of bins in the histogram that separates the two levels."""
 
 
 @dataclass(frozen=True)
@@ -299,7 +297,7 @@ def force_levels(values: Array, name: str, section: ContactStateSection) -> tupl
     """
     if section.threshold is not None:
         return section.threshold, section.release or 0.5 * section.threshold
-    counts, edges = np.histogram(values, BINS)
+    counts, edges = np.histogram(values, bins=512)
     centers = 0.5 * (edges[1:] + edges[:-1])
     below, sums = np.cumsum(counts), np.cumsum(counts * centers)
     above = below[-1] - below

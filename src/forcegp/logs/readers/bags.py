@@ -30,8 +30,6 @@ WRENCH = "geometry_msgs/msg/WrenchStamped"
 KINDS = (JOINT_STATE, WRENCH)  # that are read
 UNITS = {"position": "rad", "velocity": "rad/s", "effort": "Nm", "force": "N", "torque": "Nm"}
 """Units in joint states (REP 103) and in wrenches."""
-CLOCKS = ("header", "receive")
-"""Time columns of each topic."""
 
 Decode = Callable[[bytes], Any]
 Found = tuple[str, str, str, int, bytes, int]
@@ -71,7 +69,8 @@ class Messages:
         """Return the requested columns, with times [s] relative to `origin` [ns]."""
         stamps = (np.array(self.stamps, dtype=np.int64) - origin) * 1e-9
         order = np.argsort(stamps[:, 1], kind="stable")
-        columns: dict[str, Column] = dict(zip(CLOCKS, np.ascontiguousarray(stamps[order].T), strict=True))
+        header, receive = np.ascontiguousarray(stamps[order].T)
+        columns: dict[str, Column] = {"header": header, "receive": receive}
         values = np.ascontiguousarray(np.array(self.rows, dtype=np.float64)[order].T)
         for column, numbers in zip(self.columns, values, strict=True):
             if not np.isnan(numbers).all() and wanted(column):
