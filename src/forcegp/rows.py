@@ -26,8 +26,8 @@ def runs(*keys: NDArray[Any]) -> list[slice]:
     return [slice(first, last) for first, last in pairwise(edges)]
 
 
-def intervals(mask: NDArray[np.bool_], join: int = 0) -> Intervals:
-    """Return the runs of true rows, merging runs that are at most `join` rows apart.
+def intervals(mask: NDArray[np.bool_], join: int = 0, least: int = 1) -> Intervals:
+    """Return the runs of at least `least` true rows, after merging runs that are at most `join` rows apart.
 
     >>> intervals(np.array([True, True, False, True]))
     ((0, 2), (3, 4))
@@ -38,7 +38,7 @@ def intervals(mask: NDArray[np.bool_], join: int = 0) -> Intervals:
             near = bool(joined) and rows.start - joined[-1][1] <= join
             start = joined.pop()[0] if near else rows.start
             joined.append((start, rows.stop))
-    return tuple(joined)
+    return tuple((start, stop) for start, stop in joined if stop - start >= least)
 
 
 def repeats(*columns: NDArray[Any]) -> NDArray[np.bool_]:

@@ -35,6 +35,7 @@ Duration of the shortest run of rows for which a wrong label is reported [s]."""
 MISSED_SECONDS, MISSED_DISTANCE = 0.1, 2e-3
 """Minimum duration [s] and distance [m] of sliding along the surface for an unlabelled contact."""
 LEAST_ROWS = 20
+"""Minimum number of rows in contact for judging a contact or its force."""
 OFF = {
     "contact-early": "labelled closed before the tip touches",
     "contact-late": "labelled closed after the tip has left",
@@ -199,9 +200,7 @@ def _runs_off(
     least = max(2, round(RUN_SECONDS / log.dt)) if np.isfinite(log.dt) else 2
     runs: dict[str, Intervals] = dict.fromkeys(OFF, ())
     for start, stop in intervals(label):
-        for a, b in intervals(off[start:stop], join=least):
-            if b - a < least:
-                continue
+        for a, b in intervals(off[start:stop], join=least, least=least):
             kind = "contact-early" if a == 0 and b < stop - start else "contact-late"
             inside = (a > 0) == (b < stop - start)
             before, after = settled[start : start + a][::-1], settled[start + b : stop]
@@ -227,8 +226,8 @@ def _missed(
     least = max(3, round(MISSED_SECONDS / log.dt))
     spans = tuple(
         (a, b)
-        for a, b in intervals(near)
-        if b - a >= least and speed[a:b].sum() * log.dt > MISSED_DISTANCE + 20.0 * np.ptp(c[a:b])
+        for a, b in intervals(near, least=least)
+        if speed[a:b].sum() * log.dt > MISSED_DISTANCE + 20.0 * np.ptp(c[a:b])
     )
     if not spans:
         return []

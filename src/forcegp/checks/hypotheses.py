@@ -54,18 +54,13 @@ class Hypothesis:
 def problem_of(
     system: ConstrainedSystem, log: Log, rows: np.ndarray, scale: Array | None = None
 ) -> TorqueProblem:
-    """Return the torque problem for the given rows, including friction and an offset at each joint."""
-    nuisance = friction_columns(system, log, rows)
+    """Return the torque problem for the given rows. Viscous and dry friction and an offset are nuisances."""
+    qd = log.qd[rows]
+    laws = qd, np.tanh(qd / system.robot.friction_velocity.numpy()), np.ones_like(qd)
+    nuisance = np.concatenate([_diagonal(x) for x in laws], axis=-1)
     size = np.sqrt((log.tau[rows] ** 2).mean(axis=0))
     size = np.maximum(size, 1e-3 * size.max())
     return TorqueProblem(*residual(system, log, rows), nuisance, size, size if scale is None else scale)
-
-
-def friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
-    """Return columns (n, nq, 3 nq) for viscous friction, Coulomb friction and an offset at each joint."""
-    qd = log.qd[rows]
-    smooth = np.tanh(qd / system.robot.friction_velocity.numpy())
-    return np.concatenate([_diagonal(x) for x in (qd, smooth, np.ones_like(qd))], axis=-1)
 
 
 def other_rise_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
@@ -144,9 +139,8 @@ def gain_hypothesis(log: Log, rows: np.ndarray, joints: tuple[int, ...]) -> Hypo
 
 def drift_hypothesis(log: Log, rows: np.ndarray, j: int) -> Hypothesis:
     """Return the hypothesis that the torque of joint j drifts over the log: u − τ = −θ s with |s| ≤ 1/2."""
-    column = np.zeros((len(rows), log.nq, 1))
-    column[:, j, 0] = -_elapsed(log)[rows]
-    return Hypothesis("drift", 1, unchanged, column, np.full(1, LARGEST_DRIFT), (j,))
+    columns = -_elapsed(log)[rows, None, None] * np.eye(log.nq)[:, [j]]
+    return Hypothesis("drift", 1, unchanged, columns, np.full(1, LARGEST_DRIFT), (j,))
 
 
 def _elapsed(log: Log) -> Array:
@@ -200,8 +194,7 @@ def inertial_spread(robot: RobotModel) -> Array:
 def encoder_hypothesis(system: ConstrainedSystem, log: Log, rows: np.ndarray, j: int) -> Hypothesis:
     """Return the hypothesis that the encoder of joint j has an offset δ, so that r = u(q) − τ = −∂u/∂q δ."""
     q, qd, qdd = log.tensors(rows, "q", "qd", "qdd")
-    step = torch.zeros(log.nq, dtype=q.dtype)
-    step[j] = 1e-4
+    step = 1e-4 * torch.eye(log.nq, dtype=q.dtype)[j]
     with torch.no_grad():
         ahead, behind = (dynamics.inverse_dynamics(system.robot, q + s, qd, qdd) for s in (step, -step))
     columns = ((behind - ahead) / 2e-4).numpy()[..., None]
@@ -223,8 +216,6 @@ SMALL_TILT, EARTH = 1.0, 9.81
 """Tilt that wrong masses may cause [degrees]; magnitude assumed if the scene has no gravity [m/s²]."""
 SAME_GRAVITY = 0.2, 0.5
 """Accepted relative errors in the size of gravity due to wrong masses, for tilts and for larger angles."""
-
-
 DISCRETE = {
     "torque-sign": "the torque of {} fits the motion with the opposite sign",
     "joint-sign": "{} fits the robot file when it turns the other way",

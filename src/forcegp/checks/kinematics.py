@@ -123,20 +123,20 @@ def check_clock_unit(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def _clock_finding(log: Log, factor: float) -> Outcome:
-    near = [unit for unit in UNITS if abs(factor / unit - 1.0) <= UNIT_TOLERANCE]
-    if near:
-        kind, repaired = "time-unit", log.t * near[0]
+    unit = next((unit for unit in UNITS if abs(factor / unit - 1.0) <= UNIT_TOLERANCE), None)
+    if unit is not None:
+        kind, scale = "time-unit", unit
         text = f"time advances by {log.dt:.4g} per row, and by the motion {factor * log.dt:.4g} s"
     else:
-        kind, repaired = "time-scale", log.t * factor
+        kind, scale = "time-scale", factor
         text = f"positions and velocities change {factor:.4g} times as far as the clock allows"
     found = log.finding(kind, text, seconds_per_unit=factor, period=log.dt)
-    ratio, log = log.t[1] - log.t[0], log.replace(t=repaired)
-    ratio, second = ratio / (log.t[1] - log.t[0]), match(log, "qd", "qdd")
+    log = log.replace(t=log.t * scale)
+    second = match(log, "qd", "qdd")
     if "qdd" in log.derived | {*log.header.derived} and second is not None and second.moving.any():
         slope = max(float(np.median(second.low[second.moving])), 1e-300)
-        if abs(np.log(slope / ratio)) < abs(np.log(slope)):  # derived by the wrong clock
-            log = log.replace(qdd=log.qdd * ratio)
+        if abs(np.log(slope * scale)) < abs(np.log(slope)):  # derived by the wrong clock
+            log = log.replace(qdd=log.qdd / scale)
     return [found], log
 
 

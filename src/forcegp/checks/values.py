@@ -114,17 +114,17 @@ def check_stuck(system: ConstrainedSystem, log: Log) -> Outcome:
     least, findings, bad = max(5, round(STUCK_SECONDS / log.dt)), [], np.zeros(len(log), bool)
     still = still_joints(log)
     for name, value in logged(log).items():
+        visible = STUCK_VISIBLE * log.reach(name)
         for j, joint in enumerate(log.joint_names):
             x = value[:, j]
             steps = np.abs(np.diff(x))
             if (steps > 0.0).mean() < 0.1 or (still[j] and name != "tau"):
                 continue
-            visible = STUCK_VISIBLE * np.ptp(np.percentile(x[log.usable], (0.5, 99.5)))
             runs, same = np.zeros(len(log), bool), (steps == 0.0) & log.usable[1:] & log.usable[:-1]
-            for a, b in ((a, b) for a, b in intervals(same) if b - a >= least):
+            for a, b in intervals(same, least=least):
                 # A torque that stays at its extreme is clipped, which is another finding.
                 clips = name == "tau" and x[a] in limits_of(x[log.usable])
-                runs[a : b + 1] = not clips and _expected_change(log, name, j, a, b) > visible
+                runs[a : b + 1] = not clips and _expected_change(log, name, j, a, b) > visible[j]
             text = f"{name}.{joint} keeps one value while the arm moves, in"
             findings += at_rows(runs, "channel-stuck", text, (joint,))
             bad |= runs
@@ -133,10 +133,9 @@ def check_stuck(system: ConstrainedSystem, log: Log) -> Outcome:
 
 def _expected_change(log: Log, name: str, j: int, a: int, b: int) -> float:
     """Return the expected change of a channel between rows a and b, given the joint's other channels."""
-    if name == "q":
-        return float(np.ptp(np.cumsum(log.qd[a:b, j])) * log.dt)
-    if name == "qd":
-        return float(np.ptp(np.cumsum(log.qdd[a:b, j])) * log.dt)
+    if name in ("q", "qd"):
+        rate = log.qd if name == "q" else log.qdd
+        return float(np.ptp(np.cumsum(rate[a:b, j])) * log.dt)
     # Torque and acceleration: as far as they change over as many rows elsewhere, if the arm moves, for the
     # torque, or the joint itself, for the acceleration.
     x, moved = getattr(log, name)[:, j], log.q[a:b] if name == "tau" else log.q[a:b, j : j + 1]
@@ -147,13 +146,12 @@ def _expected_change(log: Log, name: str, j: int, a: int, b: int) -> float:
 
 def check_spikes(system: ConstrainedSystem, log: Log) -> Outcome:
     """Find isolated values far from the curve through their neighbours."""
-    bad, hit, vectors = np.zeros(len(log), bool), [], logged(log)
-    departures = {name: _departures(log, value) for name, value in vectors.items()}
+    bad, hit = np.zeros(len(log), bool), []
+    departures = {name: _departures(log, value) for name, value in logged(log).items()}
     near = np.zeros(len(log), bool)
     for label in log.contact.values():  # next to a contact switch values jump by nature
         near[1:] |= label[1:] != label[:-1]
-    for name in vectors:
-        departure, around, scale = departures[name]
+    for name, (departure, around, scale) in departures.items():
         reach = log.reach(name)
         least = np.maximum(SPIKE_VISIBLE[0] * reach, SPIKE_VISIBLE[1] * reach.max())
         outlier = (
@@ -163,7 +161,7 @@ def check_spikes(system: ConstrainedSystem, log: Log) -> Outcome:
             & _one_value(departure, scale)
             & ~_shocks(log, departures, name)
         )
-        if name == "qdd" and "tau" in vectors:
+        if name == "qdd" and "tau" in departures:
             outlier &= ~_driven(system, log, departure, outlier)
         # The neighbours of a spike are off as well, by less.
         peak = outlier & (np.abs(departure) >= _within_two(np.abs(departure)))

@@ -16,8 +16,7 @@ from forcegp.rows import describe, numbered, repeats
 
 RESTART_STEPS, SHORTEST_TRAJECTORY = 2.0, 10
 """A clock has restarted if it falls back to within this many steps of the start of its trajectory, and the
-trajectory has at least this many rows. Otherwise, the time stamps are out of order.
-"""
+trajectory has at least this many rows. Otherwise, the time stamps are out of order."""
 GAP_STEPS = 5.0
 """A step longer than this multiple of the usual step counts as a gap."""
 

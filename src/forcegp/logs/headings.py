@@ -27,6 +27,7 @@ _TIME = re.compile(
     r"^(.*[ _./])?(t|mt|time|times|timestamp|stamp|clock|sec|secs|seconds|ms|millis|zeit)([ _./\[(].*)?$"
 )
 _DECLARED = re.compile(r"[\[(]([^\])]*)[\])]|_(deg|rad|ms|us|ns|s|nm|mnm|a|ma|rpm|degps|radps)$", re.I)
+_DERIVATIVE = re.compile(r"\b(?:d |dd )+(?=q\b)|\bq (?=d*dot\b)")
 _AXES = (("force", "f"), ("torque", "m", "t", "moment"))
 _SEGMENTS = ("segment", "episode_index", "episode", "trial", "run")
 
@@ -41,9 +42,7 @@ def tokens(name: str) -> list[str]:
     """
     spaced = re.sub(r"([a-z])([A-Z])", r"\1 \2", name)
     words = " ".join(re.findall(r"[a-z]+|\d+", spaced.lower()))
-    return re.sub(
-        r"\b(?:d |dd )+(?=q\b)|\bq (?=d*dot\b)", lambda part: part[0].replace(" ", ""), words
-    ).split()
+    return _DERIVATIVE.sub(lambda part: part[0].replace(" ", ""), words).split()
 
 
 def declared_unit(name: str, stream: Stream) -> str | None:

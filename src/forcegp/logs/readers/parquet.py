@@ -14,7 +14,6 @@ import numpy as np
 
 from forcegp import guards, limits
 from forcegp.errors import DataError
-from forcegp.guards import within
 from forcegp.logs import table
 from forcegp.logs.table import Column, LogTable, Progress, Stream, Wanted
 
@@ -128,7 +127,7 @@ def _expand(source: str, name: str, values: pa.Array) -> dict[str, Column]:
 def read_lerobot(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
     """Read the numbers in all episodes, named as in `meta/info.json` (e.g. `observation.state.<motor>`)."""
     listed = path / "meta" / "info.json", *sorted((path / "data").rglob("*.parquet"))
-    description, *files = within(path, listed)
+    description, *files = guards.within(path, listed)
     guards.check_count(str(description), "bytes", description.stat().st_size, 4 * limits.MIB)
     try:
         features = json.loads(description.read_text(encoding="utf-8"))["features"]

@@ -23,10 +23,8 @@ from forcegp.logs.table import Column, LogTable, Progress, Stream, Wanted
 if TYPE_CHECKING:
     import pyarrow as pa
 
-
 SAMPLE_BYTES, SAMPLE_LINES = 1 << 18, 200
 """Size of the part of a file that is inspected; number of data lines that must agree in format."""
-
 SEPARATORS = (";", "\t", ",", "|", " ")
 """Candidate separators. A space stands for any run of blanks."""
 MISSING = ("", "nan", "NaN", "NAN", "null", "NULL", "NA", "N/A", "None", "-nan", "#N/A")
