@@ -2,8 +2,9 @@
 
 Each fault is planted in the columns of a raw log, or in the robot or scene of the user, before `import`;
 what counts as naming it was written down before the first run. Rules of the check were changed after the
-first set, and none after the second (`--set 2`); the author of the third had read neither the check nor the
-import. Run from the repository root: `python benchmarks/check_planted.py --set 1 --out planted.json`.
+first and the second set (`--set 2`), and none after the third (`--set 3`), whose author had read neither the
+check nor the import. Run from the repository root:
+`python benchmarks/check_planted.py --set 1 --out planted.json`.
 """
 
 from __future__ import annotations

@@ -70,7 +70,7 @@ def other_rise_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) ->
 
 
 def shape_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
-    """Return columns (n, nq, p) for other shapes of dry friction and for quadratic friction, by joint."""
+    """Return columns (n, nq, p) for alternative shapes of dry friction and for quadratic friction."""
     x, qd = log.qd[rows] / system.robot.friction_velocity.numpy(), log.qd[rows]
     shapes = *(np.tanh(k * x) - np.tanh(x) for k in RISES), qd * np.abs(qd)
     return np.concatenate([_diagonal(shape) for shape in shapes], axis=-1)

@@ -50,7 +50,7 @@ ByJoint = tuple[float | None, ...]
 
 @dataclass(frozen=True)
 class JointErrors:
-    """RMS errors of one predictor in one unit, one per joint.
+    """RMS errors of a predictor for each joint, in a single unit.
 
     Attributes:
         all: error over all samples.

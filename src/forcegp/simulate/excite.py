@@ -166,7 +166,7 @@ class Excitation:
     criterion: tuple[float, ...]
 
     def write(self, path: str | Path) -> None:
-        """Write the motion to CSV, with the columns t, q.<joint>, qd., qdd. and tau., or to Parquet.
+        """Write the motion to CSV (columns t, q.<joint>, qd.…, qdd.… and tau.…) or to Parquet.
 
         Raises:
             DataError: the name does not end in `.csv` or `.parquet`.

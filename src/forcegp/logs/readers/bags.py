@@ -79,7 +79,7 @@ class Messages:
 
 @dataclass
 class Collector:
-    """Collects the messages in a bag in one stream for each topic and set of joints."""
+    """Collector of the messages in a bag, with one stream for each topic and set of joints."""
 
     unpacking: Unpacking
     _streams: dict[tuple[str, frozenset[str]], Messages] = field(default_factory=dict)
