@@ -299,8 +299,7 @@ def _friction(finding: partial[Finding], path: Path, force: Array) -> list[Findi
     drag = -(force * path.along).sum(axis=1)[sliding] / speed[sliding]
     press = np.maximum((force * path.normal).sum(axis=1)[sliding], 0.0)
     # One coefficient per block: the scatter between blocks gives the standard error.
-    parts = [blocks_of(len(drag)) == k for k in range(BLOCKS)]
-    each = [(drag[part] @ press[part]) / max(press[part] @ press[part], 1e-12) for part in parts]
+    each = [(drag[b] @ press[b]) / max(press[b] @ press[b], 1e-12) for b in blocks_of(len(drag))]
     mean, error = float(np.mean(each)), float(np.std(each, ddof=1) / np.sqrt(BLOCKS))
     size = "not determined" if mean > LARGEST_FRICTION else f"about {100 * mean:.0f} % of the normal force"
     text = f"friction at {finding.keywords['contact']!r} while it slides is {size}"

@@ -17,7 +17,7 @@ import torch
 from forcegp.checks.contact import LEAST_ROWS
 from forcegp.checks.explain import Explanation, significant
 from forcegp.checks.finding import Finding
-from forcegp.checks.fit import BLOCKS, blocks_of, cross_validate, held_out, residual
+from forcegp.checks.fit import blocks_of, cross_validate, held_out, residual
 from forcegp.checks.hypotheses import encoder_hypothesis, inertial_spread, robot_columns
 from forcegp.checks.log import Array, Log, Outcome, position_unit
 from forcegp.constraints import ConstrainedSystem
@@ -175,9 +175,8 @@ def visible_size(explanation: Explanation, fault: Fault) -> float:
     problem = explanation.problem
     rest = held_out(problem, explanation.columns, explanation.prior)
     added = held_out(replace(problem, r=fault.column), explanation.columns, explanation.prior)
-    block = blocks_of(len(rest))
     square, cross, added_square = (
-        np.stack([product[block == k].mean(axis=0) for k in range(BLOCKS)])
+        np.stack([product[rows].mean(axis=0) for rows in blocks_of(len(rest))])
         for product in (rest**2, rest * added, added**2)
     )
 

@@ -117,9 +117,10 @@ class TorqueFit:
     score: Array
 
 
-def blocks_of(n: int) -> Array:
-    """Return the block index of each row."""
-    return np.minimum(np.arange(n) * BLOCKS // max(n, 1), BLOCKS - 1)
+def blocks_of(n: int) -> list[np.ndarray]:
+    """Return the mask of the rows in each block."""
+    block = np.minimum(np.arange(n) * BLOCKS // max(n, 1), BLOCKS - 1)
+    return [block == k for k in range(BLOCKS)]
 
 
 def cross_validate(
@@ -144,8 +145,7 @@ def cross_validate(
         size = np.sqrt((Z**2).sum(axis=(0, 1)))
         Z = np.concatenate([Z / np.where(size > 0.0, size, np.inf), A[..., Z.shape[-1] :]], axis=-1)
     rest, thetas, whole = _held_out(A, y, weight, Z)
-    block = blocks_of(len(y))
-    error = np.stack([np.sqrt((rest[block == k] ** 2).mean(axis=0)) for k in range(BLOCKS)])
+    error = np.stack([np.sqrt((rest[rows] ** 2).mean(axis=0)) for rows in blocks_of(len(y))])
     # Jackknife: (K − 1)/K Σ (θ_k − mean)².
     spread = np.sqrt(BLOCKS - 1.0) * np.std(thetas, axis=0) / unit
     theta = (whole / unit)[:p]
@@ -187,17 +187,17 @@ def robust_parameters(problem: TorqueProblem, columns: Array, prior: Array) -> A
 
 def _held_out(A: Array, y: Array, weight: Array, Z: Array | None = None) -> tuple[Array, Array, Array]:
     """Return held-out residuals, parameters fitted without each block, and those fitted to all blocks."""
-    block, rest, symmetric = blocks_of(len(y)), np.zeros_like(y), Z is None
+    blocks, rest, symmetric = blocks_of(len(y)), np.zeros_like(y), Z is None
     Z = A if Z is None else Z
     grams, sides, thetas = [], [], []
-    for rows in (block == k for k in range(BLOCKS)):
+    for rows in blocks:
         a, z = (x[rows].reshape(-1, A.shape[-1]) for x in (A, Z))
         grams.append(z.T @ a)
         sides.append(z.T @ y[rows].ravel())
     gram, side = np.sum(grams, axis=0), np.sum(sides, axis=0)
-    for k in range(BLOCKS):
+    for k, rows in enumerate(blocks):
         thetas.append(_solve(gram - grams[k], side - sides[k], weight, symmetric))
-        rest[block == k] = y[block == k] - A[block == k] @ thetas[-1]
+        rest[rows] = y[rows] - A[rows] @ thetas[-1]
     return rest, np.stack(thetas), _solve(gram, side, weight, symmetric)
 
 

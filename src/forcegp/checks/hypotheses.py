@@ -29,6 +29,8 @@ rarely known, and friction in MuJoCo rises more gently."""
 SLOW, GRAVITY, LARGEST_DRIFT = 0.01, 10.0, 100.0
 """Sliding speed below which dry friction at contacts is smoothed [m/s]; possible error in gravity [m/s²];
 possible drift of a torque sensor [N m, N]."""
+ROBOT = ("gravity", "payload", "masses")
+"""Hypotheses about the robot file. These do not change the log."""
 
 
 @dataclass(frozen=True)
@@ -158,14 +160,10 @@ def current_hypothesis(
 
 
 def robot_hypotheses(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterator[Hypothesis]:
-    """Yield the hypotheses about the robot file. These do not change the log."""
+    """Yield the hypotheses about the robot file."""
     for name in ROBOT:
         columns, prior = robot_columns(system, log, rows, name)
         yield Hypothesis(name, columns.shape[-1], unchanged, columns, prior)
-
-
-ROBOT = ("gravity", "payload", "masses")
-"""Hypotheses about the robot file. These do not change the log."""
 
 
 def robot_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray, name: str) -> tuple[Array, Array]:

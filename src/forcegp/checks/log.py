@@ -235,7 +235,6 @@ def read_log(path: str | Path) -> Log:
 
 def derive(log: Log, absent: list[str]) -> Log:
     """Return the log with missing derivatives computed in each contiguous run of rows, and NaN elsewhere."""
-    logged = [name for name in JOINT_VECTORS if name not in absent]
     filled = log.replace(**{name: np.zeros_like(log.q) for name in absent})
     values = {name: np.full_like(log.q, np.nan) for name in absent}
     window = 2 * max(3, round(FILTER_SECONDS / log.dt / 2.0)) + 1 if np.isfinite(log.dt) else 7
@@ -243,7 +242,7 @@ def derive(log: Log, absent: list[str]) -> Log:
     for rows in filled.stretches:
         even = filled.dt * np.arange(rows.stop - rows.start)
         for name in absent if len(even) >= window else ():
-            source, degree = ("q", 1) if name == "qd" else ("qd", 1) if "qd" in logged else ("q", 2)
+            source, degree = ("q", 1) if name == "qd" else ("q", 2) if "qd" in absent else ("qd", 1)
             one = np.zeros(len(even), np.int64)
             values[name][rows] = differentiate(even, getattr(log, source)[rows], one, method, degree)[0]
     return log.replace(**values, derived=log.derived | set(absent))

@@ -128,10 +128,6 @@ def join_stream(
     report.steps.append(f"interpolated {name} from {rate} onto the clock of the positions")
 
 
-SMOOTH = ("q", "qd")
-"""Quantities interpolated by cubic splines. Noisier quantities are interpolated linearly."""
-
-
 def onto(t: Array, values: Array, at: Array, cubic: bool = False) -> Array:
     """Interpolate values (n, d) from times t to times `at`, linearly or by a cubic spline."""
     from scipy.interpolate import CubicSpline, make_interp_spline
@@ -162,8 +158,8 @@ def even_clock(signals: Signals, period: float | None, report: ImportReport) -> 
         nearest = np.searchsorted(t, grid + 0.5 * step).clip(1, len(t)) - 1 + rows.start
         parts.append((rows, t, grid, nearest))
     for name in list(signals.vectors):
-        old = signals.vectors.pop(name)
-        new = [onto(t, old[rows], grid, cubic=name in SMOOTH) for rows, t, grid, _ in parts]
+        old, cubic = signals.vectors.pop(name), name in ("q", "qd")  # the others are noisier
+        new = [onto(t, old[rows], grid, cubic) for rows, t, grid, _ in parts]
         signals.vectors[name] = np.concatenate(new)
     index: NDArray[np.int64] = np.concatenate([nearest for *_, nearest in parts])
     signals.contact = {name: value[index] for name, value in signals.contact.items()}

@@ -212,10 +212,6 @@ def find_wrench(table: LogTable, robot: RobotModel, draft: Draft) -> None:
             return
 
 
-RELATED = 0.95
-"""Minimum correlation of a velocity with the rate of change of its position."""
-
-
 def find_by_values(stream: Stream, joints: tuple[str, ...], draft: Draft) -> None:
     """Propose families for columns without headings: blocks of one column per joint, and their rates."""
     nq = len(joints)
@@ -249,4 +245,4 @@ def _is_rate(t: np.ndarray, x: np.ndarray, v: np.ndarray) -> bool:
     rate, mean = rate[good], mean[good]
     if len(rate) < 10 or not (robust_std(rate) > 0.0).all() or not (robust_std(mean) > 0.0).all():
         return False
-    return all(np.corrcoef(a, b)[0, 1] > RELATED for a, b in zip(rate.T, mean.T, strict=True))
+    return all(np.corrcoef(a, b)[0, 1] > 0.95 for a, b in zip(rate.T, mean.T, strict=True))
