@@ -121,6 +121,13 @@ def test_a_link_without_mass_may_stay_without(wire: Case, change: float, possibl
     assert _possible(massless, masses, replace(fit, theta=theta)) == possible
 
 
+def test_every_explanation_of_the_torque_can_be_an_alternative() -> None:
+    """Two joints of which either may drift: both are torque offsets, and a test tells them apart."""
+    one, two = (Finding("torque-offset", f"{j} drifts", ((0, 9),), (j,)) for j in "ab")
+    both = with_alternatives(one, [two])
+    assert both.message == "a drifts; or b drifts" and both.told_apart_by
+
+
 def test_what_concerns_the_whole_log_comes_first() -> None:
     """A spike of one row must not hide that the clock is wrong; both are warnings."""
     robot = forcegp.load_robot("double_pendulum")

@@ -91,7 +91,7 @@ def test_an_uneven_clock_is_made_even_to_fourth_order() -> None:
     t = np.sort(np.arange(400) * 0.01 + 0.002 * random.standard_normal(400).clip(-2, 2))
     s, report = signals(t), ImportReport("log")
     even_clock(s, None, report)
-    assert np.ptp(np.diff(s.t)) < 1e-12 and report.findings[0].kind == "uneven"
+    assert np.ptp(np.diff(s.t)) < 1e-12 and report.findings[0].kind == "jitter"
     # 5/384 h⁴ |q⁗| of a cubic spline with h = 0.018 s; 1/8 h² |τ″| linearly, with |τ″| = 9.
     np.testing.assert_allclose(s.vectors["q"][:, 0], np.sin(s.t), atol=1e-8)
     np.testing.assert_allclose(s.vectors["tau"][:, 0], np.cos(3.0 * s.t), atol=4e-4)
