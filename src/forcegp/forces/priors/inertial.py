@@ -27,6 +27,7 @@ from forcegp.gp.kernels import Constant, Kernel
 from forcegp.gp.optimise import LearningOptions, minimise
 from forcegp.identification import MASS_SHARE, MOMENT_ARM, PARAMETER_NAMES, regressor
 from forcegp.robot.inertia import (
+    from_inertial_parameters,
     from_log_cholesky,
     from_pseudo_inertia,
     inertial_parameters,
@@ -54,6 +55,8 @@ class InertialPrior(ConstantForcePrior):
         name: prefix of the hyperparameters.
         scales: scales S `(10 nq,)`; by default those of the robot.
         drives: standard deviation of each joint's drive inertia [kg m², kg]; by default all are known.
+        per_gain: change of the identified parameters of links, then drives, per relative error of the gain of
+            each torque sensor, `11 nq` rows of `nq`; empty if the robot was not identified from torques.
 
     Example:
         >>> import torch, forcegp
@@ -70,6 +73,7 @@ class InertialPrior(ConstantForcePrior):
     target: str = JOINT
     scales: tuple[float, ...] | None = None
     drives: tuple[float, ...] = ()
+    per_gain: tuple[tuple[float, ...], ...] = ()
 
     def around(self, robot: RobotModel) -> InertialPrior:
         """Return the prior with its scales fixed to those of the given robot."""
@@ -169,6 +173,18 @@ class InertialPrior(ConstantForcePrior):
         with torch.enable_grad():
             theta = minimise(objective, {"x": log_cholesky(J0[sound])}, CONSISTENT).tensors["x"]
         return robot_of(theta), delta_of(theta).detach()
+
+    def curvature(self, robot: RobotModel) -> Tensor:
+        """Return the second derivative of the divergence in `updated` with respect to δ, `(10 nq, 10 nq)`.
+
+        γ ∂²(−log |J|)/∂δ_a ∂δ_b = γ tr(J⁻¹ J_a J⁻¹ J_b), as J is linear in δ; it is 0 for unphysical links.
+        """
+        J = pseudo_inertia(robot.mass, robot.com, robot.inertia)
+        sound = torch.linalg.eigvalsh(J)[:, 0] > 0.0
+        J = torch.where(sound[:, None, None], J, torch.eye(4).to(J))
+        scale = sound[:, None] * self.scale(robot)[: PER_LINK * robot.nq].view(robot.nq, PER_LINK)
+        each = torch.linalg.solve(J[:, None], from_inertial_parameters(torch.diag_embed(scale)))
+        return torch.block_diag(*DIVERGENCE * torch.einsum("kaij,kbji->kab", each, each))
 
 
 DIVERGENCE = 0.01
