@@ -128,7 +128,8 @@ class NormalEquations:
 
     def _each(self, part: Callable[[Tensor], Tensor]) -> NormalEquations:
         sums = (self.gram, self.right, self.torque, self.square, self.count)
-        return NormalEquations(*map(part, sums), self.unknowns)
+        gram, right, torque, square, count = map(part, sums)
+        return NormalEquations(gram, right, torque, square, count, self.unknowns)
 
     def friction(self, delta: Tensor) -> Tensor:
         """Return the friction weights w `(nq, f)` that best fit the residual at δ."""
@@ -400,8 +401,8 @@ def _by_stretch(rows: Rows, Z: Tensor, X: Tensor, s: Tensor, r: Tensor) -> Norma
         count = (X[inside] != 0.0).any(-1).sum(0).to(r.dtype).clamp(min=1.0)
         right, torque = ((z.mT @ part[inside].mT[..., None])[..., 0] for part in (r, rows.tau))
         groups.append((z.mT @ x, right, torque, (s[inside] * r[inside]).sum(0), count))
-    totals = (torch.stack(parts) for parts in zip(*groups, strict=True))
-    return NormalEquations(*totals, X.shape[-1] - rows.friction.shape[-1])
+    gram, right, torque, square, count = (torch.stack(parts) for parts in zip(*groups, strict=True))
+    return NormalEquations(gram, right, torque, square, count, X.shape[-1] - rows.friction.shape[-1])
 
 
 def held_out(
