@@ -26,9 +26,9 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from real_cases import Case, moving
+from real_cases import IN_MOTION, Case, moving
 from real_logs import scores
-from real_models import rigid, structured
+from real_models import Predicted, rigid, structured
 from torch import Tensor
 
 import forcegp
@@ -288,6 +288,14 @@ def mass_matrices(arm: Arm, fit: StructuredFit, q: Tensor) -> dict:
     return result
 
 
+def along_the_log(fit: StructuredFit, data: forcegp.Dataset) -> Predicted:
+    """Predictions with the memory of friction, at the samples in motion."""
+    moves = data.qd.abs().amax(-1) > IN_MOTION
+    predicted = fit.predict_log(data, noise=True)
+    assert predicted.covariance is not None
+    return Predicted(predicted.mean[moves], predicted.covariance[moves], fit.system)
+
+
 def compare(arm: Arm, case: Case) -> dict:
     """Scores of the defaults and of least squares, their ratios, and the mass matrix."""
     test = moving(case.tests["test"])
@@ -303,14 +311,22 @@ def compare(arm: Arm, case: Case) -> dict:
         found[model] |= {"seconds": time.perf_counter() - began, "notes": fitted.notes}
         if fitted.fit is not None:
             found["mass_matrix"] = mass_matrices(arm, fitted.fit, test.q[:: max(1, len(test) // STATES)])
+        if fitted.fit is not None:
+            remembering = along_the_log(fitted.fit, case.tests["test"])
+            found["along the log"] = scores(remembering, test, case.system.robot)
     ratio = np.array(found["defaults"]["torque_rmse"]) / found["least squares"]["torque_rmse"]
-    squared = np.array(found["defaults"]["acceleration_mse"]) / found["least squares"]["acceleration_mse"]
+    squared, along = (
+        np.array(found[model]["acceleration_mse"]) / found["least squares"]["acceleration_mse"]
+        for model in ("defaults", "along the log")
+    )
     found["ratios"] = {
         "torque": float(np.exp(np.log(ratio).mean())),
         "worst_joint": float(ratio.max()),
         "acceleration": squared.tolist(),
         "worst_acceleration": float(squared.max()),
         "coverage": found["defaults"]["torque_coverage"],
+        "acceleration_along": along.tolist(),
+        "coverage_along": found["along the log"]["torque_coverage"],
     }
     return found
 
