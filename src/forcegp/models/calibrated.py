@@ -36,10 +36,10 @@ from forcegp.forces.quantities import States, states_at
 from forcegp.identification import regressor
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.robot.inertia import (
-    from_inertial_parameters,
     from_pseudo_inertia,
     inertial_parameters,
     pseudo_inertia,
+    pseudo_inertia_of,
 )
 from forcegp.robot.model import RobotModel
 from forcegp.robot.write_back import is_mjcf, write_robot
@@ -382,7 +382,7 @@ class _Reader:
         root = (U @ torch.diag_embed(torch.where(sound[:, None], w, 1.0).rsqrt()) @ U.mT)[:, None]
         row, column = torch.triu_indices(4, 4)
         weight = torch.where(row == column, 1.0, 2.0**0.5).to(w)
-        entries = root @ (from_inertial_parameters(torch.eye(n).to(w)) * self.scale[:, :n, None, None]) @ root
+        entries = root @ (pseudo_inertia_of(torch.eye(n).to(w)) * self.scale[:, :n, None, None]) @ root
         entries = torch.where(sound[:, None, None], entries[..., row, column] * weight, torch.eye(n).to(w))
         T, links = torch.block_diag(*entries), slice(first, first + robot.nq * n)
 
@@ -525,7 +525,7 @@ def _projected(speeds: Tensor, curve: Tensor) -> tuple[Tensor, Tensor, Tensor, T
 def _moved(robot: RobotModel, change: Tensor) -> RobotModel:
     """Return the robot with the inertial parameters π + change `(nq, 10)`."""
     J = pseudo_inertia(robot.mass, robot.com, robot.inertia)
-    mass, com, inertia = from_pseudo_inertia(J + from_inertial_parameters(change))
+    mass, com, inertia = from_pseudo_inertia(J + pseudo_inertia_of(change))
     return robot.replace(mass=mass, com=com, inertia=inertia)
 
 

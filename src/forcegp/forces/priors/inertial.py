@@ -27,12 +27,12 @@ from forcegp.gp.kernels import Constant, Kernel
 from forcegp.gp.optimise import LearningOptions, minimise
 from forcegp.identification import MASS_SHARE, MOMENT_ARM, PARAMETER_NAMES, regressor
 from forcegp.robot.inertia import (
-    from_inertial_parameters,
     from_log_cholesky,
     from_pseudo_inertia,
     inertial_parameters,
     log_cholesky,
     pseudo_inertia,
+    pseudo_inertia_of,
 )
 from forcegp.robot.model import RobotModel
 
@@ -183,7 +183,7 @@ class InertialPrior(ConstantForcePrior):
         sound = torch.linalg.eigvalsh(J)[:, 0] > 0.0
         J = torch.where(sound[:, None, None], J, torch.eye(4).to(J))
         scale = sound[:, None] * self.scale(robot)[: PER_LINK * robot.nq].view(robot.nq, PER_LINK)
-        each = torch.linalg.solve(J[:, None], from_inertial_parameters(torch.diag_embed(scale)))
+        each = torch.linalg.solve(J[:, None], pseudo_inertia_of(torch.diag_embed(scale)))
         return torch.block_diag(*DIVERGENCE * torch.einsum("kaij,kbji->kab", each, each))
 
 
