@@ -42,10 +42,10 @@ def evaluate(
     """Compare the predictions of a model with a data set and with trivial predictors.
 
     The trivial predictors are the mean, the robot file alone, and a least-squares fit of inertial parameters,
-    viscous and Coulomb friction, and offsets. The verdict states the fraction of the torque beyond gravity
-    that the model explains, the error in open-loop motion, and the error in the contact force, if logged. It
-    is followed by a comparison of the model with each predictor in torque and acceleration. Errors are in
-    rad/s² (m/s² for prismatic joints); coverage is the fraction of samples within two standard deviations.
+    viscous and Coulomb friction, and offsets. The verdict states which fraction of the non-gravitational
+    torque the model explains, and the errors in open-loop motion and, if logged, in the contact force. A
+    comparison of the model with each predictor in torque and acceleration follows. Errors are in rad/s² (m/s²
+    for prismatic joints). Coverage is the fraction of samples within two standard deviations.
 
     With --out, the command writes a page that shows the verdict, the errors by joint, the calibration and
     the predictions over the first seconds. It prints the path of the page, and writes all scores to
@@ -87,7 +87,7 @@ def _written(
     test: forcegp.Dataset,
     names: tuple[str, str, str | None],
 ) -> dict[str, object]:
-    """Write the page and its data, and return their paths; `names` are the file names shown on the page."""
+    """Write the page and its data, and return their paths. `names` are the file names shown on the page."""
     from forcegp.destination import folder_or_keep
     from forcegp.files import write_json
     from forcegp.report.evaluation import PAGE, write_evaluation

@@ -55,16 +55,16 @@ def export(
 ) -> None:
     """Export a structured Gaussian process as C99, CasADi or torch code, or into a copy of its robot file.
 
-    C: one .h and one .c file that compute the mean and covariance of accelerations, multipliers and forces,
-    and the Jacobians of the mean, given the state and the closed contacts. They depend only on libm. A test
-    program with reference values, a CMakeLists.txt and a README are included.
+    C: the files compute the mean and covariance of accelerations, multipliers and forces, and the Jacobians
+    of the mean, given the state and the closed contacts. They depend only on libm. A test program with
+    reference values, a CMakeLists.txt and a README are included.
 
-    CasADi: the mean as a function with exact derivatives, in a file for `casadi.Function.load`.
+    CasADi: the file contains the mean as a function for `casadi.Function.load`, with exact derivatives.
 
-    torch: the mean and covariance as a program for `torch.export.load`.
+    torch: the file contains the mean and covariance as a program for `torch.export.load`.
 
-    URDF, MJCF: a copy of the robot file in which only inertia, damping and friction are replaced by their
-    identified values; a report with standard deviations and losses; and robots drawn from the posterior.
+    URDF, MJCF: the copy of the robot file contains the identified inertia, damping and friction. A report
+    with standard deviations and losses, and robots drawn from the posterior, are also written.
 
     [bold]Examples[/bold]
 

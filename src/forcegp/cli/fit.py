@@ -50,7 +50,7 @@ def fit(
     """Fit a model of the forward dynamics to logged motion.
 
     The table \\[model] in the scene or in --config defines priors, kernels, noise, robot parameters and
-    learning; command-line options override it.
+    learning. Command-line options override its entries.
 
     For structured models, Parquet logs are read piece by piece if they have more than 100,000 rows or consist
     of several files.
@@ -88,7 +88,7 @@ def fit(
 
 
 def _figures(result: FitResult, as_json: bool) -> dict[str, object]:
-    """Return the fields of the result by name; for text output, omit empty fields and printed warnings."""
+    """Return the fields of the result by name. For text output, omit empty fields and printed warnings."""
     figures = {name: value for name, value in asdict(result).items() if name != "history"}
     if as_json:
         return figures

@@ -47,8 +47,8 @@ def import_(
 ) -> None:
     """Import a log from a CSV, text, Parquet, NumPy, MATLAB, HDF5, ROS bag, MCAP or LeRobot file.
 
-    A mapping file in TOML assigns columns to joints and states their units, signs and frames; --guess
-    proposes one.
+    A mapping file in TOML assigns columns to joints and states their units, signs and frames. With --guess,
+    the command proposes a mapping file.
 
     [bold]Examples[/bold]
 
@@ -90,7 +90,7 @@ def _guess(log: Path, system: forcegp.ConstrainedSystem, out: Path) -> dict[str,
 
 
 def _summary(imported: Imported) -> dict[str, object]:
-    """Return the numbers of rows and trajectories and the period, and then findings and processing steps."""
+    """Return the numbers of rows and trajectories and the period, then findings and processing steps."""
     data, report = imported.data, imported.report
     rows, segments = f"{len(data)} from {report.rows_read} logged", int(data.segment[-1]) + 1
     result: dict[str, object] = {"rows": rows, "segments": segments, "period_s": data.header.dt}
@@ -245,8 +245,8 @@ def select(
     """Select training points that cover a log, and keep the rest for testing.
 
     By default, points are selected by exact farthest-point sampling of standardized positions, velocities
-    and torques. They are deterministic and in order of selection, so the first k rows are the selection of k
-    points.
+    and torques. The points are deterministic and in the order of selection, so that the first k rows are
+    those selected for k points.
 
     [bold]Examples[/bold]
 

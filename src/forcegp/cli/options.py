@@ -12,7 +12,7 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON o
 SCENES = sorted(
     entry.name.removesuffix(".toml") for entry in (files("forcegp") / "scene" / "bundled").iterdir()
 )
-"""Names of the bundled scenes, listed without loading the library."""
+"""Names of the bundled scenes, which are listed without loading the library."""
 _SCENE = typer.Option("--scene", "-s", help=f"Scene file, or the name of a bundled one: {', '.join(SCENES)}.")
 SceneName = Annotated[str, _SCENE]
 SceneOrNone = Annotated[str | None, _SCENE]

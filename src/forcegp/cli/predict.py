@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from forcegp.models.base import Predictor
 
 PER_CONTACT = ("multiplier", "contact_force")
-"""Quantities with one value or one vector per contact; all others have one component per joint."""
+"""Quantities with one value or one vector per contact. All others have one component per joint."""
 WRENCH = "external_wrench"
 """Wrench on a frame, saved as the force and moment of a contact named after the frame."""
 
@@ -68,7 +68,7 @@ def predict(
 
     The output is the data set with the additional column predicted_<quantity> and, for models with
     uncertainty, predicted_<quantity>_std. The standard deviation includes the noise of the motor torque and
-    of the sensor. With --no-noise, which is the default in Python, it does not.
+    of the sensor. With --no-noise (the default in Python), it excludes this noise.
 
     [bold]Examples[/bold]
 
@@ -129,7 +129,7 @@ def _with_wrench(
 ) -> tuple[forcegp.Dataset, dict[str, object]]:
     """Add the external wrench on a frame, and the detected contact, as a contact named after the frame.
 
-    Return the data set, and a summary with the fraction of samples in contact.
+    Return the data set and a summary with the fraction of samples in contact.
     """
     from forcegp.models.structured_fit import StructuredFit
 

@@ -41,9 +41,9 @@ def rollout(
 ) -> None:
     """Simulate motion with a model, starting from a logged state and applying the logged torques.
 
-    The output folder contains rollout.parquet (the predicted motion, the logged motion as q_logged, and the
-    standard deviation over samples as q_std), rollout.html with plots and an animation of the arm, the plots
-    as SVG files, and their data as rollout.json.
+    The output folder contains rollout.parquet with the predicted motion, the logged motion as q_logged, and
+    the standard deviation over samples as q_std. The page rollout.html shows plots and an animation of the
+    arm. The plots are also written as SVG files, and their data as rollout.json.
 
     [bold]Examples[/bold]
 
@@ -112,7 +112,7 @@ def _say_contact(log: forcegp.Dataset, unilateral: bool) -> None:
 
 
 def _stretch(data: forcegp.Dataset, start: int, duration: float | None) -> forcegp.Dataset:
-    """Return the rows from `start` until the end of the trajectory or of the duration."""
+    """Return the rows from `start` to the end of the trajectory or of the duration."""
     from forcegp.data.derivative import UNIFORM_TOLERANCE
 
     stretch = trajectory_from(data, start, "rollout")
@@ -128,7 +128,7 @@ def _stretch(data: forcegp.Dataset, start: int, duration: float | None) -> force
 
 
 def _spread(q: Tensor) -> Tensor:
-    """Return the standard deviation over samples `(S, T, nq)`, as long as two have not diverged."""
+    """Return the standard deviation over samples `(S, T, nq)`, as long as at least two have not diverged."""
     import numpy as np
     import torch
 
@@ -200,7 +200,7 @@ def simulate(
     """Simulate and log the robot of a scene while it slides over a surface or follows a given motion.
 
     If a model is given, MuJoCo simulates the fitted robot with the learned joint forces, which replace joint
-    friction, and computes the contact forces itself.
+    friction. MuJoCo computes the contact forces itself.
 
     [bold]Examples[/bold]
 

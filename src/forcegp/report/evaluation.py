@@ -31,7 +31,7 @@ def write_evaluation(
     """Write the page on a model together with its plots and their data, and return the path of the page.
 
     `model`, `data` and `fitted_to` are file names shown on the page. If `fitted_to` is `None`, the trivial
-    predictors were fitted to halves of the data. `comparison` contains the sets of force priors compared.
+    predictors were fitted to halves of the data. `comparison` contains the compared sets of force priors.
     """
     drawn = {"Predictions": draw_predictions(window), "Errors": draw_errors(window)}
     pictures = [dataclasses.replace(picture, title=title) for title, picture in drawn.items()]
@@ -105,7 +105,7 @@ def draw_calibration(evaluation: Evaluation) -> Picture:
 
 
 def error_tables(evaluation: Evaluation) -> tuple[Table, ...]:
-    """Return tables of torque and acceleration errors by joint; red: worse than a trivial predictor."""
+    """Return tables of torque and acceleration errors by joint. Red means worse than a trivial predictor."""
     units = {"torque": "[N m, N]", "acceleration": "[rad/s², m/s²]"}
     tables = []
     for unit, names in units.items() if evaluation.predictors else ():
@@ -158,7 +158,7 @@ def score_table(evaluation: Evaluation) -> Table:
 
 
 def comparison_tables(comparison: Sequence[Compared]) -> tuple[Table, ...]:
-    """Return a table of the sets of force priors compared, or no table if the priors were given."""
+    """Return a table of the compared sets of force priors, or no table if the priors were given."""
     rows = tuple(
         tuple(cell(x, 3) for x in (each.name, each.log_density, each.behind, each.standard_error, note))
         for each in comparison

@@ -20,7 +20,7 @@ from forcegp.simulate.urdf import link_name, write_urdf
 from forcegp.types import Array
 
 POSITIONS, MOST = 200, 0.5
-"""Number of random positions, and fraction of overlaps in these positions above which a pair is ignored."""
+"""Number of random positions; fraction of these positions in which a pair must overlap to be ignored."""
 TIP = 0.005
 """Tip radius for point contacts [m]."""
 SURROUNDINGS = "surroundings"
@@ -30,9 +30,9 @@ class Collisions:
     """Collisions of the parts of a robot with each other and with their surroundings, given a clearance.
 
     Args:
-        system: robot, and contacts with surfaces to avoid.
-        shapes: convex parts of the robot.
-        boxes: `(k, 6)` centres and side lengths of boxes that are aligned with the world axes [m].
+        system: the robot, and contacts with the surfaces to avoid.
+        shapes: the convex parts of the robot.
+        boxes: centres and side lengths of boxes aligned with the world axes, `(k, 6)` [m].
         clearance: minimum distance [m].
 
     Raises:
@@ -91,7 +91,7 @@ class Collisions:
         return found
 
     def depth(self, q: Array) -> Array:
-        """Return by how much the clearance is violated at positions `(n, nq)`, `(n,)` [m]; 0 if it is not."""
+        """Return the violation of the clearance `(n,)` [m] at positions `(n, nq)`, or 0 if there is none."""
         return np.array(
             [
                 max((self.clearance - self._data.contact.dist[k] for k, _ in self._near(x)), default=0.0)

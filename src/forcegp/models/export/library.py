@@ -1,6 +1,4 @@
-"""A fitted model that predicts with its exported C code, which is compiled by the local compiler and cached
-on disk.
-"""
+"""A fitted model that predicts with exported C code, which is compiled locally and cached on disk."""
 
 from __future__ import annotations
 
@@ -29,7 +27,7 @@ from forcegp.native import load_library
 NAME = "forcegp"
 NOT_FINITE, JAMMED, UNRESOLVED, NO_INERTIA, NO_JACOBIAN, AT_REST, NO_NOISE, OVERFLOW = 1, 2, 3, 4, 5, 6, 7, 9
 UNDETERMINED = 11
-"""What the C code returns other than 0."""
+"""Nonzero status codes that the C code returns."""
 MESSAGES = {
     JAMMED: "friction of a contact would press harder than it opposes",
     UNRESOLVED: "the precision of the C code does not resolve a predicted variance",
@@ -48,13 +46,13 @@ FUNCTIONS = {
     "forget": [ctypes.c_double, ctypes.c_int],
     "drift": [ctypes.c_int, ctypes.c_double],
 }
-"""Arguments after the pointer to the online state; all functions but the first require online learning."""
+"""Arguments after the pointer to the online state. All functions but the first require online learning."""
 
 
 class CompiledFit(Predictor):
-    """A fit that predicts in C: it computes the results of `StructuredFit.predict` in microseconds.
+    """A fit that evaluates `StructuredFit.predict` in C within microseconds.
 
-    It is created by `StructuredFit.compiled`; `library` has the functions of the C header, `forcegp_…`."""
+    It is created by `StructuredFit.compiled`. `library` has the functions of the C header, `forcegp_…`."""
 
     kind = "compiled"
 
@@ -98,14 +96,14 @@ class CompiledFit(Predictor):
         active: Tensor | None = None,
         noise_std: Tensor | None = None,
     ) -> CompiledFit:
-        """Add samples one after the other, with the result of `StructuredFit.update`.
+        """Add samples one after the other, with the same result as `StructuredFit.update`.
 
         Args:
-            q, qd, tau: `(*batch, nq)` states.
-            measured: `(*batch, d)` values at these states.
+            q, qd, tau: states, `(*batch, nq)`.
+            measured: measured values at these states, `(*batch, d)`.
             quantity: the measured quantity.
-            active: `(*batch, n_contacts)` bool, closed contacts; by default all.
-            noise_std: standard deviation of the values `(d,)`; by default, that of the fit.
+            active: mask `(*batch, n_contacts)` of closed contacts. By default, all contacts are closed.
+            noise_std: standard deviation of the noise `(d,)`. The default is that of the fit.
 
         Raises:
             ModelError: the model cannot learn in C, or the noise of the quantity is unknown.
@@ -133,15 +131,15 @@ class CompiledFit(Predictor):
         """Reduce the weight of all previous samples, as in `StructuredFit.forget`.
 
         Args:
-            factor: factor on the weight of all previous samples; with `priors`, the correlation of their
-                forces with the previous forces.
-            priors: names of priors whose forces drift towards the prior; samples then keep their weight.
-            budget: number of weights whose prior is renewed, each at the cost of one row; the others are
-                renewed in later calls. By default, all are renewed.
+            factor: factor on the weight of all previous samples. If `priors` is given, it is the correlation
+                of their forces with the previous forces.
+            priors: names of priors whose forces drift towards the prior. Samples then keep their weight.
+            budget: number of weights for which the prior is renewed, each at the cost of one row. The others
+                are renewed in later calls. By default, all are renewed.
 
         Raises:
             ModelError: the model cannot learn in C, or the factor is out of range.
-            UnknownNameError: the prior does not exist.
+            UnknownNameError: a prior does not exist.
         """
         newer, names = self._copy(), [prior.name for prior in self.model.posterior.priors]
         for name in priors or ():
@@ -192,8 +190,8 @@ class CompiledFit(Predictor):
     ) -> Prediction:
         """Return the posterior mean and covariance of a quantity, as in `StructuredFit.predict`.
 
-        Arguments and errors are those of that method. `quantity` may also be `"joint_friction"`, the friction
-        of the joints, including the friction in the robot file [N m, N].
+        The arguments and errors are those of that method. `quantity` may also be `"joint_friction"`, the
+        friction of the joints [N m, N], which includes the friction in the robot file.
 
         Raises:
             ModelError: `system` is not the system of the fit, or friction jams a contact.
@@ -250,14 +248,14 @@ class CompiledFit(Predictor):
         """Return the posterior mean of quantities and its Jacobian with respect to q, q̇ and τ.
 
         Args:
-            q, qd, tau: `(*batch, nq)` states.
+            q, qd, tau: states, `(*batch, nq)`.
             quantity: `"qdd"`, `"multiplier"`, `"contact_force"` or `"joint_friction"`, or several of them.
-            active: `(*batch, n_contacts)` bool, closed contacts; by default all.
+            active: mask `(*batch, n_contacts)` of closed contacts. By default, all contacts are closed.
 
         Raises:
             UnknownNameError: the quantity does not exist.
             ModelError: friction jams a contact, or the fit was updated in C.
-            NumericalError: closed contacts are not independent.
+            NumericalError: the closed contacts are not independent.
         """
         if self._learned is not None:
             raise ModelError(
@@ -289,13 +287,13 @@ class CompiledFit(Predictor):
     ) -> ExternalWrench:
         """Estimate, separately for each state, the external wrench on the frame of `compiled(wrench=...)`.
 
-        The result is that of `StructuredFit.external_wrench` for samples in any order: friction with memory,
-        which needs a log in time order, is not tracked.
+        The result is that of `StructuredFit.external_wrench` for samples in any order. Friction with memory
+        requires a log in time order and is not tracked.
 
         Args:
-            q, qd, tau, qdd: `(*batch, nq)` states with measured accelerations.
-            active: `(*batch, n_contacts)` bool, closed contacts; by default all.
-            qdd_std: standard deviation of the accelerations `(nq,)`; by default, that of the fit.
+            q, qd, tau, qdd: states with measured accelerations, `(*batch, nq)`.
+            active: mask `(*batch, n_contacts)` of closed contacts. By default, all contacts are closed.
+            qdd_std: standard deviation of the acceleration noise `(nq,)`. The default is that of the fit.
 
         Raises:
             ModelError: the fit was compiled without a wrench, or friction jams a contact.
@@ -318,9 +316,9 @@ class CompiledFit(Predictor):
         active: Tensor | None = None,
         qdd_std: Tensor | None = None,
     ) -> WrenchJacobian:
-        """Return the mean of `external_wrench` and its Jacobian by fourth-order finite differences.
+        """Return the mean of `external_wrench`, and its Jacobian from fourth-order finite differences.
 
-        Arguments and errors are those of `external_wrench`.
+        The arguments and errors are those of `external_wrench`.
         """
         mean, _, _, slopes = self._wrench(q, qd, tau, qdd, active, qdd_std, True)
         return WrenchJacobian(mean, *slopes.unbind(-2))
@@ -369,7 +367,7 @@ class CompiledFit(Predictor):
         active: Tensor | None = None,
         system: ConstrainedSystem | None = None,
     ) -> ForceLinearization:
-        """Return the mean acceleration and multiplier and their Jacobians; see `StructuredFit.linearize`."""
+        """Return the mean acceleration and multiplier with their Jacobians (see `StructuredFit`)."""
         if system is not None and system is not self.system:
             raise ModelError("a compiled fit predicts on its own system", hint="use that of the fit")
         found = self.jacobian(q, qd, tau, ["qdd", "multiplier"], active=active)
@@ -389,11 +387,11 @@ class CompiledFit(Predictor):
         return tuple(x.contiguous() for x in given), batch
 
     def _new(self, *shape: int) -> Tensor:
-        """Return a new array in the precision of the C code."""
+        """Return a new array with the precision of the C code."""
         return torch.empty(shape, dtype=self.model.dtype)
 
     def _error(self, status: int, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor | None) -> ForceGPError:
-        """Return the error reported by the C code, or raise an error that names a non-finite state."""
+        """Return the error that the C code reported, or raise an error that names a non-finite state."""
         flat_states(self.system, q, qd, tau, active)
         return KINDS.get(status, NumericalError)(MESSAGES[status])
 
@@ -432,9 +430,9 @@ class MeanJacobian(NamedTuple):
     """The mean of quantities and its Jacobian, with one row per component.
 
     Attributes:
-        mean: `(*batch, d)` mean.
-        dq, dqd, dtau: `(*batch, d, nq)` derivatives with respect to q, q̇ and τ.
-        parts: slice of each quantity.
+        mean: the mean `(*batch, d)`.
+        dq, dqd, dtau: derivatives with respect to q, q̇ and τ, `(*batch, d, nq)`.
+        parts: the slice of each quantity.
     """
 
     mean: Tensor
@@ -448,8 +446,8 @@ class WrenchJacobian(NamedTuple):
     """The mean of an external wrench and its Jacobian, with one row per component.
 
     Attributes:
-        mean: `(*batch, k)` mean.
-        dq, dqd, dtau, dqdd: `(*batch, k, nq)` derivatives with respect to q, q̇, τ and q̈.
+        mean: the mean `(*batch, k)`.
+        dq, dqd, dtau, dqdd: derivatives with respect to q, q̇, τ and q̈, `(*batch, k, nq)`.
     """
 
     mean: Tensor
