@@ -112,6 +112,18 @@ class InertialPrior(ConstantForcePrior):
         parts = [self.mass * m, (self.length * m).expand(-1, 3), self.inertia * torch.stack(products, dim=-1)]
         return torch.cat([torch.cat(parts, dim=-1).flatten().detach(), m.new_tensor(self.drives)])
 
+    def curvature(self, robot: RobotModel) -> Tensor:
+        """Return the second derivative of the divergence in `updated` with respect to δ, `(10 nq, 10 nq)`.
+
+        γ ∂²(−log |J|)/∂δ_a ∂δ_b = γ tr(J⁻¹ J_a J⁻¹ J_b), as J is linear in δ; it is 0 for unphysical links.
+        """
+        J = pseudo_inertia(robot.mass, robot.com, robot.inertia)
+        sound = torch.linalg.eigvalsh(J)[:, 0] > 0.0
+        J = torch.where(sound[:, None, None], J, torch.eye(4).to(J))
+        scale = sound[:, None] * self.scale(robot)[: PER_LINK * robot.nq].view(robot.nq, PER_LINK)
+        each = torch.linalg.solve(J[:, None], pseudo_inertia_of(torch.diag_embed(scale)))
+        return torch.block_diag(*DIVERGENCE * torch.einsum("kaij,kbji->kab", each, each))
+
     def updated(
         self,
         robot: RobotModel,
@@ -173,18 +185,6 @@ class InertialPrior(ConstantForcePrior):
         with torch.enable_grad():
             theta = minimise(objective, {"x": log_cholesky(J0[sound])}, CONSISTENT).tensors["x"]
         return robot_of(theta), delta_of(theta).detach()
-
-    def curvature(self, robot: RobotModel) -> Tensor:
-        """Return the second derivative of the divergence in `updated` with respect to δ, `(10 nq, 10 nq)`.
-
-        γ ∂²(−log |J|)/∂δ_a ∂δ_b = γ tr(J⁻¹ J_a J⁻¹ J_b), as J is linear in δ; it is 0 for unphysical links.
-        """
-        J = pseudo_inertia(robot.mass, robot.com, robot.inertia)
-        sound = torch.linalg.eigvalsh(J)[:, 0] > 0.0
-        J = torch.where(sound[:, None, None], J, torch.eye(4).to(J))
-        scale = sound[:, None] * self.scale(robot)[: PER_LINK * robot.nq].view(robot.nq, PER_LINK)
-        each = torch.linalg.solve(J[:, None], pseudo_inertia_of(torch.diag_embed(scale)))
-        return torch.block_diag(*DIVERGENCE * torch.einsum("kaij,kbji->kab", each, each))
 
 
 DIVERGENCE = 0.01
