@@ -200,7 +200,7 @@ def test_the_command_writes_the_file_a_report_and_samples(fit: StructuredFit, tm
     )
     for arguments, message in (
         (["--to", "urdf"], "no robot file was given"),
-        (["--to", "mjcf", "--robot", "double_pendulum"], "has another format"),
+        (["--to", "mjcf", "--robot", "double_pendulum"], "has a different format"),
         (["--to", "sdf"], "format to export to"),
     ):
         failed = runner.invoke(app, [*base, *arguments, "-o", str(tmp_path / "none.urdf")])

@@ -391,7 +391,7 @@ def is_sparse(inference: str, priors: Sequence[ForcePrior], samples: int) -> boo
     if any(prior.in_time for prior in priors):
         if inference == "sparse":
             raise ModelError(
-                "sparse inference takes samples to be independent, which a function of time couples",
+                "sparse inference assumes independent samples, which a function of time couples",
                 expected="exact inference",
                 got=", ".join(prior.name for prior in priors if prior.in_time),
                 hint='use inference="exact" on evenly spaced rows (`forcegp select --method even`)',
@@ -468,8 +468,8 @@ def lost_by_inducing(posterior: ForcePosterior) -> tuple[dict[str, Any], tuple[s
         return {"inference": "exact"}, ()
     diagnostics = posterior.latent.diagnostics
     warnings = (
-        f"more inducing points would help: {diagnostics.size} basis functions miss a variance of "
-        f"{diagnostics.missed:.3g} in units of the noise, where noise leaves {diagnostics.learned:.3g}; "
+        f"more inducing points would help: {diagnostics.size} basis functions leave a residual variance of "
+        f"{diagnostics.missed:.3g}, compared with {diagnostics.learned:.3g} that the data determine; "
         "raise inducing_points",
     )
     return {

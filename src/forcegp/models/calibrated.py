@@ -219,7 +219,7 @@ def write_calibrated(
     if drives:
         values = ", ".join(f"{x:.4g}" for x in found.robot.armature.tolist())
         losses = (
-            f"URDF has no armature ({values}): links have its inertia as far as physically possible",
+            f"URDF has no armature ({values}): the links include its inertia as far as physically possible",
             *losses,
         )
     report = {

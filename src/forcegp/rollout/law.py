@@ -304,7 +304,7 @@ def law_of(model: ForwardModel, system: ConstrainedSystem | None = None) -> Law:
         system.robot is not trained.robot or [*system.contacts] != [*trained.contacts]
     ):
         raise ModelError(
-            f"this model ({model.kind}) predicts accelerations of the system that it was fitted on only",
+            f"this model ({model.kind}) predicts accelerations only for the system to which it was fitted",
             expected=_described(trained),
             got=f"another system: {_described(system)}",
             hint="omit `system`, or use a model of forces such as StructuredGP",

@@ -147,7 +147,9 @@ def _compile(mujoco: Any, system: ConstrainedSystem, solver: ContactSolver) -> A
 def _per_joint(robot: RobotModel, solver: ContactSolver, name: str) -> np.ndarray:
     values = getattr(solver, name)
     if len(values) not in (0, robot.nq):
-        raise ForceGPError(f"{name} does not fit the robot", expected=f"{robot.nq} numbers", got=values)
+        raise ForceGPError(
+            f"{name} has the wrong length for the robot", expected=f"{robot.nq} numbers", got=values
+        )
     if bool((robot.stribeck != 0.0).any()):
         raise UnsupportedRobotError(
             f"robot {robot.name!r} declares Stribeck friction, which MuJoCo does not model",
