@@ -29,7 +29,7 @@ IMPORTED = {
     "doubt": "import-doubt",
     "faster than its source": "rows-held",
     "gap": "time-gap",
-    "uneven": "time-jitter",
+    "jitter": "time-jitter",
 }
 """Kinds of findings made during import that are reported as a finding other than `import-found`."""
 Check = Callable[[ConstrainedSystem, Log], Outcome]

@@ -51,7 +51,7 @@ def evaluate(
     the predictions over the first seconds. It prints the path of the page, and writes all scores to
     evaluation.json.
 
-    [bold]Examples[/bold]
+    **Examples**
 
     forcegp evaluate --model model --data test.parquet --train train.parquet --out evaluation/
 

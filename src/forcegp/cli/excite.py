@@ -63,7 +63,7 @@ def excite(
     displays the motion, its use of the limits, and the expected standard deviation of the torque before and
     after the motion is recorded.
 
-    [bold]Examples[/bold]
+    **Examples**
 
     forcegp excite --scene ur5_free --seconds 30 --acceleration 6 --out motion.csv
 

@@ -67,7 +67,7 @@ def export(
     URDF, MJCF: the copy of the robot file contains the identified inertia, damping and friction. A report
     with standard deviations and losses, and robots drawn from the posterior, are also written.
 
-    [bold]Examples[/bold]
+    **Examples**
 
     forcegp export --model model --to c --out controller/
 

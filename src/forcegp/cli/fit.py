@@ -57,7 +57,7 @@ def fit(
     For structured models, Parquet logs are read piece by piece if they have more than 100,000 rows or consist
     of several files.
 
-    [bold]Examples[/bold]
+    **Examples**
 
     forcegp fit --scene kuka_plane --data train.parquet --model sgp --out model
 
@@ -129,7 +129,7 @@ def sweep(
 
     Completed fits are not repeated. This command requires the extra `sweep` (Dask).
 
-    [bold]Examples[/bold]
+    **Examples**
 
     forcegp sweep --scene kuka_plane --model sgp-zero --model sgp --seeds 3 --out sweep/
 

@@ -52,7 +52,7 @@ def import_(
     A mapping file in TOML assigns columns to joints and states their units, signs and frames. With --guess,
     the command proposes a mapping file.
 
-    [bold]Examples[/bold]
+    **Examples**
 
     forcegp import run.csv --scene my_scene.toml --guess mapping.toml
 
@@ -162,7 +162,7 @@ def check(
     The last line is the verdict. The exit code is 0 if a model can be fitted, 1 if a finding makes a fit
     worthless, and 2 if the scene or the log cannot be read.
 
-    [bold]Examples[/bold]
+    **Examples**
 
     forcegp check --scene kuka_plane --data run.parquet
 
@@ -250,7 +250,7 @@ def select(
     and torques. The points are deterministic and in the order of selection, so that the first k rows are
     those selected for k points.
 
-    [bold]Examples[/bold]
+    **Examples**
 
     forcegp select run.parquet -n 1000 --out train.parquet --rest test.parquet
 

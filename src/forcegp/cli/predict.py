@@ -67,11 +67,11 @@ def predict(
 ) -> None:
     """Predict a quantity at the states of a data set.
 
-    The output is the data set with the additional column predicted_<quantity> and, for models with
-    uncertainty, predicted_<quantity>_std. The standard deviation includes the noise of the motor torque and
+    The output is the data set with the additional column `predicted_<quantity>` and, for models with
+    uncertainty, `predicted_<quantity>_std`. The standard deviation includes the noise of the motor torque and
     of the sensor. With --no-noise (the default in Python), it excludes this noise.
 
-    [bold]Examples[/bold]
+    **Examples**
 
     forcegp predict --model model --data test.parquet --out predicted.parquet
 

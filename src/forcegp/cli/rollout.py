@@ -47,7 +47,7 @@ def rollout(
     the standard deviation over samples as q_std. The page rollout.html shows plots and an animation of the
     arm. The plots are also written as SVG files, and their data as rollout.json.
 
-    [bold]Examples[/bold]
+    **Examples**
 
     forcegp rollout --model model --data test.parquet --out rollout/ --duration 2
 
@@ -207,7 +207,7 @@ def simulate(
     If a model is given, MuJoCo simulates the fitted robot with the learned joint forces, which replace joint
     friction. MuJoCo computes the contact forces itself.
 
-    [bold]Examples[/bold]
+    **Examples**
 
     forcegp simulate --scene kuka_plane --out run.parquet
 

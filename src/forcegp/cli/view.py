@@ -53,7 +53,7 @@ def view(
     The page is accessible from this computer only. With --out, it is written as one HTML file that works
     offline.
 
-    [bold]Examples[/bold]
+    **Examples**
 
     forcegp view kuka_plane
 

@@ -206,13 +206,13 @@ class Problem:
 
     @torch.no_grad()
     def hidden_torque(self) -> Tensor:
-        """Return the standard deviation `(nq,)` of torques with little effect on accelerations, otherwise 0.
+        """Return the standard deviation `(nq,)` of torques that hardly affect accelerations, 0 for others.
 
         In contact, a force along the constraint does not change the accelerations. For a joint that acts
         along the constraint, P_ii is near zero, and its noise and friction cannot be distinguished from those
-        of other joints. The estimate is the acceleration residual at such samples in excess of given unknown
-        forces e, s² = Σ (r_i² − Σ_k H_ik² Var e_k) / Σ H_ii², but at least `UNSHOWN` times the load. It
-        applies if P_ii is below one half at most samples and above it at fewer than `SHOWN` independent
+        of other joints. The estimate is the acceleration residual that given unknown forces e do not explain
+        at such samples, s² = Σ (r_i² − Σ_k H_ik² Var e_k) / Σ H_ii², and at least `UNSHOWN` times the load.
+        It applies if P_ii is less than one half at most samples and greater at fewer than `SHOWN` independent
         samples, unless forces were also measured.
         """
         if set(self.training.quantities) != {"qdd"}:

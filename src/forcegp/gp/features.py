@@ -128,7 +128,7 @@ def components_of(block: Block) -> list[int]:
 
 
 def chunked(blocks: Iterable[Block], samples: int) -> Iterator[Block]:
-    """Split blocks into blocks with a maximum number of samples."""
+    """Split blocks so that none exceeds a maximum number of samples."""
     for block in blocks:
         for first in range(0, len(block.target), samples):
             yield rows_of(block, slice(first, first + samples))

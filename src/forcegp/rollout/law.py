@@ -141,7 +141,7 @@ class Stuck(NamedTuple):
 
 
 def overshooting(G: Tensor, damping: Tensor, h: Tensor) -> Tensor | None:
-    """Return D `(n, nq)` at states with h G_ii D_i > 1 for a joint, 0 at others, or `None` if all are 0."""
+    """Return D `(n, nq)` where h G_ii D_i > 1 for any joint and 0 elsewhere, or `None` if all are 0."""
     rows = (h * G.diagonal(dim1=-2, dim2=-1) * damping > 1.0).any(-1, keepdim=True)
     return torch.where(rows, damping, 0.0) if bool(rows.any()) else None
 
