@@ -26,9 +26,9 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
-from real_cases import Case, moving
+from real_cases import IN_MOTION, Case, moving
 from real_logs import scores
-from real_models import rigid, structured
+from real_models import Predicted, rigid, structured
 from torch import Tensor
 
 import forcegp
@@ -252,12 +252,17 @@ def case_of(name: str, arm: Arm, folder: Path, seconds: Mapping[str, float] = SE
     return Case(name, forcegp.ConstrainedSystem(arm.robot), read["train"], {"test": read["test"]})
 
 
+KINDS = ("", "_of_shares", "_of_posterior")
+SIGMAS = ("sigmas", "relative_sigma")
+
+
 def mass_matrices(arm: Arm, fit: StructuredFit, q: Tensor) -> dict:
     """Diagonals of the mass matrix over the engine's, and the fit's error in units of its standard deviation.
 
     The posterior of the inertial parameters has one; without it, the inertia is taken as known. No log tells
     the gain of a torque sensor from inertia, as g τ = g M q̈ + …, so the tolerance of the gains, which a data
-    sheet states, counts beside the posterior; `sigmas_of_posterior` leaves it out.
+    sheet states, counts beside the posterior, carried through the identification: Σ_j s² (∂M/∂g_j)².
+    `sigmas_of_posterior` leaves it out, and `sigmas_of_shares` counts it as a share of M_jj alone.
     """
     robot, posterior, exact = fit.system.robot, fit.posterior, arm.mass_matrix(q.numpy()).mean(0)
     file, found = (
@@ -274,10 +279,29 @@ def mass_matrices(arm: Arm, fit: StructuredFit, q: Tensor) -> dict:
             C = torch.cat([links, eye[:, : len(prior.drives)]], dim=-1) * prior.scale(robot)
             inverse = latent_precision(posterior, one_row(posterior, fit.problem), p, robot)
             std = (C @ torch.linalg.solve(inverse, C.mT)).diagonal().sqrt().numpy()
-            tolerance = arm.wrong.gain / 3.0**0.5 * exact
-            result["sigmas"] = ((found - exact) / np.hypot(std, tolerance)).tolist()
-            result["sigmas_of_posterior"] = ((found - exact) / std).tolist()
+            tolerance, unit = arm.wrong.gain / 3.0**0.5, C / prior.scale(robot)
+            per_gain = (unit @ unit.new_tensor(prior.per_gain)).norm(dim=-1).numpy()
+            for key, gains in zip(KINDS, (per_gain, exact, 0.0), strict=True):
+                sigma = np.hypot(std, tolerance * gains)
+                result[f"sigmas{key}"] = ((found - exact) / sigma).tolist()
+                result[f"relative_sigma{key}"] = (sigma / exact).tolist()
     return result
+
+
+def inertia_alone(arm: Arm, case: Case) -> dict:
+    """The mass matrix of a fit with friction priors, without any other score."""
+    model = forcegp.StructuredGP(case.system, "analytical", force_priors="friction", inertia="auto")
+    q = moving(case.tests["test"]).q
+    found = mass_matrices(arm, model.fit(case.train), q[:: max(1, len(q) // STATES)])
+    return {"ratios": {}, "mass_matrix": found}
+
+
+def along_the_log(fit: StructuredFit, data: forcegp.Dataset) -> Predicted:
+    """Predictions with the memory of friction, at the samples in motion."""
+    moves = data.qd.abs().amax(-1) > IN_MOTION
+    predicted = fit.predict_log(data, noise=True)
+    assert predicted.covariance is not None
+    return Predicted(predicted.mean[moves], predicted.covariance[moves], fit.system)
 
 
 def compare(arm: Arm, case: Case) -> dict:
@@ -295,14 +319,22 @@ def compare(arm: Arm, case: Case) -> dict:
         found[model] |= {"seconds": time.perf_counter() - began, "notes": fitted.notes}
         if fitted.fit is not None:
             found["mass_matrix"] = mass_matrices(arm, fitted.fit, test.q[:: max(1, len(test) // STATES)])
+        if fitted.fit is not None:
+            remembering = along_the_log(fitted.fit, case.tests["test"])
+            found["along the log"] = scores(remembering, test, case.system.robot)
     ratio = np.array(found["defaults"]["torque_rmse"]) / found["least squares"]["torque_rmse"]
-    squared = np.array(found["defaults"]["acceleration_mse"]) / found["least squares"]["acceleration_mse"]
+    squared, along = (
+        np.array(found[model]["acceleration_mse"]) / found["least squares"]["acceleration_mse"]
+        for model in ("defaults", "along the log")
+    )
     found["ratios"] = {
         "torque": float(np.exp(np.log(ratio).mean())),
         "worst_joint": float(ratio.max()),
         "acceleration": squared.tolist(),
         "worst_acceleration": float(squared.max()),
         "coverage": found["defaults"]["torque_coverage"],
+        "acceleration_along": along.tolist(),
+        "coverage_along": found["along the log"]["torque_coverage"],
     }
     return found
 
@@ -311,19 +343,24 @@ def pooled(result: Mapping[str, dict]) -> dict:
     """Errors of the mass matrix over all joints and logs."""
     each = [found["mass_matrix"] for found in result.values()]
     off = {key: np.abs(np.concatenate([m[key] for m in each]) - 1.0) for key in ("file", "fit")}
-    sigmas, alone = (
-        np.abs(np.concatenate([[], *(m[key] for m in each if key in m)]))
-        for key in ("sigmas", "sigmas_of_posterior")
-    )
-    return {
+    pool: dict = {
         "logs": len(each),
         "identified": sum("sigmas" in m for m in each),
         "untouched": sum(m["fit"] == m["file"] for m in each),
         **{f"median_{key}": float(np.median(x)) for key, x in off.items()},
-        "within_2_sigma": float((sigmas <= 2.0).mean()) if len(sigmas) else None,
-        "largest_sigma": float(sigmas.max()) if len(sigmas) else None,
-        "posterior_within_2_sigma": float((alone <= 2.0).mean()) if len(alone) else None,
     }
+    known = [m for m in each if "sigmas" in m]
+    for kind in KINDS if known else ():
+        sigmas, widths = (np.abs(np.concatenate([m[f"{x}{kind}"] for m in known])) for x in SIGMAS)
+        pool[f"sigmas{kind}"] = {
+            "joints": len(sigmas),
+            "within_1": float((sigmas <= 1.0).mean()),
+            "within_2": float((sigmas <= 2.0).mean()),
+            "largest": float(sigmas.max()),
+            "median_width": float(np.median(widths)),
+            "median_width_over_error": float(np.median(1.0 / sigmas)),
+        }
+    return pool
 
 
 def main() -> None:
@@ -335,6 +372,7 @@ def main() -> None:
     parser.add_argument("--seed", type=int, nargs="*", default=[0, 1])
     parser.add_argument("--right-file", action="store_true", help="true masses, drives and torques")
     parser.add_argument("--gain", type=float, help="largest relative error of the torque sensors")
+    parser.add_argument("--mass-matrix", action="store_true", help="of fits with friction priors, no scores")
     parser.add_argument("--json", type=Path, help="write all results to this file")
     options = parser.parse_args()
     result = {}
@@ -345,7 +383,7 @@ def main() -> None:
         with tempfile.TemporaryDirectory() as folder, warnings.catch_warnings():
             warnings.simplefilter("ignore")
             logs = case_of(f"{name}, {case}, seed {seed}", arm, Path(folder))
-            result[logs.name] = found = compare(arm, logs)
+            result[logs.name] = found = (inertia_alone if options.mass_matrix else compare)(arm, logs)
         print(logs.name, json.dumps(found["ratios"] | found["mass_matrix"]), flush=True)
     print(json.dumps(pooled(result)))
     if options.json is not None:

@@ -2,12 +2,18 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
+import pytest
 import torch
 
 import forcegp
-from forcegp.forces.friction_memory import learn_memory
+from forcegp.errors import DataError
+from forcegp.forces.friction_memory import MEMORY, learn_memory
 from forcegp.forces.measurements import Measurement
+from forcegp.forces.priors.sets import friction_priors
+from forces.test_inertia import log as motion
 
 ROBOT = forcegp.load_robot("double_pendulum")
 STEP, DISTANCE = 0.01, 0.05
@@ -48,6 +54,28 @@ def test_friction_with_memory_is_explained_on_another_motion() -> None:
     # The second joint has noise alone.
     assert float(memory.share[1, 0]) > 0.95
     assert bool((memory.force(ROBOT, test)[:, 1].abs() < 0.05).all())
+
+
+def test_predictions_along_a_log_remember_how_a_joint_reversed() -> None:
+    """Another motion of the same robot; a state alone does not determine this friction."""
+    zero = torch.zeros_like(ROBOT.damping)
+    robot = ROBOT.replace(damping=zero, friction=zero)
+    system = forcegp.ConstrainedSystem(robot)
+    train, test = (motion(robot, memory=0.05, seed=seed) for seed in (0, 1))
+    fit = forcegp.StructuredGP(system, "analytical", friction_priors(system)).fit(train)
+    alone = fit.predict(test.q, test.qd, test.tau, noise=True)
+    along = fit.predict_log(test, noise=True)
+    errors = [(x.mean - test.qdd).square().mean(0) for x in (alone, along)]
+    assert bool((errors[1] < 0.3 * errors[0]).all())
+    assert alone.std is not None and along.std is not None
+    assert bool((along.std < alone.std).all())
+    inside = ((along.mean - test.qdd).abs() <= 2.0 * along.std).double().mean(0)
+    assert bool((inside > 0.9).all()) and bool((inside < 1.0).all())
+    with pytest.raises(DataError, match="needs a log in time order"):
+        fit.predict_log(test[torch.arange(len(test)).flip(0)])
+    forgetful = {k: x for k, x in fit.hyperparameters.items() if not k.startswith(MEMORY)}
+    again = dataclasses.replace(fit, hyperparameters=forgetful).predict_log(test, noise=True)
+    torch.testing.assert_close(again.mean, alone.mean)
 
 
 def test_samples_far_apart_show_no_memory() -> None:

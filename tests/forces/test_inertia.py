@@ -130,6 +130,36 @@ def test_inertia_of_drives_that_the_file_lacks_is_found(file: RobotModel) -> Non
     torch.testing.assert_close(result.robot.armature, armature, rtol=0.1, atol=0.0)
 
 
+@pytest.mark.parametrize("joint", range(2))
+def test_the_effect_of_a_gain_is_that_of_identifying_again_with_scaled_torques(
+    file: RobotModel, joint: int
+) -> None:
+    """On M_jj, by central differences of 1 %."""
+    armature = torch.tensor([0.3, 0.1], dtype=torch.float64)
+    data = log(file.replace(mass=1.3 * file.mass, com=0.9 * file.com, armature=armature), 3200)
+    only = torch.eye(2, dtype=torch.float64)[joint]
+
+    def diagonal(gain: float) -> Tensor:
+        robot = found(file, data.replace(tau=data.tau * (1.0 + gain * only))).robot
+        return dynamics.mass_matrix(robot, data.q).diagonal(dim1=-2, dim2=-1).mean(0)
+
+    per_gain = found(file, data).per_gain
+    assert per_gain is not None
+    effect = torch.cat([unit_inertia(file, data.q), torch.eye(2).double()], dim=-1) @ per_gain[:, joint]
+    expected, size = (diagonal(0.01) - diagonal(-0.01)) / 0.02, diagonal(0.0)
+    torch.testing.assert_close(effect / size, expected / size, rtol=0.01, atol=0.003)
+
+
+def unit_inertia(robot: RobotModel, q: Tensor) -> Tensor:
+    """M_jj per inertial parameter of the links `(nq, 10 nq)`, averaged over states: torque at unit
+    acceleration without weight."""
+    zero, eye = torch.zeros_like(q), torch.eye(robot.nq, dtype=q.dtype)
+    still = regressor(robot, q, zero, zero)
+    return torch.stack(
+        [(regressor(robot, q, zero, e.expand_as(q)) - still)[:, j].mean(0) for j, e in enumerate(eye)]
+    )
+
+
 def inertia_error(robot: RobotModel, truth: RobotModel, data: forcegp.Dataset) -> float:
     """Relative error of the mass matrix over a log."""
     M, exact = (dynamics.mass_matrix(each, data.q) for each in (robot, truth))
@@ -140,7 +170,7 @@ def test_links_that_the_file_describes_wrongly_are_identified(file: RobotModel) 
     truth = file.replace(mass=1.3 * file.mass, com=0.9 * file.com)
     data = log(truth)
     result = found(file, data)
-    assert result.identified and "inertial parameters" in result.doubts[0]
+    assert result.identified and "identified inertia replaces" in result.doubts[0]
     assert inertia_error(result.robot, truth, data) < 0.25 * inertia_error(file, truth, data)
     system = forcegp.ConstrainedSystem(file)
     model = forcegp.StructuredGP(system, "analytical")
@@ -184,13 +214,8 @@ def test_a_drive_and_the_link_that_it_turns_share_their_uncertainty(file: RobotM
     inputs = one_row(fit.posterior, fit.problem)
     delta = fit.posterior.latent.latent_mean(p, inputs[p])[0]
     covariance = torch.linalg.inv(latent_precision(fit.posterior, inputs, p, robot))
-    q, zero = data.q[::10], torch.zeros_like(data.q[::10])
-    # M_jj of unit errors: torque of joint j at its unit acceleration, without weight
-    columns = []
-    for j, one in enumerate(torch.eye(2, dtype=torch.float64)):
-        links = regressor(robot, q, zero, one.expand_as(q)) - regressor(robot, q, zero, zero)
-        columns.append(torch.cat([links[:, j].mean(0), one]) * prior.scale(robot))
-    C = torch.stack(columns)
+    q = data.q[::10]
+    C = torch.cat([unit_inertia(robot, q), torch.eye(2).double()], dim=-1) * prior.scale(robot)
     std = (C @ covariance @ C.mT).diagonal().sqrt()
     M, exact = (dynamics.mass_matrix(x, q).diagonal(dim1=-2, dim2=-1).mean(0) for x in (robot, truth))
     assert bool(((M + C @ delta - exact).abs() <= 3.0 * std).all()) and bool((std < 0.05 * exact).all())
@@ -258,7 +283,7 @@ def test_averaged_equations_are_sums_of_neighbours_within_a_stretch() -> None:
     slides = torch.ones_like(r, dtype=torch.bool)
     slides[30, 0] = False
     rows = Rows(
-        r, r, r, r, Phi, slides, group, group, torch.cat([i + n, i]), Phi[..., :0], 0.0 * r, 0.01, 0.03**2
+        r, r, r, r, Phi, slides, group, group, torch.cat([i + n, i]), Phi[..., :0], r, 0.0 * r, 0.01, 0.03**2
     )
     mean, columns = averaged(rows, C, inertial, 0.04)
     assert mean.step == 0.02 and len(columns) == 2 * len(range(15, n - 15, 2))
@@ -341,13 +366,13 @@ def test_sums_give_the_dense_least_squares() -> None:
     n, nq, f, p = 60, 2, 3, 4
     C = torch.randn(n, nq, p, generator=random, dtype=torch.float64)
     Phi = torch.randn(n, nq, f, generator=random, dtype=torch.float64)
-    r = torch.randn(n, nq, generator=random, dtype=torch.float64)
+    r, tau = torch.randn(2, n, nq, generator=random, dtype=torch.float64)
     group = torch.arange(n) * 3 // n
     moves = torch.ones_like(r, dtype=torch.bool)
-    by_stretch = sums(Rows(r, r, r, r, Phi, moves, group, group, torch.arange(n), Phi[..., :0], r), C)
+    by_stretch = sums(Rows(r, r, r, r, Phi, moves, group, group, torch.arange(n), Phi[..., :0], tau, r), C)
     every, rest = by_stretch.total(), by_stretch.without(1)
     for given, own in ((every, group >= 0), (rest, group != 1)):
-        H, h = given.quadratic(NOISE)
+        H, h, per_gain = given.quadratic(NOISE)
         delta = torch.linalg.solve(H, h)
         w = given.friction(delta)
         rows = [torch.cat([C[own, j], *(Phi[own, j] if k == j else 0.0 * Phi[own, j] for k in range(nq))], -1)
@@ -356,6 +381,10 @@ def test_sums_give_the_dense_least_squares() -> None:
             torch.cat(rows), torch.cat([r[own, j] / NOISE[j] for j in range(nq)])
         ).solution
         torch.testing.assert_close(torch.cat([delta, w.flatten()]), dense, rtol=ROUNDING, atol=ROUNDING)
+        # A relative error of the gain of joint k adds τ_k to the torque of that joint alone.
+        more = [torch.cat([tau[own, j] * (j == k) / NOISE[j] for j in range(nq)]) for k in range(nq)]
+        change = torch.linalg.lstsq(torch.cat(rows), torch.stack(more, dim=-1)).solution[:p]
+        torch.testing.assert_close(torch.linalg.solve(H, per_gain), change, rtol=ROUNDING, atol=ROUNDING)
         left = r[own] - (C[own] @ delta) - (Phi[own] * w).sum(-1)
         torch.testing.assert_close(given.error(delta, w), left.square().mean(0), rtol=1e-9, atol=0.0)
 
@@ -369,9 +398,10 @@ def test_instruments_give_the_textbook_estimate() -> None:
     r = torch.randn(n, nq, generator=random, dtype=torch.float64)
     partner = torch.cat([torch.arange(n // 2) + n // 2, torch.arange(n // 2)])
     group = torch.arange(n // 2).repeat(2) * 3 // (n // 2)
-    rows = Rows(r, r, r, r, Phi, torch.ones_like(r, dtype=torch.bool), group, group, partner, Phi[..., :0], r)
+    moves = torch.ones_like(r, dtype=torch.bool)
+    rows = Rows(r, r, r, r, Phi, moves, group, group, partner, Phi[..., :0], r, r)
     every = instrumental(rows, C).total()
-    delta = torch.linalg.solve(*every.quadratic(NOISE))
+    delta = torch.linalg.solve(*every.quadratic(NOISE)[:2])
     X, Z = (torch.zeros(n, nq, p + nq * f, dtype=torch.float64) for _ in range(2))
     X[..., :p], Z[..., :p] = C, C[partner]
     for j in range(nq):

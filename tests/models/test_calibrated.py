@@ -33,7 +33,7 @@ from forcegp.rollout import RolloutOptions
 from forcegp.simulate.excite import Limits, excite, random_states
 from forcegp.simulate.passive import PassiveForces
 from forcegp.simulate.urdf import write_urdf
-from forces.test_inertia import log
+from forces.test_inertia import log, unit_inertia
 
 mujoco = optional_module("mujoco", "These tests")
 DAMPING, DRY = (0.3, 0.1), (1.0, 0.4)
@@ -297,6 +297,31 @@ def test_a_model_lowers_what_is_unknown_and_a_motion_lowers_it_further(fit: Stru
     motion = excite(system, 4.0, limits=limits, unknowns=known, restarts=1)
     assert bool((motion.after.torque_std()["all"] < stds[1]["all"]).all())
     assert float(motion.motion.qd.abs().max()) > 0.5
+
+
+def test_errors_of_gains_widen_the_inertia_by_their_effect_on_its_identification(
+    fit: StructuredFit,
+) -> None:
+    """σ² of M_22 grows by s² Σ_k (∂M_22/∂g_k)² with s = 5 %; M_11 is wider, as no drive may be negative."""
+    robot = forcegp.load_robot("double_pendulum")
+    truth = robot.replace(mass=1.3 * robot.mass, com=0.9 * robot.com)
+    data = log(truth, 800)
+    identified = forcegp.StructuredGP(forcegp.ConstrainedSystem(robot), "analytical").fit(data)
+    p, prior = next((p, x) for p, x in enumerate(identified.force_priors) if isinstance(x, InertialPrior))
+    assert isinstance(prior, InertialPrior)
+    C = torch.cat([unit_inertia(robot, data.q[::50]), torch.eye(2).double()], dim=-1)
+    precision = latent_precision(
+        identified.posterior, one_row(identified.posterior, identified.problem), p, robot
+    )
+    scaled = C * prior.scale(robot)
+    known = (scaled @ torch.linalg.solve(precision, scaled.mT)).diagonal()
+    added = (0.05 * C @ torch.tensor(prior.per_gain, dtype=torch.float64)).square().sum(-1)
+    samples = sampled_robots(identified, 400, gain_std=0.05)
+    M = torch.stack([mass_matrix(x, data.q[::50]).diagonal(dim1=-2, dim2=-1).mean(0) for x in samples])
+    torch.testing.assert_close(M.std(0)[1], (known + added).sqrt()[1], rtol=0.15, atol=0.0)
+    assert bool((added > 3.0 * known).all()), "a gain is the larger error here"
+    with pytest.raises(ModelError, match="gains on the inertia is unknown"):
+        calibrated(fit, gain_std=0.05)
 
 
 def test_drives_of_an_identified_robot_are_unknown_with_its_links() -> None:

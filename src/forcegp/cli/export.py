@@ -48,6 +48,10 @@ def export(
         int, typer.Option(min=0, help="For robot files: number of robots to draw from the posterior.")
     ] = 0,
     seed: Annotated[int, typer.Option(help="Seed for drawing these robots.")] = 0,
+    gain_std: Annotated[
+        float,
+        typer.Option(min=0.0, help="Robot file: relative standard deviation of the torque sensors' gains."),
+    ] = 0.0,
     as_json: AsJson = False,
 ) -> None:
     """Export a structured Gaussian process as C99, CasADi or torch code, or into a copy of its robot file.
@@ -85,7 +89,7 @@ def export(
     if not isinstance(fit, StructuredFit):
         raise ModelError("only a structured Gaussian process can be exported", expected="sgp", got=fit.kind)
     if to in ("urdf", "mjcf"):
-        show(_written_back(fit, to, robot, out, samples, seed), as_json)
+        show(_written_back(fit, to, robot, out, samples, seed, gain_std), as_json)
         return
     wrench = None if frame is None else WrenchFrame(frame, reference)
     dtype = torch.float32 if float32 else torch.float64
@@ -97,7 +101,7 @@ def export(
 
 
 def _written_back(
-    fit: StructuredFit, to: str, robot: str | None, out: Path, samples: int, seed: int
+    fit: StructuredFit, to: str, robot: str | None, out: Path, samples: int, seed: int, gain_std: float
 ) -> dict[str, object]:
     """Write the robot file, and return a summary."""
     from forcegp.models.calibrated import write_calibrated
@@ -112,7 +116,7 @@ def _written_back(
         raise RobotFileError(
             f"{robot} has a different format", expected=to, got="mjcf" if to == "urdf" else "urdf"
         )
-    found = write_calibrated(fit, robot, out, samples=samples, seed=seed)
+    found = write_calibrated(fit, robot, out, samples=samples, seed=seed, gain_std=gain_std)
     determined = sum(parameter.determined for parameter in found.parameters)
     result: dict[str, object] = {"file": str(out), "report": str(out.with_name(f"{out.stem}.report.json"))}
     return result | {"parameters": len(found.parameters), "determined": determined, "samples": samples}

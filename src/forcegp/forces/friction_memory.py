@@ -24,7 +24,7 @@ from forcegp.forces.calibration import CHUNK_STATES, autocorrelation_time, stret
 from forcegp.forces.inverse_dynamics import bristles
 from forcegp.forces.measurements import Measurement, Training
 from forcegp.forces.noise import TORQUE_NOISE
-from forcegp.forces.posterior import stick_variance
+from forcegp.forces.posterior import STICK_NOISE, stick_variance
 from forcegp.forces.priors.base import NOISE
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import SPEEDS
@@ -84,6 +84,12 @@ class FrictionMemory:
     def force(self, robot: RobotModel, log: Measurement | Dataset) -> Tensor:
         """Return the joint force `(n, nq)` of the correction, for a log in time order [N m, N]."""
         return (_features(robot, log) * self.weights).sum(-1)
+
+    def less_noise(self, hyperparameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
+        """Return the hyperparameters with the remaining torque noise and static friction."""
+        less = dict(zip((TORQUE_NOISE, STICK_NOISE), 0.5 * self.share.log().mT, strict=True))
+        changed = {key: hyperparameters[key] + less[key] for key in less if key in hyperparameters}
+        return {**hyperparameters, **changed}
 
 
 @torch.no_grad()

@@ -67,8 +67,8 @@ WIDTHS = (0.0, 0.02, 0.05, 0.12)
 """Widths of the time averages to try (standard deviations) [s]; the narrowest posterior is used."""
 
 
-def rigid_robot(robot: RobotModel, rows: Rows) -> tuple[RobotModel, bool]:
-    """Return the robot that best predicts held-out torques, and whether its links were identified.
+def rigid_robot(robot: RobotModel, rows: Rows) -> tuple[RobotModel, Tensor | None]:
+    """Return the robot that best predicts held-out torques and, if its links were identified, ∂(π, a)/∂g.
 
     The candidates are the robot file, the robot file with added drive inertia, and a robot with identified,
     physically consistent links and drives. Each candidate must outperform the previous ones by two standard
@@ -105,28 +105,30 @@ def rigid_robot(robot: RobotModel, rows: Rows) -> tuple[RobotModel, bool]:
     file, driven = estimated(delay), estimated(driving)
     before, known = accelerations(robot, nothing), min((file, driven), key=lambda error: float(error.mean()))
     if _is_better(estimated(everything), known):
-        consistent, delta = _consistent(robot, prior, found, size)
+        consistent, delta, change = _consistent(robot, prior, found, size)
         better = _is_better(compared(lambda _: delta), known)
         if better and is_harmless(accelerations(consistent, delta), before):
-            return consistent, True
+            return consistent, change
     with_drives = robot.replace(armature=robot.armature + size * drives[:n])
     better = _is_better(driven, file) and is_harmless(accelerations(with_drives, drives), before)
-    return with_drives if better else robot, False
+    return with_drives if better else robot, None
 
 
 def _consistent(
     robot: RobotModel, prior: InertialPrior, found: _Regression, size: Tensor
-) -> tuple[RobotModel, Tensor]:
-    """Return the robot with physically consistent links and nonnegative drive inertia, and the unknowns.
+) -> tuple[RobotModel, Tensor, Tensor]:
+    """Return the robot with physically consistent links and nonnegative drive inertia, the unknowns, and
+    the change of the links' parameters and drives per relative error of each torque sensor's gain.
 
     The links are updated with the drives marginalised, and the drives are then updated given the links.
-    Drives whose inertia would be negative are removed.
+    Drives whose inertia would be negative are removed. To first order, these steps minimise
+    ½ (u − û)ᵀ P (u − û) + V(u) with the divergence V of the links, so ∂u/∂g = (P + V″)⁻¹ P ∂û/∂g.
 
     Args:
         size: units of the drive inertias `(nq,)`.
     """
     every, n = found.by_stretch.total(), len(size)
-    _, precision = found.normal()
+    _, precision, per_gain = found.normal()
     p = len(precision)
     links, last = torch.arange(n, p - 1), torch.tensor([p - 1])
     unknowns = found.estimate(every, torch.arange(p), n)
@@ -138,7 +140,14 @@ def _consistent(
         known = torch.zeros_like(best).index_put((links,), delta)
         unknowns = found.estimate(every, others, n, known)
         if bool((unknowns[drives] > 0.0).all()):
-            return moved.replace(armature=robot.armature + size * unknowns[:n]), unknowns
+            break
+    curvature = prior.around(robot).curvature(moved)
+    free = torch.cat([others, links[curvature.diagonal() > 0.0]])
+    precision[links[:, None], links] += curvature
+    change = torch.zeros_like(per_gain)
+    change[free] = torch.linalg.solve(precision[free][:, free], per_gain[free])
+    change = torch.cat([prior.scale(robot)[:, None] * change[links], size[:, None] * change[:n]])
+    return moved.replace(armature=robot.armature + size * unknowns[:n]), unknowns, change
 
 
 def with_delay(rows: Rows, columns: Tensor) -> Tensor:
@@ -154,14 +163,17 @@ class _Regression:
     noise: Tensor
     power: float
 
-    def normal(self, given: NormalEquations | None = None) -> tuple[Tensor, Tensor]:
-        """Return the linear term κ h and precision κ H + 1, ignoring directions of negative H."""
-        H, h = (given or self.by_stretch.total()).quadratic(self.noise)
+    def normal(self, given: NormalEquations | None = None) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the linear term κ h, the precision κ H + 1, and the change of κ h per relative error of each
+        gain `(p, nq)`, ignoring directions of negative H.
+        """
+        H, h, per_gain = (given or self.by_stretch.total()).quadratic(self.noise)
         values, vectors = torch.linalg.eigh(0.5 * (H + H.mT))
         shown = vectors * (values > 0.0)
         precision = self.power * (vectors * values.clamp(min=0.0)) @ vectors.mT
         eye = torch.eye(len(h), dtype=h.dtype, device=h.device)
-        return self.power * shown @ (vectors.mT @ h), precision + eye
+        h, per_gain = (self.power * shown @ (vectors.mT @ x) for x in (h, per_gain))
+        return h, precision + eye, per_gain
 
     def estimate(self, given: NormalEquations, kept: Tensor, n: int, known: Tensor | None = None) -> Tensor:
         """Return the most probable values of the unknowns `kept`, with nonnegative drives (the first n).
@@ -169,7 +181,7 @@ class _Regression:
         Args:
             known: values of the other unknowns; zero by default.
         """
-        h, precision = self.normal(given)
+        h, precision, _ = self.normal(given)
         known = torch.zeros_like(h) if known is None else known
         h = h - precision @ known
         L = torch.linalg.cholesky(precision[kept][:, kept])
@@ -238,13 +250,19 @@ class Inertia:
 
     Attributes:
         robot: robot from the robot file, with the identified inertia.
-        identified: whether inertial parameters of links were identified and thus remain uncertain.
+        per_gain: if inertial parameters of links were identified and thus remain uncertain, the change of
+            these parameters and of the drives per relative error of each torque sensor's gain `(11 nq, nq)`.
         doubts: warnings for the user.
     """
 
     robot: RobotModel
-    identified: bool = False
+    per_gain: Tensor | None = None
     doubts: tuple[str, ...] = ()
+
+    @property
+    def identified(self) -> bool:
+        """Whether inertial parameters of links were identified."""
+        return self.per_gain is not None
 
 
 @torch.no_grad()
@@ -261,10 +279,10 @@ def inertia_of(
     """
     robot = system.robot
     rows = free_rows(system, friction, mean, training)
-    better, has_links = rigid_robot(robot, rows.with_memory())
-    if has_links:
+    better, per_gain = rigid_robot(robot, rows.with_memory())
+    if per_gain is not None:
         text = "identified inertia replaces that of the robot file, since it predicts held-out torques better"
-        return Inertia(better, True, (text, *_told(robot, better.armature - robot.armature)))
+        return Inertia(better, per_gain, (text, *_told(robot, better.armature - robot.armature)))
     M = mass_matrix(robot, rows.q)
     armature = _damped(rows, M, better.armature - robot.armature)
     armature = armature * (armature > NEGLIGIBLE * M.diagonal(dim1=-2, dim2=-1).mean(0))
@@ -324,7 +342,7 @@ def _damped(rows: Rows, M: Tensor, found: Tensor) -> Tensor:
 
 def _drives(given: NormalEquations, noise: Tensor, M: Tensor, weight: float) -> Tensor:
     """Return the drive inertia a ≥ 0 that minimises ½ Σ ε²/s² − v Σ log |M + diag a| over all samples."""
-    H, h = given.quadratic(noise)
+    H, h, _ = given.quadratic(noise)
     n, M = float(given.count.max()), M[:: max(1, len(M) // VOLUME_STATES)]
     scale = M.diagonal(dim1=-2, dim2=-1).mean(0)
     H, h = (H * scale[:, None] * scale / n).cpu().numpy(), (h * scale / n).cpu().numpy()

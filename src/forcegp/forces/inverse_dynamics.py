@@ -67,6 +67,7 @@ class Rows:
         segment: trajectory number of each sample `(n,)`.
         partner: index of each sample's partner `(n,)`; for a sample without a partner, its own index.
         memory: additional features `(n, nq, k)` for friction with memory.
+        tau: measured torque `(n, nq)`.
         rate: time derivative of the torque `(n, nq)`.
         step: time between neighbouring samples [s]; 0 if they are not in time order.
         filter_variance: variance of the weights of the filter that averaged q̈ over time [s²].
@@ -82,6 +83,7 @@ class Rows:
     segment: Tensor
     partner: Tensor
     memory: Tensor
+    tau: Tensor
     rate: Tensor
     step: float = 0.0
     filter_variance: float = 0.0
@@ -99,7 +101,7 @@ class Rows:
 
 @dataclass(frozen=True)
 class NormalEquations:
-    """Σ ZᵀX `(..., nq, p + f, p + f)`, Σ Zᵀr, Σ r² and the number of samples, for each joint.
+    """Σ ZᵀX `(..., nq, p + f, p + f)`, Σ Zᵀr, Σ Zᵀτ, Σ r² and the number of samples, for each joint.
 
     X = (C, Φ). Z = (C′, Φ) if instruments are used, and Z = X otherwise. For `products`, r², XᵀX and Xᵀr are
     replaced by r r′, ½ (XᵀX′ + X′ᵀX) and ½ (Xᵀr′ + X′ᵀr).
@@ -107,6 +109,7 @@ class NormalEquations:
 
     gram: Tensor
     right: Tensor
+    torque: Tensor
     square: Tensor
     count: Tensor
     unknowns: int
@@ -124,9 +127,9 @@ class NormalEquations:
         return self._each(lambda x: x.sum(0) - x[g])
 
     def _each(self, part: Callable[[Tensor], Tensor]) -> NormalEquations:
-        return NormalEquations(
-            part(self.gram), part(self.right), part(self.square), part(self.count), self.unknowns
-        )
+        sums = (self.gram, self.right, self.torque, self.square, self.count)
+        gram, right, torque, square, count = map(part, sums)
+        return NormalEquations(gram, right, torque, square, count, self.unknowns)
 
     def friction(self, delta: Tensor) -> Tensor:
         """Return the friction weights w `(nq, f)` that best fit the residual for given δ."""
@@ -139,16 +142,16 @@ class NormalEquations:
         eye = torch.eye(self.gram.shape[-1] - p, dtype=self.gram.dtype, device=self.gram.device)
         return self.gram[:, p:, p:] + RIDGE * self.count[:, None, None] * eye
 
-    def quadratic(self, noise: Tensor) -> tuple[Tensor, Tensor]:
-        """Return H and h in H δ = h for optimal friction. Without instruments, δ minimises Σ |ε_j|²/s_j²."""
+    def quadratic(self, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return H and h in H δ = h for optimal friction, and the change of h per relative error of each
+        torque sensor's gain `(p, nq)`. Without instruments, δ minimises Σ |ε_j|²/s_j².
+        """
         # Friction is eliminated by a Schur complement: H_j = G_δδ − G_δf (G_ff + D)⁻¹ G_fδ, H = Σ_j H_j/s_j²
         p = self.unknowns
-        friction = torch.cat([self.gram[:, p:, :p], self.right[:, p:, None]], dim=-1)
-        reduced = torch.cat([self.gram[:, :p, :p], self.right[:, :p, None]], dim=-1)
-        reduced = reduced - self.gram[:, :p, p:] @ torch.linalg.solve(self._stiff(), friction)
-        H, h = reduced[..., :-1], reduced[..., -1]
-        weight = noise**-2
-        return torch.einsum("j,jpq->pq", weight, H), weight @ h
+        columns = torch.cat([self.gram[..., :p], torch.stack([self.right, self.torque], dim=-1)], dim=-1)
+        friction = torch.linalg.solve(self._stiff(), columns[:, p:])
+        reduced = (columns[:, :p] - self.gram[:, :p, p:] @ friction) * (noise**-2)[:, None, None]
+        return reduced[..., :p].sum(0), reduced[..., p].sum(0), reduced[..., p + 1].mT
 
     def error(self, delta: Tensor, friction: Tensor) -> Tensor:
         """Return the mean `(nq,)` of ε², or of ε ε′ for `products`."""
@@ -278,7 +281,7 @@ def _rows(
     Phi, memory = (x / x.square().mean(0).sqrt().clamp(min=1e-12) for x in (Phi, memory))
     residual = mean(system, at) - (at.eom.M @ m.values[..., None])[..., 0]
     slides = sliding(m.qd.abs(), min(prior.speeds), Phi, residual)
-    return Rows(m.q, m.qd, m.values, residual, Phi, slides, group, m.segment, partner, memory, rate)
+    return Rows(m.q, m.qd, m.values, residual, Phi, slides, group, m.segment, partner, memory, m.tau, rate)
 
 
 def sliding(speed: Tensor, slowest: float, Phi: Tensor, residual: Tensor) -> Tensor:
@@ -353,6 +356,7 @@ def averaged(rows: Rows, columns: Tensor, inertial: Tensor, width: float) -> tup
         residual=over(rows.residual + inertial, wide) - over(inertial, narrow),
         friction=over(rows.friction, wide),
         memory=over(rows.memory, wide),
+        tau=over(rows.tau, wide),
         rate=over(rows.rate, wide),
         slides=slides,
         partner=torch.cat([i + count, i]) if len(starts) == 2 else i,
@@ -389,16 +393,16 @@ def _equations(rows: Rows, columns: Tensor, paired: bool = False) -> tuple[Tenso
 
 
 def _by_stretch(rows: Rows, Z: Tensor, X: Tensor, s: Tensor, r: Tensor) -> NormalEquations:
-    """Return Σ ZᵀX, Σ Zᵀr and Σ s r. X includes a column of ones that is zero for ignored samples."""
+    """Return Σ ZᵀX, Σ Zᵀr, Σ Zᵀτ and Σ s r. X includes a column of ones that is zero for ignored samples."""
     groups = []
     for g in range(int(rows.group.max()) + 1):
         inside = rows.group == g
         z, x = Z[inside].transpose(0, 1), X[inside].transpose(0, 1)
         count = (X[inside] != 0.0).any(-1).sum(0).to(r.dtype).clamp(min=1.0)
-        right = (z.mT @ r[inside].mT[..., None])[..., 0]
-        groups.append((z.mT @ x, right, (s[inside] * r[inside]).sum(0), count))
-    gram, right, square, count = (torch.stack(parts) for parts in zip(*groups, strict=True))
-    return NormalEquations(gram, right, square, count, X.shape[-1] - rows.friction.shape[-1])
+        right, torque = ((z.mT @ part[inside].mT[..., None])[..., 0] for part in (r, rows.tau))
+        groups.append((z.mT @ x, right, torque, (s[inside] * r[inside]).sum(0), count))
+    gram, right, torque, square, count = (torch.stack(parts) for parts in zip(*groups, strict=True))
+    return NormalEquations(gram, right, torque, square, count, X.shape[-1] - rows.friction.shape[-1])
 
 
 def held_out(

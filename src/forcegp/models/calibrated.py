@@ -35,7 +35,12 @@ from forcegp.forces.priors.joint import AnalyticalMean, JointFrictionPrior
 from forcegp.forces.quantities import States, states_at
 from forcegp.identification import regressor
 from forcegp.models.structured_fit import StructuredFit
-from forcegp.robot.inertia import from_pseudo_inertia, inertial_parameters, pseudo_inertia
+from forcegp.robot.inertia import (
+    from_pseudo_inertia,
+    inertial_parameters,
+    pseudo_inertia,
+    pseudo_inertia_of,
+)
 from forcegp.robot.model import RobotModel
 from forcegp.robot.write_back import is_mjcf, write_robot
 
@@ -119,24 +124,29 @@ class Calibration:
 
 
 @torch.no_grad()
-def calibrated(fit: StructuredFit, *, draws: int = DRAWS, seed: int = 0) -> Calibration:
+def calibrated(
+    fit: StructuredFit, *, draws: int = DRAWS, seed: int = 0, gain_std: float = 0.0
+) -> Calibration:
     """Return the robot with the identified inertia and payload, and with friction that robot files support.
 
     Args:
         fit: a fit with an analytical mean.
         draws: number of function samples from which standard deviations are computed.
         seed: random seed for these samples, and for the poses over which friction is averaged.
+        gain_std: relative standard deviation of the torque sensors' gains, which no log determines. The
+            resulting errors of the identified inertia are included in its standard deviations.
 
     Returns:
         The robot, its parameters with standard deviations, and the losses.
 
     Raises:
-        ModelError: the fit has no analytical mean.
+        ModelError: the fit has no analytical mean, or `gain_std` is given for inertia not identified by
+            `inertia="auto"`.
 
     Example:
         `write_robot(calibrated(fit).robot, "my.urdf", "calibrated.urdf")`
     """
-    reader = _Reader.of(fit, seed)
+    reader = _Reader.of(fit, seed, gain_std=gain_std)
     mean, *samples = reader.robots(draws)
     file = fit.specified.robot
     robot, (curve, left, offset) = mean
@@ -146,7 +156,9 @@ def calibrated(fit: StructuredFit, *, draws: int = DRAWS, seed: int = 0) -> Cali
 
 
 @torch.no_grad()
-def sampled_robots(fit: StructuredFit, samples: int, *, seed: int = 0) -> list[RobotModel]:
+def sampled_robots(
+    fit: StructuredFit, samples: int, *, seed: int = 0, gain_std: float = 0.0
+) -> list[RobotModel]:
     """Draw physically consistent robots from the joint posterior of inertia, drives, payload and friction.
 
     A sample with unphysical links is replaced by the closest physical robot in the metric of the posterior.
@@ -156,6 +168,7 @@ def sampled_robots(fit: StructuredFit, samples: int, *, seed: int = 0) -> list[R
         fit: a fit with an analytical mean.
         samples: number of robots.
         seed: random seed.
+        gain_std: see `calibrated`.
 
     Raises:
         ModelError: see `calibrated`.
@@ -163,7 +176,8 @@ def sampled_robots(fit: StructuredFit, samples: int, *, seed: int = 0) -> list[R
     """
     if samples < 1:
         raise ParameterError("invalid number of samples", expected="1 or more", got=samples)
-    return [robot for robot, _ in _Reader.of(fit, seed).robots(max(samples, DRAWS))[1 : 1 + samples]]
+    reader = _Reader.of(fit, seed, gain_std=gain_std)
+    return [robot for robot, _ in reader.robots(max(samples, DRAWS))[1 : 1 + samples]]
 
 
 def write_calibrated(
@@ -173,6 +187,7 @@ def write_calibrated(
     *,
     samples: int = 0,
     seed: int = 0,
+    gain_std: float = 0.0,
     locked_joints: Mapping[str, float] | None = None,
 ) -> Calibration:
     """Write a copy of the robot file with the identified parameters, a report, and sampled robots.
@@ -186,14 +201,16 @@ def write_calibrated(
         out: path of the edited copy.
         samples: number of robots to draw from the posterior.
         seed: random seed.
+        gain_std: see `calibrated`.
         locked_joints: see `load_robot`.
 
     Raises:
         RobotFileError: the file does not match the robot, or cannot represent a change.
         ModelError: see `calibrated`.
     """
-    found, out = calibrated(fit, seed=seed), Path(out)
-    robots = [found.robot, *(sampled_robots(fit, samples, seed=seed) if samples else [])]
+    found, out = calibrated(fit, seed=seed, gain_std=gain_std), Path(out)
+    drawn = sampled_robots(fit, samples, seed=seed, gain_std=gain_std) if samples else []
+    robots = [found.robot, *drawn]
     drives = not is_mjcf(source) and bool((found.robot.armature != 0.0).any())
     losses: tuple[str, ...] = ()
     for k, robot in enumerate(robots):
@@ -288,15 +305,19 @@ class _Reader:
         speeds: speeds at which friction is evaluated, `(k, nq)`.
         at: states that combine all poses with these speeds.
         seed: random seed.
+        gain_std: relative standard deviation of the torque sensors' gains.
     """
 
     fit: StructuredFit
     speeds: Tensor
     at: States
     seed: int
+    gain_std: float
 
     @classmethod
-    def of(cls, fit: StructuredFit, seed: int, fastest: Tensor | None = None) -> _Reader:
+    def of(
+        cls, fit: StructuredFit, seed: int, fastest: Tensor | None = None, gain_std: float = 0.0
+    ) -> _Reader:
         mean = fit.problem.mean
         if not isinstance(mean, AnalyticalMean) or "actuation" not in mean.terms:
             raise ModelError(
@@ -319,7 +340,7 @@ class _Reader:
         qd = speeds.expand(POSES, -1, -1).flatten(0, 1)
         open_ = torch.zeros(len(q), len(fit.system.contacts), dtype=torch.bool, device=robot.device)
         at, _ = states_at(fit.system, q, qd, torch.zeros_like(q), open_)
-        return cls(fit, speeds, at, seed)
+        return cls(fit, speeds, at, seed, gain_std)
 
     @property
     def scale(self) -> Tensor | None:
@@ -337,11 +358,9 @@ class _Reader:
         drawn = self.fit.force_samples(draws, torch.Generator().manual_seed(self.seed))
         assert isinstance(drawn, ForceSamples)
         curves = torch.stack(list(self._curves(drawn)))
-        parts = [
-            curves.flatten(1),
-            self._constants(drawn, InertialPrior),
-            self._constants(drawn, PayloadPrior),
-        ]
+        inertia = self._constants(drawn, InertialPrior)
+        inertia[1:] += self._gain_errors(draws)
+        parts = [curves.flatten(1), inertia, self._constants(drawn, PayloadPrior)]
         sizes = [part.shape[-1] for part in parts]
         offset, (kept,) = self._offsets(curves), self._offsets(self._kept()[None])
         free = _without_offsets(offset, offset[0] - kept, torch.cat(parts, dim=-1))
@@ -364,7 +383,7 @@ class _Reader:
         root = (U @ torch.diag_embed(torch.where(sound[:, None], w, 1.0).rsqrt()) @ U.mT)[:, None]
         row, column = torch.triu_indices(4, 4)
         weight = torch.where(row == column, 1.0, 2.0**0.5).to(w)
-        entries = root @ (_pseudo(torch.eye(n).to(w)) * self.scale[:, :n, None, None]) @ root
+        entries = root @ (pseudo_inertia_of(torch.eye(n).to(w)) * self.scale[:, :n, None, None]) @ root
         entries = torch.where(sound[:, None, None], entries[..., row, column] * weight, torch.eye(n).to(w))
         T, links = torch.block_diag(*entries), slice(first, first + robot.nq * n)
 
@@ -433,6 +452,27 @@ class _Reader:
                 )
         return self.speeds.new_zeros(1 + drawn.count, 0)
 
+    def _gain_errors(self, draws: int) -> Tensor:
+        """Return samples of the errors of δ due to errors of the gains, `(draws, d)` or zeros `(draws, 1)`.
+
+        Raises:
+            ModelError: the inertia was learned in a way for which they are unknown.
+        """
+        robot = self.fit.system.robot
+        prior = next((p for p in self.fit.force_priors if isinstance(p, InertialPrior)), None)
+        if prior is None or self.gain_std == 0.0:
+            return robot.mass.new_zeros(draws, 1)
+        if not prior.per_gain:
+            raise ModelError(
+                "the effect of the torque sensors' gains on the inertia is unknown",
+                expected='inertia identified by a model with inertia="auto"',
+                got=f"the prior {prior.name!r}",
+            )
+        generator = torch.Generator().manual_seed(self.seed)
+        errors = self.gain_std * torch.randn(draws, robot.nq, generator=generator, dtype=robot.dtype)
+        shift = robot.mass.new_tensor(prior.per_gain) / prior.scale(robot).clamp(min=1e-300)[:, None]
+        return errors.to(robot.device) @ shift.mT
+
     def _features(self, p: int) -> dict[str, Tensor]:
         return self.fit.posterior.process.features(p, self.fit.system, self.at)
 
@@ -486,16 +526,8 @@ def _projected(speeds: Tensor, curve: Tensor) -> tuple[Tensor, Tensor, Tensor, T
 def _moved(robot: RobotModel, change: Tensor) -> RobotModel:
     """Return the robot with the inertial parameters π + change `(nq, 10)`."""
     J = pseudo_inertia(robot.mass, robot.com, robot.inertia)
-    mass, com, inertia = from_pseudo_inertia(J + _pseudo(change))
+    mass, com, inertia = from_pseudo_inertia(J + pseudo_inertia_of(change))
     return robot.replace(mass=mass, com=com, inertia=inertia)
-
-
-def _pseudo(pi: Tensor) -> Tensor:
-    """Return J for inertial parameters `(nq, 10)`, which is linear in them, with Σ = ½ tr(I_o) 1 − I_o."""
-    I = pi[:, [4, 5, 6, 5, 7, 8, 6, 8, 9]].unflatten(-1, (3, 3))
-    Sigma = 0.5 * I.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None] * torch.eye(3).to(I) - I
-    top = torch.cat([Sigma, pi[:, 1:4, None]], dim=-1)
-    return torch.cat([top, torch.cat([pi[:, None, 1:4], pi[:, None, :1]], dim=-1)], dim=-2)
 
 
 def without_armature(robot: RobotModel, fastest: Tensor) -> RobotModel:

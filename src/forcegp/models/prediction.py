@@ -412,7 +412,7 @@ class Predictor(ForwardModel):
         time = Timeline.of(data.t, data.segment, data.header.ordered)
         return draw_panels(panels, time, [data.contact[c] for c in system.contact_names], ax)
 
-    def _at_logged(self, data: Dataset, quantity: str, **settings: Any) -> Prediction:
+    def _at_logged(self, data: Dataset, quantity: str | Sequence[str], **settings: Any) -> Prediction:
         """Predict a quantity at the logged states and contacts."""
         active = data.active((settings.get("system") or self.system).contact_names)
         return self.predict(data.q, data.qd, data.tau, quantity, active=active, **settings)

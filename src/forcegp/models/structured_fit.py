@@ -14,9 +14,10 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.constraints.compiled_system import compiled_system
 from forcegp.data import Dataset
-from forcegp.errors import ModelError, check_name
+from forcegp.errors import DataError, ModelError, check_name
 from forcegp.files import Record
 from forcegp.forces.external_wrench import WrenchFrame
+from forcegp.forces.friction_memory import FrictionMemory
 from forcegp.forces.measurements import Observation, Training
 from forcegp.forces.noise import TORQUE_NOISE, learned_slopes
 from forcegp.forces.posterior import (
@@ -51,7 +52,7 @@ from forcegp.models.export.model import ExportedModel
 from forcegp.models.export.motion import CompiledMotion, compiled_motion
 from forcegp.models.external_wrench import ExternalWrench, external_wrench
 from forcegp.models.fit_result import FitResult
-from forcegp.models.prediction import Answer, Query, in_pieces
+from forcegp.models.prediction import Answer, Prediction, Query, in_pieces
 from forcegp.models.structured_file import pack, unpack
 from forcegp.models.structured_learning import Specification, constant_inputs, prepared, training_for
 from forcegp.rollout.inputs import Disturbance
@@ -135,6 +136,35 @@ class StructuredFit(FittedModel):
         z = self.posterior.process.coupled(system, at, z)
         spread = spread + _carried(z, unknown_variance(self.hyperparameters, at, self.problem.external_std))
         return mean, spread + self._noise_covariance(z, parts) if noise else spread
+
+    def predict_log(
+        self, data: Dataset, quantity: str | Sequence[str] = "qdd", **settings: Any
+    ) -> Prediction:
+        """Predict quantities along a log in time order, including the friction with memory that the training
+        log determined (`forces/friction_memory.py`), which a single state does not.
+
+        It acts as an additional torque, which leaves less torque noise and static friction. Without such
+        friction, the prediction is that of `predict`.
+
+        Args:
+            data: the log, with the measured torques.
+            quantity, **settings: see `predict`.
+
+        Raises:
+            DataError: the log does not match the robot, or is not in time order.
+
+        Example:
+            `fit.predict_log(log, noise=True).std`
+        """
+        data.check_robot(self.specified.robot)
+        if not data.header.ordered:
+            raise DataError("friction with memory needs a log in time order", got="points in another order")
+        memory = FrictionMemory.of(self.hyperparameters)
+        if memory is None:
+            return self._at_logged(data, quantity, **settings)
+        tau = data.tau + memory.force(self.system.robot, data)
+        fit = dataclasses.replace(self, hyperparameters=memory.less_noise(self.hyperparameters))
+        return fit._at_logged(data.replace(tau=tau), quantity, **settings)
 
     def external_wrench(
         self,

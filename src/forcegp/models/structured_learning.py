@@ -226,17 +226,21 @@ def problem_for(
         found = spec.inertia_of(training)
         robot, doubts = found.robot, (*doubts, *found.doubts)
         if found.identified:
-            spec, pinned = identified(spec, training)
+            spec, pinned = identified(spec, training, found)
             training, _ = training_for(spec, before, data, chosen)
     return spec, spec.problem(dataclasses.replace(training, part_of=part_of), robot, pinned), doubts
 
 
-def identified(spec: Specification, training: Training) -> tuple[Specification, dict[str, Tensor]]:
+def identified(
+    spec: Specification, training: Training, inertia: Inertia
+) -> tuple[Specification, dict[str, Tensor]]:
     """Return the model for the robot with identified inertia and with inertia errors of zero mean."""
     robot = spec.system.robot
     q = torch.cat([m.q for m in training.evenly(VOLUME_STATES).measurements])
     size = mass_matrix(robot, q).diagonal(dim1=-2, dim2=-1).mean(0)
-    errors = InertialPrior().around(robot).with_drives(size)
+    assert inertia.per_gain is not None
+    per_gain = tuple(map(tuple, inertia.per_gain.tolist()))
+    errors = dataclasses.replace(InertialPrior().around(robot).with_drives(size), per_gain=per_gain)
     pinned = {errors.name: robot.mass.new_zeros(errors.outputs(robot))}
     return dataclasses.replace(spec, priors=(*spec.priors, errors)), pinned
 

@@ -32,6 +32,7 @@ from forcegp.robot.inertia import (
     inertial_parameters,
     log_cholesky,
     pseudo_inertia,
+    pseudo_inertia_of,
 )
 from forcegp.robot.model import RobotModel
 
@@ -54,6 +55,8 @@ class InertialPrior(ConstantForcePrior):
         name: prefix of the hyperparameters.
         scales: scales S `(10 nq,)`; computed from the robot by default.
         drives: standard deviation of the drive inertia of each joint [kg m², kg]; by default, all are known.
+        per_gain: change of the identified parameters of links, then drives, per relative error of the gain of
+            each torque sensor, `11 nq` rows of `nq`; empty if the robot was not identified from torques.
 
     Example:
         >>> import torch, forcegp
@@ -70,6 +73,7 @@ class InertialPrior(ConstantForcePrior):
     target: str = JOINT
     scales: tuple[float, ...] | None = None
     drives: tuple[float, ...] = ()
+    per_gain: tuple[tuple[float, ...], ...] = ()
 
     def around(self, robot: RobotModel) -> InertialPrior:
         """Return the prior with its scales S fixed to those of the given robot."""
@@ -107,6 +111,18 @@ class InertialPrior(ConstantForcePrior):
         ]
         parts = [self.mass * m, (self.length * m).expand(-1, 3), self.inertia * torch.stack(products, dim=-1)]
         return torch.cat([torch.cat(parts, dim=-1).flatten().detach(), m.new_tensor(self.drives)])
+
+    def curvature(self, robot: RobotModel) -> Tensor:
+        """Return the second derivative of the divergence in `updated` with respect to δ, `(10 nq, 10 nq)`.
+
+        γ ∂²(−log |J|)/∂δ_a ∂δ_b = γ tr(J⁻¹ J_a J⁻¹ J_b), as J is linear in δ; it is 0 for unphysical links.
+        """
+        J = pseudo_inertia(robot.mass, robot.com, robot.inertia)
+        sound = torch.linalg.eigvalsh(J)[:, 0] > 0.0
+        J = torch.where(sound[:, None, None], J, torch.eye(4).to(J))
+        scale = sound[:, None] * self.scale(robot)[: PER_LINK * robot.nq].view(robot.nq, PER_LINK)
+        each = torch.linalg.solve(J[:, None], pseudo_inertia_of(torch.diag_embed(scale)))
+        return torch.block_diag(*DIVERGENCE * torch.einsum("kaij,kbji->kab", each, each))
 
     def updated(
         self,
