@@ -6,8 +6,10 @@ closed loop, the likelihood of accelerations given torques overestimates it. The
 earlier and later are instruments that avoid both biases. The unknowns are Gaussian around the robot file,
 each link stays physically consistent, and drive inertia is nonnegative.
 
-Torque and motion are seldom read at the same instant, and a delay of milliseconds biases the inertia of a
-light joint, so the delay is an additional unknown.
+Torque and motion are seldom read at the same instant: a controller that holds each torque for a period leads
+the motion by half of it. Milliseconds bias the inertia of a light joint and, since −dτ/dt resembles q̇ along
+periodic motions, viscous friction. The delay is therefore an additional unknown, and if links are identified,
+the model is trained on torques shifted by it.
 
 Torques alone are not sufficient. In closed loop, torque-sensor noise exceeds the torque that accelerates a
 light joint. Divided by the inertia in the file, it predicts accelerations far larger than the measured ones.
@@ -67,8 +69,8 @@ WIDTHS = (0.0, 0.02, 0.05, 0.12)
 """Standard deviations of the time averages to try [s]; the one with the narrowest posterior is used."""
 
 
-def rigid_robot(robot: RobotModel, rows: Rows) -> tuple[RobotModel, bool]:
-    """Return the robot that best predicts held-out torques, and whether its links were identified.
+def rigid_robot(robot: RobotModel, rows: Rows) -> tuple[RobotModel, bool, float]:
+    """Return the robot that best predicts held-out torques, whether links were identified, and their delay.
 
     The candidates are the robot file, the file with added drive inertia, and physically consistent links with
     drives. Each must outperform the previous ones by two standard errors over blocks of the log, and no
@@ -108,10 +110,10 @@ def rigid_robot(robot: RobotModel, rows: Rows) -> tuple[RobotModel, bool]:
         consistent, delta = _consistent(robot, prior, found, size)
         better = _is_better(compared(lambda _: delta), known)
         if better and is_harmless(accelerations(consistent, delta), before):
-            return consistent, True
+            return consistent, True, LATE * float(delta[-1])
     with_drives = robot.replace(armature=robot.armature + size * drives[:n])
     better = _is_better(driven, file) and is_harmless(accelerations(with_drives, drives), before)
-    return with_drives if better else robot, False
+    return with_drives if better else robot, False, 0.0
 
 
 def _consistent(
@@ -239,11 +241,13 @@ class Inertia:
     Attributes:
         robot: robot from the file, with the identified inertia.
         identified: whether inertial parameters of links were identified, so that some uncertainty remains.
+        delay: time by which the logged torque precedes the motion if links were identified, otherwise 0 [s].
         doubts: warnings for the user.
     """
 
     robot: RobotModel
     identified: bool = False
+    delay: float = 0.0
     doubts: tuple[str, ...] = ()
 
 
@@ -261,10 +265,10 @@ def inertia_of(
     """
     robot = system.robot
     rows = free_rows(system, friction, mean, training)
-    better, has_links = rigid_robot(robot, rows.with_memory())
+    better, has_links, delay = rigid_robot(robot, rows.with_memory())
     if has_links:
         text = "held-out torques favour other inertial parameters than the robot file's, now identified"
-        return Inertia(better, True, (text, *_told(robot, better.armature - robot.armature)))
+        return Inertia(better, True, delay, (text, *_told(robot, better.armature - robot.armature)))
     M = mass_matrix(robot, rows.q)
     armature = _damped(rows, M, better.armature - robot.armature)
     armature = armature * (armature > NEGLIGIBLE * M.diagonal(dim1=-2, dim2=-1).mean(0))

@@ -35,7 +35,12 @@ from forcegp.forces.priors.joint import AnalyticalMean, JointFrictionPrior
 from forcegp.forces.quantities import States, states_at
 from forcegp.identification import regressor
 from forcegp.models.structured_fit import StructuredFit
-from forcegp.robot.inertia import from_pseudo_inertia, inertial_parameters, pseudo_inertia
+from forcegp.robot.inertia import (
+    from_pseudo_inertia,
+    inertial_parameters,
+    pseudo_inertia,
+    pseudo_inertia_of,
+)
 from forcegp.robot.model import RobotModel
 from forcegp.robot.write_back import is_mjcf, write_robot
 
@@ -363,7 +368,7 @@ class _Reader:
         root = (U @ torch.diag_embed(torch.where(sound[:, None], w, 1.0).rsqrt()) @ U.mT)[:, None]
         row, column = torch.triu_indices(4, 4)
         weight = torch.where(row == column, 1.0, 2.0**0.5).to(w)
-        entries = root @ (_pseudo(torch.eye(n).to(w)) * self.scale[:, :n, None, None]) @ root
+        entries = root @ (pseudo_inertia_of(torch.eye(n).to(w)) * self.scale[:, :n, None, None]) @ root
         entries = torch.where(sound[:, None, None], entries[..., row, column] * weight, torch.eye(n).to(w))
         T, links = torch.block_diag(*entries), slice(first, first + robot.nq * n)
 
@@ -485,16 +490,8 @@ def _projected(speeds: Tensor, curve: Tensor) -> tuple[Tensor, Tensor, Tensor, T
 def _moved(robot: RobotModel, change: Tensor) -> RobotModel:
     """Return the robot with the inertial parameters π + change `(nq, 10)`."""
     J = pseudo_inertia(robot.mass, robot.com, robot.inertia)
-    mass, com, inertia = from_pseudo_inertia(J + _pseudo(change))
+    mass, com, inertia = from_pseudo_inertia(J + pseudo_inertia_of(change))
     return robot.replace(mass=mass, com=com, inertia=inertia)
-
-
-def _pseudo(pi: Tensor) -> Tensor:
-    """Return J for inertial parameters `(nq, 10)`, in which it is linear, with Σ = ½ tr(I_o) 1 − I_o."""
-    I = pi[:, [4, 5, 6, 5, 7, 8, 6, 8, 9]].unflatten(-1, (3, 3))
-    Sigma = 0.5 * I.diagonal(dim1=-2, dim2=-1).sum(-1)[:, None, None] * torch.eye(3).to(I) - I
-    top = torch.cat([Sigma, pi[:, 1:4, None]], dim=-1)
-    return torch.cat([top, torch.cat([pi[:, None, 1:4], pi[:, None, :1]], dim=-1)], dim=-2)
 
 
 def without_armature(robot: RobotModel, fastest: Tensor) -> RobotModel:

@@ -34,6 +34,14 @@ def pseudo_inertia(mass: Scalars, com: Vector3, inertia: Rotation) -> PseudoIner
     return torch.cat([top, bottom], dim=-2)
 
 
+def pseudo_inertia_of(pi: InertialParameters) -> PseudoInertia:
+    """Return J `(*batch, 4, 4)`, which is linear in π `(*batch, 10)`."""
+    I = pi[..., [4, 5, 6, 5, 7, 8, 6, 8, 9]].unflatten(-1, (3, 3))
+    half_trace = 0.5 * I.diagonal(dim1=-2, dim2=-1).sum(-1)[..., None, None]
+    top = torch.cat([half_trace * torch.eye(3).to(I) - I, pi[..., 1:4, None]], dim=-1)
+    return torch.cat([top, torch.cat([pi[..., None, 1:4], pi[..., None, :1]], dim=-1)], dim=-2)
+
+
 def from_pseudo_inertia(J: PseudoInertia) -> tuple[Scalars, Vector3, Rotation]:
     """Return the mass, centre of mass and inertia about it from J (the inverse of `pseudo_inertia`)."""
     mass = J[..., 3, 3]
