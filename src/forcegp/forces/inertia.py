@@ -70,7 +70,7 @@ WIDTHS = (0.0, 0.02, 0.05, 0.12)
 
 
 def rigid_robot(robot: RobotModel, rows: Rows) -> tuple[RobotModel, float, Tensor | None]:
-    """Return the best predictor of held-out torques, and the delay and ∂(π, a)/∂g if its links were identified.
+    """Return the best predictor of held-out torques, and the delay and ∂(π, a)/∂g if links were identified.
 
     The candidates are the robot file, the robot file with added drive inertia, and a robot with identified,
     physically consistent links and drives. Each candidate must outperform the previous ones by two standard
