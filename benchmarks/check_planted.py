@@ -3,7 +3,8 @@
 Each fault is planted in the columns of a raw log, or in the robot or scene of the user, before `import`;
 what counts as naming it was written down before the first run. Rules of the check were changed after the
 first and the second set (`--set 2`), and none after the third (`--set 3`), whose author had read neither the
-check nor the import. Run from the repository root: `python benchmarks/check_planted.py --set 1 --out planted.json`.
+check nor the import. Run from the repository root:
+`python benchmarks/check_planted.py --set 1 --out planted.json`.
 """
 
 from __future__ import annotations

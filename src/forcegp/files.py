@@ -278,7 +278,7 @@ class Header(Record):
         fields = _json_object(text, source, error, cls.MAX_BYTES)
         name, version = fields.pop("format", None), fields.pop("version", None)
         if name != cls.FORMAT:
-            raise error(f"{source} has another format", expected=cls.FORMAT, got=repr(name))
+            raise error(f"{source} has a different format", expected=cls.FORMAT, got=repr(name))
         if version != cls.VERSION:
             raise error(
                 f"{source} has a version of the {cls.FORMAT} format that this release cannot read",

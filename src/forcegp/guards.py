@@ -191,7 +191,7 @@ def foreign(source: str, kind: str) -> Iterator[None]:
     except ForceGPError:
         raise
     except (FileNotFoundError, PermissionError) as cause:
-        what = "no such file" if isinstance(cause, FileNotFoundError) else "the file may not be read"
+        what = "no such file" if isinstance(cause, FileNotFoundError) else "no permission to read the file"
         raise DataError(f"{source}: {what}", got=str(cause)) from cause
     except (Exception, RecursionError, MemoryError) as cause:
         raise damaged(source, kind, cause) from cause

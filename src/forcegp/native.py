@@ -61,7 +61,7 @@ def load_library(source: str, level: str = "-O2") -> ctypes.CDLL:
         raise MissingDependencyError(
             "the C++ compiler or its output folder cannot be used",
             got=str(cause),
-            hint="set CXX to a C++ compiler, and FORCEGP_CACHE to a folder that can be written",
+            hint="set CXX to a C++ compiler, and FORCEGP_CACHE to a writable folder",
         ) from cause
     key = hashlib.sha256("\0".join([source, version, _machine(), level, *FLAGS]).encode()).hexdigest()[:32]
     try:
@@ -77,7 +77,7 @@ def load_library(source: str, level: str = "-O2") -> ctypes.CDLL:
         raise MissingDependencyError(
             f"the kernel cannot be written to {place}",
             got=str(cause),
-            hint="set FORCEGP_CACHE to a folder that can be written",
+            hint="set FORCEGP_CACHE to a writable folder",
         ) from cause
 
 

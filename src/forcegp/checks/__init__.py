@@ -29,7 +29,7 @@ IMPORTED = {
     "doubt": "import-doubt",
     "faster than its source": "rows-held",
     "gap": "time-gap",
-    "uneven": "time-jitter",
+    "jitter": "time-jitter",
 }
 """Kinds of findings made during import that are reported as a finding other than `import-found`."""
 Check = Callable[[ConstrainedSystem, Log], Outcome]
@@ -146,12 +146,14 @@ def check(system: ConstrainedSystem, data: Dataset | Log, *, progress: Progress 
             skipped |= {other: "no row is usable" for other, _ in CHECKS[done + 1 :]}
             break
     order = list(KINDS)
+    # Faults of torque and robot keep the order in which they were found, since the first explains most.
+    first = {"torque": "torque-sign", "mechanics": "torque-sign", "learned": "torque-offset"}
 
     def rank(f: Finding) -> tuple[float, ...]:
-        # A few odd rows come after what affects the whole log, and of what a fit learns the largest is first.
+        # A few odd rows come after what affects the whole log; of what a fit learns, the largest comes first.
         family = KINDS[f.kind].family
         isolated = family in ("clock", "values") and 2 * f.rows < samples
-        place = order.index("torque-offset" if family == "learned" else f.kind)
+        place = order.index(first.get(family, f.kind))
         return SEVERITIES.index(f.severity), isolated, place, -float(f.evidence.get("largest_torque", 0.0))
 
     findings.sort(key=rank)

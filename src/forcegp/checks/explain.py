@@ -118,7 +118,9 @@ def _round(model: Explanation) -> Explanation | None:
     fits = ((h, fit) for h, fit in fits if hypotheses.plausible(system, h, fit))
     tried = [(h, fit) for h, fit in fits if not leaves_surface(system, log, corrected(log, h, fit.theta))]
     good = [(h, fit) for h, fit in tried if significant(fit.shares, null.shares, len(h.joints) or log.nq)]
-    good = [(h, fit) for h, fit in good if not h.name.endswith("order") or _helps_each(h, fit, null)]
+    if model.findings and not any(finding.kind.endswith("order") for finding in model.findings):
+        # Only after an exchange, which may be part of a permutation, may one joint gain alone.
+        good = [(h, fit) for h, fit in good if not h.name.endswith("order") or _helps_each(h, fit, null)]
     if not good:
         return None
     best = min((fit for _, fit in good), key=lambda fit: fit.score.mean())

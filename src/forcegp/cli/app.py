@@ -35,7 +35,7 @@ app = typer.Typer(
     help="Learn the forward dynamics of robot arms, free or in contact, with Gaussian-process force priors.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    rich_markup_mode="rich",
+    rich_markup_mode="markdown",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 for command in (simulate, check, select, fit, predict, evaluate, rollout, export, excite, sweep, view):

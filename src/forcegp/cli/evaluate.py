@@ -23,18 +23,18 @@ def evaluate(
     data: DataFile,
     model: Annotated[
         Path | None,
-        typer.Option("--model", "-m", help="File of a fitted model; by default, a model is fitted."),
+        typer.Option("--model", "-m", help="File of a fitted model; if omitted, a model is fitted."),
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for the page and its data.")] = None,
     train: Annotated[
         Path | None,
         typer.Option(
-            help="Data that the trivial predictors are fitted to; default: the other half of the data. "
-            "Without --model, also what a model is fitted to."
+            help="Data to fit the trivial predictors to (default: the other half of the data) and, without "
+            "--model, the model."
         ),
     ] = None,
     scene: Annotated[
-        str | None, typer.Option("--scene", "-s", help="Without --model: the scene of the model to fit.")
+        str | None, typer.Option("--scene", "-s", help="Scene of the model to fit, if --model is omitted.")
     ] = None,
     config: Config = None,
     as_json: AsJson = False,
@@ -51,7 +51,7 @@ def evaluate(
     the predictions over the first seconds. It prints the path of the page, and writes all scores to
     evaluation.json.
 
-    [bold]Examples[/bold]
+    **Examples**
 
     forcegp evaluate --model model --data test.parquet --train train.parquet --out evaluation/
 
@@ -115,7 +115,7 @@ def _model(model: Path | None, scene: str | None, config: Path | None, train: Pa
     if scene is None or train is None:
         raise ForceGPError(
             "no model to evaluate was given",
-            expected="--model FOLDER, or --scene and --train to fit one",
+            expected="--model FILE, or --scene and --train to fit one",
         )
     system = forcegp.load_scene(scene).system()
     regression = configured(model_table(config, scene), system)

@@ -30,21 +30,23 @@ def fit(
         typer.Option(
             "--model",
             "-m",
-            help="analytical, nn, gp, sgp or sgp-zero; from the paper: sgp-mean, sgp-contact, and with its "
-            "kernel sgp-zero-se, sgp-mean-se or sgp-contact-se. Default: from the file, or sgp.",
+            help="analytical, nn, gp, sgp or sgp-zero; from the paper: sgp-mean, sgp-contact or, with the "
+            "paper's kernel, sgp-zero-se, sgp-mean-se, sgp-contact-se. Default: from the file, or sgp.",
         ),
     ] = None,
     config: options.Config = None,
     noise_std: Annotated[
         float | None,
-        typer.Option(help="Noise of accelerations in rad/s²; default: from the file or the data."),
+        typer.Option(
+            help="Standard deviation of acceleration noise [rad/s²]; default: from the file or data."
+        ),
     ] = None,
     differentiate: options.Differentiate = None,
     checkpoint: Annotated[
         Path | None,
-        typer.Option(help="File that records a long fit, which resumes from it if it exists."),
+        typer.Option(help="File that stores the progress of a long fit, which resumes if it exists."),
     ] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of random initial values.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed for random initial values.")] = None,
     as_json: options.AsJson = False,
 ) -> None:
     """Fit a model of the forward dynamics to logged motion.
@@ -55,7 +57,7 @@ def fit(
     For structured models, Parquet logs are read piece by piece if they have more than 100,000 rows or consist
     of several files.
 
-    [bold]Examples[/bold]
+    **Examples**
 
     forcegp fit --scene kuka_plane --data train.parquet --model sgp --out model
 
@@ -127,7 +129,7 @@ def sweep(
 
     Completed fits are not repeated. This command requires the extra `sweep` (Dask).
 
-    [bold]Examples[/bold]
+    **Examples**
 
     forcegp sweep --scene kuka_plane --model sgp-zero --model sgp --seeds 3 --out sweep/
 

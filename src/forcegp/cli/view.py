@@ -30,13 +30,13 @@ def view(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="HTML file that works offline; default: serve the page."),
+        typer.Option("--out", "-o", help="HTML file that works offline; if omitted, the page is served."),
     ] = None,
     start: Annotated[int, typer.Option(min=0, help="Row of the log to start from.")] = 0,
     seconds: Annotated[float, typer.Option(min=0.05, help="Duration of the motion in seconds.")] = 10.0,
     samples: Annotated[
         int,
-        typer.Option(min=0, help="Number of sampled tip paths to draw, for a structured model."),
+        typer.Option(min=0, help="Number of sampled tip paths to draw (structured models only)."),
     ] = 8,
     horizon: Annotated[
         float, typer.Option(min=0.01, help="Duration of the predicted paths in seconds.")
@@ -53,7 +53,7 @@ def view(
     The page is accessible from this computer only. With --out, it is written as one HTML file that works
     offline.
 
-    [bold]Examples[/bold]
+    **Examples**
 
     forcegp view kuka_plane
 

@@ -158,7 +158,8 @@ def compile_dynamics(robot: RobotModel, quantity: str = "forward_dynamics") -> C
     check_name("quantity to compile", quantity, QUANTITIES)
     if robot.learned:
         raise ModelError(
-            "a robot with parameters that require a gradient cannot be compiled, since they become constants",
+            "a robot with parameters that require a gradient cannot be compiled, since compilation makes "
+            "them constants",
             got=", ".join(robot.learned),
             hint="use forcegp.dynamics while learning, and compile a detached robot afterwards",
         )

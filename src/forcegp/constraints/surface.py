@@ -48,7 +48,7 @@ class Surface(ABC):
             ParameterError: c is not a signed distance.
         """
         raise ParameterError(
-            f"{type(self).__name__} cannot be raised by {distance} m",
+            f"{type(self).__name__} cannot be offset by {distance} m",
             expected="a plane, a sphere or a cylinder, whose c is the signed distance",
             hint="define raised() in a subclass",
         )
@@ -100,7 +100,7 @@ class Plane(Surface):
         object.__setattr__(self, "normal", _unit(self.normal, "the plane's normal"))
         if not math.isfinite(self.offset):
             raise ParameterError(
-                "the plane's offset is not a distance", expected="a finite number [m]", got=self.offset
+                "the plane's offset is not a valid distance", expected="a finite number [m]", got=self.offset
             )
 
     def raised(self, distance: float) -> Plane:

@@ -199,7 +199,7 @@ class Plan:
     """Reference for the controller.
 
     Attributes:
-        contacts: names of the tool's contacts, which are empty in free space.
+        contacts: names of the tool's contacts (none in free space).
         frame, point: the frame and point of the tool.
         reference: the motion of the tool point.
         targets: the targets of the controller, one per sample, `(n, …)`.

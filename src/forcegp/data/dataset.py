@@ -30,7 +30,7 @@ def _time(data: Fields) -> str:
     count = int(data.segment.unique().numel())
     segments = f"{count} segment{'s' if count != 1 else ''}"
     if not data.header.ordered:
-        return f"selected from {segments}, not in order of time"
+        return f"selected from {segments}, not in time order"
     _, rows = torch.unique_consecutive(data.segment, return_counts=True)
     last = rows.cumsum(0) - 1
     return f"{float((data.t[last] - data.t[last - rows + 1]).sum()):.4g} s in {segments}"

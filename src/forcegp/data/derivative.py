@@ -139,9 +139,9 @@ def _time_step(t: NDArray[np.float64], rows: slice, window: int) -> float:
     if len(uneven) or not dt > 0.0:
         row = rows.start + int(uneven[0] if len(uneven) else 0) + 1
         raise DataError(
-            f"the time steps are uneven in row {row} and cannot be differentiated",
+            f"the time steps are uneven at row {row} and the log cannot be differentiated",
             expected=f"steps of {dt:.6g} s",
             got=f"{t[row] - t[row - 1]:.6g} s",
-            hint="resample the log, or number its unbroken stretches in a column 'segment'",
+            hint="resample the log, or number its parts without gaps in a column 'segment'",
         )
     return dt

@@ -185,7 +185,7 @@ def split_by_stretches(
     if not (0.0 < fraction < 1.0 and margin >= 0.0) or held_count >= len(blocks):
         raise DataError(
             "the log cannot be split into held-out and training stretches",
-            expected="a fraction between 0 and 1 that leaves at least one of the stretches, a margin ≥ 0",
+            expected="a fraction between 0 and 1 that leaves stretches for training, and a margin ≥ 0",
             got=f"fraction {fraction}, margin {margin} s, {len(blocks)} stretches of about {stretch} s",
             hint="use shorter stretches or a longer log",
         )
@@ -206,7 +206,7 @@ def _stretches(data: Dataset, stretch: float) -> list[tuple[int, int]]:
     """Divide the trajectories into parts of equal duration, and return their row ranges."""
     if not data.header.ordered:
         raise DataError(
-            "held-out blocks need a log in order of time",
+            "held-out blocks require a log in time order",
             got="points in order of selection",
             hint="split the log before selecting points from it",
         )

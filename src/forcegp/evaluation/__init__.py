@@ -92,7 +92,7 @@ class Evaluation:
                 f"{name} {_percent(x)}" for name, x in shares.items() if x is not None and name != "mean"
             ]
             parts.append(
-                f"the model explains {_percent(share)} of the torque beyond gravity ({', '.join(others)})"
+                f"the model explains {_percent(share)} of the non-gravitational torque ({', '.join(others)})"
             )
         if self.motion is not None:
             at = min(1, len(self.motion.horizons) - 1)
@@ -126,14 +126,16 @@ class Evaluation:
         found = []
         if self.gravity is not None and self.gravity > GRAVITY_ALONE:
             share = f"{100.0 * self.gravity:.1f} %"
-            found.append(f"Gravity alone explains {share} of the torque: the data hardly test anything else.")
+            found.append(
+                f"Gravity alone explains {share} of the torque, so the data hardly test anything else."
+            )
         if self.response is not None and min(self.response) < LEAST_RESPONSE:
             weak = [
                 f"{j} {x:.2f}"
                 for j, x in zip(self.joint_names, self.response, strict=True)
                 if x < LEAST_RESPONSE
             ]
-            text = f"An added torque has less effect than it should: {', '.join(weak)} of 1."
+            text = f"An added torque has too small an effect (expected: 1): {', '.join(weak)}."
             found.append(f"{text} The model has learned the controller, not the arm.")
         return tuple(found)
 

@@ -178,7 +178,8 @@ def _minimise(
         return (C.mT @ torch.block_diag(*by_link, torch.eye(len(friction)).double())).numpy()
 
     start = torch.cat([theta.flatten(), friction]).numpy()
-    result = least_squares(residual, start, jacobian, x_scale="jac", max_nfev=STEPS)  # pyright: ignore[reportArgumentType]
+    with np.errstate(over="ignore"):  # SciPy rejects trial steps of infinite cost
+        result = least_squares(residual, start, jacobian, x_scale="jac", max_nfev=STEPS)  # pyright: ignore[reportArgumentType]
     found = torch.from_numpy(result.x)
     return found[:n].reshape(-1, 10).to(like), at(found).to(like)
 

@@ -113,9 +113,9 @@ class MultiplierScore:
 
     def text(self) -> str:
         """Describe the comparison in words."""
-        held = "" if self.coverage is None else f", ±2σ holds {100.0 * self.coverage:.0f} %"
+        held = "" if self.coverage is None else f", ±2σ coverage {100.0 * self.coverage:.0f} %"
         error = math.hypot(self.bias, self.spread)
-        return f"the force at {self.contact!r} is off by {error:.2g} N of {self.level:.3g} N{held}"
+        return f"the force at {self.contact!r} is off by {error:.2g} N (mean force {self.level:.3g} N){held}"
 
 
 @torch.no_grad()

@@ -285,7 +285,7 @@ def inertia_of(
     rows = free_rows(system, friction, mean, training)
     better, delay, per_gain = rigid_robot(robot, rows.with_memory())
     if per_gain is not None:
-        text = "held-out torques favour other inertial parameters than the robot file's, now identified"
+        text = "identified inertia replaces that of the robot file, since it predicts held-out torques better"
         return Inertia(better, per_gain, delay, (text, *_told(robot, better.armature - robot.armature)))
     M = mass_matrix(robot, rows.q)
     armature = _damped(rows, M, better.armature - robot.armature)

@@ -330,7 +330,7 @@ def _by_contact(name: str) -> Callable[[Dataset, ConstrainedSystem], Tensor]:
                     f"contact {contact!r} may stick, and only its normal force is logged",
                     expected="three components",
                     got="one",
-                    hint='observe "contact_force", with a large noise_std of what was not measured',
+                    hint='observe "contact_force", with a large noise_std for the unmeasured components',
                 )
         columns = [logged[contact] for contact in system.contact_names]
         return torch.cat([x[:, None] if x.ndim == 1 else x for x in columns], dim=-1)

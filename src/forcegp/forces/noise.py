@@ -66,7 +66,7 @@ class Noise:
         for joint, size in (self.external or {}).items():
             if not 0.0 < size < math.inf:
                 raise ModelError(
-                    f"the unknown force on joint {joint!r} has no such size",
+                    f"the unknown force on joint {joint!r} has an invalid standard deviation",
                     expected="a positive finite standard deviation [N m, N]",
                     got=size,
                 )

@@ -229,7 +229,7 @@ def warnings_beyond(distance: Tensor, joints: Sequence[str]) -> tuple[str, ...]:
     most, joint = rows.amax(0).max(0)
     return (
         f"{far} of {len(rows)} states lie beyond the trained speeds and torques, by up to {float(most):.3g} "
-        f"training deviations ({joints[int(joint)]}); their error bars are a guess: train on such motion",
+        f"training deviations ({joints[int(joint)]}), so error bars are extrapolated: train on such motion",
     )
 
 
@@ -391,7 +391,7 @@ def doubts_of(
     residual = (posterior.latent.residual / power) ** 0.5
     if residual > MISSED:
         warnings += (
-            f"the model misses its training data by far: residuals are {residual:.3g} times the noise; check "
+            f"the model fits its training data poorly: residuals are {residual:.3g} times the noise; check "
             "the log and the robot file (`forcegp check`), or allow other forces or larger noise",
         )
     jitter = posterior.latent.jitter

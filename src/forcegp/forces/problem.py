@@ -206,13 +206,13 @@ class Problem:
 
     @torch.no_grad()
     def hidden_torque(self) -> Tensor:
-        """Return the standard deviation `(nq,)` of torques with little effect on accelerations, otherwise 0.
+        """Return the standard deviation `(nq,)` of torques that hardly affect accelerations, 0 for others.
 
         In contact, a force along the constraint does not change the accelerations. For a joint that acts
         along the constraint, P_ii is near zero, and its noise and friction cannot be distinguished from those
-        of other joints. The estimate is the acceleration residual at such samples in excess of given unknown
-        forces e, s² = Σ (r_i² − Σ_k H_ik² Var e_k) / Σ H_ii², but at least `UNSHOWN` times the load. It
-        applies if P_ii is below one half at most samples and above it at fewer than `SHOWN` independent
+        of other joints. The estimate is the acceleration residual that given unknown forces e do not explain
+        at such samples, s² = Σ (r_i² − Σ_k H_ik² Var e_k) / Σ H_ii², and at least `UNSHOWN` times the load.
+        It applies if P_ii is less than one half at most samples and greater at fewer than `SHOWN` independent
         samples, unless forces were also measured.
         """
         if set(self.training.quantities) != {"qdd"}:
@@ -391,7 +391,7 @@ def is_sparse(inference: str, priors: Sequence[ForcePrior], samples: int) -> boo
     if any(prior.in_time for prior in priors):
         if inference == "sparse":
             raise ModelError(
-                "sparse inference takes samples to be independent, which a function of time couples",
+                "sparse inference assumes independent samples, which a function of time couples",
                 expected="exact inference",
                 got=", ".join(prior.name for prior in priors if prior.in_time),
                 hint='use inference="exact" on evenly spaced rows (`forcegp select --method even`)',
@@ -468,8 +468,8 @@ def lost_by_inducing(posterior: ForcePosterior) -> tuple[dict[str, Any], tuple[s
         return {"inference": "exact"}, ()
     diagnostics = posterior.latent.diagnostics
     warnings = (
-        f"more inducing points would help: {diagnostics.size} basis functions miss a variance of "
-        f"{diagnostics.missed:.3g} in units of the noise, where noise leaves {diagnostics.learned:.3g}; "
+        f"more inducing points would help: {diagnostics.size} basis functions leave a residual variance of "
+        f"{diagnostics.missed:.3g}, compared with {diagnostics.learned:.3g} that the data determine; "
         "raise inducing_points",
     )
     return {

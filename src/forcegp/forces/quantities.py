@@ -257,7 +257,7 @@ ROUNDED = 1e-6
 """Tolerance for deciding that entries of the projector onto hidden multipliers are 0 or 1."""
 OPEN = (
     "contact {} is never closed in the training data: its force is not determined",
-    "the point of contact {} cannot move against it: its force is not determined",
+    "the point of contact {} cannot move in the direction of its force, which is not determined",
     "contacts {} hold the robot in the same direction: only the sum of their forces is determined",
 )
 """Messages about contact forces that the motion does not determine."""
@@ -330,8 +330,8 @@ def hidden_forces(
         raise ModelError(
             OPEN[0].format(", ".join(never)),
             expected="motion in contact in the training data",
-            hint="check the position of its surface (`forcegp check`), or for forces learned in free motion "
-            "pass `predict` the system with the contact",
+            hint="check the position of its surface (`forcegp check`), or, for forces learned in free "
+            "motion, pass the system with the contact to `predict`",
         )
     listed = (", ".join(dict.fromkeys(n for n, hit in zip(names, own, strict=True) if hit)) for own in found)
     doubts = tuple(text.format(own) for text, own in zip(OPEN, listed, strict=True) if own)

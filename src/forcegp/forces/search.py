@@ -256,7 +256,7 @@ def checked_start(values: Mapping[str, Tensor], start: Mapping[str, Tensor]) -> 
                 f"incompatible initial hyperparameters: {key}",
                 expected=tuple(value.shape),
                 got="none" if got is None else tuple(got),
-                hint="take those of a model with the same priors",
+                hint="use those of a model with the same priors",
             )
     return {key: values[key].detach().to(value) for key, value in start.items()}
 

@@ -128,7 +128,7 @@ def components_of(block: Block) -> list[int]:
 
 
 def chunked(blocks: Iterable[Block], samples: int) -> Iterator[Block]:
-    """Split blocks into blocks with a maximum number of samples."""
+    """Split blocks so that none exceeds a maximum number of samples."""
     for block in blocks:
         for first in range(0, len(block.target), samples):
             yield rows_of(block, slice(first, first + samples))
@@ -269,7 +269,7 @@ def require_resolved_variance(covariance: Tensor, prior: Tensor) -> Tensor:
         least = float((variance[lost] / prior[lost]).min())
         raise NumericalError(
             f"double precision does not resolve {int(lost.sum())} of {lost.numel()} predicted variances",
-            expected=f"at least {SMALLEST_FRACTION:g} of the variance before the data",
+            expected=f"at least {SMALLEST_FRACTION:g} of the prior variance",
             got=f"{least:.2g} of it",
             hint="specify a larger noise, or remove outliers, which make the prior large",
         )

@@ -61,7 +61,7 @@ def select_inducing(
     Args:
         rows: total number of rows to condition on; defaults to the number of rows in the blocks.
         limit: maximum number of points per process.
-        share: ratio of the residual to the posterior variance of all rows at which to stop.
+        share: stop when the residual variance is this fraction of the posterior variance of all rows.
     """
     candidate_rows = sum(block.rows for block in blocks)
     tolerance = share / (candidate_rows if rows is None else rows)

@@ -89,7 +89,7 @@ class Sums(Moments):
         self._check(other)
         if float(other.rows) > float(self.rows):
             raise ModelError(
-                "cannot remove more rows than there are",
+                "cannot remove more rows than were added",
                 expected=f"at most {float(self.rows):g}",
                 got=float(other.rows),
             )
@@ -241,7 +241,7 @@ def require_agreement(what: str, *values: int, hint: str | None = None) -> None:
         dist.all_gather(every, own)
     differ = [str(rank) for rank, x in enumerate(every) if not torch.equal(x, every[0])]
     if differ:
-        got = f"another one in process {', '.join(differ)} than in process 0"
+        got = f"a different one in process {', '.join(differ)} than in process 0"
         raise ModelError(f"the processes of a distributed fit differ in {what}", got=got, hint=hint)
 
 

@@ -8,9 +8,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forcegp import limits
+from forcegp.data.derivative import UNIFORM_TOLERANCE
 from forcegp.errors import DataError
 from forcegp.guards import check_count
 from forcegp.logs.table import Array, ImportReport, Signals
+from forcegp.robust import robust_std
 from forcegp.rows import describe, numbered
 
 RESTART_STEPS, SHORTEST_TRAJECTORY = 2.0, 10
@@ -154,7 +156,9 @@ def even_clock(signals: Signals, period: float | None, report: ImportReport) -> 
     steps = [np.diff(signals.t[rows]) for rows in stretches]
     worst = max(float(np.abs(s - np.median(s)).max() / np.median(s)) for s in steps)
     if worst > UNEVEN:
-        report.find("uneven", f"time steps deviate by up to {100.0 * worst:.3g} % from the usual step")
+        jitter = robust_std(np.concatenate(steps)) > UNIFORM_TOLERANCE * usual_step(signals.t)
+        message = f"time steps deviate by up to {100.0 * worst:.3g} % from the usual step"
+        report.find("jitter" if jitter else "uneven", message)
     elif period is None:
         return
     step = period if period is not None else usual_step(signals.t)

@@ -130,7 +130,8 @@ at a common distance, and of rows inside the solid, above which the surface is e
 SLIDING, TRIED_ROWS = 0.01, 500
 """Speed above which a tip counts as moving [m/s]; maximum number of rows on which joint swaps are tried."""
 ELSEWHERE = (
-    "see where it slides with --fit-surface plane (or sphere), and correct the scene; "
+    "see where it slides with --fit-surface plane (or sphere), and correct the scene (a wrong tool length or "
+    "encoder zero displaces the tip, too); "
     'for free motion, set source = "never" under [contact.{}]'
 )
 BINS = 512

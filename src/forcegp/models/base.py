@@ -130,7 +130,7 @@ class AccelerationFit(FittedModel):
     def at(self, flat: FlatStates, query: Query) -> Answer:
         if query.quantity != "qdd":
             raise ModelError(
-                f"a {self.kind!r} model predicts accelerations only",
+                f"a {self.kind!r} model predicts only accelerations",
                 expected="qdd",
                 got=query.quantity,
                 hint="use StructuredGP for forces and multipliers",
@@ -138,7 +138,7 @@ class AccelerationFit(FittedModel):
         if query.system not in (None, self.system):
             raise ModelError(
                 f"a {self.kind!r} model has no forces, so it cannot predict on another system",
-                hint="use StructuredGP, or leave out `system`",
+                hint="use StructuredGP, or omit `system`",
             )
         mean, variance = self.accelerations(flat, query.covariance)
         spread = None if variance is None else torch.diag_embed(variance)

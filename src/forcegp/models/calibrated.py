@@ -113,7 +113,8 @@ class Calibration:
     @property
     def losses(self) -> tuple[str, ...]:
         """Learned forces that a robot file cannot represent, described by one sentence per joint."""
-        joints = zip(self.robot.joint_names, self.left.tolist(), self.offset.tolist(), strict=True)
+        forces = (x.round(decimals=9).tolist() for x in (self.left, self.offset))  # no rounding errors
+        joints = zip(self.robot.joint_names, *forces, strict=True)
         return tuple(
             f"joint {joint!r}: friction beyond d q̇ + f sign q̇ of {left:.3g} (root mean square), and a "
             f"constant force of {offset:.3g} (N m or N)"
@@ -219,7 +220,7 @@ def write_calibrated(
     if drives:
         values = ", ".join(f"{x:.4g}" for x in found.robot.armature.tolist())
         losses = (
-            f"URDF has no armature ({values}): links have its inertia as far as physically possible",
+            f"URDF has no armature ({values}): the links include its inertia as far as physically possible",
             *losses,
         )
     report = {

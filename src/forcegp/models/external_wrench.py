@@ -105,7 +105,7 @@ class ExternalWrench(Prediction):
         largest = t.new_zeros(int(numbers[-1]) + 1).scatter_reduce(0, numbers, self.distance_squared, "amax")
         if len(largest) < LEAST_BLOCKS:
             raise DataError(
-                "the free motion is too short to predict false alarms",
+                "the free motion is too short to predict the false alarm rate",
                 expected=f"at least {LEAST_BLOCKS * BLOCK:g} s",
                 got=f"{len(largest) * BLOCK:g} s",
             )
@@ -264,7 +264,7 @@ class Reading:
         if self.fit.torque_std is None or correlation is None:
             raise ModelError(
                 "this fit has no learned torque noise, which the momentum filter needs",
-                hint='fit with force_priors="friction" to more samples in time order',
+                hint='fit more samples in time order, with force_priors="friction"',
             )
         noise, segment = velocity_noise(self.data), self.data.segment
         logs = [

@@ -44,8 +44,8 @@ class Compared:
         if self.coverage is None or self.coverage >= COVERED:
             return ""
         return (
-            f"the model misses held-out blocks of this log: ±2σ coverage is {self.coverage:.0%} instead "
-            "of 95%; check the log and the robot file (`forcegp check`)"
+            f"the model predicts held-out blocks of this log poorly: ±2σ coverage is {self.coverage:.0%} "
+            "instead of 95%; check the log and the robot file (`forcegp check`)"
         )
 
     def __str__(self) -> str:

@@ -112,7 +112,7 @@ class IndependentGP(Model["IndependentFit"]):
         stated = Noise.of(noise)
         if stated != Noise(stated.acceleration):
             raise ModelError(
-                "independent Gaussian processes have white noise of accelerations only",
+                "independent Gaussian processes support only white acceleration noise",
                 expected="a number, one per joint, or Noise(acceleration)",
                 got=noise,
             )
@@ -254,7 +254,9 @@ class IndependentFit(AccelerationFit):
         }
         noise = take(tensors, "training.noise_std", None, dtype, source)
         if noise.shape not in ((nq,), (n, nq)):
-            raise ModelError(f"{source}: tensor 'training.noise_std' does not fit", got=tuple(noise.shape))
+            raise ModelError(
+                f"{source}: tensor 'training.noise_std' has the wrong shape", got=tuple(noise.shape)
+            )
         training = model.training(features, take(tensors, "training.qdd", (n, nq), dtype, source), noise)
         hyperparameters = {
             f"{prior.name}.{name}": take(

@@ -151,7 +151,7 @@ class Prediction:
 
         if self.mean.ndim != 2:
             raise ShapeError(
-                "only predictions over one list of states can be drawn",
+                "only predictions for a single list of states can be plotted",
                 expected="a mean of shape (n, d)",
                 got=tuple(self.mean.shape),
             )
@@ -359,7 +359,7 @@ class Predictor(ForwardModel):
         """
         data.check_robot(self.specified.robot)
         if len(data) < 2:
-            raise DataError("a score needs two samples or more", got=len(data))
+            raise DataError("a score requires at least two samples", got=len(data))
         true = measured(self.system, data, quantity)
         mean = self._at_logged(data, quantity, covariance=False).mean
         unexplained = (true - mean).square().sum(0)

@@ -52,7 +52,9 @@ MODELS: dict[str, Entry] = {
     "nn": Entry(NeuralNetwork, "neural network with sigmoid layers on (q, qd, tau)"),
     "gp": Entry(IndependentGP, "one Gaussian process per joint acceleration on (q, qd, tau)"),
     "sgp-zero": Entry(StructuredGP, "structured GP, all joint forces unknown", ZERO, default_priors),
-    "sgp": Entry(StructuredGP, "structured GP with analytical mean, priors selected on the data", ANALYTICAL),
+    "sgp": Entry(
+        StructuredGP, "structured GP with analytical mean, priors selected using the data", ANALYTICAL
+    ),
     "sgp-mean": Entry(
         StructuredGP,
         "structured GP with analytical mean, any joint force unknown",

@@ -42,7 +42,7 @@ def with_sensor(data: Dataset, system: ConstrainedSystem, noise_std: float) -> l
         raise ModelError(
             f"the log has no sensor force at contact {contact.name!r}",
             expected=f"columns {SENSOR}.{contact.name}.x, .y, .z and rows in contact",
-            hint="import the log with a table [wrench], or leave out sensor_noise_std",
+            hint="import the log with a [wrench] table, or omit sensor_noise_std",
         )
     extras = {**data.contact_extras, "multiplier": {contact.name: sensed_force(data, system)}}
     rows = torch.nonzero(closed)[:, 0]

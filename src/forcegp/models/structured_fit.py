@@ -214,7 +214,7 @@ class StructuredFit(FittedModel):
         dtype: torch.dtype = torch.float64,
     ) -> ExportedModel:
         if functions is not None and functions < 1:
-            raise ModelError("a posterior has one function at least", expected="1 or more", got=functions)
+            raise ModelError("at least one function must be drawn", expected="1 or more", got=functions)
         tensors = {**self.hyperparameters, **self._region}
         parts = self.system, self.posterior, tensors, self.noise, self.torque_std
         learned, std = self.hyperparameters.get(TORQUE_NOISE), self.problem.torque_std
@@ -349,7 +349,7 @@ class StructuredFit(FittedModel):
         measurements, _ = training_for(self.specification, self.problem, data, learned=(), fewest=0)
         if measurements.quantities != tuple(self.noise):
             raise ModelError(
-                "the update contains other quantities than the fit",
+                "the update contains quantities that the fit does not",
                 expected=", ".join(self.noise),
                 got=", ".join(measurements.quantities),
             )

@@ -208,7 +208,7 @@ class StructuredGP(Model[StructuredFit]):
         contacts = after.system.contact_names
         if names[: len(own)] != own or contacts != self.system.contact_names:
             raise ModelError(
-                "`after` is a fit of another model",
+                "`after` is a fit of a different model",
                 expected=f"priors {', '.join(own)} and contacts {', '.join(self.system.contact_names)}",
                 got=f"priors {', '.join(names)} and contacts {', '.join(contacts)}",
             )

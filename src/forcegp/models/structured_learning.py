@@ -172,8 +172,8 @@ def _unchecked_masses(training: Training) -> tuple[str, ...]:
         return ()
     return (
         f"{training.free_motions} samples in free motion are too few to check the masses of the robot file "
-        f"(expected: {LEAST} or more), and any error of the masses biases the multiplier: train on "
-        "more samples if the log has free motion, otherwise add some seconds, or measure the contact force",
+        f"(expected: at least {LEAST}), and any mass error biases the multiplier: train on more samples if "
+        "the log contains free motion; otherwise, record a few seconds of it or measure the contact force",
     )
 
 
@@ -318,7 +318,8 @@ def in_motion(
     if not impacts:
         return moving, ()
     return moving, (
-        f"{impacts} samples in contact were excluded as impacts: they accelerate off the surface or into it",
+        f"{impacts} samples in contact were excluded as impacts: they accelerate away from the surface or "
+        "into it",
     )
 
 

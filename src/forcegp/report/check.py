@@ -57,7 +57,7 @@ def draw_overview(report: Report, log: Log) -> Picture:
 
     kinds = ", ".join(" or ".join(finding.kinds) for finding in report.findings)
     size = (SIZE[0], 0.7 + 0.22 * len(report.findings))
-    return draw(paint, size, f"Time concerned by each finding: {kinds}")
+    return draw(paint, size, f"Times affected by each finding: {kinds}")
 
 
 def picture_of(finding: Finding, system: ConstrainedSystem, log: Log) -> Picture | None:

@@ -96,12 +96,14 @@ def draw_calibration(evaluation: Evaluation) -> Picture:
         axes.plot([0.4, 1.0], [0.4, 1.0], color=INK, linewidth=0.8, linestyle=":", label="nominal")
         axes.plot(list(levels), list(levels.values()), "o-", color=colour(evaluation.kind), label="model")
         axes.set_xlabel("probability of the interval")
-        axes.set_ylabel("share of samples inside")
+        axes.set_ylabel("fraction of samples inside")
         axes.set_ylim(0.0, 1.02)
         figure.legend(loc="outside upper center", ncols=2)
 
     listed = ", ".join(f"{share:.2f} at {level:g}" for level, share in levels.items())
-    return draw(paint, (4.1, 3.4), f"Calibration, share of samples inside: {listed}.", label(evaluation.kind))
+    return draw(
+        paint, (4.1, 3.4), f"Calibration, fraction of samples inside: {listed}.", label(evaluation.kind)
+    )
 
 
 def error_tables(evaluation: Evaluation) -> tuple[Table, ...]:
@@ -119,7 +121,7 @@ def error_tables(evaluation: Evaluation) -> tuple[Table, ...]:
             rows.append((joint, *(cell(x, 3) for x in values)))
             if any((shown[0] or 0.0) > (e.in_motion[i] or 0.0) for e in others):
                 bad.add((i, 1))
-        caption = f"{unit.capitalize()} error in motion, root mean square {names}; red: worse than another"
+        caption = f"{unit.capitalize()} error in motion, root mean square {names}; red: not the lowest"
         tables.append(Table(caption, head, tuple(rows), frozenset(bad)))
     return tuple(tables)
 

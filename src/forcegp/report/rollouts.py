@@ -199,7 +199,7 @@ def _animation(data: RolloutData) -> Markup:
         for film in data.films
     ]
     content = {"times": data.frame_times, "bodies": data.bodies, "films": films}
-    return animation(content, "The arm moving: logged in black, predicted in colour")
+    return animation(content, "The arm in motion: logged in black, predicted in colour")
 
 
 WIDTH = 4.6
@@ -266,7 +266,7 @@ def draw_contact_force(data: RolloutData) -> Picture:
         panels[-1].set_xlim(0.0, data.band_seconds)
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=2)
 
-    alt = "Multiplier along the predicted trajectories, with bands over samples, and the logged one."
+    alt = "Multiplier along the predicted trajectories, with bands over samples, and logged multiplier."
     return draw(paint, (WIDTH, 3.8 if losing else 2.8), alt, "Contact force over time")
 
 
@@ -300,7 +300,7 @@ def rollout_pictures(data: RolloutData) -> tuple[Picture, ...]:
 def rollout_table(data: RolloutData) -> Table:
     """Return a table of the tip errors at the horizons, the coverage of the bands and the largest drift."""
     after = (f"after {h:g} s [mm]" for h in data.horizons)
-    head = ("model", *after, "in band", "in widened band", "largest |c(q)| [m]")
+    head = ("model", *after, "in band", "in calibrated band", "largest |c(q)| [m]")
     rows = []
     for path in data.models:
         errors = ["diverged" if e is None else f"{1e3 * e:.3g}" for e in path.errors]
@@ -335,10 +335,10 @@ def rollout_section(data: RolloutData, source: str = DATA) -> RolloutSection:
     sampled = any(path.tip_bands for path in data.models)
     why = " The curve follows the mean force. It may leave the band, since motion is nonlinear in the force."
     caption = (
-        f"Open loop from a logged state under the logged torques, {data.t[-1]:.3g} s ahead: logged in "
-        f"black, predicted in colour{band if sampled else ''}. Position and contact force are shown for the "
-        f"first {data.band_seconds:.3g} s. Errors are medians over {_starts(data.starts)}. A curve ends "
-        f"where its prediction diverged.{why if sampled else ''}"
+        f"Open-loop prediction over {data.t[-1]:.3g} s from a logged state under the logged torques: "
+        f"logged in black, predicted in colour{band if sampled else ''}. Position and contact force are "
+        f"shown for the first {data.band_seconds:.3g} s. Errors are medians over {_starts(data.starts)}. A "
+        f"curve ends where its prediction diverged.{why if sampled else ''}"
     )
     block = PictureBlock("Trajectories predicted in open loop", caption, rollout_pictures(data), source)
     return RolloutSection(block, rollout_table(data), _animation(data), animation_source())

@@ -206,7 +206,7 @@ class RobotModel:
                 )
             if value.ndim == 0 or value.shape[-1] != self.nq:
                 raise ShapeError(
-                    f"{name} does not fit robot {self.name!r}",
+                    f"{name} has the wrong shape for robot {self.name!r}",
                     expected=f"shape (*batch, {self.nq}) for joints {', '.join(self.joint_names)}",
                     got=tuple(value.shape),
                 )

@@ -141,7 +141,7 @@ def _joints(robot: RobotModel, quantity: str, names: Sequence[str] | Literal["al
 
 def _check(joints: Mapping[str, tuple[str, ...]]) -> None:
     if not any(joints.values()):
-        raise ModelError("no analytical parameter is selected", expected="joints of some quantity")
+        raise ModelError("no analytical parameter is selected", expected="joints for at least one quantity")
     for part in ("mass", "com"):
         twice = set(joints.get("inertia", ())) & set(joints.get(part, ()))
         if twice:

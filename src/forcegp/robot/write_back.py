@@ -206,7 +206,7 @@ def _shared(parts: list[_Part], J_old: Tensor, J_new: Tensor, joint: str) -> dic
         if all(body is not None and not inertia_error(body) for body in bodies.values()):
             return {name: body for name, body in bodies.items() if body is not None}
     raise RobotFileError(
-        f"no link of the file can take the change of inertia beyond joint {joint!r}",
+        f"no link in the file can absorb the change in inertia beyond joint {joint!r}",
         expected="links that stay physically consistent",
         got=", ".join(part.name for part in parts) or "no link with a name",
         hint="correct the <inertial> of these links, which is unphysical",
@@ -243,10 +243,10 @@ def _check(robot: RobotModel, read: RobotModel, writer: _Urdf | _Mjcf) -> None:
         wrong = (error > 10.0 * SAME * (size + floor)).nonzero()[:, 0].tolist()
         if wrong:
             raise RobotFileError(
-                f"{writer.label}: the file would not give joint {robot.joint_names[wrong[0]]!r} its {figure}",
+                f"{writer.label}: this would change the {figure} of joint {robot.joint_names[wrong[0]]!r}",
                 expected=wanted[wrong[0]].tolist(),
                 got=got[wrong[0]].tolist(),
-                hint="<compiler> settings such as boundmass, inertiafromgeom or settotalmass change figures",
+                hint="<compiler> settings such as boundmass, inertiafromgeom or settotalmass alter values",
             )
 
 

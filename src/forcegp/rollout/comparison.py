@@ -106,7 +106,9 @@ class Comparison:
             DataError: the comparison ends earlier.
         """
         if horizon > float(self.t[-1]) * (1.0 + 1e-9):
-            raise DataError("the comparison ends earlier", expected=f"{horizon} s", got=float(self.t[-1]))
+            raise DataError(
+                "the comparison ends before this time", expected=f"{horizon} s", got=float(self.t[-1])
+            )
         step = int((self.t - horizon).abs().argmin())
         return float(self.tip_error(model)[:, step].median())
 
@@ -231,7 +233,7 @@ def _starts(data: Dataset, steps: int, starts: int | Tensor) -> Tensor:
             "the log is too short for the rollouts, or not in time order",
             expected=f"{count} starts with {steps} further samples in the same trajectory",
             got=f"{len(data)} samples, {len(fits)} such starts",
-            hint="a shorter duration, or a log that was not selected from",
+            hint="use a shorter duration, or the log before selection",
         )
     if not isinstance(starts, int):
         return starts

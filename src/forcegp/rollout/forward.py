@@ -232,7 +232,7 @@ def _run(
     unilateral = options.unilateral and len(system.contacts) > 0
     if unilateral and not law.has_multiplier:
         raise ModelError(
-            "a model of accelerations only has no multiplier to detect the loss of contact",
+            "a model that predicts only accelerations cannot detect the loss of contact",
             hint="pass unilateral=False, or use a model with forces",
         )
     inputs = inputs_of(tau, whole if batch is None else batch, n, options.dt, options.interpolation)

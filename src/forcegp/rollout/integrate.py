@@ -57,7 +57,7 @@ def adaptive(method: str) -> Step:
     def step(problem: RolloutProblem, state: State, first: Instant, h: Tensor) -> State:
         if first.qdd.requires_grad:
             raise ModelError(
-                f"{method} has no gradients",
+                f"{method} does not support gradients",
                 expected="one of semi_implicit_euler, rk4",
                 hint="or call it under torch.no_grad()",
             )

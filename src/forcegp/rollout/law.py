@@ -141,7 +141,7 @@ class Stuck(NamedTuple):
 
 
 def overshooting(G: Tensor, damping: Tensor, h: Tensor) -> Tensor | None:
-    """Return D `(n, nq)` at states with h G_ii D_i > 1 for a joint, 0 at others, or `None` if all are 0."""
+    """Return D `(n, nq)` where h G_ii D_i > 1 for any joint and 0 elsewhere, or `None` if all are 0."""
     rows = (h * G.diagonal(dim1=-2, dim2=-1) * damping > 1.0).any(-1, keepdim=True)
     return torch.where(rows, damping, 0.0) if bool(rows.any()) else None
 
@@ -304,7 +304,7 @@ def law_of(model: ForwardModel, system: ConstrainedSystem | None = None) -> Law:
         system.robot is not trained.robot or [*system.contacts] != [*trained.contacts]
     ):
         raise ModelError(
-            f"this model ({model.kind}) predicts accelerations of the system that it was fitted on only",
+            f"this model ({model.kind}) predicts accelerations only for the system to which it was fitted",
             expected=_described(trained),
             got=f"another system: {_described(system)}",
             hint="omit `system`, or use a model of forces such as StructuredGP",

@@ -16,7 +16,7 @@ from forcegp.errors import ParameterError, optional_module
 from forcegp.robot.model import BASE, RobotModel
 from forcegp.robot.shapes import Shape
 from forcegp.simulate.contact_solver import geometry_of, tip_of
-from forcegp.simulate.urdf import link_name, write_urdf
+from forcegp.simulate.urdf import compile_spec, link_name, write_urdf
 from forcegp.types import Array
 
 POSITIONS, MOST = 200, 0.5
@@ -67,7 +67,7 @@ class Collisions:
             link, position, radius = tip_of(robot, contact, TIP)
             body = spec.worldbody if link == BASE else spec.body(link_name(robot, link))
             body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0], pos=position, **common)
-        self._model = model = spec.compile()
+        self._model = model = compile_spec(spec, robot)
         # The distances of additional contacts of a pair are only approximate.
         model.opt.disableflags |= getattr(mujoco.mjtDisableBit, "mjDSBL_MULTICCD", 0)
         self._data = mujoco.MjData(model)

@@ -14,7 +14,7 @@ from forcegp.robot.model import BASE, RobotModel
 from forcegp.robot.shapes import turn_z
 from forcegp.simulate.config import ContactSolver
 from forcegp.simulate.engines import NEEDS_MUJOCO, MuJoCoWorld
-from forcegp.simulate.urdf import link_name, write_urdf
+from forcegp.simulate.urdf import compile_spec, link_name, write_urdf
 
 CYLINDER_LENGTH = 100.0
 """Half-length of the cylinder that represents an infinite cylinder [m]."""
@@ -141,13 +141,15 @@ def _compile(mujoco: Any, system: ConstrainedSystem, solver: ContactSolver) -> A
         pair.friction = [solver.friction, solver.friction, 0.0, 0.0, 0.0]
         pair.solref = [solver.stiffness_time, 1.0]
         pair.solimp = IMPEDANCE
-    return spec.compile()
+    return compile_spec(spec, robot)
 
 
 def _per_joint(robot: RobotModel, solver: ContactSolver, name: str) -> np.ndarray:
     values = getattr(solver, name)
     if len(values) not in (0, robot.nq):
-        raise ForceGPError(f"{name} does not fit the robot", expected=f"{robot.nq} numbers", got=values)
+        raise ForceGPError(
+            f"{name} has the wrong length for the robot", expected=f"{robot.nq} numbers", got=values
+        )
     if bool((robot.stribeck != 0.0).any()):
         raise UnsupportedRobotError(
             f"robot {robot.name!r} declares Stribeck friction, which MuJoCo does not model",

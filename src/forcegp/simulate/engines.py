@@ -15,7 +15,7 @@ from torch import Tensor
 from forcegp.errors import MissingDependencyError, UnsupportedRobotError, check_name, optional_module
 from forcegp.robot.model import RobotModel
 from forcegp.simulate.engine import Engine
-from forcegp.simulate.urdf import write_urdf
+from forcegp.simulate.urdf import compile_spec, write_urdf
 from forcegp.types import JointMatrix, JointVector
 
 NEEDS_MUJOCO = "the engine 'mujoco'"
@@ -162,12 +162,13 @@ class MuJoCoEngine(MuJoCoWorld, Engine):
     """A robot in a separate MuJoCo world with step size dt [s].
 
     Raises:
+        InertiaError: the principal moments of a link violate the triangle inequality.
         MissingDependencyError: MuJoCo is not installed.
     """
 
     def __init__(self, robot: RobotModel, dt: float) -> None:
         mujoco = optional_module("mujoco", NEEDS_MUJOCO)
-        super().__init__(robot, mujoco.MjModel.from_xml_string(write_urdf(robot)), dt)
+        super().__init__(robot, compile_spec(mujoco.MjSpec.from_string(write_urdf(robot)), robot), dt)
         self.model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
         self._scratch = mujoco.MjData(self.model)
@@ -214,6 +215,7 @@ def make_engine(robot: RobotModel, dt: float, name: str = "auto") -> Engine:
     Raises:
         UnknownNameError: the engine does not exist.
         MissingDependencyError: the engine's package is not installed.
+        InertiaError: MuJoCo rejects the inertia of a link.
     """
     check_name("engine", name, ["auto", *MAKERS])
     if name != "auto":

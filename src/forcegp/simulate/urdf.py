@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import warnings
+from typing import Any
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 import torch
 from scipy.spatial.transform import Rotation as ScipyRotation
 from torch import Tensor
 
+from forcegp.errors import InertiaError
 from forcegp.robot.model import BASE, RobotModel
 
 WORLD = "world"
@@ -28,6 +30,21 @@ def write_urdf(robot: RobotModel) -> str:
         _joint(root, robot, i, joint)
     indent(root)
     return tostring(root, encoding="unicode")
+
+
+def compile_spec(spec: Any, robot: RobotModel) -> Any:
+    """Compile a MuJoCo specification (`MjSpec`) of the robot; raise `InertiaError` for unphysical inertia."""
+    try:
+        return spec.compile()
+    except ValueError as error:
+        if "inertia" not in str(error):
+            raise
+        raise InertiaError(
+            f"MuJoCo rejects the inertia of robot {robot.name!r}",
+            expected="links whose principal moments obey the triangle inequality",
+            got=" ".join(str(error).split()),
+            hint="correct the <inertial> of the link in the robot file",
+        ) from error
 
 
 def link_name(robot: RobotModel, index: int) -> str:

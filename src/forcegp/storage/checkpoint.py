@@ -71,7 +71,7 @@ class Checkpoint:
         tensors, key = _read(self.path)
         if key != self.key or _layout(tensors, growing) != _layout(like, growing):
             raise ModelError(
-                f"{self.path}: the checkpoint belongs to another fit",
+                f"{self.path}: the checkpoint belongs to a different fit",
                 expected=f"data, settings and system with key {self.key}",
                 got=key,
                 hint="remove it, or name another file",
@@ -134,8 +134,8 @@ class Evaluations:
         lengths = {len(value) for value in record.values()}
         if len(lengths) > 1 or not bool((record["positions"].abs() <= CHECKPOINT_VALUE).all()):
             raise ModelError(
-                f"{self.checkpoint.path}: the checkpoint is damaged: 'positions' that no fit reaches, or of "
-                "another length than the objectives",
+                f"{self.checkpoint.path}: the checkpoint is damaged: 'positions' are out of range, or "
+                "their number differs from that of the objectives",
                 expected=f"finite numbers up to ±{CHECKPOINT_VALUE:g}",
                 hint="remove the checkpoint to start again",
             )

@@ -120,7 +120,7 @@ def force_text(force: Force, k: int) -> str:
 
 def view_page(motion: Motion, shapes: Sequence[Shape], title: str) -> str:
     """Return a motion as self-contained HTML."""
-    label = "The robot moving, with its surfaces, contact forces and paths of the tip"
+    label = "The robot in motion, with its surfaces, contact forces and paths of the tip"
     drawn = animation(content_of(motion, shapes), label)
     return render("view.html.j2", title=title, animation=drawn, script=animation_source())
 

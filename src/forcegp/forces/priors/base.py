@@ -96,7 +96,7 @@ def check_inputs(name: str, inputs: tuple[str, ...], valid: tuple[str, ...]) -> 
         UnknownNameError: an input is unknown.
     """
     if not inputs:
-        raise ModelError(f"force prior {name!r} has no inputs", expected="one input at least")
+        raise ModelError(f"force prior {name!r} has no inputs", expected="at least one input")
     for symbol in inputs:
         check_name(f"input of force prior {name!r}", symbol, valid)
 

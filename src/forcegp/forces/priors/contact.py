@@ -200,7 +200,7 @@ class SlidingFrictionPrior(SurfaceForcePrior):
         for what, value in (speeds | {"torsional smoothing speed": self.torsion_smoothing}).items():
             if not 0.0 < value < float("inf"):
                 raise ModelError(
-                    f"force prior {self.name!r} has no such {what}",
+                    f"force prior {self.name!r} has an invalid {what}",
                     expected="a positive finite speed [m/s, rad/s]",
                     got=value,
                 )
@@ -241,7 +241,7 @@ class SlidingFrictionPrior(SurfaceForcePrior):
         if bool((gain[at.active[:, contact]] <= 0.0).any()):
             raise ModelError(
                 f"contact {self.contact!r} jams with a friction coefficient of {self.friction_coefficient:g}",
-                hint="use a smaller friction_coefficient, with which friction opposes more than it presses",
+                hint="use a smaller friction_coefficient",
             )
         return (free / gain)[:, None]
 

@@ -276,7 +276,9 @@ class CoregionalPrior(ForcePrior):
     def __post_init__(self) -> None:
         check_inputs(self.name, self.inputs, ("q", "qd", "tau"))
         if self.causes < 1:
-            raise ModelError("a coregionalised force needs a cause", expected="1 or more", got=self.causes)
+            raise ModelError(
+                "a coregionalised force needs at least one cause", expected="1 or more", got=self.causes
+            )
 
     def outputs(self, robot: RobotModel) -> int:
         return self.causes + robot.nq

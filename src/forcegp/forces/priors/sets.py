@@ -131,10 +131,12 @@ def _surfaces(system: ConstrainedSystem) -> list[str]:
 SETS: dict[str, PriorSet] = {
     each.name: each
     for each in (
-        PriorSet("sliding", "friction of contacts", contact_priors, False, needs_surface=True),
-        PriorSet("friction", "friction of joints and contacts, noise of the torque", friction_priors),
+        PriorSet("sliding", "contact friction", contact_priors, False, needs_surface=True),
+        PriorSet("friction", "joint and contact friction, torque noise", friction_priors),
         PriorSet(
-            "friction+residual", "the same, and any joint force of (q, q̇)", friction_and_residual_priors
+            "friction+residual",
+            "the same, and any joint force that depends on (q, q̇)",
+            friction_and_residual_priors,
         ),
     )
 }

@@ -77,10 +77,15 @@ def write_export(
         Path(path), model.parts()[0].rank, *loss_of(exact, fit, training), rounding_of(model, training)
     )
     where = "training" if training.samples else "random"
-    loss = f"It is reduced: at {where} states σ of q̈ and λ is wider by a fraction\n"
-    loss += f"of {result.widest:.2g} at most, {result.wider:.2g} in the median. The mean loses nothing."
-    rounding = "Single precision: at {} states means of q̈ and λ err by {:.2g} of max(|mean|, σ) at most,\n"
-    rounding = rounding.format(where, result.rounding[0]) + f"σ by a fraction of {result.rounding[1]:.2g}."
+    loss = f"It is reduced: at {where} states, σ of q̈ and λ increases by a fraction\n"
+    loss += f"of at most {result.widest:.2g} (median: {result.wider:.2g}). The mean is unchanged."
+    rounding = (
+        "Single precision: at {} states, the mean of q̈ and λ errs by at most {:.2g} of max(|mean|, σ),\n"
+    )
+    rounding = (
+        rounding.format(where, result.rounding[0])
+        + f"and σ by at most a fraction of {result.rounding[1]:.2g}."
+    )
     coarse = model.dtype == torch.float32
     fields = {
         "real": "float" if coarse else "double",

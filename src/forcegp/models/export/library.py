@@ -29,12 +29,12 @@ NOT_FINITE, JAMMED, UNRESOLVED, NO_INERTIA, NO_JACOBIAN, AT_REST, NO_NOISE, OVER
 UNDETERMINED = 11
 """Nonzero status codes that the C code returns."""
 MESSAGES = {
-    JAMMED: "friction of a contact would press harder than it opposes",
+    JAMMED: "the friction coefficient of a contact is so large that the contact jams",
     UNRESOLVED: "the precision of the C code does not resolve a predicted variance",
-    OVERFLOW: "a predicted number is not finite: states beyond what a robot can do overflow",
+    OVERFLOW: "a predicted number is not finite: implausible states cause overflow",
     NO_INERTIA: "the mass matrix is not positive definite",
     NO_JACOBIAN: "closed contacts hold the robot in the same direction, so that a Jacobian is not determined",
-    NOT_FINITE: "a measured value is not finite, or its noise not positive",
+    NOT_FINITE: "a measured value is not finite, or its noise is not positive",
     NO_NOISE: "an update needs the noise of a quantity that the fit did not measure: pass noise_std",
 }
 KINDS: dict[int, type[ForceGPError]] = {JAMMED: ModelError, NO_NOISE: ModelError, NOT_FINITE: ShapeError}
@@ -82,7 +82,9 @@ class CompiledFit(Predictor):
     def force_field(self) -> ForceField:
         """Return the posterior mean of Q̄ = Q + Q_z as a force field in PyTorch."""
         if self._learned is not None:
-            raise ModelError("what was learned in C has no force field in PyTorch", hint="update the fit")
+            raise ModelError(
+                "samples added in C are not part of the force field in PyTorch", hint="update the fit"
+            )
         return self.model.posterior
 
     def update(
@@ -114,7 +116,9 @@ class CompiledFit(Predictor):
         flat = flat_states(self.system, q, qd, tau, active)
         expected, got = (*flat.batch, read.size), tuple(measured.shape)
         if expected != got:
-            raise ShapeError(f"values of {quantity!r} do not fit the states", expected=str(expected), got=got)
+            raise ShapeError(
+                f"values of {quantity!r} do not match the states", expected=str(expected), got=got
+            )
         std = None if noise_std is None else noise_std.expand(read.size).double().contiguous()
         noise, newer = None if std is None else std.data_ptr(), self._copy()
         columns = [x.contiguous() for x in (*flat[:4], measured.double().reshape(-1, read.size))]
@@ -166,8 +170,8 @@ class CompiledFit(Predictor):
         if not self.model.online:
             raise ModelError(
                 "this fit cannot learn online in C",
-                expected="sparse inference with all functions, a state without noise, no inertia learned",
-                hint="call update of the fit",
+                expected="sparse inference with all basis functions, no state noise, and no learned inertia",
+                hint="call the `update` method of the fit",
             )
         parts = self.model.parts()
         n, folded = parts[0].rank, sum(part.weights.numel() for part in parts)
@@ -197,7 +201,9 @@ class CompiledFit(Predictor):
             ModelError: `system` is not the system of the fit, or friction jams a contact.
         """
         if system is not None and system is not self.system:
-            raise ModelError("a compiled fit predicts on its own system", hint="use the predict of the fit")
+            raise ModelError(
+                "a compiled fit predicts on its own system", hint="use the `predict` method of the fit"
+            )
         read = self._read(quantity if isinstance(quantity, str) else tuple(quantity))
         nq, (arrays, batch) = self.system.robot.nq, self._states(q, qd, tau, active)
         new = self._new
@@ -259,7 +265,7 @@ class CompiledFit(Predictor):
         """
         if self._learned is not None:
             raise ModelError(
-                "what was learned in C has no Jacobian", hint="update the fit, and compile it again"
+                "samples added in C do not change the Jacobian", hint="update the fit, and compile it again"
             )
         names = [quantity] if isinstance(quantity, str) else list(quantity)
         for name in names:
@@ -369,7 +375,7 @@ class CompiledFit(Predictor):
     ) -> ForceLinearization:
         """Return the mean acceleration and multiplier with their Jacobians (see `StructuredFit`)."""
         if system is not None and system is not self.system:
-            raise ModelError("a compiled fit predicts on its own system", hint="use that of the fit")
+            raise ModelError("a compiled fit predicts on its own system", hint="use the method of the fit")
         found = self.jacobian(q, qd, tau, ["qdd", "multiplier"], active=active)
         fields: list[Tensor] = []
         for at in found.parts.values():

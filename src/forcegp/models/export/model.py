@@ -40,7 +40,7 @@ WHY = {
     "DisturbancePrior": "its force depends on time",
     "CoregionalPrior": "its components share functions",
     "OperatorForcePrior": "its operator is Python code",
-    "PayloadPrior": "it has a known payload, and the code has the mechanics of the bare arm only",
+    "PayloadPrior": "it has a known payload, but the code contains only the mechanics of the bare arm",
     "ImplicitSurface": "it is Python code",
 }
 """Reasons why a type has no C form. Other types have no C form yet."""
@@ -144,9 +144,11 @@ class ExportedModel:
         if self.wrench is not None:
             self.system.robot.frame_index(self.wrench.frame)
             if self.dtype != torch.float64:
-                raise ModelError("an external wrench needs double precision", hint="M q̈ − Q̄ cancels digits")
+                raise ModelError(
+                    "an external wrench needs double precision", hint="M q̈ − Q̄ loses digits to cancellation"
+                )
         if self.system.robot.device.type != "cpu":
-            raise ModelError("a fit on a GPU is not exported", hint="save it, and load it on the CPU")
+            raise ModelError("a fit on a GPU cannot be exported", hint="save it, and load it on the CPU")
         for each in self.system.contacts:
             if not isinstance(each, SurfaceContact) or each.stick_speed is not None:
                 raise _no_c("contact", each.name, each, "a SurfaceContact that always slides")
@@ -160,7 +162,9 @@ class ExportedModel:
             _check_kernel(prior.name, prior.kernel)
         for kind, what in ((InertialPrior, "the inertia"), (PayloadPrior, "a payload")):
             if sum(isinstance(prior, kind) for prior in self.posterior.priors) > 1:
-                raise ModelError(f"a fit with two priors on {what} is not exported", expected="one at most")
+                raise ModelError(
+                    f"a fit with two priors on {what} cannot be exported", expected="at most one"
+                )
         latent = self.posterior.latent
         size = latent.basis.size if isinstance(latent, SparsePosterior) else len(latent.alpha)
         if self.functions is None and size > LARGEST:
