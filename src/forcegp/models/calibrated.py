@@ -14,7 +14,7 @@ with inertial parameters π + S δ (`forces/priors/inertial.py`).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -50,8 +50,8 @@ SLOWEST = 0.05
 """Smallest of these speeds relative to the largest trained speed; below it, dry friction is smooth."""
 UNTRAINED = 1.0
 """Largest speed that is assumed if the trained speeds are unknown [rad/s, m/s]."""
-DRAWS = 400
-"""Number of function samples from which standard deviations are computed."""
+DRAWS, DRAWN = 400, 4000
+"""Number of function samples from which standard deviations are computed, and from which covariances are."""
 OPEN = 2.0
 """Number of standard deviations from zero within which an offset counts as undetermined."""
 DETERMINED = 0.5
@@ -260,7 +260,7 @@ def unknowns_after(fit: StructuredFit, unknowns: Unknowns, *, draws: int = DRAWS
     if prior is not None:
         found |= dict(enumerate((delta @ torch.from_numpy(unknowns.base.combination).mT).mT))
     if any(isinstance(prior, JointFrictionPrior) for prior in fit.force_priors):
-        curves = torch.stack(list(reader._curves(drawn)))[1:]
+        curves = reader._curves(drawn)[1:]
         basis = unknowns.basis(torch.zeros_like(reader.speeds), reader.speeds)
         spread, each = (curves - curves.mean(0)).permute(2, 1, 0), basis.shape[-1]
         weights = torch.linalg.pinv(basis[..., : 2 + SPEED_BUMPS].movedim(1, 0)) @ spread
@@ -338,9 +338,9 @@ class _Reader:
 
     def robots(self, draws: int) -> list[tuple[RobotModel, Curve]]:
         """Return the robots for the posterior mean and for function samples, each with its friction curve."""
-        drawn = self.fit.force_samples(draws, torch.Generator().manual_seed(self.seed))
+        drawn = self.fit.force_samples(max(draws, DRAWN), torch.Generator().manual_seed(self.seed))
         assert isinstance(drawn, ForceSamples)
-        curves = torch.stack(list(self._curves(drawn)))
+        curves = self._curves(drawn)
         parts = [
             curves.flatten(1),
             self._constants(drawn, InertialPrior),
@@ -349,11 +349,11 @@ class _Reader:
         sizes = [part.shape[-1] for part in parts]
         offset, (kept,) = self._offsets(curves), self._offsets(self._kept()[None])
         free = _without_offsets(offset, offset[0] - kept, torch.cat(parts, dim=-1))
-        rows = (row.split(sizes) for row in self._consistent(free, sizes[0]))
+        rows = (row.split(sizes) for row in self._consistent(free, sizes[0], 1 + draws))
         return [self._robot(curve.view_as(self.speeds), delta, load) for curve, delta, load in rows]
 
-    def _consistent(self, values: Tensor, first: int) -> Tensor:
-        """Return the mean and samples `(1 + samples, d)` with the most probable physically consistent links.
+    def _consistent(self, values: Tensor, first: int, count: int) -> Tensor:
+        """Return the mean and first samples `(count, d)` with the most probable physically consistent links.
 
         Minimises ½ (x − x₀)ᵀ Σ⁻¹ (x − x₀), with the sample covariance Σ, over the entries x of J₀^-½ ΔJ J₀^-½
         ≥ −1 + ε of each link by ADMM. The links start at column `first`; other columns are adjusted according
@@ -361,7 +361,7 @@ class _Reader:
         Source: Boyd et al., *Distributed optimization and statistical learning via ADMM* (2011), section 5.
         """
         if self.scale is None:
-            return values
+            return values[:count]
         robot, n = self.fit.system.robot, len(MOMENTS)
         w, U = torch.linalg.eigh(pseudo_inertia(robot.mass, robot.com, robot.inertia))
         sound, one = w[:, 0] > 0.0, torch.eye(4).to(w)
@@ -379,7 +379,7 @@ class _Reader:
             X = V @ torch.diag_embed(w.clamp(min=SMALLEST)) @ V.mT - one
             return (X[..., row, column] * weight * sound[:, None]).flatten(1)
 
-        x0, spread = values[:, links] @ T, values[1:] - values[1:].mean(0)
+        x0, spread = values[:count, links] @ T, values[1:] - values[1:].mean(0)
         inverse = torch.linalg.inv(T)
         known = torch.linalg.pinv(spread[:, links].mT @ spread[:, links], hermitian=True)
         precision = (len(spread) - 1) * inverse @ known @ inverse.mT
@@ -390,7 +390,7 @@ class _Reader:
             x = RELAXATION * x + (1.0 - RELAXATION) * z
             z = bodies(x + u)
             u = u + x - z
-        moved = values + (z - x0) @ inverse @ known @ (spread[:, links].mT @ spread)
+        moved = values[:count] + (z - x0) @ inverse @ known @ (spread[:, links].mT @ spread)
         moved[:, links] = z @ inverse
         return moved
 
@@ -408,20 +408,20 @@ class _Reader:
                 force = force + torch.einsum("nij,nj->ni", prior.operator(fit.system, at), latent)
         return self._over_poses(force)
 
-    def _curves(self, drawn: ForceSamples) -> Iterator[Tensor]:
-        """Yield the friction Q_D `(k, nq)` of the posterior mean and of each sample, averaged over poses."""
+    def _curves(self, drawn: ForceSamples) -> Tensor:
+        """Return the friction Q_D `(1 + samples, k, nq)` of the posterior mean and samples, over poses."""
         fit, at = self.fit, self.at
         priors = [p for p, prior in enumerate(fit.force_priors) if isinstance(prior, JointFrictionPrior)]
         known = dynamics.damping_force(fit.system.robot, at.qd)
-        yield self._over_poses(known + fit.posterior.unknown_force(fit.system, at, priors))
-        for k in range(drawn.count):
-            force = torch.zeros_like(at.q)
-            for p in priors:
-                features = fit.posterior.process.features(p, fit.system, at)
-                latent = drawn.functions.by_runs(p, features, range(k, k + 1), len(at.q))
-                latent = latent + fit.posterior.shift(p, features)
-                force = force + (fit.force_priors[p].operator(fit.system, at) @ latent[..., None])[..., 0]
-            yield self._over_poses(known + force)
+        curves = self._over_poses(known).expand(drawn.count, -1, -1)
+        for p in priors:
+            features, E = self._features(p), fit.force_priors[p].operator(fit.system, at)
+            shift = fit.posterior.shift(p, features) + torch.zeros_like(E[:, 0])
+            for rows in torch.arange(len(E)).split(len(self.speeds)):
+                latent = drawn.functions.latent(p, {name: x[rows] for name, x in features.items()})
+                curves = curves + torch.einsum("nij,snj->sni", E[rows], latent + shift[rows]) / POSES
+        mean = self._over_poses(known + fit.posterior.unknown_force(fit.system, at, priors))
+        return torch.cat([mean[None], curves])
 
     def _over_poses(self, force: Tensor) -> Tensor:
         return force.unflatten(0, (POSES, len(self.speeds))).mean(0)
