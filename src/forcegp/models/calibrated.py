@@ -9,7 +9,8 @@ If friction depends on the load, Q_D is averaged over poses. The residual and th
 rarely separate an offset from the gravity force of the links, so if an offset is within 2σ of zero, all other
 parameters are conditioned on c = 0. URDF does not support armature a, so drive inertia is added to the links
 as far as physically possible. Samples are computed in the same way from functions drawn from the posterior,
-with inertial parameters π + S δ (`forces/priors/inertial.py`).
+with inertial parameters π + S δ (`forces/priors/inertial.py`), and spread further by the difference between
+the identified inertia and its posterior mean.
 """
 
 from __future__ import annotations
@@ -346,22 +347,44 @@ class _Reader:
             self._constants(drawn, InertialPrior),
             self._constants(drawn, PayloadPrior),
         ]
-        sizes = [part.shape[-1] for part in parts]
-        offset, (kept,) = self._offsets(curves), self._offsets(self._kept()[None])
-        free = _without_offsets(offset, offset[0] - kept, torch.cat(parts, dim=-1))
-        rows = (row.split(sizes) for row in self._consistent(free, sizes[0], 1 + draws))
+        sizes, values = [part.shape[-1] for part in parts], torch.cat(parts, dim=-1)
+        offset, kept, b = self._offsets(curves), self._offsets(self._kept()[None]), self._disagreement()
+        gain = _offset_gain(offset, offset[0] - kept[0], values)
+        free, b = values - offset @ gain, b - kept @ gain
+        random = torch.randn(
+            draws, 1, generator=torch.Generator().manual_seed(self.seed), dtype=torch.float64
+        )
+        spread = torch.cat([free[:1], free[1 : 1 + draws] + random.to(b) * b])
+        rows = (row.split(sizes) for row in self._consistent(spread, sizes[0], free[1:]))
         return [self._robot(curve.view_as(self.speeds), delta, load) for curve, delta, load in rows]
 
-    def _consistent(self, values: Tensor, first: int, count: int) -> Tensor:
-        """Return the mean and first samples `(count, d)` with the most probable physically consistent links.
+    def _disagreement(self) -> Tensor:
+        """Return b `(1, d)`, identified minus posterior mean; samples are spread by N(0, b bᵀ) in addition.
 
-        Minimises ½ (x − x₀)ᵀ Σ⁻¹ (x − x₀), with the sample covariance Σ, over the entries x of J₀^-½ ΔJ J₀^-½
-        ≥ −1 + ε of each link by ADMM. The links start at column `first`; other columns are adjusted according
-        to their covariance with the links. A link that is unphysical in the file does not change.
+        Instruments identify inertia without bias by noisy accelerations, but from part of the samples; the
+        posterior contains all samples, but regards accelerations in the regressor as exact. A robot at its
+        posterior mean, which contains nonzero pinned forces, has b = 0.
+        """
+        posterior = self.fit.posterior
+        identified = float(not any(bool(value.any()) for value in posterior.process.pinned.values()))
+        b = [self._kept().flatten()]
+        for kind in (InertialPrior, PayloadPrior):
+            for p in [p for p, prior in enumerate(self.fit.force_priors) if isinstance(prior, kind)][:1]:
+                one = {name: x[:1] for name, x in self._features(p).items()}
+                b.append((posterior.means.latent_mean(p, one) - posterior.latent.latent_mean(p, one))[0])
+        return identified * torch.cat(b)[None]
+
+    def _consistent(self, values: Tensor, first: int, samples: Tensor) -> Tensor:
+        """Return the values `(n, d)` with the most probable physically consistent links.
+
+        Minimises ½ (x − x₀)ᵀ Σ⁻¹ (x − x₀), with the covariance Σ of the samples `(s, d)`, over the entries x
+        of J₀^-½ ΔJ J₀^-½ ≥ −1 + ε of each link by ADMM. The links start at column `first`; other columns are
+        adjusted according to their covariance with the links. A link that is unphysical in the file does not
+        change.
         Source: Boyd et al., *Distributed optimization and statistical learning via ADMM* (2011), section 5.
         """
         if self.scale is None:
-            return values[:count]
+            return values
         robot, n = self.fit.system.robot, len(MOMENTS)
         w, U = torch.linalg.eigh(pseudo_inertia(robot.mass, robot.com, robot.inertia))
         sound, one = w[:, 0] > 0.0, torch.eye(4).to(w)
@@ -379,7 +402,7 @@ class _Reader:
             X = V @ torch.diag_embed(w.clamp(min=SMALLEST)) @ V.mT - one
             return (X[..., row, column] * weight * sound[:, None]).flatten(1)
 
-        x0, spread = values[:count, links] @ T, values[1:] - values[1:].mean(0)
+        x0, spread = values[:, links] @ T, samples - samples.mean(0)
         inverse = torch.linalg.inv(T)
         known = torch.linalg.pinv(spread[:, links].mT @ spread[:, links], hermitian=True)
         precision = (len(spread) - 1) * inverse @ known @ inverse.mT
@@ -390,7 +413,7 @@ class _Reader:
             x = RELAXATION * x + (1.0 - RELAXATION) * z
             z = bodies(x + u)
             u = u + x - z
-        moved = values[:count] + (z - x0) @ inverse @ known @ (spread[:, links].mT @ spread)
+        moved = values + (z - x0) @ inverse @ known @ (spread[:, links].mT @ spread)
         moved[:, links] = z @ inverse
         return moved
 
@@ -457,22 +480,18 @@ class _Reader:
         return robot, (curve, left, offset)
 
 
-def _without_offsets(offset: Tensor, mean: Tensor, values: Tensor) -> Tensor:
-    """Return the mean and samples of values `(1 + samples, d)`, given that undetermined offsets are zero.
+def _offset_gain(offset: Tensor, mean: Tensor, values: Tensor) -> Tensor:
+    """Return the gain G `(nq, d)` that conditions values z − c G on zero offsets c where undetermined.
 
     With sample covariances, E[z | c = 0] = z − Cov(z, c) Cov(c)⁻¹ c.
 
     Args:
         offset: offsets at the identified inertia, and of samples around it, `(1 + samples, nq)`.
         mean: `(nq,)` posterior mean of the offsets, which is compared with zero.
-        values: values to condition on c = 0.
+        values: mean and samples of the values `(1 + samples, d)`.
     """
-    c = offset[:, mean.abs() <= OPEN * offset[1:].std(0)]
-    around = c[1:] - c[1:].mean(0)
-    gain = (
-        torch.linalg.pinv(around.mT @ around, hermitian=True) @ around.mT @ (values[1:] - values[1:].mean(0))
-    )
-    return values - c @ gain
+    c = (offset[1:] - offset[1:].mean(0)) * (mean.abs() <= OPEN * offset[1:].std(0))
+    return torch.linalg.pinv(c.mT @ c, hermitian=True) @ c.mT @ (values[1:] - values[1:].mean(0))
 
 
 def _projected(speeds: Tensor, curve: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
