@@ -26,8 +26,10 @@ def runs(*keys: NDArray[Any]) -> list[slice]:
     return [slice(first, last) for first, last in pairwise(edges)]
 
 
-def intervals(mask: NDArray[np.bool_], join: int = 0) -> Intervals:
+def intervals(mask: NDArray[np.bool_], join: int = 0, least: int = 1) -> Intervals:
     """Return the intervals in which `mask` is true, merging those that are at most `join` rows apart.
+
+    Intervals of fewer than `least` rows are left out.
 
     >>> intervals(np.array([True, True, False, True]))
     ((0, 2), (3, 4))
@@ -38,7 +40,13 @@ def intervals(mask: NDArray[np.bool_], join: int = 0) -> Intervals:
             near = bool(joined) and rows.start - joined[-1][1] <= join
             start = joined.pop()[0] if near else rows.start
             joined.append((start, rows.stop))
-    return tuple(joined)
+    return tuple((start, stop) for start, stop in joined if stop - start >= least)
+
+
+def repeats(*columns: NDArray[Any]) -> NDArray[np.bool_]:
+    """Return the mask (n,) of rows in which all columns (n, d) repeat the values of the previous row."""
+    differs = [np.diff(values, axis=0).any(axis=1) for values in columns]
+    return np.append(False, ~np.any(differs, axis=0))
 
 
 def numbered(rows: NDArray[np.int64]) -> Intervals:

@@ -11,7 +11,7 @@ import torch
 
 from forcegp import kinematics
 from forcegp.checks.finding import Finding, with_alternatives
-from forcegp.checks.fit import BLOCKS, CHUNK, blocks_of, labelled_contacts, residual, tensors, unmeasured
+from forcegp.checks.fit import BLOCKS, CHUNK, blocks_of, labelled_contacts, residual
 from forcegp.checks.log import Array, Log, Outcome, evenly
 from forcegp.constraints import ConstrainedSystem, Plane, SurfaceContact
 from forcegp.logs.contact import LEVEL, TOUCHING
@@ -35,6 +35,7 @@ Duration of the shortest run of rows for which a wrong label is reported [s]."""
 MISSED_SECONDS, MISSED_DISTANCE = 0.1, 2e-3
 """Minimum duration [s] and distance [m] of sliding along the surface for an unlabelled contact."""
 LEAST_ROWS = 20
+"""Minimum number of rows in contact for judging a contact or its force."""
 OFF = {
     "contact-early": "labelled closed before the tip touches",
     "contact-late": "labelled closed after the tip has left",
@@ -71,7 +72,7 @@ def tip_path(
     parts = np.array_split(np.arange(len(log)) if rows is None else rows, -(-len(log) // CHUNK))
     paths = []
     with torch.no_grad():
-        for q, qd in (tensors(log, part, "q", "qd") for part in parts):
+        for q, qd in (log.tensors(part, "q", "qd") for part in parts):
             p = kinematics.point_position(system.robot, q, contact.frame, contact.point)
             v = kinematics.point_velocity(system.robot, q, qd, contact.frame, contact.point)
             paths.append((contact.center_surface.value(p), p, v, contact.surface.gradient(p)))
@@ -199,9 +200,7 @@ def _runs_off(
     least = max(2, round(RUN_SECONDS / log.dt)) if np.isfinite(log.dt) else 2
     runs: dict[str, Intervals] = dict.fromkeys(OFF, ())
     for start, stop in intervals(label):
-        for a, b in intervals(off[start:stop], join=least):
-            if b - a < least:
-                continue
+        for a, b in intervals(off[start:stop], join=least, least=least):
             kind = "contact-early" if a == 0 and b < stop - start else "contact-late"
             inside = (a > 0) == (b < stop - start)
             before, after = settled[start : start + a][::-1], settled[start + b : stop]
@@ -227,8 +226,8 @@ def _missed(
     least = max(3, round(MISSED_SECONDS / log.dt))
     spans = tuple(
         (a, b)
-        for a, b in intervals(near)
-        if b - a >= least and speed[a:b].sum() * log.dt > MISSED_DISTANCE + 20.0 * np.ptp(c[a:b])
+        for a, b in intervals(near, least=least)
+        if speed[a:b].sum() * log.dt > MISSED_DISTANCE + 20.0 * np.ptp(c[a:b])
     )
     if not spans:
         return []
@@ -259,21 +258,13 @@ def check_forces(system: ConstrainedSystem, log: Log) -> Outcome:
         force = _force(one, log, rows, path)
         if pulls := _pulls(finding, path, force):
             # Up to three torques cannot contradict the force that they are taken for.
-            flipped = (
-                (j, np.where(np.arange(log.nq) == j, -1.0, 1.0)) for j in range(log.nq * (log.nq <= 3))
-            )
-            others = ((j, log.replace(tau=log.tau * sign)) for j, sign in flipped)
-            text = "the torque of {} has the opposite sign"
-            findings += [
-                with_alternatives(
-                    pulls[0],
-                    [
-                        log.finding("torque-sign", text.format(log.joint_names[j]), (log.joint_names[j],))
-                        for j, other in others
-                        if np.median((_force(one, other, rows, path) * path.normal).sum(axis=1)) > 0.0
-                    ],
-                )
-            ]
+            others = []
+            for j, name in enumerate(log.joint_names if log.nq <= 3 else ()):
+                flipped = _force(one, log.changed(("tau",), flip=(j,)), rows, path)
+                if np.median((flipped * path.normal).sum(axis=1)) > 0.0:
+                    text = f"the torque of {name} has the opposite sign"
+                    others.append(log.finding("torque-sign", text, (name,)))
+            findings.append(with_alternatives(pulls[0], others))
         elif log.nq > 3:
             findings += _friction(finding, path, force)
     return findings, log
@@ -283,7 +274,7 @@ def _force(system: ConstrainedSystem, log: Log, rows: np.ndarray, path: Path) ->
     """Return the force F (n, 3) that best fits r = Jᵀ F, or its normal part with up to three joints."""
     r, J = residual(system, log, rows)
     if log.nq <= 3:
-        A = J[:, 0] * ~np.isin(np.arange(log.nq), unmeasured(log))
+        A = J[:, 0] * ~np.isin(np.arange(log.nq), log.unmeasured)
         size = np.maximum((A * A).sum(axis=1), 1e-12)
         return ((A * r).sum(axis=1) / size)[:, None] * path.normal
     gram = J @ J.transpose(0, 2, 1)
@@ -308,8 +299,7 @@ def _friction(finding: partial[Finding], path: Path, force: Array) -> list[Findi
     drag = -(force * path.along).sum(axis=1)[sliding] / speed[sliding]
     press = np.maximum((force * path.normal).sum(axis=1)[sliding], 0.0)
     # One coefficient per block: the scatter between blocks gives the standard error.
-    parts = [blocks_of(len(drag)) == k for k in range(BLOCKS)]
-    each = [(drag[part] @ press[part]) / max(press[part] @ press[part], 1e-12) for part in parts]
+    each = [(drag[b] @ press[b]) / max(press[b] @ press[b], 1e-12) for b in blocks_of(len(drag))]
     mean, error = float(np.mean(each)), float(np.std(each, ddof=1) / np.sqrt(BLOCKS))
     size = "not determined" if mean > LARGEST_FRICTION else f"about {100 * mean:.0f} % of the normal force"
     text = f"friction at {finding.keywords['contact']!r} while it slides is {size}"

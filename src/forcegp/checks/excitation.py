@@ -14,9 +14,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 import torch
 
+from forcegp.checks.contact import LEAST_ROWS
 from forcegp.checks.explain import Explanation, significant
 from forcegp.checks.finding import Finding
-from forcegp.checks.fit import BLOCKS, blocks_of, cross_validate, held_out, residual, tensors, unmeasured
+from forcegp.checks.fit import blocks_of, cross_validate, held_out, residual
 from forcegp.checks.hypotheses import encoder_hypothesis, inertial_spread, robot_columns
 from forcegp.checks.log import Array, Log, Outcome, position_unit
 from forcegp.constraints import ConstrainedSystem
@@ -93,7 +94,7 @@ def _sharpness(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> tuple[A
     base = base_parameters(robot)
     columns = np.array(base.columns)
     with torch.no_grad():
-        Y = regressor(robot, *tensors(log, rows, "q", "qd", "qdd"))[..., list(base.columns)].numpy()
+        Y = regressor(robot, *log.tensors(rows, "q", "qd", "qdd"))[..., list(base.columns)].numpy()
     tau = np.sqrt((log.tau[rows] ** 2).mean(axis=0))
     noise = np.maximum(0.01 * tau, 1e-3 * tau.max()) + 1e-12
     A = (Y / noise[:, None]).reshape(-1, len(columns)) * inertial_spread(robot)[columns]
@@ -104,8 +105,6 @@ def _sharpness(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> tuple[A
     return np.sqrt(np.diag(after)), base.names, columns
 
 
-LEAST_TOUCHING = 20
-"""Minimum number of rows in contact for which the force that a fault mimics is reported."""
 LARGEST = 1e3
 SIZES = np.geomspace(1e-3, LARGEST, 200)
 """Fault sizes that are tried."""
@@ -133,11 +132,11 @@ class Fault:
     concerned: int
 
 
-def check_visibility(system: ConstrainedSystem, explanation: Explanation) -> list[Finding]:
+def check_visibility(explanation: Explanation) -> list[Finding]:
     """Report the size above which each fault is detected, and the force error that a typical fault causes."""
-    faults = list(_faults(system, explanation.log, explanation.rows))
+    faults, robot = list(_faults(explanation)), explanation.system.robot
     sizes = {fault: visible_size(explanation, fault) for fault in faults}
-    units = {name: position_unit(system.robot, j) for j, name in enumerate(system.robot.joint_names)}
+    units = {name: position_unit(robot, j) for j, name in enumerate(robot.joint_names)}
     texts, hidden = [], [f for f in faults if not f.joint or sizes[f] > EXPECTED[f.kind][0]]
     for kind, (expected, most, scale, what, words) in EXPECTED.items():
         alike, parts = [fault for fault in hidden if fault.kind == kind], []
@@ -159,9 +158,9 @@ def check_visibility(system: ConstrainedSystem, explanation: Explanation) -> lis
 def force_of(explanation: Explanation, fault: Fault) -> float:
     """Return the RMS tip force [N] that a unit fault mimics after a fit, or 0 without enough contact."""
     problem = replace(explanation.problem, r=fault.column)
-    J = problem.J[:, : problem.J.shape[1] - len(unmeasured(explanation.log))]
+    J = problem.J[:, : problem.J.shape[1] - len(explanation.log.unmeasured)]
     touching = (J != 0.0).any(axis=(1, 2))
-    if touching.sum() < LEAST_TOUCHING:
+    if touching.sum() < LEAST_ROWS:
         return 0.0
     fit = cross_validate(problem, explanation.columns, explanation.prior)
     learned = explanation.columns @ fit.theta + problem.nuisance @ fit.nuisance
@@ -176,9 +175,8 @@ def visible_size(explanation: Explanation, fault: Fault) -> float:
     problem = explanation.problem
     rest = held_out(problem, explanation.columns, explanation.prior)
     added = held_out(replace(problem, r=fault.column), explanation.columns, explanation.prior)
-    block = blocks_of(len(rest))
     square, cross, added_square = (
-        np.stack([product[block == k].mean(axis=0) for k in range(BLOCKS)])
+        np.stack([product[rows].mean(axis=0) for rows in blocks_of(len(rest))])
         for product in (rest**2, rest * added, added**2)
     )
 
@@ -190,7 +188,8 @@ def visible_size(explanation: Explanation, fault: Fault) -> float:
     return float(SIZES[max(unseen, default=0.0) < SIZES].min(initial=LARGEST))
 
 
-def _faults(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterator[Fault]:
+def _faults(explanation: Explanation) -> Iterator[Fault]:
+    system, log, rows = explanation.system, explanation.log, explanation.rows
     delays = []
     if log.header.ordered:  # unordered rows have no neighbours in time
         # Use the torque required by the motion, since the measured torque is noisier.

@@ -87,9 +87,10 @@ class Explanation:
         return replace(self, problem=replace(self.problem, nuisance=nuisance))
 
     def without(self, columns: list[int]) -> Explanation:
-        """Return the explanation without the given nuisance columns."""
-        keep = np.setdiff1d(np.arange(self.problem.nuisance.shape[-1]), columns)
-        return replace(self, problem=replace(self.problem, nuisance=self.problem.nuisance[..., keep]))
+        """Return the explanation with the given nuisance columns set to zero."""
+        nuisance = self.problem.nuisance.copy()
+        nuisance[..., columns] = 0.0
+        return replace(self, problem=replace(self.problem, nuisance=nuisance))
 
     def with_(self, hypothesis: Hypothesis) -> TorqueFit:
         """Fit the parameters of a hypothesis in addition to those already in the model."""

@@ -32,8 +32,6 @@ TESTS: dict[str, str] = _FAMILIES.pop("tests")
 """For each kind of fault, tests that distinguish it from its alternatives, in order of preference."""
 KINDS = {name: Kind(family, *row) for family, rows in _FAMILIES.items() for name, row in rows.items()}
 """All kinds of findings, keyed by name."""
-
-
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
 """Severities, from most to least severe."""
 

@@ -21,17 +21,12 @@ CHUNK = 8192
 """Number of rows for which the dynamics are held in memory at a time."""
 
 
-def tensors(log: Log, rows: np.ndarray, *names: str) -> list[Tensor]:
-    """Return the selected rows of the named columns as tensors."""
-    return [torch.from_numpy(np.ascontiguousarray(getattr(log, name)[rows])) for name in names]
-
-
 def residual(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> tuple[Array, Array]:
     """Return the unexplained torque r (n, nq) [N m, N] and J (n, k, nq), which is zero for open contacts."""
     robot, r, J = system.robot, [], []
     with torch.no_grad():
         for part in np.array_split(rows, max(1, -(-len(rows) // CHUNK))):
-            q, qd, qdd, tau = tensors(log, part, "q", "qd", "qdd", "tau")
+            q, qd, qdd, tau = log.tensors(part, "q", "qd", "qdd", "tau")
             needed = dynamics.inverse_dynamics(robot, q, qd, qdd) - dynamics.damping_force(robot, qd)
             r.append((needed - tau).numpy())
             J.append(_contact_jacobian(system, log, part, q, qd))
@@ -48,18 +43,13 @@ def takes_friction_out(system: ConstrainedSystem, log: Log) -> bool:
     return 3 * len(labelled_contacts(system, log)) < log.nq
 
 
-def unmeasured(log: Log) -> list[int]:
-    """Return the indices of the joints whose torque is not measured according to the header."""
-    return [j for j, name in enumerate(log.joint_names) if name in log.header.unmeasured_torques]
-
-
 def _contact_jacobian(system: ConstrainedSystem, log: Log, rows: np.ndarray, q: Tensor, qd: Tensor) -> Array:
     """Return J for all components of the contact forces, or only for the normals if no torque would remain.
 
     Additional rows represent unmeasured torques, which may have any value.
     """
     contacts, whole = labelled_contacts(system, log), takes_friction_out(system, log)
-    free = np.broadcast_to(np.eye(log.nq)[unmeasured(log)], (len(rows), len(unmeasured(log)), log.nq))
+    free = np.broadcast_to(np.eye(log.nq)[log.unmeasured], (len(rows), len(log.unmeasured), log.nq))
     if not contacts or not len(rows):
         return free
     parts = []
@@ -127,9 +117,10 @@ class TorqueFit:
     score: Array
 
 
-def blocks_of(n: int) -> Array:
-    """Return the block index of each row."""
-    return np.minimum(np.arange(n) * BLOCKS // max(n, 1), BLOCKS - 1)
+def blocks_of(n: int) -> list[np.ndarray]:
+    """Return the mask of the rows in each block."""
+    block = np.minimum(np.arange(n) * BLOCKS // max(n, 1), BLOCKS - 1)
+    return [block == k for k in range(BLOCKS)]
 
 
 def cross_validate(
@@ -154,8 +145,7 @@ def cross_validate(
         size = np.sqrt((Z**2).sum(axis=(0, 1)))
         Z = np.concatenate([Z / np.where(size > 0.0, size, np.inf), A[..., Z.shape[-1] :]], axis=-1)
     rest, thetas, whole = _held_out(A, y, weight, Z)
-    block = blocks_of(len(y))
-    error = np.stack([np.sqrt((rest[block == k] ** 2).mean(axis=0)) for k in range(BLOCKS)])
+    error = np.stack([np.sqrt((rest[rows] ** 2).mean(axis=0)) for rows in blocks_of(len(y))])
     # Jackknife: (K − 1)/K Σ (θ_k − mean)².
     spread = np.sqrt(BLOCKS - 1.0) * np.std(thetas, axis=0) / unit
     theta = (whole / unit)[:p]
@@ -197,17 +187,17 @@ def robust_parameters(problem: TorqueProblem, columns: Array, prior: Array) -> A
 
 def _held_out(A: Array, y: Array, weight: Array, Z: Array | None = None) -> tuple[Array, Array, Array]:
     """Return held-out residuals, parameters fitted without each block, and those fitted to all blocks."""
-    block, rest, symmetric = blocks_of(len(y)), np.zeros_like(y), Z is None
+    blocks, rest, symmetric = blocks_of(len(y)), np.zeros_like(y), Z is None
     Z = A if Z is None else Z
     grams, sides, thetas = [], [], []
-    for rows in (block == k for k in range(BLOCKS)):
+    for rows in blocks:
         a, z = (x[rows].reshape(-1, A.shape[-1]) for x in (A, Z))
         grams.append(z.T @ a)
         sides.append(z.T @ y[rows].ravel())
     gram, side = np.sum(grams, axis=0), np.sum(sides, axis=0)
-    for k in range(BLOCKS):
+    for k, rows in enumerate(blocks):
         thetas.append(_solve(gram - grams[k], side - sides[k], weight, symmetric))
-        rest[block == k] = y[block == k] - A[block == k] @ thetas[-1]
+        rest[rows] = y[rows] - A[rows] @ thetas[-1]
     return rest, np.stack(thetas), _solve(gram, side, weight, symmetric)
 
 

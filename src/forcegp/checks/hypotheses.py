@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 from functools import partial
 from itertools import combinations
@@ -13,14 +13,7 @@ import torch
 from forcegp import dynamics, kinematics
 from forcegp.checks.contact import tip_path
 from forcegp.checks.finding import Finding
-from forcegp.checks.fit import (
-    TorqueFit,
-    TorqueProblem,
-    labelled_contacts,
-    residual,
-    takes_friction_out,
-    tensors,
-)
+from forcegp.checks.fit import TorqueFit, TorqueProblem, labelled_contacts, residual, takes_friction_out
 from forcegp.checks.log import Array, Log, displacement, force_unit
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.identification import MASS_SHARE, MOMENT_ARM, regressor
@@ -36,6 +29,8 @@ rarely known, and friction in MuJoCo rises more gently."""
 SLOW, GRAVITY, LARGEST_DRIFT = 0.01, 10.0, 100.0
 """Sliding speed below which dry friction at contacts is smoothed [m/s]; possible error in gravity [m/s²];
 possible drift of a torque sensor [N m, N]."""
+ROBOT = ("gravity", "payload", "masses")
+"""Hypotheses about the robot file. These do not change the log."""
 
 
 @dataclass(frozen=True)
@@ -61,18 +56,13 @@ class Hypothesis:
 def problem_of(
     system: ConstrainedSystem, log: Log, rows: np.ndarray, scale: Array | None = None
 ) -> TorqueProblem:
-    """Return the torque problem for the given rows, including friction and an offset at each joint."""
-    nuisance = friction_columns(system, log, rows)
+    """Return the torque problem for the given rows. Viscous and dry friction and an offset are nuisances."""
+    qd = log.qd[rows]
+    laws = qd, np.tanh(qd / system.robot.friction_velocity.numpy()), np.ones_like(qd)
+    nuisance = np.concatenate([_diagonal(x) for x in laws], axis=-1)
     size = np.sqrt((log.tau[rows] ** 2).mean(axis=0))
     size = np.maximum(size, 1e-3 * size.max())
     return TorqueProblem(*residual(system, log, rows), nuisance, size, size if scale is None else scale)
-
-
-def friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
-    """Return columns (n, nq, 3 nq) for viscous friction, Coulomb friction and an offset at each joint."""
-    qd = log.qd[rows]
-    smooth = np.tanh(qd / system.robot.friction_velocity.numpy())
-    return np.concatenate([_diagonal(x) for x in (qd, smooth, np.ones_like(qd))], axis=-1)
 
 
 def other_rise_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
@@ -90,7 +80,7 @@ def shape_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Arra
 
 def contact_friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
     """Return friction columns Jᵀv and Jᵀv/|v| (n, nq, p) for each contact that slides at velocity v."""
-    (q,), columns = tensors(log, rows, "q"), [np.zeros((len(rows), log.nq, 0))]
+    (q,), columns = log.tensors(rows, "q"), [np.zeros((len(rows), log.nq, 0))]
     for contact in [] if takes_friction_out(system, log) else labelled_contacts(system, log):
         if isinstance(contact, SurfaceContact):
             v = tip_path(system, contact, log, rows).along * log.contact[contact.name][rows][:, None]
@@ -110,13 +100,6 @@ def unchanged(log: Log) -> Log:
     return log
 
 
-def changed(log: Log, names: tuple[str, ...], *, order: Sequence[int] = (), flip: Sequence[int] = ()) -> Log:
-    """Return the log with two joints swapped, or the given joints' signs flipped, in the named columns."""
-    index, sign = np.arange(log.nq), np.ones(log.nq)
-    index[list(order)], sign[list(flip)] = order[::-1], -1.0
-    return log.replace(**{name: getattr(log, name)[:, index] * sign for name in names})
-
-
 def delayed(log: Log, shift: int, joints: tuple[int, ...] = ()) -> Log:
     """Replace the torques of the given (or all) joints by those `shift` rows later, and mask the ends."""
     tau, lost = log.tau.copy(), np.ones(len(log), bool)
@@ -130,16 +113,15 @@ def delayed(log: Log, shift: int, joints: tuple[int, ...] = ()) -> Log:
 
 def discrete(log: Log) -> Iterator[Hypothesis]:
     """Yield hypotheses without parameters: wrong signs and swapped joints."""
-    every, motion = tuple(range(log.nq)), ("q", "qd", "qdd")
+    every, tau, motion = tuple(range(log.nq)), ("tau",), ("q", "qd", "qdd")
     if log.nq > 1:
-        yield Hypothesis("torque-sign", 0, partial(changed, names=("tau",), flip=every), joints=every)
+        yield Hypothesis("torque-sign", 0, partial(Log.changed, names=tau, flip=every), joints=every)
     for j in every:
-        yield Hypothesis("torque-sign", 0, partial(changed, names=("tau",), flip=(j,)), joints=(j,))
-        yield Hypothesis("joint-sign", 0, partial(changed, names=(*motion, "tau"), flip=(j,)), joints=(j,))
-        yield Hypothesis("joint-sign", 0, partial(changed, names=motion, flip=(j,)), joints=(j,))
+        for name, names in (("torque-sign", tau), ("joint-sign", motion + tau), ("joint-sign", motion)):
+            yield Hypothesis(name, 0, partial(Log.changed, names=names, flip=(j,)), joints=(j,))
     for pair in combinations(every, 2):
-        yield Hypothesis("torque-order", 0, partial(changed, names=("tau",), order=pair), joints=pair)
-        yield Hypothesis("joint-order", 0, partial(changed, names=(*motion, "tau"), order=pair), joints=pair)
+        for name, names in (("torque-order", tau), ("joint-order", motion + tau)):
+            yield Hypothesis(name, 0, partial(Log.changed, names=names, order=pair), joints=pair)
 
 
 def continuous(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterator[Hypothesis]:
@@ -159,9 +141,8 @@ def gain_hypothesis(log: Log, rows: np.ndarray, joints: tuple[int, ...]) -> Hypo
 
 def drift_hypothesis(log: Log, rows: np.ndarray, j: int) -> Hypothesis:
     """Return the hypothesis that the torque of joint j drifts over the log: u − τ = −θ s with |s| ≤ 1/2."""
-    column = np.zeros((len(rows), log.nq, 1))
-    column[:, j, 0] = -_elapsed(log)[rows]
-    return Hypothesis("drift", 1, unchanged, column, np.full(1, LARGEST_DRIFT), (j,))
+    columns = -_elapsed(log)[rows, None, None] * np.eye(log.nq)[:, [j]]
+    return Hypothesis("drift", 1, unchanged, columns, np.full(1, LARGEST_DRIFT), (j,))
 
 
 def _elapsed(log: Log) -> Array:
@@ -179,20 +160,16 @@ def current_hypothesis(
 
 
 def robot_hypotheses(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterator[Hypothesis]:
-    """Yield the hypotheses about the robot file. These do not change the log."""
+    """Yield the hypotheses about the robot file."""
     for name in ROBOT:
         columns, prior = robot_columns(system, log, rows, name)
         yield Hypothesis(name, columns.shape[-1], unchanged, columns, prior)
 
 
-ROBOT = ("gravity", "payload", "masses")
-"""Hypotheses about the robot file. These do not change the log."""
-
-
 def robot_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray, name: str) -> tuple[Array, Array]:
     """Return the torque (n, nq, p) per unit of each uncertain parameter, and the tolerances (p,)."""
     robot = system.robot
-    q, qd, qdd = tensors(log, rows, "q", "qd", "qdd")
+    q, qd, qdd = log.tensors(rows, "q", "qd", "qdd")
     with torch.no_grad():
         if name == "gravity":  # r = Q_G(δ) for gravity off by δ
             axes = torch.eye(3, dtype=q.dtype)
@@ -214,9 +191,8 @@ def inertial_spread(robot: RobotModel) -> Array:
 
 def encoder_hypothesis(system: ConstrainedSystem, log: Log, rows: np.ndarray, j: int) -> Hypothesis:
     """Return the hypothesis that the encoder of joint j has an offset δ, so that r = u(q) − τ = −∂u/∂q δ."""
-    q, qd, qdd = tensors(log, rows, "q", "qd", "qdd")
-    step = torch.zeros(log.nq, dtype=q.dtype)
-    step[j] = 1e-4
+    q, qd, qdd = log.tensors(rows, "q", "qd", "qdd")
+    step = 1e-4 * torch.eye(log.nq, dtype=q.dtype)[j]
     with torch.no_grad():
         ahead, behind = (dynamics.inverse_dynamics(system.robot, q + s, qd, qdd) for s in (step, -step))
     columns = ((behind - ahead) / 2e-4).numpy()[..., None]
@@ -238,8 +214,6 @@ SMALL_TILT, EARTH = 1.0, 9.81
 """Tilt that wrong masses may cause [degrees]; magnitude assumed if the scene has no gravity [m/s²]."""
 SAME_GRAVITY = 0.2, 0.5
 """Accepted relative errors in the size of gravity due to wrong masses, for tilts and for larger angles."""
-
-
 DISCRETE = {
     "torque-sign": "the torque of {} fits the motion with the opposite sign",
     "joint-sign": "{} fits the robot file when it turns the other way",
@@ -260,8 +234,7 @@ def plausible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit)
         size, spread = (np.abs(x[: len(joints)]) for x in (fit.theta, fit.spread))
         return explained and bool((size > np.maximum(SMALL_GAIN, spread)).any())
     if hypothesis.name == "gravity":
-        assumed = system.robot.gravity.numpy()
-        angle, size = _turn(assumed, assumed + fit.theta[:3])
+        angle, size = _turn(system.robot, fit.theta[:3])
         # No place on earth has another size of gravity: such a fit has masses or gains that are wrong.
         same = abs(size - 1.0) <= SAME_GRAVITY[angle > TILT]
         return bool(size < WEIGHTLESS) or (angle > SMALL_TILT and same)
@@ -275,20 +248,15 @@ def plausible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit)
 
 def corrected(log: Log, hypothesis: Hypothesis, theta: Array) -> Log:
     """Return the log with the fault corrected, or the same log if the fault is in the robot file."""
-    joints = list(hypothesis.joints)
-    if hypothesis.name == "gains":
-        tau = log.tau.copy()
-        # r = u − τ = g τ: the right torque is (1 + g) τ.
-        tau[:, joints] *= 1.0 + theta[: len(joints)]
-        return log.replace(tau=tau)
+    concerned = np.isin(np.arange(log.nq), hypothesis.joints)
+    if hypothesis.name == "gains":  # r = u − τ = g τ: the right torque is (1 + g) τ
+        factor = np.ones(log.nq)
+        factor[list(hypothesis.joints)] += theta[: len(hypothesis.joints)]
+        return log.replace(tau=log.tau * factor)
     if hypothesis.name == "drift":
-        tau = log.tau.copy()
-        tau[:, joints] -= theta[:1] * _elapsed(log)[:, None]
-        return log.replace(tau=tau)
+        return log.replace(tau=log.tau - theta[0] * _elapsed(log)[:, None] * concerned)
     if hypothesis.name == "encoder-offset":
-        q = log.q.copy()
-        q[:, joints] += theta[:1]
-        return log.replace(q=q)
+        return log.replace(q=log.q + theta[0] * concerned)
     return hypothesis.change(log)
 
 
@@ -319,10 +287,8 @@ def finding_of(
         evidence = {"add_rad": float(theta[0])}
     elif name == "drift":
         unit = force_unit(system.robot, hypothesis.joints[0])
-        name, text = (
-            "torque-offset",
-            f"the logged torque of {listed} drifts by {theta[0]:+.3g} ± {spread[0]:.2g} {unit}",
-        )
+        name = "torque-offset"
+        text = f"the logged torque of {listed} drifts by {theta[0]:+.3g} ± {spread[0]:.2g} {unit}"
         evidence = {f"drift {listed}": theta[0], "largest_torque": 0.5 * abs(theta[0])}
     elif name == "payload":
         name, names = "payload-missing", (log.joint_names[-1],)
@@ -354,29 +320,31 @@ def _gains(log: Log, names: tuple[str, ...], gains: Array) -> Finding:
 
 def _gravity(system: ConstrainedSystem, log: Log, change: Array) -> Finding:
     """Return the finding that gravity is missing in the torque, or has a different direction there."""
-    assumed = system.robot.gravity.numpy()
-    fitted = assumed + change
-    strength = float(np.linalg.norm(assumed))
-    angle, size = _turn(assumed, fitted)
+    fitted = system.robot.gravity.numpy() + change
+    angle, size = _turn(system.robot, change)
     evidence = {"angle_deg": angle, **{f"g{axis}": value for axis, value in zip("xyz", fitted, strict=True)}}
     vector = ", ".join(f"{value:.3g}" for value in fitted)
-    if strength > 0.0 and size < WEIGHTLESS:
+    pulls = bool(system.robot.gravity.any())
+    if pulls and size < WEIGHTLESS:
         text = "the torque contains no gravity: gravity compensation was subtracted"
         return log.finding("torque-without-gravity", text, log.joint_names, **evidence)
-    tilted = strength > 0.0 and angle <= TILT
+    tilted = pulls and angle <= TILT
     text = f"the torque fits with gravity ({vector}) m/s², {angle:.3g}° from the scene's"
     return log.finding("base-tilted" if tilted else "gravity-direction", text, **evidence)
 
 
 def is_tilt(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit) -> bool:
     """Return whether a hypothesis rotates gravity by a small angle."""
-    assumed = system.robot.gravity.numpy()
-    angle, size = _turn(assumed, assumed + fit.theta[:3]) if hypothesis.name == "gravity" else (np.inf, 0.0)
-    return bool(assumed.any()) and angle <= TILT and size >= WEIGHTLESS
+    if hypothesis.name != "gravity" or not system.robot.gravity.any():
+        return False
+    angle, size = _turn(system.robot, fit.theta[:3])
+    return angle <= TILT and size >= WEIGHTLESS
 
 
-def _turn(assumed: Array, fitted: Array) -> tuple[float, float]:
-    """Return the angle between two vectors [°], and the ratio of the second length to the first."""
+def _turn(robot: RobotModel, change: Array) -> tuple[float, float]:
+    """Return the angle [°] by which a change turns gravity, and the ratio of its new length to the old."""
+    assumed = robot.gravity.numpy()
+    fitted = assumed + change
     lengths = float(np.linalg.norm(assumed)), float(np.linalg.norm(fitted))
     cosine = fitted @ assumed / max(lengths[0] * lengths[1], 1e-12)
     return float(np.degrees(np.arccos(np.clip(cosine, -1.0, 1.0)))), lengths[1] / (lengths[0] or EARTH)

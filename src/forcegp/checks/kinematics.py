@@ -15,7 +15,7 @@ import torch
 
 from forcegp import dynamics
 from forcegp.checks.finding import Finding
-from forcegp.checks.fit import cross_validate, tensors
+from forcegp.checks.fit import cross_validate
 from forcegp.checks.hypotheses import problem_of
 from forcegp.checks.limits import DEGREE
 from forcegp.checks.log import DEPARTURE, Array, Log, Outcome, derive
@@ -90,9 +90,8 @@ def match(log: Log, value: str, rate: str) -> Match | None:
     change, integral = (np.where(jumps, 0.0, x) for x in whole)
     cross = (change * integral).sum(axis=0)
     integral_square, change_square = (integral**2).sum(axis=0), (change**2).sum(axis=0)
-    with np.errstate(divide="ignore", invalid="ignore"):
-        low, high = cross / integral_square, change_square / cross
-        correlation = cross / np.sqrt(integral_square * change_square)
+    low, high = cross / integral_square, change_square / cross
+    correlation = cross / np.sqrt(integral_square * change_square)
     speed = np.sqrt(change_square)
     moving = speed > 1e-3 * speed.max()
     low, high, correlation = np.nan_to_num((low, high, correlation))
@@ -124,20 +123,20 @@ def check_clock_unit(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def _clock_finding(log: Log, factor: float) -> Outcome:
-    near = [unit for unit in UNITS if abs(factor / unit - 1.0) <= UNIT_TOLERANCE]
-    if near:
-        kind, repaired = "time-unit", log.t * near[0]
+    unit = next((unit for unit in UNITS if abs(factor / unit - 1.0) <= UNIT_TOLERANCE), None)
+    if unit is not None:
+        kind, scale = "time-unit", unit
         text = f"time advances by {log.dt:.4g} per row, and by the motion {factor * log.dt:.4g} s"
     else:
-        kind, repaired = "time-scale", log.t * factor
+        kind, scale = "time-scale", factor
         text = f"positions and velocities change {factor:.4g} times as far as the clock allows"
     found = log.finding(kind, text, seconds_per_unit=factor, period=log.dt)
-    ratio, log = log.t[1] - log.t[0], log.replace(t=repaired)
-    ratio, second = ratio / (log.t[1] - log.t[0]), match(log, "qd", "qdd")
+    log = log.replace(t=log.t * scale)
+    second = match(log, "qd", "qdd")
     if "qdd" in log.derived | {*log.header.derived} and second is not None and second.moving.any():
         slope = max(float(np.median(second.low[second.moving])), 1e-300)
-        if abs(np.log(slope / ratio)) < abs(np.log(slope)):  # derived by the wrong clock
-            log = log.replace(qdd=log.qdd * ratio)
+        if abs(np.log(slope * scale)) < abs(np.log(slope)):  # derived by the wrong clock
+            log = log.replace(qdd=log.qdd / scale)
     return [found], log
 
 
@@ -227,8 +226,7 @@ def _permutation(level: Match) -> np.ndarray | None:
     # Windows without impacts are those in which a joint fits its own rate, which here is the wrong one.
     change, integral = level.whole
     size = np.sqrt((change**2).sum(axis=0)), np.sqrt((integral**2).sum(axis=0))
-    with np.errstate(divide="ignore", invalid="ignore"):
-        alike = np.nan_to_num(change.T @ integral / np.outer(*size))
+    alike = np.nan_to_num(change.T @ integral / np.outer(*size))
     _, order = linear_sum_assignment(-alike)
     moved = (order != np.arange(len(order))) & level.moving
     if not moved.any():
@@ -246,7 +244,7 @@ def _held_torque(system: ConstrainedSystem, log: Log) -> Array:
     dt/m. After a change in torque, lightweight damped joints accelerate more than their velocity changes.
     """
     rows = log.rows(INERTIA_ROWS)
-    (q,) = tensors(log, rows, "q")
+    (q,) = log.tensors(rows, "q")
     if not len(q):
         return np.ones(log.nq)
     with torch.no_grad():
@@ -283,8 +281,6 @@ def check_acceleration(system: ConstrainedSystem, log: Log) -> Outcome:
     return findings, log.replace(qdd=qdd, derived=log.derived | {"qdd"})
 
 
-DEPARTURE_STRIDE = 3
-"""Stride at which the deviation from a cubic reveals noise below the cut-off frequency of a filter."""
 NOISE_FACTOR, FILTERED = 2.0, 0.4
 """Ratio of measured to stated noise above which the noise is reported; ratio of the noise at the highest
 frequency to that at a third of it, below which the noise counts as filtered."""
@@ -296,7 +292,7 @@ def noise_levels(log: Log) -> tuple[Array, Array] | None:
     from scipy.ndimage import correlate1d
 
     levels = []
-    for k in (1, DEPARTURE_STRIDE):
+    for k in (1, 3):  # neighbours at distance 3 reveal noise below the cut-off frequency of a filter
         weights = np.zeros(4 * k + 1)
         weights[::k] = DEPARTURE
         parts = (correlate1d(log.qdd[s], weights, axis=0)[2 * k : -2 * k] for s in log.stretches)

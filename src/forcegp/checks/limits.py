@@ -79,8 +79,7 @@ def check_limits(system: ConstrainedSystem, log: Log) -> Outcome:
     for name, (low, high) in _limits(system).items():
         value = getattr(log, name)
         slack = SLACK * np.where(np.isfinite(high - low), high - low, 0.0)
-        with np.errstate(invalid="ignore"):
-            beyond = ((value < low - slack) | (value > high + slack)) & log.usable[:, None]
+        beyond = ((value < low - slack) | (value > high + slack)) & log.usable[:, None]
         hit, joints = beyond.any(axis=1), log.named(beyond.any(axis=0))
         text = f"{name} of {', '.join(joints)} exceeds the limit of the robot file in"
         findings += at_rows(hit, kinds[name], text, joints, rows=hit.sum())

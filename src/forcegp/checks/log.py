@@ -9,13 +9,14 @@ force within the window.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
+import torch
 from numpy.typing import NDArray
 
 from forcegp.checks.finding import Finding
@@ -27,7 +28,7 @@ from forcegp.data.table import read_table
 from forcegp.errors import DataError
 from forcegp.robot.model import RobotModel
 from forcegp.robust import robust_std
-from forcegp.rows import intervals
+from forcegp.rows import intervals, runs
 
 Array = NDArray[Any]
 
@@ -79,8 +80,8 @@ def displacement(robot: RobotModel, j: int | np.integer, offset: float) -> str:
 GAP, CLOCK_SPREAD = 1.5, 10.0
 """A gap is longer than this multiple of the median step. It also exceeds the median step by this many robust
 standard deviations, to allow for clock jitter."""
-SHORTEST, SMOOTHING = 8, 0.1
-"""Minimum number of rows in a contiguous run; length of the filter that computes missing derivatives [s]."""
+SHORTEST, FILTER_SECONDS, FILTER_ORDER = 8, 0.1, 3
+"""Minimum number of rows in a contiguous run; length [s] and degree of the Savitzky-Golay filters."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -128,9 +129,24 @@ class Log:
         """Return the names of the joints selected by a mask."""
         return tuple(self.joint_names[j] for j in np.flatnonzero(joints))
 
+    @property
+    def unmeasured(self) -> list[int]:
+        """Indices of the joints whose torque is not measured according to the header."""
+        return [j for j, name in enumerate(self.joint_names) if name in self.header.unmeasured_torques]
+
+    def tensors(self, rows: NDArray[np.int64], *names: str) -> list[torch.Tensor]:
+        """Return the given rows of the named columns as tensors."""
+        return [torch.from_numpy(np.ascontiguousarray(getattr(self, name)[rows])) for name in names]
+
     def replace(self, **fields: Any) -> Log:
         """Return the log with the given fields replaced."""
         return dataclasses.replace(self, **fields)
+
+    def changed(self, names: Sequence[str], *, order: Sequence[int] = (), flip: Sequence[int] = ()) -> Log:
+        """Return the log with two joints swapped, or the signs of joints flipped, in the named columns."""
+        index, sign = np.arange(self.nq), np.ones(self.nq)
+        index[list(order)], sign[list(flip)] = order[::-1], -1.0
+        return self.replace(**{name: getattr(self, name)[:, index] * sign for name in names})
 
     def mask(self, rows: NDArray[np.bool_]) -> Log:
         """Return the log with additional rows masked."""
@@ -173,8 +189,8 @@ class Log:
     def stretches(self) -> list[slice]:
         """Contiguous runs of usable rows within one segment and without a gap in time."""
         linked = (self.steps > 0.0) & (self.steps <= self.longest_step) & self.usable[1:] & self.usable[:-1]
-        runs = intervals(linked) if self.header.ordered else ()
-        return [slice(a, b + 1) for a, b in runs if b + 1 - a >= SHORTEST]
+        spans = intervals(linked, least=SHORTEST - 1) if self.header.ordered else ()
+        return [slice(a, b + 1) for a, b in spans]
 
     def rows(self, most: int, margin: int = 0) -> NDArray[np.int64]:
         """Return up to `most` evenly spaced usable rows, at least `margin` rows from the end of any run."""
@@ -219,15 +235,14 @@ def read_log(path: str | Path) -> Log:
 
 def derive(log: Log, absent: list[str]) -> Log:
     """Return the log with missing derivatives computed in each contiguous run of rows, and NaN elsewhere."""
-    logged = [name for name in JOINT_VECTORS if name not in absent]
     filled = log.replace(**{name: np.zeros_like(log.q) for name in absent})
     values = {name: np.full_like(log.q, np.nan) for name in absent}
-    window = 2 * max(3, round(SMOOTHING / log.dt / 2.0)) + 1 if np.isfinite(log.dt) else 7
-    method = SavitzkyGolay(window=window, order=3)
+    window = 2 * max(3, round(FILTER_SECONDS / log.dt / 2.0)) + 1 if np.isfinite(log.dt) else 7
+    method = SavitzkyGolay(window, FILTER_ORDER)
     for rows in filled.stretches:
         even = filled.dt * np.arange(rows.stop - rows.start)
         for name in absent if len(even) >= window else ():
-            source, degree = ("q", 1) if name == "qd" else ("qd", 1) if "qd" in logged else ("q", 2)
+            source, degree = ("q", 1) if name == "qd" else ("q", 2) if "qd" in absent else ("qd", 1)
             one = np.zeros(len(even), np.int64)
             values[name][rows] = differentiate(even, getattr(log, source)[rows], one, method, degree)[0]
     return log.replace(**values, derived=log.derived | set(absent))
@@ -244,25 +259,19 @@ def of_robot(log: Log, robot: RobotModel) -> Log:
     return log.replace(**columns, joint_names=robot.joint_names)
 
 
-SMOOTHED_SECONDS, SMOOTHED_ORDER = 0.1, 3
-"""Length of the filter [s], and degree of its polynomials, which preserve curvature within the window."""
-
-
 def smoothed(log: Log) -> Log:
     """Apply a Savitzky-Golay filter to a valid log between contact switches, and mask the ends."""
     from scipy.signal import savgol_filter
 
-    half = round(SMOOTHED_SECONDS / log.dt / 2.0) if np.isfinite(log.dt) and log.header.ordered else 0
-    if 2 * half + 1 <= SMOOTHED_ORDER + 1:
+    half = round(FILTER_SECONDS / log.dt / 2.0) if np.isfinite(log.dt) and log.header.ordered else 0
+    if 2 * half + 1 <= FILTER_ORDER + 1:
         return log
-    if log.contact:
-        state = np.stack(list(log.contact.values()), axis=1)
-        switch = np.concatenate([[False], (state[1:] != state[:-1]).any(axis=1)])
-        log = log.replace(segment=2 * log.segment * len(log) + np.cumsum(switch))
+    pieces = runs(log.segment, *log.contact.values())
+    log = log.replace(segment=np.repeat(np.arange(len(pieces)), [s.stop - s.start for s in pieces]))
     columns = {name: getattr(log, name).copy() for name in JOINT_VECTORS}
     lost = np.ones(len(log), bool)
     for s in (s for s in log.stretches if s.stop - s.start > 2 * half):
         lost[s.start + half : s.stop - half] = False
         for name, value in columns.items():
-            value[s] = savgol_filter(getattr(log, name)[s], 2 * half + 1, SMOOTHED_ORDER, axis=0)
+            value[s] = savgol_filter(getattr(log, name)[s], 2 * half + 1, FILTER_ORDER, axis=0)
     return log.replace(**columns).mask(lost) if not lost.all() else log

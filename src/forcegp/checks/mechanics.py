@@ -10,10 +10,9 @@ from forcegp.checks import hypotheses
 from forcegp.checks.excitation import check_visibility, still_joints
 from forcegp.checks.explain import Explanation, explain
 from forcegp.checks.finding import Finding, NotJudgedError, with_alternatives
-from forcegp.checks.fit import FLOOR, TorqueFit, gain_of, robust_parameters, unmeasured
+from forcegp.checks.fit import FLOOR, TorqueFit, gain_of, robust_parameters
 from forcegp.checks.log import Array, Log, Outcome, force_unit, position_unit, smoothed
 from forcegp.constraints import ConstrainedSystem
-from forcegp.robot.model import RobotModel
 from forcegp.robust import robust_std
 from forcegp.rows import describe, intervals
 
@@ -46,23 +45,21 @@ def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
         inner = f"rows that lie {max(hypotheses.LAGS)} from the ends of a stretch"
         raise NotJudgedError(f"fewer than {LEAST_ROWS} {inner}")
     explanation = explain(system, smooth)
-    disturbed, rows = [], np.zeros(len(log), bool)
-    if log.header.ordered:
-        disturbed, rows = _disturbances(system, explanation)
+    disturbed, rows = _disturbances(explanation) if log.header.ordered else ([], np.zeros(0, bool))
     if disturbed and _enough(smooth.mask(rows)):
         # What happened in these rows must pass neither for friction nor for a mass.
         explanation = explain(system, smooth.mask(rows))
-    losses = _determined(system.robot, explanation)
+    losses = _determined(explanation)
     # Friction of the contacts, and declared friction that rises more sharply, must not pass for more.
     functions = (hypotheses.contact_friction_columns, hypotheses.other_rise_columns)
     shapes = [columns(system, explanation.log, explanation.rows) for columns in functions]
     findings = [
         *passive,
         *_confounded(explanation),
-        *_friction(system.robot, _determined(system.robot, explanation.with_nuisance(*shapes))),
-        *_offsets(system, losses),
+        *_friction(_determined(explanation.with_nuisance(*shapes))),
+        *_offsets(losses),
         *_unexplained(explanation),
-        *check_visibility(system, explanation),
+        *check_visibility(explanation),
     ]
     for repair in explanation.repairs:
         log = repair(log)
@@ -82,7 +79,7 @@ def _without_torque(log: Log) -> list[Finding]:
     """Find torques that are constant although the joint moves."""
     rows = log.usable
     still = (np.ptp(log.tau[rows], axis=0) == 0.0) & (np.ptp(log.q[rows], axis=0) > 0.0)
-    still[unmeasured(log)] = False
+    still[log.unmeasured] = False
     zero = still & (log.tau[rows] == 0.0).all(axis=0)
     word = "zero" if zero[still].all() else "constant"
     findings = log.on_joints("torque-zero", still, f"the torque of {{}} is {word} throughout")
@@ -97,8 +94,9 @@ def _worse(explanation: Explanation, other: TorqueFit, j: int) -> bool:
     return gain > MATERIAL and gain > SIGNIFICANT * error
 
 
-def _determined(robot: RobotModel, explanation: Explanation) -> Explanation:
+def _determined(explanation: Explanation) -> Explanation:
     """Set friction to 0 if it would drive a joint, or if it is smaller than its standard deviation."""
+    robot = explanation.system.robot
     declared = np.concatenate([robot.damping.numpy(), robot.friction.numpy()])
     for _ in range(robot.nq):
         fit = explanation.fit
@@ -106,9 +104,7 @@ def _determined(robot: RobotModel, explanation: Explanation) -> Explanation:
         wrong = (change != 0.0) & ((change + declared < -spread) | (np.abs(change) <= spread))
         if not wrong.any():
             break
-        nuisance = explanation.problem.nuisance.copy()
-        nuisance[..., np.flatnonzero(wrong)] = 0.0
-        explanation = replace(explanation, problem=replace(explanation.problem, nuisance=nuisance))
+        explanation = explanation.without(np.flatnonzero(wrong).tolist())
     return explanation
 
 
@@ -122,8 +118,8 @@ def _confounded(explanation: Explanation) -> list[Finding]:
     return findings
 
 
-def _friction(robot: RobotModel, explanation: Explanation) -> list[Finding]:
-    log, nq = explanation.log, explanation.log.nq
+def _friction(explanation: Explanation) -> list[Finding]:
+    robot, log, nq = explanation.system.robot, explanation.log, explanation.log.nq
     viscous, coulomb = -explanation.fit.nuisance[:nq], -explanation.fit.nuisance[nq : 2 * nq]
     rows = log.qd[explanation.rows]
     power = (viscous * rows**2 + coulomb * np.abs(rows)).mean(axis=0)
@@ -154,8 +150,8 @@ def _friction(robot: RobotModel, explanation: Explanation) -> list[Finding]:
     return findings
 
 
-def _offsets(system: ConstrainedSystem, explanation: Explanation) -> list[Finding]:
-    log, nq, rows = explanation.log, explanation.log.nq, explanation.rows
+def _offsets(explanation: Explanation) -> list[Finding]:
+    system, log, rows, nq = explanation.system, explanation.log, explanation.rows, explanation.log.nq
     offset = -explanation.fit.nuisance[2 * nq : 3 * nq]
     known = np.abs(offset) > explanation.fit.nuisance_spread[2 * nq : 3 * nq]
     less = {j: explanation.without([2 * nq + j]) for j in np.flatnonzero(known).tolist()}
@@ -185,11 +181,11 @@ def _unexplained(explanation: Explanation) -> list[Finding]:
     return [finding] if share > UNEXPLAINED else []
 
 
-def _disturbances(system: ConstrainedSystem, explanation: Explanation) -> tuple[list[Finding], np.ndarray]:
+def _disturbances(explanation: Explanation) -> tuple[list[Finding], np.ndarray]:
     """Find periods with far more unexplained torque than usual, and mask the rows around them."""
     from scipy.ndimage import minimum_filter1d
 
-    log, rows = explanation.log, explanation.log.rows(TRACE_ROWS)
+    robot, log, rows = explanation.system.robot, explanation.log, explanation.log.rows(TRACE_ROWS)
     trace = residual_trace(explanation, rows)
     scale = np.maximum(explanation.problem.scale, FLOOR * explanation.problem.size)
     stride = np.median(np.diff(rows)) * log.dt
@@ -197,14 +193,13 @@ def _disturbances(system: ConstrainedSystem, explanation: Explanation) -> tuple[
     energy = np.convolve(((trace / scale) ** 2).mean(axis=1), np.ones(width) / width, mode="same")
     level = np.log(energy + FLOOR**2)
     # Dry friction of joints that rest or reverse within the window may be as large as this.
-    dry = system.robot.friction.numpy() - explanation.fit.nuisance[log.nq : 2 * log.nq]
+    dry = robot.friction.numpy() - explanation.fit.nuisance[log.nq : 2 * log.nq]
     slowest = minimum_filter1d(np.abs(log.qd[rows]), 2 * width + 1, axis=0)
-    friction = np.maximum(dry, 0.0) * (slowest < system.robot.friction_velocity.numpy())
+    friction = np.maximum(dry, 0.0) * (slowest < robot.friction_velocity.numpy())
     size = np.maximum(explanation.problem.size, FLOOR * explanation.problem.size.max())
     visible = np.asarray((np.abs(trace) > VISIBLE * size + friction).any(axis=1))
     bad = _stands_out(log, rows, level)
-    spans = intervals(bad, join=width)
-    spans = tuple((a, b) for a, b in spans if b - a >= width and visible[a:b].mean() > 0.5)
+    spans = [(a, b) for a, b in intervals(bad, width, least=width) if visible[a:b].mean() > 0.5]
     mask = np.zeros(len(log), bool)
     if not spans:
         return [], mask
@@ -214,7 +209,7 @@ def _disturbances(system: ConstrainedSystem, explanation: Explanation) -> tuple[
     worst = int(np.argmax((np.abs(trace) / scale)[bad].max(axis=0)))
     peak = float(np.abs(trace[bad][:, worst]).max())
     text = (
-        f"torque of up to {peak:.3g} {force_unit(system.robot, worst)} at {log.joint_names[worst]} that "
+        f"torque of up to {peak:.3g} {force_unit(robot, worst)} at {log.joint_names[worst]} that "
         f"neither robot nor labelled contacts explain, in {describe(whole)}"
     )
     return [Finding("disturbance", text, whole, (log.joint_names[worst],), evidence={"peak": peak})], mask

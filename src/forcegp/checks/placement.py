@@ -15,7 +15,7 @@ from forcegp.checks import hypotheses
 from forcegp.checks.contact import FAR, OFFSET, SLIDING_SLOW, fit_surface, tip_path, touching
 from forcegp.checks.finding import Finding
 from forcegp.checks.fit import cross_validate, labelled_contacts
-from forcegp.checks.hypotheses import Hypothesis, changed, corrected, discrete, unchanged
+from forcegp.checks.hypotheses import Hypothesis, corrected, discrete, unchanged
 from forcegp.checks.log import Log, Outcome, displacement, evenly
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.logs.contact import LEVEL, TOUCHING, TRIED_ROWS, exchanged_joints
@@ -26,8 +26,7 @@ ROWS = 2000
 """Maximum number of contact rows used."""
 BETTER = 0.25
 """Largest accepted residual with corrected angles, relative to the residual with a displaced surface."""
-STEPS = 6
-"""Number of Gauss-Newton steps in the search for an encoder offset."""
+Correction = tuple[Hypothesis, Log]
 
 
 def check_placement(system: ConstrainedSystem, log: Log) -> Outcome:
@@ -55,7 +54,7 @@ def check_placement(system: ConstrainedSystem, log: Log) -> Outcome:
             where = f"{where} ± {1e3 * robust_std(c):.2g} mm from the surface of {contact.name!r}"
             text = f"the tip is {where}, and on it if {' and '.join(both)} are exchanged"
             found = log.finding("joint-order", text, both)
-            return [found], changed(log, ("q", "qd", "qdd", "tau"), order=pair)
+            return [found], log.changed(("q", "qd", "qdd", "tau"), order=pair)
         if len(c) and level_of(c, TOUCHING, LEVEL) is None:
             rows = evenly(np.flatnonzero(moves), TRIED_ROWS)
             if (outcome := _never_closed(system, contact, log, rows)) is not None:
@@ -84,11 +83,7 @@ def _never_closed(
 
 
 def _chosen(
-    system: ConstrainedSystem,
-    contact: SurfaceContact,
-    log: Log,
-    near: list[tuple[Hypothesis, Log]],
-    where: str,
+    system: ConstrainedSystem, contact: SurfaceContact, log: Log, near: list[Correction], where: str
 ) -> Outcome:
     """Return a finding on equally good corrections, and the log after the one that fits the torques best."""
     rows = evenly(np.flatnonzero(log.usable), TRIED_ROWS)
@@ -129,7 +124,7 @@ def _off(system: ConstrainedSystem, contact: SurfaceContact, log: Log, rows: np.
 
 def _offsets(
     system: ConstrainedSystem, contact: SurfaceContact, log: Log, rows: np.ndarray, share: float | None = None
-) -> Iterator[tuple[Hypothesis, Log]]:
+) -> Iterator[Correction]:
     """Yield, for each encoder, the offset that moves the tip to the surface, from Gauss-Newton steps.
 
     If `share` is given, one offset is computed per row, and the offset common to this fraction is used.
@@ -137,7 +132,7 @@ def _offsets(
     few = log.replace(q=log.q[rows], qd=log.qd[rows])
     for j in range(log.nq):
         hypothesis, offset = Hypothesis("encoder-offset", 1, unchanged, joints=(j,)), np.zeros(len(rows))
-        for _ in range(STEPS):
+        for _ in range(6):
             moved = (few.q + np.outer(offset + step, np.eye(log.nq)[j]) for step in (0.0, 1e-5))
             c, ahead = (tip_path(system, contact, few.replace(q=q), np.arange(len(q))).c for q in moved)
             slope = (ahead - c) / 1e-5

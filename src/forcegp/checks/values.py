@@ -8,14 +8,13 @@ import torch
 from forcegp import dynamics
 from forcegp.checks.excitation import still_joints
 from forcegp.checks.finding import Finding, at_rows
-from forcegp.checks.fit import tensors
 from forcegp.checks.log import DEPARTURE, Array, Log, Outcome, spikes
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data.clipped import limits_of
 from forcegp.data.derivative import UNIFORM_TOLERANCE
 from forcegp.data.fields import JOINT_VECTORS, resolution
 from forcegp.robust import robust_std
-from forcegp.rows import describe, intervals
+from forcegp.rows import describe, intervals, repeats
 
 
 def check_order(system: ConstrainedSystem, log: Log) -> Outcome:
@@ -28,8 +27,7 @@ def check_order(system: ConstrainedSystem, log: Log) -> Outcome:
 
 def check_gaps(system: ConstrainedSystem, log: Log) -> Outcome:
     """Find missing samples, indicated by time steps longer than clock jitter can explain."""
-    with np.errstate(invalid="ignore"):
-        gaps = log.steps > log.longest_step
+    gaps = log.steps > log.longest_step
     if log.masked is not None:
         # The step after a wrong time stamp is long because of that stamp.
         gaps &= ~log.masked[:-1]
@@ -45,8 +43,7 @@ def check_gaps(system: ConstrainedSystem, log: Log) -> Outcome:
 
 def check_jitter(system: ConstrainedSystem, log: Log) -> Outcome:
     """Find time steps that are too uneven for filters that assume even sampling."""
-    with np.errstate(invalid="ignore"):
-        regular = log.steps[(log.steps > 0.0) & (log.steps <= log.longest_step)]
+    regular = log.steps[(log.steps > 0.0) & (log.steps <= log.longest_step)]
     spread = float(robust_std(regular) / log.dt) if len(regular) > 1 else 0.0
     text = f"the time steps vary by {100 * spread:.2g} % around {log.dt:.4g} s"
     jitter = log.finding("time-jitter", text, relative_spread=spread, period_s=log.dt)
@@ -102,9 +99,8 @@ def check_finite(system: ConstrainedSystem, log: Log) -> Outcome:
 
 def check_held(system: ConstrainedSystem, log: Log) -> Outcome:
     """Find rows in which all channels repeat their values while the arm moves."""
-    differs = np.any([np.diff(value, axis=0).any(axis=1) for value in logged(log).values()], axis=0)
-    moving = np.abs(log.qd).max(axis=1)[1:] > 0.0
-    held = np.append(False, ~differs & moving & (np.diff(log.segment) == 0))
+    held = repeats(*logged(log).values()) & np.append(False, np.diff(log.segment) == 0)
+    held &= np.abs(log.qd).max(axis=1) > 0.0
     if held.sum() < HELD_RUN:
         return [], log
     text = f"{int(held.sum())} rows ({100 * held.mean():.2g} %) repeat the one before:"
@@ -118,17 +114,17 @@ def check_stuck(system: ConstrainedSystem, log: Log) -> Outcome:
     least, findings, bad = max(5, round(STUCK_SECONDS / log.dt)), [], np.zeros(len(log), bool)
     still = still_joints(log)
     for name, value in logged(log).items():
+        visible = STUCK_VISIBLE * log.reach(name)
         for j, joint in enumerate(log.joint_names):
             x = value[:, j]
             steps = np.abs(np.diff(x))
             if (steps > 0.0).mean() < 0.1 or (still[j] and name != "tau"):
                 continue
-            visible = STUCK_VISIBLE * np.ptp(np.percentile(x[log.usable], (0.5, 99.5)))
             runs, same = np.zeros(len(log), bool), (steps == 0.0) & log.usable[1:] & log.usable[:-1]
-            for a, b in ((a, b) for a, b in intervals(same) if b - a >= least):
+            for a, b in intervals(same, least=least):
                 # A torque that stays at its extreme is clipped, which is another finding.
                 clips = name == "tau" and x[a] in limits_of(x[log.usable])
-                runs[a : b + 1] = not clips and _expected_change(log, name, j, a, b) > visible
+                runs[a : b + 1] = not clips and _expected_change(log, name, j, a, b) > visible[j]
             text = f"{name}.{joint} keeps one value while the arm moves, in"
             findings += at_rows(runs, "channel-stuck", text, (joint,))
             bad |= runs
@@ -137,10 +133,9 @@ def check_stuck(system: ConstrainedSystem, log: Log) -> Outcome:
 
 def _expected_change(log: Log, name: str, j: int, a: int, b: int) -> float:
     """Return the expected change of a channel between rows a and b, given the joint's other channels."""
-    if name == "q":
-        return float(np.ptp(np.cumsum(log.qd[a:b, j])) * log.dt)
-    if name == "qd":
-        return float(np.ptp(np.cumsum(log.qdd[a:b, j])) * log.dt)
+    if name in ("q", "qd"):
+        rate = log.qd if name == "q" else log.qdd
+        return float(np.ptp(np.cumsum(rate[a:b, j])) * log.dt)
     # Torque and acceleration: as far as they change over as many rows elsewhere, if the arm moves, for the
     # torque, or the joint itself, for the acceleration.
     x, moved = getattr(log, name)[:, j], log.q[a:b] if name == "tau" else log.q[a:b, j : j + 1]
@@ -151,13 +146,12 @@ def _expected_change(log: Log, name: str, j: int, a: int, b: int) -> float:
 
 def check_spikes(system: ConstrainedSystem, log: Log) -> Outcome:
     """Find isolated values far from the curve through their neighbours."""
-    bad, hit, vectors = np.zeros(len(log), bool), [], logged(log)
-    departures = {name: _departures(log, value) for name, value in vectors.items()}
+    bad, hit = np.zeros(len(log), bool), []
+    departures = {name: _departures(log, value) for name, value in logged(log).items()}
     near = np.zeros(len(log), bool)
     for label in log.contact.values():  # next to a contact switch values jump by nature
         near[1:] |= label[1:] != label[:-1]
-    for name in vectors:
-        departure, around, scale = departures[name]
+    for name, (departure, around, scale) in departures.items():
         reach = log.reach(name)
         least = np.maximum(SPIKE_VISIBLE[0] * reach, SPIKE_VISIBLE[1] * reach.max())
         outlier = (
@@ -167,7 +161,7 @@ def check_spikes(system: ConstrainedSystem, log: Log) -> Outcome:
             & _one_value(departure, scale)
             & ~_shocks(log, departures, name)
         )
-        if name == "qdd" and "tau" in vectors:
+        if name == "qdd" and "tau" in departures:
             outlier &= ~_driven(system, log, departure, outlier)
         # The neighbours of a spike are off as well, by less.
         peak = outlier & (np.abs(departure) >= _within_two(np.abs(departure)))
@@ -211,7 +205,7 @@ def _driven(system: ConstrainedSystem, log: Log, departure: Array, outlier: np.n
     step, driven = np.maximum(step[:-1], step[1:]), np.zeros_like(outlier)
     rows = np.flatnonzero(outlier.any(axis=1))
     if len(rows):
-        M = dynamics.mass_matrix(system.robot, tensors(log, rows, "q")[0])
+        M = dynamics.mass_matrix(system.robot, log.tensors(rows, "q")[0])
         inverse = torch.linalg.inv(M).diagonal(dim1=-2, dim2=-1).detach().numpy()
         driven[rows] = step[rows] * inverse > DRIVEN * np.abs(departure[rows])
     return driven
@@ -272,8 +266,7 @@ def _jumps(log: Log, value: str, derivative: str) -> tuple[np.ndarray, tuple[str
         surplus[s][1:] = np.diff(x[s], axis=0) - mean * np.diff(log.t[s])[:, None]
     rounding = np.finfo(float).eps * np.abs(x[usable]).max()
     scale = robust_std(surplus[usable]) + resolution(x[usable]) + rounding
-    change = np.zeros_like(x)
-    change[1:] = np.abs(np.diff(x, axis=0))
+    change = np.abs(np.diff(x, axis=0, prepend=x[:1]))
     fastest = float(np.percentile(np.abs(rate[usable]), 99.9)) * log.dt
     big = (np.abs(surplus) > JUMP * scale) & (np.abs(surplus) > FASTEST * fastest)
     # Where the column itself does not change faster than usual, its rate is at fault, not the position.

@@ -13,12 +13,11 @@ from forcegp.errors import DataError
 from forcegp.guards import check_count
 from forcegp.logs.table import Array, ImportReport, Signals
 from forcegp.robust import robust_std
-from forcegp.rows import describe, numbered
+from forcegp.rows import describe, numbered, repeats
 
 RESTART_STEPS, SHORTEST_TRAJECTORY = 2.0, 10
 """A clock has restarted if it falls back to within this many steps of the start of its trajectory, and the
-trajectory has at least this many rows. Otherwise, the time stamps are out of order.
-"""
+trajectory has at least this many rows. Otherwise, the time stamps are out of order."""
 GAP_STEPS = 5.0
 """A step longer than this multiple of the usual step counts as a gap."""
 
@@ -41,7 +40,7 @@ def drop_repeated(signals: Signals, report: ImportReport) -> None:
     same = np.append(False, np.diff(signals.t) == 0.0)
     if not same.any():
         return
-    equal = same & _repeats(signals, *signals.vectors)
+    equal = same & repeats(*signals.vectors.values())
     different = np.flatnonzero(same & ~equal)
     if len(different):
         rows = signals.row[different]
@@ -50,12 +49,6 @@ def drop_repeated(signals: Signals, report: ImportReport) -> None:
         raise DataError(text, expected="one row per time stamp", got=f"{len(rows)} such rows", hint=hint)
     report.find("repeated", f"{equal.sum()} repeated rows were dropped", signals.row[equal])
     signals.keep(~equal)
-
-
-def _repeats(signals: Signals, *names: str) -> NDArray[np.bool_]:
-    """Return the rows in which all of the given vectors repeat the values of the previous row."""
-    differs = [np.diff(signals.vectors[name], axis=0).any(axis=1) for name in names]
-    return np.append(False, ~np.any(differs, axis=0))
 
 
 def split_trajectories(signals: Signals, gap: float | None, report: ImportReport) -> None:
@@ -95,7 +88,8 @@ def split_trajectories(signals: Signals, gap: float | None, report: ImportReport
 
 def find_held(signals: Signals, drop: bool, report: ImportReport) -> None:
     """Find rows that repeat because the logger is faster than its source, and drop them if requested."""
-    held = np.append(False, np.diff(signals.segment) == 0) & _repeats(signals, "q", "tau")
+    same = repeats(signals.vectors["q"], signals.vectors["tau"])
+    held = same & np.append(False, np.diff(signals.segment) == 0)
     if held.any():
         done = "were dropped" if drop else 'are kept; held = "drop" under [time] drops them'
         share = f"{held.sum()} rows ({100 * held.mean():.2g} %)"
@@ -135,12 +129,6 @@ def join_stream(
     report.steps.append(f"interpolated {name} from {rate} onto the clock of the positions")
 
 
-UNEVEN = 0.02
-"""Largest relative deviation of time steps from the median for which sampling counts as even."""
-SMOOTH = ("q", "qd")
-"""Quantities interpolated by cubic splines. Noisier quantities are interpolated linearly."""
-
-
 def onto(t: Array, values: Array, at: Array, cubic: bool = False) -> Array:
     """Interpolate values (n, d) from times t to times `at`, linearly or by a cubic spline."""
     from scipy.interpolate import CubicSpline, make_interp_spline
@@ -155,7 +143,7 @@ def even_clock(signals: Signals, period: float | None, report: ImportReport) -> 
         raise DataError("the log has no trajectory of two rows or more")
     steps = [np.diff(signals.t[rows]) for rows in stretches]
     worst = max(float(np.abs(s - np.median(s)).max() / np.median(s)) for s in steps)
-    if worst > UNEVEN:
+    if worst > UNIFORM_TOLERANCE:
         jitter = robust_std(np.concatenate(steps)) > UNIFORM_TOLERANCE * usual_step(signals.t)
         message = f"time steps deviate by up to {100.0 * worst:.3g} % from the usual step"
         report.find("jitter" if jitter else "uneven", message)
@@ -173,8 +161,8 @@ def even_clock(signals: Signals, period: float | None, report: ImportReport) -> 
         nearest = np.searchsorted(t, grid + 0.5 * step).clip(1, len(t)) - 1 + rows.start
         parts.append((rows, t, grid, nearest))
     for name in list(signals.vectors):
-        old = signals.vectors.pop(name)
-        new = [onto(t, old[rows], grid, cubic=name in SMOOTH) for rows, t, grid, _ in parts]
+        old, cubic = signals.vectors.pop(name), name in ("q", "qd")  # the others are noisier
+        new = [onto(t, old[rows], grid, cubic) for rows, t, grid, _ in parts]
         signals.vectors[name] = np.concatenate(new)
     index: NDArray[np.int64] = np.concatenate([nearest for *_, nearest in parts])
     signals.contact = {name: value[index] for name, value in signals.contact.items()}

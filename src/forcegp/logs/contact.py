@@ -76,8 +76,7 @@ def per_contact(signals: Signals, system: ConstrainedSystem, mapping: Mapping) -
     touching = [contact for contact in system.contacts if isinstance(contact, SurfaceContact)]
     section = mapping.sections.wrench
     if section is not None and len(section.force) == 1:
-        forces = (_evidence(signals, system, mapping, contact, "wrench") for contact in touching)
-        return {"multiplier": dict(zip((contact.name for contact in touching), forces, strict=True))}
+        return {"multiplier": {c.name: _evidence(signals, system, mapping, c, "wrench") for c in touching}}
 
     def sensed(q: torch.Tensor, reading: torch.Tensor) -> torch.Tensor:
         F, moment, sensor = _wrench(system.robot, mapping, q, reading)
@@ -134,8 +133,6 @@ ELSEWHERE = (
     "encoder zero displaces the tip, too); "
     'for free motion, set source = "never" under [contact.{}]'
 )
-BINS = 512
-"""Number of bins in the histogram that separates the two levels."""
 
 
 @dataclass(frozen=True)
@@ -205,7 +202,9 @@ def detect(
             values = _evidence(signals, system, mapping, contact, source)
             touches = np.abs(values) <= (sections[name].threshold or TOUCHING)
             if source == "distance" and len(values) > 1 and touches.mean() <= TOUCHED:
-                values = values - _misplaced(signals, system, contact, values, displaced, report)
+                shift, text = _misplaced(signals, system, contact, values, displaced)
+                values = values - shift
+                report.find("contact", text)
             states[name], detection = _detect(signals, values, name, sections[name])
             evidence.append(detection)
             report.find("contact", detection.sentence(), signals.row[states[name]])
@@ -216,21 +215,15 @@ def detect(
 
 
 def _misplaced(
-    signals: Signals,
-    system: ConstrainedSystem,
-    contact: SurfaceContact,
-    c: Array,
-    displaced: bool,
-    report: ImportReport,
-) -> float:
-    """Return the distance [m] from the surface at which the tip slides; raise unless `displaced` is set."""
+    signals: Signals, system: ConstrainedSystem, contact: SurfaceContact, c: Array, displaced: bool
+) -> tuple[float, str]:
+    """Return the distance [m] at which the tip slides, and a remark; raise unless `displaced` is set."""
     p, name = _rowwise(signals, ("q",), lambda q: _tip(system, contact, q)), contact.name
     moves = np.linalg.norm(np.gradient(p, axis=0), axis=1) > SLIDING * np.median(np.diff(signals.t))
     level, (middle, spread) = level_of(c[moves], TOUCHING, LEVEL), level_and_spread(1e3 * c)
     where = f"{middle:.3g} ± {spread:.2g} mm"
     if level is not None and displaced:
-        report.find("contact", f"contact {name!r} was taken where the tip slides, {1e3 * level:.3g} mm off")
-        return level
+        return level, f"contact {name!r} was taken where the tip slides, {1e3 * level:.3g} mm off"
     pair = exchanged_joints(system, contact, signals.vectors["q"][moves])
     exchanged = " and ".join(signals.joint_names[j] for j in pair)
     if exchanged or level is not None or (c < -TOUCHING).mean() > INSIDE:
@@ -242,8 +235,7 @@ def _misplaced(
             hint="match columns to joints by name in the mapping" if exchanged else ELSEWHERE.format(name),
         )
     nearest = 1e3 * float(np.abs(c).min())
-    report.find("contact", f"contact {name!r} is closed in hardly any row: {where}, {nearest:.3g} at least")
-    return 0.0
+    return 0.0, f"contact {name!r} is closed in hardly any row: {where}, {nearest:.3g} at least"
 
 
 def exchanged_joints(system: ConstrainedSystem, contact: SurfaceContact, q: Array) -> tuple[int, ...]:
@@ -300,7 +292,7 @@ def force_levels(values: Array, name: str, section: ContactStateSection) -> tupl
     """
     if section.threshold is not None:
         return section.threshold, section.release or 0.5 * section.threshold
-    counts, edges = np.histogram(values, BINS)
+    counts, edges = np.histogram(values, bins=512)
     centers = 0.5 * (edges[1:] + edges[:-1])
     below, sums = np.cumsum(counts), np.cumsum(counts * centers)
     above = below[-1] - below

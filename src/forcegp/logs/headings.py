@@ -27,6 +27,7 @@ _TIME = re.compile(
     r"^(.*[ _./])?(t|mt|time|times|timestamp|stamp|clock|sec|secs|seconds|ms|millis|zeit)([ _./\[(].*)?$"
 )
 _DECLARED = re.compile(r"[\[(]([^\])]*)[\])]|_(deg|rad|ms|us|ns|s|nm|mnm|a|ma|rpm|degps|radps)$", re.I)
+_DERIVATIVE = re.compile(r"\b(?:d |dd )+(?=q\b)|\bq (?=d*dot\b)")
 _AXES = (("force", "f"), ("torque", "m", "t", "moment"))
 _SEGMENTS = ("segment", "episode_index", "episode", "trial", "run")
 
@@ -41,9 +42,7 @@ def tokens(name: str) -> list[str]:
     """
     spaced = re.sub(r"([a-z])([A-Z])", r"\1 \2", name)
     words = " ".join(re.findall(r"[a-z]+|\d+", spaced.lower()))
-    return re.sub(
-        r"\b(?:d |dd )+(?=q\b)|\bq (?=d*dot\b)", lambda part: part[0].replace(" ", ""), words
-    ).split()
+    return _DERIVATIVE.sub(lambda part: part[0].replace(" ", ""), words).split()
 
 
 def declared_unit(name: str, stream: Stream) -> str | None:
@@ -213,10 +212,6 @@ def find_wrench(table: LogTable, robot: RobotModel, draft: Draft) -> None:
             return
 
 
-RELATED = 0.95
-"""Minimum correlation of a velocity with the rate of change of its position."""
-
-
 def find_by_values(stream: Stream, joints: tuple[str, ...], draft: Draft) -> None:
     """Propose families for columns without headings: blocks of one column per joint, and their rates."""
     nq = len(joints)
@@ -250,4 +245,4 @@ def _is_rate(t: np.ndarray, x: np.ndarray, v: np.ndarray) -> bool:
     rate, mean = rate[good], mean[good]
     if len(rate) < 10 or not (robust_std(rate) > 0.0).all() or not (robust_std(mean) > 0.0).all():
         return False
-    return all(np.corrcoef(a, b)[0, 1] > RELATED for a, b in zip(rate.T, mean.T, strict=True))
+    return all(np.corrcoef(a, b)[0, 1] > 0.95 for a, b in zip(rate.T, mean.T, strict=True))

@@ -161,13 +161,11 @@ class Signals:
         return runs(self.segment, *keys)
 
 
-MOST_INTERVALS = 20
-"""Maximum number of row intervals listed in a finding. The count of a finding includes all rows."""
-
-
 @dataclass(frozen=True)
 class ImportFinding:
-    """A finding of an import: its kind, a sentence that states the action taken, and the affected rows."""
+    """A finding of an import: its kind, a sentence that states the action taken, the number of affected rows,
+    and the first of their intervals, at most 20.
+    """
 
     kind: str
     message: str
@@ -188,5 +186,5 @@ class ImportReport:
     def find(self, kind: str, message: str, rows: NDArray[np.int64] | None = None) -> None:
         """Add a finding about the given rows, which are increasing row numbers in the log."""
         numbers = np.zeros(0, np.int64) if rows is None else rows
-        first = tuple((a, b - 1) for a, b in numbered(numbers)[:MOST_INTERVALS])
+        first = tuple((a, b - 1) for a, b in numbered(numbers)[:20])
         self.findings.append(ImportFinding(kind, message, len(numbers), first))

@@ -23,8 +23,6 @@ from forcegp.logs import table
 from forcegp.logs.table import LogTable
 
 Arrays = dict[str, NDArray[np.generic]]
-MAX_ARRAYS = 4096
-"""Maximum number of arrays in an archive."""
 
 
 def read_numpy(path: Path, **_: object) -> LogTable:
@@ -34,7 +32,7 @@ def read_numpy(path: Path, **_: object) -> LogTable:
         if zipfile.is_zipfile(path):
             with zipfile.ZipFile(path) as archive:
                 members = archive.infolist()
-                guards.check_count(str(path), "arrays", len(members), MAX_ARRAYS)
+                guards.check_count(str(path), "arrays", len(members), limits.COLUMNS)
                 size = sum(member.file_size for member in members)
                 guards.check_count(str(path), "bytes", size, 8 * limits.LOG_VALUES)
                 guards.check_expansion(str(path), size, path.stat().st_size)

@@ -30,10 +30,7 @@ WRENCH = "geometry_msgs/msg/WrenchStamped"
 KINDS = (JOINT_STATE, WRENCH)  # that are read
 UNITS = {"position": "rad", "velocity": "rad/s", "effort": "Nm", "force": "N", "torque": "Nm"}
 """Units in joint states (REP 103) and in wrenches."""
-CLOCKS = ("header", "receive")
-"""Time columns of each topic."""
 
-Decode = Callable[[bytes], Any]
 Found = tuple[str, str, str, int, bytes, int]
 """Topic, type, encoding, recording time [ns] and content of a message, and amount of data read so far."""
 
@@ -49,7 +46,7 @@ def canonical(kind: str) -> str:
 
 
 @cache
-def decoder(kind: str, encoding: str) -> Decode:
+def decoder(kind: str, encoding: str) -> Callable[[bytes], Any]:
     """Return a decoder for messages with a type in `KINDS` and the encoding `ros1` or `cdr`."""
     typesys = optional_module("rosbags.typesys", "Reading ROS messages", "import")
     first = encoding == "ros1"
@@ -71,7 +68,8 @@ class Messages:
         """Return the requested columns, with times [s] relative to `origin` [ns]."""
         stamps = (np.array(self.stamps, dtype=np.int64) - origin) * 1e-9
         order = np.argsort(stamps[:, 1], kind="stable")
-        columns: dict[str, Column] = dict(zip(CLOCKS, np.ascontiguousarray(stamps[order].T), strict=True))
+        header, receive = np.ascontiguousarray(stamps[order].T)
+        columns: dict[str, Column] = {"header": header, "receive": receive}
         values = np.ascontiguousarray(np.array(self.rows, dtype=np.float64)[order].T)
         for column, numbers in zip(self.columns, values, strict=True):
             if not np.isnan(numbers).all() and wanted(column):
@@ -83,7 +81,6 @@ class Messages:
 class Collector:
     """Collector of the messages in a bag, with one stream for each topic and set of joints."""
 
-    source: str
     unpacking: Unpacking
     _streams: dict[tuple[str, frozenset[str]], Messages] = field(default_factory=dict)
     _numbers: int = 0
@@ -94,18 +91,18 @@ class Collector:
         """Collect messages of supported types until one stream has `rows` messages."""
         for topic, kind, encoding, receive_ns, raw, done in messages:
             if kind in KINDS and encoding in ("cdr", "ros1"):
-                self._add(topic, kind, receive_ns, raw, decoder(kind, encoding))
+                self._add(topic, kind, encoding, receive_ns, raw)
             if progress is not None and self.unpacking.records % 1024 == 0:
                 progress(done, total)
             if rows is not None and any(len(stream.rows) >= rows for stream in self._streams.values()):
                 return
 
-    def _add(self, topic: str, kind: str, receive_ns: int, raw: bytes, decode: Decode) -> None:
+    def _add(self, topic: str, kind: str, encoding: str, receive_ns: int, raw: bytes) -> None:
         """Add a message; raise `DataError` if it is too large or its arrays do not match its joint names."""
-        check_count(self.source, "bytes in one message", len(raw), limits.MESSAGE_BYTES)
-        message = decode(raw)
+        check_count(self.unpacking.source, "bytes in one message", len(raw), limits.MESSAGE_BYTES)
+        message = decoder(kind, encoding)(raw)
         if kind == JOINT_STATE:
-            values = _joint_state(self.source, topic, message)
+            values = _joint_state(self.unpacking.source, topic, message)
         else:
             parts = {"force": message.wrench.force, "torque": message.wrench.torque}
             values = {f"{part}.{axis}": getattr(x, axis) for part, x in parts.items() for axis in "xyz"}
@@ -114,14 +111,15 @@ class Collector:
         stream.rows.append([values[column] for column in stream.columns])
         stream.stamps.append((stamp.sec * 10**9 + stamp.nanosec, receive_ns))
         self._numbers += len(values)
-        check_count(self.source, "numbers", self._numbers, limits.LOG_VALUES)
-        check_count(self.source, "streams", len(self._streams), limits.LOG_STREAMS)
+        check_count(self.unpacking.source, "numbers", self._numbers, limits.LOG_VALUES)
+        check_count(self.unpacking.source, "streams", len(self._streams), limits.LOG_STREAMS)
 
     def table(self, format_: str, topics: dict[str, str], wanted: Wanted) -> LogTable:
         """Return the log with the requested columns. `topics` maps all topics in the bag to their types."""
+        source = self.unpacking.source
         if not self._streams:
             listing = ", ".join(f"{topic} ({kind})" for topic, kind in topics.items())
-            text, got = f"{self.source}: no messages of a supported type", listing[:600] or "no topics"
+            text, got = f"{source}: no messages of a supported type", listing[:600] or "no topics"
             raise DataError(text, expected=" or ".join(KINDS), got=got)
         found = sorted(self._streams.values(), key=lambda s: (s.topic, -len(s.rows)))
         origin = np.min([np.min(np.array(stream.stamps), axis=0) for stream in found], axis=0)
@@ -134,7 +132,7 @@ class Collector:
         unread = [f"{t} ({k})" for t, k in topics.items() if canonical(k) not in KINDS]
         remarks = [f"topics of other types were not read: {', '.join(unread)[:600]}"] if unread else []
         remarks.append(f"time 0 is {origin[0] * 1e-9:.9f} s on the clock of the headers")
-        return LogTable(self.source, format_, tuple(streams), tuple(remarks))
+        return LogTable(source, format_, tuple(streams), tuple(remarks))
 
 
 def _joint_state(source: str, topic: str, message: Any) -> dict[str, float]:
@@ -157,7 +155,7 @@ def read_bag(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress
     """Read the joint states and wrenches in a ROS 1 bag, a ROS 2 bag or an MCAP file."""
     files = _files(path) if path.is_dir() else [path]
     unpacking = Unpacking(str(path), sum(file.stat().st_size for file in files))
-    collector, topics = Collector(str(path), unpacking), dict[str, str]()
+    collector, topics = Collector(unpacking), dict[str, str]()
     if mcaps := [file for file in files if starts_with(file, b"\x89MCAP0")]:
         with foreign(str(path), "MCAP"):
             messages = (message for file in mcaps for message in _mcap_messages(file, unpacking, topics))

@@ -14,16 +14,11 @@ import numpy as np
 
 from forcegp import guards, limits
 from forcegp.errors import DataError
-from forcegp.guards import within
 from forcegp.logs import table
 from forcegp.logs.table import Column, LogTable, Progress, Stream, Wanted
 
 if TYPE_CHECKING:
     import pyarrow as pa
-
-
-BATCH_ROWS = 1 << 16
-"""Number of rows decoded at a time."""
 
 
 def read_parquet(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
@@ -51,7 +46,7 @@ def read_columns(
     for path in paths:
         with pq.ParquetFile(path.absolute(), pre_buffer=False) as file:
             names = _readable(file, wanted, remarks)
-            for batch in file.iter_batches(BATCH_ROWS, columns=names, use_threads=False):
+            for batch in file.iter_batches(1 << 16, columns=names, use_threads=False):
                 for name in names:
                     for part, values in _expand(str(path), name, batch.column(name)).items():
                         if wanted(part) or wanted(name):
@@ -129,15 +124,11 @@ def _expand(source: str, name: str, values: pa.Array) -> dict[str, Column]:
     return {f"{name}[{i}]": np.ascontiguousarray(numbers[:, i]) for i in range(width)}
 
 
-MAX_INFO_BYTES = 4 << 20
-"""Maximum size of the description of a data set."""
-
-
 def read_lerobot(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
     """Read the numbers in all episodes, named as in `meta/info.json` (e.g. `observation.state.<motor>`)."""
     listed = path / "meta" / "info.json", *sorted((path / "data").rglob("*.parquet"))
-    description, *files = within(path, listed)
-    guards.check_count(str(description), "bytes", description.stat().st_size, MAX_INFO_BYTES)
+    description, *files = guards.within(path, listed)
+    guards.check_count(str(description), "bytes", description.stat().st_size, 4 * limits.MIB)
     try:
         features = json.loads(description.read_text(encoding="utf-8"))["features"]
         if not isinstance(features, dict):

@@ -23,10 +23,8 @@ from forcegp.logs.table import Column, LogTable, Progress, Stream, Wanted
 if TYPE_CHECKING:
     import pyarrow as pa
 
-
 SAMPLE_BYTES, SAMPLE_LINES = 1 << 18, 200
 """Size of the part of a file that is inspected; number of data lines that must agree in format."""
-
 SEPARATORS = (";", "\t", ",", "|", " ")
 """Candidate separators. A space stands for any run of blanks."""
 MISSING = ("", "nan", "NaN", "NAN", "null", "NULL", "NA", "N/A", "None", "-nan", "#N/A")
@@ -153,6 +151,8 @@ def _dialect(
 
 BLOCK_BYTES = 4 << 20
 """Size of the blocks in which text is parsed."""
+DATE_ORIGIN_NS = 1_577_836_800_000_000_000
+"""Origin of times given as dates: 2020-01-01 in nanoseconds since the epoch."""
 
 _BLANKS = re.compile(rb"[ \t]+")
 _EDGES = re.compile(rb"(?m)^ | (?=\r?$)")
@@ -217,10 +217,6 @@ def _numbers(values: pa.Array, kind: str) -> Column:
         whole = pc.cast(values, pa.int64()).to_numpy(zero_copy_only=False)
         return (whole - DATE_ORIGIN_NS).astype(np.float64) * 1e-9
     return pc.cast(values, pa.float64()).to_numpy(zero_copy_only=False)
-
-
-DATE_ORIGIN_NS = 1_577_836_800_000_000_000
-"""Origin of times given as dates: 2020-01-01 in nanoseconds since the epoch."""
 
 
 class _Blocks(io.RawIOBase):
