@@ -27,10 +27,12 @@ from forcegp.forces.inverse_dynamics import (
     sums,
 )
 from forcegp.forces.measurements import Observation, training_of
-from forcegp.forces.priors.inertial import InertialPrior
+from forcegp.forces.priors.inertial import DIVERGENCE, InertialPrior
 from forcegp.forces.priors.joint import AnalyticalMean, JointFrictionPrior
 from forcegp.forces.quantities import states
 from forcegp.identification import regressor
+from forcegp.models.calibrated import calibrated
+from forcegp.robot.inertia import inertial_parameters, pseudo_inertia, pseudo_inertia_of
 from forcegp.robot.model import RobotModel
 
 NOISE = torch.tensor([0.2, 0.05], dtype=torch.float64)
@@ -189,9 +191,51 @@ def test_a_late_torque_is_not_taken_for_inertia(file: RobotModel, late: float) -
     assert found(file, log(file, late=late)).robot is file
     truth = file.replace(mass=1.3 * file.mass, com=0.9 * file.com)
     data = log(truth, late=late)
+    result = found(file, data)
     M, exact = (dynamics.mass_matrix(each, data.q).diagonal(dim1=-2, dim2=-1).mean(0)
-                for each in (found(file, data).robot, truth))  # fmt: skip
+                for each in (result.robot, truth))  # fmt: skip
     torch.testing.assert_close(M, exact, rtol=0.01, atol=0.0)
+    assert result.delay == pytest.approx(-late, abs=1e-3)
+
+
+def test_a_late_torque_is_not_taken_for_viscous_friction(file: RobotModel) -> None:
+    """0.3 N m s/rad; a delay s of M q̈ adds s M ω² to it along a sine of frequency ω."""
+    truth = file.replace(mass=1.3 * file.mass, com=0.9 * file.com)
+    fit = forcegp.StructuredGP(forcegp.ConstrainedSystem(file), "analytical").fit(log(truth, 800, late=0.008))
+    for each in (p for p in calibrated(fit).parameters if p.name == "damping"):
+        assert abs(each.estimate - 0.3) < 3.0 * each.std < 0.15
+
+
+def test_consistent_links_are_the_most_probable_ones() -> None:
+    """Newton's decrement of the convex objective vanishes, though noise differs by a factor of 1000."""
+    robot, prior = forcegp.load_robot("kuka_iiwa14"), InertialPrior()
+    random = torch.Generator().manual_seed(0)
+    q, qd, qdd = torch.randn(3, 40, 7, generator=random, dtype=torch.float64)
+    noise = torch.logspace(-1.0, -4.0, 7, dtype=torch.float64)
+    A = (regressor(robot, q, qd, qdd) * prior.scale(robot) / noise[:, None]).flatten(0, 1)
+    precision = A.mT @ A + torch.eye(70, dtype=torch.float64)
+    mean = 3.0 * torch.randn(70, generator=random, dtype=torch.float64)
+    moved, delta = prior.updated(robot, mean, precision)
+    pi0 = inertial_parameters(robot.mass, robot.com, robot.inertia)
+    J0 = pseudo_inertia(robot.mass, robot.com, robot.inertia)
+    scale = prior.scale(robot).view(7, 10)
+    found = (inertial_parameters(moved.mass, moved.com, moved.inertia) - pi0) / scale
+    torch.testing.assert_close(found.flatten(), delta, rtol=1e-6, atol=1e-6)
+
+    def objective(x: Tensor) -> Tensor:
+        pi = pi0 + scale * x.view(7, 10)
+        m, c, I = pi[:, 0], pi[:, 1:4], pi[:, [4, 5, 6, 5, 7, 8, 6, 8, 9]].view(7, 3, 3)
+        Sigma = 0.5 * I.diagonal(dim1=1, dim2=2).sum(-1)[:, None, None] * torch.eye(3).to(I) - I
+        J = torch.cat([torch.cat([Sigma, c[:, :, None]], 2), torch.cat([c, m[:, None]], 1)[:, None]], 1)
+        ratio = torch.linalg.solve(J0, J)
+        divergence = ratio.diagonal(dim1=1, dim2=2).sum(-1) - torch.logdet(J)
+        return 0.5 * (x - mean) @ precision @ (x - mean) + DIVERGENCE * divergence.sum()
+
+    slope, curvature = torch.func.grad(objective)(delta), torch.func.hessian(objective)(delta)
+    unphysical = torch.linalg.eigvalsh(pseudo_inertia_of(pi0 + scale * mean.view(7, 10)))[:, 0] < 0.0
+    assert int(unphysical.sum()) > 3 and float(precision.diagonal().max()) > 1e6
+    assert float(torch.linalg.eigvalsh(pseudo_inertia(moved.mass, moved.com, moved.inertia)).min()) > 0.0
+    assert 0.0 <= float(slope @ torch.linalg.solve(curvature, slope)) < DIVERGENCE
 
 
 def test_links_and_drives_are_identified_together(file: RobotModel) -> None:

@@ -6,8 +6,10 @@ closed loop, the likelihood of accelerations given torques overestimates it. Usi
 slightly earlier and later times as instruments avoids both biases. The unknowns have Gaussian priors centred
 on the robot file. Links stay physically consistent, and drive inertia is nonnegative.
 
-Torque and motion are seldom sampled at the same instant, and a delay of milliseconds biases the inertia of a
-light joint. The delay is therefore an additional unknown.
+Torque and motion are seldom sampled at the same instant: a controller that holds each torque for a period
+leads the motion by half of it. Milliseconds bias the inertia of a light joint and, since −dτ/dt resembles q̇
+along periodic motions, viscous friction. The delay is therefore an additional unknown, and if links are
+identified, the model is trained on torques shifted by it.
 
 Torques alone are not sufficient. In closed loop, torque-sensor noise exceeds the torque that accelerates a
 light joint. Divided by the inertia in the file, this noise predicts accelerations far larger than the
@@ -67,8 +69,8 @@ WIDTHS = (0.0, 0.02, 0.05, 0.12)
 """Widths of the time averages to try (standard deviations) [s]; the narrowest posterior is used."""
 
 
-def rigid_robot(robot: RobotModel, rows: Rows) -> tuple[RobotModel, Tensor | None]:
-    """Return the robot that best predicts held-out torques and, if its links were identified, ∂(π, a)/∂g.
+def rigid_robot(robot: RobotModel, rows: Rows) -> tuple[RobotModel, float, Tensor | None]:
+    """Return the best predictor of held-out torques, and the delay and ∂(π, a)/∂g if links were identified.
 
     The candidates are the robot file, the robot file with added drive inertia, and a robot with identified,
     physically consistent links and drives. Each candidate must outperform the previous ones by two standard
@@ -108,10 +110,10 @@ def rigid_robot(robot: RobotModel, rows: Rows) -> tuple[RobotModel, Tensor | Non
         consistent, delta, change = _consistent(robot, prior, found, size)
         better = _is_better(compared(lambda _: delta), known)
         if better and is_harmless(accelerations(consistent, delta), before):
-            return consistent, change
+            return consistent, LATE * float(delta[-1]), change
     with_drives = robot.replace(armature=robot.armature + size * drives[:n])
     better = _is_better(driven, file) and is_harmless(accelerations(with_drives, drives), before)
-    return with_drives if better else robot, None
+    return with_drives if better else robot, 0.0, None
 
 
 def _consistent(
@@ -252,11 +254,13 @@ class Inertia:
         robot: robot from the robot file, with the identified inertia.
         per_gain: if inertial parameters of links were identified and thus remain uncertain, the change of
             these parameters and of the drives per relative error of each torque sensor's gain `(11 nq, nq)`.
+        delay: time by which the logged torque precedes the motion if links were identified, otherwise 0 [s].
         doubts: warnings for the user.
     """
 
     robot: RobotModel
     per_gain: Tensor | None = None
+    delay: float = 0.0
     doubts: tuple[str, ...] = ()
 
     @property
@@ -279,10 +283,10 @@ def inertia_of(
     """
     robot = system.robot
     rows = free_rows(system, friction, mean, training)
-    better, per_gain = rigid_robot(robot, rows.with_memory())
+    better, delay, per_gain = rigid_robot(robot, rows.with_memory())
     if per_gain is not None:
         text = "identified inertia replaces that of the robot file, since it predicts held-out torques better"
-        return Inertia(better, per_gain, (text, *_told(robot, better.armature - robot.armature)))
+        return Inertia(better, per_gain, delay, (text, *_told(robot, better.armature - robot.armature)))
     M = mass_matrix(robot, rows.q)
     armature = _damped(rows, M, better.armature - robot.armature)
     armature = armature * (armature > NEGLIGIBLE * M.diagonal(dim1=-2, dim2=-1).mean(0))

@@ -241,6 +241,16 @@ def torque_rate(m: Measurement) -> Tensor:
     return rate
 
 
+def delayed(training: Training, delay: float) -> Training:
+    """Return the samples with torques that act on the motion when they are logged, τ(t − s) ≈ τ − s dτ/dt.
+
+    Args:
+        delay: s, the time by which the logged torques precede the motion [s].
+    """
+    measurements = (dataclasses.replace(m, tau=m.tau - delay * torque_rate(m)) for m in training.measurements)
+    return dataclasses.replace(training, measurements=tuple(measurements))
+
+
 def partners(m: Measurement, filter_span: float = 0.0) -> Tensor:
     """Return the index `(n,)` of the sample `APART` later in the same trajectory, or −1 if there is none.
 

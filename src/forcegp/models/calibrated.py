@@ -9,12 +9,13 @@ If friction depends on the load, Q_D is averaged over poses. The residual and th
 rarely separate an offset from the gravity force of the links. If an offset is within 2σ of zero, all other
 parameters are therefore conditioned on c = 0. URDF does not support armature, so drive inertia is added to
 the links as far as physically possible. Samples are computed in the same way from functions drawn from the
-posterior, with inertial parameters π + S δ (`forces/priors/inertial.py`).
+posterior, with inertial parameters π + S δ (`forces/priors/inertial.py`), and spread by the difference
+between the identified inertia and its posterior mean.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -50,8 +51,8 @@ SLOWEST = 0.05
 """Smallest of these speeds relative to the largest trained speed. Dry friction is smoothed below it."""
 UNTRAINED = 1.0
 """Largest speed that is assumed if the trained speeds are unknown [rad/s, m/s]."""
-DRAWS = 400
-"""Number of function samples from which standard deviations are computed."""
+DRAWS, DRAWN = 400, 4000
+"""Number of function samples from which standard deviations are computed, and from which covariances are."""
 OPEN = 2.0
 """Number of standard deviations from zero within which an offset counts as undetermined."""
 DETERMINED = 0.5
@@ -273,7 +274,7 @@ def unknowns_after(fit: StructuredFit, unknowns: Unknowns, *, draws: int = DRAWS
     if prior is not None:
         found |= dict(enumerate((delta @ torch.from_numpy(unknowns.base.combination).mT).mT))
     if any(isinstance(prior, JointFrictionPrior) for prior in fit.force_priors):
-        curves = torch.stack(list(reader._curves(drawn)))[1:]
+        curves = reader._curves(drawn)[1:]
         basis = unknowns.basis(torch.zeros_like(reader.speeds), reader.speeds)
         spread, each = (curves - curves.mean(0)).permute(2, 1, 0), basis.shape[-1]
         weights = torch.linalg.pinv(basis[..., : 2 + SPEED_BUMPS].movedim(1, 0)) @ spread
@@ -354,25 +355,47 @@ class _Reader:
         return None
 
     def robots(self, draws: int) -> list[tuple[RobotModel, Curve]]:
-        """Return the robots for the posterior mean and each function sample, with their friction curves."""
-        drawn = self.fit.force_samples(draws, torch.Generator().manual_seed(self.seed))
+        """Return the robots for the posterior mean and for function samples, each with its friction curve."""
+        drawn = self.fit.force_samples(max(draws, DRAWN), torch.Generator().manual_seed(self.seed))
         assert isinstance(drawn, ForceSamples)
-        curves = torch.stack(list(self._curves(drawn)))
+        curves = self._curves(drawn)
         inertia = self._constants(drawn, InertialPrior)
-        inertia[1:] += self._gain_errors(draws)
+        inertia[1:] += self._gain_errors(drawn.count)
         parts = [curves.flatten(1), inertia, self._constants(drawn, PayloadPrior)]
-        sizes = [part.shape[-1] for part in parts]
-        offset, (kept,) = self._offsets(curves), self._offsets(self._kept()[None])
-        free = _without_offsets(offset, offset[0] - kept, torch.cat(parts, dim=-1))
-        rows = (row.split(sizes) for row in self._consistent(free, sizes[0]))
+        sizes, values = [part.shape[-1] for part in parts], torch.cat(parts, dim=-1)
+        offset, kept, b = self._offsets(curves), self._offsets(self._kept()[None]), self._disagreement()
+        gain = _offset_gain(offset, offset[0] - kept[0], values)
+        free, b = values - offset @ gain, b - kept @ gain
+        random = torch.randn(
+            draws, 1, generator=torch.Generator().manual_seed(self.seed), dtype=torch.float64
+        )
+        spread = torch.cat([free[:1], free[1 : 1 + draws] + random.to(b) * b])
+        rows = (row.split(sizes) for row in self._consistent(spread, sizes[0], free[1:]))
         return [self._robot(curve.view_as(self.speeds), delta, load) for curve, delta, load in rows]
 
-    def _consistent(self, values: Tensor, first: int) -> Tensor:
-        """Return the mean and samples `(1 + samples, d)` with the most probable physically consistent links.
+    def _disagreement(self) -> Tensor:
+        """Return b `(1, d)`, identified minus posterior mean; samples are spread by N(0, b bᵀ) in addition.
 
-        For each link, ADMM minimises ½ (x − x₀)ᵀ Σ⁻¹ (x − x₀) over the entries x of J₀^-½ ΔJ J₀^-½ ≥ −1 + ε,
-        where Σ is the sample covariance. The links start at column `first`. The other columns are adjusted
-        according to their covariance with the links. A link that is unphysical in the file does not change.
+        Instruments identify inertia without bias by noisy accelerations, but from part of the samples; the
+        posterior contains all samples, but regards accelerations in the regressor as exact. A robot at its
+        posterior mean, which contains nonzero pinned forces, has b = 0.
+        """
+        posterior = self.fit.posterior
+        identified = float(not any(bool(value.any()) for value in posterior.process.pinned.values()))
+        b = [self._kept().flatten()]
+        for kind in (InertialPrior, PayloadPrior):
+            for p in [p for p, prior in enumerate(self.fit.force_priors) if isinstance(prior, kind)][:1]:
+                one = {name: x[:1] for name, x in self._features(p).items()}
+                b.append((posterior.means.latent_mean(p, one) - posterior.latent.latent_mean(p, one))[0])
+        return identified * torch.cat(b)[None]
+
+    def _consistent(self, values: Tensor, first: int, samples: Tensor) -> Tensor:
+        """Return the values `(n, d)` with the most probable physically consistent links.
+
+        Minimises ½ (x − x₀)ᵀ Σ⁻¹ (x − x₀), with the covariance Σ of the samples `(s, d)`, over the entries x
+        of J₀^-½ ΔJ J₀^-½ ≥ −1 + ε of each link by ADMM. The links start at column `first`; other columns are
+        adjusted according to their covariance with the links. A link that is unphysical in the file does not
+        change.
         Source: Boyd et al., *Distributed optimization and statistical learning via ADMM* (2011), section 5.
         """
         if self.scale is None:
@@ -394,7 +417,7 @@ class _Reader:
             X = V @ torch.diag_embed(w.clamp(min=SMALLEST)) @ V.mT - one
             return (X[..., row, column] * weight * sound[:, None]).flatten(1)
 
-        x0, spread = values[:, links] @ T, values[1:] - values[1:].mean(0)
+        x0, spread = values[:, links] @ T, samples - samples.mean(0)
         inverse = torch.linalg.inv(T)
         known = torch.linalg.pinv(spread[:, links].mT @ spread[:, links], hermitian=True)
         precision = (len(spread) - 1) * inverse @ known @ inverse.mT
@@ -423,20 +446,20 @@ class _Reader:
                 force = force + torch.einsum("nij,nj->ni", prior.operator(fit.system, at), latent)
         return self._over_poses(force)
 
-    def _curves(self, drawn: ForceSamples) -> Iterator[Tensor]:
-        """Yield the friction Q_D `(k, nq)` of the posterior mean and of each sample, averaged over poses."""
+    def _curves(self, drawn: ForceSamples) -> Tensor:
+        """Return the friction Q_D `(1 + samples, k, nq)` of the posterior mean and samples, over poses."""
         fit, at = self.fit, self.at
         priors = [p for p, prior in enumerate(fit.force_priors) if isinstance(prior, JointFrictionPrior)]
         known = dynamics.damping_force(fit.system.robot, at.qd)
-        yield self._over_poses(known + fit.posterior.unknown_force(fit.system, at, priors))
-        for k in range(drawn.count):
-            force = torch.zeros_like(at.q)
-            for p in priors:
-                features = fit.posterior.process.features(p, fit.system, at)
-                latent = drawn.functions.by_runs(p, features, range(k, k + 1), len(at.q))
-                latent = latent + fit.posterior.shift(p, features)
-                force = force + (fit.force_priors[p].operator(fit.system, at) @ latent[..., None])[..., 0]
-            yield self._over_poses(known + force)
+        curves = self._over_poses(known).expand(drawn.count, -1, -1)
+        for p in priors:
+            features, E = self._features(p), fit.force_priors[p].operator(fit.system, at)
+            shift = fit.posterior.shift(p, features) + torch.zeros_like(E[:, 0])
+            for rows in torch.arange(len(E)).split(len(self.speeds)):
+                latent = drawn.functions.latent(p, {name: x[rows] for name, x in features.items()})
+                curves = curves + torch.einsum("nij,snj->sni", E[rows], latent + shift[rows]) / POSES
+        mean = self._over_poses(known + fit.posterior.unknown_force(fit.system, at, priors))
+        return torch.cat([mean[None], curves])
 
     def _over_poses(self, force: Tensor) -> Tensor:
         return force.unflatten(0, (POSES, len(self.speeds))).mean(0)
@@ -493,22 +516,18 @@ class _Reader:
         return robot, (curve, left, offset)
 
 
-def _without_offsets(offset: Tensor, mean: Tensor, values: Tensor) -> Tensor:
-    """Return the mean and samples of values `(1 + samples, d)`, given that undetermined offsets are zero.
+def _offset_gain(offset: Tensor, mean: Tensor, values: Tensor) -> Tensor:
+    """Return the gain G `(nq, d)` that conditions values z − c G on zero offsets c where undetermined.
 
     E[z | c = 0] = z − Cov(z, c) Cov(c)⁻¹ c, with sample covariances.
 
     Args:
-        offset: offset at the identified inertia and offsets of the samples, `(1 + samples, nq)`.
-        mean: posterior mean of the offsets, which is compared with zero, `(nq,)`.
-        values: values to condition on c = 0.
+        offset: offsets at the identified inertia, and of samples around it, `(1 + samples, nq)`.
+        mean: `(nq,)` posterior mean of the offsets, which is compared with zero.
+        values: mean and samples of the values `(1 + samples, d)`.
     """
-    c = offset[:, mean.abs() <= OPEN * offset[1:].std(0)]
-    around = c[1:] - c[1:].mean(0)
-    gain = (
-        torch.linalg.pinv(around.mT @ around, hermitian=True) @ around.mT @ (values[1:] - values[1:].mean(0))
-    )
-    return values - c @ gain
+    c = (offset[1:] - offset[1:].mean(0)) * (mean.abs() <= OPEN * offset[1:].std(0))
+    return torch.linalg.pinv(c.mT @ c, hermitian=True) @ c.mT @ (values[1:] - values[1:].mean(0))
 
 
 def _projected(speeds: Tensor, curve: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:

@@ -32,7 +32,7 @@ from forcegp.errors import check_name
 from forcegp.forces.calibration import calibrated_noise, residual_times
 from forcegp.forces.friction_memory import MEMORY, memory_of
 from forcegp.forces.inertia import VOLUME_STATES, Inertia, inertia_of, with_updated_robot
-from forcegp.forces.inverse_dynamics import LEAST
+from forcegp.forces.inverse_dynamics import LEAST, delayed
 from forcegp.forces.measurements import (
     Observation,
     Training,
@@ -228,6 +228,7 @@ def problem_for(
         if found.identified:
             spec, pinned = identified(spec, training, found)
             training, _ = training_for(spec, before, data, chosen)
+            training = delayed(training, found.delay)
     return spec, spec.problem(dataclasses.replace(training, part_of=part_of), robot, pinned), doubts
 
 

@@ -24,16 +24,8 @@ from forcegp.forces.priors.base import JOINT
 from forcegp.forces.priors.joint import ConstantForcePrior
 from forcegp.forces.quantities import States
 from forcegp.gp.kernels import Constant, Kernel
-from forcegp.gp.optimise import LearningOptions, minimise
 from forcegp.identification import MASS_SHARE, MOMENT_ARM, PARAMETER_NAMES, regressor
-from forcegp.robot.inertia import (
-    from_log_cholesky,
-    from_pseudo_inertia,
-    inertial_parameters,
-    log_cholesky,
-    pseudo_inertia,
-    pseudo_inertia_of,
-)
+from forcegp.robot.inertia import from_pseudo_inertia, inertial_parameters, pseudo_inertia, pseudo_inertia_of
 from forcegp.robot.model import RobotModel
 
 PER_LINK = 10
@@ -129,68 +121,113 @@ class InertialPrior(ConstantForcePrior):
         robot: RobotModel,
         mean: Tensor,
         precision: Tensor,
-        log_volume: Callable[[RobotModel], Tensor] = lambda _: torch.zeros(()),
+        log_volume: Callable[[RobotModel], Tensor] | None = None,
     ) -> tuple[RobotModel, Tensor]:
         """Return the most probable physically consistent robot given δ ~ N(mean, precision⁻¹).
 
         The objective ½ (δ − mean)ᵀ precision (δ − mean) + γ Σ_k [tr(J₀⁻¹J) − log |J₀⁻¹J| − 4] − V(δ) is
-        minimised over the log-Cholesky coordinates of the pseudo-inertias J of the links. If the log does not
-        determine the inertia of a link, the second term (the divergence of Lee, Wensing and Park, 2019, with
-        weight γ = 0.01) keeps this inertia from vanishing.
+        minimised over the pseudo-inertias J > 0 of the links, in which it is convex if V = 0. If the log does
+        not determine the inertia of a link, the second term (the divergence of Lee, Wensing and Park, 2019,
+        with weight γ = 0.01) keeps this inertia from vanishing.
 
         Args:
             robot: robot with the parameters π₀.
             mean: mean of δ `(10 nq,)`.
             precision: precision of δ `(10 nq, 10 nq)`.
-            log_volume: function V that converts the density of torques to that of accelerations.
+            log_volume: function V that converts the density of torques to that of accelerations; zero by
+                default.
 
         Returns:
             The robot and its error δ `(10 nq,)`. Links that are not physically consistent in the robot file
             remain unchanged.
         """
-        J0 = pseudo_inertia(robot.mass, robot.com, robot.inertia)
-        sound = torch.linalg.eigvalsh(J0)[:, 0] > 0.0
-        pi0 = inertial_parameters(robot.mass, robot.com, robot.inertia)
-        scale = self.scale(robot).unflatten(0, (robot.nq, PER_LINK))
-        inverse = torch.linalg.inv(J0[sound])
-
-        rows = (sound.nonzero()[:, 0],)
-
-        def delta_of(x: Tensor) -> Tensor:
-            # δ = (π − π₀)/s
-            bodies = from_pseudo_inertia(from_log_cholesky(x))
-            pi = torch.zeros_like(pi0).index_put(rows, inertial_parameters(*bodies))
-            return torch.where(sound[:, None], (pi - pi0) / scale, 0.0).flatten()
-
-        def robot_of(x: Tensor) -> RobotModel:
-            mass, com, inertia = from_pseudo_inertia(from_log_cholesky(x))
-            return robot.replace(
-                mass=robot.mass.index_put(rows, mass),
-                com=robot.com.index_put(rows, com),
-                inertia=robot.inertia.index_put(rows, inertia),
-            )
-
-        def objective(tensors: dict[str, Tensor]) -> Tensor:
-            # ½ (δ − mean)ᵀ precision (δ − mean) + γ Σ_k [tr(J₀⁻¹J) − log |J| + const] − V(δ)
-            x = tensors["x"]
-            error = delta_of(x) - mean
-            ratio = inverse @ from_log_cholesky(x)
-            log_det = 8.0 * x[:, 0] + 2.0 * x[:, 1:4].sum(-1)
-            divergence = ratio.diagonal(dim1=-2, dim2=-1).sum(-1) - log_det
-            fit = 0.5 * error @ (precision @ error) + DIVERGENCE * divergence.sum()
-            return fit - log_volume(robot_of(x))
-
-        if not bool(sound.any()):
+        J0 = pseudo_inertia(robot.mass, robot.com, robot.inertia).double()
+        links = (torch.linalg.eigvalsh(J0)[:, 0] > 0.0).nonzero()[:, 0]
+        if not len(links):
             return robot, torch.zeros_like(mean)
-        with torch.enable_grad():
-            theta = minimise(objective, {"x": log_cholesky(J0[sound])}, CONSISTENT).tensors["x"]
-        return robot_of(theta), delta_of(theta).detach()
+        own = (PER_LINK * links[:, None] + torch.arange(PER_LINK).to(links)).flatten()
+        P, r, scale = (x[own].double() for x in (precision[:, own], precision @ mean, self.scale(robot)))
+        E = pseudo_inertia_of(scale.view(-1, PER_LINK, 1) * torch.eye(PER_LINK).to(scale))
+
+        def robot_of(J: Tensor) -> RobotModel:
+            parts = zip(("mass", "com", "inertia"), from_pseudo_inertia(J.to(mean)), strict=True)
+            return robot.replace(**{name: getattr(robot, name).index_put((links,), x) for name, x in parts})
+
+        def volume(x: Tensor) -> tuple[float, Tensor]:
+            if log_volume is None:
+                return 0.0, torch.zeros_like(x)
+            with torch.enable_grad():
+                x = x.detach().requires_grad_()
+                V = log_volume(robot_of(J0[links] + _change(x, E)))
+                return float(V.detach()), torch.autograd.grad(V, x)[0]
+
+        x, J = _most_probable(P, r, J0[links], E, volume)
+        return robot_of(J), torch.zeros_like(mean).index_put((own,), x.to(mean))
+
+
+def _change(x: Tensor, E: Tensor) -> Tensor:
+    """Return Σ_p x_p E_p of each link, `(k, 4, 4)`, for x `(10 k,)` and E `(k, 10, 4, 4)`."""
+    return torch.einsum("kp,kpij->kij", x.view(-1, PER_LINK), E)
+
+
+def _most_probable(
+    P: Tensor, r: Tensor, J0: Tensor, E: Tensor, volume: Callable[[Tensor], tuple[float, Tensor]]
+) -> tuple[Tensor, Tensor]:
+    """Minimise ½ xᵀP x − rᵀx + γ Σ_k [tr(J₀⁻¹J) − log |J|] − V(x) over J = J₀ + Σ_p x_p E_p > 0.
+
+    The logarithm is the barrier of an interior-point method: γ decreases from a value at which x = 0 is close
+    to the minimum. Steps of Newton's method are J ← L (1 + Y) Lᵀ with J = L Lᵀ, since the barrier has unit
+    curvature at Y = 0. Source: Boyd and Vandenberghe, *Convex Optimization* (2004), section 11.3.
+
+    Args:
+        volume: function that returns V and its gradient.
+
+    Returns:
+        x and J.
+    """
+    row, column = torch.triu_indices(4, 4)
+    one, D = torch.eye(4).to(J0), torch.zeros(PER_LINK, 4, 4).to(J0)
+    D[range(PER_LINK), row, column] = torch.where(row == column, 0.5, 0.5**0.5).to(J0)
+    D = D + D.mT  # orthonormal basis of symmetric matrices
+    coordinates, inverse = torch.linalg.inv(E[..., row, column].mT), torch.linalg.inv(J0)
+    x, J, weight = torch.zeros_like(r), J0, 0.0
+    for _ in range(MOST_STEPS):
+        L, (V, rising) = torch.linalg.cholesky(J), volume(x)
+        moved = L[:, None] @ D @ L[:, None].mT
+        T = torch.block_diag(*(coordinates @ moved[..., row, column].mT))
+        slope, bend = T.mT @ (P @ x - r - rising), T.mT @ P @ T
+        weight = weight or max(DIVERGENCE, float(slope.norm()))
+        divergence = (inverse[:, None] * moved - D * one).sum((-1, -2)).flatten()
+        bend = bend + weight * torch.eye(len(r)).to(r)
+        y = -torch.linalg.solve(bend, slope + weight * divergence)
+        decrement = float(y @ bend @ y)
+        if decrement <= CENTRAL * weight:
+            if weight <= DIVERGENCE:
+                break
+            weight = max(DIVERGENCE, REDUCED * weight)
+            continue
+        Y, step = _change(y, D.expand_as(E)), T @ y
+        stretch = torch.linalg.eigvalsh(Y)
+        share = min(1.0, -INSIDE / float(stretch.min().clamp(max=-INSIDE)))
+        while share > LEAST:
+            # The divergence changes by tr(J₀⁻¹ΔJ) − log |1 + s Y|.
+            barrier = share * (divergence @ y + stretch.sum()) - torch.log1p(share * stretch).sum()
+            quadratic = share * step @ (P @ (x + 0.5 * share * step) - r)
+            change = float(quadratic + weight * barrier) + V - volume(x + share * step)[0]
+            if change <= -ENOUGH * share * decrement:
+                break
+            share *= 0.5
+        x, J = x + share * step, L @ (one + share * Y) @ L.mT
+    return x, J
 
 
 DIVERGENCE = 0.01
 """Weight of the divergence, which keeps the inertia of undetermined links from vanishing."""
-CONSISTENT = LearningOptions(tolerance=1e-12, max_evaluations=500)
-"""Options of the search for the physically consistent robot."""
+MOST_STEPS, REDUCED, CENTRAL = 1000, 0.8, 1e-2
+"""Maximum number of steps, reduction of γ, and squared Newton decrement over γ below which γ is reduced."""
+INSIDE, ENOUGH, LEAST = 0.9, 0.1, 1e-9
+"""Largest fraction of the way to an unphysical body in one step, smallest decrease of the objective over that
+of its linear model, and smallest fraction of a step."""
 
 
 PER_PAYLOAD = len(PARAMETER_NAMES)
