@@ -13,7 +13,7 @@ from forcegp.cli.options import AsJson
 
 app = typer.Typer(
     pretty_exceptions_enable=False,
-    rich_markup_mode="rich",
+    rich_markup_mode="markdown",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 
@@ -40,7 +40,7 @@ def reproduce(
 
     Finished stages with unchanged inputs are not run again.
 
-    [bold]Examples[/bold]
+    **Examples**
 
     python -m reproduction --profile quick --out out/quick
 

@@ -65,5 +65,5 @@ def test_shapes(batch: tuple[int, ...]) -> None:
     state = torch.zeros(*batch, robot.nq, dtype=torch.float64)
     for jacobian in forward_dynamics_derivatives(robot, state, state, state):
         assert jacobian.shape == (*batch, robot.nq, robot.nq)
-    with pytest.raises(ShapeError, match="qdd does not fit"):
+    with pytest.raises(ShapeError, match="qdd has the wrong shape"):
         inverse_dynamics_derivatives(robot, state, state, state[..., :2])

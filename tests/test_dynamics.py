@@ -203,7 +203,9 @@ def test_batches_broadcast() -> None:
 def test_wrong_shapes_are_named() -> None:
     robot = forcegp.load_robot("kuka_iiwa")
     q = torch.zeros(4, 7, dtype=torch.float64)
-    with pytest.raises(ShapeError, match=r"force does not fit robot 'kuka_iiwa'(.|\n)*got: \(4, 6\)"):
+    with pytest.raises(
+        ShapeError, match=r"force has the wrong shape for robot 'kuka_iiwa'(.|\n)*got: \(4, 6\)"
+    ):
         dynamics.forward_dynamics(robot, q, q, q[:, :6])
     with pytest.raises(ShapeError, match=r"batch shapes of q, qd, force do not broadcast(.|\n)*qd \(3, 7\)"):
         dynamics.forward_dynamics(robot, q, q[:3], q)

@@ -86,7 +86,7 @@ def test_header_round_trip() -> None:
         ("{", "not JSON"),
         ("[1]", "not a JSON object"),
         ("[" * 100_000, "not JSON"),
-        ('{"format": "dart", "version": 3}', r"x has another format\n  expected: card\n  got: 'dart'"),
+        ('{"format": "dart", "version": 3}', r"x has a different format\n  expected: card\n  got: 'dart'"),
         (
             '{"format": "card", "version": 9}',
             r"(?s)expected: version 3\n  got: version 9.*hint: .*update forcegp",

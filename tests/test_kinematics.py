@@ -117,5 +117,5 @@ def test_errors() -> None:
     q = torch.zeros(robot.nq, dtype=torch.float64)
     with pytest.raises(UnknownNameError, match=r"unknown frame of robot 'random0' 'tol'(.|\n)*mean 'tool'"):
         kinematics.frame_pose(robot, q, "tol")
-    with pytest.raises(ShapeError, match=r"q does not fit(.|\n)*got: \(5,\)"):
+    with pytest.raises(ShapeError, match=r"q has the wrong shape(.|\n)*got: \(5,\)"):
         kinematics.link_poses(robot, q[:5])

@@ -1,4 +1,4 @@
-"""Forward dynamics of robot arms, free or in contact, with Gaussian-process priors on the unknown forces.
+"""Forward dynamics of robot arms, free or in contact, with Gaussian-process priors on unknown forces.
 
 The public names listed in `__init__.pyi` are imported on first use. Since `import forcegp` alone does not
 load PyTorch, the command line starts quickly.

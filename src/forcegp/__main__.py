@@ -1,4 +1,4 @@
-"""Run the command line with `python -m forcegp`, even if the script `forcegp` is not on the path."""
+"""Run the command line with `python -m forcegp`, even if the `forcegp` script is not on the PATH."""
 
 from forcegp.cli import main
 

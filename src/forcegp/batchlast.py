@@ -1,8 +1,8 @@
 """Arithmetic on many small vectors and matrices, with the batch as the last dimension.
 
 Public tensors have their batch dimensions first. Inside kinematics and dynamics, the batch is flattened and
-comes last, so that each element-wise operation runs over contiguous memory for all samples. A vector per link
-has shape `(3, nq, B)`, a matrix per link `(3, 3, nq, B)`, and a joint-space vector `(nq, B)`.
+comes last, so that element-wise operations run over contiguous memory. The shapes are `(3, nq, B)` for
+vectors per link, `(3, 3, nq, B)` for matrices per link, and `(nq, B)` for joint-space vectors.
 """
 
 from __future__ import annotations
@@ -16,18 +16,18 @@ from torch import Tensor
 from forcegp.errors import MassMatrixError
 
 _SMALL = 4096
-"""Number of elements below which the overhead of operations dominates their run time."""
+"""Number of elements below which overhead dominates the run time of an operation."""
 
 
 def batch_last(x: Tensor, tail: int) -> Tensor:
-    """Convert `(*batch, *tail)`, with `tail` trailing dimensions, to a contiguous tensor `(*tail, B)`."""
+    """Convert a tensor `(*batch, *tail)` with `tail` trailing dimensions to a contiguous `(*tail, B)`."""
     shape = x.shape[x.ndim - tail :]
     flat = x.reshape((math.prod(x.shape[: x.ndim - tail]), *shape))
     return flat.movedim(0, -1).contiguous()
 
 
 def batch_first(x: Tensor, batch: torch.Size) -> Tensor:
-    """Return a view of shape `(*batch, *tail)` of a tensor `(*tail, B)`."""
+    """View a tensor `(*tail, B)` as a tensor `(*batch, *tail)`."""
     return x.movedim(-1, 0).reshape((*batch, *x.shape[:-1]))
 
 
@@ -46,7 +46,7 @@ def cross(a: Tensor, b: Tensor) -> Tensor:
 
 
 def skew(v: Tensor) -> Tensor:
-    """Return the matrices [v]× `(3, 3, …)` for which [v]× w = v × w."""
+    """Return the skew-symmetric matrices [v]× `(3, 3, …)`, which satisfy [v]× w = v × w."""
     x, y, z = v
     zero = torch.zeros_like(x)
     return torch.stack([zero, -z, y, z, zero, -x, -y, x, zero]).unflatten(0, (3, 3))
@@ -73,12 +73,12 @@ def product(A: Tensor, X: Tensor) -> Tensor:
 
 
 def sum_over(E: Tensor, x: Tensor) -> Tensor:
-    """Return Σ_j E_ij x_j, the sum over the joint dimension of x `(…, nq, B)`."""
+    """Return Σ_j E_ij x_j, summed over the joint dimension of x `(…, nq, B)`."""
     return E @ x
 
 
 def take(x: Tensor, joints: Sequence[int]) -> Tensor:
-    """Return the entries of x `(…, nq, B)` for the given joints, as a view if these are evenly spaced."""
+    """Return the entries of x `(…, nq, B)` for the given joints; a view if the joints are evenly spaced."""
     first, last, count = joints[0], joints[-1], len(joints)
     step = (last - first) // (count - 1) if count > 1 else 1
     if step > 0 and list(joints) == list(range(first, last + 1, step)):
@@ -89,7 +89,7 @@ def take(x: Tensor, joints: Sequence[int]) -> Tensor:
 def solve_spd(M: Tensor, rhs: Tensor) -> Tensor:
     """Return M⁻¹ rhs for symmetric positive definite matrices M `(n, n, B)` and rhs `(n, k, B)`.
 
-    Large batches are solved by elimination without pivoting (stable for such M), vectorized over samples.
+    Large batches are solved by elimination without pivoting, which is stable for such matrices.
     """
     n, B = M.shape[0], M.shape[-1]
     if M.numel() < _SMALL:

@@ -1,8 +1,8 @@
 """Closed-form derivatives of inverse and forward dynamics with respect to the state and the force.
 
-Differentiating M q̈ − Q_C − Q_G = τ gives ∂q̈ = M⁻¹(∂τ − ∂ID), with ∂ID at constant q̈ (Carpentier & Mansard,
-*Analytical derivatives of rigid body dynamics algorithms*, RSS 2018). ∂ID is computed in world axes from
-composite quantities of the subtrees (Singh, Russell & Wensing, *Efficient analytical derivatives of
+Differentiating M q̈ − Q_C − Q_G = τ gives ∂q̈ = M⁻¹(∂τ − ∂ID), where ∂ID is taken at constant q̈ (Carpentier
+& Mansard, *Analytical derivatives of rigid body dynamics algorithms*, RSS 2018). ∂ID is computed in world
+axes from composite quantities of the subtrees (Singh, Russell & Wensing, *Efficient analytical derivatives of
 rigid-body dynamics using spatial vector algebra*, RA-L 2022).
 """
 
@@ -21,7 +21,7 @@ from forcegp.types import JointMatrix, JointVector
 
 
 class InverseDynamicsDerivatives(NamedTuple):
-    """∂ID/∂q, ∂ID/∂q̇ and ∂ID/∂q̈ = M, each `(*batch, nq, nq)`, with one row per component of the force."""
+    """Jacobians ∂ID/∂q, ∂ID/∂q̇ and ∂ID/∂q̈ = M, each `(*batch, nq, nq)`, with one row per joint."""
 
     dq: JointMatrix
     dqd: JointMatrix
@@ -29,7 +29,7 @@ class InverseDynamicsDerivatives(NamedTuple):
 
 
 class ForwardDynamicsDerivatives(NamedTuple):
-    """∂q̈/∂q, ∂q̈/∂q̇ and ∂q̈/∂force = M⁻¹, each `(*batch, nq, nq)`, with one row per component of q̈."""
+    """Jacobians ∂q̈/∂q, ∂q̈/∂q̇ and ∂q̈/∂force = M⁻¹, each `(*batch, nq, nq)`, with one row per joint."""
 
     dq: JointMatrix
     dqd: JointMatrix
@@ -37,7 +37,7 @@ class ForwardDynamicsDerivatives(NamedTuple):
 
 
 def _pairs(robot: RobotModel, up: Tensor, down: Tensor) -> Tensor:
-    """Return D with D_ij = up_ij if joint j moves link i, and down_ij if joint i moves link j."""
+    """Return D with D_ij = up_ij if joint j moves link i, and D_ij = down_ij if joint i moves link j."""
     E = robot.ancestors[..., None]
     strictly = torch.tril(robot.ancestors, -1).mT[..., None]
     return up * E + down * strictly
@@ -55,12 +55,12 @@ def _gyration(links: dynamics.LinkInertia, omega: Tensor, v: Tensor) -> tuple[Te
 def _inverse_derivatives(
     robot: RobotModel, poses: LinkPoses, links: dynamics.LinkInertia, motion: LinkMotion, qdd: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return ∂ID/∂q and ∂ID/∂q̇ with the batch last, `(nq, nq, B)`.
+    """Return ∂ID/∂q and ∂ID/∂q̇ `(nq, nq, B)`, with the batch dimension last.
 
-    The subtree of joint i has the composite inertia I, linear momentum l, force F, and 2B = [[N, 0], [−2 l×,
-    0]] with N from `_gyration`. With Ṡ = V×S and S̈ = a×S + V×Ṡ for each joint, ∂τ_i/∂q_j is S_i·(2B Ṡ_j +
-    I S̈_j) if j moves i, and S_i·(2B Ṡ_j + I S̈_j + S_j ×* F), evaluated for the subtree of j, if i moves j.
-    In ∂τ/∂q̇, S and 2 Ṡ replace Ṡ and S̈, and the term with F is absent.
+    The subtree of joint i has the composite inertia I, the linear momentum l and the force F, and 2B = [[N,
+    0], [−2 l×, 0]] with N from `_gyration`. Let Ṡ = V×S and S̈ = a×S + V×Ṡ for each joint. If j moves i, then
+    ∂τ_i/∂q_j = S_i·(2B Ṡ_j + I S̈_j). If i moves j, then ∂τ_i/∂q_j = S_i·(2B Ṡ_j + I S̈_j + S_j ×* F),
+    evaluated for the subtree of j. In ∂τ/∂q̇, S and 2 Ṡ replace Ṡ and S̈, and the term with F is absent.
     """
     Et, z, l, omega, v = robot.ancestors.mT, poses.angular, poses.linear, motion.omega, motion.velocity
     alpha, a = dynamics.accelerations(robot, poses, motion, qdd)
@@ -102,7 +102,7 @@ def _inverse_derivatives(
 def inverse_dynamics_derivatives(
     robot: RobotModel, q: JointVector, qd: JointVector, qdd: JointVector
 ) -> InverseDynamicsDerivatives:
-    """Return the Jacobians of `inverse_dynamics` with respect to q, q̇ and q̈ at states `(*batch, nq)`.
+    """Return the Jacobians of `inverse_dynamics` with respect to q, q̇ and q̈ `(*batch, nq)`.
 
     Raises:
         ShapeError: an argument has the wrong shape for the robot.
@@ -118,8 +118,8 @@ def inverse_dynamics_derivatives(
 def forward_dynamics_derivatives(
     robot: RobotModel, q: JointVector, qd: JointVector, force: JointVector
 ) -> ForwardDynamicsDerivatives:
-    """Return the Jacobians −M⁻¹ ∂ID/∂q, −M⁻¹ ∂ID/∂q̇ and M⁻¹ of `forward_dynamics` with respect to q, q̇ and
-    the force, with ∂ID evaluated at the resulting q̈.
+    """Return the Jacobians of `forward_dynamics` with respect to q, q̇ and the force, which are −M⁻¹ ∂ID/∂q,
+    −M⁻¹ ∂ID/∂q̇ and M⁻¹. ∂ID is evaluated at the resulting q̈.
 
     Raises:
         ShapeError: an argument has the wrong shape for the robot.

@@ -1,4 +1,4 @@
-"""Early checks that a result can be written, and a fallback path if writing fails after all."""
+"""Early checks that a result can be written, and a fallback path if writing fails nevertheless."""
 
 from __future__ import annotations
 
@@ -14,14 +14,14 @@ from forcegp.errors import DestinationError, ForceGPError
 from forcegp.files import check_kind, writable, written_folder
 
 PROBE_BYTES = 1 << 16
-"""Number of bytes that are written and removed again to test for free space and quotas."""
+"""Number of bytes that are written and then deleted to test for free space and quotas."""
 
 
 def check_destination(path: str | Path, *, folder: bool = False, own_files: Iterable[str] = ()) -> None:
-    """Check before a long computation that a file or folder can be written, without leaving anything behind.
+    """Check, before a long computation, that a file or folder can be written.
 
-    A folder may replace an empty folder, or one that only contains files matching the patterns `own_files`.
-    Without patterns, it may replace any folder.
+    The check leaves no files behind. A folder may replace an empty folder, or one whose files all match the
+    patterns `own_files`. If no patterns are given, it may replace any folder.
 
     Raises:
         DestinationError: a file would replace a folder or vice versa, the folder contains other files, the
@@ -40,7 +40,7 @@ def check_destination(path: str | Path, *, folder: bool = False, own_files: Iter
 
 
 def write_or_keep(write: Callable[[Path], object], path: str | Path) -> None:
-    """Call `write(path)`; if it fails, write to another path, which the raised `DestinationError` names."""
+    """Call `write(path)`. If this fails, write to a different path and name it in a `DestinationError`."""
     target = Path(path)
     try:
         write(target)
@@ -59,7 +59,7 @@ def write_or_keep(write: Callable[[Path], object], path: str | Path) -> None:
 
 
 def folder_or_keep(fill: Callable[[Path], object], path: str | Path) -> None:
-    """Write a folder, whose files `fill(folder)` writes, or keep it elsewhere as `write_or_keep` does."""
+    """Call `fill(folder)` to write the files of a folder. If this fails, proceed as `write_or_keep` does."""
 
     def write(target: Path) -> None:
         with written_folder(target) as temporary:

@@ -1,8 +1,8 @@
-"""Mass matrix, bias and gravity forces, and inverse and forward dynamics of a tree of rigid links.
+"""Mass matrix, bias and gravity forces, inverse dynamics and forward dynamics of a tree of rigid links.
 
-All forces are on the right-hand side: M q̈ = Q_C + Q_G + Q_D + Q_u. The composite rigid-body algorithm and the
-recursive Newton-Euler algorithm (Featherstone, *Rigid Body Dynamics Algorithms*, ch. 5 and 6) are formulated
-in world axes, so that sums over subtrees are products with the ancestor matrix.
+All forces appear on the right-hand side: M q̈ = Q_C + Q_G + Q_D + Q_u. The composite rigid-body algorithm and
+the recursive Newton-Euler algorithm (Featherstone, *Rigid Body Dynamics Algorithms*, ch. 5 and 6) are
+formulated in world axes, so that sums over subtrees become products with the ancestor matrix.
 """
 
 from __future__ import annotations
@@ -25,8 +25,8 @@ class LinkInertia:
 
     Attributes:
         mass: `(nq, 1)` [kg].
-        moment: `(3, nq, B)` first moment m c [kg m].
-        inertia: `(3, 3, nq, B)` second moment about the base origin [kg m²].
+        moment: `(3, nq, B)` first moment of mass m c [kg m].
+        inertia: `(3, 3, nq, B)` rotational inertia about the base origin [kg m²].
     """
 
     mass: Tensor
@@ -35,7 +35,7 @@ class LinkInertia:
 
 
 def link_inertia(robot: RobotModel, poses: LinkPoses) -> LinkInertia:
-    """Return the inertia of each link, moved to the base origin: I_o = R I_c Rᵀ + m(cᵀc 1 − c cᵀ)."""
+    """Return the inertia of each link about the base origin, I_o = R I_c Rᵀ + m(cᵀc 1 − c cᵀ)."""
     R, mass = poses.R, robot.mass[:, None]
     c = poses.p + apply(R, robot.com.T[..., None])
     moment = mass * c
@@ -47,7 +47,7 @@ def link_inertia(robot: RobotModel, poses: LinkPoses) -> LinkInertia:
 
 
 def mass_matrix_of(robot: RobotModel, poses: LinkPoses, links: LinkInertia) -> Tensor:
-    """Return M `(nq, nq, B)`: s_iᵀ I^c_j s_j for ancestors i of j, with I^c = Eᵀ I, plus the armature."""
+    """Return M `(nq, nq, B)`, with M_ij = s_iᵀ (Eᵀ I)_j s_j for ancestors i of j, plus the armature."""
     E, S, L = robot.ancestors, poses.angular, poses.linear
     whole = LinkInertia(E.mT @ links.mass, sum_over(E.mT, links.moment), sum_over(E.mT, links.inertia))
     angular, linear = momentum(whole, S, L)
@@ -58,21 +58,21 @@ def mass_matrix_of(robot: RobotModel, poses: LinkPoses, links: LinkInertia) -> T
 
 
 def _gravity_force(robot: RobotModel, poses: LinkPoses, links: LinkInertia) -> Tensor:
-    """Return Q_G = sᵀ Eᵀ [m c × g; m g] with the batch last, `(nq, B)`."""
+    """Return Q_G = sᵀ Eᵀ [m c × g; m g] `(nq, B)`, with the batch dimension last."""
     Et, g = robot.ancestors.mT, robot.gravity[:, None, None]
     torque = cross(sum_over(Et, links.moment), g)
     return dot(poses.angular, torque) + dot(poses.linear, (Et @ links.mass) * g)
 
 
 def momentum(links: LinkInertia, w: Tensor, v: Tensor) -> tuple[Tensor, Tensor]:
-    """Return the inertia times a motion vector [w; v]: I w + h × v and m v − h × w, each `(3, nq, B)`."""
+    """Return the momentum for a motion vector [w; v]: I w + h × v and m v − h × w, each `(3, nq, B)`."""
     return apply(links.inertia, w) + cross(links.moment, v), links.mass * v - cross(links.moment, w)
 
 
 def link_force(
     links: LinkInertia, motion: LinkMotion, alpha: Tensor, acceleration: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return the torque and force I a + V ×* I V of links at velocity V and acceleration a, `(3, nq, B)`."""
+    """Return the torque and force I a + V ×* I V for velocity V and acceleration a, each `(3, nq, B)`."""
     n, l = momentum(links, motion.omega, motion.velocity)
     torque, force = momentum(links, alpha, acceleration)
     torque = torque + cross(motion.omega, n) + cross(motion.velocity, l)
@@ -86,14 +86,14 @@ def _joint_force(robot: RobotModel, poses: LinkPoses, torque: Tensor, force: Ten
 
 
 def _bias_force(robot: RobotModel, poses: LinkPoses, links: LinkInertia, motion: LinkMotion) -> Tensor:
-    """Return Q_C with the batch last, `(nq, B)`."""
+    """Return Q_C `(nq, B)`, with the batch dimension last."""
     return -_joint_force(robot, poses, *link_force(links, motion, motion.alpha, motion.acceleration))
 
 
 def known_terms(
     robot: RobotModel, poses: LinkPoses, motion: LinkMotion, qd: JointVector
 ) -> tuple[JointMatrix, JointVector, JointVector, JointVector]:
-    """Return M, Q_C, Q_G and Q_D with the parameters of the robot file, from the motion of the links."""
+    """Return M, Q_C, Q_G and Q_D from the motion of the links and the parameters in the robot file."""
     links, Q_D = link_inertia(robot, poses), damping_force(robot, qd)
     M, Q_C = mass_matrix_of(robot, poses, links), _bias_force(robot, poses, links, motion)
     Q_G = _gravity_force(robot, poses, links)
@@ -103,7 +103,7 @@ def known_terms(
 def accelerations(
     robot: RobotModel, poses: LinkPoses, motion: LinkMotion, qdd: Tensor
 ) -> tuple[Tensor, Tensor]:
-    """Return the spatial accelerations `(3, nq, B)` of the links for q̈ `(nq, B)` and base acceleration −g."""
+    """Return the spatial accelerations `(3, nq, B)` of links for q̈ `(nq, B)` and base acceleration −g."""
     E = robot.ancestors
     linear = motion.acceleration + sum_over(E, poses.linear * qdd) - robot.gravity[:, None, None]
     return motion.alpha + sum_over(E, poses.angular * qdd), linear
@@ -112,7 +112,7 @@ def accelerations(
 def equation_of_motion(
     robot: RobotModel, poses: LinkPoses, links: LinkInertia, motion: LinkMotion
 ) -> tuple[Tensor, Tensor]:
-    """Return M `(nq, nq, B)` and −(Q_C + Q_G) `(nq, B)` of M q̈ − Q_C − Q_G = force."""
+    """Return M `(nq, nq, B)` and −(Q_C + Q_G) `(nq, B)` in the equation M q̈ − Q_C − Q_G = force."""
     # Gravity enters as an acceleration of the base, so one pass gives both forces.
     lifted = motion.acceleration - robot.gravity[:, None, None]
     torque, force = link_force(links, motion, motion.alpha, lifted)
@@ -120,7 +120,7 @@ def equation_of_motion(
 
 
 def mass_matrix(robot: RobotModel, q: JointVector) -> JointMatrix:
-    """Return the mass matrix M(q) `(*batch, nq, nq)`, symmetric positive definite [kg m², kg m, kg].
+    """Return the symmetric positive definite mass matrix M(q) `(*batch, nq, nq)` [kg m², kg m, kg].
 
     Example:
         >>> import torch, forcegp
@@ -147,7 +147,7 @@ def gravity_force(robot: RobotModel, q: JointVector) -> JointVector:
 
 
 def bias_force(robot: RobotModel, q: JointVector, qd: JointVector) -> JointVector:
-    """Return the Coriolis and centrifugal force Q_C(q, q̇) on the right-hand side, `(*batch, nq)` [N m, N].
+    """Return the Coriolis and centrifugal force Q_C(q, q̇) on the right-hand side `(*batch, nq)` [N m, N].
 
     Raises:
         ShapeError: q or qd has the wrong shape for the robot.
@@ -159,11 +159,12 @@ def bias_force(robot: RobotModel, q: JointVector, qd: JointVector) -> JointVecto
 
 
 def damping_force(robot: RobotModel, qd: JointVector, slip: JointVector | None = None) -> JointVector:
-    """Return the viscous, Coulomb (smoothed at zero speed) and Stribeck friction of the joints.
+    """Return the viscous, Coulomb and Stribeck friction of the joints, `(*batch, nq)` [N m, N].
 
-    Q_D = −d q̇ − (f_c + f_s e^{−(q̇/v_s)²}) tanh(q̇/v_0), `(*batch, nq)` [N m, N]. If given, the direction of
-    sliding `slip` `(*batch, nq)` replaces tanh(q̇/v_0). Source: Armstrong-Hélouvry et al., *A survey of
-    models, analysis tools and compensation methods for the control of machines with friction* (1994).
+    Q_D = −d q̇ − (f_c + f_s e^{−(q̇/v_s)²}) tanh(q̇/v_0), where tanh smooths friction near zero speed. If the
+    sliding direction `slip` `(*batch, nq)` is given, it replaces tanh(q̇/v_0). Source: Armstrong-Hélouvry et
+    al., *A survey of models, analysis tools and compensation methods for the control of machines with
+    friction* (1994).
 
     Raises:
         ShapeError: qd has the wrong shape for the robot.
@@ -174,7 +175,7 @@ def damping_force(robot: RobotModel, qd: JointVector, slip: JointVector | None =
 
 
 def inverse_dynamics(robot: RobotModel, q: JointVector, qd: JointVector, qdd: JointVector) -> JointVector:
-    """Return the force Q_D + Q_u = M q̈ − Q_C − Q_G required for a motion, `(*batch, nq)` [N m, N].
+    """Return the force Q_D + Q_u = M q̈ − Q_C − Q_G required for a given motion, `(*batch, nq)` [N m, N].
 
     Example:
         >>> import torch, forcegp
@@ -195,12 +196,12 @@ def inverse_dynamics(robot: RobotModel, q: JointVector, qd: JointVector, qdd: Jo
 
 
 def forward_dynamics(robot: RobotModel, q: JointVector, qd: JointVector, force: JointVector) -> JointVector:
-    """Return q̈ = M⁻¹(force + Q_C + Q_G) of free motion (eq. 1), `(*batch, nq)` [rad/s², m/s²].
+    """Return q̈ = M⁻¹(force + Q_C + Q_G) for free motion (eq. 1), `(*batch, nq)` [rad/s², m/s²].
 
     Args:
         robot: the robot.
         q, qd: `(*batch, nq)` joint positions and velocities.
-        force: `(*batch, nq)` generalized force Q_D + Q_u (+ any other impressed force) [N m, N].
+        force: `(*batch, nq)` generalized force Q_D + Q_u, plus any other impressed force [N m, N].
 
     Example:
         >>> import torch, forcegp

@@ -21,7 +21,7 @@ class ForceGPError(Exception):
     """Base class of all errors that a user of the library can cause.
 
     Args:
-        message: one sentence that describes the fault and its location (file, joint, row).
+        message: one sentence that states the fault and its location (file, joint, row).
         expected: the valid value.
         got: the value found.
         hint: what to change.
@@ -39,7 +39,7 @@ class ForceGPError(Exception):
 
     @classmethod
     def at(cls: type[E], place: str, cause: ForceGPError) -> E:
-        """Return an error of this class that adds the location (a file, a line) to another error."""
+        """Convert an error to this class, adding its location (such as a file or a line) to the message."""
         message = f"{place}: {cause.message}"
         error = cls.__new__(cls)
         ForceGPError.__init__(error, message, expected=cause.expected, got=cause.got, hint=cause.hint)
@@ -48,14 +48,14 @@ class ForceGPError(Exception):
     @classmethod
     @contextmanager
     def within(cls, place: str) -> Iterator[None]:
-        """Re-raise library errors in the block as errors of this class that name the location."""
+        """Re-raise this library's errors in the block as errors of this class that name the location."""
         try:
             yield
         except ForceGPError as cause:
             raise cls.at(place, cause) from cause
 
     def __reduce__(self) -> tuple[Any, ...]:
-        """Reduce the error to text and plain values, so that it can be copied or sent to another process."""
+        """Reduce the error to text and plain values so that it can be copied or sent to another process."""
         state = {name: _plain(value) for name, value in self.__dict__.items()}
         return _rebuilt, (type(self), tuple(map(_plain, self.args)), state)
 
@@ -74,7 +74,7 @@ def _rebuilt(kind: type[E], args: tuple[object, ...], state: dict[str, object]) 
 
 
 def near_names(name: object, valid: Iterable[str], cutoff: float = 0.6) -> list[str]:
-    """Return the valid name closest to a misspelt one, if any, among a limited number of short names."""
+    """Return the valid name closest to a misspelt one, if any; the number of compared names is limited."""
     text = str(name)
     if len(text) > NAME_COMPARED:
         return []
@@ -93,11 +93,11 @@ class RobotFileError(ForceGPError, ValueError):
 
 
 class UnsupportedRobotError(RobotFileError):
-    """Raised if a valid robot file contains unsupported elements (the message names the joint)."""
+    """Raised if a valid robot file contains unsupported elements; the message names the joint."""
 
 
 class InertiaError(RobotFileError):
-    """Raised if inertial parameters are physically impossible (the message names the link and the reason)."""
+    """Raised if inertial parameters are physically impossible; the message names the link and the reason."""
 
 
 class RobotFileWarning(UserWarning):
@@ -125,7 +125,7 @@ def check_name(kind: str, name: object, valid: Collection[str]) -> None:
 
 
 class ParameterError(ForceGPError, ValueError):
-    """Raised if a parameter, such as a radius or a time step, is out of range (the message names it)."""
+    """Raised if a parameter (for example, a radius) is out of range; the message names the parameter."""
 
 
 def _shortened(text: str, length: int) -> str:
@@ -137,15 +137,15 @@ class ShapeError(ForceGPError, ValueError):
 
 
 class DataError(ForceGPError, ValueError):
-    """Raised if a data set or a data file cannot be used (the message names the file, column and row)."""
+    """Raised if a data set or a data file cannot be used; the message names the file, column and row."""
 
 
 class SceneError(ForceGPError, ValueError):
-    """Raised if a scene file is invalid (the message names the file, line and key)."""
+    """Raised if a scene file is invalid; the message names the file, line and key."""
 
 
 class MappingError(ForceGPError, ValueError):
-    """Raised if a mapping of log columns is invalid or does not match the log; the message names the key."""
+    """Raised if a column mapping is invalid or does not match the log; the message names the key."""
 
 
 class ModelError(ForceGPError, ValueError):
@@ -153,7 +153,7 @@ class ModelError(ForceGPError, ValueError):
 
 
 class NumericalError(ForceGPError, ArithmeticError):
-    """Raised if a computation has no trustworthy result (an indefinite matrix, a diverging run)."""
+    """Raised if a computation has no reliable result, for example because a matrix is indefinite."""
 
 
 class MassMatrixError(NumericalError):
@@ -181,8 +181,8 @@ def optional_module(name: str, purpose: str, extra: str | None = None) -> Any:
 
     Args:
         name: the module to import.
-        purpose: the subject of the message, such as `"Reading MJCF files"`.
-        extra: the extra of this library that installs the package; by default, the name of the package.
+        purpose: the subject of the error message, such as `"Reading MJCF files"`.
+        extra: the optional extra of this library that installs the package; defaults to the package name.
 
     Returns:
         The module.

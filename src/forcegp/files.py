@@ -1,8 +1,8 @@
 """Atomic writing of files, and JSON headers with a format and a version.
 
-Temporary files are hidden, locked while their writer runs, and deleted after a crash. They are named
-`.forcegp-new-<12 hex digits>-<name of the target>`. The lock (flock) is released when the process ends.
-Without flock (on Windows and some network file systems), such files remain after a crash.
+Temporary files are hidden, locked while the process that writes them runs, and deleted after a crash. They
+are named `.forcegp-new-<12 hex digits>-<name of the target>`. The lock (flock) is released when the process
+ends. Without flock (on Windows and some network file systems), such files remain after a crash.
 """
 
 from __future__ import annotations
@@ -34,13 +34,13 @@ M = TypeVar("M", bound=BaseModel)
 
 
 LONGEST = 200
-"""Maximum number of bytes of a target's name in a temporary name; file systems allow 255 in total."""
+"""Maximum number of bytes of the target's name in a temporary name; file systems allow 255 bytes in total."""
 NEW = ".forcegp-new-"
 """Prefix of temporary names."""
 
 
 def _short(target: Path) -> str:
-    """Return the name of a target, or, if it is long, its digest with the suffix, which some writers need."""
+    """Return the name of a target, or a digest if the name is long; some writers need its suffix."""
     name = os.fsencode(target.name)
     if len(name) <= LONGEST:
         return target.name
@@ -72,7 +72,7 @@ class Temporary:
 
 
 def sweep(target: Path) -> None:
-    """Delete temporary files left by crashed writers of a target."""
+    """Delete temporary files left by processes that crashed while writing a target."""
     form = re.compile(re.escape(NEW) + "[0-9a-f]{12}-" + re.escape(_short(target)))
     try:
         matches = [path for path in target.parent.iterdir() if form.fullmatch(path.name)]
@@ -98,7 +98,7 @@ def discard(path: Path) -> None:
 
 
 def _lock(path: Path) -> tuple[bool, int | None]:
-    """Lock a path; return whether it still exists and is locked (or needs no lock), and the descriptor."""
+    """Lock a path. Return whether it still exists and is locked (or needs no lock), and its descriptor."""
     if fcntl is None:
         return True, None
     try:
@@ -116,7 +116,7 @@ def _lock(path: Path) -> tuple[bool, int | None]:
 
 @contextmanager
 def writable(target: Path) -> Iterator[None]:
-    """Convert operating system errors in the block, which writes to `target`, to `DestinationError`."""
+    """Convert operating system errors in a block that writes to `target` to `DestinationError`."""
     try:
         yield
     except DestinationError:
@@ -130,9 +130,9 @@ def writable(target: Path) -> Iterator[None]:
 
 
 def check_kind(target: Path, *, folder: bool) -> None:
-    """Check that an existing target is a folder if `folder` is true, and otherwise a regular file.
+    """Check that a target, if it exists, is a folder (if `folder` is true) or a regular file (otherwise).
 
-    The path is inspected once, since another writer could change it between `exists` and `is_dir`.
+    The path is inspected only once, since another process could change it between `exists` and `is_dir`.
     """
     if "\0" in str(target):
         raise DestinationError("a path contains a null byte", got=repr(str(target)))
@@ -148,7 +148,7 @@ def check_kind(target: Path, *, folder: bool) -> None:
 
 
 def _sync(path: Path) -> None:
-    """Flush a file or folder to disk, so that a rename never precedes its data."""
+    """Flush a file or folder to disk, so that it is never renamed before its data are written."""
     descriptor = os.open(path, os.O_RDONLY)
     try:
         os.fsync(descriptor)
@@ -158,7 +158,7 @@ def _sync(path: Path) -> None:
 
 @contextmanager
 def _temporary(target: Path, *, folder: bool, mode: int) -> Iterator[Path]:
-    """Yield a temporary file or folder for a target, and delete it after the block unless it was moved."""
+    """Yield a temporary file or folder for a target; delete it after the block unless it has been moved."""
     with writable(target):
         check_kind(target, folder=folder)
         target.parent.mkdir(parents=True, exist_ok=True)
@@ -174,14 +174,14 @@ def _temporary(target: Path, *, folder: bool, mode: int) -> Iterator[Path]:
 def atomic_file(path: str | Path, mode: int = 0o666) -> Iterator[Path]:
     """Yield a temporary path that replaces `path` if the block ends without an error.
 
-    Temporary files left by crashed writers of the same file are removed.
+    Temporary files that crashed processes left for the same target are deleted.
 
     Args:
         path: the file to write; missing parent folders are created.
         mode: permissions of the new file before the umask is applied.
 
     Yields:
-        The path to write to. Readers of `path` see either the old file or the complete new one.
+        The temporary path. Readers of `path` see either the old file or the complete new file.
 
     Raises:
         DestinationError: the path cannot be written, or is a folder, a pipe or a device.
@@ -206,13 +206,13 @@ def atomic_file(path: str | Path, mode: int = 0o666) -> Iterator[Path]:
 
 @contextmanager
 def written_folder(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary folder, which is moved into the target folder if the block ends without an error.
+    """Yield a temporary folder whose files are moved to the target folder if the block ends without an error.
 
-    Each file atomically replaces the file of the same name, in the order of writing, so the last one exists
-    only if the others do. Then all other files in the folder are removed. Symbolic links are followed.
+    Files atomically replace those with the same name, in the order of writing, so the last file exists only
+    if all others do. All other files in the target folder are deleted. Symbolic links are followed.
 
     Yields:
-        The folder to write the files to.
+        The temporary folder.
 
     Raises:
         DestinationError: the path cannot be written, or is a file.
@@ -241,26 +241,26 @@ def written_folder(path: str | Path) -> Iterator[Path]:
 
 
 def write_text(path: str | Path, text: str) -> None:
-    """Write a UTF-8 text file, either completely or not at all."""
+    """Write a UTF-8 text file atomically."""
     with atomic_file(path) as temporary:
         temporary.write_text(text, encoding="utf-8")
 
 
 def write_json(path: str | Path, value: object) -> None:
-    """Write a value as indented JSON, either completely or not at all; NaN and infinity are rejected."""
+    """Write a value atomically as indented JSON. NaN and infinity are rejected."""
     write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
 
 
 class Record(BaseModel):
-    """A frozen part of a file, in which unknown fields and non-finite numbers are errors."""
+    """A frozen record in a file; unknown fields and non-finite numbers raise errors."""
 
     model_config = ConfigDict(extra="forbid", frozen=True, allow_inf_nan=False, from_attributes=True)
 
 
 class Header(Record):
-    """A frozen, versioned JSON header; a subclass sets `FORMAT` and `VERSION` and adds fields.
+    """A frozen, versioned JSON header; subclasses set `FORMAT` and `VERSION` and add fields.
 
-    Unknown fields are errors, and text longer than `MAX_BYTES` is rejected.
+    Unknown fields and text longer than `MAX_BYTES` are rejected.
     """
 
     FORMAT: ClassVar[str]
@@ -268,17 +268,17 @@ class Header(Record):
     MAX_BYTES: ClassVar[int] = HEADER_BYTES
 
     def to_json(self) -> str:
-        """Return the header as JSON text that starts with the format and the version."""
+        """Return the header as JSON text, starting with the format and the version."""
         head = {"format": self.FORMAT, "version": self.VERSION}
         return json.dumps(head | self.model_dump(mode="json"), indent=2, allow_nan=False)
 
     @classmethod
     def from_json(cls: type[H], text: str | bytes, source: str, error: type[ForceGPError]) -> H:
-        """Read and check a header; raise an `error` that names `source` and the invalid field."""
+        """Read and check a header; if it is invalid, raise an `error` that names `source` and the field."""
         fields = _json_object(text, source, error, cls.MAX_BYTES)
         name, version = fields.pop("format", None), fields.pop("version", None)
         if name != cls.FORMAT:
-            raise error(f"{source} has another format", expected=cls.FORMAT, got=repr(name))
+            raise error(f"{source} has a different format", expected=cls.FORMAT, got=repr(name))
         if version != cls.VERSION:
             raise error(
                 f"{source} has a version of the {cls.FORMAT} format that this release cannot read",
@@ -297,7 +297,7 @@ def validated(
     place: tuple[str, ...] = (),
     what: str = "field",
 ) -> M:
-    """Validate values as a pydantic model; raise an `error` that names `source`, `place` and the field."""
+    """Validate values as a pydantic model; errors name `source`, `place` and the invalid field."""
     try:
         return kind.model_validate(fields)
     except ValidationError as cause:
@@ -323,7 +323,7 @@ def _json_object(text: str | bytes, source: str, error: type[ForceGPError], most
 
 
 def depth(value: object) -> int:
-    """Return the maximum nesting depth of mappings and lists, computed without recursion."""
+    """Compute the maximum nesting depth of mappings and lists without recursion."""
     level, levels = [value], 0
     while level := [part for part in level if isinstance(part, dict | list)]:
         levels += 1

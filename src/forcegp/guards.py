@@ -1,6 +1,7 @@
 """Guards for readers, which check the declared size of a file before it is read, and convert errors.
 
-A small compressed file may declare more content than fits into memory. `forcegp.limits` defines the bounds.
+A small compressed file may declare more content than fits into memory. The limits are defined in
+`forcegp.limits`.
 """
 
 from __future__ import annotations
@@ -22,7 +23,7 @@ from forcegp.errors import DataError, ForceGPError, optional_module
 
 
 def check_count(source: str, what: str, count: int, most: int) -> None:
-    """Raise `DataError` if a log declares more than `most` items; `what` is a plural noun for them.
+    """Raise `DataError` if a log declares more than `most` items. `what` names the items in the plural.
 
     >>> check_count("run.csv", "columns", 12, limits.COLUMNS)
     """
@@ -36,7 +37,7 @@ def check_count(source: str, what: str, count: int, most: int) -> None:
 
 
 def check_expansion(source: str, size: int, file: int, free: int | None = None) -> None:
-    """Raise `DataError` if the declared `size` of the content is far larger than the file of `file` bytes."""
+    """Raise `DataError` if the declared `size` of the content far exceeds `file`, the size of the file."""
     allowed = allowed_bytes(file, free)
     if size > allowed:
         raise DataError(
@@ -48,13 +49,13 @@ def check_expansion(source: str, size: int, file: int, free: int | None = None) 
 
 
 def allowed_bytes(file: int, free: int | None = None) -> int:
-    """Return the number of bytes to which a file of `file` bytes may be unpacked, at least `free`."""
+    """Return the maximum unpacked size of a file of `file` bytes, which is at least `free` [bytes]."""
     return max(free or limits.FREE_TABLE_BYTES, limits.TABLE_EXPANSION * file)
 
 
 @dataclass
 class Unpacking:
-    """Counter of the bytes and records unpacked from a log, limited according to its `file` size [bytes]."""
+    """Counter of the bytes and records unpacked from a log, with limits that depend on the file size."""
 
     source: str
     file: int
@@ -62,14 +63,14 @@ class Unpacking:
     records: int = 0
 
     def unpack(self, packed: bytes, compression: str) -> bytes:
-        """Unpack a part of the log, up to the allowed size."""
+        """Unpack part of the log, up to the allowed size."""
         left = allowed_bytes(self.file, limits.FREE_BAG_BYTES) - self.size
         content = _opened(packed, compression).read(left + 1)
         self.read(len(content))
         return content
 
     def read(self, size: int) -> None:
-        """Count bytes that were read from the log, including repeated reads."""
+        """Count the bytes read from the log, including repeated reads."""
         self.size += size
         check_expansion(self.source, self.size, self.file, limits.FREE_BAG_BYTES)
 
@@ -81,7 +82,7 @@ class Unpacking:
 
 
 def _opened(packed: bytes, compression: str) -> Any:
-    """Return a compressed part as a file object that is unpacked while it is read."""
+    """Return compressed data as a file object that unpacks them as they are read."""
     stream = io.BytesIO(packed)
     if compression in ("", "none"):
         return stream
@@ -96,7 +97,7 @@ def _opened(packed: bytes, compression: str) -> Any:
 
 
 def bounded(reader: Any, unpacking: Unpacking) -> Any:
-    """Return a subclass of a ROS 1 bag reader that limits the sizes of unpacked chunks and of the index."""
+    """Return a subclass of a ROS 1 bag reader that limits the size of unpacked chunks and of the index."""
 
     class Bounded(reader):
         indexed = 0
@@ -117,7 +118,7 @@ def bounded(reader: Any, unpacking: Unpacking) -> Any:
 
 
 def check_tables(file: Path) -> None:
-    """Check that an SQLite bag has no computed rows or duplicate topics; other files are accepted."""
+    """Check that an SQLite bag has no computed rows and no duplicate topics; accept all other files."""
     if not starts_with(file, b"SQLite format 3"):
         return
     with closing(sqlite3.connect(f"{file.absolute().as_uri()}?immutable=1", uri=True)) as bag:
@@ -129,7 +130,7 @@ def check_tables(file: Path) -> None:
 
 
 def is_file(path: Path) -> bool:
-    """Return whether a file exists, or false if its name is invalid."""
+    """Return whether a file exists; false if its name is invalid."""
     try:
         return path.is_file()
     except (OSError, ValueError):
@@ -144,7 +145,7 @@ def starts_with(file: Path, magic: bytes) -> bool:
 
 DEFLATE, SHUFFLE, FLETCHER32, LZF = 1, 2, 3, 32000
 DEFLATE_RATIO = 1032
-"""Maximum number of bytes to which one byte of deflated data can expand."""
+"""Maximum number of bytes to which one byte of DEFLATE-compressed data can expand."""
 
 
 def check_chunks(dataset: Any, file: int) -> None:
@@ -171,7 +172,7 @@ def check_chunks(dataset: Any, file: int) -> None:
 
 
 def within(folder: Path, files: Iterable[Path]) -> list[Path]:
-    """Return the files of a folder that is read as one log; raise `DataError` if a link leads outside it."""
+    """Return the files of a folder that is read as one log; raise `DataError` if a link leaves the folder."""
     files, root = list(files), folder.resolve()
     for file in files:
         if not file.resolve().is_relative_to(root):
@@ -184,13 +185,13 @@ def within(folder: Path, files: Iterable[Path]) -> list[Path]:
 
 @contextmanager
 def foreign(source: str, kind: str) -> Iterator[None]:
-    """Convert any exception that a third-party parser raises on a damaged file to `DataError`."""
+    """Convert any exception that a third-party parser raises for a damaged file to `DataError`."""
     try:
         yield
     except ForceGPError:
         raise
     except (FileNotFoundError, PermissionError) as cause:
-        what = "no such file" if isinstance(cause, FileNotFoundError) else "the file may not be read"
+        what = "no such file" if isinstance(cause, FileNotFoundError) else "no permission to read the file"
         raise DataError(f"{source}: {what}", got=str(cause)) from cause
     except (Exception, RecursionError, MemoryError) as cause:
         raise damaged(source, kind, cause) from cause

@@ -1,8 +1,8 @@
-"""Identification of inertial parameters π, in which inverse dynamics is linear: τ = Y(q, q̇, q̈) π.
+"""Identification of inertial parameters π. Inverse dynamics is linear in π: τ = Y(q, q̇, q̈) π.
 
-Sources: Atkeson, An, Hollerbach, *Estimation of inertial parameters of manipulator loads and links*
-(IJRR 1986); Gautier, *Numerical calculation of the base inertial parameters of robots* (J. Robotic
-Systems 1991). Only the r base parameters β = B π affect the motion and can be identified.
+Sources: Atkeson, An, Hollerbach, *Estimation of inertial parameters of manipulator loads and links* (IJRR
+1986); Gautier, *Numerical calculation of the base inertial parameters of robots* (J. Robotic Systems 1991).
+Only the r base parameters β = B π affect the motion, so only they can be identified.
 """
 
 from __future__ import annotations
@@ -26,21 +26,20 @@ from forcegp.types import JointVector
 
 Regressor = Float[Tensor, "*batch nq p"]
 RANK = 1e-9
-"""Pivot of the scaled regressor, relative to the largest, below which a direction does not affect the motion.
-"""
+"""Relative pivot of the scaled regressor below which a direction is considered not to affect the motion."""
 STATES = 100
-"""Number of random states from which the rank is determined."""
+"""Number of random states used to determine the rank."""
 MASS_SHARE, MOMENT_ARM = 0.3, 0.1
-"""Assumed errors of a robot file in the mass m of a link (relative) and in its centre of mass [m]. The
-standard deviations of m, m c and the inertia are 30 % of m, m · 0.1 m and m · (0.1 m)²."""
+"""Assumed relative error in the mass m of a link, and error in its centre of mass [m], in a robot file. The
+standard deviations of m, m c and the inertia are 0.3 m, m · 0.1 m and m · (0.1 m)²."""
 PARAMETER_NAMES = ("m", "mcx", "mcy", "mcz", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
 
 
 def regressor(robot: RobotModel, q: JointVector, qd: JointVector, qdd: JointVector) -> Regressor:
-    """Return Y `(*batch, nq, 10 nq)` such that Y π = M q̈ − Q_C − Q_G without armature (`parameter_vector`).
+    """Return Y `(*batch, nq, 10 nq)` such that Y π = M q̈ − Q_C − Q_G, excluding the armature.
 
-    Inverse dynamics is linear in π, so column k of link i contains the forces caused by a unit parameter π_k
-    of this link. Only the kinematics and the gravity vector of the robot are used.
+    The parameters π are those of `parameter_vector`. Column k of link i contains the forces caused by a unit
+    parameter π_k of that link. Only the kinematics and the gravity vector of the robot are used.
 
     Example:
         >>> import torch, forcegp
@@ -68,7 +67,7 @@ def regressor(robot: RobotModel, q: JointVector, qd: JointVector, qdd: JointVect
 
 
 def _links_of(poses: LinkPoses, parameters: Tensor) -> LinkInertia:
-    """Return the inertias, about the base origin, of links that all have the same π `(10,)`."""
+    """Return the inertias of all links about the base origin; all links have the same π `(10,)`."""
     rows = torch.tensor([[4, 5, 6], [5, 7, 8], [6, 8, 9]], device=parameters.device)
     R, p, mass = poses.R, poses.p, parameters[0].expand(poses.p.shape[1], 1)
     # I_o = R I Rᵀ + (2 p·h + m p·p) 1 − p hᵀ − h pᵀ − m p pᵀ with h = R m c
@@ -80,7 +79,7 @@ def _links_of(poses: LinkPoses, parameters: Tensor) -> LinkInertia:
 
 
 def parameter_vector(robot: RobotModel) -> Float[Tensor, " p"]:
-    """Return π `(10 nq,)`: for each link in turn, m, m c and the inertia about the link origin."""
+    """Return π `(10 nq,)`, which lists m, m c and the inertia about the link origin, link by link."""
     return inertial_parameters(robot.mass, robot.com, robot.inertia).flatten()
 
 
@@ -89,8 +88,8 @@ class BaseParameters:
     """The combinations β = B π of inertial parameters that affect the motion.
 
     Attributes:
-        columns: indices in π of the r independent parameters, one per combination.
-        combination: matrix B `(r, 10 nq)`, which is the identity in these columns.
+        columns: indices of the r independent parameters in π, one per combination.
+        combination: matrix B `(r, 10 nq)`, whose submatrix in these columns is the identity.
         names: names of the combinations, such as `"Izz[joint_1] + 3 more"`.
     """
 
@@ -104,14 +103,14 @@ class BaseParameters:
         return len(self.columns)
 
     def of(self, robot: RobotModel) -> np.ndarray:
-        """Return β `(r,)` of a robot with the same kinematics."""
+        """Return the base parameters β `(r,)` of a robot with the same kinematics."""
         return self.combination @ parameter_vector(robot).detach().cpu().numpy()
 
 
 def base_parameters(robot: RobotModel) -> BaseParameters:
     """Compute the base parameters by rank-revealing QR of the regressor at random states (Gautier 1991).
 
-    Runs in double precision on the CPU. Only the kinematics and the gravity vector of the robot are used.
+    The computation runs on the CPU and uses only the kinematics and the gravity vector of the robot.
 
     Example:
         >>> import torch, forcegp
@@ -156,11 +155,11 @@ class Identification:
 
     Attributes:
         base: definition of the base parameters.
-        value, standard_error: `(r,)` estimate of β and its standard error.
+        value, standard_error: `(r,)` estimate of β and the standard error of this estimate.
         covariance: `(r, r)` covariance of the estimate.
-        damping, friction: `(nq,)` viscous and Coulomb friction coefficients if requested, otherwise `None`.
+        damping, friction: `(nq,)` viscous and Coulomb friction coefficients; `None` if not requested.
         noise_std: `(nq,)` standard deviation of the torque residual [N m, N].
-        condition: condition number of the scaled problem; above about 100, the excitation is insufficient.
+        condition: condition number of the scaled problem; above about 100, excitation is insufficient.
     """
 
     base: BaseParameters
@@ -184,11 +183,11 @@ def identify(
 ) -> Identification:
     """Identify the base parameters from a log of free motion by weighted linear least squares.
 
-    Solves τ − armature q̈ = Y_b β (+ d q̇ + f_c tanh(q̇/v_0)) + ε, first with equal weights, then with each
-    joint weighted by the inverse of its residual noise. The accelerations are treated as exact.
+    τ − armature q̈ = Y_b β (+ d q̇ + f_c tanh(q̇/v_0)) + ε is solved first with equal weights, and then with
+    each joint weighted by its inverse residual noise. Accelerations are treated as exact.
 
     Args:
-        robot: robot that provides the kinematics, gravity, drive inertia and v_0.
+        robot: source of the kinematics, gravity, drive inertia and v_0.
         q, qd, qdd: `(n, nq)` positions, velocities and accelerations.
         tau: `(n, nq)` measured joint force, excluding friction unless `friction` is true [N m, N].
         friction: whether to identify viscous and Coulomb friction as well.
@@ -236,7 +235,7 @@ def identify(
 
 
 def _least_squares(W: np.ndarray, y: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray, float]:
-    """Return the weighted solution, its covariance, and the condition number with columns of unit norm."""
+    """Return the weighted solution, its covariance, and the condition number for columns of unit norm."""
     A = (W * weights[:, None]).reshape(-1, W.shape[-1])
     b = (y * weights).ravel()
     scale = np.linalg.norm(A, axis=0)

@@ -1,8 +1,8 @@
 """Poses, Jacobians and bias accelerations of a tree of joints, batched over states.
 
-Spatial vectors are `[angular, linear]`, in world axes, about the origin of the base. With the joint screws
-s_j in this form and the ancestor matrix E, the twist of link i is V_i = Σ_j E_ij s_j q̇_j, so only the poses
-require recursion over the depth of the tree.
+Spatial vectors are `[angular, linear]`, expressed in world axes about the base origin. With the joint screws
+s_j in this form and the ancestor matrix E, the twist of link i is V_i = Σ_j E_ij s_j q̇_j. Therefore, only
+the poses require recursion over the depth of the tree.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from forcegp.robot.model import BASE, RobotModel
 from forcegp.types import FrameJacobian, JointVector, PointJacobian, Rotation, Vector3
 
 Anchor = tuple[str, Sequence[float]]
-"""A frame and a point in its coordinates [m]."""
+"""A frame, and a point in the coordinates of that frame [m]."""
 
 
 @dataclass(frozen=True)
@@ -30,7 +30,7 @@ class LinkPoses:
     """Poses of the links relative to the base origin, and the screws of their joints, in world axes.
 
     Attributes:
-        batch: batch shape, with B states in total.
+        batch: batch shape; B is the total number of states.
         R: `(3, 3, nq, B)` link axes.
         p: `(3, nq, B)` link origins [m].
         angular, linear: `(3, nq, B)` angular and linear parts of the joint screws s_j.
@@ -44,12 +44,12 @@ class LinkPoses:
 
     @property
     def rotation(self) -> Tensor:
-        """Link axes `(*batch, nq, 3, 3)`."""
+        """Orientations of the links `(*batch, nq, 3, 3)`."""
         return batch_first(self.R, self.batch).movedim(-1, -3)
 
     @property
     def position(self) -> Tensor:
-        """Link origins `(*batch, nq, 3)` [m]."""
+        """Origins of the links `(*batch, nq, 3)` [m]."""
         return batch_first(self.p, self.batch).mT
 
 
@@ -69,10 +69,10 @@ class LinkMotion:
 
 
 class PointMotion(NamedTuple):
-    """Motion of a point fixed in a frame of the robot, in world axes.
+    """Motion, in world axes, of a point fixed in a frame of the robot.
 
     Attributes:
-        rotation: `(*batch, 3, 3)` axes of the frame.
+        rotation: `(*batch, 3, 3)` orientation of the frame.
         position: `(*batch, 3)` position of the point [m].
         twist: `(*batch, 6)` [ω; ṗ] [rad/s], [m/s].
         jacobian: J `(*batch, 6, nq)` such that [ω; ṗ] = J q̇.
@@ -87,18 +87,18 @@ class PointMotion(NamedTuple):
 
     @classmethod
     def of(cls, blocks: Sequence[Tensor], qd: Tensor) -> PointMotion:
-        """Construct from the rotation, position, J and J̇ q̇ computed by a compiled kernel, and from q̇."""
+        """Construct the motion from q̇ and the rotation, position, J and J̇ q̇ given by a compiled kernel."""
         rotation, position, J, bias = blocks
         return cls(rotation, position, vecdot(J, qd[..., None, :]), J, bias)
 
 
 def skew(v: Vector3) -> Rotation:
-    """Return the matrix [v]× for which [v]× w = v × w."""
+    """Return the skew-symmetric matrix [v]×, which satisfies [v]× w = v × w."""
     return batchlast.skew(v.movedim(-1, 0)).movedim((0, 1), (-2, -1))
 
 
 def common_states(robot: RobotModel, **states: Tensor) -> tuple[Tensor, ...]:
-    """Check joint-space arguments and broadcast them to one batch shape; raise `ShapeError` on a mismatch."""
+    """Check joint-space arguments and broadcast their batch shapes; raise `ShapeError` on a mismatch."""
     robot.check_state(**states)
     if len({value.shape for value in states.values()}) == 1:
         return tuple(states.values())
@@ -116,7 +116,7 @@ def common_states(robot: RobotModel, **states: Tensor) -> tuple[Tensor, ...]:
 def _local_poses(robot: RobotModel, q: Tensor) -> Tensor:
     """Return the pose [R p] of each link relative to its parent, `(3, 4, nq, B)`, by Rodrigues' formula.
 
-    For the constant axis a, K = [a]× and the placement P, R = P a aᵀ + sin(q) P K + cos(q) (P − P a aᵀ).
+    R = P a aᵀ + sin(q) P K + cos(q) (P − P a aᵀ), with the constant axis a, K = [a]× and the placement P.
     """
     q, P, a = batch_last(q, 1), robot.placement_rotation, robot.axis[:, None, :]
     slide = (P * a).sum(-1)
@@ -136,7 +136,7 @@ def _local_poses(robot: RobotModel, q: Tensor) -> Tensor:
 
 
 def _chain(robot: RobotModel, levels: Sequence[Sequence[int]], q: JointVector) -> Tensor:
-    """Return R_parent [R p]_local of every link, `(3, 4, nq, B)`, computed level by level of the tree."""
+    """Return R_parent [R p]_local of every link, `(3, 4, nq, B)`, processing one tree level at a time."""
     local = _local_poses(robot, q)
     turned, parents = robot.base_rotation[..., None, None], [BASE]
     blocks, order = [], []
@@ -151,7 +151,7 @@ def _chain(robot: RobotModel, levels: Sequence[Sequence[int]], q: JointVector) -
 
 
 def link_poses(robot: RobotModel, q: JointVector) -> LinkPoses:
-    """Return the poses R_i = R_parent R_i^local of all links and the joint screws at q, in world axes.
+    """Return the poses R_i = R_parent R_i^local of all links, and the joint screws, at q in world axes.
 
     Raises:
         ShapeError: q has the wrong shape for the robot.
@@ -187,13 +187,13 @@ def _frame_in_base(robot: RobotModel, poses: LinkPoses, index: int) -> tuple[Ten
 
 
 def pose_of_frame(robot: RobotModel, poses: LinkPoses, index: int) -> tuple[Rotation, Vector3]:
-    """Return the axes `(*batch, 3, 3)` and position `(*batch, 3)` [m] of a frame relative to the base."""
+    """Return the rotation `(*batch, 3, 3)` and position `(*batch, 3)` [m] of a frame relative to the base."""
     rotation, position = _frame_in_base(robot, poses, index)
     return batch_first(rotation, poses.batch), batch_first(position, poses.batch)
 
 
 def as_point(robot: RobotModel, point: object) -> Vector3:
-    """Return a point `(3,)` given as a tuple or tensor, in the robot's precision and on its device."""
+    """Convert a point `(3,)`, given as a tuple or tensor, to the robot's precision and device."""
     return torch.as_tensor(point, dtype=robot.dtype, device=robot.device)
 
 
@@ -225,14 +225,14 @@ def point_position(robot: RobotModel, q: JointVector, frame: str, point: object 
 def point_jacobian(
     robot: RobotModel, q: JointVector, frame: str, point: object = (0.0, 0.0, 0.0)
 ) -> PointJacobian:
-    """Return J `(*batch, 3, nq)` with ṗ = J q̇ for a point fixed in a frame; see `frame_jacobian`."""
+    """Return J `(*batch, 3, nq)` of a point fixed in a frame, such that ṗ = J q̇ (see `frame_jacobian`)."""
     return frame_jacobian(robot, q, frame, point)[..., 3:, :]
 
 
 def frame_jacobian(
     robot: RobotModel, q: JointVector, frame: str, point: object = (0.0, 0.0, 0.0)
 ) -> FrameJacobian:
-    """Return J `(*batch, 6, nq)` with [ω; ṗ] = J q̇ for a frame and a point fixed in it, in world axes.
+    """Return J `(*batch, 6, nq)` of a point fixed in a frame, such that [ω; ṗ] = J q̇ in world axes.
 
     Raises:
         UnknownNameError: the frame does not exist.
@@ -264,14 +264,14 @@ def point_motion(
 
 
 def jacobian_of_poses(robot: RobotModel, poses: LinkPoses, index: int, point: Tensor) -> FrameJacobian:
-    """Return the same Jacobian as `frame_jacobian`, computed from known poses."""
+    """Return the Jacobian of `frame_jacobian`, computed from known poses."""
     rotation, origin = _frame_in_base(robot, poses, index)
     x = origin + batchlast.apply(rotation, point[:, None])
     return batch_first(_jacobian(robot, poses, index, x), poses.batch)
 
 
 def _jacobian(robot: RobotModel, poses: LinkPoses, index: int, x: Tensor) -> Tensor:
-    """Return J `(6, nq, B)` for the point at x `(3, B)` that is fixed in a frame."""
+    """Return J `(6, nq, B)` of a point at x `(3, B)` that is fixed in a frame."""
     linear = poses.linear + batchlast.cross(poses.angular, x[:, None])
     parent = robot.frame_parents[index]
     moving = torch.zeros_like(robot.revolute) if parent == BASE else robot.ancestors[parent]
@@ -281,12 +281,12 @@ def _jacobian(robot: RobotModel, poses: LinkPoses, index: int, x: Tensor) -> Ten
 def point_velocity(
     robot: RobotModel, q: JointVector, qd: JointVector, frame: str, point: object = (0.0, 0.0, 0.0)
 ) -> Vector3:
-    """Return the velocity ṗ = J q̇ `(*batch, 3)` [m/s] of a point fixed in a frame, in world axes."""
+    """Return the world velocity ṗ = J q̇ `(*batch, 3)` [m/s] of a point fixed in a frame."""
     return (point_jacobian(robot, q, frame, point) @ qd[..., None])[..., 0]
 
 
 def _bias(robot: RobotModel, poses: LinkPoses, motion: LinkMotion, index: int, x: Tensor) -> Tensor:
-    """Return [α; a + α × x + ω × (v + ω × x)] `(6, B)` for the point at x `(3, B)` fixed in a frame."""
+    """Return [α; a + α × x + ω × (v + ω × x)] `(6, B)` for a point at x `(3, B)` that is fixed in a frame."""
     parent = robot.frame_parents[index]
     if parent == BASE:
         return poses.p.new_zeros(6, poses.p.shape[-1])

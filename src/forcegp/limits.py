@@ -1,7 +1,7 @@
-"""Limits on the content of files, each checked before the corresponding work is done.
+"""Limits on the content of files, checked before the content is processed.
 
-They admit every robot, log and model known to us, and prevent a file of a few kilobytes from using more than
-about 1 GiB of memory or a few seconds of time.
+They admit every robot, log and model known to us, but prevent a file of a few kilobytes from using more than
+about 1 GiB of memory or a few seconds of computing time.
 """
 
 from __future__ import annotations
@@ -16,22 +16,22 @@ HEADER_DEPTH = 64
 TABLE_BYTES = 8 * GIB
 """Maximum size of a table in memory, in bytes of float64."""
 FREE_TABLE_BYTES = 128 * MIB
-"""Size of a table that is allowed for any file, since constant columns compress without limit."""
+"""Table size that is allowed for any file, since constant columns can be compressed without limit."""
 TABLE_EXPANSION = 64
-"""Maximum ratio of the size of a larger table to the size of its file."""
+"""Maximum ratio of table size to file size for larger tables."""
 COLUMNS = 4096
-"""Maximum number of columns of a log."""
+"""Maximum number of columns in a log."""
 JOINTS = 512
-"""Maximum number of joints of a log or of a saved robot."""
+"""Maximum number of joints in a log or a saved robot."""
 COLUMN_NAME = 1024
 """Maximum number of characters of a column name."""
 SEGMENT_NUMBER = 2**53
 """Largest trajectory number; float64 represents all integers up to this value."""
 
 LOG_VALUES = 1 << 28
-"""Maximum number of values read from an imported log, which take 2 GiB in float64."""
+"""Maximum number of values read from an imported log; they take up 2 GiB in float64."""
 FREE_ROWS = 100_000
-"""Number of resampled rows allowed for any log; beyond it, at most `TABLE_EXPANSION` per original row."""
+"""Number of resampled rows allowed for any log; beyond it, `TABLE_EXPANSION` per original row are allowed."""
 LOG_STREAMS = 1024
 """Maximum number of topics, groups, or arrays of different length in a log."""
 LOG_FILES = 20_000
@@ -43,9 +43,9 @@ LOG_NAME = 200
 MESSAGE_BYTES = MIB
 """Maximum size of a message in a bag; a joint state takes less than a kilobyte."""
 FREE_BAG_BYTES = 16 * MIB
-"""Unpacked size allowed for any bag; beyond it, at most `TABLE_EXPANSION` times the file size."""
+"""Unpacked size allowed for any bag; beyond it, `TABLE_EXPANSION` times the file size is allowed."""
 FREE_MESSAGES, MESSAGE_PACKED = 100_000, 2
-"""Number of messages allowed for any bag, and the minimum file size per message beyond it [bytes]."""
+"""Number of messages allowed for any bag, and minimum file size per message beyond that number [bytes]."""
 RECORD_BYTES = 256 * MIB
 """Maximum compressed size of a record in an MCAP file."""
 LISTING_BYTES = MIB

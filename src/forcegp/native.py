@@ -1,8 +1,8 @@
-"""Compilation of C++ source text to a shared library, with a cache on disk.
+"""Compilation of C++ source text to shared libraries, which are cached on disk.
 
-Compiled kernels are code, so they are stored in a folder to which only its owner can write, and are checked
-before they run. A kernel is named `<key>-<SHA-256 of the file>.so`. The key identifies the source; the digest
-verifies that the file is complete. The folder (0700) and files (0600) are private regardless of the umask.
+Compiled kernels are stored in a folder that only its owner can write to, and are checked before they run.
+Kernels are named `<key>-<SHA-256 of the file>.so`. The key identifies the source, and the digest verifies
+that the file is complete. The folder (0700) and its files (0600) are private regardless of the umask.
 """
 
 from __future__ import annotations
@@ -25,11 +25,11 @@ from forcegp.files import Temporary, atomic_file, discard, sweep
 FLAGS = ["-std=c++17", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-w", "-shared", "-fPIC"]
 LIBRARY = "kernel.so"
 PROC = Path("/proc/self/fd")
-"""Folder in which Linux lists the open files and folders by their descriptors."""
+"""Folder in which Linux lists open files and folders by descriptor."""
 
 
 def find_compiler() -> str:
-    """Return the path of `$CXX` or of a C++ compiler on the PATH; raise `MissingDependencyError` if none."""
+    """Return the path of a C++ compiler (`$CXX` or on the PATH), or raise `MissingDependencyError`."""
     wanted = [os.environ["CXX"]] if os.environ.get("CXX") else ["c++", "g++", "clang++"]
     for name in wanted:
         if path := shutil.which(name):
@@ -52,7 +52,7 @@ def _machine() -> str:
 
 
 def load_library(source: str, level: str = "-O2") -> ctypes.CDLL:
-    """Load the library of a C++ source, compiled unless cached; raise `MissingDependencyError` on failure."""
+    """Load a C++ library, compiling it unless it is cached; raise `MissingDependencyError` on failure."""
     compiler = find_compiler()
     try:
         version = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=False).stdout
@@ -61,7 +61,7 @@ def load_library(source: str, level: str = "-O2") -> ctypes.CDLL:
         raise MissingDependencyError(
             "the C++ compiler or its output folder cannot be used",
             got=str(cause),
-            hint="set CXX to a C++ compiler, and FORCEGP_CACHE to a folder that can be written",
+            hint="set CXX to a C++ compiler, and FORCEGP_CACHE to a writable folder",
         ) from cause
     key = hashlib.sha256("\0".join([source, version, _machine(), level, *FLAGS]).encode()).hexdigest()[:32]
     try:
@@ -77,12 +77,12 @@ def load_library(source: str, level: str = "-O2") -> ctypes.CDLL:
         raise MissingDependencyError(
             f"the kernel cannot be written to {place}",
             got=str(cause),
-            hint="set FORCEGP_CACHE to a folder that can be written",
+            hint="set FORCEGP_CACHE to a writable folder",
         ) from cause
 
 
 def _compiled(compiler: Sequence[str], source: str, folder: Path) -> bytes:
-    """Compile a shared library and return its content; remove files left by killed compilers."""
+    """Compile a shared library and return its content, after deleting files left by killed compilers."""
     target = folder / "build"
     sweep(target)
     build = Temporary(target, folder=True, mode=0o700)
@@ -94,7 +94,7 @@ def _compiled(compiler: Sequence[str], source: str, folder: Path) -> bytes:
 
 
 def _built(compiler: Sequence[str], source: str, folder: Path) -> bytes:
-    """Return the compiler output from a private folder, which is held open in case its path is replaced."""
+    """Compile in a private folder, held open in case its path is replaced, and return the output."""
     if not PROC.is_dir():  # this system cannot address a folder by its descriptor
         _run_compiler(compiler, source, folder)
         return (folder / LIBRARY).read_bytes()
@@ -130,7 +130,7 @@ def cache_directory() -> Path:
 
 
 def private_folder(folder: Path) -> Path:
-    """Return a folder private to its owner; raise `MissingDependencyError` if others can replace it."""
+    """Return a private folder; raise `MissingDependencyError` if other users can replace it."""
     folder.parent.mkdir(parents=True, exist_ok=True)
     with contextlib.suppress(FileExistsError):
         folder.mkdir(mode=0o700)
@@ -154,7 +154,7 @@ def _check_owner(folder: Path) -> None:
 
 
 def _is_alone_in(group: int) -> bool:
-    """Return whether a group contains only the user and root, as far as the system lists its members."""
+    """Return whether the group's members listed by the system are only the user and root."""
     import grp
     import pwd
 
@@ -176,7 +176,7 @@ def _untrusted(folder: Path, place: Path, got: str) -> MissingDependencyError:
 
 
 def find(folder: Path, key: str) -> Path | None:
-    """Return the kernel with a given key if it is complete and owned by this user; remove all others."""
+    """Return a trusted kernel with the given key, if any, and delete untrusted kernels with this key."""
     for path in sorted(folder.glob(f"{key}-*.so")):
         if _trusted(path):
             return path
@@ -201,7 +201,7 @@ def _trusted(path: Path) -> bool:
 
 
 def store(folder: Path, key: str, content: bytes) -> Path:
-    """Write a kernel and return its path; raise `OSError` if it cannot be written."""
+    """Write a kernel and return its path. Raise `OSError` if it cannot be written."""
     library = folder / f"{key}-{hashlib.sha256(content).hexdigest()}.so"
     with atomic_file(library, mode=0o600) as temporary:
         temporary.chmod(0o600)

@@ -1,4 +1,4 @@
-"""Output in notebooks: small HTML tables with escaped text, and the progress of a fit."""
+"""Notebook output: small HTML tables with escaped text, and progress bars for fits."""
 
 from __future__ import annotations
 
@@ -15,11 +15,11 @@ _FIRST = "text-align:left;padding:.15em .7em"
 def html_table(
     title: str, head: Sequence[str] = (), rows: Sequence[Sequence[object]] = (), notes: Sequence[str] = ()
 ) -> str:
-    """Return a titled table as HTML without scripts, with numbers to four significant digits.
+    """Return a titled table as HTML without scripts. Numbers have four significant digits.
 
     Args:
-        title, notes: lines above and below the table.
-        head: column names; the first column names the rows.
+        title, notes: text above and below the table.
+        head: column names; the first column contains the row names.
         rows: cells.
 
     Example:
@@ -47,7 +47,7 @@ def _row(cells: Sequence[str], tag: str) -> str:
 
 
 class FitBar:
-    """A progress bar for `fit(…, progress=FitBar())` in a notebook cell; it shows nothing elsewhere.
+    """A progress bar for `fit(…, progress=FitBar())` in a notebook cell; elsewhere, it displays nothing.
 
     Example:
         >>> bar = FitBar()
@@ -61,7 +61,7 @@ class FitBar:
         self._shown: Any = None
 
     def __call__(self, done: int, total: int, objective: float) -> None:
-        """Show the number of evaluations, out of at most `total`, and the objective."""
+        """Show the number of evaluations, which is at most `total`, and the objective."""
         self.done, self.total, self.objective = done, total, objective
         interactive = sys.modules.get("IPython")
         if interactive is None or interactive.get_ipython() is None:

@@ -1,7 +1,7 @@
 """Plots of data sets, predictions, models and rollouts over time, drawn with matplotlib.
 
-Panels share a time axis and contain curves, bands of ±2 standard deviations, and shading for contact.
-Segments are placed one after the other, with gaps between them.
+Panels share a time axis. They contain curves, bands of ±2 standard deviations, and shading during contact.
+Segments are plotted one after the other, with gaps between them.
 """
 
 from __future__ import annotations
@@ -45,7 +45,7 @@ CARTESIAN = {"multiplier": "N", "contact_force": "N", "c": "m", "cd": "m/s"}
 
 
 def unit(quantity: str, kinds: Sequence[str] = ()) -> str:
-    """Return the unit of a quantity in `SYMBOLS` without brackets, or "" for an unknown quantity.
+    """Return the unit of a quantity in `SYMBOLS`, without brackets; "" if the quantity is unknown.
 
     If the types of the plotted joints (`"revolute"` or `"prismatic"`) are not given, both units are returned.
 
@@ -72,7 +72,7 @@ def axis_label(quantity: str, kinds: Sequence[str] = (), symbol: str | None = No
 
 Array = NDArray[np.float64]
 GAP = 3.0
-"""Multiple of the median time step beyond which a step interrupts the curve."""
+"""Multiple of the median time step above which a step interrupts the curve."""
 
 
 @dataclass(frozen=True)
@@ -80,9 +80,9 @@ class Timeline:
     """Positions of samples on the time axis.
 
     Attributes:
-        x, order: `(n,)` increasing time [s], and the row at each position.
+        x, order: `(n,)` positions in increasing order [s], and the row of the sample at each position.
         breaks: positions before which a curve is interrupted.
-        ordered: whether the samples are a time series, drawn as a curve.
+        ordered: whether the samples form a time series, which is drawn as a curve.
         label: label of the axis.
     """
 
@@ -94,11 +94,11 @@ class Timeline:
 
     @classmethod
     def of(cls, t: Tensor, segment: Tensor | None = None, ordered: bool = True) -> Timeline:
-        """Place samples on the time axis; overlapping segments are placed one after the other.
+        """Place samples on the time axis. Overlapping segments are placed one after the other.
 
         Args:
             t: `(n,)` [s].
-            segment: `(n,)` trajectory number of each sample; by default, all samples form one trajectory.
+            segment: `(n,)` trajectory number of each sample; by default, there is one trajectory.
             ordered: whether the rows are in time order within each segment.
         """
         x, segments = as_array(t), np.zeros(len(t)) if segment is None else as_array(segment)
@@ -115,15 +115,15 @@ class Timeline:
         return cls(x, order, breaks, ordered, label)
 
     def place(self, values: Tensor) -> Array:
-        """Return the values `(n, …)` in the order of the axis."""
+        """Sort values `(n, …)` by their position on the axis."""
         return as_array(values)[self.order]
 
     def open(self, values: Array) -> Array:
-        """Return values `(n,)`, given in the order of the axis, with NaN inserted at interruptions."""
+        """Insert NaN at interruptions in values `(n,)` that are sorted by their position on the axis."""
         return np.insert(values, self.breaks, np.nan)
 
     def spans(self, closed: Tensor) -> list[tuple[float, float]]:
-        """Return the time intervals in which a flag `(n,)` is true, or none if samples are not in order."""
+        """Return the time intervals in which a flag `(n,)` is true; none if samples are not a time series."""
         flags = as_array(closed)[self.order] > 0
         if not self.ordered or not len(flags):
             return []
@@ -138,14 +138,14 @@ def as_array(values: Any) -> Array:
 
 
 Target = Axes | Iterable[Axes] | None
-"""Axes to draw on, one per panel, or `None` for a new figure."""
+"""Axes to draw on, one per panel; `None` creates a new figure."""
 WIDTH, ROW, MARGIN = 7.0, 1.25, 0.9
 """Width, height per panel, and margin of a new figure [inch]."""
 
 
 @dataclass(frozen=True)
 class Curve:
-    """Values over time `(n,)`, their standard deviation, drawn as a ±2σ band, and the line `width` [pt]."""
+    """Values over time `(n,)`, their standard deviation (drawn as a ±2σ band), and the line `width` [pt]."""
 
     values: Tensor
     label: str
@@ -166,9 +166,9 @@ class Panel:
 def draw_panels(
     panels: Sequence[Panel], time: Timeline, closed: Sequence[Tensor] = (), ax: Target = None
 ) -> list[Axes]:
-    """Draw panels from top to bottom on `ax`, by default a new figure, and return their axes.
+    """Draw panels from top to bottom on the axes `ax` (by default, in a new figure), and return their axes.
 
-    Intervals in which at least one contact is `closed` (flags `(n,)` for each contact) are shaded.
+    Shading marks intervals in which any contact is `closed` (given by flags `(n,)` for each contact).
 
     Raises:
         ParameterError: the number of axes is wrong.
@@ -224,7 +224,7 @@ def _draw(axes: Axes, curve: Curve, time: Timeline) -> None:
 
 
 def chosen(wanted: Sequence[str] | None, names: Sequence[str], kind: str) -> list[int]:
-    """Return the indices of the wanted names, by default all; raise `UnknownNameError` for unknown names."""
+    """Return the indices of the wanted names (all by default); raise `UnknownNameError` for unknown names."""
     for name in wanted or ():
         check_name(kind, name, names)
     return [list(names).index(name) for name in (names if wanted is None else wanted)]

@@ -1,4 +1,4 @@
-"""Checks of memory, with a warning or an error before a large allocation, and control of threads.
+"""Checks of the available memory before large allocations, and control of the number of threads.
 
 Operations on small tensors run on one thread, and SciPy uses as many threads as PyTorch.
 """
@@ -29,16 +29,16 @@ class MemoryNeedWarning(UserWarning):
 
 
 def free_memory() -> int | None:
-    """Return the memory available without swapping and within the container's limit [bytes], if known."""
+    """Return the memory available to this process without swapping [bytes]; `None` if unknown."""
     limits = [value for value in (_available(), _container_memory()) if value is not None]
     return min(limits) if limits else None
 
 
 def announce_memory(needed: int, what: str, *, certain: int | None = None) -> None:
-    """Warn if work needs over half of the free memory; raise `MemoryLimitError` if it needs more than all.
+    """Warn about high memory use, and raise `MemoryLimitError` if there is not enough free memory.
 
-    Call this before the allocation with an upper bound `needed` [bytes] and, if it is rough, a lower bound
-    `certain`. `what` is the subject of the message, such as "the covariance of 20,000 points".
+    Call this function before the allocation, with an upper bound `needed` [bytes] and, if that is rough, also
+    a lower bound `certain`. `what` is the subject of the message, such as "the covariance of 20,000 points".
     """
     free = free_memory()
     if free is None or needed <= LARGE * free:
@@ -69,7 +69,7 @@ def _available() -> int | None:
 
 
 def _container_memory() -> int | None:
-    """Return the memory available within the limit of the control group (version 2, then 1)."""
+    """Return the memory available within the limit of the control group (version 2, otherwise version 1)."""
     for most, used in (
         ("memory.max", "memory.current"),
         ("memory/memory.limit_in_bytes", "memory/memory.usage_in_bytes"),
@@ -83,10 +83,10 @@ def _container_memory() -> int | None:
 
 @contextmanager
 def one_thread() -> Iterator[None]:
-    """Run PyTorch on one thread within the block, in the calling thread only.
+    """Run PyTorch single-threaded within the block. Only calls from the current thread are affected.
 
-    For small matrices, threads cost more time than they save. OpenMP limits the calling thread only, whereas
-    `torch.set_num_threads` would permanently change the setting for all threads.
+    For small matrices, multithreading costs more time than it saves. OpenMP limits only the calling thread,
+    whereas `torch.set_num_threads` would permanently change the setting for all threads.
     """
     if torch.get_num_threads() == 1:
         yield
@@ -97,7 +97,7 @@ def one_thread() -> Iterator[None]:
 
 @contextmanager
 def threads_of_pytorch() -> Iterator[None]:
-    """Run SciPy's and NumPy's BLAS on as many threads as PyTorch within the block.
+    """Run the BLAS libraries of SciPy and NumPy on as many threads as PyTorch within the block.
 
     OpenBLAS starts one spinning thread per processor, which considerably slows down concurrent processes. Its
     setting applies to the whole process, so blocks in different threads take turns.
@@ -119,6 +119,6 @@ def _openblas() -> ThreadpoolController:
 
 @cache
 def _openmp() -> ThreadpoolController:
-    """Return the OpenMP libraries of the process, which are looked up once since this takes milliseconds."""
+    """Return the OpenMP libraries of the process, cached because the lookup takes milliseconds."""
     torch.get_num_threads()
     return ThreadpoolController().select(user_api="openmp")

@@ -1,4 +1,4 @@
-"""Stretches of rows in a log, and their description in messages."""
+"""Runs of consecutive rows in a log, and their description in messages."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ Intervals = tuple[tuple[int, int], ...]
 
 
 def runs(*keys: NDArray[Any]) -> list[slice]:
-    """Return the stretches of rows over which all keys are constant.
+    """Return the runs of consecutive rows over which all keys are constant.
 
     >>> runs(np.array([0, 0, 1, 1]), np.array([True, True, True, False]))
     [slice(0, 2, None), slice(2, 3, None), slice(3, 4, None)]
@@ -27,7 +27,7 @@ def runs(*keys: NDArray[Any]) -> list[slice]:
 
 
 def intervals(mask: NDArray[np.bool_], join: int = 0) -> Intervals:
-    """Return the runs of true rows, merging runs that are at most `join` rows apart.
+    """Return the intervals in which `mask` is true, merging those that are at most `join` rows apart.
 
     >>> intervals(np.array([True, True, False, True]))
     ((0, 2), (3, 4))
@@ -53,7 +53,7 @@ def numbered(rows: NDArray[np.int64]) -> Intervals:
 
 
 def describe(spans: Intervals, most: int = 3) -> str:
-    """Describe rows in words, such as `row 4` or `rows 4 to 9, 20 to 31 and 5 more`."""
+    """Describe rows in words, for example `row 4` or `rows 4 to 9, 20 to 31 and 5 more`."""
     texts = [f"{a}" if b - a == 1 else f"{a} to {b - 1}" for a, b in spans[:most]]
     many = len(spans) > 1 or any(b - a > 1 for a, b in spans)
     rest = f" and {len(spans) - most} more" if len(spans) > most else ""

@@ -1,4 +1,4 @@
-"""Fits of several models for several robots and seeds, run by the workers of a Dask cluster.
+"""Fits of several models to several robots with several seeds, run on a Dask cluster.
 
 Each fit is a task that writes a folder, so an interrupted sweep resumes with the missing fits.
 """
@@ -29,7 +29,7 @@ SCORE, MODEL = "score.json", "model"
 
 @dataclass(frozen=True)
 class SweptFit:
-    """A fit in a sweep, defined by a scene with its simulated motion, a model, and a seed.
+    """A fit in a sweep, defined by a scene with a simulated motion, a model, and a seed.
 
     `duration` is the simulated time [s]; if it is `None`, the duration in the scene is used.
     """
@@ -41,14 +41,14 @@ class SweptFit:
 
     @property
     def name(self) -> str:
-        """Folder of the fit."""
+        """Name of the folder for the fit."""
         return f"{Path(self.scene).stem}/{self.model}/seed-{self.seed}"
 
 
 def fits_of(
     scenes: Sequence[str], models: Sequence[str], seeds: Sequence[int], duration: float | None = None
 ) -> list[SweptFit]:
-    """Return all fits of the given models, robots and seeds.
+    """Return one fit for each combination of the given models, robots and seeds.
 
     Example:
         >>> [fit.name for fit in fits_of(["kuka_plane"], ["sgp-mean", "gp"], [0])]
@@ -58,7 +58,7 @@ def fits_of(
 
 
 def run_fit(fit: SweptFit, out: str) -> dict[str, Any]:
-    """Simulate, fit and score on one thread of a worker, or return the scores of an earlier run."""
+    """Run a fit on one thread and return its scores, or return the scores saved by an earlier run."""
     folder = Path(out) / fit.name
     if (folder / SCORE).is_file():
         return json.loads((folder / SCORE).read_text(encoding="utf-8"))
@@ -93,14 +93,14 @@ def sweep(
     address: str | None = None,
     say: Callable[[int, dict[str, Any]], None] = lambda _, __: None,
 ) -> list[dict[str, Any]]:
-    """Run fits on a Dask cluster, either a new one on this machine or a running one.
+    """Run fits on a Dask cluster, either a new one on this machine or an existing one.
 
     Args:
         fits: the fits to run.
         out: folder for the fits, accessible to all workers.
         processes: number of single-threaded workers on this machine.
         address: address of the scheduler of a running cluster, such as `tcp://host:8786`.
-        say: called with the number of finished fits and the score of the last one.
+        say: function called with the number of finished fits and the score of the last one.
 
     Returns:
         The scores in the order of the fits.

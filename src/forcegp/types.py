@@ -1,6 +1,6 @@
-"""Shape aliases, in which every batched quantity has its batch dimensions first, `(*batch, …)`.
+"""Shape aliases for tensors; the batch dimensions come first, `(*batch, …)`.
 
-The batch dimensions of joint vectors broadcast against each other (`*#batch`). The sizes are `nq` joints,
+The batch dimensions of joint vectors are broadcast against each other (`*#batch`). The sizes are `nq` joints,
 `nf` frames, `m` constraint rows, `n` samples and `d` components. The aliases document shapes in signatures,
 and the test suite enforces them at run time.
 """
@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float
 from torch import Tensor
 
 Array = Any
-"""A NumPy array, the shape of which is given in the docstring."""
+"""A NumPy array; its shape is given in the docstring."""
 Scalars = Float[Tensor, "*batch"]
 Vector3 = Float[Tensor, "*batch 3"]
 Rotation = Float[Tensor, "*batch 3 3"]

@@ -10,8 +10,8 @@ import torch
 
 import forcegp
 from forcegp.checks import Log, check, log_of
-from forcegp.checks.explain import _possible, with_alternatives
-from forcegp.checks.finding import Finding
+from forcegp.checks.explain import _possible
+from forcegp.checks.finding import Finding, with_alternatives
 from forcegp.checks.fit import cross_validate
 from forcegp.checks.hypotheses import Hypothesis, problem_of, unchanged
 from forcegp.scene import load_scene

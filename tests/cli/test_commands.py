@@ -6,6 +6,7 @@ import json
 import subprocess
 import sys
 from collections.abc import Callable
+from itertools import pairwise
 from pathlib import Path
 
 import pytest
@@ -55,6 +56,20 @@ def log(tmp_path: Path) -> Path:
 def test_help_has_examples(command: str) -> None:
     text = run(command, "--help")
     assert "Examples" in text and f"forcegp {command}" in text
+
+
+@pytest.mark.parametrize("command", ["check", "excite", "export", "sweep", "view", *COMMANDS])
+def test_help_fills_the_lines_of_a_narrow_terminal(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "80")
+    prose = run(command, "--help").partition("\u256d")[0].splitlines()
+    for line, following in pairwise(prose):
+        first = following.split()[0] if line.strip() and following.strip() else " " * 80
+        assert len(line.rstrip()) + 1 + len(first) > 79, line
+
+
+def test_help_keeps_brackets(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("COLUMNS", "200")
+    assert "predicted_<quantity> and" in run("predict", "--help") and "[m]" in run("excite", "--help")
 
 
 def test_version() -> None:

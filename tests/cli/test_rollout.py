@@ -30,7 +30,9 @@ def test_a_contact_that_the_log_changes_is_said() -> None:
     closed[:10] = False
     (name,) = log.contact
     log = log.replace(contact={name: closed})
-    with pytest.warns(UserWarning, match=rf"holds {name!r} open, .* the log changes it after .*--unilateral"):
+    with pytest.warns(
+        UserWarning, match=rf"keeps {name!r} open, .* but it changes in the log after .*--unilateral"
+    ):
         _say_contact(log, unilateral=False)
     _say_contact(log, unilateral=True)
     _say_contact(log[10:], unilateral=False)

@@ -190,7 +190,7 @@ def test_what_cannot_be_compiled_is_refused() -> None:
     q = torch.zeros(4, robot.nq, dtype=torch.float64)
     with pytest.raises(ShapeError, match=r"takes 1 arguments(.|\n)*expected: q"):
         compiled(q, q)
-    with pytest.raises(ShapeError, match="q does not fit"):
+    with pytest.raises(ShapeError, match="q has the wrong shape"):
         compiled(q[:, :2])
 
 

@@ -102,7 +102,7 @@ def test_what_cannot_be_a_ball_is_refused() -> None:
     (contact,) = CONSTRAINTS["rounded"]
     with pytest.raises(ParameterError, match="the tip of contact 'round' has an invalid radius"):
         dataclasses.replace(contact, radius=-0.1)
-    with pytest.raises(ParameterError, match="ImplicitSurface cannot be raised"):
+    with pytest.raises(ParameterError, match="ImplicitSurface cannot be offset"):
         SurfaceContact("hill", "tool", (0.0, 0.0, 0.1), ImplicitSurface(lambda p: p[2]), radius=0.1)
     SurfaceContact("hill", "tool", (0.0, 0.0, 0.1), ImplicitSurface(lambda p: p[2])).check(chain(0))
 

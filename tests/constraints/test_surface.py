@@ -108,7 +108,7 @@ def test_an_implicit_surface_need_not_be_a_distance() -> None:
         (lambda: Plane((0.0, 0.0, 0.0)), r"the plane's normal has no direction\n  expected: three finite"),
         (lambda: Plane((0.0, 1.0)), "the plane's normal has no direction"),
         (lambda: Plane((0.0, 0.0, float("nan"))), "the plane's normal has no direction"),
-        (lambda: Plane((0.0, 0.0, 1.0), float("inf")), "the plane's offset is not a distance"),
+        (lambda: Plane((0.0, 0.0, 1.0), float("inf")), "the plane's offset is not a valid distance"),
         (lambda: Sphere((0.0, 0.0, 0.0), 0.0), r"the sphere's radius is not a valid length\n.*positive"),
         (lambda: Sphere((0.0, 0.0), 1.0), "the sphere's center is not a point"),
         (lambda: Cylinder((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), 1.0), "the cylinder's axis has no direction"),

@@ -123,7 +123,7 @@ def test_the_summary_is_short_and_true() -> None:
     assert f"contact table ({closed:.0%} closed)" in text and text.endswith("; float64 on cpu>")
     assert all(name in text for name in (*log.extras, *log.contact_extras))
     assert len(text) < 250 and "tensor" not in text
-    assert "2 samples of" in repr(log[[4, 1]]) and "not in order of time" in repr(log[[4, 1]])
+    assert "2 samples of" in repr(log[[4, 1]]) and "not in time order" in repr(log[[4, 1]])
     assert repr(log[:0]).startswith("<Dataset of 'arm': 0 samples")
     assert repr(log.replace(header=DataHeader())).startswith(f"<Dataset: {len(log)} samples")
 

@@ -55,7 +55,7 @@ def test_uneven_time_and_short_segments_are_refused() -> None:
     t = np.arange(50) * DT
     t[30:] += 0.5 * DT
     zero = np.zeros(50, dtype=np.int64)
-    with pytest.raises(DataError, match=r"uneven in row 30(?s:.*)0.00625 s(?s:.*)segment"):
+    with pytest.raises(DataError, match=r"uneven at row 30(?s:.*)0.00625 s(?s:.*)segment"):
         differentiate(t, np.zeros((50, 1)), zero, SavitzkyGolay(), 1)
     with pytest.raises(DataError, match=r"rows 0 to 4 is too short(?s:.*)at least 11"):
         differentiate(t[:5], np.zeros((5, 1)), zero[:5], SavitzkyGolay(), 1)

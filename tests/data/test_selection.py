@@ -119,7 +119,7 @@ def test_splits_that_leave_nothing(options: dict[str, float]) -> None:
 
 def test_a_selection_cannot_be_cut_into_stretches() -> None:
     log = random_log(480)
-    with pytest.raises(DataError, match="in order of time"):
+    with pytest.raises(DataError, match="in time order"):
         split_by_stretches(log[[5, 3, 1]], 1)
 
 

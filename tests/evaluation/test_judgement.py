@@ -38,7 +38,7 @@ def heavy(factor: float) -> forcegp.RobotModel:
 
 def test_the_right_robot_explains_all_the_torque_and_the_motion() -> None:
     found = evaluate(forcegp.AnalyticalModel(FREE).nominal(), swinging())
-    assert found.verdict.startswith("The model explains 100 % of the torque beyond gravity")
+    assert found.verdict.startswith("The model explains 100 % of the non-gravitational torque")
     assert found.motion is not None and max(x or 0.0 for x in found.motion.model) < 0.05
     assert found.response == pytest.approx((1.0, 1.0), abs=1e-9) and found.doubts == () and not found.poor
 
@@ -74,7 +74,7 @@ def test_a_model_that_has_learned_the_controller_is_named() -> None:
     assert weak == any("learned the controller" in doubt for doubt in found.doubts)
     assert found.predictors[0].explained == () and "explains" not in found.verdict
     cancelled = replace(found, response=(0.02, 0.97))
-    assert "shoulder 0.02 of 1" in cancelled.doubts[-1] and "elbow" not in cancelled.doubts[-1]
+    assert "(expected: 1): shoulder 0.02." in cancelled.doubts[-1] and "elbow" not in cancelled.doubts[-1]
 
 
 def test_a_joint_that_bears_next_to_nothing_does_not_count() -> None:
@@ -93,7 +93,7 @@ def test_the_force_in_contact_is_in_the_verdict() -> None:
     (score,) = evaluate(model, logged).multipliers
     assert score.bias == pytest.approx(-1.0)
     assert evaluate(model, logged).verdict.endswith(
-        f"the force at 'table' is off by 1 N of {score.level:.3g} N."
+        f"the force at 'table' is off by 1 N (mean force {score.level:.3g} N)."
     )
     point = kinematics.point_position(system.robot, data.q, contact.frame, tuple(contact.point))
     F = (force + 2.0)[:, None] * contact.surface.gradient(point)

@@ -79,6 +79,13 @@ def test_identified_links_are_physical_even_from_few_samples() -> None:
     assert bool((found.mass > 0.0).all()) and bool((torch.linalg.eigvalsh(M) > 0.0).all())
 
 
+@pytest.mark.filterwarnings("error::RuntimeWarning")
+@pytest.mark.parametrize(("n", "seed", "constrained"), [(21, 5, True), (30, 3, False)])
+def test_rejected_steps_emit_no_warning(n: int, seed: int, constrained: bool) -> None:
+    found = identify_rigid(system if constrained else free, wrong_log(n, seed, constrained))
+    assert bool(found.friction.isfinite().all())
+
+
 def test_what_the_motion_does_not_excite_stays_as_in_the_file() -> None:
     data = wrong_log(60, 6, constrained=False)
     still = data.replace(q=0.0 * data.q, qd=0.0 * data.qd, qdd=0.0 * data.qdd, tau=0.0 * data.tau)

@@ -125,5 +125,5 @@ def test_a_cause_of_two_joints_is_found_and_predicted_better() -> None:
 
 
 def test_a_force_without_a_cause() -> None:
-    with pytest.raises(ModelError, match="needs a cause"):
+    with pytest.raises(ModelError, match="needs at least one cause"):
         forcegp.CoregionalPrior(causes=0)

@@ -123,7 +123,7 @@ def test_draws_have_its_covariance() -> None:
 
 
 def test_sparse_inference_refuses_it() -> None:
-    with pytest.raises(ModelError, match="samples to be independent"):
+    with pytest.raises(ModelError, match="assumes independent samples"):
         model([DisturbancePrior()], inference="sparse").fit(two_runs(), learn=[])
 
 

@@ -82,7 +82,7 @@ def test_a_saved_fit_keeps_unknown_forces(tmp_path: Path) -> None:
 
 
 def test_forces_that_cannot_be_are_refused() -> None:
-    with pytest.raises(ModelError, match="'knee' has no such size"):
+    with pytest.raises(ModelError, match="'knee' has an invalid standard deviation"):
         forcegp.Noise(external={"knee": 0.0})
     system, data, _ = pushed(20, 4)
     with pytest.raises(UnknownNameError, match="joint with an unknown force"):

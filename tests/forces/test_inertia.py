@@ -142,7 +142,7 @@ def test_links_that_the_file_describes_wrongly_are_identified(file: RobotModel) 
     truth = file.replace(mass=1.3 * file.mass, com=0.9 * file.com)
     data = log(truth)
     result = found(file, data)
-    assert result.identified and "inertial parameters" in result.doubts[0]
+    assert result.identified and "identified inertia" in result.doubts[0]
     assert inertia_error(result.robot, truth, data) < 0.25 * inertia_error(file, truth, data)
     system = forcegp.ConstrainedSystem(file)
     model = forcegp.StructuredGP(system, "analytical")

@@ -133,7 +133,7 @@ def test_a_tangent_frame_is_orthonormal_and_turns_smoothly() -> None:
         ({"terms": ("dry", "dry")}, ModelError, "has a duplicate friction term"),
         ({"terms": ()}, ModelError, "has no inputs"),
         ({"friction_coefficient": -0.1}, ModelError, "an invalid friction coefficient"),
-        ({"stribeck_speed": 0.0}, ModelError, "no such Stribeck speed"),
+        ({"stribeck_speed": 0.0}, ModelError, "invalid Stribeck speed"),
     ],
 )
 def test_friction_that_makes_no_sense_is_refused(

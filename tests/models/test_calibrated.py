@@ -1,5 +1,6 @@
 """What a fit found as figures of a robot file, beside the robot that made the log."""
 
+import dataclasses
 import json
 from pathlib import Path
 from typing import Any
@@ -83,6 +84,9 @@ def test_friction_and_inertia_are_those_of_the_robot(fit: StructuredFit) -> None
     torch.testing.assert_close(ratio, torch.full_like(ratio, 1.2), rtol=0.03, atol=0.0)
     assert float(found.left.max()) < 0.05 * max(DRY)
     assert len(found.losses) == 2 and "constant force" in found.losses[0]
+    exact = dataclasses.replace(found, offset=torch.full_like(found.offset, 3e-16))
+    assert exact.losses[0].endswith("constant force of 0 (N m or N)")
+    assert dataclasses.replace(exact, left=torch.full_like(found.left, 1e-16)).losses == ()
 
 
 def test_samples_are_consistent_and_around_the_estimate(fit: StructuredFit) -> None:
@@ -200,7 +204,7 @@ def test_the_command_writes_the_file_a_report_and_samples(fit: StructuredFit, tm
     )
     for arguments, message in (
         (["--to", "urdf"], "no robot file was given"),
-        (["--to", "mjcf", "--robot", "double_pendulum"], "has another format"),
+        (["--to", "mjcf", "--robot", "double_pendulum"], "has a different format"),
         (["--to", "sdf"], "format to export to"),
     ):
         failed = runner.invoke(app, [*base, *arguments, "-o", str(tmp_path / "none.urdf")])

@@ -163,7 +163,7 @@ def test_options_of_the_caller_override_the_table(made) -> None:
         ("noise = { torque = -1.0 }", r"model\.toml:2: model\.noise\.torque"),
         (
             'name = "gp"\nnoise = { torque = 1.0 }',
-            r"model\.toml:1: model: (.|\n)*noise of accelerations only",
+            r"model\.toml:1: model: (.|\n)*only white acceleration noise",
         ),
         ('mean = ["gravty"]', r"model\.toml:2: model\.mean: (.|\n)*did you mean 'gravity'"),
         (

@@ -568,7 +568,7 @@ def test_what_else_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         fit.export(tmp_path / "c", language="fortran")
     with pytest.raises(ParameterError, match="'My arm' cannot be the prefix"):
         fit.export(tmp_path / "c", name="My arm")
-    with pytest.raises(ModelError, match="one function at least"):
+    with pytest.raises(ModelError, match="at least one function"):
         fit.compiled(functions=0)
     (tmp_path / "mine").mkdir()
     (tmp_path / "mine" / "main.c").write_text("")
@@ -649,7 +649,7 @@ def test_a_contact_that_jams_is_an_error_in_both() -> None:
     object.__setattr__(process, "priors", (process.priors[0], jammed))
     state, _ = states(fit)
     for predictor in (fit, fit.compiled()):
-        with pytest.raises(ModelError, match=r"jams|press harder"):
+        with pytest.raises(ModelError, match="jams"):
             predictor.predict(*state)
 
 

@@ -76,7 +76,7 @@ def test_samples_are_learned_as_by_the_fit(name: str) -> None:
     assert differs(fast, slow, fit) < SAME
     assert differs(fast, fit, fit) > 1e3 * SAME, "the samples changed nothing"
     assert differs(compiled(name), fit, fit) < SAME, "the fit itself was changed"
-    with pytest.raises(ModelError, match="no force field in PyTorch"):
+    with pytest.raises(ModelError, match="not part of the force field in PyTorch"):
         fast.force_field()
 
 

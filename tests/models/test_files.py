@@ -109,7 +109,7 @@ def test_truncated_files_are_refused(saved: Callable[[str], Path], tmp_path: Pat
     [
         ("gp", "version", 99, "version 99"),
         ("gp", "version", 2, r"expected: version 3\s+got: version 2"),
-        ("gp", "format", "pickle", "another format"),
+        ("gp", "format", "pickle", "a different format"),
         ("gp", "kind", "oracle", "kind of models.*'oracle'"),
         ("gp", "settings.noise_std", "loud", "'settings.noise_std"),
         ("gp", "settings.noise_std", [0.1, -1.0], "'settings.noise_std"),

@@ -125,11 +125,11 @@ def test_batches_of_any_shape_and_chunks_agree(
 
 
 def test_wrong_use_is_refused(model: IndependentFit) -> None:
-    with pytest.raises(ModelError, match="white noise of accelerations only"):
+    with pytest.raises(ModelError, match="only white acceleration noise"):
         IndependentGP(system, noise=Noise(0.1, torque="learn"))
-    with pytest.raises(ModelError, match="predicts accelerations only"):
+    with pytest.raises(ModelError, match="predicts only accelerations"):
         model.predict(test.q, test.qd, test.tau, "multiplier")
-    with pytest.raises(ShapeError, match="qd does not fit"):
+    with pytest.raises(ShapeError, match="qd has the wrong shape"):
         model.predict(test.q, test.qd[:, :6], test.tau)
     with pytest.raises(ModelError, match="must be positive"):
         IndependentGP(system, noise=0.0).fit(data)

@@ -109,7 +109,7 @@ def test_held_out_samples_are_not_trained_on() -> None:
 def test_wrong_use_is_refused(model: NetworkFit) -> None:
     with pytest.raises(ModelError, match="at least one unit"):
         NeuralNetwork(system, (80, 0))
-    with pytest.raises(ModelError, match="predicts accelerations only"):
+    with pytest.raises(ModelError, match="predicts only accelerations"):
         model.predict(test.q, test.qd, test.tau, "joint_force")
     with pytest.raises(ModelError, match="too few samples"):
         NeuralNetwork(system).fit(data[:1])

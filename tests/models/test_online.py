@@ -59,7 +59,7 @@ def test_what_cannot_be_updated() -> None:
     sparse = model().fit(data, learn=[])
     with pytest.raises(ModelError, match="invalid forgetting factor"):
         sparse.forget(0.0)
-    with pytest.raises(ModelError, match="contains other quantities"):
+    with pytest.raises(ModelError, match="contains quantities that"):
         sparse.update([forcegp.Observation(data[:2], "multiplier", 1.0)])
 
 

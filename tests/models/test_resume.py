@@ -92,7 +92,7 @@ def test_a_checkpoint_of_other_data_is_refused(case: tuple[Callable[[], Any], An
     make, options = case
     file = tmp_path / "fit.ckpt"
     make().fit(DATA, options=options, checkpoint=file)
-    with pytest.raises(ModelError, match="belongs to another fit"):
+    with pytest.raises(ModelError, match="belongs to a different fit"):
         make().fit(random_data(table_system(), 30, seed=9), options=options, checkpoint=file)
 
 
@@ -103,7 +103,7 @@ def test_a_checkpoint_of_other_data_is_refused(case: tuple[Callable[[], Any], An
 def test_a_checkpoint_of_another_objective_is_refused(other: dict[str, Any], tmp_path: Path) -> None:
     file, options = tmp_path / "fit.ckpt", forcegp.LearningOptions(max_evaluations=3)
     forcegp.StructuredGP(table_system(), "zero", noise=0.1).fit(DATA, options=options, checkpoint=file)
-    with pytest.raises(ModelError, match="belongs to another fit"):
+    with pytest.raises(ModelError, match="belongs to a different fit"):
         forcegp.StructuredGP(table_system(), "zero", **{"noise": 0.1, **other}).fit(
             DATA, options=options, checkpoint=file
         )
@@ -114,7 +114,7 @@ def test_a_checkpoint_of_another_objective_is_refused(other: dict[str, Any], tmp
     [
         ("weights.0.weight", float("nan"), "contains an implausible value"),
         ("history", float("inf"), "contains an implausible value"),
-        ("exp_avg.0.weight", None, "belongs to another fit"),
+        ("exp_avg.0.weight", None, "belongs to a different fit"),
         ("generator", 7, "damaged"),
     ],
 )

@@ -117,7 +117,7 @@ def test_a_checkpoint_of_another_log(files: StreamedDataset, tmp_path: Path) -> 
     file = tmp_path / "checkpoint"
     model().fit(files, learn=[], checkpoint=file)
     data[5:].write(files.paths[1])
-    with pytest.raises(ModelError, match="belongs to another fit"):
+    with pytest.raises(ModelError, match="belongs to a different fit"):
         model().fit(StreamedDataset(files.paths), learn=[], checkpoint=file)
     beside(file).write_bytes(b"cut off")
     with pytest.raises(ModelError, match="damaged"):

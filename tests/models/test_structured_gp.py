@@ -425,7 +425,7 @@ REFUSED: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
     "after another model": (
         lambda: StructuredGP(table, "zero", [both[0]]).fit(data, after=fitted(force_priors=[both[1]])),
         ModelError,
-        r"fit of another model[\s\S]*expected: priors joint[\s\S]*got: priors contact_table",
+        r"fit of a different model[\s\S]*expected: priors joint[\s\S]*got: priors contact_table",
     ),
 }
 
@@ -441,7 +441,7 @@ def test_what_does_not_fit_is_refused(
 @pytest.mark.usefixtures("unchecked")
 def test_states_that_do_not_fit_are_refused(model: StructuredFit) -> None:
     q, qd, tau = data.q, data.qd, data.tau
-    with pytest.raises(ShapeError, match=r"q does not fit robot 'kuka_iiwa'[\s\S]*got: \(20, 6\)"):
+    with pytest.raises(ShapeError, match=r"q has the wrong shape for robot 'kuka_iiwa'[\s\S]*got: \(20, 6\)"):
         model.predict(q[:, :6], qd, tau)
     with pytest.raises(ShapeError, match=r"q, qd and tau do not broadcast[\s\S]*'qd': \(3, 7\)"):
         model.predict(q, qd[:3], tau)
@@ -491,7 +491,7 @@ def test_a_checkpoint_of_another_fit_is_refused(tmp_path: Path) -> None:
     path = tmp_path / "fit.safetensors"
     start = {"joint.log_std": torch.zeros(7, dtype=torch.float64)}
     Evaluations(Checkpoint(path, "another")).recorded(lambda tensors: tensors["joint.log_std"].sum())(start)
-    with pytest.raises(ModelError, match="belongs to another fit"):
+    with pytest.raises(ModelError, match="belongs to a different fit"):
         forcegp.StructuredGP(two_contacts(), "zero").fit(logged(two_contacts(), 5), checkpoint=path)
     path.write_bytes(b"not a checkpoint")
     with pytest.raises(ModelError, match="damaged"):

@@ -161,7 +161,7 @@ def test_refusals_leave_no_file(tmp_path: Path) -> None:
         write_robot(outer.replace(damping=outer.damping + 1.0), tmp_path / "outer.xml", out)
     path.write_text(CLASSES.replace('angle="radian"', 'angle="radian" boundmass="0.15"'))
     bounded = forcegp.load_robot(path)
-    with pytest.raises(RobotFileError, match="would not give joint 'c' its mass"):
+    with pytest.raises(RobotFileError, match="this would change the mass of joint 'c'"):
         write_robot(bounded.replace(mass=0.5 * bounded.mass), path, out)
     assert not out.exists()
 

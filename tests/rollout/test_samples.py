@@ -138,7 +138,7 @@ def test_a_model_of_accelerations_stays_on_its_own_system(name: str) -> None:
     data, model = log(), create(name, arm(Baumgarte()), noise=0.1)
     model = model.fit(data[torch.arange(0, 288, 24)])
     free = ConstrainedSystem(model.system.robot)
-    with pytest.raises(ModelError, match="predicts accelerations of the system that it was fitted on"):
+    with pytest.raises(ModelError, match="predicts accelerations only for the system to which it was fitted"):
         model.rollout(data.q[0], data.qd[0], data, 0.02, system=free)
     softer = dataclasses.replace(model.system, baumgarte=None)
     assert torch.isfinite(model.rollout(data.q[0], data.qd[0], data, 0.02, system=softer).q).all()

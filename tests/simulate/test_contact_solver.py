@@ -148,7 +148,7 @@ def test_what_the_solver_cannot_do_is_named() -> None:
     bumpy = SurfaceContact("bump", "tool", (0.0, 0.0, 0.1), ImplicitSurface(lambda p: p[2] - 0.05))
     with pytest.raises(ForceGPError, match="no geometry for the surface of 'bump'"):
         simulate(ConstrainedSystem(SYSTEM.robot, [bumpy]), config)
-    with pytest.raises(ForceGPError, match=r"joint_friction does not fit(.|\n)*6 numbers"):
+    with pytest.raises(ForceGPError, match=r"joint_friction has the wrong length(.|\n)*6 numbers"):
         simulate(SYSTEM, replace(config, solver=ContactSolver(joint_friction=(1.0, 2.0))))
 
 

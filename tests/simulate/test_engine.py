@@ -11,9 +11,9 @@ import torch
 
 import forcegp
 from forcegp import ConstrainedSystem, Plane, SurfaceContact, dynamics
-from forcegp.errors import UnknownNameError, UnsupportedRobotError
+from forcegp.errors import InertiaError, UnknownNameError, UnsupportedRobotError
 from forcegp.robot.model import RobotModel
-from forcegp.simulate import Engine, check_engine, make_engine
+from forcegp.simulate import Engine, SimulationConfig, check_engine, make_engine, simulate
 from forcegp.simulate.engines import MAKERS as ENGINES
 from forcegp.simulate.urdf import write_urdf
 from robots import ARMS
@@ -112,6 +112,17 @@ def test_drive_inertia_is_mujocos_alone() -> None:
     pytest.importorskip("pybullet")
     with pytest.raises(UnsupportedRobotError, match="lbr_iiwa_joint_1"):
         make_engine(geared, DT, "pybullet")
+
+
+def test_impossible_inertia_is_an_error_that_names_the_link() -> None:
+    robot = forcegp.load_robot("kuka_iiwa")
+    inertia = robot.inertia.clone()
+    inertia[2] = torch.diag(torch.tensor([0.1, 0.1, 0.3], dtype=torch.float64))  # 0.1 + 0.1 < 0.3
+    system = ConstrainedSystem(robot.replace(inertia=inertia))
+    for contact in ("rigid", "solver"):
+        config = SimulationConfig(duration=0.1, engine="mujoco", contact=contact)
+        with pytest.raises(InertiaError, match=f"link_of_{robot.joint_names[2]}.*\n.*<inertial>"):
+            simulate(system, config)
 
 
 def test_an_unknown_engine_is_named() -> None:

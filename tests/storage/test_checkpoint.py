@@ -130,13 +130,13 @@ def test_other_shapes_types_and_keys_are_refused(fresh: Callable[[], Evaluations
         *([{"gradients": torch.zeros(2, 4, dtype=torch.complex64)}] if writable(torch.complex64) else []),
     ):
         written(saved, **wrong)
-        with pytest.raises(ModelError, match="belongs to another fit"):
+        with pytest.raises(ModelError, match="belongs to a different fit"):
             saved.read(START)
     written(saved, positions=torch.zeros(3, 4, dtype=torch.float64))
-    with pytest.raises(ModelError, match="another length"):
+    with pytest.raises(ModelError, match="their number differs"):
         saved.read(START)
     written(saved, key="other")
-    with pytest.raises(ModelError, match="belongs to another fit"):
+    with pytest.raises(ModelError, match="belongs to a different fit"):
         saved.read(START)
 
 
@@ -191,7 +191,7 @@ def test_a_checkpoint_of_another_robot_or_surface_is_refused(fresh: Callable[[],
             data, options=options, progress=interrupt(2), checkpoint=path
         )
     for other in (system(offset=0.06), system(mass=1.01)):
-        with pytest.raises(ModelError, match="belongs to another fit"):
+        with pytest.raises(ModelError, match="belongs to a different fit"):
             forcegp.StructuredGP(other, "zero", noise=0.1).fit(data, options=options, checkpoint=path)
 
 

@@ -1,4 +1,4 @@
-"""Checks of a log against a scene before a model is fitted: all checks in order, and their report."""
+"""Checks that compare a log with a scene before a model is fitted, and the report of all checks."""
 
 from __future__ import annotations
 
@@ -20,11 +20,18 @@ from forcegp.resources import announce_memory
 __all__ = ["KINDS", "Finding", "Log", "Report", "check", "clipped_torques", "log_of", "read_log"]
 
 NUMBERS = 24
-"""Upper bound on the count of numbers held in memory per joint and row; about twenty were measured."""
+"""Upper bound on the number of values held in memory per joint and row. About twenty were measured."""
 OF_CONTACTS = frozenset({"contact", "contact force"})
-"""Checks of contacts, which are skipped if there are no contacts."""
+"""Names of the checks that are skipped if there are no contacts."""
 OF_TIME = frozenset({"order of time", "held rows", "gaps", "jitter", "sampling period", "standing channels"})
-"""Checks that require rows in time order."""
+"""Names of the checks that require the rows to be in time order."""
+IMPORTED = {
+    "doubt": "import-doubt",
+    "faster than its source": "rows-held",
+    "gap": "time-gap",
+    "jitter": "time-jitter",
+}
+"""Kinds of findings made during import that are reported as a finding other than `import-found`."""
 Check = Callable[[ConstrainedSystem, Log], Outcome]
 Progress = Callable[[int, int], None]
 
@@ -39,11 +46,14 @@ def check_robot(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_import(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Return the findings made during import, except those on contacts, which are checked separately."""
-    doubts = [text for kind, text in log.header.imported if kind == "doubt"]
-    others = [text for kind, text in log.header.imported if kind not in ("doubt", "contact")]
-    pairs = ("import-doubt", doubts), ("import-found", others)
-    return [log.finding(kind, "; ".join(texts)) for kind, texts in pairs if texts], log
+    """Return the findings of the import, except those about contacts, which are checked separately."""
+    texts: dict[str, list[str]] = {}
+    for kind, text in log.header.imported:
+        if kind != "contact":
+            texts.setdefault(IMPORTED.get(kind, "import-found"), []).append(text)
+    findings = [log.finding(kind, "; ".join(several)) for kind, several in texts.items()]
+    # What most rows repeat is the clock of the logger, at which nothing can be differentiated.
+    return [replace(f, weight="error") if f.kind == "rows-held" else f for f in findings], log
 
 
 CHECKS: tuple[tuple[str, Check], ...] = (
@@ -75,32 +85,32 @@ CHECKS: tuple[tuple[str, Check], ...] = (
     ("contact force", contact.check_forces),
     ("excitation", excitation.check_excitation),
 )
-"""All checks in the order in which they run; each is applied to the log as corrected by the previous ones."""
+"""All checks in the order in which they run. Each receives the log as corrected by the previous ones."""
 
 _MOTION = frozenset({"velocity-mismatch"})
 _ROBOT = frozenset(
     {"gravity-direction", "base-tilted", "payload-missing", "masses-mismatch", "torque-unexplained"}
 )
 VOIDS = {"dynamics": _MOTION, "contact force": _MOTION | _ROBOT, "excitation": _MOTION}
-"""Findings that invalidate each check."""
+"""For each check, the findings that invalidate its result."""
 
 
 def check(system: ConstrainedSystem, data: Dataset | Log, *, progress: Progress | None = None) -> Report:
     """Check a log against a scene before fitting a model.
 
-    A valid log has no findings. Each fault is corrected before the next check, so it is reported only once;
-    the log itself is not changed.
+    A valid log yields no findings. Each fault is corrected in a copy of the log before the next check runs,
+    so that it is reported only once.
 
     Args:
-        system: robot and contacts.
-        data: the log; `forcegp.checks.read_log` reads logs that `Dataset` rejects.
-        progress: called with the number of completed checks and the total number.
+        system: the robot and its contacts.
+        data: the log. Use `forcegp.checks.read_log` to read a log that `Dataset` rejects.
+        progress: a function called with the number of completed checks and the total number of checks.
 
     Returns:
-        The findings, sorted by severity; `report.usable` is true if a model can be fitted.
+        A report of the findings, sorted by severity. Its attribute `usable` is true if a model can be fitted.
 
     Raises:
-        DataError: a joint of the robot is missing in the log, or the log is empty.
+        DataError: a joint of the robot is missing from the log, or the log is empty.
 
     Example:
         >>> import forcegp
@@ -136,6 +146,15 @@ def check(system: ConstrainedSystem, data: Dataset | Log, *, progress: Progress 
             skipped |= {other: "no row is usable" for other, _ in CHECKS[done + 1 :]}
             break
     order = list(KINDS)
-    # Findings that affect most of the log come before those that affect only a few rows.
-    findings.sort(key=lambda f: (SEVERITIES.index(f.severity), 2 * f.rows < samples, order.index(f.kind)))
+    # Faults of torque and robot keep the order in which they were found, since the first explains most.
+    first = {"torque": "torque-sign", "mechanics": "torque-sign", "learned": "torque-offset"}
+
+    def rank(f: Finding) -> tuple[float, ...]:
+        # A few odd rows come after what affects the whole log; of what a fit learns, the largest comes first.
+        family = KINDS[f.kind].family
+        isolated = family in ("clock", "values") and 2 * f.rows < samples
+        place = order.index(first.get(family, f.kind))
+        return SEVERITIES.index(f.severity), isolated, place, -float(f.evidence.get("largest_torque", 0.0))
+
+    findings.sort(key=rank)
     return Report(tuple(findings), samples, system.robot.joint_names, skipped)

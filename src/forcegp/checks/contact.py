@@ -1,7 +1,4 @@
-"""Checks of the distance of the tip from the surface in rows labelled as contact, and of contact forces.
-
-A surface can only push, and friction opposes sliding.
-"""
+"""Checks of contact labels against the distance between tip and surface, and checks of contact forces."""
 
 from __future__ import annotations
 
@@ -13,7 +10,7 @@ import numpy as np
 import torch
 
 from forcegp import kinematics
-from forcegp.checks.finding import Finding
+from forcegp.checks.finding import Finding, with_alternatives
 from forcegp.checks.fit import BLOCKS, CHUNK, blocks_of, labelled_contacts, residual, tensors, unmeasured
 from forcegp.checks.log import Array, Log, Outcome, evenly
 from forcegp.constraints import ConstrainedSystem, Plane, SurfaceContact
@@ -22,34 +19,34 @@ from forcegp.robust import level_of, robust_std
 from forcegp.rows import Intervals, describe, intervals
 
 OFFSET, TILT = 5e-4, np.radians(0.2)
-"""Displacement [m] and tilt [rad] of a surface above which they are reported."""
+"""Smallest displacement [m] and tilt [rad] of a surface that are reported."""
 FAR = 0.01
-"""Median distance in contact above which the surface, the point or the labels must be wrong [m]."""
+"""Median distance in contact above which the surface, the contact point or the labels must be wrong [m]."""
 TOUCH, ROUGH = 2e-4, 8.0
-"""Distance within which a tip counts as touching, given the stiffness of surfaces and arms, in m and in
-robust standard deviations of the distance in contact."""
+"""A tip counts as touching within this distance, which allows for compliant surfaces and arms. It is given in
+m and in robust standard deviations of the distance in contact."""
 CREEP = 1e-3
-"""Speed along the normal that is always allowed in contact [m/s]."""
+"""Speed along the normal that is always accepted in contact [m/s]."""
 LANDING, STOPS = 5, 2.0
 """Number of rows within which a landing tip stops, and ratio of its speed to that of a tip in contact."""
 DRIFT, RUN_SECONDS = 2e-3, 0.02
-"""Change in distance allowed in contact, due to soft ground, deflection of the arm, or drift [m]; duration of
-the shortest run of rows for which a wrong label is reported [s]."""
+"""Accepted change in distance during contact, caused by soft ground, deflection of the arm, or drift [m].
+Duration of the shortest run of rows for which a wrong label is reported [s]."""
 MISSED_SECONDS, MISSED_DISTANCE = 0.1, 2e-3
-"""Shortest time [s] and distance [m] of sliding along the surface that count as an unlabelled contact."""
+"""Minimum duration [s] and distance [m] of sliding along the surface for an unlabelled contact."""
 LEAST_ROWS = 20
 OFF = {
     "contact-early": "labelled closed before the tip touches",
     "contact-late": "labelled closed after the tip has left",
     "contact-far": "labelled closed while the tip is off the surface",
 }
-"""Descriptions of rows that are labelled closed although the tip is off the surface, by kind of finding."""
+"""For each kind of finding, a description of rows labelled closed although the tip is off the surface."""
 
 
 @dataclass(frozen=True)
 class Path:
-    """Distance `(n,)` of a contact point from the surface in the scene [m]; its position [m] and velocity
-    [m/s] in the world, and the outward surface normal, `(n, 3)` each."""
+    """Path of a contact point: signed distance `c` from the surface in the scene, shape (n,) [m]; position
+    `p` [m], velocity `v` [m/s] and surface normal `normal` in the world, shape (n, 3)."""
 
     c: Array
     p: Array
@@ -70,7 +67,7 @@ class Path:
 def tip_path(
     system: ConstrainedSystem, contact: SurfaceContact, log: Log, rows: np.ndarray | None = None
 ) -> Path:
-    """Return the path of the contact point at the given rows, or at all rows, with NaN in non-finite rows."""
+    """Return the path of the contact point at the given (or all) rows, with NaN in non-finite rows."""
     parts = np.array_split(np.arange(len(log)) if rows is None else rows, -(-len(log) // CHUNK))
     paths = []
     with torch.no_grad():
@@ -85,7 +82,7 @@ def tip_path(
 
 
 def touching(system: ConstrainedSystem, log: Log) -> Iterator[tuple[SurfaceContact, np.ndarray]]:
-    """Yield each surface contact that is labelled as closed in enough rows, together with these rows."""
+    """Yield each surface contact that is labelled closed in enough rows, together with these rows."""
     for contact in labelled_contacts(system, log):
         rows = np.flatnonzero(log.contact[contact.name] & log.usable)
         if isinstance(contact, SurfaceContact) and len(rows) >= LEAST_ROWS:
@@ -93,7 +90,7 @@ def touching(system: ConstrainedSystem, log: Log) -> Iterator[tuple[SurfaceConta
 
 
 def check_contacts(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Check contact labels against the distance of the tip from the surface."""
+    """Check the contact labels against the distance between the tip and the surface."""
     findings = []
     for contact in system.contacts:
         if contact.name not in log.contact:
@@ -114,7 +111,7 @@ def check_contacts(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def _beside(contact: SurfaceContact, path: Path, usable: np.ndarray) -> list[Finding]:
-    """Find a tip that stays at a constant distance from the surface although the contact never closes."""
+    """Report a tip that stays at a constant distance from the surface although the contact never closes."""
     rows = usable & (np.linalg.norm(path.along, axis=1) > SLIDING_SLOW)
     level = level_of(path.c[rows], TOUCHING, LEVEL)
     if level is None or abs(level) <= TOUCHING:
@@ -150,7 +147,7 @@ def _placement(contact: SurfaceContact, path: Path, closed: np.ndarray) -> tuple
 
 
 def fit_surface(contact: SurfaceContact, path: Path, closed: np.ndarray) -> tuple[float, Array, Array]:
-    """Fit offset [m], slope `(3,)` and resulting distances `(n,)` of the surface, trimming outliers."""
+    """Fit a surface, ignoring outliers; return offset [m], slope (3,) and the distances (n,) from it."""
     offset = float(np.median(path.c[closed]))
     if not isinstance(contact.surface, Plane):
         return offset, np.zeros(3), np.full(len(path.c), offset)
@@ -177,7 +174,7 @@ def fit_surface(contact: SurfaceContact, path: Path, closed: np.ndarray) -> tupl
 def _labels(
     contact: SurfaceContact, path: Path, closed: np.ndarray, usable: np.ndarray, c: Array, log: Log
 ) -> list[Finding]:
-    """Find rows labelled closed with the tip off the surface, and rows labelled open with a sliding tip."""
+    """Find rows labelled closed with the tip off the surface, and rows labelled open while the tip slides."""
     touch = max(TOUCH, ROUGH * float(robust_std(c[closed])))
     moving = closed & (np.linalg.norm(path.v, axis=1) > CREEP)
     slow = max(CREEP, ROUGH * float(robust_std(path.approach[moving])) if moving.any() else 0.0)
@@ -197,7 +194,7 @@ def _labels(
 def _runs_off(
     approach: Array, label: np.ndarray, off: np.ndarray, c: Array, touch: float, slow: float, log: Log
 ) -> dict[str, Intervals]:
-    """Return runs of closed rows with the tip off the surface, by kind, extended until the tip settles."""
+    """Return the runs of closed rows with the tip off the surface, extended until the tip settles."""
     settled = approach <= slow
     least = max(2, round(RUN_SECONDS / log.dt)) if np.isfinite(log.dt) else 2
     runs: dict[str, Intervals] = dict.fromkeys(OFF, ())
@@ -244,27 +241,46 @@ FORCE_ROWS = 4000
 PULLS = 0.5
 """Fraction of contact rows with a pulling force above which the normal must be reversed."""
 SIGNIFICANT, LARGEST_FRICTION = 4.0, 2.0
-"""Standard errors over blocks above which friction is significant, and largest plausible coefficient."""
+"""Standard errors over blocks above which friction is significant; largest plausible friction coefficient."""
 SLIDING_SLOW, NARROW = 0.01, 0.05
-"""Speed below which the sliding direction is unknown [m/s], and minimum RMS speed across the main direction
-relative to that along it."""
+"""Speed below which the direction of sliding is unknown [m/s]; minimum RMS speed across the main direction of
+sliding, relative to the speed along it."""
 
 
 def check_forces(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Check the normal force, friction and sliding directions of each contact, if torques determine them."""
+    """Check the normal force, friction and sliding directions of each contact if torques determine them."""
     findings = []
     for contact, rows in touching(system, log):
         finding = partial(Finding, intervals=intervals(log.contact[contact.name]), contact=contact.name)
         findings += _directions(finding, tip_path(system, contact, log, rows).v)
         rows = evenly(rows, FORCE_ROWS)
         path = tip_path(system, contact, log, rows)
-        force = _force(replace(system, contacts=[contact]), log, rows, path)
-        findings += _pulls(finding, path, force) or (_friction(finding, path, force) if log.nq > 3 else [])
+        one = replace(system, contacts=[contact])
+        force = _force(one, log, rows, path)
+        if pulls := _pulls(finding, path, force):
+            # Up to three torques cannot contradict the force that they are taken for.
+            flipped = (
+                (j, np.where(np.arange(log.nq) == j, -1.0, 1.0)) for j in range(log.nq * (log.nq <= 3))
+            )
+            others = ((j, log.replace(tau=log.tau * sign)) for j, sign in flipped)
+            text = "the torque of {} has the opposite sign"
+            findings += [
+                with_alternatives(
+                    pulls[0],
+                    [
+                        log.finding("torque-sign", text.format(log.joint_names[j]), (log.joint_names[j],))
+                        for j, other in others
+                        if np.median((_force(one, other, rows, path) * path.normal).sum(axis=1)) > 0.0
+                    ],
+                )
+            ]
+        elif log.nq > 3:
+            findings += _friction(finding, path, force)
     return findings, log
 
 
 def _force(system: ConstrainedSystem, log: Log, rows: np.ndarray, path: Path) -> Array:
-    """Return the force F `(n, 3)` that best fits r = Jᵀ F; with up to three joints, only its normal part."""
+    """Return the force F (n, 3) that best fits r = Jᵀ F, or its normal part with up to three joints."""
     r, J = residual(system, log, rows)
     if log.nq <= 3:
         A = J[:, 0] * ~np.isin(np.arange(log.nq), unmeasured(log))
@@ -284,7 +300,7 @@ def _pulls(finding: partial[Finding], path: Path, force: Array) -> list[Finding]
 
 
 def _friction(finding: partial[Finding], path: Path, force: Array) -> list[Finding]:
-    """Report the friction coefficient, estimated from the force opposite to the direction of sliding."""
+    """Report the friction coefficient estimated from the force opposite to the direction of sliding."""
     speed = np.linalg.norm(path.along, axis=1)
     sliding = speed > SLIDING_SLOW
     if sliding.sum() < LEAST_ROWS:
@@ -302,7 +318,7 @@ def _friction(finding: partial[Finding], path: Path, force: Array) -> list[Findi
 
 
 def _directions(finding: partial[Finding], v: Array) -> list[Finding]:
-    """Report sliding along a single line, from which friction in the other direction cannot be determined."""
+    """Report sliding along a single line, which leaves friction in the other direction undetermined."""
     size, name = np.linalg.svd(v.T @ v / len(v), compute_uv=False), finding.keywords["contact"]
     text = f"the tip slides along one direction of {name!r} only; friction across it is unknown"
     evidence = {"share_across": float(np.sqrt(size[1] / max(size[0], 1e-300)))}

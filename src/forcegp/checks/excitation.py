@@ -1,8 +1,9 @@
-"""Information contained in the motion: which joints move and change direction, which parameters can be
-identified, and how large a fault must be for the log to reveal it.
+"""Information that the motion contains about the robot.
 
-A fault of size θ adds θ φ to the unexplained torque r, and the held-out residual is linear in it, e(r + θ φ)
-= e(r) + θ e(φ). The fault is detected if `explain.significant` accepts the increase in the residual.
+The checks determine which joints move and reverse, which parameters can be identified, and how large a fault
+must be for the log to reveal it. A fault of size θ adds θ φ to the unexplained torque r, and the held-out
+residual e is linear: e(r + θ φ) = e(r) + θ e(φ). The fault counts as detected if `explain.significant`
+accepts the increase in the residual.
 """
 
 from __future__ import annotations
@@ -22,19 +23,19 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.identification import base_parameters, parameter_vector, regressor
 
 STILL = 0.05
-"""Range of motion below which a joint counts as not moving [rad, m]."""
+"""Range of motion below which a joint counts as stationary [rad, m]."""
 REVERSALS, HYSTERESIS = 4, 0.05
-"""Number of changes of direction needed to separate Coulomb friction from a torque offset; fraction of its
-largest speed that a joint must reach for a change of direction to count."""
+"""Number of reversals needed to separate Coulomb friction from a torque offset; fraction of its largest speed
+that a joint must reach for a reversal to count."""
 SHORT_SECONDS, ROWS = 2.0, 1000
-"""Duration below which a log contains little information [s]; maximum number of rows of the regressor."""
+"""Duration below which a log contains little information [s]; maximum number of rows in the regressor."""
 LOOK, LEARNED = 0.1, 0.5
-"""Time after which the torque provides new information [s]; ratio of the posterior to the prior standard
-deviation below which a parameter counts as identified."""
+"""Time after which the torque provides new information [s]; ratio of posterior to prior standard deviation
+below which a parameter counts as identified."""
 
 
 def check_length(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Check that the log is long enough."""
+    """Check whether the log is long enough."""
     seconds = len(log.rows(len(log))) * log.dt if np.isfinite(log.dt) else 0.0
     short = log.finding("log-short", f"{seconds:.3g} s of the log can be used", seconds=seconds)
     return [short] if log.header.ordered and seconds < SHORT_SECONDS else [], log
@@ -87,7 +88,7 @@ def check_excitation(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def _sharpness(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> tuple[Array, tuple[str, ...], Array]:
-    """Return the ratio of posterior to prior deviation of each base parameter, at 1 % torque noise."""
+    """Return the ratio of posterior to prior deviation for each base parameter, assuming 1 % torque noise."""
     robot = system.robot
     base = base_parameters(robot)
     columns = np.array(base.columns)
@@ -104,12 +105,12 @@ def _sharpness(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> tuple[A
 
 
 LEAST_TOUCHING = 20
-"""Minimum number of rows in contact for stating the force that a fault mimics."""
+"""Minimum number of rows in contact for which the force that a fault mimics is reported."""
 LARGEST = 1e3
 SIZES = np.geomspace(1e-3, LARGEST, 200)
 """Fault sizes that are tried."""
 SPAN = 1
-"""Number of rows to either side used for the torque rate; smaller than the margin of `explain`."""
+"""Number of rows on either side for computing the torque rate; smaller than the margin in `explain`."""
 EXPECTED = {
     "torque-delay": (0.02, LARGEST, 1e3, "a delay of the torque", "{:.0f} ms"),
     "base-tilted": (3.0, 180.0, 1.0, "a tilt of the base", "{:.2g}°"),
@@ -118,13 +119,13 @@ EXPECTED = {
     "torque-gain": (0.5, LARGEST, 100.0, "a wrong gain", "{:.0f} %"),
     "encoder-offset": (0.1, np.pi, 1.0, "an encoder offset", "{:.2g} {unit}"),
 }
-"""Size that a user expects to be detected and largest size [s, degrees, fraction, rad], factor for conversion
-to the unit of the message, name of the fault, and format of its size; faults of the whole arm come first."""
+"""For each kind of fault, the size that a user expects to be detected and the largest size [s, degrees,
+fraction, rad], the conversion factor to the unit of the message, its name, and the format of its size."""
 
 
 @dataclass(frozen=True, eq=False)
 class Fault:
-    """A fault of unit size: its kind, its joint (if any), and the torque `(n, nq)` that it adds."""
+    """A fault of unit size: its kind, its joint (if any), and the torque (n, nq) that the fault adds."""
 
     kind: str
     joint: str
@@ -133,7 +134,7 @@ class Fault:
 
 
 def check_visibility(system: ConstrainedSystem, explanation: Explanation) -> list[Finding]:
-    """Report the size above which each fault is detected, and the force error due to a typical one."""
+    """Report the size above which each fault is detected, and the force error that a typical fault causes."""
     faults = list(_faults(system, explanation.log, explanation.rows))
     sizes = {fault: visible_size(explanation, fault) for fault in faults}
     units = {name: position_unit(system.robot, j) for j, name in enumerate(system.robot.joint_names)}

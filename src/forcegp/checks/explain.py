@@ -1,7 +1,8 @@
-"""Greedy search for faults that explain the torque, using cross-validation and the one-standard-error rule.
+"""Greedy search for faults that explain the torque.
 
-The simplest hypothesis within one standard error of the best is accepted (Breiman, Friedman, Olshen, Stone,
-*Classification and Regression Trees*, 1984, sec. 3.4.3), the log is corrected, and the search is repeated.
+Hypotheses are compared by cross-validation. The simplest one within one standard error of the best is
+accepted (Breiman et al., *Classification and Regression Trees*, 1984, sec. 3.4.3), the log is corrected, and
+the search is repeated.
 """
 
 from __future__ import annotations
@@ -13,7 +14,7 @@ from functools import cached_property, partial
 import numpy as np
 
 from forcegp.checks import hypotheses
-from forcegp.checks.finding import TESTS, Finding
+from forcegp.checks.finding import Finding, with_alternatives
 from forcegp.checks.fit import TorqueFit, TorqueProblem, cross_validate, gain_of, pooled_gain_of, score_of
 from forcegp.checks.hypotheses import Hypothesis, corrected
 from forcegp.checks.log import Array, Log
@@ -21,27 +22,26 @@ from forcegp.checks.placement import leaves_surface
 from forcegp.constraints import ConstrainedSystem
 
 ROWS, SCREENING, DELAYS = 1600, 4, 3
-"""Number of rows for testing hypotheses; stride of the rows for screening; delays kept per joint."""
+"""Number of rows used to test hypotheses; stride of the rows used for screening; delays kept per joint."""
 ROUNDS = 5
-"""Maximum number of faults searched for."""
+"""Maximum number of faults in the search."""
 SIGNIFICANT = 4.0
-"""Standard errors by which the held-out score must drop; about a hundred hypotheses are compared."""
+"""Required drop in the held-out score, in standard errors, since about a hundred hypotheses are compared."""
 SHARE, SAME = 0.03, 1e-3
-"""Fraction of the best drop that a simpler hypothesis may lack; tolerance within which errors are equal."""
-DETERMINED = 3.0
-"""A gain counts as determined if it exceeds this many standard errors."""
+"""Fraction of the best drop that a simpler hypothesis may miss; tolerance within which errors are equal."""
 MATERIAL, MATERIAL_EACH = 0.15, 0.05
-"""Minimum drop in Σ_j log error that is material: in total (14 % at one joint), and per affected joint."""
+"""Minimum material drop in Σ_j log error: in total (14 % at one joint), and per affected joint."""
 
 Tried = tuple[Hypothesis, TorqueFit]
 
 
 @dataclass(frozen=True)
 class Explanation:
-    """Faults that explain the torque: faults of the log, which are corrected in `log`, and of the robot file.
+    """Faults that explain the torque.
 
-    `problem` contains the remaining torques at `rows`. Accepted hypotheses about the robot stay in the model
-    with their `columns`, `prior` and names `robot`. Calling `repairs` in order corrects the faults of a log.
+    Faults of the log are corrected in `log`. Hypotheses about the robot file, named in `robot`, stay in the
+    model with their `columns` and `prior`. `problem` holds the remaining torques at `rows`. Calling `repairs`
+    in order corrects the faults of any log.
     """
 
     system: ConstrainedSystem
@@ -61,12 +61,12 @@ class Explanation:
         return cross_validate(self.problem, self.columns, self.prior)
 
     def on(self, log: Log, rows: np.ndarray | None = None) -> TorqueProblem:
-        """Return the problem for a log modified according to a hypothesis, keeping the joint weights."""
+        """Return the torque problem for a modified log, with the same joint weights."""
         rows = self.rows if rows is None else rows
         return hypotheses.problem_of(self.system, log, rows, self.problem.scale)
 
     def weighed(self) -> Explanation:
-        """Return the explanation with joints weighted according to their residual noise."""
+        """Return the explanation with the joints weighted by their residual noise."""
         result = self
         for _ in range(2):
             # The typical block counts: a disturbance must not make a joint look noisy.
@@ -76,15 +76,20 @@ class Explanation:
         return result
 
     def beside(self, hypothesis: Hypothesis) -> Explanation:
-        """Prepend the parameters of a hypothesis to the explanation."""
+        """Return the explanation with the parameters of a hypothesis placed before the existing ones."""
         assert hypothesis.columns is not None and hypothesis.prior is not None
         columns = np.concatenate([hypothesis.columns, self.columns], axis=-1)
         return replace(self, columns=columns, prior=np.concatenate([hypothesis.prior, self.prior]))
 
     def with_nuisance(self, *columns: Array) -> Explanation:
-        """Return the explanation with additional columns that are common to all hypotheses."""
+        """Return the explanation with additional columns that all hypotheses share."""
         nuisance = np.concatenate([self.problem.nuisance, *columns], axis=-1)
         return replace(self, problem=replace(self.problem, nuisance=nuisance))
+
+    def without(self, columns: list[int]) -> Explanation:
+        """Return the explanation without the given nuisance columns."""
+        keep = np.setdiff1d(np.arange(self.problem.nuisance.shape[-1]), columns)
+        return replace(self, problem=replace(self.problem, nuisance=self.problem.nuisance[..., keep]))
 
     def with_(self, hypothesis: Hypothesis) -> TorqueFit:
         """Fit the parameters of a hypothesis in addition to those already in the model."""
@@ -94,7 +99,7 @@ class Explanation:
 
 
 def explain(system: ConstrainedSystem, log: Log) -> Explanation:
-    """Find the faults that explain the torque that remains unexplained by the robot file."""
+    """Find the faults that explain the torque left unexplained by the robot file."""
     rows = log.rows(ROWS, margin=max(hypotheses.LAGS))
     problem = hypotheses.problem_of(system, log, rows)
     model = Explanation(system, log, rows, problem, np.zeros((*problem.r.shape, 0)), np.zeros(0)).weighed()
@@ -107,12 +112,15 @@ def explain(system: ConstrainedSystem, log: Log) -> Explanation:
 
 
 def _round(model: Explanation) -> Explanation | None:
-    """Accept the simplest hypothesis within one standard error of the best, if any explains enough."""
+    """Accept the simplest hypothesis within one standard error of the best if the best explains enough."""
     system, log, null = model.system, model.log, model.fit
     fits = ((h, fit) for h, fit in _fits(model) if (h.name, h.joints) not in model.taken)
     fits = ((h, fit) for h, fit in fits if hypotheses.plausible(system, h, fit))
     tried = [(h, fit) for h, fit in fits if not leaves_surface(system, log, corrected(log, h, fit.theta))]
     good = [(h, fit) for h, fit in tried if significant(fit.shares, null.shares, len(h.joints) or log.nq)]
+    if model.findings and not any(finding.kind.endswith("order") for finding in model.findings):
+        # Only after an exchange, which may be part of a permutation, may one joint gain alone.
+        good = [(h, fit) for h, fit in good if not h.name.endswith("order") or _helps_each(h, fit, null)]
     if not good:
         return None
     best = min((fit for _, fit in good), key=lambda fit: fit.score.mean())
@@ -133,8 +141,14 @@ def _round(model: Explanation) -> Explanation | None:
     return _accepted(model, chosen, fit.theta, finding)
 
 
+def _helps_each(exchange: Hypothesis, fit: TorqueFit, null: TorqueFit) -> bool:
+    """Return whether an exchange of two joints lowers the typical error of both."""
+    better, worse = (np.median(one.shares[:, list(exchange.joints)], axis=0) for one in (fit, null))
+    return bool((better < worse).all())
+
+
 def _accepted(model: Explanation, hypothesis: Hypothesis, theta: Array, finding: Finding) -> Explanation:
-    """Return the explanation with one more hypothesis: undo its fault, or add its parameters to the model."""
+    """Return the explanation with the fault corrected, or with its parameters added to the model."""
     taken = model.taken | {(hypothesis.name, hypothesis.joints)}
     model = replace(model, findings=(*model.findings, finding), taken=taken)
     if hypothesis.name in hypotheses.ROBOT:
@@ -146,7 +160,7 @@ def _accepted(model: Explanation, hypothesis: Hypothesis, theta: Array, finding:
 
 
 def _refined(model: Explanation, hypothesis: Hypothesis, fit: TorqueFit) -> TorqueFit:
-    """Refine an encoder offset by Gauss-Newton steps, since its effect on the torque is nonlinear."""
+    """Refine an encoder offset, which has a nonlinear effect on the torque, by Gauss-Newton steps."""
     theta = fit.theta[:1]
     for _ in range(2):
         moved = corrected(model.log, hypothesis, theta)
@@ -186,7 +200,7 @@ def _fits(model: Explanation) -> Iterator[Tried]:
 
 
 def _delays(model: Explanation) -> Iterator[Hypothesis]:
-    """Yield the delays of all torques, and of each, that leave least unexplained on the screened rows."""
+    """Yield the delays, common or of one torque, that leave least unexplained in the screened rows."""
     log, few = model.log, model.rows[::SCREENING]
     problem, columns = model.on(log, few), model.columns[::SCREENING]
     null = cross_validate(problem, columns, model.prior).score.mean()
@@ -202,7 +216,7 @@ def _delays(model: Explanation) -> Iterator[Hypothesis]:
 
 
 def _beside_friction(model: Explanation, late: Hypothesis) -> TorqueFit | None:
-    """Return the fit with a delayed torque, unless friction of a different shape explains it as well."""
+    """Return the fit with a delayed torque, unless friction with a different shape explains it as well."""
     changed = replace(model, problem=model.on(late.change(model.log)))
     shapes = hypotheses.shape_columns(model.system, model.log, model.rows)
     better, worse = (one.with_nuisance(shapes).fit.shares for one in (changed, model))
@@ -210,7 +224,7 @@ def _beside_friction(model: Explanation, late: Hypothesis) -> TorqueFit | None:
 
 
 def _beside_size(model: Explanation, tilt: Hypothesis, fit: TorqueFit) -> bool:
-    """Return whether gravity of another size, for which wrong masses pass, explains less than a tilt."""
+    """Return whether changing the size of gravity, as wrong masses seem to do, explains less than a tilt."""
     assert tilt.columns is not None and tilt.prior is not None
     along = model.system.robot.gravity.numpy()[:, None]
     size = model.with_(replace(tilt, columns=tilt.columns @ along, prior=tilt.prior[:1]))
@@ -218,11 +232,11 @@ def _beside_size(model: Explanation, tilt: Hypothesis, fit: TorqueFit) -> bool:
 
 
 def _currents(model: Explanation) -> Iterator[Tried]:
-    """Yield the hypothesis that all torques with a determined gain are scaled, if they are the majority."""
+    """Yield the hypothesis that all torques with a determined gain are scaled if they form the majority."""
     log, rows, nq = model.log, model.rows, model.log.nq
     fit = model.with_(hypotheses.current_hypothesis(log, rows, model.problem, tuple(range(nq))))
     gains = 1.0 + fit.theta[:nq]
-    determined = np.flatnonzero(np.abs(gains) > DETERMINED * fit.spread[:nq])
+    determined = np.flatnonzero(np.abs(gains) > fit.spread[:nq])
     # A current has the sign of its torque, so gains of both signs have another cause.
     if 2 * len(determined) > nq and (gains[determined] > 0.0).all():
         joints = tuple(determined.tolist())
@@ -231,7 +245,7 @@ def _currents(model: Explanation) -> Iterator[Tried]:
 
 
 def significant(better: Array, worse: Array, concerned: int) -> bool:
-    """Return whether the decrease in the score, from errors `(blocks, nq)`, is material and significant."""
+    """Return whether a decrease in the score is material and significant, given errors (blocks, nq)."""
     least = max(MATERIAL, MATERIAL_EACH * concerned)
     gains = gain_of(score_of(better), score_of(worse)), pooled_gain_of(better, worse)
     # A drop that only quiet blocks show is an artefact of them: the other mean must bear it out.
@@ -242,8 +256,8 @@ def significant(better: Array, worse: Array, concerned: int) -> bool:
 SMALL_MASS = 1e-6
 """Fraction of the robot's mass below which a mass counts as zero."""
 ALONE = 2.0
-"""Standard errors by which an alternative must lower the held-out error on its own. Chance exceeds this in
-4 % of cases, which suffices because something is already known to be wrong."""
+"""Number of standard errors by which an alternative must lower the held-out error on its own. Chance exceeds
+it in 4 % of cases. This suffices because something is already known to be wrong."""
 
 
 def alternatives_of(
@@ -251,8 +265,8 @@ def alternatives_of(
 ) -> Iterator[Tried]:
     """Yield the hypotheses within one standard error of the chosen one on held-out blocks, best first.
 
-    Hypotheses of the same kind with common joints are omitted, as are those that contain the chosen one (for
-    example, masses contain a payload).
+    Hypotheses of the same kind that share joints with the chosen one are omitted. So are hypotheses that
+    contain the chosen one (for example, masses contain a payload).
     """
     name, joints = chosen[0].name, {*chosen[0].joints}
     for hypothesis, fit in sorted(tried, key=lambda one: one[1].score.mean()):
@@ -266,23 +280,9 @@ def alternatives_of(
 
 
 def _possible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit) -> bool:
-    """Return whether the mass of every link remains positive (or zero if it is zero in the robot file)."""
+    """Return whether every link keeps a positive mass, or zero mass if it has none in the robot file."""
     if hypothesis.name != "masses":
         return True
     masses = system.robot.mass.numpy()
     fitted = masses + fit.theta[: 10 * system.robot.nq : 10]
     return bool(np.where(masses > 0.0, fitted > 0.0, fitted >= -SMALL_MASS * masses.sum()).all())
-
-
-def with_alternatives(finding: Finding, others: Iterable[Finding]) -> Finding:
-    """Return the finding with its alternatives, if any, and a test that distinguishes them."""
-    alternatives: list[Finding] = []
-    for other in others:
-        alike = (f for f in (finding, *alternatives) if f.kind == other.kind)
-        if not any({*f.joints} & {*other.joints} or not other.joints for f in alike):
-            alternatives.append(other)
-    if not alternatives:
-        return finding
-    message = "; or ".join(one.message for one in (finding, *alternatives))
-    test = next(TESTS[kind] for kind in TESTS if kind in {finding.kind, *(f.kind for f in alternatives)})
-    return replace(finding, message=message, alternatives=tuple(alternatives), told_apart_by=test)

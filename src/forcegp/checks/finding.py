@@ -1,9 +1,9 @@
-"""Findings with their rows, severity and remedy, the report of a check, and the table of all `KINDS`."""
+"""Findings, the report of a check, and the table of all kinds of findings."""
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from dataclasses import dataclass, field
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field, replace
 from importlib.resources import files
 from typing import Any, Literal, SupportsFloat
 
@@ -19,7 +19,7 @@ Severity = Literal["note", "warning", "error"]
 
 @dataclass(frozen=True)
 class Kind:
-    """A kind of finding: the part of the log it belongs to, default severity, title and remedy."""
+    """A kind of finding with its family, default severity, title and remedy."""
 
     family: str
     severity: Severity
@@ -29,27 +29,27 @@ class Kind:
 
 _FAMILIES = tomllib.loads((files("forcegp.checks") / "kinds.toml").read_text(encoding="utf-8"))
 TESTS: dict[str, str] = _FAMILIES.pop("tests")
-"""Test that distinguishes each kind of fault from its alternatives, in order of preference."""
+"""For each kind of fault, tests that distinguish it from its alternatives, in order of preference."""
 KINDS = {name: Kind(family, *row) for family, rows in _FAMILIES.items() for name, row in rows.items()}
-"""All kinds of findings by name, grouped by family."""
+"""All kinds of findings, keyed by name."""
 
 
 SEVERITIES: tuple[Severity, ...] = ("error", "warning", "note")
-"""Severities in decreasing order."""
+"""Severities, from most to least severe."""
 
 
 @dataclass(frozen=True)
 class Finding:
-    """A fault or property of a log, as found by a check.
+    """A fault or property of a log that a check has found.
 
     Args:
         kind: a key of `KINDS`.
-        message: a sentence that quotes the relevant numbers.
-        intervals: affected rows as half-open intervals in increasing order, counted from 0.
-        joints: affected joints.
-        contact: affected contact, if any.
-        evidence: numbers on which the message is based, by name.
-        weight: severity, if it differs from that of the kind.
+        message: a sentence that states the relevant numbers.
+        intervals: affected rows as half-open intervals in increasing order. Rows are counted from 0.
+        joints: names of the affected joints.
+        contact: name of the affected contact, if any.
+        evidence: numbers on which the message is based, keyed by name.
+        weight: the severity, if it differs from the default severity of the kind.
         alternatives: other explanations that fit the log equally well.
         told_apart_by: a test that distinguishes the alternatives.
 
@@ -72,9 +72,10 @@ class Finding:
 
     @property
     def severity(self) -> Severity:
-        """Severity: an `"error"` makes a fit worthless, a `"warning"` biases it, a `"note"` is worth knowing.
+        """Severity of the finding.
 
-        A finding with alternatives has the lowest severity among them.
+        An `"error"` makes a fit worthless, a `"warning"` marks a fault that biases the fit, and a `"note"` is
+        worth knowing. A finding with alternatives has the lowest of their severities.
         """
         weight: Severity = self.weight or KINDS[self.kind].severity
         every = {weight, *(other.severity for other in self.alternatives)}
@@ -82,12 +83,12 @@ class Finding:
 
     @property
     def kinds(self) -> tuple[str, ...]:
-        """Kinds of the finding and of its alternatives, without duplicates."""
+        """Kinds of the finding and its alternatives, without duplicates."""
         return tuple(dict.fromkeys((self.kind, *(other.kind for other in self.alternatives))))
 
     @property
     def remedy(self) -> str:
-        """Remedy or, if there are alternatives, a test that distinguishes them and the remedy for each."""
+        """Remedy for the fault, or a test and one remedy per fault if there are alternatives."""
         if not self.alternatives:
             return KINDS[self.kind].remedy
         each = "; ".join(f"{kind}: {KINDS[kind].remedy}" for kind in self.kinds)
@@ -110,21 +111,35 @@ class Finding:
         }
 
 
+def with_alternatives(finding: Finding, others: Iterable[Finding]) -> Finding:
+    """Return the finding with any alternatives, and with a test that distinguishes them."""
+    alternatives: list[Finding] = []
+    for other in others:
+        alike = (f for f in (finding, *alternatives) if f.kind == other.kind)
+        if not any({*f.joints} & {*other.joints} or not other.joints for f in alike):
+            alternatives.append(other)
+    if not alternatives:
+        return finding
+    message = "; or ".join(one.message for one in (finding, *alternatives))
+    test = next(TESTS[kind] for kind in TESTS if kind in {finding.kind, *(f.kind for f in alternatives)})
+    return replace(finding, message=message, alternatives=tuple(alternatives), told_apart_by=test)
+
+
 def at_rows(
     mask: NDArray[np.bool_], kind: str, text: str, joints: tuple[str, ...] = (), **evidence: SupportsFloat
 ) -> list[Finding]:
-    """Return a finding on the rows selected by a mask, which are listed in its text, or no finding."""
+    """Return a list with one finding that names the rows selected by a mask, or an empty list."""
     rows = intervals(mask)
     return [Finding(kind, f"{text} {describe(rows)}", rows, joints, evidence=evidence)] if rows else []
 
 
 class NotJudgedError(Exception):
-    """Raised if a check cannot be applied to a log; the message is stored in `Report.skipped`."""
+    """Raised if a check cannot be applied to a log. The message is stored in `Report.skipped`."""
 
 
 @dataclass(frozen=True)
 class Report:
-    """All findings on a log, sorted by severity, and the skipped checks with their reasons."""
+    """All findings on a log, sorted by severity, and the reasons why checks were skipped."""
 
     findings: tuple[Finding, ...]
     samples: int
@@ -142,7 +157,7 @@ class Report:
 
     @property
     def verdict(self) -> str:
-        """Verdict in one line on whether a model can be fitted."""
+        """One-line verdict on whether a model can be fitted."""
         errors, warnings = self.count("error"), self.count("warning")
         if errors:
             return f"verdict: stop; repair {errors} error{'s' * (errors > 1)} before fitting a model"

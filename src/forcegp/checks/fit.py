@@ -1,8 +1,8 @@
-"""Least-squares fit of a hypothesis to the torque, using all blocks of a log except one.
+"""Least-squares fit of a hypothesis to the torque, cross-validated over blocks of a log.
 
-The torque left unexplained by the robot file is r = M q̈ − Q_C − Q_G − Q_D − Q_u. If there are no faults, it
-equals Aᵀλ + Q_z = Jᵀ F in contact and zero elsewhere. The hypothesis explains the part of r that remains when
-any contact force, normal or tangential, is removed by projection onto the null space of J.
+The torque left unexplained by the robot file is r = M q̈ − Q_C − Q_G − Q_D − Q_u. Without faults, r equals
+Aᵀλ + Q_z = Jᵀ F in contact and zero elsewhere. Projection onto the null space of J removes any contact force,
+normal or tangential, and the hypothesis explains the rest of r.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from forcegp.checks.log import Array, Log
 from forcegp.constraints import ConstrainedSystem, Constraint, SurfaceContact
 
 CHUNK = 8192
-"""Number of rows whose dynamics are held in memory at a time."""
+"""Number of rows for which the dynamics are held in memory at a time."""
 
 
 def tensors(log: Log, rows: np.ndarray, *names: str) -> list[Tensor]:
@@ -27,7 +27,7 @@ def tensors(log: Log, rows: np.ndarray, *names: str) -> list[Tensor]:
 
 
 def residual(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> tuple[Array, Array]:
-    """Return the unexplained torque r `(n, nq)` [N m, N] and J `(n, k, nq)`, with zeros for open contacts."""
+    """Return the unexplained torque r (n, nq) [N m, N] and J (n, k, nq), which is zero for open contacts."""
     robot, r, J = system.robot, [], []
     with torch.no_grad():
         for part in np.array_split(rows, max(1, -(-len(rows) // CHUNK))):
@@ -39,23 +39,22 @@ def residual(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> tuple[Arr
 
 
 def labelled_contacts(system: ConstrainedSystem, log: Log) -> list[Constraint]:
-    """Return the contacts whose state is logged."""
+    """Return the contacts for which the state is logged."""
     return [c for c in system.contacts if c.name in log.contact]
 
 
 def takes_friction_out(system: ConstrainedSystem, log: Log) -> bool:
-    """Return whether torques remain after all components of the contact forces are removed."""
+    """Return whether any torque remains after all components of the contact forces are removed."""
     return 3 * len(labelled_contacts(system, log)) < log.nq
 
 
 def unmeasured(log: Log) -> list[int]:
-    """Return the joints whose torque is not measured according to the header."""
+    """Return the indices of the joints whose torque is not measured according to the header."""
     return [j for j, name in enumerate(log.joint_names) if name in log.header.unmeasured_torques]
 
 
 def _contact_jacobian(system: ConstrainedSystem, log: Log, rows: np.ndarray, q: Tensor, qd: Tensor) -> Array:
-    """Return the rows of J for all contacts, or only for the surface normals if all rows would leave no
-    torque.
+    """Return J for all components of the contact forces, or only for the normals if no torque would remain.
 
     Additional rows represent unmeasured torques, which may have any value.
     """
@@ -74,7 +73,7 @@ def _contact_jacobian(system: ConstrainedSystem, log: Log, rows: np.ndarray, q: 
 
 
 def projector(J: Array, scale: Array) -> Array:
-    """Return the projector `(n, nq, nq)` onto torques r/scale that forces at contacts cannot produce."""
+    """Return the projector (n, nq, nq) that removes torques r/scale that contact forces can produce."""
     J = J * (1.0 / scale)
     eye = np.broadcast_to(np.eye(J.shape[-1]), (len(J), *2 * (J.shape[-1],))).copy()
     touching = (J != 0.0).any(axis=(1, 2))
@@ -87,16 +86,16 @@ def projector(J: Array, scale: Array) -> Array:
 
 
 BLOCKS, REWEIGHTED = 8, 10
-"""Number of contiguous blocks of the log, each of which is held out once; number of robust-fit iterations."""
+"""Number of contiguous blocks of the log, each held out once; number of iterations of the robust fit."""
 FLOOR = 0.03
-"""Error that is negligible relative to a joint's torque, given the accuracy of robot files."""
+"""Error relative to a joint's torque that is negligible given the accuracy of robot files."""
 
 
 @dataclass(frozen=True)
 class TorqueProblem:
-    """Unexplained torque r `(n, nq)` [N m, N], Jacobian J of the contact points `(n, k, nq)`, columns common
-    to all hypotheses `(n, nq, p)`, magnitude of the logged torque, and scale of its noise, which determines
-    the weights of the joints.
+    """Data of a torque fit: unexplained torque r (n, nq) [N m, N], Jacobian J of the contact points (n, k,
+    nq), columns common to all hypotheses (n, nq, p), size of the logged torque, and scale of its noise, by
+    which the joints are weighted.
     """
 
     r: Array
@@ -106,17 +105,17 @@ class TorqueProblem:
     scale: Array
 
     def without_contact(self, x: Array) -> Array:
-        """Return P x/scale for columns x `(n, nq, p)`."""
+        """Return P x/scale for columns x of shape (n, nq, p), without contact forces."""
         x = x / self.scale[:, None]
         return projector(self.J, self.scale) @ x if self.J.any() else x
 
 
 @dataclass(frozen=True)
 class TorqueFit:
-    """A hypothesis fitted to a log and tested on held-out blocks.
+    """A hypothesis that was fitted to a log and tested on held-out blocks.
 
-    `error` and `shares` `(blocks, nq)` are RMS held-out residuals relative to `scale` and to `size`. The
-    parameters `theta` and `nuisance` `(p,)` have the jackknife standard errors `spread` over blocks.
+    `error` and `shares`, both (blocks, nq), are RMS held-out residuals relative to `scale` and to `size`.
+    `theta` and `nuisance`, both (p,), are parameters. `spread` contains their jackknife standard errors.
     """
 
     error: Array
@@ -129,7 +128,7 @@ class TorqueFit:
 
 
 def blocks_of(n: int) -> Array:
-    """Return the index of the block that contains each row."""
+    """Return the block index of each row."""
     return np.minimum(np.arange(n) * BLOCKS // max(n, 1), BLOCKS - 1)
 
 
@@ -140,11 +139,11 @@ def cross_validate(
     gains: tuple[int, ...] = (),
     instruments: Array | None = None,
 ) -> TorqueFit:
-    """Fit the nuisance columns N and the columns Φ of a hypothesis, and test the fit on held-out blocks.
+    """Fit nuisance columns N and the columns Φ of a hypothesis, and test the fit on held-out blocks.
 
-    Minimises |P(r − N η − Φ θ)/σ|² + |θ/s|², where P removes contact forces. Φ contains `columns`
-    `(n, nq, p)`, by default none. The prior s `(p,)` bounds the parameters, the first of which scale the
-    torques of the joints `gains`. With instruments Z, the fit solves Zᵀ P (r − N η − Φ θ) = 0 instead, which
+    The fit minimises |P(r − N η − Φ θ)/σ|² + |θ/s|², where P removes contact forces. `columns` contains Φ (n,
+    nq, p), which is empty by default. The prior s (p,) bounds the parameters. The first parameters scale the
+    torques of the joints `gains`. If instruments Z are given, the fit solves Zᵀ P (r − N η − Φ θ) = 0, which
     allows for errors in the columns (Wooldridge, *Introductory Econometrics*, ch. 15).
     """
     p = columns.shape[-1] if columns is not None else 0
@@ -170,7 +169,7 @@ def cross_validate(
 def _equations(
     problem: TorqueProblem, columns: Array | None, prior: Array | None
 ) -> tuple[Array, Array, Array, Array]:
-    """Return normalised columns and the right-hand side without contact forces, and units and weights."""
+    """Return normalised columns and right-hand side without contact forces, their units and the weights."""
     extra = columns if columns is not None else np.zeros((*problem.r.shape, 0))
     p = extra.shape[-1]
     every = problem.without_contact(np.concatenate([problem.r[..., None], extra, problem.nuisance], axis=-1))
@@ -185,7 +184,7 @@ def _equations(
 
 
 def robust_parameters(problem: TorqueProblem, columns: Array, prior: Array) -> Array:
-    """Fit with Huber weights min(1, k/|r|); k is twice the median |r| (*Robust Statistics*, 1981, ch. 7)."""
+    """Fit with Huber weights min(1, k/|r|), k twice the median |r| (*Robust Statistics*, 1981, ch. 7)."""
     A, y, unit, weight = _equations(problem, columns, prior)
     w, theta = np.ones(len(y)), np.zeros(A.shape[-1])
     for _ in range(REWEIGHTED):
@@ -197,7 +196,7 @@ def robust_parameters(problem: TorqueProblem, columns: Array, prior: Array) -> A
 
 
 def _held_out(A: Array, y: Array, weight: Array, Z: Array | None = None) -> tuple[Array, Array, Array]:
-    """Return held-out residuals, the parameters fitted without each block, and those fitted to all blocks."""
+    """Return held-out residuals, parameters fitted without each block, and those fitted to all blocks."""
     block, rest, symmetric = blocks_of(len(y)), np.zeros_like(y), Z is None
     Z = A if Z is None else Z
     grams, sides, thetas = [], [], []
@@ -213,13 +212,13 @@ def _held_out(A: Array, y: Array, weight: Array, Z: Array | None = None) -> tupl
 
 
 def held_out(problem: TorqueProblem, columns: Array, prior: Array) -> Array:
-    """Return held-out residuals relative to the torque `(n, nq)`, which are linear in `problem.r`."""
+    """Return the held-out residuals (n, nq) relative to the torque. They are linear in `problem.r`."""
     A, y, _, weight = _equations(problem, columns, prior)
     return _held_out(A, y, weight)[0] * problem.scale / problem.size
 
 
 def _solve(gram: Array, side: Array, weight: Array, symmetric: bool = True) -> Array:
-    """Solve the normal equations, or the equations with instruments, for which `gram` is not symmetric."""
+    """Solve the normal equations, or the equations with instruments, whose `gram` is not symmetric."""
     from scipy.linalg import cho_factor, cho_solve
 
     gram = gram + np.diag(weight + 1e-12 * np.trace(gram) / len(gram))
@@ -227,12 +226,12 @@ def _solve(gram: Array, side: Array, weight: Array, symmetric: bool = True) -> A
 
 
 def score_of(shares: Array) -> Array:
-    """Return Σ_j log error_j `(blocks,)` of errors `(blocks, nq)`, with a floor for negligible errors."""
+    """Return Σ_j log error_j (blocks,) for errors (blocks, nq), with a floor for negligible errors."""
     return 0.5 * np.log(shares**2 + FLOOR**2).sum(axis=1)
 
 
 def gain_of(better: Array, worse: Array) -> tuple[float, float]:
-    """Return the mean decrease in a score over blocks, and its standard error."""
+    """Return the mean decrease in a score over all blocks, and its standard error."""
     drop = worse - better
     return float(drop.mean()), float(drop.std(ddof=1) / np.sqrt(len(drop)))
 
@@ -240,7 +239,7 @@ def gain_of(better: Array, worse: Array) -> tuple[float, float]:
 def pooled_gain_of(better: Array, worse: Array) -> tuple[float, float]:
     """Return the decrease in Σ_j log error over all blocks, and its jackknife standard error.
 
-    Errors have shape `(blocks, nq)`. Unlike the mean over blocks, the result does not depend on the
+    Errors have shape (blocks, nq). Unlike the mean over blocks, this decrease does not depend on the
     excitation in individual blocks (Cochran, *Sampling Techniques*, ch. 6).
     """
 

@@ -1,4 +1,4 @@
-"""Possible faults of a log or a robot file, the resulting findings, and the correction of logs."""
+"""Hypotheses about faults of a log or a robot file, the resulting findings, and the correction of logs."""
 
 from __future__ import annotations
 
@@ -21,30 +21,31 @@ from forcegp.checks.fit import (
     takes_friction_out,
     tensors,
 )
-from forcegp.checks.log import Array, Log, displacement
+from forcegp.checks.log import Array, Log, displacement, force_unit
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.identification import MASS_SHARE, MOMENT_ARM, regressor
 from forcegp.robot.model import RobotModel
 
 LAGS = (1, 2, 3, 4, 6, 8, 11, 15, 20)
-"""Delays between torque and motion that are tried, in samples, in either direction."""
+"""Delays between torque and motion to be tried, in samples, in either direction."""
 TOOL_MASS = 5.0
-"""Prior standard deviation of the mass of a tool that is missing in the robot file [kg]."""
+"""Prior standard deviation of the mass of a tool that is missing from the robot file [kg]."""
 RISES = (0.3, 2.0, 10.0)
-"""Factors by which the slope of dry friction near rest may differ from that declared: its shape is rarely
-known, and friction in MuJoCo rises more gently."""
-SLOW, GRAVITY = 0.01, 10.0
-"""Sliding speed below which dry friction of contacts is smoothed [m/s]; possible error in gravity [m/s²]."""
+"""Factors by which the slope of dry friction near rest may differ from the declared slope. The shape is
+rarely known, and friction in MuJoCo rises more gently."""
+SLOW, GRAVITY, LARGEST_DRIFT = 0.01, 10.0, 100.0
+"""Sliding speed below which dry friction at contacts is smoothed [m/s]; possible error in gravity [m/s²];
+possible drift of a torque sensor [N m, N]."""
 
 
 @dataclass(frozen=True)
 class Hypothesis:
     """A possible explanation of the torque, named after a kind of finding or a group of kinds.
 
-    `size` is the number of parameters, where discrete choices count as zero. `change` corrects the log under
-    this hypothesis, except for the effects of its parameters. `columns` `(n, nq, p)` are the torques added to
-    r per unit of each parameter, whose prior standard deviations are `prior` `(p,)`. `instruments` have the
-    same shape and allow for errors in the columns. `shift` is a delay of the torque in samples.
+    `change` corrects the log under this hypothesis, except for the effects of its parameters. `size` is the
+    number of parameters, not counting discrete choices. `columns` (n, nq, p) are the torques added to r per
+    unit of each parameter, and `prior` (p,) contains their prior standard deviations. `instruments` have the
+    shape of `columns` and allow for errors in them. `shift` is a delay of the torque in samples.
     """
 
     name: str
@@ -60,7 +61,7 @@ class Hypothesis:
 def problem_of(
     system: ConstrainedSystem, log: Log, rows: np.ndarray, scale: Array | None = None
 ) -> TorqueProblem:
-    """Return the torque problem for the given rows, with friction and an offset at each joint."""
+    """Return the torque problem for the given rows, including friction and an offset at each joint."""
     nuisance = friction_columns(system, log, rows)
     size = np.sqrt((log.tau[rows] ** 2).mean(axis=0))
     size = np.maximum(size, 1e-3 * size.max())
@@ -68,27 +69,27 @@ def problem_of(
 
 
 def friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
-    """Return columns for viscous friction, Coulomb friction and an offset at each joint, `(n, nq, 3 nq)`."""
+    """Return columns (n, nq, 3 nq) for viscous friction, Coulomb friction and an offset at each joint."""
     qd = log.qd[rows]
     smooth = np.tanh(qd / system.robot.friction_velocity.numpy())
     return np.concatenate([_diagonal(x) for x in (qd, smooth, np.ones_like(qd))], axis=-1)
 
 
 def other_rise_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
-    """Return columns for declared Coulomb friction with a different slope near rest, `(n, nq, p)`."""
+    """Return columns (n, nq, p) for the declared Coulomb friction with a different slope near rest."""
     declared = np.tile(system.robot.friction.numpy() > 0.0, len(RISES))
     return shape_columns(system, log, rows)[..., : len(declared)][..., declared]
 
 
 def shape_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
-    """Return columns for other shapes of dry friction and for quadratic friction, by joint, `(n, nq, p)`."""
+    """Return columns (n, nq, p) for alternative shapes of dry friction and for quadratic friction."""
     x, qd = log.qd[rows] / system.robot.friction_velocity.numpy(), log.qd[rows]
     shapes = *(np.tanh(k * x) - np.tanh(x) for k in RISES), qd * np.abs(qd)
     return np.concatenate([_diagonal(shape) for shape in shapes], axis=-1)
 
 
 def contact_friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Array:
-    """Return friction columns Jᵀv, Jᵀv/|v| for each contact that slides at v, `(n, nq, p)`; `p` may be 0."""
+    """Return friction columns Jᵀv and Jᵀv/|v| (n, nq, p) for each contact that slides at velocity v."""
     (q,), columns = tensors(log, rows, "q"), [np.zeros((len(rows), log.nq, 0))]
     for contact in [] if takes_friction_out(system, log) else labelled_contacts(system, log):
         if isinstance(contact, SurfaceContact):
@@ -100,24 +101,24 @@ def contact_friction_columns(system: ConstrainedSystem, log: Log, rows: np.ndarr
 
 
 def _diagonal(x: Array) -> Array:
-    """Return matrices `(n, nq, nq)` with x on the diagonal."""
+    """Return matrices (n, nq, nq) with x on the diagonal."""
     return x[..., None] * np.eye(x.shape[-1])
 
 
 def unchanged(log: Log) -> Log:
-    """Return the unchanged log."""
+    """Return the log unchanged."""
     return log
 
 
 def changed(log: Log, names: tuple[str, ...], *, order: Sequence[int] = (), flip: Sequence[int] = ()) -> Log:
-    """Return the log with two joints swapped, or the signs of the given joints flipped, in given columns."""
+    """Return the log with two joints swapped, or the given joints' signs flipped, in the named columns."""
     index, sign = np.arange(log.nq), np.ones(log.nq)
     index[list(order)], sign[list(flip)] = order[::-1], -1.0
     return log.replace(**{name: getattr(log, name)[:, index] * sign for name in names})
 
 
 def delayed(log: Log, shift: int, joints: tuple[int, ...] = ()) -> Log:
-    """Return the log with the torques of all (or given) joints taken `shift` rows later, masking the ends."""
+    """Replace the torques of the given (or all) joints by those `shift` rows later, and mask the ends."""
     tau, lost = log.tau.copy(), np.ones(len(log), bool)
     columns = list(joints) or list(range(log.nq))
     for s in log.stretches:
@@ -128,7 +129,7 @@ def delayed(log: Log, shift: int, joints: tuple[int, ...] = ()) -> Log:
 
 
 def discrete(log: Log) -> Iterator[Hypothesis]:
-    """Yield hypotheses without parameters: signs and orders."""
+    """Yield hypotheses without parameters: wrong signs and swapped joints."""
     every, motion = tuple(range(log.nq)), ("q", "qd", "qdd")
     if log.nq > 1:
         yield Hypothesis("torque-sign", 0, partial(changed, names=("tau",), flip=every), joints=every)
@@ -142,10 +143,11 @@ def discrete(log: Log) -> Iterator[Hypothesis]:
 
 
 def continuous(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterator[Hypothesis]:
-    """Yield the hypotheses with parameters: gains, encoder offsets, gravity, payload and masses."""
+    """Yield the hypotheses with parameters: gains, encoder offsets, gravity, a payload and masses."""
     for j in range(log.nq):
         yield gain_hypothesis(log, rows, (j,))
         yield encoder_hypothesis(system, log, rows, j)
+        yield drift_hypothesis(log, rows, j)
     yield from robot_hypotheses(system, log, rows)
 
 
@@ -155,27 +157,40 @@ def gain_hypothesis(log: Log, rows: np.ndarray, joints: tuple[int, ...]) -> Hypo
     return Hypothesis("gains", len(joints), unchanged, columns, np.full(len(joints), 100.0), joints)
 
 
+def drift_hypothesis(log: Log, rows: np.ndarray, j: int) -> Hypothesis:
+    """Return the hypothesis that the torque of joint j drifts over the log: u − τ = −θ s with |s| ≤ 1/2."""
+    column = np.zeros((len(rows), log.nq, 1))
+    column[:, j, 0] = -_elapsed(log)[rows]
+    return Hypothesis("drift", 1, unchanged, column, np.full(1, LARGEST_DRIFT), (j,))
+
+
+def _elapsed(log: Log) -> Array:
+    """Return the time from the middle of the log as a fraction of its duration `(n,)`."""
+    t = log.t[log.usable]
+    return (log.t - 0.5 * (t.min() + t.max())) / max(np.ptp(t), 1e-12)
+
+
 def current_hypothesis(
     log: Log, rows: np.ndarray, problem: TorqueProblem, joints: tuple[int, ...]
 ) -> Hypothesis:
-    """Return a gain hypothesis with the required torque as an instrument, which is free of torque noise."""
+    """Return a gain hypothesis whose instrument is the required torque, which is free of torque noise."""
     needed = _diagonal(problem.r + log.tau[rows])[..., list(joints)]
     return replace(gain_hypothesis(log, rows, joints), instruments=needed)
 
 
 def robot_hypotheses(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> Iterator[Hypothesis]:
-    """Yield the hypotheses about the robot file, which do not change the log."""
+    """Yield the hypotheses about the robot file. These do not change the log."""
     for name in ROBOT:
         columns, prior = robot_columns(system, log, rows, name)
         yield Hypothesis(name, columns.shape[-1], unchanged, columns, prior)
 
 
 ROBOT = ("gravity", "payload", "masses")
-"""Hypotheses about the robot file, which do not change the log."""
+"""Hypotheses about the robot file. These do not change the log."""
 
 
 def robot_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray, name: str) -> tuple[Array, Array]:
-    """Return the torque `(n, nq, p)` per unit of each uncertain parameter, and the tolerances `(p,)`."""
+    """Return the torque (n, nq, p) per unit of each uncertain parameter, and the tolerances (p,)."""
     robot = system.robot
     q, qd, qdd = tensors(log, rows, "q", "qd", "qdd")
     with torch.no_grad():
@@ -191,14 +206,14 @@ def robot_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray, name: s
 
 
 def inertial_spread(robot: RobotModel) -> Array:
-    """Return the tolerances of the inertial parameters of a robot file, `(10 nq,)`."""
+    """Return the tolerances (10 nq,) of the inertial parameters in a robot file."""
     mass = robot.mass.numpy()[:, None]
     share = np.repeat([MASS_SHARE, MOMENT_ARM, MOMENT_ARM**2], (1, 3, 6))
     return (np.maximum(mass, 0.01 * mass.max()) * share).ravel()
 
 
 def encoder_hypothesis(system: ConstrainedSystem, log: Log, rows: np.ndarray, j: int) -> Hypothesis:
-    """Return the hypothesis that the encoder of joint j has an offset δ: r = u(q) − τ = −∂u/∂q δ."""
+    """Return the hypothesis that the encoder of joint j has an offset δ, so that r = u(q) − τ = −∂u/∂q δ."""
     q, qd, qdd = tensors(log, rows, "q", "qd", "qdd")
     step = torch.zeros(log.nq, dtype=q.dtype)
     step[j] = 1e-4
@@ -209,20 +224,20 @@ def encoder_hypothesis(system: ConstrainedSystem, log: Log, rows: np.ndarray, j:
 
 
 CURRENT = 1.6
-"""Median gain factor above which the error is not one of calibration: a different quantity was logged."""
+"""Median gain factor above which a different quantity must have been logged instead of the torque."""
 TILT = 30.0
-"""Largest angle at which a base counts as tilted rather than mounted in a different orientation [degrees]."""
+"""Largest angle that counts as a tilt of the base; a larger one is a different mounting [degrees]."""
 WEIGHTLESS, SIGNIFICANT = 0.3, 3.0
-"""Fraction of gravity below which torques lack it; standard errors above which payload and offsets count."""
+"""Fraction of gravity below which torques lack it; standard errors at which payload and offsets count."""
 SMALL_ANGLE, LARGEST_ANGLE = np.radians(0.5), 1.0
-"""Encoder offset below which calibration or the centres of mass may be the cause, and offset above which a
-linearisation cannot determine it [rad, m]."""
+"""Encoder offset below which calibration or the centres of mass may be the cause; offset above which a
+linearisation cannot determine the offset [rad, m]."""
 SMALL_GAIN, EXPLAINED = 0.2, 0.5
-"""Deviation of a gain from 1 that wrong masses may cause; fraction of torque it may leave unexplained."""
+"""Deviation of a gain from 1 that wrong masses may cause; accepted fraction of unexplained torque."""
 SMALL_TILT, EARTH = 1.0, 9.81
 """Tilt that wrong masses may cause [degrees]; magnitude assumed if the scene has no gravity [m/s²]."""
 SAME_GRAVITY = 0.2, 0.5
-"""Accepted relative error in the magnitude of gravity due to wrong masses, for tilts and larger angles."""
+"""Accepted relative errors in the size of gravity due to wrong masses, for tilts and for larger angles."""
 
 
 DISCRETE = {
@@ -234,7 +249,7 @@ DISCRETE = {
 
 
 def plausible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit) -> bool:
-    """Return whether the parameters are physically plausible (a tool has a positive mass, for example)."""
+    """Return whether the parameters are physically plausible. For example, tool mass must be positive."""
     if hypothesis.name == "encoder-offset":
         least = max(SMALL_ANGLE, SIGNIFICANT * fit.spread[0])
         return bool(least < abs(fit.theta[0]) <= LARGEST_ANGLE)
@@ -250,8 +265,11 @@ def plausible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit)
         # No place on earth has another size of gravity: such a fit has masses or gains that are wrong.
         same = abs(size - 1.0) <= SAME_GRAVITY[angle > TILT]
         return bool(size < WEIGHTLESS) or (angle > SMALL_TILT and same)
+    if hypothesis.name == "drift":
+        return bool(abs(fit.theta[0]) > SIGNIFICANT * fit.spread[0])
     if hypothesis.name == "payload":
-        return bool(fit.theta[0] > SIGNIFICANT * fit.spread[0])
+        known = abs(fit.theta[0]) > SIGNIFICANT * fit.spread[0]
+        return bool(known and fit.theta[0] > -float(system.robot.mass[-1]))
     return True
 
 
@@ -263,6 +281,10 @@ def corrected(log: Log, hypothesis: Hypothesis, theta: Array) -> Log:
         # r = u − τ = g τ: the right torque is (1 + g) τ.
         tau[:, joints] *= 1.0 + theta[: len(joints)]
         return log.replace(tau=tau)
+    if hypothesis.name == "drift":
+        tau = log.tau.copy()
+        tau[:, joints] -= theta[:1] * _elapsed(log)[:, None]
+        return log.replace(tau=tau)
     if hypothesis.name == "encoder-offset":
         q = log.q.copy()
         q[:, joints] += theta[:1]
@@ -273,7 +295,7 @@ def corrected(log: Log, hypothesis: Hypothesis, theta: Array) -> Log:
 def finding_of(
     system: ConstrainedSystem, log: Log, hypothesis: Hypothesis, fit: TorqueFit, alike: tuple[int, ...] = ()
 ) -> Finding:
-    """Return the finding that states a hypothesis; `alike` contains the joints of equivalent hypotheses."""
+    """Return the finding for a hypothesis. `alike` contains the joints of equivalent hypotheses."""
     name, theta, spread, evidence = hypothesis.name, fit.theta, fit.spread, dict[str, float]()
     one_of = name == "joint-sign" and len(alike) > 1
     names = tuple(log.joint_names[j] for j in (alike if one_of else hypothesis.joints))
@@ -295,9 +317,17 @@ def finding_of(
         added = displacement(system.robot, hypothesis.joints[0], float(theta[0]))
         text = f"{listed} fits with {added} added to its position, ± {spread[0]:.4f}"
         evidence = {"add_rad": float(theta[0])}
+    elif name == "drift":
+        unit = force_unit(system.robot, hypothesis.joints[0])
+        name, text = (
+            "torque-offset",
+            f"the logged torque of {listed} drifts by {theta[0]:+.3g} ± {spread[0]:.2g} {unit}",
+        )
+        evidence = {f"drift {listed}": theta[0], "largest_torque": 0.5 * abs(theta[0])}
     elif name == "payload":
         name, names = "payload-missing", (log.joint_names[-1],)
-        text = f"the torque fits with {theta[0]:.3g} ± {spread[0]:.2g} kg more on the last link"
+        more = "more" if theta[0] > 0.0 else "less"
+        text = f"the torque fits with {abs(theta[0]):.3g} ± {spread[0]:.2g} kg {more} on the last link"
         evidence = {"mass_kg": float(theta[0]), "spread_kg": spread[0]}
     else:
         text = "the torque fits better with other masses and centres of mass than those of the robot file"
@@ -323,7 +353,7 @@ def _gains(log: Log, names: tuple[str, ...], gains: Array) -> Finding:
 
 
 def _gravity(system: ConstrainedSystem, log: Log, change: Array) -> Finding:
-    """Return the finding on gravity that the torque lacks, or whose direction differs from the scene's."""
+    """Return the finding that gravity is missing in the torque, or has a different direction there."""
     assumed = system.robot.gravity.numpy()
     fitted = assumed + change
     strength = float(np.linalg.norm(assumed))
@@ -339,7 +369,7 @@ def _gravity(system: ConstrainedSystem, log: Log, change: Array) -> Finding:
 
 
 def is_tilt(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit) -> bool:
-    """Return whether a hypothesis turns gravity by a small angle."""
+    """Return whether a hypothesis rotates gravity by a small angle."""
     assumed = system.robot.gravity.numpy()
     angle, size = _turn(assumed, assumed + fit.theta[:3]) if hypothesis.name == "gravity" else (np.inf, 0.0)
     return bool(assumed.any()) and angle <= TILT and size >= WEIGHTLESS

@@ -1,9 +1,9 @@
-"""Checks that qd is the derivative of q, and qdd that of qd: units, signs and order of columns, and noise.
+"""Checks that qd is the derivative of q and that qdd is the derivative of qd.
 
-Changes of x over short windows are compared with integrals of its logged rate. Since noise flattens one of
-the two regression lines between them, a rate is wrong only if both slopes are. The noise in the acceleration
-should be white and as large as the header states. For white noise, the deviations from cubics through
-neighbours at distances of one and of three samples have the same size; for filtered noise they do not.
+The checks cover units, signs, order of columns, and noise. Changes of x over short windows are compared with
+integrals of its logged rate. Noise flattens one of the two regression lines between them, so a rate is wrong
+only if both slopes are. The noise in the acceleration should be white and as large as the header states. For
+white noise, the deviations from cubics through neighbours one and three samples away have equal size.
 """
 
 from __future__ import annotations
@@ -25,32 +25,32 @@ from forcegp.robust import robust_std
 WINDOW = 0.05
 """Length of a window [s], long enough to average out noise and short compared with the motion."""
 TOLERANCE, INSTANT = 0.05, 0.15
-"""Accepted deviations of a slope from 1, for filters and for accelerations that change within a period."""
+"""Accepted deviations of a slope from 1: for filters, and for accelerations that change within a period."""
 RELATED = 0.7
-"""Correlation below which a velocity does not belong to its position, unless encoder steps are coarse."""
+"""Correlation below which a velocity does not match its position, unless encoder steps are coarse."""
 EXCHANGED, CLEARLY = 0.9, 5.0
-"""Correlation with another joint's rate that indicates swapped columns; factor by which that order must
-reduce the unexplained variance."""
+"""Correlation with another joint's rate that indicates swapped columns; factor by which the swapped order
+must reduce the unexplained variance."""
 LATE, PERSISTS = 0.05, 0.5
-"""Fraction of the motion that a delayed velocity misses, and correlation of the missing motion in adjacent
-windows; noise is uncorrelated."""
+"""Fraction of the motion that a delayed velocity misses; correlation of the missing motion between adjacent
+windows, which is zero for noise."""
 JUMPS = 0.05
-"""Largest fraction of windows left out because of impacts, whose velocity jumps no acceleration explains."""
+"""Largest fraction of windows excluded because of impacts, at which velocity jumps without acceleration."""
 INERTIA_ROWS = 200
 """Maximum number of rows at which inertias are computed."""
 FRICTION_ROWS, LEAST_ROWS = 4000, 20
 """Maximum and minimum number of rows from which viscous friction is estimated."""
 ALIKE = 0.02
-"""Tolerance within which the slopes of all joints share a factor, which indicates an incorrect clock rate."""
+"""Tolerance within which all joints have the same slope, which indicates an incorrect clock rate."""
 UNITS = (1e-9, 1e-6, 1e-3, 1e3)
-"""Lengths of 1 ns, 1 µs, 1 ms and 1 ks, possible units of a clock [s]."""
+"""Lengths of 1 ns, 1 µs, 1 ms and 1 ks, the possible units of a clock [s]."""
 UNIT_TOLERANCE = 0.1
 
 
 @dataclass(frozen=True)
 class Match:
-    """Changes of a column and integrals of its rate over windows `(w, nq)`, set to zero if the window has an
-    impact (except in `whole`), bounds on the slopes between them `(nq,)`, and joints that move.
+    """Changes of a column, and integrals of its rate, over windows (w, nq). Both are zero in windows with an
+    impact, except in `whole`. `low` and `high` bound the slopes between them.
     """
 
     change: Array
@@ -64,7 +64,7 @@ class Match:
     def right(
         self, factor: float = 1.0, tolerance: float = TOLERANCE, least: Array | float = 1.0
     ) -> np.ndarray:
-        """Return `(nq,)` bool, whether the slope can lie between `least` · `factor` and `factor`."""
+        """Return the mask `(nq,)` of joints whose slope can lie between `least` · `factor` and `factor`."""
         ratio = np.stack([self.low, self.high]) / factor
         return (ratio.min(axis=0) < 1.0 + tolerance) & (ratio.max(axis=0) > least * (1.0 - tolerance))
 
@@ -142,7 +142,7 @@ def _clock_finding(log: Log, factor: float) -> Outcome:
 
 
 def _one_factor(level: Match, factor: float) -> bool:
-    """Return whether several joints share a slope that is neither correct nor explained by degrees."""
+    """Return whether several joints share a slope that is wrong and that degrees do not explain."""
     degrees = any(abs(np.log(abs(factor) * unit)) <= UNIT_TOLERANCE for unit in (DEGREE, 1.0 / DEGREE))
     if factor <= 0.0 or abs(factor - 1.0) <= TOLERANCE or degrees or level.moving.sum() < 2:
         return False
@@ -176,7 +176,7 @@ def check_velocity(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def _late(log: Log, level: Match) -> list[Finding]:
-    """Find velocities delayed by a filter: a delay L causes a persistent error Δq − ∫q̇ dt = L Δq̇."""
+    """Find velocities delayed by a filter. A delay L causes a persistent error Δq − ∫q̇ dt = L Δq̇."""
     rates = match(log, "qd", "qdd")
     if rates is None or "qd" in log.header.derived:
         return []
@@ -184,13 +184,13 @@ def _late(log: Log, level: Match) -> list[Finding]:
     square, change = (misfit**2).sum(axis=0), (level.change**2).sum(axis=0)
     delay = (misfit * step).sum(axis=0) / np.maximum((step**2).sum(axis=0), 1e-300)
     persists = (misfit[1:] * misfit[:-1]).sum(axis=0) > PERSISTS * square
-    late = level.moving & persists & (square > LATE**2 * change) & (delay > log.dt)
-    shown = ", ".join(f"{1e3 * x:.2g} ms" for x in delay[late])
-    return log.on_joints("velocity-delay", late, f"qd of {{}} is {shown} behind the rate of change of q")
+    late = level.moving & persists & (square > LATE**2 * change) & (np.abs(delay) > log.dt)
+    shown = ", ".join(f"{1e3 * abs(x):.2g} ms {'behind' if x > 0 else 'ahead of'}" for x in delay[late])
+    return log.on_joints("velocity-delay", late, f"qd of {{}} is {shown} the rate of change of q")
 
 
 def _velocity_findings(log: Log, level: Match, wrong: np.ndarray) -> tuple[list[Finding], Array]:
-    """Return one finding per cause, and the factors that correct the velocities."""
+    """Return one finding for each cause, and the factors that correct the velocities."""
     causes = ("velocity-sign", -1.0, "runs against"), ("degrees", 1.0 / DEGREE, "is 1/57 of")
     findings, factor, unexplained = [], np.ones(log.nq), wrong.copy()
     for kind, slope, what in (*causes, ("degrees", DEGREE, "is 57 times")):
@@ -203,7 +203,7 @@ def _velocity_findings(log: Log, level: Match, wrong: np.ndarray) -> tuple[list[
 
 
 def _mismatch(kind: str, log: Log, level: Match, wrong: np.ndarray, rate: str, value: str) -> list[Finding]:
-    """Return a rate without relation to its value, if any."""
+    """Report rates that are unrelated to their values, if any."""
     j = int(np.argmax(wrong))
     numbers = {"slope": level.low[j], "correlation": level.correlation[j]}
     shown = ", ".join(f"{name} {number:.3g}" for name, number in numbers.items())
@@ -213,7 +213,7 @@ def _mismatch(kind: str, log: Log, level: Match, wrong: np.ndarray, rate: str, v
 
 
 def _coarse(log: Log, level: Match) -> np.ndarray:
-    """Return the joints that move by about one encoder step per window, too little to judge their rate."""
+    """Return the joints that move only about one encoder step per window, too little to check their rates."""
     size = np.sqrt((level.change**2).mean(axis=0))
     moves = np.abs(np.diff(log.q, axis=0))
     steps = np.nanmedian(np.where(moves > 0.0, moves, np.nan), axis=0)
@@ -221,7 +221,7 @@ def _coarse(log: Log, level: Match) -> np.ndarray:
 
 
 def _permutation(level: Match) -> np.ndarray | None:
-    """Return the order of rates that fits the changes of the joints better than the logged one, if any."""
+    """Return the order of rates that fits the changes of the joints better than the logged order, if any."""
     from scipy.optimize import linear_sum_assignment
 
     # Windows without impacts are those in which a joint fits its own rate, which here is the wrong one.
@@ -240,10 +240,10 @@ def _permutation(level: Match) -> np.ndarray | None:
 
 
 def _held_torque(system: ConstrainedSystem, log: Log) -> Array:
-    """Return the mean acceleration over a period of constant torque relative to that at its start, `(nq,)`.
+    """Return the mean acceleration `(nq,)` over a period of constant torque, relative to its initial value.
 
-    Viscous friction d slows a joint of inertia m as exp(−d t/m), so the ratio is (1 − exp(−x))/x, x = d dt/m.
-    After a change in the torque, lightweight damped joints accelerate more than their velocity changes.
+    Viscous friction d slows a joint with inertia m as exp(−d t/m), so the ratio is (1 − exp(−x))/x with x = d
+    dt/m. After a change in torque, lightweight damped joints accelerate more than their velocity changes.
     """
     rows = log.rows(INERTIA_ROWS)
     (q,) = tensors(log, rows, "q")
@@ -286,13 +286,13 @@ def check_acceleration(system: ConstrainedSystem, log: Log) -> Outcome:
 DEPARTURE_STRIDE = 3
 """Stride at which the deviation from a cubic reveals noise below the cut-off frequency of a filter."""
 NOISE_FACTOR, FILTERED = 2.0, 0.4
-"""Ratio of measured to stated noise above which it is reported; ratio of the noise at the highest frequency
-to that at a third of it below which the noise counts as filtered."""
+"""Ratio of measured to stated noise above which the noise is reported; ratio of the noise at the highest
+frequency to that at a third of it, below which the noise counts as filtered."""
 NOISE_ROWS = 100
 
 
 def noise_levels(log: Log) -> tuple[Array, Array] | None:
-    """Return standard deviations `(nq,)` of white noise, estimated from neighbours at distances 1 and 3."""
+    """Return the standard deviations (nq,) of white noise estimated from neighbours at distances 1 and 3."""
     from scipy.ndimage import correlate1d
 
     levels = []

@@ -1,4 +1,4 @@
-"""Checks for values beyond the limits in the robot file, clipped torques, and degrees instead of radians."""
+"""Checks for values beyond the limits in the robot file, clipped torques, and angles in degrees."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from forcegp.data.clipped import clipped
 DEGREE = np.pi / 180.0
 TURN = 2.0 * np.pi
 SLACK = 1e-3
-"""Fraction of the range by which a limit may be exceeded, due to rounding or encoder readings at a stop."""
+"""Fraction of the range by which a value may exceed a limit due to rounding or encoder errors at a stop."""
 OFTEN, UNIT_ROWS = 0.05, 400
-"""Fraction of rows beyond the limits that suggests a wrong unit, and number of rows for comparing torques."""
+"""Fraction of rows beyond the limits that suggests a wrong unit; number of rows for comparing torques."""
 
 
 def _limits(system: ConstrainedSystem) -> dict[str, tuple[Array, Array]]:
@@ -29,7 +29,7 @@ def _limits(system: ConstrainedSystem) -> dict[str, tuple[Array, Array]]:
 
 
 def check_degrees(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find angles in degrees: they exceed the joint ranges, but match ranges and torques once converted."""
+    """Find angles in degrees, which exceed the joint ranges but match ranges and torques if converted."""
     low, high = _limits(system)["q"]
     turning = system.robot.revolute.cpu().numpy() > 0.0
     low, high = np.where(np.isfinite(low), low, -TURN), np.where(np.isfinite(high), high, TURN)
@@ -53,7 +53,7 @@ def check_degrees(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def _misfit(system: ConstrainedSystem, log: Log) -> float:
-    """Return the held-out torque error score with a free gain per joint; 0 if the torque is uninformative."""
+    """Return the held-out torque error with a free gain per joint, or 0 if the torque is uninformative."""
     rows = log.rows(UNIT_ROWS)
     if len(rows) < UNIT_ROWS or not log.tau[rows].any():
         return 0.0
@@ -63,7 +63,7 @@ def _misfit(system: ConstrainedSystem, log: Log) -> float:
 
 
 def _angles(log: Log) -> list[str]:
-    """Return the columns that are in degrees if angles are, including their derivatives unless in radians."""
+    """Return the columns that are in degrees if angles are. Derivatives are included unless in radians."""
     columns = ["q"]
     for name, source in (("qd", "q"), ("qdd", "qd")):
         step = sum(np.abs(np.diff(getattr(log, source)[s], axis=0)).sum() for s in log.stretches)
@@ -88,7 +88,7 @@ def check_limits(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_saturation(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find torques that stay at their largest value for several rows because the amplifier clips."""
+    """Find torques that stay at their largest value for several rows because the amplifier clips them."""
     mask = clipped_torques(log)
     joints = log.named(mask.any(axis=0))
     text = f"the torque of {', '.join(joints)} stays at its largest value in"
@@ -96,10 +96,10 @@ def check_saturation(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def clipped_torques(data: Dataset | Log) -> NDArray[np.bool_]:
-    """Return the mask `(n, nq)` of torques that remain at the largest or smallest value of their joint.
+    """Return a mask (n, nq) of torques that stay at the largest or smallest value of their joint.
 
-    Use the unfiltered log, since filters smooth the plateaus. `forcegp import` states the noise of these rows
-    in `extras["tau_std"]`, or drops them.
+    Use the unfiltered log, since filters smooth the plateaus. `forcegp import` drops these rows, or states
+    their noise in `extras["tau_std"]`.
 
     Args:
         data: a log in time order.

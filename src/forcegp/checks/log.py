@@ -2,8 +2,8 @@
 
 Noise ε in q̈ enters the explained torque as M ε. As in any regression on noisy columns, a fit would reduce
 its error by shrinking the inertia. Applying the same filter of a tenth of a second to positions, velocities,
-accelerations and torques removes the noise and preserves M q̈ = Q, up to changes in M and in the bias force
-within the window.
+accelerations and torques removes the noise. It preserves M q̈ = Q except for changes in M and in the bias
+force within the window.
 """
 
 from __future__ import annotations
@@ -40,17 +40,16 @@ def evenly(rows: NDArray[np.int64], most: int) -> NDArray[np.int64]:
 DEPARTURE = np.array([1.0, -4.0, 6.0, -4.0, 1.0]) / 6.0
 """Weights for the deviation of a value from the cubic through its four neighbours."""
 OUTER, SPREAD = np.array([3.0, -10.0, 10.0, 0.0, -5.0, 2.0, 0.0]) / 3.0, 3.7
-"""Weights for the deviation at x = −3 from the cubic through x = −2, −1, 1, 2, and the ratio of its standard
+"""Weights for the deviation at x = −3 from the cubic through x = −2, −1, 1, 2; ratio of its standard
 deviation to that of the deviation at x = 0, for white noise."""
 
 
 def spikes(x: Array) -> tuple[Array, Array]:
-    """Return the deviation of each value from the cubic through its four neighbours, and that of the
-    neighbours.
+    """Return each value's deviation from the cubic through its four neighbours, and the neighbours' own.
 
     e_i = x_i − (−x_{i−2} + 4 x_{i−1} + 4 x_{i+1} − x_{i+2})/6. The second result is the deviation among the
-    neighbours alone, without x_i. A kink in the motion increases both, a spike only the first. Values must be
-    evenly sampled, `(n, d)` with n ≥ 7; both results are zero in the three rows at either end.
+    neighbours alone. A kink in the motion increases both results, a spike only the first. Values must be
+    evenly sampled, with shape `(n, d)` and n ≥ 7. Both are zero in the three rows at either end.
     """
     from scipy.ndimage import correlate1d
 
@@ -72,22 +71,22 @@ def force_unit(robot: RobotModel, j: int | np.integer) -> str:
 
 
 def displacement(robot: RobotModel, j: int | np.integer, offset: float) -> str:
-    """Return an offset in the position of joint j as text, with angles also in degrees."""
+    """Format an offset in the position of joint j as text, with angles also in degrees."""
     degrees = f" ({np.degrees(offset):+.2f}°)" if robot.joint_types[j] == "revolute" else ""
     return f"{offset:+.4f} {position_unit(robot, j)}{degrees}"
 
 
 GAP, CLOCK_SPREAD = 1.5, 10.0
-"""A gap is longer than this multiple of the median step, and exceeds the median step by this many robust
+"""A gap is longer than this multiple of the median step. It also exceeds the median step by this many robust
 standard deviations, to allow for clock jitter."""
 SHORTEST, SMOOTHING = 8, 0.1
-"""Minimum number of rows in a stretch, and length of the filter that computes missing derivatives [s]."""
+"""Minimum number of rows in a contiguous run; length of the filter that computes missing derivatives [s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class Log:
-    """Unchecked columns of a log, named as in a `Dataset`. `derived` names computed columns, and `masked`
-    `(n,)` marks rows that subsequent checks ignore.
+    """Columns of a log that have not been validated, with the same names as in a `Dataset`. `derived` names
+    the computed columns. `masked`, shape (n,), marks rows that subsequent checks ignore.
     """
 
     t: Array
@@ -117,11 +116,11 @@ class Log:
         return ((0, len(self)),)
 
     def finding(self, kind: str, text: str, joints: tuple[str, ...] = (), **evidence: Any) -> Finding:
-        """Return a finding that concerns the whole log."""
+        """Return a finding about the whole log."""
         return Finding(kind, text, self.all_rows, joints, evidence=evidence)
 
     def on_joints(self, kind: str, mask: Array, text: str, **evidence: Any) -> list[Finding]:
-        """Return a finding on the joints selected by a mask, whose names replace `{}`, or no finding."""
+        """Return one finding on the joints in a mask, with their names in place of `{}`, or no finding."""
         joints = self.named(mask)
         return [self.finding(kind, text.format(", ".join(joints)), joints, **evidence)] if joints else []
 
@@ -149,17 +148,17 @@ class Log:
         return self.finite if self.masked is None else self.finite & ~self.masked
 
     def reach(self, name: str) -> Array:
-        """Return the range `(nq,)` of a column without its most extreme values."""
+        """Return the range (nq,) of a column for each joint, excluding the most extreme values."""
         return np.ptp(np.percentile(getattr(self, name)[self.usable], (0.5, 99.5), axis=0), axis=0)
 
     @cached_property
     def steps(self) -> Array:
-        """Time steps `(n − 1,)` [s], NaN between segments."""
+        """Time steps (n − 1,) [s], with NaN between segments."""
         return np.where(np.diff(self.segment) == 0, np.diff(self.t), np.nan)
 
     @cached_property
     def dt(self) -> float:
-        """Median of the positive time steps [s]; NaN if there are none."""
+        """Median of the positive time steps [s], or NaN if there are none."""
         forward = self.steps[self.steps > 0.0]
         return float(np.median(forward)) if len(forward) else float("nan")
 
@@ -172,13 +171,13 @@ class Log:
 
     @cached_property
     def stretches(self) -> list[slice]:
-        """Contiguous runs of usable rows that lie in one segment and have no gap in time."""
+        """Contiguous runs of usable rows within one segment and without a gap in time."""
         linked = (self.steps > 0.0) & (self.steps <= self.longest_step) & self.usable[1:] & self.usable[:-1]
         runs = intervals(linked) if self.header.ordered else ()
         return [slice(a, b + 1) for a, b in runs if b + 1 - a >= SHORTEST]
 
     def rows(self, most: int, margin: int = 0) -> NDArray[np.int64]:
-        """Return up to `most` evenly spaced usable rows, at least `margin` rows from the end of a stretch."""
+        """Return up to `most` evenly spaced usable rows, at least `margin` rows from the end of any run."""
         inner = [np.arange(s.start + margin, s.stop - margin) for s in self.stretches]
         index = np.concatenate([np.empty(0, np.int64), *inner])
         index = index if self.header.ordered else np.flatnonzero(self.usable)
@@ -186,7 +185,7 @@ class Log:
 
 
 Outcome = tuple[list[Finding], Log]
-"""Result of a check: its findings, and the corrected log for subsequent checks."""
+"""Result of a check: its findings, and the corrected log for the subsequent checks."""
 
 
 def log_of(data: Dataset) -> Log:
@@ -206,7 +205,7 @@ def read_log(path: str | Path) -> Log:
     The columns are described in docs/formats.md. Missing q̇ and q̈ are computed by a Savitzky-Golay filter.
 
     Raises:
-        DataError: the file is damaged, or a column is missing.
+        DataError: the file is damaged, or a required column is missing.
     """
     raw, header = read_table(path, missing="nan")
     joints = header.joint_names or tuple(name[2:] for name in raw if name.startswith("q."))
@@ -219,7 +218,7 @@ def read_log(path: str | Path) -> Log:
 
 
 def derive(log: Log, absent: list[str]) -> Log:
-    """Return the log with missing derivatives computed on each contiguous stretch, and NaN elsewhere."""
+    """Return the log with missing derivatives computed in each contiguous run of rows, and NaN elsewhere."""
     logged = [name for name in JOINT_VECTORS if name not in absent]
     filled = log.replace(**{name: np.zeros_like(log.q) for name in absent})
     values = {name: np.full_like(log.q, np.nan) for name in absent}
@@ -235,7 +234,7 @@ def derive(log: Log, absent: list[str]) -> Log:
 
 
 def of_robot(log: Log, robot: RobotModel) -> Log:
-    """Return the log with joints ordered as in the robot; raise `DataError` if it is empty or lacks one."""
+    """Return the log with joints in the robot's order; raise `DataError` if it is empty or lacks a joint."""
     if len(log) == 0:
         raise DataError("the log contains no rows", expected="one or more samples")
     if not set(robot.joint_names) <= set(log.joint_names):

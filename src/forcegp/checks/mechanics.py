@@ -1,4 +1,4 @@
-"""Checks of the torque: faults that explain it, and then friction, offsets and disturbances."""
+"""Checks of the torque for faults that explain it, and for friction, offsets and disturbances."""
 
 from __future__ import annotations
 
@@ -9,8 +9,8 @@ import numpy as np
 from forcegp.checks import hypotheses
 from forcegp.checks.excitation import check_visibility, still_joints
 from forcegp.checks.explain import Explanation, explain
-from forcegp.checks.finding import Finding, NotJudgedError
-from forcegp.checks.fit import FLOOR, cross_validate, gain_of, robust_parameters, unmeasured
+from forcegp.checks.finding import Finding, NotJudgedError, with_alternatives
+from forcegp.checks.fit import FLOOR, TorqueFit, gain_of, robust_parameters, unmeasured
 from forcegp.checks.log import Array, Log, Outcome, force_unit, position_unit, smoothed
 from forcegp.constraints import ConstrainedSystem
 from forcegp.robot.model import RobotModel
@@ -22,22 +22,20 @@ LEAST_ROWS = 200
 SIGNIFICANT, MATERIAL = 3.0, 0.1
 """Standard errors over blocks, and drop in a joint's log error, above which friction or offsets count."""
 SPEEDS, UNEXPLAINED = (25.0, 95.0), 0.5
-"""Percentiles of speed at which friction must oppose motion; RMS fraction of unexplained torque allowed."""
+"""Percentiles of speed at which friction must oppose motion; accepted RMS fraction of unexplained torque."""
 TRACE_ROWS, DISTURBANCE_SECONDS = 20_000, 0.1
-"""Maximum number of rows for inspecting the residual over time; duration over which it is averaged [s]."""
+"""Maximum number of rows in the trace of the residual; duration over which the residual is averaged [s]."""
 DISTURBANCE, LOUD = 5.0, 4.0
-"""A stretch stands out if its log residual exceeds the median by this many robust standard deviations, or its
-residual exceeds the 90 % quantile by this factor."""
+"""A period stands out if its log residual exceeds the median by this many robust standard deviations, or if
+its residual exceeds the 90 % quantile by this factor."""
 MOVING, VISIBLE = 0.05, 0.1
-"""Fraction of its largest speed above which an arm moves; fraction of the torque that disturbances exceed."""
-RIVALS = {"gravity": "a tilt of the base", "masses": "other masses", "gains": "a wrong gain"}
-"""Faults that may look like a constant torque, by hypothesis."""
+"""Fraction of its maximum speed above which an arm moves; fraction of torque that a disturbance exceeds."""
 ONE_SIGMA = 84.13
 """Percentile of a normal distribution at one standard deviation above the mean."""
 
 
 def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Check signs, order, gains and delays of torques, gravity, payload, masses, friction and offsets."""
+    """Check the torques for wrong signs, order, gains and delays, and the robot file for wrong parameters."""
     if len(log.rows(LEAST_ROWS)) < LEAST_ROWS:
         raise NotJudgedError(f"fewer than {LEAST_ROWS} usable rows")
     passive = _without_torque(log)
@@ -92,19 +90,15 @@ def _without_torque(log: Log) -> list[Finding]:
     return [replace(finding, weight="error" if still.all() else "warning") for finding in findings]
 
 
-def _matters(explanation: Explanation, j: int, columns: list[int]) -> bool:
-    """Return whether omitting the given nuisance columns raises the error of joint j significantly."""
-    problem = explanation.problem
-    keep = np.setdiff1d(np.arange(problem.nuisance.shape[-1]), columns)
-    less = replace(problem, nuisance=problem.nuisance[..., keep])
-    without = cross_validate(less, explanation.columns, explanation.prior)
-    floor = FLOOR * problem.size[j] / problem.scale[j]
-    gain, error = gain_of(*(np.log(np.hypot(fit.error[:, j], floor)) for fit in (explanation.fit, without)))
+def _worse(explanation: Explanation, other: TorqueFit, j: int) -> bool:
+    """Return whether another fit has a significantly larger error at joint j."""
+    floor = FLOOR * explanation.problem.size[j] / explanation.problem.scale[j]
+    gain, error = gain_of(*(np.log(np.hypot(fit.error[:, j], floor)) for fit in (explanation.fit, other)))
     return gain > MATERIAL and gain > SIGNIFICANT * error
 
 
 def _determined(robot: RobotModel, explanation: Explanation) -> Explanation:
-    """Return the explanation with friction set to 0 if it would drive a joint, or is smaller than its σ."""
+    """Set friction to 0 if it would drive a joint, or if it is smaller than its standard deviation."""
     declared = np.concatenate([robot.damping.numpy(), robot.friction.numpy()])
     for _ in range(robot.nq):
         fit = explanation.fit
@@ -119,7 +113,7 @@ def _determined(robot: RobotModel, explanation: Explanation) -> Explanation:
 
 
 def _confounded(explanation: Explanation) -> list[Finding]:
-    """Return the faults found; currents become warnings if masses are wrong, since gains depend on masses."""
+    """Return the findings. Currents become warnings if masses are wrong, since gains depend on masses."""
     findings = list(explanation.findings)
     for k, finding in enumerate(findings if "masses" in explanation.robot else ()):
         if finding.kind == "torque-current" and "masses-mismatch" not in finding.kinds:
@@ -138,13 +132,14 @@ def _friction(robot: RobotModel, explanation: Explanation) -> list[Finding]:
     damping, declared = robot.damping.numpy(), robot.friction.numpy()
     resists = ((viscous + damping) * speeds + coulomb + declared > 0.0).all(axis=0)
     spread = explanation.fit.nuisance_spread
-    significant = np.array([_matters(explanation, j, [j, nq + j]) for j in range(nq)])
+    significant = np.array([_worse(explanation, explanation.without([j, nq + j]).fit, j) for j in range(nq)])
     # Within the rise of declared friction, whose law is rarely known, a slow joint shows nothing beyond it.
     rising = (speeds[1] <= robot.friction_velocity.numpy()) & (declared > 0.0)
     significant &= resists & ~still_joints(log) & ~rising
     findings = []
     for hit, word in ((significant & (power > 0.0), "more"), (significant & (power <= 0.0), "less")):
-        evidence, parts = {}, []
+        largest = (np.abs(viscous) * speeds[1] + np.abs(coulomb))[hit].max(initial=0.0)
+        evidence, parts = {"largest_torque": largest}, []
         for j in np.flatnonzero(hit):
             unit, name, sizes = force_unit(robot, j), log.joint_names[j], []
             units = f"{unit} s/{position_unit(robot, j)}", unit
@@ -163,17 +158,23 @@ def _offsets(system: ConstrainedSystem, explanation: Explanation) -> list[Findin
     log, nq, rows = explanation.log, explanation.log.nq, explanation.rows
     offset = -explanation.fit.nuisance[2 * nq : 3 * nq]
     known = np.abs(offset) > explanation.fit.nuisance_spread[2 * nq : 3 * nq]
-    off = {j: log.joint_names[j] for j in range(nq) if known[j] and _matters(explanation, j, [2 * nq + j])}
+    less = {j: explanation.without([2 * nq + j]) for j in np.flatnonzero(known).tolist()}
+    off = {j: log.joint_names[j] for j, one in less.items() if _worse(explanation, one.fit, j)}
     if not off:
         return []
     listed = ", ".join(f"{joint} {offset[j]:+.3g} {force_unit(system.robot, j)}" for j, joint in off.items())
     evidence = {f"offset {joint}": offset[j] for j, joint in off.items()}
+    evidence["largest_torque"] = max(abs(offset[j]) for j in off)
+    text, names = f"the logged torque is off by a constant: {listed}", tuple(off.values())
     tried = *hypotheses.robot_hypotheses(system, log, rows), hypotheses.gain_hypothesis(log, rows, tuple(off))
-    beside = {RIVALS[h.name]: explanation.beside(h) for h in tried if h.name in RIVALS}
-    others = [w for w, one in beside.items() if not any(_matters(one, j, [2 * nq + j]) for j in off)]
-    or_else = f"; in this motion, {', '.join(others)} would look the same" if others else ""
-    text = f"the logged torque is off by a constant: {listed}{or_else}"
-    return [log.finding("torque-offset", text, tuple(off.values()), **evidence)]
+    without = explanation.without([2 * nq + j for j in off])
+    fits = ((h, without.with_(h)) for h in tried if h.name not in explanation.robot)
+    rivals = [
+        hypotheses.finding_of(system, log, h, fit)
+        for h, fit in fits
+        if hypotheses.plausible(system, h, fit) and not any(_worse(explanation, fit, j) for j in off)
+    ]
+    return [with_alternatives(log.finding("torque-offset", text, names, **evidence), rivals)]
 
 
 def _unexplained(explanation: Explanation) -> list[Finding]:
@@ -185,7 +186,7 @@ def _unexplained(explanation: Explanation) -> list[Finding]:
 
 
 def _disturbances(system: ConstrainedSystem, explanation: Explanation) -> tuple[list[Finding], np.ndarray]:
-    """Find stretches in which far more torque than usual is unexplained; also mask the rows around them."""
+    """Find periods with far more unexplained torque than usual, and mask the rows around them."""
     from scipy.ndimage import minimum_filter1d
 
     log, rows = explanation.log, explanation.log.rows(TRACE_ROWS)
@@ -199,7 +200,8 @@ def _disturbances(system: ConstrainedSystem, explanation: Explanation) -> tuple[
     dry = system.robot.friction.numpy() - explanation.fit.nuisance[log.nq : 2 * log.nq]
     slowest = minimum_filter1d(np.abs(log.qd[rows]), 2 * width + 1, axis=0)
     friction = np.maximum(dry, 0.0) * (slowest < system.robot.friction_velocity.numpy())
-    visible = np.asarray((np.abs(trace) > VISIBLE * explanation.problem.size + friction).any(axis=1))
+    size = np.maximum(explanation.problem.size, FLOOR * explanation.problem.size.max())
+    visible = np.asarray((np.abs(trace) > VISIBLE * size + friction).any(axis=1))
     bad = _stands_out(log, rows, level)
     spans = intervals(bad, join=width)
     spans = tuple((a, b) for a, b in spans if b - a >= width and visible[a:b].mean() > 0.5)
@@ -219,7 +221,7 @@ def _disturbances(system: ConstrainedSystem, explanation: Explanation) -> tuple[
 
 
 def _stands_out(log: Log, rows: np.ndarray, level: Array) -> np.ndarray:
-    """Return the mask `(n,)` of rows with a larger residual than usual for the same contact state."""
+    """Return a mask (n,) of rows with a larger residual than usual for the same contact state."""
     # An arm at rest leaves little unexplained; it says nothing of one that moves.
     speed = np.abs(log.qd[rows]).max(axis=1)
     moving, bad = speed >= MOVING * np.percentile(speed, 99), np.zeros(len(rows), bool)
@@ -244,7 +246,7 @@ def _upper_spread(level: Array) -> float:
 
 
 def residual_trace(explanation: Explanation, rows: np.ndarray) -> Array:
-    """Return the residual torque, excluding contact forces, at the given rows, `(n, nq)` [N m, N]."""
+    """Return the residual torque (n, nq) at the given rows [N m, N]. It excludes contact forces."""
     system, log = explanation.system, explanation.log
     parts, coefficients = [], robust_parameters(explanation.problem, explanation.columns, explanation.prior)
     for index in np.array_split(rows, max(1, len(rows) // 2048)):

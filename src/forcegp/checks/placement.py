@@ -1,7 +1,7 @@
-"""Check that the joint angles place the tip on the surface in rows labelled as contact.
+"""Check whether the joint angles place the tip on the surface in rows labelled as contact.
 
-If the surface is displaced, the distance of the tip is a linear function of its position. If the angles are
-wrong, a single correction moves the tip onto the surface in all rows.
+If the surface is displaced, the distance between tip and surface is a linear function of the tip position. If
+the angles are wrong, a single correction moves the tip onto the surface in all rows.
 """
 
 from __future__ import annotations
@@ -25,13 +25,13 @@ from forcegp.robust import level_of, robust_std
 ROWS = 2000
 """Maximum number of contact rows used."""
 BETTER = 0.25
-"""Largest accepted residual with corrected angles, relative to that with a displaced surface."""
+"""Largest accepted residual with corrected angles, relative to the residual with a displaced surface."""
 STEPS = 6
-"""Number of Gauss-Newton steps for finding an encoder offset."""
+"""Number of Gauss-Newton steps in the search for an encoder offset."""
 
 
 def check_placement(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find joints with a wrong sign, order or offset from the position of the tip in contact."""
+    """Find joints with a wrong sign, order or offset, based on the position of the tip in contact."""
     for contact, rows in touching(system, log):
         path = tip_path(system, contact, log, rows)
         if abs(np.median(path.c)) <= FAR:
@@ -90,7 +90,7 @@ def _chosen(
     near: list[tuple[Hypothesis, Log]],
     where: str,
 ) -> Outcome:
-    """Return a finding on equally good corrections, and the log corrected by that which fits torques best."""
+    """Return a finding on equally good corrections, and the log after the one that fits the torques best."""
     rows = evenly(np.flatnonzero(log.usable), TRIED_ROWS)
     scores = [cross_validate(hypotheses.problem_of(system, other, rows)).score.mean() for _, other in near]
     best, repaired = near[int(np.argmin(scores))]
@@ -123,16 +123,16 @@ def _explanation(
 
 
 def _off(system: ConstrainedSystem, contact: SurfaceContact, log: Log, rows: np.ndarray) -> float:
-    """Return the median distance of the tip from the surface [m]."""
+    """Return the median distance between tip and surface [m]."""
     return float(np.median(np.abs(tip_path(system, contact, log, rows).c)))
 
 
 def _offsets(
     system: ConstrainedSystem, contact: SurfaceContact, log: Log, rows: np.ndarray, share: float | None = None
 ) -> Iterator[tuple[Hypothesis, Log]]:
-    """Yield for each encoder the offset that moves the tip to the surface, found by Gauss-Newton steps.
+    """Yield, for each encoder, the offset that moves the tip to the surface, from Gauss-Newton steps.
 
-    If `share` is given, offsets are computed for each row, and the offset common to this fraction is used.
+    If `share` is given, one offset is computed per row, and the offset common to this fraction is used.
     """
     few = log.replace(q=log.q[rows], qd=log.qd[rows])
     for j in range(log.nq):

@@ -1,4 +1,4 @@
-"""Checks of single columns: regular time stamps, plausible values, and jumps in the state."""
+"""Checks of individual columns for irregular time stamps, implausible values and jumps in the state."""
 
 from __future__ import annotations
 
@@ -19,7 +19,7 @@ from forcegp.rows import describe, intervals
 
 
 def check_order(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find time stamps that repeat or run backward within a segment."""
+    """Find time stamps that repeat or go backward within a segment."""
     repeated, backward = (np.append(False, wrong) for wrong in (log.steps == 0.0, log.steps < 0.0))
     findings = at_rows(repeated, "time-repeated", "time repeats in", steps=repeated.sum())
     findings += at_rows(backward, "time-backward", "time runs backward in", steps=backward.sum())
@@ -27,7 +27,7 @@ def check_order(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_gaps(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find missing samples, where a time step is longer than clock jitter explains."""
+    """Find missing samples, indicated by time steps longer than clock jitter can explain."""
     with np.errstate(invalid="ignore"):
         gaps = log.steps > log.longest_step
     if log.masked is not None:
@@ -63,20 +63,21 @@ def check_period(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 HELD_RUN = 2
-"""Minimum number of repeated rows for which a logger is reported as having failed to update."""
+"""Minimum number of repeated rows for which the logger is reported to have missed updates."""
 STUCK_SECONDS, STUCK_VISIBLE = 0.05, 0.02
-"""Duration for which a channel must repeat a value [s], and fraction of its range by which it should move."""
+"""Duration for which a stuck channel repeats a value [s]; fraction of its range by which it should move."""
 SPIKE, SPIKE_ALONE = 12.0, 4.0
-"""Robust standard deviations that define a spike, never reached by noise; ratio to the neighbours' misfit."""
+"""Deviation of a spike in robust standard deviations, which noise never reaches; ratio to its neighbours'."""
 SPIKE_SHAPE, SPIKE_NOISE = 0.2, 4.0
-"""Tolerance for deviations of its neighbours, as a fraction of a spike and in robust standard deviations."""
+"""Tolerance for the neighbours' deviations, as a fraction of a spike and in robust standard deviations."""
 SPIKE_SHARED, DRIVEN = 0.05, 0.5
 """A value is not a spike if another channel deviates by this fraction of it (by the second fraction, if it
-exceeds its range), or if a torque step accounts for the second fraction of a deviating acceleration."""
+exceeds that channel's range), or if a torque step explains the second fraction of a deviating
+acceleration."""
 FEWEST = 50
 """Minimum number of values for estimating a scale."""
 SPIKE_VISIBLE = (0.01, 0.002)
-"""Minimum size of a spike as fractions of its column's range and of the largest range among the joints."""
+"""Minimum size of a spike, as a fraction of its column's range and of the largest range among the joints."""
 COARSE = 0.05
 """Fraction of the velocity that noise from encoder steps may reach when positions are differentiated."""
 
@@ -100,7 +101,7 @@ def check_finite(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_held(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find rows in which every channel repeats its value while the arm moves."""
+    """Find rows in which all channels repeat their values while the arm moves."""
     differs = np.any([np.diff(value, axis=0).any(axis=1) for value in logged(log).values()], axis=0)
     moving = np.abs(log.qd).max(axis=1)[1:] > 0.0
     held = np.append(False, ~differs & moving & (np.diff(log.segment) == 0))
@@ -111,7 +112,7 @@ def check_held(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_stuck(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find channels that keep a constant value although the joint moves."""
+    """Find channels that stay constant although the joint moves."""
     if not np.isfinite(log.dt):
         return [], log
     least, findings, bad = max(5, round(STUCK_SECONDS / log.dt)), [], np.zeros(len(log), bool)
@@ -135,7 +136,7 @@ def check_stuck(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def _expected_change(log: Log, name: str, j: int, a: int, b: int) -> float:
-    """Return the expected change of a channel over rows a to b, given the other channels of the joint."""
+    """Return the expected change of a channel between rows a and b, given the joint's other channels."""
     if name == "q":
         return float(np.ptp(np.cumsum(log.qd[a:b, j])) * log.dt)
     if name == "qd":
@@ -178,7 +179,7 @@ def check_spikes(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def _departures(log: Log, value: Array) -> tuple[Array, Array, Array]:
-    """Return the deviations of values and of their neighbours `(n, nq)`, and the usual scale `(nq,)`."""
+    """Return the deviations (n, nq) of values and of their neighbours, and the usual scale (nq,)."""
     departure, around = np.zeros_like(value), np.zeros_like(value)
     for s in log.stretches:
         departure[s], around[s] = spikes(value[s])
@@ -190,7 +191,7 @@ def _departures(log: Log, value: Array) -> tuple[Array, Array, Array]:
 
 
 def _shocks(log: Log, departures: dict[str, tuple[Array, Array, Array]], name: str) -> np.ndarray:
-    """Return the mask `(n, nq)` of values (not positions) that deviate together with other channels."""
+    """Return a mask (n, nq) of values other than positions that deviate together with other channels."""
     departure = departures[name][0]
     if name == "q":
         return np.zeros(departure.shape, bool)
@@ -205,7 +206,7 @@ def _shocks(log: Log, departures: dict[str, tuple[Array, Array, Array]], name: s
 
 
 def _driven(system: ConstrainedSystem, log: Log, departure: Array, outlier: np.ndarray) -> np.ndarray:
-    """Return the mask `(n, nq)` of accelerations caused by a step in the joint's torque, Δτ_j (M⁻¹)_jj."""
+    """Return a mask (n, nq) of accelerations caused by a torque step at the joint, Δτ_j (M⁻¹)_jj."""
     step = np.pad(np.abs(np.diff(log.tau, axis=0)), ((1, 1), (0, 0)))
     step, driven = np.maximum(step[:-1], step[1:]), np.zeros_like(outlier)
     rows = np.flatnonzero(outlier.any(axis=1))
@@ -217,13 +218,13 @@ def _driven(system: ConstrainedSystem, log: Log, departure: Array, outlier: np.n
 
 
 def _size(log: Log, name: str, departure: Array, around: Array, scale: Array) -> Array:
-    """Return the largest deviation within two rows relative to the range; zero if it may be noise."""
+    """Return the largest deviation within two rows, relative to the range, or zero if it may be noise."""
     size, reach = np.abs(departure), log.reach(name)
     return _within_two(np.where(size > SPIKE * scale, size / np.maximum(reach, 1e-300), 0.0))
 
 
 def _one_value(departure: Array, scale: Array) -> np.ndarray:
-    """Return the mask `(n, d)` of deviations h next to −4h/6 and h/6, which a kink does not cause."""
+    """Return the mask (n, d) of deviations h next to −4h/6 and h/6, which a kink does not cause."""
     around = np.lib.stride_tricks.sliding_window_view(np.pad(departure, ((2, 2), (0, 0))), 5, axis=0)
     misfit = np.abs(around - departure[..., None] * DEPARTURE).max(axis=-1)
     return misfit <= SPIKE_SHAPE * np.abs(departure) + SPIKE_NOISE * scale
@@ -256,12 +257,12 @@ def check_resolution(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 JUMP, FASTEST = 30.0, 2.0
-"""A jump exceeds this many robust standard deviations of the steps (fifteen at each of two rows), and the
-change of the fastest joint within a step by this factor."""
+"""A jump exceeds this many robust standard deviations of the steps (15 at each of two rows), and it exceeds
+the change of the fastest joint within a step by this factor."""
 
 
 def _jumps(log: Log, value: str, derivative: str) -> tuple[np.ndarray, tuple[str, ...]]:
-    """Return `(n,)` bool, rows at which a column jumps, and the joints; none if a column is derived."""
+    """Return the mask (n,) of rows at which a column jumps, and the joints; none for derived columns."""
     x, rate, usable = getattr(log, value), getattr(log, derivative), log.usable
     if log.derived & {value, derivative}:
         return np.zeros(len(log), bool), ()
@@ -288,7 +289,7 @@ def check_jumps(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def check_impacts(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find impacts, where the velocity jumps by more than the acceleration explains."""
+    """Find impacts, at which the velocity jumps by more than the acceleration explains."""
     around, joints = _jumps(log, "qd", "qdd")
     findings = at_rows(around, "impact", "the velocity jumps, as at an impact, at", joints)
     around[:-1] |= around[1:]

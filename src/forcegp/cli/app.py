@@ -24,7 +24,7 @@ from forcegp.cli.view import view
 from forcegp.errors import ForceGPError
 
 USER_ERROR = 2
-"""Exit code for invalid input, which is the same as for an invalid option."""
+"""Exit code for invalid input, which is also the code for an invalid option."""
 INTERRUPTED = 130
 """Exit code after an interrupt (SIGINT), as in a shell."""
 GRACE = 0.6
@@ -35,7 +35,7 @@ app = typer.Typer(
     help="Learn the forward dynamics of robot arms, free or in contact, with Gaussian-process force priors.",
     no_args_is_help=True,
     pretty_exceptions_enable=False,
-    rich_markup_mode="rich",
+    rich_markup_mode="markdown",
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 for command in (simulate, check, select, fit, predict, evaluate, rollout, export, excite, sweep, view):
@@ -62,7 +62,7 @@ def _options(
 
 
 def main(program: typer.Typer = app) -> None:
-    """Run a command line; exit with one message and code 2 on a user error, and code 130 on an interrupt.
+    """Run a command line. Exit with one message and code 2 on a user error, and with 130 on an interrupt.
 
     Temporary files that remain after an interrupt are removed by the next run, as after a crash.
     """
@@ -83,10 +83,10 @@ def main(program: typer.Typer = app) -> None:
 
 
 def _end_when_interrupted() -> None:
-    """Exit on an interrupt, after `GRACE` at the latest.
+    """Exit on an interrupt, after at most `GRACE` seconds.
 
-    Python handles signals only between its own operations, not during long operations of other libraries,
-    and loses exceptions raised in destructors. The file descriptor receives the signal immediately.
+    Python handles signals only between its own operations, not during long operations of other libraries. It
+    also loses exceptions raised in destructors. The file descriptor receives the signal immediately.
     """
     if signal.getsignal(signal.SIGINT) is not signal.default_int_handler:
         return  # ignored, as in a background job, or handled by the caller

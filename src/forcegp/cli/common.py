@@ -21,7 +21,7 @@ if TYPE_CHECKING:
 
 
 class Advance(Protocol):
-    """Function that advances a progress bar; `note` is a short status, such as the objective."""
+    """A function that advances a progress bar. `note` is a short status, such as the objective."""
 
     def __call__(self, done: int, total: int | None = None, note: str = "") -> None: ...
 
@@ -38,7 +38,7 @@ def printable(text: object) -> str:
 
 
 def warn(text: object) -> None:
-    """Print a warning on stderr."""
+    """Print a warning to stderr."""
     typer.secho("warning: ", fg="yellow", nl=False, err=True)
     typer.echo(printable(text), err=True)
 
@@ -53,14 +53,14 @@ def progress_bar(description: str, total: int) -> Iterator[Advance]:
     columns = (TextColumn("{task.description}"), BarColumn(), TextColumn("{task.completed}/{task.total}"))
     times = (TimeElapsedColumn(), TimeRemainingColumn(), TextColumn("{task.fields[note]}"))
     console = Console(stderr=True)
-    # No bar is shown in a file or a pipe, which it would only fill.
+    # No bar is shown if the output is a file or a pipe.
     with Progress(*columns, *times, console=console, transient=True, disable=not console.is_terminal) as bar:
         task = bar.add_task(escape(printable(description)), total=total, note="")
         yield lambda done, total=None, note="": bar.update(task, completed=done, total=total, note=note)
 
 
 def show(result: Mapping[str, object], as_json: bool) -> None:
-    """Print the nonempty values of a result, one per line, or all values as JSON."""
+    """Print the nonempty values of a result, one per line, or print all values as JSON."""
     if as_json:
         typer.echo(json.dumps(dict(result), default=str))
         return
@@ -82,7 +82,7 @@ def check_output(out: Path, *inputs: Path) -> None:
 
 
 def save(write: Callable[[Path], object], out: Path) -> None:
-    """Write a result by `write(out)` or, if that fails, to a different path, which the error names."""
+    """Write a result by `write(out)` or, if that fails, to a different path that the error names."""
     from forcegp.destination import write_or_keep
 
     write_or_keep(write, out)
@@ -104,7 +104,7 @@ def derivatives(window: int | None) -> forcegp.SavitzkyGolay | None:
 def read_data(
     path: Path, robot: forcegp.RobotModel | None = None, differentiate: int | None = None
 ) -> forcegp.Dataset:
-    """Read a data set with joints ordered as in a robot; compute derivatives if a window is given."""
+    """Read a data set with joints ordered as in a robot, and compute derivatives if a window is given."""
     data = forcegp.Dataset.read(path, differentiate=derivatives(differentiate))
     if robot is not None and set(robot.joint_names) <= set(data.joint_names):
         data = data.select(robot.joint_names)
@@ -139,7 +139,7 @@ def fitted(model: Configured, data: Any, **options: Any) -> FittedModel:
 
 
 def check_robot_named(scene: str | None, robot: str | None) -> None:
-    """Check that exactly one of a scene and a robot was given."""
+    """Check that exactly one of a scene and a robot is given."""
     if (scene is None) == (robot is None):
         problems = "no robot was given", "both --scene and --robot were given"
         raise ForceGPError(problems[scene is not None], hint="pass either --scene or --robot")
@@ -154,7 +154,7 @@ def system_of(scene: str | None, robot: str | None) -> forcegp.ConstrainedSystem
 
 
 def model_table(config: Path | None, scene: str | None) -> ModelTable:
-    """Return the table [model] from a separate file or, if none is given, from the scene, if any."""
+    """Return the table [model] from a separate file if one is given, or else from the scene, if any."""
     from forcegp.scene import default_model_table, load_model_table
 
     if config is not None:
@@ -163,7 +163,7 @@ def model_table(config: Path | None, scene: str | None) -> ModelTable:
 
 
 def warn_beyond(model: Predictor, data: forcegp.Dataset, doubts: Iterable[str] = ()) -> None:
-    """Warn about questionable predictions, and about states far from the training data."""
+    """Warn about questionable predictions and about states far from the training data."""
     from forcegp.forces.posterior import warnings_beyond
     from forcegp.models.structured_fit import StructuredFit
 

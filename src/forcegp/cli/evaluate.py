@@ -23,18 +23,18 @@ def evaluate(
     data: DataFile,
     model: Annotated[
         Path | None,
-        typer.Option("--model", "-m", help="File of a fitted model; by default, a model is fitted."),
+        typer.Option("--model", "-m", help="File of a fitted model; if omitted, a model is fitted."),
     ] = None,
     out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for the page and its data.")] = None,
     train: Annotated[
         Path | None,
         typer.Option(
-            help="Data that the trivial predictors are fitted to; default: the other half of the data. "
-            "Without --model, also what a model is fitted to."
+            help="Data to fit the trivial predictors to (default: the other half of the data) and, without "
+            "--model, the model."
         ),
     ] = None,
     scene: Annotated[
-        str | None, typer.Option("--scene", "-s", help="Without --model: the scene of the model to fit.")
+        str | None, typer.Option("--scene", "-s", help="Scene of the model to fit, if --model is omitted.")
     ] = None,
     config: Config = None,
     as_json: AsJson = False,
@@ -42,16 +42,16 @@ def evaluate(
     """Compare the predictions of a model with a data set and with trivial predictors.
 
     The trivial predictors are the mean, the robot file alone, and a least-squares fit of inertial parameters,
-    viscous and Coulomb friction, and offsets. The verdict states the fraction of the torque beyond gravity
-    that the model explains, the error in open-loop motion, and the error in the contact force, if logged. It
-    is followed by a comparison of the model with each predictor in torque and acceleration. Errors are in
-    rad/s² (m/s² for prismatic joints); coverage is the fraction of samples within two standard deviations.
+    viscous and Coulomb friction, and offsets. The verdict states which fraction of the non-gravitational
+    torque the model explains, and the errors in open-loop motion and, if logged, in the contact force. A
+    comparison of the model with each predictor in torque and acceleration follows. Errors are in rad/s² (m/s²
+    for prismatic joints). Coverage is the fraction of samples within two standard deviations.
 
     With --out, the command writes a page that shows the verdict, the errors by joint, the calibration and
     the predictions over the first seconds. It prints the path of the page, and writes all scores to
     evaluation.json.
 
-    [bold]Examples[/bold]
+    **Examples**
 
     forcegp evaluate --model model --data test.parquet --train train.parquet --out evaluation/
 
@@ -87,7 +87,7 @@ def _written(
     test: forcegp.Dataset,
     names: tuple[str, str, str | None],
 ) -> dict[str, object]:
-    """Write the page and its data, and return their paths; `names` are the file names shown on the page."""
+    """Write the page and its data, and return their paths. `names` are the file names shown on the page."""
     from forcegp.destination import folder_or_keep
     from forcegp.files import write_json
     from forcegp.report.evaluation import PAGE, write_evaluation
@@ -115,7 +115,7 @@ def _model(model: Path | None, scene: str | None, config: Path | None, train: Pa
     if scene is None or train is None:
         raise ForceGPError(
             "no model to evaluate was given",
-            expected="--model FOLDER, or --scene and --train to fit one",
+            expected="--model FILE, or --scene and --train to fit one",
         )
     system = forcegp.load_scene(scene).system()
     regression = configured(model_table(config, scene), system)

@@ -14,16 +14,16 @@ if TYPE_CHECKING:
     from forcegp.simulate.excite import Excitation
 
 Numbers = Annotated[
-    str | None, typer.Option(metavar="X[,X...]", help="Maximum; one number or one per joint.")
+    str | None, typer.Option(metavar="X[,X...]", help="Maximum, as one number or one per joint.")
 ]
 
 
 def excite(
     scene: SceneName,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Path of the motion (.csv or .parquet).")],
-    seconds: Annotated[float, typer.Option(help="Length of the motion.")] = 30.0,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Output file for the motion (.csv or .parquet).")],
+    seconds: Annotated[float, typer.Option(help="Duration of the motion in seconds.")] = 30.0,
     model: Annotated[
-        Path | None, typer.Option("--model", "-m", help="Fitted model to start from, with its posterior.")
+        Path | None, typer.Option("--model", "-m", help="Fitted model with the posterior to start from.")
     ] = None,
     region: Annotated[
         Path | None,
@@ -31,7 +31,9 @@ def excite(
     ] = None,
     start: Annotated[
         str | None,
-        typer.Option(metavar="Q,Q...", help="Initial and final position; default: a collision-free one."),
+        typer.Option(
+            metavar="Q,Q...", help="Initial and final joint positions; default: a collision-free posture."
+        ),
     ] = None,
     velocity: Numbers = None,
     acceleration: Numbers = None,
@@ -45,12 +47,13 @@ def excite(
     criterion: Annotated[
         str,
         typer.Option(
-            help="A: deviation of the torque; V: with only links and friction unknown; D: determinant."
+            help="A: expected standard deviation of the torque; V: the same for least squares, in which only "
+            "link inertia and friction are unknown; D: determinant of the covariance."
         ),
     ] = "A",
     rate: Annotated[float, typer.Option(help="Samples per second.")] = 1000.0,
-    restarts: Annotated[int, typer.Option(min=1, help="Number of optimised random starts.")] = 2,
-    seed: Annotated[int, typer.Option(help="Seed of the random starts.")] = 0,
+    restarts: Annotated[int, typer.Option(min=1, help="Number of random starts to optimise from.")] = 2,
+    seed: Annotated[int, typer.Option(help="Seed for the random starts.")] = 0,
     as_json: AsJson = False,
 ) -> None:
     """Plan a motion in free space that identifies inertia and friction as well as possible.
@@ -60,7 +63,7 @@ def excite(
     displays the motion, its use of the limits, and the expected standard deviation of the torque before and
     after the motion is recorded.
 
-    [bold]Examples[/bold]
+    **Examples**
 
     forcegp excite --scene ur5_free --seconds 30 --acceleration 6 --out motion.csv
 

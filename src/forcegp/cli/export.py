@@ -21,48 +21,49 @@ TARGETS = ("c", "casadi", "torch", "urdf", "mjcf")
 def export(
     model: ModelFile,
     out: Annotated[
-        Path, typer.Option("--out", "-o", help="Folder for the code and its test, or the robot file.")
+        Path, typer.Option("--out", "-o", help="Folder for the code and its test, or path of the robot file.")
     ],
-    to: Annotated[str, typer.Option("--to", help="c, casadi, torch, urdf or mjcf.")] = "c",
+    to: Annotated[str, typer.Option("--to", help="Format: c, casadi, torch, urdf or mjcf.")] = "c",
     name: Annotated[
-        str, typer.Option(help="C code: name of the files, and prefix of the functions.")
+        str, typer.Option(help="For C: name of the files and prefix of the functions.")
     ] = "controller",
     functions: Annotated[
         int | None,
         typer.Option(
-            min=1, help="C code: number of basis functions of a reduced covariance, which is wider."
+            min=1,
+            help="For C: number of basis functions in a reduced covariance, which widens the error bars.",
         ),
     ] = None,
     frame: Annotated[
-        str | None, typer.Option(help="Of C code: frame of an external wrench, estimated from accelerations.")
+        str | None, typer.Option(help="For C: frame of an external wrench to estimate from accelerations.")
     ] = None,
     reference: Annotated[str, typer.Option(help="Axes of the external wrench: world or local.")] = "world",
     float32: Annotated[
-        bool, typer.Option("--float32", help="Of C code: single precision; its error is measured.")
+        bool, typer.Option("--float32", help="For C: use single precision and report its rounding error.")
     ] = False,
     robot: Annotated[
         str | None, typer.Option(help="URDF or MJCF file of the robot, or name of a bundled robot.")
     ] = None,
     samples: Annotated[
-        int, typer.Option(min=0, help="Robot file: number of robots to draw from the posterior.")
+        int, typer.Option(min=0, help="For robot files: number of robots to draw from the posterior.")
     ] = 0,
-    seed: Annotated[int, typer.Option(help="Seed of these samples.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed for drawing these robots.")] = 0,
     as_json: AsJson = False,
 ) -> None:
     """Export a structured Gaussian process as C99, CasADi or torch code, or into a copy of its robot file.
 
-    C: one .h and one .c file that compute the mean and covariance of accelerations, multipliers and forces,
-    and the Jacobians of the mean, given the state and the closed contacts. They depend only on libm. A test
-    program with reference values, a CMakeLists.txt and a README are included.
+    C: the files compute the mean and covariance of accelerations, multipliers and forces, and the Jacobians
+    of the mean, given the state and the closed contacts. They depend only on libm. A test program with
+    reference values, a CMakeLists.txt and a README are included.
 
-    CasADi: the mean as a function with exact derivatives, in a file for `casadi.Function.load`.
+    CasADi: the file contains the mean as a function for `casadi.Function.load`, with exact derivatives.
 
-    torch: the mean and covariance as a program for `torch.export.load`.
+    torch: the file contains the mean and covariance as a program for `torch.export.load`.
 
-    URDF, MJCF: a copy of the robot file in which only inertia, damping and friction are replaced by their
-    identified values; a report with standard deviations and losses; and robots drawn from the posterior.
+    URDF, MJCF: the copy of the robot file contains the identified inertia, damping and friction. A report
+    with standard deviations and losses, and robots drawn from the posterior, are also written.
 
-    [bold]Examples[/bold]
+    **Examples**
 
     forcegp export --model model --to c --out controller/
 
@@ -109,7 +110,7 @@ def _written_back(
         )
     if is_mjcf(robot) != (to == "mjcf"):
         raise RobotFileError(
-            f"{robot} has another format", expected=to, got="mjcf" if to == "urdf" else "urdf"
+            f"{robot} has a different format", expected=to, got="mjcf" if to == "urdf" else "urdf"
         )
     found = write_calibrated(fit, robot, out, samples=samples, seed=seed)
     determined = sum(parameter.determined for parameter in found.parameters)

@@ -30,32 +30,34 @@ def fit(
         typer.Option(
             "--model",
             "-m",
-            help="analytical, nn, gp, sgp or sgp-zero; from the paper: sgp-mean, sgp-contact, and with its "
-            "kernel sgp-zero-se, sgp-mean-se or sgp-contact-se. Default: from the file, or sgp.",
+            help="analytical, nn, gp, sgp or sgp-zero; from the paper: sgp-mean, sgp-contact or, with the "
+            "paper's kernel, sgp-zero-se, sgp-mean-se, sgp-contact-se. Default: from the file, or sgp.",
         ),
     ] = None,
     config: options.Config = None,
     noise_std: Annotated[
         float | None,
-        typer.Option(help="Noise of accelerations in rad/s²; default: from the file or the data."),
+        typer.Option(
+            help="Standard deviation of acceleration noise [rad/s²]; default: from the file or data."
+        ),
     ] = None,
     differentiate: options.Differentiate = None,
     checkpoint: Annotated[
         Path | None,
-        typer.Option(help="File that records a long fit, which resumes from it if it exists."),
+        typer.Option(help="File that stores the progress of a long fit, which resumes if it exists."),
     ] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed of random initial values.")] = None,
+    seed: Annotated[int | None, typer.Option(help="Seed for random initial values.")] = None,
     as_json: options.AsJson = False,
 ) -> None:
     """Fit a model of the forward dynamics to logged motion.
 
     The table \\[model] in the scene or in --config defines priors, kernels, noise, robot parameters and
-    learning; command-line options override it.
+    learning. Command-line options override its entries.
 
     For structured models, Parquet logs are read piece by piece if they have more than 100,000 rows or consist
     of several files.
 
-    [bold]Examples[/bold]
+    **Examples**
 
     forcegp fit --scene kuka_plane --data train.parquet --model sgp --out model
 
@@ -88,7 +90,7 @@ def fit(
 
 
 def _figures(result: FitResult, as_json: bool) -> dict[str, object]:
-    """Return the fields of the result by name; for text output, omit empty fields and printed warnings."""
+    """Return the fields of the result by name. For text output, omit empty fields and printed warnings."""
     figures = {name: value for name, value in asdict(result).items() if name != "history"}
     if as_json:
         return figures
@@ -127,7 +129,7 @@ def sweep(
 
     Completed fits are not repeated. This command requires the extra `sweep` (Dask).
 
-    [bold]Examples[/bold]
+    **Examples**
 
     forcegp sweep --scene kuka_plane --model sgp-zero --model sgp --seeds 3 --out sweep/
 

@@ -26,31 +26,33 @@ def import_(
     scene: SceneOrNone = None,
     robot: RobotName = None,
     mapping: Annotated[
-        str | None, typer.Option("--mapping", "-m", help="Mapping file, or the name of a bundled one.")
+        str | None, typer.Option("--mapping", "-m", help="Mapping file, or name of a bundled mapping.")
     ] = None,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Path of the data set (.parquet).")] = None,
+    out: Annotated[
+        Path | None, typer.Option("--out", "-o", help="Output file for the data set (.parquet).")
+    ] = None,
     guess: Annotated[
-        Path | None, typer.Option(help="Write a proposed mapping to this file, without importing.")
+        Path | None, typer.Option(help="Write a proposed mapping to this file instead of importing.")
     ] = None,
     fit_surface: Annotated[
         Literal["plane", "sphere"] | None,
-        typer.Option(help="Fit a surface to the path of each contact, and propose it for the scene."),
+        typer.Option(help="Fit a surface to the path of each contact point and propose it for the scene."),
     ] = None,
     tip_radius: Annotated[
         str | None,
         typer.Option(
-            help="With --fit-surface: radius in metres of a ball that ends at the scene's point, or fit; "
-            "default: the scene's tip."
+            help="With --fit-surface: radius of a rounded tip that ends at the scene's point, in metres, or "
+            "'fit' to estimate it; default: the radius in the scene."
         ),
     ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Import a log from a CSV, text, Parquet, NumPy, MATLAB, HDF5, ROS bag, MCAP or LeRobot file.
 
-    A mapping file in TOML assigns columns to joints and states their units, signs and frames; --guess
-    proposes one.
+    A mapping file in TOML assigns columns to joints and states their units, signs and frames. With --guess,
+    the command proposes a mapping file.
 
-    [bold]Examples[/bold]
+    **Examples**
 
     forcegp import run.csv --scene my_scene.toml --guess mapping.toml
 
@@ -90,7 +92,7 @@ def _guess(log: Path, system: forcegp.ConstrainedSystem, out: Path) -> dict[str,
 
 
 def _summary(imported: Imported) -> dict[str, object]:
-    """Return the numbers of rows and trajectories and the period, and then findings and processing steps."""
+    """Return the numbers of rows and trajectories and the period, then findings and processing steps."""
     data, report = imported.data, imported.report
     rows, segments = f"{len(data)} from {report.rows_read} logged", int(data.segment[-1]) + 1
     result: dict[str, object] = {"rows": rows, "segments": segments, "period_s": data.header.dt}
@@ -146,7 +148,7 @@ COLOURS = {"error": "bold red", "warning": "yellow", "note": "cyan"}
 
 def check(
     data: Annotated[
-        Path, typer.Option("--data", "-d", help="Log, .parquet or .csv; NaN and gaps are findings.")
+        Path, typer.Option("--data", "-d", help="Log (.parquet or .csv); NaN and gaps become findings.")
     ],
     scene: SceneOrNone = None,
     robot: RobotName = None,
@@ -160,7 +162,7 @@ def check(
     The last line is the verdict. The exit code is 0 if a model can be fitted, 1 if a finding makes a fit
     worthless, and 2 if the scene or the log cannot be read.
 
-    [bold]Examples[/bold]
+    **Examples**
 
     forcegp check --scene kuka_plane --data run.parquet
 
@@ -219,10 +221,10 @@ def _print(report: Report) -> None:
 
 
 def select(
-    log: Annotated[Path, typer.Argument(help="Data set to select from, .parquet or .csv.")],
+    log: Annotated[Path, typer.Argument(help="Data set to select from (.parquet or .csv).")],
     count: Annotated[int, typer.Option("--count", "-n", min=1, help="Number of training points.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Path of the training points (.parquet).")],
-    rest: Annotated[Path | None, typer.Option(help="Path of the test points (.parquet).")] = None,
+    out: Annotated[Path, typer.Option("--out", "-o", help="Output file for the training points (.parquet).")],
+    rest: Annotated[Path | None, typer.Option(help="Output file for the test points (.parquet).")] = None,
     split: Annotated[
         Literal["selection", "stretches"],
         typer.Option(help="Test on all unselected points (as in the paper) or on held-out stretches."),
@@ -230,13 +232,13 @@ def select(
     stretch: Annotated[float, typer.Option(help="Duration of a held-out stretch in seconds.")] = 3.0,
     fraction: Annotated[float, typer.Option(help="Fraction of the motion to hold out.")] = 0.2,
     margin: Annotated[
-        float, typer.Option(help="Time without training points around held-out stretches in seconds.")
+        float, typer.Option(help="Gap between held-out stretches and training points in seconds.")
     ] = 0.0,
     method: Annotated[
         Literal["farthest", "even", "random"], typer.Option(help="Method for selecting training points.")
     ] = "farthest",
     keep_impacts: Annotated[
-        bool, typer.Option("--keep-impacts", help="Keep rows marked as near an impact.")
+        bool, typer.Option("--keep-impacts", help="Keep rows that are marked as close to an impact.")
     ] = False,
     differentiate: Differentiate = None,
     seed: Annotated[int, typer.Option(help="Seed for held-out stretches and random selection.")] = 0,
@@ -245,10 +247,10 @@ def select(
     """Select training points that cover a log, and keep the rest for testing.
 
     By default, points are selected by exact farthest-point sampling of standardized positions, velocities
-    and torques. They are deterministic and in order of selection, so the first k rows are the selection of k
-    points.
+    and torques. The points are deterministic and in the order of selection, so that the first k rows are
+    those selected for k points.
 
-    [bold]Examples[/bold]
+    **Examples**
 
     forcegp select run.parquet -n 1000 --out train.parquet --rest test.parquet
 

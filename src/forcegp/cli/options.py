@@ -12,32 +12,32 @@ AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON o
 SCENES = sorted(
     entry.name.removesuffix(".toml") for entry in (files("forcegp") / "scene" / "bundled").iterdir()
 )
-"""Names of the bundled scenes, listed without loading the library."""
-_SCENE = typer.Option("--scene", "-s", help=f"Scene file, or the name of a bundled one: {', '.join(SCENES)}.")
+"""Names of the bundled scenes, which are listed without loading the library."""
+_SCENE = typer.Option("--scene", "-s", help=f"Scene file, or name of a bundled scene: {', '.join(SCENES)}.")
 SceneName = Annotated[str, _SCENE]
 SceneOrNone = Annotated[str | None, _SCENE]
 RobotName = Annotated[
     str | None,
-    typer.Option("--robot", help="URDF or MJCF file, or bundled robot, instead of a scene."),
+    typer.Option("--robot", help="URDF or MJCF file, or name of a bundled robot, instead of a scene."),
 ]
 ModelFile = Annotated[Path, typer.Option("--model", "-m", help="File of a fitted model.")]
-DataFile = Annotated[Path, typer.Option("--data", "-d", help="Data set, .parquet or .csv.")]
+DataFile = Annotated[Path, typer.Option("--data", "-d", help="Data set (.parquet or .csv).")]
 SimulatedTime = Annotated[
     float | None, typer.Option("--duration", help="Simulated time in seconds; default: from the scene.")
 ]
 Config = Annotated[
     Path | None,
-    typer.Option(help="TOML file with a table \\[model], which replaces that of the scene."),
+    typer.Option(help="TOML file with a \\[model] table that replaces the one in the scene."),
 ]
 DataFiles = Annotated[
     list[Path],
-    typer.Option("--data", "-d", help="Data set, .parquet or .csv; may be given several times."),
+    typer.Option("--data", "-d", help="Data set (.parquet or .csv); may be given several times."),
 ]
 Differentiate = Annotated[
     int | None,
     typer.Option(
         metavar="WINDOW",
-        help="Compute velocities and accelerations that the log lacks by a Savitzky-Golay filter over an odd "
+        help="Compute missing velocities and accelerations with a Savitzky-Golay filter over this (odd) "
         "number of samples.",
     ),
 ]

@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     from forcegp.models.base import Predictor
 
 PER_CONTACT = ("multiplier", "contact_force")
-"""Quantities with one value or one vector per contact; all others have one component per joint."""
+"""Quantities with one value or one vector per contact. All others have one component per joint."""
 WRENCH = "external_wrench"
 """Wrench on a frame, saved as the force and moment of a contact named after the frame."""
 
@@ -28,7 +28,7 @@ WRENCH = "external_wrench"
 def predict(
     model: ModelFile,
     data: DataFile,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Path of the predictions (.parquet).")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Output file for the predictions (.parquet).")],
     quantity: Annotated[
         str,
         typer.Option(
@@ -39,38 +39,39 @@ def predict(
         ),
     ] = "qdd",
     frame: Annotated[
-        str | None, typer.Option(help="Frame that an external_wrench acts on, without a declared contact.")
+        str | None,
+        typer.Option(help="Frame on which an external_wrench acts; no declared contact is needed."),
     ] = None,
     reference: Annotated[str, typer.Option(help="Axes of an external_wrench: world or local.")] = "world",
     momentum: Annotated[
         bool,
         typer.Option(
-            "--momentum", help="Estimate external_wrench with a causal filter, without accelerations."
+            "--momentum", help="Estimate external_wrench with a causal filter that needs no accelerations."
         ),
     ] = False,
     noise: Annotated[
         bool,
         typer.Option(
             "--noise/--no-noise",
-            help="Whether the standard deviation is that of a measurement, with the noise of the motor "
-            "torque and of the sensor (for models with such noise).",
+            help="Whether the standard deviation is that of a measurement and includes motor-torque and "
+            "sensor noise (for models with such noise).",
         ),
     ] = True,
     sensor: Annotated[
         bool,
         typer.Option(
-            "--sensor", help="λ with the log's force sensor as a measurement too (fit with sensor_noise_std)."
+            "--sensor", help="Predict λ using also the log's force sensor (fit with sensor_noise_std)."
         ),
     ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Predict a quantity at the states of a data set.
 
-    The output is the data set with the additional column predicted_<quantity> and, for models with
-    uncertainty, predicted_<quantity>_std. The standard deviation includes the noise of the motor torque and
-    of the sensor. With --no-noise, which is the default in Python, it does not.
+    The output is the data set with the additional column `predicted_<quantity>` and, for models with
+    uncertainty, `predicted_<quantity>_std`. The standard deviation includes the noise of the motor torque and
+    of the sensor. With --no-noise (the default in Python), it excludes this noise.
 
-    [bold]Examples[/bold]
+    **Examples**
 
     forcegp predict --model model --data test.parquet --out predicted.parquet
 
@@ -129,7 +130,7 @@ def _with_wrench(
 ) -> tuple[forcegp.Dataset, dict[str, object]]:
     """Add the external wrench on a frame, and the detected contact, as a contact named after the frame.
 
-    Return the data set, and a summary with the fraction of samples in contact.
+    Return the data set and a summary with the fraction of samples in contact.
     """
     from forcegp.models.structured_fit import StructuredFit
 

@@ -29,23 +29,25 @@ def rollout(
         float | None, typer.Option(help="Simulated time in seconds; default: to the end of the trajectory.")
     ] = None,
     samples: Annotated[int, typer.Option(min=0, help="Number of functions to draw from the posterior.")] = 0,
-    stabilization: Annotated[str, typer.Option(help="none, baumgarte or projection.")] = "baumgarte",
+    stabilization: Annotated[
+        str, typer.Option(help="Stabilization: none, baumgarte or projection.")
+    ] = "baumgarte",
     method: Annotated[
-        str, typer.Option(help="semi_implicit_euler, rk4, rk45 or dop853.")
+        str, typer.Option(help="Integrator: semi_implicit_euler, rk4, rk45 or dop853.")
     ] = "semi_implicit_euler",
     unilateral: Annotated[
-        bool, typer.Option("--unilateral", help="Let contacts open when they would pull, and close again.")
+        bool, typer.Option("--unilateral", help="Let contacts open instead of pulling, and close again.")
     ] = False,
-    seed: Annotated[int, typer.Option(help="Seed of the samples.")] = 0,
+    seed: Annotated[int, typer.Option(help="Seed for the samples.")] = 0,
     as_json: AsJson = False,
 ) -> None:
     """Simulate motion with a model, starting from a logged state and applying the logged torques.
 
-    The output folder contains rollout.parquet (the predicted motion, the logged motion as q_logged, and the
-    standard deviation over samples as q_std), rollout.html with plots and an animation of the arm, the plots
-    as SVG files, and their data as rollout.json.
+    The output folder contains rollout.parquet with the predicted motion, the logged motion as q_logged, and
+    the standard deviation over samples as q_std. The page rollout.html shows plots and an animation of the
+    arm. The plots are also written as SVG files, and their data as rollout.json.
 
-    [bold]Examples[/bold]
+    **Examples**
 
     forcegp rollout --model model --data test.parquet --out rollout/ --duration 2
 
@@ -105,14 +107,14 @@ def _say_contact(log: forcegp.Dataset, unilateral: bool) -> None:
             row = int(changed[0])
             state = "closed" if closed[0] else "open"
             warnings.warn(
-                f"the rollout holds {name!r} {state}, as at the start; the log changes it after "
+                f"the rollout keeps {name!r} {state}, as at the start, but it changes in the log after "
                 f"{float(log.t[row] - log.t[0]):.4g} s: pass --unilateral",
                 stacklevel=2,
             )
 
 
 def _stretch(data: forcegp.Dataset, start: int, duration: float | None) -> forcegp.Dataset:
-    """Return the rows from `start` until the end of the trajectory or of the duration."""
+    """Return the rows from `start` to the end of the trajectory or of the duration."""
     from forcegp.data.derivative import UNIFORM_TOLERANCE
 
     stretch = trajectory_from(data, start, "rollout")
@@ -128,7 +130,7 @@ def _stretch(data: forcegp.Dataset, start: int, duration: float | None) -> force
 
 
 def _spread(q: Tensor) -> Tensor:
-    """Return the standard deviation over samples `(S, T, nq)`, as long as two have not diverged."""
+    """Return the standard deviation over samples `(S, T, nq)`, as long as at least two have not diverged."""
     import numpy as np
     import torch
 
@@ -174,18 +176,21 @@ def _learned(path: Path, sample: bool, seed: int) -> PassiveForces:
 
 def simulate(
     scene: SceneName,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Path of the log (.parquet).")],
+    out: Annotated[Path, typer.Option("--out", "-o", help="Output file for the log (.parquet).")],
     duration: SimulatedTime = None,
     seed: Annotated[
-        int | None, typer.Option(help="Seed of motion and noise; default: from the scene.")
+        int | None, typer.Option(help="Seed for the motion and the noise; default: from the scene.")
     ] = None,
-    engine: Annotated[str | None, typer.Option(help="pybullet, mujoco or auto; default: from scene.")] = None,
+    engine: Annotated[
+        str | None, typer.Option(help="Engine: pybullet, mujoco or auto; default: from the scene.")
+    ] = None,
     contact: Annotated[
         str | None,
-        typer.Option(help="rigid, or solver for MuJoCo's own contact and friction; default: from the scene."),
+        typer.Option(help="rigid, or solver for MuJoCo's contacts and friction; default: from the scene."),
     ] = None,
     motion: Annotated[
-        Path | None, typer.Option(help="Data set with joints to follow, such as from `forcegp excite`.")
+        Path | None,
+        typer.Option(help="Data set with the motion to follow, such as that of `forcegp excite`."),
     ] = None,
     model: Annotated[
         Path | None,
@@ -200,9 +205,9 @@ def simulate(
     """Simulate and log the robot of a scene while it slides over a surface or follows a given motion.
 
     If a model is given, MuJoCo simulates the fitted robot with the learned joint forces, which replace joint
-    friction, and computes the contact forces itself.
+    friction. MuJoCo computes the contact forces itself.
 
-    [bold]Examples[/bold]
+    **Examples**
 
     forcegp simulate --scene kuka_plane --out run.parquet
 

@@ -30,13 +30,13 @@ def view(
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="HTML file that works offline; default: serve the page."),
+        typer.Option("--out", "-o", help="HTML file that works offline; if omitted, the page is served."),
     ] = None,
     start: Annotated[int, typer.Option(min=0, help="Row of the log to start from.")] = 0,
     seconds: Annotated[float, typer.Option(min=0.05, help="Duration of the motion in seconds.")] = 10.0,
     samples: Annotated[
         int,
-        typer.Option(min=0, help="Number of sampled tip paths to draw, for a structured model."),
+        typer.Option(min=0, help="Number of sampled tip paths to draw (structured models only)."),
     ] = 8,
     horizon: Annotated[
         float, typer.Option(min=0.01, help="Duration of the predicted paths in seconds.")
@@ -46,14 +46,14 @@ def view(
 ) -> None:
     """View a robot, its surfaces, contact forces and predicted paths in 3D.
 
-    Given a model and a log, the view shows the logged motion, the predicted contact force as an arrow with a
-    bar of ±2 standard deviations at its head, and the tip paths predicted from the first state. Given a scene
-    and a log, it shows the logged force instead. Without a log, the robot does not move.
+    Given a model and a log, the view shows the logged motion, the predicted contact force, and the tip paths
+    predicted from the first state. The force is an arrow with a bar of ±2 standard deviations at its head.
+    Given a scene and a log, the view shows the logged force instead. Without a log, the robot does not move.
 
     The page is accessible from this computer only. With --out, it is written as one HTML file that works
     offline.
 
-    [bold]Examples[/bold]
+    **Examples**
 
     forcegp view kuka_plane
 
@@ -90,7 +90,7 @@ def view(
 
 
 def _target(target: str) -> tuple[forcegp.ConstrainedSystem, FittedModel | None, list[Shape]]:
-    """Return the system, the model (if the target is a model), and the shapes of the robot."""
+    """Return the system, the model if the target is a model, and the shapes of the robot."""
     from forcegp.robot.shapes import shapes_of
     from forcegp.storage.model_file import model_path
 
@@ -103,7 +103,7 @@ def _target(target: str) -> tuple[forcegp.ConstrainedSystem, FittedModel | None,
 
 
 def _stretch(log: Path, system: forcegp.ConstrainedSystem, start: int, seconds: float) -> forcegp.Dataset:
-    """Return the rows of a trajectory from `start` until the first gap or the end of the given duration."""
+    """Return the rows of a trajectory from `start` to the first gap or to the end of the given duration."""
     stretch = trajectory_from(read_data(log, system.robot), start, "view")
     steps = stretch.t.diff()
     gaps = (steps > 1.5 * steps.median()).nonzero() if len(steps) > 0 else steps  # left by `forcegp select`

@@ -1,7 +1,7 @@
 """Opt-in compiled dynamics with one fused kernel per robot and quantity, cached on disk.
 
-The robot's parameters are compiled into the kernel as constants. Use compiled functions for many evaluations
-of one robot; the eager functions in `forcegp.dynamics` need no compiler and accept learned robots.
+The robot's parameters are compiled into the kernel as constants. Use compiled functions to evaluate one robot
+many times. The eager functions in `forcegp.dynamics` need no compiler and accept learned robots.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ class CompiledDynamics:
     """A robot quantity, such as the mass matrix, compiled as a function of joint-space arguments.
 
     Call it like the eager function of the same name, but without the robot. Derivatives of any order are
-    those of the eager function; first derivatives of forward dynamics use a kernel built on first use.
+    those of the eager function. First derivatives of forward dynamics use a kernel built on first use.
     """
 
     def __init__(self, robot: RobotModel, quantity: str) -> None:
@@ -128,14 +128,14 @@ class _Kernel(torch.autograd.Function):
 
 
 def compile_dynamics(robot: RobotModel, quantity: str = "forward_dynamics") -> CompiledDynamics:
-    """Compile a function of `forcegp.dynamics` (or its derivatives) for one robot.
+    """Compile a function of `forcegp.dynamics`, or the function of its derivatives, for one robot.
 
-    The first call runs the local C++ compiler, which takes about one second for an arm, ten for a hand, and
+    The first call runs the local C++ compiler. This takes about one second for an arm, ten for a hand, and
     minutes for a hundred joints. Later calls in any process load the kernel from the cache (`$FORCEGP_CACHE`,
     or `forcegp` in the user's cache folder). On a CUDA device, NVRTC compiles the kernel in each process.
 
     Args:
-        robot: the robot, whose parameters become constants.
+        robot: the robot. Its parameters become constants.
         quantity: `forward_dynamics`, `forward_dynamics_derivatives`, `inverse_dynamics`, `mass_matrix`,
             `bias_force` or `gravity_force`.
 
@@ -158,7 +158,8 @@ def compile_dynamics(robot: RobotModel, quantity: str = "forward_dynamics") -> C
     check_name("quantity to compile", quantity, QUANTITIES)
     if robot.learned:
         raise ModelError(
-            "a robot with parameters that require a gradient cannot be compiled, since they become constants",
+            "a robot with parameters that require a gradient cannot be compiled, since compilation makes "
+            "them constants",
             got=", ".join(robot.learned),
             hint="use forcegp.dynamics while learning, and compile a detached robot afterwards",
         )

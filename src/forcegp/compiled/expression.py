@@ -1,7 +1,7 @@
 """Scalar expressions that fold constants and share equal subexpressions as they are built.
 
-They can be stored in numpy object arrays: code written for arrays of numbers also runs on arrays of `Scalar`,
-where it records a straight-line program.
+Scalars can be stored in NumPy object arrays. Code written for arrays of numbers therefore also runs on arrays
+of `Scalar`, where it records a straight-line program.
 """
 
 from __future__ import annotations
@@ -13,22 +13,22 @@ from dataclasses import dataclass, field
 import numpy as np
 
 Node = tuple[str, object, object]
-"""Operation and operands: ("const", value, None), ("input", name, index), (op, left, right) as positions."""
+"""Operation and operands: ("const", value, None), ("input", name, index), or (op, left, right) positions."""
 UNARY = ("exp", "tanh", "sqrt", "step")
-"""Functions of one operand; step is 1 for positive operands and 0 otherwise."""
+"""Functions of one operand. `step` is 1 for positive operands and 0 otherwise."""
 Tangents = dict[int, "Scalar"]
-"""Derivatives of a scalar, keyed by direction; missing ones are zero."""
+"""Derivatives of a scalar, keyed by direction. Missing derivatives are zero."""
 
 
 @dataclass
 class Graph:
-    """Nodes of a program without duplicates, each placed after its operands."""
+    """Nodes of a program without duplicates. Each node is placed after its operands."""
 
     nodes: list[Node] = field(default_factory=list)
     _positions: dict[Node, int] = field(default_factory=dict)
 
     def scalar(self, node: Node) -> Scalar:
-        """Return the scalar computed by a node, reusing an equal node if there is one."""
+        """Return the scalar that a node computes, reusing an equal node if there is one."""
         position = self._positions.setdefault(node, len(self.nodes))
         if position == len(self.nodes):
             self.nodes.append(node)
@@ -63,7 +63,7 @@ class Graph:
     def tangents(self, outputs: list[Scalar], seeds: dict[int, Tangents]) -> list[Tangents]:
         """Return the derivatives of the outputs by forward mode, given those of `seeds`, keyed by position.
 
-        A seed need not be an input; for example, the solution of an equation can be seeded with its
+        A seed need not be an input. For example, the solution of an equation can be seeded with its
         derivative. A scalar without directions is treated as a constant.
         """
         found = dict(seeds)
@@ -104,13 +104,13 @@ class Scalar:
 
     @property
     def value(self) -> float | None:
-        """Value of the scalar if it is a constant, else `None`."""
+        """Value of the scalar if it is a constant, otherwise `None`."""
         op, value, _ = self.graph.nodes[self.position]
         return value if op == "const" else None  # pyright: ignore[reportReturnType]
 
     @property
     def negated(self) -> Scalar | None:
-        """x if the scalar is −x, else `None`."""
+        """x if the scalar is −x, otherwise `None`."""
         op, operand, _ = self.graph.nodes[self.position]
         return Scalar(self.graph, operand) if op == "neg" else None  # pyright: ignore[reportArgumentType]
 

@@ -27,8 +27,8 @@ from forcegp.robot.model import BASE, RobotModel
 class CompiledMechanics:
     """Mechanics of a robot and of given points on it, as a compiled function of (q, q̇) on the CPU.
 
-    `batch` returns M, Q_C and Q_G, and for each point the axes of its frame `(3, 3)` and its position in the
-    world, the Jacobian J `(6, nq)` with [ω; ṗ] = J q̇, and the bias acceleration J̇ q̇ `(6,)`.
+    `batch` returns M, Q_C and Q_G. For each point, it returns the axes of its frame `(3, 3)`, its world
+    position, the Jacobian J `(6, nq)` with [ω; ṗ] = J q̇, and the bias acceleration J̇ q̇ `(6,)`.
 
     Raises:
         MissingDependencyError: there is no C++ compiler.

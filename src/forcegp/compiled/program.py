@@ -1,8 +1,8 @@
-"""The dynamics of a robot expanded to scalars: the algorithms of `forcegp.dynamics`, link by link.
+"""The dynamics of a robot expanded to scalars. The algorithms are those of `forcegp.dynamics`, link by link.
 
-The robot's parameters are numbers, so products with the zeros and ones in joint axes and placements are
-eliminated while the program is built. Poses, joint screws and inertias of the links are expressed in world
-axes about the base origin.
+The robot's parameters are numbers. Products with the zeros and ones in joint axes and placements are
+therefore eliminated while the program is built. Poses, joint screws and inertias of the links are expressed
+in world axes about the base origin.
 """
 
 from __future__ import annotations
@@ -32,10 +32,10 @@ class Links:
     """Poses, screws and inertias of all links as scalars.
 
     Attributes:
-        R, p: rotation and origin of each link.
-        z, l: angular and linear parts of each joint screw.
-        c, mass: centre of mass and mass of each link; `moment` is m c.
-        I: inertia about the centre of mass; `inertia` is about the base origin.
+        R, p: the rotation and origin of each link.
+        z, l: the angular and linear parts of each joint screw.
+        c, mass: the centre of mass and mass of each link. `moment` is m c.
+        I: the inertia about the centre of mass. `inertia` is the inertia about the base origin.
     """
 
     def __init__(self, robot: RobotModel) -> None:
@@ -60,7 +60,7 @@ class Links:
         self.inertia = [I + _shift(*x) for I, *x in zip(self.I, self.c, self.moment, strict=True)]
 
     def _joint(self, robot: RobotModel, i: int) -> tuple[np.ndarray, np.ndarray]:
-        """Return the pose of link i in its parent link (Rodrigues' formula about a constant axis)."""
+        """Return the pose of link i in its parent link by Rodrigues' formula about a constant axis."""
         graph, a, P = self.graph, numbers(robot.axis[i]), numbers(robot.placement_rotation[i])
         shift = graph.constants(numbers(robot.placement_position[i]))
         if robot.joint_types[i] == "prismatic":
@@ -110,7 +110,7 @@ def _shift(c: np.ndarray, h: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Program:
-    """A straight-line program with the eager function's arguments and its result in row-major order."""
+    """A straight-line program with the eager function's arguments, and with its result in row-major order."""
 
     arguments: tuple[str, ...]
     shape: tuple[int, ...]
@@ -157,7 +157,7 @@ def _composites(links: Links) -> list[_Inertia]:
 
 
 def _motion(links: Links, qd: list | None, qdd: list | None, gravity: bool) -> list[_Motion]:
-    """Return the motion of all links; gravity is included as an acceleration of the base."""
+    """Return the motion of all links. Gravity is included as an acceleration of the base."""
     zero, motion = links.graph.constants(np.zeros(3)), []
     rest = _Motion(zero, zero, zero, -links.gravity if gravity else zero)
     for i, parent in enumerate(links.parents):
@@ -174,7 +174,7 @@ def _motion(links: Links, qd: list | None, qdd: list | None, gravity: bool) -> l
 
 
 def _link_forces(links: Links, motion: list[_Motion]) -> tuple[list, list]:
-    """Return the torque and force on each joint's subtree, by Newton-Euler about the centres of mass."""
+    """Return the torque and force on each joint's subtree by Newton-Euler about the centres of mass."""
     torques, forces = [], []
     for (omega, v, alpha, a), c, I, mass in zip(motion, links.c, links.I, links.mass, strict=True):
         force = (a + cross(alpha, c) + cross(omega, v + cross(omega, c))) * mass
@@ -184,7 +184,7 @@ def _link_forces(links: Links, motion: list[_Motion]) -> tuple[list, list]:
 
 
 def _joint_force(links: Links, qd: list | None, qdd: list | None, gravity: bool) -> np.ndarray:
-    """Return the terms of M q̈ − Q_C − Q_G whose arguments are given (recursive Newton-Euler)."""
+    """Return the terms of M q̈ − Q_C − Q_G with given arguments by the recursive Newton-Euler algorithm."""
     torques, forces = _link_forces(links, _motion(links, qd, qdd, gravity))
     result = [z @ t + l @ f for z, l, t, f in zip(links.z, links.l, torques, forces, strict=True)]
     if qdd is not None:
@@ -316,11 +316,11 @@ QUANTITIES: dict[str, tuple[tuple[str, ...], Callable[[Links], np.ndarray]]] = {
     "bias_force": (("q", "qd"), lambda links: -_joint_force(links, links.vector("qd"), None, gravity=False)),
     "gravity_force": (("q",), lambda links: -_joint_force(links, None, None, gravity=True)),
 }
-"""Arguments and algorithm of each supported quantity."""
+"""Arguments and algorithm for each supported quantity."""
 
 
 def trace(robot: RobotModel, quantity: str) -> Program:
-    """Return the recorded program for one quantity in `QUANTITIES` of one robot."""
+    """Return the recorded program for one robot and one quantity in `QUANTITIES`."""
     arguments, algorithm = QUANTITIES[quantity]
     links = Links(robot)
     result = algorithm(links)

@@ -18,7 +18,7 @@ from forcegp.errors import MissingDependencyError
 from forcegp.native import load_library
 
 LANES_BYTES = 64
-"""Vector width of a CPU kernel [bytes]; the compiler splits vectors if those of the machine are narrower."""
+"""Vector width of a CPU kernel [bytes]. The compiler splits vectors if those of the machine are narrower."""
 CUDA_THREADS = 128
 
 _CPU = """\
@@ -71,7 +71,7 @@ extern "C" __global__ void kernel({parameters}, T* out, int batch) {{
 
 @dataclass(frozen=True)
 class Source:
-    """Source code, and the arrays that its kernel reads: arguments of the quantity, "sin" or "cos" of q."""
+    """Source code, and the arrays that its kernel reads: arguments of the quantity, sin q and cos q."""
 
     text: str
     arrays: tuple[str, ...]
@@ -99,7 +99,7 @@ def statements(program: Program, load: dict[tuple[str, int], str], store: str) -
 
 
 def _operation(op: str, left: str, right: str = "") -> str:
-    """Return the source code of an operation; `step` and other functions exist only in C."""
+    """Return the source code of an operation. `step` and other functions exist only in C."""
     if op in UNARY:
         return f"{left} > 0.0" if op == "step" else f"{op}({left})"
     return f"{left} {op} {right}" if right else f"-{left}"
@@ -217,14 +217,14 @@ def cuda_source(program: Program, nq: int, dtype: torch.dtype) -> Source:
 
 
 Kernel = Callable[[Sequence[Tensor], Tensor], None]
-"""Function that reads contiguous arrays `(B, nq)` and fills a contiguous result `(B, …)`."""
+"""A function that reads contiguous arrays `(B, nq)` and fills a contiguous result `(B, …)`."""
 
 SAMPLES_PER_THREAD = 512
 """Minimum number of samples per thread, to amortise thread start-up."""
 
 
 def cpu_kernel(text: str) -> Kernel:
-    """Return the kernel compiled from a `cpu_source`, which runs on `torch.get_num_threads()` threads."""
+    """Return the kernel compiled from `cpu_source` code. It runs on `torch.get_num_threads()` threads."""
     function = load_library(text).kernel
     function.restype = None
     function.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_long, ctypes.c_long]
@@ -239,7 +239,7 @@ def cpu_kernel(text: str) -> Kernel:
 
 
 def cuda_kernel(text: str) -> Kernel:
-    """Return the kernel that NVRTC compiles from a `cuda_source`.
+    """Return the kernel that NVRTC compiles from `cuda_source` code.
 
     Raises:
         MissingDependencyError: the installed PyTorch cannot compile CUDA kernels at run time.

@@ -1,4 +1,4 @@
-"""Implicit constraints: surfaces, contacts, stabilization, and constrained equations of motion."""
+"""Implicit constraints: surfaces, contacts, stabilization, and the constrained equations of motion."""
 
 from forcegp.constraints.contact import Constraint, PointConnection, SurfaceContact
 from forcegp.constraints.gauss import Equations, Linearization

@@ -1,7 +1,7 @@
-"""Equations of motion in which a compiled kernel computes the robot's mechanics.
+"""Equations of motion computed by a compiled kernel.
 
-For a few states, the overhead of tensor operations far exceeds the actual computation. The kernel is built by
-the local C++ compiler and cached on disk.
+For a few states, the overhead of tensor operations far exceeds the cost of the computation itself. The kernel
+is built by the local C++ compiler and cached on disk.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ _SYSTEMS: WeakKeyDictionary[ConstrainedSystem, ConstrainedSystem] = WeakKeyDicti
 
 @dataclass(frozen=True, eq=False, repr=False)
 class CompiledSystem(ConstrainedSystem):
-    """A constrained system with equations of motion from a compiled kernel if no gradient is required.
+    """A constrained system whose equations of motion come from a compiled kernel unless gradients are needed.
 
-    It is created by `compiled_system`. The kernel also computes the motion of additional `points`.
+    Use `compiled_system` to create one. The kernel also computes the motion of additional `points`.
     """
 
     points: tuple[Anchor, ...] = ()
@@ -73,9 +73,9 @@ class CompiledSystem(ConstrainedSystem):
 def compiled_system(system: ConstrainedSystem, *points: Anchor) -> ConstrainedSystem:
     """Return the system with compiled equations of motion, for repeated evaluations of the same robot.
 
-    The first call for a robot takes a few seconds to compile; later calls in any process read the cache. The
-    system is returned unchanged if there is no compiler, or if the robot's parameters require gradients or
-    are on a GPU. `points` are additional points for `Equations.point_motion`.
+    The first call for a robot takes a few seconds to compile the kernel; later calls, in any process, load it
+    from the cache. The system is returned unchanged if there is no compiler, or if the robot's parameters
+    require gradients or are on a GPU. `points` are additional points for `Equations.point_motion`.
 
     Example:
         >>> import torch, forcegp
@@ -92,7 +92,7 @@ def compiled_system(system: ConstrainedSystem, *points: Anchor) -> ConstrainedSy
 
 
 def _anchors_of(system: ConstrainedSystem, points: Sequence[Anchor]) -> tuple[Anchor, ...]:
-    """Return the points used by constraints and the additional points, without duplicates."""
+    """Return the points used by the constraints, followed by the additional points, without duplicates."""
     read = (anchor for contact in system.contacts for anchor in contact.anchors)
     return tuple(dict.fromkeys(map(_key, (*read, *points))))
 
@@ -103,7 +103,7 @@ def _key(anchor: Anchor) -> Anchor:
 
 
 def _kernel(robot: RobotModel, anchors: tuple[Anchor, ...]) -> CompiledMechanics | None:
-    """Return the kernel of a robot, cached as long as the robot exists; `None` if it cannot be compiled."""
+    """Return the kernel for a robot, cached as long as the robot exists; `None` if compilation fails."""
     kept = _KERNELS.setdefault(robot, {})
     if anchors not in kept:
         known = robot.device.type == "cpu" and robot.dtype in (torch.float64, torch.float32)
@@ -115,7 +115,7 @@ def _kernel(robot: RobotModel, anchors: tuple[Anchor, ...]) -> CompiledMechanics
 
 
 def _traced(x: Tensor) -> bool:
-    """Return whether x may be differentiated, by autograd or by a transform of `torch.func`."""
+    """Return whether x may be differentiated by autograd or a `torch.func` transform."""
     if x.requires_grad and torch.is_grad_enabled():
         return True
     try:

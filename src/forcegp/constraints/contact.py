@@ -1,4 +1,4 @@
-"""Holonomic constraints c(q) = 0: contact of a point with a surface, and connection of two points.
+"""Holonomic constraints c(q) = 0: the contact of a point with a surface, and the connection of two points.
 
 Differentiating twice gives A q̈ = b with A = ∂c/∂q and b = −Ȧ q̇ (eq. 3).
 """
@@ -23,14 +23,14 @@ from forcegp.robot.model import RobotModel
 
 
 class ConstraintTerms(NamedTuple):
-    """A constraint at a state.
+    """A constraint evaluated at a state.
 
     Attributes:
-        c: `(*batch, rows)` position-level error.
+        c: `(*batch, rows)` constraint error at position level.
         A: `(*batch, rows, nq)` Jacobian of c.
-        b: `(*batch, rows)` with A q̈ = b, without stabilization.
+        b: `(*batch, rows)` right-hand side of A q̈ = b, without stabilization.
         point: the contact point, for a contact with a surface.
-        holds: `(*batch, rows)` bool, rows that apply at this state; `None` means all.
+        holds: `(*batch, rows)` bool, rows that apply at this state; `None` means that all rows apply.
     """
 
     c: Tensor
@@ -49,7 +49,7 @@ class Constraint(ABC):
     @property
     @abstractmethod
     def anchors(self) -> tuple[Anchor, ...]:
-        """Points on the robot on which the constraint depends, each with its frame."""
+        """Frames and points of the robot that the constraint depends on."""
 
     @abstractmethod
     def terms_of(self, points: Sequence[PointMotion]) -> ConstraintTerms:
@@ -67,29 +67,27 @@ class Constraint(ABC):
 
 @dataclass(frozen=True)
 class SurfaceContact(Constraint):
-    """Contact of a point or a ball on the robot with a surface, c(q) = c_surface(p(q)) − r.
+    """Contact between a surface and a point or a ball on the robot, c(q) = c_surface(p(q)) − r.
 
-    A = ∇cᵀ J_p and b = −(∇cᵀ J̇_p q̇ + ṗᵀ ∇²c ṗ); the multiplier is the normal force if |∇c| = 1. A rounded
-    tip is a ball of radius r around p. The contact point p − r n has the material velocity ṗ + ω × (−r n), so
-    J_E = J_p + r [n]ₓ J_ω. At a rounded tip, friction has the lever arm −r n; the normal force has none.
+    A = ∇cᵀ J_p and b = −(∇cᵀ J̇_p q̇ + ṗᵀ ∇²c ṗ). If |∇c| = 1, the multiplier is the normal force. A rounded
+    tip is a ball of radius r around p. Its contact point p − r n has the material velocity ṗ + ω × (−r n), so
+    J_E = J_p + r [n]ₓ J_ω. About p, friction has the lever arm −r n, and the normal force has none.
 
     A contact that may stick has two additional rows, (t_1, t_2)ᵀ J_E q̇ = 0 in the tangent frame of the
-    surface, which apply while the tangential speed of the contact point is below `stick_speed`. Their
+    surface. They apply while the tangential speed of the contact point is below `stick_speed`, and their
     multipliers are the components of the tangential force. In a rollout, sticking ends when this force
     exceeds the friction predicted by the model (`rollout/cone.py`).
 
     Args:
-        name: name of the contact, as in `contact.<name>` in a data set.
+        name: name of the contact; in a data set, its column is `contact.<name>`.
         frame: link or frame of the contact point.
-        point: coordinates in that frame [m]; for a rounded tip, the coordinates of its centre.
+        point: coordinates of the point in that frame [m], or those of the centre of a rounded tip.
         surface: the surface in the world frame.
         radius: radius r of a rounded tip [m]; 0 for a sharp tip.
-        stick_speed: tangential speed below which the contact point sticks [m/s]; `None` if the contact
-            always slides.
+        stick_speed: tangential speed below which the contact point sticks [m/s]; `None` if it always slides.
 
     Raises:
-        ParameterError: the radius is negative, the surface is not a signed distance, or the speed is not
-            positive.
+        ParameterError: the radius is negative, c is not a signed distance, or the speed is not positive.
 
     Example:
         >>> from forcegp import Plane
@@ -125,7 +123,7 @@ class SurfaceContact(Constraint):
 
     @property
     def center_surface(self) -> Surface:
-        """Surface on which `point` moves: the contact surface, raised by the radius of the tip."""
+        """Surface on which `point` moves, which is the contact surface offset by the radius of the tip."""
         return self.surface.raised(self.radius) if self.radius else self.surface
 
     def check(self, robot: RobotModel) -> None:
@@ -176,8 +174,8 @@ class PointConnection(Constraint):
 
     Args:
         name: name of the constraint.
-        frame, point: first frame, and a point in its coordinates [m].
-        other_frame, other_point: second frame and point; with the frame `None`, a point in the world.
+        frame, point: first frame, and a point in the coordinates of that frame [m].
+        other_frame, other_point: second frame and point; a frame of `None` is the world.
     """
 
     name: str

@@ -2,14 +2,14 @@
 
 M q̈ = Q̄ + Aᵀλ and A q̈ = b imply q̈ = L b + H Q̄ and λ = (A M⁻¹ Aᵀ)⁺(b − A M⁻¹ Q̄). With the Cholesky
 factorization M = G Gᵀ and W = A G⁻ᵀ, L = G⁻ᵀ W⁺ and (A M⁻¹ Aᵀ)⁺ = W⁺ᵀ W⁺. The rank is determined from the
-singular values of W. The singular values of A M⁻¹ Aᵀ are their squares, which in single precision do not
-separate redundant constraints from rounding errors.
+singular values of W. Those of A M⁻¹ Aᵀ are their squares, which are too small in single precision to
+distinguish redundant constraints from rounding errors.
 
-At fixed q̈ and λ, differentiating M q̈ − Q_C − Q_G − Q_D − Aᵀλ = Q and A q̈ = b leaves the residuals
-r_f = ∂Q − ∂ID + ∂Q_D + ∂(Aᵀ)λ and r_c = ∂b − ∂A q̈, so ∂q̈ = H r_f + L r_c and
-∂λ = (A M⁻¹ Aᵀ)⁺(r_c − A M⁻¹ r_f). The derivatives of inverse dynamics have a closed form; those of the few
-constraint rows are computed by autograd. The pseudo-inverse itself is not differentiated, so redundant
-constraints of constant rank are handled correctly.
+Differentiating M q̈ − Q_C − Q_G − Q_D − Aᵀλ = Q and A q̈ = b at fixed q̈ and λ gives the residuals r_f = ∂Q −
+∂ID + ∂Q_D + ∂(Aᵀ)λ and r_c = ∂b − ∂A q̈, from which ∂q̈ = H r_f + L r_c and ∂λ = (A M⁻¹ Aᵀ)⁺(r_c − A M⁻¹
+r_f). The derivatives of inverse dynamics have a closed form; those of the few constraint rows are computed by
+autograd. The pseudo-inverse itself is not differentiated, so redundant constraints of constant rank are
+handled correctly.
 """
 
 from __future__ import annotations
@@ -32,24 +32,24 @@ from forcegp.robot.model import RobotModel
 from forcegp.types import ConstraintInverse, ConstraintMatrix, ConstraintVector, JointMatrix, JointVector
 
 RANK_TOLERANCE = 1e-5
-"""Fraction of the largest singular value of A G⁻ᵀ, M = G Gᵀ, below which constraints are redundant."""
+"""Singular value of A G⁻ᵀ with M = G Gᵀ, relative to the largest, below which constraints are redundant."""
 ROUNDING = 1e3
-"""The same fraction in units of the machine precision ε, used if it is larger: 1.2e-4 in single precision.
-    Redundant contacts of the bundled arms leave 2 ε; closed loops and ill-conditioned M leave more."""
+"""The same threshold in units of the machine epsilon ε, used if it is larger: 1.2e-4 in single precision.
+Redundant contacts of the bundled arms give 2 ε; closed loops and ill-conditioned M give more."""
 
 
 def rank_tolerance(dtype: torch.dtype) -> float:
-    """Return the smallest singular value of A G⁻ᵀ, relative to the largest, of an independent constraint."""
+    """Return the relative singular value of A G⁻ᵀ below which a constraint is redundant."""
     return max(RANK_TOLERANCE, ROUNDING * torch.finfo(dtype).eps)
 
 
 def nothing(dtype: torch.dtype) -> float:
-    """Return the norm below which a row of A G⁻ᵀ counts as zero [1/√kg] because its point cannot move."""
+    """Return the norm below which a row of A G⁻ᵀ is treated as zero [1/√kg] because its point cannot move."""
     return ROUNDING * torch.finfo(dtype).eps
 
 
 FACING_DOWN = 1e-6
-"""Value of 1 + n_z below which a normal is treated as −e_z, for which the smallest rotation is not unique."""
+"""Value of 1 + n_z below which a normal is treated as −e_z, to which the smallest rotation is not unique."""
 
 
 def tangent_frame(n: Tensor) -> Tensor:
@@ -68,13 +68,13 @@ def tangent_frame(n: Tensor) -> Tensor:
 
 @dataclass(frozen=True, eq=False)
 class ContactPoint:
-    """The point on the robot that touches a surface; for a rounded tip, the current material point.
+    """The point on the robot that touches a surface. For a rounded tip, it is the material point in contact.
 
     Attributes:
-        position, velocity: `(*batch, 3)` motion in the world [m], [m/s].
+        position, velocity: `(*batch, 3)` position [m] and velocity [m/s] in the world.
         jacobian: J_E `(*batch, 3, nq)`, in world axes.
         normal: ∇c `(*batch, 3)` at the point.
-        sticks: `(*batch,)` bool, whether the point sticks to the surface; `None` if it always slides.
+        sticks: `(*batch,)` bool, whether the point sticks to the surface; `None` if it never sticks.
     """
 
     position: Tensor
@@ -85,7 +85,7 @@ class ContactPoint:
 
     @cached_property
     def unit_normal(self) -> Tensor:
-        """Unit normal n `(*batch, 3)`, the direction of ∇c."""
+        """Unit normal n `(*batch, 3)`, parallel to ∇c."""
         return normalize(self.normal, dim=-1)
 
     @cached_property
@@ -95,7 +95,7 @@ class ContactPoint:
         return J - n[..., None] * (n[..., None, :] @ J), v - n * vecdot(n, v)[..., None]
 
     def directions(self, rows: int) -> Tensor:
-        """Return the directions `(*batch, 3, rows)` of the multipliers: ∇c, and tangents if it may stick."""
+        """Return the multiplier directions `(*batch, 3, rows)`: ∇c, and tangents if the point may stick."""
         normal = self.normal[..., None]
         return normal if rows == 1 else torch.cat([normal, tangent_frame(self.unit_normal)], dim=-1)
 
@@ -106,15 +106,15 @@ class Equations:
 
     Attributes:
         M: `(*batch, nq, nq)` mass matrix.
-        A: `(*batch, m, nq)`; rows of inactive contacts are zero.
-        b: `(*batch, m)` with A q̈ = b, including Baumgarte terms.
+        A: `(*batch, m, nq)` constraint matrix; rows of inactive contacts are zero.
+        b: `(*batch, m)` right-hand side of A q̈ = b, including Baumgarte terms.
         c, cd: `(*batch, m)` constraint error and its rate for all contacts, whether active or not.
         Q_C, Q_G, Q_D: `(*batch, nq)` bias force, gravity force and dissipative joint force.
-        contact_points: contact point of each surface contact, by name.
-        point_motion: function that returns the motion of a point `(frame, point)` at the states.
+        contact_points: contact point of each surface contact, keyed by name.
+        point_motion: function that returns the motion of a point, given as `(frame, point)`, at the states.
         links: function that returns the poses and the motion of the links at the states.
-        holds: `(*batch, m)` bool, rows of A that apply: those of closed contacts, including the tangential
-            rows of contacts that stick.
+        holds: `(*batch, m)` bool, rows of A that apply, namely those of closed contacts, including the
+            tangential rows of sticking contacts.
     """
 
     M: JointMatrix
@@ -198,7 +198,7 @@ class Equations:
     def hidden(self) -> Tensor:
         """Projector `(*batch, m, m)` onto multipliers μ that do not affect the motion, Aᵀμ = 0.
 
-        It is 1 for a point that cannot move, and between 0 and 1 for contacts that share their load.
+        Diagonal entries are 1 for fixed points, and between 0 and 1 for contacts that share a load.
         """
         # R = 1 − W W⁺
         return torch.diag_embed(self.holds.to(self.M)) - self.scaled_jacobian @ self.scaled_inverse
@@ -225,7 +225,7 @@ class Equations:
 
     @property
     def Q_K(self) -> JointVector:
-        """Force Q_C + Q_G + Q_D computed from the robot file, excluding actuation."""
+        """Force Q_C + Q_G + Q_D computed from the robot file, excluding the motor torque."""
         return self.Q_C + self.Q_G + self.Q_D
 
     def free_acceleration(self, Q: JointVector) -> JointVector:
@@ -233,26 +233,26 @@ class Equations:
         return torch.cholesky_solve(Q[..., None], self.M_cholesky)[..., 0]
 
     def _gap(self, free: JointVector) -> ConstraintVector:
-        """Return b − A q̈′ `(*batch, m)`, by which free motion violates the constraint."""
+        """Return b − A q̈′ `(*batch, m)`, the constraint violation of the free motion."""
         return self.b - (self.A @ free[..., None])[..., 0]
 
     def acceleration(self, Q_bar: JointVector) -> JointVector:
-        """Return q̈ = L b + H Q̄ (eq. 4), computed from the free acceleration as q̈′ + L(b − A q̈′).
+        """Return q̈ = L b + H Q̄ (eq. 4), computed as q̈′ + L(b − A q̈′) from the free acceleration q̈′.
 
         Args:
-            Q_bar: `(*batch, nq)` sum of all impressed generalized forces, Q + Q_z [N m, N].
+            Q_bar: `(*batch, nq)` sum Q + Q_z of all impressed generalized forces [N m, N].
         """
         free = self.free_acceleration(Q_bar)
         return free + (self.L @ self._gap(free)[..., None])[..., 0]
 
     def motion_under(self, Q_bar: JointVector) -> tuple[JointVector, ConstraintVector]:
-        """Return both q̈ = q̈′ + M⁻¹Aᵀ λ and λ, for a step of a rollout."""
+        """Return the acceleration q̈ = q̈′ + M⁻¹Aᵀ λ and the multiplier λ for one step of a rollout."""
         free = self.free_acceleration(Q_bar)
         multiplier = (self.constraint_inertia @ self._gap(free)[..., None])[..., 0]
         return free + (self.M_inv_At @ multiplier[..., None])[..., 0], multiplier
 
     def multiplier(self, Q_bar: JointVector) -> ConstraintVector:
-        """Return λ = (A M⁻¹ Aᵀ)⁺(b − A M⁻¹ Q̄) `(*batch, m)` (eq. 16 with all impressed forces)."""
+        """Return λ = (A M⁻¹ Aᵀ)⁺(b − A M⁻¹ Q̄) `(*batch, m)` (eq. 16, including all impressed forces)."""
         return (self.constraint_inertia @ self._gap(self.free_acceleration(Q_bar))[..., None])[..., 0]
 
     def constraint_force(self, Q_bar: JointVector) -> JointVector:
@@ -261,14 +261,14 @@ class Equations:
 
 
 class Linearization(NamedTuple):
-    """q̈ and λ at a state, and their Jacobians, with one row per component of q̈ or λ.
+    """q̈ and λ at a state, and their Jacobians, which have one row per component of q̈ or λ.
 
     Attributes:
         qdd: `(*batch, nq)` constrained acceleration.
-        dq, dqd, dforce: `(*batch, nq, nq)` ∂q̈/∂q, ∂q̈/∂q̇ and ∂q̈/∂Q = H.
-        multiplier: `(*batch, m)` λ.
-        multiplier_dq, multiplier_dqd, multiplier_dforce: `(*batch, m, nq)` Jacobians of λ, with minimum norm
-            for redundant constraints, which determine only Aᵀλ.
+        dq, dqd, dforce: `(*batch, nq, nq)` Jacobians ∂q̈/∂q, ∂q̈/∂q̇ and ∂q̈/∂Q = H.
+        multiplier: `(*batch, m)` multiplier λ.
+        multiplier_dq, multiplier_dqd, multiplier_dforce: `(*batch, m, nq)` Jacobians of λ. Redundant
+            constraints determine only Aᵀλ, so the λ of minimum norm is used.
     """
 
     qdd: JointVector
@@ -289,7 +289,7 @@ def linearize(
     qd: JointVector,
     force: JointVector,
 ) -> Linearization:
-    """Linearize at states (q, q̇) with known equations of motion, where `rows` returns A and b at states."""
+    """Linearize at states (q, q̇) with known equations of motion; `rows` returns A and b at given states."""
     with torch.no_grad():
         Q_bar = eom.Q_K + force
         qdd, multiplier = eom.acceleration(Q_bar), eom.multiplier(Q_bar)
@@ -310,7 +310,7 @@ def _residuals(
     qdd: Tensor,
     multiplier: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Return the Jacobians of b − A q̈ `(*batch, m, 2 nq)` and Aᵀλ + Q_D in (q, q̇) at fixed q̈ and λ."""
+    """Return the Jacobians of b − A q̈ and Aᵀλ + Q_D with respect to (q, q̇) at fixed q̈ and λ."""
     with torch.enable_grad():
         state = state.detach().clone().requires_grad_()
         q, qd = state.chunk(2, -1)

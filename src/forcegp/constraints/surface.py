@@ -1,10 +1,10 @@
-"""Rigid surfaces as implicit functions c(p) of a point: zero on the surface and positive outside the solid.
+"""Rigid surfaces as implicit functions c(p), which are zero on the surface and positive outside the solid.
 
-The gradient points out of the solid, so a contact under pressure has a multiplier λ ≥ 0. Except for
-`ImplicitSurface`, c is the signed distance and the gradient is the unit normal.
+The gradient points out of the solid, so the multiplier of a contact under pressure is λ ≥ 0. For all surfaces
+except `ImplicitSurface`, c is the signed distance and the gradient is the unit normal.
 
-`SurfaceSchema` describes surfaces in files: scene files and saved models are validated against these classes,
-which the field `type` selects.
+`SurfaceSchema` describes surfaces in scene files and saved models, which are validated against these classes.
+The field `type` selects the class.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ from forcegp.types import Scalars, Vector3
 
 
 class Surface(ABC):
-    """A surface with the derivatives that a contact needs, batched over points in the world."""
+    """A surface with the derivatives that a contact needs, evaluated at batches of points in the world."""
 
     @abstractmethod
     def value(self, p: Vector3) -> Scalars:
-        """Return c(p), `(*batch,)`, in metres if c is a signed distance."""
+        """Return c(p), `(*batch,)` [m if c is a signed distance]."""
 
     @abstractmethod
     def gradient(self, p: Vector3) -> Vector3:
@@ -39,16 +39,16 @@ class Surface(ABC):
         """Return vᵀ ∇²c(p) v, `(*batch,)`."""
 
     def raised(self, distance: float) -> Surface:
-        """Return the offset surface c(p) − distance, if c is a signed distance.
+        """Return the offset surface c(p) − distance; c must be a signed distance.
 
         Args:
             distance: offset along the normal [m].
 
         Raises:
-            ParameterError: the surface is not a signed distance.
+            ParameterError: c is not a signed distance.
         """
         raise ParameterError(
-            f"{type(self).__name__} cannot be raised by {distance} m",
+            f"{type(self).__name__} cannot be offset by {distance} m",
             expected="a plane, a sphere or a cylinder, whose c is the signed distance",
             hint="define raised() in a subclass",
         )
@@ -80,7 +80,7 @@ class Plane(Surface):
     """The plane c(p) = n·p − offset.
 
     Args:
-        normal: direction out of the solid, which is scaled to unit length.
+        normal: direction that points out of the solid; it is normalized.
         offset: distance from the world origin along the normal [m].
 
     Example:
@@ -89,7 +89,7 @@ class Plane(Surface):
         0.25
 
     Raises:
-        ParameterError: the normal has no direction, or the offset is not finite.
+        ParameterError: the normal is zero, or the offset is not finite.
     """
 
     normal: Sequence[float] = (0.0, 0.0, 1.0)
@@ -100,7 +100,7 @@ class Plane(Surface):
         object.__setattr__(self, "normal", _unit(self.normal, "the plane's normal"))
         if not math.isfinite(self.offset):
             raise ParameterError(
-                "the plane's offset is not a distance", expected="a finite number [m]", got=self.offset
+                "the plane's offset is not a valid distance", expected="a finite number [m]", got=self.offset
             )
 
     def raised(self, distance: float) -> Plane:
@@ -117,7 +117,7 @@ class Plane(Surface):
 
 
 class _Round(Surface):
-    """c(p) = |r| − radius for contact from outside, with r computed from p − center by `_across`."""
+    """c(p) = |r| − radius, where `_across` computes r from p − center. Contact is from outside."""
 
     center: Sequence[float]
     radius: float
@@ -156,7 +156,7 @@ class _Round(Surface):
 
 @dataclass(frozen=True)
 class Sphere(_Round):
-    """The sphere c(p) = |p − center| − radius, for contact from outside.
+    """The sphere c(p) = |p − center| − radius, which is touched from outside.
 
     Args:
         center: centre of the sphere [m].
@@ -168,7 +168,7 @@ class Sphere(_Round):
         2.0
 
     Raises:
-        ParameterError: the radius is not positive, or the center is not a point.
+        ParameterError: the radius is not positive, or the centre is not a point.
     """
 
     center: Sequence[float]
@@ -178,11 +178,11 @@ class Sphere(_Round):
 
 @dataclass(frozen=True)
 class Cylinder(_Round):
-    """The infinite cylinder c(p) = |p − center − a aᵀ(p − center)| − radius, for contact from outside.
+    """The infinite cylinder c(p) = |p − center − a aᵀ(p − center)| − radius, which is touched from outside.
 
     Args:
         center: a point on the axis [m].
-        axis: direction a of the axis, which is scaled to unit length.
+        axis: direction a of the axis; it is normalized.
         radius: radius [m].
 
     Example:
@@ -191,7 +191,7 @@ class Cylinder(_Round):
         2.0
 
     Raises:
-        ParameterError: the axis has no direction, the radius is not positive, or the center is not a point.
+        ParameterError: the axis is zero, the radius is not positive, or the centre is not a point.
     """
 
     center: Sequence[float]
@@ -214,11 +214,11 @@ SurfaceSchema = Annotated[Plane | Sphere | Cylinder, Field(discriminator="type")
 
 @dataclass(frozen=True)
 class ImplicitSurface(Surface):
-    """Any smooth surface c(p), with derivatives by automatic differentiation.
+    """Any smooth surface c(p), differentiated automatically.
 
     Args:
         function: function that maps one point `(3,)` to a scalar tensor. It must be positive outside the
-            solid and twice differentiable by PyTorch. The multiplier is in newtons if |∇c| = 1.
+            solid and twice differentiable. If |∇c| = 1, the multiplier is in newtons.
 
     Example:
         >>> import torch

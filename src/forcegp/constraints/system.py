@@ -1,4 +1,4 @@
-"""Constrained systems: a robot with constraints, their stabilization, and its equations of motion."""
+"""Constrained systems: a robot, its constraints, their stabilization, and the equations of motion."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ from forcegp.types import ConstraintVector, JointVector
 SQUARE, LINEAR = 20, 60
 """Measured peak number of matrices and vectors, over joints and constraint rows, per state."""
 CERTAIN = 0.25
-"""Fraction of the memory bound that all measured computations exceed."""
+"""Fraction of the memory bound that every measured computation exceeded."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Baumgarte:
     """Baumgarte stabilization, which damps the constraint error according to c̈ + 2ωξ ċ + ω² c = 0 (eq. 29).
 
     The right-hand side becomes b̃ = b − 2ωξ A q̇ − ω² c. Equation (30) of the paper has the opposite signs,
-    with which the error would grow.
+    for which the error would grow.
 
     Args:
         natural_frequency: natural frequency ω > 0 [rad/s].
@@ -69,7 +69,7 @@ class ConstrainedSystem:
 
     Args:
         robot: the robot.
-        contacts: the constraints; an empty sequence describes free motion.
+        contacts: the constraints; if there are none, the robot moves freely.
         baumgarte: stabilization of the constraint error, or `None`.
 
     Example:
@@ -82,7 +82,7 @@ class ConstrainedSystem:
 
     Raises:
         UnknownNameError: a contact is attached to an unknown frame.
-        ParameterError: two contacts have the same name, or a point is invalid.
+        ParameterError: two contacts have the same name, or a point is not valid.
     """
 
     robot: RobotModel
@@ -100,7 +100,7 @@ class ConstrainedSystem:
             contact.check(self.robot)
 
     def __repr__(self) -> str:
-        """Return a one-line summary of the robot and the contacts, without values."""
+        """Return a one-line summary of the robot and its contacts, without numerical values."""
         contacts = ", ".join(f"{type(contact).__name__} {contact.name!r}" for contact in self.contacts)
         rule = f"; {self.baumgarte}" if self.baumgarte is not None else ""
         return f"<ConstrainedSystem: {self.robot!r}; {contacts or 'no contacts'}{rule}>"
@@ -128,12 +128,12 @@ class ConstrainedSystem:
 
     @property
     def row_names(self) -> list[str]:
-        """Name of each constraint row: the name of the constraint, numbered if it has several rows."""
+        """Name of each constraint row: the name of the constraint, numbered if there are several rows."""
         rows = ((c.name, c.rows, row + 1) for c in self.contacts for row in range(c.rows))
         return [name if count == 1 else f"{name} {row}" for name, count, row in rows]
 
     def contact(self, name: str) -> Constraint:
-        """Return a constraint by name.
+        """Return the constraint with the given name.
 
         Raises:
            UnknownNameError: the contact does not exist.
@@ -144,7 +144,7 @@ class ConstrainedSystem:
 
     @cached_property
     def rows(self) -> dict[str, slice]:
-        """Constraint rows of each constraint, by name."""
+        """Constraint rows of each constraint, keyed by name."""
         ends = itertools.accumulate(contact.rows for contact in self.contacts)
         return {c.name: slice(end - c.rows, end) for c, end in zip(self.contacts, ends, strict=True)}
 
@@ -159,7 +159,7 @@ class ConstrainedSystem:
 
     @cached_property
     def can_open(self) -> Tensor:
-        """Mask `(n_contacts,)` of the constraints that can open, which are contacts with a surface."""
+        """Mask `(n_contacts,)` of the constraints that can open, namely the contacts with a surface."""
         flags = [isinstance(contact, SurfaceContact) for contact in self.contacts]
         return torch.tensor(flags, dtype=torch.bool, device=self.robot.device)
 
@@ -170,9 +170,9 @@ class ConstrainedSystem:
         return 8 * (SQUARE * width**2 + LINEAR * width)
 
     def announce_states(self, states: int, copies: float, what: str) -> None:
-        """Warn about or reject a computation on many states at once; see `announce_memory`.
+        """Warn about or reject a computation at many states at once (see `announce_memory`).
 
-        `copies` is its peak memory relative to that of the equations of motion; `what` describes it.
+        `copies` is the peak memory relative to that of the equations of motion; `what` names the computation.
 
         Raises:
             MemoryLimitError: the computation needs more memory than is free.
@@ -185,7 +185,7 @@ class ConstrainedSystem:
         return dataclasses.replace(self, robot=robot)
 
     def with_stick_speeds(self, speeds: Mapping[str, float]) -> ConstrainedSystem:
-        """Return the system with contacts that stick below given speeds [m/s] unless they specify a speed."""
+        """Return the system with the given stick speeds [m/s] for contacts that do not specify one."""
         contacts = [
             dataclasses.replace(each, stick_speed=speeds[each.name])
             if isinstance(each, SurfaceContact) and each.stick_speed is None and each.name in speeds
@@ -196,7 +196,7 @@ class ConstrainedSystem:
         return dataclasses.replace(self, contacts=contacts) if changed else self
 
     def active_rows(self, active: Tensor | None, batch: torch.Size) -> Tensor:
-        """Expand a mask of active contacts `(*batch, n_contacts)` to rows `(*batch, m)`; `None` means all.
+        """Expand a mask of active contacts `(*batch, n_contacts)` to rows `(*batch, m)`; `None` selects all.
 
         Raises:
             ShapeError: the mask is not boolean, or does not match the contacts and the batch shape.
@@ -223,7 +223,7 @@ class ConstrainedSystem:
 
         Args:
             q, qd: `(*batch, nq)` joint positions and velocities.
-            active: `(*batch, n_contacts)` bool, the closed contacts of each sample; by default all.
+            active: `(*batch, n_contacts)` bool, the closed contacts of each sample; all by default.
 
         Example:
             >>> import torch, forcegp
@@ -253,7 +253,7 @@ class ConstrainedSystem:
         point_motion: Callable[[str, Sequence[float]], PointMotion],
         links: Callable[[], tuple[LinkPoses, LinkMotion]],
     ) -> Equations:
-        """Assemble the equations of motion from M, Q_C, Q_G, Q_D and the motion of the points."""
+        """Assemble the equations of motion from M, Q_C, Q_G, Q_D and the motion of the constraint points."""
         terms = self._terms(point_motion)
         c, cd, A, b, holds = self._rows(q, qd, terms, active)
         touching = zip(self.contact_names, (term.point for term in terms), strict=True)
@@ -264,16 +264,16 @@ class ConstrainedSystem:
     def linearize(
         self, q: JointVector, qd: JointVector, force: JointVector, active: Tensor | None = None
     ) -> Linearization:
-        """Return the constrained acceleration and the multiplier, and their Jacobians with respect to q, q̇
-        and the force.
+        """Return the constrained acceleration and the multiplier, with their Jacobians.
 
-        q̈(q, q̇, Q) = L b + H (Q_C + Q_G + Q_D + Q) and its exact derivatives are detached from the graph.
-        If Q depends on the state, as learned forces do, add `dforce` times the derivative of Q.
+        The acceleration is q̈(q, q̇, Q) = L b + H (Q_C + Q_G + Q_D + Q). The exact derivatives with respect
+        to q, q̇ and Q are detached from the autograd graph. If Q depends on the state, as learned forces do,
+        add `dforce` times the derivative of Q.
 
         Args:
             q, qd: `(*batch, nq)` joint positions and velocities.
-            force: `(*batch, nq)` Q, the motor torques and all other forces that the robot file lacks.
-            active: `(*batch, n_contacts)` bool, the closed contacts of each sample; by default all.
+            force: `(*batch, nq)` sum Q of the motor torques and all forces missing from the robot file.
+            active: `(*batch, n_contacts)` bool, the closed contacts of each sample; all by default.
 
         Raises:
             ShapeError: an argument has the wrong shape, dtype or device.
@@ -305,19 +305,19 @@ class ConstrainedSystem:
     def _moving(
         self, q: Tensor, qd: Tensor
     ) -> tuple[LinkPoses, LinkMotion, Callable[[str, Sequence[float]], PointMotion]]:
-        """Return the poses and velocities of the links, and a function for the motion of their points."""
+        """Return the poses and motion of the links, and a function that computes the motion of a point."""
         poses = kinematics.link_poses(self.robot, q)
         motion = kinematics.link_motion(self.robot, poses, qd)
         return poses, motion, partial(kinematics.point_motion, self.robot, poses, motion, qd)
 
     def _terms(self, point_motion: Callable[[str, Sequence[float]], PointMotion]) -> list[ConstraintTerms]:
-        """Evaluate the constraints at their points."""
+        """Evaluate the constraints from the motion of their points."""
         return [c.terms_of([point_motion(*anchor) for anchor in c.anchors]) for c in self.contacts]
 
     def _rows(
         self, q: Tensor, qd: Tensor, terms: Sequence[ConstraintTerms], active: Tensor | None
     ) -> tuple[Tensor, Tensor, Tensor, Tensor, Tensor]:
-        """Return c and ċ of all contacts, A and stabilized b of active contacts, and a mask of their rows."""
+        """Return c and ċ of all contacts, and A, stabilized b and the row mask of active contacts."""
         if len(terms) == 1:
             c, A, b = terms[0].c, terms[0].A, terms[0].b
         else:

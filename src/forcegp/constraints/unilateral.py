@@ -1,7 +1,7 @@
 """Unilateral contact with a surface: opening, closing, impact and sliding friction.
 
 A closed contact opens when its multiplier would become negative. An open contact closes with an inelastic
-impact when c ≤ 0 and ċ < 0. Other constraints, such as a connection of two points, never open or close.
+impact when c ≤ 0 and ċ < 0. Other constraints, such as the connection of two points, never open or close.
 """
 
 from __future__ import annotations
@@ -17,27 +17,27 @@ from forcegp.errors import NumericalError
 from forcegp.types import ActiveContacts, JointVector
 
 PULL = 1e-9
-"""Value of −λ above which a contact pulls [N]; rounding errors must not open a contact without load."""
+"""Value of −λ above which a contact pulls [N]; rounding errors must not open an unloaded contact."""
 APPROACH = 1e-9
-"""Value of −ċ above which a contact closes [m/s]; after an impact, ċ is zero up to rounding errors."""
+"""Value of −ċ above which a contact closes [m/s]; after an impact, ċ is zero up to rounding error."""
 
 POSITION_TOLERANCE = 1e-12
-"""Largest constraint error that counts as zero [m]; rounding errors in an arm's kinematics are near 1e-15."""
+"""Largest constraint error considered zero [m]; rounding errors in an arm's kinematics are near 1e-15 m."""
 ROUNDING = 100.0
-"""Constraint error due to rounding, in units of the machine precision ε; only relevant in float32."""
+"""Constraint error caused by rounding, in units of the machine epsilon; relevant only in float32."""
 MAX_ITERATIONS = 30
-"""Maximum number of Newton iterations; a state that is a centimetre off the surface needs four."""
+"""Maximum number of Newton iterations; four are needed for a state one centimetre from the surface."""
 MAX_STEP = 0.2
-"""Largest change in a joint position in one iteration [rad, m]; it mainly limits lightweight wrist joints."""
+"""Largest change in a joint position per iteration [rad, m]; it mainly limits lightweight wrist joints."""
 
 
 class Landing(NamedTuple):
-    """State of the contacts at the start of a step, before forces are computed.
+    """State of the contacts at the start of a time step, before the forces are computed.
 
     Attributes:
         closed: `(n_contacts,)` bool, closed contacts.
-        qd: `(nq,)` velocity after the impact, if there was one.
-        eom: equations of motion with the closed contacts.
+        qd: `(nq,)` velocity, after the impact if there was one.
+        eom: equations of motion under the constraints of the closed contacts.
         impact: whether a contact has just closed.
     """
 
@@ -48,14 +48,14 @@ class Landing(NamedTuple):
 
 
 class ContactForces(NamedTuple):
-    """Contacts and forces during a step.
+    """Contacts and forces during a time step.
 
     Attributes:
         closed: `(n_contacts,)` bool, closed contacts.
-        c: `(m,)` constraint error of all contacts, open or closed [m].
-        multiplier: `(m,)` λ, zero for open contacts.
+        c: `(m,)` constraint error of all contacts, whether open or closed [m].
+        multiplier: `(m,)` multiplier λ, which is zero for open contacts.
         Q: `(nq,)` joint force Q_C + Q_G + Q_D + Q_u [N m].
-        Q_D, Q_I, Q_z: `(nq,)` joint friction, and normal and friction forces of the contacts [N m].
+        Q_D, Q_I, Q_z: `(nq,)` joint friction, normal contact force and contact friction [N m].
     """
 
     closed: Tensor
@@ -74,7 +74,7 @@ def rows_of(system: ConstrainedSystem, active: Tensor) -> Tensor:
 
 
 def any_row(system: ConstrainedSystem, rows: Tensor) -> Tensor:
-    """Reduce a mask of rows `(*batch, m)` to the constraints `(*batch, n_contacts)` with any row set."""
+    """Return a mask `(*batch, n_contacts)` of the constraints with at least one row set in `(*batch, m)`."""
     if system.m == len(system.contacts):
         return rows
     parts = rows.split([contact.rows for contact in system.contacts], dim=-1)
@@ -82,24 +82,24 @@ def any_row(system: ConstrainedSystem, rows: Tensor) -> Tensor:
 
 
 def normal_rows(system: ConstrainedSystem, rows: Tensor) -> Tensor:
-    """Select the first (normal) row of each contact, `(*batch, n_contacts)`, from rows `(*batch, m)`."""
+    """Select the first (normal) row of each contact, `(*batch, n_contacts)`, from all rows `(*batch, m)`."""
     if system.m == len(system.contacts):
         return rows
     return rows[..., [own.start for own in system.rows.values()]]
 
 
 def pulling(system: ConstrainedSystem, active: Tensor, multiplier: Tensor) -> Tensor:
-    """Return a mask of the closed contacts that open because they would pull, λ `(*batch, m)` < 0."""
+    """Return a mask of the closed contacts that open because their multiplier λ `(*batch, m)` is negative."""
     return normal_rows(system, multiplier < -PULL) & system.can_open & active
 
 
 def reached(system: ConstrainedSystem, active: Tensor, c: Tensor, cd: Tensor) -> Tensor:
-    """Return a mask `(*batch, n_contacts)` of the open contacts that close, c ≤ 0 and ċ < 0."""
+    """Return a mask `(*batch, n_contacts)` of the open contacts that close because c ≤ 0 and ċ < 0."""
     return normal_rows(system, (c <= 0.0) & (cd < -APPROACH)) & system.can_open & ~active
 
 
 def project_velocity(eom: Equations, qd: Tensor) -> Tensor:
-    """Return the velocity `(*batch, nq)` after a frictionless inelastic impact on active constraints.
+    """Return the velocity `(*batch, nq)` after a frictionless inelastic impact with the active constraints.
 
     M (q̇⁺ − q̇⁻) = Aᵀ Λ with A q̇⁺ = 0, so q̇⁺ = T q̇⁻ = q̇⁻ − L A q̇⁻.
     """
@@ -111,10 +111,10 @@ def project_state(
 ) -> tuple[JointVector, JointVector]:
     """Project (q, q̇) `(*batch, nq)` onto the constraint manifold in the metric of M.
 
-    The Newton iteration q ← q − M⁻¹Aᵀ(A M⁻¹ Aᵀ)⁺ c moves along the directions of the constraint forces, and
-    q̇ ← q̇ − L A q̇ is the closest velocity on the manifold in the metric of the kinetic energy. The result
-    satisfies |c(q)| ≤ 1e−12 m (1e−5 m in float32) and A q̇ = 0 for the `active` contacts
-    `(*batch, n_contacts)`, by default all.
+    The Newton iteration q ← q − M⁻¹Aᵀ(A M⁻¹ Aᵀ)⁺ c moves along the directions of the constraint forces. The
+    projected q̇ − L A q̇ is the closest admissible velocity in the kinetic-energy metric. The result
+    satisfies |c(q)| ≤ 1e−12 m (1e−5 m in float32) and A q̇ = 0 for the `active` contacts `(*batch,
+    n_contacts)` (all by default).
 
     Raises:
         NumericalError: the iteration does not converge, for example if the surface is out of reach.
@@ -141,9 +141,9 @@ def project_state(
 def sliding_friction(
     system: ConstrainedSystem, eom: Equations, active: Tensor, viscous_friction: float
 ) -> Tensor:
-    """Return the friction of active contacts, Q_z = Σ J_Eᵀ F_z `(*batch, nq)` with F_z = −θ_v (I − n nᵀ) ṗ_E.
+    """Return the friction Q_z = Σ J_Eᵀ F_z `(*batch, nq)` of active contacts, F_z = −θ_v (I − n nᵀ) ṗ_E.
 
-    `active` is a mask `(*batch, n_contacts)`, and `viscous_friction` is θ_v [N s/m].
+    `active` is a mask `(*batch, n_contacts)`, and `viscous_friction` is the coefficient θ_v [N s/m].
     """
     Q_z = 0.0 * eom.Q_C
     for i, contact in enumerate(system.contacts):
@@ -158,7 +158,7 @@ def sliding_friction(
 
 
 def land(system: ConstrainedSystem, q: Tensor, qd: Tensor, closed: Tensor) -> Landing:
-    """Close the contacts that a state `(nq,)` has reached, and apply their impact."""
+    """Close the contacts reached at a state `(nq,)`, and apply their impacts."""
     eom = system.equations(q, qd, active=closed)
     new = reached(system, closed, eom.c, eom.cd)
     if not bool(new.any()):
@@ -179,7 +179,7 @@ def contact_forces(
     """Return the normal and friction forces at a state `(nq,)` under the torque Q_u [N m].
 
     Contacts that would pull are opened first. `landing` contains the closed contacts and their equations of
-    motion, and `viscous_friction` is θ_v [N s/m].
+    motion. `viscous_friction` is the coefficient θ_v [N s/m].
     """
     closed, eom = landing.closed, landing.eom
     # Q = Q_C + Q_G + Q_D + Q_u

@@ -1,15 +1,15 @@
 """Information that a motion provides about the unknown forces of a robot.
 
 The torque is linear in the unknowns, τ = τ₀ + Φ(q, q̇, q̈) θ with θ ~ N(0, U Uᵀ). The unknowns are the base
-parameters of the links; for each joint, a function of its speed (viscous friction, dry friction and Gaussian
-bumps) and a function of its position (bumps); and drive inertia, if a fit has learned it. After a motion x
-with torque noise Σ,
+parameters of the links, the functions of each joint, and drive inertia if a fit has learned it. Each joint
+has a function of its speed (viscous friction, dry friction and Gaussian bumps) and a function of its position
+(bumps). After a motion x with torque noise Σ,
 
     Cov θ = U (1 + Uᵀ G U)⁻¹ Uᵀ,    G = Σ_i Φ(x_i)ᵀ Σ⁻¹ Φ(x_i),
 
-over independent samples i. Criterion `A` is the geometric mean over joints of the standard deviation of the
-torque in a region, and `D` is the entropy of θ. Sources: Swevers et al., *Optimal robot excitation and
-identification* (IEEE T-RA 1997); Pukelsheim, *Optimal Design of Experiments* (1993).
+The sum extends over independent samples i. Criterion `A` is the geometric mean over joints of the standard
+deviation of the torque in a region, and `D` is the entropy of θ. Sources: Swevers et al., *Optimal robot
+excitation and identification* (IEEE T-RA 1997); Pukelsheim, *Optimal Design of Experiments* (1993).
 """
 
 from __future__ import annotations
@@ -30,7 +30,7 @@ from forcegp.robot.model import RobotModel
 LOOK = 0.1
 """Time after which torque errors are independent [s]."""
 NOISE = 0.01
-"""Standard deviation of torque noise, relative to the root mean square torque in the region."""
+"""Standard deviation of torque noise, relative to the RMS torque in the region."""
 FRICTION, BUMP = 0.1, 0.03
 """Prior standard deviations of friction and of each bump, relative to the same torque."""
 SPEEDS, PLACES = 7, 5
@@ -39,7 +39,7 @@ DRY = 0.02
 """Speed scale on which dry friction changes sign, relative to the maximum speed of a joint."""
 
 States = tuple[Tensor, Tensor, Tensor]
-"""Positions, velocities and accelerations `(n, nq)`."""
+"""Positions, velocities and accelerations, each `(n, nq)`."""
 Criterion = Callable[[Tensor, "Unknowns"], Tensor]
 """Objective to minimise, as a function of the information matrix G `(p, p)` of a motion and the unknowns."""
 
@@ -49,12 +49,12 @@ class Unknowns:
     """Unknown forces of a robot before a motion.
 
     Attributes:
-        robot: robot that defines kinematics, gravity and drives, and the prior mean of the links.
-        base: combinations of the inertial parameters that affect the motion.
-        low, high, fastest: `(nq,)` range of positions, and largest speeds, over which the functions extend.
-        region: states `(m, nq)` at which the torque is to be predicted.
-        noise: `(nq,)` standard deviation of the noise of a torque sample [N m, N].
-        root: U `(p, p)`, where U Uᵀ is the covariance of θ before the motion.
+        robot: the robot that defines the kinematics, gravity, the drives, and the prior mean of the links.
+        base: the combinations of inertial parameters that affect the motion.
+        low, high, fastest: range of positions and largest speeds over which the functions extend, `(nq,)`.
+        region: states at which the torque is to be predicted, `(m, nq)`.
+        noise: standard deviation of the noise in a torque sample, `(nq,)` [N m, N].
+        root: matrix U `(p, p)`, where U Uᵀ is the covariance of θ before the motion.
     """
 
     robot: RobotModel
@@ -79,10 +79,10 @@ class Unknowns:
         """Return the unknown forces of a robot before any data were recorded.
 
         Args:
-            robot: robot from the file.
+            robot: the robot from the file.
             low, high, fastest, region: see the attributes.
-            noise: torque noise; by default, 1 % of each joint's root mean square torque in the region, but at
-                least 0.1 % of the largest.
+            noise: torque noise. The default is 1 % of each joint's RMS torque in the region, at least 0.1 %
+                of the largest.
 
         Raises:
             ParameterError: the region is empty.
@@ -124,7 +124,7 @@ class Unknowns:
         return Y, torch.cat(parts, dim=-1)
 
     def information(self, Phi: Tensor, seconds: float) -> Tensor:
-        """Return the information matrix G `(p, p)` of a motion of given duration from Φ at its states."""
+        """Return the information matrix G `(p, p)` of a motion, given its duration and Φ at its states."""
         A = (Phi / self.noise[:, None]).flatten(0, 1)
         return A.mT @ A * (seconds / LOOK / len(Phi))
 
@@ -152,9 +152,9 @@ class Unknowns:
         return replace(self, root=self.covariance_root(G))
 
     def torque_std(self) -> Mapping[str, Tensor]:
-        """Return the root mean square of the torque standard deviation over the region, `(nq,)` [N m, N].
+        """Return the RMS of the torque standard deviation over the region, `(nq,)` [N m, N].
 
-        The keys are `all` for all parameters, and `links`, `friction` and `drives` for these alone.
+        The keys are `all` for all parameters, and `links`, `friction` and `drives` for each group alone.
         """
         Phi = self.columns(*self.region)[1]
         parts = {"all": slice(None), **self.parts}
@@ -163,18 +163,18 @@ class Unknowns:
 
 
 def rigid_torque(robot: RobotModel, q: Tensor, qd: Tensor, qdd: Tensor, Y: Tensor | None = None) -> Tensor:
-    """Return the torque that a motion requires, Y π + armature q̈ − Q_D `(n, nq)` [N m, N]."""
+    """Return the torque that a motion requires, Y π + armature q̈ − Q_D, `(n, nq)` [N m, N]."""
     Y = regressor(robot, q, qd, qdd) if Y is None else Y
     return Y @ parameter_vector(robot) + robot.armature * qdd - damping_force(robot, qd)
 
 
 def a_optimal(G: Tensor, unknowns: Unknowns) -> Tensor:
-    """Return the mean over joints of the log torque standard deviation (root mean square over the region)."""
+    """Return the log of the RMS torque standard deviation over the region, averaged over the joints."""
     return _log_std(unknowns.covariance_root(G), unknowns)
 
 
 def v_optimal(G: Tensor, unknowns: Unknowns) -> Tensor:
-    """Return `a_optimal` for only links, viscous and dry friction, which least squares can identify."""
+    """Return `a_optimal` for links and for viscous and dry friction, which least squares can identify."""
     return _log_std(unknowns.without_bumps().covariance_root(G), unknowns)
 
 

@@ -42,26 +42,26 @@ def check_setting(name: str, valid: bool, expected: str, got: object) -> None:
 
 @dataclass(frozen=True)
 class MotionConfig:
-    """A random motion of the tool over a surface or in free space; the defaults are the paper's task.
+    """A random motion of the tool over a surface or in free space. The defaults are the paper's task.
 
     Args:
         duration: duration of the motion [s].
         dt: sampling period of the motion and of the controller [s].
-        center: centre of the rectangle of waypoints, moved onto the surface if there is a contact [m].
+        center: centre of the rectangle of waypoints [m]. It is moved onto the surface if there is a contact.
         size: side lengths of the rectangle, ahead and across [m].
         travel_time: time between two waypoints [s].
         max_acceleration: maximum acceleration of the end-effector along a line [m/s²].
-        lift_probability: probability that a waypoint is above the surface; with 0, the tool stays in contact.
-        lift_height: range of heights of such a waypoint [m].
-        pressing_force: range of the force on the surface, which is drawn for each line [N].
-        elbow_swing: variation of the null-space posture between lines [rad].
+        lift_probability: probability that a waypoint is above the surface. With 0, the tool stays in contact.
+        lift_height: range of heights for such a waypoint [m].
+        pressing_force: range of the force on the surface [N], which is drawn for each line.
+        elbow_swing: variation in the null-space posture between lines [rad].
         tool_turn: rotation of the tool about the surface normal, for better reachability [rad].
         gains: gains of the controller.
-        torque_limit: torque limits, one per joint [N m]; `None` means the limits of the robot.
-        frame, point: tool frame and point if there is no contact; by default, the last frame of the robot.
+        torque_limit: torque limits, one per joint [N m]. `None` means the limits of the robot.
+        frame, point: tool frame and point if there is no contact. The default is the last frame of the robot.
 
     Raises:
-        ParameterError: a value is out of range; the message names it.
+        ParameterError: a value is out of range. The message names it.
     """
 
     duration: float = 60.0
@@ -104,11 +104,11 @@ class MotionConfig:
 POSE_TOLERANCE = 1e-10
 """Largest error in a component of a reached pose (metres, or the sine of an angle)."""
 ITERATIONS = 150
-"""Maximum number of steps from each start; successful starts need about thirty."""
+"""Maximum number of steps from each start. Successful starts need about thirty."""
 MAX_STEP = 0.3
 """Largest rotation of a joint in one step [rad], within the range of the linear model of the pose."""
 DAMPING = 0.1
-"""Damping of the least-squares steps relative to the squared error; it vanishes as the pose is reached."""
+"""Damping of the least-squares steps relative to the squared error. It vanishes as the pose is reached."""
 LEANING = 0.1
 """Fraction of the way to the preferred joint positions that a step covers in the null space of the pose."""
 
@@ -122,11 +122,12 @@ def inverse_kinematics(
     starts: Tensor,
     near: JointVector,
 ) -> JointVector:
-    """Return joint positions `(nq,)` at which a point in a frame has a given pose, by damped least squares.
+    """Find joint positions `(nq,)` at which a point in a frame has a given pose, by damped least squares.
 
     Each step is Jᵀ(J Jᵀ + μ I)⁻¹ e. The first half of the steps also move towards `near` `(nq,)` in the null
     space of J. Of the solutions from all `starts` `(k, nq)`, the closest to `near` is returned. The pose in
-    the world is `(3,)` [m] and `(3, 3)`; with fewer than six joints, only the position is matched.
+    the world is given by `position` `(3,)` [m] and `rotation` `(3, 3)`. With fewer than six joints, only the
+    position is matched.
 
     Raises:
         NumericalError: the pose is not reached from any start within the joint limits.
@@ -156,8 +157,8 @@ def _pose_error(
 ) -> tuple[Tensor, Tensor, Tensor]:
     """Return the error of pose `(k, 6)` or position `(k, 3)`, its Jacobian, and whether the axes agree.
 
-    The sine in the orientation error also vanishes at an error of half a turn, for which the trace of the
-    relative rotation is −1 instead of 3.
+    The orientation error is the sine of an angle, which also vanishes at half a turn. In that case, the trace
+    of the relative rotation is −1 instead of 3.
     """
     poses = kinematics.link_poses(robot, q)
     reached, origin = kinematics.pose_of_frame(robot, poses, index)
@@ -182,8 +183,8 @@ def _damped_step(J: Tensor, error: Tensor, leaning: Tensor) -> Tensor:
 def tool_rotation(normal: Vector3, ahead: Vector3, tool_axis: Vector3) -> Rotation:
     """Return the axes `(3, 3)` of a frame in which `tool_axis` points into the surface.
 
-    Half a turn about the side axis turns the tool down. `normal` and `ahead` are the unit normal out of the
-    surface and a unit tangent, `(3,)` each.
+    Half a turn about the side axis turns the tool down. `normal` is the unit normal out of the surface, and
+    `ahead` is a unit tangent, both `(3,)`.
     """
     down = torch.stack([-ahead, torch.linalg.cross(normal, ahead), -normal], dim=-1)
     return down @ torch.from_numpy(turn_z(tool_axis.double().numpy()).T).to(down)
@@ -198,11 +199,11 @@ class Plan:
     """Reference for the controller.
 
     Attributes:
-        contacts: names of the tool's contacts; empty in free space.
-        frame, point: frame and point of the tool.
-        reference: motion of the tool point.
-        targets: targets of the controller `(n, …)`, one per sample.
-        start: `(nq,)` joint positions at the first waypoint.
+        contacts: names of the tool's contacts (none in free space).
+        frame, point: the frame and point of the tool.
+        reference: the motion of the tool point.
+        targets: the targets of the controller, one per sample, `(n, …)`.
+        start: the joint positions at the first waypoint, `(nq,)`.
     """
 
     contacts: tuple[str, ...]
@@ -221,7 +222,7 @@ class Plan:
         return control_torque(tool, eom, q, qd, target, self.press(eom), gains)
 
     def press(self, eom: Equations) -> Tensor:
-        """Return the sum of the generalized unit normal forces on the tool, Σ Jᵀn/|n| `(*batch, nq)`."""
+        """Return the sum of the generalized unit normal forces on the tool, Σ Jᵀn/|n|, `(*batch, nq)`."""
         total = 0.0 * eom.Q_C
         for name in self.contacts:
             at = eom.contact_points[name]
@@ -299,14 +300,14 @@ def joint_plan(system: ConstrainedSystem, config: MotionConfig, t: Tensor, motio
 
 
 def _tool_axis(point: Tensor) -> Tensor:
-    """Return the direction of the tool point in its frame, or the z axis for a point at the origin."""
+    """Return the direction of the tool point in its frame, or the z axis if the point is at the origin."""
     if float(torch.linalg.vector_norm(point)) == 0.0:
         return torch.tensor([0.0, 0.0, 1.0], dtype=point.dtype)
     return torch.nn.functional.normalize(point, dim=-1)
 
 
 def _draw_push(reference: Reference, config: MotionConfig, generator: torch.Generator) -> Tensor:
-    """Draw the force into the surface `(n,)`: one value per line, and zero for lines off the surface."""
+    """Draw the force into the surface `(n,)`, with one value per line and zero for lines off the surface."""
     low, high = config.pressing_force
     draws = torch.rand(len(reference.travel_time), dtype=torch.float64, generator=generator)
     return (low + (high - low) * draws).to(reference.t.dtype)[reference.segment] * reference.on_surface

@@ -1,8 +1,8 @@
 """Task-space inverse-dynamics control, with null-space control of redundant degrees of freedom.
 
 The task is the pose of the tool, or only its position for an arm with fewer than six joints. A redundant arm
-moves its elbow in the null space of the task Jacobian, which does not affect the error dynamics of the task
-(Siciliano et al., *Robotics: Modelling, Planning and Control*, p. 347 and section 3.5.1).
+moves its elbow in the null space of the task Jacobian. This motion does not affect the error dynamics of the
+task (Siciliano et al., *Robotics: Modelling, Planning and Control*, p. 347 and section 3.5.1).
 """
 
 from __future__ import annotations
@@ -45,10 +45,10 @@ class Target(NamedTuple):
     """Target of the controller at one instant.
 
     Attributes:
-        position, velocity, acceleration: `(*batch, 3)` motion of the tool point [m], [m/s], [m/s²].
-        rotation: `(*batch, 3, 3)` constant axes of the tool frame.
-        posture: `(*batch, nq)` preferred joint positions in the null space [rad].
-        push: `(*batch,)` desired normal force of the tool on the surface [N].
+        position, velocity, acceleration: motion of the tool point, `(*batch, 3)` [m], [m/s], [m/s²].
+        rotation: constant axes of the tool frame, `(*batch, 3, 3)`.
+        posture: preferred joint positions in the null space, `(*batch, nq)` [rad].
+        push: desired normal force of the tool on the surface, `(*batch,)` [N].
     """
 
     position: Tensor
@@ -60,7 +60,7 @@ class Target(NamedTuple):
 
 
 class JointTarget(NamedTuple):
-    """Target positions, velocities and accelerations of the joints at one instant, `(*batch, nq)` each."""
+    """Target positions, velocities and accelerations of the joints at one instant, each `(*batch, nq)`."""
 
     q: Tensor
     qd: Tensor
@@ -68,14 +68,14 @@ class JointTarget(NamedTuple):
 
 
 def task_rows(nq: int) -> slice:
-    """Return the rows of [ω; ṗ] that an arm with nq joints can follow: all for six or more joints, else ṗ."""
+    """Return the rows of [ω; ṗ] that an arm with nq joints can follow: all if nq ≥ 6, otherwise only ṗ."""
     return slice(0 if nq >= POSE_ROWS else POSITION_ROWS, POSE_ROWS)
 
 
 def orientation_error(rotation: Tensor, target: Tensor) -> Tensor:
-    """Return e_O = ½ Σᵢ rᵢ × rᵢᵈ `(*batch, 3)`, sin(angle) times the rotation axis, for frames' axes rᵢ.
+    """Return e_O = ½ Σᵢ rᵢ × rᵢᵈ, sin(angle) times the rotation axis, for frames with axes rᵢ and rᵢᵈ.
 
-    The sum is the vector of the skew-symmetric part of R_d Rᵀ, in world axes (Siciliano et al., eq. 3.98).
+    It is the axial vector `(*batch, 3)` of the skew part of R_d Rᵀ in world axes (Siciliano, eq. 3.98).
     """
     E = target @ rotation.mT
     skew = E - E.mT
@@ -100,9 +100,9 @@ def task_acceleration(tool: PointMotion, target: Target, gains: Gains) -> Tensor
 def joint_acceleration(tool: PointMotion, task: Tensor, posture: Tensor) -> Tensor:
     """Return y = J⁺(a − J̇q̇) + (I − J⁺J) y₀, with the posture acceleration in the null space of the task.
 
-    a `(*batch, 6)` is the task acceleration and y₀ `(*batch, nq)` the posture acceleration. J contains the
-    rows of the tool Jacobian that the arm can follow (`task_rows`). If the arm has fewer joints than rows,
-    the task is followed in the least-squares sense.
+    The task acceleration a has shape `(*batch, 6)`, and the posture acceleration y₀ has shape `(*batch, nq)`.
+    J contains the rows of the tool Jacobian that the arm can follow (`task_rows`). If the arm has fewer
+    joints than rows, the task is followed in the least-squares sense.
 
     Raises:
         NumericalError: the arm is in a singular pose.
@@ -135,12 +135,12 @@ def control_torque(
     """Return the motor torque Q_u = M y − Q_K − Q_n F of inverse-dynamics control, before limits [N m].
 
     Args:
-        tool: motion of the tool at the state.
-        eom: equations of motion at the state, of which M and Q_K = Q_C + Q_G + Q_D are used.
-        q, qd: `(*batch, nq)` positions and velocities.
-        target: desired motion, with `push` as F.
-        press: Q_n `(*batch, nq)`, Jᵀn of unit normal forces at the actual tool position, summed over its
-            contacts; a force along the normal at the reference would push the tool off a convex surface.
+        tool: the motion of the tool at the state.
+        eom: the equations of motion at the state, with M and Q_K = Q_C + Q_G + Q_D.
+        q, qd: positions and velocities, `(*batch, nq)`.
+        target: the desired motion, with `push` as F.
+        press: Q_n `(*batch, nq)`, the sum of Jᵀn for unit normal forces at the actual contacts of the tool.
+            Forces along the normal at the reference would push the tool off a convex surface.
         gains: feedback gains.
 
     Raises:
@@ -152,6 +152,6 @@ def control_torque(
 
 
 def joint_torque(eom: Any, q: Tensor, qd: Tensor, target: JointTarget, gains: Gains) -> Tensor:
-    """Return the motor torque M (q̈_d + k_D ė + k_P e) − Q_K `(*batch, nq)`, using the position gains."""
+    """Return the motor torque M (q̈_d + k_D ė + k_P e) − Q_K, `(*batch, nq)`, using the position gains."""
     y = target.qdd + gains.position_damping * (target.qd - qd) + gains.position_stiffness * (target.q - q)
     return (eom.M @ y[..., None])[..., 0] - eom.Q_K

@@ -1,8 +1,8 @@
 """Reference motions of the end-effector: random points joined by straight lines (section 5.2 of the paper).
 
-Points are drawn in a chart (u, v, h), with u and v along the sides of a rectangle that touches the surface at
-its centre, and with height h above the surface. A line in the chart is traversed with a trapezoidal velocity
-profile (Siciliano et al., *Robotics*, section 4.2.1) and then mapped onto the surface.
+Points are drawn in a chart (u, v, h). The coordinates u and v run along the sides of a rectangle that touches
+the surface at its centre, and h is the height above the surface. A line in the chart is traversed with a
+trapezoidal velocity profile (Siciliano et al., *Robotics*, section 4.2.1) and mapped onto the surface.
 """
 
 from __future__ import annotations
@@ -17,17 +17,17 @@ from forcegp.constraints.surface import Plane, Surface
 from forcegp.errors import ForceGPError
 
 PROJECTION_STEPS = 8
-"""Number of Newton steps onto a surface; one is exact for a signed distance, else each doubles the digits."""
+"""Number of Newton steps onto a surface. One is exact for a signed distance. Others double the digits."""
 
 
 class Trapezoid(NamedTuple):
     """Trapezoidal velocity profiles, one per segment, at rest at both ends.
 
     Attributes:
-        length: `(*batch,)` distance travelled [m].
-        travel_time: `(*batch,)` travel time [s].
-        blend_time: `(*batch,)` duration of acceleration and of deceleration [s].
-        acceleration: `(*batch,)` acceleration during the blends [m/s²].
+        length: distance travelled, `(*batch,)` [m].
+        travel_time: travel time, `(*batch,)` [s].
+        blend_time: duration of acceleration and of deceleration, `(*batch,)` [s].
+        acceleration: acceleration during the blends, `(*batch,)` [m/s²].
     """
 
     length: Tensor
@@ -36,7 +36,7 @@ class Trapezoid(NamedTuple):
     acceleration: Tensor
 
     def at(self, t: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return distance, speed and acceleration at time t after the start; the motion ends at rest."""
+        """Return distance, speed and acceleration at time t after the start. The motion ends at rest."""
         t = torch.minimum(t.clamp(min=0.0), self.travel_time)
         remaining = self.travel_time - t
         a, blend = self.acceleration, self.blend_time
@@ -53,7 +53,7 @@ class Trapezoid(NamedTuple):
 
 
 def trapezoid(length: Tensor, travel_time: float, max_acceleration: float) -> Trapezoid:
-    """Return the profiles for lengths d `(*batch,)` [m] with travel time T and maximum acceleration a.
+    """Return the profiles for lengths d `(*batch,)` [m], with travel time T and maximum acceleration a.
 
     The blend time is t_c = T/2 − ½ √(T² − 4 d/a). If the acceleration a is too small to cover d in time T,
     the `travel_time` of the result is 2 √(d/a). Source: Siciliano et al., eqs. 4.7 and 4.8.
@@ -72,12 +72,12 @@ def trapezoid(length: Tensor, travel_time: float, max_acceleration: float) -> Tr
 
 @dataclass(frozen=True)
 class Chart:
-    """Coordinates (u, v, h) about a point: two along the surface, and the height above it.
+    """Coordinates (u, v, h) about a point, with u and v along the surface and the height h above it.
 
     Args:
-        center: `(3,)` origin, which is on the surface if there is one [m].
-        axes: `(3, 3)`, with the directions of u and v and the normal at the centre as rows.
-        surface: the curved surface under u and v; `None` for a linear chart (on a plane or in free space).
+        center: origin, `(3,)` [m], which is on the surface if there is one.
+        axes: matrix `(3, 3)` with the directions of u and v and the normal at the centre as its rows.
+        surface: the curved surface under u and v, or `None` for a linear chart (a plane or free space).
     """
 
     center: Tensor
@@ -108,7 +108,7 @@ class Chart:
         return foot + w[..., 2:] * normal
 
     def motion(self, w: Tensor, wd: Tensor, wdd: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the world position, velocity and acceleration of a motion in the chart, `(n, 3)` each."""
+        """Return the world position, velocity and acceleration of a motion in the chart, each `(n, 3)`."""
         if self.surface is None:
             return self.point(w), wd @ self.axes, wdd @ self.axes
 
@@ -125,7 +125,7 @@ class Chart:
 
 
 def project(surface: Surface, p: Tensor) -> Tensor:
-    """Return the point on a surface reached from p `(*batch, 3)` along the gradient, p ← p − c ∇c/|∇c|²."""
+    """Project p `(*batch, 3)` onto a surface along the gradient, p ← p − c ∇c/|∇c|²."""
     for _ in range(PROJECTION_STEPS):
         gradient = surface.gradient(p)
         p = p - (surface.value(p) / (gradient * gradient).sum(-1))[..., None] * gradient
@@ -137,13 +137,13 @@ class Reference:
     """A sampled reference motion of the end-effector.
 
     Attributes:
-        t: `(n,)` time [s].
-        position, velocity, acceleration: `(n, 3)` motion in the world [m], [m/s], [m/s²].
-        segment: `(n,)` index of the current line.
-        on_surface: `(n,)` bool, true if the line is on the surface.
-        waypoints: `(segments + 1, 3)` end points of the lines, in the world [m].
-        travel_time: `(segments,)` travel time of each line [s].
-        lengthened: number of lines whose travel time was increased to respect the maximum acceleration.
+        t: time, `(n,)` [s].
+        position, velocity, acceleration: motion in the world, `(n, 3)` [m], [m/s], [m/s²].
+        segment: index of the current line, `(n,)`.
+        on_surface: mask `(n,)` that is true if the line is on the surface.
+        waypoints: end points of the lines in the world, `(segments + 1, 3)` [m].
+        travel_time: travel time of each line, `(segments,)` [s].
+        lengthened: number of lines with a travel time that was increased to respect the maximum acceleration.
     """
 
     t: Tensor
@@ -178,7 +178,7 @@ def straight_lines(
     """Return the motion along lines between waypoints `(k, 3)` of a chart at times t `(n,)` ≥ 0.
 
     The velocity is trapezoidal, with travel time and acceleration as in `trapezoid`. Speed and acceleration
-    refer to the chart and, on a plane or in free space, also to the end-effector. The motion ends at rest.
+    refer to the chart, and on a plane or in free space also to the end-effector. The motion ends at rest.
     """
     lines = waypoints.diff(dim=0)
     length = torch.linalg.vector_norm(lines, dim=-1)

@@ -10,24 +10,25 @@ from forcegp.rows import Intervals, intervals
 Array = NDArray[np.float64]
 
 CLIPPED_RUN, OFTENER = 3, 5.0
-"""Minimum number of successive rows at an extreme value that form a plateau, and factor by which a clipped
-value occurs more often than its neighbours (2.4 at the peaks of a sine)."""
+"""Minimum number of successive rows at an extreme value that form a plateau; factor by which a clipped value
+occurs more often than its neighbours (2.4 at the peaks of a sine)."""
 BAND = 0.03
 """Width of the band of a noisy clipped torque, as a fraction of the torque's range."""
 PLATEAUS, FLAT_ROWS, FLAT = 3, 10, 0.35
-"""Minimum number of plateaus of a noisy clipped torque while its joint moves, of rows in each, and minimum
-variance of steps over twice the variance of values in the middle halves of plateaus: 1 for white noise about
-a limit, 0.43 for the current of a real drive, and 0.05 to 0.3 at smooth peaks."""
+"""Three criteria for a noisy clipped torque: minimum number of plateaus while its joint moves, minimum number
+of rows in each, and minimum ratio of the variance of steps to twice the variance of values in the middle
+halves of plateaus. The ratio is 1 for white noise about a limit, 0.43 for the current of a real drive, and
+0.05 to 0.3 at smooth peaks."""
 MOVES = 0.02
-"""Fraction of its maximum speed above which a joint moves; the torque of a joint at rest is constant."""
+"""Fraction of its maximum speed above which a joint moves. The torque of a joint at rest is constant."""
 
 
 def clipped(tau: Array, qd: Array, usable: NDArray[np.bool_]) -> NDArray[np.bool_]:
     """Return a mask `(n, nq)` of unfiltered torques that stay at the maximum or minimum of their joint.
 
     Args:
-        tau, qd: torques and velocities `(n, nq)`, in time order.
-        usable: mask of the rows to check `(n,)`.
+        tau, qd: torques and velocities in time order, `(n, nq)`.
+        usable: mask of the rows to check, `(n,)`.
     """
     found = np.zeros(tau.shape, bool)
     for j in range(tau.shape[1]):

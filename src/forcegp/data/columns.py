@@ -33,7 +33,7 @@ def unparse(data: Fields) -> tuple[Columns, DataHeader]:
 
 
 def parse(source: str, raw: Columns, header: DataHeader, method: SavitzkyGolay | None) -> Arrays:
-    """Return a data set's arrays from file columns; a `DataError` suggests the nearest existing column."""
+    """Return a data set's arrays from file columns; raise a `DataError` that suggests the nearest column."""
     joints = header.joint_names or tuple(name[2:] for name in raw if name.startswith("q."))
     if not joints:
         raise DataError(f"{source}: no column 'q.<joint>'", expected="one per joint", got=_listing(raw))

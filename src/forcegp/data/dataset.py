@@ -30,7 +30,7 @@ def _time(data: Fields) -> str:
     count = int(data.segment.unique().numel())
     segments = f"{count} segment{'s' if count != 1 else ''}"
     if not data.header.ordered:
-        return f"selected from {segments}, not in order of time"
+        return f"selected from {segments}, not in time order"
     _, rows = torch.unique_consecutive(data.segment, return_counts=True)
     last = rows.cumsum(0) - 1
     return f"{float((data.t[last] - data.t[last - rows + 1]).sum()):.4g} s in {segments}"
@@ -45,17 +45,17 @@ class Dataset(Fields):
     """Logged motion of a robot with `nq` joints and `n` samples, in SI units and radians.
 
     Args:
-        t: `(n,)` time [s], strictly increasing within a segment unless `header.ordered` is false.
-        q, qd, qdd: `(n, nq)` joint positions, velocities and accelerations.
-        tau: `(n, nq)` motor torque Q_u [N m, N].
-        joint_names: the joints in column order.
-        contact: name → `(n,)` bool, whether the contact is closed.
-        extras: name → `(n, nq)` additional joint vectors: `qdd_clean`, `Q`, `Q_z`, `Q_I`, …
-        contact_extras: name → contact → `(n,)` or `(n, 3)`: `multiplier`, `F_I`, …
-        segment: `(n,)` trajectory number of each row; by default a single trajectory.
+        t: time, `(n,)` [s]. It increases strictly within a segment unless `header.ordered` is false.
+        q, qd, qdd: joint positions, velocities and accelerations, `(n, nq)`.
+        tau: motor torque Q_u, `(n, nq)` [N m, N].
+        joint_names: names of the joints in column order.
+        contact: mask `(n,)` of the rows in which a contact is closed, keyed by contact.
+        extras: additional joint vectors `(n, nq)`, keyed by name: `qdd_clean`, `Q`, `Q_z`, `Q_I`, …
+        contact_extras: contact quantities `(n,)`, `(n, 3)`, keyed by name and contact: `multiplier`, `F_I`, …
+        segment: trajectory number of each row, `(n,)`. By default, there is a single trajectory.
         header: noise, sampling period, robot, seed and provenance.
 
-    Extras are also available as attributes: `data.Q_z`, `data.multiplier["table"]`.
+    Extras are also available as attributes, as in `data.Q_z` and `data.multiplier["table"]`.
 
     Example:
         >>> import forcegp, torch
@@ -68,7 +68,7 @@ class Dataset(Fields):
         (2, 10, 40)
 
     Raises:
-        DataError: a shape, type, value or time is invalid; the message names the column and row.
+        DataError: a shape, type, value or time is invalid. The message names the column and row.
     """
 
     def __post_init__(self) -> None:
@@ -106,7 +106,7 @@ class Dataset(Fields):
         )
 
     def __getitem__(self, rows: object) -> Dataset:
-        """Return the data set with only the given rows, as a slice, a mask `(n,)` or indices in any order.
+        """Return a data set with the given rows, which are a slice, a mask `(n,)` or indices in any order.
 
         If the rows are not in time order, `header.ordered` is false, and they cannot be split into stretches.
 
@@ -139,7 +139,7 @@ class Dataset(Fields):
         return tuple(self.contact)
 
     def active(self, contacts: Sequence[str]) -> Tensor:
-        """Return whether each of the named contacts is closed, `(n, len(contacts))` bool.
+        """Return whether each of the named contacts is closed, as a mask `(n, len(contacts))`.
 
         Raises:
             DataError: the state of a contact is not logged.
@@ -159,10 +159,10 @@ class Dataset(Fields):
         return self._map(lambda x: x.to(device=device, dtype=dtype if x.is_floating_point() else None))
 
     def select(self, joints: Sequence[str]) -> Dataset:
-        """Return the data set with only the given joints (such as `robot.joint_names`), in this order.
+        """Return a data set with only the given joints, such as `robot.joint_names`, in this order.
 
         Raises:
-            UnknownNameError: a joint is not in the data set; the message suggests the nearest name.
+            UnknownNameError: a joint is not in the data set. The message suggests the nearest name.
         """
         for joint in joints:
             check_name("joint of the data set", joint, self.joint_names)
@@ -179,7 +179,7 @@ class Dataset(Fields):
             RobotMismatchWarning: the robot's parameters differ from those of the logged robot.
 
         Raises:
-            DataError: joints are missing, unknown or in the wrong order; the hint suggests a remedy.
+            DataError: joints are missing, unknown or in the wrong order. The hint suggests a remedy.
         """
         fields.check_robot(self, robot)
 
@@ -190,9 +190,9 @@ class Dataset(Fields):
 
         Args:
             quantity: a logged quantity, such as `"tau"` or `"multiplier"`, with one panel per joint or
-                contact; by default q, qd, tau and qdd, each in one panel with all joints.
-            joints: names of the joints to plot; by default all.
-            ax: matplotlib axes to draw on, one per panel; by default, a new figure is created.
+                contact. By default, q, qd, tau and qdd are plotted, each in one panel with all joints.
+            joints: names of the joints to plot. By default, all are plotted.
+            ax: matplotlib axes to draw on, one per panel. By default, a new figure is created.
 
         Raises:
             ForceGPError: the quantity or joint does not exist, or the number of axes is wrong.
@@ -202,7 +202,7 @@ class Dataset(Fields):
         return plot(self, quantity, joints, ax)
 
     def _repr_html_(self) -> str:
-        """Return an HTML table for notebooks with the range of motion of each joint."""
+        """Return an HTML table of each joint's range of motion, for notebooks."""
         names = {"q": "rad, m", "qd": "rad/s, m/s", "tau": "N m, N", "qdd": "rad/s², m/s²"}
         head = ("joint", *(f"{name} [{unit}]" for name, unit in names.items()))
         rows: list[tuple[object, ...]] = []
@@ -241,15 +241,15 @@ class Dataset(Fields):
         dtype: torch.dtype = torch.float64,
         device: torch.device | str = "cpu",
     ) -> Dataset:
-        """Read a data set from Parquet or CSV (columns as in docs/formats.md).
+        """Read a data set from a Parquet or CSV file, with columns as described in docs/formats.md.
 
         Args:
             path: the file to read.
-            differentiate: method for computing `qd` and `qdd` if they are missing.
+            differentiate: the method for computing `qd` and `qdd` if they are missing.
             dtype, device: data type and device of the tensors.
 
         Raises:
-            DataError: the file is damaged or is not a valid log; the message names the file, column and row.
+            DataError: the file is damaged or is not a valid log. The message names the file, column and row.
         """
         raw, header = read_table(path)
         fields = parse(str(path), raw, header, differentiate)

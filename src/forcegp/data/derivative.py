@@ -13,7 +13,7 @@ from forcegp.robust import MAD_TO_STD
 from forcegp.rows import runs
 
 WINDOWS = (5, 7, 9, 11, 15, 21, 31, 41, 61, 81, 101, 121, 151, 201)
-"""Window lengths tried by cross-validation, in samples."""
+"""Window lengths that cross-validation tries, in samples."""
 UNIFORM_TOLERANCE = 0.02
 """Maximum relative deviation of a time step from the median, which allows for jitter but not for gaps."""
 
@@ -22,8 +22,8 @@ UNIFORM_TOLERANCE = 0.02
 class SavitzkyGolay:
     """Differentiation of a polynomial fitted by least squares in a moving window.
 
-    A wider window reduces noise and increases bias; a higher order has the opposite effect. The noise of the
-    results is correlated over about one window, which a likelihood with white noise ignores.
+    A wider window reduces the noise and increases the bias. A higher order has the opposite effect. The noise
+    of the results is correlated over about one window, which a likelihood with white noise ignores.
 
     Args:
         window: number of samples, which must be odd.
@@ -48,16 +48,16 @@ class SavitzkyGolay:
 def cross_validated_window(
     signals: Sequence[NDArray[np.float64]], order: int = 3, most: int | None = None
 ) -> int:
-    """Return the window in which each sample of the noisiest signal is best predicted from the others.
+    """Return the window length that best predicts each sample of the noisiest signal from the others.
 
-    If a sample has weight h in its own fit, its leave-one-out error is (x − x̂)/(1 − h). The window with the
-    smallest mean squared error is determined for each column, and the widest of these windows is returned, so
-    all signals have the same bandwidth.
+    If a sample has weight h in its own fit, its leave-one-out error is (x − x̂)/(1 − h). For each column, the
+    window with the smallest mean squared error is determined. The widest of these windows is returned, so
+    that all signals have the same bandwidth.
 
     Args:
         signals: logged values, each `(n, d)`, evenly spaced in time.
         order: degree of the polynomial.
-        most: maximum window length; by default the number of samples.
+        most: maximum window length. The default is the number of samples.
 
     Raises:
         DataError: a signal has fewer samples than the narrowest window.
@@ -96,11 +96,11 @@ def differentiate(
 ) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
     """Return the `degree`-th time derivative of x and the standard deviation of its noise, each `(n, d)`.
 
-    The derivative is Σ_k w_k x_{i+k}, so white noise of standard deviation σ on x results in noise of σ |w|.
-    For each column, σ is estimated from the median absolute residual of the fit, whose standard deviation is
-    σ √(1 − h) if a sample has weight h in its own fit. At the ends of each segment, the outermost fits are
-    used, with larger noise. Time t `(n,)` [s] must be evenly spaced within each segment. Windows do not cross
-    segments.
+    The derivative is Σ_k w_k x_{i+k}, so that white noise of standard deviation σ on x causes noise of σ |w|.
+    For each column, σ is estimated from the median absolute residual of the fit. The residual has standard
+    deviation σ √(1 − h) if a sample has weight h in its own fit. At the ends of each segment, the outermost
+    fits are used, which have larger noise. The time t, `(n,)` [s], must be evenly spaced within each segment.
+    Windows do not cross segments.
 
     Raises:
         DataError: a segment is shorter than the window, or its time steps are uneven.
@@ -139,9 +139,9 @@ def _time_step(t: NDArray[np.float64], rows: slice, window: int) -> float:
     if len(uneven) or not dt > 0.0:
         row = rows.start + int(uneven[0] if len(uneven) else 0) + 1
         raise DataError(
-            f"the time steps are uneven in row {row} and cannot be differentiated",
+            f"the time steps are uneven at row {row} and the log cannot be differentiated",
             expected=f"steps of {dt:.6g} s",
             got=f"{t[row] - t[row - 1]:.6g} s",
-            hint="resample the log, or number its unbroken stretches in a column 'segment'",
+            hint="resample the log, or number its parts without gaps in a column 'segment'",
         )
     return dt

@@ -20,24 +20,24 @@ from forcegp.robot.model import RobotModel
 
 
 class DataHeader(Header):
-    """Header of a data set. Every field is optional, so logs from other programs can be read.
+    """Header of a data set. Every field is optional, so that logs from other programs can be read.
 
     Attributes:
         dt: sampling period [s].
         noise_std: standard deviation of the noise on q̈ [rad/s²].
-        filtered: whether q̈ was computed by a filter, so that its noise is correlated in time; otherwise,
+        filtered: whether q̈ was computed by a filter, so that its noise is correlated in time. Otherwise,
             `noise_std` refers to white noise.
-        filter_span: time span of the filter that computed q̈ [s]; noise further apart is uncorrelated.
+        filter_span: time span of the filter that computed q̈ [s]. Noise is uncorrelated over longer times.
         robot: name of the robot.
         robot_fingerprint: `RobotModel.fingerprint` of the logged robot.
         seed: random seed used to generate the data.
-        ordered: whether rows are in time order within each segment (false for selected points).
+        ordered: whether rows are in time order within each segment. It is false for selected points.
         provenance: processing steps applied to the data, oldest first.
-        derived: joint vectors computed by a filter.
+        derived: names of the joint vectors that a filter computed.
         imported: kind and message of each finding of the import, including warnings about the mapping.
-        unmeasured_torques: joints whose motor torque was not measured, so that the column is 0.
-        stick_speeds: speed below which a contact sticks [m/s], keyed by contact name; others always slide.
-        joint_names, contact_names: names in column order; empty if not logged.
+        unmeasured_torques: names of joints without a measured motor torque. Their torque column is 0.
+        stick_speeds: speed below which a contact sticks [m/s], keyed by contact. Other contacts always slide.
+        joint_names, contact_names: names in column order, empty if not logged.
     """
 
     FORMAT: ClassVar[str] = "forcegp-dataset"
@@ -61,10 +61,10 @@ class DataHeader(Header):
 
     @property
     def filter_variance(self) -> float:
-        """Second moment of the weights with which the filter averages q̈ over time [s²]; 0 if unknown.
+        """Second moment of the weights with which the filter averages q̈ over time [s²], or 0 if unknown.
 
-        The second derivative of cubics fitted to positions over a span T is q̈ + T²/56 d²q̈/dt² + …, like an
-        average with variance T²/28. The first derivative of cubics fitted to q̇ has no such term.
+        The second derivative of cubics fitted to positions over a span T is q̈ + T²/56 d²q̈/dt² + …, like
+        that of an average with variance T²/28. The first derivative of cubics fitted to q̇ has no such term.
         """
         return (self.filter_span or 0.0) ** 2 / 28.0 if {"qd", "qdd"} <= set(self.derived) else 0.0
 
@@ -81,7 +81,7 @@ AXES = ("x", "y", "z")
 
 @dataclass(frozen=True, eq=False)
 class Fields:
-    """Fields of a data set, documented in `Dataset`."""
+    """Fields of a data set, which are documented in `Dataset`."""
 
     t: Tensor
     q: Tensor
@@ -108,7 +108,7 @@ def component_names(name: str, value: Tensor, joint_names: Sequence[str]) -> lis
 
 
 def named_columns(data: Fields) -> dict[str, Tensor]:
-    """Return all floating-point columns except time, keyed by name on disk; vectors are not split."""
+    """Return all floating-point columns except time, keyed by their name on disk. Vectors are not split."""
     named = {name: getattr(data, name) for name in JOINT_VECTORS} | dict(data.extras)
     for name, group in data.contact_extras.items():
         named |= {f"{name}.{contact}": value for contact, value in group.items()}
@@ -237,7 +237,7 @@ def check_values(data: Fields) -> None:
 
 
 def check_time(data: Fields) -> None:
-    """Check that segments are contiguous and time increases strictly; a `DataError` names the row."""
+    """Check that segments are contiguous and that time increases; raise a `DataError` that names the row."""
     t, segment = data.t, data.segment
     same = segment[1:] == segment[:-1]
     back = same & (t[1:] <= t[:-1])
@@ -260,7 +260,7 @@ def check_time(data: Fields) -> None:
 
 
 def row_indices(rows: object, n: int, device: torch.device) -> Tensor:
-    """Return the row numbers `(k,)` of a slice, mask or list; negative numbers count from the end."""
+    """Return the row numbers `(k,)` of a slice, mask or list. Negative numbers count from the end."""
     if isinstance(rows, slice):
         return torch.tensor(range(n)[rows], dtype=torch.int64, device=device)
     rule = "rows are selected by a slice, a mask or a list of row numbers"
@@ -311,7 +311,7 @@ def lock_hint(joints: Sequence[str]) -> str:
 
 
 def check_robot(data: Fields, robot: RobotModel) -> None:
-    """Check that joints match, and warn if robot parameters differ or angles may be in degrees."""
+    """Check that joints match, and warn if robot parameters differ or if angles may be in degrees."""
     check_joints(data.joint_names, robot.joint_names, robot.name)
     q, free = data.q.to(robot.lower) * robot.revolute, torch.full_like(robot.lower, MOST_RADIANS)
     low, high = (
@@ -337,7 +337,7 @@ def check_robot(data: Fields, robot: RobotModel) -> None:
 
 
 def contact_table(data: Fields, contacts: Sequence[str]) -> Tensor:
-    """Return `(n, len(contacts))` bool, true if the named contact is closed."""
+    """Return a mask `(n, len(contacts))` that is true if the named contact is closed."""
     for name in contacts:
         if name not in data.contact:
             raise DataError(
@@ -350,7 +350,7 @@ def contact_table(data: Fields, contacts: Sequence[str]) -> Tensor:
 
 
 def resolution(x: NDArray[Any]) -> NDArray[Any]:
-    """Return the step between the levels of each column with few distinct values, and zero for the others."""
+    """Return the step between the levels of each column with few distinct values, and zero elsewhere."""
     steps = np.zeros(x.shape[1])
     for j, levels in enumerate(map(np.unique, x.T)):
         if 2 < len(levels) < 0.75 * len(x):
@@ -393,7 +393,7 @@ def common_stick_speeds(headers: Sequence[DataHeader]) -> dict[str, float]:
 
 
 def common_header(headers: Sequence[DataHeader]) -> DataHeader:
-    """Return a header with the fields on which all headers agree; other fields have default values."""
+    """Return a header with the fields on which all headers agree. Other fields have default values."""
     first = headers[0].model_dump()
     agreed = {name: v for name, v in first.items() if all(getattr(h, name) == v for h in headers)}
     steps = tuple(dict.fromkeys(step for header in headers for step in header.provenance))

@@ -24,7 +24,7 @@ from forcegp.plots import (
 def plot(
     data: Fields, quantity: str | None = None, joints: Sequence[str] | None = None, ax: Target = None
 ) -> list[Axes]:
-    """Plot a data set; see `Dataset.plot` for the arguments."""
+    """Plot a data set. The arguments are those of `Dataset.plot`."""
     wanted = chosen(joints, data.joint_names, "joint of the data set")
     if quantity is None:
         panels = _overview(data, wanted)

@@ -1,7 +1,7 @@
 """Preparation of a log for learning: selection of points, held-out blocks, impacts, and noise.
 
 Farthest-point sampling selects a few points that cover the inputs of a log (section 5.3 of the paper). If
-training points come from the same stretches as the test rows, as in the paper, the test error measures
+training points come from the same parts of the log as the test rows, as in the paper, the test error measures
 interpolation. Held-out blocks measure how well unseen motion is predicted.
 """
 
@@ -23,14 +23,14 @@ INPUTS = ("q", "qd", "tau")
 
 
 def standardized_inputs(data: Dataset) -> Float[Tensor, "n d"]:
-    """Return (q, q̇, τ) of each sample with standardized columns; constant columns become zero."""
+    """Return (q, q̇, τ) of each sample with standardized columns. Constant columns become zero."""
     return standardized(torch.cat([getattr(data, name) for name in INPUTS], dim=-1))
 
 
 def standardized(x: Float[Tensor, "n d"]) -> Float[Tensor, "n d"]:
-    """Scale columns to zero mean and unit variance; constant columns become zero."""
+    """Scale columns to zero mean and unit variance. Constant columns become zero."""
     centred = x - x.mean(0)
-    # Rounding leaves a constant column a spread of some units in the last place.
+    # Due to rounding, a constant column may vary by a few units in the last place.
     noise = x.abs().amax(0) * torch.finfo(x.dtype).eps * 16.0
     spread = centred.square().mean(0).sqrt()
     return torch.where(spread > noise, centred / spread.where(spread > noise, 1.0), 0.0)
@@ -45,15 +45,15 @@ def farthest_points(
 ) -> Int[Tensor, " count"]:
     """Select points such that each is the farthest from its predecessors, and return their indices.
 
-    i_{k+1} = argmax_i min_{j ≤ k} |x_i − x_{i_j}| in Euclidean distance. Ties go to the lowest index, so the
-    result is deterministic, and its first k entries are the result for k points. The cost is O(n d) per
-    point, and memory use is O(n).
+    The selection is i_{k+1} = argmax_i min_{j ≤ k} |x_i − x_{i_j}| in Euclidean distance. Ties go to the
+    lowest index. The result is therefore deterministic, and its first k entries are the result for k points.
+    The cost is O(n d) per point, and memory use is O(n).
 
     Args:
-        x: `(n, d)` points.
+        x: the points, `(n, d)`.
         count: number of points to select.
-        start: index of the first point; by default, that of the point closest to the mean.
-        progress: called after each point with the number of points selected so far.
+        start: index of the first point. The default is that of the point closest to the mean.
+        progress: a function called after each point with the number of points selected so far.
 
     Raises:
         DataError: there are fewer than `count` distinct points, or `start` is out of range.
@@ -82,7 +82,7 @@ def _check_count(count: int, n: int) -> None:
 
 
 def _distance(x: Tensor, point: Tensor) -> Tensor:
-    """Return |x_i − point| from differences, which, unlike products, are accurate for close points."""
+    """Return |x_i − point| from differences, which are accurate for close points, unlike products."""
     return torch.cdist(x, point[None], compute_mode="donot_use_mm_for_euclid_dist")[:, 0]
 
 
@@ -102,9 +102,9 @@ def select_points(
         count: number of points.
         method: `"farthest"` (on standardized q, q̇, τ), `"even"` (evenly spaced rows, in order), or
             `"random"` for comparison. Farthest-point selection favours outliers in real logs.
-        seed: seed for random selection.
-        candidates: row numbers to select from; by default all rows.
-        progress: called with the number of points selected so far.
+        seed: random seed for `method="random"`.
+        candidates: row numbers to select from. The default is all rows.
+        progress: a function called with the number of points selected so far.
 
     Raises:
         ForceGPError: the method is unknown, or there are too few distinct points.
@@ -145,7 +145,7 @@ def split_by_selection(
     seed: int = 0,
     progress: Callable[[int], None] | None = None,
 ) -> Split:
-    """Split a log as in the paper: select training points from the whole log, and test on the rest."""
+    """Split a log as in the paper. Select training points from the whole log, and test on the rest."""
     train = select_points(data, count, method=method, seed=seed, progress=progress)
     return Split(train, complement(train, len(data)))
 
@@ -161,21 +161,21 @@ def split_by_stretches(
     seed: int = 0,
     progress: Callable[[int], None] | None = None,
 ) -> Split:
-    """Hold out randomly drawn stretches of motion, and select training points only from the rest.
+    """Hold out randomly drawn parts of a log, and select training points only from the rest.
 
     Args:
         data: a log in time order.
         count: number of training points.
-        stretch: approximate duration of the equal stretches into which each trajectory is divided [s].
-        fraction: fraction of the stretches to hold out.
-        margin: duration before and after each held-out block that contains no training points [s].
-        method: selection method, as in `select_points`.
-        seed: seed for the held-out blocks and for random selection.
-        progress: called with the number of points selected so far.
+        stretch: approximate duration [s] of the equal parts into which each trajectory is divided.
+        fraction: fraction of the parts to hold out.
+        margin: duration without training points before and after each held-out block [s].
+        method: the selection method, as in `select_points`.
+        seed: random seed for the held-out blocks and for random selection.
+        progress: a function called with the number of points selected so far.
 
     Returns:
-        Training rows, all rows of the held-out blocks, and the stretches. Rows in a margin and unselected
-        rows outside the stretches are in neither set.
+        Training rows, all rows of the held-out blocks, and the row ranges of these blocks. Rows in a margin
+        and rows that were not selected are in neither set.
 
     Raises:
         DataError: the log is not in time order, is too short, or leaves too few points.
@@ -185,7 +185,7 @@ def split_by_stretches(
     if not (0.0 < fraction < 1.0 and margin >= 0.0) or held_count >= len(blocks):
         raise DataError(
             "the log cannot be split into held-out and training stretches",
-            expected="a fraction between 0 and 1 that leaves at least one of the stretches, a margin ≥ 0",
+            expected="a fraction between 0 and 1 that leaves stretches for training, and a margin ≥ 0",
             got=f"fraction {fraction}, margin {margin} s, {len(blocks)} stretches of about {stretch} s",
             hint="use shorter stretches or a longer log",
         )
@@ -206,7 +206,7 @@ def _stretches(data: Dataset, stretch: float) -> list[tuple[int, int]]:
     """Divide the trajectories into parts of equal duration, and return their row ranges."""
     if not data.header.ordered:
         raise DataError(
-            "held-out blocks need a log in order of time",
+            "held-out blocks require a log in time order",
             got="points in order of selection",
             hint="split the log before selecting points from it",
         )
@@ -226,11 +226,11 @@ def _stretches(data: Dataset, stretch: float) -> list[tuple[int, int]]:
 
 
 IMPACT = "impact"
-"""Name of the masks that `forcegp import` writes for each contact; they are 1 near a contact change."""
+"""Name of the masks that `forcegp import` writes for each contact. They are 1 near a contact change."""
 
 
 def without_marked_impacts(data: Dataset) -> Dataset:
-    """Return the rows not marked in any mask `impact.<contact>`, or all rows if there are no masks."""
+    """Return the rows that no mask `impact.<contact>` marks, or all rows if there are no masks."""
     marked = torch.zeros(len(data), dtype=torch.bool, device=data.t.device)
     for mask in data.contact_extras.get(IMPACT, {}).values():
         marked |= mask > 0.0

@@ -1,4 +1,4 @@
-"""Long logs in Parquet files, read piece by piece, with filter windows that extend into adjacent pieces."""
+"""Long logs in Parquet files that are read piece by piece. Filter windows extend into adjacent pieces."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Piece:
-    """Consecutive rows of a file, starting at row `first`; `columns` starts `before` rows earlier."""
+    """Consecutive rows of a file that start at row `first`. `columns` starts `before` rows earlier."""
 
     columns: Columns
     header: DataHeader
@@ -54,8 +54,7 @@ def shape_of(path: Path) -> tuple[int, DataHeader]:
 def pieces_of(path: Path, size: int, window: int, number: int) -> Iterator[Piece]:
     """Yield the pieces of a file, each with `size` rows and `window` rows around them in the same trajectory.
 
-    Trajectories are numbered from `number`. Raise `DataError` if the file is damaged or a trajectory is not
-    contiguous.
+    Trajectories are numbered from `number`. A damaged file or a non-contiguous trajectory raises `DataError`.
     """
     import pyarrow as pa
 
@@ -103,7 +102,7 @@ class _Trajectories:
         self.raw, self.time, self.segments = np.nan, -np.inf, set[float]()
 
     def number(self, columns: Columns, ordered: bool) -> None:
-        """Renumber the segments of the next rows, continuing the numbering of previous rows."""
+        """Renumber the segments of the next rows, continuing the numbering of the previous rows."""
         raw, t = columns["segment"], columns.get("t")
         if ordered and t is not None and raw[0] == self.raw and t[0] <= self.time:
             raise DataError(
@@ -138,19 +137,19 @@ class _Trajectories:
 PIECE_ROWS = 8192
 """Number of rows read at a time."""
 Keep = Callable[[Dataset], Tensor]
-"""Function that returns the numbers of the rows to keep in a piece."""
+"""A function that returns the numbers of the rows to keep in a piece."""
 
 
 @dataclass(frozen=True)
 class StreamedDataset:
     """A log of any length in one or more Parquet files, each with separate trajectories.
 
-    Missing columns are computed as in `Dataset.read`; their noise is estimated piece by piece.
+    Missing columns are computed as in `Dataset.read`. Their noise is estimated piece by piece.
 
     Args:
-        paths: the files, whose joints, contacts and additional columns must agree.
-        differentiate: method for computing `qd` and `qdd` if they are missing.
-        joints: joints to read, in this order; by default those of the files.
+        paths: the files. Their joints, contacts and additional columns must agree.
+        differentiate: the method for computing `qd` and `qdd` if they are missing.
+        joints: the joints to read, in this order. The default is the joints of the files.
         dtype, device: data type and device of the tensors.
         distributed: whether the processes of `torch.distributed` share the pieces in a fit. Each process
             makes the same call and obtains the same result.
@@ -223,7 +222,7 @@ class StreamedDataset:
 
         Args:
             start: number of pieces to skip.
-            share: (r, k) yields data only for piece r of every k; the others belong to other processes.
+            share: (r, k) yields data only for piece r of every k. The others belong to other processes.
 
         Raises:
             DataError: a file is damaged, is not a valid log, or has different columns from the first file.
@@ -261,8 +260,10 @@ class StreamedDataset:
 
 
 def spaced_sample(pieces: Iterable[Dataset], count: int, keep: Keep | None = None) -> tuple[Dataset, int]:
-    """Return between `count` and 2 `count` evenly spaced rows (or all, if fewer) of a log of unknown length,
-    and the total number of rows kept by `keep`, in one pass; raise `DataError` if there are no pieces.
+    """Return evenly spaced rows of a log of unknown length, and the total number of rows kept by `keep`.
+
+    The number of rows is between `count` and 2 `count`, or all rows if there are fewer. The log is read in
+    one pass. Raise `DataError` if there are no pieces.
     """
     kept: list[tuple[Tensor, Dataset]] = []
     step, total = 1, 0

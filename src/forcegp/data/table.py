@@ -1,4 +1,4 @@
-"""Named numeric columns on disk: Parquet with a JSON header, and CSV."""
+"""Named numeric columns on disk: Parquet files with a JSON header, and CSV files."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ def check_ending(path: str | Path) -> None:
 
 
 def write_parquet(path: str | Path, columns: Columns, header: DataHeader) -> None:
-    """Write columns and header to a Parquet file atomically; raise `OSError` if that fails."""
+    """Write columns and header to a Parquet file atomically; raise `OSError` if this fails."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -66,8 +66,7 @@ def read_table(
 ) -> tuple[Columns, DataHeader]:
     """Return the numeric columns and the header (or a default header) of a Parquet or CSV file.
 
-    Empty values are errors, or NaN if `missing` is `"nan"`. If the file cannot be read, a `DataError` states
-    the reason.
+    Empty values are errors, or NaN if `missing` is `"nan"`. Unreadable files raise `DataError`.
     """
     file = existing(path)
     readers = {".parquet": _read_parquet, ".csv": _read_csv}
@@ -79,7 +78,7 @@ def read_table(
 
 
 def existing(path: str | Path) -> Path:
-    """Return the path of an existing file, or raise a `DataError` that suggests the nearest name."""
+    """Return the path of an existing file; raise a `DataError` that suggests the nearest name otherwise."""
     file = Path(path)
     with foreign(str(path), "a path"):
         if file.is_file():
@@ -110,7 +109,7 @@ def _read_parquet(file: Path) -> tuple[pa.Table, DataHeader]:
 
 @contextmanager
 def opened_parquet(file: Path) -> Iterator[tuple[pq.ParquetFile, list[str], DataHeader]]:
-    """Open a Parquet file and yield it with numeric columns and header; raise `DataError` if it is no log."""
+    """Open a Parquet file, and yield it with its numeric columns and header; raise `DataError` if invalid."""
     import pyarrow as pa
     import pyarrow.parquet as pq
 
@@ -192,7 +191,7 @@ def _usable(file: Path, schema: pa.Schema) -> list[str]:
 
 
 def numeric(file: Path, name: str, column: pa.ChunkedArray, missing: str) -> NDArray[np.generic]:
-    """Return the values of a column; missing values raise `DataError`, or become NaN."""
+    """Return the values of a column. Missing values raise `DataError` or become NaN."""
     if column.null_count and missing == "refuse":
         row = int(np.flatnonzero(column.is_null().to_numpy())[0])
         raise DataError(

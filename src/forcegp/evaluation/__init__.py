@@ -1,4 +1,4 @@
-"""Quality of a model: errors and uncertainty by joint, comparisons with trivial predictors, a verdict."""
+"""Quality of a model: errors and uncertainty by joint, comparison with trivial predictors, and a verdict."""
 
 from __future__ import annotations
 
@@ -47,23 +47,22 @@ class Evaluation:
     Attributes:
         kind: type of the model.
         samples: number of predictions.
-        joint_names: joints in the order used by the per-joint scores.
+        joint_names: names of the joints, in the order of the per-joint scores.
         noisy: errors relative to the measured accelerations.
-        clean: errors relative to the noise-free accelerations, `None` if they are not logged.
-        uncertainty: coverage and density, `None` if there is no covariance or the noise is unknown.
-        residual, residual_max: mean and largest |A q̈ − b| of the predicted mean over closed contacts
-            [m/s²], `None` if no contact is closed.
+        clean: errors relative to the noise-free accelerations, or `None` if they are not logged.
+        uncertainty: coverage and density, or `None` if there is no covariance or the noise is unknown.
+        residual, residual_max: mean and largest |A q̈ − b| of the predicted mean over closed contacts [m/s²],
+            or `None` if no contact is closed.
         noise_std: assumed standard deviation of the acceleration noise, one per joint.
         seconds_per_state: prediction time per state, including the covariance if there is one.
         predictors: per-joint errors of the model and of the trivial predictors.
-        verdicts: comparison of the model with each trivial predictor; empty if there are too few samples.
-        multipliers: comparison of λ with logged values, if the model predicts forces and the log contains λ.
-        sensed: the same for predictions that also use the force sensor at each state, if the fit included it.
-        gravity: fraction R² of the torque explained by gravity alone; if it is close to 1, the log is a weak
-            test of a model.
-        response: fraction of an added torque that takes effect, one per joint: 1 for a rigid robot, 0 for a
-            model that has learned the controller; `None` if there is no free motion.
-        motion: open-loop motion, if the model predicts forces and the data are in time order.
+        verdicts: comparison of the model with each trivial predictor, empty if there are too few samples.
+        multipliers: comparison of λ with logged values if the model predicts forces and the log contains λ.
+        sensed: the same comparison for predictions that use the force sensor, if the fit included the sensor.
+        gravity: fraction R² of the torque that gravity alone explains. If near 1, the log is a weak test.
+        response: fraction of an added torque that takes effect at each joint. It is 1 for a rigid robot, and
+            0 for a model that has learned the controller. It is `None` if there is no free motion.
+        motion: open-loop motion if the model predicts forces and the data are in time order.
     """
 
     kind: str
@@ -86,14 +85,14 @@ class Evaluation:
 
     @property
     def verdict(self) -> str:
-        """Verdict in one sentence on explained torque beyond gravity, open-loop motion and contact force."""
+        """One-sentence verdict on non-gravitational torque, open-loop motion and contact forces."""
         parts, shares = [], {p.name: p.beyond_gravity for p in self.predictors}
         if (share := shares.pop("model", None)) is not None:
             others = [
                 f"{name} {_percent(x)}" for name, x in shares.items() if x is not None and name != "mean"
             ]
             parts.append(
-                f"the model explains {_percent(share)} of the torque beyond gravity ({', '.join(others)})"
+                f"the model explains {_percent(share)} of the non-gravitational torque ({', '.join(others)})"
             )
         if self.motion is not None:
             at = min(1, len(self.motion.horizons) - 1)
@@ -111,14 +110,14 @@ class Evaluation:
 
     @property
     def poor(self) -> bool:
-        """Whether there are `doubts`, or the model explains no torque, or less torque than the robot file."""
+        """Whether there are `doubts`, or the model explains no torque or less than the robot file does."""
         shares = {p.name: x for p in self.predictors if (x := p.beyond_gravity) is not None}
         model = shares.get("model", 1.0)
         return bool(self.doubts) or model <= 0.0 or model < shares.get("robot file", 0.0)
 
     @property
     def comparison(self) -> str:
-        """A sentence on whether the model beats the trivial predictors in both torque and acceleration."""
+        """Sentence on whether the model beats the trivial predictors in both torque and acceleration."""
         return sentence(self.verdicts)
 
     @property
@@ -127,14 +126,16 @@ class Evaluation:
         found = []
         if self.gravity is not None and self.gravity > GRAVITY_ALONE:
             share = f"{100.0 * self.gravity:.1f} %"
-            found.append(f"Gravity alone explains {share} of the torque: the data hardly test anything else.")
+            found.append(
+                f"Gravity alone explains {share} of the torque, so the data hardly test anything else."
+            )
         if self.response is not None and min(self.response) < LEAST_RESPONSE:
             weak = [
                 f"{j} {x:.2f}"
                 for j, x in zip(self.joint_names, self.response, strict=True)
                 if x < LEAST_RESPONSE
             ]
-            text = f"An added torque has less effect than it should: {', '.join(weak)} of 1."
+            text = f"An added torque has too small an effect (expected: 1): {', '.join(weak)}."
             found.append(f"{text} The model has learned the controller, not the arm.")
         return tuple(found)
 
@@ -145,7 +146,7 @@ class Evaluation:
         return asdict(self) | said | {"verdict_texts": texts}
 
     def summary(self) -> dict[str, float | int | str | None]:
-        """Return the overall scores by name."""
+        """Return the overall scores, keyed by name."""
         clean, spread = self.clean, self.uncertainty
         return {
             "kind": self.kind,
@@ -177,12 +178,12 @@ def evaluate(
     Args:
         model: a fitted model.
         data: states and measured accelerations, and noise-free accelerations as `qdd_clean` if known.
-        train: data for fitting the trivial predictors; by default, each half of `data` (in row order) is
-            predicted by predictors fitted to the other half.
+        train: data for fitting the trivial predictors. By default, they are fitted to one half of `data` (in
+            row order) to predict the other half, and vice versa.
         compare: whether to fit the trivial predictors.
-        system: robot and contacts used for the constraint residual, the torque errors and the trivial
-            predictors; by default, those of the model before learning.
-        progress: called with the number of states predicted so far and the total number.
+        system: the robot and contacts for the constraint residual, the torque errors and the trivial
+            predictors. The default is the system of the model before learning.
+        progress: a function called with the number of states predicted so far and the total number.
 
     Raises:
         ForceGPError: the data are empty, their joints differ from those of the robot, or they lack a contact.

@@ -1,8 +1,8 @@
-"""Criteria for a good model: explained torque beyond gravity, open-loop motion, and response to a torque.
+"""Criteria for a good model: non-gravitational torque, open-loop motion, and response to a torque.
 
-The torque error is that of inverse dynamics, M(q)(predicted − measured q̈), with the mass matrix of the
-predictor's robot. The explained fraction of the torque beyond gravity is R² = 1 − Σ (N M Δq̈)² / Σ (N (τ −
-τ_g))². Here, τ_g is gravity plus a constant, fitted to the torques; N = 1 − A⁺A removes constraint forces.
+The torque error is M(q)(predicted − measured q̈), with the mass matrix of the predictor's robot. The
+explained fraction of the non-gravitational torque is R² = 1 − Σ (N M Δq̈)² / Σ (N (τ − τ_g))². Here, τ_g is
+gravity plus a constant, fitted to the torques, and N = 1 − A⁺A removes constraint forces.
 """
 
 from __future__ import annotations
@@ -28,22 +28,22 @@ HORIZONS = (0.1, 0.3, 1.0)
 STARTS, FEWEST_STARTS = 12, 3
 """Maximum and minimum number of evenly spaced starting points of these motions."""
 FAINT = 0.1
-"""Joints are scored if their torque beyond gravity, or their motion, exceeds this fraction of the largest."""
+"""Joints are scored if their non-gravitational torque, or motion, exceeds this fraction of the largest."""
 RESPONSE_SAMPLES, FEWEST_FREE = 500, 20
 """Maximum and minimum number of states at which a torque is added."""
 GRAVITY_SAMPLES, RIDGE = 4000, 1e-9
-"""Maximum number of samples for fitting gravity, and relative ridge for undetermined directions."""
+"""Maximum number of samples for fitting gravity; relative ridge for undetermined directions."""
 
 
 @dataclass(frozen=True)
 class Motion:
-    """Accuracy of open-loop motion that starts from logged states and is driven by the logged torques.
+    """Accuracy of open-loop motion that starts from logged states under the logged torques.
 
     Attributes:
         horizons: times after the start [s].
         starts: number of starting points.
-        model, robot_file: root-mean-square error of the joint positions relative to their change since the
-            start, as the median over the moving joints; `None` after a divergence.
+        model, robot_file: RMS error of the joint positions relative to their change since the start, as the
+            median over the moving joints, or `None` after a divergence.
     """
 
     horizons: tuple[float, ...]
@@ -54,7 +54,7 @@ class Motion:
 
 @torch.no_grad()
 def beyond_gravity(system: ConstrainedSystem, data: Dataset) -> tuple[Tensor, float]:
-    """Return N (τ − τ_g) `(n, nq)` and the fraction R² of the torque variance explained by gravity alone."""
+    """Return N (τ − τ_g) `(n, nq)`, and the fraction R² of the torque that gravity alone explains."""
     scale = data.tau.std(0).clamp(min=1e-9)
 
     def rows(part: Dataset) -> tuple[Tensor, Tensor]:
@@ -77,7 +77,7 @@ def beyond_gravity(system: ConstrainedSystem, data: Dataset) -> tuple[Tensor, fl
 
 
 def explained(error: Tensor, rest: Tensor) -> tuple[float | None, ...]:
-    """Return R² of each joint from torque errors and torques beyond gravity `(n, nq)`; `None` if `FAINT`."""
+    """Return R² of each joint from errors and non-gravitational torques `(n, nq)`, or `None` if `FAINT`."""
     left, whole = (error**2).sum(0), (rest**2).sum(0)
     shares, seen = (1.0 - left / whole).tolist(), (whole > FAINT**2 * whole.max()).tolist()
     return tuple(share if clear else None for share, clear in zip(shares, seen, strict=True))
@@ -87,7 +87,7 @@ def explained(error: Tensor, rest: Tensor) -> tuple[float | None, ...]:
 def torque_response(model: FittedModel, data: Dataset) -> tuple[float, ...] | None:
     """Return the fraction of an added torque that takes effect at each joint, or `None` without free motion.
 
-    The fraction is 1 for a rigid robot and 0 if the model cancels the torque. Random torques of a tenth of
+    The fraction is 1 for a rigid robot, and 0 if the model cancels the torque. Random torques of a tenth of
     the logged standard deviation are added to states in free motion. The effective torque is M(q) times the
     change in the predicted acceleration.
     """
@@ -109,7 +109,7 @@ def torque_response(model: FittedModel, data: Dataset) -> tuple[float, ...] | No
 
 @torch.no_grad()
 def open_loop(model: FittedModel, system: ConstrainedSystem, data: Dataset) -> Motion | None:
-    """Simulate a model and the robot file in open loop; `None` if the data are too short or unordered."""
+    """Simulate a model and the robot file in open loop; return `None` for short or unordered data."""
     if model.force_field() is None or not data.header.ordered or len(data) < 2:
         return None
     dt = data.header.dt or float((data.t[1:] - data.t[:-1]).median())

@@ -1,11 +1,11 @@
 """Baseline predictors that any model should beat: the mean, the robot file alone, and least squares.
 
-Least squares identifies a rigid robot with physically consistent inertial parameters,
-τ = M q̈ − Q_C − Q_G − Q_D + Y(q, q̇, q̈) δπ + d q̇ + f tanh(q̇/v₀) + o + noise, where δπ corrects the
-inertial parameters of every link, and d, f, o are the viscous friction, Coulomb friction and offset of every
-joint. A ridge penalty keeps all unknowns close to the values in the robot file. Log-Cholesky coordinates keep
-every link physically consistent (Rucker and Wensing 2022) and therefore the mass matrix positive definite.
-In contact, the equations are projected onto the directions in which the constraint force has no component.
+Least squares identifies a rigid robot with physically consistent inertial parameters, τ = M q̈ − Q_C − Q_G −
+Q_D + Y(q, q̇, q̈) δπ + d q̇ + f tanh(q̇/v₀) + o + noise. Here, δπ corrects the inertial parameters of every
+link, and d, f, o are the viscous friction, Coulomb friction and offset of every joint. A ridge penalty keeps
+all unknowns close to the values in the robot file. Log-Cholesky coordinates keep every link physically
+consistent (Rucker and Wensing 2022), and therefore the mass matrix positive definite. In contact, the
+equations are projected onto the directions in which the constraint force has no component.
 """
 
 from __future__ import annotations
@@ -39,9 +39,9 @@ MOST = 4000
 WIDE = 10.0
 """Prior standard deviation of friction and offsets, relative to the largest torque at the joint."""
 NOISE_PASSES, STEPS = 3, 30
-"""Number of passes that re-estimate the noise, and maximum number of least-squares steps in each pass."""
+"""Number of passes that re-estimate the noise; maximum number of least-squares steps in each pass."""
 POINT = 1e-4
-"""Fraction of the largest mass that is added at 0.1 m to give spatial extent to links that have none."""
+"""Fraction of the largest mass that is added at 0.1 m to links without spatial extent."""
 
 
 @dataclass(frozen=True)
@@ -70,7 +70,7 @@ def data_chunks(data: Dataset) -> Iterator[Dataset]:
 
 
 def identify_rigid(system: ConstrainedSystem, train: Dataset) -> LeastSquares:
-    """Identify inertial parameters, friction and offsets; those not excited remain as in the robot file."""
+    """Identify inertia, friction and offsets. Those that are not excited keep their values in the file."""
     rows = torch.linspace(0, len(train) - 1, min(len(train), MOST)).round().long()
     train, robot = train[rows.unique()], system.robot
     prior = _prior_std(robot, train)
@@ -178,7 +178,8 @@ def _minimise(
         return (C.mT @ torch.block_diag(*by_link, torch.eye(len(friction)).double())).numpy()
 
     start = torch.cat([theta.flatten(), friction]).numpy()
-    result = least_squares(residual, start, jacobian, x_scale="jac", max_nfev=STEPS)  # pyright: ignore[reportArgumentType]
+    with np.errstate(over="ignore"):  # SciPy rejects trial steps of infinite cost
+        result = least_squares(residual, start, jacobian, x_scale="jac", max_nfev=STEPS)  # pyright: ignore[reportArgumentType]
     found = torch.from_numpy(result.x)
     return found[:n].reshape(-1, 10).to(like), at(found).to(like)
 
@@ -197,9 +198,10 @@ class Baseline:
     """A trivial predictor of accelerations.
 
     Attributes:
-        name, system: name of the predictor, and the robot whose mass matrix converts its errors to torques.
-        predict: function that returns the predicted accelerations `(n, nq)` for a data set.
-        std: `(nq,)` root-mean-square error on the training data, used as the uncertainty.
+        name: name of the predictor. system: the robot with the mass matrix that converts its errors to
+            torques.
+        predict: a function that returns the predicted accelerations `(n, nq)` for a data set.
+        std: RMS error on the training data, which is used as the uncertainty, `(nq,)`.
     """
 
     name: str

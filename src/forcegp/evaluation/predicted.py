@@ -28,9 +28,9 @@ class Predicted:
     """Acceleration predictions of a model at all samples of a data set.
 
     Attributes:
-        mean, variance: `(n, nq)`; `variance` is `None` if the model provides no covariance.
-        noise_std: `(n, nq)` assumed noise in measured accelerations, including torque noise, or `None`.
-        residual: `(k,)` |A q̈ − b| for all constraint rows of closed contacts.
+        mean, variance: mean and variance, `(n, nq)`. The variance is `None` if the model has no covariance.
+        noise_std: assumed noise in measured accelerations, including torque noise, `(n, nq)`, or `None`.
+        residual: |A q̈ − b| for all constraint rows of closed contacts, `(k,)`.
         seconds: computation time.
     """
 
@@ -42,7 +42,7 @@ class Predicted:
 
 
 Moments = tuple[Tensor, Tensor | None]
-"""Mean, and the variance or standard deviation if available."""
+"""Mean, and variance or standard deviation if available."""
 
 
 def in_chunks(
@@ -80,7 +80,7 @@ def predict_all(
 
 
 def _noise_std(model: Predictor, data: Dataset) -> Tensor | None:
-    """Return the acceleration noise `(n, nq)` assumed by the model, or else that stated by the data."""
+    """Return the acceleration noise `(n, nq)` that the model assumes, or that the data state."""
     if isinstance(model, StructuredFit):
         active = data.active(model.system.contact_names)
         return model.noise_variance(data.q, data.qd, data.tau, active=active).sqrt()
@@ -93,14 +93,14 @@ def _noise_std(model: Predictor, data: Dataset) -> Tensor | None:
 
 @dataclass(frozen=True)
 class MultiplierScore:
-    """Comparison of the predicted multiplier λ of one contact with the logged one, over samples in contact.
+    """Comparison of the predicted and logged multiplier λ of one contact over samples in contact.
 
     Attributes:
         contact: name of the contact.
         samples: number of samples in contact.
         bias, spread, level: mean and standard deviation of predicted minus logged λ, and mean logged λ [N].
-        correlation: correlation of predicted and logged λ, or `None` if either is constant.
-        coverage: fraction of logged values within ±2σ, where σ includes torque noise; `None` if σ is unknown.
+        correlation: correlation between predicted and logged λ, or `None` if either is constant.
+        coverage: fraction of logged values within ±2σ, where σ includes torque noise, or `None` if unknown.
     """
 
     contact: str
@@ -113,14 +113,14 @@ class MultiplierScore:
 
     def text(self) -> str:
         """Describe the comparison in words."""
-        held = "" if self.coverage is None else f", ±2σ holds {100.0 * self.coverage:.0f} %"
+        held = "" if self.coverage is None else f", ±2σ coverage {100.0 * self.coverage:.0f} %"
         error = math.hypot(self.bias, self.spread)
-        return f"the force at {self.contact!r} is off by {error:.2g} N of {self.level:.3g} N{held}"
+        return f"the force at {self.contact!r} is off by {error:.2g} N (mean force {self.level:.3g} N){held}"
 
 
 @torch.no_grad()
 def multiplier_scores(model: Predictor, data: Dataset) -> tuple[MultiplierScore, ...]:
-    """Compare λ with values logged by a simulator or sensor, for each contact with at least two samples."""
+    """Compare λ with values from a simulator or sensor for each contact with at least two samples."""
     if not logged_forces(model, data):
         return ()
     return _scores(model, data, *in_chunks(lambda part: predicted_forces(model, part), data))
@@ -151,7 +151,7 @@ def logged_forces(model: Predictor, data: Dataset) -> dict[str, Tensor]:
 
 @torch.no_grad()
 def sensed_scores(model: Predictor, data: Dataset) -> tuple[MultiplierScore, ...]:
-    """Return the scores of predictions that use the force sensor in the log, if any, at each state."""
+    """Return the scores of predictions that use the logged force sensor, if any, at each state."""
     if not isinstance(model, StructuredFit) or "multiplier" not in model.noise:
         return ()
     if not has_sensor(data, model.system) or "multiplier" not in data.contact_extras:

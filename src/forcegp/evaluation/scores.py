@@ -11,9 +11,9 @@ import torch
 from torch import Tensor
 
 REST = 0.02
-"""A joint is considered at rest below this fraction of the 95 % quantile of its speed in the data, ..."""
+"""Fraction of the 95 % quantile of a joint's speed below which the joint counts as being at rest."""
 SLOWEST = 5e-3
-"""... and always below this speed [rad/s, m/s], so that noise at rest does not count as motion."""
+"""Speed below which every joint counts as at rest [rad/s, m/s], so that noise is not taken for motion."""
 FEWEST = 10
 """Minimum number of samples required to compute an error in motion or at rest."""
 
@@ -45,12 +45,12 @@ class Errors:
 
 
 ByJoint = tuple[float | None, ...]
-"""One value per joint; `None` if there are too few samples."""
+"""One value per joint, or `None` if there are too few samples."""
 
 
 @dataclass(frozen=True)
 class JointErrors:
-    """Root-mean-square errors of one predictor in one unit, one per joint.
+    """RMS errors of a predictor for each joint, in a single unit.
 
     Attributes:
         all: error over all samples.
@@ -71,7 +71,7 @@ class JointErrors:
 
     @classmethod
     def of(cls, error: Tensor, measured: Tensor, moving: Tensor) -> JointErrors:
-        """Compute the errors from differences, the measured quantity and motion flags, each `(n, nq)`."""
+        """Compute the errors from differences, the measured quantity and a mask of motion, each `(n, nq)`."""
         spread = measured.std(0, correction=0)
         total = _rmse(error, torch.ones_like(moving), fewest=1)
         pairs = zip(total, spread.tolist(), strict=True)
@@ -85,7 +85,7 @@ def _rmse(error: Tensor, rows: Tensor, fewest: int) -> ByJoint:
 
 
 def moving_joints(qd: Tensor) -> Tensor:
-    """Return whether each joint moves, `(n, nq)` bool: |q̇| > max(`REST` · its 95 % quantile, `SLOWEST`)."""
+    """Return a mask `(n, nq)` of moving joints, for which |q̇| > max(`REST` · 95 % quantile, `SLOWEST`)."""
     fast = qd.abs().quantile(0.95, dim=0) if len(qd) < 1_000_000 else qd.abs().amax(0)
     return qd.abs() > (REST * fast).clamp(min=SLOWEST)
 
@@ -100,7 +100,7 @@ class Uncertainty:
 
     Attributes:
         coverage_noisy: fraction of measured accelerations within ±2σ, where σ includes the noise.
-        coverage_clean: fraction of noise-free accelerations within ±2σ; `None` if they are not logged.
+        coverage_clean: fraction of noise-free accelerations within ±2σ, or `None` if they are not logged.
         coverage_by_joint: `coverage_noisy` for each joint.
         calibration: fraction of measured accelerations in the central interval for each level in `LEVELS`.
         nlpd: mean negative log predictive density of the measured joint accelerations [nats].
@@ -141,7 +141,7 @@ def share(inside: Tensor) -> float:
 
 
 TINY = 1e-12
-"""Errors below this count as equal, since accelerations of order one have rounding errors."""
+"""Errors below this value count as equal, since accelerations of order one have rounding errors."""
 EQUAL = 1e-9
 """Tolerance within which an error ratio counts as one, to allow for rounding errors."""
 
@@ -152,11 +152,11 @@ class PredictorScores:
 
     Attributes:
         name: `model`, `mean`, `robot file` or `least squares`.
-        torque: error M(q)(predicted − measured q̈), where M is that of the predictor's robot [N m, N].
+        torque: error M(q)(predicted − measured q̈) [N m, N], with the mass matrix M of the predictor's robot.
         acceleration: error in q̈ [rad/s², m/s²].
-        nlpd: mean negative log predictive density of the measured joint accelerations [nats]; the standard
+        nlpd: mean negative log predictive density of the measured joint accelerations [nats]. The standard
             deviation of a trivial predictor is constant and equal to its training error.
-        explained: R² of each joint, the explained fraction of the torque beyond gravity.
+        explained: R² of each joint, which is the explained fraction of the non-gravitational torque.
     """
 
     name: str
@@ -167,7 +167,7 @@ class PredictorScores:
 
     @property
     def beyond_gravity(self) -> float | None:
-        """Explained fraction of the torque beyond gravity, median over the joints."""
+        """Explained fraction of the non-gravitational torque, as the median over the joints."""
         known = [share for share in self.explained if share is not None]
         return median(known) if known else None
 
@@ -178,8 +178,8 @@ class Verdict:
 
     Attributes:
         against: name of the trivial predictor.
-        torque, acceleration: ratio of the model's error to that of the predictor (geometric mean over the
-            joints, for samples in motion); the model is better if the ratio is below 1.
+        torque, acceleration: ratio of the model's error to that of the predictor, as the geometric mean over
+            the joints for samples in motion. The model is better if the ratio is below 1.
         worse: joints at which the model has the larger torque or acceleration error, or `every joint`.
     """
 

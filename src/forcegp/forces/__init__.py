@@ -1,1 +1,1 @@
-"""Priors on unknown forces, and the quantities of a constrained system computed from their posterior."""
+"""Priors on unknown forces, and quantities of a constrained system computed from the posterior forces."""

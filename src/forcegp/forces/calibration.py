@@ -1,8 +1,8 @@
 """Residual torques of a fit: their autocorrelation, and their magnitude on held-out blocks of the log.
 
-Temperature, hysteresis and filters leave residuals that are correlated in time, which divides the number of
-independent samples in a log by the integrated autocorrelation time. The variance on new motions is estimated
-from stretches of the training log that the posterior was not conditioned on.
+Temperature, hysteresis and filters cause residuals that are correlated in time. The number of independent
+samples in a log is therefore smaller by a factor equal to the integrated autocorrelation time. The variance
+on new motions is estimated from blocks of the training log that the posterior was not conditioned on.
 """
 
 from __future__ import annotations
@@ -30,35 +30,34 @@ from forcegp.forces.problem import UNSHOWN, Problem, force_posterior, typical
 from forcegp.forces.quantities import affine_map
 
 STRETCHES = 8
-"""Number of contiguous stretches into which a log of fewer than three segments is divided."""
+"""Number of contiguous blocks into which a log with fewer than three segments is divided."""
 MOST_STRETCHES = 16
-"""Maximum number of stretches, each of which requires a posterior; several segments can share a stretch."""
+"""Maximum number of blocks, each of which requires a posterior; a block may consist of several segments."""
 FEWEST = 50
 """Minimum number of samples required for calibration."""
 SWEEPS, SETTLED = 20, 1e-3
-"""Maximum number of sweeps over the joints, and relative change in their noise at convergence."""
+"""Maximum number of sweeps over the joints, and relative change in the noise at convergence."""
 MOST_RESIDUALS = 16_000
-"""Maximum number of residuals used to estimate correlation; longer logs are reduced to some stretches."""
+"""Maximum number of residuals used to estimate correlation; only parts of longer logs are used."""
 CHUNK_STATES = 2000
 """Number of states for which residuals are computed at a time, to limit memory use."""
 NEGLIGIBLE = 0.05
-"""Autocorrelation below which estimates are considered noise."""
+"""Autocorrelation below which an estimate is considered noise."""
 SIGNIFICANT = 2.0
 """Number of standard errors above which the covariance of neighbouring samples is significant."""
 REGIME = 0.25
-"""Fraction of the samples in the fastest or most heavily loaded regime."""
+"""Fraction of the samples in the fast regime and in the heavily loaded regime."""
 PRIOR_SAMPLES = 4.0
 """Weight of the prior in `growth`, as an equivalent number of independent samples."""
 WINDOW, WINDOWS = 10.0, 20
-"""Length of the windows of `correlation_times` in autocorrelation times, and their minimum number.
-"""
+"""Window length in `correlation_times`, in autocorrelation times, and minimum number of windows."""
 
 
 def autocorrelation_time(x: Tensor, segment: Tensor, white: Tensor | float = 0.0) -> Tensor:
-    """Return the integrated autocorrelation time of each column, 1 + 2 Σ ρ_k, in samples `(d,)`.
+    """Return the integrated autocorrelation time 1 + 2 Σ ρ_k of each column, in samples `(d,)`.
 
-    The sum ends when ρ falls below 0.05, or at half the longest segment. The result is 1 for a column whose
-    neighbouring samples have no significant covariance (at least two standard errors of that of white noise).
+    The sum ends when ρ falls below 0.05, or at half the length of the longest segment. The result is 1 if the
+    covariance of neighbouring samples is not significant (below two standard errors).
 
     Args:
         x: `(n, d)` zero-mean signals in time order.
@@ -78,11 +77,11 @@ def autocorrelation_time(x: Tensor, segment: Tensor, white: Tensor | float = 0.0
 
 
 def correlation_times(x: Tensor, segment: Tensor, length: int, white: Tensor | float = 0.0) -> Tensor:
-    """Return each column's spectral density at low frequencies divided by its variance, in samples `(d,)`.
+    """Return the ratio of low-frequency spectral density to variance for each column, in samples `(d,)`.
 
-    L · mean(x̄²) / (mean(x²) − white) over windows of L samples with means x̄ (batch means, Flegal and Jones
-    2010). In contrast to `autocorrelation_time`, it includes the negative lobes of an oscillating residual,
-    such as noise of differentiated positions or the ringing of a gear, which hardly moves a robot.
+    The ratio is L · mean(x̄²) / (mean(x²) − white), where x̄ are the means over windows of L samples (batch
+    means, Flegal and Jones 2010). Unlike `autocorrelation_time`, it includes the negative lobes of
+    oscillating residuals that barely move a robot, such as the noise of differentiated positions.
 
     Args:
         x: `(n, d)` zero-mean signals in time order.
@@ -98,29 +97,29 @@ def correlation_times(x: Tensor, segment: Tensor, length: int, white: Tensor | f
 
 
 def _variance_in_time(x: Tensor, segment: Tensor, white: Tensor | float) -> tuple[Tensor, Tensor]:
-    """Return the variance minus white noise `(d,)`, and its lower bound, the covariance of neighbours."""
+    """Return the variance without white noise `(d,)`, which is at least the covariance of neighbours."""
     first = _covariance(x, segment, 1)
     return (x.square().mean(0) - white).clamp(min=1e-300).maximum(first), first
 
 
 def _covariance(x: Tensor, segment: Tensor, lag: int) -> Tensor:
-    """Return the mean product `(d,)` of samples of the same segment that are separated by the given lag."""
+    """Return the mean product `(d,)` of samples in the same segment that are separated by a given lag."""
     same = segment[:-lag] == segment[lag:]
     return ((x[:-lag] * x[lag:]) * same[:, None]).sum(0) / same.sum().clamp(min=1)
 
 
 def _motions(training: Training) -> list[int]:
-    """Return the indices of measured accelerations, and of joint forces that include a force sensor."""
+    """Return the indices of measured accelerations, and of joint forces computed with a force sensor."""
     return [i for i, quantity in enumerate(training.quantities) if quantity in ("qdd", "joint_force")]
 
 
 def residual_times(
     problem: Problem, hyperparameters: Mapping[str, Tensor], training: Training
 ) -> tuple[float, Tensor | None]:
-    """Return κ ≤ 1, and the `correlation_times` of the joints `(nq,)` [s] (`None` with too few samples).
+    """Return κ ≤ 1, and the `correlation_times` `(nq,)` of the joints [s] (`None` if samples are too few).
 
     κ = 1/τ̄, where τ̄ is the autocorrelation time of torque noise in the residuals of `training`, averaged
-    geometrically over the joints: n samples contain as much information as n/τ̄ independent ones.
+    geometrically over the joints. n samples contain as much information as n/τ̄ independent samples.
     """
     posterior = force_posterior(problem, hyperparameters)
     logs, times = [], []
@@ -147,7 +146,7 @@ def residual_times(
 
 
 def _some(n: int) -> Tensor:
-    """Return at most `MOST_RESIDUALS` of n rows, in contiguous stretches so that neighbours stay together."""
+    """Select at most `MOST_RESIDUALS` of n rows, in contiguous blocks so that neighbours stay together."""
     if n <= MOST_RESIDUALS:
         return torch.arange(n)
     length = MOST_RESIDUALS // STRETCHES
@@ -162,11 +161,11 @@ def _torque_noise(
     m: Measurement,
     std: Tensor,
 ) -> tuple[Tensor, Tensor]:
-    """Return the estimated torque noise of each joint divided by its standard deviation, and the
-    contribution of white acceleration noise to its variance, each `(n, nq)`.
+    """Return the estimated torque noise of each joint divided by its standard deviation, and the contribution
+    of white acceleration noise to the variance of this estimate, each `(n, nq)`.
 
-    Residuals are r = B ε + e with torque noise ε ~ N(0, S), B = H for accelerations, and white e ~ N(0, Σ),
-    which masks the correlation of ε and contributes least to E[ε | r] = G r.
+    Residuals are r = B ε + e with torque noise ε ~ N(0, S) and white noise e ~ N(0, Σ), where B = H for
+    accelerations. e masks the correlation of ε, and contributes least to the estimate E[ε | r] = G r.
     """
     system, force_noise = problem.system, problem.force_noise(hyperparameters)
     assert force_noise is not None
@@ -182,7 +181,7 @@ def _torque_noise(
 
 
 def calibrated_noise(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return torque noise calibrated on held-out samples, the trained region, and error growth beyond it."""
+    """Return torque noise calibrated on held-out samples, the trained region, and error growth outside it."""
     load, training = problem.typical_load(), problem.training
     qd, tau = (torch.cat([getattr(m, name) for m in training.measurements]) for name in ("qd", "tau"))
     # Rounding to steps h has the variance h²/12.
@@ -199,12 +198,12 @@ def calibrated_noise(problem: Problem, hyperparameters: Mapping[str, Tensor]) ->
 def held_out_torque_std(problem: Problem, hyperparameters: Mapping[str, Tensor], least: Tensor) -> Tensor:
     """Return the torque noise `(nq,)` for which normalised errors on held-out blocks have unit variance.
 
-    Each stretch is predicted from all others with the given hyperparameters. The force error computed from
-    accelerations is r = M(q̈ − E q̈) = P ε, where P = I in free motion. For joint i, s_i² solves
-    mean(r_i² / (Σ_k P_ik² s_k² + Var r_i)) = 1, averaged over all samples with P_ii above one half.
+    Each block is predicted from all others with the given hyperparameters. The force error computed from
+    accelerations is r = M(q̈ − E q̈) = P ε, where P = I in free motion. For joint i, s_i² is the solution of
+    mean(r_i² / (Σ_k P_ik² s_k² + Var r_i)) = 1, where the mean is over all samples with P_ii above one half.
 
     Args:
-        least: the learned standard deviation, used as a lower bound.
+        least: the learned standard deviations, which are the lower bounds.
     """
     parts = []
     for i in _motions(problem.training):
@@ -218,16 +217,16 @@ def held_out_torque_std(problem: Problem, hyperparameters: Mapping[str, Tensor],
 
 
 def growth(problem: Problem, hyperparameters: Mapping[str, Tensor], load: Tensor) -> Tensor:
-    """Return the growth rate g `(nq,)` of torque standard deviations beyond the trained region.
+    """Return the growth rate g `(nq,)` of torque standard deviations outside the trained region.
 
     The fastest quarter and the most heavily loaded quarter of the training samples are predicted from the
-    rest. Here g = c · load with a common c for all joints, and D is the distance beyond the region of the
-    rest. c maximises the posterior under r_i ~ N(0, V_i + Σ_k P_ik² (s_k² + g_k² D_k²)), tempered like the
+    rest; D is their distance from the region of the rest. The rate is g = c · load with a common c for all
+    joints. c is the posterior mode under r_i ~ N(0, V_i + Σ_k P_ik² (s_k² + g_k² D_k²)), tempered like the
     likelihood, and a scaled inverse-χ² prior, which dominates if the log has only one regime.
 
     Args:
-        problem: the learned problem, including the exponent of its likelihood.
-        hyperparameters: hyperparameters including the predicted torque noise.
+        problem: the learned problem, including its likelihood exponent.
+        hyperparameters: hyperparameters, including the predicted torque noise.
         load: typical torque of each joint `(nq,)` [N m, N].
     """
     s2, square, known, slope = hyperparameters[TORQUE_NOISE].exp() ** 2, [], [], []
@@ -260,7 +259,7 @@ def growth(problem: Problem, hyperparameters: Mapping[str, Tensor], load: Tensor
 
 
 def stretches(segment: Tensor) -> Tensor:
-    """Return the stretch index of each sample: its segment, or its eighth of a log with few segments."""
+    """Return the block index of each sample. Blocks are segments, or eighths of a log with few segments."""
     _, own = segment.unique(return_inverse=True)
     if int(own.max()) + 1 >= 3:
         return own % MOST_STRETCHES
@@ -271,7 +270,7 @@ def stretches(segment: Tensor) -> Tensor:
 def _held_out(
     problem: Problem, hyperparameters: Mapping[str, Tensor], i: int, own: Tensor
 ) -> tuple[Tensor, Tensor, Tensor]:
-    """Return held-out torque residuals of measurement i and their noise-free variance, `(n, nq)`, and P."""
+    """Return held-out torque residuals `(n, nq)` of measurement i, their variance without noise, and P."""
     training, std = problem.training, problem.noise_at(hyperparameters, i)
     m, system = training.measurements[i][own], problem.system
     posterior = force_posterior(
@@ -292,10 +291,10 @@ def _held_out(
 
 
 def unit_scales(r2: Tensor, V: Tensor, share: Tensor, least: Tensor) -> Tensor:
-    """Solve mean(r_i² / (Σ_k share_ik s_k² + V_i)) = 1 for s, joint by joint.
+    """Solve mean(r_i² / (Σ_k share_ik s_k² + V_i)) = 1 for s, one joint at a time.
 
     Args:
-        r2, V: `(n, nq)` squared errors, and the part of their variance that is not noise.
+        r2, V: `(n, nq)` squared errors, and the part of their variance that is not due to noise.
         share: `(n, nq, nq)` P_ik², the contribution of the noise of joint k to the error of joint i.
         least: `(nq,)` lower bounds.
     """
@@ -315,7 +314,7 @@ def unit_scales(r2: Tensor, V: Tensor, share: Tensor, least: Tensor) -> Tensor:
 
 
 def _unit_scale(r2: Tensor, V: Tensor, least: Tensor) -> Tensor:
-    """Solve mean(r² / (s² + V)) = 1 for s, at least `least`."""
+    """Solve mean(r² / (s² + V)) = 1 for s ≥ `least`."""
     low, high = 2.0 * math.log(float(least)), math.log(float(r2.mean()) + float(least) ** 2) + 1.0
 
     def excess(log_variance: float) -> float:

@@ -1,6 +1,6 @@
 """External wrench on a robot frame, estimated from the equations of motion with learned forces.
 
-An undeclared wrench w acts on a frame with Jacobian J:
+An unknown wrench w acts at a frame with Jacobian J:
 
     M q̈ = Q̄ + Aᵀλ + Jᵀ w,   Q̄ ~ N(E Q̄, S).
 
@@ -9,15 +9,15 @@ S is the posterior covariance of the learned forces, including torque noise.
 - **From accelerations** (`least_squares`): r = M q̈ − E Q̄ = Jᵀ w + e with Cov(e) = S + M Σ_q̈ Mᵀ and a prior
   w ~ N(0, W), solved by generalized least squares: C = (J Cov(e)⁻¹ Jᵀ + W⁻¹)⁻¹, E w = C J Cov(e)⁻¹ r.
   Directions that have no effect on the joints retain the prior covariance.
-- **From momenta** (`observe`), without accelerations: p = M q̇ obeys ṗ = Q̄ − Q_C + ½ ∂(q̇ᵀM q̇)/∂q + Jᵀ w. A
-  Kalman filter estimates p, w, and the error of the learned forces, whose correlation time is that of the
-  torque residuals in the training log. The observer of De Luca and Mattone (*Sensorless robot collision
+- **From momenta** (`observe`), without accelerations: p = M q̇ satisfies ṗ = Q̄ − Q_C + ½ ∂(q̇ᵀM q̇)/∂q + Jᵀ
+  w. A Kalman filter estimates p, w, and the error of the learned forces, which has the correlation time of
+  the torque residuals in the training log. The observer of De Luca and Mattone (*Sensorless robot collision
   detection and hybrid force/motion control*, ICRA 2005) is the steady-state filter without force errors.
-- **With an unknown lever arm** (`over_levers`): a moment about the point is a force times its distance. The
-  estimate is a mixture over priors with moments of several scales, weighted by their evidence at the sample.
-  The evidence resolves directions that hardly affect the joints.
+- **With an unknown lever arm** (`over_levers`): a moment about the point is the product of a force and a
+  distance. The estimate is a mixture over priors whose moments have different scales, weighted by their
+  evidence at the sample. The evidence resolves directions that have little effect on the joints.
 
-The wrench is exerted by the environment on the robot. Multipliers of closed contacts are also unknown.
+The wrench is exerted by the environment on the robot. The multipliers of closed contacts are also unknown.
 """
 
 from __future__ import annotations
@@ -41,29 +41,29 @@ FORCES, MOMENTS = ("fx", "fy", "fz"), ("mx", "my", "mz")
 """Components of a wrench; moments are taken about the point."""
 AXES = (*FORCES, *MOMENTS)
 FORCE_STD, MOMENT_STD = 30.0, 5.0
-"""Prior standard deviations of each force [N] and moment [N m], large compared with pushes by hand."""
+"""Prior standard deviations of each force [N] and moment [N m], which are large for pushes by hand."""
 FORCE_CHANGE, MOMENT_CHANGE = 10.0, 1.0
-"""Standard deviations of their change within one second, for the momentum filter."""
+"""Standard deviations of the changes in force and moment within one second, for the momentum filter."""
 LEVERS = (1.0, 0.3, 0.1)
 """Scales of moments relative to the prior, with equal prior probabilities."""
 MULTIPLIER_STD = 1e4
-"""Large prior standard deviation of the multipliers of declared contacts [N]."""
+"""Prior standard deviation of the multipliers of declared contacts, chosen to be large [N]."""
 ROWS = {name: row for row, name in enumerate((*MOMENTS, *FORCES))}
 """Row of each component in `frame_jacobian`, in which rotations come first."""
 
 
 @dataclass(frozen=True)
 class WrenchFrame:
-    """A frame on which an unknown wrench acts, and the nonzero components of the wrench.
+    """A frame at which an unknown wrench acts, and the components of the wrench to estimate.
 
     Args:
         frame: frame of the robot.
-        reference: axes of the components, `"world"` or `"local"` (those of the frame).
-        axes: components in `AXES` to estimate, in this order; the others are zero.
+        reference: axes of the components, either `"world"` or `"local"` (the axes of the frame).
+        axes: components in `AXES` to estimate, in the given order; all others are zero.
         point: point of application of the force and reference point of moments, in frame coordinates [m].
         prior_std: prior standard deviations of forces [N] and moments [N m].
         change: standard deviations of the change in a force [N] and a moment [N m] within one second, for the
-            momentum filter; larger values make it faster and noisier.
+            momentum filter. Larger values make the filter faster and noisier.
 
     Example:
         >>> WrenchFrame("tool", axes=("fx", "fz")).prior.tolist()
@@ -112,12 +112,12 @@ class WrenchFrame:
 
     @property
     def levers(self) -> list[Tensor]:
-        """Factors `(k,)` on `prior` for each of `LEVERS`; only ones, unless there are forces and moments."""
+        """Factors `(k,)` on `prior` for each value in `LEVERS`; all 1 unless there are forces and moments."""
         both = len({axis in FORCES for axis in self.axes}) == 2
         return [self._each((1.0, lever)) for lever in (LEVERS if both else (1.0,))]
 
     def jacobian(self, robot: RobotModel, q: Tensor) -> Tensor:
-        """Return J `(*batch, k, nq)` of the components at q `(*batch, nq)`; the joint force is Jᵀ w.
+        """Return J `(*batch, k, nq)` at q `(*batch, nq)`, such that the joint force is Jᵀ w.
 
         Raises:
             UnknownNameError: the frame does not exist.
@@ -131,12 +131,12 @@ class WrenchFrame:
 
 
 def least_squares(J: Tensor, r: Tensor, S: Tensor, prior: Tensor) -> tuple[Tensor, Tensor]:
-    """Solve r = Jᵀ w + e with e ~ N(0, S), w ~ N(0, diag prior²) by generalized least squares.
+    """Solve r = Jᵀ w + e with e ~ N(0, S) and w ~ N(0, diag prior²) by generalized least squares.
 
     Args:
         J: `(n, k, nq)` Jacobians.
         r: `(n, nq)` residual joint force.
-        S: `(n, nq, nq)` covariance of r for w = 0.
+        S: `(n, nq, nq)` covariance of r if w = 0.
         prior: `(k,)` or `(n, k)` standard deviations.
 
     Returns:
@@ -154,14 +154,14 @@ def least_squares(J: Tensor, r: Tensor, S: Tensor, prior: Tensor) -> tuple[Tenso
 def over_levers(
     mean: Tensor, covariance: Tensor, prior: Tensor, levers: Sequence[Tensor]
 ) -> tuple[Tensor, Tensor]:
-    """Convert an estimate under w ~ N(0, diag prior²) to one under a mixture of W_s = diag (s prior)², s ≤ 1.
+    """Convert an estimate for w ~ N(0, diag prior²) to one for a mixture of W_s = diag (s prior)², s ≤ 1.
 
-    C_s⁻¹ = C⁻¹ + W_s⁻¹ − W⁻¹ and m_s = C_s C⁻¹ m, with evidence ∝ (|C_s| / |W_s|)^½ exp(½ m_sᵀ C_s⁻¹ m_s).
+    C_s⁻¹ = C⁻¹ + W_s⁻¹ − W⁻¹, m_s = C_s C⁻¹ m, and the evidence is ∝ (|C_s| / |W_s|)^½ exp(½ m_sᵀ C_s⁻¹ m_s).
 
     Args:
-        mean, covariance: m `(n, k)` and C `(n, k, k)` under W = diag prior².
+        mean, covariance: m `(n, k)` and C `(n, k, k)` for W = diag prior².
         prior: `(k,)` standard deviations.
-        levers: scales s of each prior `(k,)`, with equal prior probability.
+        levers: scales s `(k,)` of each prior; all priors are equally probable.
 
     Returns:
         Mean `(n, k)` and covariance `(n, k, k)` of the mixture.
@@ -186,7 +186,7 @@ def over_levers(
 
 
 def momentum_force(robot: RobotModel, q: Tensor, qd: Tensor) -> tuple[Tensor, Tensor]:
-    """Return M `(n, nq, nq)`, and ½ ∂(q̇ᵀM q̇)/∂q = Ṁ q̇ + Q_C `(n, nq)`, the contribution of inertia to ṗ."""
+    """Return M `(n, nq, nq)`, and the contribution ½ ∂(q̇ᵀM q̇)/∂q = Ṁ q̇ + Q_C `(n, nq)` of inertia to ṗ."""
     with torch.enable_grad():
         x = q.detach().clone().requires_grad_()
         M = dynamics.mass_matrix(robot, x)
@@ -197,14 +197,14 @@ def momentum_force(robot: RobotModel, q: Tensor, qd: Tensor) -> tuple[Tensor, Te
 
 @dataclass(frozen=True)
 class MomentumLog:
-    """Inputs to the filter, as arrays over n samples in time order.
+    """Inputs to the momentum filter, as arrays over n samples in time order.
 
     Attributes:
         t: `(n,)` time [s].
-        p: momentum M q̇ `(n, nq)`, with noise covariance `p_noise` `(n, nq, nq)`.
-        u: `(n, nq)` mean of ṗ without the wrench.
+        p, p_noise: momentum M q̇ `(n, nq)`, and the covariance `(n, nq, nq)` of its noise.
+        u: `(n, nq)` mean of ṗ if there is no wrench.
         J: `(n, k, nq)` Jacobians of the unknown components.
-        prior, change: `(k,)` standard deviations of the components and of their change within one second.
+        prior, change: `(k,)` standard deviations of the components and of their changes within one second.
         factor: `(n, nq, nq)` lower Cholesky factor of S.
         correlation: `(nq,)` integral of the autocorrelation of the force error over all lags [s].
     """
@@ -221,12 +221,12 @@ class MomentumLog:
 
 
 def observe(log: MomentumLog) -> tuple[Array, Array]:
-    """Filter the wrench along a trajectory causally; return its mean `(n, k)` and covariance `(n, k, k)`.
+    """Return the causally filtered mean `(n, k)` and covariance `(n, k, k)` of the wrench along a trajectory.
 
-    The state is x = (p, w, η): w is an Ornstein-Uhlenbeck process that has the prior variance W and changes
-    by `change` within one second. S½ η is the error of the learned forces, where η has unit variance. Over
-    a step h, p⁺ = p + h (u + Jᵀ w + S½ η), w⁺ = φ w + √(1 − φ²) W½ ε, η⁺ = ψ η + √(1 − ψ²) ε, with φ =
-    exp(−h change²/2 W), and ψ = (c − h)/(c + h), which preserves the low-frequency spectral density c of η.
+    The state is x = (p, w, η). The wrench w is an Ornstein-Uhlenbeck process with prior variance W that
+    changes by about `change` within one second. The learned forces have the error S½ η, where η has unit
+    variance. In a step h, p⁺ = p + h (u + Jᵀ w + S½ η), w⁺ = φ w + √(1 − φ²) W½ ε and η⁺ = ψ η + √(1 − ψ²) ε.
+    Here φ = exp(−h change²/2 W), and ψ = (c − h)/(c + h) preserves the low-frequency spectral density c of η.
     """
     n, nq = log.p.shape
     k = len(log.prior)

@@ -1,12 +1,12 @@
-"""Dry friction with memory in the torque residuals of a fit.
+"""Dry friction with memory, learned from the torque residuals of a fit.
 
-Friction modelled as a function of velocity jumps when a joint reverses. Real friction develops over a
-distance δ: in Dahl's model it is proportional to z, with dz/dt = q̇/δ − |q̇| z/δ (Dahl 1976, *Solid friction
-damping of mechanical vibrations*). Force priors depend only on the state, so near reversals they can be wrong
-by the full friction, which makes other learned forces less certain. For a log in time order, z can be
-computed from the velocities. The correction is a ridge regression of the torque residual on z for several
-values of δ, on functions of the velocity, and on the gravity torques of the links. A joint is corrected only
-if the correction reduces the residual on held-out blocks of the training log.
+If friction is modelled as a function of velocity, it jumps when a joint reverses. Real friction develops over
+a distance δ. In Dahl's model, it is proportional to z with dz/dt = q̇/δ − |q̇| z/δ (Dahl 1976, *Solid
+friction damping of mechanical vibrations*). Since force priors depend only on the state, their error near
+reversals can be as large as the friction itself, which makes other learned forces less certain. For a log in
+time order, z can be computed from the velocities. The torque residual is fitted by ridge regression on z for
+several values of δ, functions of the velocity, and the gravity torques of the links. A joint is corrected
+only if this reduces its residual on held-out blocks of the training log.
 """
 
 from __future__ import annotations
@@ -35,17 +35,17 @@ from forcegp.robot.model import RobotModel
 
 MEMORY = f"{NOISE}.memory."
 WEIGHTS, SHARE, CORRELATION = (MEMORY + name for name in ("weights", "share", "correlation"))
-"""Names under which the correction is stored in the hyperparameters."""
+"""Names under which the correction is stored among the hyperparameters."""
 RIDGE = 1e-3
 """Ridge penalty for features of unit size, relative to the number of samples."""
 LONGEST_STEP = 0.05
-"""Longest time between training samples over which velocities are interpolated [s]."""
+"""Longest interval between training samples over which velocities are interpolated [s]."""
 LEAST_SHARE = 0.01
-"""Lower bound on the remaining fraction of the variance."""
+"""Lower bound on the fraction of the variance that remains after the correction."""
 
 
 def _features(robot: RobotModel, log: Measurement | Dataset) -> Tensor:
-    """Return features `(n, nq, f)`: bristles for all distances, memoryless friction, offset, and gravity."""
+    """Return features `(n, nq, f)`: z for each distance, memoryless friction, an offset, and gravity."""
     v = log.qd[..., None]
     friction = [bristles(log), *(torch.tanh(v / speed) for speed in SPEEDS), v, torch.ones_like(v)]
     return torch.cat([*friction, _weight(robot, log.q)], dim=-1)
@@ -53,7 +53,7 @@ def _features(robot: RobotModel, log: Measurement | Dataset) -> Tensor:
 
 def _weight(robot: RobotModel, q: Tensor) -> Tensor:
     """Return the gravity torque `(n, nq, 4 nq)` [N m, N] due to errors in the mass and first moment of each
-    link, each equal to one standard deviation of `InertialPrior`.
+    link. Each error is one standard deviation of `InertialPrior`.
     """
     columns, zero = torch.arange(10 * robot.nq).view(-1, 10)[:, :4].flatten(), torch.zeros_like(q)
     Y = regressor(robot, q, zero, zero)[..., columns]
@@ -62,12 +62,12 @@ def _weight(robot: RobotModel, q: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class FrictionMemory:
-    """Torque correction of a fit.
+    """Torque correction for a fit.
 
     Attributes:
         weights: weights of the features, `(nq, f)` [N m, N].
-        share: remaining fractions of the variances of torque noise and of static friction, `(nq, 2)`.
-        correlation: integral of the autocorrelation of the residual over all lags, `(nq,)` [s].
+        share: remaining fractions `(nq, 2)` of the variances of torque noise and static friction.
+        correlation: integral `(nq,)` of the autocorrelation of the residual over all lags [s].
     """
 
     weights: Tensor
@@ -76,13 +76,13 @@ class FrictionMemory:
 
     @classmethod
     def of(cls, hyperparameters: Mapping[str, Tensor]) -> FrictionMemory | None:
-        """Return the correction learned by a fit, or `None` if the log was not sufficient to determine it."""
+        """Return the correction learned by a fit, or `None` if the log did not determine it."""
         if WEIGHTS not in hyperparameters:
             return None
         return cls(*(hyperparameters[name] for name in (WEIGHTS, SHARE, CORRELATION)))
 
     def force(self, robot: RobotModel, log: Measurement | Dataset) -> Tensor:
-        """Return the joint force of the correction for a log in time order, `(n, nq)` [N m, N]."""
+        """Return the joint force `(n, nq)` of the correction, for a log in time order [N m, N]."""
         return (_features(robot, log) * self.weights).sum(-1)
 
 
@@ -90,11 +90,12 @@ class FrictionMemory:
 def memory_of(
     problem: Problem, hyperparameters: Mapping[str, Tensor], training: Training
 ) -> dict[str, Tensor]:
-    """Return the correction learned from samples in free motion, as hyperparameters; empty if the samples are
-    too far apart or are not in time order.
+    """Learn the correction from samples in free motion and return it as hyperparameters.
+
+    The result is empty if the samples are too far apart or not in time order.
 
     Args:
-        training: samples whose residuals are to be explained.
+        training: samples whose residuals the correction explains.
     """
     if not training.period:
         return {}
@@ -134,13 +135,13 @@ def learn_memory(
     """Learn the correction from training samples in free motion.
 
     Args:
-        residual: joint force that the fit does not explain, M q̈ − E Q̄ `(n, nq)`.
-        white: contribution of acceleration noise to the variance of the residual, `(n, nq)`.
-        forces: contribution of the learned forces, `(n, nq)`.
-        noise: contributions of torque noise and of static friction, `(n, nq, 2)`.
+        residual: unexplained joint force M q̈ − E Q̄ `(n, nq)`.
+        white: contribution `(n, nq)` of acceleration noise to the variance of the residual.
+        forces: contribution `(n, nq)` of the learned forces to this variance.
+        noise: contributions `(n, nq, 2)` of torque noise and static friction to this variance.
 
     Returns:
-        The correction, or `None` if the samples are too far apart or are not in time order.
+        The correction, or `None` if the samples are too far apart or not in time order.
     """
     steps = motion.t.diff()[motion.segment[1:] == motion.segment[:-1]]
     if not len(steps) or not 0.0 < float(steps.median()) <= LONGEST_STEP or float(steps.min()) <= 0.0:
@@ -165,7 +166,7 @@ def learn_memory(
         target = (remaining[:, j].square() - white[:, j] - forces[:, j]) / total[:, j]
         found = torch.from_numpy(scipy.optimize.nnls(rows.cpu().numpy(), target.cpu().numpy())[0])
         share[j] = found.to(share).clamp(min=LEAST_SHARE, max=1.0)
-        # A new motion is like another stretch, so its variance scatters as much as theirs does.
+        # A new motion is like another block, so its variance scatters as much as theirs does.
         square = remaining[:, j].square() / (white[:, j] + forces[:, j] + noise[:, j] @ share[j])
         by_stretch = torch.stack([square[group == g].mean() for g in group.unique()])
         share[j] *= (by_stretch.mean() + by_stretch.std()).clamp(min=1.0)

@@ -1,10 +1,10 @@
-"""Inertia of a real robot: that of its file, optionally with added drive inertia, or identified inertia.
+"""Inertia of a real robot: that of the robot file, the same with added drive inertia, or identified inertia.
 
-Held-out blocks of the log decide whether an estimate predicts torques better than the robot file
+Estimates are accepted if they predict torques on held-out blocks of the log better than the robot file does
 (`inverse_dynamics.py`). With noisy accelerations, least squares underestimates inertia. With noisy torques in
-closed loop, the likelihood of accelerations given torques overestimates it. The equations of motion slightly
-earlier and later are instruments that avoid both biases. The unknowns are Gaussian around the robot file,
-each link stays physically consistent, and drive inertia is nonnegative.
+closed loop, the likelihood of accelerations given torques overestimates it. Using the equations of motion at
+slightly earlier and later times as instruments avoids both biases. The unknowns have Gaussian priors centred
+on the robot file. Links stay physically consistent, and drive inertia is nonnegative.
 
 Torque and motion are seldom read at the same instant: a controller that holds each torque for a period leads
 the motion by half of it. Milliseconds bias the inertia of a light joint and, since −dτ/dt resembles q̇ along
@@ -12,10 +12,10 @@ periodic motions, viscous friction. The delay is therefore an additional unknown
 the model is trained on torques shifted by it.
 
 Torques alone are not sufficient. In closed loop, torque-sensor noise exceeds the torque that accelerates a
-light joint. Divided by the inertia in the file, it predicts accelerations far larger than the measured ones.
-If their mean square is ten times too large, the drives are assigned the inertia that maximises
-−½ Σ ε²/s² + v Σ log |M|, with the smallest v ≤ 1 at which accelerations are predicted as well as by their
-mean, provided that no joint's torque error on held-out blocks increases by more than 2 %.
+light joint. Divided by the inertia in the file, this noise predicts accelerations far larger than the
+measured ones. If the mean squared error is ten times the variance of the accelerations, the drive inertia is
+set to the maximum of −½ Σ ε²/s² + v Σ log |M|. Here v ≤ 1 is the smallest value for which accelerations are
+predicted as well as by their mean. No joint's torque error on held-out blocks may increase by more than 2 %.
 
 If an `InertialPrior` is given, the inertial parameters of the robot are set to their posterior mean in one
 physically consistent Gauss–Newton step.
@@ -64,20 +64,20 @@ from forcegp.identification import regressor
 from forcegp.robot.model import RobotModel
 
 PASSES = 3
-"""Number of successive estimates of the unknowns, each with the residual noise of the previous one."""
+"""Number of successive estimates of the unknowns, each using the residual noise of the previous estimate."""
 WIDTHS = (0.0, 0.02, 0.05, 0.12)
-"""Standard deviations of the time averages to try [s]; the one with the narrowest posterior is used."""
+"""Widths of the time averages to try (standard deviations) [s]; the narrowest posterior is used."""
 
 
 def rigid_robot(robot: RobotModel, rows: Rows) -> tuple[RobotModel, bool, float]:
     """Return the robot that best predicts held-out torques, whether links were identified, and their delay.
 
-    The candidates are the robot file, the file with added drive inertia, and physically consistent links with
-    drives. Each must outperform the previous ones by two standard errors over blocks of the log, and no
-    joint's held-out acceleration error may increase.
+    The candidates are the robot file, the robot file with added drive inertia, and a robot with identified,
+    physically consistent links and drives. Each candidate must outperform the previous ones by two standard
+    errors over blocks of the log, without increasing the held-out acceleration error of any joint.
 
     Args:
-        robot: robot from the file.
+        robot: robot from the robot file.
         rows: samples in free motion.
     """
     prior, n = InertialPrior(), robot.nq
@@ -93,7 +93,7 @@ def rigid_robot(robot: RobotModel, rows: Rows) -> tuple[RobotModel, bool, float]
     driving, everything = torch.cat([torch.arange(n), delay]), torch.arange(C.shape[-1])
 
     def compared(estimate: Estimate) -> Tensor:
-        """Return held-out errors of single samples in units of their noise; averages hide sharp friction."""
+        """Return held-out errors of single samples in units of noise. Averages would hide sharp friction."""
         return held_out(single.by_stretch, estimate, judged, found.by_stretch) / single.noise**2
 
     def estimated(kept: Tensor) -> Tensor:
@@ -121,11 +121,11 @@ def _consistent(
 ) -> tuple[RobotModel, Tensor]:
     """Return the robot with physically consistent links and nonnegative drive inertia, and the unknowns.
 
-    The links are updated with the drives marginalised, and the drives then adapt to them. Drives that would
-    become negative are removed.
+    The links are updated with the drives marginalised, and the drives are then updated given the links.
+    Drives whose inertia would be negative are removed.
 
     Args:
-        size: unit of the inertia of each drive `(nq,)`.
+        size: units of the drive inertias `(nq,)`.
     """
     every, n = found.by_stretch.total(), len(size)
     _, precision = found.normal()
@@ -144,20 +144,20 @@ def _consistent(
 
 
 def with_delay(rows: Rows, columns: Tensor) -> Tensor:
-    """Append a column for the delay s of the torque: τ(t + s) ≈ τ(t) + s dτ/dt."""
+    """Append a column for the torque delay s, with τ(t + s) ≈ τ(t) + s dτ/dt."""
     return torch.cat([columns, LATE * rows.rate[..., None]], dim=-1)
 
 
 @dataclass(frozen=True)
 class _Regression:
-    """Regression with instrumental variables, with its residual noise `(nq,)` and likelihood exponent κ."""
+    """A regression with instrumental variables, its residual noise `(nq,)` and its likelihood exponent κ."""
 
     by_stretch: NormalEquations
     noise: Tensor
     power: float
 
     def normal(self, given: NormalEquations | None = None) -> tuple[Tensor, Tensor]:
-        """Return linear term κ h and precision κ H + 1 of the unknowns, ignoring directions of negative H."""
+        """Return the linear term κ h and precision κ H + 1, ignoring directions of negative H."""
         H, h = (given or self.by_stretch.total()).quadratic(self.noise)
         values, vectors = torch.linalg.eigh(0.5 * (H + H.mT))
         shown = vectors * (values > 0.0)
@@ -166,10 +166,10 @@ class _Regression:
         return self.power * shown @ (vectors.mT @ h), precision + eye
 
     def estimate(self, given: NormalEquations, kept: Tensor, n: int, known: Tensor | None = None) -> Tensor:
-        """Return the most probable unknowns with indices `kept`; the first n are drives and nonnegative.
+        """Return the most probable values of the unknowns `kept`, with nonnegative drives (the first n).
 
         Args:
-            known: values of the other unknowns, zero by default.
+            known: values of the other unknowns; zero by default.
         """
         h, precision = self.normal(given)
         known = torch.zeros_like(h) if known is None else known
@@ -183,16 +183,16 @@ class _Regression:
 
 
 def _marginal(precision: Tensor, kept: Tensor, others: Tensor) -> Tensor:
-    """Return the precision of the kept unknowns with the others marginalised (a Schur complement)."""
+    """Return the precision of the kept unknowns, marginalising the others (a Schur complement)."""
     across = precision[kept][:, others]
     return precision[kept][:, kept] - across @ torch.linalg.solve(precision[others][:, others], across.mT)
 
 
 def _over_widths(rows: Rows, inertial: Tensor, M: Tensor) -> Iterator[_Regression]:
-    """Yield a regression on equations averaged over time for each width of the average.
+    """Yield, for each averaging width, a regression on equations averaged over time.
 
     Args:
-        inertial: columns of drives and links `(n, nq, p)`.
+        inertial: columns `(n, nq, p)` of drives and links.
         M: mass matrix of the robot file.
     """
     accelerating, n = (M @ rows.qdd[..., None])[..., 0], M.shape[-1]
@@ -214,7 +214,7 @@ def _over_widths(rows: Rows, inertial: Tensor, M: Tensor) -> Iterator[_Regressio
 
 
 def _power(rows: Rows, left: Tensor) -> float:
-    """Return κ = 1/τ̄ of the unexplained residual, as in `residual_times`."""
+    """Return κ = 1/τ̄ for the unexplained residual, as in `residual_times`."""
     times = autocorrelation_time(left[: rows.leading], rows.segment[: rows.leading])
     return min(1.0, math.exp(-float(times.log().mean())))
 
@@ -225,11 +225,11 @@ def _is_better(after: Tensor, before: Tensor) -> bool:
 
 
 VOLUME_STATES = 100
-"""Number of states over which log |M|, or the volume of the noise, is averaged."""
+"""Number of states over which log |M| or the noise volume is averaged."""
 FAR_LARGER = 10.0
-"""Mean squared acceleration error, relative to that of the mean, above which drive inertia is raised."""
+"""Mean squared acceleration error, relative to that of the mean, above which drive inertia is increased."""
 NEGLIGIBLE = 0.02
-"""Ratio of drive to joint inertia below which it is neglected: a gain error of the sensor can explain it."""
+"""Ratio of drive to joint inertia below which drives are neglected; a sensor gain error can explain them."""
 WEIGHTS = tuple(2.0 ** (-k / 2) for k in range(20, -1, -1))
 """Weights v of the volume term, from 1/1024 to 1."""
 
@@ -239,8 +239,8 @@ class Inertia:
     """Inertia determined from a log.
 
     Attributes:
-        robot: robot from the file, with the identified inertia.
-        identified: whether inertial parameters of links were identified, so that some uncertainty remains.
+        robot: robot from the robot file, with the identified inertia.
+        identified: whether inertial parameters of links were identified, and thus remain uncertain.
         delay: time by which the logged torque precedes the motion if links were identified, otherwise 0 [s].
         doubts: warnings for the user.
     """
@@ -267,7 +267,7 @@ def inertia_of(
     rows = free_rows(system, friction, mean, training)
     better, has_links, delay = rigid_robot(robot, rows.with_memory())
     if has_links:
-        text = "held-out torques favour other inertial parameters than the robot file's, now identified"
+        text = "identified inertia replaces that of the robot file, since it predicts held-out torques better"
         return Inertia(better, True, delay, (text, *_told(robot, better.armature - robot.armature)))
     M = mass_matrix(robot, rows.q)
     armature = _damped(rows, M, better.armature - robot.armature)
@@ -278,7 +278,7 @@ def inertia_of(
 
 
 def _told(robot: RobotModel, armature: Tensor) -> tuple[str, ...]:
-    """Return the message about drives with identified inertia `(nq,)`, if any."""
+    """Return a message about drives with identified inertia `(nq,)`, if there are any."""
     pairs = zip(robot.joint_names, armature.tolist(), strict=True)
     found = ", ".join(f"{name} {a:.2g}" for name, a in pairs if a > 0.0)
     lacks = "the drives have inertia that the robot file lacks [kg m², kg for sliding joints]"
@@ -286,13 +286,13 @@ def _told(robot: RobotModel, armature: Tensor) -> tuple[str, ...]:
 
 
 def _noise(every: NormalEquations) -> Tensor:
-    """Return the root mean square of the torque that the robot file and friction do not explain `(nq,)`."""
+    """Return the root mean square `(nq,)` of the torque that the robot file and friction do not explain."""
     none = every.gram.new_zeros(every.unknowns)
     return every.error(none, every.friction(none)).clamp(min=1e-300).sqrt()
 
 
 def _excess(rows: Rows, every: NormalEquations, M: Tensor, armature: Tensor) -> float:
-    """Return the log ratio of mean squared acceleration error to acceleration variance, mean over joints."""
+    """Return the log ratio of mean squared acceleration error to variance, averaged over the joints."""
     friction = every.friction(armature)
     left = rows.slides * (rows.residual - armature * rows.qdd - (rows.friction * friction).sum(-1))
     missed = torch.linalg.solve(M + torch.diag(armature), left[..., None])[..., 0]
@@ -301,14 +301,14 @@ def _excess(rows: Rows, every: NormalEquations, M: Tensor, armature: Tensor) -> 
 
 
 def _damped(rows: Rows, M: Tensor, found: Tensor) -> Tensor:
-    """Return the drive inertia in addition to the file's `(nq,)`, raised if torque noise hides accelerations.
+    """Return the drive inertia `(nq,)` to add to the robot file.
 
-    This is the case if torques predict accelerations far worse than their mean does, even with friction with
-    memory (which is not noise). Drive inertia is then raised until both predict them equally well.
+    If torques predict accelerations far worse than the mean acceleration does, even with friction with memory
+    included, drive inertia is increased until both predict equally well.
 
     Args:
         M: mass matrix of the robot file at the samples.
-        found: drive inertia identified from torques.
+        found: drive inertia identified from the torques.
     """
     remembering, C = rows.with_memory(), torch.diag_embed(rows.qdd)
     if _excess(remembering, sums(remembering, C).total(), M, found) <= math.log(FAR_LARGER):
@@ -327,7 +327,7 @@ def _damped(rows: Rows, M: Tensor, found: Tensor) -> Tensor:
 
 
 def _drives(given: NormalEquations, noise: Tensor, M: Tensor, weight: float) -> Tensor:
-    """Return the a ≥ 0 that minimises ½ Σ ε²/s² − v Σ log |M + diag a| over all samples."""
+    """Return the drive inertia a ≥ 0 that minimises ½ Σ ε²/s² − v Σ log |M + diag a| over all samples."""
     H, h = given.quadratic(noise)
     n, M = float(given.count.max()), M[:: max(1, len(M) // VOLUME_STATES)]
     scale = M.diagonal(dim1=-2, dim2=-1).mean(0)
@@ -349,7 +349,7 @@ def _drives(given: NormalEquations, noise: Tensor, M: Tensor, weight: float) -> 
 
 @torch.no_grad()
 def with_updated_robot(problem: Problem, values: Mapping[str, Tensor]) -> Problem:
-    """Return the problem at the posterior mean of the inertial parameters (one Gauss–Newton step)."""
+    """Return the problem with the inertial parameters at their posterior mean (one Gauss–Newton step)."""
     for p, prior in enumerate(problem.priors):
         moves = prior.name not in problem.pinned and problem.parameters is None
         if isinstance(prior, InertialPrior) and moves and not prior.drives:
@@ -370,10 +370,10 @@ def with_updated_robot(problem: Problem, values: Mapping[str, Tensor]) -> Proble
 
 
 def _log_volume(problem: Problem, values: Mapping[str, Tensor]) -> Callable[[RobotModel], Tensor]:
-    """Return κ Σ_i log |M (Σ_τ + M Σ_q̈ Mᵀ)^−½| at the samples in free motion, as a function of the robot.
+    """Return robot ↦ κ Σ_i log |M (Σ_τ + M Σ_q̈ Mᵀ)^−½| over the samples in free motion.
 
     This term converts the density of the torque error to that of the acceleration error. Without it, a robot
-    with almost no inertia would best explain small torques, regardless of the resulting accelerations.
+    with almost no inertia would best explain small torques, whatever the resulting accelerations.
     """
     terms = []
     std = problem.system.robot.mass.new_zeros(problem.system.robot.nq)
@@ -403,7 +403,7 @@ def _log_volume(problem: Problem, values: Mapping[str, Tensor]) -> Callable[[Rob
 
 
 def one_row(posterior: ForcePosterior, problem: Problem) -> list[dict[str, Tensor]]:
-    """Return the kernel inputs of every prior at the first sample, which is enough for constants."""
+    """Return the kernel inputs of every prior at the first sample, which is sufficient for constants."""
     m = problem.training.measurements[0]
     at = m[torch.zeros(1, dtype=torch.int64, device=m.q.device)].at(problem.system)
     return [posterior.process.features(p, problem.system, at) for p in range(len(problem.priors))]
@@ -412,7 +412,7 @@ def one_row(posterior: ForcePosterior, problem: Problem) -> list[dict[str, Tenso
 def latent_precision(
     posterior: ForcePosterior, features: list[dict[str, Tensor]], p: int, robot: RobotModel
 ) -> Tensor:
-    """Return the inverse posterior covariance of the components of prior p, with all others marginalised."""
+    """Return the inverse posterior covariance of the components of prior p, marginalising all others."""
     widths = [prior.outputs(robot) for prior in posterior.priors]
     eye = torch.eye(widths[p], dtype=robot.dtype, device=robot.device)
     operators = [eye[None] if q == p else eye.new_zeros(1, widths[p], w) for q, w in enumerate(widths)]

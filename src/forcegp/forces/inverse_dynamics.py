@@ -1,11 +1,11 @@
 """Inverse dynamics of a real robot as a linear regression, validated on held-out blocks of the log.
 
 In free motion, r = τ + Q_C + Q_G + Q_D − M₀ q̈ = C δ + Φ w + ε, with separate friction Φ w for each joint.
-Each column of C is the torque due to one unknown: the inertia of a drive or an inertial parameter of a link.
+Each column of C is the torque due to one unknown, namely a drive inertia or an inertial parameter of a link.
 
 Because C contains the noise of the accelerations, least squares underestimates inertia. Each sample therefore
 has a partner at a time lag beyond the correlation time of the noise. The partner's columns C′ serve as
-instruments, C′ᵀ(C δ + Φ w − r) = 0, and errors are assessed by the product ε ε′, in which noise vanishes in
+instruments, C′ᵀ(C δ + Φ w − r) = 0. Errors are assessed by the product ε ε′, in which noise vanishes in
 expectation (Söderström and Stoica, *Instrumental Variable Methods for System Identification*, 1983).
 """
 
@@ -27,31 +27,31 @@ from forcegp.forces.priors.base import ForceMean
 from forcegp.forces.priors.joint import JointFrictionPrior
 
 LEAST, MOST = 200, 4000
-"""Minimum number of samples required in free motion, and maximum number used, evenly spaced."""
+"""Minimum number of samples required in free motion, and maximum number of (evenly spaced) samples used."""
 SCATTER = 4.0
-"""Ratio of mean squares of the torque residual at rest and in motion above which a joint is sticking."""
+"""Ratio of mean squared torque residuals at rest and in motion above which a joint is considered to stick."""
 NOISY = (1.0, 2.0, 4.0)
-"""Apparent speeds of a joint at rest, relative to the speed of the sharpest dry friction."""
+"""Apparent speeds of a joint at rest, relative to the saturation speed of the sharpest dry friction."""
 MOVES = 0.1
-"""Minimum fraction of samples in which a joint must move for sticking to be detected."""
+"""Minimum fraction of samples in which a joint must move so that sticking can be detected."""
 RIDGE = 1e-8
-"""Ridge penalty for scaled friction columns, relative to the number of samples."""
+"""Ridge penalty on the scaled friction columns, relative to the number of samples."""
 SIGNIFICANT = 2.0
-"""Number of standard errors over stretches above which a difference is significant."""
+"""Number of standard errors over blocks above which a difference is significant."""
 APART = 0.05
-"""Time between a sample and its partner [s], unless the filter of the accelerations spans more."""
+"""Time between a sample and its partner [s], unless the acceleration filter spans a longer time."""
 DISTANCES = (0.01, 0.03, 0.1)
 """Distances over which friction with memory develops [rad, m]."""
 REACH = 3.0
 """Number of standard deviations at which Gaussian weights are truncated."""
 LEAST_SQUARE = 1e-300
-"""Lower bound on mean squares, for joints that do not move during a stretch and thus have no error."""
+"""Lower bound on mean squares, for joints that do not move during a block and therefore have no error."""
 TOLERATED = 0.02
 """Tolerated relative increase in the held-out error of a joint."""
 LATE = 0.01
 """Prior standard deviation of the delay between torque and motion [s]."""
 COHERENT = 0.9
-"""Minimum autocorrelation of the velocities of a sample and its partner, as the median over the joints."""
+"""Minimum autocorrelation between the velocities of a sample and its partner (median over the joints)."""
 
 
 @dataclass(frozen=True)
@@ -60,16 +60,16 @@ class Rows:
 
     Attributes:
         q, qd, qdd: `(n, nq)` positions, velocities and accelerations.
-        residual: torque that the robot file does not explain `(n, nq)`.
-        friction: Φ, features of the friction and offset of each joint `(n, nq, f)`.
-        slides: `(n, nq)` bool, moving joints; the torque of a sticking joint is uninformative.
-        group: stretch of each sample `(n,)`, numbered from 0 without gaps.
-        segment: trajectory of each sample `(n,)`.
-        partner: index of each sample's partner `(n,)`, or its own index if it has none.
-        memory: additional features for friction with memory `(n, nq, k)`.
+        residual: torque `(n, nq)` that the robot file does not explain.
+        friction: features Φ `(n, nq, f)` of the friction and offset of each joint.
+        slides: `(n, nq)` bool, moving joints; the torques of sticking joints are not informative.
+        group: block index of each sample `(n,)`, numbered from 0 without gaps.
+        segment: trajectory number of each sample `(n,)`.
+        partner: index of each sample's partner `(n,)`; for a sample without a partner, its own index.
+        memory: additional features `(n, nq, k)` for friction with memory.
         rate: time derivative of the torque `(n, nq)`.
         step: time between neighbouring samples [s]; 0 if they are not in time order.
-        filter_variance: variance of the weights with which a filter averaged q̈ over time [s²].
+        filter_variance: variance of the weights of the filter that averaged q̈ over time [s²].
     """
 
     q: Tensor
@@ -87,12 +87,12 @@ class Rows:
     filter_variance: float = 0.0
 
     def with_memory(self) -> Rows:
-        """Return the samples with the features of friction with memory included in Φ."""
+        """Add the features of friction with memory to Φ."""
         return dataclasses.replace(self, friction=torch.cat([self.friction, self.memory], dim=-1))
 
     @property
     def leading(self) -> int:
-        """Return the number of samples that precede the partners; they are in the order of the log."""
+        """Return the number of leading samples; all later samples are kept only as partners."""
         paired = int(self.partner[0]) > 0
         return len(self.partner) // 2 if paired else len(self.partner)
 
@@ -101,8 +101,8 @@ class Rows:
 class NormalEquations:
     """Σ ZᵀX `(..., nq, p + f, p + f)`, Σ Zᵀr, Σ r² and the number of samples, for each joint.
 
-    X = (C, Φ), and Z = X or, with instruments, (C′, Φ). For `products`, r², XᵀX and Xᵀr are replaced by r r′,
-    ½ (XᵀX′ + X′ᵀX) and ½ (Xᵀr′ + X′ᵀr).
+    X = (C, Φ). Z = (C′, Φ) if instruments are used, and Z = X otherwise. For `products`, r², XᵀX and Xᵀr are
+    replaced by r r′, ½ (XᵀX′ + X′ᵀX) and ½ (Xᵀr′ + X′ᵀr).
     """
 
     gram: Tensor
@@ -112,15 +112,15 @@ class NormalEquations:
     unknowns: int
 
     def total(self) -> NormalEquations:
-        """Return the equations summed over all blocks."""
+        """Sum the equations over all blocks."""
         return self._each(lambda x: x.sum(0))
 
     def of(self, g: int) -> NormalEquations:
-        """Return the equations of stretch g."""
+        """Return the equations of block g."""
         return self._each(lambda x: x[g])
 
     def without(self, g: int) -> NormalEquations:
-        """Return the equations summed over all blocks except g."""
+        """Sum the equations over all blocks except g."""
         return self._each(lambda x: x.sum(0) - x[g])
 
     def _each(self, part: Callable[[Tensor], Tensor]) -> NormalEquations:
@@ -129,7 +129,7 @@ class NormalEquations:
         )
 
     def friction(self, delta: Tensor) -> Tensor:
-        """Return the friction weights w `(nq, f)` that best fit the residual at δ."""
+        """Return the friction weights w `(nq, f)` that best fit the residual for given δ."""
         p = self.unknowns
         right = self.right[:, p:] - self.gram[:, p:, :p] @ delta
         return torch.linalg.solve(self._stiff(), right[..., None])[..., 0]
@@ -140,7 +140,7 @@ class NormalEquations:
         return self.gram[:, p:, p:] + RIDGE * self.count[:, None, None] * eye
 
     def quadratic(self, noise: Tensor) -> tuple[Tensor, Tensor]:
-        """Return H and h of H δ = h with optimal friction; without instruments, δ minimises Σ |ε_j|²/s_j²."""
+        """Return H and h in H δ = h for optimal friction. Without instruments, δ minimises Σ |ε_j|²/s_j²."""
         # Friction is eliminated by a Schur complement: H_j = G_δδ − G_δf (G_ff + D)⁻¹ G_fδ, H = Σ_j H_j/s_j²
         p = self.unknowns
         friction = torch.cat([self.gram[:, p:, :p], self.right[:, p:, None]], dim=-1)
@@ -151,7 +151,7 @@ class NormalEquations:
         return torch.einsum("j,jpq->pq", weight, H), weight @ h
 
     def error(self, delta: Tensor, friction: Tensor) -> Tensor:
-        """Return the mean of ε² `(nq,)`, or of ε ε′ for `products`."""
+        """Return the mean `(nq,)` of ε², or of ε ε′ for `products`."""
         x = torch.cat([delta.expand(len(friction), -1), friction], dim=-1)
         fitted = 2.0 * (x * self.right).sum(-1) - torch.einsum("jp,jpq,jq->j", x, self.gram, x)
         return (self.square - fitted) / self.count
@@ -164,7 +164,7 @@ Estimate = Callable[[NormalEquations], Tensor]
 def free_rows(
     system: ConstrainedSystem, prior: JointFrictionPrior, mean: ForceMean, training: Training
 ) -> Rows:
-    """Return samples in free motion and the samples matched to them, of the first measurement with enough."""
+    """Return samples in free motion, and their partners, from the first measurement with enough of them."""
     motions = (m for m in training.measurements if m.quantity == "qdd")
     free = ((m, (~m.active.any(-1)).nonzero()[:, 0]) for m in motions)
     m = next(m[rows] for m, rows in free if len(rows) >= LEAST)
@@ -192,10 +192,10 @@ def _in_time(m: Measurement | Dataset) -> Tensor:
 
 
 def bristles(m: Measurement | Dataset) -> Tensor:
-    """Return z of Dahl's friction model dz/dt = q̇/δ − |q̇| z/δ for each δ in `DISTANCES`, `(n, nq, k)`.
+    """Return z `(n, nq, k)` in Dahl's friction model dz/dt = q̇/δ − |q̇| z/δ for each δ in `DISTANCES`.
 
-    Within δ of a reversal, this friction acts like a spring, and its torque is roughly proportional to −q̈.
-    Without these columns, it would resemble negative inertia.
+    Within a distance δ of a reversal, this friction acts like a spring, with a torque that is roughly
+    proportional to −q̈. Without these columns, friction would be mistaken for negative inertia.
     """
     order = _in_time(m)
     t, qd, segment = m.t[order], m.qd[order], m.segment[order]
@@ -217,7 +217,7 @@ def bristles(m: Measurement | Dataset) -> Tensor:
 
 
 def torque_rate(m: Measurement) -> Tensor:
-    """Return the time derivative of the torque, from differences over `LATE` on either side `(n, nq)`.
+    """Return the time derivative `(n, nq)` of the torque, from differences over `LATE` on either side.
 
     A small delay between torque and motion changes the torque in proportion to this derivative.
     """
@@ -249,10 +249,10 @@ def delayed(training: Training, delay: float) -> Training:
 
 
 def partners(m: Measurement, filter_span: float = 0.0) -> Tensor:
-    """Return the index of the sample `APART` later in the same trajectory, or −1 if there is none, `(n,)`.
+    """Return the index `(n,)` of the sample `APART` later in the same trajectory, or −1 if there is none.
 
     The lag is reduced if velocities would change too much, but not below the span of the log's filter [s],
-    within which noise is correlated.
+    over which noise is correlated.
     """
     later = torch.full((len(m.t),), -1, device=m.t.device)
     order = _in_time(m)
@@ -292,14 +292,14 @@ def _rows(
 
 
 def sliding(speed: Tensor, slowest: float, Phi: Tensor, residual: Tensor) -> Tensor:
-    """Return which joints move, `(n, nq)` bool; if a joint sticks, its torque scatters more at low speed.
+    """Return a mask `(n, nq)` of moving joints. The torque of a sticking joint scatters more at low speed.
 
-    Velocity noise hides that a joint is at rest, so the speed limit is the one with the largest ratio of
-    scatter at low speed to scatter in motion.
+    Because of velocity noise, the speed of a joint at rest is not zero. The speed threshold is the one with
+    the largest ratio of scatter at low speed to scatter in motion.
 
     Args:
         speed: |q̇| `(n, nq)`.
-        slowest: speed of the sharpest dry friction [rad/s, m/s].
+        slowest: saturation speed of the sharpest dry friction [rad/s, m/s].
         Phi: features of friction `(n, nq, f)`.
         residual: `(n, nq)` torque that the robot file does not explain.
     """
@@ -321,19 +321,19 @@ def sliding(speed: Tensor, slowest: float, Phi: Tensor, residual: Tensor) -> Ten
 
 
 def averaged(rows: Rows, columns: Tensor, inertial: Tensor, width: float) -> tuple[Rows, Tensor]:
-    """Return equations averaged over time with Gaussian weights; sums of valid equations remain valid.
+    """Average the equations over time with Gaussian weights; sums of valid equations remain valid.
 
-    Noise of differentiated positions has high frequencies, whereas motion has low ones. Since a filter has
+    Differentiated positions have high-frequency noise, whereas motion has low frequencies. Since a filter has
     already averaged the accelerations, the variance of its weights is added when averaging the other terms.
 
     Args:
         columns: C `(n, nq, p)`.
-        inertial: M₀ q̈ `(n, nq)`, which is part of the residual.
+        inertial: term M₀ q̈ `(n, nq)` of the residual.
         width: standard deviation of the weights [s].
 
     Returns:
-        The averaged samples, which count as moving only if the whole window does so within one stretch, and
-        their columns.
+        The averaged samples and their columns. Averaged samples are considered moving only if the whole
+        window moves and lies within one block.
     """
     stds = [x / rows.step for x in (width, math.hypot(width, math.sqrt(rows.filter_variance)))]
     reach, stride = math.ceil(REACH * stds[1]), max(1, int(0.5 * stds[0]))
@@ -373,33 +373,33 @@ def averaged(rows: Rows, columns: Tensor, inertial: Tensor, width: float) -> tup
 
 
 def sums(rows: Rows, columns: Tensor) -> NormalEquations:
-    """Return the `NormalEquations` of each stretch for the columns C `(n, nq, p)`."""
+    """Return the `NormalEquations` of each block for the columns C `(n, nq, p)`."""
     X, r = _equations(rows, columns)
     return _by_stretch(rows, X, X, r, r)
 
 
 def instrumental(rows: Rows, columns: Tensor) -> NormalEquations:
-    """Return the equations with partners as instruments; velocities and friction are considered exact."""
+    """Return the equations with partners as instruments. Velocities and friction are considered exact."""
     X, r = _equations(rows, columns, paired=True)
     p = columns.shape[-1]
     return _by_stretch(rows, torch.cat([X[rows.partner][..., :p], X[..., p:]], dim=-1), X, r, r)
 
 
 def products(rows: Rows, columns: Tensor) -> NormalEquations:
-    """Return the `NormalEquations` of products with the partners."""
+    """Return the `NormalEquations` for products of samples with their partners."""
     X, r = _equations(rows, columns, paired=True)
     return _by_stretch(rows, X[rows.partner], X, r[rows.partner], r)
 
 
 def _equations(rows: Rows, columns: Tensor, paired: bool = False) -> tuple[Tensor, Tensor]:
-    """Return X and r, set to zero for joints that stick (at the sample or, if `paired`, at its partner)."""
+    """Return X and r, set to zero for joints that stick at the sample or, if `paired`, at its partner."""
     slides = rows.slides & rows.slides[rows.partner] if paired else rows.slides
     X = torch.cat([columns, rows.friction], dim=-1)
     return X * slides[..., None], rows.residual * slides
 
 
 def _by_stretch(rows: Rows, Z: Tensor, X: Tensor, s: Tensor, r: Tensor) -> NormalEquations:
-    """Return Σ ZᵀX, Σ Zᵀr and Σ s r; X includes a column of ones, which is zero for ignored samples."""
+    """Return Σ ZᵀX, Σ Zᵀr and Σ s r. X includes a column of ones that is zero for ignored samples."""
     groups = []
     for g in range(int(rows.group.max()) + 1):
         inside = rows.group == g
@@ -417,13 +417,13 @@ def held_out(
     judged: NormalEquations | None = None,
     source: NormalEquations | None = None,
 ) -> Tensor:
-    """Return mean squared torque errors on blocks held out from estimating δ and w, `(groups, nq)`.
+    """Return the mean squared torque errors `(groups, nq)` on blocks that are not used to estimate δ and w.
 
     Args:
-        by_stretch: equations from which friction is estimated.
+        by_stretch: equations used to estimate friction.
         estimate: function that estimates δ from all blocks except one.
-        judged: equations from which errors are computed, such as `products`; by default `by_stretch`.
-        source: equations from which δ is estimated, such as averaged ones; by default `by_stretch`.
+        judged: equations used to compute errors, such as `products`; defaults to `by_stretch`.
+        source: equations used to estimate δ, such as averaged equations; defaults to `by_stretch`.
     """
     errors = []
     for g in range(len(by_stretch.gram)):
@@ -436,7 +436,7 @@ def held_out(
 def acceleration_errors(
     rows: Rows, by_stretch: NormalEquations, columns: Tensor, delta: Tensor, M: Tensor
 ) -> Tensor:
-    """Return the mean squared acceleration errors at δ, with held-out friction, `(groups, nq)`."""
+    """Return the mean squared acceleration errors `(groups, nq)` for given δ, with held-out friction."""
     residual, errors = rows.residual - columns @ delta, []
     for g in range(len(by_stretch.gram)):
         inside = rows.group == g
@@ -447,15 +447,15 @@ def acceleration_errors(
 
 
 def log_ratio(after: Tensor, before: Tensor) -> Tensor:
-    """Return the log ratio of root mean squares, which is zero for a joint at rest during a stretch."""
+    """Return the log ratio of root mean squares, which is zero for a joint at rest during a block."""
     return 0.5 * (after.clamp(min=LEAST_SQUARE) / before.clamp(min=LEAST_SQUARE)).log()
 
 
 def is_harmless(after: Tensor, before: Tensor) -> bool:
-    """Return whether no joint's error increases by more than the tolerance."""
+    """Return whether the error of every joint stays within the tolerance."""
     return bool((log_ratio(after, before).mean(0) <= TOLERATED).all())
 
 
 def is_less(difference: Tensor) -> bool:
-    """Return whether differences `(groups,)` are significantly below zero."""
+    """Return whether the mean of differences `(groups,)` is significantly below zero."""
     return float(difference.mean()) < -SIGNIFICANT * float(difference.std()) / math.sqrt(len(difference))

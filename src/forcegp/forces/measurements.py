@@ -1,7 +1,7 @@
-"""Measured quantities at states, from the columns of a log to the data of a posterior.
+"""Measured quantities at states, converted from the columns of a log and used to condition a posterior.
 
-In contact, A q̈ = b. If a measurement violates this by far more than the usual noise (because of an impact or
-a wrong contact flag), the contact does not persist, and the whole acceleration is unusable.
+In contact, A q̈ = b. If a measurement violates this equation by far more than the usual noise, because of an
+impact or an incorrect contact flag, the contact does not persist and the acceleration is unusable.
 """
 
 from __future__ import annotations
@@ -31,12 +31,12 @@ class Measurement:
 
     Attributes:
         quantity: name of the quantity, as in `QUANTITIES`.
-        q, qd, tau: `(n, nq)` states.
+        q, qd, tau: `(n, nq)` positions, velocities and motor torques.
         active: `(n, n_contacts)` bool, closed contacts.
         values: `(n, d)` measured values.
-        segment: `(n,)` trajectory of each sample; one trajectory by default.
+        segment: `(n,)` trajectory number of each sample; by default, there is one trajectory.
         t: `(n,)` time of each sample [s]; zero by default.
-        tau_std: `(n, nq)` standard deviation of each torque beyond the usual noise [N m, N]; `None` for zero.
+        tau_std: `(n, nq)` additional standard deviation of each torque [N m, N]; `None` for zero.
     """
 
     quantity: str
@@ -58,16 +58,16 @@ class Measurement:
 
     @property
     def states(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
-        """Return q, q̇, τ and the closed contacts."""
+        """Return q, q̇, τ and the flags of closed contacts."""
         return self.q, self.qd, self.tau, self.active
 
     @property
     def tensors(self) -> tuple[Tensor, ...]:
-        """Return q, q̇, τ, the closed contacts and the measured values."""
+        """Return q, q̇, τ, the flags of closed contacts, and the measured values."""
         return (*self.states, self.values)
 
     def at(self, system: ConstrainedSystem) -> States:
-        """Return the states with their equations of motion, and the measured accelerations if available."""
+        """Return the states with their equations of motion and, if available, the measured accelerations."""
         time = torch.stack([self.t, self.segment.to(self.t)], dim=-1)
         return states(system, *self.states, qdd=self.values if self.quantity == "qdd" else None, time=time)
 
@@ -87,19 +87,19 @@ class Measurement:
 
 @dataclass(frozen=True)
 class Training:
-    """Data that a posterior is conditioned on.
+    """The data that a posterior is conditioned on.
 
     Attributes:
-        measurements: the values.
+        measurements: the measured quantities.
         noise_std: standard deviation of each measurement, `(d,)` or `(n, d)`.
         scales: standardization of the inputs of each prior.
-        part_of: total number of samples to condition on, if these are only some of them; otherwise 0.
+        part_of: total number of samples to condition on if these are only part of them; otherwise 0.
         period: sampling period of the log [s]; 0 if its rows are not in time order.
         filter_span: time span of the filter that computed the accelerations [s]; 0 if unknown.
-        filter_variance: variance of the filter's weights over time [s²], as in `DataHeader`.
-        weights: weights `(n,)` that divide the noise variance of each sample, per measurement; `None` for 1.
-        slopes: G = dz/d(q, q̇) `(n, d, 2 nq)` of each measurement under the learned forces (`None` for a
-            quantity that has none), or `None` to use those of the robot file (`forces/noise.py`).
+        filter_variance: variance of the weights of this filter over time [s²], as in `DataHeader`.
+        weights: weights `(n,)` for each measurement, which divide the noise variances; `None` for 1.
+        slopes: slopes G = dz/d(q, q̇) `(n, d, 2 nq)` of each measurement under the learned forces (`None` for
+            quantities that have none); if `None`, those of the robot file are used (`forces/noise.py`).
     """
 
     measurements: tuple[Measurement, ...]
@@ -114,7 +114,7 @@ class Training:
 
     @property
     def samples(self) -> int:
-        """Return the number of samples in all measurements."""
+        """Return the total number of samples in all measurements."""
         return sum(len(m.q) for m in self.measurements)
 
     @property
@@ -123,19 +123,19 @@ class Training:
         return self.part_of or self.samples
 
     def pieces(self, samples: int) -> Iterator[Training]:
-        """Yield the samples in pieces of about this many, with the same share of each measurement in each."""
+        """Yield pieces of about `samples` samples, each with the same fraction of every measurement."""
         count = max(1, math.ceil(self.samples / samples))
         parts = [torch.arange(len(m.q), device=m.q.device).tensor_split(count) for m in self.measurements]
         yield from (self.of_rows(rows) for rows in zip(*parts, strict=True))
 
     @property
     def quantities(self) -> tuple[str, ...]:
-        """Return the measured quantities."""
+        """Return the names of the measured quantities."""
         return tuple(m.quantity for m in self.measurements)
 
     @property
     def free_motions(self) -> int:
-        """Return the largest number of free-motion accelerations in any measurement."""
+        """Return the largest number of accelerations in free motion in any one measurement."""
         free = [int((~m.active.any(-1)).sum()) for m in self.measurements if m.quantity == "qdd"]
         return max(free, default=0)
 
@@ -145,22 +145,22 @@ class Training:
         return torch.cat([m.digests for m in self.measurements])
 
     def never_closed(self, system: ConstrainedSystem) -> tuple[str, ...]:
-        """Return the contacts that are never closed."""
+        """Return the names of the contacts that are never closed."""
         closed = torch.stack([m.active.any(0) for m in self.measurements]).any(0).tolist()
         return tuple(name for name, seen in zip(system.contact_names, closed, strict=True) if not seen)
 
     def thinned(self, samples: int) -> Training:
-        """Return about this many samples, chosen by farthest-point sampling of each measurement's states."""
+        """Select about `samples` samples by farthest-point sampling of the states of each measurement."""
         share = samples / self.samples
         return self.of_rows([_spread(m, math.ceil(share * len(m.q))) for m in self.measurements])
 
     def evenly(self, samples: int) -> Training:
-        """Return at most this many samples, evenly spaced."""
+        """Select at most `samples` evenly spaced samples."""
         step = max(1, math.ceil(self.samples / samples))
         return self.of_rows([torch.arange(0, len(m.q), step, device=m.q.device) for m in self.measurements])
 
     def without(self, measurement: int, rows: Tensor) -> Training:
-        """Return all samples except the given rows of one measurement."""
+        """Remove the given rows of one measurement."""
         kept = [torch.ones(len(m.q), dtype=torch.bool, device=m.q.device) for m in self.measurements]
         kept[measurement][rows] = False
         return self.of_rows([mask.nonzero()[:, 0] for mask in kept])
@@ -180,7 +180,7 @@ class Training:
         )
 
     def joined(self, more: Training, noise_std: Sequence[Tensor]) -> Training:
-        """Return the union of these and additional measurements with the given noise, including slopes."""
+        """Add other measurements, with their noise and slopes."""
         weights, slopes = tuple(torch.ones_like(m.t) for m in more.measurements), more.slopes or ()
         return dataclasses.replace(
             self,
@@ -191,13 +191,13 @@ class Training:
         )
 
     def moving(self, speed: float) -> Training:
-        """Return the samples in which any joint moves faster than the given speed [rad/s, m/s]."""
+        """Return the samples at which at least one joint moves faster than the given speed [rad/s, m/s]."""
         fast = [(m.qd.abs().amax(-1) > speed).nonzero()[:, 0] for m in self.measurements]
         return self.of_rows(fast)
 
 
 def _spread(m: Measurement, count: int) -> Tensor:
-    """Return at most `count` rows whose states are distinct and far from each other."""
+    """Return at most `count` rows with distinct states that are far apart."""
     x = standardized(torch.cat([m.q, m.qd, m.tau], dim=-1))
     return farthest_points(x, min(count, len(x.unique(dim=0))))
 
@@ -207,10 +207,10 @@ FAR = 6.0
 
 
 def without_impacts(training: Training, system: ConstrainedSystem) -> tuple[Training, int]:
-    """Return the samples without impacts, and the number of samples removed.
+    """Remove samples with impacts; return the others and the number of samples removed.
 
     Args:
-        training: measurements, of which only accelerations are checked.
+        training: measurements; only accelerations are checked.
     """
     if not system.m:
         return training, 0
@@ -224,7 +224,7 @@ def without_impacts(training: Training, system: ConstrainedSystem) -> tuple[Trai
 
 
 def _persists(system: ConstrainedSystem, m: Measurement, std: Tensor) -> Tensor:
-    """Return whether |A q̈ − b| is in the usual range for each sample, `(n,)` bool; true in free motion."""
+    """Return a mask `(n,)` of the samples for which |A q̈ − b| is in the usual range; true in free motion."""
     eom = system.equations(m.q, m.qd, m.active)
     violation = (eom.A @ m.values[..., None])[..., 0] - eom.b
     noise = (eom.A.square() @ std.expand_as(m.values)[..., None].square())[..., 0].sqrt()
@@ -241,7 +241,7 @@ def _persists(system: ConstrainedSystem, m: Measurement, std: Tensor) -> Tensor:
 
 NoiseStd = float | Sequence[float] | Tensor
 DEFAULT_NOISE_STD = 0.1
-"""Acceleration noise used if neither the caller nor the log provides it, as in the paper [rad/s², m/s²]."""
+"""Acceleration noise used if neither the caller nor the log specifies it, as in the paper [rad/s², m/s²]."""
 
 
 def plain(noise: NoiseStd | str | None) -> Any:
@@ -260,8 +260,8 @@ class Observation:
         data: states, contacts and measured values.
         quantity: the measured quantity: `qdd` (in contact or free), `multiplier`, `contact_force`,
             `constraint_force`, `joint_force`, `contact_friction` or `total_force`.
-        noise_std: standard deviation of the measurement: one number, one per component, or `(n, d)`. For
-            `qdd`, the default is the value in the model, else the log's `qdd_std`, else that in its header.
+        noise_std: standard deviation of the measurement, as one number, one per component, or `(n, d)`. For
+            `qdd`, it defaults to the value in the model, then to `qdd_std` in the log, then to the header.
 
     Example:
         >>> import forcegp, torch
@@ -280,7 +280,7 @@ class Observation:
 
 
 def observations_of(data: Dataset | Sequence[Observation]) -> Sequence[Observation]:
-    """Return a data set as measurements of accelerations, or the given measurements.
+    """Return the given measurements, or measurements of accelerations if a data set is given.
 
     Raises:
         ModelError: there are no measurements, or the argument has the wrong type.
@@ -330,7 +330,7 @@ def _by_contact(name: str) -> Callable[[Dataset, ConstrainedSystem], Tensor]:
                     f"contact {contact!r} may stick, and only its normal force is logged",
                     expected="three components",
                     got="one",
-                    hint='observe "contact_force", with a large noise_std of what was not measured',
+                    hint='observe "contact_force", with a large noise_std for the unmeasured components',
                 )
         columns = [logged[contact] for contact in system.contact_names]
         return torch.cat([x[:, None] if x.ndim == 1 else x for x in columns], dim=-1)
@@ -357,8 +357,8 @@ def measurement_of(
 
     Raises:
         UnknownNameError: the quantity cannot be measured, or a contact is not logged.
-        ModelError: the noise is not positive, or is not given for a quantity other than qdd.
-        DataError: the joints of the data are not those of the robot.
+        ModelError: the noise is not positive, or it is missing for a quantity other than qdd.
+        DataError: the joints in the data differ from those of the robot.
     """
     data, quantity = observation.data, observation.quantity
     if quantity not in QUANTITIES or quantity not in COLUMNS:
@@ -375,7 +375,7 @@ def measurement_of(
 
 
 def _noise_of(observation: Observation, default: NoiseStd | None) -> NoiseStd:
-    """Return the noise given by the observation, model, log (`qdd_std`) or header, in that order."""
+    """Return the noise from the observation, the model, the log (`qdd_std`) or the header, in that order."""
     data = observation.data
     if observation.noise_std is not None:
         return observation.noise_std
@@ -418,7 +418,7 @@ def training_of(
     """Return the measurements with their noise and input scales.
 
     Args:
-        noise_std: standard deviation of accelerations whose noise is not given.
+        noise_std: standard deviation of accelerations that do not specify their noise.
         kept: existing scales to keep, keyed by prior name.
         standardize: whether to standardize kernel inputs.
 
@@ -445,7 +445,7 @@ def scaled(
     kept: Mapping[str, Standardization],
     standardize: bool = True,
 ) -> Training:
-    """Return the training data with input scales for the given priors; arguments are as in `training_of`."""
+    """Return the training data with input scales for given priors; see `training_of` for the arguments."""
     new = [prior for prior in priors if prior.name not in kept]
     at = [m.at(system) for m in training.measurements] if new else []
     scales = dict(kept)

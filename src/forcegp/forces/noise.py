@@ -1,10 +1,10 @@
-"""Measurement noise of a log: accelerations, motor torques, and the state.
+"""Measurement noise in a log: noise of accelerations, motor torques, and states.
 
-**State noise**, to first order. At a measured state x + δ, with δ ~ N(0, Σ_x), the model predicts
-z(x + δ) ≈ z(x) + G δ with G = ∂z/∂(q, q̇), so a sample's rows have additional noise of covariance G Σ_x Gᵀ
-(McHutchon and Rasmussen, *Gaussian process training with input noise*, 2011). G is computed from the robot
-file's equations of motion under the measured torque, or, once forces have been learned, from q̈ = L b + H F̄
-with their posterior mean F̄ (`forces/noise_learning.py`).
+State noise is propagated to first order. At a measured state x + δ with δ ~ N(0, Σ_x), the model predicts z(x
++ δ) ≈ z(x) + G δ with G = ∂z/∂(q, q̇), so the rows of a sample have additional noise with covariance G Σ_x Gᵀ
+(McHutchon and Rasmussen, *Gaussian process training with input noise*, 2011). G is first computed from the
+equations of motion of the robot file under the measured torque. Once forces have been learned, it is computed
+from q̈ = L b + H F̄ with their posterior mean F̄ (`forces/noise_learning.py`).
 """
 
 from __future__ import annotations
@@ -34,17 +34,17 @@ class Noise:
 
     Args:
         acceleration: standard deviation of measured accelerations [rad/s², m/s²], one number or one per
-            joint; by default the value in the log (`qdd_std` of each sample, else its header), else 0.1.
-        learn: whether the acceleration noise is learned, starting from `acceleration`.
-        torque: standard deviation of the motor torque's white noise [N m, N], one number or one per joint;
-            `"learn"`, `None` for no noise, or `"auto"` to learn it with the priors for real robots.
+            joint. Defaults to the value in the log (`qdd_std` or the header), or to 0.1.
+        learn: whether to learn the acceleration noise, starting from `acceleration`.
+        torque: standard deviation of the motor torque's white noise [N m, N], one number or one per joint.
+            `"learn"` learns it, `"auto"` learns it with priors for real robots, and `None` means no noise.
         state: standard deviations of the white noise of measured q and q̇ [rad, rad/s], each one number or
-            one per joint; `None` for no noise. It is propagated to first order (`forces/noise.py`).
-        degrees_of_freedom: ν > 2 of a Student t distribution of each sample's noise, such as 4, for logs with
-            impacts and other outliers; `None` for Gaussian noise (`forces/noise_learning.py`).
-        external: standard deviation of unknown forces [N m, N], keyed by joint name, for example for a joint
-            that has no torque sensor or is moved by hand. For joints without a logged torque, the default is
-            the size of the force that moves them.
+            one per joint; `None` for no noise.
+        degrees_of_freedom: degrees of freedom ν > 2 of a Student t distribution for the noise of each sample;
+            4 is suitable for logs with impacts and other outliers. `None` for Gaussian noise.
+        external: standard deviations of unknown forces [N m, N], keyed by joint name, for example for joints
+            that have no torque sensor or are moved by hand. For joints without a logged torque, the default
+            is the size of the force that moves them.
 
     Example:
         >>> Noise(0.1, torque="learn").learns_torque
@@ -66,7 +66,7 @@ class Noise:
         for joint, size in (self.external or {}).items():
             if not 0.0 < size < math.inf:
                 raise ModelError(
-                    f"the unknown force on joint {joint!r} has no such size",
+                    f"the unknown force on joint {joint!r} has an invalid standard deviation",
                     expected="a positive finite standard deviation [N m, N]",
                     got=size,
                 )
@@ -86,16 +86,16 @@ class Noise:
 
     @classmethod
     def of(cls, noise: NoiseStd | Noise | None) -> Noise:
-        """Return the given `Noise`, or one with the given acceleration noise."""
+        """Return a given `Noise` unchanged, or construct one from the given acceleration noise."""
         return noise if isinstance(noise, cls) else cls(noise)  # pyright: ignore[reportArgumentType]
 
     @property
     def learns_torque(self) -> bool:
-        """Whether motor torque noise is learned."""
+        """Whether the motor torque noise is learned."""
         return self.torque == "learn" if isinstance(self.torque, str) else False
 
     def for_priors(self, priors: Sequence[ForcePrior]) -> Noise:
-        """Return the noise with `torque="auto"` resolved: learned with the priors for real robots."""
+        """Resolve `torque="auto"`. Torque noise is learned if there are friction or inertial priors."""
         if not isinstance(self.torque, str) or self.torque != "auto":
             return self
         measured = any(isinstance(prior, JointFrictionPrior | InertialPrior) for prior in priors)
@@ -107,7 +107,7 @@ TORQUE_NOISE = f"{NOISE}.torque.log_noise_std"
 
 
 def initial_torque_noise(residual: Tensor) -> dict[str, Tensor]:
-    """Return the initial torque noise, given the RMS of the unexplained torque `(nq,)` [N m, N]."""
+    """Return the initial torque noise, given the RMS `(nq,)` of the unexplained torque [N m, N]."""
     std = (0.5 * residual).clamp(min=1e-4).log().double()
     return {
         TORQUE_NOISE: std,
@@ -120,7 +120,7 @@ def external_std(external: Mapping[str, float] | None, robot: RobotModel) -> Ten
     """Return the standard deviation of unknown forces on the joints `(nq,)`, or `None` if there are none.
 
     Raises:
-        UnknownNameError: the robot has no such joint.
+        UnknownNameError: a joint does not exist.
     """
     for joint in external or {}:
         if joint not in robot.joint_names:
@@ -131,19 +131,19 @@ def external_std(external: Mapping[str, float] | None, robot: RobotModel) -> Ten
 
 
 ForceNoise = Callable[[States], Tensor]
-"""Function that returns the variance of the white noise on the joint force at states, `(n, nq)`."""
+"""Function that returns the variance `(n, nq)` of the white noise on the joint force at given states."""
 
 
 @dataclass(frozen=True, eq=False)
 class SampleNoise:
-    """Noise of the samples in one measurement, a sum of independent terms: (diag σ² + Σ_k N_k N_kᵀ)/w.
+    """Noise of the samples in one measurement, with covariance (diag σ² + Σ_k N_k N_kᵀ)/w.
 
     Attributes:
-        std: σ of each component, `(d,)` or `(n, d)`.
-        force: Σ_τ, the variance of the joint force.
+        std: standard deviation σ of each component, `(d,)` or `(n, d)`.
+        force: function that returns the variance Σ_τ of the joint force.
         torque: `(n, nq)` standard deviation of individual torques in addition to Σ_τ.
-        state: G Σ_x½ `(n, d, 2 nq)`, factor of the state noise.
-        weight: w of each sample `(n,)`; `None` for unit weights.
+        state: factor G Σ_x½ `(n, d, 2 nq)` of the state noise.
+        weight: weight w of each sample `(n,)`; `None` if all are 1.
     """
 
     std: Tensor
@@ -153,7 +153,7 @@ class SampleNoise:
     torque: Tensor | None = None
 
     def factors(self, at: States, z: AffineMap) -> list[Tensor]:
-        """Return the terms N_k `(n, d, ·)` other than σ, for the measured quantity."""
+        """Return the factors N_k `(n, d, ·)` for the measured quantity."""
         # N = (G Σ_x½, B_Q Σ_τ½)
         terms = [] if self.state is None else [self.state]
         if self.torque is not None:
@@ -161,7 +161,7 @@ class SampleNoise:
         return terms if self.force is None else [*terms, z.B_Q * self.force(at).sqrt()[:, None, :]]
 
     def covariance(self, at: States, z: AffineMap) -> Tensor:
-        """Return Σ_y + B_Q Σ_τ B_Qᵀ + G Σ_x Gᵀ of each sample `(n, d, d)`, not divided by its weight."""
+        """Return Σ_y + B_Q Σ_τ B_Qᵀ + G Σ_x Gᵀ of each sample `(n, d, d)`, ignoring the weights."""
         white = torch.diag_embed(self.std.square().expand_as(z.o))
         return sum((N @ N.mT for N in self.factors(at, z)), start=white)
 
@@ -175,10 +175,10 @@ class SampleNoise:
 def state_jacobian(
     system: ConstrainedSystem, m: Measurement, force: ForceField | None = None
 ) -> Tensor | None:
-    """Return G = dz/d(q, q̇) `(n, d, 2 nq)` of accelerations or multipliers, and `None` for other quantities.
+    """Return G = dz/d(q, q̇) `(n, d, 2 nq)` for accelerations or multipliers; `None` for other quantities.
 
     Args:
-        force: all impressed forces; by default those of the robot file and the measured torque.
+        force: all impressed forces; defaults to those of the robot file plus the measured torque.
     """
     if m.quantity not in ("qdd", "multiplier"):
         return None
@@ -191,7 +191,7 @@ def state_jacobian(
 
 
 def learned_slopes(training: Training, system: ConstrainedSystem, force: ForceField) -> Training:
-    """Return the training data with G computed for a force field at each sample."""
+    """Return the training data with G computed at each sample for a given force field."""
     slopes = tuple(state_jacobian(system, m, force) for m in training.measurements)
     return dataclasses.replace(training, slopes=slopes)
 
@@ -200,7 +200,7 @@ def state_std_of(given: Sequence[NoiseStd] | None, robot: RobotModel) -> Tensor 
     """Return the standard deviations of q and q̇ as one vector `(2 nq,)`, or `None` if none are given.
 
     Raises:
-        ModelError: `given` is not two standard deviations ≥ 0, each one number or one per joint.
+        ModelError: `given` is not a pair of standard deviations ≥ 0 (one number or one per joint each).
     """
     if given is None:
         return None

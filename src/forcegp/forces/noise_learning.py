@@ -1,26 +1,26 @@
 """Noise that depends on the learned forces: slopes that propagate state noise, and sample weights.
 
-Both are updated in alternation with the hyperparameters (`solve` in `models/structured_learning.py`).
+Updates of both alternate with updates of the hyperparameters (`solve` in `models/structured_learning.py`).
 
 **Slopes.** The first fit propagates state noise through the equations of motion of the robot file
-(`noise.py`), which lack the unknown forces: a spring of 100 N m/rad turns noise of 1 mrad into 0.1 N m.
-Following McHutchon and Rasmussen (*Gaussian process training with input noise*, 2011), the slope of the
-posterior mean F̄ is computed at each sample, and hyperparameters are relearned with
+(`noise.py`), which do not include the unknown forces. For example, a spring of 100 N m/rad converts noise of
+1 mrad to 0.1 N m. Following McHutchon and Rasmussen (*Gaussian process training with input noise*, 2011), the
+slope of the posterior mean F̄ is computed at each sample, and the hyperparameters are relearned with
 
     cov(y_i) = Σ_y + G_i Σ_x G_iᵀ,   G_i = ∂(L b + H F̄)/∂(q, q̇) + H ∂F̄/∂(q, q̇),
 
-where the first derivative is taken at fixed F̄; likewise for multipliers. The posterior mean can be worse than
-the robot file, for example far from other samples, so new slopes are accepted only if they increase the
-evidence of the training data, including the weak priors.
+where the first derivative is taken at fixed F̄. The same applies to multipliers. The posterior mean can be
+worse than the robot file, for example far from other samples. New slopes are therefore accepted only if they
+increase the evidence of the training data, including the weak priors.
 
-**Weights.** Impacts, dropped packets and gear shocks violate the equations of motion for a few samples, which
-would dominate a Gaussian likelihood. With y_i | w_i ~ N(E y_i, Σ_i/w_i) and w_i ~ Γ(ν/2, ν/2), the noise of
-sample i, whose d components share one w_i, has a t distribution with ν degrees of freedom. Given the weights,
-all distributions are Gaussian, so inference stays exact. Expectation maximisation alternates learning with
+**Weights.** Impacts, dropped packets and gear shocks violate the equations of motion at a few samples, which
+would dominate a Gaussian likelihood. With y_i | w_i ~ N(E y_i, Σ_i/w_i) and w_i ~ Γ(ν/2, ν/2), where the d
+components of sample i share w_i, the noise has a t distribution with ν degrees of freedom. Given the weights,
+all distributions are Gaussian, so inference remains exact. Expectation maximisation alternates learning with
 
     w_i = (ν + d) / (ν + E[r_iᵀ Σ_i⁻¹ r_i]),
 
-where r_i is the residual under the posterior. Samples with residuals far above the noise have almost no
+where r_i is the residual under the posterior. Samples with residuals far above the noise receive almost no
 weight (Lange, Little and Taylor, *Robust statistical modeling using the t distribution*, 1989).
 """
 
@@ -41,7 +41,7 @@ from forcegp.forces.search import Search
 from forcegp.gp.optimise import Learned, Progress
 
 STEPS = 5
-"""Number of weight updates at given hyperparameters, each of which requires a posterior."""
+"""Number of weight updates for given hyperparameters; each requires a posterior."""
 CHUNK_STATES = 1024
 """Number of samples for which residuals are computed at a time."""
 IGNORED = 0.1
@@ -53,8 +53,8 @@ def with_learned_slopes(
 ) -> tuple[Problem, Learned, tuple[str, ...]]:
     """Return the problem with slopes of its learned forces, the resulting hyperparameters, and warnings.
 
-    The problem and the hyperparameters are unchanged if the evidence does not increase, or if the slopes
-    cannot be computed or used, for example because a force is not computed with tensors.
+    The problem and the hyperparameters are returned unchanged if the evidence does not increase, or if the
+    slopes cannot be computed or used (for example, because a force is not computed with tensors).
 
     Args:
         problem: problem with exact inference and state noise.
@@ -73,7 +73,7 @@ def with_learned_slopes(
 
 @torch.no_grad()
 def weighted(problem: Problem, values: Mapping[str, Tensor], degrees: float) -> Problem:
-    """Return the problem with sample weights after `STEPS` more updates.
+    """Return the problem with its sample weights updated `STEPS` more times.
 
     Args:
         degrees: degrees of freedom ν.
@@ -98,7 +98,7 @@ def left_out(problem: Problem) -> int:
 def _weights(
     problem: Problem, posterior: ForcePosterior, values: Mapping[str, Tensor], i: int, degrees: float
 ) -> Tensor:
-    """Return the weights of the samples in measurement i `(n,)`."""
+    """Return the weights `(n,)` of the samples in measurement i."""
     m, system, weights = problem.training.measurements[i], problem.system_at(values), []
     noise = problem.sample_noise(values, system, i)
     for first in range(0, len(m.q), CHUNK_STATES):

@@ -1,17 +1,17 @@
 """Prior and posterior (eqs. 22 to 25) of the impressed forces, and functions drawn from the posterior.
 
-Q̄ = m + Σ_p E_p f_p with f_p ~ GP(0, k_p), plus contact friction proportional to the multiplier.
-Every quantity z = B_Q Q + B_z Q_z + o is an affine map of the latent forces f_p and is determined by their
-posterior. Each function drawn from the posterior is a deterministic force field that can be integrated.
+Q̄ = m + Σ_p E_p f_p with f_p ~ GP(0, k_p), plus contact friction proportional to the multiplier. Every
+quantity z = B_Q Q + B_z Q_z + o is an affine map of the latent forces f_p, so its posterior follows from
+theirs. Each function drawn from the posterior is a deterministic force field that can be integrated.
 
 Accelerations in contact depend only on Q + Q_z (remark 3.3). The two are distinguished by their directions
-(Q_z acts only in contact, along the tangent), by their inputs, and by measurements of either. Their posterior
-correlation measures how well they are separated: at −1, only the sum is identifiable; at 0, each of them is.
+(Q_z acts only in contact, and tangentially), by their inputs, and by measurements of either force. Their
+posterior correlation is −1 if only the sum is identifiable, and 0 if both are.
 
-**Forces that are not functions of the state.** At rest, joint friction balances the other forces. A joint
-that hardly moves therefore has an additional unknown force of variance σ_s² e^{−(q̇/v_s)²}. Beyond the
-trained range of speeds and torques, a joint force has an additional standard deviation g D, where D is the
-distance from that range in training standard deviations and g is estimated by `calibration.growth`.
+**Forces that are not functions of the state.** At rest, joint friction balances the other forces. An
+additional unknown force with variance σ_s² e^{−(q̇/v_s)²} therefore acts on joints that barely move. Beyond
+the trained range of speeds and torques, joint forces have an additional standard deviation g D, where D is
+the distance from that range in training standard deviations, and g is estimated by `calibration.growth`.
 """
 
 from __future__ import annotations
@@ -37,33 +37,34 @@ from forcegp.gp.features import Block, Features, Standardization
 from forcegp.gp.sparse import SparsePosterior
 
 STICK_NOISE, STICK_SPEED = f"{NOISE}.stick.log_noise_std", f"{NOISE}.stick.log_speed"
-"""Names of the learned σ_s and v_s of each joint."""
+"""Names of the learned parameters σ_s and v_s of each joint."""
 STICKING = 0.02
 """Initial value of v_s [rad/s, m/s]."""
 REGION = f"{NOISE}.region."
 LOW, HIGH, SPREAD, GROWTH = (REGION + name for name in ("low", "high", "spread", "growth"))
-"""Names under which the trained region is stored: lower and upper limits and standard deviation of the speed
-and torque of each joint `(2, nq)`, and g `(nq,)` [N m, N]."""
+"""Names under which the trained region is stored: the lower limits, upper limits and standard deviations of
+the speed and torque of each joint, each `(2, nq)`, and g `(nq,)` [N m, N]."""
 OUTERMOST, WIDEST = 0.01, 0.16
-"""Smallest and largest fraction of the training samples beyond either limit of the region. The largest
-corresponds to one Gaussian standard deviation. Of fewer than 100 independent samples, one lies beyond."""
+"""Smallest and largest fraction of the training samples beyond each limit of the region. The largest is the
+tail of a Gaussian beyond one standard deviation. At least one independent sample lies beyond.
+"""
 RELATIVE = 0.05
-"""Prior growth g relative to the typical load of a joint: torque constants and load-dependent friction are
-    uncertain by about 5 %."""
+"""Prior ratio of the growth rate g to the typical load of a joint; torque constants and load-dependent
+friction are uncertain by about 5 %."""
 FAR_BEYOND = 3.0
-"""Distance beyond the trained region above which predictions emit a warning."""
+"""Distance beyond the trained region above which predictions issue a warning."""
 
 
 @dataclass(frozen=True, eq=False)
 class ForceProcess:
-    """Force priors, with the learned parameters of their operators.
+    """Force priors and the learned parameters of their operators.
 
     Attributes:
-        priors, scales: force priors and the standardization of their inputs.
+        priors, scales: force priors, and the standardization of their inputs.
         mean: prior mean of Q.
         coulomb: contact friction proportional to the multiplier.
-        pinned: values `(components,)` of constant latent forces already contained in the robot, keyed by the
-            index of the prior. Their prior mean is minus this value, and their posterior mean is zero.
+        pinned: values `(components,)` of constant latent forces that the robot already includes, keyed by
+            prior index. The prior mean of such a force is minus its value, and the posterior mean is zero.
     """
 
     priors: tuple[ForcePrior, ...]
@@ -73,7 +74,7 @@ class ForceProcess:
     pinned: Mapping[int, Tensor] = field(default_factory=dict)
 
     def features(self, p: int, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
-        """Return the standardized kernel inputs of prior p at the given states."""
+        """Return the standardized kernel inputs of prior p at given states."""
         return self.scales[p].apply(self.priors[p].features(system, at))
 
     def coupled(self, system: ConstrainedSystem, at: States, z: AffineMap) -> AffineMap:
@@ -81,13 +82,13 @@ class ForceProcess:
         return coupled(system, at, z, self.coulomb)
 
     def rows(self, system: ConstrainedSystem, at: States, z: AffineMap) -> Block:
-        """Express a quantity as rows of the latent forces.
+        """Express a quantity as rows that act on the latent forces.
 
         Args:
             z: the quantity, including Coulomb friction at the contacts.
 
         Returns:
-            Kernel inputs and operators B(x) E(x) of each prior, with o(x) + B(x) m(x) as target.
+            Kernel inputs and operators B(x) E(x) of each prior, with the target o(x) + B(x) m(x).
         """
         # E[z] = o + B_Q m (eq. 15)
         target = z.o + vecdot(z.B_Q, self.mean(system, at)[..., None, :])
@@ -105,16 +106,16 @@ class ForceProcess:
 
 
 LatentPosterior = ExactPosterior | SparsePosterior
-"""Latent processes conditioned on rows, either exactly or with inducing points."""
+"""Latent processes conditioned on rows, exactly or with inducing points."""
 
 
 @dataclass(frozen=True, eq=False)
 class ForcePosterior:
-    """Latent forces conditioned on data, independent of the constraint used for prediction.
+    """Latent forces conditioned on data. They do not depend on the constraint used for prediction.
 
     Attributes:
         process: prior on the forces.
-        latent: conditioned latent processes.
+        latent: the conditioned latent processes.
     """
 
     process: ForceProcess
@@ -126,26 +127,26 @@ class ForcePosterior:
         return self.process.priors
 
     def shift(self, p: int, features: Features) -> Tensor | float:
-        """Return the shift that centres samples of latent force p on the predicted mean."""
+        """Return the shift that makes the mean of samples of latent force p equal to the predicted mean."""
         if not self.process.pinned:
             return 0.0
         return self.means.latent_mean(p, features) - self.latent.latent_mean(p, features)
 
     @cached_property
     def means(self) -> LatentPosterior:
-        """Processes used for means, conditioned on the forces already contained in the robot."""
+        """Processes used to compute means, conditioned on the forces that the robot already includes."""
         means = self.latent
         for p, value in self.process.pinned.items():
             means = means.knowing(p, {"one": value.new_zeros(1, 1)}, value)
         return means
 
     def __call__(self, system: ConstrainedSystem, at: States) -> Tensor:
-        """Return the posterior mean of Q̄ = Σ E f + m, `(n, nq)`, which is the force field for rollouts."""
+        """Return the posterior mean `(n, nq)` of Q̄ = Σ E f + m, which is the force field for rollouts."""
         force = self.unknown_force(system, at, range(len(self.priors))) + self.process.mean(system, at)
         return with_coulomb(system, at, force, self.process.coulomb)
 
     def unknown_force(self, system: ConstrainedSystem, at: States, priors: Iterable[int]) -> Tensor | float:
-        """Return the posterior mean of Σ E f over the given priors, `(n, nq)`, without Coulomb friction."""
+        """Return the posterior mean `(n, nq)` of Σ E f over the given priors, excluding Coulomb friction."""
         # Σ_p E_p μ_p
         force: Tensor | float = 0.0
         for p in (p for p in priors if self.means.measured[p]):
@@ -154,10 +155,10 @@ class ForcePosterior:
         return force
 
     def rows(self, system: ConstrainedSystem, at: States, z: AffineMap) -> Block:
-        """Express a quantity at n states as rows of the processes, with its prior mean as target.
+        """Express a quantity at n states as rows that act on the processes. The target is its prior mean.
 
         Args:
-            z: the quantity, without Coulomb friction at the contacts.
+            z: the quantity, excluding Coulomb friction at the contacts.
         """
         # W = B E, target o + B m (eqs. 12 and 15)
         return self.process.rows(system, at, self.process.coupled(system, at, z))
@@ -169,13 +170,13 @@ class ForcePosterior:
         return rows.target + self.means.mean(rows), self.latent.covariance(rows)
 
     def read_mean(self, system: ConstrainedSystem, at: States, z: AffineMap) -> Tensor:
-        """Return the posterior mean o + B (m + Σ E μ) of a quantity at the given states, `(n, d)`."""
+        """Return the posterior mean o + B (m + Σ E μ) `(n, d)` of a quantity at the given states."""
         rows = self.rows(system, at, z)
         return rows.target + self.means.mean(rows)
 
 
 def stick_variance(tensors: Mapping[str, Tensor], at: States) -> Tensor:
-    """Return the variance of static joint friction, `(n, nq)`; zero if it is not learned."""
+    """Return the variance of static joint friction, `(n, nq)`, which is zero unless it is learned."""
     if STICK_NOISE not in tensors:
         return torch.zeros_like(at.q)
     std, speed = tensors[STICK_NOISE].exp(), tensors[STICK_SPEED].exp()
@@ -185,14 +186,14 @@ def stick_variance(tensors: Mapping[str, Tensor], at: States) -> Tensor:
 def trained_region(
     qd: Tensor, tau: Tensor, load: Tensor, hidden: Tensor | None = None, independent: float = math.inf
 ) -> dict[str, Tensor]:
-    """Return the region of the training samples `(n, nq)` under the names `LOW`, `HIGH` and `SPREAD`.
+    """Return the region of the training samples `(n, nq)` as entries named `LOW`, `HIGH` and `SPREAD`.
 
     Args:
         qd, tau: velocities and torques of the samples in motion.
-        load: typical torque of each joint `(nq,)`, a fraction of which is the lower bound on the standard
+        load: typical torque of each joint `(nq,)`. A fraction of it is the lower bound on the standard
             deviation of the torque.
         hidden: `(nq,)` bool, joints whose torques do not affect accelerations. Their torque region extends
-            one standard deviation to either side of the mean.
+            one standard deviation on either side of the mean.
         independent: number of independent samples, one of which lies beyond each limit.
     """
     x = torch.stack([qd, tau], dim=1)
@@ -207,7 +208,7 @@ def trained_region(
 
 
 def distance_beyond(tensors: Mapping[str, Tensor], qd: Tensor, tau: Tensor) -> Tensor:
-    """Return D `(*batch, nq)` in training standard deviations; zero inside the region or if there is none."""
+    """Return the distance D `(*batch, nq)` from the trained region, in training standard deviations."""
     if LOW not in tensors:
         return torch.zeros_like(qd)
     x = torch.stack([qd, tau], dim=-2)
@@ -228,18 +229,18 @@ def warnings_beyond(distance: Tensor, joints: Sequence[str]) -> tuple[str, ...]:
     most, joint = rows.amax(0).max(0)
     return (
         f"{far} of {len(rows)} states lie beyond the trained speeds and torques, by up to {float(most):.3g} "
-        f"training deviations ({joints[int(joint)]}); their error bars are a guess: train on such motion",
+        f"training deviations ({joints[int(joint)]}), so error bars are extrapolated: train on such motion",
     )
 
 
 def hidden_variance(tensors: Mapping[str, Tensor], at: States, external: Tensor | None) -> Tensor:
-    """Return the variance `(n, nq)` of static friction plus unknown forces of std `external` `(nq,)`."""
+    """Return the variance `(n, nq)` of static friction and of unknown forces with std `external` `(nq,)`."""
     variance = stick_variance(tensors, at)
     return variance if external is None else variance + external**2
 
 
 def unknown_variance(tensors: Mapping[str, Tensor], at: States, external: Tensor | None) -> Tensor:
-    """Return the additional variance of predicted forces `(n, nq)`: `hidden_variance` and g² D²."""
+    """Return the additional variance `(n, nq)` of predicted forces, which is `hidden_variance` plus g² D²."""
     variance = hidden_variance(tensors, at, external)
     if GROWTH not in tensors:
         return variance
@@ -247,7 +248,7 @@ def unknown_variance(tensors: Mapping[str, Tensor], at: States, external: Tensor
 
 
 CHUNK_STATES = 256
-"""Number of states at which samples are evaluated at a time, to keep arrays in the processor cache."""
+"""Number of states at which samples are evaluated at a time, so that arrays fit into the processor cache."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,7 +256,7 @@ class ForceSamples:
     """Forces drawn from the posterior.
 
     Attributes:
-        posterior: source of the samples.
+        posterior: the posterior that the samples are drawn from.
         functions: sampled latent functions.
     """
 
@@ -271,7 +272,7 @@ class ForceSamples:
         """Return Q̄ = Q + Q_z with one sample per trajectory, which is the force field for rollouts.
 
         Args:
-            at: samples × k states; the s-th run of k states belongs to sample s.
+            at: samples · k states, of which the s-th group of k states belongs to sample s.
 
         Returns:
             `(samples · k, nq)` [N m, N].
@@ -282,7 +283,7 @@ class ForceSamples:
         return with_coulomb(system, at, Q_bar, self.posterior.process.coulomb)
 
     def unknown_force(self, system: ConstrainedSystem, at: States, priors: Iterable[int]) -> Tensor | float:
-        """Return Σ E f over the given priors, without Coulomb friction at the contacts."""
+        """Return Σ E f over the given priors, excluding Coulomb friction at the contacts."""
         unknown: Tensor | float = 0.0
         runs = len(at.q) // self.count
         step = max(1, CHUNK_STATES // max(runs, 1))
@@ -312,29 +313,29 @@ def draw_samples(
 
     Args:
         generator: source of randomness, on the CPU.
-        features: number of random features per component; the default depends on the posterior.
+        features: number of random features per component; the default depends on the type of posterior.
     """
     size = () if features is None else (features,)
     return ForceSamples(posterior, posterior.latent.draw(count, generator, *size))
 
 
 CORRELATION_STATES = 50
-"""Number of training states at which the correlation of Q and Q_z is evaluated after a fit."""
+"""Number of training states at which a fit evaluates the correlation of Q and Q_z."""
 FAR = 0.02
-"""Distance from its surface above which a closed contact is questionable [m]."""
+"""Distance from the surface above which a closed contact is questionable [m]."""
 UNDETERMINED = 10.0
-"""Relative standard deviation of the multiplier above which a fit emits a warning."""
+"""Relative standard deviation of the multiplier above which a fit issues a warning."""
 MISSED = 2.0
-"""Root mean square residual, in units of the noise, above which a fit emits a warning."""
+"""Root mean square residual, in units of the noise, above which a fit issues a warning."""
 LARGE_JITTER = 0.01
-"""Jitter, relative to unit noise, from which a fit emits a warning; it raises the noise by half its size."""
+"""Jitter, relative to unit noise, at which a fit issues a warning; it increases the noise by half as much."""
 
 
 def force_correlation(posterior: ForcePosterior, system: ConstrainedSystem, at: States) -> Tensor:
-    """Return the posterior correlation of Q and Q_z at each state and joint, `(n, nq)`; 0 if one is certain.
+    """Return the posterior correlation of Q and Q_z for each state and joint, `(n, nq)`.
 
-    corr_i = Cov(Q_i, Q_z,i) / √(Var Q_i Var Q_z,i), excluding the part of Q along the constraint, which does
-    not affect accelerations.
+    corr_i = Cov(Q_i, Q_z,i) / √(Var Q_i Var Q_z,i), excluding the part of Q along the constraint; 0 if either
+    variance is zero.
     """
     z = affine_map(system, at, ("joint_force", "contact_friction"))
     rows = posterior.rows(system, at, z)
@@ -352,10 +353,10 @@ def force_correlation(posterior: ForcePosterior, system: ConstrainedSystem, at: 
 def doubts_of(
     posterior: ForcePosterior, system: ConstrainedSystem, training: Training, power: float
 ) -> tuple[float | None, tuple[str, ...]]:
-    """Return warnings about a posterior, with the likelihood tempered by `power`, at training states.
+    """Return warnings about a posterior at training states, for a likelihood with exponent `power`.
 
     Returns:
-        The mean correlation of Q and Q_z over training states in contact, or `None` unless both have priors,
+        The mean correlation of Q and Q_z over training states in contact (`None` unless both have priors),
         and the warnings, each with a suggested remedy.
     """
     few = training.evenly(min(CORRELATION_STATES, training.samples)).measurements if training.samples else ()
@@ -390,7 +391,7 @@ def doubts_of(
     residual = (posterior.latent.residual / power) ** 0.5
     if residual > MISSED:
         warnings += (
-            f"the model misses its training data by far: residuals are {residual:.3g} times the noise; check "
+            f"the model fits its training data poorly: residuals are {residual:.3g} times the noise; check "
             "the log and the robot file (`forcegp check`), or allow other forces or larger noise",
         )
     jitter = posterior.latent.jitter
@@ -403,7 +404,7 @@ def doubts_of(
 
 
 def _on_multiplier(mean: Tensor, variance: Tensor) -> tuple[str, ...]:
-    """Return a warning if the multiplier is too uncertain to be determined by the data."""
+    """Return a warning if the multiplier is poorly determined by the data."""
     size, spread = float(mean.abs().median()), float(variance.sqrt().median())
     if spread <= UNDETERMINED * max(size, 1e-12):
         return ()

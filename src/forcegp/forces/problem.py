@@ -1,7 +1,7 @@
-"""The learning problem of force priors: its rows, their likelihood, and the forces conditioned on them.
+"""The problem of learning forces: its rows, their likelihood, and the forces conditioned on them.
 
-Conditioning is either exact or, with features and inducing points of the priors, sparse. Sparse conditioning
-proceeds piece by piece: it accumulates sums over the samples, and these sums determine the posterior.
+Conditioning is exact, or sparse with features and inducing points. Sparse conditioning processes a log piece
+by piece, accumulating sums over the samples that determine the posterior.
 """
 
 from __future__ import annotations
@@ -38,22 +38,22 @@ OWN = tuple(name + "." for name in RESERVED)
 MIXED = "." + MIXING
 """Suffix of the names of learned operator parameters."""
 SHOWN = 10.0
-"""Independent samples with accelerations sensitive to a joint's torque that are needed to learn its noise."""
+"""Number of independent samples, with accelerations sensitive to a torque, needed to learn torque noise."""
 UNSHOWN = 0.1
-"""Uncertainty of a joint's torque and friction, as a fraction of its load, if no measurement is sensitive to
-them, and its growth per training standard deviation beyond the trained region; 0.08 on a real iiwa 14."""
+"""Uncertainty of a joint's torque and friction, relative to the load, if no measurement is sensitive to them.
+It is also the growth per training standard deviation outside the trained region; 0.08 for a real iiwa 14."""
 
 REGION_STATES = 10_000
-"""Maximum number of training states for the trained region."""
+"""Maximum number of training states used to compute the trained region."""
 
 
 def kernel_parameters(tensors: Mapping[str, Tensor]) -> Tensors:
-    """Return the hyperparameters of the priors from the learned tensors."""
+    """Extract the hyperparameters of the priors from the learned tensors."""
     return {key: x for key, x in tensors.items() if not key.startswith(OWN) and not key.endswith(MIXED)}
 
 
 def analytical_parameters(tensors: Mapping[str, Tensor]) -> Tensors:
-    """Return the analytical parameters θ_A from the learned tensors, keyed by their names in the module."""
+    """Extract the analytical parameters θ_A from the learned tensors, keyed by their names in the module."""
     prefix = ANALYTICAL + "."
     return {k.removeprefix(prefix): v for k, v in tensors.items() if k.startswith(prefix)}
 
@@ -65,19 +65,20 @@ def noise_key(measurement: int) -> str:
 
 @dataclass(frozen=True)
 class Problem:
-    """The components of the likelihood of force priors.
+    """The components of the likelihood of a model with force priors.
 
     Attributes:
-        system: robot and contacts, with fixed parameters unless θ_A is learned.
+        system: robot and contacts; their parameters are fixed unless θ_A is learned.
         priors: the force priors.
         mean: prior mean of Q.
         training: measurements, noise and input scales.
-        parameters: module with a `forward()` that returns the robot at θ_A, or `None`.
-        torque_std: standard deviation of the white noise of the motor torque, `(nq,)`, unless it is learned.
-        power: exponent κ of the likelihood; below 1 if samples are correlated.
-        correlation: correlation time of the noise of each torque, `(nq,)` [s]; `None` if unknown.
-        pinned: values `(components,)` of latent forces already contained in the robot, keyed by prior. Their
-            prior mean is minus this value, their posterior mean zero; other forces are conditioned on them.
+        parameters: module whose `forward()` returns the robot at θ_A, or `None`.
+        torque_std: standard deviation `(nq,)` of the white noise of the motor torque, unless it is learned.
+        power: exponent κ of the likelihood, which is below 1 if samples are correlated.
+        correlation: correlation time `(nq,)` of the noise of each torque [s]; `None` if unknown.
+        pinned: values `(components,)` of latent forces that the robot already includes, keyed by prior. Their
+            prior mean is minus this value, their posterior mean is 0, and other forces are conditioned on
+            them.
         inducing: inducing inputs of each prior, for sparse inference; `None` for exact inference.
         state_std: standard deviation of the noise of q and q̇, `(2 nq,)`, or `None` if there is none.
         external_std: standard deviation of unknown forces on the joints `(nq,)`, or `None` if there are none.
@@ -97,14 +98,14 @@ class Problem:
     external_std: Tensor | None = None
 
     def system_at(self, tensors: Mapping[str, Tensor]) -> ConstrainedSystem:
-        """Return the system, with its robot evaluated at the analytical parameters in the tensors."""
+        """Return the system with the robot evaluated at the analytical parameters in the tensors."""
         own = {} if self.parameters is None else analytical_parameters(tensors)
         if self.parameters is None or not own:
             return self.system
         return self.system.with_robot(torch.func.functional_call(self.parameters, own, ()))
 
     def noise_at(self, tensors: Mapping[str, Tensor], measurement: int) -> Tensor:
-        """Return the noise of a measurement, `(d,)` or `(n, d)`; learned noise scales per-sample noise."""
+        """Return the noise `(d,)` or `(n, d)` of a measurement; learned noise scales per-sample noise."""
         std = self.training.noise_std[measurement]
         learned = tensors.get(noise_key(measurement))
         if learned is None:
@@ -112,18 +113,18 @@ class Problem:
         return learned.exp() if std.ndim == 1 else std * (learned.exp() / typical(std))
 
     def coulomb(self, tensors: Mapping[str, Tensor]) -> tuple[CoulombFriction, ...]:
-        """Return Coulomb friction at the contacts, with initial values for missing parameters."""
+        """Return the Coulomb friction at the contacts, with initial values for missing parameters."""
         return coulomb_of(self.priors, tensors, self.system.robot.mass) if self.has_coulomb else ()
 
     @property
     def has_coulomb(self) -> bool:
-        """Whether any prior is coupled with Coulomb friction proportional to the multiplier."""
+        """Whether any prior is coupled to Coulomb friction, which is proportional to the multiplier."""
         return any(prior.coupled for prior in self.priors)
 
     def with_coulomb_errors(self, tensors: Mapping[str, Tensor]) -> tuple[Problem, Tensors]:
-        """Return the problem and tensors with the error of learned Coulomb friction as an additional force.
+        """Add the error of learned Coulomb friction as a force to the problem and the tensors.
 
-        The result is used for conditioning, not for learning.
+        The result is used for conditioning, but not for learning.
         """
         friction = self.coulomb(tensors)
         priors = tuple(CoulombErrorPrior(f.contact, friction) for f in friction)
@@ -164,7 +165,7 @@ class Problem:
     def sample_noise(
         self, tensors: Mapping[str, Tensor], system: ConstrainedSystem, measurement: int
     ) -> SampleNoise:
-        """Return the noise of the samples in a measurement."""
+        """Return the noise of the samples of a measurement."""
         weights = self.training.weights
         return SampleNoise(
             self.noise_at(tensors, measurement),
@@ -191,7 +192,7 @@ class Problem:
 
     @torch.no_grad()
     def torque_residual(self) -> Tensor:
-        """Return the RMS of force residuals and of M times acceleration residuals, `(nq,)` [N m, N]."""
+        """Return the RMS `(nq,)` of force residuals and of M times acceleration residuals [N m, N]."""
         squares = [torch.zeros_like(self.system.robot.mass)[None]]
         for m in self.training.measurements:
             at = m.at(self.system)
@@ -205,14 +206,14 @@ class Problem:
 
     @torch.no_grad()
     def hidden_torque(self) -> Tensor:
-        """Return σ `(nq,)` of torques that hardly affect accelerations, and 0 for other joints.
+        """Return the standard deviation `(nq,)` of torques that hardly affect accelerations, 0 for others.
 
-        In contact, a force along the constraint does not change the accelerations. A joint that acts along
-        the constraint has P_ii near zero, and neither its noise nor its friction can be distinguished from
-        those of other joints. The estimate is the residual of its acceleration at such samples in excess of
-        unknown forces e of given size, s² = Σ (r_i² − Σ_k H_ik² Var e_k) / Σ H_ii², but at least `UNSHOWN`
-        times the load of such joints. It applies to joints with P_ii below one half at most samples and above
-        it at fewer than `SHOWN` independent samples, unless forces were also measured.
+        In contact, a force along the constraint does not change the accelerations. For a joint that acts
+        along the constraint, P_ii is near zero, and its noise and friction cannot be distinguished from those
+        of other joints. The estimate is the acceleration residual that given unknown forces e do not explain
+        at such samples, s² = Σ (r_i² − Σ_k H_ik² Var e_k) / Σ H_ii², and at least `UNSHOWN` times the load.
+        It applies if P_ii is less than one half at most samples and greater at fewer than `SHOWN` independent
+        samples, unless forces were also measured.
         """
         if set(self.training.quantities) != {"qdd"}:
             return torch.zeros_like(self.system.robot.mass)
@@ -237,7 +238,7 @@ class Problem:
 
     @torch.no_grad()
     def typical_load(self) -> Tensor:
-        """Return the RMS of the torques on each joint (motor, gravity, bias), `(nq,)` [N m, N]."""
+        """Return the RMS `(nq,)` of the motor, gravity and bias torques on each joint [N m, N]."""
         states = [m.at(self.system) for m in self.training.measurements]
         squares = [at.tau**2 + at.eom.Q_G**2 + at.eom.Q_C**2 for at in states]
         return torch.cat(squares).mean(0).sqrt()
@@ -245,40 +246,40 @@ class Problem:
     @cached_property
     @torch.no_grad()
     def region(self) -> dict[str, Tensor]:
-        """Region of speeds and torques of the training data, from `REGION_STATES` of them at most."""
+        """Region of speeds and torques in the training data, from at most `REGION_STATES` samples."""
         training = self.training.evenly(REGION_STATES)
         qd, tau = (torch.cat([getattr(m, name) for m in training.measurements]) for name in ("qd", "tau"))
         return trained_region(qd, tau, dataclasses.replace(self, training=training).typical_load())
 
     def negative_log_likelihood(self, params: Tensors, rows: WhitenedRows) -> Tensor:
-        """Return the negative log likelihood of the rows, in weight space if sparse and priors are finite."""
+        """Return the negative log likelihood of the rows, computed in weight space if possible."""
         exact = self.inducing is None or not is_finite(self.priors)
         of = negative_log_likelihood if exact else negative_log_likelihood_of_weights
         return of(self.priors, params, rows.blocks) + rows.constant
 
     def rows_for(self, tensors: Tensors, held: Tensors) -> WhitenedRows:
-        """Return the rows for the learned and fixed tensors; cached if the rows do not depend on them."""
+        """Return the rows for given tensors. They are cached if they do not depend on the tensors."""
         keys = [*tensors, *held]
         own = any(key.startswith(OWN) or key.endswith(MIXED) for key in keys)
         return self.rows({**held, **tensors}) if own else self.fixed_rows
 
 
 def typical(std: Tensor) -> Tensor:
-    """Return one standard deviation per component, `(d,)`."""
+    """Return one typical standard deviation per component, `(d,)`."""
     return std if std.ndim == 1 else std.square().mean(0).sqrt()
 
 
 PIECE_SAMPLES = 8192
-"""Number of samples for which equations of motion are kept in memory at a time."""
+"""Number of samples whose equations of motion are kept in memory at a time."""
 
 
 @dataclass(frozen=True, eq=False)
 class Totals:
-    """State of sparse conditioning after a number of pieces.
+    """State of sparse conditioning after part of the log has been processed.
 
     Attributes:
         sums: sums over the whitened rows.
-        constant: part of the negative log likelihood that is independent of the latent forces `()`.
+        constant: part `()` of the negative log likelihood that is independent of the latent forces.
         samples: number of samples `()`.
         pieces: number of pieces.
     """
@@ -290,12 +291,12 @@ class Totals:
 
     @classmethod
     def zero(cls, problem: Problem, basis: LatentBasis) -> Totals:
-        """Return totals over zero samples."""
+        """Return the totals of an empty log."""
         like = next(iter(basis.params.values()))
         return cls(Sums.zero(basis, like), like.new_zeros(()), like.new_zeros(()), 0)
 
     def over_processes(self) -> Totals:
-        """Sum the totals over all `torch.distributed` processes; each process receives the same result."""
+        """Sum the totals over all `torch.distributed` processes. Every process obtains the same result."""
         constant, samples = add_over_processes(torch.stack([self.constant, self.samples])).unbind()
         return Totals(reduce_sums(self.sums), constant, samples, self.pieces)
 
@@ -321,13 +322,13 @@ def total_over(
     begin: Totals | None = None,
     after: Callable[[Totals], None] = lambda _: None,
 ) -> Totals:
-    """Return the totals over the pieces of a log, using an amount of memory independent of their number.
+    """Return the totals over the pieces of a log. The memory needed does not depend on their number.
 
     Args:
-        problem: robot, priors and noise; its own training data are not used.
-        pieces: the samples; may be a generator.
-        begin: totals over earlier pieces.
-        after: called after each piece.
+        problem: source of the robot, priors and noise; its training data are not used.
+        pieces: the samples, possibly from a generator.
+        begin: totals over previous pieces.
+        after: function called after each piece.
     """
     total = begin or Totals.zero(problem, basis)
     for piece in pieces:
@@ -346,10 +347,10 @@ def total_over(
 def posterior_of(
     problem: Problem, hyperparameters: Mapping[str, Tensor], basis: LatentBasis, total: Totals
 ) -> ForcePosterior:
-    """Return the forces conditioned on the samples that the totals contain.
+    """Return the forces conditioned on the samples in the totals.
 
     Raises:
-        NumericalError: the sums are not finite, or the noise is negligible compared with the prior.
+        NumericalError: the sums are not finite, or the noise is negligible compared with the prior variance.
     """
     # A = I + Σ V S Vᵀ, w ~ N(A⁻¹v, A⁻¹)
     latent = SparsePosterior.of(basis, total.sums)
@@ -362,7 +363,7 @@ EXACT_SAMPLES = 1000
 
 
 def require_double(system: ConstrainedSystem) -> None:
-    """Reject robots in single precision, for which rounding makes covariance matrices indefinite.
+    """Reject single-precision robots, for which rounding errors make covariance matrices indefinite.
 
     Raises:
         ModelError: the robot is not float64.
@@ -377,12 +378,12 @@ def require_double(system: ConstrainedSystem) -> None:
 
 
 def is_finite(priors: Sequence[ForcePrior]) -> bool:
-    """Return whether all priors have finitely many features, so that sparse inference is exact."""
+    """Return whether all priors have finitely many features, in which case sparse inference is exact."""
     return all(prior.kernel.is_finite for prior in priors)
 
 
 def is_sparse(inference: str, priors: Sequence[ForcePrior], samples: int) -> bool:
-    """Return whether inference is sparse: on request, and by default for finite priors or many samples.
+    """Return whether inference is sparse. By default, it is sparse for finite priors and large data sets.
 
     Raises:
         ModelError: sparse inference is requested, but a force is a function of time.
@@ -390,7 +391,7 @@ def is_sparse(inference: str, priors: Sequence[ForcePrior], samples: int) -> boo
     if any(prior.in_time for prior in priors):
         if inference == "sparse":
             raise ModelError(
-                "sparse inference takes samples to be independent, which a function of time couples",
+                "sparse inference assumes independent samples, which a function of time couples",
                 expected="exact inference",
                 got=", ".join(prior.name for prior in priors if prior.in_time),
                 hint='use inference="exact" on evenly spaced rows (`forcegp select --method even`)',
@@ -421,7 +422,7 @@ def with_inducing(problem: Problem, hyperparameters: Mapping[str, Tensor], limit
 
 
 def without_inducing(problem: Problem) -> Problem:
-    """Return the problem for sparse inference with finitely many features, without inducing points."""
+    """Return the problem for sparse inference without inducing points, if it has finitely many features."""
     block = dataclasses.replace(problem, training=problem.training.evenly(1)).fixed_rows.blocks[0]
     empty = tuple({name: x[:0] for name, x in features.items()} for features in block.features)
     return dataclasses.replace(problem, inducing=empty)
@@ -440,7 +441,7 @@ def force_posterior(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> 
 def forces_and_constant(
     problem: Problem, hyperparameters: Mapping[str, Tensor]
 ) -> tuple[ForcePosterior, Tensor]:
-    """Return the forces conditioned on a problem's data, and the likelihood term that is independent of them.
+    """Return the forces conditioned on a problem's data, and the likelihood term independent of the forces.
 
     Raises:
         ModelError: exact inference does not fit into memory.
@@ -458,17 +459,17 @@ def forces_and_constant(
 
 
 def lost_by_inducing(posterior: ForcePosterior) -> tuple[dict[str, Any], tuple[str, ...]]:
-    """Return the kind of inference of a posterior, and the information lost by inducing points.
+    """Return the kind of inference used for a posterior, and the information lost by inducing points.
 
     Returns:
-        Fields of `FitResult`, and a warning if the inducing points lose much of the information in the data.
+        Fields of `FitResult`, and a warning if inducing points lose much of the information in the data.
     """
     if not isinstance(posterior.latent, SparsePosterior):
         return {"inference": "exact"}, ()
     diagnostics = posterior.latent.diagnostics
     warnings = (
-        f"more inducing points would help: {diagnostics.size} basis functions miss a variance of "
-        f"{diagnostics.missed:.3g} in units of the noise, where noise leaves {diagnostics.learned:.3g}; "
+        f"more inducing points would help: {diagnostics.size} basis functions leave a residual variance of "
+        f"{diagnostics.missed:.3g}, compared with {diagnostics.learned:.3g} that the data determine; "
         "raise inducing_points",
     )
     return {

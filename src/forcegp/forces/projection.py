@@ -1,12 +1,12 @@
-"""Measurements as rows with unit white noise, with the directions fixed by the constraint projected out.
+"""Measurements as rows with unit white noise, after projecting out the directions fixed by the constraint.
 
-If q̈ is measured in contact, A q̈ = b determines the part of q̈ in the range of Aᵀ up to white noise. With an
-orthonormal basis U of the null space of A (after scaling by the noise), Uᵀ q̈ contains the whole Gaussian
-process in nq − rank A rows per sample, and the likelihood splits exactly into the two parts.
+If q̈ is measured in contact, A q̈ = b determines the part of q̈ in the range of Aᵀ up to white noise. Let U
+be an orthonormal basis of the null space of A, after scaling by the noise. Then the nq − rank A rows Uᵀ q̈ of
+a sample contain the whole Gaussian process, and the likelihood splits exactly into the two parts.
 
 Motor torque noise is white noise on the joint force. It affects the rows of a sample through the same
-operator as the force, so their noise has covariance I + N Nᵀ with N = B Σ_τ½. They are whitened by its
-Cholesky factor. State noise affects the rows, to first order, through the Jacobian of the measured quantity.
+operator as the force, so the rows have noise of covariance I + N Nᵀ with N = B Σ_τ½, whose Cholesky factor
+whitens them. To first order, state noise affects the rows through the Jacobian of the measured quantity.
 """
 
 from __future__ import annotations
@@ -30,11 +30,11 @@ from forcegp.gp.features import Block, Features
 
 @dataclass(frozen=True, eq=False)
 class WhitenedRows:
-    """Rows of all measurements, and the part of the likelihood that does not depend on the latent forces.
+    """Rows of all measurements, and the part of the likelihood that is independent of the latent forces.
 
     Attributes:
-        blocks: rows explained by the latent forces.
-        rest: function that returns the negative log likelihood of the remainder, which updates do not need.
+        blocks: rows that depend on the latent forces.
+        rest: function that returns the negative log likelihood of the remainder; updates do not call it.
     """
 
     blocks: list[Block]
@@ -42,14 +42,14 @@ class WhitenedRows:
 
     @cached_property
     def constant(self) -> Tensor:
-        """Negative log likelihood of the remainder, including the normalisation of the noise `()`."""
+        """Negative log likelihood `()` of the remainder, including the normalisation of the noise."""
         return self.rest()
 
     def tempered(self, power: float) -> WhitenedRows:
-        """Return the rows of the likelihood raised to the power κ.
+        """Return the rows for the likelihood raised to the power κ.
 
-        Noise variances are divided by κ and normalisations multiplied by κ. If noise is correlated over τ
-        samples, n samples contain as much information as n/τ independent ones, hence κ = 1/τ.
+        Noise variances are divided by κ, and normalisations are multiplied by κ. If noise is correlated over
+        τ samples, n samples contain as much information as n/τ independent samples, so κ = 1/τ.
         """
         if power == 1.0:
             return self
@@ -82,12 +82,12 @@ class _NullSpaceBasis(torch.autograd.Function):
 def null_space_basis(A: Tensor, rank: int) -> Tensor:
     """Return an orthonormal basis U of the null space of matrices of equal rank, A U = 0, UᵀU = I.
 
-    The basis is defined up to a rotation U R, so only functions that do not depend on R have a derivative;
-    for these, dU = −A⁺ dA U.
+    The basis is unique only up to a rotation U R, so only functions that do not depend on R have a
+    derivative. For these functions, dU = −A⁺ dA U.
 
     Args:
         A: `(*batch, m, n)`.
-        rank: the rank of every matrix in the batch.
+        rank: common rank of the matrices.
 
     Returns:
         `(*batch, n, n − rank)`.
@@ -101,9 +101,9 @@ def null_space_basis(A: Tensor, rank: int) -> Tensor:
 def _independent(A: Tensor, rank: int) -> tuple[Tensor, Tensor | None]:
     """Return `rank` independent rows C A, and C; return A and `None` if all rows are independent.
 
-    The rank is that of the equations of motion: with a different one, A⁺ would amplify contradictions between
-    nearly redundant rows. Fixed combinations of consistent rows have the same solutions as all rows, and
-    hence the same derivatives.
+    The rank is that used in the equations of motion. A larger rank would let A⁺ amplify contradictions
+    between nearly redundant rows. Fixed combinations of consistent rows have the same solutions as all rows,
+    and therefore the same derivatives.
     """
     if rank == A.shape[-2]:
         return A, None
@@ -112,7 +112,7 @@ def _independent(A: Tensor, rank: int) -> tuple[Tensor, Tensor | None]:
 
 
 def _by_rank(rank: Tensor) -> list[tuple[int, Tensor | slice]]:
-    """Return the samples of each rank; if all ranks are equal, as a slice, which avoids a copy."""
+    """Return the samples of each rank; a slice if all ranks are equal, since it avoids a copy."""
     if not len(rank):
         return []
     low, high = (int(value) for value in rank.aminmax())
@@ -129,7 +129,7 @@ class _Rows:
     Attributes:
         features: kernel inputs of each prior.
         widths: number of columns of each operator.
-        rows: concatenated operators, residual, and noise factor N `(n, r, ·)`; the noise of the rows has
+        rows: concatenated operators, residual, and noise factor N `(n, r, ·)`. The noise of the rows has
             covariance I + N Nᵀ.
     """
 
@@ -138,16 +138,16 @@ class _Rows:
     rows: Tensor
 
     def of(self, index: Tensor | slice, U: Tensor) -> _Rows:
-        """Return Uᵀ times the rows of the given samples, or of all samples if `index` is a slice."""
+        """Multiply Uᵀ by the rows of the given samples (of all samples if `index` is a slice)."""
         if isinstance(index, slice):
             return _Rows(self.features, self.widths, U.mT @ self.rows)
         features = tuple({name: x[index] for name, x in f.items()} for f in self.features)
         return _Rows(features, self.widths, U.mT @ self.rows[index])
 
     def whitened(self, weight: Tensor | None) -> tuple[Block, Tensor]:
-        """Return the rows divided by the factor of I + N Nᵀ, and the log determinant of the factors.
+        """Divide the rows by the factor of I + N Nᵀ, and return them with the log determinant of the factors.
 
-        A weight divides the noise variance of a sample.
+        The noise variance of a sample is divided by its weight.
         """
         signal = sum(self.widths) + 1
         rows, N = self.rows.tensor_split([signal], dim=-1)
@@ -170,7 +170,7 @@ class _Rows:
 def whiten(
     system: ConstrainedSystem, process: ForceProcess, measurement: Measurement, noise: SampleNoise
 ) -> WhitenedRows:
-    """Return the rows of one measurement with unit white noise, without the directions that A q̈ = b fixes."""
+    """Return the rows of one measurement with unit white noise, excluding directions fixed by A q̈ = b."""
     # z = B_Q Q + B_z Q_z + o (eqs. 19 and 20)
     at, std = measurement.at(system), noise.std.expand_as(measurement.values)
     z = process.coupled(system, at, affine_map(system, at, measurement.quantity))
@@ -198,7 +198,7 @@ def whiten(
 def _without_fixed(
     everything: _Rows, eom: Equations, values: Tensor, std: Tensor, weight: Tensor | None
 ) -> WhitenedRows:
-    """Return the rows of q̈ along the null space of A; directions fixed by A q̈ = b enter the constant."""
+    """Return the rows of q̈ in the null space of A; directions fixed by A q̈ = b enter the constant."""
     # (A σ) U = 0, rows Uᵀ (W, y, N)
     A, b = eom.A, eom.b
     scaled, groups, blocks, log_determinants = A * std[:, None, :], _by_rank(eom.rank), [], []
@@ -219,14 +219,13 @@ def _without_fixed(
 
 
 def _log_scale(std: Tensor, weight: Tensor | None) -> Tensor:
-    """Return the sum of the log standard deviations over all samples, including their weights `()`."""
+    """Return the sum `()` of the log standard deviations of all samples, including their weights."""
     total = std.log().sum()
     return total if weight is None else total - 0.5 * std.shape[-1] * weight.log().sum()
 
 
 def _fixed(A: Tensor, rank: int, violated: Tensor, weight: Tensor) -> Tensor:
-    """Return the negative log likelihood `()` of the directions fixed by the constraint, given the violation
-    A q̈ − b."""
+    """Return the negative log likelihood `()` of the constraint violation A q̈ − b."""
     # ½ w |(A σ)⁺ (A q̈ − b)|² + ½ rank A log 2π
     rows, C = _independent(A, rank)
     pinv = torch.linalg.pinv(rows) if C is None else torch.linalg.pinv(rows) @ C

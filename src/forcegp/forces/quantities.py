@@ -1,15 +1,15 @@
 """Quantities as affine maps of the forces, z = B_Q Q + B_z Q_z + o.
 
-The operators follow from M q̈ = Q̄ + Aᵀλ and A q̈ = b (eqs. 19 to 25 with two corrections: the operator
-from force to λ is −Lᵀ, and λ depends on all impressed forces Q + Q_z).
+The operators follow from M q̈ = Q̄ + Aᵀλ and A q̈ = b. They are those of eqs. 19 to 25 with two corrections:
+the operator from force to λ is −Lᵀ, and λ depends on all impressed forces Q + Q_z.
 
-`linearize_field` differentiates q̈ and λ under a force field with respect to state and torque. Linearizing a
-system at a fixed force (`constraints/gauss.py`) neglects the change in the force. With F = Q̄ − Q_C − Q_G −
-Q_D, the part of the impressed forces that the robot file does not contain,
+`linearize_field` differentiates q̈ and λ under a force field with respect to the state and the torque.
+Linearization at a fixed force (`constraints/gauss.py`) neglects the change in the force. Let F = Q̄ − Q_C −
+Q_G − Q_D be the impressed forces missing from the robot file. Then
 
     dq̈/dx = ∂q̈/∂x + H ∂F/∂x,   dλ/dx = ∂λ/∂x − Lᵀ ∂F/∂x   for x = q, q̇, τ.
 
-The mechanics are differentiated in closed form, the force field by autograd.
+The mechanics are differentiated in closed form, and the force field is differentiated by autograd.
 """
 
 from __future__ import annotations
@@ -35,8 +35,7 @@ class States:
         active: `(n, n_contacts)` bool, closed contacts.
         eom: equations of motion at these states.
         qdd: `(n, nq)` measured accelerations, if known.
-        slip: `(n, nq)` sliding direction of each joint, which replaces the smooth tanh(q̇/v₀) in dry
-            friction.
+        slip: `(n, nq)` sliding direction of each joint, which replaces tanh(q̇/v₀) in dry friction.
         time: `(n, 2)` time [s] and trajectory number, for states in a training log.
     """
 
@@ -64,16 +63,16 @@ def states(
 
 
 ForceField = Callable[[ConstrainedSystem, States], Tensor]
-"""Function that returns the impressed force Q̄ at states, `(n, nq)`; k samples share the n rows equally."""
+"""Function that returns the impressed force Q̄ `(n, nq)` at states; k samples take n/k rows each."""
 
 
 class FlatStates(NamedTuple):
-    """States of any batch shape, flattened.
+    """Flattened states of any batch shape.
 
     Attributes:
         q, qd, tau: `(n, nq)` positions, velocities and motor torques.
         active: `(n, n_contacts)` bool, closed contacts.
-        batch: original batch shape, with product n.
+        batch: original batch shape; its product is n.
     """
 
     q: Tensor
@@ -95,7 +94,7 @@ class FlatStates(NamedTuple):
 def flat_states(
     system: ConstrainedSystem, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor | None
 ) -> FlatStates:
-    """Broadcast states `(*batch, nq)` against each other and flatten them; contacts are closed by default.
+    """Broadcast states `(*batch, nq)` against each other and flatten them. By default, contacts are closed.
 
     Raises:
         ShapeError: an argument does not match the system, or is not finite.
@@ -124,20 +123,19 @@ def flat_states(
 def states_at(
     system: ConstrainedSystem, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor | None
 ) -> tuple[States, torch.Size]:
-    """Return the flattened states with their equations of motion, and the batch shape; raise the same errors
-    as `flat_states`."""
+    """Return flattened states with equations of motion, and the batch shape (see `flat_states`)."""
     flat = flat_states(system, q, qd, tau, active)
     return flat.with_equations(system), flat.batch
 
 
 class AffineMap(NamedTuple):
-    """Affine map z = B_Q Q + B_z Q_z + o at each state.
+    """The affine map z = B_Q Q + B_z Q_z + o at each state.
 
     Attributes:
         B_Q: `(n, d, nq)` operator on the joint force Q.
         B_z: `(n, d, nq)` operator on the dissipative contact force Q_z.
-        B_N: `(n, d, nq)` operator on the part of Q in the range of Aᵀ. It equals B_Q, except for q̈, for which
-            it is `None` since H Aᵀ = 0.
+        B_N: `(n, d, nq)` operator on the part of Q in the range of Aᵀ. It equals B_Q for all quantities
+            except q̈, for which it is `None` because H Aᵀ = 0.
         o: `(n, d)` offset.
     """
 
@@ -161,7 +159,7 @@ def _times(C: Tensor, z: AffineMap) -> AffineMap:
 
 
 def _acceleration(system: ConstrainedSystem, at: States) -> AffineMap:
-    """Return q̈ = L b + H (Q + Q_z) (eqs. 4 and 15)."""
+    """Return the map q̈ = L b + H (Q + Q_z) (eqs. 4 and 15)."""
     H = at.eom.H
     return AffineMap(H, H, None, vecdot(at.eom.L, at.eom.b[..., None, :]))
 
@@ -173,7 +171,7 @@ def _free_acceleration(system: ConstrainedSystem, at: States) -> AffineMap:
 
 
 def _multiplier(system: ConstrainedSystem, at: States) -> AffineMap:
-    """Return λ = (A M⁻¹ Aᵀ)⁺ b − Lᵀ (Q + Q_z) (eqs. 16 and 19, with the two corrections)."""
+    """Return the map λ = (A M⁻¹ Aᵀ)⁺ b − Lᵀ (Q + Q_z) (eqs. 16 and 19 with the two corrections)."""
     B = -at.eom.L.mT
     return AffineMap(B, B, B, (at.eom.constraint_inertia @ at.eom.b[..., None])[..., 0])
 
@@ -189,7 +187,7 @@ def _contact_force(system: ConstrainedSystem, at: States) -> AffineMap:
 
 
 def _directions(system: ConstrainedSystem, at: States) -> Tensor:
-    """Return N `(n, 3 k, m)` with F_I = N λ, which contains the directions of each surface contact."""
+    """Return N `(n, 3 k, m)` such that F_I = N λ; it contains the directions of each surface contact."""
     blocks = [at.q.new_zeros(len(at.q), 0, system.m)]
     for name, rows in system.rows.items():
         if name in at.eom.contact_points:
@@ -232,7 +230,7 @@ QUANTITIES: dict[str, Callable[[ConstrainedSystem, States], AffineMap]] = {
 def affine_maps(
     system: ConstrainedSystem, at: States, quantity: str | Sequence[str]
 ) -> tuple[AffineMap, dict[str, slice]]:
-    """Return the affine map of one quantity, or of several quantities stacked, and the rows of each.
+    """Return the affine map of one quantity or of several stacked quantities, and the rows of each quantity.
 
     Raises:
         UnknownNameError: a quantity does not exist.
@@ -256,22 +254,22 @@ def affine_maps(
 
 
 ROUNDED = 1e-6
-"""Tolerance for entries of the projector on hidden multipliers that equal 0 or 1 up to rounding error."""
+"""Tolerance for deciding that entries of the projector onto hidden multipliers are 0 or 1."""
 OPEN = (
     "contact {} is never closed in the training data: its force is not determined",
-    "the point of contact {} cannot move against it: its force is not determined",
+    "the point of contact {} cannot move in the direction of its force, which is not determined",
     "contacts {} hold the robot in the same direction: only the sum of their forces is determined",
 )
-"""Messages about contact forces that motion does not determine."""
+"""Messages about contact forces that the motion does not determine."""
 
 
 class Hidden(NamedTuple):
-    """Parts of quantities that motion does not determine.
+    """Parts of quantities that the motion does not determine.
 
     Attributes:
         whole: `(n, d)` bool, undetermined components.
-        shared: `(n, d, d)` C R Cᵀ, the load sharing between contacts, where R projects onto Aᵀμ = 0.
-        seen: `(n,)` number of directions of the shared load that motion determines.
+        shared: `(n, d, d)` matrix C R Cᵀ of load sharing between contacts, where R projects onto Aᵀμ = 0.
+        seen: `(n,)` number of directions of the shared load that the motion determines.
         doubts: warnings that describe the undetermined components.
     """
 
@@ -281,8 +279,8 @@ class Hidden(NamedTuple):
     doubts: tuple[str, ...]
 
     def applied(self, mean: Tensor, covariance: Tensor | None) -> tuple[Tensor, Tensor | None]:
-        """Return the mean `(n, d)` and covariance, with NaN for undetermined components. The variance of
-        undetermined directions is the mean square of the components in determined directions.
+        """Return the mean `(n, d)` and the covariance, with NaN for undetermined components. Undetermined
+        directions are assigned the mean square of the determined directions as variance.
         """
         if covariance is not None:
             square = mean.square() + covariance.diagonal(dim1=-2, dim2=-1)
@@ -299,7 +297,7 @@ def hidden_forces(
     """Return the undetermined parts of the given quantities, or `None` if everything is determined.
 
     Args:
-        parts: rows of each quantity, from `affine_maps`.
+        parts: rows of each quantity, as returned by `affine_maps`.
         never: contacts that are never closed in the training data.
 
     Raises:
@@ -332,8 +330,8 @@ def hidden_forces(
         raise ModelError(
             OPEN[0].format(", ".join(never)),
             expected="motion in contact in the training data",
-            hint="check the position of its surface (`forcegp check`), or for forces learned in free motion "
-            "pass `predict` the system with the contact",
+            hint="check the position of its surface (`forcegp check`), or, for forces learned in free "
+            "motion, pass the system with the contact to `predict`",
         )
     listed = (", ".join(dict.fromkeys(n for n, hit in zip(names, own, strict=True) if hit)) for own in found)
     doubts = tuple(text.format(own) for text, own in zip(OPEN, listed, strict=True) if own)
@@ -343,18 +341,18 @@ def hidden_forces(
 
 
 def affine_map(system: ConstrainedSystem, at: States, quantity: str | Sequence[str]) -> AffineMap:
-    """Return the affine map of one quantity or several stacked; raise the same errors as `affine_maps`."""
+    """Return the affine map of one or several stacked quantities (see `affine_maps`)."""
     return affine_maps(system, at, quantity)[0]
 
 
 class ForceLinearization(NamedTuple):
-    """q̈ and λ at a state, and their Jacobians, with one row per component of q̈ or λ.
+    """q̈ and λ at a state, and their Jacobians, which have one row per component of q̈ or λ.
 
     Attributes:
         qdd: `(*batch, nq)` acceleration [rad/s², m/s²].
-        dq, dqd, dtau: `(*batch, nq, nq)` dq̈/dq, dq̈/dq̇ and dq̈/dτ.
+        dq, dqd, dtau: `(*batch, nq, nq)` Jacobians dq̈/dq, dq̈/dq̇ and dq̈/dτ.
         multiplier: `(*batch, m)` multiplier λ.
-        multiplier_dq, multiplier_dqd, multiplier_dtau: `(*batch, m, nq)` dλ/dq, dλ/dq̇ and dλ/dτ.
+        multiplier_dq, multiplier_dqd, multiplier_dtau: `(*batch, m, nq)` Jacobians dλ/dq, dλ/dq̇ and dλ/dτ.
     """
 
     qdd: Tensor
@@ -378,9 +376,9 @@ def linearize_field(
     """Linearize the constrained motion under a force field.
 
     Args:
-        force: function that returns the impressed force Q̄ at states, `(n, nq)`.
-        q, qd, tau: `(*batch, nq)` states.
-        active: `(*batch, n_contacts)` bool, closed contacts; by default all.
+        force: function that returns the impressed force Q̄ `(n, nq)` at states.
+        q, qd, tau: `(*batch, nq)` positions, velocities and motor torques.
+        active: `(*batch, n_contacts)` bool, closed contacts; all by default.
 
     Raises:
         ShapeError: an argument does not match the system.

@@ -1,10 +1,10 @@
-"""Search for hyperparameters by L-BFGS: initial values, bounds, weak priors, warm starts, restarts.
+"""Search for hyperparameters by L-BFGS: initial values, bounds, weak priors, warm starts and restarts.
 
-Inputs are standardized, so with a length-scale of about the square root of their number, typical samples are
-correlated. A log-normal prior around this initial value keeps the length-scales of irrelevant inputs from
-drifting to infinity (its width above is four e-folds) and penalises length-scales so short that a force could
-fit the noise (its width below is one e-fold). The initial standard deviation of a force is the root mean
-square of the force that best explains the training residuals in the least-squares sense.
+Inputs are standardized, so typical samples are correlated if the length-scale is about the square root of the
+number of inputs. A log-normal prior around this initial value has a width of four e-folds above and one
+below. It keeps the length-scales of irrelevant inputs from drifting to infinity, and penalises length-scales
+so short that a force could fit the noise. The initial standard deviation of a force is the root mean square
+of the force that best explains the training residuals in the least-squares sense.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ LIMITS = {
     "log_smoothing": (math.log(1e-4), math.log(0.1)),
     MIXING: (-10.0, 10.0),
 }
-"""Bounds on hyperparameters that have an absolute scale."""
+"""Bounds on the hyperparameters that have an absolute scale."""
 REACH = {"log_lengthscale": (4.0, 8.0)}
 """Range of the other hyperparameters below and above their initial values, in e-folds; `FAR` if not listed.
-An input whose length-scale is 8 e-folds above its initial value no longer matters."""
+An input becomes irrelevant if its length-scale is 8 e-folds above the initial value."""
 FAR = (7.0, 7.0)
 AT_BOUND = 1e-6
 """Distance from a bound, in e-folds, within which a learned value is considered to be at the bound."""
@@ -60,7 +60,7 @@ FRICTION_SAMPLES = 200
 COEFFICIENTS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
 """Friction coefficients to try."""
 PARALLEL = 1e-9
-"""Two directions are considered equal if one minus their mean cosine is below this value."""
+"""Two directions are considered parallel if one minus their mean cosine is below this value."""
 
 
 def initial(problem: Problem, learn_noise: bool, learn_torque_noise: bool = False) -> Tensors:
@@ -92,7 +92,7 @@ def initial(problem: Problem, learn_noise: bool, learn_torque_noise: bool = Fals
 def _with_friction(problem: Problem, noise: Tensors) -> Tensors:
     """Return the most likely Coulomb friction coefficient, and hyperparameters of the remaining forces.
 
-    From a poor coefficient, learning may reach a local optimum in which friction is a function of the state.
+    From a poor coefficient, learning may reach a local optimum in which friction depends on the state.
     """
     few = dataclasses.replace(problem, training=problem.training.evenly(FRICTION_SAMPLES), inducing=None)
     like = problem.system.robot.mass
@@ -129,7 +129,7 @@ def initial_hyperparameters(
         beyond_noise: whether to subtract the contribution of noise, for example if unknown forces are given.
 
     Raises:
-        ModelError: contacts hold all joints in every sample, so that no measurement depends on a force.
+        ModelError: contacts hold all joints in every sample, so no measurement depends on a force.
     """
     if not any(block.target.shape[-1] for block in blocks):
         raise ModelError(
@@ -149,10 +149,10 @@ def initial_hyperparameters(
 
 
 def _force_scale(p: int, blocks: Sequence[Block], commensurate: bool, beyond_noise: bool) -> Tensor:
-    """Return the root mean square of the least-squares force of prior p, `(components,)`.
+    """Return the root mean square `(components,)` of the least-squares force of prior p.
 
-    The rows determine only the sum of components along one direction. If all have the same unit, the
-    least-norm solution divides it evenly. Viscous and dry friction have different units and start separately.
+    The rows determine only the sum of components with the same direction, which the minimum-norm solution
+    divides evenly. Components with different units, such as viscous and dry friction, are fitted separately.
     """
     operators = [block.operators[p] for block in blocks]
     each = torch.arange(operators[0].shape[-1], device=operators[0].device)
@@ -172,7 +172,7 @@ def _force_scale(p: int, blocks: Sequence[Block], commensurate: bool, beyond_noi
 
 
 def _first_parallel(operators: Sequence[Tensor]) -> Tensor:
-    """Return, for each component, the first with the same direction at every sample, `(components,)`."""
+    """Return, for each component, the first one with the same direction at all samples, `(components,)`."""
     along = most = torch.zeros_like(operators[0][0].mT @ operators[0][0])
     for W in operators:
         size = W.square().sum(1).sqrt()
@@ -184,7 +184,7 @@ def _first_parallel(operators: Sequence[Tensor]) -> Tensor:
 
 
 def limits_of(params: Parameters) -> dict[str, tuple[float, float]]:
-    """Return the bounds on those hyperparameters that have an absolute scale."""
+    """Return the bounds on the hyperparameters that have an absolute scale."""
     return {key: LIMITS[_kind(key)] for key in params if _kind(key) in LIMITS}
 
 
@@ -194,10 +194,10 @@ def box_around(
     """Return the bounds on each hyperparameter for the optimiser.
 
     Far from the initial values, double precision cannot resolve the likelihood, for example if forces are a
-    million times the noise.
+    million times as large as the noise.
 
     Args:
-        begin: other initial values that must lie within the bounds.
+        begin: additional initial values that the bounds must include.
     """
     box: dict[str, tuple[float | Tensor, float | Tensor]] = {}
     for key, x in start.items():
@@ -208,10 +208,9 @@ def box_around(
 
 
 def doubts_at_bounds(tensors: Mapping[str, Tensor], box: Bounds) -> tuple[str, ...]:
-    """Return warnings if learning ended at a bound.
+    """Return warnings about hyperparameters that ended at a bound.
 
-    A force may vanish and an input may be irrelevant, but noise at a bound, or a force at its upper bound, is
-    questionable.
+    Noise at either bound and forces at the upper bound are questionable.
     """
     doubts = []
     for key, (low, high) in box.items():
@@ -230,12 +229,12 @@ def doubts_at_bounds(tensors: Mapping[str, Tensor], box: Bounds) -> tuple[str, .
 
 
 def _kind(key: str) -> str:
-    """Return the kind of hyperparameter, which is the last part of its name."""
+    """Return the kind of a hyperparameter, which is the last part of its name."""
     return key.rsplit(".", 1)[-1]
 
 
 def negative_log_prior(params: Parameters, start: Mapping[str, Tensor]) -> Tensor | float:
-    """Return Σ ½ ((θ − θ_start)/width)², the negative log of the weak priors up to a constant."""
+    """Return Σ ½ ((θ − θ_start)/width)², the negative log density of the weak priors up to a constant."""
     total: Tensor | float = 0.0
     for key, value in params.items():
         below, above = WIDTH.get(_kind(key), (3.0, 3.0))
@@ -245,7 +244,7 @@ def negative_log_prior(params: Parameters, start: Mapping[str, Tensor]) -> Tenso
 
 
 def checked_start(values: Mapping[str, Tensor], start: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Check the given initial values against the defaults, and return them.
+    """Check initial values against the defaults, and return them.
 
     Raises:
         ModelError: a value is missing or has the wrong shape.
@@ -257,13 +256,13 @@ def checked_start(values: Mapping[str, Tensor], start: Mapping[str, Tensor]) -> 
                 f"incompatible initial hyperparameters: {key}",
                 expected=tuple(value.shape),
                 got="none" if got is None else tuple(got),
-                hint="take those of a model with the same priors",
+                hint="use those of a model with the same priors",
             )
     return {key: values[key].detach().to(value) for key, value in start.items()}
 
 
 def random_starts(start: Mapping[str, Tensor], restarts: int, seed: int) -> Iterator[dict[str, Tensor]]:
-    """Yield the initial values, followed by random values around them, one set per restart."""
+    """Yield the initial values, and then one set of random values around them per restart."""
     generator = torch.Generator().manual_seed(seed)
     yield dict(start)
     for _ in range(restarts):
@@ -276,7 +275,7 @@ def random_starts(start: Mapping[str, Tensor], restarts: int, seed: int) -> Iter
 
 
 def warm_start_sizes(samples: int, first: int | None) -> list[int]:
-    """Return the numbers of samples used for warm starts, doubling until half of all samples is reached."""
+    """Return the numbers of samples used for warm starts, which double up to half of all samples."""
     sizes: list[int] = []
     size = first
     while size is not None and samples > 2 * size:
@@ -290,9 +289,9 @@ class Search:
     """Search for hyperparameters.
 
     Attributes:
-        start: default initial values, which are also the centres of the weak priors.
-        held: values that are not learned.
-        options: options of the optimiser, such as its limits.
+        start: default initial values, on which the weak priors are centred.
+        held: fixed values, which are not learned.
+        options: optimiser options.
         recorded: function that wraps the objective, such as `Checkpoint.recorded`.
     """
 
@@ -307,11 +306,11 @@ class Search:
         progress: Progress | None = None,
         begin: Mapping[str, Tensor] | None = None,
     ) -> Learned:
-        """Learn, starting with a subset of a large data set, and from several initial values if requested.
+        """Learn the hyperparameters, with warm starts and restarts as requested by the options.
 
         Args:
             progress: called after each evaluation on all data.
-            begin: initial values for learning from all data, used in place of warm starts and restarts.
+            begin: initial values for learning from all data, which replace warm starts and restarts.
 
         Raises:
             ModelError: `begin` does not match the learned parameters.
@@ -326,18 +325,18 @@ class Search:
         return min(candidates, key=lambda learned: learned.value)
 
     def values(self, learned: Learned) -> Tensors:
-        """Return all hyperparameters, learned and fixed."""
+        """Return all hyperparameters, both learned and fixed."""
         return {**self.held, **learned.tensors}
 
     def objective(self, problem: Problem, tensors: Tensors) -> Tensor:
-        """Return −κ log p(y | θ) − log p(θ), exact or as a bound; p(θ) are the weak priors, if enabled."""
+        """Return −κ log p(y | θ) − log p(θ), or a bound on it; p(θ) is the weak prior, if enabled."""
         hyper = {key: v for key, v in tensors.items() if not key.startswith(ANALYTICAL + ".")}
         weak = negative_log_prior(hyper, self.start) if self.options.hyperpriors else 0.0
         rows = problem.rows_for(tensors, self.held)
         return problem.negative_log_likelihood(kernel_parameters({**self.held, **tensors}), rows) + weak
 
     def _warmed(self, problem: Problem, cold: Tensors) -> Tensors:
-        """Return initial values for all data: those learned from fewer samples, unless `cold` is better."""
+        """Return the values learned from fewer samples, or `cold` if it is a better start for all data."""
         first = cold
         for samples in warm_start_sizes(problem.training.samples, self.options.warm_start):
             small = dataclasses.replace(problem, training=problem.training.thinned(samples))

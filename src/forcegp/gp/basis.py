@@ -1,9 +1,9 @@
 """Basis functions of latent components: whitened covariances with inducing points, and exact features.
 
-A sum of linear kernels and of products of linear kernels equals k(x, x′) = φ(x)ᵀφ(x′) exactly, with a few
-features φ. The rest, that is, every product with a stationary factor, is approximated with inducing points Z.
-Given the truncated square root R of the inverse of their covariance, R Rᵀ = K_zz⁺, the features
-V(x) = Rᵀk(Z, x) have weights with a standard normal prior, and V(x)ᵀV(x′) = k(x, Z) K_zz⁺ k(Z, x′).
+Sums and products of linear kernels have a few exact features φ, with k(x, x′) = φ(x)ᵀφ(x′). The rest of a
+kernel, that is, every product with a stationary factor, is approximated with inducing points Z. Let R be the
+truncated square root of the inverse of their covariance, R Rᵀ = K_zz⁺. Then the weights of the features V(x)
+= Rᵀk(Z, x) have a standard normal prior, and V(x)ᵀV(x′) = k(x, Z) K_zz⁺ k(Z, x′).
 """
 
 from __future__ import annotations
@@ -21,38 +21,38 @@ from forcegp.gp.features import Block, FeatureMap, Features, points
 from forcegp.gp.kernels import Constant, Kernel, Linear, Parameters, Process, Product, Sum, sides, sub
 
 EXACT: tuple[type[Kernel], ...] = (Linear, Constant)
-"""Elementary kernels for which `draw` returns all features, regardless of the requested number."""
+"""Elementary kernels for which `draw` returns all features, whatever the requested number."""
 
 
 @dataclass(frozen=True)
 class KernelPart:
-    """A kernel composed of factors of another kernel, with its log-hyperparameters."""
+    """A kernel that consists of factors of another kernel, with its log-hyperparameters."""
 
     kernel: Kernel
     params: Parameters
 
     def features(self, x: Features) -> FeatureMap:
-        """Return the features φ of a finite part, for which φ(x)ᵀφ(x′) equals the kernel exactly."""
+        """Return the features φ of a finite part, such that φ(x)ᵀφ(x′) equals the kernel exactly."""
         # This draw uses no random numbers, so any generator can be passed.
         return self.kernel.draw(self.params, x, 1, torch.Generator())
 
 
 @dataclass(frozen=True)
 class KernelSplit:
-    """A kernel as the sum of a finite part (sums and products of linear kernels) and the rest."""
+    """A kernel split into a finite part (sums and products of linear kernels) and the rest."""
 
     finite: KernelPart | None
     rest: KernelPart | None
 
 
 def split(kernel: Kernel, params: Parameters) -> KernelSplit:
-    """Split a kernel into its finite part and the rest, expanding products of sums where needed."""
+    """Split a kernel into its finite part and the rest, expanding products of sums if necessary."""
     finite, rest = _terms(KernelPart(kernel, params))
     return KernelSplit(_sum(finite), _sum(rest))
 
 
 def _terms(part: KernelPart) -> tuple[list[KernelPart], list[KernelPart]]:
-    """Return the terms with finitely many features, and the other terms."""
+    """Return the terms that have finitely many features, and the other terms."""
     kernel = part.kernel
     if isinstance(kernel, EXACT):
         return [part], []
@@ -86,7 +86,7 @@ class ProcessBasis:
         kernel: covariance of each component.
         params: log-hyperparameters of the kernel.
         components: number of components.
-        inducing: kernel inputs of the inducing points, empty if only the finite part has features.
+        inducing: kernel inputs of the inducing points; empty if there are none.
         spectra: eigendecomposition of K_zz for each component.
     """
 
@@ -103,14 +103,14 @@ class ProcessBasis:
 
     @cached_property
     def roots(self) -> Tensor:
-        """R of each component, padded with zero columns to equal width `(components, m, width)`."""
+        """R of each component `(components, m, width)`, padded with zero columns to equal width."""
         kept = [spectrum.root for spectrum in self.spectra]
         most = max(R.shape[1] for R in kept)
         return torch.stack([torch.nn.functional.pad(R, (0, most - R.shape[1])) for R in kept])
 
     @cached_property
     def to_inducing(self) -> Callable[[Features], Tensor] | None:
-        """Function x ↦ k(x, Z) `(components, n, m)` of the kernel's rest; `None` without inducing points."""
+        """Function x ↦ k(x, Z) `(components, n, m)` for the rest; `None` if there are no inducing points."""
         rest = self.split.rest
         if rest is None or not points(self.inducing):
             return None
@@ -128,7 +128,7 @@ class ProcessBasis:
 
     @cached_property
     def used(self) -> Tensor:
-        """Mask of the values that are basis functions and not padding, `(components, width)`."""
+        """Mask `(components, width)` of the values that are basis functions rather than padding."""
         width = (self.roots.shape[-1] if self.spectra else 0) + self.finite_size
         used = torch.ones(self.components, width, dtype=torch.bool)
         for k, spectrum in enumerate(self.spectra):
@@ -142,7 +142,7 @@ class ProcessBasis:
         return self.used.reshape(-1).nonzero()[:, 0].to(device)
 
     def values(self, features: Features) -> tuple[Tensor, Tensor]:
-        """Return V(x), padded with zeros `(components, n, width)`, and |V|² due to the inducing points."""
+        """Return V(x) `(components, n, width)`, padded with zeros, and |V|² due to the inducing points."""
         if self.to_inducing is None:
             none = next(iter(features.values())).new_zeros(self.components, points(features), 0)
             return none if self.finite is None else self.finite.basis(features), none.sum(-1)
@@ -154,7 +154,7 @@ class ProcessBasis:
         return torch.cat([whitened, self.finite.basis(features)], dim=-1), explained
 
     def rows(self, W: Tensor, values: Tensor) -> Tensor:
-        """Return the rows W_i V_iᵀ of n samples in terms of the basis functions, `(n d, Σ sizes)`.
+        """Return the rows W_i V_iᵀ of n samples, in terms of the basis functions, `(n d, Σ sizes)`.
 
         Args:
             W: operators `(n, d, components)`.
@@ -167,14 +167,14 @@ class ProcessBasis:
 
     @cached_property
     def _filled(self) -> bool:
-        """Whether there is no padding, so that all values are basis functions."""
+        """Whether all values are basis functions, without padding."""
         return bool(self.used.all())
 
     def fold(self, weights: Tensor) -> tuple[Tensor, Tensor]:
         """Convert weights of basis functions to weights of k(x, Z) and of the exact features.
 
         Args:
-            weights: weights of the process's basis functions `(Σ sizes, s)`.
+            weights: weights `(Σ sizes, s)` of the basis functions of this process.
 
         Returns:
             Weights `(components, m, s)` and `(components, features, s)`.
@@ -188,7 +188,7 @@ class ProcessBasis:
         return on_kernel, filled[:, width:]
 
     def prior_variance(self, features: Features, values: Tensor) -> Tensor:
-        """Return k(x, x) of the whole kernel `(components, n)`.
+        """Return the variance k(x, x) of the whole kernel `(components, n)`.
 
         Args:
             values: V(x), as returned by `values`.
@@ -200,21 +200,20 @@ class ProcessBasis:
     def missed(self, variance: Tensor, explained: Tensor) -> Tensor:
         """Return the residual variance k(x, x) − |V(x)|² ≥ 0 of the approximated part, `(components, n)`.
 
-        Negative values are due to rounding error. If the posterior is resolved, they are smaller than
-        `SMALLEST_FRACTION` times the variance.
+        Negative values, which are rounding errors, are set to zero.
         """
         return (variance - explained).clamp(min=0.0)
 
     @cached_property
     def rest_variance(self) -> Callable[[Features], Tensor]:
-        """Function x ↦ prior variance `(components, n)` of the part approximated with inducing points."""
+        """Function that maps x to the prior variance `(components, n)` of the approximated part."""
         rest = self.split.rest
         if rest is None:
             return lambda x: next(iter(x.values())).new_zeros(self.components, points(x))
         return rest.kernel.variance(rest.params)
 
     def evaluate(self, features: Features) -> tuple[Tensor, Tensor, Tensor]:
-        """Return the part of `LatentBasis.evaluate` for this process, with V `(n, Σ sizes)`."""
+        """Evaluate this process as `LatentBasis.evaluate` does for all processes, with V `(n, Σ sizes)`."""
         values, explained = self.values(features)
         V = values.transpose(0, 1).reshape(points(features), -1).index_select(1, self.columns)
         prior = self.rest_variance(features)
@@ -223,12 +222,12 @@ class ProcessBasis:
 
 @dataclass(frozen=True, eq=False)
 class LatentBasis:
-    """Basis functions of all components of all processes, concatenated.
+    """Concatenated basis functions of all components of all processes.
 
     Attributes:
         processes: the processes.
         params: all log-hyperparameters.
-        parts: basis of each process.
+        parts: basis functions of each process.
     """
 
     processes: tuple[Process, ...]
@@ -237,7 +236,7 @@ class LatentBasis:
 
     @cached_property
     def columns(self) -> tuple[slice, ...]:
-        """Basis functions of each component, in the order of the processes."""
+        """Positions of the basis functions of each component, in the order of the processes."""
         sizes = [size for part in self.parts for size in part.used.sum(-1).tolist()]
         ends = torch.tensor([0, *sizes]).cumsum(0).tolist()
         return tuple(slice(a, b) for a, b in pairwise(ends))
@@ -256,7 +255,7 @@ class LatentBasis:
     def tensors(self) -> dict[str, Tensor]:
         """Return the inducing points and eigenvectors, keyed by name.
 
-        Eigenvectors are stored with the sums, since recomputed ones may differ in sign or by a rotation.
+        Eigenvectors are saved with the sums, since recomputed ones may differ in sign or by a rotation.
         """
         tensors: dict[str, Tensor] = {}
         for p, part in enumerate(self.parts):
@@ -293,7 +292,7 @@ class LatentBasis:
         return slice(slices[0].start, slices[-1].stop)
 
     def rows(self, block: Block) -> Tensor:
-        """Return the rows of a block in terms of the basis functions, Φ `(n r, size)`."""
+        """Express the rows of a block in terms of the basis functions, Φ `(n r, size)`."""
         each = zip(self.parts, block.operators, block.features, strict=True)
         return torch.cat([part.rows(W, part.values(x)[0]) for part, W, x in each], dim=-1)
 
@@ -304,8 +303,8 @@ class LatentBasis:
             features: kernel inputs of each process.
 
         Returns:
-            V `(n, size)`, and for each component `(n, components)` the prior variance of the kernel's rest
-            and its residual variance k(x, x) − |V(x)|².
+            V `(n, size)`, and the prior variance and residual variance k(x, x) − |V(x)|² of the rest of the
+            kernel, each `(n, components)`.
         """
         parts = [part.evaluate(x) for part, x in zip(self.parts, features, strict=True)]
         V, prior, missed = (torch.cat(columns, dim=-1) for columns in zip(*parts, strict=True))
@@ -321,7 +320,7 @@ def latent_basis(
     """Return the basis functions of processes with given inducing points.
 
     Args:
-        inducing: kernel inputs of any number of inducing points (including none) for each process.
+        inducing: kernel inputs of the inducing points for each process; there may be none.
         components: number of components of each process.
     """
     parts = []

@@ -1,11 +1,11 @@
-"""Functions drawn from a posterior, cheap to evaluate anywhere (pathwise conditioning; Wilson et al. 2020).
+"""Functions drawn from a posterior by pathwise conditioning (Wilson et al. 2020), cheap to evaluate anywhere.
 
-A function drawn from the prior, composed of random features, is corrected by the data. Each sample is a
+A function is drawn from the prior with random features and then corrected to match the data. Each sample is a
 deterministic function, so a trajectory integrated under it satisfies Newton's equations and the constraint.
 
-A sparse posterior applies Matheron's rule to the inducing points, at a cost that does not depend on the
-number of samples: f(x) = f_prior(x) + V(x)ᵀ(w − Rᵀf_prior(Z)) with weights w ~ N(A⁻¹v, A⁻¹), and φ(x)ᵀw for
-the part of the kernel that has exact features.
+For a sparse posterior, Matheron's rule is applied at the inducing points, so the cost does not depend on the
+number of samples: f(x) = f_prior(x) + V(x)ᵀ(w − Rᵀf_prior(Z)) with weights w ~ N(A⁻¹v, A⁻¹). The part of the
+kernel that has exact features contributes φ(x)ᵀw.
 """
 
 from __future__ import annotations
@@ -24,19 +24,19 @@ from forcegp.gp.features import Basis, Block, FeatureMap, Features, stacked
 from forcegp.gp.kernels import Kernel, Linear, Parameters, Process, Product, Stationary, Sum, sub
 
 FEATURES = 1024
-"""Number of random features per component; prior draws have a covariance error of about 1/√FEATURES."""
+"""Number of random features per component; the covariance error of prior draws is about 1/√FEATURES."""
 UNMEASURED = 4
-"""Factor by which the number of features is reduced if no row depends on a process, so no data correct it."""
+"""Factor by which the number of features is reduced for processes that no row depends on."""
 
 
 class FoldedSamples(NamedTuple):
-    """Samples of one process as weights of k(x, Z), of exact features, and of random features.
+    """Samples of one process, as weights of k(x, Z), of exact features, and of random features.
 
     Attributes:
         on_kernel: weights of k(x, Z) `(components, m, samples)`.
         on_features: weights of the exact features `(components, features, samples)`.
-        missed: random features for the residual that the inducing points do not represent, if any, and their
-            weights `(components, features, samples)`.
+        missed: random features and their weights `(components, features, samples)`, for the residual that the
+            inducing points do not represent; `None` if there is no residual.
     """
 
     on_kernel: Tensor
@@ -49,9 +49,9 @@ class FunctionSamples:
     """Samples of latent processes, f_s(x) = Σ_t φ_t(x) w_ts.
 
     Attributes:
-        bases: bases of each process, as functions of its standardized features.
-        weights: weights for each process and basis, `(components, terms, samples)`.
-        folded: for a sparse posterior, these samples as one `FoldedSamples` per process.
+        bases: basis functions of each process, which take standardized features.
+        weights: weights `(components, terms, samples)` for each basis of each process.
+        folded: these samples in the form of one `FoldedSamples` per process, for a sparse posterior.
     """
 
     bases: tuple[tuple[Basis, ...], ...]
@@ -62,7 +62,7 @@ class FunctionSamples:
     def of(
         cls, terms: Sequence[Sequence[tuple[Basis, Tensor]]], folded: tuple[FoldedSamples, ...] | None = None
     ) -> FunctionSamples:
-        """Construct from the terms of each process, that is, functions and their weights."""
+        """Construct samples from the terms of each process, which are functions and their weights."""
         bases = tuple(tuple(basis for basis, _ in process_terms) for process_terms in terms)
         return cls(bases, tuple(tuple(w for _, w in process_terms) for process_terms in terms), folded)
 
@@ -72,19 +72,18 @@ class FunctionSamples:
         return self.weights[0][0].shape[-1]
 
     def latent(self, p: int, features: Features) -> Tensor:
-        """Return process p at n states, given its standardized inputs, `(samples, n, components)`."""
+        """Evaluate process p at n standardized inputs; the result is `(samples, n, components)`."""
         # f_s(x) = Σ_t φ_t(x) w_ts
         terms = zip(self.bases[p], self.weights[p], strict=True)
         return torch.stack([basis(features) @ w for basis, w in terms]).sum(0).permute(2, 1, 0)
 
     @cached_property
     def _weights_by_sample(self) -> list[list[Tensor]]:
-        """Weights `(samples, components, terms)` for each process and basis."""
+        """Weights `(samples, components, terms)` for each basis of each process."""
         return [[w.permute(2, 0, 1).contiguous() for w in weights] for weights in self.weights]
 
     def by_runs(self, p: int, features: Features, samples: range, runs: int) -> Tensor:
-        """Return the given samples of process p, each at its own run of states, `(samples · runs,
-        components)`."""
+        """Evaluate samples of process p, each at its own run of states, `(samples · runs, components)`."""
         parts = []
         for basis, w in zip(self.bases[p], self._weights_by_sample[p], strict=True):
             phi, w_runs = basis(features).unflatten(1, (len(samples), runs)), w[samples.start : samples.stop]
@@ -113,7 +112,7 @@ def draw_priors(
         features: number of random features per component.
 
     Returns:
-        The functions of each process with their weights, and W f(X) at the rows `(rows, samples)`.
+        The functions of each process with their weights, and the values W f(X) `(rows, samples)`.
     """
     like, terms = blocks[0].target, []
     at_rows = like.new_zeros(sum(block.rows for block in blocks), count)
@@ -135,17 +134,17 @@ def draw_priors(
 
 
 def kernel_terms(kernel: Kernel, params: Parameters, X: Features, w: Tensor) -> list[tuple[Basis, Tensor]]:
-    """Return k(x, X) w as a sum of functions of x, each with weights.
+    """Return k(x, X) w as a sum of weighted functions of x.
 
     Terms with finitely many features are converted to weights of these features. A stationary term whose
-    length-scales are shared by all components is evaluated only once, as is a product of such terms.
+    length-scales are shared by all components, or a product of such terms, is evaluated only once.
 
     Args:
         X: n points.
         w: weights `(k, n, samples)`.
 
     Returns:
-        Functions `(k or 1, ·, terms)`, each with weights `(k, terms, samples)`.
+        Functions `(k or 1, ·, terms)` with their weights `(k, terms, samples)`.
     """
     if isinstance(kernel, Sum) and not isinstance(kernel, Product):
         return [term for k, theta in kernel.parts(params) for term in kernel_terms(k, theta, X, w)]
@@ -165,8 +164,8 @@ def kernel_terms(kernel: Kernel, params: Parameters, X: Features, w: Tensor) -> 
 def _common(
     kernel: Kernel, params: Parameters, X: Features
 ) -> tuple[Callable[[Features], list[Tensor]], list[Tensor]] | None:
-    """Return a kernel as Σ_t a_t g_t, with functions g_t(x, X) `(1, ·, n)` common to all components and
-    factors a_t `(k,)`, or `None` if components differ by more than constant factors.
+    """Return the terms of a kernel Σ_t a_t g_t with functions g_t(x, X) `(1, ·, n)` common to all components
+    and factors a_t `(k,)`; `None` if the components differ by more than constant factors.
     """
     if isinstance(kernel, Stationary) and len(params["log_lengthscale"]) == 1:
         g = kernel.towards({**params, "log_std": torch.zeros_like(params["log_std"][:1])}, X)
@@ -195,18 +194,18 @@ def _common(
 
 
 MISSED_FEATURES = 256
-"""Number of random features per component. They represent only the residual of the inducing points, whose
-    covariance has a relative error of about 1/√MISSED_FEATURES; the other part is exact.
+"""Number of random features per component. They represent only the residual that the inducing points leave,
+and the relative error of its covariance is about 1/√MISSED_FEATURES. The other part is exact.
 """
 
 
 def draw_functions(
     basis: LatentBasis, weights: Tensor, generator: torch.Generator, features: int
 ) -> FunctionSamples:
-    """Return functions with the given weights of the basis functions; the residual is drawn from the prior.
+    """Return functions with the given basis weights, and with a residual drawn from the prior.
 
     Args:
-        weights: weights drawn from their posterior `(size, samples)`.
+        weights: weights drawn from the posterior `(size, samples)`.
         generator: source of randomness, on the CPU.
         features: number of random features for the prior of each component.
     """
@@ -218,7 +217,7 @@ def draw_functions(
 
 
 def _folded(part: ProcessBasis, weights: Tensor, generator: torch.Generator, features: int) -> FoldedSamples:
-    """Return the samples of one process with the given weights of its basis functions."""
+    """Return the samples of one process, given the weights of its basis functions."""
     on_kernel, on_features = part.fold(weights)
     rest = part.split.rest
     if rest is None:

@@ -1,6 +1,6 @@
 """Exact posterior of latent processes given whitened rows (eqs. 11 and 22 to 24).
 
-Memory use grows with the square of the number of rows. Fits that would exceed the memory are rejected.
+Memory use grows with the square of the number of rows. Fits that exceed the available memory are rejected.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from forcegp.gp.likelihood import Conditioned, add_rows, condition, cross_gram, 
 from forcegp.resources import announce_memory, free_memory
 
 MATRICES_TO_LEARN = 3.0
-"""Number of square matrices over all rows in memory while learning: the covariance, its factor and a copy."""
+"""Number of matrices `(rows, rows)` in memory during learning: the covariance, its factor and a copy."""
 MATRICES_TO_CONDITION = 2.0
-"""Number of such matrices in memory while conditioning: the covariance and its factor."""
+"""Number of matrices `(rows, rows)` in memory during conditioning: the covariance and its factor."""
 SHARE = 0.8
 """Fraction of the free memory that exact inference may use."""
 CHUNK_COLUMNS = 700
@@ -42,7 +42,7 @@ class ExactPosterior:
     """Latent processes conditioned on rows.
 
     Attributes:
-        processes: kernels with the prefixes of their hyperparameters.
+        processes: the kernels and the prefixes of their hyperparameters.
         params: log-hyperparameters.
         blocks: the rows.
         alpha: (K + I)⁻¹ y `(rows,)`.
@@ -58,8 +58,7 @@ class ExactPosterior:
         """Condition on rows.
 
         Raises:
-            NumericalError: the covariance of the rows is not positive definite, or its noise is below
-                rounding error.
+            NumericalError: the covariance is not positive definite, or the noise is below rounding error.
         """
         fitted = condition(processes, params, blocks)
         if len(fitted.L):
@@ -71,7 +70,7 @@ class ExactPosterior:
 
     @cached_property
     def conditioned(self) -> Conditioned:
-        """Factorisation of the covariance of the rows, computed on first use after loading."""
+        """Factorisation of the covariance of the rows. After loading, it is computed on first use."""
         require_exact_fits(self.blocks, learning=False)
         return condition(self.processes, self.params, self.blocks)
 
@@ -87,7 +86,7 @@ class ExactPosterior:
         return self.conditioned.jitter
 
     def updated(self, blocks: Sequence[Block]) -> ExactPosterior:
-        """Condition on r additional rows in O(r n²), compared with O((n + r)³) for refactorising.
+        """Condition on r additional rows in O(r n²); a new factorisation would take O((n + r)³).
 
         Raises:
             ModelError: exact inference does not fit into memory.
@@ -104,7 +103,7 @@ class ExactPosterior:
         return result
 
     def knowing(self, p: int, features: Features, value: Tensor) -> ExactPosterior:
-        """Return the posterior given the value `(components,)` of a constant process p, which gets mean 0."""
+        """Condition on the value `(components,)` of a constant process p; its mean becomes zero."""
         # y ← y − W_p f_p, with W_p ← 0
         blocks = [
             Block(
@@ -118,12 +117,12 @@ class ExactPosterior:
 
     @cached_property
     def measured(self) -> tuple[bool, ...]:
-        """For each process, whether any row depends on it; the data do not affect the others."""
+        """Flags of the processes that affect at least one row. All other processes keep their prior."""
         return tuple(map(any, self._depends))
 
     @cached_property
     def _depends(self) -> list[list[bool]]:
-        """For each process and block, whether any row depends on the process."""
+        """Whether any row of each block depends on each process."""
         return [[bool(b.operators[p].any()) for b in self.blocks] for p in range(len(self.processes))]
 
     @cached_property
@@ -133,11 +132,11 @@ class ExactPosterior:
 
     @cached_property
     def _weights(self) -> list[list[Tensor]]:
-        """Weights `(components, n, 1)` by process and block; the mean is the sum of k(x, X) times weights."""
+        """Weights `(components, n, 1)` for each process and block; products with k(x, X) sum to the mean."""
         return self.weights_of(self.alpha[:, None])
 
     def weights_of(self, rows: Tensor) -> list[list[Tensor]]:
-        """Apply Wᵀ to vectors over the rows `(rows, s)`; return `(components, n, s)` by process and block."""
+        """Apply Wᵀ to vectors `(rows, s)`, yielding `(components, n, s)` for each process and block."""
         weights: list[list[Tensor]] = [[] for _ in self.processes]
         first = 0
         for block in self.blocks:
@@ -156,7 +155,7 @@ class ExactPosterior:
         ]
 
     def latent_mean(self, p: int, features: Features) -> Tensor:
-        """Return the posterior mean of process p, given its standardized features, `(n, components)`."""
+        """Return the posterior mean of process p at standardized features, `(n, components)`."""
         if not self.measured[p]:
             x, components = next(iter(features.values())), self.blocks[0].operators[p].shape[-1]
             return x.new_zeros(len(x), components)
@@ -210,12 +209,13 @@ class ExactPosterior:
 
     @property
     def log_likelihood(self) -> float:
-        """log p(y) without the constant of the rows, −½ yᵀ(K + I)⁻¹y − ½ log|K + I| − ½ n log 2π."""
+        """Log-likelihood −½ yᵀ(K + I)⁻¹y − ½ log|K + I| − ½ n log 2π, without the constant of the rows."""
         return -float(self.conditioned.negative_log_likelihood(target_of(self.blocks)))
 
     def draw(self, count: int, generator: torch.Generator, features: int = FEATURES) -> FunctionSamples:
-        """Draw functions from the posterior by Matheron's rule: f(x) + k(x, X) WᵀΣ⁻¹(y − W f(X) − ε) with
-        Σ = K + I.
+        """Draw functions f(x) + k(x, X) WᵀΣ⁻¹(y − W f(X) − ε) from the posterior (Matheron's rule).
+
+        Here f is drawn from the prior, ε ~ N(0, I) and Σ = K + I.
 
         Args:
             generator: source of randomness, on the CPU.
@@ -237,7 +237,7 @@ class ExactPosterior:
 
 
 def exact_bytes(blocks: Sequence[Block], learning: bool = True) -> int:
-    """Return the peak memory needed for exact inference on whitened rows [bytes].
+    """Return the peak memory required for exact inference on whitened rows [bytes].
 
     Args:
         learning: whether hyperparameters are learned.
@@ -254,7 +254,7 @@ def require_exact_fits(blocks: Sequence[Block], learning: bool = True, available
     """Reject exact inference that does not fit into memory, and warn if it needs most of the memory.
 
     Args:
-        available: usable memory [bytes]; by default `SHARE` of the free memory.
+        available: usable memory [bytes]; by default, a fraction `SHARE` of the free memory.
 
     Raises:
         ModelError: inference needs more memory than is available.

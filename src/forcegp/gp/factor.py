@@ -1,4 +1,4 @@
-"""Cholesky factors with reported jitter, factor updates for added rows, and spectra."""
+"""Cholesky factors with reported jitter, updates of factors for added rows, and spectra."""
 
 from __future__ import annotations
 
@@ -22,9 +22,9 @@ JITTER_STEPS = (0.0, 1e-14, 1e-12, 1e-10, 1e-8)
 PANEL = 24
 """Block size of LAPACK's triangular-pentagonal QR."""
 TRUNCATION = 1e-12
-"""Eigenvalues of the inducing point covariance below this fraction of the largest are dropped. Kernels are
-accurate to about 10⁻¹⁵ of their scale, so an eigenvalue at the threshold is accurate to 10⁻³. If the prior is
-a million times as strong as the noise, a threshold of 10⁻¹⁰ would lose information in the data.
+"""Fraction of the largest eigenvalue of the inducing-point covariance below which eigenvalues are dropped.
+Kernels are accurate to about 10⁻¹⁵ of their scale, so an eigenvalue at the threshold is accurate to 10⁻³. If
+the prior is a million times as strong as the noise, a threshold of 10⁻¹⁰ would discard information.
 """
 
 
@@ -32,10 +32,10 @@ def cholesky(K: Tensor) -> tuple[Tensor, float]:
     """Return the lower Cholesky factor of K + ε I for the smallest ε in `JITTER_STEPS` that succeeds.
 
     Args:
-        K: `(n, n)` symmetric matrix, of which only the lower triangle is used.
+        K: `(n, n)` symmetric matrix; only the lower triangle is used.
 
     Returns:
-        The factor `(n, n)`, and the added ε, or 0.0 if none was needed.
+        The factor `(n, n)` and the added ε, which is usually 0.0.
 
     Raises:
         NumericalError: K is not finite, or not positive definite even with the largest jitter.
@@ -59,14 +59,14 @@ def cholesky(K: Tensor) -> tuple[Tensor, float]:
 
 
 def extended(L: Tensor, rows: Tensor) -> Tensor:
-    """Return the lower factor of L Lᵀ + ΦᵀΦ, from the QR factorisation of Lᵀ above the rows Φ, in O(r n²).
+    """Return the lower factor of L Lᵀ + ΦᵀΦ in O(r n²), by QR factorisation of Lᵀ stacked on the rows Φ.
 
-    If a C++ compiler is available, a compiled kernel is used, which is three to four times as fast as LAPACK
-    for a few rows. LAPACK may return negative diagonal entries, which are harmless in solves.
+    If a C++ compiler is available, a compiled kernel is used; for a few rows, it is three to four times as
+    fast as LAPACK. LAPACK may return negative diagonal entries, which are harmless in solves.
 
     Args:
-        L: lower factor on the CPU `(n, n)`; fastest if its columns are contiguous.
-        rows: Φ `(r, n)`.
+        L: lower factor `(n, n)` on the CPU; contiguous columns are fastest.
+        rows: additional rows Φ `(r, n)`.
 
     Raises:
         NumericalError: LAPACK rejects the arguments.
@@ -84,7 +84,7 @@ def extended(L: Tensor, rows: Tensor) -> Tensor:
 
 @cache
 def _kernel() -> Callable[[int, int, int, int, int], None] | None:
-    """Return `extend` from factor_rows.cpp, or `None` if there is no compiler."""
+    """Return `extend` from `factor_rows.cpp`, or `None` if there is no compiler."""
     source = files("forcegp.gp").joinpath("factor_rows.cpp").read_text(encoding="utf-8")
     try:
         function = load_library(source, level="-O3").extend
@@ -111,10 +111,10 @@ def bordered(L: Tensor, cross: Tensor, corner: Tensor) -> tuple[Tensor, float]:
     Args:
         L: lower factor `(n, n)`.
         cross: C `(n, r)`.
-        corner: K `(r, r)`, of which only the lower triangle is used.
+        corner: K `(r, r)`; only its lower triangle is used.
 
     Returns:
-        The factor `(n + r, n + r)`, and the jitter for the new rows.
+        The factor `(n + r, n + r)` and the jitter added for the new rows.
 
     Raises:
         NumericalError: the matrix is not positive definite.
@@ -137,7 +137,7 @@ class Spectrum:
     Attributes:
         values: all eigenvalues, in ascending order `(m,)`.
         vectors: U `(m, m)`.
-        dropped: number of smallest eigenvalues that are dropped.
+        dropped: number of dropped eigenvalues, which are the smallest ones.
     """
 
     values: Tensor
@@ -153,5 +153,5 @@ class Spectrum:
 
     @property
     def root(self) -> Tensor:
-        """R = U Λ^{−1/2} for the kept eigenvalues `(m, kept)`; R Rᵀ is the pseudo-inverse of K_zz."""
+        """R = U Λ^{−1/2} `(m, kept)` for the eigenvalues kept; R Rᵀ is the pseudo-inverse of K_zz."""
         return self.vectors[:, self.dropped :] * self.values[self.dropped :].rsqrt()

@@ -1,8 +1,8 @@
 """Named kernel inputs, rows of samples, and feature maps φ(x) of kernels and random functions.
 
 With unit noise variance, entries of the covariance K of whitened rows have rounding errors of about ε K_ii
-with ε = 2.2e-16. The relative errors of standard deviations are therefore about ε K_ii, or ε/r if data reduce
-a prior variance to a fraction r: 0.1 % at K_ii = 1e12, 0.5 % at r = 1e-13, compared with 80-bit arithmetic.
+with ε = 2.2e-16. Relative errors of standard deviations are thus about ε K_ii, or ε/r if data reduce a prior
+variance to a fraction r. Compared with 80-bit results, they are 0.1 % at K_ii = 1e12, 0.5 % at r = 1e-13.
 """
 
 from __future__ import annotations
@@ -17,8 +17,8 @@ from torch import Tensor
 from forcegp.errors import NumericalError, UnknownNameError
 
 FLOOR = 0.01
-"""Smallest scale of a column, relative to the typical scale of its input. It is below the value for motions
-through the workspace (0.034 for the torque of an arm's joint 5), and above that caused by drift."""
+"""Smallest scale of a column, relative to the typical scale of its input. Motions through the workspace have
+larger values (0.034 for the torque of an arm's joint 5), and drift causes smaller ones."""
 PRIOR_TO_NOISE = 1e6
 """Largest prior standard deviation of a row, in units of its noise."""
 SMALLEST_FRACTION = 1e-13
@@ -29,7 +29,7 @@ Features = Mapping[str, Tensor]
 
 
 def stacked(x: Features, inputs: tuple[str, ...] | None) -> Tensor:
-    """Concatenate the named features to `(n, w)`, or to `(k, n, w)` if components have different inputs.
+    """Concatenate the named features to shape `(n, w)`, or `(k, n, w)` if inputs differ between components.
 
     Raises:
         UnknownNameError: a feature is missing.
@@ -48,15 +48,14 @@ def stacked(x: Features, inputs: tuple[str, ...] | None) -> Tensor:
 
 @dataclass(frozen=True)
 class Standardization:
-    """Shift and scale of each named input, x ↦ (x − mean)/std, from training data.
+    """Shift and scale of each named input, x ↦ (x − mean)/std, determined from training data.
 
-    A column that hardly varies does not determine a scale. Scales are therefore at least `FLOOR` times the
-    root mean square of the standard deviations of all columns of the input. The columns of a vector share
-    this root mean square as their scale, so results hardly depend on the orientation of the axes. Features
+    The scale of a nearly constant column is not meaningful. Scales are therefore at least `FLOOR` times the
+    root mean square of the standard deviations of all columns of the input. This root mean square is the
+    common scale of the columns of a vector, so results barely depend on the orientation of the axes. Features
     with a meaningful zero, such as velocities, are scaled but not shifted.
 
-    Columns that are constant up to rounding error have scale 1, or that of their vector, and are listed in
-    `constant`.
+    Columns that are constant up to rounding error have scale 1 (or that of their vector); see `constant`.
     """
 
     mean: Mapping[str, Tensor]
@@ -67,7 +66,7 @@ class Standardization:
     def of(
         cls, features: Mapping[str, Tensor], vectors: Collection[str] = (), centred: bool = True
     ) -> Standardization:
-        """Compute the mean and standard deviation of each column, or zero and its root mean square.
+        """Compute the mean and standard deviation of each column, or its root mean square if not centred.
 
         Args:
             features: named inputs `(n, w)`.
@@ -103,8 +102,8 @@ class Block:
     """Samples with the same number of rows.
 
     Attributes:
-        features: standardized kernel inputs `(n, w)` of each prior, keyed by name.
-        operators: W for each prior, `(n, r, components)`.
+        features: standardized kernel inputs `(n, w)` for each prior, keyed by name.
+        operators: operator W `(n, r, components)` for each prior.
         target: whitened residual `(n, r)`.
     """
 
@@ -129,7 +128,7 @@ def components_of(block: Block) -> list[int]:
 
 
 def chunked(blocks: Iterable[Block], samples: int) -> Iterator[Block]:
-    """Split blocks into blocks with a maximum number of samples."""
+    """Split blocks so that none exceeds a maximum number of samples."""
     for block in blocks:
         for first in range(0, len(block.target), samples):
             yield rows_of(block, slice(first, first + samples))
@@ -148,7 +147,7 @@ def rows_mean(latent_mean: Callable[[int, Features], Tensor], block: Block) -> T
     """Return the mean Σ_p W_p μ_p of the rows of each sample of a block, `(n, d)` (eq. 23).
 
     Args:
-        latent_mean: function that returns μ_p of process p at kernel inputs, `(n, components)`.
+        latent_mean: function that returns μ_p `(n, components)` of process p at kernel inputs.
         block: samples; their targets are not used.
     """
     mean = torch.zeros_like(block.target)
@@ -163,7 +162,7 @@ Basis = Callable[[Features], Tensor]
 
 @dataclass(frozen=True, eq=False)
 class FeatureTerm:
-    """Features a_kf φ_f(x) of k components, often with functions φ common to all components.
+    """Features a_kf φ_f(x) of k components; the functions φ are often common to all components.
 
     Attributes:
         values: φ.
@@ -178,7 +177,7 @@ class FeatureTerm:
 
 @dataclass(frozen=True, eq=False)
 class FeatureMap:
-    """Concatenated terms φ(x) with E[φ(x)ᵀφ(x′)] = k(x, x′), where f(x) = φ(x)ᵀw and w ~ N(0, I).
+    """Concatenated terms φ(x) of a function f(x) = φ(x)ᵀw with w ~ N(0, I) and E[φ(x)ᵀφ(x′)] = k(x, x′).
 
     Attributes:
         terms: groups of features.
@@ -192,7 +191,7 @@ class FeatureMap:
         return parts[0] if len(parts) == 1 else torch.cat(parts, dim=-1)
 
     def weighted(self, weights: Tensor) -> list[tuple[Basis, Tensor]]:
-        """Return φ(x)ᵀw as functions with weights, given w `(k, features, samples)`."""
+        """Return φ(x)ᵀw as weighted functions, given w `(k, features, samples)`."""
         parts = weights.split([term.scale.shape[-1] for term in self.terms], dim=1)
         pairs = zip(self.terms, parts, strict=True)
         return [(term.values, term.scale[..., None] * w) for term, w in pairs]
@@ -210,11 +209,11 @@ class FeatureMap:
         return FeatureTerm(values, torch.cat([term.scale for term in self.terms], dim=-1))
 
     def __add__(self, other: FeatureMap) -> FeatureMap:
-        """Return the features of both maps, for the sum of two kernels."""
+        """Return the features of both maps, which represent the sum of two kernels."""
         return FeatureMap((*self.terms, *other.terms))
 
     def __mul__(self, other: FeatureMap) -> FeatureMap:
-        """Return all pairs of features, for the product of two kernels."""
+        """Return all pairs of features, which represent the product of two kernels."""
         a, b = self.joined(), other.joined()
         scale = (a.scale[:, :, None] * b.scale[:, None, :]).flatten(-2)
 
@@ -224,7 +223,7 @@ class FeatureMap:
         return FeatureMap((FeatureTerm(products, scale),))
 
     def paired(self, other: FeatureMap, count: int, generator: torch.Generator) -> FeatureMap:
-        """Return `count` random pairs of features, for the product of two kernels that have many features."""
+        """Return `count` random pairs of features, for the product of two kernels with many features each."""
         a, b = self.joined(), other.joined()
         sizes = a.scale.shape[-1], b.scale.shape[-1]
         pairs = torch.Generator().manual_seed(int(torch.randint(2**31, (1,), generator=generator)))
@@ -253,7 +252,7 @@ def require_resolved_noise(prior: Tensor) -> None:
 
 
 def require_resolved_variance(covariance: Tensor, prior: Tensor) -> Tensor:
-    """Return a posterior covariance `(n, d, d)` after checking that all of its variances are resolved.
+    """Return a posterior covariance `(n, d, d)` after checking that rounding errors do not dominate it.
 
     Args:
         covariance: covariance of the rows of each sample.
@@ -270,7 +269,7 @@ def require_resolved_variance(covariance: Tensor, prior: Tensor) -> Tensor:
         least = float((variance[lost] / prior[lost]).min())
         raise NumericalError(
             f"double precision does not resolve {int(lost.sum())} of {lost.numel()} predicted variances",
-            expected=f"at least {SMALLEST_FRACTION:g} of the variance before the data",
+            expected=f"at least {SMALLEST_FRACTION:g} of the prior variance",
             got=f"{least:.2g} of it",
             hint="specify a larger noise, or remove outliers, which make the prior large",
         )
@@ -294,10 +293,10 @@ def fourier_features(inputs: tuple[str, ...] | None, omega: Tensor, phase: Tenso
 
 
 def linear_features(x: Features, inputs: tuple[str, ...] | None, slope: Tensor, bias: Tensor) -> FeatureMap:
-    """Return the features of the linear kernel, which are slopes and a bias.
+    """Return the features of a linear kernel, which are slopes and a bias.
 
     Args:
-        x: kernel inputs, of which only the widths are used.
+        x: kernel inputs; only their widths are used.
         inputs: names of the inputs; `None` for all.
         slope: standard deviation of each slope `(k, w)`, or of all slopes `(k, 1)`.
         bias: standard deviation of the bias `(k,)`.

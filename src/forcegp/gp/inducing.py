@@ -1,8 +1,8 @@
 """Greedy selection of inducing points from the data by conditional variance.
 
-Each step adds the sample with the largest residual variance Σ_k S_kk Var(f_k(x) | f(Z)), which is the trace
-term of the collapsed bound (pivoted partial Cholesky factorisation; Burt, Rasmussen & van der Wilk 2020). The
-weights S = WᵀW convert it to units of the noise variance.
+Each step adds the sample with the largest residual variance Σ_k S_kk Var(f_k(x) | f(Z)), which appears in the
+trace term of the collapsed bound. This is a pivoted partial Cholesky factorisation (Burt, Rasmussen & van der
+Wilk 2020). The weights S = WᵀW convert the residual variance to units of the noise variance.
 """
 
 from __future__ import annotations
@@ -19,15 +19,15 @@ from forcegp.gp.features import Block, Features, points
 from forcegp.gp.kernels import Parameters, Process, sub
 
 CANDIDATES = 4000
-"""Number of samples from which points are selected."""
+"""Number of samples from which inducing points are selected."""
 
 LIMIT = 100
 """Maximum number of inducing points per process."""
 
 SHARE = 0.02
-"""Residual variance of all rows at which selection stops, as a fraction of their posterior variance. In units
-    of the noise variance, M basis functions learned from noisy rows have a total posterior variance of at
-    most M over all rows; the residual variance should be small compared with it.
+"""Ratio of the residual to the posterior variance of all rows at which selection stops. In units of the noise
+variance, M basis functions learned from noisy rows have a total posterior variance of at most M over all
+rows. The residual variance should be small compared with this.
 """
 
 
@@ -37,8 +37,8 @@ class Selection:
 
     Attributes:
         points: kernel inputs of the points.
-        missed: residual prior variance of a row given 0, 1, … points, averaged over the candidates, in units
-            of the noise variance `(points + 1,)`.
+        missed: residual prior variance `(points + 1,)` of a row given 0, 1, … points, averaged over the
+            candidates, in units of the noise variance.
     """
 
     points: dict[str, Tensor]
@@ -56,12 +56,12 @@ def select_inducing(
 ) -> list[Selection]:
     """Select inducing points for each process from the samples in the blocks.
 
-    Processes that affect no row, or that have finitely many features, get no inducing points.
+    Processes that affect no row or that have finitely many features have no inducing points.
 
     Args:
-        rows: total number of rows to condition on; by default, the number of rows in the blocks.
+        rows: total number of rows to condition on; defaults to the number of rows in the blocks.
         limit: maximum number of points per process.
-        share: residual variance of all rows at which to stop, as a fraction of their posterior variance.
+        share: stop when the residual variance is this fraction of the posterior variance of all rows.
     """
     candidate_rows = sum(block.rows for block in blocks)
     tolerance = share / (candidate_rows if rows is None else rows)
@@ -76,7 +76,7 @@ def select_inducing(
 
 
 def _greedy(rest: KernelPart | None, x: Features, weight: Tensor, limit: int, tolerance: float) -> Selection:
-    """Compute a pivoted partial Cholesky factorisation of every component, with common pivots."""
+    """Compute pivoted partial Cholesky factorisations of all components with common pivots."""
     none = Selection({name: value[:0] for name, value in x.items()}, weight.new_zeros(1))
     if rest is None or not bool(weight.any()):
         return none

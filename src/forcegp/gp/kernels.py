@@ -1,8 +1,8 @@
-"""Covariance functions of independent latent outputs, as frozen descriptions with a dictionary of parameters.
+"""Covariance functions of independent latent outputs.
 
-A kernel describes `k` independent outputs at once; its covariance has shape `(k, n, n')`. Inputs are
-standardized named features, `{"q": (n, w), "qd": (n, w), …}`, of which a kernel uses those listed in
-`inputs`, or all. Hyperparameters are logarithms in a flat dictionary, so one optimiser handles every kernel.
+A kernel describes `k` independent outputs; its covariance has shape `(k, n, n')`. Inputs are standardized
+named features, `{"q": (n, w), "qd": (n, w), …}`. A kernel uses those listed in `inputs`, or all of them. The
+logarithms of the hyperparameters are passed in a flat dictionary, so one optimiser handles every kernel.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ Parameters = Mapping[str, Tensor]
 Initial = dict[str, Tensor]
 
 LARGEST_EXPONENT = 300.0
-"""Bound on exponents; exp(−300) is far below rounding error but far above slow denormal numbers."""
+"""Bound on exponents; exp(−300) is far below rounding error but far above (slow) denormal numbers."""
 LINEAR_PAIRS = 8
-"""Divisor of the number of random features of a factor, per linear factor of the other side of a product."""
+"""Divisor of the number of random features of a kernel, for each linear kernel that it is multiplied by."""
 
 
 def sub(params: Parameters, prefix: str) -> dict[str, Tensor]:
-    """Return the entries `prefix.*`, with the prefix removed from their names."""
+    """Return the entries named `prefix.*`, with the prefix removed from their names."""
     return {key[len(prefix) + 1 :]: value for key, value in params.items() if key.startswith(prefix + ".")}
 
 
 class Kernel(ABC):
-    """Covariance function of `k` independent outputs."""
+    """A covariance function of `k` independent outputs."""
 
     is_finite: bool = False
     """Whether k(x, x′) = φ(x)ᵀφ(x′) with finitely many features φ."""
@@ -55,12 +55,12 @@ class Kernel(ABC):
         Args:
             outputs: number of outputs.
             widths: number of columns of each feature.
-            log_std: logarithm of the standard deviation of the functions, one value or one per output.
+            log_std: logarithm of the standard deviation of the functions, as one value or one per output.
         """
 
     @abstractmethod
     def towards(self, params: Parameters, x2: Features) -> Callable[[Features], Tensor]:
-        """Return the function x ↦ k(x, x′) `(k, n, n')` for fixed x′, with terms in x′ precomputed."""
+        """Return the function x ↦ k(x, x′) `(k, n, n')` for fixed x′. Terms in x′ are precomputed."""
 
     def covariance(self, params: Parameters, x1: Features, x2: Features) -> Tensor:
         """Return k(x, x′) `(k, n, n')`."""
@@ -68,7 +68,7 @@ class Kernel(ABC):
 
     @abstractmethod
     def variance(self, params: Parameters) -> Callable[[Features], Tensor]:
-        """Return the function x ↦ k(x, x) `(k, n)`, with terms in the hyperparameters precomputed."""
+        """Return the function x ↦ k(x, x) `(k, n)`. Terms in the hyperparameters are precomputed."""
 
     def diagonal(self, params: Parameters, x: Features) -> Tensor:
         """Return k(x, x) `(k, n)`."""
@@ -76,13 +76,13 @@ class Kernel(ABC):
 
     @abstractmethod
     def draw(self, params: Parameters, x: Features, features: int, generator: torch.Generator) -> FeatureMap:
-        """Draw `features` random features per output, which represent functions from the prior.
+        """Draw `features` random features per output to represent functions from the prior.
 
-        Linear and constant kernels have exact features, whose number is fixed.
+        Linear and constant kernels have a fixed number of exact features instead.
 
         Args:
             params: log-hyperparameters.
-            x: any inputs, of which only the widths are used.
+            x: any inputs; only their widths are used.
             features: number of random features.
             generator: source of randomness, on the CPU.
         """
@@ -118,12 +118,12 @@ def width_of(inputs: tuple[str, ...] | None, widths: Mapping[str, int]) -> int:
 
 @dataclass(frozen=True)
 class Linear(Kernel):
-    """k = s² Σ_d σ_d² x_d x′_d + σ_0²: functions that are linear in the inputs.
+    """Functions that are linear in the inputs: k = s² Σ_d σ_d² x_d x′_d + σ_0².
 
     Two options reduce the number of hyperparameters. With `ard=False`, all inputs have the same σ, so
     learning cannot set individual slopes to zero. With `shared=True`, all outputs share the σ_d but have
-    separate s and σ_0. If `offset` is given, σ_0 is a learned fraction of the root mean square of the σ_d,
-    initially `offset`. All outputs share it, since the constant of a single output does not determine σ_0.
+    separate s and σ_0. If `offset` is given, σ_0 is a learned fraction (initially `offset`) of the root mean
+    square of the σ_d. All outputs share this fraction, since a single constant does not determine σ_0.
     """
 
     inputs: tuple[str, ...] | None = None
@@ -146,7 +146,7 @@ class Linear(Kernel):
         return sizes | {"log_offset": share.new_tensor([math.log(self.offset)])}
 
     def slope_std(self, params: Parameters) -> Tensor:
-        """Return s σ_d `(k, w)`, or `(k, 1)` if it is common to all inputs."""
+        """Return s σ_d `(k, w)`, or `(k, 1)` if all inputs share one σ."""
         log = params["log_slope_std"]
         return torch.exp(log + params["log_std"][:, None] if self.shared else log)
 
@@ -172,7 +172,7 @@ class Linear(Kernel):
 
 @dataclass(frozen=True)
 class Constant(Kernel):
-    """k = s²: constants, with one standard deviation s (initially 1) per `group` of outputs."""
+    """Constants: k = s², with one standard deviation s (initially 1) per `group` of outputs."""
 
     group: int = 1
 
@@ -199,10 +199,10 @@ class Constant(Kernel):
 
 @dataclass(frozen=True)
 class Stationary(Kernel):
-    """k = σ² g(r) with scaled distance r² = Σ_d (x_d − x′_d)² / ℓ_d² (automatic relevance determination).
+    """k = σ² g(r) with the scaled distance r² = Σ_d (x_d − x′_d)² / ℓ_d² (automatic relevance determination).
 
-    With `shared=True`, all outputs share the length-scales but not σ, so there are fewer hyperparameters and
-    only one distance to compute.
+    With `shared=True`, all outputs share the length-scales but have separate σ. This reduces the number of
+    hyperparameters, and only one distance needs to be computed.
     """
 
     inputs: tuple[str, ...] | None = None
@@ -240,7 +240,7 @@ class Stationary(Kernel):
 
     @abstractmethod
     def frequencies(self, shape: tuple[int, ...], generator: torch.Generator) -> Tensor:
-        """Sample from the spectral density of g at unit length-scales."""
+        """Sample from the spectral density of g for unit length-scales."""
 
     def draw(self, params: Parameters, x: Features, features: int, generator: torch.Generator) -> FeatureMap:
         lengthscale = params["log_lengthscale"].exp()
@@ -311,7 +311,7 @@ class Sum(Kernel):
 
     @staticmethod
     def combined(left: Tensor, right: Tensor) -> Tensor:
-        """Combine the covariances of the two sides."""
+        """Combine the covariances of the two kernels."""
         return left + right
 
     @property
@@ -319,7 +319,7 @@ class Sum(Kernel):
         return self.left.is_finite and self.right.is_finite
 
     def parts(self, params: Parameters) -> tuple[tuple[Kernel, Initial], tuple[Kernel, Initial]]:
-        """Return both kernels with their hyperparameters."""
+        """Return each of the two kernels with its hyperparameters."""
         return (self.left, sub(params, "left")), (self.right, sub(params, "right"))
 
     def towards(self, params: Parameters, x2: Features) -> Callable[[Features], Tensor]:
@@ -337,7 +337,7 @@ class Sum(Kernel):
 
 @dataclass(frozen=True)
 class Product(Sum):
-    """k = k_1 k_2; the second factor initially has unit standard deviation."""
+    """k = k_1 k_2, where the second factor initially has unit standard deviation."""
 
     def initial(self, outputs: int, widths: Mapping[str, int], log_std: Tensor | float = 0.0) -> Initial:
         return sides(self.left.initial(outputs, widths, log_std), self.right.initial(outputs, widths))
@@ -367,7 +367,7 @@ class Product(Sum):
 
 
 def _linear_factors(kernel: Kernel) -> int:
-    """Return the number of factors of a linear kernel or product of linear kernels; 0 for other kernels."""
+    """Return the number of factors in a product of linear kernels; 0 if there is any other factor."""
     if isinstance(kernel, Product):
         left, right = _linear_factors(kernel.left), _linear_factors(kernel.right)
         return left + right if left and right else 0
@@ -385,7 +385,7 @@ class Process(Protocol):
 
     @property
     def prefix(self) -> str:
-        """Prefix of the hyperparameters; if they are shared, that of another process."""
+        """Prefix of the hyperparameters. Processes with the same prefix share their hyperparameters."""
         ...
 
 
@@ -395,8 +395,7 @@ TIME, SEGMENT = "time", "segment"
 
 @dataclass(frozen=True)
 class OrnsteinUhlenbeck(Kernel):
-    """k = σ² exp(−|t − t′|/T) within a trajectory, and 0 between trajectories (Rasmussen and Williams, eq.
-    B.28).
+    """k = σ² exp(−|t − t′|/T) within a trajectory, and 0 otherwise (Rasmussen and Williams, eq. B.28).
 
     Args:
         time: initial value of the correlation time T [s].

@@ -1,10 +1,10 @@
 """The covariance of whitened rows (eq. 10) and their likelihood, with closed-form gradients.
 
-A block contains `n` samples with `r` rows each. The covariance between the rows of two samples is
-Σ_k W[i,:,k] k_k(x_i, x_j) W[j,:,k]ᵀ, summed over the components k of every prior: the block-wise
-form of H k_Q Hᵀ (eq. 32, figure 1) for any operator W. Rows are ordered by block, sample, and row.
+A block contains `n` samples with `r` rows each. The covariance between the rows of two samples is Σ_k
+W[i,:,k] k_k(x_i, x_j) W[j,:,k]ᵀ, summed over the components k of every prior. This is the block-wise form of
+H k_Q Hᵀ (eq. 32, figure 1) for any operator W. Rows are ordered by block, sample and row.
 
-Processes with finitely many features have few weights and many rows, so their likelihood is computed in
+Processes with finitely many features have far fewer weights than rows, so their likelihood is computed in
 weight space (Rasmussen and Williams, *Gaussian Processes for Machine Learning*, section 2.1).
 """
 
@@ -29,7 +29,7 @@ from forcegp.gp.kernels import Parameters, Process, sub
 from forcegp.resources import threads_of_pytorch
 
 CHUNK_ELEMENTS = 400_000
-"""Size of intermediate arrays for a chunk of samples, chosen to fit into the processor cache."""
+"""Size of the intermediate arrays for a chunk of samples, chosen to fit into the processor cache."""
 
 
 Place = tuple[Any, ...]
@@ -54,7 +54,7 @@ def _chunks(n: int, size: int) -> Iterator[tuple[int, int]]:
 
 
 def add_rows(out: Tensor, W1: Tensor, k: Tensor, W2: Tensor, lower: bool = False) -> None:
-    """Add Σ_k W1 k W2ᵀ to `out`, chunk by chunk; if `lower`, only up to the diagonal."""
+    """Add Σ_k W1 k W2ᵀ to `out` in chunks; if `lower` is true, only up to the diagonal."""
     r = W1.shape[1]
     W2k = W2.permute(2, 0, 1)
     for i, j in _chunks(len(W1), W2.numel()):
@@ -71,7 +71,7 @@ def _pairs(
     blocks2: Sequence[Block],
     lower: bool,
 ) -> Iterator[tuple[int, dict[str, Tensor], int, int]]:
-    """Yield each prior with its hyperparameters and the pairs of blocks to which it contributes."""
+    """Yield each prior with its hyperparameters and the pairs of blocks that it contributes to."""
     for p, prior in enumerate(priors):
         depends1, depends2 = ([bool(b.operators[p].any()) for b in blocks] for blocks in (blocks1, blocks2))
         process_params = sub(params, prior.prefix)
@@ -105,7 +105,7 @@ def cross_gram(
 
 
 def gram(priors: Sequence[Process], params: Parameters, blocks: Sequence[Block]) -> Tensor:
-    """Return the covariance of the rows including unit white noise, `(rows, rows)`; lower triangle only."""
+    """Return the covariance of the rows `(rows, rows)`, including unit white noise; lower triangle only."""
     # Σ = K + I (eq. 10)
     K = cross_gram(priors, params, blocks)
     K.diagonal().add_(1.0)
@@ -123,13 +123,13 @@ def gram_gradient(
     """Return the derivatives of F = ½ log|Σ| + ½ yᵀΣ⁻¹y with Σ = K + I, in closed form.
 
     With G = Σ⁻¹ − ααᵀ, ∂F/∂Σ = ½ G, and the derivative with respect to the kernel between samples i and j is
-    ½ W_iᵀ G_ij W_j; only the kernels themselves are differentiated automatically.
+    ½ W_iᵀ G_ij W_j. Only the kernels themselves are differentiated automatically.
 
     Args:
         priors, params, blocks: as for `gram`.
-        K_inv: Σ⁻¹ `(rows, rows)`, of which only the lower triangle is used.
+        K_inv: Σ⁻¹ `(rows, rows)`; only its lower triangle is used.
         alpha: Σ⁻¹ y `(rows,)`.
-        deep: whether to also differentiate with respect to targets, operators and features.
+        deep: whether to differentiate with respect to targets, operators and features as well.
     """
     rows = [slice(*pair) for pair in pairwise(offsets(blocks))]
     total: Gradient = {}
@@ -163,7 +163,7 @@ def gram_gradient(
 def _kernel_with_leaves(
     prior: Process, process_params: Parameters, f1: Features, f2: Features, with_features: bool
 ) -> tuple[dict[tuple[str, str], Tensor], Tensor]:
-    """Return new leaves for the kernel's parameters and optionally its inputs, and the kernel matrix."""
+    """Return the kernel matrix, and new autograd leaves for its parameters and (optionally) inputs."""
     leaves = {("param", key): value.detach().requires_grad_() for key, value in process_params.items()}
     one: Mapping[str, Tensor] = f1
     two: Mapping[str, Tensor] = f2
@@ -186,7 +186,7 @@ def _kernel_gradient(
 ) -> Tensor:
     """Return ∂F/∂k `(components, n, n')`, and add the derivatives with respect to the operators to `into`.
 
-    On a diagonal block, the lower triangle also accounts for the upper triangle.
+    In a diagonal block, the lower triangle also accounts for the upper one.
     """
     W1, W2 = operators
     r, s = W1.shape[1], W2.shape[1]
@@ -213,7 +213,7 @@ def _kernel_gradient(
 
 @dataclass(frozen=True)
 class Conditioned:
-    """A Gaussian process conditioned on rows.
+    """A Gaussian process conditioned on whitened rows.
 
     Attributes:
         L: lower Cholesky factor of K + I `(rows, rows)`.
@@ -251,9 +251,9 @@ def condition(priors: Sequence[Process], params: Parameters, blocks: Sequence[Bl
 
 
 def negative_log_likelihood(priors: Sequence[Process], params: Parameters, blocks: Sequence[Block]) -> Tensor:
-    """Return the negative log marginal likelihood of whitened rows, differentiable in all its inputs.
+    """Return the negative log marginal likelihood of whitened rows, which is differentiable in all inputs.
 
-    Value and gradient are computed from the same factorisation.
+    The value and the gradient are computed from the same factorisation.
 
     Returns:
         The negative log marginal likelihood `()`.
@@ -272,7 +272,7 @@ def negative_log_likelihood(priors: Sequence[Process], params: Parameters, block
 
 
 class _OfRows(torch.autograd.Function):
-    """Negative log likelihood that computes value and gradient together, from shared intermediate results."""
+    """Negative log likelihood whose value and gradient are computed from the same intermediate results."""
 
     @staticmethod
     def forward(ctx: Any, rows: tuple[Any, Any, Any], places: list[Place], *tensors: Tensor) -> Tensor:
@@ -297,7 +297,7 @@ class _OfRows(torch.autograd.Function):
 
 
 def cholesky_inverse_(L: Tensor) -> Tensor:
-    """Overwrite the factor L with (L Lᵀ)⁻¹ (LAPACK potri) and return it; only its lower triangle is valid."""
+    """Overwrite the factor L with (L Lᵀ)⁻¹ (LAPACK potri) and return it. Only the lower triangle is valid."""
     if L.device.type != "cpu":
         return torch.cholesky_inverse(L)
     if L.shape[0] == 0:
@@ -315,7 +315,7 @@ def cholesky_inverse_(L: Tensor) -> Tensor:
 
 
 class _OfWeights(torch.autograd.Function):
-    """Negative log likelihood −log N(y; 0, I + Φ Φᵀ), with its derivatives."""
+    """Negative log likelihood −log N(y; 0, I + Φ Φᵀ) and its derivatives."""
 
     @staticmethod
     def forward(ctx: Any, Phi: Tensor, y: Tensor) -> Tensor:
@@ -338,7 +338,7 @@ def negative_log_likelihood_of_weights(
 ) -> Tensor:
     """Return `negative_log_likelihood` for finitely many features, at a cost linear in the number of rows.
 
-    The rows are Φ w + ε with w ~ N(0, I), and Φ_i = W_i φ(x_i)ᵀ.
+    The rows are modelled as Φ w + ε with w ~ N(0, I) and Φ_i = W_i φ(x_i)ᵀ.
 
     Raises:
         NumericalError: the features are not finite.

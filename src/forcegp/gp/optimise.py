@@ -1,4 +1,4 @@
-"""Minimisation of a differentiable objective over named tensors, by L-BFGS or, as in the paper, by ADAM."""
+"""Minimisation of a differentiable objective over named tensors with L-BFGS or, as in the paper, ADAM."""
 
 from __future__ import annotations
 
@@ -17,15 +17,15 @@ from forcegp.errors import ModelError, NumericalError, check_name
 
 Objective = Callable[[dict[str, Tensor]], Tensor]
 Progress = Callable[[int, float, dict[str, Tensor]], None]
-"""Function called after each evaluation with the number of evaluations, objective and best tensors so far."""
+"""Function called after each evaluation with the evaluation count, the objective and the best tensors."""
 FitProgress = Callable[[int, int, float], None]
-"""Function called with the number of evaluations, their maximum number, and the objective."""
+"""Function called with the evaluation count, the maximum number of evaluations, and the objective."""
 Bounds = Mapping[str, tuple[float | Tensor, float | Tensor]]
-"""Lower and upper bounds on each tensor, common to all its entries or separate for each entry."""
+"""Lower and upper bounds on each tensor, either common to all its entries or separate for each entry."""
 
 OPTIMIZERS = ("lbfgs", "adam")
 FIRST_STEP = 2.0
-"""Largest change in an entry in the first step of L-BFGS with bounds; two e-folds for logarithms."""
+"""Largest change in an entry in the first step of bounded L-BFGS; for logarithms, this is two e-folds."""
 STOPPED = ("converged", "stopped at the iteration limit", "the line search found no smaller objective")
 
 
@@ -41,12 +41,12 @@ class LearningOptions:
         learning_rate: learning rate of ADAM for the hyperparameters θ_M.
         analytical_learning_rate: learning rate of ADAM for the analytical parameters θ_A.
         patience: number of evaluations without improvement after which ADAM stops.
-        warm_start: number of samples to learn from first, if there are more than twice as many; it is
-            doubled until all are used. If `None`, all samples are used from the start.
+        warm_start: number of samples to learn from first, if there are more than twice as many samples. The
+            number is then doubled until all are used. If `None`, all samples are used from the start.
         restarts: number of additional random starts; the best result is kept.
         seed: seed for the random starts.
         hyperpriors: whether hyperparameters have weak log-normal priors around their initial values (maximum
-            a posteriori). If not, learning maximises the likelihood, as in the paper.
+            a posteriori estimation). Otherwise, learning maximises the likelihood, as in the paper.
 
     Example:
         >>> LearningOptions(max_evaluations=50).optimizer
@@ -76,7 +76,7 @@ class LearningOptions:
 
 @dataclass(frozen=True)
 class Learned:
-    """Result of learning.
+    """The result of learning.
 
     Attributes:
         tensors: the best tensors found.
@@ -100,7 +100,7 @@ class Learned:
 
     @property
     def outcome(self) -> dict[str, Any]:
-        """Result of learning as fields of `FitResult`."""
+        """The result of learning as fields of `FitResult`."""
         return {
             "converged": self.converged,
             "evaluations": self.evaluations,
@@ -112,7 +112,7 @@ class Learned:
 
 
 def reported(progress: FitProgress | None, most: int, before: int = 0) -> Progress | None:
-    """Adapt a progress function to an optimisation that starts after `before` evaluations."""
+    """Adapt a progress function to an optimisation that starts after `before` earlier evaluations."""
     if progress is None:
         return None
     return lambda evaluations, value, _: progress(before + evaluations, most, value)
@@ -157,7 +157,7 @@ def minimise(
 
     Args:
         objective: differentiable function that maps the tensors to a scalar.
-        analytical: names of the analytical parameters θ_A, which have a separate ADAM optimiser.
+        analytical: names of the analytical parameters θ_A, for which ADAM has a separate learning rate.
         bounds: bounds on each tensor, used by L-BFGS.
         first_step: largest change in an entry in the first step of L-BFGS with bounds.
 
@@ -229,7 +229,7 @@ def _flattened(tensors: Iterable[Tensor]) -> np.ndarray:
 
 
 def _unflattened(x: np.ndarray, like: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Split a vector into tensors with the names, shapes and types of `like`."""
+    """Split a vector into tensors with the same names, shapes and types as `like`."""
     first, tensors = next(iter(like.values())), {}
     flat = torch.as_tensor(x, dtype=first.dtype, device=first.device)
     for key, value in like.items():

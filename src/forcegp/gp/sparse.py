@@ -1,12 +1,12 @@
-"""Sparse posterior over latent components, computed from two sums over samples.
+"""Sparse posterior of latent components, computed from two sums over the samples.
 
 With A = I + Σ V_i S_i V_iᵀ and v = Σ V_i W_iᵀ y_i, the latent mean is V_*ᵀA⁻¹v, and the latent covariance is
 k_** − V_*ᵀV_* + V_*ᵀA⁻¹V_* (Titsias 2009; Hensman et al. 2013). The cost of a prediction does not depend on
 the number of samples.
 
-Weights of basis functions may drift, so that some components change while others do not. A drifting weight is
-an Ornstein–Uhlenbeck process whose stationary distribution is the prior, w′ = ρ w + √(1 − ρ²) ξ, ξ ~ N(0, I).
-In information form, with A = I + G, v, drifting weights p and other weights o,
+The weights of some basis functions may drift, so that some components change while others do not. A drifting
+weight is an Ornstein–Uhlenbeck process whose stationary distribution is the prior: w′ = ρ w + √(1 − ρ²) ξ
+with ξ ~ N(0, I). In information form (A = I + G, v), with drifting weights p and other weights o,
 
     S = A_pp + ρ²a I,  a = 1/(1 − ρ²),
     A′_oo = A_oo − A_op S⁻¹ A_po,  A′_op = ρa A_op S⁻¹,  A′_pp = a I − ρ²a² S⁻¹,
@@ -40,12 +40,12 @@ from forcegp.gp.sums import Moments, Sums, accumulate, add_rows
 
 
 def drifted(sums: Sums, weights: Tensor, factor: float) -> Sums:
-    """Return the sums after the given weights have drifted; predictions from other weights do not change.
+    """Let the given weights drift. Predictions that depend only on the other weights do not change.
 
     Args:
-        sums: sums over the samples so far.
+        sums: sums over the previous samples.
         weights: positions of the drifting weights `(k,)`.
-        factor: correlation ρ with the previous weights; 1 keeps them, and 0 resets them to their prior.
+        factor: correlation ρ of the new with the previous weights; 1 keeps them, and 0 restores their prior.
 
     Raises:
         ModelError: the factor is not between 0 and 1.
@@ -73,7 +73,7 @@ def drifted(sums: Sums, weights: Tensor, factor: float) -> Sums:
 
 
 MISSED = 0.1
-"""Residual variance, as a fraction of the posterior variance, from which more inducing points would help."""
+"""Ratio of residual to posterior variance above which more inducing points would help."""
 
 
 @dataclass(frozen=True)
@@ -82,9 +82,9 @@ class Diagnostics:
 
     Attributes:
         size: number of basis functions.
-        learned: effective number of basis functions determined by the data, tr A⁻¹G, which is the total
+        learned: effective number tr A⁻¹G of basis functions determined by the data. It equals the total
             posterior variance of all rows in units of the noise variance.
-        missed: total residual prior variance of all rows, in the same units.
+        missed: total residual prior variance of all rows in units of the noise variance.
     """
 
     size: int
@@ -103,16 +103,16 @@ CHUNK_PREDICTIONS = 256
 """Number of samples for which covariances are computed at a time."""
 
 UPDATE_FRACTION = 0.25
-"""Number of new rows, relative to that of basis functions, above which the factor is recomputed."""
+"""Ratio of the numbers of new rows and basis functions above which the factor is recomputed."""
 
 
 @dataclass(frozen=True, eq=False)
 class SparsePosterior:
-    """Latent components conditioned on any number of samples through basis functions.
+    """Latent components conditioned on any number of samples, in terms of basis functions.
 
     Attributes:
         basis: basis functions.
-        moments: sums over the samples, except G, which follows from the factor.
+        moments: sums over the samples other than G, which is recovered from the factor.
         L: lower Cholesky factor of A = I + G.
         jitter: jitter added to the diagonal, usually 0.0.
     """
@@ -127,7 +127,7 @@ class SparsePosterior:
         """Factorise A = I + G.
 
         Raises:
-            NumericalError: A is not positive definite, for example after removing samples that were never
+            NumericalError: A is not positive definite, for example after removing samples that were not
                 added.
         """
         # A = I + G = L Lᵀ
@@ -138,7 +138,7 @@ class SparsePosterior:
         return result
 
     def tensors(self) -> dict[str, Tensor]:
-        """Return all tensors to be saved, keyed by name, except those of processes and hyperparameters."""
+        """Return the tensors to save, keyed by name; processes and hyperparameters are saved separately."""
         tensors = {f"moments.{name}": getattr(self.moments, name) for name in MOMENTS}
         tensors |= {"L": self.L, "jitter": torch.tensor(self.jitter, dtype=torch.float64)}
         tensors |= self.basis.tensors()
@@ -172,7 +172,7 @@ class SparsePosterior:
 
     @cached_property
     def sums(self) -> Sums:
-        """All sums over the samples; G is recovered from the factor if samples were added to that."""
+        """All sums over the samples; G is recovered from the factor if samples were added to the factor."""
         eye = torch.eye(len(self.L), dtype=self.L.dtype, device=self.L.device)
         return Sums(**vars(self.moments), G=self.L @ self.L.mT - (1.0 + self.jitter) * eye)
 
@@ -183,7 +183,7 @@ class SparsePosterior:
 
     @property
     def log_likelihood(self) -> float:
-        """Collapsed lower bound on the log p(y) of exact inference (Titsias 2009)."""
+        """Collapsed lower bound on the exact log-likelihood log p(y) (Titsias 2009)."""
         # F = −½ [Σ y² − vᵀA⁻¹v + log|A| + rows log 2π + Σ tr W(k − VᵀV)Wᵀ], log|A| = 2 Σ log L_ii
         moments = self.moments
         fit = moments.yy - moments.v @ self.weights
@@ -200,7 +200,7 @@ class SparsePosterior:
 
     @cached_property
     def measured(self) -> tuple[bool, ...]:
-        """For each process, whether it affects any row; the samples do not affect the others."""
+        """Flags of the processes that affect at least one row. All other processes keep their prior."""
         # The factor of A = I + G is that of the identity where G is zero.
         diagonal = self.L.diagonal().abs()
         slices = (self.basis.of_process(p) for p in range(len(self.basis.parts)))
@@ -208,7 +208,7 @@ class SparsePosterior:
 
     @cached_property
     def folded(self) -> list[tuple[Tensor, Tensor]]:
-        """Posterior mean of each process, as weights of k(x, Z) and of the exact features."""
+        """Posterior mean of each process, as weights of k(x, Z) and of its exact features."""
         basis, weights = self.basis, self.weights[:, None]
         return [part.fold(weights[basis.of_process(p)]) for p, part in enumerate(basis.parts)]
 
@@ -229,7 +229,7 @@ class SparsePosterior:
         return rows_mean(self.latent_mean, block)
 
     def knowing(self, p: int, features: Features, value: Tensor) -> SparsePosterior:
-        """Return the posterior given the value `(components,)` of a constant process p with finite features.
+        """Condition on the value `(components,)` of a constant process p with finitely many features.
 
         The mean of process p becomes zero, since the value is now part of the prior mean.
         """
@@ -248,8 +248,8 @@ class SparsePosterior:
     def _inverse_factor(self) -> list[Tensor]:
         """L⁻ᵀ for each process, with one block of rows per component `(components, width, size)`.
 
-        The basis functions of a component involve only its own rows. With L⁻ᵀ, the other rows can be
-        skipped, unlike in a triangular solve.
+        The basis functions of a component involve only the rows of that component. The other rows of L⁻ᵀ can
+        be skipped, which is not possible in a triangular solve.
         """
         eye = torch.eye(len(self.L), dtype=self.L.dtype, device=self.L.device)
         inverse = torch.linalg.solve_triangular(self.L, eye, upper=False).mT
@@ -261,8 +261,8 @@ class SparsePosterior:
         return blocks
 
     def _latent(self, features: Sequence[Features]) -> tuple[Tensor, Tensor, Tensor]:
-        """Return T `(n, components, size)`, where T Tᵀ is the covariance that the basis explains, and the
-        residual variance and prior variance of all components `(n, components)`."""
+        """Return T `(n, components, size)`, where T Tᵀ is the covariance represented by the basis, and the
+        residual and prior variances of all components, each `(n, components)`."""
         T, missed, prior = [], [], []
         for part, inverse, x in zip(self.basis.parts, self._inverse_factor, features, strict=True):
             # T = Vᵀ L⁻ᵀ, so that T Tᵀ = Vᵀ A⁻¹ V
@@ -297,14 +297,14 @@ class SparsePosterior:
         """Reject a prior whose variance is so large that double precision cannot resolve the noise.
 
         Raises:
-            NumericalError: the prior of the approximated part is too large.
+            NumericalError: the prior variance of the approximated part is too large.
         """
         if float(self.moments.rows) > 0.0:
             require_resolved_noise(self.moments.prior.sum() / self.moments.rows)
 
     @cached_property
     def diagnostics(self) -> Diagnostics:
-        """Variance determined by the samples, and residual variance of the inducing points."""
+        """Posterior variance of the rows, and residual variance not represented by the inducing points."""
         # tr A⁻¹G = size − tr A⁻¹ = size − |L⁻ᵀ|²
         inverse = sum((block**2).sum() for block in self._inverse_factor)
         size = self.basis.size
@@ -326,7 +326,7 @@ class SparsePosterior:
         return draw_functions(self.basis, weights, generator, features)
 
     def updated(self, blocks: Sequence[Block]) -> SparsePosterior:
-        """Condition on additional samples, at a cost that does not depend on the number of previous samples.
+        """Condition on additional samples. The cost does not depend on the number of previous samples.
 
         Raises:
             NumericalError: the factorisation fails.
@@ -339,7 +339,7 @@ class SparsePosterior:
         return SparsePosterior(self.basis, moments, extended(self.L, Phi), self.jitter)
 
     def forgetting(self, factor: float) -> SparsePosterior:
-        """Scale the weight of all previous samples by `factor`; 0 restores the prior.
+        """Multiply the weight of all previous samples by `factor`; 0 restores the prior.
 
         Raises:
             ModelError: the factor is not between 0 and 1.
@@ -347,7 +347,7 @@ class SparsePosterior:
         return SparsePosterior.of(self.basis, self.sums.scaled(factor))
 
     def drifting(self, factor: float, processes: Sequence[int]) -> SparsePosterior:
-        """Let the weights of the given processes drift towards their prior; the others do not change.
+        """Let the weights of the given processes drift towards their prior. Other weights do not change.
 
         Raises:
             ModelError: the factor is not between 0 and 1.

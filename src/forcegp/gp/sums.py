@@ -1,10 +1,10 @@
-"""The two sums over samples that determine a sparse posterior, which can be streamed, added and discounted.
+"""The two sums over samples that determine a sparse posterior. They can be streamed, added and discounted.
 
-Whitened rows y_i = W_i f(x_i) + ε enter only through S_i = W_iᵀW_i and c_i = W_iᵀy_i: G = Σ V_i S_i V_iᵀ and
-v = Σ V_i c_i, where V_i contains the basis functions of each component at sample i.
+Only S_i = W_iᵀW_i and c_i = W_iᵀy_i of whitened rows y_i = W_i f(x_i) + ε enter the sums G = Σ V_i S_i V_iᵀ
+and v = Σ V_i c_i, where V_i contains the basis functions of each component at sample i.
 
-With `torch.distributed` (gloo on CPUs, NCCL on GPUs), each process sums over different samples, with common
-inducing points and hyperparameters.
+With `torch.distributed` (gloo on CPUs, NCCL on GPUs), each process sums over different samples, but all
+processes share the inducing points and hyperparameters.
 
     torchrun --standalone --nproc-per-node 2 script.py
 
@@ -28,19 +28,19 @@ from forcegp.gp.features import Block, Features, chunked
 from forcegp.gp.kernels import Parameters
 
 CHUNK_SAMPLES = 1024
-"""Number of samples for which basis functions are kept in memory at a time."""
+"""Number of samples whose basis functions are kept in memory at a time."""
 
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """Sums over samples that need little memory.
+    """All sums over the samples except the large matrix G.
 
     Attributes:
         v: Σ V Wᵀy `(size,)`.
         yy: Σ y² `()`.
-        rows: number of rows, reduced by forgetting `()`.
-        prior: Σ tr W k Wᵀ for the part of each process approximated with inducing points `(processes,)`.
-        missed: its residual with respect to the basis, Σ tr W (k − VᵀV) Wᵀ `(processes,)`.
+        rows: number of rows, scaled down by forgetting `()`.
+        prior: Σ tr W k Wᵀ `(processes,)` for the part of each process that inducing points approximate.
+        missed: the residual prior variance, Σ tr W (k − VᵀV) Wᵀ `(processes,)`.
     """
 
     v: Tensor
@@ -57,7 +57,7 @@ class Moments:
 
 @dataclass(frozen=True, eq=False)
 class Sums(Moments):
-    """All sums over samples for one basis.
+    """All sums over the samples for one basis.
 
     Attributes:
         G: Σ V S Vᵀ `(size, size)`.
@@ -67,12 +67,12 @@ class Sums(Moments):
 
     @classmethod
     def zero(cls, basis: LatentBasis, like: Tensor) -> Sums:
-        """Return sums over zero samples."""
+        """Return the sums of an empty data set."""
         n, p = basis.size, len(basis.parts)
         return cls(*(like.new_zeros(shape) for shape in ((n,), (), (), (p,), (p,), (n, n))))
 
     def __add__(self, other: Sums) -> Sums:
-        """Return the sums over the samples of both operands.
+        """Add the sums over two sets of samples.
 
         Raises:
             ModelError: the sums belong to bases of different sizes.
@@ -81,7 +81,7 @@ class Sums(Moments):
         return Sums(*(a + b for a, b in zip(self.tensors, other.tensors, strict=True)))
 
     def __sub__(self, other: Sums) -> Sums:
-        """Return the sums without the samples of `other`, which must be a subset.
+        """Remove the samples of `other`, which must be a subset of the samples.
 
         Raises:
             ModelError: the sums belong to bases of different sizes, or `other` has more rows.
@@ -89,14 +89,14 @@ class Sums(Moments):
         self._check(other)
         if float(other.rows) > float(self.rows):
             raise ModelError(
-                "cannot remove more rows than there are",
+                "cannot remove more rows than were added",
                 expected=f"at most {float(self.rows):g}",
                 got=float(other.rows),
             )
         return Sums(*(a - b for a, b in zip(self.tensors, other.tensors, strict=True)))
 
     def scaled(self, factor: float) -> Sums:
-        """Return the sums scaled by `factor`, for exponential forgetting.
+        """Scale the sums by `factor` for exponential forgetting.
 
         Raises:
             ModelError: the factor is not between 0 and 1.
@@ -117,10 +117,10 @@ class Sums(Moments):
 
 @torch.no_grad()
 def accumulate(basis: LatentBasis, blocks: Iterable[Block], chunk: int = CHUNK_SAMPLES) -> Sums:
-    """Sum over the samples in the blocks, using an amount of memory independent of their number.
+    """Sum over the samples in the blocks. The memory needed does not depend on their number.
 
     Args:
-        blocks: whitened rows; may be a generator.
+        blocks: whitened rows, possibly from a generator.
         chunk: number of samples per chunk.
     """
     total: Sums | None = None
@@ -136,7 +136,7 @@ def accumulate(basis: LatentBasis, blocks: Iterable[Block], chunk: int = CHUNK_S
 
 
 def _add(basis: LatentBasis, block: Block, into: Sums) -> None:
-    """Add a block in place, to the upper triangle of G only."""
+    """Add a block in place. Only the upper triangle of G is updated."""
     V, prior, missed = basis.evaluate(block.features)
     # S = WᵀW `(k, k, n)` and c = Wᵀy `(n, k)` of each sample
     W = torch.cat(block.operators, dim=-1)
@@ -162,19 +162,19 @@ def _add(basis: LatentBasis, block: Block, into: Sums) -> None:
 
 
 def _by_process(basis: LatentBasis, S_kk: Tensor, variance: Tensor) -> Tensor:
-    """Return Σ S_kk var_k of each process `(processes,)`, given S_kk and variances `(n, k)`."""
+    """Return Σ S_kk var_k for each process `(processes,)`, given S_kk and the variances `(n, k)`."""
     traces = (S_kk * variance).sum(0)
     return torch.stack([traces[components].sum() for components in basis.components])
 
 
 @torch.no_grad()
 def add_rows(basis: LatentBasis, moments: Moments, blocks: Sequence[Block]) -> tuple[Moments, Tensor]:
-    """Return the moments with a few samples added, and the new rows in terms of the basis functions.
+    """Add a few samples to the moments, and express their rows in terms of the basis functions.
 
-    The rows are formed explicitly, which is faster than `accumulate` for a small number of samples.
+    The rows are computed explicitly, which is faster than `accumulate` for a small number of samples.
 
     Returns:
-        The new moments, and Φ with rows W_i V_iᵀ `(rows, size)`.
+        The new moments, and the matrix Φ `(rows, size)` of rows W_i V_iᵀ.
     """
     Phi = moments.v.new_zeros(sum(block.rows for block in blocks), basis.size)
     traces = [moments.v.new_zeros(2)] * len(basis.parts)
@@ -209,7 +209,7 @@ def _runs(columns: list[slice]) -> list[slice]:
 
 
 def reduce_sums(sums: Sums) -> Sums:
-    """Add the sums of all processes; each process obtains the same result.
+    """Add the sums of all processes. Every process obtains the same result.
 
     All must use the basis from `share_basis`, since eigenvectors are unique only up to sign and rotation.
 
@@ -222,7 +222,7 @@ def reduce_sums(sums: Sums) -> Sums:
 
 
 def add_over_processes(x: Tensor) -> Tensor:
-    """Add the tensors of all processes; each process obtains the same result."""
+    """Add the tensors of all processes. Every process obtains the same result."""
     total = x.detach().clone()
     with _processes():
         dist.all_reduce(total, op=dist.ReduceOp.SUM)
@@ -230,7 +230,7 @@ def add_over_processes(x: Tensor) -> Tensor:
 
 
 def require_agreement(what: str, *values: int, hint: str | None = None) -> None:
-    """Check that the values agree across all processes; the error is raised in all of them or in none.
+    """Check that all processes have the same values. If not, every process raises the error.
 
     Raises:
         ModelError: the values differ, or no process group has been initialised.
@@ -241,12 +241,12 @@ def require_agreement(what: str, *values: int, hint: str | None = None) -> None:
         dist.all_gather(every, own)
     differ = [str(rank) for rank, x in enumerate(every) if not torch.equal(x, every[0])]
     if differ:
-        got = f"another one in process {', '.join(differ)} than in process 0"
+        got = f"a different one in process {', '.join(differ)} than in process 0"
         raise ModelError(f"the processes of a distributed fit differ in {what}", got=got, hint=hint)
 
 
 def share_basis(basis: LatentBasis) -> LatentBasis:
-    """Send the basis of the first process to all others, whose bases must have the same shapes.
+    """Send the basis of the first process to all others. Their bases must have the same shapes.
 
     Raises:
         ModelError: no process group has been initialised.
@@ -276,7 +276,7 @@ def _broadcast(x: Tensor) -> Tensor:
 
 @contextmanager
 def _processes() -> Iterator[None]:
-    """Exchange data with the other processes; raise `ModelError` if there are none or if one is lost."""
+    """Exchange data with the other processes; raise `ModelError` if there are none or one has failed."""
     if not (dist.is_available() and dist.is_initialized()):
         raise ModelError(
             "no group of processes has been initialised",

@@ -1,4 +1,4 @@
-"""Import of logs from other programs: readers, column mappings, clocks, units, derivatives and contacts.
+"""Import of logs from other programs.
 
 `read_log` reads a log file of any supported format as a data set for a robot.
 """
@@ -41,12 +41,12 @@ __all__ = [
 ]
 
 NUMBERS = 16
-"""Upper bound on the count of numbers held in memory per joint and row; ten were measured."""
+"""Upper bound on the number of values held in memory per joint and row. Ten were measured."""
 
 
 @dataclass(frozen=True)
 class Imported:
-    """An imported data set, the report of the import, and the evidence for each detected contact."""
+    """An imported data set with the report of the import and the evidence for each detected contact."""
 
     data: Dataset
     report: ImportReport
@@ -58,19 +58,19 @@ def read_log(
     scene: Scene | ConstrainedSystem | RobotModel | str | Path,
     mapping: Mapping | str | Path | None = None,
 ) -> Dataset:
-    """Read a log of any supported format as a data set for a robot; see also `import_log`.
+    """Read a log of any supported format as a data set for a robot.
 
     Args:
-        path: the log, which is a file or a folder.
-        scene: a scene or its file, a system, or a robot.
-        mapping: a mapping of the columns, its file, or the name of a bundled mapping. By default, columns
-            must be named as in a data set or in ROS joint states.
+        path: the log file or folder.
+        scene: a scene or the path of its file, a system, or a robot.
+        mapping: a mapping of the columns, the path of its file, or the name of a bundled mapping. If it is
+            omitted, columns must be named as in a data set or in ROS joint states.
 
     Returns:
         The log in SI units and in the robot's joint order.
 
     Raises:
-        DataError: the log cannot be read or used; the message names the column and the rows.
+        DataError: the log cannot be read or used. The message names the column and the rows.
         MappingError: the mapping is invalid or does not match the log.
         MissingDependencyError: the reader for the format is not installed.
 
@@ -101,7 +101,7 @@ def import_log(
     progress: Callable[[int, int], None] | None = None,
     displaced: bool = False,
 ) -> Imported:
-    """Read a log as in `read_log`, with a report; if `displaced`, the tip may slide away from its surface."""
+    """Read a log as in `read_log`, and report the import. If `displaced`, accept a displaced surface."""
     system = system_of(scene)
     robot = system.robot
     log_mapping = default_mapping(path, system) if mapping is None else mapping
@@ -128,7 +128,7 @@ def import_log(
 
 
 def system_of(scene: Scene | ConstrainedSystem | RobotModel | str | Path) -> ConstrainedSystem:
-    """Convert a scene, its file or name, or a robot to a system of a robot with its contacts."""
+    """Convert a scene (or its file or name) or a robot to a system of a robot with its contacts."""
     if isinstance(scene, ConstrainedSystem):
         return scene
     if isinstance(scene, RobotModel):
@@ -139,7 +139,7 @@ def system_of(scene: Scene | ConstrainedSystem | RobotModel | str | Path) -> Con
 def _contacts(
     signals: Signals, system: ConstrainedSystem, mapping: Mapping, report: ImportReport, displaced: bool
 ) -> list[Evidence]:
-    """Find the state of each contact; to detect it by λ, first compute accelerations across the switches."""
+    """Determine the state of each contact; detection by λ first computes accelerations across switches."""
     if not any(section.source == "multiplier" for section in mapping.sections.contact.values()):
         return detect(signals, system, mapping, report, displaced)
     copies = {name: value.copy() for name, value in signals.vectors.items()}
@@ -165,10 +165,9 @@ def _find_clipped(signals: Signals, mapping: Mapping) -> None:
 def _treat_clipped(
     signals: Signals, std: Array | None, mapping: Mapping, report: ImportReport
 ) -> Array | None:
-    """Drop rows with clipped torques, or set the noise `tau_std` of these torques to their magnitude; return
-    σ of q̈ in the remaining rows.
+    """Drop rows with clipped torques, or set their noise `tau_std` to their magnitude.
 
-    A filter spreads a clipped torque to the rows within half its window.
+    Filters spread a clipped torque over half their window. Return σ of q̈ in the remaining rows.
     """
     if "clipped" not in signals.vectors or not (mask := signals.vectors.pop("clipped")).any():
         return std
@@ -190,7 +189,7 @@ def _treat_clipped(
 def _dataset(
     signals: Signals, std: Array | None, mapping: Mapping, system: ConstrainedSystem, report: ImportReport
 ) -> Dataset:
-    """Return the data set made from processed signals."""
+    """Return the data set built from the processed signals."""
     robot = system.robot
     settings = mapping.sections.derivatives
     dt = usual_step(signals.t)

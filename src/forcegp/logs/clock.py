@@ -1,6 +1,4 @@
-"""Processing of time stamps: backward steps, restarts, gaps, repeated and held rows, alignment of streams
-with different rates, and resampling of uneven clocks.
-"""
+"""Processing of time stamps: order, restarts, gaps, repeated rows, alignment of streams, and resampling."""
 
 from __future__ import annotations
 
@@ -10,17 +8,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forcegp import limits
+from forcegp.data.derivative import UNIFORM_TOLERANCE
 from forcegp.errors import DataError
 from forcegp.guards import check_count
 from forcegp.logs.table import Array, ImportReport, Signals
+from forcegp.robust import robust_std
 from forcegp.rows import describe, numbered
 
 RESTART_STEPS, SHORTEST_TRAJECTORY = 2.0, 10
-"""A clock has restarted if it falls back to at most this many steps after the start of its trajectory, and
-the trajectory has at least this many rows; otherwise, time stamps are out of order.
+"""A clock has restarted if it falls back to within this many steps of the start of its trajectory, and the
+trajectory has at least this many rows. Otherwise, the time stamps are out of order.
 """
 GAP_STEPS = 5.0
-"""Multiple of the usual step above which a step counts as a gap."""
+"""A step longer than this multiple of the usual step counts as a gap."""
 
 
 def usual_step(t: Array) -> float:
@@ -37,7 +37,7 @@ def usual_step(t: Array) -> float:
 
 
 def drop_repeated(signals: Signals, report: ImportReport) -> None:
-    """Drop rows that repeat the previous row; raise `DataError` if only the time stamp is repeated."""
+    """Drop rows that repeat the previous row; raise `DataError` if only the time stamp repeats."""
     same = np.append(False, np.diff(signals.t) == 0.0)
     if not same.any():
         return
@@ -53,17 +53,17 @@ def drop_repeated(signals: Signals, report: ImportReport) -> None:
 
 
 def _repeats(signals: Signals, *names: str) -> NDArray[np.bool_]:
-    """Return the rows in which some vectors have the values of the previous row."""
+    """Return the rows in which all of the given vectors repeat the values of the previous row."""
     differs = [np.diff(signals.vectors[name], axis=0).any(axis=1) for name in names]
     return np.append(False, ~np.any(differs, axis=0))
 
 
 def split_trajectories(signals: Signals, gap: float | None, report: ImportReport) -> None:
-    """Number the trajectories. A new one begins if the number in the log changes, if the clock restarts, or
-    after a step longer than `gap` [s], by default `GAP_STEPS` usual steps.
+    """Number the trajectories. A new trajectory begins if the trajectory number in the log changes, if the
+    clock restarts, or after a step longer than `gap` [s], which is `GAP_STEPS` usual steps by default.
 
     Raises:
-        DataError: time runs backward without a restart; the message lists the rows.
+        DataError: time runs backward without a restart. The message lists the rows.
     """
     t = signals.t
     step = usual_step(t)
@@ -94,12 +94,14 @@ def split_trajectories(signals: Signals, gap: float | None, report: ImportReport
 
 
 def find_held(signals: Signals, drop: bool, report: ImportReport) -> None:
-    """Find rows repeated because the logger is faster than its source, and drop them if requested."""
+    """Find rows that repeat because the logger is faster than its source, and drop them if requested."""
     held = np.append(False, np.diff(signals.segment) == 0) & _repeats(signals, "q", "tau")
     if held.any():
         done = "were dropped" if drop else 'are kept; held = "drop" under [time] drops them'
-        message = f"{held.sum()} rows repeat the values of the previous row and {done}"
-        report.find("held", message, signals.row[held])
+        share = f"{held.sum()} rows ({100 * held.mean():.2g} %)"
+        message = f"{share} repeat the values of the previous row and {done}"
+        kind = "faster than its source" if 2 * held.sum() > len(held) and not drop else "held"
+        report.find(kind, message, signals.row[held])
         if drop:
             signals.keep(~held)
 
@@ -107,7 +109,7 @@ def find_held(signals: Signals, drop: bool, report: ImportReport) -> None:
 def join_stream(
     signals: Signals, name: str, t: Array, values: Array, gap: float | None, report: ImportReport
 ) -> None:
-    """Add a vector interpolated from a stream with time stamps t `(k,)`, and drop rows outside its range."""
+    """Interpolate a vector from a stream with time stamps t (k,), and drop rows outside its range."""
     back = np.flatnonzero(np.diff(t) <= 0.0)
     if len(back):
         text = f"the stream of {name} has a clock that does not increase in row {back[0] + 1}"
@@ -136,25 +138,27 @@ def join_stream(
 UNEVEN = 0.02
 """Largest relative deviation of time steps from the median for which sampling counts as even."""
 SMOOTH = ("q", "qd")
-"""Quantities interpolated by cubic splines; noisier quantities are interpolated linearly."""
+"""Quantities interpolated by cubic splines. Noisier quantities are interpolated linearly."""
 
 
 def onto(t: Array, values: Array, at: Array, cubic: bool = False) -> Array:
-    """Interpolate values `(n, d)` with time stamps t at times `at`, linearly or by a cubic spline."""
+    """Interpolate values (n, d) from times t to times `at`, linearly or by a cubic spline."""
     from scipy.interpolate import CubicSpline, make_interp_spline
 
     return CubicSpline(t, values)(at) if cubic and len(t) >= 4 else make_interp_spline(t, values, k=1)(at)
 
 
 def even_clock(signals: Signals, period: float | None, report: ImportReport) -> None:
-    """Resample uneven trajectories with the step `period` [s], by default the usual step."""
+    """Resample uneven trajectories with the step `period` [s] (default: the usual step)."""
     stretches = [rows for rows in signals.runs() if rows.stop - rows.start > 1]
     if not stretches:
         raise DataError("the log has no trajectory of two rows or more")
     steps = [np.diff(signals.t[rows]) for rows in stretches]
     worst = max(float(np.abs(s - np.median(s)).max() / np.median(s)) for s in steps)
     if worst > UNEVEN:
-        report.find("uneven", f"time steps deviate by up to {100.0 * worst:.3g} % from the usual step")
+        jitter = robust_std(np.concatenate(steps)) > UNIFORM_TOLERANCE * usual_step(signals.t)
+        message = f"time steps deviate by up to {100.0 * worst:.3g} % from the usual step"
+        report.find("jitter" if jitter else "uneven", message)
     elif period is None:
         return
     step = period if period is not None else usual_step(signals.t)

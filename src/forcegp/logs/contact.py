@@ -1,13 +1,13 @@
-"""Detection of the intervals in which a contact is closed, from its distance, a measured force or λ.
+"""Detection of closed contacts from the distance to the surface, a measured force, or λ.
 
 The reading of a force-torque sensor is converted to the force and moment that the environment exerts at the
-contact, in world coordinates. The sensor is located at p_S in a frame of the robot, with rotation R. Its
-reading f, m is the action of the environment and gravity on the robot. The weight m_T g of the tool, which
-acts at its centre of mass p_T, is subtracted, and the moment is taken about the contact point p_C:
+contact, in world coordinates. The sensor has position p_S and rotation R in the world. Its reading f, m is
+the action of the environment and gravity on the robot. The weight m_T g of the tool, which acts at its centre
+of mass p_T, is subtracted, and the moment is taken about the contact point p_C:
 
     F = R f − m_T g,   M = R m − (p_T − p_S) × m_T g − (p_C − p_S) × F.
 
-The inertial force m_T p̈_T of the tool is neglected, since it is small for light tools and slow motion.
+The inertial force m_T p̈_T is neglected, since it is small for lightweight tools and slow motion.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ CHUNK = 1 << 12
 
 
 def _rowwise(signals: Signals, names: Sequence[str], function: Callable[..., torch.Tensor]) -> Array:
-    """Evaluate a function of the named vectors of a log, in blocks of rows."""
+    """Evaluate a function of the named vectors of a log in blocks of rows."""
     blocks = []
     for start in range(0, len(signals), CHUNK):
         rows = slice(start, start + CHUNK)
@@ -51,7 +51,7 @@ def _tip(system: ConstrainedSystem, contact: SurfaceContact, q: torch.Tensor) ->
 def _wrench(
     robot: RobotModel, mapping: Mapping, q: torch.Tensor, reading: torch.Tensor
 ) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
-    """Return the force and moment at the sensor without the tool's weight, and its position, in the world."""
+    """Return, in the world, the force and moment without the tool's weight, and the sensor position."""
     section = mapping.sections.wrench
     assert section is not None
     if section.frame == GROUND:
@@ -72,7 +72,7 @@ def _wrench(
 
 
 def per_contact(signals: Signals, system: ConstrainedSystem, mapping: Mapping) -> dict[str, dict[str, Array]]:
-    """Return `F_sensor` and `M_sensor` at each contact with a surface, or the `multiplier` of a load cell."""
+    """Return `F_sensor` and `M_sensor` at each surface contact, or the `multiplier` from a load cell."""
     touching = [contact for contact in system.contacts if isinstance(contact, SurfaceContact)]
     section = mapping.sections.wrench
     if section is not None and len(section.force) == 1:
@@ -91,7 +91,7 @@ def per_contact(signals: Signals, system: ConstrainedSystem, mapping: Mapping) -
 
 
 def multiplier(signals: Signals, system: ConstrainedSystem, contact: SurfaceContact) -> Array:
-    """Return λ = (A M⁻¹Aᵀ)⁺ A (q̈ − M⁻¹Q) `(n,)` at a contact [N], which is close to zero in free motion."""
+    """Return λ = (A M⁻¹Aᵀ)⁺ A (q̈ − M⁻¹Q) `(n,)` at a contact [N]. In free motion, λ is close to zero."""
     alone = ConstrainedSystem(system.robot, [contact])
 
     def value(q: torch.Tensor, qd: torch.Tensor, qdd: torch.Tensor, tau: torch.Tensor) -> torch.Tensor:
@@ -105,7 +105,7 @@ def multiplier(signals: Signals, system: ConstrainedSystem, contact: SurfaceCont
 def _evidence(
     signals: Signals, system: ConstrainedSystem, mapping: Mapping, contact: SurfaceContact, source: str
 ) -> Array:
-    """Return the signal `(n,)` from which a contact is detected: c(q) [m], the sensor's n·F [N], or λ [N]."""
+    """Return the signal (n,) for detecting a contact: c(q) [m], the measured n·F [N], or λ [N]."""
 
     def normal_force(q: torch.Tensor, reading: torch.Tensor) -> torch.Tensor:
         force = _wrench(system.robot, mapping, q, reading)[0]
@@ -120,28 +120,29 @@ def _evidence(
 
 SEPARATION, RELEASE_STD, RELEASE = 6.0, 4.0, 0.01
 """Minimum difference between the force levels of open and closed contact, in standard deviations of the open
-level; minimum margin above the open level in closed intervals, in the same unit and as a fraction of it."""
+level. Minimum margin above the open level in closed intervals, in the same unit and as a fraction of it."""
 TOUCHING, DISTANCE_STD, SMALLEST_DISTANCE = 1e-3, 6.0, 1e-6
-"""Largest distance in contact [m]; margin above the median distance of the closed contact, in standard
-deviations and at least, to allow for rounding [m]; a mapping may override the result."""
+"""Largest distance in contact [m]; margin above the median distance in contact, in standard deviations;
+smallest margin, to allow for rounding [m]. A mapping may override the result."""
 TOUCHED, LEVEL, INSIDE = 0.02, 0.2, 0.95
-"""Fraction of rows on the surface above which the surface is where the scene states; fractions of moving rows
-at a common distance, and of rows inside the solid, above which it is not."""
+"""Fraction of rows on the surface above which the surface is where the scene states. Fractions of moving rows
+at a common distance, and of rows inside the solid, above which the surface is elsewhere."""
 SLIDING, TRIED_ROWS = 0.01, 500
-"""Speed above which a tip moves [m/s], and maximum number of rows on which swapped joints are tried."""
+"""Speed above which a tip counts as moving [m/s]; maximum number of rows on which joint swaps are tried."""
 ELSEWHERE = (
-    "see where it slides with --fit-surface plane (or sphere), and correct the scene; "
+    "see where it slides with --fit-surface plane (or sphere), and correct the scene (a wrong tool length or "
+    "encoder zero displaces the tip, too); "
     'for free motion, set source = "never" under [contact.{}]'
 )
 BINS = 512
-"""Number of bins of the histogram in which the two levels are separated."""
+"""Number of bins in the histogram that separates the two levels."""
 
 
 @dataclass(frozen=True)
 class Evidence:
-    """Evidence for the state of a contact [N, m]. The contact is closed above `threshold`, and intervals are
-    extended to `release` on either side. Levels and spreads are NaN for a state that does not occur. For each
-    closed interval, the first and last time are given [s]. `merged` counts intervals that were too short.
+    """Evidence for the state of a contact, in N or m. The contact is closed above `threshold`, and intervals
+    are extended to `release` on either side. Levels and spreads are NaN for a state that does not occur.
+    Closed intervals are given by first and last times [s]. `merged` counts intervals that were too short.
     """
 
     contact: str
@@ -222,7 +223,7 @@ def _misplaced(
     displaced: bool,
     report: ImportReport,
 ) -> float:
-    """Return the distance [m] from the surface at which the tip slides if `displaced`; otherwise raise."""
+    """Return the distance [m] from the surface at which the tip slides; raise unless `displaced` is set."""
     p, name = _rowwise(signals, ("q",), lambda q: _tip(system, contact, q)), contact.name
     moves = np.linalg.norm(np.gradient(p, axis=0), axis=1) > SLIDING * np.median(np.diff(signals.t))
     level, (middle, spread) = level_of(c[moves], TOUCHING, LEVEL), level_and_spread(1e3 * c)
@@ -246,7 +247,7 @@ def _misplaced(
 
 
 def exchanged_joints(system: ConstrainedSystem, contact: SurfaceContact, q: Array) -> tuple[int, ...]:
-    """Return the two joints, if any, whose exchange moves the tip onto its surface in enough rows."""
+    """Return the two joints, if any, that must be swapped to move the tip onto its surface in enough rows."""
     q = q[:: max(1, len(q) // TRIED_ROWS)]
     for pair in combinations(range(q.shape[1]) if len(q) else (), 2):
         order = np.arange(q.shape[1])
@@ -277,8 +278,8 @@ def _detect(
 def touching(distance: Array) -> float:
     """Return the distance up to which a contact counts as closed [m], at most `TOUCHING`.
 
-    Most rows within `TOUCHING` belong to the closed contact. The threshold, their median plus `DISTANCE_STD`
-    standard deviations, separates them from approach and departure.
+    Most rows within `TOUCHING` belong to the closed contact. The threshold is their median plus
+    `DISTANCE_STD` standard deviations, which separates them from approach and departure.
 
     >>> touching(np.array([0.0, 0.001, -0.001, 0.0, 0.002, 0.9, 30.0]) * 1e-3) < 1e-5
     True
@@ -293,9 +294,9 @@ def touching(distance: Array) -> float:
 def force_levels(values: Array, name: str, section: ContactStateSection) -> tuple[float, float]:
     """Return the force above which a contact is closed, and the lower force to which intervals extend [N].
 
-    The first separates the forces into the two groups with the least variance (Otsu 1979). The second exceeds
-    the median of the open group by `RELEASE_STD` standard deviations, or by a fraction `RELEASE` of the
-    difference if that is larger. Raise `DataError` if the groups are not distinct.
+    The first force separates the values into the two groups with the least variance (Otsu 1979). The second
+    exceeds the median of the open group by `RELEASE_STD` standard deviations, or by a fraction `RELEASE` of
+    the difference if that is larger. Raise `DataError` if the groups are not distinct.
     """
     if section.threshold is not None:
         return section.threshold, section.release or 0.5 * section.threshold
@@ -320,7 +321,7 @@ def force_levels(values: Array, name: str, section: ContactStateSection) -> tupl
 
 
 def hysteresis(values: Array, high: float, low: float, segment: NDArray[np.int64]) -> NDArray[np.bool_]:
-    """Return the mask of all stretches above `low` that reach `high`.
+    """Return the mask of all runs above `low` that reach `high`.
 
     >>> hysteresis(np.array([0.0, 2, 5, 2, 0, 2, 0]), 4.0, 1.0, np.zeros(7, dtype=np.int64)).astype(int)
     array([0, 1, 1, 1, 0, 0, 0])
@@ -332,7 +333,7 @@ def hysteresis(values: Array, high: float, low: float, segment: NDArray[np.int64
 
 
 def _merge_short(closed: NDArray[np.bool_], signals: Signals, shortest: float) -> int:
-    """Merge intervals shorter than `shortest` [s] with their neighbours, and return their number."""
+    """Merge intervals shorter than `shortest` [s] with their neighbours, and return how many were merged."""
     count = 0
     for trajectory in signals.runs():
         t, state = signals.t[trajectory], closed[trajectory]

@@ -1,7 +1,7 @@
-"""Motion of unlogged joints that follows from a closed contact, and speeds below which a contact sticks.
+"""Motion of unlogged joints derived from a closed contact, and speeds below which a contact sticks.
 
 **Joints without a column.** A closed contact satisfies c(q) = 0, A q̇ = 0 and A q̈ = b. Let u denote the
-unknown joints and o the logged joints. Then q_u is found by solving c(q_o, q_u) = 0 by Gauss-Newton, and
+unknown joints and o the logged joints. Gauss-Newton iterations solve c(q_o, q_u) = 0 for q_u. Then
 
     q̇_u = −A_u⁺ A_o q̇_o,   q̈_u = A_u⁺ (b − A_o q̈_o).
 
@@ -34,8 +34,8 @@ UNMOVED = 1e-6
 BINS, SMOOTH = 10, 1.5
 """Number of bins per decade of speed, and standard deviation of the smoothing kernel, in bins."""
 VALLEY, SHARE = 0.5, 0.1
-"""Maximum height of a valley relative to the lower of the two modes, and minimum fraction of rows on either
-side, since a tip that pauses only when it reverses does not stick."""
+"""Maximum height of a valley relative to the lower mode; minimum fraction of rows on either side, since a tip
+that pauses only when it reverses does not stick."""
 SLOWEST = 1e-6
 """Lower bound to which speeds are clamped [m/s]."""
 
@@ -43,8 +43,8 @@ SLOWEST = 1e-6
 def derive_joints(
     signals: Signals, system: ConstrainedSystem, mapping: Mapping, report: ImportReport
 ) -> None:
-    """Fill in positions, and velocities and accelerations if logged, of the joints listed in `from_contact`;
-    drop rows in which the contact is open.
+    """Fill in the positions of the joints listed in `from_contact`, and their derivatives if logged. Drop the
+    rows in which the contact is open.
 
     Raises:
         MappingError: the contact does not exist, or its state cannot be determined without the position.
@@ -82,7 +82,7 @@ def derive_joints(
 def _solve(
     system: ConstrainedSystem, vectors: dict[str, Tensor], u: list[int], joints: tuple[str, ...]
 ) -> dict[str, Tensor]:
-    """Return q, q̇ and q̈ `(n, nq)`, as far as logged, with the joints u that keep the contacts closed."""
+    """Return q, q̇ and q̈ (n, nq), as far as logged, with the joints u such that the contacts stay closed."""
     robot, q = system.robot, vectors["q"].clone()
     zero = torch.zeros_like(q)
     middle = 0.5 * (robot.lower + robot.upper)
@@ -120,7 +120,7 @@ def _solve(
 def stick_speeds(
     signals: Signals, system: ConstrainedSystem, mapping: Mapping, report: ImportReport
 ) -> dict[str, float]:
-    """Return the speed below which each surface contact sticks [m/s], given by the mapping or the log."""
+    """Return the speed below which each surface contact sticks [m/s], from the mapping or the log."""
     speeds: dict[str, float] = {}
     for contact in system.contacts:
         section, closed = mapping.sections.contact.get(contact.name), signals.contact.get(contact.name)
@@ -174,7 +174,7 @@ def resting_speed(speed: Array) -> float | None:
 
 
 def dividing_speed(speed: Array, sticks: NDArray[np.bool_]) -> float | None:
-    """Return the speed that separates rows marked as sticking from the other rows with the fewest errors."""
+    """Return the speed that separates sticking from other rows with the fewest errors."""
     if not sticks.any():
         return None
     order = np.argsort(speed)

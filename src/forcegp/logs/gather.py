@@ -1,9 +1,9 @@
 """Conversion of a mapped table to quantities in SI units and in the robot's joint order.
 
-A reading r is converted to y = s k (r − o), with one set of numbers per joint: o is the reading at zero, in
-the unit of the column; s = ±1; and k is the unit, multiplied by the torque constant K_t for a current. With a
-gear of ratio N, a motor turns N times as fast as its joint, and the joint torque is N times the motor torque:
-q = q_m / N, τ = N τ_m.
+A reading r is converted to y = s k (r − o), with one set of numbers per joint. Here, o is the reading at zero
+in the unit of the column, s = ±1 is the sign, and k is the unit, multiplied by the torque constant K_t for a
+current. With a gear of ratio N, a motor turns N times as fast as its joint, and the joint torque is N times
+the motor torque: q = q_m / N, τ = N τ_m.
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from forcegp.logs.table import Array, ImportReport, LogTable, Progress, Signals,
 from forcegp.rows import describe, numbered
 
 CLOSED, STICKS = "contact ", "sticks "
-"""Prefixes of the contact name for vectors in `Signals` that contain flags of the contact's state."""
+"""Prefixes of the contact name for vectors in `Signals` that flag the state of the contact."""
 
 
 def gather(
@@ -33,7 +33,7 @@ def gather(
     progress: Progress | None = None,
     rows: int | None = None,
 ) -> Signals:
-    """Read the mapped columns of a log onto a common clock, and at most `rows` rows if the format permits."""
+    """Read the mapped columns of a log onto a common clock, with at most `rows` rows if possible."""
     sections = mapping.sections
     needed = {sections.time.column, sections.time.segment or sections.time.column}
     for name in SYMBOLS:
@@ -60,7 +60,7 @@ class _Gathering:
         self.reference = table.stream_of(position[0], mapping.sections.position.stream)
 
     def run(self) -> Signals:
-        """Return the quantities, with those of other streams interpolated onto the reference stream."""
+        """Return the quantities, interpolating those of other streams onto the reference stream."""
         quantities = [name for name in SYMBOLS if self.mapping.quantity(name) is not None]
         vectors = {SYMBOLS[name]: self._vector(name) for name in quantities}
         if self.mapping.sections.wrench is not None:
@@ -80,7 +80,7 @@ class _Gathering:
         return self.table.stream_of(column, stream.name).columns[column]
 
     def _vector(self, name: str) -> tuple[Stream, Array]:
-        """Return a joint vector in SI units on the joint side, with zeros for joints that are not logged."""
+        """Return a joint vector in SI units on the joint side. Joints that are not logged are zero."""
         joints = self.mapping.measured(name, self.joints)
 
         def numbers(key: str) -> Array:
@@ -108,7 +108,7 @@ class _Gathering:
         return stream, result
 
     def _wrench(self) -> tuple[Stream, Array]:
-        """Return force and moment `(n, 6)` in SI units without offsets; components not measured are zero."""
+        """Return force and moment (n, 6) in SI units without offsets, with zeros for missing components."""
         section = self.mapping.sections.wrench
         assert section is not None
         stream = self.table.stream_of(section.force[0], section.stream)
@@ -121,7 +121,7 @@ class _Gathering:
         return stream, result
 
     def _flags(self) -> dict[str, tuple[Stream, Array]]:
-        """Return flags of closed and of sticking contacts, keyed by `CLOSED` or `STICKS` and the name."""
+        """Return the flags of closed and sticking contacts, keyed by `CLOSED` or `STICKS` plus the name."""
         flags = {}
         for name, section in self.mapping.sections.contact.items():
             closed = section.column if section.source == "column" else None
@@ -147,7 +147,7 @@ class _Gathering:
         return holder.columns[self.time.column] * units.TIME[self.time.unit]
 
     def _reference(self, vectors: dict[str, Array]) -> Signals:
-        """Return the complete, cropped rows of the stream that contains the positions, with trajectories."""
+        """Return the complete, cropped rows of the stream with the positions, and their trajectories."""
         t = self._stamps(self.reference)
         self.report.rows_read = len(t)
         segment = np.zeros(len(t), dtype=np.int64)

@@ -1,4 +1,4 @@
-"""`--guess`: a mapping proposed on the basis of headings, magnitudes and the robot's dynamics.
+"""Proposal of a mapping (`--guess`) based on headings, magnitudes and the dynamics of the robot.
 
 Units and signs are inferred by comparing the logged velocity with the derivative of the position, and the
 logged torque with the inverse dynamics of the robot in the scene. Uncertain entries are marked CHECK.
@@ -39,11 +39,11 @@ LEAST_DEGREES = 3.2
 CLEARER, NEAR = 1.5, 1.3
 """Factor by which torques must fit better for a unit to be certain; tolerance for the ratio of two units."""
 TRAJECTORY, LEAST_FORCE = 10, 1.0
-"""Minimum ratio of trajectory to filter window; minimum force of a contact that is always closed [N]."""
+"""Minimum ratio of trajectory to filter window; minimum force in a contact that is always closed [N]."""
 
 
 def guess_mapping(path: str | Path, system: ConstrainedSystem, progress: Progress | None = None) -> Draft:
-    """Propose a mapping for a log; raise `MappingError` if time, positions or torques are not recognised."""
+    """Propose a mapping for a log; raise `MappingError` if time, position or torque is not recognised."""
     table = read(path, rows=ROWS, progress=progress)
     draft = Draft(str(path))
     with foreign(str(path), "a log that can be imported"):
@@ -63,7 +63,7 @@ def guess_mapping(path: str | Path, system: ConstrainedSystem, progress: Progres
 
 
 def _try(path: str | Path, draft: Draft, system: ConstrainedSystem, possible: list[str]) -> None:
-    """Read the log according to the draft, and infer units and the sign of the torque from its values."""
+    """Read the log according to the draft, and infer units and the sign of the torque from the values."""
     for quantity, family in draft.families.items():
         family.unit = family.unit or units.SI[quantity]
     fits = {}
@@ -86,7 +86,7 @@ def _try(path: str | Path, draft: Draft, system: ConstrainedSystem, possible: li
 
 
 def _window(draft: Draft, trial: Signals) -> None:
-    """Choose a filter window that suits the noise in positions and velocities of the longest trajectory."""
+    """Choose a filter window that suits the noise in the longest trajectory's positions and velocities."""
     rows = max(runs(trial.segment), key=lambda rows: rows.stop - rows.start)
     names = ["q", *(["qd"] if "velocity" in draft.families else [])]
     samples, most = [trial.vectors[name][rows] for name in names], (rows.stop - rows.start) // TRAJECTORY
@@ -98,7 +98,7 @@ def _window(draft: Draft, trial: Signals) -> None:
 
 
 def _signals(path: str | Path, draft: Draft, system: ConstrainedSystem, without: str = "") -> Signals:
-    """Return the complete rows of a log according to the draft `without` a quantity, with accelerations."""
+    """Return the complete rows of a log read with a draft, omitting one quantity and adding accelerations."""
     families = {name: family for name, family in draft.families.items() if name != without}
     further = {name: table for name, table in draft.further.items() if not name.startswith("contact")}
     toml = replace(draft, time=draft.time | {"missing": "drop"}, families=families, further=further).toml()
@@ -111,7 +111,7 @@ def _signals(path: str | Path, draft: Draft, system: ConstrainedSystem, without:
 
 
 def _velocity_unit(draft: Draft, trial: Signals) -> None:
-    """Infer the unit and sign of the velocity from its slope over the derivative of the position."""
+    """Infer the unit and sign of the velocity from its slope against the derivative of the position."""
     family = draft.families["velocity"]
     q, qd = trial.vectors["q"], trial.vectors["qd"]
     inner = np.flatnonzero(trial.segment[2:] == trial.segment[:-2]) + 1
@@ -176,10 +176,10 @@ def _torque(draft: Draft, trial: Signals, system: ConstrainedSystem) -> None:
 
 
 def torque_slopes(trial: Signals, system: ConstrainedSystem) -> tuple[Array, Array]:
-    """Return the slope and partial correlation of the logged torque over the inverse dynamics, `(nq,)` each.
+    """Return the slope (nq,) of the logged torque over inverse dynamics, and the partial correlation (nq,).
 
     For each joint, τ_log = k τ_rigid + v q̇ + f sign(q̇) + Aᵀλ + const is fitted by least squares, with a
-    constant λ for each contact. The partial correlation is between τ_log and τ_rigid given the other terms.
+    constant λ for each contact. The partial correlation is that of τ_log and τ_rigid given the other terms.
     """
     nq = system.robot.nq
     rows = np.linspace(0, len(trial) - 1, min(TRIED_ROWS, len(trial))).astype(int)
@@ -202,7 +202,7 @@ def torque_slopes(trial: Signals, system: ConstrainedSystem) -> tuple[Array, Arr
 def propose_contacts(
     log: LogTable, draft: Draft, system: ConstrainedSystem, signals: Callable[[], Signals]
 ) -> None:
-    """Add to a draft a proposed source for the state of each contact in the scene, based on `signals`."""
+    """Add a proposed source for the state of each contact in the scene to a draft, based on `signals`."""
     named = [(c, x) for s in log.streams for c, x in s.columns.items() if "contact" in c.lower()]
     flags = [name for name, x in named if np.isin(x, (0.0, 1.0)).all()]
     in_order = flags if len(system.contacts) in (1, len(flags)) else []
@@ -223,7 +223,7 @@ def propose_contacts(
 
 
 def _state(values: Array, name: str) -> tuple[str, str]:
-    """Return the source of a contact's state according to λ of the rigid body, and the reason."""
+    """Return the source of a contact's state according to λ of the rigid-body model, and the reason."""
     middle, spread = level_and_spread(values)
     try:
         high, low = force_levels(values, name, ContactStateSection(source="multiplier"))

@@ -20,9 +20,9 @@ from forcegp.robot import RobotModel
 from forcegp.robust import robust_std
 
 WORDS: dict[str, list[str]] = units.VOCABULARY["words"]
-"""Words for each quantity, in the order of search."""
+"""Words for each quantity, in the order in which they are tried."""
 MEASURED, COMMANDED = (units.VOCABULARY["columns"][kind] for kind in ("measured", "commanded"))
-"""Words for measured columns, and for columns to avoid, such as commands."""
+"""Words for measured columns, and words for columns to avoid, such as commands."""
 _TIME = re.compile(
     r"^(.*[ _./])?(t|mt|time|times|timestamp|stamp|clock|sec|secs|seconds|ms|millis|zeit)([ _./\[(].*)?$"
 )
@@ -32,7 +32,7 @@ _SEGMENTS = ("segment", "episode_index", "episode", "trial", "run")
 
 
 def tokens(name: str) -> list[str]:
-    """Return the words of a heading in lower case; a derivative of q is one word.
+    """Return the words of a heading in lower case, treating a derivative of q as one word.
 
     >>> tokens("actualJointPos_3 [deg]")
     ['actual', 'joint', 'pos', '3', 'deg']
@@ -149,7 +149,7 @@ def _families(stream: Stream, robot: RobotModel) -> list[Family]:
 
 
 def _rate(family: Family, quantity: str) -> float:
-    """Return a score for how well the name of a family matches a quantity, or 0 if it does not."""
+    """Return a score for how well the name of a family matches a quantity, or 0 for no match."""
     words = tokens(family.pattern.replace("{joint}", " "))
     meant = (other for other in WORDS if any(word in WORDS[other] for word in words))
     if next(meant, None) != quantity:
@@ -218,7 +218,7 @@ RELATED = 0.95
 
 
 def find_by_values(stream: Stream, joints: tuple[str, ...], draft: Draft) -> None:
-    """Propose families without headings: blocks of one column per joint, some of them rates of others."""
+    """Propose families for columns without headings: blocks of one column per joint, and their rates."""
     nq = len(joints)
     names = [name for name in stream.columns if name != draft.time["column"]]
     blocks = [names[k : k + nq] for k in range(0, len(names) - nq + 1, nq)]

@@ -1,8 +1,8 @@
 """Mapping files in TOML, which assign the columns of a log to quantities and joints (see docs/import.md).
 
-`[joints]` contains the name of each joint in the log, which is inserted into columns such as `"q_{joint}"`.
-Data sets, and ROS joint states with the robot's joint names, need no mapping file. A draft is a proposed
-mapping with comments on uncertain entries.
+`[joints]` contains the name of each joint in the log. These names are inserted into column patterns such as
+`"q_{joint}"`. No mapping file is needed for data sets, or for ROS joint states with the robot's joint names.
+A draft is a proposed mapping with comments on uncertain entries.
 """
 
 from __future__ import annotations
@@ -28,9 +28,9 @@ from forcegp.scene.document import Document, Key
 from forcegp.scene.sections import Section
 
 CHECK = "# CHECK: "
-"""Start of a comment on an entry that the user must check."""
+"""Prefix of a comment on an entry that the user must check."""
 CURRENT = {"side": "motor", "gear_ratio": 1.0, "torque_constant": 1.0}
-"""Keys that a current requires in addition to its unit."""
+"""Keys that are required for a current, in addition to its unit."""
 
 
 @dataclass
@@ -48,7 +48,7 @@ class Family:
     by_joint: dict[str, str] = field(default_factory=dict)
 
     def table(self) -> dict[str, Any]:
-        """Return the table of the mapping."""
+        """Return the table for this family in the mapping file."""
         columns = {"columns": self.by_joint} if self.by_joint else {"column": self.pattern}
         sign = None if self.sign == 1.0 else self.sign
         current = CURRENT if self.unit in ("A", "mA") else {}
@@ -58,7 +58,7 @@ class Family:
 @dataclass
 class Draft:
     """A proposed mapping: tables (keys with value `None` are omitted), families of columns by quantity,
-    comments placed above each table, entries for the user to check, and the filter window for derivatives.
+    comments placed above each table, entries that the user must check, and the filter window for derivatives.
     """
 
     source: str
@@ -71,7 +71,7 @@ class Draft:
     window: int = 11
 
     def say(self, table: str, sentence: str, doubt: bool = False) -> None:
-        """Add a comment to a table; if `doubt` is set, mark it CHECK and add it to `doubts`."""
+        """Add a comment to a table. If `doubt` is set, mark the comment CHECK and add it to `doubts`."""
         self.comments.setdefault(table, []).append((CHECK[2:] if doubt else "") + sentence)
         if doubt:
             self.doubts.append(sentence)
@@ -95,12 +95,12 @@ class Draft:
 
 
 def _plain(text: str) -> str:
-    """Return text as one line without control characters, as required in TOML comments."""
+    """Return text as one line without control characters, as TOML comments require."""
     return "".join(c if c.isprintable() else " " for c in text)
 
 
 def quoted(name: str) -> str:
-    """Return a name as a TOML key, in quotation marks if necessary."""
+    """Return a name as a TOML key, with quotation marks if necessary."""
     return name if name.replace("_", "").replace("-", "").isalnum() and name.isascii() else json.dumps(name)
 
 
@@ -145,8 +145,8 @@ class QuantitySection(Section):
 
 
 class TorqueSection(QuantitySection):
-    """`[torque]`: a torque, or a current and the torque constant of the motor [N m/A]; joints without either
-    are listed as `unmeasured`. Rows with `clipped` torques are kept, given large noise, or dropped."""
+    """`[torque]`: a torque, or a current and the torque constant of the motor [N m/A]. Joints with neither
+    are listed in `unmeasured`. Rows with `clipped` torques are kept, given large noise, or dropped."""
 
     torque_constant: PerJoint | None = None
     unmeasured: tuple[str, ...] = ()
@@ -154,7 +154,7 @@ class TorqueSection(QuantitySection):
 
 
 class PositionSection(QuantitySection):
-    """`[position]`: `from_contact` names the closed contact that determines a joint without a column."""
+    """`[position]`: for each joint without a column, `from_contact` names the contact that determines it."""
 
     from_contact: dict[str, str] = Field(default_factory=dict)
 
@@ -186,7 +186,7 @@ class WrenchSection(Section):
 
 
 class ContactStateSection(Section):
-    """`[contact.<name>]`: source of the state of a contact in the scene."""
+    """`[contact.<name>]`: the source of the state of a contact in the scene."""
 
     source: Literal["column", "wrench", "multiplier", "distance", "always", "never"]
     column: str | None = None
@@ -224,12 +224,12 @@ class MappingSections(Section):
 
 
 BUNDLED = ("double_pendulum_csv", "iiwa14_txt", "ros_joint_states", "ur3_bag", "ur3_mat")
-"""Mappings included in the library: for published logs, and for ROS topics with the robot's joint names."""
+"""Mappings included in the library for published logs, and for ROS topics with the robot's joint names."""
 
 
 @dataclass(frozen=True)
 class Mapping:
-    """A validated mapping file: its tables, the document for error messages, and remaining CHECK comments."""
+    """A validated mapping file: its tables, the document for error messages, and the CHECK comments."""
 
     sections: MappingSections
     document: Document
@@ -240,15 +240,15 @@ class Mapping:
         return getattr(self.sections, name)
 
     def measured(self, name: str, joints: Sequence[str]) -> list[str]:
-        """Return the joints for which a quantity is logged: all except those with an `unmeasured` torque, or
-        with motion derived from a contact."""
+        """Return the joints for which a quantity is logged. Joints with an `unmeasured` torque, or with
+        motion derived from a contact, are excluded."""
         name, key = ("torque", "unmeasured") if name == "torque" else ("position", "from_contact")
         lacking = getattr(self.quantity(name), key)
         self._check_joints((name, key), lacking, joints)
         return [joint for joint in joints if joint not in lacking]
 
     def columns_of(self, name: str, joints: Sequence[str]) -> list[str]:
-        """Return the column of a quantity in the log for each joint for which it is logged."""
+        """Return the column of a quantity for each joint for which the quantity is logged."""
         section = self.quantity(name)
         assert section is not None
         self._check_joints(("joints",), self.sections.joints, joints)
@@ -269,7 +269,7 @@ class Mapping:
         return columns
 
     def per_joint(self, name: str, key: str, joints: Sequence[str]) -> NDArray[np.float64]:
-        """Return the values `(nq,)` of a key that has one value for all joints or one per joint."""
+        """Return the values (nq,) of a key that has either one value for all joints or one per joint."""
         value: PerJoint = getattr(self.quantity(name), key)
         if not isinstance(value, dict):
             return np.full(len(joints), float(value))
@@ -282,7 +282,7 @@ class Mapping:
     def error(
         self, key: Key, message: str, expected: object = None, got: object = None, hint: str | None = None
     ) -> MappingError:
-        """Return an error that refers to a key in the file."""
+        """Return an error that refers to a key in the mapping file."""
         place = self.document.place(key)
         return MappingError(f"{place}: {message}", expected=expected, got=got, hint=hint)
 
@@ -294,10 +294,10 @@ class Mapping:
 
 
 def load_mapping(source: str | Path) -> Mapping:
-    """Read a mapping file by path, or a bundled mapping by name.
+    """Read a mapping file, or a bundled mapping by name.
 
     Raises:
-        MappingError: the mapping does not exist or is invalid; the message names the file, line and key.
+        MappingError: the mapping does not exist or is invalid. The message names the file, line and key.
 
     >>> load_mapping("ros_joint_states").sections.torque.unit
     'Nm'
@@ -312,7 +312,7 @@ def load_mapping(source: str | Path) -> Mapping:
 
 
 def parse_mapping(content: bytes, source: str) -> Mapping:
-    """Parse the bytes of a mapping file; a `MappingError` names the line and key of an invalid entry."""
+    """Parse the bytes of a mapping file; raise a `MappingError` that names the line and key if invalid."""
     document = Document(content, source, MappingError)
     lines = content.decode().splitlines()
     doubts = tuple(line[len(CHECK) :] for line in lines if line.startswith(CHECK))
@@ -322,7 +322,7 @@ def parse_mapping(content: bytes, source: str) -> Mapping:
 
 
 def _check(mapping: Mapping) -> None:
-    """Check units, and keys that depend on each other."""
+    """Check the units, and the keys that depend on each other."""
     sections = mapping.sections
     for name in SYMBOLS:
         if (section := mapping.quantity(name)) is not None:
@@ -375,7 +375,7 @@ def _check_quantity(mapping: Mapping, name: str, section: QuantitySection) -> No
 
 
 def default_mapping(path: str | Path, system: ConstrainedSystem) -> Mapping:
-    """Return the mapping for a log whose column names are unambiguous; otherwise, raise `MappingError`."""
+    """Return the mapping for a log with unambiguous column names; raise `MappingError` otherwise."""
     table, robot = read(path, rows=1), system.robot
     names, joints = set(table.names), robot.joint_names
     logged = {n: s for n, s in SYMBOLS.items() if names >= {f"{s}.{joint}" for joint in joints}}

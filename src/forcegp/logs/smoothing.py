@@ -1,11 +1,11 @@
-"""Computation of missing velocities and accelerations within each trajectory, never across a contact switch.
+"""Computation of missing velocities and accelerations within trajectories, never across a contact switch.
 
-For each joint, the Kalman smoother returns position, velocity and acceleration with error bars. Its model is
-constant jerk disturbed by white snap of intensity s, measured with white noise of deviation σ: x = (q, q̇,
-q̈, q⃛), dx = F x dt + e₄ √s dw, y = q + ε. For the scaled state z = (q, h q̇, h² q̈, h³ q⃛) with time step h,
-transition and noise matrices are constant: z⁺ = A z + w, A_ij = 1/(j−i)!, Cov(w)_ij = ρ σ² W_ij with ρ = s
-h⁷/σ² and W_ij = 1/((3−i)! (3−j)! (7−i−j)), i, j from 0. ρ maximises the evidence; σ has a closed form (Rauch,
-Tung and Striebel 1965; Särkkä, Bayesian Filtering and Smoothing, 2013, ch. 8 and 12).
+For each joint, a Kalman smoother returns position, velocity and acceleration with error bars. The model is
+constant jerk disturbed by white snap of intensity s, and the position is measured with white noise ε of
+deviation σ: x = (q, q̇, q̈, q⃛), dx = F x dt + e₄ √s dw, y = q + ε. For time step h and scaled state z = (q,
+h q̇, h² q̈, h³ q⃛), the transition and noise matrices are constant: z⁺ = A z + w, A_ij = 1/(j−i)!, Cov(w)_ij
+= ρ σ² W_ij with ρ = s h⁷/σ² and W_ij = 1/((3−i)! (3−j)! (7−i−j)), i, j from 0. ρ maximises the evidence; σ
+has a closed form (Rauch et al. 1965; Särkkä, Bayesian Filtering and Smoothing, 2013, ch. 8 and 12).
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ from forcegp.rows import runs
 STATES, SHORTEST = 4, 8
 """Size of the state, from position to jerk, and minimum number of rows per piece."""
 LEARNED_ROWS, LOG_RHO = 2000, (-30.0, 8.0)
-"""Number of rows (of the longest pieces) used to learn ρ, and range of log ρ, from cubics to no smoothing."""
+"""Number of rows (from the longest pieces) used to learn ρ; range of log ρ, from cubics to no smoothing."""
 DIFFUSE, SETTLED = 1e8, 1e-10
 """Uninformative prior variance of the first scaled state [σ²]; relative change of a stationary covariance."""
 
@@ -39,7 +39,7 @@ W = np.outer(TAYLOR, TAYLOR) / (7.0 - np.add.outer(np.arange(STATES), np.arange(
 
 @dataclass(frozen=True)
 class Smoothed:
-    """Estimates for a joint `(n,)`, a second column after the same filter, and σ of measured positions."""
+    """Estimates (n,) for a joint, a second column filtered in the same way, and σ of measured positions."""
 
     position: Array
     velocity: Array
@@ -50,10 +50,10 @@ class Smoothed:
 
 
 def smooth(t: Array, q: Array, piece: NDArray[np.int64], also: Array | None = None) -> Smoothed:
-    """Smooth the positions q of a joint piece by piece, using the same ρ and σ for all pieces.
+    """Smooth the positions of a joint piece by piece, with the same ρ and σ for all pieces.
 
-    All arguments have shape `(n,)`: time, evenly spaced within each piece [s]; positions; the piece number of
-    each row (pieces have at least `SHORTEST` rows); and `also`, a second quantity to filter in the same way.
+    All arguments have shape `(n,)`: times `t`, evenly spaced within each piece [s]; positions `q`; the piece
+    number of each row (at least `SHORTEST` rows per piece); and `also`, a second quantity to filter as well.
 
     >>> t = np.arange(400) * 0.01
     >>> noise = 1e-3 * np.random.default_rng(0).standard_normal(400)
@@ -100,7 +100,7 @@ def learn(q: Array, stretches: list[slice]) -> tuple[float, float]:
 
 
 def _forward(n: int, rho: float) -> tuple[Array, Array, Array, Array]:
-    """Return the gains, innovation variances, and predicted and filtered covariances for n rows."""
+    """Return gains, innovation variances, and predicted and filtered covariances for n rows."""
     gain, innovation = np.empty((n, STATES)), np.empty(n)
     predicted, filtered = np.empty((n, STATES, STATES)), np.empty((n, STATES, STATES))
     P = DIFFUSE * np.eye(STATES)
@@ -120,7 +120,7 @@ def _forward(n: int, rho: float) -> tuple[Array, Array, Array, Array]:
 
 
 def _gains(n: int, rho: float) -> tuple[Array, Array, Array]:
-    """Return filter gains `(n, 4)`, and smoother gains and covariances divided by σ², `(n, 4, 4)` each."""
+    """Return filter gains (n, 4), and smoother gains and covariances divided by σ², each (n, 4, 4)."""
     gain, _, predicted, filtered = _forward(n, rho)
     back, covariance = np.zeros((n, STATES, STATES)), filtered.copy()
     settled = False
@@ -193,7 +193,7 @@ def _pieces(signals: Signals, least: int, report: ImportReport) -> NDArray[np.in
 
 
 def _filter(signals: Signals, piece: NDArray[np.int64], settings: DerivativesSection) -> Array | None:
-    """Compute derivatives of polynomials fitted to a moving window (Savitzky and Golay); return σ of q̈."""
+    """Fit polynomials to a moving window (Savitzky and Golay) to compute derivatives; return σ of q̈."""
     from scipy.signal import savgol_filter
 
     method, vectors = SavitzkyGolay(settings.window, settings.order), signals.vectors
@@ -229,7 +229,7 @@ def _smooth(signals: Signals, piece: NDArray[np.int64], settings: DerivativesSec
 
 
 def impact_mask(signals: Signals, margin: float) -> dict[str, Array]:
-    """Mark the rows within `margin` [s] of a switch of each contact, with impacts or one-sided fits, by 1."""
+    """Return a mask for each contact that is 1 within `margin` [s] of a switch, and 0 elsewhere."""
     masks = {}
     for name, closed in signals.contact.items():
         masks[name] = np.zeros(len(signals))

@@ -1,7 +1,6 @@
-"""Fit of a plane or a sphere to the path of the tip, with error bars that account for residuals that are
-correlated in time.
+"""Fit of a plane or a sphere to the path of the tip, which is a point or a ball.
 
-The tip is a point, or a ball of known or unknown radius.
+Error bars account for residuals that are correlated in time. The radius of the ball may be fitted.
 """
 
 from __future__ import annotations
@@ -23,14 +22,14 @@ from forcegp.logs.table import Array
 from forcegp.robust import robust_std
 
 LEAST_POINTS, ROUNDING = 20, 1e-9
-"""Minimum number of points for a fit, and minimum scale of their residuals."""
+"""Minimum number of points for a fit; smallest scale assumed for the residuals."""
 OUTLIER_STD = 4.0
-"""Number of standard deviations beyond which residuals are outliers."""
+"""Residuals beyond this many standard deviations are outliers."""
 
 
 @dataclass(frozen=True)
 class Solution:
-    """Parameters, covariance, residuals of the rows used, their effective number, and number of outliers."""
+    """Parameters, covariance, residuals, effective number of rows, and number of outliers of a fit."""
 
     x: Array
     covariance: Array
@@ -64,21 +63,21 @@ LEAST_RADIUS_STD = 4.0
 
 @dataclass(frozen=True)
 class Tip:
-    """A ball of radius r [m] (`None`: to be fitted), and unit vectors `(n, 3)` along the tool, or zeros."""
+    """A ball of radius r [m] (`None` if to be fitted), and unit vectors (n, 3) along the tool, or zeros."""
 
     axes: Array
     radius: float | None
 
     def start(self, *x: float) -> Array:
-        """Return the initial parameters, beginning with those of the surface."""
+        """Return the initial parameters, which begin with those of the surface."""
         return np.array([*x, 0.0] if self.radius is None else x)
 
     def of(self, x: Array) -> float:
-        """Return the radius given the parameters."""
+        """Return the radius, given the parameters."""
         return float(x[-1]) if self.radius is None else self.radius
 
     def std(self, solution: Solution) -> dict[str, float]:
-        """Return the error bar of a fitted radius; raise `DataError` if the path does not determine it."""
+        """Return the error bar of a fitted radius; raise `DataError` if the path cannot determine it."""
         if self.radius is not None:
             return {}
         radius, std = self.of(solution.x), float(np.sqrt(solution.covariance[-1, -1]))
@@ -95,7 +94,7 @@ class Tip:
 def tip_of(
     system: ConstrainedSystem, contact: SurfaceContact, q: torch.Tensor, radius: float | Literal["fit"] | None
 ) -> Tip:
-    """Return the tip at positions `(n, nq)`: that of the scene, or a ball that ends at the contact point."""
+    """Return the tip at positions (n, nq): the tip in the scene, or a ball that ends at the contact point."""
     if radius is None:
         return Tip(np.zeros((len(q), 3)), contact.radius)
     point = torch.tensor(tuple(contact.point), dtype=q.dtype)
@@ -113,15 +112,15 @@ def tip_of(
 MOST_POINTS = 20_000
 """Maximum number of points in a fit; for a longer path, every k-th point is used."""
 LEAST_WIDTH, LARGEST_TILT = 10.0, 0.2
-"""For a plane: minimum width of the path relative to the residuals, and largest σ of the tilt [rad]."""
+"""Minimum width of the path for a plane, relative to the residuals; largest σ of its tilt [rad]."""
 
 
 @dataclass(frozen=True)
 class SurfaceFit:
     """A fitted surface, the radius of the tip [m], and standard deviations.
 
-    The standard deviations are `offset` [m] (at the middle of the path) and `tilt` [rad] for a plane,
-    `center` [m] (the largest of three) and `radius` [m] for a sphere, and `tip_radius` [m] if fitted.
+    The standard deviations of a plane are `offset` [m], at the middle of the path, and `tilt` [rad]. Those of
+    a sphere are `center` [m], the largest of three, and `radius` [m]. A fitted tip adds `tip_radius` [m].
     """
 
     contact: str
@@ -155,13 +154,13 @@ def fit_surface(
 ) -> SurfaceFit:
     """Fit a surface to the path of the contact point while a contact is closed.
 
-    Squared signed distances are minimised, excluding outliers of a robust fit. Error bars account for
-    residuals that are correlated in time. If `tip_radius` is given ([m] or `"fit"`), the tip is a ball that
-    ends at the contact point of the scene; by default, the tip is that of the scene.
+    The fit minimises the sum of squared signed distances, excluding outliers of a robust fit. Error bars
+    account for residuals that are correlated in time. If `tip_radius` is a number [m] or `"fit"`, the tip is
+    a ball that ends at the contact point of the scene. By default, the tip is that of the scene.
 
     Raises:
-        DataError: the tip in the scene already has a radius or lacks an axis, the contact is closed in too
-            few rows, or the path is too straight or too short.
+        DataError: the tip in the scene already has a radius or has no axis, the contact is closed in too few
+            rows, or the path is too straight or too short.
         UnknownNameError: the contact does not exist.
     """
     touching = system.contact(contact)

@@ -1,6 +1,4 @@
-"""Data structures of an import: columns with a common clock, as returned by readers; quantities in SI units
-and in the robot's joint order; and the report.
-"""
+"""Data structures of an import: columns as returned by readers, quantities in SI units, and the report."""
 
 from __future__ import annotations
 
@@ -19,7 +17,7 @@ from forcegp.rows import numbered, runs
 
 
 def check_values(source: str, rows: int, columns: int) -> None:
-    """Raise `DataError` if a table exceeds the limits in width or size; warn if it needs much memory."""
+    """Raise `DataError` if a table is too wide or too large; warn if it needs a lot of memory."""
     check_count(source, "columns", columns, limits.COLUMNS)
     check_count(source, f"numbers ({rows:,} rows × {columns} columns)", rows * columns, limits.LOG_VALUES)
     announce_memory(2 * 8 * rows * columns, f"reading {source}")  # once as in the file, once as float64
@@ -27,14 +25,14 @@ def check_values(source: str, rows: int, columns: int) -> None:
 
 Column = Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
-"""Function called with the completed and the total work, in bytes or messages."""
+"""A function called with the completed and the total work, in bytes or messages."""
 Wanted = Callable[[str], bool]
-"""Function that returns whether to read the column with a given name."""
+"""A function that returns whether to read the column with a given name."""
 
 
 @dataclass(frozen=True, eq=False)
 class Stream:
-    """Columns `(n,)` with a common clock, with NaN for missing values, and the units declared in the log."""
+    """Columns (n,) with a common clock, NaN for missing values, and the units declared in the log."""
 
     name: str
     columns: Mapping[str, Column]
@@ -47,7 +45,7 @@ class Stream:
 
 @dataclass(frozen=True, eq=False)
 class LogTable:
-    """A log, with notes (`remarks`) on omissions and assumptions made by the reader, one sentence each."""
+    """A log with notes (`remarks`) about omissions and assumptions of the reader, one sentence each."""
 
     source: str
     format: str
@@ -56,11 +54,11 @@ class LogTable:
 
     @property
     def names(self) -> list[str]:
-        """All column names, stream by stream."""
+        """Names of all columns, stream by stream."""
         return [name for stream in self.streams for name in stream.columns]
 
     def stream_of(self, column: str, stream: str | None = None) -> Stream:
-        """Return the stream that contains a column; raise `DataError` if there is none, or several."""
+        """Return the stream that contains a column; raise `DataError` if there is none, or more than one."""
         among = [s for s in self.streams if stream is None or s.name == stream]
         if not among:
             raise missing(self.source, "stream", stream or "", [s.name for s in self.streams])
@@ -75,12 +73,12 @@ class LogTable:
 
 
 def joined(chunks: dict[str, list[Column]], rows: int | None) -> dict[str, Column]:
-    """Join columns that were read in pieces, truncating them to `rows` and copying one column at a time."""
+    """Join columns that were read in pieces. Truncate them to `rows`, copying one column at a time."""
     return {name: np.concatenate(chunks.pop(name))[:rows] for name in list(chunks)}
 
 
 def streams_by_length(groups: Mapping[int, Mapping[str, Column]], common: int) -> tuple[Stream, ...]:
-    """Return one stream for each number of rows; the stream with `common` rows is first and unnamed."""
+    """Return one stream for each number of rows. The stream with `common` rows comes first and is unnamed."""
     ordered = sorted(groups, key=lambda rows: rows != common)
     return tuple(Stream("" if rows == common else f"{rows} rows", groups[rows]) for rows in ordered)
 
@@ -101,8 +99,8 @@ def table_of_arrays(
     """Convert the arrays in a file to a log with one stream for each number of rows.
 
     A matrix `(n, d)` becomes the columns `name[0]` to `name[d-1]`. Rows run along the axis with the most
-    common length, so an array `(d, n)` is transposed. Arrays of other lengths form separate streams. Notes on
-    transposed or omitted arrays are appended to the `remarks` of the reader.
+    common length, so that an array `(d, n)` is transposed. Arrays of other lengths form separate streams. The
+    notes in `remarks` are followed by notes about transposed and omitted arrays.
     """
     usable, remarks, source = {}, list(remarks), str(path)
     check_expansion(source, 8 * sum(array.size for array in arrays.values()), path.stat().st_size)
@@ -132,8 +130,8 @@ def table_of_arrays(
 
 @dataclass
 class Signals:
-    """Quantities in a log: the time [s], row number in the log, and trajectory of each row, `(n,)` each; the
-    vectors `q`, `qd`, `qdd`, `tau` `(n, nq)` and `wrench` `(n, 6)`, if logged; contacts by name, `(n,)` bool.
+    """Quantities in a log: the time [s], row number in the log and trajectory of each row, shape (n,); the
+    vectors `q`, `qd`, `qdd`, `tau` (n, nq) and `wrench` (n, 6), if logged; and contacts by name, (n,) bool.
     """
 
     joint_names: tuple[str, ...]
@@ -148,7 +146,7 @@ class Signals:
         return len(self.t)
 
     def keep(self, mask: NDArray[np.bool_], split: bool = False) -> None:
-        """Keep only the rows in `mask` `(n,)`; if `split` is set, removed rows split trajectories."""
+        """Keep only the rows in `mask` (n,). If `split` is set, trajectories are split at removed rows."""
         if mask.all():
             return
         if split:
@@ -164,7 +162,7 @@ class Signals:
 
 
 MOST_INTERVALS = 20
-"""Maximum number of row intervals listed in a finding; its count includes all rows."""
+"""Maximum number of row intervals listed in a finding. The count of a finding includes all rows."""
 
 
 @dataclass(frozen=True)
@@ -179,7 +177,7 @@ class ImportFinding:
 
 @dataclass
 class ImportReport:
-    """Findings and actions in order; `rows_read` is the length of the stream that defines the clock."""
+    """Findings and actions of an import. `rows_read` is the length of the stream that defines the clock."""
 
     source: str
     format: str = ""
@@ -188,7 +186,7 @@ class ImportReport:
     steps: list[str] = field(default_factory=list)
 
     def find(self, kind: str, message: str, rows: NDArray[np.int64] | None = None) -> None:
-        """Add a finding that concerns the given rows, as increasing row numbers in the log."""
+        """Add a finding about the given rows, which are increasing row numbers in the log."""
         numbers = np.zeros(0, np.int64) if rows is None else rows
         first = tuple((a, b - 1) for a, b in numbered(numbers)[:MOST_INTERVALS])
         self.findings.append(ImportFinding(kind, message, len(numbers), first))

@@ -1,4 +1,4 @@
-"""Units used in logs, as conversion factors to SI units and radians."""
+"""Units used in logs, with conversion factors to SI units and radians."""
 
 from __future__ import annotations
 
@@ -15,13 +15,13 @@ TIME, VELOCITY, TORQUE, CURRENT, FORCE = (
     _UNITS[name] for name in ("time", "velocity", "torque", "current", "force")
 )
 QUANTITY: Mapping[str, Mapping[str, float]] = {**_UNITS, "torque": {**TORQUE, **CURRENT}}
-"""Factors that convert the units of each mapped quantity to SI units; currents are converted to ampere."""
+"""Factors that convert the units of each mapped quantity to SI units. Currents are converted to amperes."""
 SI = {name: next(iter(_UNITS[name])) for name in ("position", "velocity", "acceleration", "torque")}
-"""Default unit of each joint vector for a revolute joint."""
+"""Default unit of each joint vector for revolute joints."""
 
 
 def spelled(text: str) -> str | None:
-    """Return the canonical name of a unit given in common notation, or `None` if it is unknown.
+    """Return the canonical name of a unit in common notation, or `None` if the unit is unknown.
 
     >>> spelled("[deg/sec]"), spelled("Seconds"), spelled("furlong")
     ('deg/s', 's', None)

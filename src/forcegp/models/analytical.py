@@ -1,6 +1,7 @@
-"""The analytical model: the equations of motion with learned robot parameters and without contact friction.
+"""The analytical model: equations of motion with learned robot parameters and no contact friction.
 
-q̈ = L b + H(Q_C + Q_G + Q_D + Q_u) (eqs. 2 and 4, with Q_z = 0), trained by minimising the mean squared error.
+q̈ = L b + H(Q_C + Q_G + Q_D + Q_u) (eqs. 2 and 4, with Q_z = 0). The parameters minimise the mean squared
+error of the accelerations.
 """
 
 from __future__ import annotations
@@ -33,12 +34,12 @@ from forcegp.storage.system import pack_system, take, take_robot
 KIND = "analytical"
 LearnedParameters = Mapping[str, Sequence[str] | Literal["all"]]
 EVERY_LINK: LearnedParameters = {"inertia": "all", "damping": "all"}
-"""Mass, centre of mass and rotational inertia of every link, and the viscous friction of every joint."""
+"""The mass, centre of mass and rotational inertia of every link, and the viscous friction of every joint."""
 ADAM = BatchOptions(epochs=30, batch=128, learning_rate=0.05, patience=10)
 
 
 class AnalyticalSettings(Window):
-    """Saved settings of an analytical model; the robot in the file has the learned parameters."""
+    """Saved settings of an analytical model. The robot in the file has the learned parameters."""
 
     analytical_parameters: dict[str, tuple[str, ...]]
     seed: int
@@ -48,13 +49,14 @@ class AnalyticalModel(Model["AnalyticalFit"]):
     """The constrained equations of motion with robot parameters θ_A learned from accelerations.
 
     `nominal()` predicts with the parameters from the robot file. Learned parameters are always physically
-    consistent, since θ_A can only describe physical bodies.
+    consistent, since every θ_A describes a physical body.
 
     Args:
-        system: robot and contacts.
-        analytical_parameters: parameters to learn, as joint names by quantity (see `AnalyticalParameters`).
-        window: window, around the parameters in the file, for random initial values.
-        seed: seed for the initial values.
+        system: the robot and its contacts.
+        analytical_parameters: the parameters to learn, given as joint names for each quantity (see
+            `AnalyticalParameters`).
+        window: interval around the parameters in the file from which initial values are drawn.
+        seed: random seed for the initial values.
 
     Raises:
         UnknownNameError, ModelError, InertiaError: `analytical_parameters` do not match the robot.
@@ -83,13 +85,13 @@ class AnalyticalModel(Model["AnalyticalFit"]):
         progress: FitProgress | None = None,
         checkpoint: str | Path | None = None,
     ) -> AnalyticalFit:
-        """Minimise the mean squared error of the accelerations, from a random start in the window.
+        """Minimise the mean squared acceleration error, starting from random parameters in the window.
 
         Args:
             data: states and measured accelerations.
-            options: by default, ADAM on batches with early stopping is used; with `LearningOptions`, the loss
-                over all samples is minimised by L-BFGS or ADAM.
-            progress: called after each epoch or evaluation.
+            options: learning options. `BatchOptions` (the default) select ADAM on batches with early
+                stopping. `LearningOptions` select L-BFGS or ADAM on all samples.
+            progress: a function called after each epoch or evaluation.
             checkpoint: see `Model.fit`.
 
         Raises:
@@ -118,7 +120,7 @@ class AnalyticalModel(Model["AnalyticalFit"]):
         return AnalyticalFit(system, theta, self.window, self.seed, FitResult(**learned.outcome))
 
     def nominal(self) -> AnalyticalFit:
-        """Return the equations of motion with the parameters from the robot file; nothing is learned."""
+        """Return the equations of motion with the parameters from the robot file, without learning."""
         result = FitResult(True, 0, 0.0, 0.0, message="parameters of the robot file, nothing learned")
         return AnalyticalFit(self.system, self.parameters, self.window, self.seed, result)
 
@@ -128,10 +130,10 @@ class AnalyticalFit(FittedModel):
     """Equations of motion of a robot with learned parameters.
 
     Attributes:
-        system: robot and contacts.
-        parameters: learned coordinates.
-        window, seed: window and seed for the initial values.
-        result: result of the fit.
+        system: the robot and its contacts.
+        parameters: the learned coordinates of the robot parameters.
+        window, seed: interval and random seed for the initial values.
+        result: the result of the fit.
     """
 
     system: ConstrainedSystem
@@ -144,7 +146,7 @@ class AnalyticalFit(FittedModel):
 
     @property
     def specified(self) -> ConstrainedSystem:
-        """System before the fit, with the initial robot."""
+        """System before the fit, with the initial parameters of the robot."""
         return self.system.with_robot(self.parameters.start)
 
     def described(self) -> list[tuple[str, object]]:

@@ -31,7 +31,7 @@ class FittedModel(Predictor):
     """Result of the fit."""
 
     def __repr__(self) -> str:
-        """Return a one-line summary of the robot, the contacts and the fit."""
+        """Return a one-line summary of the robot, its contacts and the fit."""
         return model_line(type(self).__name__, self.system, self.result)
 
     def _repr_html_(self) -> str:
@@ -39,7 +39,7 @@ class FittedModel(Predictor):
         return fit_table(repr(self), self.result, self.described())
 
     def described(self) -> list[tuple[str, object]]:
-        """Return the names and values of learned parameters, for tables."""
+        """Return the names and values of the learned parameters for display in tables."""
         return []
 
     @classmethod
@@ -50,13 +50,13 @@ class FittedModel(Predictor):
         """Restore a saved model.
 
         Args:
-            header: header of the file, with the settings from `record`.
-            tensors: tensors from `record`.
-            system: robot and contacts.
-            source: name of the file, for messages.
+            header: header of the file, which contains the settings from `record`.
+            tensors: the tensors from `record`.
+            system: the robot and its contacts.
+            source: name of the file, used in messages.
 
         Raises:
-            ModelError: a tensor or setting is missing or invalid; the message names the file and the field.
+            ModelError: a tensor or setting is missing or invalid. The message names the file and the field.
         """
 
     @abstractmethod
@@ -71,7 +71,7 @@ F = TypeVar("F", bound=FittedModel)
 
 
 class Model(ABC, Generic[F]):
-    """An immutable specification of a model; `fit` learns from data and returns a fitted model."""
+    """An immutable specification of a model. `fit` learns from data and returns a fitted model."""
 
     kind: str
     """Name of the model class in saved files."""
@@ -81,18 +81,18 @@ class Model(ABC, Generic[F]):
     _params: dict[str, Any]
 
     def _keep(self, arguments: Mapping[str, Any]) -> None:
-        """Store the arguments of the constructor, passed as its `locals()`."""
+        """Store the arguments of the constructor, which are passed as its `locals()`."""
         self._params = {name: x for name, x in arguments.items() if name not in ("self", "__class__")}
 
     if not TYPE_CHECKING:
 
         def __getattr__(self, name: str) -> None:
-            """Raise `AttributeError` with a hint if the fitted model has the attribute."""
+            """Raise `AttributeError`, with a hint if the fitted model has the attribute."""
             hint = "; call fit = model.fit(data), which has it" if hasattr(FittedModel, name) else ""
             raise AttributeError(f"a {type(self).__name__} has no attribute {name!r}{hint}")
 
     def __repr__(self) -> str:
-        """Return a one-line summary of the robot and the contacts."""
+        """Return a one-line summary of the robot and its contacts."""
         return model_line(type(self).__name__, self.system, None)
 
     def _repr_html_(self) -> str:
@@ -100,7 +100,7 @@ class Model(ABC, Generic[F]):
         return fit_table(repr(self), None, list(self.get_params().items()))
 
     def get_params(self) -> dict[str, Any]:
-        """Return the arguments of the constructor; `type(model)(**model.get_params())` is a copy."""
+        """Return the arguments of the constructor. `type(model)(**model.get_params())` is a copy."""
         return dict(self._params)
 
     @abstractmethod
@@ -115,12 +115,12 @@ class Model(ABC, Generic[F]):
 
         Args:
             data: states and measurements.
-            progress: called during the fit.
-            checkpoint: file that records a long fit. If it exists, the fit resumes from it and produces a
-                bit-identical result. Remove the file once the fitted model is saved.
+            progress: a function called during the fit.
+            checkpoint: a file that records the progress of a long fit. If the file exists, the fit resumes
+                from it and gives a bit-identical result. Delete the file once the fitted model is saved.
 
         Returns:
-            The fitted model. Repeated fits are bit-identical.
+            The fitted model. Repeated fits give bit-identical results.
         """
 
 
@@ -130,7 +130,7 @@ class AccelerationFit(FittedModel):
     def at(self, flat: FlatStates, query: Query) -> Answer:
         if query.quantity != "qdd":
             raise ModelError(
-                f"a {self.kind!r} model predicts accelerations only",
+                f"a {self.kind!r} model predicts only accelerations",
                 expected="qdd",
                 got=query.quantity,
                 hint="use StructuredGP for forces and multipliers",
@@ -138,7 +138,7 @@ class AccelerationFit(FittedModel):
         if query.system not in (None, self.system):
             raise ModelError(
                 f"a {self.kind!r} model has no forces, so it cannot predict on another system",
-                hint="use StructuredGP, or leave out `system`",
+                hint="use StructuredGP, or omit `system`",
             )
         mean, variance = self.accelerations(flat, query.covariance)
         spread = None if variance is None else torch.diag_embed(variance)
@@ -146,4 +146,4 @@ class AccelerationFit(FittedModel):
 
     @abstractmethod
     def accelerations(self, at: FlatStates, variance: bool) -> tuple[Tensor, Tensor | None]:
-        """Return the mean `(n, nq)` at n states and, if requested and available, the variance `(n, nq)`."""
+        """Return the mean at n states and, if requested and available, the variance, both `(n, nq)`."""

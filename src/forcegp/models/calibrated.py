@@ -1,7 +1,7 @@
-"""The robot identified by a fit, expressed in the parameters of robot files, and posterior samples of it.
+"""The robot identified by a fit, with parameters that robot files support, and posterior samples of it.
 
-Links have the identified inertia. Robot files only support joint friction of the form d q̇ + f sign q̇, so d
-and f are fitted to the learned friction Q_D(q̇) over the trained speeds by least squares with an offset,
+Robot files support joint friction only in the form d q̇ + f sign q̇. The coefficients d and f are therefore
+fitted to the learned friction Q_D(q̇) over the trained speeds by least squares, with an offset c:
 
     min Σ_v (Q_D(v) + d v + f sign v − c)²,   d, f ≥ 0.
 
@@ -48,7 +48,7 @@ from forcegp.robot.write_back import is_mjcf, write_robot
 SPEEDS, POSES = 20, 20
 """Number of speeds in each direction, and number of poses, at which friction is evaluated."""
 SLOWEST = 0.05
-"""Smallest of these speeds relative to the largest trained speed; below it, dry friction is smooth."""
+"""Smallest of these speeds relative to the largest trained speed. Dry friction is smoothed below it."""
 UNTRAINED = 1.0
 """Largest speed that is assumed if the trained speeds are unknown [rad/s, m/s]."""
 DRAWS, DRAWN = 400, 4000
@@ -56,13 +56,13 @@ DRAWS, DRAWN = 400, 4000
 OPEN = 2.0
 """Number of standard deviations from zero within which an offset counts as undetermined."""
 DETERMINED = 0.5
-"""Standard deviation below which a parameter is determined, relative to the prior's or to the magnitude."""
+"""Standard deviation, relative to the prior's or to the value, below which a parameter is determined."""
 SMALLEST = 1e-2
 """Smallest eigenvalue ε of a link's pseudo-inertia relative to the identified pseudo-inertia."""
 ROUNDS, RELAXATION = 300, 1.6
 """Number of iterations and over-relaxation of the search for the closest physical bodies."""
 STATES, RATE = 400, 4.0
-"""Number of random states used to add drive inertia to links, and ratio of acceleration to speed [1/s]."""
+"""Number of random states used to add drive inertia to links; ratio of acceleration to speed [1/s]."""
 WANTED = 0.01
 """Target relative torque error ε."""
 MOMENTS = ("mass", "mass·x", "mass·y", "mass·z", "Ixx", "Ixy", "Ixz", "Iyy", "Iyz", "Izz")
@@ -73,12 +73,12 @@ FIGURES = ("damping", "friction", *MOMENTS, "armature")
 
 @dataclass(frozen=True)
 class Parameter:
-    """A parameter of the robot.
+    """An identified parameter of the robot.
 
     Attributes:
-        element: joint to which the parameter belongs; inertia is that of the link moved by the joint.
+        element: name of the joint. Inertial parameters are those of the link that the joint moves.
         name: name of the parameter.
-        file, estimate, std: value in the file, estimate and standard deviation, in SI units.
+        file, estimate, std: value in the file, estimate, and standard deviation in SI units.
         determined: whether the data determine the parameter more precisely than the prior.
     """
 
@@ -95,12 +95,12 @@ class Calibration:
     """The robot identified by a fit.
 
     Attributes:
-        robot: robot with identified inertia, and friction in the form that robot files support.
-        parameters: changed parameters and their values in the file, with standard deviations.
-        speeds, friction, friction_std: `(k, nq)` the learned friction of each joint over its trained speeds
-            [rad/s, m/s], [N m, N].
-        left: `(nq,)` root mean square of the friction that d q̇ + f sign q̇ does not explain [N m, N].
-        offset: `(nq,)` additional constant force [N m, N].
+        robot: the robot with the identified inertia, and with friction in a form that robot files support.
+        parameters: the changed parameters with their values in the file and their standard deviations.
+        speeds, friction, friction_std: speeds [rad/s, m/s], learned friction of each joint and its standard
+            deviation [N m, N], each `(k, nq)`.
+        left: RMS friction that d q̇ + f sign q̇ does not explain, `(nq,)` [N m, N].
+        offset: additional constant force, `(nq,)` [N m, N].
     """
 
     robot: RobotModel
@@ -113,8 +113,9 @@ class Calibration:
 
     @property
     def losses(self) -> tuple[str, ...]:
-        """Learned forces that a robot file cannot represent, one sentence per joint."""
-        joints = zip(self.robot.joint_names, self.left.tolist(), self.offset.tolist(), strict=True)
+        """Learned forces that a robot file cannot represent, described by one sentence per joint."""
+        forces = (x.round(decimals=9).tolist() for x in (self.left, self.offset))  # no rounding errors
+        joints = zip(self.robot.joint_names, *forces, strict=True)
         return tuple(
             f"joint {joint!r}: friction beyond d q̇ + f sign q̇ of {left:.3g} (root mean square), and a "
             f"constant force of {offset:.3g} (N m or N)"
@@ -125,12 +126,12 @@ class Calibration:
 
 @torch.no_grad()
 def calibrated(fit: StructuredFit, *, draws: int = DRAWS, seed: int = 0) -> Calibration:
-    """Return the robot with the identified inertia and payload, and with friction as robot files support it.
+    """Return the robot with the identified inertia and payload, and with friction that robot files support.
 
     Args:
-        fit: fit with an analytical mean.
+        fit: a fit with an analytical mean.
         draws: number of function samples from which standard deviations are computed.
-        seed: seed for these samples and for the poses over which friction is averaged.
+        seed: random seed for these samples, and for the poses over which friction is averaged.
 
     Returns:
         The robot, its parameters with standard deviations, and the losses.
@@ -154,11 +155,11 @@ def calibrated(fit: StructuredFit, *, draws: int = DRAWS, seed: int = 0) -> Cali
 def sampled_robots(fit: StructuredFit, samples: int, *, seed: int = 0) -> list[RobotModel]:
     """Draw physically consistent robots from the joint posterior of inertia, drives, payload and friction.
 
-    A sample with unphysical links is replaced by the closest physical robot in the metric of the posterior
-    (with eigenvalues of pseudo-inertias, relative to the identified ones, of at least ε = 0.01).
+    A sample with unphysical links is replaced by the closest physical robot in the metric of the posterior.
+    Relative to the identified pseudo-inertias, the new ones have eigenvalues of at least ε = 0.01.
 
     Args:
-        fit: fit with an analytical mean.
+        fit: a fit with an analytical mean.
         samples: number of robots.
         seed: random seed.
 
@@ -182,12 +183,12 @@ def write_calibrated(
 ) -> Calibration:
     """Write a copy of the robot file with the identified parameters, a report, and sampled robots.
 
-    Next to `calibrated.urdf`, for example, it writes `calibrated.report.json`, with parameters, losses and
-    complete friction curves, and the samples `calibrated.sample_000.urdf` and so on.
+    For `calibrated.urdf`, for example, the report is `calibrated.report.json`. It contains the parameters,
+    the losses and the complete friction curves. The samples are `calibrated.sample_000.urdf` and so on.
 
     Args:
-        fit: fit with an analytical mean.
-        source: robot file, or name of a bundled robot.
+        fit: a fit with an analytical mean.
+        source: the robot file, or the name of a bundled robot.
         out: path of the edited copy.
         samples: number of robots to draw from the posterior.
         seed: random seed.
@@ -208,7 +209,7 @@ def write_calibrated(
     if drives:
         values = ", ".join(f"{x:.4g}" for x in found.robot.armature.tolist())
         losses = (
-            f"URDF has no armature ({values}): links have its inertia as far as physically possible",
+            f"URDF has no armature ({values}): the links include its inertia as far as physically possible",
             *losses,
         )
     report = {
@@ -229,16 +230,16 @@ def write_calibrated(
 
 @torch.no_grad()
 def unknowns_after(fit: StructuredFit, unknowns: Unknowns, *, draws: int = DRAWS, seed: int = 0) -> Unknowns:
-    """Return the unknowns for planning the next motion, from the covariance of functions drawn from a fit.
+    """Return the unknowns for planning the next motion, based on functions drawn from a fit.
 
-    Base parameters, payload and friction over speed have the posterior covariance. Parameters that have no
+    Base parameters, payload and friction at each speed have the posterior covariance. Parameters without a
     prior in the fit keep their covariance from `unknowns`. The noise is at least the torque noise of the fit.
 
     Args:
-        fit: fit with an analytical mean.
-        unknowns: unknowns of the robot before any data were recorded.
+        fit: a fit with an analytical mean.
+        unknowns: the unknowns of the robot before any data were recorded.
         draws: number of function samples.
-        seed: seed for these samples.
+        seed: random seed for these samples.
 
     Raises:
         ModelError: see `calibrated`.
@@ -281,7 +282,7 @@ def unknowns_after(fit: StructuredFit, unknowns: Unknowns, *, draws: int = DRAWS
 JITTER = 1e-6
 """Jitter added to the covariance, relative to the prior variances."""
 Curve = tuple[Tensor, Tensor, Tensor]
-"""Friction at given speeds `(k, nq)`, its residual after fitting d q̇ + f sign q̇, and the offset `(nq,)`."""
+"""Friction at given speeds `(k, nq)`, the residual after fitting d q̇ + f sign q̇, and the offset `(nq,)`."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -290,8 +291,8 @@ class _Reader:
 
     Attributes:
         fit: the fit.
-        speeds: `(k, nq)` speeds at which friction is evaluated.
-        at: states with all poses and these speeds.
+        speeds: speeds at which friction is evaluated, `(k, nq)`.
+        at: states that combine all poses with these speeds.
         seed: random seed.
     """
 
@@ -328,7 +329,7 @@ class _Reader:
 
     @property
     def scale(self) -> Tensor | None:
-        """Prior standard deviations of links and drives `(nq, 11)`; `None` if inertia was not identified."""
+        """Prior standard deviations of links and drives `(nq, 11)`, or `None` without identified inertia."""
         robot = self.fit.system.robot
         for prior in self.fit.force_priors:
             if isinstance(prior, InertialPrior):
@@ -483,7 +484,7 @@ class _Reader:
 def _offset_gain(offset: Tensor, mean: Tensor, values: Tensor) -> Tensor:
     """Return the gain G `(nq, d)` that conditions values z − c G on zero offsets c where undetermined.
 
-    With sample covariances, E[z | c = 0] = z − Cov(z, c) Cov(c)⁻¹ c.
+    E[z | c = 0] = z − Cov(z, c) Cov(c)⁻¹ c, with sample covariances.
 
     Args:
         offset: offsets at the identified inertia, and of samples around it, `(1 + samples, nq)`.
@@ -516,13 +517,13 @@ def _moved(robot: RobotModel, change: Tensor) -> RobotModel:
 def without_armature(robot: RobotModel, fastest: Tensor) -> RobotModel:
     """Return the robot with its drive inertia added to the links as far as physically possible.
 
-    Over n random states, the squared relative torque error of each joint is minimised:
+    The relative torque errors of the joints are minimised over n random states:
 
         min_δ ½ n Σ_j E(Y_j S δ − a_j q̈_j)² / (ε² E τ_j²), with the divergence of `InertialPrior.updated`.
 
     Args:
-        robot: robot with armature a.
-        fastest: `(nq,)` largest speeds of these states, reached in a quarter of a second [rad/s, m/s].
+        robot: a robot with armature a.
+        fastest: largest speeds of these states, reached in a quarter of a second, `(nq,)` [rad/s, m/s].
     """
     held, errors = robot.replace(armature=torch.zeros_like(robot.armature)), InertialPrior()
     generator = torch.Generator().manual_seed(0)
@@ -539,7 +540,7 @@ def without_armature(robot: RobotModel, fastest: Tensor) -> RobotModel:
 
 
 def _figures(robot: RobotModel) -> Tensor:
-    """Return the parameters of each joint that a fit can change `(nq, 13)`, in the order of `FIGURES`."""
+    """Return the parameters of each joint that a fit can change, `(nq, 13)`, in the order of `FIGURES`."""
     friction = torch.stack([robot.damping, robot.friction], dim=-1)
     links = inertial_parameters(robot.mass, robot.com, robot.inertia)
     return torch.cat([friction, links, robot.armature[:, None]], dim=-1)
@@ -548,7 +549,7 @@ def _figures(robot: RobotModel) -> Tensor:
 def _parameters(
     file: RobotModel, robot: RobotModel, samples: list[RobotModel], scale: Tensor | None
 ) -> tuple[Parameter, ...]:
-    """Return all parameters that a fit can change, with their standard deviations over samples."""
+    """Return all parameters that a fit can change, with their standard deviations over the samples."""
     before, after = _figures(file), _figures(robot)
     std, prior = torch.stack([_figures(each) for each in samples]).std(0), after.abs()
     if scale is not None:

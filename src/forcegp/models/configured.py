@@ -1,4 +1,4 @@
-"""Models defined by the table `[model]` in a scene or in a separate file (docs/formats.md)."""
+"""Models defined by the table `[model]` in a scene or in a separate file (see docs/formats.md)."""
 
 from __future__ import annotations
 
@@ -35,7 +35,7 @@ DEFAULT = "sgp"
 COMMON = ("name", "noise", "seed", "learning")
 """Keys of `[model]` that are accepted for every model, even if the model ignores them."""
 ARGUMENTS = {"priors": "force_priors"}
-"""Keys with a name that differs from the argument of the model class."""
+"""Keys that differ from the name of the argument of the model class."""
 Options = LearningOptions | BatchOptions
 
 
@@ -46,8 +46,8 @@ class Configured:
     Attributes:
         name: name of the model.
         model: the model.
-        options: learning options; `None` means the default.
-        sensor_noise_std: noise of the force sensor, if it is used as an additional measurement [N].
+        options: learning options. `None` selects the default options.
+        sensor_noise_std: standard deviation of the force sensor noise [N], if the sensor is used.
     """
 
     name: str
@@ -56,7 +56,7 @@ class Configured:
     sensor_noise_std: float | None = None
 
     def fit(self, data: Dataset, *, progress: FitProgress | None = None, **settings: Any) -> FittedModel:
-        """Fit the model to data with its options, using the force sensor if `sensor_noise_std` is given."""
+        """Fit the model with its options, and use the force sensor if `sensor_noise_std` is given."""
         if self.options is not None:
             settings["options"] = self.options
         if self.sensor_noise_std is not None and isinstance(self.model, StructuredGP):
@@ -76,12 +76,12 @@ def configured(
     """Create the model defined by a table `[model]`.
 
     Args:
-        table: table from a scene or from `load_model_table`.
-        system: robot and contacts.
-        name, noise_std, seed: values that override those in the table.
+        table: the table from a scene or from `load_model_table`.
+        system: the robot and its contacts.
+        name, noise_std, seed: values that override the values in the table.
 
     Raises:
-        SceneError: a value is invalid for the model or the system; the message gives the file, line and key.
+        SceneError: a value is invalid for the model or the system. The message gives the file, line and key.
         UnknownNameError: `name` is not a model.
 
     Example:
@@ -103,14 +103,14 @@ def configured(
 
 
 def keys_of(kind: type[Model[Any]]) -> tuple[str, ...]:
-    """Return the keys of `[model]` for a model class: the common keys and its constructor arguments."""
+    """Return the keys of `[model]` for a model class: the common keys and the constructor arguments."""
     keys = {argument: key for key, argument in ARGUMENTS.items()}
     own = [keys.get(name, name) for name in signature(kind).parameters if name not in ("system", *COMMON)]
     return (*COMMON, *own, *(("sensor_noise_std",) if kind is StructuredGP else ()))
 
 
 def _arguments(table: ModelTable, system: ConstrainedSystem, name: str) -> dict[str, Any]:
-    """Return the arguments for the model class that the keys in the file define."""
+    """Return the arguments for the model class that are defined in the table."""
     made, at = MODELS[name].made, table.document.at
     given, arguments = table.section.given(), dict[str, Any]()
     for key, value in given.items():
@@ -128,7 +128,7 @@ def _arguments(table: ModelTable, system: ConstrainedSystem, name: str) -> dict[
 
 
 def _noise(section: NoiseSection, acceleration: NoiseStd | None) -> NoiseStd | Noise | None:
-    """Return the noise defined in `[model]`, with the acceleration noise overridden by `acceleration`."""
+    """Return the noise defined in `[model]`. If given, `acceleration` overrides the acceleration noise."""
     given = section.given() | ({} if acceleration is None else {"acceleration": acceleration})
     if set(given) <= {"acceleration"}:
         return given.get("acceleration")
@@ -155,7 +155,7 @@ def _priors(table: ModelTable, written: Sequence[dict[str, Any]]) -> tuple[Force
 
 
 def _learning(table: ModelTable, model: Model[Any]) -> Options | None:
-    """Return the options defined in `[model.learning]`, completed by the defaults of the model."""
+    """Return the options defined in `[model.learning]`, with defaults of the model for missing keys."""
     given: dict[str, Any] = table.section.learning.given()
     if not given:
         return None
@@ -170,7 +170,7 @@ def _learning(table: ModelTable, model: Model[Any]) -> Options | None:
 
 
 def _default(model: Model[Any], given: Mapping[str, Any]) -> Options:
-    """Return the default options of a model; for an analytical model, the given keys select their class."""
+    """Return the default options of a model. For an analytical model, the given keys select their class."""
     if isinstance(model, NeuralNetwork):
         return DEEP if len(model.hidden) > 2 else SHALLOW
     if isinstance(model, AnalyticalModel) and not {"optimizer", "max_evaluations"} & set(given):

@@ -1,4 +1,4 @@
-"""Estimation of external wrenches from a log using a fitted model, and contact detection."""
+"""Estimation of external wrenches from a log with a fitted model, and detection of contact."""
 
 from __future__ import annotations
 
@@ -35,38 +35,39 @@ from forcegp.robust import MAD_TO_STD
 
 METHODS = ("acceleration", "momentum")
 LEAST_NOISE = 1e-9
-"""Minimum velocity noise, above rounding errors [rad/s, m/s]."""
+"""Minimum velocity noise, which exceeds rounding errors [rad/s, m/s]."""
 THRESHOLD = 5.0
 """Number of standard deviations beyond which a contact is detected."""
 
 BLOCK, LEAST_BLOCKS = 0.5, 20
-"""Length of blocks with independent maxima of d² [s], and minimum number of blocks for estimating a tail."""
+"""Length of blocks with independent maxima of d² [s]; minimum number of blocks for estimating a tail."""
 
 
 @dataclass(frozen=True, repr=False)
 class ExternalWrench(Prediction):
-    """External wrench at each sample of a log, with `mean` `(n, k)` and `covariance` `(n, k, k)`.
+    """Estimated external wrench at each sample of a log.
 
-    The covariance includes the uncertainty of the learned forces, the noise of torques and motion, and the
-    prior on the wrench. In directions that have no effect on the joints, it equals the prior covariance.
+    Its `mean` has shape `(n, k)`, and its `covariance` has shape `(n, k, k)`. The covariance includes the
+    uncertainty of the learned forces, the noise of torques and motion, and the prior on the wrench. In
+    directions that have no effect on the joints, the covariance equals the prior covariance.
 
     Attributes:
-        frame: frame and estimated components.
+        frame: the frame, and the estimated components of the wrench.
     """
 
     frame: WrenchFrame | None = None
 
     def detect(self, threshold: float = THRESHOLD, hold: int = 1, limit: float = 0.0) -> Tensor:
-        """Return whether a wrench acts at each sample, `(n,)` bool.
+        """Return whether a wrench acts at each sample, as a mask `(n,)`.
 
         Without a wrench, d² = ŵᵀ C⁻¹ ŵ is at most a χ² variable with k degrees of freedom. A contact is
-        detected if, in `hold` consecutive samples, d² exceeds both `limit` and the χ² quantile at which the
-        tail probability is that of a Gaussian beyond ± `threshold` standard deviations.
+        detected if, in `hold` consecutive samples, d² exceeds both `limit` and a quantile of this
+        distribution. The quantile has the tail probability of a Gaussian beyond ± `threshold` σ.
 
         Args:
-            threshold: threshold [σ]; `false_alarm_rate(threshold)` is the false alarm probability per sample.
-            hold: number of consecutive samples, including the current one.
-            limit: lower bound on d², such as `exceeded_once_in` of an estimate from free motion.
+            threshold: threshold [σ]. The probability of a false alarm is `false_alarm_rate(threshold)`.
+            hold: number of consecutive samples, including the current sample.
+            limit: lower limit for d², such as that of `exceeded_once_in`.
 
         Raises:
             ParameterError: the threshold is not positive, or `hold` is below one.
@@ -86,13 +87,13 @@ class ExternalWrench(Prediction):
     def exceeded_once_in(self, seconds: float, t: Tensor) -> float:
         """Return the value that d² exceeds about once in a given time of free motion.
 
-        Call this on the estimate from a log of free motion, such as the training log. Friction errors persist
-        and have heavier tails than a Gaussian. The maxima of d² over blocks of `BLOCK` seconds are treated as
-        independent; above their median u, P(d² > u + x) = ½ exp(−x/β).
+        Call this method on an estimate from a log of free motion, such as the training log. Friction errors
+        persist and have heavier tails than a Gaussian. The maxima of d² over blocks of `BLOCK` seconds are
+        therefore treated as independent. Above their median u, P(d² > u + x) = ½ exp(−x/β).
 
         Args:
-            seconds: time of free motion in which one false alarm is expected [s].
-            t: times of this estimate `(n,)` [s], in order within each trajectory.
+            seconds: duration of free motion in which one false alarm is expected [s].
+            t: time of each sample `(n,)` [s], increasing within each trajectory.
 
         Example:
             `wrench.detect(limit=fit.external_wrench(train, "tool").exceeded_once_in(600.0, train.t))`
@@ -104,7 +105,7 @@ class ExternalWrench(Prediction):
         largest = t.new_zeros(int(numbers[-1]) + 1).scatter_reduce(0, numbers, self.distance_squared, "amax")
         if len(largest) < LEAST_BLOCKS:
             raise DataError(
-                "the free motion is too short to predict false alarms",
+                "the free motion is too short to predict the false alarm rate",
                 expected=f"at least {LEAST_BLOCKS * BLOCK:g} s",
                 got=f"{len(largest) * BLOCK:g} s",
             )
@@ -123,7 +124,7 @@ class ExternalWrench(Prediction):
 
 
 def false_alarm_rate(threshold: float) -> float:
-    """Return the probability that a Gaussian variable is beyond ± `threshold` standard deviations.
+    """Return the probability that a Gaussian deviates by more than `threshold` standard deviations.
 
     Example:
         >>> round(false_alarm_rate(2.0), 4)
@@ -134,7 +135,7 @@ def false_alarm_rate(threshold: float) -> float:
 
 @runtime_checkable
 class LearnedForces(Protocol):
-    """Learned forces of a fit: posterior, noise, and robot."""
+    """The learned forces of a fit, with their posterior, the noise and the robot."""
 
     @property
     def system(self) -> ConstrainedSystem: ...
@@ -159,7 +160,7 @@ def external_wrench(
     method: str,
     external: Mapping[str, float] | None = None,
 ) -> ExternalWrench:
-    """Return the external wrench at each sample of a log; see `StructuredFit.external_wrench`."""
+    """Return the external wrench at each sample of a log, as in `StructuredFit.external_wrench`."""
     check_name("method of estimating a wrench", method, METHODS)
     reading = Reading.of(fit, data, frame, external)
     if method == "acceleration":
@@ -182,8 +183,8 @@ def external_wrench(
 
 
 class JointForces(NamedTuple):
-    """Mean of Q̄ `(n, nq)` at n states, its covariance including torque noise `(n, nq, nq)`, the equations of
-    motion, J `(n, k, nq)` for the wrench and multipliers, and their prior standard deviations `(k,)`."""
+    """Forces at n states: mean of Q̄ `(n, nq)`, its covariance with torque noise `(n, nq, nq)`, the equations
+    of motion, J for the wrench and multipliers `(n, k, nq)`, and their prior standard deviations `(k,)`."""
 
     mean: Tensor
     covariance: Tensor
@@ -197,10 +198,10 @@ class Reading:
     """A log prepared for wrench estimation.
 
     Attributes:
-        fit, data, frame: learned forces, log, and frame with the components to estimate.
-        memory: friction with memory, if the log is in time order.
-        remembered: force due to this friction `(n, nq)`, or zero.
-        external: standard deviation of other unknown forces on the joints `(nq,)`, or `None`.
+        fit, data, frame: the learned forces, the log, and the frame with the components to estimate.
+        memory: friction with memory if the log is in time order, otherwise `None`.
+        remembered: force caused by this friction `(n, nq)`, or zero.
+        external: standard deviation of other unknown joint forces `(nq,)`, or `None`.
     """
 
     fit: LearnedForces
@@ -242,7 +243,7 @@ class Reading:
         return JointForces(mean + self.remembered[rows], S, at.eom, J, prior)
 
     def from_accelerations(self) -> tuple[Tensor, Tensor]:
-        """Estimate the mean and covariance by generalized least squares."""
+        """Estimate the mean and covariance for each sample by generalized least squares."""
         stated, parts = self.data.extras.get("qdd_std"), []
         learned = self.fit.noise.get("qdd", self.data.q.new_zeros(self.data.nq))
         for rows in torch.arange(len(self.data)).split(CHUNK):
@@ -256,14 +257,14 @@ class Reading:
         return torch.cat(mean), torch.cat(covariance)
 
     def from_momenta(self) -> tuple[Tensor, Tensor]:
-        """Estimate the mean and covariance of each trajectory with the momentum filter."""
+        """Estimate the mean and covariance along each trajectory with the momentum filter."""
         if not self.data.header.ordered:
             raise DataError("the momentum filter needs a log in time order", got="points in another order")
         correlation = self.fit.problem.correlation if self.memory is None else self.memory.correlation
         if self.fit.torque_std is None or correlation is None:
             raise ModelError(
                 "this fit has no learned torque noise, which the momentum filter needs",
-                hint='fit with force_priors="friction" to more samples in time order',
+                hint='fit more samples in time order, with force_priors="friction"',
             )
         noise, segment = velocity_noise(self.data), self.data.segment
         logs = [
@@ -295,7 +296,7 @@ class Reading:
 
 
 def velocity_noise(data: Dataset) -> Tensor:
-    """Return `white_noise_std` of the joint velocities `(nq,)` in an evenly sampled log in time order.
+    """Return the standard deviation `(nq,)` of white velocity noise in an evenly sampled log.
 
     Raises:
         DataError: no trajectory has five consecutive samples.
@@ -310,7 +311,7 @@ def white_noise_std(x: Tensor, whole: Tensor) -> Tensor:
     """Return the standard deviation σ `(d,)` of the white noise in each column of a smooth signal `(n, d)`.
 
     The deviation from the cubic through the neighbours, x_i − (−x_{i−2} + 4 x_{i−1} + 4 x_{i+1} − x_{i+2})/6,
-    has variance 35/18 σ²; its median absolute value is robust to jumps. `whole` `(n − 4,)` bool marks the
+    has variance 35/18 σ². Its median absolute value is robust to jumps. `whole`, shape `(n − 4,)`, marks the
     first of every five samples that are consecutive.
     """
     a, b, middle, c, d = (x[k : len(x) - 4 + k][whole] for k in range(5))

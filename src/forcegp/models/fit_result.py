@@ -12,7 +12,7 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.notebook import html_table
 
 COVERED = 0.8
-"""Held-out ±2σ coverage below which a fit issues a warning; it results if σ is 36 % too small."""
+"""Held-out ±2σ coverage below which a fit issues a warning. It corresponds to a σ that is 36 % too small."""
 
 
 @dataclass(frozen=True)
@@ -21,13 +21,13 @@ class Compared:
 
     Attributes:
         name: name of the set.
-        log_density: mean log predictive density of held-out samples [nats per sample]; `None` if it was not
+        log_density: mean log predictive density of held-out samples [nats per sample], or `None` if not
             computed.
         behind: deficit relative to the best set [nats per sample].
         standard_error: standard error of this deficit.
         chosen: whether this set was selected.
-        note: reason why the set was not tested on any or on all stretches.
-        coverage: fraction of held-out values within ±2σ; 0.95 for correct error bars.
+        note: reason why the set was not tested, or was not tested on both halves of the log.
+        coverage: fraction of held-out values within ±2σ, which is 0.95 for correct error bars.
     """
 
     name: str
@@ -44,8 +44,8 @@ class Compared:
         if self.coverage is None or self.coverage >= COVERED:
             return ""
         return (
-            f"the model misses held-out blocks of this log: ±2σ coverage is {self.coverage:.0%} instead "
-            "of 95%; check the log and the robot file (`forcegp check`)"
+            f"the model predicts held-out blocks of this log poorly: ±2σ coverage is {self.coverage:.0%} "
+            "instead of 95%; check the log and the robot file (`forcegp check`)"
         )
 
     def __str__(self) -> str:
@@ -58,33 +58,33 @@ class Compared:
 
 @dataclass(frozen=True)
 class FitResult:
-    """Result of a fit; saved files contain all fields except the history.
+    """Result of a fit. Saved files contain all fields except the history.
 
     Attributes:
         converged: whether the optimiser reached its tolerance.
         evaluations: number of evaluations of the objective.
         seconds: duration of the fit.
-        objective: final value (mean squared error, or negative log posterior of the hyperparameters).
-        log_marginal_likelihood: log marginal likelihood of the training data; `None` for models without one.
-        jitter: jitter added to the diagonal of the covariance, in units of the noise variance; the effective
+        objective: final mean squared error, or negative log posterior of the hyperparameters.
+        log_marginal_likelihood: log marginal likelihood of the training data, or `None` if undefined.
+        jitter: jitter added to the diagonal of the covariance, in units of the noise variance. The effective
             noise is √(1 + jitter) times the given noise.
-        constant_inputs: inputs that are constant in the training data and were therefore not scaled.
+        constant_inputs: inputs that are constant in the training data and therefore are not scaled.
         message: reason why the optimiser stopped.
         history: the objective at each evaluation.
-        force_correlation: mean posterior correlation of the joint force Q and the contact force Q_z at
-            training states. Near −1, only their sum is identifiable; near 0, both are. `None` unless there
-            are priors on both.
+        force_correlation: mean posterior correlation between the joint force Q and the contact force Q_z at
+            training states. If it is near −1, only the sum of the forces is identifiable. If it is near 0,
+            both are. It is `None` unless both forces have priors.
         warnings: warnings about the fit, each with a suggested remedy.
-        inference: `"exact"` or `"sparse"`, for models that support both.
+        inference: `"exact"` or `"sparse"` for models that support both.
         samples: number of samples on which the model is conditioned.
         learned_on: number of samples used to learn the hyperparameters.
         basis_functions: number of basis functions of a sparse posterior.
-        determined: effective number of basis functions that are determined by the data.
-        missed: total residual prior variance of all rows given the inducing points, in units of the noise
-            variance; `determined` is the total posterior variance in the same units.
+        determined: effective number of basis functions that the data determine.
+        missed: total residual prior variance of all rows, given the inducing points, in units of the noise
+            variance. In the same units, `determined` is the total posterior variance.
         more_points_would_help: whether `missed` is at least a tenth of `determined`.
-        comparison: scores of the compared sets of force priors; empty if the priors were specified.
-        never_closed: contacts that are never closed in the training data; their forces are undetermined.
+        comparison: scores of the compared sets of force priors. It is empty if the priors were specified.
+        never_closed: contacts that are never closed in the training data. Their forces are undetermined.
     """
 
     converged: bool
@@ -110,7 +110,7 @@ class FitResult:
 
 
 def model_line(kind: str, system: ConstrainedSystem, result: FitResult | None) -> str:
-    """Return a line of text with the robot, the contacts and the result of the fit, if any."""
+    """Return a line of text that describes the robot, the contacts and the result of the fit, if any."""
     robot = system.robot
     contacts = f", contact {', '.join(system.contact_names)}" if system.contacts else ""
     outcome = "" if result is None else f"; {_outcome(result)}"

@@ -1,14 +1,14 @@
-"""Tracking of forces that change abruptly, such as a payload that is picked up.
+"""Tracking of forces that change abruptly, such as the force due to a payload that is picked up.
 
-Exponential forgetting discards the payload estimate while the arm is at rest, and is slow to detect a new
-payload. Earlier samples are therefore forgotten only if, for new samples D,
+Exponential forgetting discards the payload estimate while the arm is at rest, and it is slow to detect a new
+payload. Earlier samples are therefore forgotten only if new samples D satisfy
 
     p(D | payload drawn again from its prior) · p(change) > p(D | payload unchanged).
 
 Both densities are marginal likelihoods, computed from the posterior before and after the update.
 
-The force due to a payload is accurate to first order around the known payload in its prior. After a change,
-the prior is linearized around the current estimate, as in an extended Kalman filter.
+The force caused by a payload is accurate to first order around the known payload in its prior. After a
+change, the prior is linearized around the current estimate, as in an extended Kalman filter.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ class Followed:
     """Result of `follow`.
 
     Attributes:
-        fit: the fit with the new samples.
-        changed: whether a change was detected, so that the forces were relearned.
-        log_odds: log odds of a change versus no change, given the new samples.
+        fit: the fit that includes the new samples.
+        changed: whether a change was detected and the forces were relearned.
+        log_odds: log odds of a change, given the new samples.
     """
 
     fit: StructuredFit
@@ -51,10 +51,11 @@ def follow(
     """Add samples to a fit, and relearn the forces of the given priors if the samples contradict them.
 
     Args:
-        fit: fit with sparse inference.
-        data: a few new samples, such as 0.05 s of data.
-        priors: names of the priors on forces that may change, such as `payload`.
-        factor: correlation of these forces with those at the previous call, to allow for slow drift as well.
+        fit: a fit with sparse inference.
+        data: a few new samples, for example over 0.05 s.
+        priors: names of the priors whose forces may change, such as `payload`.
+        factor: correlation of these forces with those at the previous call. A factor below 1 allows for
+            drift.
         change: prior probability of a change between two calls.
 
     Raises:
@@ -85,10 +86,10 @@ def _knowing(
     """Linearize payload priors around an estimate.
 
     Args:
-        fit: fit with the priors to replace.
-        estimate: fit with the estimated payloads.
+        fit: the fit with the priors to replace.
+        estimate: the fit with the estimated payloads.
         priors: names of the tracked priors.
-        begin: whether to replace priors without a known payload as well.
+        begin: whether to replace also priors without a known payload.
     """
     one = {"one": torch.zeros(1, 1, dtype=torch.float64)}
     updated_priors = tuple(

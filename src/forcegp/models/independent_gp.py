@@ -1,4 +1,4 @@
-"""Gaussian-process baseline with one process per joint acceleration and no knowledge of mechanics.
+"""Gaussian-process baseline with one process per joint acceleration and no mechanical model.
 
 q̈_j ~ GP(0, k_j(x, x′)) with x = (q, q̇, τ) and squared-exponential k_j (section 5.4 of the paper).
 """
@@ -39,17 +39,17 @@ from forcegp.storage.system import take
 
 KIND = "independent_gp"
 LEARNING = 6
-"""Measured number of `(n, n)` matrices for learning one joint, in addition to the factors of all joints."""
+"""Number of `(n, n)` matrices needed to learn one joint, as measured, besides the factors of all joints."""
 
 
 @dataclass(frozen=True)
 class IndependentTraining:
-    """Training data of a fitted model.
+    """Training data of fitted independent Gaussian processes.
 
     Attributes:
-        features: inputs before standardization, `(n, nq)` by name.
-        qdd: `(n, nq)` accelerations [rad/s², m/s²].
-        noise_std: `(nq,)` or `(n, nq)` standard deviation of the acceleration noise.
+        features: inputs before standardization, `(n, nq)` each, keyed by name.
+        qdd: accelerations `(n, nq)` [rad/s², m/s²].
+        noise_std: standard deviation of the acceleration noise, `(nq,)` or `(n, nq)`.
         scale: standardization of the inputs.
     """
 
@@ -59,9 +59,9 @@ class IndependentTraining:
     scale: Standardization
 
     def processes(self) -> list[tuple[JointForcePrior, Block, Tensor]]:
-        """Return, for each joint, its process, its accelerations in units of the noise, and Σ log σ.
+        """Return the process, the accelerations in units of the noise, and Σ log σ for each joint.
 
-        The likelihood only uses the name and the kernel of a process.
+        The likelihood uses only the name and the kernel of a process.
         """
         inputs, noise = self.scale.apply(self.features), self.noise_std.expand_as(self.qdd)
         columns = enumerate(zip(self.qdd.split(1, dim=1), noise.split(1, dim=1), strict=True))
@@ -75,7 +75,7 @@ class IndependentTraining:
         ]
 
     def announce(self, copies: int) -> None:
-        """Warn if the matrices of all joints need much memory."""
+        """Warn if the matrices of all joints need a lot of memory."""
         n, nq = self.qdd.shape
         announce_memory(8 * (2 * nq + copies) * n**2, f"independent Gaussian processes on {n:,} samples")
 
@@ -89,13 +89,13 @@ class IndependentSettings(KernelOptions):
 class IndependentGP(Model["IndependentFit"]):
     """Independent zero-mean Gaussian processes, one per joint acceleration, on standardized (q, q̇, τ).
 
-    The inputs are states and torques only, not contacts.
+    The inputs are states and torques. Contacts are not used as inputs.
 
     Args:
-        system: robot and contacts; contacts are used for evaluation only, not for learning.
-        noise: standard deviation of measured accelerations [rad/s², m/s²], one value or one per joint; by
-            default, the value in the log, or 0.1.
-        standardize: whether to standardize the inputs (the paper does not).
+        system: the robot and its contacts, which are used only for evaluation.
+        noise: standard deviation of measured accelerations [rad/s², m/s²], as one value or one per joint. The
+            default is the value in the log, or 0.1 if the log states none.
+        standardize: whether to standardize the inputs, which the paper does not do.
 
     Raises:
         ModelError: the robot is not in float64, or `noise` specifies more than acceleration noise.
@@ -112,7 +112,7 @@ class IndependentGP(Model["IndependentFit"]):
         stated = Noise.of(noise)
         if stated != Noise(stated.acceleration):
             raise ModelError(
-                "independent Gaussian processes have white noise of accelerations only",
+                "independent Gaussian processes support only white acceleration noise",
                 expected="a number, one per joint, or Noise(acceleration)",
                 got=noise,
             )
@@ -131,8 +131,8 @@ class IndependentGP(Model["IndependentFit"]):
 
         Args:
             data: states and measured accelerations.
-            options: optimiser and its limits, which apply to each joint.
-            progress: called after each evaluation; evaluations are counted over all joints.
+            options: the optimiser and its limits, which apply to each joint.
+            progress: a function called after each evaluation. Evaluations are counted over all joints.
             checkpoint: see `Model.fit`.
 
         Raises:
@@ -162,7 +162,7 @@ class IndependentGP(Model["IndependentFit"]):
         return fitted(self, training, hyperparameters, parts)
 
     def training(self, features: dict[str, Tensor], qdd: Tensor, noise_std: Tensor) -> IndependentTraining:
-        """Return the training data with the standardization of their inputs."""
+        """Return the training data, including the standardization of the inputs."""
         scaled = Standardization.of if self.options.standardize else Standardization.none
         return IndependentTraining(features, qdd, noise_std, scaled(features))
 
@@ -185,7 +185,7 @@ def fitted(
     hyperparameters: dict[str, Tensor],
     parts: Sequence[Learned] = (),
 ) -> IndependentFit:
-    """Condition the processes on training data at given hyperparameters.
+    """Condition the processes on training data for given hyperparameters.
 
     Raises:
         NumericalError: a covariance is not positive definite.
@@ -215,11 +215,11 @@ class IndependentFit(AccelerationFit):
     """Fitted independent Gaussian processes.
 
     Attributes:
-        system: robot and contacts.
-        specification: specification of the model.
-        training: data on which the processes are conditioned.
+        system: the robot and its contacts.
+        specification: the specification of the model.
+        training: the data on which the processes are conditioned.
         hyperparameters: log-hyperparameters of all processes.
-        posteriors: posterior for each joint.
+        posteriors: the posterior for each joint.
         result: result of the fit.
     """
 
@@ -254,7 +254,9 @@ class IndependentFit(AccelerationFit):
         }
         noise = take(tensors, "training.noise_std", None, dtype, source)
         if noise.shape not in ((nq,), (n, nq)):
-            raise ModelError(f"{source}: tensor 'training.noise_std' does not fit", got=tuple(noise.shape))
+            raise ModelError(
+                f"{source}: tensor 'training.noise_std' has the wrong shape", got=tuple(noise.shape)
+            )
         training = model.training(features, take(tensors, "training.qdd", (n, nq), dtype, source), noise)
         hyperparameters = {
             f"{prior.name}.{name}": take(

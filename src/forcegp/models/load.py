@@ -1,4 +1,4 @@
-"""Loading of saved models of any kind; pickling and copying use the same format."""
+"""Loading of saved models of any kind. Pickling and copying use the same format."""
 
 from __future__ import annotations
 
@@ -28,15 +28,15 @@ from forcegp.storage.system import PREFIX, unpack_system
 KINDS: dict[str, type[FittedModel]] = {
     kind.kind: kind for kind in (AnalyticalFit, NetworkFit, IndependentFit, StructuredFit)
 }
-"""Fitted models by their name in files."""
+"""Fitted models, keyed by their name in files."""
 
 
 def load_model(path: str | Path, *, system: ConstrainedSystem | None = None) -> FittedModel:
-    """Load a saved model; its predictions are bit-identical to those before saving.
+    """Load a saved model. Its predictions are bit-identical to those before saving.
 
     Args:
-        path: the file; `.safetensors` is added if missing.
-        system: system with the constraints defined in Python (such as an `ImplicitSurface`), if any; the
+        path: the file. The suffix `.safetensors` is added if it is missing.
+        system: a system with the constraints that were defined in Python, such as an `ImplicitSurface`. The
             robot and all other constraints are read from the file.
 
     Example:
@@ -54,14 +54,14 @@ def load_model(path: str | Path, *, system: ConstrainedSystem | None = None) -> 
         'analytical'
 
     Raises:
-        ModelError: there is no model, it is damaged, or a constraint must be passed by `system`.
+        ModelError: the file is missing or damaged, or a constraint must be passed in `system`.
         UnknownNameError: this release does not support this kind of model.
     """
     return _restored(*read_model(path), str(model_path(path)), system)
 
 
 def model_of_bytes(data: bytes) -> FittedModel:
-    """Load a model from the content of its file.
+    """Load a model from the content of a model file.
 
     Raises:
         ModelError, UnknownNameError: see `load_model`.
@@ -93,7 +93,7 @@ def register() -> None:
 
 
 def _sent(model: FittedModel) -> tuple[Any, ...]:
-    """Return a function and arguments that restore a model from the content of its file.
+    """Return a function and its arguments, which restore a model from the content of its file.
 
     Raises:
         ModelError: a part of the model is defined in Python.

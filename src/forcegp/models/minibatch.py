@@ -1,4 +1,4 @@
-"""Minimisation of a mean loss, either by ADAM on batches with early stopping or over all samples at once."""
+"""Minimisation of a mean loss, either over all samples at once or by ADAM on batches with early stopping."""
 
 from __future__ import annotations
 
@@ -16,9 +16,9 @@ from forcegp.gp.optimise import FitProgress, Learned, LearningOptions, minimise,
 from forcegp.storage.checkpoint import Checkpoint, Evaluations
 
 HISTORY = "history"
-"""Name of the tensor with one entry per epoch, the only tensor of variable length."""
+"""Name of the tensor with one entry per epoch, which is the only tensor of variable length."""
 Loss = Callable[[Mapping[str, Tensor], Tensor], Tensor]
-"""Function that maps tensors and row numbers `(k,)` to the mean squared error over these rows."""
+"""A function that maps tensors and row numbers `(k,)` to the mean squared error over these rows."""
 
 
 @dataclass(frozen=True)
@@ -26,11 +26,11 @@ class BatchOptions:
     """Options for training on batches.
 
     Args:
-        epochs: maximum number of passes over the data, with a half-cosine decay of the learning rate to 0.
+        epochs: maximum number of passes over the data. The learning rate decays to 0 along a half cosine.
         batch: number of samples per step.
         learning_rate: initial learning rate of ADAM.
         held_out: fraction of the samples held out for early stopping.
-        patience: number of epochs without held-out improvement after which training stops.
+        patience: number of epochs without improvement in the held-out loss after which training stops.
 
     Raises:
         ModelError: a value is out of range.
@@ -67,18 +67,18 @@ def train(
     """Minimise a mean loss over samples.
 
     Args:
-        loss: mean squared error over rows, differentiable with respect to the tensors.
-        start: initial tensors by name.
+        loss: the mean squared error over rows, which is differentiable with respect to the tensors.
+        start: initial tensors, keyed by name.
         samples: number of rows.
-        options: options for training on batches, which returns the best epoch on the held-out samples, or
-            for training on all samples at once.
-        generator: source of randomness for the held-out part and the order of rows.
-        progress: called after each epoch or evaluation with its number, their maximum number, and the loss.
-        checkpoint: file with the state of training, from which training resumes.
+        options: options for training on batches or on all samples at once. Training on batches returns the
+            tensors of the epoch with the smallest held-out loss.
+        generator: random generator that selects the held-out samples and the order of the rows.
+        progress: a function called after each epoch or evaluation with its number, the maximum and the loss.
+        checkpoint: a file that contains the state of training. If the file exists, training resumes from it.
         key: identifier of the loss for the checkpoint.
 
     Returns:
-        The tensors, their loss, and one entry per epoch or evaluation as history.
+        The tensors, their loss, and a history with one entry per epoch or evaluation.
 
     Raises:
         ModelError: there are too few samples to hold any out, or the checkpoint belongs to a different fit.
@@ -188,7 +188,7 @@ class _State:
         return tensors
 
     def restore(self, tensors: Mapping[str, Tensor], source: Path) -> None:
-        """Continue from a saved state.
+        """Resume from a saved state.
 
         Raises:
             ModelError: the state of the generator is damaged.
@@ -204,7 +204,7 @@ class _State:
 
 
 FLAT = 0.05
-"""Relative decrease in held-out loss over the last tenth of the epochs below which training has converged."""
+"""Relative decrease in held-out loss over the last tenth of the epochs that indicates convergence."""
 
 
 def _flat(history: list[float]) -> bool:

@@ -1,4 +1,4 @@
-"""Neural-network baseline: sigmoid layers from (q, q̇, τ) to q̈, without knowledge of mechanics (sec. 5.4)."""
+"""Neural-network baseline with sigmoid layers from (q, q̇, τ) to q̈ and no mechanical model (sec. 5.4)."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ from forcegp.storage.system import take
 KIND = "neural_network"
 SHALLOW = BatchOptions(epochs=3000, batch=1024, learning_rate=0.03, patience=300)
 DEEP = BatchOptions(epochs=300, batch=256, learning_rate=0.003)
-"""Options for more than two hidden layers, which need smaller steps and take longer per epoch."""
+"""Options for more than two hidden layers, which need smaller steps and more time per epoch."""
 
 
 class NetworkSettings(Record):
@@ -38,14 +38,14 @@ class NetworkSettings(Record):
 
 
 class NeuralNetwork(Model["NetworkFit"]):
-    """A feed-forward network with sigmoid layers on standardized (q, q̇, τ), trained on mean squared error.
+    """A feed-forward network of sigmoid layers on standardized (q, q̇, τ), trained on mean squared error.
 
     The network does not use contacts as inputs and does not predict covariances.
 
     Args:
-        system: robot and contacts; contacts are used for evaluation only, not for learning.
+        system: the robot and its contacts, which are used only for evaluation.
         hidden: widths of the hidden layers.
-        seed: seed for the initial weights, the held-out samples and the order of the batches.
+        seed: random seed for the initial weights, the held-out samples and the order of the batches.
 
     Raises:
         ModelError: a width is not positive.
@@ -69,17 +69,17 @@ class NeuralNetwork(Model["NetworkFit"]):
         progress: FitProgress | None = None,
         checkpoint: str | Path | None = None,
     ) -> NetworkFit:
-        """Train with ADAM on batches, keeping the weights of the best epoch on held-out samples.
+        """Train with ADAM on batches, and keep the weights of the epoch with the smallest held-out error.
 
         Args:
             data: states and measured accelerations.
-            options: training options; by default, `SHALLOW` or `DEEP`.
-            progress: called after each epoch.
+            options: training options. The default is `SHALLOW` or `DEEP`, depending on the number of layers.
+            progress: a function called after each epoch.
             checkpoint: see `Model.fit`.
 
         Returns:
-            The fitted network, with the number of epochs as `evaluations` and the held-out error of
-            standardized accelerations as `objective`.
+            The fitted network. In its result, `evaluations` is the number of epochs, and `objective` is the
+            held-out error of the standardized accelerations.
 
         Raises:
             ModelError, DataError: the data are incompatible with the model.
@@ -111,11 +111,11 @@ class NetworkFit(AccelerationFit):
     """A trained network.
 
     Attributes:
-        system: robot and contacts.
-        hidden, seed: layer widths and seed of the specification.
-        network: layers of the network.
-        inputs, outputs: standardization of (q, q̇, τ) and of q̈.
-        result: result of training.
+        system: the robot and its contacts.
+        hidden, seed: the layer widths and the random seed of the specification.
+        network: the layers of the network.
+        inputs, outputs: the standardization of (q, q̇, τ) and of q̈.
+        result: the result of training.
     """
 
     system: ConstrainedSystem
@@ -168,7 +168,7 @@ class NetworkFit(AccelerationFit):
 
 
 def _network(system: ConstrainedSystem, hidden: tuple[int, ...]) -> nn.Sequential:
-    """Return the layers of the network, before `_initialise`."""
+    """Return the layers of the network before they are initialised."""
     robot = system.robot
     widths = [3 * robot.nq, *hidden]
     layers: list[nn.Module] = []
@@ -179,7 +179,7 @@ def _network(system: ConstrainedSystem, hidden: tuple[int, ...]) -> nn.Sequentia
 
 
 SIGMOID_GAIN = 4.0
-"""Gain that preserves the variance of the signal between layers: the inverse slope of the sigmoid at 0."""
+"""Gain that preserves the variance of the signal between layers, the inverse slope of the sigmoid at 0."""
 
 
 def _initialise(network: nn.Sequential, generator: torch.Generator) -> None:
@@ -195,5 +195,5 @@ def _initialise(network: nn.Sequential, generator: torch.Generator) -> None:
 
 
 def _stacked(scale: Standardization, states: dict[str, Tensor]) -> Tensor:
-    """Return the standardized inputs concatenated, `(n, 3 nq)`."""
+    """Return the concatenated standardized inputs, `(n, 3 nq)`."""
     return torch.cat(list(scale.apply(states).values()), dim=-1)

@@ -47,17 +47,17 @@ class Prediction:
     """A predicted quantity at a batch of states.
 
     Attributes:
-        mean: `(*batch, d)` mean.
-        covariance: `(*batch, d, d)` covariance of the noise-free quantity, unless noise was requested; `None`
-            if the model does not provide it or it was not requested.
-        parts: slice of each requested quantity.
-        beyond: `(*batch, nq)` distance by which the speed and torque of each joint exceed the training data,
-            in standard deviations of these data; `None` if the model does not provide it.
-        joint_names: joints in the order of `beyond`.
-        determined: `(*batch, d)` bool, components determined by the data and the motion; the others are NaN.
-            `None` if all are determined.
-        doubts: descriptions of undetermined components.
-        checked: whether the mean and covariance were checked before, as the C code does.
+        mean: mean `(*batch, d)`.
+        covariance: covariance `(*batch, d, d)` of the noise-free quantity, or of the noisy quantity if noise
+            was requested. It is `None` if it was not requested, or if the model does not provide it.
+        parts: the slice of each requested quantity.
+        beyond: distance `(*batch, nq)` by which the speed and torque of each joint exceed the training data,
+            in standard deviations of these data, or `None` if the model does not provide it.
+        joint_names: names of the joints in the order of `beyond`.
+        determined: mask `(*batch, d)` of the components that the data and the motion determine, or `None` if
+            all are determined. The other components are NaN.
+        doubts: descriptions of the undetermined components.
+        checked: whether the mean and covariance have already been checked, as the C code does.
     """
 
     mean: Tensor
@@ -73,8 +73,7 @@ class Prediction:
         """Reject non-finite numbers and invalid covariances.
 
         Raises:
-            NumericalError: a determined mean or covariance is not finite, or an eigenvalue is clearly
-                negative.
+            NumericalError: a determined value is not finite, or an eigenvalue is clearly negative.
         """
         if checked:
             return
@@ -118,7 +117,7 @@ class Prediction:
         return (*self.doubts, *beyond)
 
     def __repr__(self) -> str:
-        """Return a one-line summary with shapes, without numbers."""
+        """Return a one-line summary of the shapes, without numbers."""
         what = ", ".join(self.parts) or "values"
         bars = "no uncertainty" if self.covariance is None else "with covariance"
         return f"<Prediction of {what}: mean {tuple(self.mean.shape)}, {bars}>"
@@ -133,13 +132,13 @@ class Prediction:
     ) -> list[Axes]:
         """Plot the mean with a band of ±2 standard deviations, one panel per component.
 
-        `model.plot(data)` does the same with the names, times and measurements from a data set.
+        `model.plot(data)` takes the names, times and measurements from a data set.
 
         Args:
-            t: `(n,)` time of each sample [s]; by default, the number of the sample is used.
-            measured: `(n, d)` measured values for comparison.
+            t: time of each sample `(n,)` [s]. By default, the samples are numbered.
+            measured: measured values for comparison, `(n, d)`.
             names: names of the components.
-            ax: matplotlib axes to draw on, one per panel; by default, a new figure is created.
+            ax: matplotlib axes to draw on, one per panel. By default, a new figure is created.
 
         Returns:
             The axes, one per panel.
@@ -152,7 +151,7 @@ class Prediction:
 
         if self.mean.ndim != 2:
             raise ShapeError(
-                "only predictions over one list of states can be drawn",
+                "only predictions for a single list of states can be plotted",
                 expected="a mean of shape (n, d)",
                 got=tuple(self.mean.shape),
             )
@@ -173,7 +172,7 @@ class Prediction:
         return axes
 
     def panel(self, i: int, name: str, label: str, true: Tensor | None) -> Panel:
-        """Return a panel for component i, with its measured values if there are any."""
+        """Return a panel for component i, with the measured values if there are any."""
         from forcegp.plots import MEASURED, PREDICTED, Curve, Panel
 
         curves = [] if true is None else [Curve(true[:, i], "measured", MEASURED, width=0.7)]
@@ -182,7 +181,7 @@ class Prediction:
 
 
 class Query(NamedTuple):
-    """Arguments of `Predictor.predict`; the default system is that of the fit."""
+    """Arguments of `Predictor.predict`. By default, the system is that of the fit."""
 
     quantity: str | Sequence[str]
     system: ConstrainedSystem | None
@@ -198,7 +197,7 @@ Answer = tuple[tuple[Tensor | None, ...], dict[str, slice], tuple[str, ...]]
 def in_pieces(
     at: FlatStates, read: Callable[[FlatStates], tuple[Tensor | None, ...]]
 ) -> tuple[Tensor | None, ...]:
-    """Evaluate `read` on `CHUNK` states at a time, so that only the result and one piece are in memory."""
+    """Evaluate `read` on `CHUNK` states at a time to keep only the result and one piece in memory."""
     whole, n = list[Tensor | None](), len(at.q)
     for first in range(0, max(n, 1), CHUNK):
         piece = read(at.rows(slice(first, first + CHUNK)))
@@ -247,28 +246,26 @@ class Predictor(ForwardModel):
         system: ConstrainedSystem | None = None,
         noise: bool = False,
     ) -> Prediction:
-        """Predict the mean and covariance of a quantity; for `StructuredGP`, from the posterior (eqs. 22–25).
+        """Predict the mean and covariance of a quantity. `StructuredGP` uses the posterior (eqs. 22–25).
 
         Args:
-            q, qd, tau: `(*batch, nq)` states.
-            quantity: a name in `QUANTITIES` or, for models with forces, several names for their joint
+            q, qd, tau: states, `(*batch, nq)`.
+            quantity: a name in `QUANTITIES`. If the model has forces, several names give their joint
                 distribution.
-            active: `(*batch, n_contacts)` bool, the closed contacts; by default all.
-            covariance: whether to compute the covariance, which costs more than the mean.
-            system: a different system, such as one with a different surface or none, for models with forces.
-                On the system of the fit, the forces of contacts that are never closed in the training data
-                are undetermined.
-            noise: whether the covariance includes the noise of torques and sensors.
+            active: mask `(*batch, n_contacts)` of closed contacts. By default, all contacts are closed.
+            covariance: whether to compute the covariance, which is more expensive than the mean.
+            system: a different system, such as one with a different surface, if the model predicts forces. On
+                the system of the fit, forces of contacts that are never closed in training are undetermined.
+            noise: whether to include the noise of torques and sensors in the covariance.
 
         Returns:
-            The mean `(*batch, d)` and, if the model provides it, the covariance `(*batch, d, d)`, by default
-            without measurement noise.
+            The mean `(*batch, d)` and, if the model provides it, the covariance `(*batch, d, d)`.
 
         Raises:
             UnknownNameError: the quantity does not exist.
             ShapeError: a state or `active` does not match the system.
             ModelError: all requested forces belong to contacts that are never closed in the training data, or
-                the model predicts only accelerations and does not support the quantity, system or noise.
+                a model that predicts only accelerations does not support the quantity, system or noise.
         """
         if noise and not self.has_noise:
             raise ModelError(f"a {self.kind!r} model has no noise of measurements", hint="use StructuredGP")
@@ -308,12 +305,12 @@ class Predictor(ForwardModel):
         """Return the mean acceleration and multiplier, and their Jacobians with respect to q, q̇ and τ.
 
         Args:
-            q, qd, tau: `(*batch, nq)` states.
-            active: `(*batch, n_contacts)` bool, the closed contacts; by default all.
-            system: a different system for the prediction.
+            q, qd, tau: states, `(*batch, nq)`.
+            active: mask `(*batch, n_contacts)` of closed contacts. By default, all contacts are closed.
+            system: a different system for which to predict the motion.
 
         Raises:
-            ModelError: the model has no forces.
+            ModelError: the model does not predict forces.
             ShapeError: an argument does not match the system.
         """
         force = self.force_field()
@@ -333,28 +330,28 @@ class Predictor(ForwardModel):
         samples: int = 0,
         **settings: Any,
     ) -> Rollout:
-        """Predict trajectories from initial states (section 4); see `forcegp.rollout.rollout_model`.
+        """Predict trajectories from initial states (section 4), as in `forcegp.rollout.rollout_model`.
 
         Args:
-            q0, qd0: `(*batch, nq)` initial states.
-            tau: motor torque over time: a log, an array `(samples, nq)` or `(*batch, samples, nq)` with
-                its sampling period in `options`, or a feedback law as a function of (t, q, q̇).
+            q0, qd0: initial states, `(*batch, nq)`.
+            tau: motor torque over time. It is a log, a function of (t, q, q̇), or an array `(samples, nq)` or
+                `(*batch, samples, nq)`. The sampling period of an array is set in `options`.
             duration: simulated time [s].
             samples: number of function samples to integrate in addition to the mean.
-            **settings: `options`, `seed`, `active`, `system` and `progress` for `rollout_model`.
+            **settings: the arguments `options`, `seed`, `active`, `system` and `progress` of `rollout_model`.
         """
         return rollout_model(self, q0, qd0, tau, duration, samples, **settings)
 
     def score(self, data: Dataset, quantity: str = "qdd") -> float:
         """Return the coefficient of determination R² of the predicted mean on a data set, as in scikit-learn.
 
-        R² = 1 − Σ(measured − predicted)² / Σ(measured − mean)², averaged over the components. A value of 1 is
-        perfect, 0 is as good as predicting the mean of the data, and negative values are worse. Unlike
+        R² = 1 − Σ(measured − predicted)² / Σ(measured − mean)², averaged over the components. A perfect
+        prediction scores 1. Predicting the mean of the data scores 0, and negative scores are worse. Unlike
         `forcegp.evaluate`, the score ignores the uncertainty.
 
         Args:
             data: logged states and measured values.
-            quantity: quantity to predict, which the data set must contain.
+            quantity: the quantity to predict. The data set must contain it.
 
         Raises:
             UnknownNameError, NotLoggedError: the quantity is unknown or was not logged.
@@ -362,7 +359,7 @@ class Predictor(ForwardModel):
         """
         data.check_robot(self.specified.robot)
         if len(data) < 2:
-            raise DataError("a score needs two samples or more", got=len(data))
+            raise DataError("a score requires at least two samples", got=len(data))
         true = measured(self.system, data, quantity)
         mean = self._at_logged(data, quantity, covariance=False).mean
         unexplained = (true - mean).square().sum(0)
@@ -380,14 +377,14 @@ class Predictor(ForwardModel):
         ax: Target = None,
         **settings: Any,
     ) -> list[Axes]:
-        """Plot a predicted quantity with ±2 standard deviations, and the measured values if they were logged.
+        """Plot a predicted quantity with ±2 standard deviations, and with the measured values if logged.
 
         Args:
-            data: logged states; for a long log, only every k-th row is predicted and plotted.
-            quantity: quantity to predict.
-            joints: names of joints or contacts to plot; by default all.
-            ax: matplotlib axes to draw on, one per panel; by default, a new figure is created.
-            **settings: other arguments of `predict`, such as `noise=True` for a band that includes noise.
+            data: logged states. For a long log, only every k-th row is predicted and plotted.
+            quantity: the quantity to predict.
+            joints: names of the joints or contacts to plot. By default, all are plotted.
+            ax: matplotlib axes to draw on, one per panel. By default, a new figure is created.
+            **settings: other arguments of `predict`. With `noise=True`, the band includes noise.
 
         Returns:
             The axes, one per panel.
@@ -422,10 +419,10 @@ class Predictor(ForwardModel):
 
     @abstractmethod
     def save(self, path: str | Path) -> None:
-        """Save the model to a file, which `forcegp.load_model` restores exactly.
+        """Save the model to a file from which `forcegp.load_model` restores it exactly.
 
         Args:
-            path: the file; `.safetensors` is added if missing.
+            path: the file. The suffix `.safetensors` is added if it is missing.
 
         Raises:
             ModelError: a part of the model is defined in Python.
@@ -434,10 +431,10 @@ class Predictor(ForwardModel):
 
 
 def require_semidefinite(covariance: Tensor) -> None:
-    """Reject covariances that, scaled to unit variances, have a clearly negative eigenvalue.
+    """Reject covariances with a clearly negative eigenvalue after scaling to unit variances.
 
     Args:
-        covariance: `(*batch, d, d)` covariances.
+        covariance: covariances, `(*batch, d, d)`.
 
     Raises:
         NumericalError: a scaled variance or eigenvalue is below −`NEGATIVE`.

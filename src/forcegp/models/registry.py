@@ -1,4 +1,4 @@
-"""Models by the short names that are used on the command line and in reports."""
+"""Models by their short names, which are used on the command line and in reports."""
 
 from __future__ import annotations
 
@@ -26,12 +26,12 @@ class Entry:
     """A named model.
 
     Attributes:
-        made: class of the model.
+        made: the class of the model.
         description: one-line description for help texts and the report.
-        options: arguments for the class.
-        priors: function that returns the force priors for a system, mean and kernel; `None` if the class
-            selects them.
-        kernel: kernel for these priors; `None` means the default.
+        options: arguments of the class.
+        priors: a function that returns the force priors for a system, mean and kernel, or `None` if the class
+            selects the priors.
+        kernel: the kernel of these priors. `None` selects the default kernel.
     """
 
     made: type[Any]
@@ -52,7 +52,9 @@ MODELS: dict[str, Entry] = {
     "nn": Entry(NeuralNetwork, "neural network with sigmoid layers on (q, qd, tau)"),
     "gp": Entry(IndependentGP, "one Gaussian process per joint acceleration on (q, qd, tau)"),
     "sgp-zero": Entry(StructuredGP, "structured GP, all joint forces unknown", ZERO, default_priors),
-    "sgp": Entry(StructuredGP, "structured GP with analytical mean, priors selected on the data", ANALYTICAL),
+    "sgp": Entry(
+        StructuredGP, "structured GP with analytical mean, priors selected using the data", ANALYTICAL
+    ),
     "sgp-mean": Entry(
         StructuredGP,
         "structured GP with analytical mean, any joint force unknown",
@@ -73,7 +75,7 @@ MODELS: dict[str, Entry] = {
         StructuredGP, "the same with any tangential force and the paper's kernel", ANALYTICAL, _contact, PAPER
     ),
 }
-"""Models by name, simplest first."""
+"""Models by name, from simplest to most complex."""
 
 
 def create(
@@ -84,13 +86,13 @@ def create(
     seed: int = 0,
     **options: Any,
 ) -> Model:
-    """Create a model by its short name.
+    """Create a model from its short name.
 
     Args:
         name: a key of `MODELS`.
-        system: robot and contacts.
-        noise: noise of measured accelerations, if the model uses it; by default, the value in the log.
-        seed: seed for random initial values, if the model uses them.
+        system: the robot and its contacts.
+        noise: noise of measured accelerations, if the model uses it. The default is the value in the log.
+        seed: random seed for initial values, if the model uses them.
         options: other arguments of the model class.
 
     Raises:

@@ -1,15 +1,15 @@
 """Selection of a set of force priors by cross-validation on a log.
 
-Each candidate, a set in `SETS` with or without identification of the inertia, is trained on one half of the
-log and tested on the other, and vice versa. Each half consists of contiguous stretches, since any set would
-score well if training and test samples were neighbours. The score is the mean log predictive density of the
-measurements, including noise,
+Each candidate is a set in `SETS` with or without identification of the inertia. It is trained on one half of
+the log and tested on the other, and vice versa. Each half consists of contiguous segments of the log, since
+any set would score well if training and test samples were neighbours. The score is the mean log predictive
+density of the measurements, including noise,
 
     S = 1/N Σ_i log N(y_i; E z(x_i), Var z(x_i) + Σ),
 
-and candidates are compared by the differences of S over blocks of rows, from which a standard error follows.
-The simplest candidate within one standard error of the best is selected. No candidate depends on the motor
-torque, since in closed loop such a residual learns to cancel the torque and appears to have the best density.
+Candidates are compared by the differences of S over blocks of rows, which also give a standard error. The
+simplest candidate within one standard error of the best is selected. No candidate depends on the motor
+torque. In closed loop, such a residual learns to cancel the torque and appears to have the best density.
 """
 
 from __future__ import annotations
@@ -44,15 +44,15 @@ from forcegp.models.structured_learning import (
 FEWEST = 100
 """Number of samples below which the set `FEW` is used."""
 HALVES, STRETCHES, BLOCKS = 2, 4, 8
-"""Number of halves of the log, of alternating stretches, and of blocks of rows compared in each half."""
+"""Number of halves of the log, of alternating segments, and of blocks of rows compared in each half."""
 ROWS = 400
-"""Number of evenly spaced rows of each half on which a candidate is conditioned or tested."""
+"""Number of evenly spaced rows in each half on which a candidate is conditioned or tested."""
 LEARN_ROWS = 150
 """Number of rows for learning hyperparameters if a prior has infinitely many features."""
 QUICK = LearningOptions(tolerance=1e-5, max_evaluations=150)
-"""Learning options for candidates; the tolerance can be loose since their scores differ clearly."""
+"""Learning options for candidates. The tolerance can be loose, since their scores differ clearly."""
 DROPPED = 2.0
-"""Number of standard errors behind the best beyond which a candidate is not tried on the second half."""
+"""Candidates further behind the best than this many standard errors are not tried on the second half."""
 
 
 @dataclass(frozen=True)
@@ -69,7 +69,7 @@ class Candidate:
 
 
 def candidates_of(spec: Specification) -> list[Candidate]:
-    """Return the candidates, simplest first; if joint forces are unknown, only those with torque noise."""
+    """Return the candidates, simplest first. All include torque noise if joint forces are unknown."""
     candidates = []
     sets = [each for each in SETS.values() if each.fits(spec.system)]
     for chosen in sets if not spec.noise.external else [each for each in sets if each.has_joint_friction]:
@@ -100,10 +100,10 @@ def with_priors(
     """Return the specification with automatically selected priors, and the comparison table.
 
     Args:
-        spec: the model, with the noise for these data.
-        data: the log, or those of its rows that are in memory.
-        learn: parts to learn, if not all.
-        progress: called after each candidate with the number of completed candidates, their total, and NaN.
+        spec: the model with the noise for these data.
+        data: the log, or the rows of the log that are in memory.
+        learn: the parts to learn. By default, all parts are learned.
+        progress: a function called after each candidate with the number completed, the total number, and NaN.
     """
     if learn is not None:
         return without_comparison(spec, "not everything is learned")
@@ -135,12 +135,12 @@ class Trial:
     """The scores of a candidate so far.
 
     Attributes:
-        candidate: the tested candidate.
-        scores: score of each block, by half.
+        candidate: the candidate.
+        scores: the score of each block, by half.
         coverage: fraction of measured values within ±2σ, by half.
-        begin: hyperparameters learned on the first half.
-        inertia_found: whether an inertia different from that of the robot file was found.
-        note: reason why the candidate was dropped.
+        begin: the hyperparameters learned on the first half.
+        inertia_found: whether the identified inertia differs from that of the robot file.
+        note: the reason why the candidate was dropped.
     """
 
     candidate: Candidate
@@ -151,7 +151,7 @@ class Trial:
     note: str = ""
 
     def row(self, best: Tensor, chosen: bool) -> Compared:
-        """Return the row of the comparison table."""
+        """Return the row for this candidate in the comparison table."""
         if not self.scores:
             return Compared(self.candidate.name, note=self.note)
         own = torch.cat(self.scores)
@@ -174,7 +174,7 @@ def _score(
         inertia = Inertia(robot)
     trial.inertia_found |= inertia.robot is not robot
     if candidate.inertia and inertia.robot is robot:
-        # The model is the same as without identification.
+        # The model is the same as that without identification.
         for other in trials:
             same = other.candidate == Candidate(candidate.set) and not other.note
             if same and len(other.scores) == len(trial.scores) + 1:
@@ -219,7 +219,7 @@ def _result(spec: Specification, trials: Sequence[Trial]) -> tuple[Specification
 
 
 def halves_of(q: Tensor, qd: Tensor, in_order: bool) -> Tensor:
-    """Assign rows to halves `(n,)`, in alternating stretches of time or along a direction in state space."""
+    """Assign each row to a half, in alternating segments of time or along a direction in state space."""
     n = len(q)
     rank = torch.arange(n, device=q.device)
     if not in_order:
@@ -237,8 +237,8 @@ def trained(
     """Return a candidate conditioned on `ROWS` rows of one half of the data.
 
     Args:
-        spec: specification with the priors of the candidate.
-        inertia: robot inertia to use in learning.
+        spec: the specification with the priors of the candidate.
+        inertia: the robot inertia to use in learning.
     """
     spec, pinned = identified(spec, train) if inertia.identified else (spec, {})
     rows = scaled(train.evenly(ROWS), spec.system, spec.priors, {}, spec.options.standardize)
@@ -255,7 +255,7 @@ def trained(
 
 @torch.no_grad()
 def log_density(fit: StructuredFit, test: Training) -> tuple[Tensor, float]:
-    """Return log N(y_i; E z, Var z + Σ) of each sample `(n,)` and the fraction of values within ±2σ.
+    """Return log N(y_i; E z, Var z + Σ) of each sample `(n,)`, and the fraction of values within ±2σ.
 
     If accelerations were measured, other measurements are ignored.
 
@@ -278,11 +278,11 @@ def log_density(fit: StructuredFit, test: Training) -> tuple[Tensor, float]:
 
 
 def blocks_of(density: Tensor) -> Tensor:
-    """Return the means over contiguous blocks of rows `(BLOCKS,)`."""
+    """Return the means `(BLOCKS,)` over contiguous blocks of rows."""
     return torch.stack([part.mean() for part in density.tensor_split(BLOCKS)])
 
 
 def difference(best: Tensor, own: Tensor) -> tuple[float, float]:
-    """Return how far a score is behind the best, and the standard error, from blocks `(k,)` of both."""
+    """Return the deficit of a score relative to the best, and its standard error, from blocks `(k,)`."""
     behind = best - own
     return float(behind.mean()), float(behind.std() / math.sqrt(len(behind)))

@@ -1,8 +1,8 @@
-"""Use of a logged force sensor as a measurement of the normal force λ in addition to accelerations.
+"""Use of a force sensor to measure the normal force λ in addition to the accelerations.
 
-A model is fitted to both. At a state with a sensor reading s ± σ, the reading is combined with the model's
-prediction λ_m ± w, where w includes motor torque noise: λ̂ = (λ_m/w² + s/σ²) / (1/w² + 1/σ²). The two errors
-are independent.
+A model is fitted to both. At a state with a sensor reading s ± σ, the model predicts λ_m ± w, where w
+includes motor torque noise. The combined estimate is λ̂ = (λ_m/w² + s/σ²) / (1/w² + 1/σ²), since the two
+errors are independent.
 """
 
 from __future__ import annotations
@@ -25,16 +25,16 @@ TINY = 1e-12
 
 
 def with_sensor(data: Dataset, system: ConstrainedSystem, noise_std: float) -> list[Observation]:
-    """Return the accelerations of a log, and the sensed normal force λ = n·F while the contact is closed.
+    """Return the accelerations in a log, and the measured normal force λ = n·F while the contact is closed.
 
     Args:
-        data: a log with `F_sensor`.
-        system: robot with a single surface contact.
-        noise_std: standard deviation of the errors in the normal force that are caused by the sensor and by
-            unmeasured forces, such as the inertial force of the tool [N].
+        data: a log that contains `F_sensor`.
+        system: a robot with a single surface contact.
+        noise_std: standard deviation of errors in the normal force due to the sensor and to unmeasured
+            forces, such as the inertial force of the tool [N].
 
     Raises:
-        ModelError: the log has no sensor or no row in contact, or the system has more than one contact.
+        ModelError: the log has no sensor or no rows in contact, or the system has more than one contact.
     """
     contact = _contact(system)
     closed = data.active([contact.name])[:, 0]
@@ -42,7 +42,7 @@ def with_sensor(data: Dataset, system: ConstrainedSystem, noise_std: float) -> l
         raise ModelError(
             f"the log has no sensor force at contact {contact.name!r}",
             expected=f"columns {SENSOR}.{contact.name}.x, .y, .z and rows in contact",
-            hint="import the log with a table [wrench], or leave out sensor_noise_std",
+            hint="import the log with a [wrench] table, or omit sensor_noise_std",
         )
     extras = {**data.contact_extras, "multiplier": {contact.name: sensed_force(data, system)}}
     rows = torch.nonzero(closed)[:, 0]
@@ -63,7 +63,7 @@ def _contact(system: ConstrainedSystem) -> SurfaceContact:
 
 
 def has_sensor(data: Dataset, system: ConstrainedSystem) -> bool:
-    """Return whether the log contains a sensor force at the system's contact."""
+    """Return whether the log contains the sensor force at the contact of the system."""
     return any(name in data.contact_extras.get(SENSOR, {}) for name in system.contact_names)
 
 
@@ -71,7 +71,7 @@ def sensed_force(data: Dataset, system: ConstrainedSystem) -> Tensor:
     """Return the normal force n·F measured by the sensor, `(n,)` [N].
 
     Raises:
-        ModelError: the system has more than one contact, or none with a surface.
+        ModelError: the system has more than one contact, or has no surface contact.
     """
     contact = _contact(system)
     q = data.select(system.robot.joint_names).q
@@ -80,11 +80,11 @@ def sensed_force(data: Dataset, system: ConstrainedSystem) -> Tensor:
 
 
 def sensor_noise_std(data: Dataset, system: ConstrainedSystem) -> float:
-    """Estimate, from a log, the standard deviation of the white noise in the sensed normal force [N].
+    """Estimate the standard deviation of the white noise in the measured normal force [N] from a log.
 
     Args:
-        data: a log in time order, with `F_sensor`.
-        system: robot with a single surface contact.
+        data: a log in time order that contains `F_sensor`.
+        system: a robot with a single surface contact.
 
     Raises:
         ModelError: the log does not have five consecutive rows in contact.
@@ -103,11 +103,11 @@ def sensor_noise_std(data: Dataset, system: ConstrainedSystem) -> float:
 
 @torch.no_grad()
 def force_from_sensor(fit: StructuredFit, data: Dataset) -> tuple[Tensor, Tensor]:
-    """Return the mean and standard deviation `(n,)` [N] of λ given the sensor readings.
+    """Return the mean and standard deviation `(n,)` [N] of λ, given the sensor readings.
 
     Args:
-        fit: model fitted to the accelerations and the sensor (see `with_sensor`).
-        data: states with `F_sensor`.
+        fit: a model fitted to the accelerations and the sensor (see `with_sensor`).
+        data: states for which `F_sensor` is logged.
 
     Raises:
         ModelError: the fit has no sensor noise, or the log has no sensor.

@@ -1,7 +1,7 @@
 """Structured Gaussian processes in saved files.
 
-An exact posterior is saved with its data, and a sparse one with its sums over the data. The options are those
-of `StructuredOptions`, and priors are written field by field.
+An exact posterior is saved with its data, and a sparse posterior with its sums over the data. The options are
+those of `StructuredOptions`. Priors are saved field by field.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ from forcegp.storage.options import StructuredOptions
 from forcegp.storage.system import take_robot
 
 Stated = NonNegativeFloat | tuple[NonNegativeFloat, ...]
-"""Noise that may be zero, given as one number or one per joint."""
+"""Noise, which may be zero, as one number or one per joint."""
 CLASSES: dict[str, type] = {
     "squared_exponential": kernels.SquaredExponential,
     "matern32": kernels.Matern32,
@@ -78,7 +78,7 @@ NOT_REAL = (
     (re.compile(r"data\.\d+\.active"), torch.bool),
     (re.compile(r"added|data\.\d+\.segment|sparse\..*\.(components|dropped)"), torch.int64),
 )
-"""Name patterns of the tensors that do not contain real numbers, and their types."""
+"""Name patterns and types of the tensors that do not contain real numbers."""
 Parts = tuple[
     Specification, Problem, dict[str, Tensor], ForcePosterior, FitResult, ConstrainedSystem, dict[str, Tensor]
 ]
@@ -111,7 +111,7 @@ class StructuredSettings(StructuredOptions):
 
     @field_serializer("result")
     def _saved(self, result: FitResult) -> dict[str, Any]:
-        """Return the result without the long history and the constant inputs, which the scales contain."""
+        """Return the result without its history and without constant inputs, which the scales contain."""
         left_out = ("history", "constant_inputs")
         return {name: x for name, x in dataclasses.asdict(result).items() if name not in left_out}
 
@@ -126,7 +126,7 @@ def pack(
     """Convert a fit to settings and tensors.
 
     Args:
-        problem: problem with the data on which the posterior is conditioned.
+        problem: the problem with the data on which the posterior is conditioned.
 
     Raises:
         ModelError: a prior or kernel is defined in Python.
@@ -162,7 +162,7 @@ def pack(
 
 
 def _conditioned_on(spec: Specification, training: Training, posterior: ForcePosterior) -> dict[str, Tensor]:
-    """Return the data of an exact posterior, or the sums over the data of a sparse posterior."""
+    """Return the data of an exact posterior, or the sums of a sparse posterior over the data."""
     latent = posterior.latent
     if not isinstance(latent, ExactPosterior):
         return {f"sparse.{name}": value for name, value in latent.tensors().items()}
@@ -184,7 +184,7 @@ def _columns(spec: Specification) -> tuple[str, ...]:
 
 
 def _kept(hyper: Mapping[str, Tensor], own: AnalyticalParameters | None) -> dict[str, Tensor]:
-    """Return the hyperparameters without θ_A of a module that cannot be saved; the robot contains them."""
+    """Return the hyperparameters. Omit θ_A if its module cannot be saved, since the robot contains it."""
     left_out = analytical_parameters(hyper) if own is None else {}
     return {k: v for k, v in hyper.items() if k.removeprefix(f"{ANALYTICAL}.") not in left_out}
 
@@ -196,10 +196,10 @@ def _below(tensors: Mapping[str, Tensor], prefix: str) -> dict[str, Tensor]:
 def unpack(
     header: ModelHeader, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
 ) -> Parts:
-    """Restore the fields of a fit from `pack`.
+    """Restore the fields of a fit from the output of `pack`.
 
     Raises:
-        ModelError: a tensor or setting is missing or invalid; the message names the file and the field.
+        ModelError: a tensor or setting is missing or invalid. The message names the file and the field.
     """
     settings = header.settings_as(StructuredSettings, source)
     spec = _specification(settings, tensors, system, source)
@@ -238,7 +238,7 @@ def _specification(
 
 
 def _check_types(tensors: Mapping[str, Tensor]) -> None:
-    """Raise `ValueError` if a tensor does not contain real numbers or have its type in `NOT_REAL`."""
+    """Raise `ValueError` unless each tensor contains real numbers or has its type in `NOT_REAL`."""
     for name, value in tensors.items():
         dtype = next((dtype for names, dtype in NOT_REAL if names.fullmatch(name)), None)
         if not value.is_floating_point() if dtype is None else value.dtype != dtype:
@@ -295,7 +295,7 @@ def _restored(
     settings: StructuredSettings,
     system: ConstrainedSystem,
 ) -> Parts:
-    """Restore the fit with its weights; matrices are factorised only when a covariance is needed."""
+    """Restore the fit with its weights. Matrices are factorised only when a covariance is needed."""
     correlation = tensors.get("torque_correlation")
     if correlation is None and settings.correlation_time > 0.0:  # older models have one time for all joints
         correlation = torch.full_like(system.robot.mass, settings.correlation_time)
@@ -313,7 +313,7 @@ def _restored(
 
 
 def _in_order(problem: Problem, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the tensors with the inputs of each kernel in the order defined by its prior.
+    """Return the tensors with the inputs of each kernel in the order that its prior defines.
 
     A kernel on all inputs depends on their order, which files do not preserve.
     """

@@ -1,4 +1,4 @@
-"""Fitted structured Gaussian processes: forces conditioned on data, from which all quantities follow."""
+"""Fitted structured Gaussian processes. All quantities follow from forces conditioned on data."""
 
 from __future__ import annotations
 
@@ -67,13 +67,13 @@ class StructuredFit(FittedModel):
     """Force priors conditioned on data, with learned hyperparameters.
 
     Attributes:
-        specification: specification of the model.
-        problem: training data with robot, priors and noise.
-        hyperparameters: all learned tensors, by name.
-        posterior: posterior over latent forces.
-        result: result of the fit.
-        system: robot and contacts, with learned parameters.
-        noise: standard deviation `(d,)` of the measurements of each measured quantity.
+        specification: the specification of the model.
+        problem: the training data with the robot, priors and noise.
+        hyperparameters: all learned tensors, keyed by name.
+        posterior: the posterior over the latent forces.
+        result: the result of the fit.
+        system: the robot with its learned parameters, and its contacts.
+        noise: the standard deviation of the noise `(d,)` for each measured quantity.
         added: digests of the samples that `forget` can remove from a sparse posterior.
     """
 
@@ -145,31 +145,31 @@ class StructuredFit(FittedModel):
         external: Mapping[str, float] | None = None,
         **components: Any,
     ) -> ExternalWrench:
-        """Estimate the wrench that the environment exerts on a frame, besides learned forces and closed
-        contacts.
+        """Estimate the wrench that the environment exerts on a frame.
 
-        In M q̈ = Q̄ + Aᵀλ + Jᵀ w (`forces/external_wrench.py`), with `method="acceleration"`, w is estimated
-        separately for each sample by generalized least squares. With `method="momentum"`, a causal Kalman
-        filter runs over each trajectory and needs no accelerations. For logs in time order, the learned
-        forces include friction with memory.
+        The wrench w acts in addition to learned forces and closed contacts: M q̈ = Q̄ + Aᵀλ + Jᵀ w
+        (`forces/external_wrench.py`). `method="acceleration"` estimates w separately for each sample by
+        generalized least squares. `method="momentum"` runs a causal Kalman filter over each trajectory and
+        needs no accelerations. For logs in time order, the learned forces include friction with memory.
 
         Args:
-            data: a log, in time order for the momentum filter.
-            frame: frame of the robot.
+            data: a log. The momentum filter requires a log in time order.
+            frame: the name of a frame of the robot.
             method: `"acceleration"` or `"momentum"`.
-            external: standard deviation of unknown joint forces that did not act in the training log, such as
-                those of a hand that pushes the arm, by joint name [N m, N].
-            **components: `reference` (`"world"` or `"local"` axes), `axes` (some of `fx`, `fy`, `fz`, `mx`,
-                `my`, `mz`; the others are zero), `point`, `prior_std` and `change` for `WrenchFrame`.
+            external: standard deviations [N m, N], by joint name, of unknown joint forces that did not act in
+                the training log, such as those of a hand that pushes the arm.
+            **components: the arguments `reference` (`"world"` or `"local"`), `axes` (some of `fx`, `fy`,
+                `fz`, `mx`, `my` and `mz`), `point`, `prior_std` and `change` of `WrenchFrame`. Components
+                that are not in `axes` are zero.
 
         Returns:
-            The mean `(n, k)` and covariance `(n, k, k)` [N, N m], with the method `detect` for contacts.
+            An `ExternalWrench` with a mean `(n, k)` and a covariance `(n, k, k)` [N, N m].
 
         Raises:
             UnknownNameError: the frame, reference, component or method does not exist.
             ParameterError: a number is out of range.
             DataError: the log does not match the robot, or is not in time order.
-            ModelError: the fit has no torque noise, which the momentum filter needs.
+            ModelError: the fit has no torque noise, which the momentum filter requires.
 
         Example:
             `wrench = fit.external_wrench(log, "tool", axes=("fx", "fy", "fz"), method="momentum")`
@@ -184,7 +184,7 @@ class StructuredFit(FittedModel):
         dtype: torch.dtype = torch.float64,
     ) -> ExportedModel:
         if functions is not None and functions < 1:
-            raise ModelError("a posterior has one function at least", expected="1 or more", got=functions)
+            raise ModelError("at least one function must be drawn", expected="1 or more", got=functions)
         tensors = {**self.hyperparameters, **self._region}
         parts = self.system, self.posterior, tensors, self.noise, self.torque_std
         learned, std = self.hyperparameters.get(TORQUE_NOISE), self.problem.torque_std
@@ -206,28 +206,28 @@ class StructuredFit(FittedModel):
         wrench: WrenchFrame | None = None,
         dtype: torch.dtype = torch.float64,
     ) -> Export:
-        """Export the fit as C99 code that needs only libm, with a test program, or its mean as a CasADi
-        function.
+        """Export the fit as C99 code with a test program, or its mean as a CasADi function.
 
-        The code maps (q, q̇, τ, closed contacts) to the mean and covariance of every quantity, and to the
-        Jacobians of the mean. The CasADi function returns the mean, with exact derivatives of any order.
+        The C code requires only libm. It maps (q, q̇, τ, closed contacts) to the mean and covariance of every
+        quantity, and to the Jacobians of the mean. The CasADi function returns the mean, with exact
+        derivatives of any order.
 
         Args:
-            path: folder to create.
-            language: `"c"`, `"casadi"`, or `"torch"` for mean and covariance as a `torch.export` program.
-            name: name of the files, and prefix of all names in them.
-            functions: number r of basis functions for a reduced covariance; `None` uses all.
+            path: the folder to create.
+            language: `"c"`, `"casadi"`, or `"torch"` for the mean and covariance as a `torch.export` program.
+            name: name of the files, and prefix of all identifiers in them.
+            functions: number of basis functions in a reduced-rank covariance. `None` uses all of them.
             wrench: frame and components of an external wrench to estimate from the state and accelerations.
             dtype: precision of the C code, `torch.float64` or `torch.float32`.
 
         Returns:
-            The folder and, at training states, the growth of error bars caused by a reduced covariance and
-            the errors caused by single precision.
+            The folder, the growth of error bars caused by a reduced-rank covariance, and the errors caused by
+            single precision. Both are measured at training states.
 
         Raises:
             ModelError: a prior, kernel or contact cannot be exported to C, or the posterior is too large.
             NumericalError: single precision cannot resolve a variance.
-            UnknownNameError, ParameterError: the language or frame does not exist, or the name is not a C
+            UnknownNameError, ParameterError: the language or frame is unknown, or the name is not a C
                 identifier.
             DestinationError: the folder cannot be written, or contains other files.
             MissingDependencyError: CasADi is not installed.
@@ -240,9 +240,9 @@ class StructuredFit(FittedModel):
         """Compile the fit to a fast predictor in C with the local compiler.
 
         Args:
-            functions: number r of basis functions for a reduced-rank covariance, which can only be larger;
-                `None` uses all.
-            wrench: frame and components to estimate by `external_wrench`.
+            functions: number of basis functions in a reduced-rank covariance, which is never smaller than the
+                full covariance. `None` uses all of them.
+            wrench: the frame and components that `external_wrench` estimates.
 
         Raises:
             ModelError: a prior, kernel or contact cannot be exported to C, or the posterior is too large.
@@ -252,15 +252,15 @@ class StructuredFit(FittedModel):
         return CompiledFit(self._exported(functions, wrench))
 
     def beyond(self, qd: Tensor, tau: Tensor) -> Tensor | None:
-        """Return the distance of the speed and torque of each joint beyond the training data, in training
-        standard deviations `(*batch, nq)`; `None` for a model from a file without the trained region.
+        """Return how far speeds and torques exceed the training data, `(*batch, nq)`, in standard deviations
+        of these data. The result is `None` if the model file does not contain the trained region.
         """
         region = self._region
         return distance_beyond(region, qd, tau) if LOW in region else None
 
     @property
     def _region(self) -> Mapping[str, Tensor]:
-        """Return the trained region: that of the calibrated noise or, without it, of the training data."""
+        """Return the trained region, which is that of the calibrated noise or else of the training data."""
         calibrated = GROWTH in self.hyperparameters or not self.training.samples
         return self.hyperparameters if calibrated else self.problem.region
 
@@ -283,8 +283,8 @@ class StructuredFit(FittedModel):
         """Condition the forces on different data, with the same hyperparameters and input scales.
 
         Args:
-            data: data to condition on.
-            hyperparameters: hyperparameters to use instead of those of the fit.
+            data: the data to condition on.
+            hyperparameters: hyperparameters to use in place of those of the fit.
 
         Raises:
             ModelError: the data are incompatible with the model.
@@ -307,7 +307,7 @@ class StructuredFit(FittedModel):
     def update(self, data: Dataset | Sequence[Observation]) -> StructuredFit:
         """Add samples, for example in a control loop.
 
-        With sparse inference, the cost does not depend on the number of previous samples; with exact
+        With sparse inference, the cost does not depend on the number of previous samples. With exact
         inference, it grows quadratically. Hyperparameters, input scales and inducing points do not change.
 
         Args:
@@ -319,7 +319,7 @@ class StructuredFit(FittedModel):
         measurements, _ = training_for(self.specification, self.problem, data, learned=(), fewest=0)
         if measurements.quantities != tuple(self.noise):
             raise ModelError(
-                "the update contains other quantities than the fit",
+                "the update contains quantities that the fit does not",
                 expected=", ".join(self.noise),
                 got=", ".join(measurements.quantities),
             )
@@ -340,7 +340,7 @@ class StructuredFit(FittedModel):
         return dataclasses.replace(updated, problem=whole)
 
     def _with_slopes(self, measurements: Training) -> Training:
-        """Return the measurements with the slopes of the learned forces, if the fit uses slopes."""
+        """Return the measurements with the slopes of the learned forces if the fit uses slopes."""
         if self.training.slopes is None:
             return measurements
         return learned_slopes(measurements, self.system, self.posterior)
@@ -357,14 +357,14 @@ class StructuredFit(FittedModel):
         """Remove given samples, or reduce the weight of all previous samples.
 
         Args:
-            what: a factor between 0 and 1 that multiplies the weight of all previous samples, such as
-                exp(−Δt/T) for a memory of T seconds, or samples to remove from the fit.
-            priors: names of priors, such as a payload, to which forgetting is limited. Their forces drift
-                towards the prior, and the factor is their correlation with the previous forces.
+            what: samples to remove from the fit, or a factor between 0 and 1 by which the weight of all
+                previous samples is multiplied. For a memory of T seconds, the factor is exp(−Δt/T).
+            priors: names of the priors to which forgetting is limited, such as a payload. Their forces drift
+                towards the prior, and the factor is the correlation of these forces with the previous ones.
 
         Raises:
-            ModelError: inference is exact, the factor is out of range, or samples to remove were never added,
-                are partly forgotten, or belong to a streamed log.
+            ModelError: inference is exact, the factor is out of range, or a sample to remove was never added,
+                is partly forgotten, or belongs to a streamed log.
             UnknownNameError: a prior does not exist.
         """
         latent = self.posterior.latent
@@ -393,7 +393,7 @@ class StructuredFit(FittedModel):
     def _with(
         self, latent: ExactPosterior | SparsePosterior, added: tuple[Tensor, ...] = ()
     ) -> StructuredFit:
-        """Return the fit with a new posterior, which can forget the samples `added`."""
+        """Return the fit with a new posterior that can forget the samples in `added`."""
         posterior = dataclasses.replace(self.posterior, latent=latent)
         return dataclasses.replace(self, posterior=posterior, added=added)
 
@@ -427,7 +427,7 @@ class StructuredFit(FittedModel):
     def disturbance(self) -> Disturbance | None:
         """Torque noise as s √T (standard deviation s, correlation time T), and the size of unknown forces.
 
-        Over times longer than T, the noise acts like white noise with spectral density s² T.
+        Over times longer than T, the noise acts as white noise with spectral density s² T.
         """
         none, density = torch.zeros_like(self.system.robot.mass[:1]).expand(self.system.robot.nq), None
         if self.torque_std is not None and self.problem.correlation is not None:
@@ -463,10 +463,10 @@ class StructuredFit(FittedModel):
         """Return the variance that noise adds to measurements of a quantity, `(*batch, d)`.
 
         Args:
-            q, qd, tau: `(*batch, nq)` states.
-            quantity: the measured quantity. Torque noise affects every quantity; sensor noise is known only
+            q, qd, tau: states, `(*batch, nq)`.
+            quantity: the measured quantity. Torque noise affects every quantity. Sensor noise is known only
                 for quantities that were used in training.
-            active: `(*batch, n_contacts)` bool, closed contacts; by default all.
+            active: mask `(*batch, n_contacts)` of closed contacts. By default, all contacts are closed.
             sensor: whether to include sensor noise.
         """
 
@@ -482,10 +482,10 @@ class StructuredFit(FittedModel):
 
 
 def _without(added: tuple[Tensor, ...], removed: Tensor) -> tuple[Tensor, ...]:
-    """Return the digests of samples without those of removed samples.
+    """Return the digests of the samples that remain after some have been removed.
 
     Raises:
-        ModelError: a removed sample is not among them.
+        ModelError: a removed sample is not in `added`.
     """
     values, counts = torch.cat([*added, removed]).unique(return_counts=True)
     _, own = torch.cat([values, removed]).unique(return_counts=True)
@@ -499,7 +499,7 @@ def _without(added: tuple[Tensor, ...], removed: Tensor) -> tuple[Tensor, ...]:
 
 
 def _carried(z: AffineMap, variance: Tensor) -> Tensor:
-    """Return the covariance B Σ Bᵀ `(n, d, d)` caused by white noise on the joint force."""
+    """Return the covariance B Σ Bᵀ `(n, d, d)` that white noise on the joint force causes."""
     return (z.B_Q * variance[..., None, :]) @ z.B_Q.mT
 
 
@@ -513,11 +513,11 @@ def conditioned(
     learned_on: int | None = None,
     forces: tuple[ForcePosterior, Tensor] | None = None,
 ) -> StructuredFit:
-    """Condition the forces on the data of a problem at given hyperparameters.
+    """Condition the forces on the data of a problem with given hyperparameters.
 
     Args:
         learned_on: number of samples used for learning.
-        forces: result of conditioning, if the problem contains only part of the log.
+        forces: the result of conditioning if the problem contains only part of the log.
 
     Raises:
         NumericalError: the covariance of the data is not positive definite.

@@ -1,8 +1,8 @@
 """Gaussian-process priors on forces, mapped to accelerations and multipliers by known mechanics.
 
-q̈ ~ GP(L b + H m_Q, H k_Q Hᵀ) (eq. 15), and similarly for every other quantity (eqs. 19 to 25). `fit` learns
-the hyperparameters (`structured_learning.solve`) and conditions on the data (`structured_fit.conditioned`);
-`gram` in `gp/likelihood.py` computes the covariance in equation 10.
+The acceleration has the prior q̈ ~ GP(L b + H m_Q, H k_Q Hᵀ) (eq. 15). Priors on all other quantities are
+similar (eqs. 19 to 25). `fit` learns the hyperparameters (`structured_learning.solve`) and conditions on the
+data (`structured_fit.conditioned`). `gram` in `gp/likelihood.py` computes the covariance in eq. 10.
 """
 
 from __future__ import annotations
@@ -32,33 +32,33 @@ from forcegp.models.structured_stream import Pass, Sample, sample_of
 from forcegp.storage.options import StructuredOptions
 
 FIT_COPIES = 3.0
-"""Memory of a fit in addition to its inference matrices, relative to that of the equations of motion."""
+"""Memory of a fit besides its inference matrices, relative to the memory of the equations of motion."""
 
 
 class StructuredGP(Model[StructuredFit]):
     """A structured Gaussian process (S-GP) with priors on the unknown forces of a constrained system.
 
     Args:
-        system: robot and contacts.
+        system: the robot and its contacts.
         mean: `"analytical"`, `"zero"`, or an `AnalyticalMean` with a subset of its terms.
         force_priors: priors on the unknown forces, the name of a set in `SETS` (`"sliding"`, `"friction"`,
             `"friction+residual"`), or `"auto"`. With `"auto"` and the analytical mean, the set is selected on
-            held-out blocks of the training log (`models/selection.py`); `fit.result.comparison` contains
-            the scores. Logs of fewer than 100 samples, and fits with `learn=`, use `"friction"`. If the mean
-            does not include the motor torque, `"auto"` means `default_priors`: a `JointForcePrior` and, in
-            contact, its `NormalForcePrior`, which only affects multipliers.
-        noise: standard deviation of measured accelerations [rad/s², m/s²], one value or one per joint, or a
-            `Noise`, which includes the noise of torques and states; by default, the value in the log, or 0.1.
+            held-out blocks of the training log (`models/selection.py`), and `fit.result.comparison` contains
+            the scores. Logs with fewer than 100 samples, and fits with `learn=`, use `"friction"`. If the
+            mean does not include the motor torque, `"auto"` selects `default_priors`: a `JointForcePrior`
+            and, in contact, a `NormalForcePrior` that affects only multipliers.
+        noise: standard deviation of measured accelerations [rad/s², m/s²], as one value or one per joint, or
+            a `Noise` for accelerations, torques and states. The default is the value in the log, or 0.1.
         analytical_parameters: a module with a `forward()` method that returns the robot with learned
-            analytical parameters θ_A; `None` leaves the robot unchanged.
+            analytical parameters θ_A. `None` leaves the robot unchanged.
         inference: `"exact"`, `"sparse"` or `"auto"`.
-        inducing_points: maximum number of inducing points per prior; fewer are used if they suffice, and the
-            result of the fit indicates whether more would help.
-        inertia: `"file"` keeps the inertia of the robot; `"auto"` identifies links and drives if held-out
-            stretches of the log favour it (`forces/inertia.py`), which requires a `JointFrictionPrior` and a
-            mean that includes the motor torque. `None` means `"auto"` for automatically selected priors, and
-            `"file"` otherwise.
-        standardize: whether to standardize kernel inputs (the paper does not).
+        inducing_points: maximum number of inducing points per prior. Fewer points are used if they suffice.
+            The result of the fit indicates whether more points would help.
+        inertia: `"file"` keeps the inertia of the robot. `"auto"` identifies the inertia of links and drives
+            if this improves the score on held-out parts of the log (`forces/inertia.py`). It requires a
+            `JointFrictionPrior` and a mean that includes the motor torque. `None` means `"auto"` for
+            automatically selected priors, and `"file"` otherwise.
+        standardize: whether to standardize kernel inputs, which the paper does not do.
 
     Example:
         >>> import forcegp, torch
@@ -127,26 +127,26 @@ class StructuredGP(Model[StructuredFit]):
         progress: FitProgress | None = None,
         checkpoint: str | Path | None = None,
     ) -> StructuredFit:
-        """Learn the hyperparameters (and analytical parameters) by maximum a posteriori estimation, and
-        condition the forces on the data.
+        """Learn the hyperparameters by maximum a posteriori estimation, and condition the forces on the data.
 
         Args:
-            data: measured accelerations, any mixture of measurements, or a streamed log, which needs a
-                constant amount of memory.
-            learn: parts to learn: names of priors, `"noise"`, `"analytical_parameters"`. Other parts keep the
-                values (and input scales) of the fit `after`, or the initial values. By default, all parts are
-                learned; with an empty list, the forces are only conditioned.
-            after: an earlier fit of this model, for example to different or fewer data. It provides the
-                values of parts that are not learned and, without `learn`, the initial values.
-            options: optimiser and its limits; by default L-BFGS, with a tolerance of 1e-9 if θ_A is learned.
-            progress: called after each evaluation; for a streamed log also after each piece, with the number
-                of samples so far, their total, and NaN.
-            checkpoint: file that records the evaluations of a long fit, with a second file for the sums over
-                a streamed log. If the files exist, the fit resumes and produces a bit-identical result.
-                Remove them once the fitted model is saved.
+            data: measured accelerations, any mixture of measurements, or a streamed log. Fitting a streamed
+                log requires a constant amount of memory.
+            learn: the parts to learn, which are names of priors, `"noise"` or `"analytical_parameters"`.
+                Other parts keep the values and input scales of the fit `after`, or their initial values. By
+                default, all parts are learned. With an empty list, the forces are only conditioned.
+            after: an earlier fit of this model, for example to fewer data. It provides the values of parts
+                that are not learned. If `learn` is not given, it provides the initial values.
+            options: the optimiser and its limits. The default is L-BFGS, with tolerance 1e-9 if θ_A is
+                learned.
+            progress: a function called after each evaluation. For a streamed log, it is also called after
+                each piece with the number of processed samples, the total number, and NaN.
+            checkpoint: a file that records the evaluations of a long fit. A second file contains the sums
+                over a streamed log. If the files exist, the fit resumes from them and gives a bit-identical
+                result. Delete them once the fitted model is saved.
 
         Returns:
-            The fitted model. Repeated fits are bit-identical.
+            The fitted model. Repeated fits give bit-identical results.
 
         Raises:
             ModelError, DataError, UnknownNameError: the data, the earlier fit, `learn` or the checkpoint do
@@ -208,7 +208,7 @@ class StructuredGP(Model[StructuredFit]):
         contacts = after.system.contact_names
         if names[: len(own)] != own or contacts != self.system.contact_names:
             raise ModelError(
-                "`after` is a fit of another model",
+                "`after` is a fit of a different model",
                 expected=f"priors {', '.join(own)} and contacts {', '.join(self.system.contact_names)}",
                 got=f"priors {', '.join(names)} and contacts {', '.join(contacts)}",
             )

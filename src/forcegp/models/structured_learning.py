@@ -1,15 +1,15 @@
 """Parts of a structured Gaussian process, and the steps of learning.
 
-1. Samples at rest only provide a bound on friction, and impacts violate the equations of motion, so only
-   samples in motion and without impacts are used if torque noise is learned.
+1. Samples at rest only provide a bound on friction, and impacts violate the equations of motion. If torque
+   noise is learned, only samples in motion and without impacts are used.
 2. Hyperparameters are learned from part of a long log, or from all of a short log.
 3. If residuals are correlated in time, the likelihood is tempered, unless a `DisturbancePrior` explains them.
-   Residuals also determine slopes and weights (`forces/noise_learning.py`), after which hyperparameters are
-   learned again.
+   Residuals also determine slopes and weights (`forces/noise_learning.py`). Hyperparameters are then learned
+   again.
 4. Inertial parameters move to their posterior mean in one physically consistent Gauss–Newton step.
-5. Torque noise is increased to the level on held-out blocks of the training log, and its growth beyond the
-   trained speeds and torques is learned from held-out regimes. Dry friction with memory is learned from the
-   residuals of logs in time order.
+5. Torque noise is increased to the level observed on held-out blocks of the training log. Its growth beyond
+   the trained speeds and torques is learned from held-out regimes. Dry friction with memory is learned from
+   the residuals of logs in time order.
 6. The posterior is conditioned on all samples.
 """
 
@@ -65,7 +65,7 @@ LEARN_SAMPLES = 800
 LEARN_SAMPLES_INDUCING = 400
 """Number of samples for learning hyperparameters by exact inference if the log needs sparse inference."""
 REST_SPEED = 0.01
-"""Largest joint speed of a sample at rest [rad/s, m/s]."""
+"""Largest joint speed at which a sample counts as being at rest [rad/s, m/s]."""
 FEWEST_MOVING = 20
 """Number of samples in motion below which samples at rest are also kept."""
 FIRST_POWER = 0.25
@@ -80,11 +80,11 @@ class Specification:
     """Parts of a structured Gaussian process before it is fitted.
 
     Attributes:
-        system: robot and contacts.
-        mean: prior mean of Q.
-        priors: priors on the unknown forces.
-        noise: noise of measured accelerations, torques and states.
-        analytical_parameters: module with a `forward()` that returns the robot at θ_A, or `None`.
+        system: the robot and its contacts.
+        mean: the prior mean of Q.
+        priors: the priors on the unknown forces.
+        noise: the noise of measured accelerations, torques and states.
+        analytical_parameters: a module with a `forward()` method that returns the robot at θ_A, or `None`.
         automatic: whether the priors are selected from `SETS` based on the data.
         options: options with plain values.
     """
@@ -100,7 +100,7 @@ class Specification:
     def for_data(self, data: Dataset | Sequence[Observation]) -> Specification:
         """Return the specification with the noise resolved for the given data.
 
-        Unless it is given, acceleration noise is learned if torque noise is learned or sets of priors are
+        Unless given, the acceleration noise is learned if torque noise is learned or sets of priors are
         compared. Joints without a measured torque have an unknown force. Contacts stick below the speeds
         specified in the header of the log.
         """
@@ -119,14 +119,14 @@ class Specification:
         return dataclasses.replace(self, options=self.options.model_copy(update=changed))
 
     def with_set(self, chosen: PriorSet) -> Specification:
-        """Return the specification with a given set of priors and the torque noise for this set."""
+        """Return the specification with a given set of priors, and with the torque noise for this set."""
         priors, noise = chosen.priors(self.system), self.noise
         if isinstance(noise.torque, str) and noise.torque == "auto":
             noise = noise.for_priors(priors)
         return dataclasses.replace(self, priors=priors, noise=noise, automatic=False)
 
     def inertia_of(self, training: Training) -> Inertia:
-        """Return the inertia identified from the training samples, or, if not requested, that of the file."""
+        """Return the inertia identified from the training samples if requested, or that of the robot file."""
         friction = next((prior for prior in self.priors if isinstance(prior, JointFrictionPrior)), None)
         asks = (
             self.options.inertia == "auto"
@@ -145,8 +145,8 @@ class Specification:
         """Return the learning problem for training data.
 
         Args:
-            robot: robot used for learning, if it differs from that of the file.
-            pinned: values, by prior, of the forces that are included in this robot.
+            robot: the robot used for learning, if it differs from that of the file.
+            pinned: the values of the forces that this robot includes, keyed by prior.
         """
         system = self.system if robot in (None, self.system.robot) else self.system.with_robot(robot)
         noise, robot, std = self.noise, self.system.robot, None
@@ -166,19 +166,19 @@ class Specification:
 
 
 def _unchecked_masses(training: Training) -> tuple[str, ...]:
-    """Return a warning if the log has contact but too little free motion and no measured force."""
+    """Return a warning if the log has contact but no measured force and too little free motion."""
     closed = sum(int(m.active.any(-1).sum()) for m in training.measurements)
     if not closed or set(training.quantities) != {"qdd"}:
         return ()
     return (
         f"{training.free_motions} samples in free motion are too few to check the masses of the robot file "
-        f"(expected: {LEAST} or more), and any error of the masses biases the multiplier: train on "
-        "more samples if the log has free motion, otherwise add some seconds, or measure the contact force",
+        f"(expected: at least {LEAST}), and any mass error biases the multiplier: train on more samples if "
+        "the log contains free motion; otherwise, record a few seconds of it or measure the contact force",
     )
 
 
 def constant_inputs(problem: Problem) -> tuple[str, ...]:
-    """Return the inputs of priors that are constant in the training data."""
+    """Return the inputs that are constant in the training data, for each prior."""
     pairs = zip(problem.priors, problem.training.scales, strict=True)
     return tuple(f"{prior.name}.{name}" for prior, scale in pairs for name in scale.constant)
 
@@ -188,9 +188,9 @@ class Lesson:
     """Result of learning, and the problem on which the posterior is conditioned.
 
     Attributes:
-        problem: problem with all samples, the updated robot, and the noise.
-        hyperparameters: learned and fixed hyperparameters.
-        learned: result of the optimisation.
+        problem: the problem with all samples, the updated robot, and the noise.
+        hyperparameters: the learned and fixed hyperparameters.
+        learned: the result of the optimisation.
         learned_on: number of samples used for learning.
         warnings: warnings about the result.
     """
@@ -212,11 +212,11 @@ def problem_for(
     """Return the learning problem for a first fit to data, or for a fit after an earlier one.
 
     Args:
-        part_of: total number of samples to condition on, if the data are only a part of them.
+        part_of: total number of samples to condition on, if the data are only part of these samples.
 
     Returns:
-        The model, with a prior on the remaining inertia errors if a first fit identifies the robot; the
-        problem; and warnings about the samples and the robot.
+        The model, the problem, and warnings about the samples and the robot. If a first fit identifies the
+        robot, the model has a prior on the remaining inertia errors.
     """
     training, doubts = training_for(spec, before, data, chosen)
     robot, pinned = spec.system.robot, dict[str, Tensor]()
@@ -233,7 +233,7 @@ def problem_for(
 
 
 def identified(spec: Specification, training: Training) -> tuple[Specification, dict[str, Tensor]]:
-    """Return the model for a robot with identified inertia, in which the remaining errors have zero mean."""
+    """Return the model for the robot with identified inertia and with inertia errors of zero mean."""
     robot = spec.system.robot
     q = torch.cat([m.q for m in training.evenly(VOLUME_STATES).measurements])
     size = mass_matrix(robot, q).diagonal(dim1=-2, dim2=-1).mean(0)
@@ -251,8 +251,8 @@ def training_for(
 ) -> tuple[Training, tuple[str, ...]]:
     """Return the training data, and warnings about them.
 
-    Priors that are not `learned` (`None` means all are) keep the scales of their inputs. Samples at rest are
-    kept if fewer than `fewest` samples are in motion.
+    Priors that are not in `learned` keep the scales of their inputs. If `learned` is `None`, all priors are
+    learned. Samples at rest are kept if fewer than `fewest` samples are in motion.
     """
     kept = {}
     if before is not None and learned is not None:
@@ -268,7 +268,7 @@ def check_learned(spec: Specification, learn: Iterable[str]) -> None:
     """Check the names of the parts to learn, which are prefixes of the names of their tensors.
 
     Raises:
-        UnknownNameError: a name is neither a prior nor another learnable part.
+        UnknownNameError: a name is neither that of a prior nor that of another learnable part.
     """
     names = (*(prior.name for prior in spec.priors), NOISE, ANALYTICAL, COULOMB)
     for name in learn:
@@ -282,9 +282,9 @@ def search_of(
     chosen: Sequence[str] | None,
     options: LearningOptions | None,
 ) -> Search:
-    """Return the search for the learned parts of a problem, with initial values and the values of held parts.
+    """Return the search for the learned parts of a problem, with initial values and fixed values.
 
-    The scale of a force that is included in the robot is not learned.
+    The scale of a force that the robot includes is not learned.
     """
     options = options or (OPTIONS if spec.analytical_parameters is None else WITH_PARAMETERS)
     start = initial(problem, spec.noise.learn, spec.noise.learns_torque)
@@ -314,7 +314,8 @@ def in_motion(
     if not impacts:
         return moving, ()
     return moving, (
-        f"{impacts} samples in contact were excluded as impacts: they accelerate off the surface or into it",
+        f"{impacts} samples in contact were excluded as impacts: they accelerate away from the surface or "
+        "into it",
     )
 
 
@@ -344,7 +345,7 @@ def learned(
     """Learn the free parameters of a search, and record the evaluations.
 
     Args:
-        file: record of the evaluations, from which learning resumes with a bit-identical result.
+        file: a record of the evaluations. Learning resumes from it with a bit-identical result.
 
     Raises:
         ModelError: the file belongs to a different fit.
@@ -365,7 +366,7 @@ def learned(
 
 
 def _with_memory(lesson: Lesson, neighbours: Training | None) -> Lesson:
-    """Add friction with memory to the result if the log has enough free motion."""
+    """Add friction with memory to the result if the log contains enough free motion."""
     training = neighbours or lesson.problem.training
     if training.free_motions < LEAST:
         return lesson
@@ -406,7 +407,7 @@ def solve(
 ) -> Lesson:
     """Learn the free parameters of a search, and prepare the problem for conditioning.
 
-    The residuals determine the exponent of the (tempered) likelihood, the slopes that propagate state noise,
+    The residuals determine the exponent of the tempered likelihood, the slopes that propagate state noise,
     and the sample weights. Whenever these change, hyperparameters are relearned, at most `ROUNDS` times.
 
     Args:
@@ -457,7 +458,7 @@ def _at_the_rate_of_the_log(part: Problem, values: Mapping[str, Tensor], trainin
     """Return the problem with the correlation of its residuals at the sampling rate of the log.
 
     Neighbouring samples are closer in time in the whole log than in the part used for learning. For a
-    streamed log, a few contiguous stretches are used.
+    streamed log, the correlation is estimated from a few contiguous runs of samples.
     """
     power, correlation = residual_times(part, values, training)
     if part.training.measurements is training.measurements:

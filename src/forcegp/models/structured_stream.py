@@ -1,7 +1,7 @@
 """Fitting of a structured Gaussian process to a streamed log.
 
-A first pass draws a sample, from which input scales, hyperparameters and inducing points are determined. A
-second pass computes the sums over all samples.
+In a first pass, a sample of the log is drawn. It determines input scales, hyperparameters and inducing
+points. In a second pass, the sums over all samples are computed.
 """
 
 from __future__ import annotations
@@ -32,18 +32,18 @@ from forcegp.models.structured_learning import FEWEST_MOVING, REST_SPEED, Specif
 from forcegp.storage.checkpoint import Checkpoint, beside
 
 SAMPLE_ROWS = 20_000
-"""Number of evenly spaced rows for learning; fewer than twice this number are in memory."""
+"""Number of evenly spaced rows for learning. Fewer than twice this number are in memory at a time."""
 
 
 @dataclass(frozen=True)
 class Sample:
-    """The part of a streamed log that one pass keeps, or all of a log in memory.
+    """The samples that one pass over a streamed log keeps, or all samples of a log in memory.
 
     Attributes:
-        data: the samples, evenly spaced for a streamed log.
-        count: total number of samples to condition on; 0 if `data` contains all of them.
-        log: streamed log, if any.
-        stretches: a few contiguous stretches of the log, for estimating the correlation time of residuals.
+        data: the samples. Those of a streamed log are evenly spaced.
+        count: total number of samples to condition on, or 0 if `data` contains all of them.
+        log: the streamed log, if any.
+        stretches: a few contiguous runs of samples, for estimating the correlation time of residuals.
         moving: whether samples at rest are ignored.
     """
 
@@ -54,7 +54,7 @@ class Sample:
     moving: bool = False
 
     def neighbours(self, spec: Specification, training: Training) -> Training | None:
-        """Return the contiguous stretches of the log as training data.
+        """Return the contiguous runs of samples as training data.
 
         Args:
             training: the sample, with the input scales to keep.
@@ -70,7 +70,7 @@ class Sample:
 
 @torch.no_grad()
 def sample_of(spec: Specification, data: StreamedDataset) -> Sample:
-    """Return evenly spaced samples of a log for training, restricted to motion if the model requires it.
+    """Return evenly spaced training samples of a log, restricted to motion if the model requires it.
 
     Raises:
         DataError: a file is damaged or contains no samples.
@@ -88,14 +88,14 @@ def sample_of(spec: Specification, data: StreamedDataset) -> Sample:
 
 
 def _rows_of(log: StreamedDataset, keep: Keep | None) -> tuple[Dataset, Dataset, int]:
-    """Return evenly spaced rows to keep, contiguous stretches of such rows, and their total number."""
+    """Return evenly spaced rows to keep, contiguous runs of rows to keep, and the number of all such rows."""
     stretches: list[Dataset] = []
     rows, count = spaced_sample(_with_stretches(log, stretches, keep), SAMPLE_ROWS, keep)
     return rows, Dataset.concatenate(stretches), count
 
 
 def _with_stretches(stream: StreamedDataset, parts: list[Dataset], keep: Keep | None) -> Iterator[Dataset]:
-    """Yield the pieces of a log, appending the first rows of some pieces to `parts`."""
+    """Yield the pieces of a log, and append the first rows of some pieces to `parts`."""
     last, length = stream.piece_count - 1, MOST_RESIDUALS // STRETCHES
     wanted = {round(last * i / (STRETCHES - 1)) for i in range(STRETCHES)}
     for number, piece in enumerate(stream.pieces()):
@@ -105,7 +105,7 @@ def _with_stretches(stream: StreamedDataset, parts: list[Dataset], keep: Keep | 
 
 
 def _check_inference(spec: Specification, count: int, held: int) -> None:
-    """Raise `ModelError` if the model needs all samples in memory but only `held` samples are."""
+    """Raise `ModelError` if the model needs all samples in memory but only `held` samples are in memory."""
     if spec.noise.degrees_of_freedom is not None and count > held:
         raise ModelError(
             "heavy-tailed noise needs a weight for every sample, which a streamed log does not have",
@@ -123,12 +123,12 @@ def _check_inference(spec: Specification, count: int, held: int) -> None:
 
 
 def kept_scales(priors: Sequence[ForcePrior], training: Training) -> dict[str, Standardization]:
-    """Return the input scales of the training data by prior."""
+    """Return the input scales of the training data, keyed by prior."""
     return {prior.name: scale for prior, scale in zip(priors, training.scales, strict=True)}
 
 
 def moving_rows(data: Dataset) -> Tensor:
-    """Return the rows in which a joint moves."""
+    """Return the rows in which at least one joint moves."""
     return (data.qd.abs().amax(-1) > REST_SPEED).nonzero()[:, 0]
 
 
@@ -139,9 +139,9 @@ class Pass:
     Attributes:
         spec: the model.
         log: the log.
-        sample: sample used for learning.
-        checkpoint: file that records the sums, or `None`.
-        progress: called with the number of samples so far, their total, and NaN.
+        sample: the sample used for learning.
+        checkpoint: the file that records the sums, or `None`.
+        progress: a function called with the number of processed samples, the total number, and NaN.
     """
 
     spec: Specification
@@ -154,7 +154,7 @@ class Pass:
     def forces(
         self, problem: Problem, hyperparameters: Mapping[str, Tensor]
     ) -> tuple[ForcePosterior, Tensor]:
-        """Return the forces conditioned on the whole log, and the part of the likelihood independent of them.
+        """Return the forces conditioned on the whole log, and the likelihood terms independent of them.
 
         Raises:
             ModelError: the checkpoint belongs to a different fit.
@@ -196,7 +196,7 @@ class Pass:
         return posterior_of(problem, hyperparameters, basis, total), total.constant
 
     def _pieces(self, problem: Problem, start: int) -> Iterator[Training]:
-        """Yield the samples of this process piece by piece; pieces of other processes are empty."""
+        """Yield the samples of this process piece by piece. Pieces of other processes are empty."""
         rank, processes = (dist.get_rank(), dist.get_world_size()) if self.log.distributed else (0, 1)
         kept = kept_scales(problem.priors, problem.training)
         for piece in self.log.pieces(start, (rank, processes)):
@@ -213,7 +213,7 @@ class Pass:
         return path.with_name(f"{path.name}.{dist.get_rank()}") if self.log.distributed else path
 
     def _key(self, problem: Problem, hyperparameters: Mapping[str, Tensor]) -> str:
-        """Return an identifier for the sums over a log for a given basis, system and noise."""
+        """Return an identifier for the sums over a log with a given basis, system and noise."""
         files = [(path.name, path.stat().st_size) for path in self.log.files]
         points = [x for Z in problem.inducing or () for x in Z.values()]
         named = [part for pair in sorted(hyperparameters.items()) for part in pair]
@@ -223,7 +223,7 @@ class Pass:
 
 
 def _tensors(basis: LatentBasis, total: Totals) -> dict[str, Tensor]:
-    """Return the intermediate results of a pass by name."""
+    """Return the intermediate results of a pass, keyed by name."""
     tensors = {f"basis.{name}": value for name, value in basis.tensors().items()}
     tensors |= {f"sums.{i}": value for i, value in enumerate(total.sums.tensors)}
     counts = {"constant": total.constant, "samples": total.samples, "pieces": torch.tensor(total.pieces)}

@@ -1,4 +1,4 @@
-"""Animations of the arm, drawn by a script embedded in the page."""
+"""Animations of the arm, which are drawn by a script embedded in the page."""
 
 from __future__ import annotations
 
@@ -23,11 +23,12 @@ def animation(content: Mapping[str, object], label: str) -> Markup:
     """Return a canvas with a slider, a play button and a checkbox for each arm.
 
     Args:
-        content: input to `templates/animation.js`: the `times` of the frames [s]; `bodies`, the number of
-            points per arm; `films`, the arms, with `label`, `colour`, `dash` and flattened `points` (frames,
-            bodies, 3) [m]. Optional: convex `solids` with `colour`, `opacity`, flattened `points` [m] and
-            `link`, their column in `poses` (frames, links, 12); `paths` with `colour`, `width` and `points`;
-            `forces` with `start`, `tip` and `bar` in each frame; `texts` for each frame.
+        content: input to `templates/animation.js`. `times` are the times of the frames [s], and `bodies` is
+            the number of points per arm. `films` are the arms, with `label`, `colour`, `dash` and flattened
+            `points` (frames, bodies, 3) [m]. The other keys are optional. Convex `solids` have `colour`,
+            `opacity`, flattened `points` [m] and `link`, their column in `poses` (frames, links, 12). `paths`
+            have `colour`, `width` and `points`. `forces` have `start`, `tip` and `bar` in each frame, and
+            `texts` has one text per frame.
         label: text alternative for the canvas.
     """
     # "</" would end the script element, even within a string.

@@ -22,20 +22,20 @@ from forcegp.rows import describe
 
 COLOURS = {"error": "#a1121f", "warning": "#d08c00", "note": "#0072b2"}
 POINTS = 1500
-"""Maximum number of points in a curve; more could not be distinguished on a page."""
+"""Maximum number of points in a curve. More could not be distinguished on a page."""
 CONTEXT = 3.0
 """Number of surrounding rows shown, relative to the length of the interval."""
 LEAST_ROWS = 200
 JOINTS, FEW = 7, 3
-"""Maximum number of joints shown for a finding that names joints, and for one that does not."""
+"""Maximum number of joints shown for a finding that names joints, and for one that names none."""
 SIZE = (12.0, 1.35)
-"""Width of a plot and height of each panel [inch]."""
+"""Width of a plot, and height of each panel [inch]."""
 
 Paint = Callable[[Axes, Log, slice, int], None]
 
 
 def _axis(log: Log) -> tuple[Array, str]:
-    """Return the time since the first row [s] (row numbers if it is not monotonic) and the axis label."""
+    """Return the time since the first row [s], or row numbers if it is not monotonic, and the axis label."""
     runs = bool(log.header.ordered and np.isfinite(log.t).all() and (np.diff(log.t) >= 0.0).all())
     return (log.t - log.t[0], "time [s]") if runs and len(log) else (np.arange(float(len(log))), "row")
 
@@ -57,7 +57,7 @@ def draw_overview(report: Report, log: Log) -> Picture:
 
     kinds = ", ".join(" or ".join(finding.kinds) for finding in report.findings)
     size = (SIZE[0], 0.7 + 0.22 * len(report.findings))
-    return draw(paint, size, f"Time concerned by each finding: {kinds}")
+    return draw(paint, size, f"Times affected by each finding: {kinds}")
 
 
 def picture_of(finding: Finding, system: ConstrainedSystem, log: Log) -> Picture | None:
@@ -65,13 +65,13 @@ def picture_of(finding: Finding, system: ConstrainedSystem, log: Log) -> Picture
     rows, family = _window(finding, log), KINDS[finding.kind].family
     if family == "import":
         return None
-    if family == "contact" and finding.contact is not None:
+    if family.startswith("contact") and finding.contact is not None:
         return _contact(finding, system, log, rows)
     joints = [log.joint_names.index(name) for name in finding.joints][:JOINTS] or _largest(log)
     column = next((name for name in ("tau", "qdd", "qd", "q") if f"{name}." in finding.message), None)
     whole = rows.stop - rows.start > 0.9 * len(log)
     paint, quantity = _column(column or "q"), column or "q"
-    if family in ("torque", "mechanics"):
+    if family in ("torque", "mechanics", "learned"):
         paint, quantity = _torque(system, log, rows), "tau"
     elif finding.kind in ("torque-saturated", "torque-limit"):
         paint, quantity = _column("tau"), "tau"
@@ -142,7 +142,7 @@ def _shade(axes: Axes, finding: Finding, rows: slice, log: Log) -> None:
 
 
 def _line(axes: Axes, log: Log, rows: slice, y: Array, colour: str = INK, name: str | None = None) -> None:
-    """Draw a curve over time; a long one is reduced to the minimum and maximum in each bin."""
+    """Draw a curve over time. A long curve is reduced to the minimum and maximum in each bin."""
     x = _axis(log)[0][rows]
     if len(y) > POINTS:
         width = -(-len(y) // (POINTS // 2))

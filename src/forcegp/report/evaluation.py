@@ -31,7 +31,7 @@ def write_evaluation(
     """Write the page on a model together with its plots and their data, and return the path of the page.
 
     `model`, `data` and `fitted_to` are file names shown on the page. If `fitted_to` is `None`, the trivial
-    predictors were fitted to halves of the data. `comparison` contains the sets of force priors compared.
+    predictors were fitted to halves of the data. `comparison` contains the compared sets of force priors.
     """
     drawn = {"Predictions": draw_predictions(window), "Errors": draw_errors(window)}
     pictures = [dataclasses.replace(picture, title=title) for title, picture in drawn.items()]
@@ -96,16 +96,18 @@ def draw_calibration(evaluation: Evaluation) -> Picture:
         axes.plot([0.4, 1.0], [0.4, 1.0], color=INK, linewidth=0.8, linestyle=":", label="nominal")
         axes.plot(list(levels), list(levels.values()), "o-", color=colour(evaluation.kind), label="model")
         axes.set_xlabel("probability of the interval")
-        axes.set_ylabel("share of samples inside")
+        axes.set_ylabel("fraction of samples inside")
         axes.set_ylim(0.0, 1.02)
         figure.legend(loc="outside upper center", ncols=2)
 
     listed = ", ".join(f"{share:.2f} at {level:g}" for level, share in levels.items())
-    return draw(paint, (4.1, 3.4), f"Calibration, share of samples inside: {listed}.", label(evaluation.kind))
+    return draw(
+        paint, (4.1, 3.4), f"Calibration, fraction of samples inside: {listed}.", label(evaluation.kind)
+    )
 
 
 def error_tables(evaluation: Evaluation) -> tuple[Table, ...]:
-    """Return tables of torque and acceleration errors by joint; red: worse than a trivial predictor."""
+    """Return tables of torque and acceleration errors by joint. Red means worse than a trivial predictor."""
     units = {"torque": "[N m, N]", "acceleration": "[rad/s², m/s²]"}
     tables = []
     for unit, names in units.items() if evaluation.predictors else ():
@@ -119,7 +121,7 @@ def error_tables(evaluation: Evaluation) -> tuple[Table, ...]:
             rows.append((joint, *(cell(x, 3) for x in values)))
             if any((shown[0] or 0.0) > (e.in_motion[i] or 0.0) for e in others):
                 bad.add((i, 1))
-        caption = f"{unit.capitalize()} error in motion, root mean square {names}; red: worse than another"
+        caption = f"{unit.capitalize()} error in motion, root mean square {names}; red: not the lowest"
         tables.append(Table(caption, head, tuple(rows), frozenset(bad)))
     return tuple(tables)
 
@@ -158,7 +160,7 @@ def score_table(evaluation: Evaluation) -> Table:
 
 
 def comparison_tables(comparison: Sequence[Compared]) -> tuple[Table, ...]:
-    """Return a table of the sets of force priors compared, or no table if the priors were given."""
+    """Return a table of the compared sets of force priors, or no table if the priors were given."""
     rows = tuple(
         tuple(cell(x, 3) for x in (each.name, each.log_density, each.behind, each.standard_error, note))
         for each in comparison

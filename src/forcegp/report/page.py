@@ -1,4 +1,4 @@
-"""Style of plots (colours, names and sizes), and rendering of single HTML files with SVG plots and tables."""
+"""Style of plots (colours, names and sizes), and rendering of HTML files with SVG plots and tables."""
 
 from __future__ import annotations
 
@@ -24,7 +24,7 @@ NAMES = tomllib.loads((TEMPLATES / "names.toml").read_text(encoding="utf-8"))
 COLOURS, DASHES, KINDS, LABELS = (NAMES[table] for table in ("colours", "dashes", "kinds", "labels"))
 """Line colours and dashes of models, labels for the kinds of saved models, and labels for models."""
 OTHER = "#0072b2"
-"""Colour of all other models; black is reserved for measurements."""
+"""Colour of all other models. Black is reserved for measurements."""
 INK = "#222222"
 AXES = ("#0072b2", "#d55e00", "#007a5e")
 """Colours of the Cartesian axes x, y, z."""
@@ -32,7 +32,7 @@ AXES = ("#0072b2", "#d55e00", "#007a5e")
 
 @dataclass(frozen=True)
 class Picture:
-    """A plot as SVG text; `alt` is the text alternative."""
+    """A plot as SVG text. `alt` is the text alternative."""
 
     svg: str
     alt: str
@@ -94,7 +94,7 @@ NONE = "–"
 
 @dataclass(frozen=True)
 class Table:
-    """A table of text; the first column names the rows, and `bad` lists the `(row, column)` of red cells."""
+    """A table of text. The first column names the rows, and `bad` lists the `(row, column)` of red cells."""
 
     caption: str
     head: tuple[str, ...]
@@ -103,13 +103,13 @@ class Table:
 
 
 def cell(value: object, digits: int = 4) -> str:
-    """Format a value as text: floats with the given number of significant digits, `None` as a dash."""
+    """Format a value as text, with floats to the given number of significant digits and `None` as a dash."""
     return NONE if value is None else text(value, digits)
 
 
 @dataclass(frozen=True)
 class PictureBlock:
-    """Plots with a common heading and caption, full width if `wide`; `source` is the file of their data."""
+    """Plots with a common heading and caption, in full width if `wide`. `source` is their data file."""
 
     heading: str
     caption: str
@@ -119,7 +119,7 @@ class PictureBlock:
 
 
 def render(template: str, package: str = "forcegp.report", **values: object) -> str:
-    """Render a template from `templates/` in the given package or in this one; missing values are errors."""
+    """Render a template from `templates/` in the given or this package. Missing values are errors."""
     packages = dict.fromkeys((package, "forcegp.report"))
     environment = jinja2.Environment(
         loader=jinja2.ChoiceLoader([jinja2.PackageLoader(name) for name in packages]),

@@ -1,4 +1,4 @@
-"""Comparison of predicted trajectories with the logged one: data, plots, table and animation."""
+"""Comparison of predicted trajectories with the logged one: data, plots, a table and an animation."""
 
 from __future__ import annotations
 
@@ -46,15 +46,15 @@ class ModelPath(Record):
     Attributes:
         model: name of the model.
         tip: x, y and z coordinates of the tip [m].
-        tip_bands: bands for x, y and z over function samples; empty if there are no samples.
-        tip_error: distance from the logged tip, median over the starts [m].
-        drift: constraint error c(q) [m]; empty if there are no contacts.
-        multiplier: λ [N]; empty if the model predicts no forces.
-        multiplier_band: band for λ over samples.
-        lost: fraction of samples that have lost contact by each time; empty if there are no samples.
-        errors: tip error after each horizon, median over the starts [m]; `None` if more than half diverged.
-        coverage: fraction of logged tip coordinates within the bands; `None` if there are no samples.
-        inflation: factor by which the bands are widened, calibrated on a different motion, or `None`.
+        tip_bands: bands for x, y and z over function samples, empty if there are no samples.
+        tip_error: distance from the logged tip, as the median over the starts [m].
+        drift: constraint error c(q) [m], empty if there are no contacts.
+        multiplier: λ [N], empty if the model does not predict forces.
+        multiplier_band: band for λ over function samples.
+        lost: fraction of samples that have lost contact by each time, empty if there are no samples.
+        errors: median tip error after each horizon over the starts [m], or `None` if more than half diverged.
+        coverage: fraction of logged tip coordinates within the bands, or `None` if there are no samples.
+        inflation: factor that widens the bands, calibrated on a different motion, or `None`.
         calibrated_coverage: coverage of the bands widened by this factor.
         worst_drift: largest constraint error of the mean and the samples over all starts [m].
         diverged_at: time of the first divergence [s].
@@ -77,7 +77,7 @@ class ModelPath(Record):
 
 
 class Film(Record):
-    """Points of an arm in an animation, flattened from (frames, points, 3) [m]; `label` names the model."""
+    """Points of an arm in an animation, flattened from (frames, points, 3) [m]. `label` names the model."""
 
     label: str
     points: Series
@@ -93,7 +93,7 @@ class RolloutData(Header):
         band_starts, band_seconds, level: number of starts, duration and nominal coverage of the bands.
         horizons: times at which `ModelPath.errors` are given [s].
         models: the trajectory of each model.
-        frame_times, bodies, films: animation times [s], points per arm, and the arms (the logged one first).
+        frame_times, bodies, films: animation times [s], points per arm, and the arms (the logged arm first).
     """
 
     FORMAT: ClassVar[str] = "forcegp-rollout"
@@ -115,7 +115,7 @@ class RolloutData(Header):
 
 
 def rollout_data(comparison: Comparison, calibration: Comparison | None = None) -> RolloutData:
-    """Return the data to plot: curves from the first start, and the band widening found on `calibration`."""
+    """Return the data to plot, with curves from the first start, and bands widened using `calibration`."""
     horizons = [h for h in HORIZONS if h <= float(comparison.t[-1]) * (1.0 + 1e-9)]
     stride = max(1, round(1.0 / (FRAMES_PER_SECOND * float(comparison.t[1] - comparison.t[0]))))
     tip = comparison.frame, comparison.point
@@ -199,7 +199,7 @@ def _animation(data: RolloutData) -> Markup:
         for film in data.films
     ]
     content = {"times": data.frame_times, "bodies": data.bodies, "films": films}
-    return animation(content, "The arm moving: logged in black, predicted in colour")
+    return animation(content, "The arm in motion: logged in black, predicted in colour")
 
 
 WIDTH = 4.6
@@ -229,7 +229,7 @@ def draw_tip(data: RolloutData) -> Picture:
 def _draw_logarithmic(
     data: RolloutData, curves: list[tuple[ModelPath, Series]], least: float, name: str, alt: str, title: str
 ) -> Picture:
-    """Plot magnitudes on a logarithmic scale, omitting the first one, which is zero."""
+    """Plot magnitudes on a logarithmic scale, omitting the first magnitude, which is zero."""
 
     def paint(figure: Figure) -> None:
         axes = figure.subplots()
@@ -266,7 +266,7 @@ def draw_contact_force(data: RolloutData) -> Picture:
         panels[-1].set_xlim(0.0, data.band_seconds)
         figure.legend(*panels[0].get_legend_handles_labels(), loc="outside upper center", ncols=2)
 
-    alt = "Multiplier along the predicted trajectories, with bands over samples, and the logged one."
+    alt = "Multiplier along the predicted trajectories, with bands over samples, and logged multiplier."
     return draw(paint, (WIDTH, 3.8 if losing else 2.8), alt, "Contact force over time")
 
 
@@ -284,7 +284,7 @@ def _starts(number: int) -> str:
 
 
 def rollout_pictures(data: RolloutData) -> tuple[Picture, ...]:
-    """Return those plots of the section for which there are data."""
+    """Return all plots of the section for which data exist."""
     log = "logarithmic scale, one curve per model."
     errors = [(path, path.tip_error) for path in data.models]
     alt = f"Tip error over time, median over {_starts(data.starts)}, {log}"
@@ -300,7 +300,7 @@ def rollout_pictures(data: RolloutData) -> tuple[Picture, ...]:
 def rollout_table(data: RolloutData) -> Table:
     """Return a table of the tip errors at the horizons, the coverage of the bands and the largest drift."""
     after = (f"after {h:g} s [mm]" for h in data.horizons)
-    head = ("model", *after, "in band", "in widened band", "largest |c(q)| [m]")
+    head = ("model", *after, "in band", "in calibrated band", "largest |c(q)| [m]")
     rows = []
     for path in data.models:
         errors = ["diverged" if e is None else f"{1e3 * e:.3g}" for e in path.errors]
@@ -321,7 +321,7 @@ def rollout_table(data: RolloutData) -> Table:
 
 @dataclass(frozen=True)
 class RolloutSection:
-    """Plots, table and animation of trajectories; `script` is the hash of the script (`animation_source`)."""
+    """Plots, table and animation of trajectories. `script` is the hash of the script (`animation_source`)."""
 
     block: PictureBlock
     table: Table
@@ -330,15 +330,15 @@ class RolloutSection:
 
 
 def rollout_section(data: RolloutData, source: str = DATA) -> RolloutSection:
-    """Return the section on trajectories; `source` names the data file next to the page."""
+    """Return the section on trajectories. `source` names the data file next to the page."""
     band = f" with the band that contains {data.level:.0%} of the function samples"
     sampled = any(path.tip_bands for path in data.models)
     why = " The curve follows the mean force. It may leave the band, since motion is nonlinear in the force."
     caption = (
-        f"Open loop from a logged state under the logged torques, {data.t[-1]:.3g} s ahead: logged in "
-        f"black, predicted in colour{band if sampled else ''}. Position and contact force are shown for the "
-        f"first {data.band_seconds:.3g} s. Errors are medians over {_starts(data.starts)}. A curve ends "
-        f"where its prediction diverged.{why if sampled else ''}"
+        f"Open-loop prediction over {data.t[-1]:.3g} s from a logged state under the logged torques: "
+        f"logged in black, predicted in colour{band if sampled else ''}. Position and contact force are "
+        f"shown for the first {data.band_seconds:.3g} s. Errors are medians over {_starts(data.starts)}. A "
+        f"curve ends where its prediction diverged.{why if sampled else ''}"
     )
     block = PictureBlock("Trajectories predicted in open loop", caption, rollout_pictures(data), source)
     return RolloutSection(block, rollout_table(data), _animation(data), animation_source())

@@ -19,12 +19,12 @@ from forcegp.report.page import INK, Picture, Series, as_tensor, colour, columns
 WIDTH, WIDE, ROW, MARGIN = 4.1, 12.0, 0.92, 0.75
 """Widths of a normal and a full-width plot, height of a row, and total height of the margins [inch]."""
 OUTSIDE, ROOM = 0.005, 0.25
-"""Fraction of extreme values that axes may clip on either side, and relative margin around the others."""
+"""Fraction of extreme values that axes may clip on either side; relative margin around the other values."""
 GREY = "#9a9a9a"
 
 
 class ForceWindow(Record):
-    """Normal force at a contact over a time window [N]; `logged` and `std` are optional."""
+    """Normal force at a contact over a time window [N]. `logged` and `std` are optional."""
 
     contact: str
     closed: list[bool]
@@ -34,7 +34,7 @@ class ForceWindow(Record):
 
 
 class WindowData(Header):
-    """Predictions of a model over a time window, by joint [rad/s²]; `clean` and `std` are optional.
+    """Predictions of a model over a time window, by joint [rad/s²]. `clean` and `std` are optional.
 
     If the model predicts forces and a contact closes, `forces` contains all contacts. `noise_std` is the
     standard deviation of the acceleration noise [rad/s²], and `t` is the time since the first sample [s].
@@ -73,7 +73,7 @@ def opening(data: Dataset, seconds: float) -> Dataset:
 
 @torch.no_grad()
 def predicted_window(model: Predictor, data: Dataset, name: str) -> WindowData:
-    """Return the predictions for a window of samples sorted by time; `name` identifies the model."""
+    """Return the predictions for a window of samples sorted by time. `name` identifies the model."""
     predicted = model.predict(data.q, data.qd, data.tau, active=data.active(model.system.contact_names))
     clean, variance = data.extras.get("qdd_clean"), predicted.variance
     if variance is not None and isinstance(model, StructuredFit) and model.torque_std is not None:
@@ -83,7 +83,7 @@ def predicted_window(model: Predictor, data: Dataset, name: str) -> WindowData:
     return WindowData(
         model=name,
         noise_std=data.header.noise_std,
-        # Measured logs may count seconds since 1970, for which a series keeps too few digits.
+        # Logs of real robots may count seconds since 1970, for which a series keeps too few digits.
         t=series(data.t - data.t[0]),
         joint_names=list(data.joint_names),
         measured=columns(data.qdd),
@@ -148,14 +148,14 @@ def _robust_limits(axes: Axes, values: Tensor) -> None:
 
 
 def draw_predictions(window: WindowData) -> Picture:
-    """Plot measured accelerations and predicted ones with ±2σ bands, in one row per joint."""
+    """Plot measured accelerations, and predicted accelerations with ±2σ bands, in one row per joint."""
     band = ", with the ±2σ band," if window.std else ""
     alt = f"accelerations of {{}}; measured in black, predicted{band} in colour."
     return _draw(window, torch.zeros(len(window.t), dtype=torch.float64), alt)
 
 
 def draw_errors(window: WindowData, limit: float | None = None) -> Picture:
-    """Plot prediction errors by joint within ±`limit` [rad/s²]; by default, each row has its own scale."""
+    """Plot prediction errors by joint within ±`limit` [rad/s²]. By default, each row has its own scale."""
     error = window.error.abs()
     alt = (
         f"error of the predicted accelerations of {{}}, mean magnitude {error.mean():.2g}, "

@@ -1,7 +1,7 @@
 """In-place editing of XML documents that changes only the edited attributes and elements.
 
 XML writers lose comments, attribute order or indentation. This editor locates start tags and attribute values
-in the text and replaces only these spans.
+in the text, and replaces only these spans.
 """
 
 from __future__ import annotations
@@ -21,9 +21,10 @@ _TAG_NAME = re.compile(rb"<[^\s/>]+")
 
 @dataclass(eq=False)
 class Span:
-    """An element of the text: the ends of its name (`head`) and of its start tag (`close`), whether it is
-    written as `<tag/>`, the indentation of its line, and for each attribute the start and end of its quoted
-    value and the start of the attribute including the preceding space.
+    """An element in the text of a document: the end of its name (`head`), the end of its start tag (`close`),
+    whether it is written as `<tag/>`, the indentation of its line, and its attributes. For each attribute, it
+    contains the start and end of the quoted value, and the start of the attribute including the preceding
+    space.
     """
 
     tag: str
@@ -36,7 +37,7 @@ class Span:
     children: list[Span] = field(default_factory=list)
 
     def find(self, tag: str) -> Span | None:
-        """Return the first child with the given tag, or `None` if there is none."""
+        """Return the first child with the given tag, or `None` if there is no such child."""
         return next((child for child in self.children if child.tag == tag), None)
 
     def iter(self) -> Iterator[Span]:
@@ -51,10 +52,10 @@ class EditableXml:
 
     Args:
         data: the document.
-        label: name of the file for messages.
+        label: name of the file, used in messages.
 
     Raises:
-        RobotFileError: the document is not well-formed UTF-8, or is rejected by `safety.parse_xml`.
+        RobotFileError: the document is not well-formed UTF-8, or `safety.parse_xml` rejects it.
 
     Example:
         >>> document = EditableXml(b"<robot> <!-- mine --> <mass value='1'/></robot>", "my.urdf")
@@ -100,7 +101,7 @@ class EditableXml:
         )
 
     def set(self, element: Span, name: str, text: str) -> None:
-        """Set an attribute; new attributes are added after the existing ones."""
+        """Set an attribute. A new attribute is added after the existing attributes."""
         quoted = quoteattr(text).encode()
         if name in element.values:
             first, last, _ = element.values[name]
@@ -117,7 +118,7 @@ class EditableXml:
             self._edits.append((before, last, b""))
 
     def add_child(self, element: Span, tag: str, attributes: dict[str, str], inside: str = "") -> None:
-        """Insert an element as the first child; `inside` is its content in the form of empty tags."""
+        """Insert an element as the first child. `inside` is its content, as empty tags."""
         text = "".join(f" {name}={quoteattr(value)}" for name, value in attributes.items())
         child = f"<{tag}{text}>{inside}</{tag}>" if inside else f"<{tag}{text}/>"
         step = element.children[0].indent if element.children else element.indent + b"  "

@@ -1,9 +1,9 @@
-"""Inertial parameters of a rigid body in coordinates whose values are always physically consistent.
+"""Inertial parameters of a rigid body, in coordinates that are always physically consistent.
 
-A body has the ten parameters π = (m, m c, I_o), with I_o about the link origin. They correspond to a mass
-distribution if and only if the pseudo-inertia J = [[Σ, m c], [m cᵀ, m]], Σ = ½ tr(I_o) 1 − I_o, is positive
-definite (Wensing, Kim, Slotine, RA-L 2018). The log-Cholesky coordinates θ of Rucker and Wensing, *Smooth
-parameterization of rigid-body inertia* (RA-L 2022), parametrise exactly these J.
+A body has the ten parameters π = (m, m c, I_o), where I_o is the inertia about the link origin. They
+correspond to a mass distribution if and only if the pseudo-inertia J = [[Σ, m c], [m cᵀ, m]] with Σ = ½
+tr(I_o) 1 − I_o is positive definite (Wensing, Kim, Slotine, RA-L 2018). The log-Cholesky coordinates θ of
+Rucker and Wensing, *Smooth parameterization of rigid-body inertia* (RA-L 2022), parametrise exactly these J.
 """
 
 from __future__ import annotations
@@ -22,8 +22,8 @@ InertialParameters = Float[Tensor, "*batch 10"]
 def pseudo_inertia(mass: Scalars, com: Vector3, inertia: Rotation) -> PseudoInertia:
     """Return J = [[Σ, m c], [m cᵀ, m]] `(*batch, 4, 4)` with Σ = ½ tr(I_c) 1 − I_c + m c cᵀ.
 
-    J > 0 if the parameters are physical. `com` is the centre of mass in the link frame [m], and `inertia` is
-    the inertia about it in link axes [kg m²].
+    J is positive definite if the parameters are physical. `com` is the centre of mass in the link frame [m].
+    `inertia` is the inertia about the centre of mass in link axes [kg m²].
     """
     eye = torch.eye(3, dtype=inertia.dtype, device=inertia.device)
     half_trace = 0.5 * inertia.diagonal(dim1=-2, dim2=-1).sum(-1)
@@ -54,7 +54,7 @@ def from_pseudo_inertia(J: PseudoInertia) -> tuple[Scalars, Vector3, Rotation]:
 def from_log_cholesky(theta: InertialParameters) -> PseudoInertia:
     """Return J = U Uᵀ from log-Cholesky coordinates θ = (α, d1, d2, d3, s12, s23, s13, t1, t2, t3).
 
-    U = e^α [[e^{d1}, s12, s13, t1], [0, e^{d2}, s23, t2], [0, 0, e^{d3}, t3], [0, 0, 0, 1]]; J > 0 for all θ.
+    U = e^α [[e^{d1}, s12, s13, t1], [0, e^{d2}, s23, t2], [0, 0, e^{d3}, t3], [0, 0, 0, 1]]. J > 0 for all θ.
     """
     alpha, d1, d2, d3, s12, s23, s13, t1, t2, t3 = theta.unbind(-1)
     zero, one = torch.zeros_like(alpha), torch.ones_like(alpha)
@@ -69,7 +69,7 @@ def from_log_cholesky(theta: InertialParameters) -> PseudoInertia:
 
 
 def log_cholesky(J: PseudoInertia) -> InertialParameters:
-    """Return θ `(*batch, 10)` of J (inverse of `from_log_cholesky`); raise `InertiaError` unless J > 0."""
+    """Return θ `(*batch, 10)` from J (inverse of `from_log_cholesky`); raise `InertiaError` unless J > 0."""
     # An upper factor is the lower factor of the matrix with rows and columns reversed.
     lower, info = torch.linalg.cholesky_ex(J.flip(-1, -2))
     if bool((info != 0).any()):

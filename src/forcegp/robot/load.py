@@ -1,6 +1,6 @@
-"""`load_robot`: load a robot model from a bundled name, a URDF file or an MJCF file.
+"""Loading of a robot model from a bundled name, a URDF file or an MJCF file.
 
-The ordered tree of links and joints becomes the robot model, with links merged across fixed joints.
+The ordered tree of links and joints becomes the robot model. Links are merged across fixed joints.
 """
 
 from __future__ import annotations
@@ -31,17 +31,17 @@ from forcegp.robot.urdf import read_urdf
 FRICTION_VELOCITY = 0.1
 """Default speed scale of Coulomb friction [rad/s, m/s], which robot files do not specify."""
 SINGULAR = 1e-12
-"""Eigenvalue of the scaled mass matrix below which the matrix is considered singular in double precision."""
+"""Eigenvalue of the scaled mass matrix below which the matrix counts as singular in double precision."""
 LIMB_JOINTS, WALKING_JOINTS, BODY_MASS = 2, 6, 1.0
-"""Minimum number of joints in a limb, and minimum number of joints and base mass [kg] of a robot that might
-walk (hands are lighter)."""
+"""Minimum number of joints in a limb; minimum number of joints and base mass [kg] of a robot that may walk
+(hands are lighter)."""
 OF_JOINTS = ("axis", "damping", "friction", "armature", "lower", "upper", "velocity_limit", "effort_limit")
-"""Joint attributes copied unchanged from the file."""
+"""Joint attributes that are copied unchanged from the file."""
 
 
 @dataclass(frozen=True)
 class _Placed:
-    """Moving joints, and for each link of the file its moving joint and its pose in that joint's link."""
+    """Moving joints and, for each link of the file, its moving joint and its pose in that joint's link."""
 
     moving: list[Joint]
     parents: list[int]
@@ -50,7 +50,7 @@ class _Placed:
 
 
 def robot_of(tree: Tree, world: Mapping[str, np.ndarray]) -> RobotModel:
-    """Build the robot from a tree; raise typed errors for ambiguous frames and motion without inertia."""
+    """Build the robot from a tree; raise typed errors for ambiguous frames and for motion without inertia."""
     remarks, placed = list(tree.remarks), _place(tree.joints)
     bodies = _merge(tree, placed)
     remarks += _held_base(tree, placed)
@@ -99,7 +99,7 @@ def _place(joints: tuple[Joint, ...]) -> _Placed:
 
 
 def _held_base(tree: Tree, placed: _Placed) -> list[str]:
-    """Return a note if a fixed base with mass carries several limbs, like that of a walking robot."""
+    """Return a note if a fixed base with mass carries several limbs, as in a walking robot."""
     limb: list[int] = []
     for i, parent in enumerate(placed.parents):
         limb.append(i if parent == BASE else limb[parent])
@@ -136,7 +136,7 @@ def _sum(bodies: list[Inertial]) -> Inertial:
 
 
 def _check_mass_matrix(tree: Tree, placed: _Placed, bodies: list[Inertial]) -> None:
-    """Reject robots that can move without kinetic energy, as tested in a generic configuration."""
+    """Reject robots that can move without kinetic energy. The test uses a generic configuration."""
     M = _mass_matrix(placed, bodies) + np.diag([joint.armature for joint in placed.moving])
     scale = np.sqrt(np.diag(M))
     if scale.min() > 0.0:
@@ -208,16 +208,16 @@ def load_robot(
     dtype: torch.dtype = torch.float64,
     device: torch.device | str = "cpu",
 ) -> RobotModel:
-    """Load a bundled robot model by name, or a model from a URDF or MJCF file.
+    """Load a robot model by the name of a bundled robot, or from a URDF or MJCF file.
 
-    A usable but questionable file triggers a `RobotFileWarning`, which is also listed in `robot.remarks`.
+    A usable but questionable file triggers a `RobotFileWarning`, which `robot.remarks` also lists.
 
     Args:
-        source: `"kuka_iiwa"`, `"kuka_iiwa14"`, `"franka_panda"`, `"ur5"`, `"double_pendulum"`, or the path
-            of a file.
+        source: `"kuka_iiwa"`, `"kuka_iiwa14"`, `"franka_panda"`, `"ur5"`, `"double_pendulum"`, or a file
+            path.
         base_position: position of the root link in the world [m].
         base_rpy: roll, pitch and yaw of the root link about the world axes [rad].
-        gravity: gravitational acceleration in the world [m/s²]; the value in an MJCF file is ignored.
+        gravity: gravitational acceleration in the world [m/s²]. The value in an MJCF file is ignored.
         locked_joints: positions [rad, m] of joints to treat as fixed, such as those of a gripper.
         dtype: floating-point type of all constants.
         device: device of all constants.
@@ -232,8 +232,8 @@ def load_robot(
 
     Raises:
         UnknownNameError: the bundled robot or a joint to lock does not exist.
-        RobotFileError: the file cannot be read or is not a valid robot; the message names the link or joint.
-        UnsupportedRobotError: a joint is a floating, planar, ball or mimic joint; the hint is to lock it.
+        RobotFileError: the file cannot be read or is invalid. The message names the link or joint.
+        UnsupportedRobotError: a joint is a floating, planar, ball or mimic joint. The hint is to lock it.
         MissingDependencyError: the file is MJCF and MuJoCo is not installed.
         InertiaError: the inertia of a link is not physical.
         ShapeError: base_position, base_rpy or gravity is not a vector of three finite numbers.
@@ -260,7 +260,7 @@ def robot_path(source: str | Path) -> Path:
 
 
 def read_tree(data: bytes, path: Path) -> Tree:
-    """Return links and joints of a URDF or MJCF document from `path`; raise `RobotFileError` if invalid."""
+    """Return the links and joints in the content of a file; raise `RobotFileError` if it is invalid."""
     root = parse_xml(data, str(path))
     if root.tag == "robot":
         return read_urdf(root, str(path))

@@ -1,6 +1,6 @@
 """Reading of MJCF files, which are reduced to their mechanics and compiled by MuJoCo.
 
-This module is imported only for reading MJCF files, since it needs the optional package `mujoco`.
+This module is imported only to read MJCF files, since it requires the optional package `mujoco`.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ _KINDS: dict[int, JointKind] = {
 def read_mjcf(root: Element, path: Path) -> Tree:
     """Return the links and joints of a `<mujoco>` document.
 
-    Bodies become links, bodies and sites become frames, and multiple joints of a body are separated by
+    Bodies become links, and bodies and sites become frames. Multiple joints of a body are separated by
     massless links. Typed errors quote MuJoCo's compiler, or name unsupported or unphysical elements.
     """
     document, coupled, remarks = reduce_mjcf(root, path)
@@ -65,7 +65,7 @@ _HANDLER = threading.RLock()
 def _warnings_of_mujoco(label: str, remarks: list[str]) -> Iterator[None]:
     """Collect MuJoCo's warnings, which would otherwise be written to a log file in the working directory.
 
-    The handler is global to the process. Only one reader at a time replaces and restores it; warnings from
+    The handler is global to the process. Only one reader at a time replaces and restores it. Warnings from
     other threads are passed on.
     """
     thread = threading.get_ident()
@@ -126,7 +126,7 @@ def _chain(
 
 
 def _joint(model: Any, j: int, name: str, body: str, follows: Coupling | None, label: str) -> Joint:
-    """Return joint j of a body, placed at zero joint position, before its links are assigned."""
+    """Return joint j of a body, placed at zero joint position, before links are assigned to it."""
     kind, dof = _KINDS.get(int(model.jnt_type[j])), model.jnt_dofadr[j]
     if kind is None:
         word = "free (floating)" if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE else "ball"
@@ -162,7 +162,7 @@ def _joint(model: Any, j: int, name: str, body: str, follows: Coupling | None, l
 
 
 def _effort(model: Any, j: int) -> float:
-    """Return the largest force that the joint, its actuators, and the control range of motors allow."""
+    """Return the largest force that the limits of the joint, its actuators and its motors allow."""
     effort = float(np.abs(model.jnt_actfrcrange[j]).max()) if model.jnt_actfrclimited[j] else np.inf
     of_joint = model.actuator_trntype == int(mujoco.mjtTrn.mjTRN_JOINT)
     efforts = []

@@ -1,4 +1,4 @@
-"""Reduction of MJCF documents to their mechanics, before MuJoCo's compiler reads them.
+"""Reduction of MJCF documents to their mechanics, before MuJoCo compiles them.
 
 Bodies, joints, sites, inertias and defaults are kept. Elements for visuals, sensors, actuation or collisions
 are dropped, so meshes and textures are never opened. Unsupported elements that affect motion cause errors.
@@ -39,8 +39,8 @@ class Coupling(NamedTuple):
 
 
 def reduce_mjcf(root: Element, path: Path) -> tuple[Element, dict[str, Coupling], list[str]]:
-    """Return the reduced document with included files from its folder, couplings keyed by the name of the
-    constrained joint, and notes; raise typed errors that name invalid or unsupported elements.
+    """Return the reduced document with files included from its folder, the couplings keyed by the name of the
+    constrained joint, and notes. Raise typed errors that name invalid or unsupported elements.
     """
     _expand_includes(root, path)
     document = Element("mujoco", model=root.get("model", path.stem))
@@ -73,7 +73,7 @@ def reduce_mjcf(root: Element, path: Path) -> tuple[Element, dict[str, Coupling]
 
 
 def _expand_includes(root: Element, path: Path) -> None:
-    """Insert included files, each at most once and only from within the robot file's folder."""
+    """Insert included files, each at most once and only from within the folder of the robot file."""
     folder = path.resolve().parent
     included = {path.resolve()}
     stack = [root]
@@ -136,7 +136,7 @@ def _without(element: Element, names: tuple[str, ...]) -> dict[str, str]:
 
 
 def _copy_actuators(section: Element) -> Element:
-    """Copy the limits of joint actuators; the name of a copy indicates whether its control is a force."""
+    """Copy the limits of joint actuators. The name of a copy states whether its control is a force."""
     copy = Element("actuator")
     for i, actuator in enumerate(section):
         if actuator.tag in _ACTUATORS and actuator.get("joint"):
@@ -147,7 +147,7 @@ def _copy_actuators(section: Element) -> Element:
 
 
 def _parts(body: Element) -> Iterator[Element]:
-    """Yield the elements of a body, including those within frames but excluding those of child bodies."""
+    """Yield the elements of a body, including those inside frames but excluding those of child bodies."""
     for child in body:
         yield child
         if child.tag == "frame":

@@ -1,9 +1,9 @@
-"""The frozen description of a robot as a tree of rigid links and joints with one degree of freedom each.
+"""The frozen description of a robot as a tree of rigid links and joints with one degree of freedom.
 
-Joint `i` moves link `i`. The joint frame has the pose `placement` in the frame of the parent link; the link
-frame is the joint frame after the motion. All inertial parameters of link `i` are expressed in the axes of
-link frame `i`, with the inertia about the centre of mass. Links connected by fixed joints are merged; their
-frames remain available by name.
+Joint `i` moves link `i`. The joint frame has the pose `placement` in the frame of the parent link. The link
+frame is the joint frame after the motion of the joint. All inertial parameters of link `i` are expressed in
+the axes of link frame `i`, and its inertia is about the centre of mass. Links connected by fixed joints are
+merged. Their frames remain available by name.
 """
 
 from __future__ import annotations
@@ -27,32 +27,32 @@ BASE = -1
 
 @dataclass(frozen=True, eq=False)
 class RobotModel:
-    """A robot arm with `nq` joints and `nf` named frames (constants in SI units and radians).
+    """A robot arm with `nq` joints and `nf` named frames. All constants are in SI units and radians.
 
     Args:
         name: name of the robot.
-        joint_names: the moving joints, with parents before children.
-        joint_types: `"revolute"` or `"prismatic"`, one per joint (continuous joints are revolute).
-        parents: index of the parent joint of each joint, −1 for the base.
-        placement_rotation: `(nq, 3, 3)` orientation of the joint frame in the parent link frame at q = 0.
-        placement_position: `(nq, 3)` position of the joint frame in the parent link frame [m].
-        axis: `(nq, 3)` unit joint axis in the joint frame.
-        mass: `(nq,)` link mass [kg].
-        com: `(nq, 3)` centre of mass in the link frame [m].
-        inertia: `(nq, 3, 3)` rotational inertia about the centre of mass, in link axes [kg m²].
-        damping: `(nq,)` viscous joint friction [N m s/rad, N s/m].
-        friction: `(nq,)` Coulomb joint friction [N m, N].
-        stribeck: `(nq,)` static friction above the Coulomb level [N m, N].
-        stribeck_velocity: `(nq,)` decay speed of the static part [rad/s, m/s].
-        friction_velocity: `(nq,)` speed scale on which Coulomb friction changes sign [rad/s, m/s].
-        armature: `(nq,)` inertia of the drive, reflected to the joint [kg m², kg].
-        lower, upper: `(nq,)` joint limits [rad, m], infinite if absent.
-        velocity_limit, effort_limit: `(nq,)` limits [rad/s, m/s] and [N m, N], infinite if absent.
+        joint_names: names of the moving joints, with parents before children.
+        joint_types: `"revolute"` or `"prismatic"` for each joint. Continuous joints are revolute.
+        parents: index of the parent joint of each joint, or −1 for the base.
+        placement_rotation: orientation of each joint frame in the parent link frame at q = 0, `(nq, 3, 3)`.
+        placement_position: position of each joint frame in the parent link frame, `(nq, 3)` [m].
+        axis: unit axis of each joint in the joint frame, `(nq, 3)`.
+        mass: mass of each link, `(nq,)` [kg].
+        com: centre of mass in the link frame, `(nq, 3)` [m].
+        inertia: rotational inertia about the centre of mass in link axes, `(nq, 3, 3)` [kg m²].
+        damping: viscous joint friction, `(nq,)` [N m s/rad, N s/m].
+        friction: Coulomb joint friction, `(nq,)` [N m, N].
+        stribeck: static friction in excess of the Coulomb level, `(nq,)` [N m, N].
+        stribeck_velocity: speed over which this excess decays, `(nq,)` [rad/s, m/s].
+        friction_velocity: speed scale on which Coulomb friction changes sign, `(nq,)` [rad/s, m/s].
+        armature: inertia of the drive, reflected to the joint, `(nq,)` [kg m², kg].
+        lower, upper: joint limits, `(nq,)` [rad, m], infinite if absent.
+        velocity_limit, effort_limit: limits, `(nq,)` [rad/s, m/s], [N m, N], infinite if absent.
         frame_names: names of all links and fixed frames in the file.
-        frame_parents: index of the joint that moves each frame, −1 for the base.
-        frame_rotation, frame_position: pose `(nf, 3, 3)`, `(nf, 3)` [m] in the link frame of that joint.
-        base_rotation, base_position: pose `(3, 3)`, `(3,)` [m] of the base in the world.
-        gravity: `(3,)` gravitational acceleration in the world [m/s²].
+        frame_parents: index of the joint that moves each frame, or −1 for the base.
+        frame_rotation, frame_position: pose in the link frame of that joint, `(nf, 3, 3)`, `(nf, 3)` [m].
+        base_rotation, base_position: pose of the base in the world, `(3, 3)`, `(3,)` [m].
+        gravity: gravitational acceleration in the world, `(3,)` [m/s²].
         remarks: notes on questionable properties of the file, one sentence each.
     """
 
@@ -128,7 +128,7 @@ class RobotModel:
 
     @cached_property
     def ancestors(self) -> Tensor:
-        """Matrix E `(nq, nq)` with E[i, j] = 1 if joint j moves link i, else 0."""
+        """Matrix E `(nq, nq)` with E[i, j] = 1 if joint j moves link i, and 0 otherwise."""
         E = torch.eye(self.nq, dtype=self.dtype, device=self.device)
         for i, parent in enumerate(self.parents):
             if parent != BASE:
@@ -137,13 +137,13 @@ class RobotModel:
 
     @cached_property
     def revolute(self) -> Tensor:
-        """Mask `(nq,)` that is 1 for revolute joints and 0 for prismatic ones."""
+        """Vector `(nq,)` that is 1 for revolute joints and 0 for prismatic joints."""
         flags = [float(kind == "revolute") for kind in self.joint_types]
         return torch.tensor(flags, dtype=self.dtype, device=self.device)
 
     @cached_property
     def fingerprint(self) -> str:
-        """SHA-256 hash of joint names, kinematics and inertial parameters; equal robots have equal hashes."""
+        """SHA-256 hash of joint names, kinematics and inertial parameters. Equal robots have equal hashes."""
         digest = hashlib.sha256(repr((self.joint_names, self.joint_types, self.parents)).encode())
         for name, value in self.tensors.items():
             digest.update(name.encode())
@@ -157,17 +157,17 @@ class RobotModel:
 
     @property
     def tensors(self) -> dict[str, Tensor]:
-        """Every constant that is a tensor, by name."""
+        """All constants that are tensors, keyed by name."""
         values = ((field.name, getattr(self, field.name)) for field in dataclasses.fields(self))
         return {name: value for name, value in values if isinstance(value, Tensor)}
 
     def frame_index(self, frame: str) -> int:
-        """Return the index of a named frame; an `UnknownNameError` suggests the closest name."""
+        """Return the index of a named frame; raise an `UnknownNameError` that suggests the closest name."""
         check_name(f"frame of robot {self.name!r}", frame, self.frame_names)
         return self.frame_names.index(frame)
 
     def joint_index(self, joint: str) -> int:
-        """Return the index of a named joint; an `UnknownNameError` lists the joints and the nearest one."""
+        """Return the index of a named joint; raise an `UnknownNameError` that suggests the closest name."""
         check_name(f"joint of robot {self.name!r}", joint, self.joint_names)
         return self.joint_names.index(joint)
 
@@ -206,7 +206,7 @@ class RobotModel:
                 )
             if value.ndim == 0 or value.shape[-1] != self.nq:
                 raise ShapeError(
-                    f"{name} does not fit robot {self.name!r}",
+                    f"{name} has the wrong shape for robot {self.name!r}",
                     expected=f"shape (*batch, {self.nq}) for joints {', '.join(self.joint_names)}",
                     got=tuple(value.shape),
                 )

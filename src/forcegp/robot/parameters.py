@@ -1,4 +1,4 @@
-"""Analytical parameters θ_A: the learnable parameters of a robot.
+"""Analytical parameters θ_A, which are the learnable parameters of a robot.
 
 | quantity            | coordinates of each joint j                                         | number |
 |---------------------|---------------------------------------------------------------------|--------|
@@ -29,20 +29,19 @@ POSITIVE = (
 )  # fmt: skip
 QUANTITIES = ("inertia", "com", "offset", *POSITIVE)
 SMALLEST = 1e-3
-"""Initial value of friction and drive parameters that are zero in the robot, since logarithms are learned.
-"""
+"""Initial value of friction and drive parameters that are zero in the robot, since logarithms are learned."""
 
 
 class AnalyticalParameters(nn.Module):
-    """The learnable parameters of a robot; calling the module returns the robot with these parameters.
+    """The learnable parameters of a robot. Calling the module returns the robot with these parameters.
 
     The state dict has one tensor per quantity, `coordinates.<quantity>`, with one row per joint. The tensors
-    have the robot's device and precision; to change these, start from `robot.to(...)`.
+    have the device and precision of the robot. To change these, start from `robot.to(...)`.
 
     Args:
-        robot: robot with the initial values and the parameters that are not learned.
-        learn: joint names (or `"all"`) for each quantity, as in `{"mass": ["joint_7"], "damping": "all"}`.
-            For inertia, mass and centre of mass, a joint name refers to the link that the joint moves.
+        robot: a robot with the initial values and the parameters that are not learned.
+        learn: joint names or `"all"` for each quantity, as in `{"mass": ["joint_7"], "damping": "all"}`. For
+            inertia, mass and centre of mass, a joint name refers to the link that the joint moves.
 
     Example:
         >>> import torch, forcegp
@@ -70,7 +69,7 @@ class AnalyticalParameters(nn.Module):
         self.coordinates = nn.ParameterDict({name: self._initial(name) for name in self.joints})
 
     def forward(self) -> RobotModel:
-        """Return the robot with the learned parameters, differentiable in the coordinates."""
+        """Return the robot with the learned parameters, which is differentiable in the coordinates."""
         fields: dict[str, Tensor] = {}
         for quantity, x in self.coordinates.items():
             for name, rows in self._fields(quantity, x).items():
@@ -142,7 +141,7 @@ def _joints(robot: RobotModel, quantity: str, names: Sequence[str] | Literal["al
 
 def _check(joints: Mapping[str, tuple[str, ...]]) -> None:
     if not any(joints.values()):
-        raise ModelError("no analytical parameter is selected", expected="joints of some quantity")
+        raise ModelError("no analytical parameter is selected", expected="joints for at least one quantity")
     for part in ("mass", "com"):
         twice = set(joints.get("inertia", ())) & set(joints.get(part, ()))
         if twice:

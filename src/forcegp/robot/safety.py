@@ -1,4 +1,4 @@
-"""Safe parsing of XML from untrusted files, with entities rejected and size and depth bounded."""
+"""Safe parsing of XML from untrusted files. Entities are rejected, and size and depth are limited."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ MAX_BYTES = 8 * 2**20
 MAX_ELEMENTS = 20_000
 MAX_DEPTH = 128
 MAX_NUMBER = 1e12
-"""Bound on lengths, masses and moments, which prevents overflow in their products."""
+"""Upper bound on lengths, masses and moments, which prevents overflow in their products."""
 
 
 class _BoundedBuilder(TreeBuilder):
@@ -69,7 +69,7 @@ def read_bytes(path: Path) -> bytes:
 
 
 def parse_xml(data: bytes, label: str) -> Element:
-    """Parse an XML document; raise `RobotFileError` if it is malformed, malicious, or too large or deep."""
+    """Parse an XML document; raise `RobotFileError` if it is malformed, malicious, too large or too deep."""
     parser = DefusedXMLParser(
         target=_BoundedBuilder(label), forbid_dtd=True, forbid_entities=True, forbid_external=True
     )
@@ -113,7 +113,7 @@ def xacro_error(label: str, got: str) -> RobotFileError:
 def parse_numbers(
     text: str, where: str, count: int, *, infinite: bool = False, error: type[RobotFileError] = RobotFileError
 ) -> list[float]:
-    """Parse the `count` finite numbers (±∞ if `infinite`) in an attribute; an `error` names `where`."""
+    """Parse an attribute with `count` finite numbers (or ±∞ if `infinite`); raise `error` if invalid."""
     expected = f"{count} finite number{'s' if count > 1 else ''}"
     try:
         values = [float(word) for word in text.split()]

@@ -18,7 +18,7 @@ from forcegp.robot.safety import parse_numbers, parse_xml, read_bytes
 
 Array = NDArray[np.float64]
 MESHES = (".stl", ".obj", ".ply", ".glb")
-"""Supported mesh formats; parts in other formats are skipped."""
+"""Supported mesh formats. Parts in other formats are skipped."""
 MESH_BYTES = 1 << 25
 MESH_CORNERS = 200
 """Maximum number of vertices of the convex hull of a mesh."""
@@ -30,14 +30,14 @@ SIZES = {"box": {"size": 3}, "cylinder": {"radius": 1, "length": 1}, "sphere": {
 
 @dataclass(frozen=True)
 class Shape:
-    """A convex part of the link moved by joint `link` (−1: base), with vertices `(k, 3)` in its frame [m]."""
+    """A convex part of the link of joint `link` (−1: base), with vertices `(k, 3)` in the link frame [m]."""
 
     link: int
     points: Array
 
 
 def box(x: float, y: float, z: float) -> Array:
-    """Return the vertices `(8, 3)` of a box centred at the origin, given its side lengths [m]."""
+    """Return the vertices `(8, 3)` of a box centred at the origin with the given side lengths [m]."""
     signs = np.stack(np.meshgrid(*3 * [[-0.5, 0.5]], indexing="ij"), axis=-1)
     return signs.reshape(-1, 3) * [x, y, z]
 
@@ -70,8 +70,8 @@ def shapes_of(
 ) -> list[Shape]:
     """Return the parts of a robot from its own or a bundled URDF file, or rods between its joints.
 
-    By default, the file of a bundled robot with the same name and frames is used. From the file, the first of
-    `elements` (`"visual"`, `"collision"`) that it contains is used.
+    The default is the file of a bundled robot with the same name and frames. Of the `elements` (`"visual"`,
+    `"collision"`), the first that the file contains is used.
 
     Raises:
         RobotFileError: the shapes in the file are invalid.
@@ -85,7 +85,7 @@ def shapes_of(
 
 
 def rods(robot: RobotModel) -> list[Shape]:
-    """Return rods to each joint, and to the last frame of each link."""
+    """Return rods to each joint, and rods to the last frame of each link."""
     place, at = robot.placement_position.detach().cpu().numpy(), robot.frame_position.detach().cpu().numpy()
     ends = list(zip(robot.parents, place, strict=True))
     for link in range(robot.nq):
@@ -101,7 +101,7 @@ def rods(robot: RobotModel) -> list[Shape]:
 
 
 def _parts(root: Element, path: Path, robot: RobotModel, element: str) -> list[Shape]:
-    """Return the visual or collision elements of the links in a URDF document that are robot frames."""
+    """Return the visual or collision elements of those links in a URDF document that are robot frames."""
     parts = []
     for link in root.findall("link"):
         name = link.get("name", "")
@@ -154,7 +154,7 @@ def _hull(file: Path) -> Array:
 
 
 def _mesh_file(name: str, folder: Path) -> Path | None:
-    """Return a mesh file named in a robot file, if it is in the file's folder or package, else `None`."""
+    """Return a mesh file named in a robot file if it is in the folder or package of the file, else `None`."""
     package, _, rest = name.removeprefix("package://").partition("/")
     if name.startswith("package://"):
         roots = [parent / package for parent in (folder, *folder.resolve().parents)] + [folder]

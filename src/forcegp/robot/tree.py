@@ -18,7 +18,7 @@ JointKind = Literal["revolute", "prismatic", "fixed"]
 
 @dataclass(frozen=True)
 class Inertial:
-    """Mass [kg], centre of mass [m] and inertia about it [kg m²], expressed in link axes."""
+    """Mass [kg], centre of mass [m] and inertia about the centre of mass [kg m²], in link axes."""
 
     mass: float
     com: np.ndarray
@@ -27,7 +27,7 @@ class Inertial:
 
 @dataclass(frozen=True)
 class Link:
-    """A rigid link, which becomes a frame of the robot if `frame` is true."""
+    """A rigid link. It becomes a frame of the robot if `frame` is true."""
 
     name: str
     inertial: Inertial | None = None
@@ -39,8 +39,8 @@ class Joint:
     """A joint between two links.
 
     Attributes:
-        refused: reason why the joint must be locked, or "".
-        follows: the joint that this one mimics, with multiplier and offset.
+        refused: the reason why the joint must be locked, or an empty string.
+        follows: the joint that this joint mimics, with a multiplier and an offset.
     """
 
     name: str
@@ -71,7 +71,7 @@ class Site:
 
 @dataclass(frozen=True)
 class Tree:
-    """All links, joints and sites in a file; `label` is the file name for messages."""
+    """All links, joints and sites in a file. `label` is the file name used in messages."""
 
     name: str
     label: str
@@ -121,7 +121,7 @@ def lock_joints(tree: Tree, locked: Mapping[str, float]) -> Tree:
 
 MAX_JOINTS = 500
 ROUNDING = 1e-6
-"""Relative error in principal moments due to rounding in files."""
+"""Relative error in principal moments due to rounding of the numbers in files."""
 
 
 def checked(tree: Tree) -> Tree:
@@ -152,7 +152,7 @@ def checked(tree: Tree) -> Tree:
 
 
 def _check_inertia(tree: Tree, joints: list[Joint]) -> list[str]:
-    """Check the inertia of each link; for a link that never moves, invalid inertia only causes a note."""
+    """Check the inertia of each link. For a link that never moves, invalid inertia only causes a note."""
     moving: set[str] = set()
     for joint in joints:
         if joint.kind != "fixed" or joint.parent in moving:
@@ -176,7 +176,7 @@ def _check_inertia(tree: Tree, joints: list[Joint]) -> list[str]:
 
 
 def inertia_error(body: Inertial) -> str:
-    """Return the reason why the parameters are unphysical, or "" (see also `inertia_doubt`)."""
+    """Return the reason why inertial parameters are unphysical, or an empty string (see `inertia_doubt`)."""
     mass, com, inertia = body.mass, body.com, body.inertia
     if not (np.isfinite(mass) and np.isfinite(com).all() and np.isfinite(inertia).all()):
         return "a value is not finite"
@@ -189,7 +189,7 @@ def inertia_error(body: Inertial) -> str:
 
 
 def inertia_doubt(body: Inertial) -> str:
-    """Return the reason why the parameters are only approximately physical (such as rounding), or ""."""
+    """Return the reason why parameters are only approximately physical, or an empty string."""
     low, mid, high = np.linalg.eigvalsh(body.inertia)
     if body.mass == 0.0 and high > 0.0:
         return f"it has a rotational inertia of {high:.4g} kg m² but no mass"

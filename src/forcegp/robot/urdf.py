@@ -1,4 +1,4 @@
-"""Reading of URDF files, in which all elements that are used are checked and all others are ignored."""
+"""Reading of URDF files. All elements that are used are checked, and all others are ignored."""
 
 from __future__ import annotations
 
@@ -36,11 +36,11 @@ _INSTEAD = {
 """Remedies for unsupported joint types."""
 _KINDS = ("revolute", "continuous", "prismatic", "fixed")
 WORLD = "world"
-"""Name of the fixed world, which some files use as a link without declaring it as one."""
+"""Name of the fixed world, which some files use as a link without declaring it as such."""
 
 
 def read_urdf(root: Element, label: str) -> Tree:
-    """Return the links and joints of a `<robot>` element; errors name invalid or unsupported elements."""
+    """Return the links and joints of a `<robot>` element. Errors name invalid or unsupported elements."""
     for element in root.iter():
         macros = [text for text in element.attrib.values() if "${" in text or "$(" in text]
         if macros or "xacro" in element.tag:
@@ -68,7 +68,7 @@ def _name(element: Element, label: str) -> str:
 
 
 def _part(element: Element, tag: str, where: str) -> dict[str, Any]:
-    """Return the parsed attributes of the only part with the given tag; empty if there is none."""
+    """Return the parsed attributes of the only part with the given tag, or an empty mapping."""
     parts = element.findall(tag)
     if len(parts) > 1:
         raise RobotFileError(f"{where} has several <{tag}>", expected="one", got=len(parts))
@@ -160,7 +160,7 @@ def _unit(axis: np.ndarray, where: str) -> np.ndarray:
 
 
 def _limits(limit: dict[str, Any], kind: str, where: str) -> dict[str, float]:
-    """Return position, effort and velocity limits; zero or missing effort or velocity limits are infinite."""
+    """Return the limits of a joint. Missing or zero effort and velocity limits become infinite."""
     effort, velocity = (limit.get(name) or np.inf for name in ("effort", "velocity"))
     if min(effort, velocity) < 0.0:
         raise RobotFileError(

@@ -1,9 +1,9 @@
 """Writing of robot parameters into a copy of the URDF or MJCF file.
 
-Only changed attributes are edited (`edit_xml.py`); meshes, comments, order and formatting are preserved. A
-link of the robot may consist of several links in the file that are fixed to each other. The heaviest of those
-that stay physically consistent takes the whole change J − J₀ in pseudo-inertia. If none does, each changes to
-E J_k Eᵀ, where E satisfies E J₀ Eᵀ = J. The edited text is read back and compared before it is written.
+Only changed attributes are edited (`edit_xml.py`). Meshes, comments, order and formatting are preserved. A
+link of the robot may consist of several links in the file that are fixed to each other. Of those that stay
+physically consistent, the heaviest takes the whole change J − J₀ in pseudo-inertia. If none stays consistent,
+each J_k changes to E J_k Eᵀ, where E satisfies E J₀ Eᵀ = J. The edited text is checked before it is written.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ CHANGED = 1e-6
 SAME = 1e-6
 """Relative tolerance for parameters read back from a written file."""
 ORIENTATIONS = ("axisangle", "euler", "xyaxes", "zaxis")
-"""Attributes for the orientation of an inertial frame in MJCF, other than a quaternion."""
+"""Attributes for the orientation of an inertial frame in MJCF, apart from a quaternion."""
 
 
 class Change(NamedTuple):
@@ -54,7 +54,7 @@ class Change(NamedTuple):
 
 @dataclass(frozen=True)
 class WrittenRobot:
-    """The changed parameters, and descriptions of parameters that the format cannot represent."""
+    """The changed parameters, and descriptions of the parameters that the format cannot represent."""
 
     changes: tuple[Change, ...]
     losses: tuple[str, ...]
@@ -70,17 +70,17 @@ def write_robot(
     """Write the masses, inertias, damping, friction and armature of a robot into a copy of its file.
 
     Args:
-        robot: robot with the parameters to write, and with the links and joints of the file.
-        source: URDF or MJCF file of the robot, or a bundled name.
-        out: path of the edited copy; it may be `source` itself.
-        locked_joints: as for `load_robot`.
+        robot: the robot with the parameters to write. It must have the links and joints of the file.
+        source: the URDF or MJCF file of the robot, or the name of a bundled robot.
+        out: path of the edited copy, which may be `source` itself.
+        locked_joints: see `load_robot`.
 
     Returns:
         The changed parameters, and the parameters that the format cannot represent.
 
     Raises:
         RobotFileError: the joints differ from those in the file, an element to change is in an included file,
-            no link can take a change, or the written file would not describe the robot.
+            no link can take a change, or the written file would not represent the robot.
 
     Example:
         >>> import tempfile, forcegp
@@ -114,7 +114,7 @@ def write_robot(
 
 
 def is_mjcf(source: str | Path) -> bool:
-    """Return whether a robot file is MJCF (which supports armature) rather than URDF."""
+    """Return whether a robot file is MJCF, which supports armature, rather than URDF."""
     path = robot_path(source)
     return parse_xml(read_bytes(path), str(path)).tag == "mujoco"
 
@@ -166,7 +166,7 @@ _PLACES = (0, 1, 2, 0, 0, 1), (0, 1, 2, 1, 2, 2)
 
 
 class _Part(NamedTuple):
-    """A file link in a robot link: pose and pseudo-inertia J `(4, 4)` in it, and whether J is physical."""
+    """A link of the file, with its pose and its pseudo-inertia J `(4, 4)` in the robot link."""
 
     name: str
     pose: Tensor
@@ -190,7 +190,7 @@ def _parts(file: RobotModel, i: int, old: Mapping[str, Inertial | None]) -> list
 
 
 def _shared(parts: list[_Part], J_old: Tensor, J_new: Tensor, joint: str) -> dict[str, Inertial]:
-    """Return new inertias of links fixed to each other; one takes the whole change, or all take a share."""
+    """Return new inertias of links fixed to each other. One takes the whole change, or all take a share."""
     for part in parts:
         body = _body(part.pose, part.J + J_new - J_old)
         if body is not None and not inertia_error(body) and not (part.sound and inertia_doubt(body)):
@@ -206,7 +206,7 @@ def _shared(parts: list[_Part], J_old: Tensor, J_new: Tensor, joint: str) -> dic
         if all(body is not None and not inertia_error(body) for body in bodies.values()):
             return {name: body for name, body in bodies.items() if body is not None}
     raise RobotFileError(
-        f"no link of the file can take the change of inertia beyond joint {joint!r}",
+        f"no link in the file can absorb the change in inertia beyond joint {joint!r}",
         expected="links that stay physically consistent",
         got=", ".join(part.name for part in parts) or "no link with a name",
         hint="correct the <inertial> of these links, which is unphysical",
@@ -234,7 +234,7 @@ def _losses(robot: RobotModel, figures: Mapping[str, str]) -> tuple[str, ...]:
 
 
 def _check(robot: RobotModel, read: RobotModel, writer: _Urdf | _Mjcf) -> None:
-    """Compare a robot with the one read from the written text; raise `RobotFileError` if they differ."""
+    """Compare a robot with the robot read from the written text; raise `RobotFileError` if they differ."""
     for figure in ("mass", "com", "inertia", *writer.figures):
         wanted, got = getattr(robot, figure), getattr(read, figure)
         error = (wanted - got).abs().flatten(1).amax(-1) if wanted.ndim > 1 else (wanted - got).abs()
@@ -243,10 +243,10 @@ def _check(robot: RobotModel, read: RobotModel, writer: _Urdf | _Mjcf) -> None:
         wrong = (error > 10.0 * SAME * (size + floor)).nonzero()[:, 0].tolist()
         if wrong:
             raise RobotFileError(
-                f"{writer.label}: the file would not give joint {robot.joint_names[wrong[0]]!r} its {figure}",
+                f"{writer.label}: this would change the {figure} of joint {robot.joint_names[wrong[0]]!r}",
                 expected=wanted[wrong[0]].tolist(),
                 got=got[wrong[0]].tolist(),
-                hint="<compiler> settings such as boundmass, inertiafromgeom or settotalmass change figures",
+                hint="<compiler> settings such as boundmass, inertiafromgeom or settotalmass alter values",
             )
 
 

@@ -1,6 +1,6 @@
 """Comparison of predicted and logged trajectories: tip error over time, drift, and coverage of the bands.
 
-Split-conformal widening scales the bands so that they have their nominal coverage.
+The half-widths of the bands can be scaled by split-conformal prediction to reach their nominal coverage.
 """
 
 from __future__ import annotations
@@ -26,21 +26,21 @@ from forcegp.rollout.trajectory import Bands, Rollout
 def widening(values: Tensor, band: Bands, level: float) -> float:
     """Return the factor by which the half-widths of bands must be scaled to reach a coverage `level`.
 
-    The score of a trajectory is the factor for which a fraction `level` of its values is inside the band,
-    computed from the ratios |value − median| / (half-width on that side). The result is the ⌈(n + 1)
-    level⌉-th smallest of n scores. For a further trajectory exchangeable with these, a fraction `level` of
-    the values is then inside the band with probability at least `level`, however wrong the model is (Lei,
-    G'Sell, Rinaldo, Tibshirani, Wasserman, *Distribution-free predictive inference for regression*, JASA 113,
-    2018, section 2.2).
+    Each trajectory has a score, which is the factor at which a fraction `level` of its values lies inside the
+    band. The score follows from the ratios |value − median| / (half-width on that side). The result is the
+    ⌈(n + 1) level⌉-th smallest of n scores. For a further trajectory that is exchangeable with these, at
+    least a fraction `level` of the values lies inside the scaled band with probability `level` or more,
+    whether or not the model is correct (Lei, G'Sell, Rinaldo, Tibshirani, Wasserman, *Distribution-free
+    predictive inference for regression*, JASA 113, 2018, section 2.2).
 
     Args:
-        values: `(n, …)` observed values of n trajectories; missing values are NaN.
+        values: observed values of n trajectories, `(n, …)`. Missing values are NaN.
         band: the band for each value.
         level: nominal coverage, between 0 and 1.
 
     Returns:
-        The factor; infinite if there are too few trajectories (a level of 0.9 needs at least 9) or too few
-        samples of the model.
+        The factor, which is infinite if there are too few trajectories (a level of 0.9 requires at least 9)
+        or too few samples of the model.
 
     Example:
         >>> bands = Bands(torch.tensor([-1.0]), torch.tensor([1.0]), torch.tensor([0.0]))
@@ -58,7 +58,7 @@ def widening(values: Tensor, band: Bands, level: float) -> float:
 HORIZONS = (0.5, 1.0, 2.0, 5.0, 10.0)
 """Times after the start at which tip errors are reported [s]."""
 LEVEL = 0.9
-"""Default fraction of the samples that are inside a band."""
+"""Default fraction of the samples that lie inside a band."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -66,12 +66,12 @@ class Comparison:
     """Open-loop predictions of several models from the same logged states under the logged torques.
 
     Attributes:
-        system: robot and contacts of the log.
-        frame, point: frame of the tip, and its coordinates in that frame.
-        t: `(T,)` time since the start [s].
-        q: `(k, T, nq)` logged joint positions.
-        multiplier: `(k, T, n_contacts)` logged λ [N], or `None`.
-        predicted: rollouts with batch shape `(k,)`, by model.
+        system: the robot and the contacts of the log.
+        frame, point: the frame of the tip, and the coordinates of the tip in that frame.
+        t: time since the start, `(T,)` [s].
+        q: logged joint positions, `(k, T, nq)`.
+        multiplier: logged multipliers, `(k, T, n_contacts)` [N], or `None`.
+        predicted: rollouts with batch shape `(k,)`, keyed by model.
     """
 
     system: ConstrainedSystem
@@ -88,34 +88,35 @@ class Comparison:
         return kinematics.point_position(self.system.robot, self.q, self.frame, tuple(self.point))
 
     def predicted_tip(self, model: str) -> Tensor:
-        """Return the predicted position of the tip `(k, T, 3)` [m], which is NaN after a divergence."""
+        """Return the predicted position of the tip, `(k, T, 3)` [m], which is NaN after a divergence."""
         return self._whole(self.predicted[model].tip(self.frame, self.point))
 
     def sampled_tip(self, model: str) -> Tensor:
-        """Return the tip position in each function sample, `(S, k, T, 3)` [m]."""
+        """Return the position of the tip in each function sample, `(S, k, T, 3)` [m]."""
         return self._whole(self.predicted[model].need_samples().tip(self.frame, self.point))
 
     def tip_error(self, model: str) -> Tensor:
-        """Return the distance between predicted and logged tip `(k, T)` [m], infinite after a divergence."""
+        """Return the distance between the predicted and logged tip, `(k, T)` [m], ∞ after a divergence."""
         return (self.predicted_tip(model) - self.tip).norm(dim=-1).nan_to_num(torch.inf)
 
     def error_at(self, model: str, horizon: float) -> float:
-        """Return the tip error after `horizon` seconds, as a median over the starts [m].
+        """Return the tip error after `horizon` seconds, as the median over all starts [m].
 
         Raises:
             DataError: the comparison ends earlier.
         """
         if horizon > float(self.t[-1]) * (1.0 + 1e-9):
-            raise DataError("the comparison ends earlier", expected=f"{horizon} s", got=float(self.t[-1]))
+            raise DataError(
+                "the comparison ends before this time", expected=f"{horizon} s", got=float(self.t[-1])
+            )
         step = int((self.t - horizon).abs().argmin())
         return float(self.tip_error(model)[:, step].median())
 
     def coverage(self, model: str, level: float = LEVEL, inflation: float = 1.0) -> float:
-        """Return the fraction of tip coordinates inside the band, over all starts and all times except the
-        first.
+        """Return the fraction of tip coordinates inside the band, excluding the initial coordinates.
 
-        The band contains a fraction `level` of the samples; its half-widths are multiplied by `inflation`. On
-        a surface, only tangential coordinates are counted, since the constraint fixes the normal one.
+        The band contains a fraction `level` of the samples. Its half-widths are multiplied by `inflation`. On
+        a surface, only tangential coordinates are counted, since the constraint fixes the normal coordinate.
         """
         logged, band = self._tip_along(model, level)
         band = band.widened(inflation)
@@ -134,7 +135,7 @@ class Comparison:
         return logged[:, 1:], self.predicted[model].bands(sampled[:, :, 1:], level)
 
     def _tangents(self) -> Tensor:
-        """Return two orthonormal surface tangents at the logged tip `(k, T, 3, 2)`, or all three axes."""
+        """Return two orthonormal surface tangents at the logged tip, `(k, T, 3, 2)`, or all three axes."""
         contact = _tip_contact(self.system)
         if contact is None or contact.frame != self.frame:
             return torch.eye(3, dtype=self.q.dtype).expand(*self.q.shape[:-1], 3, 3)
@@ -142,7 +143,7 @@ class Comparison:
         return torch.linalg.svd(normal[..., None, :]).Vh.mT[..., 1:]
 
     def _whole(self, values: Tensor) -> Tensor:
-        """Extend values to the full duration, with NaN after the divergence of all trajectories."""
+        """Extend values to the full duration, with NaN after all trajectories have diverged."""
         missing = len(self.t) - values.shape[-2]
         return torch.nn.functional.pad(values, (0, 0, 0, missing), value=torch.nan)
 
@@ -171,14 +172,14 @@ def compare(
     """Simulate models in open loop from logged states under the logged torques.
 
     Args:
-        models: fitted models by name.
+        models: fitted models, keyed by name.
         data: a log in time order.
         duration: duration of each trajectory [s].
         starts: number of evenly spaced starts, or the row numbers of the starts.
-        samples: number of function samples, for models that support them.
-        system: robot and contacts of the log; by default, those of the first model.
-        options: options for the rollouts; by default, diverged rollouts are kept up to their divergence.
-        progress: called during the rollouts.
+        samples: number of function samples for models that support them.
+        system: the robot and the contacts of the log. The default is the system of the first model.
+        options: options for the rollouts. By default, diverged rollouts are kept up to their divergence.
+        progress: a function called during the rollouts.
 
     Raises:
         DataError: the log is too short or not in time order.
@@ -201,7 +202,7 @@ def compare(
 
 
 def beside_log(name: str, predicted: Rollout, log: Dataset, dt: float) -> Comparison:
-    """Return a comparison of a log with a rollout from its first row, both with the period dt [s]."""
+    """Compare a log with a rollout from its first row. Both have the period dt [s]."""
     rows = torch.arange(len(log))[None]
     return _beside(predicted.system, log, rows, dt, {name: predicted[None]})
 
@@ -222,7 +223,7 @@ def _period(data: Dataset) -> float:
 
 
 def _starts(data: Dataset, steps: int, starts: int | Tensor) -> Tensor:
-    """Return the given or evenly spaced start rows `(count,)`, each of which is followed by `steps` rows."""
+    """Return the given or evenly spaced start rows `(count,)`. Each is followed by at least `steps` rows."""
     count = starts if isinstance(starts, int) else len(starts)
     fits = torch.arange(max(len(data) - steps, 0))
     fits = fits[data.segment[fits] == data.segment[fits + steps]]
@@ -232,7 +233,7 @@ def _starts(data: Dataset, steps: int, starts: int | Tensor) -> Tensor:
             "the log is too short for the rollouts, or not in time order",
             expected=f"{count} starts with {steps} further samples in the same trajectory",
             got=f"{len(data)} samples, {len(fits)} such starts",
-            hint="a shorter duration, or a log that was not selected from",
+            hint="use a shorter duration, or the log before selection",
         )
     if not isinstance(starts, int):
         return starts

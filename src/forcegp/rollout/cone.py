@@ -1,9 +1,9 @@
-"""Sticking contacts in a rollout: the friction cone that limits sticking, and the arrest of sliding contacts.
+"""Sticking contacts in a rollout: their friction cone, and the stopping of sliding contacts.
 
 A contact sticks if the required tangential force λ_t is within its friction cone, which the model defines.
-The contact slides along d = −λ_t/|λ_t| if the model's friction at a velocity v d does not stop it,
-dᵀ(A_t q̈ − b_t) > 0, where v exceeds `stick_speed` and the speed scale of smoothed friction.
-Within a step, friction can stop a sliding contact but not reverse its motion.
+For a test, the model's friction is evaluated at a velocity v d along d = −λ_t/|λ_t|, where v exceeds
+`stick_speed` and the speed scale of smoothed friction. The contact slides along d if this friction does not
+stop it: dᵀ(A_t q̈ − b_t) > 0. Within a step, friction can stop a sliding contact but not reverse it.
 """
 
 from __future__ import annotations
@@ -35,12 +35,12 @@ def sticking_contacts(system: ConstrainedSystem, at: States, among: Container[st
 def sliding_away(
     system: ConstrainedSystem, at: States, multiplier: Tensor, slides: Tensor, speeds: Mapping[str, float]
 ) -> States:
-    """Return the states with given sticking contacts made to slide.
+    """Return the states after the given sticking contacts start to slide.
 
     Args:
         multiplier: multipliers λ `(n, m)` while the contacts stick.
-        slides: `(n, n_contacts)` bool, contacts that start to slide.
-        speeds: sliding speed of each contact, by name [m/s].
+        slides: mask `(n, n_contacts)` of the contacts that start to slide.
+        speeds: sliding speed of each contact [m/s], keyed by name.
     """
     eom, points = at.eom, dict(at.eom.contact_points)
     free = torch.zeros_like(eom.b, dtype=torch.bool)
@@ -76,15 +76,15 @@ def arrested(
     closed: Tensor,
     qd: Tensor,
 ) -> Tensor:
-    """Return the velocity `(n, nq)` after a step, stopping contacts that friction would otherwise reverse.
+    """Return the velocity `(n, nq)` after a step in which friction stops contacts but does not reverse them.
 
-    They are stopped by an inelastic impact on the tangential rows, q̇ ← q̇ − L A q̇.
+    Contacts are stopped by an inelastic impact on the tangential rows, q̇ ← q̇ − L A q̇.
 
     Args:
-        rough: contacts with friction.
+        rough: names of the contacts with friction.
         before, after: the equations of motion at the start and at the end of the step.
-        closed: `(n, n_contacts)` bool, contacts that are closed at both times.
-        qd: `(n, nq)` velocity after the step.
+        closed: mask `(n, n_contacts)` of the contacts that are closed at both times.
+        qd: velocity `(n, nq)` after the step.
     """
     A, stops = after.A, torch.zeros_like(closed[:, :1])
     for k, contact, rows in system.may_stick:

@@ -1,7 +1,7 @@
 """Times at which contacts open and close, located within a step.
 
 A closed contact opens when λ falls to zero, and an open contact closes when c falls to zero, as described in
-`constraints/unilateral.py`. The probability that contact is lost at a state is computed from the posterior
+`constraints/unilateral.py`. The probability that a contact opens at a state is computed from the posterior
 over the multiplier.
 """
 
@@ -18,11 +18,11 @@ from forcegp.rollout.inputs import ForwardModel
 from forcegp.rollout.law import Instant, RolloutProblem, State, Step
 
 MAX_EVENTS = 8
-"""Maximum number of events within a step; a contact that bounces to rest would have infinitely many."""
+"""Maximum number of events within a step. A contact that bounces to rest would have infinitely many."""
 LOCATION = 1e-9
-"""Magnitude of λ or c, relative to its value at the start of the step, at which an event is located."""
+"""An event is located when λ or c, relative to its value at the start of the step, falls below this value."""
 MAX_TRIALS = 40
-"""Maximum number of trials to locate an event; the Illinois variant of regula falsi needs about eight."""
+"""Maximum number of trials to locate an event. The Illinois variant of regula falsi needs about eight."""
 
 
 class ContactEvent(NamedTuple):
@@ -50,7 +50,7 @@ def _signal(problem: RolloutProblem, state: State, now: Instant) -> tuple[Tensor
 
 
 def switch(problem: RolloutProblem, state: State, crossed: Tensor) -> State:
-    """Open or close the contacts whose signals have crossed `(n, n_contacts)`, with impacts on closing."""
+    """Open or close the contacts whose signals have crossed zero, with an impact when a contact closes."""
     active = state.active ^ crossed
     landing = (crossed & active).any(-1)
     if not bool(landing.any()):
@@ -60,7 +60,7 @@ def switch(problem: RolloutProblem, state: State, crossed: Tensor) -> State:
 
 
 def settle(problem: RolloutProblem, state: State, end: Tensor) -> tuple[State, Instant, list[ContactEvent]]:
-    """Return the state at the start of a step, after contacts that pull are opened and those reached closed.
+    """Open contacts that pull, close contacts that touch, and return the state at the start of a step.
 
     The torque, and therefore λ, may jump at the start of a step.
     """
@@ -111,7 +111,7 @@ def _locate(
     signal: Tensor,
     crossed: Tensor,
 ) -> Tensor:
-    """Return the fraction `(n, 1)` of the step at which the first signal crosses zero; 1 if none does."""
+    """Return the fraction `(n, 1)` of the step at which the first signal crosses zero, or 1 if none does."""
 
     def smallest(values: Tensor) -> Tensor:
         return torch.where(crossed, values, torch.inf).amin(-1, keepdim=True)
@@ -149,10 +149,10 @@ def _listed(problem: RolloutProblem, state: State, crossed: Tensor) -> list[Cont
 def contact_loss_probability(
     model: ForwardModel, q: Tensor, qd: Tensor, tau: Tensor, *, active: Tensor | None = None
 ) -> Tensor:
-    """Return the probability `(*batch, m)` that λ < 0 at states `(*batch, nq)`, so that the contact opens.
+    """Return the probability `(*batch, m)` that λ < 0, so that the contact opens, at states `(*batch, nq)`.
 
-    P(λ < 0) = Φ(−μ/σ) for the multiplier's posterior N(μ, σ²), and 1 for an open contact. `active`
-    `(*batch, n_contacts)` bool selects the closed contacts, by default all.
+    P(λ < 0) = Φ(−μ/σ) for the posterior N(μ, σ²) of the multiplier, and 1 for an open contact. `active` is a
+    mask `(*batch, n_contacts)` of closed contacts. By default, all contacts are closed.
 
     Raises:
         ModelError: the model does not predict the variance of the multiplier.

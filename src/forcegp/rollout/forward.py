@@ -1,4 +1,4 @@
-"""Long-term predictions: integration of a model, or of any force law, from initial states (section 4)."""
+"""Long-term predictions by integrating a model, or any other acceleration law (section 4)."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ from forcegp.rollout.trajectory import FIELDS, DivergedError, Rollout
 STEP = 1.0 / 240.0
 """Step size of a rollout under a feedback law in continuous time [s]."""
 CLOSED = 5e-4
-"""Constraint error below which a contact that can open is initially closed [m]: larger than the drift of a
-logged contact, but smaller than a distance at which the tip would be considered off the surface.
+"""A contact that can open is initially closed if its constraint error is below this value [m]. The value is
+larger than the drift of a logged contact, but smaller than the distance of a tip that is off the surface.
 """
 STEPS_PER_STATE = 4
-"""Number of recorded steps that need as much memory as the equations of motion at one state (measured)."""
+"""Number of recorded steps that need as much memory as the equations of motion at one state, as measured."""
 FEW = 8
-"""Number of trajectories up to which one thread is used, since more threads are slower on small tensors."""
+"""Number of trajectories up to which one thread is used. More threads are slower on small tensors."""
 
 COMPILED_STEPS = 1000
-"""Number of steps from which compiled mechanics save more time than their compilation takes."""
+"""Number of steps above which compiled mechanics save more time than their compilation takes."""
 STABILIZATIONS = ("none", "baumgarte", "projection")
 ON_DIVERGENCE = ("raise", "keep")
 
@@ -42,22 +42,22 @@ class RolloutOptions:
     """Options for a rollout.
 
     Args:
-        dt: step size, output period, and sampling period of torques passed as an array [s]. By default, the
-            sampling period of a log or controller, and 1/240 s for a feedback law; an array requires `dt`.
-        method: `semi_implicit_euler` (the method of the simulators), `rk4`, or SciPy's `rk45` and `dop853`,
-            which are adaptive within each step.
-        stabilization: `none`, `baumgarte` (the terms of the system, or the default terms), custom
-            `Baumgarte` terms, or `projection` of q and q̇ onto the manifold after each step.
-        unilateral: whether contacts with a surface open when they would pull, and can close again.
+        dt: step size, output period, and sampling period of torques passed as an array [s]. The default is
+            the period of a log or controller, and 1/240 s for a feedback law. An array requires `dt`.
+        method: `semi_implicit_euler` (the method of the simulators), `rk4`, or SciPy's adaptive `rk45` and
+            `dop853`, which choose their steps within each output period.
+        stabilization: `none`, `baumgarte` (the terms of the system, or default terms), custom `Baumgarte`
+            terms, or `projection`, which projects q and q̇ onto the manifold after each step.
+        unilateral: whether contacts with a surface open when they would pull, and may close again.
         interpolation: interpolation of a torque array between samples, `hold` or `linear`.
         speed_limit: joint speed above which a trajectory counts as diverged [rad/s, m/s].
-        torque_noise: whether each function sample has independent torque noise, if the model has learned the
-            noise of logged torques, and independent unknown forces, constant over a trajectory, if their size
-            is given.
-        sticking: whether dry joint friction (from the robot file, or from a prior such as
-            `JointFrictionPrior`) holds a joint at rest while the net force is within the friction limit. If
-            not, friction is a smooth function of the velocity, and joints creep.
-        on_divergence: `raise` a `DivergedError` that contains the trajectories, or `keep` the trajectories.
+        torque_noise: whether each function sample has independent torque noise and independent unknown
+            forces. The noise requires a model that has learned the noise of logged torques. The unknown
+            forces are constant over a trajectory, and are used if their size is given.
+        sticking: whether dry joint friction, from the robot file or from a prior such as
+            `JointFrictionPrior`, holds a joint at rest while the net force is within the friction limit.
+            Otherwise, friction is a smooth function of the velocity, and joints creep.
+        on_divergence: `raise` raises a `DivergedError` that contains the trajectories, and `keep` keeps them.
 
     Example:
         >>> RolloutOptions(method="rk4", stabilization="projection", dt=0.002).method
@@ -116,22 +116,22 @@ def rollout(
     """Integrate q̈ = law(q, q̇, τ) from initial states.
 
     With fixed-step methods, the result is differentiable with respect to the initial state, the torques and
-    the parameters of the robot, as long as no contact opens or closes.
+    the parameters of the robot, provided that no contact opens or closes.
 
     Args:
-        law: function that returns the acceleration.
-        system: robot and contacts.
-        q0, qd0: `(*batch, nq)` initial states.
-        tau: motor torque Q_u over time (a log, or an array with its sampling period in `options`), or as a
+        law: the law that gives the acceleration.
+        system: the robot and its contacts.
+        q0, qd0: initial states, `(*batch, nq)`.
+        tau: motor torque Q_u. It is a log, an array over time with its sampling period in `options`, or a
             function of (t, q, q̇).
         duration: simulated time [s], rounded to whole steps.
-        active: `(*batch, n_contacts)` bool, initially closed contacts; by default all or, if contacts can
-            open, those that touch their surface.
+        active: mask `(*batch, n_contacts)` of initially closed contacts. By default, all contacts are closed
+            or, if contacts can open, those that touch their surface.
         options: options such as step size, method and stabilization.
-        progress: called after each step.
+        progress: a function called after each step.
 
     Raises:
-        DivergedError: a trajectory diverged; the error contains the result.
+        DivergedError: a trajectory diverged. The error contains the result.
         ShapeError: an argument does not match the robot.
         ModelError: contacts can open but the law has no multiplier, or the torques have no sampling period.
     """
@@ -157,22 +157,22 @@ def rollout_model(
     """Return the mean motion of a model, and its motions under functions drawn from the posterior.
 
     Each sample is a deterministic force function, so its trajectories satisfy the constraint and Newton's
-    equations. If the model includes learned torque noise, independent noise is added to each sample
-    (`RolloutOptions.torque_noise`).
+    equations. If the model has learned the torque noise, independent noise is added to each sample (see
+    `RolloutOptions.torque_noise`).
 
     Args:
         model: a fitted model.
         q0, qd0, tau, duration, active, options, progress: see `rollout`.
         samples: number S of function samples, which are integrated together.
-        seed: seed for the samples.
+        seed: random seed for the samples.
         system: a different system, for example with a different surface or different robot parameters.
 
     Returns:
-        The mean motion; its attribute `samples` contains the sampled trajectories, batch `(S, *batch)`.
+        The mean motion. Its `samples` are the sampled trajectories, with batch shape `(S, *batch)`.
 
     Raises:
-        DivergedError: a trajectory diverged; the error contains the result.
-        ModelError: the model does not support function samples or other systems.
+        DivergedError: a trajectory diverged. The error contains the result.
+        ModelError: the model does not support function samples, or does not support other systems.
     """
     options = options or DEFAULT
     batch = torch.broadcast_shapes(q0.shape[:-1], qd0.shape[:-1])
@@ -202,7 +202,7 @@ def replayed(
     options: RolloutOptions,
     progress: Progress | None = None,
 ) -> Rollout:
-    """Simulate a model from the first state of a logged trajectory, under its torques and up to its end.
+    """Simulate a model from the first state of a logged trajectory to its end, under the logged torques.
 
     The other arguments are those of `rollout_model`.
     """
@@ -232,7 +232,7 @@ def _run(
     unilateral = options.unilateral and len(system.contacts) > 0
     if unilateral and not law.has_multiplier:
         raise ModelError(
-            "a model of accelerations only has no multiplier to detect the loss of contact",
+            "a model that predicts only accelerations cannot detect the loss of contact",
             hint="pass unilateral=False, or use a model with forces",
         )
     inputs = inputs_of(tau, whole if batch is None else batch, n, options.dt, options.interpolation)
@@ -288,7 +288,7 @@ def _touching(system: ConstrainedSystem, q: Tensor, qd: Tensor) -> Tensor:
 
 
 def share_of(progress: Progress | None, part: int, parts: int) -> Progress | None:
-    """Adapt a progress function for use in one of several runs of equal length."""
+    """Adapt a progress function for one of several runs of equal length."""
     if progress is None:
         return None
     return lambda done, total: progress(part * total + done, parts * total)

@@ -20,14 +20,14 @@ from forcegp.forces.quantities import ForceField
 
 INTERPOLATIONS = ("hold", "linear")
 EDGE = 1e-6
-"""Fraction of a sampling period within which a time counts as a sampling time, in view of rounding errors."""
+"""Fraction of a sampling period within which a time counts as a sampling time, to allow for rounding."""
 EVEN = 0.02
 """Largest relative deviation of a time step from the sampling period in a log that is replayed."""
 
 
 CompiledMotion = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor, bool], tuple[Tensor, ...]]
-"""From q, q̇, τ, closed contacts, step lengths h `(n, 1)` and whether joints stick: q̈, λ, constraint error and
-rate, and the joints held by friction, without gradients."""
+"""A function without gradients. It maps q, q̇, τ, closed contacts, step lengths h `(n, 1)` and whether joints
+may stick to q̈, λ, the constraint error and its rate, and the joints held by friction."""
 
 
 class ForwardModel(ABC):
@@ -39,21 +39,21 @@ class ForwardModel(ABC):
     """Whether `force_samples` draws functions from a posterior over forces."""
 
     system: ConstrainedSystem
-    """Robot and contacts to which predictions refer."""
+    """The robot and contacts to which predictions refer."""
 
     def force_field(self) -> ForceField | None:
-        """Return the mean impressed force Q̄ as a force field; `None` if only accelerations are modelled."""
+        """Return the mean impressed force Q̄ as a force field, or `None` if the model has no forces."""
         return None
 
     def force_samples(self, samples: int, generator: torch.Generator) -> ForceField:
-        """Return a force field with functions drawn from the posterior, which are evaluated together.
+        """Return a force field with several functions drawn from the posterior.
 
         Args:
             samples: number S of functions.
-            generator: source of randomness.
+            generator: random generator.
 
         Returns:
-            A force field on `(S * k, nq)` states; the s-th run of k states belongs to function s.
+            A force field on states `(S * k, nq)`. The s-th block of k states belongs to function s.
 
         Raises:
             ModelError: the model has no posterior over force functions.
@@ -68,7 +68,7 @@ class ForwardModel(ABC):
 
     @property
     def disturbance(self) -> Disturbance | None:
-        """Additional random forces in the rollouts of function samples, or `None`."""
+        """Random forces to be added in the rollouts of function samples, or `None`."""
         return None
 
     @abstractmethod
@@ -86,12 +86,12 @@ class ForwardModel(ABC):
 
 
 class Disturbance(NamedTuple):
-    """Additional random forces in the rollouts of function samples.
+    """Random forces to be added in the rollouts of function samples.
 
     Attributes:
         density: square root of the spectral density of the torque noise `(nq,)` [N m √s, N √s].
-        constant: standard deviation `(nq,)` of an unknown force on each joint [N m, N]. The force is constant
-            over the trajectory, since its variation is unknown.
+        constant: standard deviation `(nq,)` of an unknown force on each joint [N m, N]. Since its variation
+            over time is unknown, the force is constant over a trajectory.
     """
 
     density: Tensor
@@ -103,9 +103,9 @@ class Reached:
     """The current states of a rollout.
 
     Attributes:
-        system: robot and contacts.
-        q, qd: `(n, nq)` positions and velocities.
-        active: `(n, n_contacts)` bool, closed contacts.
+        system: the robot and its contacts.
+        q, qd: positions and velocities, `(n, nq)`.
+        active: mask `(n, n_contacts)` of closed contacts.
     """
 
     system: ConstrainedSystem
@@ -124,7 +124,7 @@ class Inputs(ABC):
 
     @property
     def period(self) -> float | None:
-        """Sampling period [s]; `None` for a continuous-time law."""
+        """Sampling period [s], or `None` for a continuous-time law."""
         return None
 
     @abstractmethod
@@ -132,21 +132,20 @@ class Inputs(ABC):
         """Return the motor torque Q_u `(n, nq)` [N m].
 
         Args:
-            t: `(n, 1)` time [s].
-            end: `(n, 1)` end of the current step [s]; if the torque jumps at t = end, the value before the
+            t: time, `(n, 1)` [s].
+            end: end of the current step, `(n, 1)` [s]. If the torque jumps at `end`, the value before the
                 jump is returned.
-            at: current states with their equations of motion.
+            at: the current states with their equations of motion.
         """
 
 
 Torque = Tensor | Dataset | Inputs | Callable[[Tensor, Tensor, Tensor], Tensor]
-"""An array over time `(samples, nq)` or `(*batch, samples, nq)`, a log, `Inputs`, or a function of
-(t, q, q̇)."""
+"""An array `(samples, nq)` or `(*batch, samples, nq)`, a log, `Inputs`, or a function of (t, q, q̇)."""
 
 
 @dataclass(frozen=True)
 class Sampled(Inputs):
-    """Torques `(n or 1, samples, nq)` with period dt [s], held or interpolated; the last torque is held."""
+    """Torques `(n or 1, samples, nq)` with period dt [s], held or interpolated. The last torque is held."""
 
     values: Tensor
     dt: float
@@ -185,7 +184,7 @@ class Feedback(Inputs):
 
 @dataclass(frozen=True)
 class Disturbed(Inputs):
-    """Inputs with additive noise `(n, steps, nq)` [N m], in which each value is held for dt [s]."""
+    """Inputs with additive noise `(n, steps, nq)` [N m]. Each value of the noise is held for dt [s]."""
 
     inputs: Inputs
     noise: Tensor
@@ -214,8 +213,8 @@ class Disturbed(Inputs):
 class TaskSpaceControl(Inputs):
     """The simulator's task-space controller, which tracks a plan with sampling period dt [s].
 
-    The controller uses the analytical mechanics of `system`. `limit` `(nq,)` contains the torque limits
-    [N m], by default those of the robot.
+    The controller uses the analytical mechanics of `system`. `limit` contains the torque limits `(nq,)` [N
+    m], which are those of the robot by default.
     """
 
     system: ConstrainedSystem
@@ -241,7 +240,7 @@ class TaskSpaceControl(Inputs):
 def inputs_of(
     tau: Torque, batch: torch.Size, rows: int, dt: float | None, interpolation: str = "hold"
 ) -> Inputs:
-    """Return the inputs defined by `tau` for `rows` trajectories, a multiple of the batch size.
+    """Return the inputs that `tau` defines for `rows` trajectories, a multiple of the batch size.
 
     `tau` is an array `(*batch, samples, nq)` or `(samples, nq)` with period dt [s], a log, a feedback law of
     (t, q, q̇), or `Inputs`. A single sample is a constant torque. `interpolation` is `"hold"` or `"linear"`.
@@ -250,7 +249,7 @@ def inputs_of(
         UnknownNameError: the interpolation is unknown.
         ShapeError: the array does not match the initial states.
         ModelError: the sampling period of an array is missing.
-        DataError: the log is not one trajectory with a constant sampling period.
+        DataError: the log is not a single trajectory with a constant sampling period.
     """
     if interpolation not in INTERPOLATIONS:
         raise UnknownNameError("interpolation", interpolation, INTERPOLATIONS)
@@ -282,10 +281,10 @@ def inputs_of(
 
 
 def sampling_period(log: Dataset) -> float:
-    """Return the sampling period of a log with one trajectory [s], computed from its time column.
+    """Return the sampling period [s] of a log with one trajectory, computed from the logged times.
 
     Raises:
-        DataError: the rows are out of order or a selection, or the log has several trajectories or gaps.
+        DataError: the rows are not in order or not consecutive, or the log has several trajectories or gaps.
     """
     steps = log.t.diff()
     period = float(log.t[-1] - log.t[0]) / max(len(steps), 1)

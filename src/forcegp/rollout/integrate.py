@@ -1,7 +1,6 @@
 """Integration of a rollout over time: the methods for one step, and the loop over all steps.
 
-The methods are semi-implicit Euler, fourth-order Runge-Kutta, and the adaptive methods of SciPy with error
-control.
+The methods for one step are semi-implicit Euler, fourth-order Runge-Kutta, and the adaptive methods of SciPy.
 """
 
 from __future__ import annotations
@@ -21,7 +20,7 @@ from forcegp.rollout.law import REGULARIZATION, STILL, Instant, RolloutProblem, 
 from forcegp.rollout.trajectory import Divergence, Rollout
 
 Progress = Callable[[int, int], None]
-"""Called with the number of completed steps and their total number."""
+"""A function called with the number of completed steps and the total number."""
 
 RELATIVE_TOLERANCE = 1e-9
 ABSOLUTE_TOLERANCE = 1e-11
@@ -50,16 +49,15 @@ def runge_kutta_4(problem: RolloutProblem, state: State, first: Instant, h: Tens
 
 
 def adaptive(method: str) -> Step:
-    """Return a step function that uses an adaptive method of `scipy.integrate` with error control.
+    """Return a step function that uses an adaptive method of `scipy.integrate`.
 
-    All rows share the internal steps. Time is normalised to run from 0 to 1, since the rows may have steps of
-    different length.
+    All rows share the internal steps. Time runs from 0 to 1, since the rows may have different step lengths.
     """
 
     def step(problem: RolloutProblem, state: State, first: Instant, h: Tensor) -> State:
         if first.qdd.requires_grad:
             raise ModelError(
-                f"{method} has no gradients",
+                f"{method} does not support gradients",
                 expected="one of semi_implicit_euler, rk4",
                 hint="or call it under torch.no_grad()",
             )
@@ -89,7 +87,7 @@ METHODS: dict[str, Step] = {
     "rk45": adaptive("RK45"),
     "dop853": adaptive("DOP853"),
 }
-"""Integration methods by name."""
+"""Integration methods, keyed by name."""
 
 
 @dataclass
@@ -127,11 +125,11 @@ def integrate(
     speed_limit: float,
     progress: Progress | None = None,
 ) -> Rollout:
-    """Integrate n trajectories over steps of dt [s], dropping those that diverge.
+    """Integrate n trajectories over steps of length dt [s], dropping trajectories that diverge.
 
     If `project` is true, position and velocity are projected onto the manifold after each step. A trajectory
-    with a joint faster than `speed_limit` [rad/s, m/s] counts as diverged. The result has batch shape `(n,)`
-    and is shorter if all trajectories diverge.
+    counts as diverged if a joint is faster than `speed_limit` [rad/s, m/s]. The result has batch shape
+    `(n,)`. It is shorter than requested if all trajectories diverge.
     """
     record, state, step = _Record(), start, _stopping(step)
     alive = torch.ones(len(start.q), dtype=torch.bool, device=start.q.device)
@@ -169,7 +167,7 @@ def integrate(
 
 
 def _stopping(step: Step) -> Step:
-    """Wrap a step function so that contacts and joints stopped by friction are at rest after the step."""
+    """Wrap a step function such that contacts and joints stopped by friction are at rest after the step."""
 
     def stopped(problem: RolloutProblem, state: State, first: Instant, h: Tensor) -> State:
         reached = problem.stopped(state, step(problem, state, first, h))
@@ -185,9 +183,9 @@ def _stopping(step: Step) -> Step:
 
 
 def _braked(problem: RolloutProblem, state: State, held: Tensor) -> State:
-    """Return the state after the friction impulse that stops the `held` joints.
+    """Return the state after the friction impulse that stops the joints in `held`.
 
-    The impulse also changes the speed of other joints, since stopping a joint alone could add kinetic energy.
+    The impulse also changes the speed of other joints. Stopping a joint alone could add kinetic energy.
     """
     G = problem.system.equations(state.q, state.qd, state.active).H
     eye = torch.eye(G.shape[-1], dtype=G.dtype, device=G.device)
@@ -199,7 +197,7 @@ def _braked(problem: RolloutProblem, state: State, held: Tensor) -> State:
 def _survivors(
     record: _Record, before: State, after: State, alive: Tensor, speed_limit: float
 ) -> tuple[State, Tensor]:
-    """Return the state after a step, with diverged trajectories kept at their previous state."""
+    """Return the state after a step, with diverged trajectories held at their previous state."""
     sound = torch.isfinite(after.q).all(-1) & (after.qd.abs().amax(-1) < speed_limit)
     if bool(sound.all()):
         return after, alive

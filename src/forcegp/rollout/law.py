@@ -1,22 +1,22 @@
-"""The right-hand side of a rollout: states, laws for the acceleration, and sticking joints.
+"""The right-hand side of a rollout: states, acceleration laws, and sticking joints.
 
-Dry friction is within ±F if a joint is at rest, and equals −F sign(q̇) if it slides. For learning and
-differentiation, the equations of motion smooth it to −F tanh(q̇/v₀); a rollout uses the original law. Let Q(s)
-be the force in which the direction s of dry friction replaces tanh(q̇/v₀) for each joint. Then
+Dry friction lies within ±F if a joint is at rest, and equals −F sign(q̇) if the joint slides. For learning
+and differentiation, the equations of motion smooth it to −F tanh(q̇/v₀). A rollout uses the original law. Let
+Q(s) be the force in which the direction s of dry friction replaces tanh(q̇/v₀) for each joint. Then
 
     Q = ½ (Q(1) + Q(−1)) − F s,   F = ½ (Q(−1) − Q(1)).
 
 Over a step h, dry joint friction p changes the velocity to q̇⁺ = q̇ + h (q̈₀ + G p), where q̈₀ is the
 frictionless acceleration. Friction satisfies |p_i| ≤ F_i, and p_i = −F_i sign(q̇⁺_i) if the joint slides
 (Stewart and Trinkle, *An implicit time-stepping scheme for rigid body dynamics with inelastic collisions and
-Coulomb friction*, 1996). In contact, G = H, so the contact force depends on the friction of sticking joints.
-Block principal pivoting solves this complementarity problem exactly (Júdice and Pires, *A block principal
-pivoting algorithm for large-scale strictly monotone linear complementarity problems*, 1994): it guesses which
-joints stick, solves for their friction, and exchanges the joints that contradict the guess.
+Coulomb friction*, 1996). In contact, G = H, so that the contact force depends on the friction of sticking
+joints. Block principal pivoting solves this complementarity problem exactly (Júdice and Pires, *A block
+principal pivoting algorithm for large-scale strictly monotone linear complementarity problems*, 1994). It
+guesses which joints stick, solves for their friction, and exchanges joints that contradict the guess.
 
-If h G_ii D_i > 1 for a light joint with viscous friction D, an explicit step reverses the joint's motion, and
-above 2, it is unstable. Viscous friction is then evaluated at the end of the step instead of the start, q̈ =
-q̈₀ + G (p − h D q̈), as in MuJoCo's Euler integrator.
+Let D be the viscous friction of a joint with low inertia. If h G_ii D_i > 1, an explicit step reverses the
+motion of the joint, and above 2 it is unstable. Viscous friction is then evaluated at the end of the step
+instead of the start, q̈ = q̈₀ + G (p − h D q̈), as in MuJoCo's Euler integrator.
 """
 
 from __future__ import annotations
@@ -47,31 +47,30 @@ REGULARIZATION = 1e-10
 CONTRADICTION = 1e-9
 """Relative tolerance for forces beyond their limit and for motion against the direction of sliding."""
 BLOCK_TRIALS = 5
-"""Number of block exchanges without improvement before joints are exchanged one at a time."""
+"""Number of block exchanges without improvement after which joints are exchanged one at a time."""
 MAX_EXCHANGES = 300
-"""Maximum number of exchanges; arms need fewer than ten."""
+"""Maximum number of exchanges. Arms need fewer than ten."""
 INSTANT = 1e-12
-"""Step size that stands for an instant [s], over which every moving joint slides."""
+"""Step size that represents an instant [s], over which every moving joint slides."""
 STILL = 1e-8
-"""Speed up to which a joint counts as at rest [rad/s, m/s]; sticking joints creep due to rounding errors."""
+"""Speed up to which a joint counts as at rest [rad/s, m/s]. Sticking joints creep due to rounding errors."""
 SMOOTH = 0.02
-"""Speed scale on which learned "friction" that drives a joint, and so cannot stick, is smoothed [rad/s, m/s].
-"""
+"""Speed scale for smoothing learned "friction" that drives a joint, and so cannot stick [rad/s, m/s]."""
 SATURATED = 10.0
 """Speed, relative to the scale of smoothed Coulomb friction, above which a contact slides."""
 NUDGE = 1e-4
-"""Change in speed for computing the slope of friction [rad/s, m/s]."""
+"""Change in speed used to compute the slope of friction [rad/s, m/s]."""
 
 
 @dataclass(frozen=True, eq=False)
 class DryFriction:
-    """An impressed force separated into dry joint friction and other forces.
+    """An impressed force, separated into dry joint friction and all other forces.
 
     Attributes:
-        Q_bar: `(n, nq)` all other impressed forces [N m, N].
-        limit: `(n, nq)` largest magnitude F ≥ 0 of dry friction [N m, N].
-        response: `(n, nq, nq)` ∂Q̄/∂Q including Coulomb friction of contacts; `None` means the identity.
-        damping: `(n, nq)` damping D = −∂Q_i/∂q̇_i ≥ 0 of the remaining joint friction [N m s/rad, N s/m].
+        Q_bar: all other impressed forces, `(n, nq)` [N m, N].
+        limit: largest magnitude F ≥ 0 of dry friction, `(n, nq)` [N m, N].
+        response: ∂Q̄/∂Q including Coulomb friction at contacts, `(n, nq, nq)`. `None` means the identity.
+        damping: D = −∂Q_i/∂q̇_i ≥ 0 of the remaining joint friction, `(n, nq)` [N m s/rad, N s/m].
     """
 
     Q_bar: Tensor
@@ -90,7 +89,7 @@ def split(system: ConstrainedSystem, at: States, force: ForceField) -> DryFricti
     """Evaluate a force field at states, and separate the dry friction of joints.
 
     Args:
-        force: force field Q̄, which is a posterior mean, posterior samples, or a prior mean.
+        force: the force field Q̄, which is a posterior mean, posterior samples, or a prior mean.
 
     Example:
         >>> import torch, forcegp
@@ -131,9 +130,9 @@ class Stuck(NamedTuple):
     """Dry friction over a step.
 
     Attributes:
-        force: p `(n, nq)` [N m, N].
-        held: `(n, nq)` bool, joints at rest at the end of the step.
-        stopping: `(n, nq)` accelerations that bring the joints to rest at the end of the step.
+        force: dry friction p, `(n, nq)` [N m, N].
+        held: mask `(n, nq)` of the joints at rest at the end of the step.
+        stopping: accelerations that bring the joints to rest at the end of the step, `(n, nq)`.
     """
 
     force: Tensor
@@ -142,7 +141,7 @@ class Stuck(NamedTuple):
 
 
 def overshooting(G: Tensor, damping: Tensor, h: Tensor) -> Tensor | None:
-    """Return D `(n, nq)` at states with h G_ii D_i > 1 for a joint, and 0 at others; `None` if all are 0."""
+    """Return D `(n, nq)` where h G_ii D_i > 1 for any joint and 0 elsewhere, or `None` if all are 0."""
     rows = (h * G.diagonal(dim1=-2, dim2=-1) * damping > 1.0).any(-1, keepdim=True)
     return torch.where(rows, damping, 0.0) if bool(rows.any()) else None
 
@@ -163,16 +162,16 @@ def at_the_end(qdd: Tensor, G: Tensor, damping: Tensor, h: Tensor) -> tuple[Tens
 
 
 def compliance_of(G: Tensor) -> Tensor:
-    """Return the acceleration per force of each joint, G_ii `(n, nq)`, but at least 1/1000 of the largest."""
+    """Return the acceleration G_ii per unit force of each joint `(n, nq)`, at least 1/1000 of the largest."""
     diagonal = G.diagonal(dim1=-2, dim2=-1)
     return diagonal.clamp(min=1e-3 * diagonal.amax(-1, keepdim=True))
 
 
 def dry_friction_force(qdd: Tensor, G: Tensor, limit: Tensor, qd: Tensor, h: Tensor) -> Stuck:
-    """Return the dry friction of joints over a step h `(n, 1)` [s] (0 for an instant) from q̇ `(n, nq)`.
+    """Return the dry friction of joints with velocity q̇ `(n, nq)` over a step h `(n, 1)` [s].
 
-    `qdd` is the frictionless acceleration, `G` `(n, nq, nq)` the acceleration per unit friction (H or M⁻¹),
-    and `limit` `(n, nq)` the largest magnitude F ≥ 0 of friction [N m, N].
+    The step h is 0 for an instant. `qdd` is the frictionless acceleration, `G` `(n, nq, nq)` the acceleration
+    per unit friction (H or M⁻¹), and `limit` `(n, nq)` the largest magnitude F ≥ 0 of friction [N m, N].
 
     Raises:
         NumericalError: there is no solution because G is not positive definite.
@@ -221,13 +220,13 @@ def dry_friction_force(qdd: Tensor, G: Tensor, limit: Tensor, qd: Tensor, h: Ten
 
 
 class Law(ABC):
-    """A deterministic law for the acceleration of a constrained system."""
+    """A deterministic law that gives the acceleration of a constrained system."""
 
     has_multiplier: bool
 
     @abstractmethod
     def motion(self, system: ConstrainedSystem, at: States) -> tuple[Tensor, Tensor]:
-        """Return q̈ `(n, nq)` and λ `(n, m)` at states; λ is NaN if the law has no forces."""
+        """Return q̈ `(n, nq)` and λ `(n, m)` at states. λ is NaN if the law does not model forces."""
 
     def dry_friction(self, system: ConstrainedSystem) -> Callable[[States], DryFriction] | None:
         """Return a function that separates dry joint friction from the force, or `None` if there is none."""
@@ -235,7 +234,7 @@ class Law(ABC):
 
     @property
     def rough(self) -> Mapping[str, float]:
-        """Contacts with friction, and the speed above which each slides [m/s]."""
+        """Contacts with friction, and the speed above which each of them slides [m/s]."""
         return {}
 
     def knows_friction(self, system: ConstrainedSystem, at: States) -> bool:
@@ -282,7 +281,7 @@ class ForceLaw(Law):
 
 @dataclass(frozen=True)
 class AccelerationLaw(Law):
-    """A law in which a model predicts q̈, which need not satisfy the constraint."""
+    """An acceleration law given by a model that predicts q̈. The prediction may violate the constraint."""
 
     model: ForwardModel
     has_multiplier: bool = False
@@ -293,7 +292,7 @@ class AccelerationLaw(Law):
 
 
 def law_of(model: ForwardModel, system: ConstrainedSystem | None = None) -> Law:
-    """Return the law for a model's mean motion, using its force field if it has one, or its accelerations.
+    """Return the law for the mean motion of a model, based on its force field or else its accelerations.
 
     Raises:
         ModelError: a model that predicts only accelerations cannot predict the motion of a different system.
@@ -305,7 +304,7 @@ def law_of(model: ForwardModel, system: ConstrainedSystem | None = None) -> Law:
         system.robot is not trained.robot or [*system.contacts] != [*trained.contacts]
     ):
         raise ModelError(
-            f"this model ({model.kind}) predicts accelerations of the system that it was fitted on only",
+            f"this model ({model.kind}) predicts accelerations only for the system to which it was fitted",
             expected=_described(trained),
             got=f"another system: {_described(system)}",
             hint="omit `system`, or use a model of forces such as StructuredGP",
@@ -318,12 +317,12 @@ def _described(system: ConstrainedSystem) -> str:
 
 
 class State(NamedTuple):
-    """States of n trajectories; their times can differ because of events within a step.
+    """States of n trajectories. Their times may differ because of events within a step.
 
     Attributes:
-        t: `(n, 1)` time [s].
-        q, qd: `(n, nq)` positions and velocities.
-        active: `(n, n_contacts)` bool, closed contacts.
+        t: time, `(n, 1)` [s].
+        q, qd: positions and velocities, `(n, nq)`.
+        active: mask `(n, n_contacts)` of closed contacts.
     """
 
     t: Tensor
@@ -332,7 +331,7 @@ class State(NamedTuple):
     active: Tensor
 
     def where(self, rows: Tensor, other: State) -> State:
-        """Return this state in the given rows `(n,)`, and the `other` state in all others."""
+        """Return this state in the given rows `(n,)`, and the state `other` in all other rows."""
         return State(*(torch.where(rows[:, None], a, b) for a, b in zip(self, other, strict=True)))
 
 
@@ -340,9 +339,9 @@ class Instant(NamedTuple):
     """Motion at a state.
 
     Attributes:
-        tau, qdd: `(n, nq)` motor torque and acceleration.
-        multiplier, c, cd: `(n, m)` λ, constraint error and its rate.
-        held: `(n, nq)` bool, joints at rest at the end of the step; `None` without dry friction.
+        tau, qdd: motor torque and acceleration, `(n, nq)`.
+        multiplier, c, cd: λ, the constraint error and its rate, `(n, m)`.
+        held: mask `(n, nq)` of joints at rest at the end of the step, `None` without dry friction.
     """
 
     tau: Tensor
@@ -355,10 +354,10 @@ class Instant(NamedTuple):
 
 @dataclass(frozen=True)
 class RolloutProblem:
-    """q̈ = law(q, q̇, τ(t, q, q̇)) on a constrained system with the stabilization of the rollout.
+    """The equations q̈ = law(q, q̇, τ(t, q, q̇)) on a constrained system with the rollout's stabilization.
 
-    If `unilateral` is true, contacts with a surface can open and close; if `sticking` is true, dry friction
-    can hold joints. `compiled` computes the same motion in C and is used if no gradient is required.
+    If `unilateral` is true, contacts with a surface can open and close. If `sticking` is true, dry friction
+    can hold joints. If no gradient is required, `compiled` computes the motion in C.
     """
 
     system: ConstrainedSystem
@@ -372,18 +371,18 @@ class RolloutProblem:
 
     @cached_property
     def rough(self) -> Mapping[str, float]:
-        """Contacts with friction that may stick, and the speed above which each slides [m/s]."""
+        """Contacts with friction that may stick, and the speed above which each of them slides [m/s]."""
         speeds = {contact.name: contact.stick_speed or 0.0 for _, contact, _ in self.system.may_stick}
         known = self.law.rough if speeds else {}
         return {name: max(speeds[name], known[name]) for name in speeds if name in known}
 
     @cached_property
     def dry_friction(self) -> Callable[[States], DryFriction] | None:
-        """Function that separates dry joint friction from the force; `None` without dry friction."""
+        """Function that separates dry joint friction from the force, or `None` without dry friction."""
         return self.law.dry_friction(self.system) if self.sticking else None
 
     def evaluate(self, state: State, end: Tensor) -> Instant:
-        """Return the motion at a state within a step that ends at `end` `(n, 1)`."""
+        """Return the motion at a state within a step that ends at the time `end`, `(n, 1)`."""
         at, h = Reached(self.system, state.q, state.qd, state.active), end - state.t
         tau = self.inputs.torque(state.t, end, at)
         if self.compiled is not None and not any(x.requires_grad for x in (state.q, state.qd, tau)):
@@ -413,7 +412,7 @@ class RolloutProblem:
         return after._replace(qd=arrested(self.system, self.rough, first, last, closed, after.qd))
 
     def _instant(self, at: States, h: Tensor) -> Instant:
-        """Return the motion at states, with friction for a step h `(n, 1)` [s]."""
+        """Return the motion at states, with friction evaluated over a step h `(n, 1)` [s]."""
         eom, tau = at.eom, at.tau
         if self.dry_friction is None:
             qdd, multiplier = self.law.motion(self.system, at)
@@ -434,4 +433,4 @@ class RolloutProblem:
 
 
 Step = Callable[[RolloutProblem, State, Instant, Tensor], State]
-"""Function that advances a state with known motion by step sizes h `(n, 1)` [s]."""
+"""A function that advances a state with known motion by steps h `(n, 1)` [s]."""

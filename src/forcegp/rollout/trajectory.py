@@ -1,4 +1,4 @@
-"""The result of a rollout: trajectories, drift, multipliers, contacts, and bands of the samples."""
+"""The result of a rollout: trajectories, drift, multipliers, contacts, and bands over the samples."""
 
 from __future__ import annotations
 
@@ -31,10 +31,10 @@ class Divergence(NamedTuple):
     """A trajectory that was dropped because it diverged.
 
     Attributes:
-        t: time of the last trustworthy state [s].
+        t: time of the last valid state [s].
         row: index of the trajectory in the flattened batch.
-        q, qd: state at that time.
-        reason: reason why the next state was rejected.
+        q, qd: the state at that time.
+        reason: the reason why the next state was rejected.
     """
 
     t: float
@@ -45,7 +45,7 @@ class Divergence(NamedTuple):
 
 
 class DivergedError(NumericalError):
-    """Raised if a trajectory of a rollout diverged; the attribute `rollout` contains the result."""
+    """Raised if a trajectory of a rollout diverged. The attribute `rollout` contains the result."""
 
     def __init__(self, diverged: Sequence[Divergence], rows: int, rollout: Rollout) -> None:
         self.rollout = rollout
@@ -63,8 +63,8 @@ class Bands(NamedTuple):
     """Pointwise quantiles over samples.
 
     Attributes:
-        lower, upper: bounds of the central band.
-        median: median of the samples.
+        lower, upper: the bounds of the central band.
+        median: the median of the samples.
     """
 
     lower: Tensor
@@ -72,25 +72,25 @@ class Bands(NamedTuple):
     median: Tensor
 
     def widened(self, inflation: float) -> Bands:
-        """Return the band with half-widths scaled by a factor."""
+        """Return the band with its half-widths scaled by a factor."""
         lower = self.median + inflation * (self.lower - self.median)
         return Bands(lower, self.median + inflation * (self.upper - self.median), self.median)
 
 
 @dataclass(frozen=True, eq=False, repr=False)
 class Rollout:
-    """Trajectories from a batch of initial states at T times, filled with NaN after a divergence.
+    """Trajectories from a batch of initial states at T times, with NaN after a divergence.
 
     Attributes:
-        system: robot and contacts, with the stabilization of the rollout.
-        t: `(T,)` time [s].
-        q, qd, qdd, tau: `(*batch, T, nq)` positions, velocities, accelerations and motor torques.
-        multiplier: `(*batch, T, m)` λ [N]; NaN if the model has no forces.
-        c, cd: `(*batch, T, m)` constraint error and its rate for all contacts, open or closed [m], [m/s].
-        active: `(*batch, T, n_contacts)` bool, closed contacts.
-        events: times at which contacts opened or closed.
+        system: the robot and its contacts, with the stabilization of the rollout.
+        t: time, `(T,)` [s].
+        q, qd, qdd, tau: positions, velocities, accelerations and motor torques, `(*batch, T, nq)`.
+        multiplier: λ, `(*batch, T, m)` [N], which is NaN if the model does not predict forces.
+        c, cd: constraint errors and their rates for open and closed contacts, `(*batch, T, m)` [m], [m/s].
+        active: mask of closed contacts, `(*batch, T, n_contacts)`.
+        events: the events at which contacts opened or closed.
         diverged: trajectories that were dropped.
-        samples: trajectories of function samples, with batch shape `(S, *batch)`.
+        samples: the trajectories of function samples, with batch shape `(S, *batch)`.
     """
 
     system: ConstrainedSystem
@@ -130,14 +130,14 @@ class Rollout:
 
         Args:
             quantity: `q`, `qd`, `qdd`, `tau`, `multiplier`, `c` or `cd`.
-            log: logged motion from the same start, for comparison.
-            joints: names of joints or contacts; by default all.
-            ax: matplotlib axes to draw on, one per panel; by default, a new figure is created.
+            log: the logged motion from the same start, for comparison.
+            joints: names of the joints or contacts. By default, all are plotted.
+            ax: matplotlib axes to draw on, one per panel. By default, a new figure is created.
 
         Raises:
             UnknownNameError: the quantity or joint does not exist.
-            ParameterError: there are several trajectories (select one: `rollout[0].plot()`), or the number of
-                axes is wrong.
+            ParameterError: there are several trajectories (select one, as in `rollout[0].plot()`), or the
+                number of axes is wrong.
         """
         from forcegp.plots import MEASURED, PREDICTED, Curve, Panel, Timeline, axis_label, chosen, draw_panels
 
@@ -176,19 +176,19 @@ class Rollout:
 
     @property
     def drift(self) -> Tensor:
-        """Constraint error c(q) of closed contacts, and 0 for open contacts, `(*batch, T, m)` [m]."""
+        """Constraint error c(q), `(*batch, T, m)` [m], which is set to 0 for open contacts."""
         rows = self.system.active_rows(self.active, self.active.shape[:-1])
         return torch.where(rows, self.c, 0.0)
 
     def tip(self, frame: str, point: Sequence[float] = (0.0, 0.0, 0.0)) -> Tensor:
-        """Return the world position `(*batch, T, 3)` [m] of a point in a frame, NaN after a divergence."""
+        """Return the world position of a point in a frame, `(*batch, T, 3)` [m], NaN after a divergence."""
         return kinematics.point_position(self.system.robot, self.q, frame, tuple(point))
 
     def bands(self, values: Tensor, level: float = 0.9) -> Bands:
         """Return the central band of a quantity over function samples.
 
         Args:
-            values: `(S, …)` values such as `rollout.samples.multiplier`; NaN of diverged samples is ignored.
+            values: values `(S, …)` such as `rollout.samples.multiplier`. NaN in diverged samples is ignored.
             level: fraction of the samples inside the band, between 0 and 1.
         """
         tail = 0.5 * (1.0 - level)
@@ -217,7 +217,7 @@ class Rollout:
         return lost.to(self.q.dtype).mean(0)
 
     def __getitem__(self, index: object) -> Rollout:
-        """Return the trajectories of selected batch members; events keep their row in the full batch."""
+        """Return the trajectories of the selected batch members. Events keep their row in the full batch."""
         chosen = {name: getattr(self, name)[index] for name in FIELDS}
         places = index if isinstance(index, tuple) else (index,)
         samples = None if self.samples is None else self.samples[(slice(None), *places)]

@@ -58,7 +58,7 @@ class Document:
         self._lines = _lines_of_keys(text)
 
     def validated(self, schema: type[Schema]) -> Schema:
-        """Convert the content to a pydantic model, or raise the first error with its line and key."""
+        """Convert the content to a pydantic model; raise the first error with its line and key."""
         # In JSON mode, strict validation accepts a list for a tuple and an integer for a float.
         try:
             return schema.model_validate_json(json.dumps(self.data, default=str))
@@ -70,7 +70,7 @@ class Document:
             raise self._error(schema, errors[0]) from error
 
     def at(self, key: Key, make: Callable[..., T], *args: object, **options: object) -> T:
-        """Return `make(*args, **options)`; errors are reported with the location of a key in this file."""
+        """Return `make(*args, **options)`. Errors are reported with the location of a key in this file."""
         with self.error.within(self.place(key)):
             return make(*args, **options)
 
@@ -115,7 +115,7 @@ class Document:
         return self.error(f"{place}: {error['msg'][0].lower()}{error['msg'][1:]}", got=repr(error["input"]))
 
     def _named(self, key: Key, message: str) -> Key:
-        """Return the key of the table entry that is named in a message, or else the key of the table."""
+        """Return the key of the table entry that a message names, or else the key of the table."""
         table: Any = self.data
         for part in key:
             members: Any = dict(enumerate(table)) if isinstance(table, list) else table
@@ -126,7 +126,7 @@ class Document:
 
 
 def _check_keys(text: str, source: str, error: type[ForceGPError]) -> None:
-    """Check the number of keys and the number of parts of each key, in which parsing time is quadratic."""
+    """Check the number of keys and the number of parts of each key. Parsing time is quadratic in both."""
     keys = text.count("=") + len(_BRACKET.findall(text))
     if keys > SCENE_KEYS:
         raise error(f"{source}: too many keys and tables", expected=f"at most {SCENE_KEYS}", got=keys)
@@ -184,7 +184,7 @@ def _split(name: str) -> Key:
 
 
 def _lines_of_keys(text: str) -> dict[Key, int]:
-    """Return the line of each table and key; keys of an inline table are assigned the line of that table."""
+    """Return the line of each table and key. Keys of an inline table have the line of that table."""
     lines: dict[Key, int] = {}
     counts: dict[Key, int] = {}
     table: Key = ()

@@ -20,7 +20,7 @@ from forcegp.simulate.config import SimulationConfig
 
 FOLDER = Path(str(files("forcegp.scene") / "bundled"))
 BUNDLED = tuple(sorted(path.stem for path in FOLDER.glob("*.toml")))
-"""Names of the bundled scenes; `kuka_plane` is the task in the paper."""
+"""Names of the bundled scenes. `kuka_plane` is the task in the paper."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class ModelTable:
 
 @dataclass(frozen=True)
 class Scene:
-    """A validated scene file; its paths are relative to `folder`."""
+    """A validated scene file. Its paths are relative to `folder`."""
 
     sections: SceneSections
     document: Document
@@ -56,7 +56,7 @@ class Scene:
         return named if named in BUNDLED_ROBOTS else self.folder / named
 
     def robot(self, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu") -> RobotModel:
-        """Return the robot; a `SceneError` names the key and line of an invalid entry."""
+        """Return the robot; raise a `SceneError` that names the key and line of an invalid entry."""
         section, source = self.sections.robot, self.robot_source
         if isinstance(source, Path) and not is_file(source):
             raise SceneError(
@@ -71,7 +71,7 @@ class Scene:
     def system(
         self, dtype: torch.dtype = torch.float64, device: torch.device | str = "cpu"
     ) -> ConstrainedSystem:
-        """Return the robot with its contacts; a `SceneError` names the key and line of an invalid entry."""
+        """Return the robot with its contacts; raise a `SceneError` that locates an invalid entry."""
         robot, sections, at = self.robot(dtype, device), self.sections, self.document.at
         tables = [(("contact", i), table) for i, table in enumerate(sections.contact)]
         tables += [(("connection", i), table) for i, table in enumerate(sections.connection)]
@@ -82,16 +82,16 @@ class Scene:
 
 
 def load_scene(source: str | Path) -> Scene:
-    """Read a scene file by path, or by name if it is one of the `BUNDLED` scenes.
+    """Read a scene file by path, or a bundled scene by name.
 
-    The robot file is not read yet.
+    The robot file is not read at this point.
 
     Example:
         >>> load_scene("kuka_plane").system().contact_names
         ('table',)
 
     Raises:
-        SceneError: the scene does not exist or is invalid; the message names the file, line and key.
+        SceneError: the scene does not exist or is invalid. The message names the file, line and key.
     """
     bundled = str(source) in BUNDLED
     path = FOLDER / f"{source}.toml" if bundled else Path(source)

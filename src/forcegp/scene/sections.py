@@ -1,7 +1,7 @@
 """Schemas of the tables in a scene file.
 
 The keys are constructor parameters of the class that a table describes, or fields of saved models. Keys that
-are missing in `[model]` take the default values of the model.
+are missing from `[model]` take the default values of the model.
 """
 
 from __future__ import annotations
@@ -21,18 +21,18 @@ class Section(Record, strict=True):
     """A table of a TOML file."""
 
     def given(self) -> dict[str, Any]:
-        """Return the keys present in the file with their values."""
+        """Return the keys that are present in the file, with their values."""
         return {name: getattr(self, name) for name in self.model_fields_set}
 
 
 State = NonNegativeFloat | tuple[NonNegativeFloat, ...]
-"""Standard deviation of the noise in positions or velocities: a single number, or one number per joint."""
+"""Standard deviation of the noise in positions or velocities, as a single number or one number per joint."""
 
 
 class LearningSection(Section):
     """`[model.learning]`: fields of `LearningOptions`, or of `BatchOptions` for models trained on batches.
 
-    If `warm_start = false`, all samples are used from the start.
+    If `warm_start` is false, all samples are used from the start.
     """
 
     optimizer: Literal["lbfgs", "adam"] = "lbfgs"
@@ -51,7 +51,7 @@ class LearningSection(Section):
 
 
 class NoiseSection(Section):
-    """`[model.noise]`: fields of `Noise`; `torque = "none"` means that torques are exact."""
+    """`[model.noise]`: fields of `Noise`. `torque = "none"` means that torques are exact."""
 
     acceleration: NonNegativeFloat | tuple[NonNegativeFloat, ...] | None = None
     learn: bool = False
@@ -62,7 +62,7 @@ class NoiseSection(Section):
 
 
 class ModelSection(Section, StructuredOptions):
-    """`[model]`: options of models, and the additional keys used by `forcegp.models.configured`."""
+    """`[model]`: options of models, and the additional keys that `forcegp.models.configured` uses."""
 
     name: str | None = None
     noise: NoiseSection = NoiseSection()
@@ -83,7 +83,7 @@ class ModelSection(Section, StructuredOptions):
 
 
 def _tuples(value: Any) -> Any:
-    """Convert lists to tuples, because strict validation after a Python validator rejects lists."""
+    """Convert lists to tuples, since strict validation after a Python validator rejects lists."""
     if isinstance(value, dict):
         return {key: _tuples(part) for key, part in value.items()}
     return tuple(map(_tuples, value)) if isinstance(value, list) else value
@@ -96,7 +96,7 @@ class ModelFile(Section):
 
 
 class RobotSection(Section):
-    """`[robot]`: arguments of `forcegp.load_robot`; a path is relative to the folder of the scene file."""
+    """`[robot]`: arguments of `forcegp.load_robot`. A path is relative to the folder of the scene file."""
 
     model: str
     base_position: Point = (0.0, 0.0, 0.0)
@@ -106,15 +106,15 @@ class RobotSection(Section):
 
 
 class ContactSection(ContactFields, strict=True):
-    """`[[contact]]`: a point on the robot, or a ball of the given `radius` around it, and a surface."""
+    """`[[contact]]`: a surface, and a point on the robot or a ball of the given `radius` around it."""
 
 
 class ConnectionSection(ConnectionFields, strict=True):
-    """`[[connection]]`: two coincident points, the second fixed in the world if `other_frame` is omitted."""
+    """`[[connection]]`: two coincident points. Without `other_frame`, the second is fixed in the world."""
 
 
 class SceneSections(Section):
-    """All tables of a scene file; constraints are stabilized only if there is a `[baumgarte]` table."""
+    """All tables of a scene file. Constraints are stabilized only if there is a `[baumgarte]` table."""
 
     robot: RobotSection
     contact: tuple[ContactSection, ...] = ()

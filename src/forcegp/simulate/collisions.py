@@ -16,11 +16,11 @@ from forcegp.errors import ParameterError, optional_module
 from forcegp.robot.model import BASE, RobotModel
 from forcegp.robot.shapes import Shape
 from forcegp.simulate.contact_solver import geometry_of, tip_of
-from forcegp.simulate.urdf import link_name, write_urdf
+from forcegp.simulate.urdf import compile_spec, link_name, write_urdf
 from forcegp.types import Array
 
 POSITIONS, MOST = 200, 0.5
-"""Number of random positions, and fraction of overlaps in these positions above which a pair is ignored."""
+"""Number of random positions; fraction of these positions in which a pair must overlap to be ignored."""
 TIP = 0.005
 """Tip radius for point contacts [m]."""
 SURROUNDINGS = "surroundings"
@@ -30,9 +30,9 @@ class Collisions:
     """Collisions of the parts of a robot with each other and with their surroundings, given a clearance.
 
     Args:
-        system: robot, and contacts with surfaces to avoid.
-        shapes: convex parts of the robot.
-        boxes: `(k, 6)` centres and side lengths of boxes that are aligned with the world axes [m].
+        system: the robot, and contacts with the surfaces to avoid.
+        shapes: the convex parts of the robot.
+        boxes: centres and side lengths of boxes aligned with the world axes, `(k, 6)` [m].
         clearance: minimum distance [m].
 
     Raises:
@@ -67,7 +67,7 @@ class Collisions:
             link, position, radius = tip_of(robot, contact, TIP)
             body = spec.worldbody if link == BASE else spec.body(link_name(robot, link))
             body.add_geom(type=mujoco.mjtGeom.mjGEOM_SPHERE, size=[radius, 0, 0], pos=position, **common)
-        self._model = model = spec.compile()
+        self._model = model = compile_spec(spec, robot)
         # The distances of additional contacts of a pair are only approximate.
         model.opt.disableflags |= getattr(mujoco.mjtDisableBit, "mjDSBL_MULTICCD", 0)
         self._data = mujoco.MjData(model)
@@ -91,7 +91,7 @@ class Collisions:
         return found
 
     def depth(self, q: Array) -> Array:
-        """Return by how much the clearance is violated at positions `(n, nq)`, `(n,)` [m]; 0 if it is not."""
+        """Return the violation of the clearance `(n,)` [m] at positions `(n, nq)`, or 0 if there is none."""
         return np.array(
             [
                 max((self.clearance - self._data.contact.dist[k] for k, _ in self._near(x)), default=0.0)

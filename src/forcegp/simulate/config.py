@@ -20,15 +20,15 @@ class ContactSolver:
 
     Args:
         friction: Coulomb friction coefficient μ between the tool and the surface.
-        tip_radius: radius [m] of a spherical tip ending at the contact point, if the contact has no radius.
-        joint_friction: additional Coulomb friction of each joint [N m]; empty for none.
-        joint_damping: additional viscous friction coefficient of each joint [N m s/rad]; empty for none.
-        stiffness_time: time constant of the contact's restoring force [s]; a shorter time is stiffer.
-        step: step size of the engine, which must divide the sampling period [s]; by default, the longest such
-            step up to `LONGEST_STEP`.
+        tip_radius: radius [m] of a sphere that ends at the contact point, if the contact has no radius.
+        joint_friction: additional Coulomb friction of each joint [N m], or empty for none.
+        joint_damping: additional viscous friction coefficient of each joint [N m s/rad], or empty for none.
+        stiffness_time: time constant of the contact's restoring force [s]. A shorter time is stiffer.
+        step: step size of the engine, which must divide the sampling period [s]. The default is the longest
+            such step up to `LONGEST_STEP`.
 
     Raises:
-        ParameterError: a value is out of range; the message names it.
+        ParameterError: a value is out of range. The message names it.
     """
 
     friction: float = 0.3
@@ -61,7 +61,7 @@ class ContactSolver:
 
 @dataclass(frozen=True)
 class Sensors:
-    """Imperfect sensors, which provide the values for the controller and the log; perfect by default.
+    """Sensors, perfect by default, which provide the values for the controller and the log.
 
     Args:
         encoder_resolution: resolution of the measured joint positions [rad, m].
@@ -70,7 +70,7 @@ class Sensors:
         torque_delay: delay of the logged torque relative to the motion [s], rounded to whole samples.
 
     Raises:
-        ParameterError: a value is out of range; the message names it.
+        ParameterError: a value is out of range. The message names it.
     """
 
     encoder_resolution: float = 0.0
@@ -85,14 +85,14 @@ class Sensors:
 
 @dataclass(frozen=True)
 class SimulationConfig(MotionConfig):
-    """Settings of a simulation; the defaults are the paper's task on the bundled arm.
+    """Settings of a simulation. The defaults are the paper's task on the bundled arm.
 
     The following settings are added to those of the motion (`MotionConfig`).
 
     Args:
-        seed: seed for the waypoints, the postures and the noise.
+        seed: random seed for the waypoints, the postures and the noise.
         engine: `"pybullet"`, `"mujoco"` or `"auto"`.
-        contact: `"rigid"` computes contact forces with the library's equations of motion, and `"solver"` with
+        contact: `"rigid"` computes contact forces with the library's equations of motion. `"solver"` uses
             MuJoCo's contact solver, which is an independent reference.
         viscous_friction: θ_v in F_z = −θ_v ṗ_E, tangential to the surface, for rigid contact [N s/m].
         noise_std: standard deviation of the noise in q̈ [rad/s²].
@@ -104,7 +104,7 @@ class SimulationConfig(MotionConfig):
         480
 
     Raises:
-        ParameterError: a value is out of range; the message names it.
+        ParameterError: a value is out of range. The message names it.
     """
 
     seed: int = 0

@@ -14,27 +14,27 @@ from forcegp.robot.model import BASE, RobotModel
 from forcegp.robot.shapes import turn_z
 from forcegp.simulate.config import ContactSolver
 from forcegp.simulate.engines import NEEDS_MUJOCO, MuJoCoWorld
-from forcegp.simulate.urdf import link_name, write_urdf
+from forcegp.simulate.urdf import compile_spec, link_name, write_urdf
 
 CYLINDER_LENGTH = 100.0
 """Half-length of the cylinder that represents an infinite cylinder [m]."""
 IMPEDANCE = [0.01, 0.95, 0.0002, 0.5, 2.0]
 """Parameters of MuJoCo's impedance, which grows from almost zero within 0.2 mm to avoid force jumps."""
 SOLVED = 1e-15
-"""Solver tolerance at which forces and accelerations satisfy Newton's equations up to rounding errors."""
+"""Solver tolerance at which forces and accelerations satisfy Newton's equations to within rounding errors."""
 NO_FORCE = 1e-9
 """Normal force below which a contact counts as open [N]."""
 
 
 class SolvedForces(NamedTuple):
-    """Result of the engine's solver at a state under a torque.
+    """Result of the engine's solver at a state for a given torque.
 
     Attributes:
-        qdd: `(nq,)` acceleration [rad/s², m/s²].
-        Q: `(nq,)` joint forces other than contact forces: Q_C + Q_G + Q_u and joint friction [N m].
-        Q_I, Q_z: `(nq,)` generalized normal and friction forces of the contacts [N m].
-        multiplier: `(n_contacts,)` normal forces [N].
-        F_I, F_z: `(n_contacts, 3)` normal and friction forces on the tip, in world axes [N].
+        qdd: acceleration, `(nq,)` [rad/s², m/s²].
+        Q: joint forces without contact forces, Q_C + Q_G + Q_u and joint friction, `(nq,)` [N m].
+        Q_I, Q_z: generalized normal and friction forces of the contacts, `(nq,)` [N m].
+        multiplier: normal forces, `(n_contacts,)` [N].
+        F_I, F_z: normal and friction forces on the tip in world axes, `(n_contacts, 3)` [N].
     """
 
     qdd: np.ndarray
@@ -49,8 +49,7 @@ class SolvedForces(NamedTuple):
 class ContactSolverEngine(MuJoCoWorld):
     """A robot in a MuJoCo world with solid surfaces and rounded tips, driven only by motor torques.
 
-    The surface of each contact must be a plane, a sphere or a cylinder. Torques are held for the sampling
-    period dt [s].
+    Contact surfaces must be planes, spheres or cylinders. Torques are held for the sampling period dt [s].
 
     Raises:
         MissingDependencyError: MuJoCo is not installed.
@@ -79,9 +78,9 @@ class ContactSolverEngine(MuJoCoWorld):
     def forces(self, torque: np.ndarray) -> SolvedForces:
         """Return the acceleration and forces at the current state under a motor torque `(nq,)` [N m].
 
-        The engine evaluates viscous friction at the end of the step, (M + h D) q̈ = Q(q, q̇). For light joints,
-        the result differs considerably from M⁻¹Q. The returned q̈ and friction are those of the step, in which
-        the velocity changes by h q̈.
+        The engine evaluates viscous friction at the end of the step, (M + h D) q̈ = Q(q, q̇). For joints with
+        low inertia, the result differs considerably from M⁻¹Q. The returned q̈ and friction are those of the
+        step, in which the velocity changes by h q̈.
         """
         data, dof = self._data, self._dof
         data.qfrc_applied[dof] = torque
@@ -121,7 +120,7 @@ class ContactSolverEngine(MuJoCoWorld):
 
 
 def _compile(mujoco: Any, system: ConstrainedSystem, solver: ContactSolver) -> Any:
-    """Compile the robot with a tip and a surface for each contact; only these pairs can collide."""
+    """Compile the robot with a tip and a surface for each contact. Only these pairs can collide."""
     robot = system.robot
     spec = mujoco.MjSpec.from_string(write_urdf(robot))
     for i, contact in enumerate(system.contacts):
@@ -142,13 +141,15 @@ def _compile(mujoco: Any, system: ConstrainedSystem, solver: ContactSolver) -> A
         pair.friction = [solver.friction, solver.friction, 0.0, 0.0, 0.0]
         pair.solref = [solver.stiffness_time, 1.0]
         pair.solimp = IMPEDANCE
-    return spec.compile()
+    return compile_spec(spec, robot)
 
 
 def _per_joint(robot: RobotModel, solver: ContactSolver, name: str) -> np.ndarray:
     values = getattr(solver, name)
     if len(values) not in (0, robot.nq):
-        raise ForceGPError(f"{name} does not fit the robot", expected=f"{robot.nq} numbers", got=values)
+        raise ForceGPError(
+            f"{name} has the wrong length for the robot", expected=f"{robot.nq} numbers", got=values
+        )
     if bool((robot.stribeck != 0.0).any()):
         raise UnsupportedRobotError(
             f"robot {robot.name!r} declares Stribeck friction, which MuJoCo does not model",
@@ -160,8 +161,8 @@ def _per_joint(robot: RobotModel, solver: ContactSolver, name: str) -> np.ndarra
 def tip_of(robot: RobotModel, contact: SurfaceContact, radius: float) -> tuple[int, np.ndarray, float]:
     """Return the link of the tip, the centre of the tip in link coordinates, and the radius of the tip.
 
-    For a point contact, the tip is a sphere that ends at the point and is centred on the line to the frame's
-    origin.
+    For a point contact, the tip is a sphere that ends at the point. It is centred on the line from the point
+    to the origin of the frame.
     """
     index = robot.frame_index(contact.frame)
     center = np.array(contact.point, dtype=float)
@@ -175,7 +176,7 @@ def tip_of(robot: RobotModel, contact: SurfaceContact, radius: float) -> tuple[i
 
 
 def geometry_of(mujoco: Any, contact: SurfaceContact) -> dict[str, Any]:
-    """Return the type, size and pose of the MuJoCo geometry of a contact surface."""
+    """Return the type, size and pose of the MuJoCo geometry for a contact surface."""
     surface, geom = contact.surface, mujoco.mjtGeom
 
     def along(axis: Sequence[float]) -> np.ndarray:

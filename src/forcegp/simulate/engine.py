@@ -16,11 +16,11 @@ from forcegp.types import JointMatrix, JointVector
 
 @runtime_checkable
 class Engine(Protocol):
-    """A physics engine with one robot under gravity and no other forces.
+    """A physics engine with one robot and no forces other than gravity.
 
-    A step uses the semi-implicit Euler method, q̇ₖ₊₁ = q̇ₖ + dt q̈(qₖ, q̇ₖ) and qₖ₊₁ = qₖ + dt q̇ₖ₊₁, so the
-    acceleration during a step is (q̇ₖ₊₁ − q̇ₖ)/dt. Contacts, collisions, joint limits, motors and damping are
-    disabled; all forces except gravity are passed to `step`.
+    A step uses the semi-implicit Euler method, q̇ₖ₊₁ = q̇ₖ + dt q̈(qₖ, q̇ₖ) and qₖ₊₁ = qₖ + dt q̇ₖ₊₁. The
+    acceleration during a step is therefore (q̇ₖ₊₁ − q̇ₖ)/dt. Contacts, collisions, joint limits, motors and
+    damping are disabled. All forces except gravity are passed to `step`.
     """
 
     @property
@@ -68,7 +68,7 @@ class EngineCheck:
         mass_matrix: difference in the mass matrix [kg m²].
         inverse_dynamics: difference in inverse dynamics [N m].
         free_acceleration: difference in acceleration over one step under a random force [rad/s²].
-        constrained_acceleration: the same with additional constraint force and joint friction [rad/s²].
+        constrained_acceleration: the same with an additional constraint force and joint friction [rad/s²].
         largest_acceleration: largest acceleration in any step, as a reference for scale [rad/s²].
     """
 
@@ -95,7 +95,7 @@ def check_engine(
 ) -> EngineCheck:
     """Return the largest differences between an engine and the library at random states of a system.
 
-    Angles are within ±π, and speeds and accelerations are a few rad/s and rad/s².
+    Angles lie within ±π. Speeds and accelerations are a few rad/s and rad/s².
     """
     robot = system.robot
 

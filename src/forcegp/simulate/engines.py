@@ -15,12 +15,12 @@ from torch import Tensor
 from forcegp.errors import MissingDependencyError, UnsupportedRobotError, check_name, optional_module
 from forcegp.robot.model import RobotModel
 from forcegp.simulate.engine import Engine
-from forcegp.simulate.urdf import write_urdf
+from forcegp.simulate.urdf import compile_spec, write_urdf
 from forcegp.types import JointMatrix, JointVector
 
 NEEDS_MUJOCO = "the engine 'mujoco'"
 MAX_JOINT_VELOCITY = 1e6
-"""Joint velocity limit for Bullet, which by default clamps at 100 rad/s and so adds an unwanted force."""
+"""Joint velocity limit for Bullet. By default, Bullet clamps at 100 rad/s, which adds an unwanted force."""
 
 
 class PyBulletEngine(Engine):
@@ -117,7 +117,7 @@ class PyBulletEngine(Engine):
 
 
 class MuJoCoWorld:
-    """A robot in a compiled MuJoCo model, which has its joint names and receives its gravity and armature."""
+    """A robot in a compiled MuJoCo model, which has the robot's joint names, gravity and armature."""
 
     def __init__(self, robot: RobotModel, model: Any, dt: float) -> None:
         self._mujoco, self._robot, self.model = optional_module("mujoco", NEEDS_MUJOCO), robot, model
@@ -141,7 +141,7 @@ class MuJoCoWorld:
         return self._tensor(self._data.qpos[self._dof]), self._tensor(self._data.qvel[self._dof])
 
     def close(self) -> None:
-        """Release the engine's resources, of which MuJoCo has none."""
+        """Release the engine's resources. MuJoCo has none."""
 
     def _set(self, data: Any, q: JointVector, qd: JointVector) -> None:
         data.qpos[self._dof] = q.numpy()
@@ -151,7 +151,7 @@ class MuJoCoWorld:
         return torch.tensor(values, dtype=self._robot.dtype)
 
     def _mass_matrix(self, data: Any) -> np.ndarray:
-        """Return M `(nv, nv)` after positions were updated; `mj_fullM` differs between versions of MuJoCo."""
+        """Return M `(nv, nv)` after positions were updated. `mj_fullM` differs between versions of MuJoCo."""
         M = np.zeros((self.model.nv, self.model.nv))
         for column, unit in zip(M, np.eye(self.model.nv), strict=True):
             self._mujoco.mj_mulM(self.model, data, column, unit)
@@ -162,12 +162,13 @@ class MuJoCoEngine(MuJoCoWorld, Engine):
     """A robot in a separate MuJoCo world with step size dt [s].
 
     Raises:
+        InertiaError: the principal moments of a link violate the triangle inequality.
         MissingDependencyError: MuJoCo is not installed.
     """
 
     def __init__(self, robot: RobotModel, dt: float) -> None:
         mujoco = optional_module("mujoco", NEEDS_MUJOCO)
-        super().__init__(robot, mujoco.MjModel.from_xml_string(write_urdf(robot)), dt)
+        super().__init__(robot, compile_spec(mujoco.MjSpec.from_string(write_urdf(robot)), robot), dt)
         self.model.opt.integrator = mujoco.mjtIntegrator.mjINT_EULER
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONSTRAINT
         self._scratch = mujoco.MjData(self.model)
@@ -214,6 +215,7 @@ def make_engine(robot: RobotModel, dt: float, name: str = "auto") -> Engine:
     Raises:
         UnknownNameError: the engine does not exist.
         MissingDependencyError: the engine's package is not installed.
+        InertiaError: MuJoCo rejects the inertia of a link.
     """
     check_name("engine", name, ["auto", *MAKERS])
     if name != "auto":

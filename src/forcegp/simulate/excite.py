@@ -1,11 +1,11 @@
 """Planning of collision-free motions, within limits, that best identify the unknown forces.
 
 Joints follow uniform cubic B-splines that start and end at rest in the same position. A spline stays in the
-convex hull of its control points, so bounds on the control points and their differences guarantee the limits
-on position, velocity and acceleration at all times. From random starts within all limits, L-BFGS minimises an
-information criterion (`control/information.py`) plus squared hinges for all limits and the clearance. The
-result is verified at 1 kHz; the times of violations are added to the nodes of the hinges. Finally, the motion
-is scaled towards its start until all limits are satisfied.
+convex hull of its control points. Bounds on the control points and on their differences therefore guarantee
+the limits on position, velocity and acceleration at all times. From random starts within all limits, L-BFGS
+minimises an information criterion (`control/information.py`) plus squared hinges for all limits and the
+clearance. The result is verified at 1 kHz, and times of violations are added to the nodes of the hinges.
+Finally, the motion is scaled towards its start until all limits are satisfied.
 """
 
 from __future__ import annotations
@@ -38,15 +38,15 @@ KNOT, NODE, FINE = 0.5, 0.1, 0.001
 SINES, SLOWEST, QUICKEST = 6, 0.05, 0.6
 """Number of sine functions in a random start, and the range of their frequencies [Hz]."""
 STEEP = 5.0
-"""Initial weight of the squared hinges, which is doubled after each round that violates a limit."""
+"""Initial weight of the squared hinges. It is doubled after each round that violates a limit."""
 INSIDE = 0.97
 """Fraction of a limit above which its hinge is active."""
 KEEP = 1.5
 """Distance, relative to the clearance, below which the hinge for the clearance is active."""
 ROUNDS, STEPS, REPAIRS = 4, 150, 30
-"""Number of verification rounds, and of evaluations in the first round and in later rounds."""
+"""Number of verification rounds; number of evaluations in the first round and in later rounds."""
 SHARES = (1.0, 0.98, 0.95, 0.9, 0.8, 0.7, 0.6, 0.5, 0.4, 0.3, 0.2, 0.1, 0.05)
-"""Scales of a motion, which are tried in order until all limits are satisfied."""
+"""Scales of a motion, which are tried in this order until all limits are satisfied."""
 REGION = 300
 """Number of states in the default region."""
 CHUNK = 3000
@@ -57,7 +57,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """Limits of a motion, `(nq,)` each; positions without a limit are limited to ±π.
+    """Limits of a motion, with shape `(nq,)`. Positions without a limit are limited to ±π.
 
     Attributes:
         low, high: position limits [rad, m].
@@ -83,14 +83,13 @@ class Limits:
         """Return the limits for a motion as a fraction of the limits of a robot.
 
         Args:
-            robot: robot that defines the limits that are not given.
+            robot: the robot, which defines the limits that are not given.
             velocity, acceleration, torque: one number for all joints, or one per joint. By default, velocity
-                and torque from the file, and accelerations that reach the velocity in a quarter of a second.
-            share: fraction of the velocity, acceleration and torque limits to use; the rest is reserved for
-                the controller.
+                and torque limits are those in the file, and accelerations reach the velocity limit in 0.25 s.
+            share: fraction of these limits to use. The rest is reserved for the controller.
 
         Raises:
-            ParameterError: a limit is missing or not positive; the message names the joint and the option.
+            ParameterError: a limit is missing or not positive. The message names the joint and the option.
         """
         if not 0.0 < share <= 1.0:
             raise ParameterError(
@@ -103,7 +102,7 @@ class Limits:
         return cls(low, high, share * speed, share * rate, share * effort)
 
     def shares(self, q: Tensor, qd: Tensor, qdd: Tensor, torque: Tensor) -> dict[str, Tensor]:
-        """Return the signed fractions of the limits in use, `(n, nq)` each."""
+        """Return the signed fractions of the limits that a motion uses, `(n, nq)` each."""
         middle, half = 0.5 * (self.low + self.high), 0.5 * (self.high - self.low)
         return {
             "position": (q - middle) / half,
@@ -114,7 +113,7 @@ class Limits:
 
 
 def _given(robot: RobotModel, name: str, values: Sequence[float], default: Tensor) -> Tensor:
-    """Return the limits of all joints, either the given values or those of the robot."""
+    """Return the limits of all joints, which are the given values or those of the robot."""
     option = f"give --{name}, as one number or one per joint"
     if len(values) not in (0, 1, robot.nq):
         raise ParameterError(
@@ -135,7 +134,7 @@ def _given(robot: RobotModel, name: str, values: Sequence[float], default: Tenso
 
 
 def random_states(robot: RobotModel, limits: Limits, count: int = REGION, seed: int = 0) -> States:
-    """Draw states uniformly within the limits, and slow down those that need too much torque."""
+    """Draw states uniformly within the limits, and slow down the states that need too much torque."""
     share = torch.rand(3, count, robot.nq, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
     q = limits.low + share[0] * (limits.high - limits.low)
     qd, qdd = (
@@ -153,10 +152,10 @@ class Excitation:
 
     Attributes:
         motion: positions, velocities, accelerations, and the torque according to the robot file.
-        limits: limits of the motion.
-        used: largest used fraction of each limit, verified at 1 kHz, by name; `clearance_m` is the clearance.
-        before, after: unknowns before the motion is recorded, and expected unknowns afterwards.
-        criterion: objective for each random start, of which the first was selected.
+        limits: the limits of the motion.
+        used: largest used fraction of each limit by name, verified at 1 kHz, and the clearance `clearance_m`.
+        before, after: the unknowns before the motion is recorded, and the expected unknowns afterwards.
+        criterion: the objective for each random start. The first start was selected.
     """
 
     motion: Dataset
@@ -167,7 +166,7 @@ class Excitation:
     criterion: tuple[float, ...]
 
     def write(self, path: str | Path) -> None:
-        """Write the motion as CSV with the columns t, q.<joint>, qd., qdd. and tau., or as Parquet.
+        """Write the motion to CSV (columns t, q.<joint>, qd.…, qdd.… and tau.…) or to Parquet.
 
         Raises:
             DataError: the name does not end in `.csv` or `.parquet`.
@@ -205,7 +204,7 @@ class Spline:
         return first, first.diff(dim=0) / self.h
 
     def random(self, limits: Limits, random: np.random.Generator) -> Array:
-        """Draw control points `(free, nq)` for a sum of sine functions within the kinematic limits."""
+        """Draw control points `(free, nq)` of a sum of sine functions within the kinematic limits."""
         t = np.arange(1, self.free + 1)[:, None, None] * self.h
         shape = (1, len(self.start), SINES)
         w, phase = (
@@ -227,9 +226,9 @@ class Search:
     """Objective for a motion as a function of its control points.
 
     Args:
-        spline, limits, collisions: spline and limits of the motion, and collisions to avoid.
+        spline, limits, collisions: the spline and limits of the motion, and the collisions to avoid.
         unknowns: the unknown forces to identify.
-        criterion: objective as a function of the information.
+        criterion: the objective as a function of the information.
     """
 
     def __init__(
@@ -302,7 +301,7 @@ class Search:
 
     @torch.no_grad()
     def used(self, x: Array, step: float) -> tuple[dict[str, float], Array]:
-        """Return the largest used fraction of each limit at multiples of `step`, and times of violations."""
+        """Return the largest used fraction of each limit at multiples of `step`, and violation times."""
         t = np.linspace(0.0, self.spline.seconds, round(self.spline.seconds / step) + 1)
         worst: dict[str, float] = {}
         where, limits, near = [], self.limits, self.collisions
@@ -395,19 +394,19 @@ def excite(
     """Plan the motion in free space that best identifies the unknown forces.
 
     Args:
-        system: robot, and contacts with surfaces to avoid.
+        system: the robot, and contacts with the surfaces to avoid.
         seconds: duration [s].
-        limits: limits of the motion; by default, `Limits.of(robot)`.
-        unknowns: unknown forces before the motion; by default, all unknowns of `Unknowns.of`.
-        collisions: collisions to avoid; by default, those of the robot's shapes and of the contact surfaces.
-        start: `(nq,)` initial and final position; by default, a collision-free position near the middle.
+        limits: limits of the motion. The default is `Limits.of(robot)`.
+        unknowns: unknown forces before the motion. The default is all unknowns of `Unknowns.of`.
+        collisions: collisions to avoid. The default is those of the robot's shapes and the contact surfaces.
+        start: initial and final position, `(nq,)`. The default is a collision-free position near the middle.
         criterion: `"A"`, the standard deviation of the torque in the region of `unknowns`; `"V"`, the same if
-            only link inertia, viscous and dry friction are unknown; `"D"`, the determinant of the covariance;
-            or a function of the information.
+            only link inertia and viscous and dry friction are unknown; `"D"`, the determinant of the
+            covariance; or a function of the information.
         rate: sampling rate of the result [Hz].
-        restarts: number of random starts to optimise, which are the best of four times as many.
-        seed: seed for the random starts.
-        progress: called with the number of completed rounds and their total.
+        restarts: number of random starts to optimise. They are the best of four times as many.
+        seed: random seed for the starts.
+        progress: a function called with the number of completed rounds and the total number.
 
     Example:
         >>> import forcegp
@@ -417,8 +416,7 @@ def excite(
         401
 
     Raises:
-        ParameterError: limits are missing, the start is in collision or exceeds the limits, or an option is
-            out of range.
+        ParameterError: limits are missing, the start is invalid, or an option is out of range.
         NumericalError: no motion from the start satisfies the limits.
         MissingDependencyError: MuJoCo is not installed.
     """

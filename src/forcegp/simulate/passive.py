@@ -24,9 +24,9 @@ class PassiveForces:
     friction itself. Q_u is the sum of `qfrc_applied` and the last actuator forces.
 
     Args:
-        system: system with the fitted robot.
+        system: the system with the fitted robot.
         field: `fit.force_field()`, or a posterior sample, `fit.force_samples(1, generator)`.
-        joint_names: names of the joints in the MuJoCo model; by default, those of the robot.
+        joint_names: names of the joints in the MuJoCo model. The default is those of the robot.
 
     Raises:
         ModelError: the number of names differs from the number of joints.
@@ -64,7 +64,7 @@ class PassiveForces:
         return force[0].double().numpy()
 
     def _places(self, model: Any) -> tuple[np.ndarray, np.ndarray]:
-        """Return the indices, in a model, of the joints' degrees of freedom and positions."""
+        """Return the indices of the joints' degrees of freedom and positions in a model."""
         known = [model.joint(k).name for k in range(model.njnt)]
         for name in self.joint_names:
             check_name("joint of the MuJoCo model", name, known)
@@ -76,7 +76,7 @@ class PassiveForces:
         """Install the callback for all simulations within the block, and disable the model's joint friction.
 
         Raises:
-            UnknownNameError: the model lacks a joint of the robot.
+            UnknownNameError: a joint of the robot is not in the model.
         """
         mujoco = optional_module("mujoco", "Learned forces in a simulation")
         dof, _ = self._places(model)

@@ -16,7 +16,7 @@ from forcegp.data.fields import DataHeader
 from forcegp.simulate.config import SimulationConfig
 
 CHUNK = 8192
-"""Number of states whose equations of motion are in memory at a time."""
+"""Number of states for which equations of motion are in memory at a time."""
 
 
 @dataclass(frozen=True)
@@ -24,11 +24,12 @@ class RunLog:
     """Quantities recorded at every step.
 
     Attributes:
-        q, qd, qdd, tau, Q, Q_I, Q_z: `(n, nq)` motion and forces; qdd is the engine's noise-free value.
-        multiplier, c: `(n, m)` multipliers and constraint errors.
-        contact, saturated: bool, closed contacts `(n, n_contacts)`, and samples at a torque limit `(n,)`.
-        contact_forces: forces `(n, 3)` [N] by name (`F_I`, `F_z`) and contact, if the engine computed them.
-        measured: sensor values of `q`, `qd` and `tau`, if the sensors are imperfect.
+        q, qd, qdd, tau, Q, Q_I, Q_z: motion and forces, `(n, nq)`. `qdd` is noise-free.
+        multiplier, c: multipliers and constraint errors, `(n, m)`.
+        contact, saturated: masks of closed contacts `(n, n_contacts)` and of samples at a torque limit
+            `(n,)`.
+        contact_forces: forces `(n, 3)` [N] from the engine, keyed by name (`F_I`, `F_z`) and contact, if any.
+        measured: sensor values of `q`, `qd` and `tau` if the sensors are imperfect.
     """
 
     q: Tensor
@@ -58,7 +59,7 @@ class RunLog:
         return RunLog(q, qd, qdd, tau, Q, Q_I, Q_z, columns(m), columns(m), contact, saturated)
 
     def write(self, k: int, **values: Tensor) -> None:
-        """Write the values of row k, a mapping from columns to values."""
+        """Write the values of row k from a mapping of columns to values."""
         for name, value in values.items():
             getattr(self, name)[k] = value
 
@@ -75,8 +76,8 @@ class SimulationResult:
     Attributes:
         data: the log as a data set.
         reference: planned motion of the tool point.
-        position, velocity, acceleration: `(n, 3)` actual motion of the point in the world [m], [m/s], [m/s²].
-        c: `(n, m)` constraint error [m].
+        position, velocity, acceleration: actual motion of the point in the world, `(n, 3)` [m, m/s, m/s²].
+        c: constraint error, `(n, m)` [m].
         saturated: number of samples at a torque limit.
         beyond_limits: number of samples with a joint outside its limits.
         acceleration_mismatch: largest difference in acceleration between engine and library [rad/s²].
@@ -95,7 +96,7 @@ class SimulationResult:
     engine: str
 
     def summary(self) -> dict[str, float | int | str]:
-        """Return statistics of the run; their names include the units."""
+        """Return statistics of the run. Their names include the units."""
         touching = torch.stack(list(self.data.contact.values()), dim=-1) if self.data.contact else None
         figures: dict[str, float | int | str] = {
             "engine": self.engine,
@@ -150,7 +151,7 @@ def make_result(
 def _mismatch(system: ConstrainedSystem, config: SimulationConfig, log: RunLog) -> float:
     """Return the largest difference between the engine's accelerations and L b + H Q̄ [rad/s²].
 
-    Contact forces computed by the engine are treated as impressed forces in free motion.
+    Contact forces that the engine computed are treated as impressed forces in free motion.
     """
     Q_bar, active = log.Q + log.Q_z, log.contact
     if config.contact == "solver":

@@ -1,7 +1,6 @@
-"""Simulated runs: a motion is planned, executed in a physics engine, and logged.
+"""Simulated runs in which a motion is planned, executed in a physics engine, and logged.
 
-Contact forces are computed either from the library's equations of motion, or by MuJoCo's solver, with
-simulated sensors.
+Contact forces come from the library's equations of motion, or from MuJoCo's solver and simulated sensors.
 """
 
 from __future__ import annotations
@@ -29,12 +28,12 @@ from forcegp.simulate.passive import PassiveForces
 from forcegp.simulate.result import RunLog, SimulationResult, make_result, noise
 
 RUNAWAY_SPEED = 50.0
-"""Joint speed that no planned motion reaches, so that the simulation has diverged [rad/s]."""
+"""Joint speed at which the simulation has diverged, since no planned motion reaches it [rad/s]."""
 PROGRESS_STRIDE = 24
-"""Number of steps between calls of the progress function: a tenth of a second at 240 Hz."""
+"""Number of steps between calls of the progress function, a tenth of a second at 240 Hz."""
 
 Progress = Callable[[int, int], None]
-"""Called with the number of completed steps and their total number."""
+"""A function called with the number of completed steps and the total number."""
 
 
 def _torque_limit(system: ConstrainedSystem, config: MotionConfig) -> Tensor:
@@ -51,7 +50,7 @@ def _check_speed(t: float, q: Tensor, qd: Tensor) -> None:
     """Stop a run that diverges.
 
     Raises:
-        NumericalError: a joint is too fast, or the state is not finite; the message gives the time and state.
+        NumericalError: a joint is too fast, or the state is not finite. The message gives the time and state.
     """
     if not (bool(q.isfinite().all()) and float(qd.abs().max()) < RUNAWAY_SPEED):
         raise NumericalError(
@@ -125,20 +124,20 @@ def simulate(
 ) -> SimulationResult:
     """Simulate a motion of the robot, in contact or free, and log it.
 
-    The engine moves the robot under Q_u + Q_D + Q_I + Q_z: the motor torque of a task-space controller, joint
-    friction, the normal force from the constrained equations of motion with Baumgarte terms, and viscous
-    contact friction (section 5 of the paper). A contact opens when its multiplier would become negative, and
-    closes with an inelastic impact. The simulation runs on the CPU.
+    The engine moves the robot under Q_u + Q_D + Q_I + Q_z. These are the motor torque of a task-space
+    controller, joint friction, the normal force from the constrained equations of motion with Baumgarte
+    terms, and viscous contact friction (section 5 of the paper). A contact opens when its multiplier would
+    become negative, and closes with an inelastic impact. The simulation runs on the CPU.
 
     Args:
-        system: robot and contacts; if there are no contacts, the motion is free.
+        system: the robot and its contacts. Without contacts, the motion is free.
         config: settings of the simulation.
-        motion: joint motion to follow, for the configured duration, instead of a random tool motion.
+        motion: joint motion to follow for the configured duration, in place of a random tool motion.
         forces: learned joint forces that replace the robot's friction if `contact = "solver"`.
-        progress: called every few steps and after the last step.
+        progress: a function called every few steps and after the last step.
 
     Returns:
-        The data set, with the reference, the actual motion of the tool, and statistics of the run.
+        The data set with the reference, the actual motion of the tool, and statistics of the run.
 
     Example:
         >>> import forcegp

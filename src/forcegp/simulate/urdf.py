@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import warnings
+from typing import Any
 from xml.etree.ElementTree import Element, SubElement, indent, tostring
 
 import torch
 from scipy.spatial.transform import Rotation as ScipyRotation
 from torch import Tensor
 
+from forcegp.errors import InertiaError
 from forcegp.robot.model import BASE, RobotModel
 
 WORLD = "world"
@@ -30,13 +32,28 @@ def write_urdf(robot: RobotModel) -> str:
     return tostring(root, encoding="unicode")
 
 
+def compile_spec(spec: Any, robot: RobotModel) -> Any:
+    """Compile a MuJoCo specification (`MjSpec`) of the robot; raise `InertiaError` for unphysical inertia."""
+    try:
+        return spec.compile()
+    except ValueError as error:
+        if "inertia" not in str(error):
+            raise
+        raise InertiaError(
+            f"MuJoCo rejects the inertia of robot {robot.name!r}",
+            expected="links whose principal moments obey the triangle inequality",
+            got=" ".join(str(error).split()),
+            hint="correct the <inertial> of the link in the robot file",
+        ) from error
+
+
 def link_name(robot: RobotModel, index: int) -> str:
-    """Return the name that a link has in the written file."""
+    """Return the name of a link in the written file."""
     return WORLD if index == BASE else f"link_of_{robot.joint_names[index]}"
 
 
 def _link(root: Element, name: str, mass: float, com: Tensor, axes: Tensor, moments: Tensor) -> None:
-    """Write a link with its inertia in principal axes, so that engines do not have to diagonalize it."""
+    """Write a link with its inertia in principal axes, so that engines need not diagonalize it."""
     inertial = SubElement(SubElement(root, "link", name=name), "inertial")
     SubElement(inertial, "origin", xyz=_numbers(com), rpy=_numbers(_roll_pitch_yaw(axes)))
     SubElement(inertial, "mass", value=repr(mass))
@@ -61,7 +78,7 @@ def _joint(root: Element, robot: RobotModel, i: int, name: str) -> None:
 
 
 def _roll_pitch_yaw(rotation: Tensor) -> list[float]:
-    """Return the angles about the fixed axes x, y and z, as in URDF."""
+    """Return the angles about the fixed axes x, y and z, as used in URDF."""
     with warnings.catch_warnings():
         warnings.simplefilter("ignore")  # at a pitch of 90°, roll and yaw share an axis and one becomes zero
         return ScipyRotation.from_matrix(rotation.numpy()).as_euler("xyz").tolist()

@@ -1,4 +1,4 @@
-"""State of a long fit, saved to disk so that an interrupted fit can resume with a bit-identical result."""
+"""State of a long fit, saved to disk so that an interrupted fit resumes with a bit-identical result."""
 
 from __future__ import annotations
 
@@ -36,7 +36,7 @@ def beside(checkpoint: str | Path) -> Path:
 
 @dataclass
 class Checkpoint:
-    """A safetensors file from which a long fit resumes; `key` (see `key_of`) identifies the fit."""
+    """A safetensors file from which a long fit resumes. `key` (see `key_of`) identifies the fit."""
 
     path: Path
     key: str
@@ -60,8 +60,8 @@ class Checkpoint:
         """Return the tensors in the file, or an empty dictionary if there is no file.
 
         Args:
-            like: tensors with the names, types and shapes of those in the file.
-            growing: names of tensors with variable length.
+            like: tensors with the same names, types and shapes as those in the file.
+            growing: names of the tensors that have variable length.
 
         Raises:
             ModelError: the file is damaged, contains non-finite values, or belongs to a different fit.
@@ -71,7 +71,7 @@ class Checkpoint:
         tensors, key = _read(self.path)
         if key != self.key or _layout(tensors, growing) != _layout(like, growing):
             raise ModelError(
-                f"{self.path}: the checkpoint belongs to another fit",
+                f"{self.path}: the checkpoint belongs to a different fit",
                 expected=f"data, settings and system with key {self.key}",
                 got=key,
                 hint="remove it, or name another file",
@@ -102,9 +102,9 @@ class Checkpoint:
 class Evaluations:
     """Record of all evaluations of an objective (position, value and gradient) in a checkpoint.
 
-    A resumed fit replays the optimiser on the recorded values and is therefore bit-identical to an
-    uninterrupted fit. If the optimiser requests a different point (for example, on another machine or with
-    another library release), the rest of the record is discarded and recomputed.
+    A resumed fit replays the optimiser on the recorded values. Its result is therefore bit-identical to that
+    of an uninterrupted fit. If the optimiser requests a different point, for example on another machine or
+    with another library release, the rest of the record is discarded and recomputed.
 
     Args:
         checkpoint: file for the record, or `None` to record nothing.
@@ -116,7 +116,7 @@ class Evaluations:
 
     @classmethod
     def resumed(cls, path: str | Path | None, start: Mapping[str, Tensor], *key: object) -> Evaluations:
-        """Load the evaluations in a file, if any; `key` identifies the fit that begins at `start`."""
+        """Load the evaluations in a file, if any. `key` identifies the fit that begins at `start`."""
         if path is None:
             return cls(None)
         result = cls(Checkpoint(Path(path), Checkpoint.key_of(*key)))
@@ -124,7 +124,7 @@ class Evaluations:
         return result
 
     def read(self, start: Mapping[str, Tensor]) -> int:
-        """Load the evaluations from the file, if it exists, and return their number."""
+        """Load the evaluations from the file if it exists, and return their number."""
         assert self.checkpoint is not None
         size = sum(value.numel() for value in start.values())
         rows = torch.zeros(0, size, dtype=torch.float64)
@@ -134,8 +134,8 @@ class Evaluations:
         lengths = {len(value) for value in record.values()}
         if len(lengths) > 1 or not bool((record["positions"].abs() <= CHECKPOINT_VALUE).all()):
             raise ModelError(
-                f"{self.checkpoint.path}: the checkpoint is damaged: 'positions' that no fit reaches, or of "
-                "another length than the objectives",
+                f"{self.checkpoint.path}: the checkpoint is damaged: 'positions' are out of range, or "
+                "their number differs from that of the objectives",
                 expected=f"finite numbers up to ±{CHECKPOINT_VALUE:g}",
                 hint="remove the checkpoint to start again",
             )
@@ -168,7 +168,7 @@ class Evaluations:
         return again
 
     def write(self) -> None:
-        """Write all evaluations made so far, up to the first non-finite one."""
+        """Write all evaluations so far, up to the first non-finite one."""
         if self.checkpoint is not None and self._finite():
             self.checkpoint.write(self._tensors())
 
@@ -204,7 +204,7 @@ def _evaluated(
 
 
 class _StoredGradient(torch.autograd.Function):
-    """A value whose gradient is known."""
+    """A value with a known gradient."""
 
     @staticmethod
     def forward(ctx: Any, value: Tensor, gradient: Tensor, *tensors: Tensor) -> Tensor:

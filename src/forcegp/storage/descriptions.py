@@ -1,8 +1,8 @@
 """Conversion of frozen descriptions, such as kernels and force priors, to JSON and back.
 
 Only classes in a given table are written and read, field by field. A description that contains Python code
-(an operator or a function) has no JSON form and is rejected. Reading checks names and types and does not
-execute code.
+(an operator or a function) has no JSON form and is rejected. Reading checks names and types, and executes no
+code.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ Classes = Mapping[str, type]
 """Classes that may be written and read, keyed by their names in the file."""
 
 MAX_DEPTH = 40
-"""Maximum nesting depth; a sum of kernels has one level per term."""
+"""Maximum nesting depth. A sum of kernels has one level per term."""
 _CHECK = ConfigDict(arbitrary_types_allowed=True, strict=True, allow_inf_nan=False)
 
 
@@ -40,10 +40,10 @@ def encode(value: Any, classes: Classes) -> Any:
 
 
 def decode(json: Any, classes: Classes, place: str, depth: int = 0, *, whole: bool = True) -> Any:
-    """Restore a description returned by `encode`; missing fields take their defaults unless `whole` is set.
+    """Restore a description from `encode`. Missing fields take their defaults unless `whole` is set.
 
     Raises:
-        ForceGPError: a field is missing, unknown or of the wrong type, or a class is unknown; the message
+        ForceGPError: a field is missing, unknown or of the wrong type, or a class is unknown. The message
             names the location.
     """
     if depth > MAX_DEPTH:
@@ -91,7 +91,7 @@ def _check_fields(kind: type, name: str, members: Mapping[str, Any], place: str,
 
 
 def _checked(value: Any, hint: Any, place: str) -> Any:
-    """Check and convert a value to the declared type of its field."""
+    """Check a value against the declared type of its field, and convert it."""
     if isinstance(hint, type) and is_dataclass(hint):
         if not isinstance(value, hint):
             raise ModelError(f"{place} is not valid", expected=hint.__name__, got=type(value).__name__)

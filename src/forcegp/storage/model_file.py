@@ -1,8 +1,8 @@
-"""Saved models: one safetensors file whose metadata hold a versioned header and a hash of the whole file.
+"""Saved models, each in one safetensors file with a versioned header and a hash of the whole file.
 
-The hash is the SHA-256 of the file with 64 zeros in place of the hash, so any changed bit in the header or
-the tensors is detected. The file is replaced by a single `os.replace`, so a reader sees either the old model
-or the new one. Tensors are checked once, when the file is read.
+The hash is the SHA-256 of the file with 64 zeros in place of the hash, so that any changed bit in the header
+or the tensors is detected. The file is replaced by a single `os.replace`, so that a reader sees either the
+old model or the new one. Tensors are checked once, when the file is read.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ TYPES = (torch.float64, torch.float32, torch.int64, torch.bool)
 
 _MAY_BE_INFINITE = re.compile(rf"(system|start)\.({'|'.join(MAY_BE_INFINITE)})")
 _POSITIVE = re.compile(r"(data\.\d+|training)\.noise_std|std\.[^.]+|scale\..+\.std\.[^.]+")
-"""Names of tensors that must be positive: standard deviations of the noise and of scaled inputs."""
+"""Names of tensors that must be positive, which are standard deviations of the noise and of scaled inputs."""
 
 
 def check_tensors(tensors: Mapping[str, Tensor], source: str) -> None:
@@ -57,14 +57,14 @@ def check_tensors(tensors: Mapping[str, Tensor], source: str) -> None:
 
 SUFFIX = ".safetensors"
 HEADER = "forcegp"
-"""Metadata key under which the hash and the JSON header are stored."""
+"""Metadata key for the hash and the JSON header."""
 NO_HASH = "0" * 64
 COPIES = 3
 """Copies of a model in memory during reading: the file content, and tensors before and after alignment."""
 
 
 class ModelHeader(Header):
-    """Header of a saved model: its `Model.kind`, settings, and system (as returned by `pack_system`)."""
+    """Header of a saved model: its `Model.kind`, settings, and system as returned by `pack_system`."""
 
     FORMAT: ClassVar[str] = "forcegp-model"
     VERSION: ClassVar[int] = 3
@@ -74,7 +74,7 @@ class ModelHeader(Header):
     system: dict[str, Any]
 
     def settings_as(self, kind: type[M], source: str) -> M:
-        """Validate the settings of a saved model; if invalid, a `ModelError` names the file and the field."""
+        """Validate the settings of a saved model; raise a `ModelError` that names the file and the field."""
         return validated(kind, self.settings, source, ModelError, ("settings",))
 
 
@@ -89,7 +89,7 @@ def model_path(path: str | Path) -> Path:
 def model_bytes(
     kind: str, system: ConstrainedSystem, settings: Record, tensors: Mapping[str, Tensor]
 ) -> bytes:
-    """Return the content of a model file; tensor names must not begin with `system.`."""
+    """Return the content of a model file. Tensor names must not begin with `system.`."""
     record, robot = pack_system(system)
     copies = {name: value.detach().to("cpu", copy=True).contiguous() for name, value in tensors.items()}
     header = ModelHeader(kind=kind, settings=settings.model_dump(mode="json"), system=record)

@@ -17,11 +17,11 @@ O = TypeVar("O", bound="KernelOptions")
 
 
 class Window(Record):
-    """Window from which initial values are drawn, centred on the parameters in the robot file.
+    """Intervals from which initial values are drawn, centred on the parameters in the robot file.
 
     Attributes:
-        relative: half-width for logarithms of masses, moments and friction; 0.5 corresponds to a factor
-            between 0.37 and 2.7 for the mass of a link, and between 0.61 and 1.65 for friction.
+        relative: half-width for logarithms of masses, moments and friction. A value of 0.5 corresponds to a
+            factor between 0.37 and 2.7 for the mass of a link, and between 0.61 and 1.65 for friction.
         length: half-width for centres of mass and other lengths [m].
         angle: half-width for rotations [rad].
     """
@@ -32,17 +32,17 @@ class Window(Record):
 
 
 class KernelOptions(Record):
-    """Options of models whose kernels depend on the state.
+    """Options of models with kernels that depend on the state.
 
     Attributes:
-        standardize: whether to standardize kernel inputs (the paper does not).
+        standardize: whether to standardize kernel inputs, which the paper does not do.
     """
 
     standardize: bool = True
 
     @classmethod
     def of(cls: type[O], values: Mapping[str, Any]) -> O:
-        """Return the options contained in a mapping, after checking their types.
+        """Return the options in a mapping, after checking their types.
 
         Raises:
             UnknownNameError: a value is not one of the names allowed for its field.
@@ -67,9 +67,9 @@ class StructuredOptions(KernelOptions):
     are repeated only in the constructor signature.
 
     Attributes:
-        inference: type of inference; `"auto"` chooses it according to the number of samples.
+        inference: the type of inference. `"auto"` chooses it according to the number of samples.
         inducing_points: maximum number of inducing points per prior.
-        inertia: `"file"`, or `"auto"` to identify the inertia if the log supports it; `None` means `"auto"`
+        inertia: `"file"`, or `"auto"` to identify the inertia if the log supports it. `None` means `"auto"`
             if priors are selected automatically, and `"file"` otherwise.
     """
 

@@ -1,8 +1,8 @@
 """Storage of a constrained system as JSON and tensors, so that a saved model is self-contained.
 
 The robot is saved as the tensors of `RobotModel`, bit for bit. Constraints that the user defines in Python
-(an `ImplicitSurface` or a subclass of `Constraint`) cannot be saved. The file contains placeholders for them,
-and the caller supplies a system with these constraints when the file is read.
+(an `ImplicitSurface` or a subclass of `Constraint`) cannot be saved. The file contains placeholders for them.
+When it is read, the caller supplies a system with these constraints.
 """
 
 from __future__ import annotations
@@ -70,7 +70,7 @@ class ContactFields(Record):
 
 
 class ConnectionFields(Record):
-    """Two coincident points, the second fixed in the world if `other_frame` is `None`."""
+    """Two coincident points. The second is fixed in the world if `other_frame` is `None`."""
 
     name: str
     frame: str
@@ -115,7 +115,7 @@ class SystemRecord(Record):
 
 
 def _record(contact: Constraint) -> ConstraintRecord:
-    """Return the record of a constraint, or a placeholder if it is defined in Python code."""
+    """Return the record of a constraint, or a placeholder if the constraint is defined in Python code."""
     if type(contact) is PointConnection:
         return PointConnectionRecord.model_validate(contact)
     described = contact.surface if type(contact) is SurfaceContact else contact
@@ -138,12 +138,12 @@ SHAPES: dict[str, tuple[str | int, ...]] = {
     "base_position": (3,),
     "gravity": (3,),
 }
-"""Shapes of those robot tensors that do not consist of one number per joint."""
+"""Shapes of the robot tensors that do not consist of one number per joint."""
 MAY_BE_INFINITE = ("lower", "upper", "velocity_limit", "effort_limit")
 
 
 def pack_system(system: ConstrainedSystem) -> tuple[dict[str, Any], dict[str, Tensor]]:
-    """Return a system as a JSON object, and CPU copies of its robot's tensors (named `system.<field>`)."""
+    """Return a system as a JSON object, and CPU copies of its robot's tensors, named `system.<field>`."""
     record = SystemRecord(
         robot=RobotRecord.model_validate(system.robot),
         contacts=tuple(map(_record, system.contacts)),
@@ -162,7 +162,7 @@ def unpack_system(
     source: str,
     fallback: ConstrainedSystem | None = None,
 ) -> ConstrainedSystem:
-    """Restore a system returned by `pack_system`; constraints that cannot be saved are taken from `fallback`.
+    """Restore a system from `pack_system`. Constraints that cannot be saved are taken from `fallback`.
 
     Raises:
         ModelError: a field or tensor is missing or invalid, or `fallback` lacks an unsaved constraint.
@@ -239,7 +239,7 @@ def take(
 
 
 def take_robot(tensors: Mapping[str, Tensor], prefix: str, like: RobotModel, source: str) -> RobotModel:
-    """Return a robot built from the tensors `<prefix><field>`, checked by `take`; copy all other fields."""
+    """Return a robot built from tensors `<prefix><field>`, checked by `take`, with other fields copied."""
     fields = {}
     for name, value in like.tensors.items():
         shape, finite = tuple(value.shape), name not in MAY_BE_INFINITE

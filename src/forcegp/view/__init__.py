@@ -1,1 +1,1 @@
-"""3D view in the browser, showing a robot, its surfaces, contact forces and predicted paths."""
+"""3D view in the browser that shows a robot, its surfaces, contact forces and predicted paths."""

@@ -76,7 +76,7 @@ def write_excitation(
     limits = PictureBlock(
         "Limits",
         f"Largest fractions of the limits at 1 kHz: {used}. "
-        f"All parts stay {1e3 * result.used['clearance_m']:.3g} mm apart.",
+        f"All parts stay at least {1e3 * result.used['clearance_m']:.3g} mm apart.",
         (draw_limits(result),),
         "the planned motion",
         wide=True,

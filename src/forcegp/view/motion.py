@@ -28,9 +28,10 @@ LOGGED, MEAN, SAMPLE = "logged", "predicted", "sampled"
 
 @dataclass(frozen=True)
 class Force:
-    """Normal force of a contact in each frame, its point of application `(k, 3)` [m] and the surface normal.
+    """Normal force at a contact in each frame, with its point of application and the surface normal.
 
-    `value` `(k,)` [N] is NaN while the contact is open; `std` is 0 if unknown.
+    `value` `(k,)` [N] is NaN while the contact is open. `std` is 0 if the uncertainty is unknown. Points have
+    shape `(k, 3)` [m].
     """
 
     contact: str
@@ -42,7 +43,7 @@ class Force:
 
 @dataclass(frozen=True)
 class Path3D:
-    """Path of the tip `(n, 3)` [m]; `kind` is `"logged"`, `"predicted"` or `"sampled"`."""
+    """Path of the tip, `(n, 3)` [m]. `kind` is `"logged"`, `"predicted"` or `"sampled"`."""
 
     kind: str
     points: Array
@@ -78,7 +79,7 @@ def of_log(system: ConstrainedSystem, data: Dataset, model: Predictor | None = N
 
 
 def with_rollout(motion: Motion, path: Rollout) -> Motion:
-    """Add the tip paths of a rollout to a motion: one for the mean and one for each function sample."""
+    """Add the tip paths of a rollout to a motion, one for the mean and one for each function sample."""
     paths = [Path3D(MEAN, tip_path(motion.system, path.q.reshape(-1, path.q.shape[-1])))]
     if path.samples is not None:
         sampled = path.samples.q.reshape(-1, *path.samples.q.shape[-2:])
@@ -87,7 +88,7 @@ def with_rollout(motion: Motion, path: Rollout) -> Motion:
 
 
 def sampled_rollout(model: Predictor, data: Dataset, samples: int, seconds: float) -> Rollout:
-    """Simulate a model from the first state of a trajectory, applying the logged torques."""
+    """Simulate a model from the first state of a trajectory under the logged torques."""
     options = RolloutOptions(sampling_period(data), on_divergence="keep")
     return replayed(model, data, samples if model.has_function_samples else 0, seconds, options=options)
 

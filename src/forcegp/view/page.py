@@ -24,15 +24,15 @@ from forcegp.view.motion import LOGGED, MEAN, Force, Motion
 
 ROBOT, BASE_COLOUR, SURFACE = "#607d96", "#464e56", "#e2cd96"
 OPACITY = 0.45
-"""Opacity of the solids, chosen so that a force drawn inside the tool remains visible."""
+"""Opacity of the solids, which keeps a force drawn inside the tool visible."""
 PATHS = {LOGGED: ("#222222", 2.0), MEAN: ("#0072b2", 2.0)}
 SAMPLED = ("#82b9dc", 1.0)
 ARROW = 0.3
 """Length of the longest arrow [m]."""
 MARGIN = 0.15
-"""Margin by which a drawn surface extends beyond the path of the tip [m]."""
+"""Distance by which a drawn surface extends beyond the path of the tip [m]."""
 LOCAL, PORT = "127.0.0.1", 8080
-"""Address of the server, accessible from this computer only."""
+"""Address of the server, which is accessible only from this computer."""
 
 
 def content_of(motion: Motion, shapes: Sequence[Shape]) -> dict[str, Any]:
@@ -98,7 +98,7 @@ def _patch(surface: Surface, points: Array) -> Array:
 
 
 def _arrow(force: Force, scale: float) -> dict[str, Any]:
-    """Return the arrow of a force in each frame and its ±2σ segment; `None` while the contact is open."""
+    """Return the arrow of a force in each frame and its ±2σ segment, or `None` while the contact is open."""
     along = scale * force.normal
     tip, bar = force.point + force.value[:, None] * along, 2.0 * force.std[:, None] * along
     closed = np.isfinite(force.value)
@@ -120,7 +120,7 @@ def force_text(force: Force, k: int) -> str:
 
 def view_page(motion: Motion, shapes: Sequence[Shape], title: str) -> str:
     """Return a motion as self-contained HTML."""
-    label = "The robot moving, with its surfaces, contact forces and paths of the tip"
+    label = "The robot in motion, with its surfaces, contact forces and paths of the tip"
     drawn = animation(content_of(motion, shapes), label)
     return render("view.html.j2", title=title, animation=drawn, script=animation_source())
 
@@ -132,9 +132,9 @@ def write_view(path: str | Path, motion: Motion, shapes: Sequence[Shape], title:
 
 
 def serve(page: str, port: int = PORT, say: Callable[[str], None] = print) -> None:
-    """Serve a page to a browser on this computer until interrupted; `say` is called with its address.
+    """Serve a page to a browser on this computer until interrupted. `say` is called with its address.
 
-    Other users of the computer cannot guess the address, and requests that name other hosts are rejected.
+    Other users of the computer cannot guess the address. Requests that name other hosts are rejected.
     """
     path = f"/{secrets.token_urlsafe(16)}"
 

@@ -1,4 +1,4 @@
-"""Gaussian-process priors on unknown forces, each defined by a direction, inputs and a kernel.
+"""Gaussian-process priors on unknown forces, each defined by an operator, inputs and a kernel.
 
 `OperatorForcePrior` is a prior on an arbitrary force with a user-defined operator.
 """
@@ -19,7 +19,7 @@ from forcegp.robot.model import RobotModel
 
 JOINT, CONTACT, CONSTRAINT = "joint", "contact", "constraint"
 """Targets of priors: the joint force Q, the dissipative contact force Q_z, or the part of Q along the
-    constraint (the range of Aᵀ), which does not affect accelerations in contact."""
+constraint (in the range of Aᵀ), which does not affect accelerations in contact."""
 NOISE, ANALYTICAL, COULOMB = "noise", "analytical_parameters", "coulomb"
 RESERVED = (NOISE, ANALYTICAL, COULOMB)
 """Prefixes of learned parameters other than the hyperparameters of the priors."""
@@ -28,13 +28,13 @@ MIXING = "mixing"
 """Suffix of the names of learned operator parameters."""
 
 ForceMean = Callable[[ConstrainedSystem, States], Tensor]
-"""Prior mean of the joint force Q at states, `(n, nq)`."""
+"""Function that returns the prior mean of the joint force Q at states, `(n, nq)`."""
 
 
 class ForcePrior(ABC):
     """A zero-mean prior on an unknown force f(x), mapped to generalized forces by a known operator E(x).
 
-    The generalized force is E(x) f(x); `target` is the part of Q̄ to which it belongs: Q, Q_z, or Q along the
+    The generalized force E(x) f(x) belongs to the part of Q̄ given by `target`: Q, Q_z, or Q along the
     constraint. A subclass has a `name`, a `kernel` and a `target`, and implements `outputs`, `features` and
     `operator`. Only classes listed in `CLASSES` of `models/structured_file.py` can be saved.
     """
@@ -45,23 +45,23 @@ class ForcePrior(ABC):
     coupled: bool = False
     """Whether the prior includes Coulomb friction proportional to the multiplier."""
     vectors: tuple[str, ...] = ()
-    """Vector inputs, standardized by a common scale so that results do not depend on the axes."""
+    """Vector inputs, which have a common scale so that results do not depend on the axes."""
     commensurate: bool = True
-    """Whether all components of f have the same unit."""
+    """Whether all components of f have the same physical unit."""
     sticks: bool = False
-    """Whether the force includes dry joint friction, which `States.slip` makes separable."""
+    """Whether the force includes dry joint friction, for which `States.slip` is needed."""
     in_time: bool = False
-    """Whether the force is a function of time, which correlates the samples of a trajectory."""
+    """Whether the force is a function of time, which makes the samples of a trajectory correlated."""
     scaled: bool = True
-    """Whether to standardize the inputs."""
+    """Whether to standardize the kernel inputs."""
     per_joint: bool = False
-    """Whether f has one component per joint and E = I, so products with E can be skipped."""
+    """Whether f has one component per joint and E = I, so that products with E can be skipped."""
     centred: bool = True
     """Whether to subtract the mean of the training data from the inputs before scaling."""
 
     @property
     def prefix(self) -> str:
-        """Prefix of the hyperparameters; the name of another prior if they are shared."""
+        """Prefix of the hyperparameters. Priors with the same prefix share their hyperparameters."""
         return self.name
 
     @abstractmethod
@@ -70,18 +70,18 @@ class ForcePrior(ABC):
 
     @abstractmethod
     def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
-        """Return the named inputs of the kernel `(n, w)`, before standardization."""
+        """Return the named kernel inputs `(n, w)` before standardization."""
 
     @abstractmethod
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
         """Return E(x) `(n, nq, outputs)`."""
 
     def initial_parameters(self, robot: RobotModel) -> dict[str, Tensor]:
-        """Return initial values of the learned parameters of E, keyed by name; empty for most priors."""
+        """Return initial values of the learned parameters of E, keyed by name. Most priors have none."""
         return {}
 
     def with_parameters(self, params: Mapping[str, Tensor]) -> ForcePrior:
-        """Return the prior with the given learned parameters of its operator (see `initial_parameters`)."""
+        """Return the prior with the given parameters of its operator (see `initial_parameters`)."""
         return self
 
     def check(self, system: ConstrainedSystem) -> None:  # noqa: B027  (most priors fit every system)
@@ -89,24 +89,24 @@ class ForcePrior(ABC):
 
 
 def check_inputs(name: str, inputs: tuple[str, ...], valid: tuple[str, ...]) -> None:
-    """Check the inputs of a force.
+    """Check the names of the inputs of a force.
 
     Raises:
         ModelError: there are no inputs.
         UnknownNameError: an input is unknown.
     """
     if not inputs:
-        raise ModelError(f"force prior {name!r} has no inputs", expected="one input at least")
+        raise ModelError(f"force prior {name!r} has no inputs", expected="at least one input")
     for symbol in inputs:
         check_name(f"input of force prior {name!r}", symbol, valid)
 
 
 def check_priors(priors: tuple[ForcePrior, ...], system: ConstrainedSystem) -> None:
-    """Check that priors match a system and have distinct names, which are prefixes of their hyperparameters.
+    """Check that priors match a system and have distinct names, since names are hyperparameter prefixes.
 
     Raises:
-        ModelError: there are no priors, two priors share a name, a name is not one word, or a prior shares
-            the hyperparameters of a missing prior.
+        ModelError: there are no priors, two priors have the same name, a name is not a single word, or a
+            prior shares the hyperparameters of a missing prior.
         UnknownNameError: a prior names a contact that the system does not have.
     """
     names = [prior.name for prior in priors]
@@ -130,15 +130,15 @@ def check_priors(priors: tuple[ForcePrior, ...], system: ConstrainedSystem) -> N
 
 @dataclass(frozen=True)
 class OperatorForcePrior(ForcePrior):
-    """A prior on a force with a user-defined operator ("any analytical tensor of appropriate size").
+    """A prior on a force with a user-defined operator, which may be any tensor of appropriate size.
 
     Args:
         name: prefix of the hyperparameters.
         size: number of components of f.
         operator_function: function that maps `(system, states)` to E(x) `(n, nq, size)`.
-        feature_function: function that maps `(system, states)` to named inputs `(n, w)`; by default q, q̇, τ.
+        feature_function: function that maps `(system, states)` to named inputs `(n, w)`; default q, q̇, τ.
         kernel: covariance of each component.
-        target: `joint`, `contact` or `constraint`, for a force in Q, Q_z or Q along the constraint.
+        target: `joint` for Q, `contact` for Q_z, or `constraint` for Q along the constraint.
 
     Example:
         >>> import torch, forcegp

@@ -1,4 +1,4 @@
-"""Priors on drive constants, and on constants that differ between recordings."""
+"""Priors on drive constants, and priors on constants that differ between recordings."""
 
 from __future__ import annotations
 
@@ -21,9 +21,9 @@ class DrivePrior(ConstantForcePrior):
     """A prior on relative errors s δ_i of drive constants (torque constant times gear ratio).
 
     Q_i = s τ_i δ_i with δ_i ~ N(0, 1). Logged currents are converted to torques with nominal drive constants
-    (`torque_constant` and `gear_ratio` in a mapping); the true constants are (1 + s δ_i) times these. Motion
-    depends only on the ratio of drive constants to inertia, so specify known masses or record a log with a
-    known payload.
+    (`torque_constant` and `gear_ratio` in a mapping). The true constants are 1 + s δ_i times the nominal
+    ones. Since motion depends only on the ratio of drive constants to inertia, specify known masses or record
+    a log with a known payload.
 
     Args:
         std: relative standard deviation s of the drive constants.
@@ -61,13 +61,13 @@ class DrivePrior(ConstantForcePrior):
 
 @dataclass(frozen=True)
 class PerRecording(ForcePrior):
-    """A prior with separate constants f_r, such as a payload, for each recording r.
+    """A prior on constants that differ between recordings, such as a payload.
 
-    All other priors are shared, so a fit to several recordings learns friction from all of them. Predictions
-    use the constants of the last recording.
+    All other priors are common to the recordings, so a fit to several recordings learns friction from all of
+    them. Predictions use the constants of the last recording.
 
     Args:
-        prior: prior on the force in each recording, which also provides the names of the hyperparameters.
+        prior: prior on the force in each recording; it also provides the names of the hyperparameters.
         starts: first segment of each recording, as in `Dataset.segment`.
 
     Example:
@@ -77,7 +77,7 @@ class PerRecording(ForcePrior):
         8
 
     Raises:
-        ModelError: the starts are not increasing, or `prior` is not a prior on constants.
+        ModelError: `starts` is not increasing, or `prior` is not a prior on constants.
     """
 
     prior: ForcePrior

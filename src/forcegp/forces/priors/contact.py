@@ -1,26 +1,26 @@
 """Forces at a surface contact: tangential, normal, and Coulomb friction proportional to the multiplier.
 
-Contact forces do not depend on world axes: tangential vectors have two coordinates in a tangent frame of
-the surface. The frame at normal n is (R e_x, R e_y), where R is the smallest rotation that maps e_z
-to n. Forces learned on one surface therefore transfer to a raised, tilted or curved one. A force normal to
-the surface does not change the accelerations.
+Contact forces do not depend on the world axes. Tangential vectors have two coordinates in a tangent frame of
+the surface. At normal n, this frame is (R e_x, R e_y), where R is the smallest rotation that maps e_z to n.
+Forces learned on one surface therefore transfer to a raised, tilted or curved surface. A force normal to the
+surface does not change the accelerations.
 
-Friction proportional to the normal force couples force and multiplier. For a single contact with
-u = −J_Eᵀ s(v) and g = Lᵀ u, the equations λ = λ_K − Lᵀ Q_z and Q_z = μ λ u have the solution
-λ = λ_K / (1 + μ g), where λ_K is the multiplier without friction. Latent functions must enter the force
-linearly, but μ does not, so the operator is the secant u λ_K / (1 + μ̂ g) at a given μ̂.
+Friction proportional to the normal force couples the force and the multiplier. For a single contact with u =
+−J_Eᵀ s(v) and g = Lᵀ u, the equations λ = λ_K − Lᵀ Q_z and Q_z = μ λ u have the solution λ = λ_K / (1 + μ g),
+where λ_K is the multiplier without friction. Latent functions must enter the force linearly, but μ does not.
+The operator is therefore the secant u λ_K / (1 + μ̂ g) at a given μ̂.
 
-A learned coefficient is coupled exactly. Let Q_z = Q_z′ + U λ, where a contact with friction coefficient μ
-has the column μ u, and let λ₀ = (A M⁻¹ Aᵀ)⁺ b − Lᵀ (Q + Q_z′) be the multiplier without this friction. Then
-λ = λ₀ − LᵀU λ has the solution λ = (I + LᵀU)⁻¹ λ₀. For given μ, every quantity therefore remains an affine
-map of the forces, with operators and offset B_Q, B_z, o replaced by
+For a learned constant coefficient, the coupling is exact. Let Q_z = Q_z′ + U λ, where a contact with friction
+coefficient μ has the column μ u, and let λ₀ = (A M⁻¹ Aᵀ)⁺ b − Lᵀ (Q + Q_z′) be the multiplier without this
+friction. Then λ = λ₀ − LᵀU λ has the solution λ = (I + LᵀU)⁻¹ λ₀. For given μ, every quantity therefore
+remains an affine map of the forces, in which B_Q, B_z and o are replaced by
 
     B_Q − G Lᵀ,  B_z − G Lᵀ,  o + G (A M⁻¹ Aᵀ)⁺ b   with   G = B_z U (I + LᵀU)⁻¹.
 
-Learned μ and ε are uncertain. To first order in their errors δ, friction at fixed λ changes by
-∂(μ u λ)/∂(log μ, log ε) δ, a contact force to which λ responds as to any other. Hence δ is an additional
-latent force. The joint posterior of all latent forces is a Laplace approximation that marginalises δ, and the
-variance of every quantity z includes (∂z/∂δ)² Var δ.
+The learned μ and ε are uncertain. To first order in their errors δ, friction at fixed λ changes by ∂(μ u
+λ)/∂(log μ, log ε) δ. λ responds to this contact force as to any other, so δ is an additional latent force.
+The joint posterior of all latent forces is a Laplace approximation that marginalises δ, and the variance of
+every quantity z includes (∂z/∂δ)² Var δ.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ WIDTHS = {"position": 2, "velocity": 2, "speed": 1}
 and sliding speed [m/s].
 """
 TERMS = ("viscous", "dry", "coulomb", "stribeck", "torsion")
-"""Friction terms in the order of the components of the latent function."""
+"""Friction terms, in the order of the components of the latent function."""
 LOADED = ("coulomb", "stribeck", "torsion")
 """Friction terms proportional to the multiplier."""
 
@@ -99,14 +99,14 @@ class SurfaceForcePrior(ForcePrior):
         """Return E(x) `(n, nq, outputs)` while the contact is closed and slides."""
 
     def _touching(self, system: ConstrainedSystem, at: States) -> ContactPoint:
-        """Return the contact point; if the contact has none, raise the errors of `check`."""
+        """Return the contact point. If the contact has none, raise the errors of `check`."""
         if self.contact not in at.eom.contact_points:
             self.check(system)
         return at.eom.contact_points[self.contact]
 
 
 def _along(point: ContactPoint, name: str) -> Tensor:
-    """Return an input on the surface: `position` or `velocity` in the tangent frame, or sliding `speed`."""
+    """Return an input on the surface: the tangential `position` or `velocity`, or the sliding `speed`."""
     if name == "speed":
         # The floor keeps the derivative of the root finite at rest.
         return point.sliding[1].square().sum(-1, keepdim=True).clamp(min=1e-30).sqrt()
@@ -115,17 +115,16 @@ def _along(point: ContactPoint, name: str) -> Tensor:
 
 @dataclass(frozen=True)
 class ContactForcePrior(SurfaceForcePrior):
-    """A prior on the dissipative force at a contact along the surface, F_z = t_1 f_1 + t_2 f_2.
+    """A prior on the dissipative tangential force at a contact, F_z = t_1 f_1 + t_2 f_2.
 
-    E = J_Eᵀ (t_1, t_2) while the contact is closed, and 0 otherwise; t_1 and t_2 span the tangent plane at
-    the contact point (`tangent_frame`).
+    E = J_Eᵀ (t_1, t_2) while the contact is closed, and E = 0 otherwise. t_1 and t_2 span the tangent plane
+    at the contact point (`tangent_frame`).
 
     Args:
         contact: name of a surface contact of the system.
         kernel: covariance of each component.
-        inputs: inputs of the force, from `position`, `velocity` and `speed` of the contact point along the
-            surface.
-        name: prefix of the hyperparameters; by default the name of the contact.
+        inputs: inputs of the force, chosen from the tangential `position`, `velocity` and `speed`.
+        name: prefix of the hyperparameters; defaults to the name of the contact.
 
     Example:
         >>> ContactForcePrior("table").target
@@ -147,30 +146,30 @@ class ContactForcePrior(SurfaceForcePrior):
 class SlidingFrictionPrior(SurfaceForcePrior):
     """A prior on friction that opposes sliding, with v = (1 − n nᵀ) ṗ_E and s(v) = v / √(|v|² + ε²).
 
-    F_z = −θ_v v − (θ_d + λ (μ + μ_s e^{−|v|²/v_s²})) s(v), and the moment −θ_t λ s(ω_n) n about the normal.
+    F_z = −θ_v v − (θ_d + λ (μ + μ_s e^{−|v|²/v_s²})) s(v). The moment about the normal is −θ_t λ s(ω_n) n.
 
     The unknowns are the scalar functions listed in `terms`: `viscous` θ_v [N s/m], `dry` θ_d [N], `coulomb`
-    μ, `stribeck` μ_s, `torsion` θ_t [m]. They need fewer samples than the components of a force. By default,
-    they depend on the sliding speed, so they transfer to surfaces of any position, tilt and shape.
+    μ, `stribeck` μ_s and `torsion` θ_t [m]. They require fewer samples than the components of a force. By
+    default, they depend on the sliding speed, so they transfer to surfaces with any position, tilt and shape.
 
-    λ = max(λ_K, 0) / (1 + μ̂ g), where λ_K is the multiplier under the analytical forces Q_K + τ without
-    friction, and g = −Lᵀ J_Eᵀ s(v). This is exact for a single contact with friction −μ̂ λ s(v). Otherwise, it
-    neglects second-order terms: μ (μ − μ̂), μ times any other friction of the contact, and μ times unknown
-    joint forces or the friction of other contacts. If unknown joint forces are large, prefer `dry`, or learn
-    them as analytical parameters.
+    λ = max(λ_K, 0) / (1 + μ̂ g), where λ_K is the frictionless multiplier under the analytical forces Q_K +
+    τ, and g = −Lᵀ J_Eᵀ s(v). This is exact for a single contact with friction −μ̂ λ s(v). In all other cases,
+    second-order terms are neglected: μ (μ − μ̂), and the products of μ with other friction at the contact,
+    friction at other contacts, and unknown joint forces. If unknown joint forces are large, use `dry`, or
+    learn these forces as analytical parameters.
 
     Args:
         contact: name of a surface contact of the system.
         kernel: covariance of each unknown.
-        inputs: inputs of the functions, from `position`, `velocity` and `speed`.
-        name: prefix of the hyperparameters; by default the name of the contact.
+        inputs: inputs of the functions, chosen from `position`, `velocity` and `speed`.
+        name: prefix of the hyperparameters; defaults to the name of the contact.
         smoothing: smoothing speed ε [m/s].
         terms: friction terms.
         friction_coefficient: friction coefficient μ̂.
         stribeck_speed: Stribeck speed v_s [m/s].
-        torsion_smoothing: angular speed about the normal below which torsional friction is smoothed [rad/s].
-        coupled: whether the mechanics include, in addition to `terms`, Coulomb friction −μ λ s(v) with a
-            constant μ, which is learned together with its ε (`forces/priors/contact.py`).
+        torsion_smoothing: smoothing angular speed of torsional friction about the normal [rad/s].
+        coupled: whether to include Coulomb friction −μ λ s(v) in addition to `terms`. Its μ is constant and
+            is learned together with its ε (`forces/priors/contact.py`).
 
     Raises:
         UnknownNameError: an input or a friction term is unknown.
@@ -201,7 +200,7 @@ class SlidingFrictionPrior(SurfaceForcePrior):
         for what, value in (speeds | {"torsional smoothing speed": self.torsion_smoothing}).items():
             if not 0.0 < value < float("inf"):
                 raise ModelError(
-                    f"force prior {self.name!r} has no such {what}",
+                    f"force prior {self.name!r} has an invalid {what}",
                     expected="a positive finite speed [m/s, rad/s]",
                     got=value,
                 )
@@ -230,7 +229,7 @@ class SlidingFrictionPrior(SurfaceForcePrior):
         return torch.stack([columns[term] for term in self.terms], dim=-1)
 
     def _load(self, system: ConstrainedSystem, at: States, u: Tensor) -> Tensor:
-        """Return the multiplier under the analytical forces and the friction μ̂ λ u, `(n, 1)`.
+        """Return the multiplier `(n, 1)` under the analytical forces and the friction μ̂ λ u.
 
         Raises:
             ModelError: this friction jams the contact.
@@ -242,12 +241,12 @@ class SlidingFrictionPrior(SurfaceForcePrior):
         if bool((gain[at.active[:, contact]] <= 0.0).any()):
             raise ModelError(
                 f"contact {self.contact!r} jams with a friction coefficient of {self.friction_coefficient:g}",
-                hint="use a smaller friction_coefficient, with which friction opposes more than it presses",
+                hint="use a smaller friction_coefficient",
             )
         return (free / gain)[:, None]
 
     def _spin(self, system: ConstrainedSystem, at: States) -> Tensor:
-        """Return the generalized force of a unit moment that opposes rotation about the normal, `(n, nq)`."""
+        """Return the generalized force `(n, nq)` of a unit moment that opposes rotation about the normal."""
         contact = system.contact(self.contact)
         assert isinstance(contact, SurfaceContact)
         index, origin = (
@@ -262,11 +261,11 @@ class SlidingFrictionPrior(SurfaceForcePrior):
 
 @dataclass(frozen=True)
 class NormalForcePrior(ForcePrior):
-    """A joint force along the constraint, E = Aᵀ Lᵀ = I − P, which does not affect accelerations in contact.
+    """A prior on a joint force along the constraint, which does not affect accelerations in contact.
 
-    Since H Aᵀ = 0, a force Aᵀ g(x) changes the multiplier by −g(x) but not the accelerations. A joint force
-    prior alone is overconfident along the normal. This independent process shares its hyperparameters but
-    retains the uncertainty along the normal until a force sensor, for example, reduces it.
+    E = Aᵀ Lᵀ = I − P. Since H Aᵀ = 0, a force Aᵀ g(x) changes the multiplier by −g(x) but does not change the
+    accelerations. A joint force prior alone is overconfident along the normal. This prior adds an independent
+    process with the same hyperparameters, so the normal force remains uncertain unless it is measured.
 
     Args:
         like: the joint force prior that provides the kernel, inputs and hyperparameters.
@@ -299,13 +298,13 @@ class NormalForcePrior(ForcePrior):
 
 
 SHARP = 1e-6
-"""Smoothing speed that is small enough for friction to have its full magnitude [m/s]."""
+"""Smoothing speed at which friction has almost its full magnitude [m/s]."""
 
 
 FRICTION_COEFFICIENT = 0.2
 """Initial value of a learned friction coefficient."""
 NEARLY_JAMMED = 0.95
-"""Largest friction coefficient, relative to that at which the contact jams."""
+"""Largest friction coefficient, relative to the coefficient at which the contact jams."""
 LEARNED = 2
 """Number of learned friction parameters per contact, μ and ε."""
 
@@ -331,7 +330,7 @@ def coulomb_keys(contact: str) -> tuple[str, str]:
 
 
 def initial_coulomb(priors: Iterable[ForcePrior], like: Tensor) -> dict[str, Tensor]:
-    """Return initial values of learned friction for contacts whose prior is coupled with the multiplier."""
+    """Return initial values of learned friction for contacts with a prior coupled to the multiplier."""
     start = {}
     for prior in _coupled_priors(priors):
         coefficient, smoothing = coulomb_keys(prior.contact)
@@ -343,7 +342,7 @@ def initial_coulomb(priors: Iterable[ForcePrior], like: Tensor) -> dict[str, Ten
 def coulomb_of(
     priors: Sequence[ForcePrior], tensors: Mapping[str, Tensor], like: Tensor
 ) -> tuple[CoulombFriction, ...]:
-    """Return contact friction with learned parameters, or with initial values if they are not learned."""
+    """Return contact friction with learned parameters, or with initial values if they are missing."""
     values = initial_coulomb(priors, like) | dict(tensors)
     return tuple(
         CoulombFriction(prior.contact, *(values[key].exp() for key in coulomb_keys(prior.contact)))
@@ -357,14 +356,14 @@ def _coupled_priors(priors: Iterable[ForcePrior]) -> list[SlidingFrictionPrior]:
 
 @dataclass(frozen=True, eq=False)
 class CoulombErrorPrior(ConstantForcePrior):
-    """Remaining uncertainty of a contact's friction, Q_z = λ̂ ∂(μ u)/∂(log μ, log ε) δ with δ ~ N(0, 1).
+    """A prior on the error of learned friction, Q_z = λ̂ ∂(μ u)/∂(log μ, log ε) δ with δ ~ N(0, 1).
 
-    λ̂ is the multiplier under the analytical forces and the learned friction. One e-fold is about the width of
-    the weak priors on μ and ε (`forces/search.py`).
+    λ̂ is the multiplier under the analytical forces and the learned friction. The unit standard deviation of
+    δ is about the width of the weak priors on log μ and log ε (`forces/search.py`).
 
     Attributes:
-        contact: the contact with uncertain friction.
-        friction: learned friction of all contacts, on which λ̂ depends.
+        contact: name of the contact with uncertain friction.
+        friction: learned friction of all contacts, which determines λ̂.
     """
 
     contact: str
@@ -396,7 +395,7 @@ class CoulombErrorPrior(ConstantForcePrior):
 
 
 def against_sliding(at: States, contact: str, smoothing: Tensor | float) -> Tensor:
-    """Return u = −J_Eᵀ s(v), the generalized force of a unit friction force, `(n, nq)`."""
+    """Return u = −J_Eᵀ s(v) `(n, nq)`, the generalized force of a unit friction force."""
     # s = v/√(|v|² + ε²); where the point sticks, its force is a multiplier
     point = at.eom.contact_points[contact]
     J, v = point.sliding
@@ -407,12 +406,12 @@ def against_sliding(at: States, contact: str, smoothing: Tensor | float) -> Tens
 def coupled(
     system: ConstrainedSystem, at: States, z: AffineMap, friction: Sequence[CoulombFriction]
 ) -> AffineMap:
-    """Return the affine map of a quantity including Coulomb friction at the contacts.
+    """Include Coulomb friction at the contacts in the affine map of a quantity.
 
     Args:
-        system: robot and contacts; friction of contacts that it does not have is ignored.
-        z: the quantity without this friction.
-        friction: Coulomb friction of contacts.
+        system: robot and contacts; friction of other contacts is ignored.
+        z: affine map of the quantity without this friction.
+        friction: Coulomb friction of the contacts.
     """
     gain = _gain(system, at, friction)
     if gain is None:
@@ -438,7 +437,7 @@ def with_coulomb(
 def coulomb_response(
     system: ConstrainedSystem, at: States, friction: Sequence[CoulombFriction]
 ) -> Tensor | None:
-    """Return ∂Q̄/∂Q = I − G Lᵀ `(n, nq, nq)`, the friction response to joint forces; `None` if it is I."""
+    """Return ∂Q̄/∂Q = I − G Lᵀ `(n, nq, nq)`, the response of friction to joint forces; `None` if it is I."""
     gain = _gain(system, at, friction)
     if gain is None:
         return None
@@ -452,7 +451,7 @@ def below_jamming(
     priors: Iterable[ForcePrior],
     bounds: Mapping[str, tuple[float, float]],
 ) -> dict[str, tuple[float, float]]:
-    """Return bounds that exclude jamming at all sliding training states, such that 1 + μ Lᵀu > 0."""
+    """Return bounds on μ that exclude jamming at all sliding training states, that is, 1 + μ Lᵀu > 0."""
     changed = dict(bounds)
     for prior in _coupled_priors(priors):
         key, row = coulomb_keys(prior.contact)[0], system.rows[prior.contact].start

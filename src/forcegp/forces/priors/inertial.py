@@ -1,11 +1,11 @@
 """Gaussian priors on errors of inertial parameters and on a payload, marginalised in closed form.
 
-Inverse dynamics is linear in the inertial parameters π: with π = π₀ + δ, M₀ q̈ − Q_C,0 − Q_G,0 + Y(q, q̇,
-q̈) δ = Q is an identity at the measured acceleration. Hence δ acts like a joint force −Y δ with a constant
-latent δ ~ N(0, S²). Least-squares identification with a ridge penalty towards the file is a special case. A
-prediction uses the robot with the updated parameters, and the remaining uncertainty acts through Y at the
-predicted acceleration. An unknown mass attached to link k is treated in the same way, with the columns Y_k
-for the mass and first moment of that link (Atkeson, An, Hollerbach 1986).
+Inverse dynamics is linear in the inertial parameters π = π₀ + δ, so M₀ q̈ − Q_C,0 − Q_G,0 + Y(q, q̇, q̈) δ =
+Q holds exactly at the measured acceleration. The error δ therefore acts like a joint force −Y δ with a
+constant latent δ ~ N(0, S²). Least-squares identification with a ridge penalty towards the robot file is a
+special case. Predictions use the robot with updated parameters, and the remaining uncertainty enters through
+Y at the predicted acceleration. An unknown mass attached to link k is treated in the same way, with the
+columns Y_k for the mass and first moment of that link (Atkeson, An, Hollerbach 1986).
 """
 
 from __future__ import annotations
@@ -36,17 +36,17 @@ PER_LINK = 10
 class InertialPrior(ConstantForcePrior):
     """A prior on errors of inertial parameters, with one learned scale s_k (initially 1) per link k.
 
-    Q = −[Y(q, q̇, q̈), diag q̈] S δ with δ ~ N(0, diag(s_k²)). Without `drives`, Q = −Y S δ.
+    Q = −[Y(q, q̇, q̈), diag q̈] S δ with δ ~ N(0, diag(s_k²)). If `drives` is not given, Q = −Y S δ.
 
     Args:
         mass: relative standard deviation of each link's mass.
         length: standard deviation of the first moment divided by the mass [m].
-        inertia: relative standard deviation of each link's moments of inertia, and standard deviation of the
-            products of inertia I_ab relative to √(I_aa I_bb).
+        inertia: relative standard deviation of the moments of inertia of each link, and standard deviation of
+            the products of inertia I_ab divided by √(I_aa I_bb).
         kernel: covariance of the constants.
         name: prefix of the hyperparameters.
-        scales: scales S `(10 nq,)`; by default those of the robot.
-        drives: standard deviation of each joint's drive inertia [kg m², kg]; by default all are known.
+        scales: scales S `(10 nq,)`; computed from the robot by default.
+        drives: standard deviation of the drive inertia of each joint [kg m², kg]; by default, all are known.
 
     Example:
         >>> import torch, forcegp
@@ -65,14 +65,14 @@ class InertialPrior(ConstantForcePrior):
     drives: tuple[float, ...] = ()
 
     def around(self, robot: RobotModel) -> InertialPrior:
-        """Return the prior with its scales fixed to those of the given robot."""
+        """Return the prior with its scales S fixed to those of the given robot."""
         return dataclasses.replace(self, scales=tuple(self.scale(robot)[: PER_LINK * robot.nq].tolist()))
 
     def with_drives(self, std: Tensor) -> InertialPrior:
-        """Return the prior with unknown drive inertia of standard deviation `(nq,)`.
+        """Return the prior with uncertain drive inertia, given the standard deviation of each joint `(nq,)`.
 
-        Motion hardly distinguishes drive inertia from the inertia of the moved links. If the drives were
-        treated as known, their errors would be attributed to the links, with too small a standard deviation.
+        Drive inertia and link inertia have similar effects on the motion. If drive inertia were treated as
+        known, its errors would be attributed to the links, with too small a standard deviation.
         """
         return dataclasses.replace(self, drives=tuple(std.tolist()), kernel=Constant())
 
@@ -90,7 +90,7 @@ class InertialPrior(ConstantForcePrior):
         return -columns * self.scale(system.robot)
 
     def scale(self, robot: RobotModel) -> Tensor:
-        """Return S, standard deviations before scales are learned: `(10 nq,)`, or `(11 nq,)` with drives."""
+        """Return the standard deviations S without learned scales: `(10 nq,)`, or `(11 nq,)` with drives."""
         if self.scales is not None:
             return robot.mass.new_tensor((*self.scales, *self.drives))
         m, J = robot.mass[:, None], inertial_parameters(robot.mass, robot.com, robot.inertia)
@@ -122,8 +122,8 @@ class InertialPrior(ConstantForcePrior):
             log_volume: V, which converts the density of torques to that of accelerations, zero by default.
 
         Returns:
-            The robot, and the δ `(10 nq,)` that it contains. Links that are not physically consistent in the
-            file remain unchanged.
+            The robot and its error δ `(10 nq,)`. Links that are not physically consistent in the robot file
+            remain unchanged.
         """
         J0 = pseudo_inertia(robot.mass, robot.com, robot.inertia).double()
         links = (torch.linalg.eigvalsh(J0)[:, 0] > 0.0).nonzero()[:, 0]
@@ -216,34 +216,34 @@ of its linear model, and smallest fraction of a step."""
 
 PER_PAYLOAD = len(PARAMETER_NAMES)
 MASS_AND_MOMENT = 4
-"""Number of entries for mass and first moment, which gravity determines without bias from noisy q̈."""
+"""Number of entries for the mass and first moment, which gravity determines without bias due to noisy q̈."""
 FARTHEST = 3.0
-"""Largest distance of a point mass from the origin of its link, in standard lengths."""
+"""Largest distance of a point mass from the origin of the link, in units of `length`."""
 
 
 @dataclass(frozen=True)
 class PayloadPrior(ConstantForcePrior):
-    """A prior on a point mass on a link, Q = −Y_k(q, q̇, q̈) S δ with δ ~ N(0, s² I).
+    """A prior on a point mass attached to a link, Q = −Y_k(q, q̇, q̈) S δ with δ ~ N(0, s² I).
 
-    q̈ is the acceleration of the arm with the payload `known` (by default none). The force is exact for this
-    payload and accurate to first order for others; `around` linearizes at the current estimate.
+    q̈ is the acceleration of the arm with the payload `known` (by default, no payload). The force is exact
+    for this payload and accurate to first order for others. `around` linearizes at the current estimate.
 
-    With `update` and `forget`, the prior tracks a payload that is picked up or put down. Fitting to a log
-    without a payload would set its scale to zero, so fix the scale while learning other priors:
-    `model.fit(data, learn=["joint"])`.
+    With `update` and `forget`, a model tracks a payload that is picked up or put down. Fitting to a log
+    without a payload would set the scale s to zero. To keep it, list the other priors: `model.fit(data,
+    learn=["joint"])`.
 
     Args:
-        joint: joint that moves the link carrying the payload; by default the last one.
+        joint: joint that moves the link with the payload; defaults to the last joint.
         mass: standard deviation of the mass [kg].
-        length: standard deviation of the first moment divided by that of the mass [m].
+        length: ratio of the standard deviations of the first moment and the mass [m].
         kernel: covariance of the constants.
         name: prefix of the hyperparameters.
-        known: mass [kg] and first moment [kg m] of the payload at which the acceleration is computed.
-        measured: whether to use the measured acceleration if available. The force is then exact for any
-            payload, but noise biases the estimate towards zero if the arm hardly accelerates.
+        known: mass [kg] and first moment [kg m] of the payload with which the acceleration is computed.
+        measured: whether to use the measured acceleration, if available. The force is then exact for any
+            payload, but noise biases the estimate towards zero if the accelerations are small.
 
     Raises:
-        ModelError: the known payload does not consist of a mass and a first moment.
+        ModelError: `known` does not consist of a mass and a first moment.
     """
 
     joint: str | None = None
@@ -278,10 +278,10 @@ class PayloadPrior(ConstantForcePrior):
         return -Y * self.units(at.q)
 
     def around(self, mean: Tensor) -> PayloadPrior:
-        """Return the prior with the acceleration computed for the arm with the estimated payload.
+        """Return the prior linearized at the estimated payload.
 
         Args:
-            mean: mean of the latent constants `(4,)`. Unless they describe a point mass near the link, no
+            mean: mean of the latent constants `(4,)`. If they do not describe a point mass near the link, no
                 payload is assumed.
         """
         mass, *moment = (mean * self.units(mean)).tolist()
@@ -289,11 +289,11 @@ class PayloadPrior(ConstantForcePrior):
         return dataclasses.replace(self, known=(mass, *moment) if near else ())
 
     def units(self, like: Tensor) -> Tensor:
-        """Return the mass and first moment per unit of the latent constants, `(4,)`."""
+        """Return the mass and first moment `(4,)` per unit of the latent constants."""
         return like.new_tensor([self.mass, *3 * [self.mass * self.length]])
 
     def loaded(self, robot: RobotModel) -> RobotModel:
-        """Return the robot with the known payload, a point mass, if any."""
+        """Return the robot with the known payload, if any, as a point mass."""
         if not self.known:
             return robot
         J = pseudo_inertia(robot.mass, robot.com, robot.inertia)
@@ -308,7 +308,7 @@ class PayloadPrior(ConstantForcePrior):
         self.link(system.robot)
 
     def link(self, robot: RobotModel) -> int:
-        """Return the index of the joint that carries the payload."""
+        """Return the index of the joint that moves the link with the payload."""
         if self.joint is None:
             return robot.nq - 1
         check_name("joint that carries a payload", self.joint, robot.joint_names)

@@ -1,12 +1,12 @@
-"""Priors on the joint force Q: its mean from the robot file, and priors on the remainder.
+"""The prior mean of the joint force Q, computed from the robot file, and priors on the remainder.
 
-- `JointForcePrior`: an arbitrary force, with one process per joint.
+- `JointForcePrior`: an arbitrary force with one process per joint.
 - `JointFrictionPrior`: friction missing from the robot file (viscous, Coulomb, a transition between the two,
   and a part that increases with the load) and the offset of the torque sensor. The friction of a joint
-  depends only on that joint's velocity, so the prior extrapolates to new motions of other joints. It does not
-  depend on τ, since in closed loop the most likely force would cancel torque-sensor noise.
-- `DisturbancePrior`: slowly varying torques (temperature, hysteresis), which functions of the state would
-  overfit and white noise would underestimate.
+  depends only on the velocity of that joint, so the prior extrapolates to new motions of other joints.
+  Friction does not depend on τ, since in closed loop the most likely force would cancel torque-sensor noise.
+- `DisturbancePrior`: slowly varying torques caused by temperature or hysteresis, which functions of the state
+  would overfit and white noise would underestimate.
 - `CoregionalPrior`: common causes of several joint forces, such as a cable or a contact missing from the
   scene, which independent processes would have to learn separately for each joint.
 """
@@ -30,11 +30,11 @@ from forcegp.gp.kernels import SEGMENT, TIME, Kernel, Linear, OrnsteinUhlenbeck,
 from forcegp.robot.model import RobotModel
 
 TERMS = ("bias", "gravity", "friction", "actuation")
-"""Known parts of Q: Q_C, Q_G, Q_D and Q_u."""
+"""Names of the known parts of Q: Q_C, Q_G, Q_D and Q_u."""
 
 
 class ConstantForcePrior(ForcePrior):
-    """A prior on constants, whose kernel has no inputs."""
+    """A prior on constants; its kernel has no inputs."""
 
     def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
         return {"one": at.q.new_zeros(len(at.q), 1)}
@@ -42,10 +42,10 @@ class ConstantForcePrior(ForcePrior):
 
 @dataclass(frozen=True)
 class AnalyticalMean:
-    """Prior mean m(x; θ_A) = Q_K, the sum of selected terms among Q_C, Q_G, Q_D and Q_u.
+    """The prior mean m(x; θ_A) = Q_K, a sum of terms selected from Q_C, Q_G, Q_D and Q_u.
 
     Args:
-        terms: known terms from `bias`, `gravity`, `friction`, `actuation`; empty for the zero mean.
+        terms: known terms, chosen from `bias`, `gravity`, `friction` and `actuation`; empty for a zero mean.
 
     Example:
         >>> AnalyticalMean(("gravity", "actuation")).terms
@@ -72,7 +72,7 @@ class AnalyticalMean:
 
 
 def mean_of(mean: str | AnalyticalMean) -> AnalyticalMean:
-    """Return the mean named `"zero"` or `"analytical"`, or a given mean.
+    """Return the mean named `"zero"` or `"analytical"`, or return a given mean unchanged.
 
     Raises:
         UnknownNameError: the mean does not exist.
@@ -85,7 +85,7 @@ def mean_of(mean: str | AnalyticalMean) -> AnalyticalMean:
 
 
 class PerJointPrior(ForcePrior):
-    """A prior on one force per joint, E = I; subclasses may have a different operator."""
+    """A prior on one force per joint with E = I; subclasses may have a different operator."""
 
     per_joint = True
 
@@ -102,7 +102,7 @@ class PerJointPrior(ForcePrior):
 
 @dataclass(frozen=True)
 class JointForcePrior(PerJointPrior):
-    """A prior with an independent process for each joint force Q_i (eq. 31), E = I.
+    """A prior with an independent process for each joint force Q_i (eq. 31) and E = I.
 
     Args:
         kernel: covariance of each component.
@@ -138,8 +138,7 @@ class JointForcePrior(PerJointPrior):
 
 
 SPEEDS = (0.02, 0.1, 0.5)
-"""Saturation velocities of the Coulomb features [rad/s, m/s]: a sharp step and two more gradual transitions.
-"""
+"""Saturation speeds of the Coulomb features [rad/s, m/s]: a sharp step and two more gradual transitions."""
 OFFSET = 0.3
 """Initial standard deviation of an offset, relative to that of a friction weight."""
 
@@ -149,17 +148,17 @@ class JointFrictionPrior(PerJointPrior):
     """A prior on the viscous, Coulomb and load-dependent friction and the offset of each joint.
 
     Q_i = w_i·φ(q̇_i) + c_i with φ = (q̇_i, tanh(q̇_i/v_1), tanh(q̇_i/v_2), …, |Q_G,i| tanh(q̇_i/v_1)). The
-    weights w_i and the offset c_i are Gaussian and marginalised. Three kinds of scales are learned: the
-    friction of each joint, the relevance of each feature, and the offsets relative to friction; the last two
-    are shared by all joints. If a joint moved in only one direction, its offset and friction cannot be
-    separated, but the other joints indicate which is likely. With a separate standard deviation for each
-    weight, learning would set most of them to zero and be overconfident on new motions. A kernel such as
-    `Linear(shared=True, offset=0.3) + SquaredExponential(("velocity",))` adds a smooth remainder.
+    weights w_i and the offset c_i are Gaussian and are marginalised. Three kinds of scales are learned: the
+    friction of each joint, the relevance of each feature, and the ratio of offsets to friction. All joints
+    share the last two. If a joint moved in only one direction, its offset and friction cannot be separated,
+    but the other joints indicate which is likely. With a separate standard deviation for each weight,
+    learning would set most of them to zero, and the model would be overconfident on new motions. A kernel
+    such as `Linear(shared=True, offset=0.3) + SquaredExponential(("velocity",))` adds a smooth remainder.
 
     Args:
-        kernel: covariance of each component; by default linear in the features.
+        kernel: covariance of each component; linear in the features by default.
         speeds: saturation speeds v_1, v_2, … [rad/s, m/s].
-        load: whether friction proportional to the load |Q_G,i| is a feature.
+        load: whether to include the load-dependent feature |Q_G,i| tanh(q̇_i/v_1).
         name: prefix of the hyperparameters.
 
     Example:
@@ -192,7 +191,7 @@ class JointFrictionPrior(PerJointPrior):
 
     @property
     def sharpest(self) -> int:
-        """Index of the Coulomb feature that represents the dry friction of a sticking joint."""
+        """Index of the Coulomb feature that models dry friction of a sticking joint."""
         return self.speeds.index(min(self.speeds))
 
     def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
@@ -207,16 +206,16 @@ class JointFrictionPrior(PerJointPrior):
 
 
 NEW_MOTION = -1.0
-"""Trajectory number of states that are not in the training log."""
+"""Trajectory number assigned to states that are not in the training log."""
 
 
 @dataclass(frozen=True)
 class DisturbancePrior(PerJointPrior):
     """A prior on slow disturbances Q_i = d_i(t), with one Ornstein–Uhlenbeck process per joint.
 
-    The processes are independent between trajectories; their standard deviations σ_i and correlation times
-    T_i are learned. On new motions, they cannot be predicted, and they add σ_i² to the variance of the joint
-    force but nothing to its mean. Inference is exact, since sparse inference assumes independent samples.
+    Different trajectories have independent disturbances. The standard deviations σ_i and correlation times
+    T_i are learned. Disturbances cannot be predicted on new motions, so they add σ_i² to the variance of the
+    joint force. Inference must be exact, since sparse inference assumes independent samples.
 
     Args:
         kernel: covariance over time.
@@ -243,13 +242,13 @@ class DisturbancePrior(PerJointPrior):
 
 @dataclass(frozen=True)
 class CoregionalPrior(ForcePrior):
-    """A prior on joint forces with common causes, with covariance k(x, x′) (W Wᵀ + diag κ) between joints.
+    """A prior on joint forces with common causes and covariance k(x, x′) (W Wᵀ + diag κ) between joints.
 
     Q_i = Σ_r W_ir g_r(x) + h_i(x). The causes g_r and the remainders h_i are independent processes with the
-    same length-scales, W has one column per cause, and κ is the variance of the remainders (the intrinsic
-    coregionalisation model; Álvarez, Rosasco and Lawrence, *Kernels for vector-valued functions*, 2012,
-    section 4.2). All of these are learned; the norm of a column of W is the standard deviation of its cause.
-    With separate length-scales, the kernel describes the linear model of coregionalisation.
+    same length-scales, W has one column per cause, and κ is the variance of the remainders. This is the
+    intrinsic coregionalisation model (Álvarez, Rosasco and Lawrence, *Kernels for vector-valued functions*,
+    2012, section 4.2). All of these parameters are learned. The norm of a column of W is the standard
+    deviation of the cause.
 
     Args:
         kernel: covariance of each process.
@@ -263,7 +262,7 @@ class CoregionalPrior(ForcePrior):
         9
 
     Raises:
-        ModelError: the number of causes is zero.
+        ModelError: the number of causes is not positive.
         UnknownNameError: an input is not one of the three.
     """
 
@@ -277,7 +276,9 @@ class CoregionalPrior(ForcePrior):
     def __post_init__(self) -> None:
         check_inputs(self.name, self.inputs, ("q", "qd", "tau"))
         if self.causes < 1:
-            raise ModelError("a coregionalised force needs a cause", expected="1 or more", got=self.causes)
+            raise ModelError(
+                "a coregionalised force needs at least one cause", expected="1 or more", got=self.causes
+            )
 
     def outputs(self, robot: RobotModel) -> int:
         return self.causes + robot.nq
@@ -286,7 +287,7 @@ class CoregionalPrior(ForcePrior):
         return {name: getattr(at, name) for name in self.inputs}
 
     def initial_parameters(self, robot: RobotModel) -> dict[str, Tensor]:
-        """Return the columns of a cosine transform, starting with equal weights for all joints."""
+        """Return the columns of a cosine transform. The first has equal weights for all joints."""
         i, r = torch.arange(robot.nq) + 0.5, torch.arange(self.causes)
         return {MIXING: torch.cos(math.pi / robot.nq * i[:, None] * r).to(robot.mass)}
 

@@ -1,4 +1,4 @@
-"""Named sets of force priors: the candidates for automatic selection, and those of the paper."""
+"""Named sets of force priors: the candidates for automatic selection, and the priors of the paper."""
 
 from __future__ import annotations
 
@@ -15,29 +15,29 @@ from forcegp.gp.kernels import Kernel, Linear, SquaredExponential
 PAPER = SquaredExponential()
 """The paper's kernel for a joint force (eq. 31)."""
 ANGLES, RATES = SquaredExponential(("q",), shared=True), Linear(("qd",), shared=True)
-"""Kernel on the configuration, and linear kernel on the joint velocities."""
+"""Kernel that depends on the configuration, and linear kernel that depends on the joint velocities."""
 WHOLE = Linear(("tau",)) + ANGLES + RATES * RATES * ANGLES + SquaredExponential(("qd",), shared=True)
 """Kernel for a force that includes the motor torque (linear), gravity (a function of the configuration), bias
-    and damping (quadratic and linear in the velocity), and any joint friction."""
+and damping forces (quadratic and linear in the velocity), and any joint friction."""
 REMAINING = RATES * ANGLES + SquaredExponential(shared=True)
 """Kernel for a force without the motor torque: configuration-dependent damping and an arbitrary remainder."""
 STATE_RESIDUAL = SquaredExponential(("q", "qd"), shared=True)
-"""Kernel for a residual force in addition to friction. It does not depend on the motor torque because, in
-    closed loop, such a residual would learn to cancel it."""
+"""Kernel for a residual force in addition to friction. It does not depend on the motor torque, because in
+closed loop the residual would learn to cancel this torque."""
 
 
 def default_priors(
     system: ConstrainedSystem, mean: str | AnalyticalMean = "analytical", kernel: Kernel | None = None
 ) -> tuple[ForcePrior, ...]:
-    """Return a joint force prior and, for contacts, a prior on the part that accelerations do not determine.
+    """Return a joint force prior and, for contacts, a prior on the part not identifiable from accelerations.
 
-    If the mean includes the motor torque, each surface contact also has a `SlidingFrictionPrior`; otherwise
-    its friction would be attributed to the joints, and predictions in free motion would be overconfident.
+    If the mean includes the motor torque, each surface contact also has a `SlidingFrictionPrior`. Otherwise,
+    contact friction would be attributed to the joints, and predictions in free motion would be overconfident.
 
     Args:
-        mean: the model's prior mean, which determines the default kernel.
-        kernel: covariance of each joint force; by default `REMAINING` if the mean includes the motor torque,
-            and otherwise `WHOLE`. The prior on contact friction does not use it.
+        mean: prior mean of the model, which determines the default kernel.
+        kernel: covariance of each joint force. Defaults to `REMAINING` if the mean includes the motor torque,
+            and to `WHOLE` otherwise. The prior on contact friction does not use it.
 
     Example:
         >>> import torch, forcegp
@@ -56,7 +56,7 @@ def default_priors(
 def friction_priors(system: ConstrainedSystem) -> tuple[ForcePrior, ...]:
     """Return priors on the friction of each joint and on the Coulomb friction of each surface contact.
 
-    None of the priors depends on the motor torque.
+    None of these priors depends on the motor torque.
 
     Args:
         system: robot and contacts.
@@ -72,7 +72,7 @@ def friction_priors(system: ConstrainedSystem) -> tuple[ForcePrior, ...]:
 
 
 def friction_and_residual_priors(system: ConstrainedSystem) -> tuple[ForcePrior, ...]:
-    """Return `friction_priors` and a prior on an arbitrary joint force that depends on (q, q̇)."""
+    """Return `friction_priors` together with a prior on an arbitrary joint force that depends on (q, q̇)."""
     residual = JointForcePrior(STATE_RESIDUAL, inputs=("q", "qd"))
     normal = (NormalForcePrior(residual),) if system.m else ()
     return (*friction_priors(system), residual, *normal)
@@ -84,10 +84,10 @@ class PriorSet:
 
     Attributes:
         name: name of the set.
-        description: description of the modelled forces.
+        description: description of the forces that are modelled.
         priors: function that returns the priors for a system.
-        has_joint_friction: whether joint friction and torque noise are modelled, as is required for
-            identifying inertia.
+        has_joint_friction: whether joint friction and torque noise are modelled, which is required to
+            identify inertia.
         needs_surface: whether the set requires a surface contact.
     """
 
@@ -103,10 +103,10 @@ class PriorSet:
 
 
 def contact_priors(system: ConstrainedSystem, kernel: Kernel | None = None) -> tuple[ForcePrior, ...]:
-    """Return priors on the friction of each surface contact, or a joint force prior if there are none.
+    """Return priors on the friction of each surface contact, or a joint force prior if there are no contacts.
 
     Args:
-        kernel: covariance of each component of an arbitrary tangential force; by default, the force is
+        kernel: covariance of each component of an arbitrary tangential force. By default, the force is
             friction that opposes sliding.
 
     Example:
@@ -131,22 +131,24 @@ def _surfaces(system: ConstrainedSystem) -> list[str]:
 SETS: dict[str, PriorSet] = {
     each.name: each
     for each in (
-        PriorSet("sliding", "friction of contacts", contact_priors, False, needs_surface=True),
-        PriorSet("friction", "friction of joints and contacts, noise of the torque", friction_priors),
+        PriorSet("sliding", "contact friction", contact_priors, False, needs_surface=True),
+        PriorSet("friction", "joint and contact friction, torque noise", friction_priors),
         PriorSet(
-            "friction+residual", "the same, and any joint force of (q, q̇)", friction_and_residual_priors
+            "friction+residual",
+            "the same, and any joint force that depends on (q, q̇)",
+            friction_and_residual_priors,
         ),
     )
 }
-"""Sets for automatic selection with the analytical mean, simplest first."""
+"""Sets for automatic selection with the analytical mean, from the simplest to the most complex."""
 FEW = SETS["friction"]
-"""The set used if there are few samples."""
+"""The set for small data sets."""
 
 
 def priors_of(
     system: ConstrainedSystem, mean: AnalyticalMean, force_priors: str | Sequence[ForcePrior]
 ) -> tuple[ForcePrior, ...]:
-    """Return the given force priors, or those of a named set; `"auto"` selects the set for small data sets.
+    """Return the given force priors, or those of a named set. `"auto"` names the set for small data sets.
 
     Raises:
         UnknownNameError: the set does not exist.

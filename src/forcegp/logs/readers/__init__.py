@@ -1,4 +1,4 @@
-"""Detection of log formats by the first bytes, then by file name; formats that can run code are rejected."""
+"""Detection of log formats by first bytes, then by file name. Formats that can run code are rejected."""
 
 from __future__ import annotations
 
@@ -47,13 +47,13 @@ def read(
     rows: int | None = None,
     progress: Progress | None = None,
 ) -> LogTable:
-    """Read a log (a file or a folder) of any supported format.
+    """Read a log file or folder of any supported format.
 
-    Only columns for which `wanted` returns true are read, and at most `rows` rows if the format supports it.
-    `progress` is called with the completed and total work.
+    Only columns for which `wanted` returns true are read, and at most `rows` rows if the format permits.
+    `progress` is called with the completed and the total work.
 
     Raises:
-        DataError: the file does not exist, is damaged or too large, or its format is unsupported or unsafe.
+        DataError: the file is missing, damaged or too large, or its format is unsupported or unsafe.
         MissingDependencyError: the reader for the format is not installed.
 
     >>> import tempfile
@@ -71,7 +71,7 @@ def read(
 
 
 def format_of(path: Path) -> str:
-    """Return the key of a log's format in `FORMATS`."""
+    """Return the format of a log as a key of `FORMATS`."""
     if path.is_dir():
         return _format_of_folder(path)
     if not path.is_file():

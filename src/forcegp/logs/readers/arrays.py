@@ -1,8 +1,8 @@
 """Readers of files with named arrays: NumPy archives without pickled objects, HDF5 and MATLAB.
 
-MATLAB files of version 7.3 are read as HDF5 files, and those of version 4 by SciPy. In versions 5 to 7, every
-tag is checked before it is followed, since SciPy's reader crashes on some damaged files; for the layout, see
-"MAT-File Format" (MathWorks), chapter 1. Links to other files from an HDF5 file are not followed.
+MATLAB files of version 7.3 are read as HDF5 files, and those of version 4 with SciPy. In versions 5 to 7,
+every tag is checked before it is followed, since SciPy's reader crashes on some damaged files. For the
+layout, see "MAT-File Format" (MathWorks), chapter 1. Links from an HDF5 file to other files are not followed.
 """
 
 from __future__ import annotations
@@ -28,7 +28,7 @@ MAX_ARRAYS = 4096
 
 
 def read_numpy(path: Path, **_: object) -> LogTable:
-    """Read the numeric arrays of an `.npz` archive, or the array of an `.npy` file."""
+    """Read the numeric arrays in an `.npz` archive, or the array in an `.npy` file."""
     arrays: Arrays = {}
     with guards.foreign(str(path), "a NumPy file"):
         if zipfile.is_zipfile(path):
@@ -49,7 +49,7 @@ def read_numpy(path: Path, **_: object) -> LogTable:
 
 
 def _array(source: str, name: str, file: Any, size: int) -> Arrays:
-    """Return an array, or the fields of a structured array, by name, after checking the declared size."""
+    """Return an array, or the fields of a structured array by name, after checking the declared size."""
     form = np.lib.format
     version = form.read_magic(file)  # pyright: ignore[reportArgumentType]
     read_header = {(1, 0): form.read_array_header_1_0, (2, 0): form.read_array_header_2_0}.get(version)
@@ -72,7 +72,7 @@ def _array(source: str, name: str, file: Any, size: int) -> Arrays:
 
 
 def read_hdf5(path: Path, **_: object) -> LogTable:
-    """Read the numeric data sets in an HDF5 file; those in groups are named `group/name`."""
+    """Read the numeric data sets in an HDF5 file. Those in groups are named `group/name`."""
     remarks: list[str] = []
     return table.table_of_arrays(path, "hdf5", _hdf5_arrays(path, "/", remarks), remarks)
 
@@ -88,7 +88,7 @@ def _hdf5_arrays(path: Path, separator: str, remarks: list[str]) -> Arrays:
 def _walk(
     h5py: Any, group: Any, prefix: str, separator: str, arrays: Arrays, remarks: list[str], seen: set[Any]
 ) -> None:
-    """Collect the data sets in a group, omitting duplicates due to links."""
+    """Collect the data sets in a group, omitting duplicates created by links."""
     if prefix.count(separator) > limits.GROUP_DEPTH:
         raise DataError(f"{group.file.filename}: groups are nested too deeply", got=prefix[:200])
     for key in group:
@@ -133,7 +133,7 @@ COMPLEX = 0x08
 
 
 class Variable(NamedTuple):
-    """A named array (`struct.field` for the field of a struct), or the reason why it cannot be read."""
+    """A named array (`struct.field` for a field of a struct), or the reason why it cannot be read."""
 
     name: str
     value: NDArray[np.generic] | str
@@ -145,7 +145,7 @@ class _Element(NamedTuple):
 
 
 def variables(content: bytes, source: str) -> Iterator[Variable]:
-    """Yield the variables in the content of a file, in order; `source` is the file name for messages."""
+    """Yield the variables in the content of a file, in order. `source` is the file name for messages."""
     order = {b"IM": "<", b"MI": ">"}.get(content[126:128])
     if order is None:
         raise DataError(f"{source}: not a MATLAB file of versions 5 to 7", got=content[:20])
@@ -176,7 +176,7 @@ class _Reader:
         return memoryview(content)
 
     def elements(self, content: memoryview) -> Iterator[_Element]:
-        """Yield consecutive elements, which are aligned to eight bytes; short ones are part of their tag."""
+        """Yield consecutive elements. They are aligned to 8 bytes, and short ones are part of their tag."""
         at = 0
         while at < len(content):
             if len(content) - at < 8:
@@ -199,7 +199,7 @@ class _Reader:
         return element
 
     def matrix(self, element: _Element, what: str, field: str = "", depth: int = 0) -> Iterator[Variable]:
-        """Yield a variable or a field of a struct or, if it is itself a struct, all of its fields."""
+        """Yield a variable or a field of a struct. If the field is itself a struct, yield all its fields."""
         if element.kind != MATRIX:
             raise self.damaged(what, f"an element of type {element.kind}")
         if depth > limits.GROUP_DEPTH:
@@ -258,11 +258,11 @@ class _Reader:
 
 
 HDF5_MAGIC = b"\x89HDF\r\n\x1a\n"
-"""HDF5 signature, which in version 7.3 follows a header of 512 bytes."""
+"""HDF5 signature, which follows a header of 512 bytes in version 7.3."""
 
 
 def read_matlab(path: Path, **_: object) -> LogTable:
-    """Read the numeric arrays in a MATLAB file, naming fields `struct.field`; note any other variables."""
+    """Read the numeric arrays in a MATLAB file, naming fields `struct.field`, and note other variables."""
     with path.open("rb") as file:
         head = file.read(520)
     arrays, remarks = Arrays(), list[str]()
@@ -281,7 +281,7 @@ def read_matlab(path: Path, **_: object) -> LogTable:
 
 
 def _version4(path: Path) -> Iterator[Variable]:
-    """Yield the variables in a version 4 file, which has no structs."""
+    """Yield the variables in a version 4 file, which cannot contain structs."""
     from scipy.io import loadmat, whosmat
 
     listing = whosmat(path)

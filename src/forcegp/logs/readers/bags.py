@@ -1,9 +1,10 @@
-"""Reader of ROS 1 and ROS 2 bags and MCAP files, which needs no ROS installation.
+"""Reader of ROS 1 and ROS 2 bags and MCAP files that needs no ROS installation.
 
-Joint states become the columns `position.<joint>`, `velocity.<joint>` and `effort.<joint>`, and wrenches the
-columns `force.x` to `torque.z`. Both also have `header`, the time stamp of the driver [s], and `receive`, the
-time of recording [s], each relative to the earliest one in the log, since float64 cannot resolve nanoseconds
-since 1970. Message layouts are those of the ROS distributions; definitions stored in a bag are not compiled.
+Joint states become the columns `position.<joint>`, `velocity.<joint>` and `effort.<joint>`. Wrenches become
+the columns `force.x` to `torque.z`. Both also have the columns `header`, the time stamp of the driver [s],
+and `receive`, the time of recording [s]. Each is relative to the earliest one in the log, since float64
+cannot resolve nanoseconds since 1970. Message layouts are those of the ROS distributions, and definitions
+stored in a bag are not compiled.
 """
 
 from __future__ import annotations
@@ -28,13 +29,13 @@ JOINT_STATE = "sensor_msgs/msg/JointState"
 WRENCH = "geometry_msgs/msg/WrenchStamped"
 KINDS = (JOINT_STATE, WRENCH)  # that are read
 UNITS = {"position": "rad", "velocity": "rad/s", "effort": "Nm", "force": "N", "torque": "Nm"}
-"""Units in joint states (REP 103) and wrenches."""
+"""Units in joint states (REP 103) and in wrenches."""
 CLOCKS = ("header", "receive")
 """Time columns of each topic."""
 
 Decode = Callable[[bytes], Any]
 Found = tuple[str, str, str, int, bytes, int]
-"""Topic, type, encoding, recording time [ns] and content of a message, and the amount of data read so far."""
+"""Topic, type, encoding, recording time [ns] and content of a message, and amount of data read so far."""
 
 
 def canonical(kind: str) -> str:
@@ -49,7 +50,7 @@ def canonical(kind: str) -> str:
 
 @cache
 def decoder(kind: str, encoding: str) -> Decode:
-    """Return a decoder for messages of a type in `KINDS` with the encoding `ros1` or `cdr`."""
+    """Return a decoder for messages with a type in `KINDS` and the encoding `ros1` or `cdr`."""
     typesys = optional_module("rosbags.typesys", "Reading ROS messages", "import")
     first = encoding == "ros1"
     store = typesys.get_typestore(typesys.Stores.ROS1_NOETIC if first else typesys.Stores.ROS2_HUMBLE)
@@ -59,7 +60,7 @@ def decoder(kind: str, encoding: str) -> Decode:
 
 @dataclass
 class Messages:
-    """Messages of a topic that have the same columns, with their time stamps and recording times [ns]."""
+    """Messages of a topic with the same columns, their time stamps and their recording times [ns]."""
 
     topic: str
     columns: tuple[str, ...]
@@ -80,7 +81,7 @@ class Messages:
 
 @dataclass
 class Collector:
-    """Collects the messages in a bag, in one stream for each topic and set of joints."""
+    """Collector of the messages in a bag, with one stream for each topic and set of joints."""
 
     source: str
     unpacking: Unpacking
@@ -90,7 +91,7 @@ class Collector:
     def take(
         self, messages: Iterable[Found], rows: int | None, progress: Progress | None, total: int
     ) -> None:
-        """Collect messages of supported types until a stream has `rows` messages."""
+        """Collect messages of supported types until one stream has `rows` messages."""
         for topic, kind, encoding, receive_ns, raw, done in messages:
             if kind in KINDS and encoding in ("cdr", "ros1"):
                 self._add(topic, kind, receive_ns, raw, decoder(kind, encoding))
@@ -100,7 +101,7 @@ class Collector:
                 return
 
     def _add(self, topic: str, kind: str, receive_ns: int, raw: bytes, decode: Decode) -> None:
-        """Add a message; raise `DataError` if it is too large, or its arrays do not match its joint names."""
+        """Add a message; raise `DataError` if it is too large or its arrays do not match its joint names."""
         check_count(self.source, "bytes in one message", len(raw), limits.MESSAGE_BYTES)
         message = decode(raw)
         if kind == JOINT_STATE:
@@ -117,7 +118,7 @@ class Collector:
         check_count(self.source, "streams", len(self._streams), limits.LOG_STREAMS)
 
     def table(self, format_: str, topics: dict[str, str], wanted: Wanted) -> LogTable:
-        """Return the log with the requested columns; `topics` maps all topics in the bag to their types."""
+        """Return the log with the requested columns. `topics` maps all topics in the bag to their types."""
         if not self._streams:
             listing = ", ".join(f"{topic} ({kind})" for topic, kind in topics.items())
             text, got = f"{self.source}: no messages of a supported type", listing[:600] or "no topics"
@@ -137,7 +138,7 @@ class Collector:
 
 
 def _joint_state(source: str, topic: str, message: Any) -> dict[str, float]:
-    """Return the position, velocity and effort of each joint by column, with NaN for empty quantities."""
+    """Return position, velocity and effort of each joint, keyed by column, with NaN for empty quantities."""
     names = tuple(str(name)[: limits.LOG_NAME] for name in message.name)
     if not names or len(set(names)) < len(names):
         raise DataError(f"{source}: a joint state on {topic} has no joint names, or one twice", got=names[:8])
@@ -202,7 +203,7 @@ def _files(path: Path) -> list[Path]:
 
 
 def _mcap_messages(path: Path, unpacking: Unpacking, topics: dict[str, str]) -> Iterator[Found]:
-    """Yield the messages in an MCAP file in file order, and add its topics and their types to `topics`."""
+    """Yield the messages in an MCAP file in file order, and add their topics and types to `topics`."""
     records = optional_module("mcap.records", "Reading MCAP files", "import")
     schemas, channels = {}, {}
     with path.open("rb") as file:

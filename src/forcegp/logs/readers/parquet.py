@@ -1,6 +1,7 @@
-"""Readers of Parquet tables, with vectors in list columns or in separate columns, and of LeRobot data sets.
+"""Readers of Parquet tables and of LeRobot data sets.
 
-A LeRobot data set (version 2.1 or 3) is a folder with `meta/info.json` and the Parquet files of its episodes.
+Vectors may be list columns or separate columns. A LeRobot data set (version 2.1 or 3) is a folder with
+`meta/info.json` and the Parquet files of its episodes.
 """
 
 from __future__ import annotations
@@ -26,7 +27,7 @@ BATCH_ROWS = 1 << 16
 
 
 def read_parquet(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read the columns that contain numbers, flags and times; list columns become `name[0]`, `name[1]`, …"""
+    """Read columns of numbers, flags and times. A list column becomes `name[0]`, `name[1]`, and so on."""
     remarks: list[str] = []
     with guards.foreign(str(path), "Parquet"):
         columns = read_columns([path], wanted, rows, remarks, progress)
@@ -36,7 +37,7 @@ def read_parquet(path: Path, *, wanted: Wanted, rows: int | None, progress: Prog
 def read_columns(
     paths: list[Path], wanted: Wanted, rows: int | None, remarks: list[str], progress: Progress | None
 ) -> dict[str, Column]:
-    """Return the concatenated columns of files, with lists as `name[i]`; add omitted columns to `remarks`."""
+    """Return the joined columns of files, with lists as `name[i]`, and note omitted ones in `remarks`."""
     import pyarrow.parquet as pq
 
     chunks: dict[str, list[Column]] = {}
@@ -133,7 +134,7 @@ MAX_INFO_BYTES = 4 << 20
 
 
 def read_lerobot(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read the numbers in all episodes, named as in `meta/info.json`, such as `observation.state.<motor>`."""
+    """Read the numbers in all episodes, named as in `meta/info.json` (e.g. `observation.state.<motor>`)."""
     listed = path / "meta" / "info.json", *sorted((path / "data").rglob("*.parquet"))
     description, *files = within(path, listed)
     guards.check_count(str(description), "bytes", description.stat().st_size, MAX_INFO_BYTES)
@@ -160,7 +161,7 @@ def read_lerobot(path: Path, *, wanted: Wanted, rows: int | None, progress: Prog
 
 
 def _motors(description: Any) -> list[str]:
-    """Return the names of a feature's values, given as a list, possibly under a key such as `motors`."""
+    """Return the names of a feature's values, which are a list, possibly under a key such as `motors`."""
     names = description.get("names") if isinstance(description, dict) else None
     if isinstance(names, dict) and len(names) == 1:
         names = next(iter(names.values()))

@@ -1,8 +1,7 @@
-"""Readers of CSV and text tables with any separator, decimal mark and headings, and of folders of such
-files.
+"""Readers of CSV and text tables and of folders of such tables.
 
-The format of a table is inferred from its first lines. In a folder, each file contains one quantity, such as
-`q.txt`.
+The separator, decimal mark and headings of a table are inferred from its first lines. In a folder, each file
+contains one quantity (for example, `q.txt`).
 """
 
 from __future__ import annotations
@@ -26,12 +25,12 @@ if TYPE_CHECKING:
 
 
 SAMPLE_BYTES, SAMPLE_LINES = 1 << 18, 200
-"""Size of the part of a file that is inspected, and number of data lines that must agree in format."""
+"""Size of the part of a file that is inspected; number of data lines that must agree in format."""
 
 SEPARATORS = (";", "\t", ",", "|", " ")
-"""Candidate separators; a space stands for any run of blanks."""
+"""Candidate separators. A space stands for any run of blanks."""
 MISSING = ("", "nan", "NaN", "NAN", "null", "NULL", "NA", "N/A", "None", "-nan", "#N/A")
-"""Fields that mark a missing value."""
+"""Fields that represent a missing value."""
 
 _NUMBER = re.compile(r"[+-]?(\d+\.?\d*|\.\d+)([eEdD][+-]?\d+)?$|[+-]?(inf|infinity)$", re.IGNORECASE)
 _COMMA_NUMBER = re.compile(r"[+-]?(\d+,?\d*|,\d+)([eE][+-]?\d+)?$")
@@ -41,8 +40,8 @@ _UNIT = re.compile(r"^[\[(]?\s*([A-Za-zµ°%][\w°²^/*·. -]{0,15}|-|1)?\s*[\])
 
 @dataclass(frozen=True)
 class Dialect:
-    """Format of a text table that begins at `first_line`; columns are of type `number`, `bool`, `date`,
-    `text` or `empty`."""
+    """Format of a text table from `first_line` on. Columns are of type `number`, `bool`, `date`, `text` or
+    `empty`."""
 
     encoding: str
     separator: str
@@ -81,7 +80,7 @@ def split(line: str, separator: str) -> list[str]:
 
 
 def kind_of(field: str, decimal: str = ".") -> str:
-    """Return the kind of a field as in `Dialect`; a missing value is `empty`."""
+    """Return the type of a field as in `Dialect`. The type of a missing value is `empty`."""
     if field in MISSING:
         return "empty"
     if (_COMMA_NUMBER if decimal == "," else _NUMBER).match(field):
@@ -119,7 +118,7 @@ def _try(lines: list[str], separator: str, decimal: str) -> tuple[float, str, st
 
 
 def _numeric(fields: list[str], decimal: str) -> bool:
-    """Return whether a line contains values, that is, numbers or dates in more than half of its fields."""
+    """Return whether more than half of the fields in a line are numbers or dates."""
     if fields and fields[0].startswith(("#", "%", "//")):
         return False
     kinds = [kind for kind in (kind_of(f, decimal) for f in fields) if kind != "empty"]
@@ -160,7 +159,7 @@ _EDGES = re.compile(rb"(?m)^ | (?=\r?$)")
 
 
 def read_text(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read a text table; text columns are skipped with a note."""
+    """Read a text table, skipping text columns with a note."""
     dialect = sniff(path)
     kinds = {n: kind for n, kind in zip(dialect.names, dialect.kinds, strict=True) if wanted(n)}
     remarks = [f"column {n!r} contains text and was ignored" for n, kind in kinds.items() if kind == "text"]
@@ -209,7 +208,7 @@ def _batches(source: _Blocks, dialect: Dialect, kinds: dict[str, str]) -> Iterat
 
 
 def _numbers(values: pa.Array, kind: str) -> Column:
-    """Convert a column to float64: dates to seconds since 2020, true and false to 1 and 0."""
+    """Convert a column to float64. Dates become seconds since 2020, and flags become 1 and 0."""
     import pyarrow as pa
     import pyarrow.compute as pc
 
@@ -225,7 +224,7 @@ DATE_ORIGIN_NS = 1_577_836_800_000_000_000
 
 
 class _Blocks(io.RawIOBase):
-    """A binary file passed to the parser, which counts the bytes read and collapses runs of blanks."""
+    """A binary file that counts the bytes read by the parser and collapses runs of blanks."""
 
     def __init__(self, file: IO[bytes], dialect: Dialect, size: int, progress: Progress | None) -> None:
         self._file, self._size, self._progress = file, size, progress
@@ -252,11 +251,11 @@ class _Blocks(io.RawIOBase):
 
 
 ENDINGS = (".txt", ".csv", ".tsv", ".dat", ".asc")
-"""Suffixes of the files to read; other files in the folder are ignored."""
+"""Suffixes of the files to read. Other files in the folder are ignored."""
 
 
 def read_folder(path: Path, *, wanted: Wanted, rows: int | None, progress: Progress | None) -> LogTable:
-    """Read the tables in a folder as `file[i]` or `file.heading`; tables of equal length form one stream."""
+    """Read the tables in a folder as `file[i]` or `file.heading`. Equally long tables form one stream."""
 
     def in_file(file: Path, column: str) -> str:
         return f"{file.stem}[{column}]" if column.isdigit() else f"{file.stem}.{column}"

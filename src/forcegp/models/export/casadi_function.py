@@ -24,13 +24,12 @@ OPERATORS = {
 
 
 def casadi_function(model: ExportedModel, name: str = "forcegp") -> Any:
-    """Return a `casadi.Function` from (q, q̇, τ, closed) to the mean of each quantity in `DIFFERENTIATED`.
+    """Return a `casadi.Function` that maps (q, q̇, τ, closed) to the means of `DIFFERENTIATED` quantities.
 
-    `closed` is 1 for each closed contact and 0 for each open contact. The closed contacts must be independent
-    of each other.
+    `closed` is 1 for each closed contact and 0 for each open contact. Closed contacts must be independent.
 
     Raises:
-        ModelError: a part of the model cannot be exported; the message names it.
+        ModelError: a part of the model cannot be exported. The message names it.
         MissingDependencyError: CasADi is not installed.
     """
     ca: Any = optional_module("casadi", "a CasADi function")
@@ -46,7 +45,7 @@ def casadi_function(model: ExportedModel, name: str = "forcegp") -> Any:
 
 
 def _vector(ca: Any, graph: Graph, given: Mapping[str, Any], outputs: Iterable[Scalar]) -> Any:
-    """Return the output scalars as one CasADi vector."""
+    """Return the output scalars as a single CasADi vector."""
     outputs, values = list(outputs), dict[int, Any]()
     functions = {"step": lambda x: x > 0.0, "exp": ca.exp, "tanh": ca.tanh, "sqrt": ca.sqrt} | OPERATORS
     for position in graph.live(outputs):
@@ -61,7 +60,7 @@ def _vector(ca: Any, graph: Graph, given: Mapping[str, Any], outputs: Iterable[S
 
 
 def write_casadi(model: ExportedModel, path: Path, name: str) -> None:
-    """Write the function and a README to a folder; raises the same errors as `casadi_function`."""
+    """Write the function and a README to a folder. The errors are those of `casadi_function`."""
     function = casadi_function(model, name)
     names = {"joints": model.system.robot.joint_names, "contacts": model.system.contact_names or ("none",)}
     fields: dict[str, object] = {"name": name, "robot": model.system.robot.name}

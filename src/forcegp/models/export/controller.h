@@ -16,18 +16,18 @@ extern "C" {
 #define FORCEGP_JOINTS @nq@
 #define FORCEGP_CONTACTS @contacts@
 
-/* Quantities, to be combined by |. Mean and covariance contain them in this order. */
+/* Quantities, which can be combined with |. Mean and covariance contain them in this order. */
 @bits@
 
 /* Error codes; 0 means success */
 #define FORCEGP_NOT_FINITE 1  /* a state is not finite; nothing is written */
-#define FORCEGP_JAMMED 2      /* friction of a contact would press harder than it opposes */
+#define FORCEGP_JAMMED 2      /* the friction coefficient of a contact is so large that it jams */
 #define FORCEGP_UNRESOLVED 3  /* a variance is below rounding error, or a covariance has a negative eigenvalue */
 #define FORCEGP_NO_INERTIA 4  /* the mass matrix is not positive definite */
 #define FORCEGP_NO_JACOBIAN 5 /* the quantity has no Jacobian, or the closed contacts are not independent */
 #define FORCEGP_OVERFLOW 9    /* a result is not finite */
-#define FORCEGP_UNDETERMINED 11 /* all is written, but some forces of contacts are not determined: those of contacts
-                                 * that are never closed in the data or cannot move are NaN, and shared loads wide */
+#define FORCEGP_UNDETERMINED 11 /* results are written, but some contact forces are not determined: NaN for contacts that are
+                                 * never closed in the data or cannot move, and wide error bars for shared loads */
 
 /* Number d of components of the given quantities. */
 int forcegp_size(unsigned quantities);
@@ -41,13 +41,13 @@ int forcegp_size(unsigned quantities);
  * mean         d numbers
  * covariance   d x d numbers, row by row; NULL if it is not needed, which takes less time
  * beyond       FORCEGP_JOINTS distances by which speeds and torques exceed the training data, in standard
- *              deviations of these data, 0 inside; above 3, error bars are a guess. NULL if not needed
+ *              deviations of these data, 0 inside; above 3, error bars are extrapolated. NULL if not needed
  */
 int forcegp_predict(const double *q, const double *qd, const double *tau, const unsigned char *closed,
                     unsigned quantities, int noise, double *mean, double *covariance, double *beyond);
 
-/* The same at `count` states, from what was learned online, or, with NULL, in the fit; returns the first error, if there is
- * none FORCEGP_UNDETERMINED where it holds for a state. */
+/* The same at `count` states, with the online state, or with that of the fit if `learned` is NULL. Returns the first error
+ * or, if there is none, FORCEGP_UNDETERMINED if it applies to any state. */
 typedef struct forcegp_learned forcegp_learned;
 int forcegp_predict_learned(const forcegp_learned *learned, long count, const double *q, const double *qd,
                             const double *tau, const unsigned char *closed, unsigned quantities, int noise, double *mean,
@@ -56,7 +56,7 @@ int forcegp_predict_learned(const forcegp_learned *learned, long count, const do
 @online@@wrench@/* Mass matrix M, and the rows of A for all contacts; three planes through a tool give its Jacobian. */
 int forcegp_equations(const double *q, const double *qd, double *M, double *A);
 
-/* Posterior mean and its Jacobian: of qdd, multiplier, contact force and joint friction, undetermined ones included.
+/* Posterior mean and its Jacobian for qdd, multiplier, contact force and joint friction, including undetermined ones.
  *
  * jacobian     d x 3 FORCEGP_JOINTS numbers, row by row: derivatives with respect to q, then qd, then tau
  */

@@ -26,7 +26,7 @@ from forcegp.models.prediction import Predictor, Query
 
 LANGUAGES = ("c", "casadi", "torch")
 STATES, LOSS_STATES = 16, 200
-"""Number of states in the test program, and number at which the loss of a reduced posterior is measured."""
+"""Number of states in the test program; number of states at which the loss of a reduction is measured."""
 TOLERANCE, ZERO = 1e-10, 1e-5
 """Largest difference from Python, relative to max(|mean|, σ), or to `ZERO` times its maximum at a state."""
 
@@ -36,12 +36,13 @@ class Export:
     """The files of an export, and their errors.
 
     Attributes:
-        folder: path of the folder.
-        functions: number of basis functions of the covariance.
-        widest, wider: largest and median relative growth of σ of q̈ and λ caused by a reduced covariance, at
-            training states or, if a saved fit has none, at random states.
-        rounding: largest errors caused by single precision at these states: of the means of q̈ and λ, in
-            units of max(|mean|, σ), and of σ, as a fraction; zero in double precision.
+        folder: the path of the folder.
+        functions: number of basis functions in the covariance.
+        widest, wider: largest and median relative growth of σ of q̈ and λ caused by a reduced-rank
+            covariance. They are measured at training states or, if a saved fit has none, at random states.
+        rounding: largest errors caused by single precision at these states. The first is the error of the
+            means of q̈ and λ in units of max(|mean|, σ). The second is the relative error of σ. Both are zero
+            in double precision.
     """
 
     folder: Path
@@ -54,7 +55,7 @@ class Export:
 def write_export(
     model: ExportedModel, fit: Predictor, training: Training, path: str | Path, language: str, name: str
 ) -> Export:
-    """Write a model to a folder; see `StructuredFit.export` for the arguments and errors."""
+    """Write a model to a folder. The arguments and errors are those of `StructuredFit.export`."""
     check_name("language of an export", language, LANGUAGES)
     if not re.fullmatch(r"[a-z][a-z0-9_]{0,40}", name):
         raise ParameterError(
@@ -76,10 +77,15 @@ def write_export(
         Path(path), model.parts()[0].rank, *loss_of(exact, fit, training), rounding_of(model, training)
     )
     where = "training" if training.samples else "random"
-    loss = f"It is reduced: at {where} states σ of q̈ and λ is wider by a fraction\n"
-    loss += f"of {result.widest:.2g} at most, {result.wider:.2g} in the median. The mean loses nothing."
-    rounding = "Single precision: at {} states means of q̈ and λ err by {:.2g} of max(|mean|, σ) at most,\n"
-    rounding = rounding.format(where, result.rounding[0]) + f"σ by a fraction of {result.rounding[1]:.2g}."
+    loss = f"It is reduced: at {where} states, σ of q̈ and λ increases by a fraction\n"
+    loss += f"of at most {result.widest:.2g} (median: {result.wider:.2g}). The mean is unchanged."
+    rounding = (
+        "Single precision: at {} states, the mean of q̈ and λ errs by at most {:.2g} of max(|mean|, σ),\n"
+    )
+    rounding = (
+        rounding.format(where, result.rounding[0])
+        + f"and σ by at most a fraction of {result.rounding[1]:.2g}."
+    )
     coarse = model.dtype == torch.float32
     fields = {
         "real": "float" if coarse else "double",
@@ -103,7 +109,7 @@ def write_export(
 
 
 def rounding_of(model: ExportedModel, training: Training) -> tuple[float, float]:
-    """Return the errors of the means and σ of q̈ and λ caused by single precision; see `Export.rounding`.
+    """Return the errors of the means and σ of q̈ and λ caused by single precision (see `Export.rounding`).
 
     Raises:
         NumericalError: single precision cannot resolve a variance.
@@ -124,7 +130,7 @@ def rounding_of(model: ExportedModel, training: Training) -> tuple[float, float]
 
 
 def loss_of(model: ExportedModel, fit: Predictor, training: Training) -> tuple[float, float]:
-    """Return the largest and median growth of σ of q̈ and λ caused by a reduced covariance."""
+    """Return the largest and median growth of σ of q̈ and λ caused by a reduced-rank covariance."""
     if model.functions is None:
         return 0.0, 0.0
     states = states_of(model, training)
@@ -133,7 +139,7 @@ def loss_of(model: ExportedModel, fit: Predictor, training: Training) -> tuple[f
         for x in (CompiledFit(model), fit)
     ]
     small, whole = (x.covariance.diagonal(dim1=-2, dim2=-1).sqrt() for x in read if x.covariance is not None)
-    # Nothing is lost of structural zeros, such as λ of an open contact.
+    # Structural zeros, such as λ of an open contact, have no error bars that could grow.
     growth = (small / whole - 1.0)[whole > ZERO * whole.nan_to_num().amax()]
     return float(growth.max()), float(growth.median())
 
@@ -163,12 +169,12 @@ def random_states(model: ExportedModel, count: int) -> tuple[Tensor, ...]:
     shares = torch.rand(3, count, robot.nq, dtype=torch.float64, generator=random)
     state = [low + share * (high - low) for (low, high), share in zip(limits, shares, strict=True)]
     closed = torch.rand(count, len(model.system.contacts), generator=random) < 0.7
-    # Accelerations of an arm that contacts hold completely are rounding.
+    # If contacts hold the arm completely, its accelerations are only rounding errors.
     return *state, closed & (closed.cumsum(-1) < robot.nq)
 
 
 def _reference(model: ExportedModel, fit: Predictor, name: str) -> str:
-    """Return C tables of states and of the mean, covariance and Jacobians that Python computes at them."""
+    """Return C tables of states, and of the mean, covariance and Jacobians that Python computes for them."""
     q, qd, tau, active = random_states(model, STATES)
     read = fit.predict(q, qd, tau, list(READ[:-1]), active=active)  # pyright: ignore[reportArgumentType]
     assert read.covariance is not None
@@ -219,8 +225,8 @@ class _Posterior(torch.nn.Module):
 
 @torch.no_grad()
 def write_torch(fit: Predictor, path: Path, name: str) -> None:
-    """Write the program from q, q̇, τ `(1, nq)` and closed contacts `(1, n_contacts)` to mean, covariance and
-    distance from the training data; it raises no errors."""
+    """Write the program that maps q, q̇, τ `(1, nq)` and closed contacts `(1, n_contacts)` to the mean, the
+    covariance and the distance from the training data. The program raises no errors."""
     system = fit.system
     state = [torch.zeros(1, system.robot.nq, dtype=system.robot.dtype) for _ in range(3)]
     closed = torch.ones(1, len(system.contacts), dtype=torch.bool)

@@ -1,6 +1,4 @@
-"""A fitted model that predicts with its exported C code, which is compiled by the local compiler and cached
-on disk.
-"""
+"""A fitted model that predicts with exported C code, which is compiled locally and cached on disk."""
 
 from __future__ import annotations
 
@@ -29,14 +27,14 @@ from forcegp.native import load_library
 NAME = "forcegp"
 NOT_FINITE, JAMMED, UNRESOLVED, NO_INERTIA, NO_JACOBIAN, AT_REST, NO_NOISE, OVERFLOW = 1, 2, 3, 4, 5, 6, 7, 9
 UNDETERMINED = 11
-"""What the C code returns other than 0."""
+"""Nonzero status codes that the C code returns."""
 MESSAGES = {
-    JAMMED: "friction of a contact would press harder than it opposes",
+    JAMMED: "the friction coefficient of a contact is so large that the contact jams",
     UNRESOLVED: "the precision of the C code does not resolve a predicted variance",
-    OVERFLOW: "a predicted number is not finite: states beyond what a robot can do overflow",
+    OVERFLOW: "a predicted number is not finite: implausible states cause overflow",
     NO_INERTIA: "the mass matrix is not positive definite",
     NO_JACOBIAN: "closed contacts hold the robot in the same direction, so that a Jacobian is not determined",
-    NOT_FINITE: "a measured value is not finite, or its noise not positive",
+    NOT_FINITE: "a measured value is not finite, or its noise is not positive",
     NO_NOISE: "an update needs the noise of a quantity that the fit did not measure: pass noise_std",
 }
 KINDS: dict[int, type[ForceGPError]] = {JAMMED: ModelError, NO_NOISE: ModelError, NOT_FINITE: ShapeError}
@@ -48,13 +46,13 @@ FUNCTIONS = {
     "forget": [ctypes.c_double, ctypes.c_int],
     "drift": [ctypes.c_int, ctypes.c_double],
 }
-"""Arguments after the pointer to the online state; all functions but the first require online learning."""
+"""Arguments after the pointer to the online state. All functions but the first require online learning."""
 
 
 class CompiledFit(Predictor):
-    """A fit that predicts in C: it computes the results of `StructuredFit.predict` in microseconds.
+    """A fit that evaluates `StructuredFit.predict` in C within microseconds.
 
-    It is created by `StructuredFit.compiled`; `library` has the functions of the C header, `forcegp_…`."""
+    It is created by `StructuredFit.compiled`. `library` has the functions of the C header, `forcegp_…`."""
 
     kind = "compiled"
 
@@ -84,7 +82,9 @@ class CompiledFit(Predictor):
     def force_field(self) -> ForceField:
         """Return the posterior mean of Q̄ = Q + Q_z as a force field in PyTorch."""
         if self._learned is not None:
-            raise ModelError("what was learned in C has no force field in PyTorch", hint="update the fit")
+            raise ModelError(
+                "samples added in C are not part of the force field in PyTorch", hint="update the fit"
+            )
         return self.model.posterior
 
     def update(
@@ -98,14 +98,14 @@ class CompiledFit(Predictor):
         active: Tensor | None = None,
         noise_std: Tensor | None = None,
     ) -> CompiledFit:
-        """Add samples one after the other, with the result of `StructuredFit.update`.
+        """Add samples one after the other, with the same result as `StructuredFit.update`.
 
         Args:
-            q, qd, tau: `(*batch, nq)` states.
-            measured: `(*batch, d)` values at these states.
+            q, qd, tau: states, `(*batch, nq)`.
+            measured: measured values at these states, `(*batch, d)`.
             quantity: the measured quantity.
-            active: `(*batch, n_contacts)` bool, closed contacts; by default all.
-            noise_std: standard deviation of the values `(d,)`; by default, that of the fit.
+            active: mask `(*batch, n_contacts)` of closed contacts. By default, all contacts are closed.
+            noise_std: standard deviation of the noise `(d,)`. The default is that of the fit.
 
         Raises:
             ModelError: the model cannot learn in C, or the noise of the quantity is unknown.
@@ -116,7 +116,9 @@ class CompiledFit(Predictor):
         flat = flat_states(self.system, q, qd, tau, active)
         expected, got = (*flat.batch, read.size), tuple(measured.shape)
         if expected != got:
-            raise ShapeError(f"values of {quantity!r} do not fit the states", expected=str(expected), got=got)
+            raise ShapeError(
+                f"values of {quantity!r} do not match the states", expected=str(expected), got=got
+            )
         std = None if noise_std is None else noise_std.expand(read.size).double().contiguous()
         noise, newer = None if std is None else std.data_ptr(), self._copy()
         columns = [x.contiguous() for x in (*flat[:4], measured.double().reshape(-1, read.size))]
@@ -133,15 +135,15 @@ class CompiledFit(Predictor):
         """Reduce the weight of all previous samples, as in `StructuredFit.forget`.
 
         Args:
-            factor: factor on the weight of all previous samples; with `priors`, the correlation of their
-                forces with the previous forces.
-            priors: names of priors whose forces drift towards the prior; samples then keep their weight.
-            budget: number of weights whose prior is renewed, each at the cost of one row; the others are
-                renewed in later calls. By default, all are renewed.
+            factor: factor on the weight of all previous samples. If `priors` is given, it is the correlation
+                of their forces with the previous forces.
+            priors: names of priors whose forces drift towards the prior. Samples then keep their weight.
+            budget: number of weights for which the prior is renewed, each at the cost of one row. The others
+                are renewed in later calls. By default, all are renewed.
 
         Raises:
             ModelError: the model cannot learn in C, or the factor is out of range.
-            UnknownNameError: the prior does not exist.
+            UnknownNameError: a prior does not exist.
         """
         newer, names = self._copy(), [prior.name for prior in self.model.posterior.priors]
         for name in priors or ():
@@ -168,8 +170,8 @@ class CompiledFit(Predictor):
         if not self.model.online:
             raise ModelError(
                 "this fit cannot learn online in C",
-                expected="sparse inference with all functions, a state without noise, no inertia learned",
-                hint="call update of the fit",
+                expected="sparse inference with all basis functions, no state noise, and no learned inertia",
+                hint="call the `update` method of the fit",
             )
         parts = self.model.parts()
         n, folded = parts[0].rank, sum(part.weights.numel() for part in parts)
@@ -192,14 +194,16 @@ class CompiledFit(Predictor):
     ) -> Prediction:
         """Return the posterior mean and covariance of a quantity, as in `StructuredFit.predict`.
 
-        Arguments and errors are those of that method. `quantity` may also be `"joint_friction"`, the friction
-        of the joints, including the friction in the robot file [N m, N].
+        The arguments and errors are those of that method. `quantity` may also be `"joint_friction"`, the
+        friction of the joints [N m, N], which includes the friction in the robot file.
 
         Raises:
             ModelError: `system` is not the system of the fit, or friction jams a contact.
         """
         if system is not None and system is not self.system:
-            raise ModelError("a compiled fit predicts on its own system", hint="use the predict of the fit")
+            raise ModelError(
+                "a compiled fit predicts on its own system", hint="use the `predict` method of the fit"
+            )
         read = self._read(quantity if isinstance(quantity, str) else tuple(quantity))
         nq, (arrays, batch) = self.system.robot.nq, self._states(q, qd, tau, active)
         new = self._new
@@ -250,18 +254,18 @@ class CompiledFit(Predictor):
         """Return the posterior mean of quantities and its Jacobian with respect to q, q̇ and τ.
 
         Args:
-            q, qd, tau: `(*batch, nq)` states.
+            q, qd, tau: states, `(*batch, nq)`.
             quantity: `"qdd"`, `"multiplier"`, `"contact_force"` or `"joint_friction"`, or several of them.
-            active: `(*batch, n_contacts)` bool, closed contacts; by default all.
+            active: mask `(*batch, n_contacts)` of closed contacts. By default, all contacts are closed.
 
         Raises:
             UnknownNameError: the quantity does not exist.
             ModelError: friction jams a contact, or the fit was updated in C.
-            NumericalError: closed contacts are not independent.
+            NumericalError: the closed contacts are not independent.
         """
         if self._learned is not None:
             raise ModelError(
-                "what was learned in C has no Jacobian", hint="update the fit, and compile it again"
+                "samples added in C do not change the Jacobian", hint="update the fit, and compile it again"
             )
         names = [quantity] if isinstance(quantity, str) else list(quantity)
         for name in names:
@@ -289,13 +293,13 @@ class CompiledFit(Predictor):
     ) -> ExternalWrench:
         """Estimate, separately for each state, the external wrench on the frame of `compiled(wrench=...)`.
 
-        The result is that of `StructuredFit.external_wrench` for samples in any order: friction with memory,
-        which needs a log in time order, is not tracked.
+        The result is that of `StructuredFit.external_wrench` for samples in any order. Friction with memory
+        requires a log in time order and is not tracked.
 
         Args:
-            q, qd, tau, qdd: `(*batch, nq)` states with measured accelerations.
-            active: `(*batch, n_contacts)` bool, closed contacts; by default all.
-            qdd_std: standard deviation of the accelerations `(nq,)`; by default, that of the fit.
+            q, qd, tau, qdd: states with measured accelerations, `(*batch, nq)`.
+            active: mask `(*batch, n_contacts)` of closed contacts. By default, all contacts are closed.
+            qdd_std: standard deviation of the acceleration noise `(nq,)`. The default is that of the fit.
 
         Raises:
             ModelError: the fit was compiled without a wrench, or friction jams a contact.
@@ -318,9 +322,9 @@ class CompiledFit(Predictor):
         active: Tensor | None = None,
         qdd_std: Tensor | None = None,
     ) -> WrenchJacobian:
-        """Return the mean of `external_wrench` and its Jacobian by fourth-order finite differences.
+        """Return the mean of `external_wrench`, and its Jacobian from fourth-order finite differences.
 
-        Arguments and errors are those of `external_wrench`.
+        The arguments and errors are those of `external_wrench`.
         """
         mean, _, _, slopes = self._wrench(q, qd, tau, qdd, active, qdd_std, True)
         return WrenchJacobian(mean, *slopes.unbind(-2))
@@ -369,9 +373,9 @@ class CompiledFit(Predictor):
         active: Tensor | None = None,
         system: ConstrainedSystem | None = None,
     ) -> ForceLinearization:
-        """Return the mean acceleration and multiplier and their Jacobians; see `StructuredFit.linearize`."""
+        """Return the mean acceleration and multiplier with their Jacobians (see `StructuredFit`)."""
         if system is not None and system is not self.system:
-            raise ModelError("a compiled fit predicts on its own system", hint="use that of the fit")
+            raise ModelError("a compiled fit predicts on its own system", hint="use the method of the fit")
         found = self.jacobian(q, qd, tau, ["qdd", "multiplier"], active=active)
         fields: list[Tensor] = []
         for at in found.parts.values():
@@ -389,11 +393,11 @@ class CompiledFit(Predictor):
         return tuple(x.contiguous() for x in given), batch
 
     def _new(self, *shape: int) -> Tensor:
-        """Return a new array in the precision of the C code."""
+        """Return a new array with the precision of the C code."""
         return torch.empty(shape, dtype=self.model.dtype)
 
     def _error(self, status: int, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor | None) -> ForceGPError:
-        """Return the error reported by the C code, or raise an error that names a non-finite state."""
+        """Return the error that the C code reported, or raise an error that names a non-finite state."""
         flat_states(self.system, q, qd, tau, active)
         return KINDS.get(status, NumericalError)(MESSAGES[status])
 
@@ -432,9 +436,9 @@ class MeanJacobian(NamedTuple):
     """The mean of quantities and its Jacobian, with one row per component.
 
     Attributes:
-        mean: `(*batch, d)` mean.
-        dq, dqd, dtau: `(*batch, d, nq)` derivatives with respect to q, q̇ and τ.
-        parts: slice of each quantity.
+        mean: the mean `(*batch, d)`.
+        dq, dqd, dtau: derivatives with respect to q, q̇ and τ, `(*batch, d, nq)`.
+        parts: the slice of each quantity.
     """
 
     mean: Tensor
@@ -448,8 +452,8 @@ class WrenchJacobian(NamedTuple):
     """The mean of an external wrench and its Jacobian, with one row per component.
 
     Attributes:
-        mean: `(*batch, k)` mean.
-        dq, dqd, dtau, dqdd: `(*batch, k, nq)` derivatives with respect to q, q̇, τ and q̈.
+        mean: the mean `(*batch, k)`.
+        dq, dqd, dtau, dqdd: derivatives with respect to q, q̇, τ and q̈, `(*batch, k, nq)`.
     """
 
     mean: Tensor

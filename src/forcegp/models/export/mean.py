@@ -1,13 +1,13 @@
-"""The posterior mean of a fit in scalars, from which its C code, Jacobians and CasADi function are derived.
+"""The posterior mean of a fit in scalars, from which C code, Jacobians and a CasADi function are derived.
 
 All terms that depend only on the state form a straight-line program: mechanics, contact points, and inputs
-and features of the priors. Functions with support points are evaluated in loops; they enter as inputs f, with
-their slopes ∂f/∂x. A motion M q̈ = Q + (A + U)ᵀ λ, A q̈ = b, with friction U λ proportional to the multiplier,
-is differentiated implicitly: at fixed q̈ and λ, the equations change by dR and dg, and
+and features of the priors. Functions with support points are evaluated in loops. In the program, they are
+inputs f with slopes ∂f/∂x. Consider a motion M q̈ = Q + (A + U)ᵀ λ, A q̈ = b, with friction U λ proportional
+to the multiplier. It is differentiated implicitly. At fixed q̈ and λ, the equations change by dR and dg, and
 
     (I + LᵀU) dλ = (A M⁻¹ Aᵀ)⁻¹ dg − Lᵀ dR,   dq̈ = M⁻¹ (dR + (Aᵀ + U) dλ),
 
-where the mechanics in dR are closed-form derivatives of inverse dynamics. The contacts must be independent.
+The mechanics in dR are closed-form derivatives of inverse dynamics. The contacts must be independent.
 """
 
 from __future__ import annotations
@@ -44,14 +44,14 @@ from forcegp.gp.features import stacked
 from forcegp.models.export.model import ExportedModel, Functions, row_of
 
 DIFFERENTIATED = ("qdd", "multiplier", "contact_force", "joint_friction")
-"""Quantities for which the mean has Jacobians and a CasADi form."""
+"""Quantities with a mean that has Jacobians and a CasADi form."""
 ARGUMENTS = ("q", "qd", "tau", "closed")
 REST = 1e-30
-"""Squared sliding speed, or squared distance, below which its root has no slope."""
+"""Squared sliding speed, or squared distance, below which the square root has slope zero."""
 
 
 def _matern(square: Scalar, more: float) -> Scalar:
-    """Return (1 + r + more r²) e^{−r}, with a root that can be differentiated at a support point as well."""
+    """Return (1 + r + more r²) e^{−r}, with a root that is also differentiable at a support point."""
     r = (square + REST).sqrt()
     return (r + 1.0 + square * more) * (-r).exp()
 
@@ -89,8 +89,8 @@ class Mean:
 
     Attributes:
         M, Q_C, Q_G, Q_D: mass matrix, bias force, gravity force and damping force.
-        touching: each contact, computed as if it were closed.
-        A, b: constraint rows of the contacts, zero for open contacts.
+        touching: the contacts, each computed as if it were closed.
+        A, b: constraint rows of the contacts, which are zero for open contacts.
         x: standardized inputs of each prior, `(1 or components, width)`.
         phi: features of each component of each prior.
     """
@@ -122,7 +122,7 @@ class Mean:
         return self.graph.constants(np.zeros(shape))
 
     def sliding(self) -> tuple[list[int], list[Scalar]]:
-        """Return the priors of joints that can stick; and Q_D, inputs and features for given `slip`."""
+        """Return the priors of joints that can stick, and Q_D, the inputs and the features for a `slip`."""
         slip = [self.graph.input("slip", i) for i in range(self.robot.nq)]
         priors = [p for p, part in enumerate(self.parts) if part.prior.sticks]
         x = [self._inputs(p, slip) for p in priors]
@@ -132,7 +132,7 @@ class Mean:
         return priors, outputs
 
     def wrench_jacobian(self, frame: WrenchFrame) -> Program:
-        """Return a program from q to J for the components of a wrench; see `WrenchFrame.jacobian`."""
+        """Return a program that maps q to J for the components of a wrench (see `WrenchFrame.jacobian`)."""
         index, point = self.robot.frame_index(frame.frame), np.array(frame.point, dtype=float)
         rotation, _, J, _ = _point_blocks(self.links, self.robot, index, point)
         if frame.reference == "local":
@@ -148,7 +148,7 @@ class Mean:
         ]
 
     def _damping(self, slip: Sequence[Scalar] | None) -> Scalars:
-        """Return the viscous, Coulomb and Stribeck friction of the robot file; `slip` replaces tanh(q̇/v₀)."""
+        """Return viscous, Coulomb and Stribeck friction from the robot file; `slip` replaces tanh(q̇/v₀)."""
         names = ("damping", "friction", "friction_velocity", "stribeck", "stribeck_velocity")
         force, columns = [], (numbers(getattr(self.robot, x)) for x in names)
         for i, (v, d, c, v_c, s, v_s) in enumerate(zip(self.qd, *columns, strict=True)):
@@ -185,7 +185,7 @@ class Mean:
         )
 
     def _surface(self, surface: object, p: Scalars, v: Scalars) -> tuple[Scalars, Scalar, Scalar]:
-        """Return the normal, the signed distance c and vᵀ (∇²c) v at a point p with velocity v."""
+        """Return the normal, the signed distance c and vᵀ (∇²c) v at a point p that has velocity v."""
         constants = self.graph.constants
         if isinstance(surface, Plane):
             n = constants(surface.normal)
@@ -208,7 +208,7 @@ class Mean:
         return np.array([[x, both, -n[0]], [both, y, -n[1]]], dtype=object)
 
     def _inputs(self, p: int, slip: Sequence[Scalar] | None) -> Scalars:
-        """Return the standardized inputs x, with a single row if all components share them."""
+        """Return the standardized inputs x, in a single row if all components share them."""
         part, scales = self.parts[p], self.model.posterior.process.scales[p]
         shared = all(x.ndim == 2 for x in part.support.values())
         rows: list[list[Scalar]] = []
@@ -223,7 +223,7 @@ class Mean:
         return np.array(rows, dtype=object)
 
     def _raw_inputs(self, prior: ForcePrior, slip: Sequence[Scalar] | None) -> dict[str, list[Scalar]]:
-        """Return the inputs by name; joint friction has one input per joint."""
+        """Return the inputs, keyed by name. Joint friction has one input per joint."""
         if isinstance(prior, contact.NormalForcePrior):
             return self._raw_inputs(prior.like, slip)
         if isinstance(prior, JointFrictionPrior):
@@ -291,19 +291,18 @@ class Mean:
 
 
 class Motion(NamedTuple):
-    """The motion q̈ and multipliers λ under given impressed forces."""
+    """The motion q̈ and the multipliers λ under given impressed forces."""
 
     qdd: Scalars
     multiplier: Scalars
 
 
 class LearnedMotion(Mean):
-    """The mean of quantities, given values f (and, for Jacobians, slopes) of functions with support points.
+    """The mean of quantities, given the values (and slopes, for Jacobians) of functions with support points.
 
     Args:
         model, parts: the model, and the functions of its priors.
-        differentiate: whether to compute derivatives as well, with respect to q, q̇ and τ (directions 0 to
-            3 nq − 1).
+        differentiate: whether to compute derivatives with respect to q, q̇ and τ (directions 0 to 3 nq − 1).
     """
 
     def __init__(self, model: ExportedModel, parts: Sequence[Functions], differentiate: bool) -> None:
@@ -322,7 +321,7 @@ class LearnedMotion(Mean):
             self.U[:, c] = self._against(c, float(law.smoothing)) * float(law.coefficient)
 
     def tangents(self, outputs: Iterable[Scalar]) -> Scalars:
-        """Return the derivatives of scalars, `(outputs, 3 nq)`."""
+        """Return the derivatives of scalars, with shape `(outputs, 3 nq)`."""
         found, zero = self.graph.tangents(list(outputs), self.seeds), self.graph.constant(0.0)
         directions = range(3 * self.robot.nq)
         return np.array([[t.get(d, zero) for d in directions] for t in found], dtype=object)
@@ -367,9 +366,9 @@ class LearnedMotion(Mean):
 
         Args:
             rest: impressed forces other than Q_C and Q_G.
-            terms: terms that determine which of Q_C and Q_G act.
+            terms: names of the acting terms, such as `"bias"` for Q_C and `"gravity"` for Q_G.
             U: friction per unit of the multiplier.
-            pulled: whether A q̈ is b instead of 0.
+            pulled: whether A q̈ equals b rather than 0.
         """
         M_inv, S, L = self._inverses
         zero, m = self.zeros(self.robot.nq), len(self.names)
@@ -402,7 +401,7 @@ class LearnedMotion(Mean):
         return motion
 
     def _forces_of_priors(self) -> tuple[Scalars, Scalars, Scalars]:
-        """Return Q without Q_C and Q_G, Q_z, and the learned friction of the joints."""
+        """Return Q without Q_C and Q_G, the contact force Q_z, and the learned friction of the joints."""
         n, terms = self.robot.nq, self._mean_terms
         Q, Q_z, Q_F = self.zeros(n), self.zeros(n), self.zeros(n)
         Q = Q + (self.Q_D if "friction" in terms else Q) + (self.tau if "actuation" in terms else Q)
@@ -431,8 +430,8 @@ class LearnedMotion(Mean):
         return Q, Q_z, Q_F
 
     def _latent(self, p: int, first: int, slope: int) -> Scalars:
-        """Return the latent force f of a prior. With derivatives, the part with support points is an input
-        that has slopes with respect to x."""
+        """Return the latent force f of a prior. If derivatives are computed, the part with support points is
+        an input that has slopes with respect to x."""
         part, forces = self.parts[p], []
         for k, phi in enumerate(self.phi[p]):
             weights = part.weights[k, part.size :].tolist()
@@ -485,7 +484,7 @@ class LearnedMotion(Mean):
         return np.stack([columns[term] * closed for term in prior.terms], axis=1)
 
     def _inertial_force(self, errors: Scalars, drives: Scalars) -> Scalars:
-        """Return [Y(q, q̇, q̈), diag q̈] δ at the analytical q̈ for errors δ of links `(nq, 10)` and drives."""
+        """Return [Y(q, q̇, q̈), diag q̈] δ at the analytical q̈, for errors δ of links and drives."""
         links, qdd = self.links, self._motion(self.Q_D + self.tau, TERMS).qdd
         motion = _motion(links, list(self.qd), list(qdd), gravity=True)
         torques, forces = [], []

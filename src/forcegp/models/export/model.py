@@ -1,12 +1,13 @@
-"""The numbers of a fitted model that its C code contains: the functions of each prior, and their posterior.
+"""The numbers of a fitted model that its C code contains: the functions of each prior and the posterior.
 
 The posterior covariance of the latent forces f is D ± T Tᵀ, with diagonal D and a row V(x)ᵀ C in T for each
 component. The functions V are covariances k(x, X) with support points, and features φ(x) of the finite part
-of the kernel. For a posterior over basis functions, whose weights have precision A = L Lᵀ, V is whitened,
-C = L⁻ᵀ, and D is the residual variance given the support points. For an exact posterior with Σ = L Lᵀ,
-C = Wᵀ L⁻ᵀ, D = k(x, x), and the sign is −. A posterior reduced to r functions also has D = k(x, x) and the
-sign −: A⁻¹ = I − U (1 − Λ⁻¹) Uᵀ with the r largest eigenvalues Λ of A, or Σ⁻¹ = U Λ⁻¹ Uᵀ with those of Σ.
-The training data determine these directions best. A reduction only widens error bars; the mean is unchanged.
+of the kernel. For a posterior over basis functions with weights of precision A = L Lᵀ, V is whitened, C =
+L⁻ᵀ, and D is the residual variance given the support points. For an exact posterior with Σ = L Lᵀ, C = Wᵀ
+L⁻ᵀ, D = k(x, x), and the sign is −. A posterior reduced to r functions also has D = k(x, x) and the sign −.
+It uses A⁻¹ = I − U (1 − Λ⁻¹) Uᵀ with the r largest eigenvalues Λ of A, or Σ⁻¹ = U Λ⁻¹ Uᵀ with those of Σ. The
+training data determine these directions best. A reduction only widens error bars and leaves the mean
+unchanged.
 """
 
 from __future__ import annotations
@@ -39,10 +40,10 @@ WHY = {
     "DisturbancePrior": "its force depends on time",
     "CoregionalPrior": "its components share functions",
     "OperatorForcePrior": "its operator is Python code",
-    "PayloadPrior": "it has a known payload, and the code has the mechanics of the bare arm only",
+    "PayloadPrior": "it has a known payload, but the code contains only the mechanics of the bare arm",
     "ImplicitSurface": "it is Python code",
 }
-"""Reasons, by type; others have no C form yet."""
+"""Reasons why a type has no C form. Other types have no C form yet."""
 LARGEST = 1700
 """Maximum number of functions of a posterior that is not reduced: about 30 MB of text, which a compiler
 translates in half a minute."""
@@ -54,12 +55,12 @@ class Functions:
 
     Attributes:
         prior: the force prior.
-        rest, finite: the parts of its kernel with support points and with features; `None` if absent.
+        rest, finite: the parts of its kernel with support points and with features, or `None` if absent.
         support: standardized inputs of the m support points.
         weights: weights `(components, m + features)` of k(x, X) and φ in the posterior mean.
-        whitening: factor that whitens k(x, X), a matrix `(m, kept)` for each component, or `None`.
-        roots: matrix C of each component, `(functions, rank − first)`.
-        first: first nonzero column, by component.
+        whitening: a matrix `(m, kept)` that whitens k(x, X) for each component, or `None`.
+        roots: the matrix C of each component, `(functions, rank − first)`.
+        first: the first nonzero column for each component.
     """
 
     prior: ForcePrior
@@ -100,15 +101,16 @@ class ExportedModel:
     """The exported part of a fit.
 
     Attributes:
-        system: robot and contacts.
-        posterior: posterior over latent forces.
+        system: the robot and its contacts.
+        posterior: the posterior over the latent forces.
         tensors: all hyperparameters.
-        noise: standard deviation of the measurements of each measured quantity.
+        noise: standard deviation of the noise for each measured quantity.
         torque_std, external_std: standard deviations of torque noise and of unknown joint forces, or `None`.
-        functions: number r of functions of a reduced covariance; `None` means all, and 0 only the mean.
+        functions: number r of functions in a reduced-rank covariance. `None` means all functions, and 0 means
+            that only the mean is exported.
         sampling: for samples learned online, the variance of the torque noise `(nq,)`, the exponent κ of the
-            likelihood, and whether samples must be in motion; `None` if the model cannot learn online.
-        wrench: frame and components of an external wrench to estimate, or `None`.
+            likelihood, and whether samples must be in motion. It is `None` if the model cannot learn online.
+        wrench: the frame and components of an external wrench to estimate, or `None`.
         dtype: precision of the C code.
         never_closed: contacts that are never closed in the training data.
     """
@@ -142,9 +144,11 @@ class ExportedModel:
         if self.wrench is not None:
             self.system.robot.frame_index(self.wrench.frame)
             if self.dtype != torch.float64:
-                raise ModelError("an external wrench needs double precision", hint="M q̈ − Q̄ cancels digits")
+                raise ModelError(
+                    "an external wrench needs double precision", hint="M q̈ − Q̄ loses digits to cancellation"
+                )
         if self.system.robot.device.type != "cpu":
-            raise ModelError("a fit on a GPU is not exported", hint="save it, and load it on the CPU")
+            raise ModelError("a fit on a GPU cannot be exported", hint="save it, and load it on the CPU")
         for each in self.system.contacts:
             if not isinstance(each, SurfaceContact) or each.stick_speed is not None:
                 raise _no_c("contact", each.name, each, "a SurfaceContact that always slides")
@@ -158,7 +162,9 @@ class ExportedModel:
             _check_kernel(prior.name, prior.kernel)
         for kind, what in ((InertialPrior, "the inertia"), (PayloadPrior, "a payload")):
             if sum(isinstance(prior, kind) for prior in self.posterior.priors) > 1:
-                raise ModelError(f"a fit with two priors on {what} is not exported", expected="one at most")
+                raise ModelError(
+                    f"a fit with two priors on {what} cannot be exported", expected="at most one"
+                )
         latent = self.posterior.latent
         size = latent.basis.size if isinstance(latent, SparsePosterior) else len(latent.alpha)
         if self.functions is None and size > LARGEST:
@@ -174,7 +180,7 @@ class ExportedModel:
         return 1 if isinstance(self.posterior.latent, SparsePosterior) and self.functions is None else -1
 
     def parts(self) -> list[Functions]:
-        """Return the functions of each prior, and their posterior."""
+        """Functions of each prior, and their posterior."""
         if isinstance(self.posterior.latent, SparsePosterior):
             return self._of_basis(self.posterior.latent)
         return self._of_rows(self.posterior.latent)
@@ -239,7 +245,7 @@ class ExportedModel:
 
 
 def row_of(x: Tensor, k: int) -> Tensor:
-    """Return the row of component k, or the row shared by all components."""
+    """Return the row of component k, or the row that all components share."""
     return x[k if len(x) > 1 else 0]
 
 

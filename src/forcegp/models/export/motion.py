@@ -22,7 +22,7 @@ POINTER, LONG = ctypes.c_void_p, ctypes.c_long
 
 
 class Waves(ctypes.Structure):
-    """Random features of one prior, and their weights in each function sample; see `motion.c`."""
+    """Random features of one prior, and their weights in each function sample (see `motion.c`)."""
 
     _fields_ = [("turn", POINTER), ("phase", POINTER), ("weights", POINTER), ("rows", LONG), ("n", LONG)]
 
@@ -95,7 +95,7 @@ class CompiledMotion:
 def compiled_motion(
     model: ExportedModel, force: ForceField, trained: ConstrainedSystem
 ) -> CompiledMotion | None:
-    """Return the motion of a model in C code, or `None` if a part or a function sample has no C form."""
+    """Return C code for the motion of a model, or `None` if a part or a function sample has no C form."""
     system, samples = model.system, force if isinstance(force, ForceSamples) else None
     if system.contact_names != trained.contact_names or system.robot.learned:
         return None

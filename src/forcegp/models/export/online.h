@@ -9,7 +9,7 @@ struct forcegp_learned {
   int next;                                                        /* the first one that waits */
 };
 #define FORCEGP_AT_REST 6      /* as in a fit, nothing is learned while the robot is at rest */
-#define FORCEGP_NO_NOISE 7     /* the fit has not measured the quantity, and no noise is given */
+#define FORCEGP_NO_NOISE 7     /* the fit contains no measurements of the quantity, and no noise is given */
 #define FORCEGP_OUT_OF_RANGE 8 /* a factor is not between 0 and 1, or the prior does not exist */
 void forcegp_begin(forcegp_learned *learned); /* initialise with the state of the fit */
 

@@ -1,6 +1,6 @@
 """C99 source text of a fitted model: its numbers, its straight-line mechanics, and the code of its priors.
 
-`controller.c` contains the code that does not depend on the model.
+`controller.c` contains the code that is the same for all models.
 """
 
 from __future__ import annotations
@@ -50,9 +50,9 @@ LAW = (
     "NUDGE",
 )
 READ = (*QUANTITIES, "joint_friction")
-"""Quantities of the C code, in the order of their bits; only the last is not in `QUANTITIES`."""
+"""Quantities of the C code, in the order of their bits. Only the last is not in `QUANTITIES`."""
 STEPS = 2e-5, 1e-3
-"""Steps of fourth-order differences in q and q̇, and in τ and q̈; friction changes within 0.01 rad/s."""
+"""Steps of fourth-order differences in q and q̇, and in τ and q̈. Friction changes within 0.01 rad/s."""
 TARGETS = (JOINT, CONTACT, CONSTRAINT)
 GIVEN = """const double *restrict q, const double *restrict qd, const double *restrict tau,
     const equations *restrict e, const double *restrict gain, int spread, latent *restrict f"""
@@ -63,7 +63,7 @@ def c_source(model: ExportedModel, name: str, rollout: bool = False) -> tuple[st
     """Return the header and the source text, with Jacobians or, for a rollout, the motion of trajectories.
 
     Raises:
-        ModelError: a part of the model has no C form; the message names it.
+        ModelError: a part of the model has no C form. The message names it.
     """
     model.check()
     before, _, rest = template("controller.c").partition("/* HELPERS")
@@ -145,7 +145,7 @@ def _called(text: str) -> str:
 
 
 def _programs(mean: LearnedMotion, rollout: bool) -> list[str]:
-    """Return the code of mechanics with contacts, forward dynamics, Y, and Jacobians or sliding friction."""
+    """Return the code for mechanics with contacts, forward dynamics, Y, and Jacobians or sliding friction."""
     robot = mean.robot
     blocks = [mean.M, mean.Q_C, mean.Q_G, mean.Q_D, *(x for at in mean.touching for x in at), *mean.x]
     outputs = [x for block in blocks for x in block.flat]
@@ -168,7 +168,7 @@ def _programs(mean: LearnedMotion, rollout: bool) -> list[str]:
 
 
 class Writer:
-    """Writer of the code of priors; `lines` contains the tables that this code reads."""
+    """Writer of the code for the priors. `lines` contains the tables that this code reads."""
 
     def __init__(self, model: ExportedModel, rollout: bool) -> None:
         self.model, self.parts, self.lines, self.rollout = model, model.parts(), list[str](), rollout
@@ -181,7 +181,7 @@ class Writer:
         self._wrench()
 
     def array(self, values: Tensor | Iterable[float], name: str = "", kind: str = "double") -> str:
-        """Add a constant array, unless it exists, and return its name."""
+        """Add a constant array unless it already exists, and return its name."""
         x = values if isinstance(values, Tensor) else torch.tensor(list(values), dtype=torch.float64)
         rows = x.detach().double().reshape(-1, x.shape[-1] if x.ndim else 1).tolist() or [[0.0]]
         texts = [", ".join(repr(v) if kind == "double" else str(int(v)) for v in row) for row in rows]
@@ -312,7 +312,7 @@ class Writer:
         return template("wrench.h", fields | at)
 
     def online_header(self) -> str:
-        """Return the part of the header for learning online, if the model supports it."""
+        """Return the part of the header for learning online if the model supports it."""
         names = ", ".join(f"{p} {_comment(part.prior.name)}" for p, part in enumerate(self.parts))
         folded = sum(part.weights.numel() for part in self.parts)
         fields = {"functions": self.parts[0].rank, "folded": folded, "priors": names}
@@ -340,7 +340,7 @@ class Writer:
         return [*texts, f"static int sticking_forces({GIVEN}) {{\n{unread}{chosen}  return 0;\n}}\n"]
 
     def sticking(self) -> dict[str, object]:
-        """Return the `motion.c` tables for the friction of sticking joints: components, inputs, features."""
+        """Return the `motion.c` tables for friction of sticking joints: components, inputs and features."""
         (priors, outputs), x, phi = self.mean.sliding(), self.mean.x, self.mean.phi
         sizes = [sum(map(len, features)) for features in phi]
         places = [("x", sum(each.size for each in x[:p]), x[p].size) for p in priors]
@@ -365,7 +365,7 @@ class Writer:
         }
 
     def _operator(self, part: Functions, start: int) -> list[str]:
-        """Return the code of E(x), from f to generalized forces; for inertial errors, see `controller.c`."""
+        """Return the code for E(x), which maps f to generalized forces (inertial errors: `controller.c`)."""
         prior, E = part.prior, f"f->E + {start}"
         if isinstance(prior, InertialPrior | PayloadPrior):
             return []
@@ -388,7 +388,7 @@ class Writer:
         return [f"  if (! {called}) return 1;"]
 
     def _functions(self, p: int, part: Functions) -> list[str]:
-        """Return the code of the functions V of each component and of their posterior."""
+        """Return the code for the functions V of each component and for their posterior."""
         before = self.mean.phi[:p]
         lines, m, first = [], part.size, sum(len(phi) for features in before for phi in features)
         kernel = KernelCode(self, p, lines, f"e->x + {sum(x.size for x in self.mean.x[:p])}")
@@ -409,7 +409,7 @@ class Writer:
         return lines
 
     def _slopes(self) -> list[str]:
-        """Return code for the part of the mean of f with support points, and for its derivatives in x."""
+        """Return the code for the part of the mean of f with support points, and for its derivatives in x."""
         texts, calls, first, start = [], "", 0, 0
         for p, part in enumerate(self.parts):
             if not part.size or part.rest is None:
@@ -443,7 +443,7 @@ class Leaf(NamedTuple):
 
 
 class KernelCode:
-    """C code for the kernel of one prior; the terms of a leaf are computed once before they are used."""
+    """C code for the kernel of one prior. The terms of a leaf are computed once before they are used."""
 
     def __init__(self, writer: Writer, p: int, lines: list[str], x: str, differentiate: bool = False) -> None:
         self.writer, self.part, self.lines = writer, writer.parts[p], lines
@@ -473,7 +473,7 @@ class KernelCode:
         )
 
     def slopes(self, part: KernelPart, k: int, value: str, f: str, slope: str) -> list[str]:
-        """Return the code of f = Σ w_j k(x, z_j) and ∂f/∂x for component k."""
+        """Return the code for f = Σ w_j k(x, z_j) and ∂f/∂x for component k."""
         m, w = self.part.size, self.writer.array(self.part.weights[k])
         lines = [f"  {{\n    double h[{m}];\n    for (int j = 0; j < {m}; ++j) h[j] = {value};"]
         lines.append(f"    *({f}) = dot(h, {w}, {m});")
@@ -486,7 +486,7 @@ class KernelCode:
         return [*lines, "  }"]
 
     def _leaves(self, part: KernelPart, k: int, factor: str) -> Iterable[tuple[Leaf, bool, str]]:
-        """Yield the leaves of a kernel that depend on x, each with the factor by which it is multiplied."""
+        """Yield the leaves of a kernel that depend on x, each with the factor that multiplies it."""
         if isinstance(part.kernel, kernels.Sum):
             sides = [KernelPart(*side) for side in part.kernel.parts(part.params)]
             for side, other in zip(sides, sides[::-1], strict=True):
@@ -497,7 +497,7 @@ class KernelCode:
             yield self._leaf(part, k), isinstance(part.kernel, kernels.Stationary), factor
 
     def _leaf(self, part: KernelPart, k: int) -> Leaf:
-        """Return a local array over the support points, which contains xᵀz_j or a profile of |x − z_j|."""
+        """Return a local array over the support points that contains xᵀz_j or a profile of |x − z_j|."""
         kernel, params = part.kernel, part.params
         if isinstance(kernel, kernels.Linear):
             # k = Σ_d (s σ_d)² x_d x′_d + σ_0²
