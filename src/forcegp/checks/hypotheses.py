@@ -267,7 +267,8 @@ def finding_of(
     name, theta, spread, evidence = hypothesis.name, fit.theta, fit.spread, dict[str, float]()
     one_of = name == "joint-sign" and len(alike) > 1
     names = tuple(log.joint_names[j] for j in (alike if one_of else hypothesis.joints))
-    listed = "all joints" if len(names) == log.nq > 1 else (" or " if one_of else " and ").join(names)
+    every = len(names) == log.nq > 1 and not one_of
+    listed = "all joints" if every else (" or " if one_of else " and ").join(names)
     if name == "gains":
         return _gains(log, names, 1.0 + theta[: len(names)])
     if name == "gravity":
