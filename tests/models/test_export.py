@@ -458,7 +458,7 @@ def test_single_precision_errs_by_what_the_export_states(name: str, compiler: st
     fit = fitted(name)
     written = fit.export(tmp_path / "c", dtype=torch.float32)
     assert "double" not in (written.folder / "controller.c").read_text()
-    assert f"err by {written.rounding[0]:.2g} of" in (written.folder / "README.md").read_text()
+    assert f"errs by at most {written.rounding[0]:.2g} of" in (written.folder / "README.md").read_text()
     sanitized = ["-O0", "-fsanitize=address,undefined", "-fno-sanitize-recover=all"]
     ran = built(written.folder, *sanitized, compiler=compiler)
     assert ran.returncode == 0, ran.stdout + ran.stderr

@@ -199,7 +199,7 @@ def test_what_cannot_learn_is_refused() -> None:
     state, active, _ = samples(fitted("sparse"))
     with pytest.raises(ModelError, match="cannot learn online in C"):
         fitted("sparse").compiled(functions=30).update(*state, active=active)
-    with pytest.raises(ShapeError, match="values of 'qdd' do not fit"):
+    with pytest.raises(ShapeError, match="values of 'qdd' do not match"):
         fast.update(*state[:3], state[3][:, :6], active=active)
     with pytest.raises(ShapeError, match="not finite"):
         fast.update(*state[:3], torch.nan * state[3], active=active)

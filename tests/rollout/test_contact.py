@@ -112,7 +112,7 @@ def test_sliding_motions_lose_no_contact() -> None:
 def test_a_law_without_forces_cannot_lose_contact() -> None:
     data = simulated().data
     law = AccelerationLaw(None)  # type: ignore[arg-type]
-    with pytest.raises(ModelError, match="no multiplier"):
+    with pytest.raises(ModelError, match="predicts only accelerations cannot detect"):
         rollout(law, arm(), data.q[0], data.qd[0], data, 0.1, options=unilateral())
 
 
