@@ -167,7 +167,8 @@ def check_spikes(system: ConstrainedSystem, log: Log) -> Outcome:
         peak = outlier & (np.abs(departure) >= _within_two(np.abs(departure)))
         bad |= peak.any(axis=1)
         hit += [(name, joint) for joint in log.named(peak.any(axis=0))]
-    text = f"{int(bad.sum())} isolated outlier{'s' * (bad.sum() > 1)} in {', '.join(map('.'.join, hit[:4]))}:"
+    count = int(bad.sum())
+    text = f"{count} isolated outlier{'s' * (count > 1)} in {', '.join(map('.'.join, hit[:4]))}:"
     joints = tuple(dict.fromkeys(joint for _, joint in hit))
     return at_rows(bad, "spike", text, joints, rows=bad.sum()), log.mask(bad)
 
