@@ -29,6 +29,7 @@ extensions = [
 ]
 exclude_patterns = ["_build", "_ext"]
 default_role = "code"
+smartquotes = False  # options and messages stay as they are typed
 nitpicky = False
 suppress_warnings = ["myst.header"]  # CHANGELOG.md repeats headings and skips levels
 

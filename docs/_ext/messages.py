@@ -39,8 +39,10 @@ def raised(source: Path = SOURCE) -> Iterator[tuple[str, str, str]]:
 
 
 def cell(text: str) -> str:
-    """Text of a table: no markup."""
-    return re.sub(r"([|*_`<>\[\]$\\])", r"\\\1", " ".join(text.split()))
+    """Text of a table: no markup but code between backticks."""
+    parts = re.split(r"(`[^`|]+`)", " ".join(text.split()))
+    plain = (re.sub(r"([|*_`<>\[\]$\\])", r"\\\1", part) for part in parts[::2])
+    return "".join(piece for pair in zip(plain, [*parts[1::2], ""], strict=True) for piece in pair)
 
 
 def explained() -> list[list[str]]:
