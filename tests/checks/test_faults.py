@@ -143,7 +143,9 @@ ON_IIWA = (
 @pytest.mark.slow
 def test_a_real_log_shows_what_is_true_of_it() -> None:
     report = check(*real_iiwa())
-    assert serious(report) <= TRUE_OF_IIWA and report.usable, _told(report)
+    # A finding that is true may list what looks the same: here a tilt of 1° beside the offsets.
+    kinds = {finding.kind for finding in report.findings if finding.severity != "note"}
+    assert kinds <= TRUE_OF_IIWA and report.usable, _told(report)
 
 
 @needs_real
