@@ -104,6 +104,10 @@ class RobotFileWarning(UserWarning):
     """Issued if a robot file is usable but questionable; `RobotModel.remarks` also contains the message."""
 
 
+class ConvergenceWarning(UserWarning):
+    """Issued if a search ends at its maximum number of steps, so that its result may not be optimal."""
+
+
 class UnknownNameError(ForceGPError, LookupError):
     """Raised if a name (of a joint, frame, model, …) does not exist; the message lists the valid names."""
 

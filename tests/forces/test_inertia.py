@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+
 import numpy as np
 import pytest
 import torch
@@ -11,7 +13,7 @@ from torch import Tensor
 import forcegp
 from forcegp import dynamics
 from forcegp.data import DataHeader
-from forcegp.errors import UnknownNameError
+from forcegp.errors import ConvergenceWarning, UnknownNameError
 from forcegp.forces.calibration import correlation_times
 from forcegp.forces.inertia import Inertia, inertia_of, latent_precision, one_row
 from forcegp.forces.inverse_dynamics import (
@@ -27,6 +29,7 @@ from forcegp.forces.inverse_dynamics import (
     sums,
 )
 from forcegp.forces.measurements import Observation, training_of
+from forcegp.forces.priors import inertial
 from forcegp.forces.priors.inertial import DIVERGENCE, InertialPrior
 from forcegp.forces.priors.joint import AnalyticalMean, JointFrictionPrior
 from forcegp.forces.quantities import states
@@ -204,6 +207,17 @@ def test_a_late_torque_is_not_taken_for_viscous_friction(file: RobotModel) -> No
     fit = forcegp.StructuredGP(forcegp.ConstrainedSystem(file), "analytical").fit(log(truth, 800, late=0.008))
     for each in (p for p in calibrated(fit).parameters if p.name == "damping"):
         assert abs(each.estimate - 0.3) < 3.0 * each.std < 0.15
+
+
+def test_a_search_for_links_that_does_not_converge_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
+    robot, prior = forcegp.load_robot("double_pendulum"), InertialPrior()
+    mean, precision = torch.ones(20, dtype=torch.float64), 1e6 * torch.eye(20, dtype=torch.float64)
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        prior.updated(robot, mean, precision)
+    monkeypatch.setattr(inertial, "MOST_STEPS", 2)
+    with pytest.warns(ConvergenceWarning, match="ended after 2 steps"):
+        prior.updated(robot, mean, precision)
 
 
 def test_consistent_links_are_the_most_probable_ones() -> None:

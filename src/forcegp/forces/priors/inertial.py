@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, field
 
@@ -19,7 +20,7 @@ import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
-from forcegp.errors import ModelError, check_name
+from forcegp.errors import ConvergenceWarning, ModelError, check_name
 from forcegp.forces.priors.base import JOINT
 from forcegp.forces.priors.joint import ConstantForcePrior
 from forcegp.forces.quantities import States
@@ -218,6 +219,9 @@ def _most_probable(
                 break
             share *= 0.5
         x, J = x + share * step, L @ (one + share * Y) @ L.mT
+    else:
+        text = "physically consistent links may not be the most probable ones: the search ended after"
+        warnings.warn(f"{text} {MOST_STEPS} steps", ConvergenceWarning, stacklevel=3)
     return x, J
 
 
