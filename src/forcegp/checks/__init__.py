@@ -52,7 +52,7 @@ def check_import(system: ConstrainedSystem, log: Log) -> Outcome:
         if kind != "contact":
             texts.setdefault(IMPORTED.get(kind, "import-found"), []).append(text)
     findings = [log.finding(kind, "; ".join(several)) for kind, several in texts.items()]
-    # What most rows repeat is the clock of the logger, at which nothing can be differentiated.
+    # If most rows are repeated, the logger was faster than its source, and no derivative can be computed.
     return [replace(f, weight="error") if f.kind == "rows-held" else f for f in findings], log
 
 
@@ -150,7 +150,7 @@ def check(system: ConstrainedSystem, data: Dataset | Log, *, progress: Progress 
     first = {"torque": "torque-sign", "mechanics": "torque-sign", "learned": "torque-offset"}
 
     def rank(f: Finding) -> tuple[float, ...]:
-        # A few odd rows come after what affects the whole log; of what a fit learns, the largest comes first.
+        # Findings on a few rows follow those on the whole log. Effects that a fit learns are sorted by size.
         family = KINDS[f.kind].family
         isolated = family in ("clock", "values") and 2 * f.rows < samples
         place = order.index(first.get(family, f.kind))

@@ -257,7 +257,7 @@ def check_forces(system: ConstrainedSystem, log: Log) -> Outcome:
         one = replace(system, contacts=[contact])
         force = _force(one, log, rows, path)
         if pulls := _pulls(finding, path, force):
-            # Up to three torques cannot contradict the force that they are taken for.
+            # With up to three joints, a contact force fits any torque, so a wrong sign shows only in its direction.
             others = []
             for j, name in enumerate(log.joint_names if log.nq <= 3 else ()):
                 flipped = _force(one, log.changed(("tau",), flip=(j,)), rows, path)

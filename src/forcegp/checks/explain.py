@@ -120,7 +120,7 @@ def _round(model: Explanation) -> Explanation | None:
     tried = [(h, fit) for h, fit in fits if not leaves_surface(system, log, corrected(log, h, fit.theta))]
     good = [(h, fit) for h, fit in tried if significant(fit.shares, null.shares, len(h.joints) or log.nq)]
     if model.findings and not any(finding.kind.endswith("order") for finding in model.findings):
-        # Only after an exchange, which may be part of a permutation, may one joint gain alone.
+        # An exchange may improve one joint only if it continues a permutation.
         good = [(h, fit) for h, fit in good if not h.name.endswith("order") or _helps_each(h, fit, null)]
     if not good:
         return None
@@ -249,7 +249,7 @@ def significant(better: Array, worse: Array, concerned: int) -> bool:
     """Return whether a decrease in the score is material and significant, given errors (blocks, nq)."""
     least = max(MATERIAL, MATERIAL_EACH * concerned)
     gains = gain_of(score_of(better), score_of(worse)), pooled_gain_of(better, worse)
-    # A drop that only quiet blocks show is an artefact of them: the other mean must bear it out.
+    # A decrease in both means is required, since quiet blocks alone may cause a decrease in one.
     agree = all(gain > error for gain, error in gains)
     return gains[0][0] > least and agree and any(gain > SIGNIFICANT * error for gain, error in gains)
 

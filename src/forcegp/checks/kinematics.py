@@ -102,7 +102,7 @@ def check_clock_unit(system: ConstrainedSystem, log: Log) -> Outcome:
     """Find a factor common to all joints and both derivatives, which indicates an incorrect clock rate."""
     if not log.stretches:
         return [], log
-    if "qd" in log.derived:  # only the length of a step says anything
+    if "qd" in log.derived:  # only the length of a step can be judged
         step = f"{log.dt:.4g} apart, which in seconds is an implausible sampling period of a robot's log"
         long = log.finding("time-unit", f"rows are {step}", period=log.dt)
         return [long] if log.dt >= 1.0 else [], log
@@ -318,7 +318,7 @@ def check_noise(system: ConstrainedSystem, log: Log) -> Outcome:
     if filtered.mean() > 0.5 and not log.header.filtered:
         high = f"at the highest frequencies it holds {100 * np.median(top / middle):.2g} % of the noise"
         text = f"the acceleration is filtered: {high} that it holds at a third of them, so it is not white"
-        # Without a claim of white noise a filter contradicts nothing, but a likelihood has to know.
+        # A filter contradicts the header only if the header states white noise, but a likelihood depends on it.
         weight = "note" if stated is None else "warning"
         finding = log.finding("noise-filtered", text, log.named(filtered), **evidence)
         return [replace(finding, weight=weight)], log

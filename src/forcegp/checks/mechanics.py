@@ -47,10 +47,10 @@ def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
     explanation = explain(system, smooth)
     disturbed, rows = _disturbances(explanation) if log.header.ordered else ([], np.zeros(0, bool))
     if disturbed and _enough(smooth.mask(rows)):
-        # What happened in these rows must pass neither for friction nor for a mass.
+        # A disturbance must not be mistaken for friction or for a mass.
         explanation = explain(system, smooth.mask(rows))
     losses = _determined(explanation)
-    # Friction of the contacts, and declared friction that rises more sharply, must not pass for more.
+    # Contact friction, or a steeper rise of declared friction, must not be mistaken for additional friction.
     functions = (hypotheses.contact_friction_columns, hypotheses.other_rise_columns)
     shapes = [columns(system, explanation.log, explanation.rows) for columns in functions]
     findings = [
@@ -64,7 +64,7 @@ def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
     for repair in explanation.repairs:
         log = repair(log)
     if log.contact and log.nq > 3:
-        # Friction and offsets of the joints must not pass for a force at the tip.
+        # Joint friction and offsets must not be mistaken for a force at the tip.
         viscous, dry, offset = losses.fit.nuisance.reshape(3, log.nq)
         smooth = np.tanh(log.qd / system.robot.friction_velocity.numpy())
         log = log.replace(tau=log.tau + viscous * log.qd + dry * smooth + offset)
@@ -129,7 +129,7 @@ def _friction(explanation: Explanation) -> list[Finding]:
     resists = ((viscous + damping) * speeds + coulomb + declared > 0.0).all(axis=0)
     spread = explanation.fit.nuisance_spread
     significant = np.array([_worse(explanation, explanation.without([j, nq + j]).fit, j) for j in range(nq)])
-    # Within the rise of declared friction, whose law is rarely known, a slow joint shows nothing beyond it.
+    # At speeds where declared friction is still rising, additional friction cannot be distinguished from it.
     rising = (speeds[1] <= robot.friction_velocity.numpy()) & (declared > 0.0)
     significant &= resists & ~still_joints(log) & ~rising
     findings = []
@@ -217,7 +217,7 @@ def _disturbances(explanation: Explanation) -> tuple[list[Finding], np.ndarray]:
 
 def _stands_out(log: Log, rows: np.ndarray, level: Array) -> np.ndarray:
     """Return a mask (n,) of rows with a larger residual than usual for the same contact state."""
-    # An arm at rest leaves little unexplained; it says nothing of one that moves.
+    # The residual of an arm at rest is small and is no reference for an arm in motion.
     speed = np.abs(log.qd[rows]).max(axis=1)
     moving, bad = speed >= MOVING * np.percentile(speed, 99), np.zeros(len(rows), bool)
     labels = [label[rows] for label in log.contact.values()]

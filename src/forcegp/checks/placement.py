@@ -41,7 +41,7 @@ def check_placement(system: ConstrainedSystem, log: Log) -> Outcome:
         if (outcome := _explanation(system, contact, log, rows, most)) is not None:
             return outcome
     for contact in labelled_contacts(system, log):
-        # Labels by distance are lost with the place of the tip.
+        # If the tip is displaced, no row is labelled as contact by distance.
         if not isinstance(contact, SurfaceContact) or log.contact[contact.name].any():
             continue
         path = tip_path(system, contact, log)
