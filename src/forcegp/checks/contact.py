@@ -257,7 +257,7 @@ def check_forces(system: ConstrainedSystem, log: Log) -> Outcome:
         one = replace(system, contacts=[contact])
         force = _force(one, log, rows, path)
         if pulls := _pulls(finding, path, force):
-            # With up to three joints, a contact force fits any torque, so a wrong sign shows only in its direction.
+            # With up to three joints, a contact force fits any torque, even one with the wrong sign.
             others = []
             for j, name in enumerate(log.joint_names if log.nq <= 3 else ()):
                 flipped = _force(one, log.changed(("tau",), flip=(j,)), rows, path)
@@ -271,7 +271,7 @@ def check_forces(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def _force(system: ConstrainedSystem, log: Log, rows: np.ndarray, path: Path) -> Array:
-    """Return the force F (n, 3) that best fits r = Jᵀ F, or its normal part with up to three joints."""
+    """Return the force F `(n, 3)` that best fits r = Jᵀ F, or its normal part with up to three joints."""
     r, J = residual(system, log, rows)
     if log.nq <= 3:
         A = J[:, 0] * ~np.isin(np.arange(log.nq), log.unmeasured)

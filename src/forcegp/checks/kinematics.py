@@ -318,7 +318,7 @@ def check_noise(system: ConstrainedSystem, log: Log) -> Outcome:
     if filtered.mean() > 0.5 and not log.header.filtered:
         high = f"at the highest frequencies it holds {100 * np.median(top / middle):.2g} % of the noise"
         text = f"the acceleration is filtered: {high} that it holds at a third of them, so it is not white"
-        # A filter contradicts the header only if the header states white noise, but a likelihood depends on it.
+        # A filter contradicts only a header that states white noise, but a likelihood depends on it.
         weight = "note" if stated is None else "warning"
         finding = log.finding("noise-filtered", text, log.named(filtered), **evidence)
         return [replace(finding, weight=weight)], log
