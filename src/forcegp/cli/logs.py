@@ -88,7 +88,8 @@ def _guess(log: Path, system: forcegp.ConstrainedSystem, out: Path) -> dict[str,
         guessed = guess_mapping(log, system, progress=advance)
     save(lambda path: write_text(path, guessed.toml()), out)
     doubts = {f"doubt_{i + 1}": text for i, text in enumerate(guessed.doubts)}
-    return {"mapping": str(out), **doubts, "next": f"check {out}, then import with --mapping {out}"}
+    step = f"fill in [{'] and ['.join(guessed.incomplete)}] in" if guessed.incomplete else "check"
+    return {"mapping": str(out), **doubts, "next": f"{step} {out}, then import with --mapping {out}"}
 
 
 def _summary(imported: Imported) -> dict[str, object]:
