@@ -391,7 +391,7 @@ def excite(
     unknowns: Unknowns | None = None,
     collisions: Collisions | None = None,
     start: Sequence[float] | None = None,
-    criterion: str | Criterion = "A",
+    criterion: str | Criterion | None = None,
     rate: float = 1000.0,
     restarts: int = 2,
     seed: int = 0,
@@ -406,9 +406,9 @@ def excite(
         unknowns: unknown forces before the motion. The default is all unknowns of `Unknowns.of`.
         collisions: collisions to avoid. The default is those of the robot's shapes and the contact surfaces.
         start: initial and final position, `(nq,)`. The default is a collision-free position near the middle.
-        criterion: `"A"`, the standard deviation of the torque in the region of `unknowns`; `"V"`, the same if
-            only link inertia and viscous and dry friction are unknown; `"D"`, the determinant of the
-            covariance; or a function of the information.
+        criterion: `"A"`, the standard deviation of the torque in the region of `unknowns`; `"V"`, the same
+            for links, viscous and dry friction by least squares, including bias; `"D"`, the determinant of
+            the covariance; or a function of the information. By default `"V"`, or `"A"` with `unknowns`.
         rate: sampling rate of the result [Hz].
         restarts: number of random starts to optimise. They are the best of four times as many.
         seed: random seed for the starts.
@@ -432,10 +432,12 @@ def excite(
     robot = system.robot.to("cpu", torch.float64)
     limits = limits or Limits.of(robot)
     collisions = collisions or Collisions(system, shapes_of(robot, elements=("collision", "visual")))
+    default = "A"
     with one_thread():
         if unknowns is None:
             region = random_states(robot, limits)
-            unknowns = Unknowns.of(robot, limits.low, limits.high, limits.velocity, region)
+            unknowns, default = Unknowns.of(robot, limits.low, limits.high, limits.velocity, region), "V"
+        criterion = criterion or default
         if isinstance(criterion, str):
             check_name("criterion", criterion, CRITERIA)
             criterion = CRITERIA[criterion]
