@@ -8,8 +8,7 @@ import pytest
 import torch
 
 import forcegp
-from forcegp.cli.rollout import _as_data, _say_contact, _spread, _stretch
-from forcegp.errors import DataError
+from forcegp.cli.rollout import _as_data, _say_contact, _spread
 from forcegp.rollout.trajectory import Divergence, Rollout
 from logs import random_log
 
@@ -37,21 +36,6 @@ def test_a_contact_that_the_log_changes_is_said() -> None:
         _say_contact(log, unilateral=False)
     _say_contact(log, unilateral=True)
     _say_contact(log[10:], unilateral=False)
-
-
-def test_a_rollout_ends_at_a_gap() -> None:
-    """Blocks that `select --split stretches` holds out of one trajectory have gaps between them."""
-    log = random_log(40)
-    held_out = log[[*range(5, 17), *range(30, 40)]]
-    with pytest.warns(UserWarning, match=r"ends after [\d.]+ s, at a gap after row 11; pass a log without"):
-        torch.testing.assert_close(_stretch(held_out, 0, None).t, log.t[5:17])
-    with pytest.warns(UserWarning, match=r"at a gap after row 11;"):
-        torch.testing.assert_close(_stretch(held_out, 4, None).t, log.t[9:17])
-    torch.testing.assert_close(_stretch(held_out, 12, None).t, log.t[30:40])
-    step = float(log.t[1] - log.t[0])
-    torch.testing.assert_close(_stretch(held_out, 0, 3.0 * step).t, log.t[5:9])
-    with pytest.raises(DataError, match="two rows or more"):
-        _stretch(held_out, 11, None)
 
 
 @pytest.mark.parametrize(("steps", "rows"), [(11.4, 12), (11.6, 12), (5.0, 6)])

@@ -114,25 +114,19 @@ def _say_contact(log: forcegp.Dataset, unilateral: bool) -> None:
 
 
 def _stretch(data: forcegp.Dataset, start: int, duration: float | None) -> forcegp.Dataset:
-    """Return the rows from `start` to the end of the trajectory or of the duration, or to the first gap."""
+    """Return the rows from `start` to the end of the trajectory or of the duration."""
     from forcegp.data.derivative import UNIFORM_TOLERANCE
 
     stretch = trajectory_from(data, start, "rollout")
     if duration is not None:
         stretch = stretch[stretch.t <= stretch.t[0] + duration * (1.0 + 1e-9)]
     steps = stretch.t.diff()
-    usual = data.header.dt or float(steps.median()) if len(steps) else 0.0
-    gaps = ((steps - usual).abs() > UNIFORM_TOLERANCE * usual).nonzero()[:, 0]
-    even = stretch[: int(gaps[0]) + 1] if len(gaps) else stretch
-    if len(even) < 2:
+    if len(stretch) < 2 or bool(((steps - steps.median()).abs() > UNIFORM_TOLERANCE * steps.median()).any()):
         raise DataError(
             "a rollout needs two rows or more at a constant sampling period",
             hint="start in a trajectory without gaps; rows left over from a selection have gaps",
         )
-    if len(gaps):
-        end = f"{float(even.t[-1] - even.t[0]):.4g} s, at a gap after row {start + len(even) - 1}"
-        warnings.warn(f"the rollout ends after {end}; pass a log without gaps for a longer one", stacklevel=2)
-    return even
+    return stretch
 
 
 def _spread(q: Tensor) -> Tensor:
