@@ -6,8 +6,8 @@
 Arms of `solver_arms.py` whose links are off by up to 30 % and whose joints have friction that the file
 lacks record 30 s of each motion, all within the same limits and free of collisions. The motions are
 planned from the file alone, for two seeds of the search, which the seeds of the arms share. `excited` has
-criterion V, for links, viscous and dry friction by least squares. `condition` is the condition number of the
-weighted regressor of the same, minimised by the same search. `random` is the largest of twenty random Fourier
+criterion A, the default. `condition` is the condition number of the regressor of links, viscous and dry
+friction, minimised by the same search. `random` is the largest of twenty random Fourier
 series. Errors are those of the identified links and friction against the true ones, as torques along third
 motions: `fast`, another random series within the same limits, and `slow`, that of `solver_arms.py`. They are
 identified by physically consistent least squares, without and with the delay of the torque as an unknown, as
@@ -76,7 +76,7 @@ def motions(name: str, seed: int) -> tuple[dict[str, Motion], dict[str, Any]]:
     system = forcegp.ConstrainedSystem(robot)
     limits = Limits.of(robot, velocity=robot.velocity_limit.clamp(max=SPEED).tolist(), acceleration=[RATE])
     found, notes = {}, {}
-    for label, criterion in {"excited": "V", "condition": condition}.items():
+    for label, criterion in {"excited": "A", "condition": condition}.items():
         began, cpu = time.perf_counter(), time.process_time()
         result = excite(system, SECONDS, limits=limits, criterion=criterion, rate=1.0 / STEP, seed=seed)
         notes[label] = {
