@@ -28,8 +28,11 @@ def scene_log(name: str) -> tuple[forcegp.ConstrainedSystem, forcegp.Dataset]:
     return scene.system(), data[:: max(1, len(data) // ROWS)]
 
 
-def pendulum_log(force: str, seed: int = 0) -> tuple[forcegp.ConstrainedSystem, forcegp.Dataset]:
-    """Random motion of a double pendulum with a joint force that the robot file lacks."""
+def pendulum_log(
+    force: str, seed: int = 0, held: int = 1
+) -> tuple[forcegp.ConstrainedSystem, forcegp.Dataset]:
+    """Random motion of a double pendulum with a joint force that the robot file lacks, and noise that keeps
+    its value for some samples."""
     generator = torch.Generator().manual_seed(seed)
     system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
     t = 0.02 * torch.arange(ROWS, dtype=torch.float64)
@@ -42,7 +45,8 @@ def pendulum_log(force: str, seed: int = 0) -> tuple[forcegp.ConstrainedSystem, 
         "spring": 3.0 * torch.sin(2.0 * q) - 0.1 * qd,
     }[force]
     tau = forcegp.dynamics.inverse_dynamics(system.robot, q, qd, qdd) - unknown
-    noise = 0.1 * torch.randn(ROWS, 2, generator=generator, dtype=torch.float64)
+    noise = 0.1 * torch.randn(ROWS // held, 2, generator=generator, dtype=torch.float64)
+    noise = noise.repeat_interleave(held, dim=0)
     header = DataHeader(noise_std=0.1)
     return system, forcegp.Dataset(t, q, qd, tau, qdd + noise, system.robot.joint_names, header=header)
 
@@ -98,6 +102,17 @@ def test_few_samples_get_a_stated_set() -> None:
     assert (only.name, only.chosen, only.note) == ("friction", True, "fewer than 100 samples")
     held = forcegp.StructuredGP(system, "analytical").fit(data, learn=[])
     assert [each.name for each in held.result.comparison] == ["friction"]
+
+
+def test_correlated_samples_count_as_few() -> None:
+    """The same spring, but 160 samples in which the noise of the torque has ten values."""
+    fit = fitted(*pendulum_log("spring", held=16))
+    friction, residual = (
+        next(x for x in fit.result.comparison if x.name == name) for name in ("friction", "friction+residual")
+    )
+    assert friction.chosen and friction.note == "fewer than 100 independent samples"
+    assert residual.log_density is not None and friction.log_density is not None
+    assert residual.log_density > friction.log_density
 
 
 def test_a_log_that_no_candidate_can_explain_gets_the_error_of_the_fit() -> None:

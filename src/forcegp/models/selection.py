@@ -8,7 +8,9 @@ density of the measurements, including noise,
     S = 1/N Σ_i log N(y_i; E z(x_i), Var z(x_i) + Σ),
 
 Candidates are compared by the differences of S over blocks of rows, which also give a standard error. The
-simplest candidate within one standard error of the best is selected. No candidate depends on the motor
+simplest candidate within one standard error of the best is selected. If its residuals are correlated so much
+that the n samples contain fewer than `FEWEST` independent samples, κ n, the held-out segments resemble the
+others too much to justify a flexible force, and the set `FEW` is used. No candidate depends on the motor
 torque. In closed loop, such a residual learns to cancel the torque and appears to have the best density.
 """
 
@@ -42,7 +44,7 @@ from forcegp.models.structured_learning import (
 )
 
 FEWEST = 100
-"""Number of samples below which the set `FEW` is used."""
+"""Number of independent samples below which the set `FEW` is used."""
 HALVES, STRETCHES, BLOCKS = 2, 4, 8
 """Number of halves of the log, of alternating segments, and of blocks of rows compared in each half."""
 ROWS = 400
@@ -138,6 +140,7 @@ class Trial:
         candidate: the candidate.
         scores: the score of each block, by half.
         coverage: fraction of measured values within ±2σ, by half.
+        independent: number of independent samples κ n in the halves on which the candidate was trained.
         begin: the hyperparameters learned on the first half.
         inertia_found: whether the identified inertia differs from that of the robot file.
         note: the reason why the candidate was dropped.
@@ -146,6 +149,7 @@ class Trial:
     candidate: Candidate
     scores: list[Tensor] = field(default_factory=list)
     coverage: list[float] = field(default_factory=list)
+    independent: float = 0.0
     begin: Mapping[str, Tensor] | None = None
     inertia_found: bool = False
     note: str = ""
@@ -180,12 +184,14 @@ def _score(
             if same and len(other.scores) == len(trial.scores) + 1:
                 trial.scores.append(other.scores[-1])
                 trial.coverage.append(other.coverage[-1])
+                trial.independent = other.independent
                 return
     try:
         fit = trained(spec.with_set(candidate.set), inertia, train, trial.begin)
         density, coverage = log_density(fit, test)
         trial.scores.append(blocks_of(density))
         trial.coverage.append(coverage)
+        trial.independent += fit.problem.power * fit.problem.training.samples
         trial.begin = fit.hyperparameters
     except NumericalError as cause:
         trial.note = f"not computed: {str(cause).splitlines()[0]}"
@@ -212,8 +218,11 @@ def _result(spec: Specification, trials: Sequence[Trial]) -> tuple[Specification
     best = max((own for _, own in whole), key=lambda x: float(x.mean()))
     behind = ((trial, *difference(best, own)) for trial, own in whole)
     chosen = next(trial for trial, by, error in behind if by <= error)
-    table = tuple(trial.row(best, trial is chosen) for trial in shown)
     identifies = chosen.candidate.inertia or not found
+    if chosen.independent < FEWEST and chosen.candidate.set is not FEW:
+        chosen = next(trial for trial in shown if trial.candidate.set is FEW)
+        chosen.note, identifies = f"fewer than {FEWEST} independent samples", True
+    table = tuple(trial.row(best, trial is chosen) for trial in shown)
     spec = spec.with_options(inertia=spec.options.inertia or ("auto" if identifies else "file"))
     return spec.with_set(chosen.candidate.set), table
 
