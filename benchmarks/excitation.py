@@ -1,16 +1,16 @@
 """Errors after a log of the excited motion, of a random Fourier series, and of the best condition number.
 
     python benchmarks/excitation.py --json result.json       # some minutes for each arm
-    python benchmarks/excitation.py --arm ur5 --seed 0 1 --fit
+    python benchmarks/excitation.py --arm ur5 --seed 0 1 --case plain --fit
 
 Arms of `solver_arms.py` whose links are off by up to 30 % and whose joints have friction that the file
 lacks record 30 s of each motion, all within the same limits and free of collisions. The motions are
-planned from the file alone, for two seeds of the search, which the seeds of the arms share. `excited` has the
-criterion V: links, viscous and dry friction are unknown, which are what least squares identify. `condition`
-is the condition number of the weighted regressor of the same, minimised by the same search. `random` is the
-largest of twenty random Fourier series. Errors are those of the identified links and friction against the
-true ones, as torques along a third motion, by physically consistent least squares and, with `--fit`, by the
-robot calibrated by the default structured GP.
+planned from the file alone, for two seeds of the search, which the seeds of the arms share. `excited` has
+criterion V, for links, viscous and dry friction by least squares. `condition` is the condition number of the
+weighted regressor of the same, minimised by the same search. `random` is the largest of twenty random Fourier
+series. Errors are those of the identified links and friction against the true ones, as torques along a third
+motion, by physically consistent least squares, without and with the delay of the torque as an unknown, as
+training identifies it, and, with `--fit`, by the robot calibrated by the default structured GP.
 """
 
 from __future__ import annotations
@@ -28,14 +28,15 @@ from typing import Any
 import numpy as np
 import torch
 from results_page import table
-from solver_arms import ARMS, MAPPING, STEP, Arm, sines
+from solver_arms import ARMS, FOLLOWED, MAPPING, STEP, Arm, sines
 from torch import Tensor
 from write_back import WRONG
 
 import forcegp
 from forcegp.control.information import Unknowns
 from forcegp.dynamics import damping_force, inverse_dynamics
-from forcegp.evaluation.least_squares import identify_rigid
+from forcegp.evaluation.least_squares import LeastSquares, identify_rigid
+from forcegp.identification import regressor
 from forcegp.logs import parse_mapping
 from forcegp.models.calibrated import calibrated
 from forcegp.robot.shapes import shapes_of
@@ -108,7 +109,10 @@ def log(arm: Arm, motion: Motion, seed: int, folder: Path) -> forcegp.Dataset:
 
 
 def truth(arm: Arm, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
-    """Torque of the true links, drives, viscous and dry friction, without noise and ripple `(n, nq)`."""
+    """Torque of the true links, drives, viscous and dry friction, without noise and ripple `(n, nq)`.
+
+    MuJoCo's dry friction develops over some 0.03 rad/s, like tanh(q̇ / `FOLLOWED`).
+    """
     dry = arm.true.dof_frictionloss.copy()
     arm.true.dof_frictionloss[:] = 0.0
     data, found = arm.mujoco.MjData(arm.true), []
@@ -117,20 +121,36 @@ def truth(arm: Arm, q: Tensor, qd: Tensor, qdd: Tensor) -> Tensor:
         arm.mujoco.mj_inverse(arm.true, data)
         found.append(data.qfrc_inverse.copy())
     arm.true.dof_frictionloss[:] = dry
-    return torch.from_numpy(np.array(found)) + torch.from_numpy(dry) * torch.tanh(
-        qd / arm.robot.friction_velocity
-    )
+    return torch.from_numpy(np.array(found)) + torch.from_numpy(dry) * torch.tanh(qd / FOLLOWED)
+
+
+def without_delay(squares: LeastSquares, log: forcegp.Dataset) -> forcegp.Dataset:
+    """The log without the delay of its torques, which is an unknown of least squares beside those found."""
+    robot, q, qd, qdd = squares.system.robot, log.q, log.qd, log.qdd
+    torque = inverse_dynamics(robot, q, qd, qdd) - damping_force(robot, qd) + squares.losses(qd)
+    rate = torch.gradient(torque, spacing=float(log.t[1]), dim=0)[0]
+    dry = torch.tanh(qd / robot.friction_velocity)
+    friction = [torch.diag_embed(x) for x in (qd, dry, torch.ones_like(qd))]
+    A = torch.cat([rate[..., None], regressor(robot, q, qd, qdd), *friction], dim=-1)
+    weight = (log.tau - torque).std(0)[:, None]
+    A, y = (A / weight).flatten(0, 1), ((log.tau - torque) / weight[:, 0]).flatten()
+    x = torch.linalg.lstsq(A / A.norm(dim=0).clamp(min=1e-12), y[:, None], driver="gelsd").solution
+    return log.replace(tau=log.tau - float(x[0, 0] / A[:, 0].norm()) * rate)
 
 
 def errors(arm: Arm, train: forcegp.Dataset, seed: int, fit: bool) -> dict[str, list[float]]:
     """Root mean square error of each joint's torque along a third motion."""
     states = [torch.from_numpy(x[::20]) for x in sines(arm.robot, TEST, np.random.default_rng([seed, 2]))]
     exact, system = truth(arm, *states), forcegp.ConstrainedSystem(arm.robot)
-    squares = identify_rigid(system, train)
-    found = {"least squares": (squares.system.robot, squares.losses(states[1]))}
+    sharp = arm.robot.replace(friction_velocity=torch.full_like(arm.robot.mass, FOLLOWED))
+    squares = identify_rigid(system.with_robot(sharp), train)
+    shifted = identify_rigid(system.with_robot(sharp), without_delay(squares, train))
+    found = {"least squares": squares, "with delay": shifted}
+    found = {label: (each.system.robot, each.losses(states[1])) for label, each in found.items()}
     if fit:
         gp = forcegp.StructuredGP(system, "analytical").fit(train)
-        found["fit"] = (calibrated(gp).robot, 0.0)
+        identified = calibrated(gp).robot.replace(friction_velocity=sharp.friction_velocity)
+        found["fit"] = (identified, torch.zeros_like(exact))
     return {
         name: (inverse_dynamics(robot, *states) - damping_force(robot, states[1]) + losses - exact)
         .square()
@@ -147,35 +167,37 @@ def main() -> None:
     )
     parser.add_argument("--arm", choices=ARMS, nargs="*", default=list(ARMS))
     parser.add_argument("--seed", type=int, nargs="*", default=list(range(10)))
+    parser.add_argument("--case", choices=SENSORS, nargs="*", default=list(SENSORS))
     parser.add_argument("--fit", action="store_true", help="fit the default structured GP too")
     parser.add_argument("--json", type=Path, help="write all results to this file")
     options = parser.parse_args()
     warnings.simplefilter("ignore")
     torch.set_num_threads(1)
     result: dict[str, Any] = {}
-    rows = []
+    rows, designs = [], {}
     for name in options.arm:
-        designs = {k: motions(name, k) for k in sorted({seed % DESIGNS for seed in options.seed})}
-        result[name] = {"motions": {k: notes for k, (_, notes) in designs.items()}}
-        for case, seed in itertools.product(SENSORS, options.seed):
-            arm = Arm(forcegp.load_robot(name), SENSORS[case], np.random.default_rng(seed))
-            found = {}
-            with tempfile.TemporaryDirectory() as folder:
-                for label, motion in designs[seed % DESIGNS][0].items():
-                    train = log(arm, motion, seed, Path(folder))
-                    wanted = np.array([np.interp(train.t, STEP * np.arange(len(q)), q) for q in motion[0].T])
-                    followed = float(np.abs(train.q.numpy() - wanted.T).max()) < LOST
-                    found[label] = errors(arm, train, seed, options.fit) if followed else {}
-            result[name][f"{case}, seed {seed}"] = found
-            if lost := [label for label, value in found.items() if not value]:
-                print(f"seed {seed}", name, case, "left the motion:", *lost, flush=True)
-                continue
-            for model in found["excited"]:
-                ratio = [np.divide(found["excited"][model], found[k][model]) for k in ("random", "condition")]
-                rows.append((name, case, model, *(float(np.exp(np.log(x).mean())) for x in ratio)))
-                print(f"seed {seed}", *rows[-1], flush=True)
+        planned = {k: motions(name, k) for k in sorted({seed % DESIGNS for seed in options.seed})}
+        designs[name] = {k: motion for k, (motion, _) in planned.items()}
+        result[name] = {"motions": {k: notes for k, (_, notes) in planned.items()}}
+    for case, name, seed in itertools.product(options.case, options.arm, options.seed):
+        arm = Arm(forcegp.load_robot(name), SENSORS[case], np.random.default_rng(seed))
+        found = {}
+        with tempfile.TemporaryDirectory() as folder:
+            for label, motion in designs[name][seed % DESIGNS].items():
+                train = log(arm, motion, seed, Path(folder))
+                wanted = np.array([np.interp(train.t, STEP * np.arange(len(q)), q) for q in motion[0].T])
+                followed = float(np.abs(train.q.numpy() - wanted.T).max()) < LOST
+                found[label] = errors(arm, train, seed, options.fit) if followed else {}
+        result[name][f"{case}, seed {seed}"] = found
         if options.json:
             options.json.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
+        if lost := [label for label, value in found.items() if not value]:
+            print(f"seed {seed}", name, case, "left the motion:", *lost, flush=True)
+            continue
+        for model in found["excited"]:
+            ratio = [np.divide(found["excited"][model], found[k][model]) for k in ("random", "condition")]
+            rows.append((name, case, model, *(float(np.exp(np.log(x).mean())) for x in ratio)))
+            print(f"seed {seed}", *rows[-1], flush=True)
     head = ["arm", "torques", "model", "÷ random", "÷ condition"]
     groups = dict.fromkeys(row[:3] for row in rows)
     means = [

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import re
+import subprocess
 import sys
 from pathlib import Path
 
@@ -27,6 +28,10 @@ extensions = [
     "plain_docstrings",
     "shell_cells",
 ]
+# The pages offer the wheel of this checkout for download.
+WHEELS = HERE.parent / "out" / "wheel"
+BUILD = ["-m", "pip", "wheel", "--quiet", "--no-deps", "--no-build-isolation", "--wheel-dir", WHEELS]
+subprocess.run([sys.executable, *BUILD, HERE.parent], check=True)
 exclude_patterns = ["_build", "_ext"]
 default_role = "code"
 smartquotes = False  # options and messages stay as they are typed

@@ -9,10 +9,13 @@ import dataclasses
 import re
 from typing import Any
 
+from docutils import nodes
 from sphinx.application import Sphinx
 
 CODE = re.compile(r"(`[^`]+`)")
 SEVERAL = re.compile(r"^(\s+)(\w+(?:, \w+)+): ")
+NO_SPACE = "\N{ZERO WIDTH SPACE}"
+"""Stands for a space between the names of an entry until the page is read."""
 MARKUP = re.compile(r"(?<!\\)([*|]|(?<=\w)_(?!\w))")
 
 
@@ -20,14 +23,19 @@ def escaped(line: str) -> str:
     """Absolute values, products and trailing underscores are mathematics, not markup."""
     if line.lstrip().startswith((">>>", "...")):
         return line
-    # One entry may describe several attributes; Napoleon takes a name with a space for a type and a name.
-    line = SEVERAL.sub(lambda found: f"{found[1]}{found[2].replace(', ', ',')}: ", line)
+    # One entry may describe several attributes; Sphinx takes a name with a space for a type and a name.
+    line = SEVERAL.sub(lambda found: f"{found[1]}{found[2].replace(', ', f',{NO_SPACE}')}: ", line)
     parts = CODE.split(line)
     return "".join(f"`{part}`" if CODE.fullmatch(part) else MARKUP.sub(r"\\\1", part) for part in parts)
 
 
 def _process(_: Sphinx, what: str, name: str, obj: object, options: Any, lines: list[str]) -> None:
     lines[:] = [escaped(line) for line in lines]
+
+
+def _spaced(_: Sphinx, doctree: nodes.document) -> None:
+    for text in [text for text in doctree.findall(nodes.Text) if NO_SPACE in text]:
+        text.parent.replace(text, nodes.Text(text.replace(NO_SPACE, " ")))
 
 
 def made(value: object) -> str:
@@ -50,4 +58,5 @@ def setup(app: Sphinx) -> dict[str, Any]:
     """Run before Napoleon."""
     app.connect("autodoc-process-docstring", _process, priority=100)
     app.connect("autodoc-process-signature", _defaults)
+    app.connect("doctree-read", _spaced)
     return {"parallel_read_safe": True, "parallel_write_safe": True}

@@ -56,7 +56,7 @@ def contact_frame() -> None:
     arrow(axis, (0, 0), (0, 1.75), BLUE)
     axis.text(0.12, 1.62, "normal force $F_I = \\nabla c\\,\\lambda$", color=BLUE, fontsize=10)
     arrow(axis, (0, 0), (1.7, 0), GREEN)
-    axis.text(1.75, 0.08, "velocity $v$ of the touching point", color=GREEN, fontsize=10)
+    axis.text(1.75, -0.03, "velocity $v$", color=GREEN, fontsize=10)
     arrow(axis, (0, 0), (-1.35, 0), ORANGE)
     axis.text(-1.3, 0.12, "friction $F_z$", color=ORANGE, fontsize=10, ha="center")
     arrow(axis, (-2.3, -0.32), (-2.42, 0.33), GRAY, 1.2)
@@ -107,7 +107,7 @@ def forces_to_quantities() -> None:
     box(axis, 3.8, 1.5, 2.3, 1.7, "forces\n$\\bar Q = m + \\sum E_p f_p$\n$= Q + Q_z$", ORANGE, 10)
     box(axis, 3.5, 3.65, 2.9, 0.75, "robot file: mean $m(x)$", GRAY)
     arrow(axis, (4.95, 3.63), (4.95, 3.22), GRAY, 1.2)
-    axis.text(6.95, 4.4, "$B_Q,\\ B_z,\\ o$", fontsize=9, color=GREEN, ha="center")
+    axis.text(7.18, 2.36, "$B_Q,\\ B_z,\\ o$", fontsize=8, color=GREEN, ha="center", va="center")
     quantities = ("acceleration $\\ddot q$", "multiplier $\\lambda$", "contact force", "joint force $Q$")
     for k, name in enumerate(quantities):
         box(axis, 7.8, 3.55 - 1.1 * k, 2.5, 0.85, name, GREEN)
@@ -120,7 +120,7 @@ def forces_to_quantities() -> None:
         "ls": "--",
     }
     axis.annotate("", (5.0, 1.45), (7.7, 0.35), arrowprops=style)
-    axis.text(4.4, 0.12, "measured values condition the forces", fontsize=9, ha="center")
+    axis.text(2.5, 0.15, "measured values\ncondition the forces", fontsize=9)
     saved(axis, "forces_to_quantities")
 
 

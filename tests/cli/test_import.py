@@ -49,6 +49,27 @@ def test_a_log_in_degrees_and_milliseconds_by_two_commands(tmp_path: Path) -> No
     np.testing.assert_allclose(data.qd.numpy(), m.qd, rtol=0.0, atol=1e-14)
 
 
+def test_columns_that_are_not_recognised_are_left_to_fill_in(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    m = motion()
+    rows = [",".join(map(repr, row)) for row in np.column_stack([m.t, m.q, m.tau]).tolist()]
+    log, mapping, out = tmp_path / "run.csv", tmp_path / "m.toml", tmp_path / "log.parquet"
+    log.write_text("\n".join(["t,foo,bar,tau1,tau2", *rows]))
+    told = run(log, "--robot", "double_pendulum", "--guess", mapping)
+    assert "unused columns: foo, bar" in told and f"fill in [position] in {mapping}" in told
+    said = fail(monkeypatch, capfd, log, "--robot", "double_pendulum", "--mapping", mapping, "--out", out)
+    assert f"{mapping}:15: position: joint 'shoulder' has no column" in said and "under columns" in said
+    text = (
+        mapping.read_text()
+        .replace('shoulder = ""', 'shoulder = "foo"')
+        .replace('elbow = ""', 'elbow = "bar"')
+    )
+    mapping.write_text(text)
+    run(log, "--robot", "double_pendulum", "--mapping", mapping, "--out", out)
+    np.testing.assert_array_equal(Dataset.read(out).q.numpy(), m.q)
+
+
 def test_json_says_what_was_found(tmp_path: Path) -> None:
     log, _ = WRITERS["rosbag 2"](tmp_path, motion())
     out = tmp_path / "log.parquet"

@@ -50,7 +50,37 @@ def test_control_characters_are_shown_escaped(place: str, tmp_path: Path) -> Non
     else:
         named = tmp_path / f"{ESCAPE}.csv"
         named.write_text(log.read_text())
-        arguments = ["import", str(named), "--robot", "double_pendulum", "--guess", str(tmp_path / "m.toml")]
+        arguments = ["import", str(named), "--robot", "double_pendulum", "--out", str(tmp_path / "x.parquet")]
     text = shown(*arguments)
     assert b"error" in text and b"x1b]0;owned" in text
     assert b"\x1b]0;owned" not in text and b"\x1b[2J" not in text and "\u202e".encode() not in text
+
+
+@pytest.mark.parametrize("columns", [None, "40", "70"])
+def test_prose_is_wrapped_at_the_width_of_the_terminal(
+    columns: str | None, monkeypatch: pytest.MonkeyPatch, capfd: pytest.CaptureFixture[str]
+) -> None:
+    from forcegp.cli import common
+
+    text, path, line = " ".join(["word"] * 40), "/tmp/" + 30 * "long-name-", "surface = { offset = 0.1 } " * 5
+    if columns is None:
+        monkeypatch.delenv("COLUMNS", raising=False)
+    else:
+        monkeypatch.setenv("COLUMNS", columns)
+    common.show({"text": text, "file": path, "line": common.Verbatim(line)}, as_json=False)
+    common.warn(f"{text} of {path}")
+    out, err = (stream.splitlines() for stream in capfd.readouterr())
+    assert f"line  {line}" in out
+    if columns is None:
+        assert [*out, *err] == [
+            f"text  {text}",
+            f"file  {path}",
+            f"line  {line}",
+            f"warning: {text} of {path}",
+        ]
+    else:
+        rest = [row for row in (*out, *err) if path not in row and line not in row]
+        assert max(map(len, rest)) <= int(columns) and any(path in row for row in err)
+        assert " ".join(" ".join(err).split()) == f"warning: {text} of {path}"
+        assert " ".join(" ".join(out).split()).startswith(f"text {text}")
+        assert all(row.startswith("      ") for row in out if row.strip().startswith("word"))

@@ -9,6 +9,8 @@ import torch
 import forcegp
 from forcegp.evaluation import least_squares
 from forcegp.evaluation.least_squares import LeastSquares, as_torque, baselines, identify_rigid
+from forcegp.forces.priors.inertial import DIVERGENCE
+from forcegp.robot.inertia import pseudo_inertia, pseudo_inertia_of
 from random_data import random_data, table_system
 
 system = table_system()
@@ -61,8 +63,7 @@ def test_an_interior_optimum_is_the_ridge_regression_of_a_textbook() -> None:
     prior = least_squares._prior_std(free.robot, data)
     G, g, _ = least_squares._normal_equations(free, data, prior)
     gram, right = G.sum(0) / TORQUE_NOISE**2 + torch.eye(91, dtype=torch.float64), g.sum(0) / TORQUE_NOISE**2
-    start = least_squares._start(free.robot)
-    _, x = least_squares._minimise(free.robot, gram, right, prior[:70], start, torch.zeros(21).double())
+    _, x = least_squares._minimised(free.robot, gram, right, prior[:70])
     W, y = (v.numpy() for v in least_squares._rows(free, data))
     A = np.concatenate([(W * prior.numpy()).reshape(-1, 91) / TORQUE_NOISE, np.eye(91)])
     b = np.concatenate([y.ravel() / TORQUE_NOISE, np.zeros(91)])
@@ -71,6 +72,30 @@ def test_an_interior_optimum_is_the_ridge_regression_of_a_textbook() -> None:
     # Physical links restrict the parameters, so that the unrestricted optimum is a lower bound.
     assert np.sum((A @ ridge - b) ** 2) <= physical * (1 + 1e-9)
     assert physical < 1.05 * np.sum((A @ ridge - b) ** 2)
+
+
+def test_links_at_the_edge_of_the_physical_are_the_most_probable_ones() -> None:
+    """The gradient of the objective balances that of the divergence γ [tr(J₀⁻¹J) − log |J|]."""
+    data = wrong_log(60, 3, constrained=False)
+    data = data.replace(
+        tau=data.tau + torch.randn(data.tau.shape, generator=torch.Generator().manual_seed(0))
+    )
+    prior = least_squares._prior_std(free.robot, data)
+    G, g, _ = least_squares._normal_equations(free, data, prior)
+    gram, right = G.sum(0) / TORQUE_NOISE**2 + torch.eye(91, dtype=torch.float64), g.sum(0) / TORQUE_NOISE**2
+    found, x = least_squares._minimised(free.robot, gram, right, prior[:70])
+    J, J0 = (pseudo_inertia(r.mass, r.com, r.inertia) for r in (found, free.robot))
+    units = pseudo_inertia_of(torch.eye(10, dtype=torch.float64))
+    slope = ((gram @ x - right)[:70] / prior[:70]).view(7, 10)
+    # S with ⟨S, E_p⟩ = ∂f/∂π_p
+    row, column = torch.triu_indices(4, 4)
+    twice = torch.where(row == column, 1.0, 2.0).double()
+    S = torch.zeros_like(J)
+    S[:, row, column] = S[:, column, row] = torch.linalg.solve(units[:, row, column] * twice, slope.mT).mT
+    L = torch.linalg.cholesky(J)
+    left = L.mT @ (S + DIVERGENCE * torch.linalg.inv(J0)) @ L - DIVERGENCE * torch.eye(4)
+    assert float(left.abs().max()) < DIVERGENCE
+    assert float(torch.linalg.eigvals(torch.linalg.solve(J0, J)).abs().min()) < 1e-2, "an edge is reached"
 
 
 def test_identified_links_are_physical_even_from_few_samples() -> None:

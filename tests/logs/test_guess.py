@@ -103,8 +103,71 @@ def test_logs_whose_columns_say_nothing(tmp_path: Path) -> None:
     system, log = kuka_log()
     with pytest.raises(MappingError, match="no column increases like time"):
         guess.guess_mapping(written(tmp_path, {"a": log["q"][:, 0]}, ",", "."), system)
-    with pytest.raises(MappingError, match=r"no columns were recognised as the position of 7 joints"):
-        guess.guess_mapping(written(tmp_path, {"t": log["t"], "a": log["q"][:, 0]}, ",", "."), system)
+    path = written(tmp_path, {"t": log["t"], "a": log["q"][:, 0]}, ",", ".")
+    proposal = guess.guess_mapping(path, system)
+    assert proposal.incomplete == ["position", "torque"]
+    assert "# CHECK: no position was recognised" in proposal.toml() and "unused columns: a" in proposal.toml()
+    with pytest.raises(MappingError, match=r"m.toml:10: position: joint 'lbr_iiwa_joint_1' has no column"):
+        read_log(path, system, parse_mapping(proposal.toml().encode(), "m.toml"))
+
+
+def two_joints() -> tuple[forcegp.ConstrainedSystem, dict[str, np.ndarray]]:
+    """A motion of the double pendulum, torques by inverse dynamics."""
+    system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
+    t, rate = np.arange(ROWS) * DT, np.array([3.0, 4.0])
+    x = t[:, None] * rate + np.array([0.0, 1.0])
+    state = [torch.from_numpy(v) for v in (np.sin(x), rate * np.cos(x), -(rate**2) * np.sin(x))]
+    tau = forcegp.dynamics.inverse_dynamics(system.robot, *state).numpy()
+    return system, {"t": t, "q": np.sin(x), "qd": rate * np.cos(x), "tau": tau}
+
+
+@pytest.mark.parametrize(
+    ("positions", "torques", "factor", "unit"),
+    [
+        ("shoulder_pos_deg elbow_pos_deg", "shoulder_trq_Nm elbow_trq_Nm", 1.0, "Nm"),
+        ("pan_pos_deg tilt_pos_deg", "u1_Nm u2_Nm", 1.0, "Nm"),
+        ("q1_deg q2_deg", "u1_mNm u2_mNm", 1e3, "mNm"),
+        ("Shoulder Angle (deg)|Elbow Angle (deg)", "Shoulder Effort [Nm]|Elbow Effort [Nm]", 1.0, "Nm"),
+        ("az_deg el_deg", "az_Nm el_Nm", 1.0, "Nm"),
+        ("arm 1 deg|wrist deg", "tau_wide tau_narrow", 1.0, "Nm"),
+        ("ang_a[deg] ang_b[deg]", "current_a[mA] current_b[mA]", 1e3, "mA"),
+    ],
+)
+def test_names_with_quantities_and_units(
+    tmp_path: Path, positions: str, torques: str, factor: float, unit: str
+) -> None:
+    system, log = two_joints()
+    q, tau = (names.split("|" if "|" in names else " ") for names in (positions, torques))
+    columns = {"time_ms": 1e3 * log["t"], "temp_degC": np.full(ROWS, 30.0)}
+    columns |= {name: np.degrees(log["q"][:, i]) for i, name in enumerate(q)}
+    columns |= {name: factor * log["tau"][:, i] for i, name in enumerate(tau)}
+    path = written(tmp_path, columns, ",", ".")
+    proposal = guess.guess_mapping(path, system)
+    sections = mapping_of(proposal).sections
+    assert not proposal.incomplete and (sections.position.unit, sections.torque.unit) == ("deg", unit)
+    data = read_log(path, system, mapping_of(proposal))
+    np.testing.assert_allclose(data.q.numpy(), log["q"], atol=1e-12)
+    assert np.corrcoef(data.tau.numpy().T[1], log["tau"].T[1])[0, 1] > 0.99
+    assert ("torque constant" in " ".join(proposal.doubts)) == (unit == "mA")
+
+
+def test_joints_named_like_positions(tmp_path: Path) -> None:
+    """Joint names `q1` and `q2` are part of `dq1`, which is not a position."""
+    robot = Path(forcegp.__file__).parent / "robot" / "bundled" / "double_pendulum.urdf"
+    text = robot.read_text().replace('"shoulder"', '"q1"').replace('"elbow"', '"q2"')
+    (tmp_path / "robot.urdf").write_text(text)
+    system = forcegp.ConstrainedSystem(forcegp.load_robot(tmp_path / "robot.urdf"))
+    assert system.robot.joint_names == ("q1", "q2")
+    _, log = two_joints()
+    columns = {"t": log["t"]}
+    for name in ("q", "qd", "tau"):
+        columns |= {f"{name.replace('qd', 'dq')}{i + 1}": log[name][:, i] for i in range(2)}
+    path = written(tmp_path, columns, ",", ".")
+    proposal = guess.guess_mapping(path, system)
+    assert set(proposal.families) == {"position", "velocity", "torque"}
+    data = read_log(path, system, mapping_of(proposal))
+    for name in ("q", "qd"):
+        np.testing.assert_allclose(getattr(data, name).numpy(), log[name], atol=1e-12)
 
 
 @real_logs

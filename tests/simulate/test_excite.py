@@ -66,18 +66,43 @@ def test_the_gradient_is_that_of_finite_differences(criterion: str, monkeypatch:
     assert np.abs(numeric - gradient[some]).max() < 1e-6 * np.abs(gradient).max()
 
 
-def test_the_criterion_of_least_squares_has_no_bumps() -> None:
+def test_the_criterion_of_least_squares_is_their_error_if_other_functions_exist() -> None:
+    """The error of the estimate K y from torques y = A θ + B g + noise, with K for g = 0."""
     found, q = unknowns(), torch.randn(3, 40, 6, dtype=torch.float64)
     links, each = found.base.rank, (found.parts["friction"].stop - found.base.rank) // 6
-    columns = [*range(links), *(links + each * j + k for j in range(6) for k in (0, 1))]
-    Phi = found.columns(*q)[1]
-    A = (Phi[..., columns] / found.noise[:, None]).flatten(0, 1) * (10.0 / LOOK / 40) ** 0.5
-    prior = found.root[columns][:, columns]
-    covariance = torch.linalg.inv(torch.linalg.inv(prior @ prior.mT) + A.mT @ A)
-    rows = found.columns(*found.region)[1][..., columns]
+    fitted = [*range(links), *(links + each * j + k for j in range(6) for k in (0, 1))]
+    others = [k for k in range(len(found.root)) if k not in fitted]
+    rate = torch.randn(40, 6, dtype=torch.float64)
+    Phi = torch.cat([found.columns(*q)[1][..., :-1], rate[..., None]], dim=-1)
+    A, B = (
+        (Phi[..., some] / found.noise[:, None]).flatten(0, 1) * (10.0 / LOOK / 40) ** 0.5
+        for some in (fitted, others)
+    )
+    prior, spread = ((found.root @ found.root.mT)[some][:, some] for some in (fitted, others))
+    K = torch.linalg.solve(torch.linalg.inv(prior) + A.mT @ A, A.mT)
+    missed, biased = K @ A - torch.eye(len(fitted)), K @ B
+    covariance = missed @ prior @ missed.mT + K @ K.mT + biased @ spread @ biased.mT
+    rows = found.columns(*found.region)[1][..., fitted]
     variance = torch.einsum("njp,pk,njk->nj", rows, covariance, rows).mean(0)
-    value = float(CRITERIA["V"](found.information(Phi, 10.0), found))
+    value = float(CRITERIA["V"](found.information(found.columns(*q)[1], 10.0, rate), found))
     assert value == pytest.approx(0.5 * float(variance.log().mean()), rel=1e-6)
+
+
+def test_a_delay_of_the_torque_shifts_it_in_time() -> None:
+    search = Search(Spline(np.array(START), 4.0), LIMITS, unknowns(), collisions(), CRITERIA["V"])
+    x = 0.2 * search.spline.random(LIMITS, np.random.default_rng(1))
+
+    def torque(t: np.ndarray) -> torch.Tensor:
+        q, qd, qdd = (torch.from_numpy(m @ x) for m in search.spline.at(t))
+        return rigid_torque(ROBOT, q + torch.tensor(START), qd, qdd)
+
+    step, nodes = 1e-4, search.nodes
+    rate = torch.zeros(len(nodes), 6, dtype=torch.float64)
+    rate[1:-1] = (torque(nodes[1:-1] + step) - torque(nodes[1:-1] - step)) / (2.0 * step)
+    Phi = search.unknowns.columns(*search.states(torch.from_numpy(x)))[1]
+    expected = search.unknowns.information(Phi, 4.0, rate)[-1]
+    found = search.information(Phi, torque(nodes))[-1]
+    assert float((found - expected).norm()) < 0.1 * float(expected.norm())  # differences over 0.2 s
 
 
 def test_the_gradient_of_the_clearance_is_that_of_finite_differences() -> None:
@@ -131,11 +156,15 @@ def test_the_box_is_in_the_way_of_the_motion_without_it() -> None:
 
 def test_the_motion_tells_more_than_its_random_start_and_the_same_seed_gives_it_again() -> None:
     found = short(5)
-    search = Search(Spline(np.array(START), 4.0), LIMITS, found.before, collisions(), CRITERIA["A"])
+    search = Search(Spline(np.array(START), 4.0), LIMITS, found.before, collisions(), CRITERIA["V"])
     random = np.random.default_rng(5)
     starts = [search.shrunk(search.spline.random(LIMITS, random), 0.05)[0] for _ in range(4)]
     assert found.criterion[0] < min(search(search.flat(x))[0] for x in starts) - 0.2
-    assert torch.equal(short(5).motion.q, found.motion.q)
+    assert torch.equal(short(5, criterion="V").motion.q, found.motion.q)
+    assert torch.equal(
+        short(5, unknowns=found.before).motion.q,
+        short(5, unknowns=found.before, criterion="A").motion.q,
+    )
 
 
 def test_the_expected_covariance_is_that_of_the_dense_formula() -> None:

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from scipy.linalg import cho_factor, cho_solve
 from torch import Tensor
 
 from forcegp import dynamics, kinematics
@@ -209,8 +210,6 @@ def held_out(problem: TorqueProblem, columns: Array, prior: Array) -> Array:
 
 def _solve(gram: Array, side: Array, weight: Array, symmetric: bool = True) -> Array:
     """Solve the normal equations, or the equations with instruments, whose `gram` is not symmetric."""
-    from scipy.linalg import cho_factor, cho_solve
-
     gram = gram + np.diag(weight + 1e-12 * np.trace(gram) / len(gram))
     return cho_solve(cho_factor(gram), side) if symmetric else np.linalg.solve(gram, side)
 

@@ -12,6 +12,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
+from scipy.ndimage import correlate1d
+from scipy.optimize import linear_sum_assignment
 
 from forcegp import dynamics
 from forcegp.checks.finding import Finding
@@ -221,8 +223,6 @@ def _coarse(log: Log, level: Match) -> np.ndarray:
 
 def _permutation(level: Match) -> np.ndarray | None:
     """Return the order of rates that fits the changes of the joints better than the logged order, if any."""
-    from scipy.optimize import linear_sum_assignment
-
     # Windows without impacts are those in which a joint fits its own rate, which here is the wrong one.
     change, integral = level.whole
     size = np.sqrt((change**2).sum(axis=0)), np.sqrt((integral**2).sum(axis=0))
@@ -289,8 +289,6 @@ NOISE_ROWS = 100
 
 def noise_levels(log: Log) -> tuple[Array, Array] | None:
     """Return the standard deviations (nq,) of white noise estimated from neighbours at distances 1 and 3."""
-    from scipy.ndimage import correlate1d
-
     levels = []
     for k in (1, 3):  # neighbours at distance 3 reveal noise below the cut-off frequency of a filter
         weights = np.zeros(4 * k + 1)

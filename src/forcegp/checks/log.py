@@ -18,6 +18,7 @@ from typing import Any
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from scipy.ndimage import correlate1d
 
 from forcegp.checks.finding import Finding
 from forcegp.data.columns import parse
@@ -52,8 +53,6 @@ def spikes(x: Array) -> tuple[Array, Array]:
     neighbours alone. A kink in the motion increases both results, a spike only the first. Values must be
     evenly sampled, with shape `(n, d)` and n ≥ 7. Both are zero in the three rows at either end.
     """
-    from scipy.ndimage import correlate1d
-
     departure, left, right = (correlate1d(x, w, axis=0) for w in (DEPARTURE, OUTER, OUTER[::-1]))
     around = np.maximum(np.abs(left), np.abs(right)) / SPREAD
     for value in (departure, around):

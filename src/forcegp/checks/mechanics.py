@@ -5,6 +5,7 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+from scipy.ndimage import minimum_filter1d
 
 from forcegp.checks import hypotheses
 from forcegp.checks.excitation import check_visibility, still_joints
@@ -183,8 +184,6 @@ def _unexplained(explanation: Explanation) -> list[Finding]:
 
 def _disturbances(explanation: Explanation) -> tuple[list[Finding], np.ndarray]:
     """Find periods with far more unexplained torque than usual, and mask the rows around them."""
-    from scipy.ndimage import minimum_filter1d
-
     robot, log, rows = explanation.system.robot, explanation.log, explanation.log.rows(TRACE_ROWS)
     trace = residual_trace(explanation, rows)
     scale = np.maximum(explanation.problem.scale, FLOOR * explanation.problem.size)

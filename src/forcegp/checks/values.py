@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import torch
+from scipy.ndimage import maximum_filter1d
 
 from forcegp import dynamics
 from forcegp.checks.excitation import still_joints
@@ -227,8 +228,6 @@ def _one_value(departure: Array, scale: Array) -> np.ndarray:
 
 def _within_two(x: Array) -> Array:
     """Return the largest value within two rows."""
-    from scipy.ndimage import maximum_filter1d
-
     return maximum_filter1d(x, 5, axis=0, mode="constant")
 
 

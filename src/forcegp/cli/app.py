@@ -12,7 +12,7 @@ import warnings
 
 import typer
 
-from forcegp.cli.common import printable, warn
+from forcegp.cli.common import say, warn
 from forcegp.cli.evaluate import evaluate
 from forcegp.cli.excite import excite
 from forcegp.cli.export import export
@@ -110,6 +110,5 @@ def _end_when_interrupted() -> None:
 
 
 def _fail(message: str) -> None:
-    typer.secho("error: ", fg="red", bold=True, nl=False, err=True)
-    typer.echo(printable(message), err=True)
+    say(message, "error: ", indent=4, err=True, fg="red", bold=True)
     sys.exit(USER_ERROR)

@@ -4,6 +4,10 @@ from __future__ import annotations
 
 import json
 import math
+import os
+import shutil
+import sys
+import textwrap
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from pathlib import Path
@@ -37,10 +41,29 @@ def printable(text: object) -> str:
     )
 
 
+WHOLE = ("break_long_words", "break_on_hyphens")
+"""Ways to break words, which would damage paths and names."""
+
+
+class Verbatim(str):
+    """A line to copy into a file, which is not wrapped."""
+
+
+def say(text: object, label: str = "", indent: int = 2, err: bool = False, **style: Any) -> None:
+    """Print a text after a styled label, wrapped at the width of the terminal, but not in files and pipes."""
+    lines = printable(f"{label}{text}").splitlines()
+    terminal = (sys.stderr if err else sys.stdout).isatty() or "COLUMNS" in os.environ
+    if terminal and not isinstance(text, Verbatim):
+        width, whole = max(shutil.get_terminal_size().columns, 2 * indent), dict.fromkeys(WHOLE, False)
+        lines = [textwrap.fill(line, width, subsequent_indent=" " * indent, **whole) for line in lines]
+    printed = "\n".join(lines)
+    typer.secho(printed[: len(label)], nl=False, err=err, **style)
+    typer.echo(printed[len(label) :], err=err)
+
+
 def warn(text: object) -> None:
     """Print a warning to stderr."""
-    typer.secho("warning: ", fg="yellow", nl=False, err=True)
-    typer.echo(printable(text), err=True)
+    say(text, "warning: ", err=True, fg="yellow")
 
 
 @contextmanager
@@ -67,9 +90,9 @@ def show(result: Mapping[str, object], as_json: bool) -> None:
     fields = {name: value for name, value in result.items() if value is not None and value != ()}
     width = max(len(name) for name in fields)
     for name, value in fields.items():
-        text = ", ".join(map(str, value)) if isinstance(value, list | tuple) else str(value)
+        text = ", ".join(map(str, value)) if isinstance(value, list | tuple) else value
         text = f"{value:.6g}" if isinstance(value, float) else text
-        typer.echo(printable(f"{name.replace('_', ' '):<{width}}  {text}"))
+        say(text, f"{name.replace('_', ' '):<{width}}  ", indent=width + 2)
 
 
 def check_output(out: Path, *inputs: Path) -> None:

@@ -45,12 +45,13 @@ def excite(
     ] = None,
     clearance: Annotated[float, typer.Option(min=1e-4, help="Minimum distance between parts [m].")] = 0.01,
     criterion: Annotated[
-        str,
+        str | None,
         typer.Option(
-            help="A: expected standard deviation of the torque; V: the same for least squares, in which only "
-            "link inertia and friction are unknown; D: determinant of the covariance."
+            help="V: expected torque error of links, viscous and dry friction by least squares; A: expected "
+            "standard deviation of the torque; D: determinant of the covariance. Default: A with a model or "
+            "a region, otherwise V."
         ),
-    ] = "A",
+    ] = None,
     rate: Annotated[float, typer.Option(help="Samples per second.")] = 1000.0,
     restarts: Annotated[int, typer.Option(min=1, help="Number of random starts to optimise from.")] = 2,
     seed: Annotated[int, typer.Option(help="Seed for the random starts.")] = 0,
@@ -117,7 +118,7 @@ def excite(
             unknowns=unknowns if fit is None else unknowns_after(fit, unknowns),
             collisions=collisions,
             start=_numbers("start", start) or None,
-            criterion=criterion,
+            criterion=criterion or ("V" if model is None and region is None else "A"),
             rate=rate,
             restarts=restarts,
             seed=seed,

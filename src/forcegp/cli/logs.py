@@ -11,7 +11,7 @@ import typer
 
 import forcegp
 from forcegp.cli import common
-from forcegp.cli.common import printable, progress_bar, save, show
+from forcegp.cli.common import Verbatim, printable, progress_bar, save, say, show
 from forcegp.cli.options import AsJson, Differentiate, RobotName, SceneOrNone
 from forcegp.errors import ForceGPError
 
@@ -88,7 +88,8 @@ def _guess(log: Path, system: forcegp.ConstrainedSystem, out: Path) -> dict[str,
         guessed = guess_mapping(log, system, progress=advance)
     save(lambda path: write_text(path, guessed.toml()), out)
     doubts = {f"doubt_{i + 1}": text for i, text in enumerate(guessed.doubts)}
-    return {"mapping": str(out), **doubts, "next": f"check {out}, then import with --mapping {out}"}
+    step = f"fill in [{'] and ['.join(guessed.incomplete)}] in" if guessed.incomplete else "check"
+    return {"mapping": str(out), **doubts, "next": f"{step} {out}, then import with --mapping {out}"}
 
 
 def _summary(imported: Imported) -> dict[str, object]:
@@ -121,7 +122,7 @@ def _surfaces(
 
     touched = [name for name, closed in imported.data.contact.items() if bool(closed.any())]
     fits = ((name, fit_surface(imported.data, system, name, kind, tip_radius)) for name in touched)
-    return {name: fit.toml().strip() for name, fit in fits}
+    return {name: Verbatim(fit.toml().strip()) for name, fit in fits}
 
 
 def _json(imported: Imported) -> dict[str, object]:
@@ -188,8 +189,9 @@ def check(
         show({**report.to_dict(), "page": str(out) if out else None}, as_json)
     else:
         _print(report)
-        typer.echo(printable(f"page: {out}") if out else "", nl=out is not None)
-        typer.secho(printable(report.verdict), bold=True)
+        if out is not None:
+            say(out, "page: ")
+        say("", report.verdict, bold=True)
     if not report.usable:
         raise typer.Exit(NOT_USABLE)
 
@@ -217,7 +219,7 @@ def _print(report: Report) -> None:
             table.add_row(Text(finding.severity, style=COLOURS[finding.severity]), kinds, rows, body)
         Console().print(table)
     for name, reason in report.skipped.items():
-        typer.echo(printable(f"not checked: {name} ({reason})"))
+        say(f"not checked: {name} ({reason})")
 
 
 def select(

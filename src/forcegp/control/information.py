@@ -1,15 +1,18 @@
 """Information that a motion provides about the unknown forces of a robot.
 
 The torque is linear in the unknowns, τ = τ₀ + Φ(q, q̇, q̈) θ with θ ~ N(0, U Uᵀ). The unknowns are the base
-parameters of the links, the functions of each joint, and drive inertia if a fit has learned it. Each joint
-has a function of its speed (viscous friction, dry friction and Gaussian bumps) and a function of its position
-(bumps). After a motion x with torque noise Σ,
+parameters of the links, the functions of each joint, drive inertia if a fit has learned it, and the delay s
+of the torque, τ(t + s) ≈ τ + s dτ/dt. Each joint has a function of its speed (viscous friction, dry friction,
+a deviation at low speed and Gaussian bumps) and a function of its position (bumps). After a motion x with
+torque noise Σ,
 
     Cov θ = U (1 + Uᵀ G U)⁻¹ Uᵀ,    G = Σ_i Φ(x_i)ᵀ Σ⁻¹ Φ(x_i),
 
 The sum extends over independent samples i. Criterion `A` is the geometric mean over joints of the standard
-deviation of the torque in a region, and `D` is the entropy of θ. Sources: Swevers et al., *Optimal robot
-excitation and identification* (IEEE T-RA 1997); Pukelsheim, *Optimal Design of Experiments* (1993).
+deviation of the torque in a region, and `D` is the entropy of θ. Criterion `V` is the same as `A` for least
+squares, which fit links, viscous and dry friction and are biased by all other unknowns. Sources: Swevers et
+al., *Optimal robot excitation and identification* (IEEE T-RA 1997); Pukelsheim, *Optimal Design of
+Experiments* (1993); Box and Draper, *A basis for the selection of a response surface design* (JASA 1959).
 """
 
 from __future__ import annotations
@@ -32,7 +35,11 @@ LOOK = 0.1
 NOISE = 0.01
 """Standard deviation of torque noise, relative to the RMS torque in the region."""
 FRICTION, BUMP = 0.1, 0.03
-"""Prior standard deviations of friction and of each bump, relative to the same torque."""
+"""Prior standard deviations of friction and of every other function, relative to the same torque."""
+SLOW = 0.1
+"""Speed at which the deviation at low speed is largest, relative to the maximum speed of a joint."""
+DELAY = 0.002
+"""Prior standard deviation of the delay: half a period of a controller that acts every 4 ms [s]."""
 SPEEDS, PLACES = 7, 5
 """Number of bumps over the range of speeds, and over the range of positions, of a joint."""
 DRY = 0.02
@@ -91,40 +98,54 @@ class Unknowns:
             raise ParameterError("the region has no states", expected="one state or more", got="none")
         torque = rigid_torque(robot, *region).square().mean(0).sqrt()
         torque = torch.maximum(torque, 0.1 * torque.max()).clamp(min=1e-9)
-        functions = torque.new_tensor([FRICTION] * 2 + [BUMP] * (SPEEDS + PLACES))
+        functions = torque.new_tensor([FRICTION] * 2 + [BUMP] * (1 + SPEEDS + PLACES))
         base = base_parameters(robot)
         # β = B π
         B = torch.from_numpy(base.combination) * InertialPrior().scale(robot)
         links = torch.linalg.cholesky(B @ B.mT)
         friction, drives = (torque[:, None] * functions).flatten().diag(), torch.zeros_like(torque).diag()
-        root = torch.block_diag(links, friction, drives)
+        root = torch.block_diag(links, friction, drives, torque.new_tensor([[DELAY]]))
         noise = NOISE * torque if noise is None else noise
         return cls(robot, base, low, high, fastest, region, noise, root)
 
     @property
     def parts(self) -> dict[str, slice]:
-        """Positions of links, joint functions and drives in θ."""
-        links, drives = self.base.rank, len(self.root) - self.robot.nq
-        return {"links": slice(0, links), "friction": slice(links, drives), "drives": slice(drives, None)}
+        """Positions of links, joint functions and drives in θ. The delay is last."""
+        links, last = self.base.rank, len(self.root) - 1
+        drives = last - self.robot.nq
+        return {"links": slice(0, links), "friction": slice(links, drives), "drives": slice(drives, last)}
 
     def basis(self, q: Tensor, qd: Tensor) -> Tensor:
-        """Return the functions of each joint `(n, nq, k)`: scaled q̇ and tanh q̇, and bumps over q̇ and q."""
+        """Return the functions of each joint `(n, nq, k)`, in the order given above."""
         u, place = qd / self.fastest, 2.0 * (q - self.low) / (self.high - self.low) - 1.0
+        slow = u / SLOW
         bumps = [
             torch.exp(-0.5 * ((x[..., None] - torch.linspace(-1.0, 1.0, k).to(x)) * (k - 1) / 2.0) ** 2)
             for x, k in ((u, SPEEDS), (place, PLACES))
         ]
-        return torch.cat([u[..., None], torch.tanh(u / DRY)[..., None], *bumps], dim=-1)
+        smooth = torch.stack([u, torch.tanh(u / DRY), slow * torch.exp(0.5 - 0.5 * slow.square())], dim=-1)
+        return torch.cat([smooth, *bumps], dim=-1)
 
     def columns(self, q: Tensor, qd: Tensor, qdd: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the regressor Y of the links, and Φ `(n, nq, p)` for all parameters, at states `(n, nq)`."""
+        """Return the regressor Y of the links, and Φ `(n, nq, p)` for all parameters, at states `(n, nq)`.
+
+        The column for the delay is zero, since states alone do not determine the rate of the torque.
+        """
         Y = regressor(self.robot, q, qd, qdd)
         functions = torch.diag_embed(self.basis(q, qd).movedim(-1, 1)).movedim(1, -1)
-        parts = [Y[..., list(self.base.columns)], functions.flatten(-2), torch.diag_embed(qdd)]
-        return Y, torch.cat(parts, dim=-1)
+        links, delay = Y[..., list(self.base.columns)], torch.zeros_like(q[..., None])
+        return Y, torch.cat([links, functions.flatten(-2), torch.diag_embed(qdd), delay], dim=-1)
 
-    def information(self, Phi: Tensor, seconds: float) -> Tensor:
-        """Return the information matrix G `(p, p)` of a motion, given its duration and Φ at its states."""
+    def information(self, Phi: Tensor, seconds: float, rate: Tensor | None = None) -> Tensor:
+        """Return the information matrix G `(p, p)` of a motion.
+
+        Args:
+            Phi: Φ at states along the motion.
+            seconds: duration of the motion.
+            rate: time derivative of the torque at these states `(n, nq)`; zero by default.
+        """
+        if rate is not None:
+            Phi = torch.cat([Phi[..., :-1], rate[..., None]], dim=-1)
         A = (Phi / self.noise[:, None]).flatten(0, 1)
         return A.mT @ A * (seconds / LOOK / len(Phi))
 
@@ -140,9 +161,10 @@ class Unknowns:
         L = torch.linalg.cholesky(eye + self.root.mT @ G @ self.root)
         return torch.linalg.solve_triangular(L, self.root.mT, upper=False).mT
 
-    def without_bumps(self) -> Unknowns:
-        """Return the unknowns with viscous and dry friction as the only functions of the joints."""
+    def of_least_squares(self) -> Unknowns:
+        """Return the unknowns with viscous and dry friction as the only functions, and without a delay."""
         known = torch.ones_like(self.root[:, 0])
+        known[-1] = 0.0
         functions = known[self.parts["friction"]].view(self.robot.nq, -1)
         functions[:, 2:] = 0.0
         return replace(self, root=known[:, None] * self.root)
@@ -174,8 +196,14 @@ def a_optimal(G: Tensor, unknowns: Unknowns) -> Tensor:
 
 
 def v_optimal(G: Tensor, unknowns: Unknowns) -> Tensor:
-    """Return `a_optimal` for links and for viscous and dry friction, which least squares can identify."""
-    return _log_std(unknowns.without_bumps().covariance_root(G), unknowns)
+    """Return `a_optimal` for least squares, whose error has covariance C + C G U_g U_gᵀ G C.
+
+    C is the covariance if the other unknowns, with covariance U_g U_gᵀ, were zero. They bias the estimate.
+    """
+    fitted = unknowns.of_least_squares()
+    R = fitted.covariance_root(G)
+    bias = R @ (R.mT @ (G @ (unknowns.root - fitted.root)))
+    return _log_std(torch.cat([R, bias], dim=-1), unknowns)
 
 
 def _log_std(R: Tensor, unknowns: Unknowns) -> Tensor:

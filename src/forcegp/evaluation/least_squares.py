@@ -3,9 +3,9 @@
 Least squares identifies a rigid robot with physically consistent inertial parameters, τ = M q̈ − Q_C − Q_G −
 Q_D + Y(q, q̇, q̈) δπ + d q̇ + f tanh(q̇/v₀) + o + noise. Here, δπ corrects the inertial parameters of every
 link, and d, f, o are the viscous friction, Coulomb friction and offset of every joint. A ridge penalty keeps
-all unknowns close to the values in the robot file. Log-Cholesky coordinates keep every link physically
-consistent (Rucker and Wensing 2022), and therefore the mass matrix positive definite. In contact, the
-equations are projected onto the directions in which the constraint force has no component.
+all unknowns close to the values in the robot file. All links are physically consistent, and the mass matrix
+is therefore positive definite. This convex problem is solved by the interior-point method of `InertialPrior`.
+In contact, the equations are projected onto the directions in which the constraint force has no component.
 """
 
 from __future__ import annotations
@@ -13,23 +13,15 @@ from __future__ import annotations
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
-import numpy as np
 import torch
-from scipy.optimize import least_squares
 from torch import Tensor
-from torch.func import jacfwd, vmap
 
 from forcegp import dynamics
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
+from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.identification import MASS_SHARE, MOMENT_ARM, parameter_vector, regressor
-from forcegp.robot.inertia import (
-    from_log_cholesky,
-    from_pseudo_inertia,
-    inertial_parameters,
-    log_cholesky,
-)
-from forcegp.robot.inertia import pseudo_inertia as pseudo_inertia_of
+from forcegp.robot.inertia import from_pseudo_inertia, pseudo_inertia
 from forcegp.robot.model import RobotModel
 
 CHUNK_STATES = 1000
@@ -38,8 +30,8 @@ MOST = 4000
 """Maximum number of evenly spaced samples, which gives a few hundred equations per unknown."""
 WIDE = 10.0
 """Prior standard deviation of friction and offsets, relative to the largest torque at the joint."""
-NOISE_PASSES, STEPS = 3, 30
-"""Number of passes that re-estimate the noise; maximum number of least-squares steps in each pass."""
+NOISE_PASSES = 3
+"""Number of passes that re-estimate the noise."""
 POINT = 1e-4
 """Fraction of the largest mass that is added at 0.1 m to links without spatial extent."""
 
@@ -75,17 +67,15 @@ def identify_rigid(system: ConstrainedSystem, train: Dataset) -> LeastSquares:
     train, robot = train[rows.unique()], system.robot
     prior = _prior_std(robot, train)
     G, g, y2 = _normal_equations(system, train, prior)
-    theta, split = _start(robot), 10 * robot.nq
+    split = 10 * robot.nq
     x = torch.zeros_like(prior)
-    noise = (y2 / len(train)).sqrt()
+    noise, identified = (y2 / len(train)).sqrt(), robot
     for _ in range(NOISE_PASSES):
         weight = noise.clamp(min=1e-9) ** -2
         gram = torch.einsum("j,jkl->kl", weight, G) + torch.eye(len(prior), dtype=prior.dtype)
-        theta, x = _minimise(robot, gram, weight @ g, prior[:split], theta, x[split:])
+        identified, x = _minimised(robot, gram, weight @ g, prior[:split])
         square_error = y2 - 2.0 * g @ x + torch.einsum("k,jkl,l->j", x, G, x)
         noise = (square_error.clamp(min=0.0) / len(train)).sqrt()
-    mass, com, inertia = from_pseudo_inertia(from_log_cholesky(theta))
-    identified = robot.replace(mass=mass, com=com, inertia=inertia)
     return LeastSquares(system.with_robot(identified), x[split:] * prior[split:])
 
 
@@ -147,46 +137,27 @@ def free_directions(system: ConstrainedSystem, data: Dataset) -> Tensor:
     return one - torch.linalg.pinv(A) @ A
 
 
-def _start(robot: RobotModel) -> Tensor:
-    """Return the log-Cholesky coordinates `(nq, 10)` of the robot file, giving all bodies some extent."""
-    J = pseudo_inertia_of(robot.mass, robot.com, robot.inertia)
+def _minimised(robot: RobotModel, gram: Tensor, right: Tensor, prior: Tensor) -> tuple[RobotModel, Tensor]:
+    """Minimise ½ xᵀ gram x − rightᵀ x over x = ((π − π₀)/S, friction) with physically consistent links."""
+    sound, n = _with_extent(robot), len(prior)
+    by_friction = torch.linalg.solve(gram[n:, n:], gram[n:, :n])
+    # without friction, ½ δᵀ P δ − rᵀ δ
+    P = gram[:n, :n] - gram[:n, n:] @ by_friction
+    r = right[:n] - by_friction.mT @ right[n:]
+    start = (parameter_vector(sound) - parameter_vector(robot)) / prior
+    errors = InertialPrior(scales=tuple(prior.tolist()))
+    identified, change = errors.updated(sound, torch.linalg.solve(P, r) - start, P)
+    links = start + change
+    return identified, torch.cat([links, torch.linalg.solve(gram[n:, n:], right[n:]) - by_friction @ links])
+
+
+def _with_extent(robot: RobotModel) -> RobotModel:
+    """Return the robot with mass added to links without spatial extent, so that all links are bodies."""
+    J = pseudo_inertia(robot.mass, robot.com, robot.inertia)
     least = POINT * float(robot.mass.max()) * torch.tensor([MOMENT_ARM**2] * 3 + [1.0]).to(J)
     bad = torch.linalg.cholesky_ex(J - 1e-2 * torch.diag(least)).info != 0
-    return log_cholesky(J + bad[:, None, None] * torch.diag(least))
-
-
-def _minimise(
-    robot: RobotModel, gram: Tensor, right: Tensor, prior: Tensor, theta: Tensor, friction: Tensor
-) -> tuple[Tensor, Tensor]:
-    """Minimise ½ xᵀ gram x − rightᵀ x over x = ((π(θ) − π₀)/S, friction), as ½ |Cᵀx − C⁻¹ right|²."""
-    like, n = friction, theta.numel()
-    gram, right, prior, theta, friction = (x.double() for x in (gram, right, prior, theta, friction))
-    centre, links = parameter_vector(robot).detach().double().reshape(-1, 10), prior.reshape(-1, 10)
-    # gram = C Cᵀ; owing to the ridge, its eigenvalues are at least 1, up to rounding
-    values, vectors = torch.linalg.eigh(gram)
-    root = values.clamp(min=1.0).sqrt()
-    C, target = vectors * root, (vectors.mT @ right) / root
-
-    def at(p: Tensor) -> Tensor:
-        return torch.cat([((_parameters(p[:n].reshape(-1, 10)) - centre) / links).flatten(), p[n:]])
-
-    def residual(p: np.ndarray) -> np.ndarray:
-        return (C.mT @ at(torch.from_numpy(p)) - target).numpy()
-
-    def jacobian(p: np.ndarray) -> np.ndarray:
-        by_link = vmap(jacfwd(_parameters))(torch.from_numpy(p[:n]).reshape(-1, 10)) / links[..., None]
-        return (C.mT @ torch.block_diag(*by_link, torch.eye(len(friction)).double())).numpy()
-
-    start = torch.cat([theta.flatten(), friction]).numpy()
-    with np.errstate(over="ignore"):  # SciPy rejects trial steps of infinite cost
-        result = least_squares(residual, start, jacobian, x_scale="jac", max_nfev=STEPS)  # pyright: ignore[reportArgumentType]
-    found = torch.from_numpy(result.x)
-    return found[:n].reshape(-1, 10).to(like), at(found).to(like)
-
-
-def _parameters(theta: Tensor) -> Tensor:
-    """Return the parameters π `(..., 10)` that correspond to log-Cholesky coordinates `(..., 10)`."""
-    return inertial_parameters(*from_pseudo_inertia(from_log_cholesky(theta)))
+    mass, com, inertia = from_pseudo_inertia(J + bad[:, None, None] * torch.diag(least))
+    return robot.replace(mass=mass, com=com, inertia=inertia)
 
 
 FEWEST_TRAINING = 20

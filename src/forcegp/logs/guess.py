@@ -43,13 +43,19 @@ TRAJECTORY, LEAST_FORCE = 10, 1.0
 
 
 def guess_mapping(path: str | Path, system: ConstrainedSystem, progress: Progress | None = None) -> Draft:
-    """Propose a mapping for a log; raise `MappingError` if time, position or torque is not recognised."""
+    """Propose a mapping for a log, with empty entries for a position or torque that is not recognised."""
     table = read(path, rows=ROWS, progress=progress)
     draft = Draft(str(path))
     with foreign(str(path), "a log that can be imported"):
         stream = find_time(table, draft)
         find_families(stream, system.robot, draft)
         find_wrench(table, system.robot, draft)
+        for quantity, family in draft.families.items():
+            if draft.incomplete and not family.unit:
+                draft.say(quantity, f"the unit {units.SI[quantity]} was assumed", doubt=True)
+            family.unit = family.unit or units.SI[quantity]
+        if draft.incomplete:
+            return draft
         family = draft.families["position"]
         if family.declared and family.unit is not None:
             possible = [family.unit]
@@ -64,8 +70,6 @@ def guess_mapping(path: str | Path, system: ConstrainedSystem, progress: Progres
 
 def _try(path: str | Path, draft: Draft, system: ConstrainedSystem, possible: list[str]) -> None:
     """Read the log according to the draft, and infer units and the sign of the torque from the values."""
-    for quantity, family in draft.families.items():
-        family.unit = family.unit or units.SI[quantity]
     fits = {}
     for unit in possible:
         draft.families["position"].unit = unit
@@ -154,24 +158,23 @@ def _torque(draft: Draft, trial: Signals, system: ConstrainedSystem) -> None:
     clear = np.abs(correlation) > 0.5
     listing = ", ".join(f"{j} {c:+.2f}" for j, c in zip(trial.joint_names, correlation, strict=True))
     draft.say("torque", f"correlation with the robot's inverse dynamics: {listing}")
+    named = {"current", "currents"}.intersection(tokens(family.pattern))
+    if current := family.unit in units.CURRENT or (bool(named) and not family.declared):
+        family.unit = family.unit if family.declared else "A"
+        text = "a current: give the gear ratio and the torque constant [N m/A]; DrivePrior learns its error"
+        draft.say("torque", text, doubt=True)
     if not clear.any():
-        unknown = "no joint's torque follows the robot's inverse dynamics: sign unknown"
-        return draft.say("torque", unknown, doubt=True)
+        return draft.say("torque", "no torque follows the inverse dynamics: sign unknown", doubt=True)
     family.sign = _signs(slopes, clear, trial.joint_names)
     if isinstance(family.sign, dict):
         draft.say("torque", "the sign differs between joints; are the joints in the right order?", doubt=True)
     elif not clear.all():
         draft.say("torque", f"the sign is that of {clear.sum()} of {len(clear)} joints", doubt=True)
     size = float(np.median(np.abs(slopes[clear])))
-    words = tokens(family.pattern)
-    if not family.declared and ("current" in words or "currents" in words):
-        family.unit = "A"
-        text = "a current: give the gear ratio and the torque constant [N m/A]; DrivePrior learns its error"
-        draft.say("torque", text, doubt=True)
-    elif not family.declared and 1000.0 / NEAR**2 < size < 1000.0 * NEAR**2:
+    if not family.declared and not current and 1000.0 / NEAR**2 < size < 1000.0 * NEAR**2:
         family.unit = "mNm"
         draft.say("torque", f"{size:.4g} times the inverse dynamics: taken for mNm", doubt=True)
-    elif not 0.5 < size < 2.0:
+    elif not current and not 0.5 < size < 2.0:
         draft.say("torque", f"{size:.3g} times the inverse dynamics: a current, or motor side?", doubt=True)
 
 

@@ -8,6 +8,7 @@ from __future__ import annotations
 import re
 from difflib import SequenceMatcher
 from itertools import permutations
+from os.path import commonprefix
 
 import numpy as np
 from scipy.optimize import linear_sum_assignment
@@ -26,7 +27,10 @@ MEASURED, COMMANDED = (units.VOCABULARY["columns"][kind] for kind in ("measured"
 _TIME = re.compile(
     r"^(.*[ _./])?(t|mt|time|times|timestamp|stamp|clock|sec|secs|seconds|ms|millis|zeit)([ _./\[(].*)?$"
 )
-_DECLARED = re.compile(r"[\[(]([^\])]*)[\])]|_(deg|rad|ms|us|ns|s|nm|mnm|a|ma|rpm|degps|radps)$", re.I)
+_DECLARED = re.compile(
+    r"[\[(]([^\])]*)[\])]|[_ ](deg|rad|ms|us|ns|s|nm|mnm|a|ma|rpm|degps|radps|(?:deg|rad)[_/]s2?)$", re.I
+)
+_KNOWN = {word for words in WORDS.values() for word in words}.union(MEASURED, COMMANDED)
 _DERIVATIVE = re.compile(r"\b(?:d |dd )+(?=q\b)|\bq (?=d*dot\b)")
 _AXES = (("force", "f"), ("torque", "m", "t", "moment"))
 _SEGMENTS = ("segment", "episode_index", "episode", "trial", "run")
@@ -92,96 +96,110 @@ def find_time(table: LogTable, draft: Draft) -> Stream:
 
 
 def find_families(stream: Stream, robot: RobotModel, draft: Draft) -> None:
-    """Find the columns of each quantity, and the joint names used in the log."""
-    families = _families(stream, robot)
-    if not any(re.search("[A-Za-z]", name) for name in stream.columns):
-        find_by_values(stream, robot.joint_names, draft)
-        families = []
+    """Find the columns of each quantity and the log's joint names; leave empty what is not recognised."""
+    numbered, alike = _families(stream, robot), _alike(stream, robot)
     for quantity in WORDS:
-        rated = [family for family in families if _rate(family, quantity) > 0.0]
+        rated = _rated(numbered, quantity, stream) or _rated(alike, quantity, stream)
         if rated:
-            best, *others = sorted(rated, key=lambda family: -_rate(family, quantity))
-            draft.families[quantity] = best
-            if others:
-                listing = ", ".join(family.pattern for family in others)
+            draft.families[quantity] = best = rated[0]
+            if len(rated) > 1:
+                listing = ", ".join(family.pattern for family in rated[1:])
                 draft.say(quantity, f"{best.pattern!r} was selected; also available: {listing}", doubt=True)
-    for quantity in ("position", "torque"):
-        if quantity not in draft.families:
-            raise MappingError(
-                f"{draft.source}: no columns were recognised as the {quantity} of {robot.nq} joints",
-                expected=f"headings such as {WORDS[quantity][1]}_1 to {WORDS[quantity][1]}_{robot.nq}",
-                got=", ".join(stream.columns)[:300],
-                hint="write the mapping yourself; docs/import.md shows every key",
-            )
+            if _quantity(best.pattern) is None:
+                draft.say(quantity, f"the {quantity} was recognised by its unit alone", doubt=True)
+    if not draft.families:
+        find_by_values(stream, robot.joint_names, draft)
     _match_joints(robot, draft)
     for quantity, family in draft.families.items():
-        declared = {declared_unit(column, stream) for column in family.columns.values()} - {None}
-        valid = [unit for unit in declared if unit in units.QUANTITY[quantity]]
-        if len(valid) == 1:
-            family.unit, family.declared = valid[0], True
-            draft.say(quantity, f"the unit {valid[0]} is declared")
+        if len(valid := _units(family, stream) & set(units.QUANTITY[quantity])) == 1:
+            family.unit, family.declared = valid.pop(), True
+            draft.say(quantity, f"the unit {family.unit} is declared")
+    used = {draft.time["column"]}.union(*(f.columns.values() for f in draft.families.values()))
+    unused = ", ".join(column for column in stream.columns if column not in used)
+    for quantity in ("position", "torque"):
+        if quantity not in draft.families:
+            empty = dict.fromkeys(robot.joint_names, "")
+            draft.families[quantity] = Family("", {}, stream.name, units.SI[quantity], by_joint=empty)
+            text = f"no {quantity} was recognised: fill in columns and unit; unused columns: {unused[:300]}"
+            draft.say(quantity, text, doubt=True)
 
 
 def _families(stream: Stream, robot: RobotModel) -> list[Family]:
-    """Return groups of columns that differ in a joint name, a number, or the part after the first dot."""
+    """Return groups of columns that differ in a joint name or a number."""
     groups: dict[str, dict[str, str]] = {}
-    names = sorted(robot.joint_names, key=len, reverse=True)
+    names = "|".join(re.escape(name) for name in sorted(robot.joint_names, key=len, reverse=True))
     for column in stream.columns:
-        joint = next((j for j in names if j in column), None)
-        if joint is not None:
-            groups.setdefault(column.replace(joint, "{joint}", 1), {})[joint] = column
-            continue
-        for number in re.finditer(r"\d+", column):
-            pattern = f"{column[: number.start()]}{{joint}}{column[number.end() :]}"
-            groups.setdefault(pattern, {})[number[0]] = column
-        head, dot, tail = column.partition(".")
-        if dot and tail and head in ("position", "velocity", "effort"):
-            groups.setdefault(f"{head}.{{joint}}", {})[tail] = column
-    exact = set(robot.joint_names)
+        joint = re.search(names, column) or re.search(names, column, re.I)
+        for found in [*([joint] if joint else []), *re.finditer(r"\d+", column)]:
+            pattern = f"{column[: found.start()]}{{joint}}{column[found.end() :]}"
+            groups.setdefault(pattern, {})[found[0]] = column
+            if found is joint and _quantity(pattern) is not None:
+                break
+    return [Family(pattern, of, stream.name) for pattern, of in groups.items() if len(of) == robot.nq]
+
+
+def _alike(stream: Stream, robot: RobotModel) -> list[Family]:
+    """Return groups of nq columns with the same unit and the same known words, such as `az_deg`, `el_deg`."""
+    if robot.nq == 1:
+        return [Family(column, {robot.joint_names[0]: column}, stream.name) for column in stream.columns]
+    groups: dict[object, list[str]] = {}
+    for column in stream.columns:
+        key = declared_unit(column, stream), *sorted(_KNOWN.intersection(tokens(column)))
+        groups.setdefault(key, []).append(column)
     result = []
-    for pattern, columns in groups.items():
-        if exact <= set(columns):
-            columns = {joint: columns[joint] for joint in robot.joint_names}
-        if len(columns) == robot.nq:
-            result.append(Family(pattern, columns, stream.name))
+    for columns in (columns for columns in groups.values() if len(columns) == robot.nq):
+        turned = [column[::-1] for column in columns]
+        start, end = (re.sub("[A-Za-z0-9]*$", "", commonprefix(x)) for x in (columns, turned))  # noqa: RUF071
+        names = {column[len(start) : len(column) - len(end)]: column for column in columns}
+        result.append(Family(f"{start}{{joint}}{end[::-1]}", names, stream.name))
     return result
 
 
-def _rate(family: Family, quantity: str) -> float:
-    """Return a score for how well the name of a family matches a quantity, or 0 for no match."""
-    words = tokens(family.pattern.replace("{joint}", " "))
-    meant = (other for other in WORDS if any(word in WORDS[other] for word in words))
-    if next(meant, None) != quantity:
-        return 0.0
-    score = 1.0 + 0.5 * any(w in MEASURED for w in words) - 0.8 * any(w in COMMANDED for w in words)
-    return score - 0.01 * len(words) - 0.2 * ("current" in words or "currents" in words)
+def _units(family: Family, stream: Stream) -> set[str]:
+    return {unit for c in family.columns.values() if (unit := declared_unit(c, stream)) is not None}
+
+
+def _quantity(pattern: str) -> str | None:
+    """Return the quantity named in a pattern, or `None`."""
+    words = tokens(pattern.replace("{joint}", " "))
+    return next((quantity for quantity in WORDS if not set(words).isdisjoint(WORDS[quantity])), None)
+
+
+def _rated(families: list[Family], quantity: str, stream: Stream) -> list[Family]:
+    """Return the families with the name or, in headings without one, the unit of a quantity, best first."""
+    scored = []
+    for family in families:
+        words, named = tokens(family.pattern.replace("{joint}", " ")), _quantity(family.pattern)
+        unit = _units(family, stream) - set(units.FORCE)
+        if named == quantity or (not named and unit and unit <= set(units.QUANTITY[quantity])):
+            score = 1.0 + 0.5 * any(w in MEASURED for w in words) - 0.8 * any(w in COMMANDED for w in words)
+            score -= 0.01 * len(words) + 0.2 * ("current" in words or "currents" in words) + 0.3 * (not named)
+            scored.append((score, family))
+    return [family for score, family in sorted(scored, key=lambda pair: -pair[0]) if score > 0.0]
 
 
 def _match_joints(robot: RobotModel, draft: Draft) -> None:
-    """Match the robot's joints to the names that the log uses for its positions."""
-    names = list(draft.families["position"].columns)
-    if all(name.isdigit() for name in names):
-        draft.say("joints", "the log numbers its joints; they were numbered from base to tip", doubt=True)
-        draft.joints = dict(zip(robot.joint_names, sorted(names, key=int), strict=True))
-    elif set(names) != set(robot.joint_names):
-        likeness = np.array([[_likeness(j, name) for name in names] for j in robot.joint_names])
-        # Among equally similar names, the order in the log decides; the user is asked to check it.
-        likeness += 0.3 * np.eye(len(names))
-        rows, columns = linear_sum_assignment(-likeness)
-        draft.joints = {robot.joint_names[i]: names[k] for i, k in zip(rows, columns, strict=True)}
-        draft.say("joints", "the names were matched by similarity", doubt=True)
-    # Numbered families whose joint names differ from those of the positions get one column per joint.
-    for quantity, family in list(draft.families.items()):
-        if set(family.columns) == set(names):
+    """Match the robot's joints to the names that the log uses for its positions or, without them, torques."""
+    families = sorted(draft.families.items(), key=lambda item: item[0] != "position")
+    for quantity, family in families:
+        names = list(family.columns)
+        if set(names) == set(draft.joints.values() or robot.joint_names):
             continue
-        if all(name.isdigit() for name in family.columns):
-            columns = [family.columns[name] for name in sorted(family.columns, key=int)]
-            family.by_joint = dict(zip(robot.joint_names, columns, strict=True))
-            draft.say(quantity, "numbered joints were taken from base to tip", doubt=True)
+        if all(name.isdigit() for name in names):
+            order, how = sorted(names, key=int), "numbered joints were taken from base to tip"
         else:
-            del draft.families[quantity]
-            text = f"{family.pattern!r} names its joints differently and was ignored"
-            draft.say("joints", text, doubt=True)
+            likeness = np.array([[_likeness(j, name) for name in names] for j in robot.joint_names])
+            # Among equally similar names, the order in the log decides; the user is asked to check it.
+            likeness += 0.3 * np.eye(len(names))
+            order = [names[k] for k in linear_sum_assignment(-likeness)[1]]
+            how = "joint names were matched by similarity"
+        matched = dict(zip(robot.joint_names, order, strict=True))
+        first = family is families[0][1]
+        draft.say("joints" if first else quantity, f"{quantity}: {how}", doubt=True)
+        if first:
+            draft.joints = matched
+        else:
+            family.by_joint = {joint: family.columns[name] for joint, name in matched.items()}
 
 
 def _likeness(joint: str, name: str) -> float:

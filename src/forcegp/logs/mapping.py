@@ -70,6 +70,11 @@ class Draft:
     doubts: list[str] = field(default_factory=list)
     window: int = 11
 
+    @property
+    def incomplete(self) -> list[str]:
+        """Names of the quantities whose columns the user must fill in."""
+        return [name for name, family in self.families.items() if not family.columns]
+
     def say(self, table: str, sentence: str, doubt: bool = False) -> None:
         """Add a comment to a table. If `doubt` is set, mark the comment CHECK and add it to `doubts`."""
         self.comments.setdefault(table, []).append((CHECK[2:] if doubt else "") + sentence)
@@ -79,8 +84,11 @@ class Draft:
     def toml(self) -> str:
         """Return the text of the mapping file."""
         lines = [f"# Mapping of {_plain(self.source)}, proposed from its headings and values."]
-        lines += ["# Check it, above all the lines marked CHECK, and import with --mapping.", ""]
-        quantities = {name: family.table() for name, family in self.families.items()}
+        lines += [
+            "# Check it, delete the mark CHECK of each line that is right, and import with --mapping.",
+            "",
+        ]
+        quantities = {name: self.families[name].table() for name in SYMBOLS if name in self.families}
         tables = {"time": self.time, "joints": self.joints, **quantities, **self.further}
         for name, table in tables.items():
             body = [f"{quoted(k)} = {_value(value)}" for k, value in table.items() if value is not None]
@@ -258,9 +266,12 @@ class Mapping:
         named = {} if pattern is None else {j: pattern.replace("{joint}", n) for j, n in called.items()}
         named |= section.columns
         measured = self.measured(name, joints)
-        lacking = [joint for joint in measured if joint not in named]
+        lacking = [joint for joint in measured if not named.get(joint)]
         if lacking:
-            text, expected = f"joint {lacking[0]!r} has no column", f"{lacking[0]} = under columns"
+            text, expected = (
+                f"joint {lacking[0]!r} has no column",
+                f'{quoted(lacking[0])} = "…" under columns',
+            )
             raise self.error((name,), text, expected=expected, hint=lock_hint(lacking))
         columns = [named[joint] for joint in measured]
         if len(set(columns)) < len(columns):

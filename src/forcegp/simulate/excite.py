@@ -269,13 +269,13 @@ class Search:
 
     def __call__(self, flat: Array) -> tuple[float, Array]:
         """Return the sum of the criterion and the hinges, and its gradient, at scaled control points w."""
-        limits, n = self.limits, len(self.nodes)
+        limits = self.limits
         w = torch.tensor(flat.reshape(len(self.spline.start), -1), requires_grad=True)
         x = (self.scale @ w[..., None])[..., 0].mT
         states = self.states(x)
         Y, Phi = self.unknowns.columns(*states)
         torque = rigid_torque(self.unknowns.robot, *states, Y)
-        value = self.criterion(self.unknowns.information(Phi[:n], self.spline.seconds), self.unknowns)
+        value = self.criterion(self.information(Phi, torque), self.unknowns)
         speed, rate = self.spline.differences(x)
         middle, half = 0.5 * (limits.low + limits.high), 0.5 * (limits.high - limits.low)
         place = torch.from_numpy(self.spline.start) + x - middle
@@ -287,6 +287,12 @@ class Search:
         objective = value + self.steep * (hinges + near + away.sum())
         objective.backward()
         return float(objective.detach()), w.grad.numpy().ravel()  # pyright: ignore[reportOptionalMemberAccess]
+
+    def information(self, Phi: Tensor, torque: Tensor) -> Tensor:
+        """Return the information, given Φ and the torque at the nodes and the additional times."""
+        n = len(self.nodes)
+        rate = torch.gradient(torque[:n], spacing=float(self.nodes[1]), dim=0)[0]
+        return self.unknowns.information(Phi[:n], self.spline.seconds, rate)
 
     def flat(self, x: Array) -> Array:
         """Convert control points `(free, nq)` to scaled control points."""
@@ -385,7 +391,7 @@ def excite(
     unknowns: Unknowns | None = None,
     collisions: Collisions | None = None,
     start: Sequence[float] | None = None,
-    criterion: str | Criterion = "A",
+    criterion: str | Criterion | None = None,
     rate: float = 1000.0,
     restarts: int = 2,
     seed: int = 0,
@@ -400,9 +406,9 @@ def excite(
         unknowns: unknown forces before the motion. The default is all unknowns of `Unknowns.of`.
         collisions: collisions to avoid. The default is those of the robot's shapes and the contact surfaces.
         start: initial and final position, `(nq,)`. The default is a collision-free position near the middle.
-        criterion: `"A"`, the standard deviation of the torque in the region of `unknowns`; `"V"`, the same if
-            only link inertia and viscous and dry friction are unknown; `"D"`, the determinant of the
-            covariance; or a function of the information.
+        criterion: `"A"`, the standard deviation of the torque in the region of `unknowns`; `"V"`, the same
+            for links, viscous and dry friction by least squares, including bias; `"D"`, the determinant of
+            the covariance; or a function of the information. By default `"V"`, or `"A"` with `unknowns`.
         rate: sampling rate of the result [Hz].
         restarts: number of random starts to optimise. They are the best of four times as many.
         seed: random seed for the starts.
@@ -426,10 +432,12 @@ def excite(
     robot = system.robot.to("cpu", torch.float64)
     limits = limits or Limits.of(robot)
     collisions = collisions or Collisions(system, shapes_of(robot, elements=("collision", "visual")))
+    default = "A"
     with one_thread():
         if unknowns is None:
             region = random_states(robot, limits)
-            unknowns = Unknowns.of(robot, limits.low, limits.high, limits.velocity, region)
+            unknowns, default = Unknowns.of(robot, limits.low, limits.high, limits.velocity, region), "V"
+        criterion = criterion or default
         if isinstance(criterion, str):
             check_name("criterion", criterion, CRITERIA)
             criterion = CRITERIA[criterion]
@@ -492,8 +500,9 @@ def _result(
     )
     tau = rigid_torque(robot, q, qd, qdd)
     motion = Dataset(torch.from_numpy(t), q, qd, tau, qdd, robot.joint_names, header=header)
-    Phi = unknowns.columns(*search.states(torch.from_numpy(x)))[1][: len(search.nodes)]
-    after = unknowns.after(unknowns.information(Phi, spline.seconds))
+    states = search.states(torch.from_numpy(x))
+    Y, Phi = unknowns.columns(*states)
+    after = unknowns.after(search.information(Phi, rigid_torque(robot, *states, Y)))
     clearance = search.collisions.clearance
     kept = {name: value for name, value in used.items() if name != "clearance"}
     return Excitation(motion, search.limits, kept | {"clearance_m": clearance}, unknowns, after, values)
