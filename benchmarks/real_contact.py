@@ -18,7 +18,7 @@ height of the foot.
   best on both test halves.
 - `forcegp`: the external wrench at the foot, learned with a foot that sticks and no force sensor; `sensor`:
   learned from the joint forces that sensor and accelerations show together; `vertical axis`: from the
-  sensor's vertical axis alone.
+  sensor's vertical axis alone; `own half`: in the half that it is learned from.
 """
 
 from __future__ import annotations
@@ -261,7 +261,10 @@ def hopping_scores(logs: Path, train: tuple[float, float], test: tuple[float, fl
         result[name] = scores(force, second, rows)
     std = sensor_std(logs, "hopping", train, window)
     for name in ("", "sensor", "vertical axis"):
-        result[f"forcegp {name}".strip()] = wrench_scores(learned(system, first, name, std), second, rows)
+        fit = learned(system, first, name, std)
+        result[f"forcegp {name}".strip()] = wrench_scores(fit, second, rows)
+        own = wrench_scores(fit, first, first.contact["ground"])
+        result[f"forcegp {name}".strip() + ", own half"] = own
     return result
 
 
@@ -269,7 +272,7 @@ def ratios(ways: list[dict[str, Any]]) -> dict[str, dict[str, list[float]]]:
     """Errors of each method over those of the equations of motion, geometric means over both ways, and their
     standard errors from a bootstrap over blocks of rows."""
     random, found = np.random.default_rng(0), {}
-    for name in (k for k, x in ways[0].items() if isinstance(x, dict)):
+    for name in (k for k, x in ways[0].items() if isinstance(x, dict) and not k.endswith("own half")):
         logs, drawn = [], []
         for way in ways:
             own, plain = (np.array(way[k]["rmse_N"]) for k in (name, "equations of motion"))

@@ -13,7 +13,7 @@ import forcegp
 from forcegp.data import DataHeader
 from forcegp.errors import NumericalError, UnknownNameError
 from forcegp.forces.priors.sets import SETS
-from forcegp.models.selection import candidates_of, halves_of
+from forcegp.models.selection import Candidate, Trial, behind_best, candidates_of, halves_of
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.simulate import simulate
 
@@ -28,11 +28,8 @@ def scene_log(name: str) -> tuple[forcegp.ConstrainedSystem, forcegp.Dataset]:
     return scene.system(), data[:: max(1, len(data) // ROWS)]
 
 
-def pendulum_log(
-    force: str, seed: int = 0, held: int = 1
-) -> tuple[forcegp.ConstrainedSystem, forcegp.Dataset]:
-    """Random motion of a double pendulum with a joint force that the robot file lacks, and noise that keeps
-    its value for some samples."""
+def pendulum_log(force: str, seed: int = 0) -> tuple[forcegp.ConstrainedSystem, forcegp.Dataset]:
+    """Random motion of a double pendulum with a joint force that the robot file lacks."""
     generator = torch.Generator().manual_seed(seed)
     system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
     t = 0.02 * torch.arange(ROWS, dtype=torch.float64)
@@ -45,8 +42,7 @@ def pendulum_log(
         "spring": 3.0 * torch.sin(2.0 * q) - 0.1 * qd,
     }[force]
     tau = forcegp.dynamics.inverse_dynamics(system.robot, q, qd, qdd) - unknown
-    noise = 0.1 * torch.randn(ROWS // held, 2, generator=generator, dtype=torch.float64)
-    noise = noise.repeat_interleave(held, dim=0)
+    noise = 0.1 * torch.randn(ROWS, 2, generator=generator, dtype=torch.float64)
     header = DataHeader(noise_std=0.1)
     return system, forcegp.Dataset(t, q, qd, tau, qdd + noise, system.robot.joint_names, header=header)
 
@@ -104,15 +100,16 @@ def test_few_samples_get_a_stated_set() -> None:
     assert [each.name for each in held.result.comparison] == ["friction"]
 
 
-def test_correlated_samples_count_as_few() -> None:
-    """The same spring, but 160 samples in which the noise of the torque has ten values."""
-    fit = fitted(*pendulum_log("spring", held=16))
-    friction, residual = (
-        next(x for x in fit.result.comparison if x.name == name) for name in ("friction", "friction+residual")
-    )
-    assert friction.chosen and friction.note == "fewer than 100 independent samples"
-    assert residual.log_density is not None and friction.log_density is not None
-    assert residual.log_density > friction.log_density
+@pytest.mark.parametrize(("independent", "name"), [(20.0, "friction"), (400.0, "friction+residual")])
+def test_parameters_cost_if_few_samples_are_independent(independent: float, name: str) -> None:
+    """A gain of 0.5 nats per sample by ten more parameters, whose cost is 0.7 for 20 independent samples."""
+    trials = []
+    for each, parameters, score in (("friction", 5, 1.0), ("friction+residual", 15, 1.5)):
+        scores = [torch.tensor([score, score + 0.1]), torch.tensor([score + 0.1, score])]
+        begin = {f"{each}.log_scale": torch.zeros(parameters)}
+        trials.append(Trial(Candidate(SETS[each]), scores, begin=begin, independent=independent))
+    fits = [trial.candidate.name for trial, behind, error in behind_best(trials) if behind <= error]
+    assert fits[0] == name
 
 
 def test_a_log_that_no_candidate_can_explain_gets_the_error_of_the_fit() -> None:
