@@ -6,11 +6,12 @@
 Arms of `solver_arms.py` whose links are off by up to 30 % and whose joints have friction that the file
 lacks record 30 s of each motion, all within the same limits and free of collisions. The motions are
 planned from the file alone, for two seeds of the search, which the seeds of the arms share. `excited` has
-criterion V, for links, viscous and dry friction by least squares. `condition` is the condition number of the
-weighted regressor of the same, minimised by the same search. `random` is the largest of twenty random Fourier
-series. Errors are those of the identified links and friction against the true ones, as torques along a third
-motion, by physically consistent least squares, without and with the delay of the torque as an unknown, as
-training identifies it, and, with `--fit`, by the robot calibrated by the default structured GP.
+criterion A, the default. `condition` is the condition number of the regressor of links, viscous and dry
+friction, minimised by the same search. `random` is the largest of twenty random Fourier
+series. Errors are those of the identified links and friction against the true ones, as torques along third
+motions: `fast`, another random series within the same limits, and `slow`, that of `solver_arms.py`. They are
+identified by physically consistent least squares, without and with the delay of the torque as an unknown, as
+training identifies it, and, with `--fit`, by the default structured GP.
 """
 
 from __future__ import annotations
@@ -21,6 +22,7 @@ import json
 import tempfile
 import time
 import warnings
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -47,6 +49,8 @@ SECONDS, TEST = 30.0, 20.0
 SPEED, RATE = 2.0, 6.0
 """Limits where a file has none, or larger ones [rad/s, rad/s²]."""
 SERIES = 20
+FAST, SLOW = "fast", "slow"
+"""Third motions: a random Fourier series within the same limits, and that of `solver_arms.py`."""
 DESIGNS = 2
 LOST = 0.5
 """An arm that is further from its motion than this has left it, as simulations that diverge do [rad]."""
@@ -67,12 +71,12 @@ def condition(G: Tensor, unknowns: Unknowns) -> Tensor:
 
 
 def motions(name: str, seed: int) -> tuple[dict[str, Motion], dict[str, Any]]:
-    """The three motions of an arm at the steps of the engine, and how they were found."""
+    """The motions of an arm at the steps of the engine, and how they were found."""
     robot = forcegp.load_robot(name)
     system = forcegp.ConstrainedSystem(robot)
     limits = Limits.of(robot, velocity=robot.velocity_limit.clamp(max=SPEED).tolist(), acceleration=[RATE])
     found, notes = {}, {}
-    for label, criterion in {"excited": "V", "condition": condition}.items():
+    for label, criterion in {"excited": "A", "condition": condition}.items():
         began, cpu = time.perf_counter(), time.process_time()
         result = excite(system, SECONDS, limits=limits, criterion=criterion, rate=1.0 / STEP, seed=seed)
         notes[label] = {
@@ -89,15 +93,17 @@ def motions(name: str, seed: int) -> tuple[dict[str, Motion], dict[str, Any]]:
     region = random_states(robot, limits)
     unknowns = Unknowns.of(robot, limits.low, limits.high, limits.velocity, region)
     search = Search(spline, limits, unknowns, Collisions(system, shapes_of(robot)), condition)
-    random = np.random.default_rng(1000 + seed)
-    drawn = [spline.random(limits, random) for _ in range(SERIES)]
-    small = [search.shrunk(x, 0.05)[0] for x in drawn]
-    sizes = [float(np.abs(y).max() / np.abs(x).max()) for x, y in zip(drawn, small, strict=True)]
-    x, used = search.shrunk(small[int(np.argmax(sizes))], FINE)
-    notes["random"] = {"share": max(sizes), "used": used}
     t = np.linspace(0.0, SECONDS, round(SECONDS / STEP) + 1)
-    q, qd, qdd = (matrix @ x for matrix in spline.at(t))
-    return found | {"random": (q + spline.start, qd, qdd)}, notes
+    for label, first in {"random": 1000, FAST: 2000}.items():
+        random = np.random.default_rng(first + seed)
+        drawn = [spline.random(limits, random) for _ in range(SERIES)]
+        small = [search.shrunk(x, 0.05)[0] for x in drawn]
+        sizes = [float(np.abs(y).max() / np.abs(x).max()) for x, y in zip(drawn, small, strict=True)]
+        x, used = search.shrunk(small[int(np.argmax(sizes))], FINE)
+        notes[label] = {"share": max(sizes), "used": used}
+        q, qd, qdd = (matrix @ x for matrix in spline.at(t))
+        found[label] = q + spline.start, qd, qdd
+    return found, notes
 
 
 def log(arm: Arm, motion: Motion, seed: int, folder: Path) -> forcegp.Dataset:
@@ -138,27 +144,31 @@ def without_delay(squares: LeastSquares, log: forcegp.Dataset) -> forcegp.Datase
     return log.replace(tau=log.tau - float(x[0, 0] / A[:, 0].norm()) * rate)
 
 
-def errors(arm: Arm, train: forcegp.Dataset, seed: int, fit: bool) -> dict[str, list[float]]:
-    """Root mean square error of each joint's torque along a third motion."""
-    states = [torch.from_numpy(x[::20]) for x in sines(arm.robot, TEST, np.random.default_rng([seed, 2]))]
-    exact, system = truth(arm, *states), forcegp.ConstrainedSystem(arm.robot)
+def errors(
+    arm: Arm, train: forcegp.Dataset, fit: bool, thirds: Mapping[str, Motion]
+) -> dict[str, list[float]]:
+    """Root mean square error of each joint's torque along third motions."""
+    system = forcegp.ConstrainedSystem(arm.robot)
     sharp = arm.robot.replace(friction_velocity=torch.full_like(arm.robot.mass, FOLLOWED))
     squares = identify_rigid(system.with_robot(sharp), train)
     shifted = identify_rigid(system.with_robot(sharp), without_delay(squares, train))
     found = {"least squares": squares, "with delay": shifted}
-    found = {label: (each.system.robot, each.losses(states[1])) for label, each in found.items()}
     if fit:
-        gp = forcegp.StructuredGP(system, "analytical").fit(train)
-        identified = calibrated(gp).robot.replace(friction_velocity=sharp.friction_velocity)
-        found["fit"] = (identified, torch.zeros_like(exact))
-    return {
-        name: (inverse_dynamics(robot, *states) - damping_force(robot, states[1]) + losses - exact)
-        .square()
-        .mean(0)
-        .sqrt()
-        .tolist()
-        for name, (robot, losses) in found.items()
-    }
+        gp = calibrated(forcegp.StructuredGP(system, "analytical").fit(train)).robot
+        nothing = torch.zeros(3 * gp.nq, dtype=gp.dtype)
+        found["fit"] = LeastSquares(
+            system.with_robot(gp.replace(friction_velocity=sharp.friction_velocity)), nothing
+        )
+    rmse = {}
+    for third, motion in thirds.items():
+        states = [torch.from_numpy(x[::20]) for x in motion]
+        exact = truth(arm, *states)
+        for model, each in found.items():
+            robot = each.system.robot
+            torque = inverse_dynamics(robot, *states) - damping_force(robot, states[1])
+            error = torque + each.losses(states[1]) - exact
+            rmse[f"{model}, {third}"] = error.square().mean(0).sqrt().tolist()
+    return rmse
 
 
 def main() -> None:
@@ -176,18 +186,23 @@ def main() -> None:
     result: dict[str, Any] = {}
     rows, designs = [], {}
     for name in options.arm:
-        planned = {k: motions(name, k) for k in sorted({seed % DESIGNS for seed in options.seed})}
-        designs[name] = {k: motion for k, (motion, _) in planned.items()}
-        result[name] = {"motions": {k: notes for k, (_, notes) in planned.items()}}
+        searched = {k: motions(name, k) for k in sorted({seed % DESIGNS for seed in options.seed})}
+        designs[name] = {k: motion for k, (motion, _) in searched.items()}
+        result[name] = {"motions": {k: notes for k, (_, notes) in searched.items()}}
     for case, name, seed in itertools.product(options.case, options.arm, options.seed):
         arm = Arm(forcegp.load_robot(name), SENSORS[case], np.random.default_rng(seed))
         found = {}
         with tempfile.TemporaryDirectory() as folder:
-            for label, motion in designs[name][seed % DESIGNS].items():
+            planned = designs[name][seed % DESIGNS]
+            slow = sines(arm.robot, TEST, np.random.default_rng([seed, 2]))
+            thirds = {FAST: planned[FAST], SLOW: slow}
+            for label, motion in planned.items():
+                if label == FAST:
+                    continue
                 train = log(arm, motion, seed, Path(folder))
                 wanted = np.array([np.interp(train.t, STEP * np.arange(len(q)), q) for q in motion[0].T])
                 followed = float(np.abs(train.q.numpy() - wanted.T).max()) < LOST
-                found[label] = errors(arm, train, seed, options.fit) if followed else {}
+                found[label] = errors(arm, train, options.fit, thirds) if followed else {}
         result[name][f"{case}, seed {seed}"] = found
         if options.json:
             options.json.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import warnings
 
 import numpy as np
@@ -207,6 +208,28 @@ def test_a_late_torque_is_not_taken_for_viscous_friction(file: RobotModel) -> No
     fit = forcegp.StructuredGP(forcegp.ConstrainedSystem(file), "analytical").fit(log(truth, 800, late=0.008))
     for each in (p for p in calibrated(fit).parameters if p.name == "damping"):
         assert abs(each.estimate - 0.3) < 3.0 * each.std < 0.15
+
+
+def test_later_samples_are_shifted_by_the_identified_delay(file: RobotModel) -> None:
+    truth, system = file.replace(mass=1.3 * file.mass, com=0.9 * file.com), forcegp.ConstrainedSystem(file)
+    late, timely = (log(truth, 800, late=x) for x in (0.008, 0.0))
+    fit = forcegp.StructuredGP(system, "analytical").fit(late)
+    shifted = fit.training.measurements[0].tau
+    errors = [(x - timely.tau).square().mean().sqrt() for x in (shifted, late.tau)]
+    assert float(errors[0]) < 0.2 * float(errors[1])
+    again = forcegp.StructuredGP(system, "analytical").fit(late, learn=["joint_friction"], after=fit)
+    for each in (again, fit.condition(late)):
+        assert torch.equal(each.training.measurements[0].tau, shifted)
+    # An update with late torques is one of a fit without a delay with timely torques.
+    priors = tuple(dataclasses.replace(p, delay=0.0) if p.delay else p for p in fit.force_priors)
+    spec = dataclasses.replace(fit.specification, priors=priors)
+    plain = dataclasses.replace(fit, specification=spec)
+    late, timely = (log(truth, 400, late=x, seed=3) for x in (0.008, 0.0))
+    states = torch.randn(3, 50, 2, generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    exact, found, unshifted = (
+        each.predict(*states).mean for each in (plain.update(timely), fit.update(late), plain.update(late))
+    )
+    assert float((found - exact).norm()) < 0.1 * float((unshifted - exact).norm())
 
 
 def test_a_search_for_links_that_does_not_converge_says_so(monkeypatch: pytest.MonkeyPatch) -> None:

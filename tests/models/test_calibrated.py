@@ -13,14 +13,16 @@ from typer.testing import CliRunner
 import forcegp
 from forcegp.cli.app import app
 from forcegp.control.information import Unknowns
-from forcegp.dynamics import inverse_dynamics, mass_matrix
+from forcegp.dynamics import damping_force, inverse_dynamics, mass_matrix
 from forcegp.errors import ModelError, ParameterError, UnknownNameError, optional_module
 from forcegp.forces.inertia import latent_precision, one_row
+from forcegp.forces.posterior import ForceSamples
 from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
 from forcegp.forces.priors.joint import JointFrictionPrior
 from forcegp.forces.quantities import states_at
 from forcegp.identification import regressor
 from forcegp.models.calibrated import (
+    _Reader,
     calibrated,
     sampled_robots,
     unknowns_after,
@@ -299,39 +301,92 @@ def test_a_model_lowers_what_is_unknown_and_a_motion_lowers_it_further(fit: Stru
     assert float(motion.motion.qd.abs().max()) > 0.5
 
 
-def test_errors_of_gains_widen_the_inertia_by_their_effect_on_its_identification(
-    fit: StructuredFit,
-) -> None:
-    """σ² of M_22 grows by s² Σ_k (∂M_22/∂g_k)² with s = 5 %; M_11 is wider, as no drive may be negative."""
+@pytest.fixture(scope="module")
+def identified() -> StructuredFit:
+    """Links whose mass and centre differ from the file; the drives have no inertia, as in the file."""
     robot = forcegp.load_robot("double_pendulum")
     truth = robot.replace(mass=1.3 * robot.mass, com=0.9 * robot.com)
-    data = log(truth, 800)
-    identified = forcegp.StructuredGP(forcegp.ConstrainedSystem(robot), "analytical").fit(data)
+    return forcegp.StructuredGP(forcegp.ConstrainedSystem(robot), "analytical").fit(log(truth, 800))
+
+
+def inertia_of(identified: StructuredFit) -> tuple[Tensor, Tensor, Tensor, InertialPrior]:
+    """States, columns C S of the mean diagonal of M at these, its posterior variance, and the prior."""
+    robot, q = identified.specified.robot, identified.training.measurements[0].q[::50]
     p, prior = next((p, x) for p, x in enumerate(identified.force_priors) if isinstance(x, InertialPrior))
     assert isinstance(prior, InertialPrior)
-    C = torch.cat([unit_inertia(robot, data.q[::50]), torch.eye(2).double()], dim=-1)
+    C = torch.cat([unit_inertia(robot, q), torch.eye(2).double()], dim=-1) * prior.scale(robot)
     precision = latent_precision(
         identified.posterior, one_row(identified.posterior, identified.problem), p, robot
     )
-    scaled = C * prior.scale(robot)
-    known = (scaled @ torch.linalg.solve(precision, scaled.mT)).diagonal()
-    added = (0.05 * C @ torch.tensor(prior.per_gain, dtype=torch.float64)).square().sum(-1)
-    samples = sampled_robots(identified, 400, gain_std=0.05)
-    M = torch.stack([mass_matrix(x, data.q[::50]).diagonal(dim1=-2, dim2=-1).mean(0) for x in samples])
-    torch.testing.assert_close(M.std(0)[1], (known + added).sqrt()[1], rtol=0.15, atol=0.0)
+    return q, C, (C @ torch.linalg.solve(precision, C.mT)).diagonal(), prior
+
+
+def mean_inertia(robots: list[forcegp.RobotModel], q: Tensor) -> Tensor:
+    return torch.stack([mass_matrix(x, q).diagonal(dim1=-2, dim2=-1).mean(0) for x in robots])
+
+
+def test_errors_of_gains_widen_the_inertia_by_their_effect_on_its_identification(
+    fit: StructuredFit, identified: StructuredFit
+) -> None:
+    """σ² of M_22 grows by s² Σ_k (∂M_22/∂g_k)² with s = 5 %; drives of at least zero bound it from below."""
+    q, C, known, prior = inertia_of(identified)
+    unit = C / prior.scale(identified.specified.robot)
+    added = (0.05 * unit @ torch.tensor(prior.per_gain, dtype=torch.float64)).square().sum(-1)
+    M = mean_inertia(sampled_robots(identified, 400, gain_std=0.05), q)
+    assert bool((M.std(0) < 1.1 * (known + added).sqrt()).all())
+    assert bool((M.std(0) > 0.6 * (known + added).sqrt()).all())
     assert bool((added > 3.0 * known).all()), "a gain is the larger error here"
     with pytest.raises(ModelError, match="gains on the inertia is unknown"):
         calibrated(fit, gain_std=0.05)
 
 
-def test_drives_of_an_identified_robot_are_unknown_with_its_links() -> None:
+def test_drives_that_would_be_negative_leave_the_inertia_of_the_joint_as_it_was_measured(
+    identified: StructuredFit,
+) -> None:
+    """Torques tell the sum of link and drive in joint 1 to 0.1 %, and hardly its parts."""
+    q, C, known, _ = inertia_of(identified)
+    robots = sampled_robots(identified, 400)
+    drives = torch.stack([robot.armature for robot in robots])
+    assert float(drives.min()) == 0.0 and float((drives[:, 0] == 0.0).double().mean()) > 0.3
+    M, exact = mean_inertia(robots, q), mean_inertia([identified.system.robot], q)[0]
+    b = _Reader.of(identified, 0)._disagreement()[0, -C.shape[-1] :]
+    expected = (known + (C @ b).square()).sqrt()
+    assert bool((0.8 * expected < M.std(0)).all() and (M.std(0) < 1.5 * expected).all())
+    assert bool(((M.mean(0) - exact).abs() < 0.5 * expected).all())
+
+
+def test_samples_are_spread_by_the_difference_between_identification_and_posterior(
+    fit: StructuredFit, identified: StructuredFit
+) -> None:
+    """Functions drawn from the posterior have its mean δ; the identified robot has δ = 0, so b = −E δ."""
+    reader = _Reader.of(identified, 0)
+    b, (_, C, _, prior) = reader._disagreement()[0], inertia_of(identified)
+    drawn = identified.force_samples(4000, torch.Generator().manual_seed(5))
+    assert isinstance(drawn, ForceSamples)
+    p = identified.force_priors.index(prior)
+    one = {name: x[:1] for name, x in reader._features(p).items()}
+    delta = drawn.functions.latent(p, one)[:, 0]
+    count = C.shape[-1]
+    assert bool(((b[-count:] + delta.mean(0)).abs() < 5.0 * delta.std(0) / 4000**0.5).all())
+    # Friction of the samples moves with the inertia, from the mean at δ = E δ to that at δ = 0.
+    curves = reader._curves(drawn)
+    moved = b[: curves[0].numel()].view_as(curves[0])
+    joint = next(k for k, x in enumerate(identified.force_priors) if isinstance(x, JointFrictionPrior))
+    latent = drawn.functions.latent(joint, reader._features(joint)).mean(0)
+    E = identified.force_priors[joint].operator(identified.system, reader.at)
+    force = reader._over_poses(torch.einsum("nij,nj->ni", E, latent))
+    known = reader._over_poses(damping_force(identified.system.robot, reader.at.qd))
+    error = (known + force + moved - curves[0]).abs()
+    assert bool((error < 5.0 * curves[1:].std(0) / 4000**0.5 + 1e-9).all())
+    assert float(b.norm()) > 0.0 and not _Reader.of(fit, 0)._disagreement().any()
+
+
+def test_drives_of_an_identified_robot_are_unknown_with_its_links(identified: StructuredFit) -> None:
     """Joint 1 of the pendulum turns about a fixed axis: torque tells the sum of link and drive."""
-    robot = forcegp.load_robot("double_pendulum")
-    truth = robot.replace(mass=1.3 * robot.mass, com=0.9 * robot.com)
-    fit = forcegp.StructuredGP(forcegp.ConstrainedSystem(robot), "analytical").fit(log(truth, 800))
+    robot = identified.specified.robot
     limits = Limits.of(robot, velocity=[3.0], acceleration=[10.0], torque=[50.0])
     before = Unknowns.of(robot, limits.low, limits.high, limits.velocity, random_states(robot, limits, 40))
-    known = unknowns_after(fit, before)
+    known = unknowns_after(identified, before)
     drive = known.root[known.parts["drives"]].norm(dim=-1)[0]
     still = torch.zeros(2, 2, dtype=torch.float64)
     Phi = known.columns(still, still, torch.tensor([[0.0, 0.0], [1.0, 0.0]], dtype=torch.float64))[1][:, 0]

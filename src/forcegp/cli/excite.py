@@ -45,13 +45,12 @@ def excite(
     ] = None,
     clearance: Annotated[float, typer.Option(min=1e-4, help="Minimum distance between parts [m].")] = 0.01,
     criterion: Annotated[
-        str | None,
+        str,
         typer.Option(
-            help="V: expected torque error of links, viscous and dry friction by least squares; A: expected "
-            "standard deviation of the torque; D: determinant of the covariance. Default: A with a model or "
-            "a region, otherwise V."
+            help="A: expected standard deviation of the torque; V: expected torque error of least squares "
+            "with link inertia, viscous and dry friction alone; D: determinant of the covariance."
         ),
-    ] = None,
+    ] = "A",
     rate: Annotated[float, typer.Option(help="Samples per second.")] = 1000.0,
     restarts: Annotated[int, typer.Option(min=1, help="Number of random starts to optimise from.")] = 2,
     seed: Annotated[int, typer.Option(help="Seed for the random starts.")] = 0,
@@ -118,7 +117,7 @@ def excite(
             unknowns=unknowns if fit is None else unknowns_after(fit, unknowns),
             collisions=collisions,
             start=_numbers("start", start) or None,
-            criterion=criterion or ("V" if model is None and region is None else "A"),
+            criterion=criterion,
             rate=rate,
             restarts=restarts,
             seed=seed,

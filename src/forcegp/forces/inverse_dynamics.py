@@ -13,7 +13,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import torch
@@ -23,7 +23,7 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.forces.calibration import stretches
 from forcegp.forces.measurements import Measurement, Training
-from forcegp.forces.priors.base import ForceMean
+from forcegp.forces.priors.base import ForceMean, ForcePrior
 from forcegp.forces.priors.joint import JointFrictionPrior
 
 LEAST, MOST = 200, 4000
@@ -50,6 +50,8 @@ TOLERATED = 0.02
 """Tolerated relative increase in the held-out error of a joint."""
 LATE = 0.01
 """Prior standard deviation of the delay between torque and motion [s]."""
+WIDEST = 4.0 * LATE
+"""Longest time between two samples whose difference counts as a derivative [s]."""
 COHERENT = 0.9
 """Minimum autocorrelation between the velocities of a sample and its partner (median over the joints)."""
 
@@ -222,7 +224,8 @@ def bristles(m: Measurement | Dataset) -> Tensor:
 def torque_rate(m: Measurement) -> Tensor:
     """Return the time derivative `(n, nq)` of the torque, from differences over `LATE` on either side.
 
-    A small delay between torque and motion changes the torque in proportion to this derivative.
+    A small delay between torque and motion changes the torque in proportion to this derivative. It is zero
+    where neighbours in time are missing.
     """
     order = _in_time(m)
     t, tau, segment = m.t[order], m.tau[order], m.segment[order]
@@ -237,16 +240,20 @@ def torque_rate(m: Measurement) -> Tensor:
                 ends[side] = torch.where(segment[next_] == segment, next_, ends[side])
         before, after = ends
         span = (t[after] - t[before])[:, None]
-        rate[order] = torch.where(span > 0.0, (tau[after] - tau[before]) / span.clamp(min=1e-300), 0.0)
+        rate[order] = torch.where(
+            (span > 0.0) & (span <= WIDEST), (tau[after] - tau[before]) / span.clamp(min=1e-300), 0.0
+        )
     return rate
 
 
-def delayed(training: Training, delay: float) -> Training:
+def without_delay(training: Training, priors: Sequence[ForcePrior]) -> Training:
     """Return the samples with torques that act on the motion when they are logged, τ(t − s) ≈ τ − s dτ/dt.
 
-    Args:
-        delay: s, the time by which the logged torques precede the motion [s].
+    The priors contain the identified delay s.
     """
+    delay = sum(prior.delay for prior in priors)
+    if not delay:
+        return training
     measurements = (dataclasses.replace(m, tau=m.tau - delay * torque_rate(m)) for m in training.measurements)
     return dataclasses.replace(training, measurements=tuple(measurements))
 

@@ -26,8 +26,7 @@ from scipy.optimize import lsq_linear
 from torch import Tensor
 
 from forcegp import dynamics
-from forcegp.control.information import SPEEDS as SPEED_BUMPS
-from forcegp.control.information import Unknowns
+from forcegp.control.information import PLACES, Unknowns
 from forcegp.errors import ModelError, ParameterError
 from forcegp.files import write_json
 from forcegp.forces.posterior import HIGH, LOW, ForceSamples
@@ -277,7 +276,7 @@ def unknowns_after(fit: StructuredFit, unknowns: Unknowns, *, draws: int = DRAWS
         curves = reader._curves(drawn)[1:]
         basis = unknowns.basis(torch.zeros_like(reader.speeds), reader.speeds)
         spread, each = (curves - curves.mean(0)).permute(2, 1, 0), basis.shape[-1]
-        weights = torch.linalg.pinv(basis[..., : 2 + SPEED_BUMPS].movedim(1, 0)) @ spread
+        weights = torch.linalg.pinv(basis[..., :-PLACES].movedim(1, 0)) @ spread
         found |= {links + each * j + k: w for j in range(nq) for k, w in enumerate(weights[j])}
     if not found:
         return unknowns
@@ -390,12 +389,12 @@ class _Reader:
         return identified * torch.cat(b)[None]
 
     def _consistent(self, values: Tensor, first: int, samples: Tensor) -> Tensor:
-        """Return the values `(n, d)` with the most probable physically consistent links.
+        """Return the values `(n, d)` with the most probable physically consistent links and drives.
 
         Minimises ½ (x − x₀)ᵀ Σ⁻¹ (x − x₀), with the covariance Σ of the samples `(s, d)`, over the entries x
-        of J₀^-½ ΔJ J₀^-½ ≥ −1 + ε of each link by ADMM. The links start at column `first`; other columns are
-        adjusted according to their covariance with the links. A link that is unphysical in the file does not
-        change.
+        of J₀^-½ ΔJ J₀^-½ ≥ −1 + ε of each link and over drive inertia of at least zero, by ADMM. The links,
+        and the drives after them, start at column `first`; other columns are adjusted according to their
+        covariance with these. A link that is unphysical in the file does not change.
         Source: Boyd et al., *Distributed optimization and statistical learning via ADMM* (2011), section 5.
         """
         if self.scale is None:
@@ -408,28 +407,34 @@ class _Reader:
         weight = torch.where(row == column, 1.0, 2.0**0.5).to(w)
         entries = root @ (pseudo_inertia_of(torch.eye(n).to(w)) * self.scale[:, :n, None, None]) @ root
         entries = torch.where(sound[:, None, None], entries[..., row, column] * weight, torch.eye(n).to(w))
-        T, links = torch.block_diag(*entries), slice(first, first + robot.nq * n)
+        drives = self.scale[:, n] if bool(self.scale[:, n].any()) else self.scale[:0, n]
+        least = -robot.armature[: len(drives)] / drives.clamp(min=1e-300)
+        T, count = torch.block_diag(*entries, torch.eye(len(drives)).to(w)), robot.nq * n
+        inertial = slice(first, first + len(T))
 
         def bodies(x: Tensor) -> Tensor:
             X = x.new_zeros(len(x), robot.nq, 4, 4)
-            X[..., row, column] = X[..., column, row] = x.view(len(x), robot.nq, n) / weight
+            X[..., row, column] = X[..., column, row] = x[:, :count].view(len(x), robot.nq, n) / weight
             w, V = torch.linalg.eigh(X + one)
             X = V @ torch.diag_embed(w.clamp(min=SMALLEST)) @ V.mT - one
-            return (X[..., row, column] * weight * sound[:, None]).flatten(1)
+            links = (X[..., row, column] * weight * sound[:, None]).flatten(1)
+            return torch.cat([links, torch.maximum(x[:, count:], least)], dim=1)
 
-        x0, spread = values[:, links] @ T, samples - samples.mean(0)
+        x0, spread = values[:, inertial] @ T, samples - samples.mean(0)
         inverse = torch.linalg.inv(T)
-        known = torch.linalg.pinv(spread[:, links].mT @ spread[:, links], hermitian=True)
+        known = torch.linalg.pinv(spread[:, inertial].mT @ spread[:, inertial], hermitian=True)
         precision = (len(spread) - 1) * inverse @ known @ inverse.mT
-        pull = torch.linalg.inv(precision + torch.eye(len(T)).to(w))
+        # The penalty is scalar for each body, for the projection, and matches the precision of its entries.
+        penalty = torch.cat([_scale_of(precision[:count, :count], n), precision.diagonal()[count:]])
+        pull = torch.linalg.inv(precision + penalty.diag())
         z, u = bodies(x0), torch.zeros_like(x0)
         for _ in range(ROUNDS):
-            x = (x0 @ precision + z - u) @ pull
+            x = (x0 @ precision + penalty * (z - u)) @ pull
             x = RELAXATION * x + (1.0 - RELAXATION) * z
             z = bodies(x + u)
             u = u + x - z
-        moved = values + (z - x0) @ inverse @ known @ (spread[:, links].mT @ spread)
-        moved[:, links] = z @ inverse
+        moved = values + (z - x0) @ inverse @ known @ (spread[:, inertial].mT @ spread)
+        moved[:, inertial] = z @ inverse
         return moved
 
     def _offsets(self, curves: Tensor) -> Tensor:
@@ -514,6 +519,13 @@ class _Reader:
         if prior is not None:
             robot = prior.around(load).loaded(robot)
         return robot, (curve, left, offset)
+
+
+def _scale_of(precision: Tensor, n: int) -> Tensor:
+    """Return the geometric mean of the eigenvalues of each diagonal block of size n, n times each."""
+    blocks = [precision[k : k + n, k : k + n] for k in range(0, len(precision), n)]
+    values = torch.linalg.eigvalsh(torch.stack(blocks)).clamp(min=1e-12)
+    return values.log().mean(-1).exp().repeat_interleave(n)
 
 
 def _offset_gain(offset: Tensor, mean: Tensor, values: Tensor) -> Tensor:

@@ -32,7 +32,7 @@ from forcegp.errors import check_name
 from forcegp.forces.calibration import calibrated_noise, residual_times
 from forcegp.forces.friction_memory import MEMORY, memory_of
 from forcegp.forces.inertia import VOLUME_STATES, Inertia, inertia_of, with_updated_robot
-from forcegp.forces.inverse_dynamics import LEAST, delayed
+from forcegp.forces.inverse_dynamics import LEAST, without_delay
 from forcegp.forces.measurements import (
     Observation,
     Training,
@@ -228,7 +228,6 @@ def problem_for(
         if found.identified:
             spec, pinned = identified(spec, training, found)
             training, _ = training_for(spec, before, data, chosen)
-            training = delayed(training, found.delay)
     return spec, spec.problem(dataclasses.replace(training, part_of=part_of), robot, pinned), doubts
 
 
@@ -241,7 +240,8 @@ def identified(
     size = mass_matrix(robot, q).diagonal(dim1=-2, dim2=-1).mean(0)
     assert inertia.per_gain is not None
     per_gain = tuple(map(tuple, inertia.per_gain.tolist()))
-    errors = dataclasses.replace(InertialPrior().around(robot).with_drives(size), per_gain=per_gain)
+    errors = InertialPrior().around(robot).with_drives(size)
+    errors = dataclasses.replace(errors, per_gain=per_gain, delay=inertia.delay)
     pinned = {errors.name: robot.mass.new_zeros(errors.outputs(robot))}
     return dataclasses.replace(spec, priors=(*spec.priors, errors)), pinned
 
@@ -253,7 +253,7 @@ def training_for(
     learned: Sequence[str] | None,
     fewest: int = FEWEST_MOVING,
 ) -> tuple[Training, tuple[str, ...]]:
-    """Return the training data, and warnings about them.
+    """Return the training data, without an identified delay of the torque, and warnings about them.
 
     Priors that are not in `learned` keep the scales of their inputs. If `learned` is `None`, all priors are
     learned. Samples at rest are kept if fewer than `fewest` samples are in motion.
@@ -265,6 +265,7 @@ def training_for(
     training = training_of(
         data, spec.system, spec.priors, spec.noise.acceleration, kept, spec.options.standardize
     )
+    training = without_delay(training, spec.priors)
     return in_motion(spec.system, training, fewest) if spec.noise.learns_torque else (training, ())
 
 

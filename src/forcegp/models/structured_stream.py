@@ -19,6 +19,7 @@ from forcegp.data import Dataset
 from forcegp.data.stream import Keep, StreamedDataset, spaced_sample
 from forcegp.errors import ModelError
 from forcegp.forces.calibration import MOST_RESIDUALS, STRETCHES
+from forcegp.forces.inverse_dynamics import without_delay
 from forcegp.forces.measurements import Observation, Training, training_of
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import ForcePrior
@@ -65,7 +66,8 @@ class Sample:
         if self.stretches is None or not spec.noise.learns_torque or len(self.data) == self.count:
             return None
         scales = kept_scales(spec.priors, training)
-        return training_of(self.stretches, spec.system, spec.priors, spec.noise.acceleration, scales)
+        stretches = training_of(self.stretches, spec.system, spec.priors, spec.noise.acceleration, scales)
+        return without_delay(stretches, spec.priors)
 
 
 @torch.no_grad()
@@ -205,7 +207,10 @@ class Pass:
             if len(piece) == 0:
                 yield problem.training.of_rows([torch.arange(0)] * len(problem.training.measurements))
             else:
-                yield training_of(piece, self.spec.system, problem.priors, self.spec.noise.acceleration, kept)
+                rows = training_of(
+                    piece, self.spec.system, problem.priors, self.spec.noise.acceleration, kept
+                )
+                yield without_delay(rows, problem.priors)
 
     def _own_file(self) -> Path:
         assert self.checkpoint is not None

@@ -391,7 +391,7 @@ def excite(
     unknowns: Unknowns | None = None,
     collisions: Collisions | None = None,
     start: Sequence[float] | None = None,
-    criterion: str | Criterion | None = None,
+    criterion: str | Criterion = "A",
     rate: float = 1000.0,
     restarts: int = 2,
     seed: int = 0,
@@ -408,7 +408,7 @@ def excite(
         start: initial and final position, `(nq,)`. The default is a collision-free position near the middle.
         criterion: `"A"`, the standard deviation of the torque in the region of `unknowns`; `"V"`, the same
             for links, viscous and dry friction by least squares, including bias; `"D"`, the determinant of
-            the covariance; or a function of the information. By default `"V"`, or `"A"` with `unknowns`.
+            the covariance; or a function of the information.
         rate: sampling rate of the result [Hz].
         restarts: number of random starts to optimise. They are the best of four times as many.
         seed: random seed for the starts.
@@ -432,12 +432,10 @@ def excite(
     robot = system.robot.to("cpu", torch.float64)
     limits = limits or Limits.of(robot)
     collisions = collisions or Collisions(system, shapes_of(robot, elements=("collision", "visual")))
-    default = "A"
     with one_thread():
         if unknowns is None:
             region = random_states(robot, limits)
-            unknowns, default = Unknowns.of(robot, limits.low, limits.high, limits.velocity, region), "V"
-        criterion = criterion or default
+            unknowns = Unknowns.of(robot, limits.low, limits.high, limits.velocity, region)
         if isinstance(criterion, str):
             check_name("criterion", criterion, CRITERIA)
             criterion = CRITERIA[criterion]

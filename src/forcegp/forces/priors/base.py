@@ -58,6 +58,8 @@ class ForcePrior(ABC):
     """Whether f has one component per joint and E = I, so that products with E can be skipped."""
     centred: bool = True
     """Whether to subtract the mean of the training data from the inputs before scaling."""
+    delay: float = 0.0
+    """Time by which logged torques precede the motion, if it was identified with the force [s]."""
 
     @property
     def prefix(self) -> str:

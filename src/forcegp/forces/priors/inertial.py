@@ -50,6 +50,7 @@ class InertialPrior(ConstantForcePrior):
         drives: standard deviation of the drive inertia of each joint [kg m², kg]; by default, all are known.
         per_gain: change of the identified parameters of links, then drives, per relative error of the gain of
             each torque sensor, `11 nq` rows of `nq`; empty if the robot was not identified from torques.
+        delay: time by which logged torques precede the motion, identified with the robot [s].
 
     Example:
         >>> import torch, forcegp
@@ -67,6 +68,7 @@ class InertialPrior(ConstantForcePrior):
     scales: tuple[float, ...] | None = None
     drives: tuple[float, ...] = ()
     per_gain: tuple[tuple[float, ...], ...] = ()
+    delay: float = 0.0
 
     def around(self, robot: RobotModel) -> InertialPrior:
         """Return the prior with its scales S fixed to those of the given robot."""
