@@ -14,9 +14,11 @@ height of the foot.
 - `least squares`: the same, with offset, gain and friction of these joints (`TERMS`), learned from the force
   sensor in training.
 - `weighted`: of all three, the slider's missing force known to ± 1 N in motion and ± 4 N at rest.
+- `oracle`: `least squares` with that subset of the terms of each joint (and an inertia of each drive) that is
+  best on both test halves.
 - `forcegp`: the external wrench at the foot, learned with a foot that sticks and no force sensor; `sensor`:
   learned from the joint forces that sensor and accelerations show together; `vertical axis`: from the
-  sensor's vertical axis alone.
+  sensor's vertical axis alone; `own half`: in the half that it is learned from.
 """
 
 from __future__ import annotations
@@ -26,6 +28,7 @@ import json
 import sys
 import warnings
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import torch
@@ -61,6 +64,11 @@ HAND = 30.0
 """Size of the unknown force on the base while somebody pushes it [N]."""
 UNKNOWN = 1e4
 """Standard deviation of axes of the sensor that are not used [N]."""
+BOUNDS = torch.tensor([0.85, 0.55], dtype=torch.float64)
+"""Of the errors with a sensor, fore-aft and vertical, over those of the equations of motion."""
+BLOCK, DRAWS = 100, 4000
+"""Length of a block of rows that the bootstrap draws [samples], longer than the 76 ms over which errors are
+correlated, and number of draws."""
 FLIGHT = 0.5
 """Vertical force below which the sensor shows flight [N], to judge the contact labels."""
 BEFORE, AFTER = 0.15, 0.3
@@ -209,6 +217,7 @@ def scores(
         "rmse_N": error.square().mean(0).sqrt().tolist(),
         "bias_N": error.mean(0).tolist(),
     }
+    score["block_mse"] = torch.stack([x.square().mean(0) for x in error.split(BLOCK)]).tolist()
     if std is not None:
         score["median_std_N"] = std[rows].median(0).values.tolist()
         score["coverage"] = (error.abs() <= 2.0 * std[rows]).double().mean(0).tolist()
@@ -252,7 +261,74 @@ def hopping_scores(logs: Path, train: tuple[float, float], test: tuple[float, fl
         result[name] = scores(force, second, rows)
     std = sensor_std(logs, "hopping", train, window)
     for name in ("", "sensor", "vertical axis"):
-        result[f"forcegp {name}".strip()] = wrench_scores(learned(system, first, name, std), second, rows)
+        fit = learned(system, first, name, std)
+        result[f"forcegp {name}".strip()] = wrench_scores(fit, second, rows)
+        own = wrench_scores(fit, first, first.contact["ground"])
+        result[f"forcegp {name}".strip() + ", own half"] = own
+    return result
+
+
+def ratios(ways: list[dict[str, Any]]) -> dict[str, dict[str, list[float]]]:
+    """Errors of each method over those of the equations of motion, geometric means over both ways, and their
+    standard errors from a bootstrap over blocks of rows."""
+    random, found = np.random.default_rng(0), {}
+    for name in (k for k, x in ways[0].items() if isinstance(x, dict) and not k.endswith("own half")):
+        logs, drawn = [], []
+        for way in ways:
+            own, plain = (np.array(way[k]["rmse_N"]) for k in (name, "equations of motion"))
+            logs.append(np.log(own / plain))
+            own, plain = (np.array(way[k]["block_mse"]) for k in (name, "equations of motion"))
+            rows = random.integers(0, len(own), (DRAWS, len(own)))
+            drawn.append(0.5 * np.log(own[rows].mean(1) / plain[rows].mean(1)))
+        deviation = np.exp(np.mean(drawn, axis=0)).std(0)
+        found[name] = {"ratio": np.exp(np.mean(logs, axis=0)).tolist(), "error": deviation.tolist()}
+    return found
+
+
+def oracle(logs: Path) -> dict[str, dict[str, object]]:
+    """The subset of terms of each joint, learned from the sensor in one half, that is best in the other.
+
+    It has the least largest ratio of errors to `BOUNDS`, geometric means over both ways, so the test halves
+    choose it. Forces are learned from both axes of the sensor, or from the vertical one.
+    """
+    names = [f"{joint} {name}" for joint in ("hip", "knee") for name in (*TERMS, "inertia")]
+    halves = []
+    for train, test in ((FIRST, SECOND), (SECOND, FIRST)):
+        system, data = hopping(logs, window_of(logs, train))
+        parts = []
+        for half in (train, test):
+            own = between(data, half)
+            moving, J = unexplained(system.robot, own)
+            terms = [term(own.qd, own.tau) for term in TERMS.values()]
+            columns = torch.stack([*terms, own.qdd], dim=-1)[:, 1:]
+            to_force = torch.linalg.inv(J[..., 1:].mT)
+            # (n, 2, joints · terms)
+            lost = (to_force[..., None] * columns[:, None]).flatten(2)
+            error = (to_force @ moving[:, 1:, None])[..., 0] - own.contact_extras[SENSOR]["ground"][:, [0, 2]]
+            closed = own.contact["ground"]
+            parts.append((lost[closed], error[closed]))
+        halves.append(parts)
+
+    def ratio(chosen: list[int], axes: list[int]) -> Tensor:
+        """Fore-aft and vertical error over that without any term, geometric mean over both ways."""
+        logs = []
+        for (lost, error), (test_lost, test_error) in halves:
+            A = lost[:, axes][..., chosen].flatten(0, 1)
+            w = torch.linalg.lstsq(A, error[:, axes].flatten()[:, None]).solution
+            left = test_error - (test_lost[..., chosen] @ w)[..., 0]
+            logs.append(0.5 * (left.square().mean(0) / test_error.square().mean(0)).log())
+        return torch.stack(logs).mean(0).exp()
+
+    result: dict[str, dict[str, object]] = {}
+    for name, axes in {"sensor": [0, 1], "vertical axis": [1]}.items():
+        subsets = [[i for i in range(len(names)) if m >> i & 1] for m in range(1, 2 ** len(names))]
+        found = torch.stack([ratio(subset, axes) for subset in subsets])
+        best = int((found / BOUNDS).amax(-1).argmin())
+        result[name] = {
+            "ratio": found[best].tolist(),
+            "terms": [names[i] for i in subsets[best]],
+            "met": int((found <= BOUNDS).all(-1).sum()),
+        }
     return result
 
 
@@ -395,7 +471,7 @@ def main() -> None:
     warnings.simplefilter("ignore")
     try:
         existing(options.logs / "hopper" / "teststand.urdf")
-        result = {
+        result: dict[str, Any] = {
             "hopping, second half": hopping_scores(options.logs, FIRST, SECOND),
             "hopping, first half": hopping_scores(options.logs, SECOND, FIRST),
             "pushed": pushed_scores(options.logs),
@@ -415,6 +491,11 @@ def main() -> None:
     ]
     print(table(head, [row for name, part in result.items() for row in lines(name, part)]))
     print({name: part["window"] for name, part in result.items() if "window" in part})
+    result["ratios"] = ratios([result["hopping, second half"], result["hopping, first half"]])
+    for name, ratio in result["ratios"].items():
+        print(f"{name}, over equations of motion:", ratio)
+    result["oracle"] = oracle(options.logs)
+    print("oracle:", result["oracle"])
     print(result["contact labels"])
     print(result["hop"])
     print(result["torque shares"])

@@ -20,8 +20,7 @@ def with_sensed_forces(data: Dataset, system: ConstrainedSystem, force_std: floa
     """Return joint forces computed from a force sensor and the accelerations, Q̄ = M q̈ − J_Eᵀ F.
 
     Both contain the same torque errors, which two separate measurements would count twice. Fit these forces
-    without the contact, `StructuredGP(ConstrainedSystem(system.robot), …)`, since its force is measured. A
-    joint without a measured torque has an unknown force of the magnitude of Q̄ − Q_C − Q_G − Q_D.
+    without the contact, `StructuredGP(ConstrainedSystem(system.robot), …)`, since its force is measured.
 
     Args:
         data: a log with `F_sensor`; no force acts while the contact is open.
@@ -46,8 +45,5 @@ def with_sensed_forces(data: Dataset, system: ConstrainedSystem, force_std: floa
     qdd_std = data.extras.get("qdd_std", qdd_std)
     # Σ = σ² J_EᵀJ_E + M Σ_q̈ M
     variance = force_std**2 * J.square().sum(-2) * closed + (M.square() @ qdd_std[..., None] ** 2)[..., 0]
-    unknown = (Q - at.eom.Q_K).square().mean(0)
-    unmeasured = [name in data.header.unmeasured_torques for name in data.joint_names]
-    variance = variance + unknown * torch.tensor(unmeasured, device=Q.device)
     std = (variance + (LEAST_FORCE * Q.square().mean(0).sqrt()) ** 2).sqrt()
     return [Observation(data.replace(extras={**data.extras, "Q": Q}), "joint_force", std)]

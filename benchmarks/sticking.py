@@ -13,7 +13,8 @@ springs in Dahl's (`dahl`). The speed below which the tip sticks is that which a
 - `with friction`: the same, with viscous and dry friction and an offset of each joint from the free motion of
   training; `and gain`: with a gain and load friction too.
 - `forcegp`: force predicted from q, q̇, τ, with a tip that may stick.
-- `forcegp wrench`: the external wrench at the tip, no contact declared.
+- `forcegp wrench`: the external wrench at the tip, no contact declared; `told`: both, with a torque noise of
+  each joint of at least the error of its torque in these rows, which the simulator knows.
 """
 
 from __future__ import annotations
@@ -37,7 +38,9 @@ from torch import Tensor
 
 import forcegp
 from forcegp.errors import optional_module
+from forcegp.forces.noise import TORQUE_NOISE
 from forcegp.logs.from_contact import resting_speed
+from forcegp.models.structured_fit import StructuredFit
 from forcegp.scene import load_scene
 from forcegp.simulate import simulate
 
@@ -120,6 +123,18 @@ def score(error: Tensor, std: Tensor | None = None) -> dict[str, float]:
     return result
 
 
+def told(fit: StructuredFit, data: forcegp.Dataset) -> StructuredFit:
+    """The fit with a torque noise of at least the error of the learned torque in a log in contact."""
+    (contact,) = fit.system.contacts
+    left, J, _ = residual(fit.specified, data)
+    true = left - (J.mT @ truth(data, contact.name)[..., None])[..., 0]
+    found = fit.predict(data.q, data.qd, data.tau, "joint_force").mean
+    known = data.tau + fit.specified.equations(data.q, data.qd).Q_K
+    error = (found - known - true).square().mean(0).sqrt()
+    noise = fit.hyperparameters[TORQUE_NOISE].maximum(error.log())
+    return dataclasses.replace(fit, hyperparameters={**fit.hyperparameters, TORQUE_NOISE: noise})
+
+
 def recorded(
     scene: str, friction: str, seed: int, seconds: float
 ) -> tuple[forcegp.ConstrainedSystem, dict[str, forcegp.Dataset]]:
@@ -159,16 +174,17 @@ def scores(
         moves = speed < stick_speed if name == "sticks" else speed > stick_speed
         rows, true = test.contact[contact.name] & moves, truth(test, contact.name)
         own = {k: score((force - true)[rows]) for k, force in plain(system, train, test).items()}
-        force = fit.predict(
-            test.q, test.qd, test.tau, "contact_force", active=test.active((contact.name,)), noise=True
-        )
         open_ = test.replace(contact={contact.name: torch.zeros_like(rows)})
-        wrench = fit.external_wrench(
-            open_, contact.frame, axes=("fx", "fy", "fz"), point=tuple(contact.point)
-        )
-        if name == "sticks":
-            own["forcegp"] = score((force.mean - true)[rows], force.std[rows])
-        own["forcegp wrench"] = score((wrench.mean - true)[rows], wrench.std[rows])
+        for label, known in {"forcegp": fit, "forcegp, told": told(fit, test[rows])}.items():
+            force = known.predict(
+                test.q, test.qd, test.tau, "contact_force", active=test.active((contact.name,)), noise=True
+            )
+            wrench = known.external_wrench(
+                open_, contact.frame, axes=("fx", "fy", "fz"), point=tuple(contact.point)
+            )
+            if name == "sticks":
+                own[label] = score((force.mean - true)[rows], force.std[rows])
+            own[f"{label} wrench"] = score((wrench.mean - true)[rows], wrench.std[rows])
         result[name] = own
     return result
 

@@ -64,7 +64,7 @@ def errors() -> str:
         for message, hint in sorted(rows):
             cure = " ([cause and cure](../troubleshooting.md))"
             linked = any(all(part in message for part in parts) for parts in common)
-            text += f"| {cell(message)} | {cell(hint)}{cure if linked else ''} |\n"
+            text += f"| {cell(message)} | {cell(hint) + (cure if linked else '') or '–'} |\n"
     return text
 
 

@@ -104,6 +104,11 @@ def test_select_holds_out_stretches(log: Path, tmp_path: Path) -> None:
     assert result["test_points"] == sum(b - a for a, b in result["held_out_rows"])
     held = set(Dataset.read(rest).t.tolist())
     assert not held & set(Dataset.read(train).t.tolist())
+    # A block is a trajectory, which a rollout can follow; adjacent blocks are one.
+    steps, segment = Dataset.read(rest).t.diff(), Dataset.read(rest).segment
+    assert torch.equal(segment.diff() > 0, steps > 1.5 * steps.median())
+    (first, last), (second, _) = result["held_out_rows"]
+    assert first < last < second and int(segment[last - first - 1]) == 0 and int(segment[-1]) == 1
 
 
 def rename(log: Path, old: str, new: str) -> None:

@@ -8,6 +8,7 @@ from torch import Tensor
 
 import forcegp
 from forcegp.errors import ModelError, UnknownNameError
+from forcegp.forces.measurements import unmeasured_forces
 from forcegp.forces.quantities import affine_map, states_at
 from forcegp.models.structured_fit import StructuredFit
 
@@ -68,6 +69,44 @@ def test_pushes_of_one_joint_are_no_friction_of_another(stated: bool) -> None:
     torque = fit.predict(test.q, test.qd, test.tau, "joint_force").mean - test.tau - at.eom.Q_K
     error = (torque + 0.3 * torch.tanh(test.qd / 0.05))[:, 1]
     assert float(error.square().mean().sqrt()) < 0.1
+
+
+def test_a_measured_contact_force_is_no_unknown_force() -> None:
+    """M q̈ = Q_K + τ + push + J_EᵀF: the push alone is what the joint without a sensor lacks."""
+    robot = forcegp.load_robot("double_pendulum")
+    floor = forcegp.SurfaceContact(
+        "floor", robot.frame_names[-1], (0.0, 0.0, 0.0), forcegp.Plane((0.0, 0.0, 1.0), 0.0)
+    )
+    system = forcegp.ConstrainedSystem(robot, [floor])
+    generator = torch.Generator().manual_seed(5)
+    q, qd, tau, random = torch.randn(4, 500, 2, generator=generator, dtype=torch.float64)
+    push, tau = SIZE * random * torch.tensor([1.0, 0.0], dtype=torch.float64), 0.1 * tau
+    tau[:, 0] = 0.0
+    force = 40.0 * torch.randn(500, 3, generator=generator, dtype=torch.float64)
+    J = forcegp.kinematics.point_jacobian(robot, q, floor.frame, tuple(floor.point))
+    lever = (J.mT @ force[..., None])[..., 0]
+    data = forcegp.Dataset(
+        0.01 * torch.arange(500, dtype=torch.float64),
+        q,
+        qd,
+        tau,
+        forcegp.dynamics.forward_dynamics(robot, q, qd, tau + push + lever),
+        robot.joint_names,
+        contact={"floor": torch.ones(500, dtype=torch.bool)},
+        header=forcegp.data.DataHeader(unmeasured_torques=robot.joint_names[:1]),
+    )
+    Q = tau + push + forcegp.ConstrainedSystem(robot).equations(q, qd).Q_K
+    moved = forcegp.Observation(data)
+    joint = forcegp.Observation(data.replace(extras={"Q": Q}), "joint_force", 0.1)
+    sensed = data.replace(contact_extras={"F_I": {"floor": force}})
+    true = float(push[:, 0].square().mean().sqrt())
+    added = float(lever[:, 0].square().mean().sqrt())
+    name = robot.joint_names[0]
+    assert unmeasured_forces(system, [moved])[name] > 0.8 * added > 2.0 * true
+    assert unmeasured_forces(system, [moved, joint])[name] == pytest.approx(true, rel=1e-6)
+    exact, vague = (forcegp.Observation(sensed, "contact_force", std) for std in (1e-6, 1e4))
+    assert unmeasured_forces(system, [exact, moved])[name] == pytest.approx(true, rel=1e-6)
+    assert unmeasured_forces(system, [vague, moved]) == unmeasured_forces(system, [moved])
 
 
 def test_a_saved_fit_keeps_unknown_forces(tmp_path: Path) -> None:

@@ -56,6 +56,24 @@ def test_friction_with_memory_is_explained_on_another_motion() -> None:
     assert bool((memory.force(ROBOT, test)[:, 1].abs() < 0.05).all())
 
 
+def test_a_joint_at_rest_does_not_show_its_torque_noise_in_motion() -> None:
+    """The preload of the second joint is explained, but only where it rests."""
+    train, z = log(60.0, 1)
+    noise = 0.05 * torch.randn(len(z), 2, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
+    residual = noise + torch.tensor([0.0, 0.5], dtype=torch.float64)
+    residual[:, 0] += 2.0 * z - 2.0 * torch.tanh(train.qd[:, 0] / 0.02)
+    expected = torch.stack([residual.square().mean(0).expand_as(residual), 0.0 * residual], dim=-1)
+    for slower, determined in ((1.0, True), (1e-3, False)):
+        speed = train.qd * torch.tensor([1.0, slower], dtype=torch.float64)
+        motion = dataclasses.replace(train, qd=speed)
+        memory = learn_memory(ROBOT, motion, residual, 0.0 * residual, 0.0 * residual, expected)
+        assert memory is not None
+        assert float(memory.force(ROBOT, motion)[:, 1].mean()) == pytest.approx(0.5, abs=0.05)
+        assert float(memory.share[0, 0]) < 0.1
+        assert (float(memory.share[1, 0]) < 0.1) is determined
+        assert determined or float(memory.share[1, 0]) >= 1.0
+
+
 def test_predictions_along_a_log_remember_how_a_joint_reversed() -> None:
     """Another motion of the same robot; a state alone does not determine this friction."""
     zero = torch.zeros_like(ROBOT.damping)

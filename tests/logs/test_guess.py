@@ -95,8 +95,9 @@ def test_declared_units_are_taken_from_headings() -> None:
     from forcegp.logs.table import Stream
 
     stream = Stream("", {}, {"pos": "[deg]"})
-    names = ("pos", "q1 [rad]", "vel (deg/s)", "tau_Nm", "t_ms", "x")
-    assert [declared_unit(n, stream) for n in names] == ["deg", "rad", "deg/s", "Nm", "ms", None]
+    names = ("pos", "q1 [rad]", "vel (deg/s)", "tau_Nm", "t_ms", "x", "qd_rad_s", "deg_pan", "q []")
+    found = [declared_unit(n, stream) for n in names]
+    assert found == ["deg", "rad", "deg/s", "Nm", "ms", None, "rad/s", "deg", None]
 
 
 def test_logs_whose_columns_say_nothing(tmp_path: Path) -> None:
@@ -129,6 +130,7 @@ def two_joints() -> tuple[forcegp.ConstrainedSystem, dict[str, np.ndarray]]:
         ("q1_deg q2_deg", "u1_mNm u2_mNm", 1e3, "mNm"),
         ("Shoulder Angle (deg)|Elbow Angle (deg)", "Shoulder Effort [Nm]|Elbow Effort [Nm]", 1.0, "Nm"),
         ("az_deg el_deg", "az_Nm el_Nm", 1.0, "Nm"),
+        ("deg_shoulder deg_elbow", "mNm_shoulder mNm_elbow", 1e3, "mNm"),
         ("arm 1 deg|wrist deg", "tau_wide tau_narrow", 1.0, "Nm"),
         ("ang_a[deg] ang_b[deg]", "current_a[mA] current_b[mA]", 1e3, "mA"),
     ],

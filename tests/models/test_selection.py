@@ -13,7 +13,7 @@ import forcegp
 from forcegp.data import DataHeader
 from forcegp.errors import NumericalError, UnknownNameError
 from forcegp.forces.priors.sets import SETS
-from forcegp.models.selection import candidates_of, halves_of
+from forcegp.models.selection import Candidate, Trial, behind_best, candidates_of, halves_of
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.simulate import simulate
 
@@ -98,6 +98,18 @@ def test_few_samples_get_a_stated_set() -> None:
     assert (only.name, only.chosen, only.note) == ("friction", True, "fewer than 100 samples")
     held = forcegp.StructuredGP(system, "analytical").fit(data, learn=[])
     assert [each.name for each in held.result.comparison] == ["friction"]
+
+
+@pytest.mark.parametrize(("independent", "name"), [(20.0, "friction"), (400.0, "friction+residual")])
+def test_parameters_cost_if_few_samples_are_independent(independent: float, name: str) -> None:
+    """A gain of 0.5 nats per sample by ten more parameters, whose cost is 0.7 for 20 independent samples."""
+    trials = []
+    for each, parameters, score in (("friction", 5, 1.0), ("friction+residual", 15, 1.5)):
+        scores = [torch.tensor([score, score + 0.1]), torch.tensor([score + 0.1, score])]
+        begin = {f"{each}.log_scale": torch.zeros(parameters)}
+        trials.append(Trial(Candidate(SETS[each]), scores, begin=begin, independent=independent))
+    fits = [trial.candidate.name for trial, behind, error in behind_best(trials) if behind <= error]
+    assert fits[0] == name
 
 
 def test_a_log_that_no_candidate_can_explain_gets_the_error_of_the_fit() -> None:

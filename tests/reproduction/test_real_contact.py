@@ -105,11 +105,6 @@ def test_sensor_and_accelerations_show_the_joint_forces(logs: dict[str, Dataset]
     assert float((left - friction).std()) < float(left.std()), "what is left is friction of the joints"
     open_ = ~log.contact["ball"]
     assert bool((noise[open_].mean(0) < noise[~open_].mean(0)).all()), "no force, no noise of it"
-    slider = SYSTEM.robot.joint_names[0]
-    lacking = log.replace(header=log.header.model_copy(update={"unmeasured_torques": (slider,)}))
-    (hidden,) = with_sensed_forces(lacking, SYSTEM, FORCE_NOISE)
-    unknown = measurement_of(hidden, SYSTEM)[1]
-    assert bool((unknown[:, 0] > noise[:, 0]).all()) and torch.equal(unknown[:, 1:], noise[:, 1:])
     with pytest.raises(ModelError, match="no sensor force"):
         with_sensed_forces(logs["truth"], SYSTEM, FORCE_NOISE)
 

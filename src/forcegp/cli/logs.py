@@ -142,6 +142,8 @@ def _json(imported: Imported) -> dict[str, object]:
     }
 
 
+GAP = 1.5
+"""Multiple of the median time step above which a step counts as a gap."""
 NOT_USABLE = 1
 """Exit code if a finding makes a fit worthless."""
 COLOURS = {"error": "bold red", "warning": "yellow", "note": "cyan"}
@@ -287,8 +289,18 @@ def _written(
     for done, kind, rows, path in files:
         if path is not None:
             step = f"{done} {len(rows)} {kind} points {how}"
-            save(data[rows].with_step(step).write, path)
+            points = _split_at_gaps(data[rows]) if parts.stretches and kind == "test" else data[rows]
+            save(points.with_step(step).write, path)
             result |= {f"{kind}_points": len(rows), f"{kind}_file": str(path)}
     if parts.stretches:
         result["held_out_rows"] = [list(rows) for rows in parts.stretches]
     return result
+
+
+def _split_at_gaps(data: forcegp.Dataset) -> forcegp.Dataset:
+    """Number the trajectories so that a new one begins after each gap, as in an import."""
+    import torch
+
+    steps = data.t.diff()
+    new = (data.segment.diff() != 0) | (steps > GAP * steps.median())
+    return data.replace(segment=torch.nn.functional.pad(new.cumsum(0), (1, 0)))

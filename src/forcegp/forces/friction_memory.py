@@ -24,11 +24,11 @@ from forcegp.forces.calibration import CHUNK_STATES, autocorrelation_time, stret
 from forcegp.forces.inverse_dynamics import bristles
 from forcegp.forces.measurements import Measurement, Training
 from forcegp.forces.noise import TORQUE_NOISE
-from forcegp.forces.posterior import STICK_NOISE, stick_variance
+from forcegp.forces.posterior import STICK_NOISE, STICKING, stick_variance
 from forcegp.forces.priors.base import NOISE
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import SPEEDS
-from forcegp.forces.problem import Problem, force_posterior
+from forcegp.forces.problem import SHOWN, Problem, force_posterior
 from forcegp.forces.quantities import affine_map
 from forcegp.identification import regressor
 from forcegp.robot.model import RobotModel
@@ -165,6 +165,9 @@ def learn_memory(
         w = torch.linalg.solve(gram.sum(0) - gram[i] + ridge, right.sum(0) - right[i])
         remaining[group == g] -= (X[group == g] * w).sum(-1)
     better = remaining.square().sum(0) < residual.square().sum(0)
+    left = torch.where(better, remaining, residual)
+    times = autocorrelation_time(left, motion.segment, white.mean(0))
+    moving = (motion.qd.abs() > STICKING).sum(0) / times
     total, share = white + forces + noise.sum(-1), torch.ones_like(noise[0])
     for j in better.nonzero()[:, 0].tolist():
         # r² − white − forces ≈ share · noise, weighted by the variance of r²
@@ -172,11 +175,12 @@ def learn_memory(
         target = (remaining[:, j].square() - white[:, j] - forces[:, j]) / total[:, j]
         found = torch.from_numpy(scipy.optimize.nnls(rows.cpu().numpy(), target.cpu().numpy())[0])
         share[j] = found.to(share).clamp(min=LEAST_SHARE, max=1.0)
+        if moving[j] < SHOWN:
+            # Friction of a joint at rest does not determine the torque noise in motion.
+            share[j, 0] = 1.0
         # A new motion is like another block, so its variance scatters as much as theirs does.
         square = remaining[:, j].square() / (white[:, j] + forces[:, j] + noise[:, j] @ share[j])
         by_stretch = torch.stack([square[group == g].mean() for g in group.unique()])
         share[j] *= (by_stretch.mean() + by_stretch.std()).clamp(min=1.0)
     weights = torch.linalg.solve(gram.sum(0) + ridge, right.sum(0)) * better[:, None]
-    left = torch.where(better, remaining, residual)
-    times = autocorrelation_time(left, motion.segment, white.mean(0))
     return FrictionMemory(weights, share, steps.median() * times)

@@ -309,13 +309,28 @@ def states_noise(observations: Sequence[Observation]) -> bool:
 
 @torch.no_grad()
 def unmeasured_forces(system: ConstrainedSystem, observations: Sequence[Observation]) -> dict[str, float]:
-    """Return the RMS of M q̈ − Q_C − Q_G for joints without a logged torque, keyed by joint name [N m, N]."""
+    """Return the size of the unknown force on each joint without a logged torque, keyed by name [N m, N].
+
+    The size is the RMS of Q̄ − Q_C − Q_G, where Q̄ is the measured joint force. If only accelerations are
+    measured, Q̄ = M q̈, which includes the contact force and is therefore an upper limit. A measured contact
+    force F with noise Σ is subtracted: Q̄ = M q̈ − J_EᵀF, with the variance diag J_EᵀΣ J_E. The smallest of
+    several limits is returned.
+    """
     sizes: dict[str, float] = {}
-    for data in (o.data for o in observations if o.data.header.unmeasured_torques):
-        eom = system.equations(data.q, data.qd, contact_table(data, system.contact_names))
-        force = (eom.M @ data.qdd[..., None])[..., 0] - eom.Q_C - eom.Q_G
-        rms = force.square().mean(0).sqrt().tolist()
-        sizes |= {joint: rms[data.joint_names.index(joint)] for joint in data.header.unmeasured_torques}
+    for observation in (o for o in observations if o.data.header.unmeasured_torques):
+        data, active = observation.data, contact_table(observation.data, system.contact_names)
+        eom = system.equations(data.q, data.qd, active)
+        moved, added = (eom.M @ data.qdd[..., None])[..., 0], torch.zeros_like(data.q)
+        if observation.quantity == "joint_force":
+            moved = measurement_of(observation, system)[0].values
+        if observation.quantity == "contact_force":
+            m, std = measurement_of(observation, system)
+            J = torch.cat([eom.contact_points[name].jacobian for name in system.contact_names], dim=-2)
+            moved = moved - (J.mT @ m.values[..., None])[..., 0]
+            added = (J.square().mT @ std.square().expand_as(m.values)[..., None])[..., 0]
+        rms = ((moved - eom.Q_C - eom.Q_G).square() + added).mean(0).sqrt().tolist()
+        for joint in data.header.unmeasured_torques:
+            sizes[joint] = min(rms[data.joint_names.index(joint)], sizes.get(joint, math.inf))
     return sizes
 
 

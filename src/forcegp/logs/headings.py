@@ -28,7 +28,8 @@ _TIME = re.compile(
     r"^(.*[ _./])?(t|mt|time|times|timestamp|stamp|clock|sec|secs|seconds|ms|millis|zeit)([ _./\[(].*)?$"
 )
 _DECLARED = re.compile(
-    r"[\[(]([^\])]*)[\])]|[_ ](deg|rad|ms|us|ns|s|nm|mnm|a|ma|rpm|degps|radps|(?:deg|rad)[_/]s2?)$", re.I
+    r"(?i)[\[(]([^\])]*)[\])]|^(deg|rad|rpm|nm|mnm|ma)[_ ]"
+    r"|[_ ](deg|rad|ms|us|ns|s|nm|mnm|a|ma|rpm|degps|radps|(?:deg|rad)[_/]s2?)$"
 )
 _KNOWN = {word for words in WORDS.values() for word in words}.union(MEASURED, COMMANDED)
 _DERIVATIVE = re.compile(r"\b(?:d |dd )+(?=q\b)|\bq (?=d*dot\b)")
@@ -53,7 +54,7 @@ def declared_unit(name: str, stream: Stream) -> str | None:
     """Return the unit declared in a heading or in the line below it, or `None`."""
     if name in stream.units:
         return units.spelled(stream.units[name])
-    found = (units.spelled(match[1] or match[2] or "") for match in _DECLARED.finditer(name))
+    found = (units.spelled(match[match.lastindex or 0]) for match in _DECLARED.finditer(name))
     return next((unit for unit in found if unit is not None), None)
 
 
@@ -190,8 +191,7 @@ def _match_joints(robot: RobotModel, draft: Draft) -> None:
         else:
             likeness = np.array([[_likeness(j, name) for name in names] for j in robot.joint_names])
             # Among equally similar names, the order in the log decides; the user is asked to check it.
-            likeness += 0.3 * np.eye(len(names))
-            order = [names[k] for k in linear_sum_assignment(-likeness)[1]]
+            order = [names[k] for k in linear_sum_assignment(-likeness - 0.3 * np.eye(len(names)))[1]]
             how = "joint names were matched by similarity"
         matched = dict(zip(robot.joint_names, order, strict=True))
         first = family is families[0][1]

@@ -8,8 +8,11 @@ density of the measurements, including noise,
     S = 1/N Σ_i log N(y_i; E z(x_i), Var z(x_i) + Σ),
 
 Candidates are compared by the differences of S over blocks of rows, which also give a standard error. The
-simplest candidate within one standard error of the best is selected. No candidate depends on the motor
-torque. In closed loop, such a residual learns to cancel the torque and appears to have the best density.
+simplest candidate within one standard error of the best is selected. If the residuals of the best are
+correlated so much that there are only κ n < `FEWEST` independent samples, each of its additional k parameters
+must also gain ½ ln(κ n)/κ n nats per sample (Schwarz, *Estimating the dimension of a model*, 1978). No
+candidate depends on the motor torque. In closed loop, such a residual learns to cancel the torque and appears
+to have the best density.
 """
 
 from __future__ import annotations
@@ -27,7 +30,7 @@ from forcegp.errors import NumericalError
 from forcegp.forces.inertia import Inertia
 from forcegp.forces.measurements import Observation, Training, scaled, training_of
 from forcegp.forces.priors.sets import FEW, SETS, PriorSet
-from forcegp.forces.problem import is_finite
+from forcegp.forces.problem import is_finite, kernel_parameters
 from forcegp.gp.optimise import LearningOptions
 from forcegp.models.base import FitProgress
 from forcegp.models.fit_result import Compared
@@ -42,7 +45,8 @@ from forcegp.models.structured_learning import (
 )
 
 FEWEST = 100
-"""Number of samples below which the set `FEW` is used."""
+"""Number of samples below which the set `FEW` is used, and of independent samples below which additional
+parameters have a cost."""
 HALVES, STRETCHES, BLOCKS = 2, 4, 8
 """Number of halves of the log, of alternating segments, and of blocks of rows compared in each half."""
 ROWS = 400
@@ -138,6 +142,7 @@ class Trial:
         candidate: the candidate.
         scores: the score of each block, by half.
         coverage: fraction of measured values within ±2σ, by half.
+        independent: number of independent samples κ n in the halves on which the candidate was trained.
         begin: the hyperparameters learned on the first half.
         inertia_found: whether the identified inertia differs from that of the robot file.
         note: the reason why the candidate was dropped.
@@ -146,9 +151,15 @@ class Trial:
     candidate: Candidate
     scores: list[Tensor] = field(default_factory=list)
     coverage: list[float] = field(default_factory=list)
+    independent: float = 0.0
     begin: Mapping[str, Tensor] | None = None
     inertia_found: bool = False
     note: str = ""
+
+    @property
+    def parameters(self) -> int:
+        """Number of learned parameters of the kernels."""
+        return sum(x.numel() for x in kernel_parameters(self.begin or {}).values())
 
     def row(self, best: Tensor, chosen: bool) -> Compared:
         """Return the row for this candidate in the comparison table."""
@@ -180,12 +191,14 @@ def _score(
             if same and len(other.scores) == len(trial.scores) + 1:
                 trial.scores.append(other.scores[-1])
                 trial.coverage.append(other.coverage[-1])
+                trial.independent = other.independent
                 return
     try:
         fit = trained(spec.with_set(candidate.set), inertia, train, trial.begin)
         density, coverage = log_density(fit, test)
         trial.scores.append(blocks_of(density))
         trial.coverage.append(coverage)
+        trial.independent += fit.problem.power * fit.problem.training.samples
         trial.begin = fit.hyperparameters
     except NumericalError as cause:
         trial.note = f"not computed: {str(cause).splitlines()[0]}"
@@ -193,12 +206,25 @@ def _score(
 
 def _drop(trials: Sequence[Trial]) -> None:
     """Drop the candidates that are far behind the best."""
-    blocks = [(trial, torch.cat(trial.scores)) for trial in trials if not trial.note]
-    best = max((own for _, own in blocks), key=lambda x: float(x.mean()), default=torch.empty(0))
-    for trial, own in blocks:
-        behind, error = difference(best, own)
+    for trial, behind, error in behind_best([trial for trial in trials if not trial.note]):
         if behind > DROPPED * error:
             trial.note = "dropped after the first half"
+
+
+def behind_best(trials: Sequence[Trial]) -> list[tuple[Trial, float, float]]:
+    """Return the deficit of each candidate and its standard error.
+
+    The deficit is relative to the best candidate, less the cost of the additional parameters of the best.
+    """
+    if not trials:
+        return []
+    best = max(trials, key=lambda trial: float(torch.cat(trial.scores).mean()))
+    n, found = best.independent, []
+    cost = 0.5 * math.log(n) / n if 1.0 < n < FEWEST else 0.0
+    for trial in trials:
+        behind, error = difference(torch.cat(best.scores), torch.cat(trial.scores))
+        found.append((trial, behind - cost * max(best.parameters - trial.parameters, 0), error))
+    return found
 
 
 def _result(spec: Specification, trials: Sequence[Trial]) -> tuple[Specification, tuple[Compared, ...]]:
@@ -206,12 +232,11 @@ def _result(spec: Specification, trials: Sequence[Trial]) -> tuple[Specification
     found = any(trial.inertia_found for trial in trials)
     # If no different inertia was found, a candidate with identification equals the one without.
     shown = [t for t in trials if not t.candidate.inertia or spec.options.inertia == "auto" or found]
-    whole = [(trial, torch.cat(trial.scores)) for trial in shown if not trial.note]
+    whole = [trial for trial in shown if not trial.note]
     if not whole:
         return without_comparison(spec, "no candidate could be computed")
-    best = max((own for _, own in whole), key=lambda x: float(x.mean()))
-    behind = ((trial, *difference(best, own)) for trial, own in whole)
-    chosen = next(trial for trial, by, error in behind if by <= error)
+    chosen = next(trial for trial, by, error in behind_best(whole) if by <= error)
+    best = max((torch.cat(trial.scores) for trial in whole), key=lambda x: float(x.mean()))
     table = tuple(trial.row(best, trial is chosen) for trial in shown)
     identifies = chosen.candidate.inertia or not found
     spec = spec.with_options(inertia=spec.options.inertia or ("auto" if identifies else "file"))
