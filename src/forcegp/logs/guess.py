@@ -38,8 +38,9 @@ LEAST_DEGREES = 3.2
 """If no position exceeds this value, the unit is not degrees, since the arm would hardly move [°]."""
 CLEARER, NEAR = 1.5, 1.3
 """Factor by which torques must fit better for a unit to be certain; tolerance for the ratio of two units."""
-TRAJECTORY, LEAST_FORCE = 10, 1.0
-"""Minimum ratio of trajectory to filter window; minimum force in a contact that is always closed [N]."""
+TRAJECTORY, LONGEST, LEAST_FORCE = 10, 0.06, 1.0
+"""Minimum ratio of trajectory to filter window; maximum window, as wider ones hide dry friction and fits
+average noise anyway [s]; minimum force in a contact that is always closed [N]."""
 
 
 def guess_mapping(path: str | Path, system: ConstrainedSystem, progress: Progress | None = None) -> Draft:
@@ -90,13 +91,13 @@ def _try(path: str | Path, draft: Draft, system: ConstrainedSystem, possible: li
 
 
 def _window(draft: Draft, trial: Signals) -> None:
-    """Choose a filter window that suits the noise in the longest trajectory's positions and velocities."""
+    """Choose a filter window for the noise in the longest trajectory, narrow enough for dry friction."""
     rows = max(runs(trial.segment), key=lambda rows: rows.stop - rows.start)
     names = ["q", *(["qd"] if "velocity" in draft.families else [])]
     samples, most = [trial.vectors[name][rows] for name in names], (rows.stop - rows.start) // TRAJECTORY
     asked = cross_validated_window(samples, most=most)
-    draft.window = max(asked, draft.window)
     period = float(np.median(np.diff(trial.t[rows])))
+    draft.window = max(draft.window, min(asked, 1 + 2 * int(0.5 * LONGEST / period)))
     text = f"window of {1e3 * period * draft.window:.3g} ms: cross-validation asks for {asked} samples"
     draft.say("derivatives", text)
 
@@ -163,8 +164,8 @@ def _torque(draft: Draft, trial: Signals, system: ConstrainedSystem) -> None:
         family.unit = family.unit if family.declared else "A"
         text = "a current: give the gear ratio and the torque constant [N m/A]; DrivePrior learns its error"
         draft.say("torque", text, doubt=True)
-    if not clear.any():
-        return draft.say("torque", "no torque follows the inverse dynamics: sign unknown", doubt=True)
+    if clear.mean() < 0.5:
+        return draft.say("torque", "few torques follow the inverse dynamics: sign unknown", doubt=True)
     family.sign = _signs(slopes, clear, trial.joint_names)
     if isinstance(family.sign, dict):
         draft.say("torque", "the sign differs between joints; are the joints in the right order?", doubt=True)

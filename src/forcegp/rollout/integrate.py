@@ -216,7 +216,9 @@ def _result(problem: RolloutProblem, record: _Record, dt: float) -> Rollout:
     states, motions = record.states, record.motions
     if not motions:
         raise ForceGPError(
-            "the motion at the initial state cannot be computed", got=record.diverged[0].reason
+            "the motion at the initial state cannot be computed",
+            got=record.diverged[0].reason,
+            hint="evaluate the model, start elsewhere, or use RolloutOptions(sticking=False)",
         )
 
     def over_time(values: Sequence[State] | Sequence[Instant], names: str) -> dict[str, Tensor]:
