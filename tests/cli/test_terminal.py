@@ -9,6 +9,7 @@ import sys
 from pathlib import Path
 
 import pytest
+from click import unstyle
 
 ESCAPE = "\x1b]0;owned\x07\x1b[2J\u202e"
 
@@ -63,13 +64,12 @@ def test_prose_is_wrapped_at_the_width_of_the_terminal(
     from forcegp.cli import common
 
     text, path, line = " ".join(["word"] * 40), "/tmp/" + 30 * "long-name-", "surface = { offset = 0.1 } " * 5
-    if columns is None:
-        monkeypatch.delenv("COLUMNS", raising=False)
-    else:
-        monkeypatch.setenv("COLUMNS", columns)
+    monkeypatch.setenv("COLUMNS", columns or "40")
+    for stream in (sys.stdout, sys.stderr):
+        monkeypatch.setattr(stream, "isatty", lambda: columns is not None)
     common.show({"text": text, "file": path, "line": common.Verbatim(line)}, as_json=False)
     common.warn(f"{text} of {path}")
-    out, err = (stream.splitlines() for stream in capfd.readouterr())
+    out, err = (unstyle(text).splitlines() for text in capfd.readouterr())
     assert f"line  {line}" in out
     if columns is None:
         assert [*out, *err] == [

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import json
 import math
-import os
 import shutil
 import sys
 import textwrap
@@ -52,12 +51,11 @@ class Verbatim(str):
 def say(text: object, label: str = "", indent: int = 2, err: bool = False, **style: Any) -> None:
     """Print a text after a styled label, wrapped at the width of the terminal, but not in files and pipes."""
     lines = printable(f"{label}{text}").splitlines()
-    terminal = (sys.stderr if err else sys.stdout).isatty() or "COLUMNS" in os.environ
-    if terminal and not isinstance(text, Verbatim):
+    if (sys.stderr if err else sys.stdout).isatty() and not isinstance(text, Verbatim):
         width, whole = max(shutil.get_terminal_size().columns, 2 * indent), dict.fromkeys(WHOLE, False)
         lines = [textwrap.fill(line, width, subsequent_indent=" " * indent, **whole) for line in lines]
     printed = "\n".join(lines)
-    typer.secho(printed[: len(label)], nl=False, err=err, **style)
+    typer.secho(printed[: len(label)], nl=False, err=err, reset=bool(style), **style)
     typer.echo(printed[len(label) :], err=err)
 
 
