@@ -125,6 +125,7 @@ def test_mpc_holds_a_force(tmp_path: Path) -> None:
     assert learned <= 5.0 < file
 
 
+@pytest.mark.slow
 def test_force_observer(tmp_path: Path) -> None:
     pytest.importorskip("mujoco")
     figure = tmp_path / "force.png"

@@ -94,6 +94,7 @@ def test_what_this_motion_hides_is_said(
     assert rival in offset.kinds[1:] and offset.told_apart_by
 
 
+@pytest.mark.slow
 def test_a_torque_that_drifts_is_found_with_its_size(free: Case) -> None:
     system, log = free
     drift = np.linspace(0.0, 6.0, len(log))[:, None] * (np.arange(log.nq) == 1)
@@ -236,6 +237,7 @@ def fast_log(path: Path, window: int, order: int) -> Log:
     return log_of(Dataset.read(path, differentiate=SavitzkyGolay(window, order)))
 
 
+@pytest.mark.slow
 def test_an_acceleration_that_was_computed_here_is_no_reason_to_stop(tmp_path: Path) -> None:
     report = check(PENDULUM, fast_log(tmp_path / "log.csv", 121, 2))
     assert report.usable and [f.remedy for f in of_kind(report, "filter-wide")] == [

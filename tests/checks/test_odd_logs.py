@@ -139,6 +139,7 @@ def test_what_concerns_the_whole_log_comes_first() -> None:
     assert warnings[:2] == ["torque-offset", "spike"]
 
 
+@pytest.mark.slow
 def test_a_torque_that_is_not_logged_is_no_fault() -> None:
     """A motor without a sensor, declared in the header: its column holds zeros, and no finding names it."""
     robot = forcegp.load_robot("double_pendulum")
@@ -160,6 +161,7 @@ def test_milliseconds_beside_an_acceleration_that_the_import_derived() -> None:
     assert kinds[0] == "time-unit" and "filter-wide" not in kinds and "masses-mismatch" not in kinds
 
 
+@pytest.mark.slow
 def test_a_pulse_of_the_torque_that_drives_the_arm_is_no_outlier(free: Case) -> None:
     """A controller's pulse of one row, larger than the torque is elsewhere, accelerates every joint."""
     system, log = free

@@ -66,7 +66,7 @@ def run(*arguments: object) -> str:
     return done.stdout
 
 
-@pytest.mark.parametrize("kind", slow_except(FORMATS, "foreign csv", "mcap"))
+@pytest.mark.parametrize("kind", slow_except(FORMATS, "mcap"))
 def test_a_log_becomes_a_model(kind: str, tmp_path: Path) -> None:
     """The guessed mapping is right as it stands, so that confirming it is all that is left to the user."""
     m = driven_motion()

@@ -170,6 +170,7 @@ def coverage(fit: StructuredFit, data: forcegp.Dataset, force: Tensor) -> float:
     return float(((found.mean[:, 0] - force).abs() <= 2.0 * found.std[:, 0]).double().mean())
 
 
+@pytest.mark.slow
 def test_a_joint_that_contact_hides_is_not_trusted(tmp_path: Path) -> None:
     """All that the knee does wrong acts along the normal, where no acceleration shows it."""
     system = leg(tmp_path)

@@ -202,6 +202,7 @@ def test_a_late_torque_is_not_taken_for_inertia(file: RobotModel, late: float) -
     assert result.delay == pytest.approx(-late, abs=1e-3)
 
 
+@pytest.mark.slow
 def test_a_late_torque_is_not_taken_for_viscous_friction(file: RobotModel) -> None:
     """0.3 N m s/rad; a delay s of M q̈ adds s M ω² to it along a sine of frequency ω."""
     truth = file.replace(mass=1.3 * file.mass, com=0.9 * file.com)
@@ -210,6 +211,7 @@ def test_a_late_torque_is_not_taken_for_viscous_friction(file: RobotModel) -> No
         assert abs(each.estimate - 0.3) < 3.0 * each.std < 0.15
 
 
+@pytest.mark.slow
 def test_later_samples_are_shifted_by_the_identified_delay(file: RobotModel) -> None:
     truth, system = file.replace(mass=1.3 * file.mass, com=0.9 * file.com), forcegp.ConstrainedSystem(file)
     late, timely = (log(truth, 800, late=x) for x in (0.008, 0.0))
@@ -284,6 +286,7 @@ def test_links_and_drives_are_identified_together(file: RobotModel) -> None:
     assert inertia_error(result.robot, truth, data) < 0.15 * inertia_error(file, truth, data)
 
 
+@pytest.mark.slow
 def test_a_drive_and_the_link_that_it_turns_share_their_uncertainty(file: RobotModel) -> None:
     """Joint 1 turns link 1 about a fixed axis, so no motion tells the two apart: their sum is known alone."""
     truth = file.replace(mass=1.3 * file.mass, com=0.9 * file.com)

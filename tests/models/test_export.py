@@ -207,7 +207,7 @@ def differences(ours: Prediction, theirs: Prediction) -> tuple[float, float]:
     return float(in_mean.max()), 0.5 * float(in_covariance.max())
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", slow_except(CASES, "free_friction", "one_contact", "zero_mean", "exact"))
 def test_the_numbers_of_predict(name: str) -> None:
     fit, fast = fitted(name), compiled(name)
     state, active = states(fit)
@@ -271,6 +271,7 @@ def log_of(fit: StructuredFit) -> forcegp.Dataset:
     return forcegp.Dataset(t, m.q, m.qd, m.tau, m.values, fit.system.robot.joint_names, contact=closed)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("first", [0, 2])
 def test_undetermined_forces_are_those_of_the_fit(first: int) -> None:
     fit, n = fitted("undetermined"), 16
@@ -301,6 +302,7 @@ def test_undetermined_forces_are_those_of_the_fit(first: int) -> None:
                 predictor.predict(*state, "constraint_force", active=active)
 
 
+@pytest.mark.slow
 @needs_gcc
 def test_the_test_program_expects_undetermined_forces(tmp_path: Path) -> None:
     folder = fitted("undetermined").export(tmp_path / "c").folder
@@ -390,6 +392,7 @@ def test_the_folder_compiles_without_warnings_and_passes_its_test(
         assert not line.startswith("static double ") or "(" in line, "global state that can change"
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compiler", COMPILERS)
 @pytest.mark.parametrize("name", slow_except(["sparse", "exact"], "exact"))
 def test_sanitizers_find_nothing(name: str, compiler: str, tmp_path: Path) -> None:
@@ -410,6 +413,7 @@ def test_the_test_program_finds_a_wrong_number(tmp_path: Path) -> None:
     assert built(folder, "-O1").returncode == 1
 
 
+@pytest.mark.slow
 @needs_gcc
 def test_two_models_fit_into_one_program(tmp_path: Path) -> None:
     for name in ("left", "right"):
@@ -422,6 +426,7 @@ def test_two_models_fit_into_one_program(tmp_path: Path) -> None:
     assert subprocess.run([str(tmp_path / "run")], check=False).returncode == 0
 
 
+@pytest.mark.slow
 @needs_gcc
 @pytest.mark.parametrize("name", slow_except(["sparse", "exact"], "exact"))
 def test_a_reduced_covariance_is_wider_by_no_more_than_stated(name: str, tmp_path: Path) -> None:
@@ -452,6 +457,7 @@ def test_more_functions_lose_less() -> None:
     assert lost[0] > lost[1] > lost[2] and lost[2] < 1e-6 * float(theirs.max())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compiler", COMPILERS)
 @pytest.mark.parametrize("name", slow_except(["sparse", "exact", "one_contact"], "one_contact"))
 def test_single_precision_errs_by_what_the_export_states(name: str, compiler: str, tmp_path: Path) -> None:
@@ -640,6 +646,7 @@ def test_the_c_code_finds_negative_eigenvalues(tmp_path: Path) -> None:
     assert sum(verdicts[3::4]) < 5
 
 
+@pytest.mark.slow
 def test_a_contact_that_jams_is_an_error_in_both() -> None:
     prior = SlidingFrictionPrior("table", terms=("coulomb",), friction_coefficient=0.0)
     model = forcegp.StructuredGP(two_contacts(), "analytical", [JointFrictionPrior(), prior], noise=0.1)

@@ -70,7 +70,7 @@ def updated(name: str) -> tuple[CompiledFit, StructuredFit]:
 CASES = ["free_friction", "free_inertial", "one_contact", "sparse", "zero_mean", "rounded_tip"]
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", slow_except(CASES, "free_inertial", "one_contact", "zero_mean"))
 def test_samples_are_learned_as_by_the_fit(name: str) -> None:
     fit, (fast, slow) = fitted(name), updated(name)
     assert differs(fast, slow, fit) < SAME
@@ -135,6 +135,7 @@ def _faded(fit: StructuredFit, data: forcegp.Dataset, factor: float) -> Structur
     return fit
 
 
+@pytest.mark.slow
 def test_another_measured_quantity() -> None:
     system, log = two_contacts(), logged(two_contacts(), 40)
     values = torch.randn(40, 2, dtype=torch.float64, generator=torch.Generator().manual_seed(3))
@@ -191,6 +192,7 @@ def test_a_robot_at_rest_teaches_nothing() -> None:
     assert differs(fast.update(q, 0.0 * qd, tau, q), fit, fit) < SAME
 
 
+@pytest.mark.slow
 def test_what_cannot_learn_is_refused() -> None:
     state, active, _ = samples(fitted("contained_inertia"))
     with pytest.raises(ModelError, match="cannot learn online in C"):
@@ -252,6 +254,7 @@ int main(void) {
 """
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compiler", COMPILERS)
 @pytest.mark.parametrize("name", slow_except(["sparse", "one_contact"], "one_contact"))
 def test_sanitizers_find_nothing_in_what_learns(name: str, compiler: str, tmp_path: Path) -> None:

@@ -92,6 +92,7 @@ def test_it_learns_online() -> None:
     assert max(differences(fast.external_wrench(*at, active=active), theirs)) > 1e3 * SAME
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("compiler", COMPILERS)
 def test_its_code_compiles_without_warnings_and_sanitizers_find_nothing(
     compiler: str, tmp_path: Path
@@ -109,6 +110,7 @@ def test_its_code_compiles_without_warnings_and_sanitizers_find_nothing(
     assert built(folder, "-O0").returncode == 1, "a wrong wrench is not found"
 
 
+@pytest.mark.slow
 def test_what_is_refused() -> None:
     fit = fitted("one_contact")
     data, _ = log_of(fit)

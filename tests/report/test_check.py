@@ -23,6 +23,7 @@ def page(folder: Path, log: Log) -> str:
     return path.read_text(encoding="utf-8")
 
 
+@pytest.mark.slow
 def test_the_verdict_is_green_amber_or_red(tmp_path: Path) -> None:
     assert '<p class="yes"><strong>verdict: go on<' in page(tmp_path, LOG)
     offset = LOG.replace(tau=LOG.tau + 3.0 * (np.arange(7) == 3))
