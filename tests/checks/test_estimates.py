@@ -131,6 +131,7 @@ def test_a_cause_comes_before_what_a_fit_learns(free: Case) -> None:
     assert kinds[:2] == ["torque-delay", "friction-undeclared"]
 
 
+@pytest.mark.slow
 def test_what_an_import_saw_of_the_clock_is_a_finding(free: Case) -> None:
     system, log = free
     seen = (

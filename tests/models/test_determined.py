@@ -175,6 +175,7 @@ def test_a_model_that_misses_its_data_by_far_says_by_how_much(data: forcegp.Data
     assert found is not None and float(found[1]) > 3.0
 
 
+@pytest.mark.slow
 def test_held_out_stretches_show_a_model_that_misses_the_log(
     data: forcegp.Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:

@@ -402,6 +402,7 @@ def test_sanitizers_find_nothing(name: str, compiler: str, tmp_path: Path) -> No
     assert ran.returncode == 0, ran.stdout + ran.stderr
 
 
+@pytest.mark.slow
 @needs_gcc
 def test_the_test_program_finds_a_wrong_number(tmp_path: Path) -> None:
     folder = fitted("one_contact").export(tmp_path / "c").folder

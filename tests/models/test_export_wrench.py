@@ -52,7 +52,7 @@ CASES = ["free_friction", "free_inertial", "contained_inertia", "one_contact", "
 
 
 @pytest.mark.parametrize("frame", [TOOL, ELBOW], ids=["world", "local"])
-@pytest.mark.parametrize("name", slow_except(CASES, "free_inertial", "one_contact"))
+@pytest.mark.parametrize("name", slow_except(CASES, "one_contact"))
 def test_the_wrench_of_the_fit_and_its_jacobian(name: str, frame: forcegp.WrenchFrame) -> None:
     fit, fast = fitted(name), fitted(name).compiled(wrench=frame)
     data, active = log_of(fit)
