@@ -263,11 +263,6 @@ class Inertia:
     delay: float = 0.0
     doubts: tuple[str, ...] = ()
 
-    @property
-    def identified(self) -> bool:
-        """Whether inertial parameters of links were identified."""
-        return self.per_gain is not None
-
 
 @torch.no_grad()
 def inertia_of(

@@ -265,7 +265,7 @@ def trained(
         spec: the specification with the priors of the candidate.
         inertia: the robot inertia to use in learning.
     """
-    spec, pinned = identified(spec, train, inertia) if inertia.identified else (spec, {})
+    spec, pinned = identified(spec, train, inertia) if inertia.per_gain is not None else (spec, {})
     rows = scaled(train.evenly(ROWS), spec.system, spec.priors, {}, spec.options.standardize)
     few = problem = spec.problem(rows, inertia.robot, pinned)
     if not is_finite(problem.priors):

@@ -225,7 +225,7 @@ def problem_for(
     elif before is None and chosen is None:
         found = spec.inertia_of(training)
         robot, doubts = found.robot, (*doubts, *found.doubts)
-        if found.identified:
+        if found.per_gain is not None:
             spec, pinned = identified(spec, training, found)
             training, _ = training_for(spec, before, data, chosen)
     return spec, spec.problem(dataclasses.replace(training, part_of=part_of), robot, pinned), doubts
@@ -265,7 +265,8 @@ def training_for(
     training = training_of(
         data, spec.system, spec.priors, spec.noise.acceleration, kept, spec.options.standardize
     )
-    training = without_delay(training, spec.priors)
+    if any(prior.delay for prior in spec.priors):
+        training = without_delay(training, spec.priors)
     return in_motion(spec.system, training, fewest) if spec.noise.learns_torque else (training, ())
 
 
