@@ -278,3 +278,17 @@ def test_a_block_slides_where_the_push_leaves_its_friction_cone(block) -> None:
     stopped = 2 * each + int((speeds[2 * each :] < 1e-3).double().argmax())
     assert stopped == pytest.approx(2 * each + speed / (MU * GRAVITY) / dt, abs=2)
     assert float(speeds[stopped:].abs().max()) < 1e-3
+
+
+def test_friction_is_found_where_exchanging_joints_goes_round_in_circles() -> None:
+    """In contact with Coulomb friction the response is asymmetric; two of three joints are nearly at rest."""
+    G = [[5.6159, 1.3711, -1.2225], [-0.21329, -0.051675, -0.0054935], [0.18167, -0.2473, 37.804]]
+    G = torch.tensor(G, dtype=torch.float64)
+    limit = torch.tensor([0.5052, 0.8354, 0.2852], dtype=torch.float64)
+    free = torch.tensor([-262.0699, 10.6164, -0.6146], dtype=torch.float64)
+    still, h = torch.zeros(1, 3, dtype=torch.float64), torch.full((1, 1), 0.0025, dtype=torch.float64)
+    force, held, _ = dry_friction_force(free[None], G[None], limit[None], still, h)
+    motion = free + G @ force[0]
+    assert held[0].tolist() == [False, False, True] and float(motion[2].abs()) < 1e-5
+    assert bool((force[0].abs() <= limit + 1e-9).all())
+    torch.testing.assert_close(force[0, :2], -motion[:2].sign() * limit[:2])

@@ -218,7 +218,7 @@ def _result(problem: RolloutProblem, record: _Record, dt: float) -> Rollout:
         raise ForceGPError(
             "the motion at the initial state cannot be computed",
             got=record.diverged[0].reason,
-            hint="evaluate the model, start elsewhere, or use RolloutOptions(sticking=False)",
+            hint="start elsewhere, or use RolloutOptions(sticking=False)",
         )
 
     def over_time(values: Sequence[State] | Sequence[Instant], names: str) -> dict[str, Tensor]:

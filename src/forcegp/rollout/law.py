@@ -21,6 +21,7 @@ instead of the start, q̈ = q̈₀ + G (p − h D q̈), as in MuJoCo's Euler int
 
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
@@ -48,8 +49,8 @@ CONTRADICTION = 1e-9
 """Relative tolerance for forces beyond their limit and for motion against the direction of sliding."""
 BLOCK_TRIALS = 5
 """Number of block exchanges without improvement after which joints are exchanged one at a time."""
-MAX_EXCHANGES = 300
-"""Maximum number of exchanges. Arms need fewer than ten."""
+MAX_EXCHANGES, MOST_JOINTS = 300, 8
+"""Maximum number of exchanges (arms need fewer than ten); of joints whose every combination may be tried."""
 INSTANT = 1e-12
 """Step size that represents an instant [s], over which every moving joint slides."""
 STILL = 1e-8
@@ -188,35 +189,51 @@ def dry_friction_force(qdd: Tensor, G: Tensor, limit: Tensor, qd: Tensor, h: Ten
     G = G + torch.diag_embed(REGULARIZATION * compliance)
     slack_force = CONTRADICTION * (limit + (free / compliance).abs())
     slack_motion = CONTRADICTION * (free.abs() + compliance * limit)
-    eye = torch.eye(G.shape[-1], dtype=G.dtype, device=G.device).expand_as(G)
+    problem = free, G, limit, slack_force, slack_motion
     # 0 for joints that stick, ±1 for joints that slide.
     direction = torch.where(limit > 0.0, 0.0, free.sign())
     fewest = torch.full((len(G),), G.shape[-1] + 1, device=G.device)
     trials = torch.full_like(fewest, BLOCK_TRIALS)
     count = fewest
     for _ in range(MAX_EXCHANGES):
-        sticks = (direction == 0.0)[..., None]
-        system = torch.where(sticks, G, eye)
-        rhs = torch.where(sticks[..., 0], -free, -direction * limit)
-        force = torch.linalg.solve(system, rhs[..., None])[..., 0]
-        motion = free + (G @ force[..., None])[..., 0]
-        over = torch.where(sticks[..., 0] & (force.abs() > limit + slack_force), -force.sign(), 0.0)
-        back = (direction * motion < -slack_motion) & ~sticks[..., 0]
-        wrong = (over != 0.0) | back
+        force, over, wrong = _tried(direction, *problem)
         count = wrong.sum(-1)
         if not bool(count.any()):
-            return Stuck(force, sticks[..., 0], stopping)
+            return Stuck(force, direction == 0.0, stopping)
         better = count < fewest
         fewest = torch.where(better, count, fewest)
         trials = torch.where(better, BLOCK_TRIALS, trials - 1)
         last = wrong & (wrong.flip(-1).cumsum(-1).flip(-1) == 1)
         exchanged = torch.where((trials >= 0)[:, None], wrong, last)
         direction = torch.where(exchanged, over, direction)
-    raise NumericalError(
-        "the dry friction of the joints cannot be computed",
-        got=f"{int(count.count_nonzero())} of {len(G)} states without a solution",
-        hint="a smaller step, or RolloutOptions(sticking=False)",
-    )
+    # Coulomb friction of contacts makes G asymmetric, and exchanges may then go round in circles.
+    joints = G.shape[-1] if G.shape[-1] <= MOST_JOINTS else 0
+    patterns = torch.cartesian_prod(*[G.new_tensor([0.0, 1.0, -1.0])] * joints).view(-1, max(joints, 1))
+    for row in count.nonzero()[:, 0].tolist() if joints else ():
+        one = (x[row].expand(len(patterns), *x.shape[1:]) for x in problem)
+        right = (~_tried(patterns, *one)[2].any(-1)).nonzero()[:, 0]
+        if len(right):
+            direction[row], count[row] = patterns[right[0]], 0
+    if bool(count.any()):
+        raise NumericalError(
+            "the dry friction of the joints cannot be computed",
+            got=f"{int(count.count_nonzero())} of {len(G)} states without a solution",
+            hint="a smaller step, or RolloutOptions(sticking=False)",
+        )
+    return Stuck(_tried(direction, *problem)[0], direction == 0.0, stopping)
+
+
+def _tried(
+    direction: Tensor, free: Tensor, G: Tensor, limit: Tensor, slack_force: Tensor, slack_motion: Tensor
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return friction if joints stick (0) or slide (±1), new directions, and which joints contradict them."""
+    sticks = direction == 0.0
+    eye = torch.eye(G.shape[-1], dtype=G.dtype, device=G.device)
+    rhs = torch.where(sticks, -free, -direction * limit)
+    force = torch.linalg.solve_ex(torch.where(sticks[..., None], G, eye), rhs[..., None])[0][..., 0]
+    motion = free + (G @ force[..., None])[..., 0]
+    over = torch.where(sticks & ~(force.abs() <= limit + slack_force), -force.sign(), 0.0)
+    return force, over, (over != 0.0) | (direction * motion < -slack_motion) & ~sticks
 
 
 class Law(ABC):
@@ -387,8 +404,9 @@ class RolloutProblem:
         tau = self.inputs.torque(state.t, end, at)
         if self.compiled is not None and not any(x.requires_grad for x in (state.q, state.qd, tau)):
             sticks = self.dry_friction is not None
-            qdd, multiplier, c, cd, held = self.compiled(state.q, state.qd, tau, state.active, h, sticks)
-            return Instant(tau, qdd, multiplier, c, cd, held if sticks else None)
+            with contextlib.suppress(NumericalError):  # more is tried below
+                qdd, multiplier, c, cd, held = self.compiled(state.q, state.qd, tau, state.active, h, sticks)
+                return Instant(tau, qdd, multiplier, c, cd, held if sticks else None)
         at = States(state.q, state.qd, tau, state.active, at.eom)
         now, rough = self._instant(at, h), self.rough
         if not rough or not bool((sticks := sticking_contacts(self.system, at, rough)).any()):
