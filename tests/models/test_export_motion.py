@@ -33,7 +33,12 @@ CASES = [
 
 
 def both(
-    monkeypatch: pytest.MonkeyPatch, name: str, samples: int, still: bool = False, **options
+    monkeypatch: pytest.MonkeyPatch,
+    name: str,
+    samples: int,
+    still: bool = False,
+    duration: float = 0.02,
+    **options,
 ) -> list[Rollout]:
     """A rollout by the law in PyTorch, and by C code."""
     fit, paths = fitted(name), []
@@ -53,7 +58,7 @@ def both(
     for steps in (10**9, 1):
         assert not calls
         monkeypatch.setattr(forward, "COMPILED_STEPS", steps)
-        paths.append(fit.rollout(q, qd, tau[:, None], 0.02, samples, active=active, options=how))
+        paths.append(fit.rollout(q, qd, tau[:, None], duration, samples, active=active, options=how))
     assert {3, 3 * samples} - {0} == set(calls), "means and samples come from C code"
     return paths
 
@@ -76,7 +81,12 @@ def test_trajectories_are_those_of_the_law_in_pytorch(name: str, monkeypatch: py
 
 @pytest.mark.parametrize("options", [{"method": "rk4"}, {"sticking": False}, {"stabilization": "projection"}])
 def test_so_they_are_with_other_options(options: dict, monkeypatch: pytest.MonkeyPatch) -> None:
-    agree(*both(monkeypatch, "one_contact", 0, **options))
+    # One of the states needs the search of `dry_friction_force`. It is unstable: in PyTorch alone, a change
+    # of q by 1e-13 grows to 1e-6 in 20 ms of rk4.
+    duration = 0.004 if options.get("method") == "rk4" else 0.02
+    first, second = both(monkeypatch, "one_contact", 0, duration=duration, **options)
+    assert duration == 0.02 or not (first.diverged or second.diverged)
+    agree(first, second)
 
 
 def test_joints_stick_and_start_to_slide_at_the_same_time(monkeypatch: pytest.MonkeyPatch) -> None:
