@@ -39,7 +39,7 @@ LEAST_DEGREES = 3.2
 CLEARER, NEAR = 1.5, 1.3
 """Factor by which torques must fit better for a unit to be certain; tolerance for the ratio of two units."""
 TRAJECTORY, LONGEST, LEAST_FORCE = 10, 0.06, 1.0
-"""Least ratio of trajectory to window; longest window, as wide ones hide dry friction [s]; least force [N]."""
+"""Least ratio of trajectory to window; longest window (dry friction is sharp) [s]; least force [N]."""
 
 
 def guess_mapping(path: str | Path, system: ConstrainedSystem, progress: Progress | None = None) -> Draft:
