@@ -142,8 +142,6 @@ def _json(imported: Imported) -> dict[str, object]:
     }
 
 
-GAP = 1.5
-"""Multiple of the median time step above which a step counts as a gap."""
 NOT_USABLE = 1
 """Exit code if a finding makes a fit worthless."""
 COLOURS = {"error": "bold red", "warning": "yellow", "note": "cyan"}
@@ -301,6 +299,8 @@ def _split_at_gaps(data: forcegp.Dataset) -> forcegp.Dataset:
     """Number the trajectories so that a new one begins after each gap, as in an import."""
     import torch
 
+    from forcegp.logs.clock import GAP_STEPS
+
     steps = data.t.diff()
-    new = (data.segment.diff() != 0) | (steps > GAP * steps.median())
+    new = (data.segment.diff() != 0) | (steps > GAP_STEPS * steps.median())
     return data.replace(segment=torch.nn.functional.pad(new.cumsum(0), (1, 0)))

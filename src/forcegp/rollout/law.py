@@ -50,7 +50,8 @@ CONTRADICTION = 1e-9
 BLOCK_TRIALS = 5
 """Number of block exchanges without improvement after which joints are exchanged one at a time."""
 MAX_EXCHANGES, MOST_JOINTS = 300, 8
-"""Maximum number of exchanges (arms need fewer than ten); of joints whose every combination may be tried."""
+"""Maximum number of exchanges, of which arms need fewer than ten, and of joints for which all combinations of
+sticking and sliding are tried."""
 INSTANT = 1e-12
 """Step size that represents an instant [s], over which every moving joint slides."""
 STILL = 1e-8
@@ -206,21 +207,18 @@ def dry_friction_force(qdd: Tensor, G: Tensor, limit: Tensor, qd: Tensor, h: Ten
         last = wrong & (wrong.flip(-1).cumsum(-1).flip(-1) == 1)
         exchanged = torch.where((trials >= 0)[:, None], wrong, last)
         direction = torch.where(exchanged, over, direction)
-    # Coulomb friction of contacts makes G asymmetric, and exchanges may then go round in circles.
-    joints = G.shape[-1] if G.shape[-1] <= MOST_JOINTS else 0
-    patterns = torch.cartesian_prod(*[G.new_tensor([0.0, 1.0, -1.0])] * joints).view(-1, max(joints, 1))
-    for row in count.nonzero()[:, 0].tolist() if joints else ():
-        one = (x[row].expand(len(patterns), *x.shape[1:]) for x in problem)
-        right = (~_tried(patterns, *one)[2].any(-1)).nonzero()[:, 0]
-        if len(right):
-            direction[row], count[row] = patterns[right[0]], 0
-    if bool(count.any()):
-        raise NumericalError(
-            "the dry friction of the joints cannot be computed",
-            got=f"{int(count.count_nonzero())} of {len(G)} states without a solution",
-            hint="a smaller step, or RolloutOptions(sticking=False)",
-        )
-    return Stuck(_tried(direction, *problem)[0], direction == 0.0, stopping)
+    # Coulomb friction at contacts makes G asymmetric, so exchanges may cycle although a solution exists.
+    unsolved = count.nonzero()[:, 0].tolist()
+    for row in unsolved:
+        direction[row] = _enumerated(*(x[row] for x in problem))
+    force, _, wrong = _tried(direction, *problem)
+    if not bool(wrong.any()):
+        return Stuck(force, direction == 0.0, stopping)
+    raise NumericalError(
+        "the dry friction of the joints cannot be computed",
+        got=f"{int(wrong.any(-1).sum())} of {len(G)} states without a solution",
+        hint="a smaller step, or RolloutOptions(sticking=False)",
+    )
 
 
 def _tried(
@@ -234,6 +232,16 @@ def _tried(
     motion = free + (G @ force[..., None])[..., 0]
     over = torch.where(sticks & ~(force.abs() <= limit + slack_force), -force.sign(), 0.0)
     return force, over, (over != 0.0) | (direction * motion < -slack_motion) & ~sticks
+
+
+def _enumerated(free: Tensor, G: Tensor, limit: Tensor, slack_force: Tensor, slack_motion: Tensor) -> Tensor:
+    """Return, for one state, the combination of directions `(nq,)` that the fewest joints contradict."""
+    joints = len(limit)
+    if joints > MOST_JOINTS:
+        return torch.zeros_like(limit)
+    directions = torch.cartesian_prod(*[G.new_tensor([0.0, 1.0, -1.0])] * joints).view(-1, joints)
+    wrong = _tried(directions, free, G.expand(len(directions), -1, -1), limit, slack_force, slack_motion)[2]
+    return directions[wrong.sum(-1).argmin()]
 
 
 class Law(ABC):
