@@ -97,8 +97,8 @@ def _window(draft: Draft, trial: Signals) -> None:
     asked = cross_validated_window(samples, most=most)
     period = float(np.median(np.diff(trial.t[rows])))
     draft.window = max(draft.window, min(asked, 1 + 2 * int(0.5 * LONGEST / period)))
-    text = f"window of {1e3 * period * draft.window:.3g} ms: cross-validation asks for {asked} samples"
-    draft.say("derivatives", text)
+    text = f"window of {1e3 * period * draft.window:.3g} ms (at most 60, or 11 samples): "
+    draft.say("derivatives", f"{text}cross-validation asks for {asked} samples")
 
 
 def _signals(path: str | Path, draft: Draft, system: ConstrainedSystem, without: str = "") -> Signals:
