@@ -1,4 +1,4 @@
-"""Speed of the dynamics beside Pinocchio, MuJoCo, adam-robotics and differentiable-robot-model.
+"""Speed of the dynamics beside Pinocchio, MuJoCo, frax, adam-robotics and differentiable-robot-model.
 
     python benchmarks/dynamics.py --json result.json --docs benchmarks/notes/speed.md
 
@@ -20,7 +20,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from dynamics_peers import Adam, Call, DifferentiableRobotModel, Mujoco, Pinocchio, torch_call
+from dynamics_peers import Adam, Call, DifferentiableRobotModel, Frax, Mujoco, Pinocchio, torch_call
 from results_page import write_section
 from torch import Tensor
 
@@ -37,7 +37,7 @@ QUANTITIES = {
     "jacobians": "all Jacobians ∂q̈/∂(q, q̇, τ) in closed form",
 }
 FRAME, POINT = "lbr_iiwa_link_7", (0.0, 0.0, 0.1)
-PACKAGES = ("torch", "pin", "mujoco", "adam-robotics", "differentiable-robot-model")
+PACKAGES = ("torch", "pin", "mujoco", "frax", "jax", "adam-robotics", "differentiable-robot-model")
 SECONDS_PER_CELL = 1.5
 """Time spent on each entry of the table, beyond one warming-up call."""
 LONGEST_CALL = 2.0
@@ -47,46 +47,53 @@ Prepare = Callable[..., Call | None]
 
 
 def ours(robot: forcegp.RobotModel) -> dict[str, Prepare]:
-    """This library: eager, compiled, and eager on CUDA when there is one."""
+    """This library, eager and compiled, on the CPU and on CUDA if there is a device."""
+    table = {"forcegp": eager_on(robot), "forcegp compiled": compiled_on(robot)}
+    if torch.cuda.is_available():
+        moved = robot.to("cuda")
+        table |= {"forcegp on CUDA": eager_on(moved), "forcegp compiled on CUDA": compiled_on(moved)}
+    return table
+
+
+def eager_on(robot: forcegp.RobotModel) -> Prepare:
     contact = forcegp.SurfaceContact(
         name="table", frame=FRAME, point=POINT, surface=forcegp.Plane(normal=(0.0, 0.0, 1.0), offset=0.0)
     )
+    system = forcegp.ConstrainedSystem(robot, [contact])
+
+    def terms(q: Tensor, qd: Tensor) -> None:
+        eom = system.equations(q, qd)
+        _ = eom.L, eom.T, eom.H
+
+    def prepare(quantity: str, *states: Tensor) -> Call | None:
+        states = tuple(x.to(robot.device) for x in states)
+        calls = {
+            "constraint_terms": lambda: terms(*states[:2]),
+            "jacobians": lambda: derivatives.forward_dynamics_derivatives(robot, *states) and None,
+        }
+        return calls.get(quantity) or torch_call(
+            quantity,
+            lambda q: dynamics.mass_matrix(robot, q),
+            lambda *x: dynamics.forward_dynamics(robot, *x),
+            *states,
+        )
+
+    return prepare
+
+
+def compiled_on(robot: forcegp.RobotModel) -> Prepare:
     compiled = {
         name: compile_dynamics(robot, name)
         for name in ("forward_dynamics", "mass_matrix", "forward_dynamics_derivatives")
     }
 
-    def eager_on(robot: forcegp.RobotModel) -> Prepare:
-        system = forcegp.ConstrainedSystem(robot, [contact])
-
-        def terms(q: Tensor, qd: Tensor) -> None:
-            eom = system.equations(q, qd)
-            _ = eom.L, eom.T, eom.H
-
-        def prepare(quantity: str, *states: Tensor) -> Call | None:
-            states = tuple(x.to(robot.device) for x in states)
-            calls = {
-                "constraint_terms": lambda: terms(*states[:2]),
-                "jacobians": lambda: derivatives.forward_dynamics_derivatives(robot, *states) and None,
-            }
-            return calls.get(quantity) or torch_call(
-                quantity,
-                lambda q: dynamics.mass_matrix(robot, q),
-                lambda *x: dynamics.forward_dynamics(robot, *x),
-                *states,
-            )
-
-        return prepare
-
-    def prepare_compiled(quantity: str, *states: Tensor) -> Call | None:
+    def prepare(quantity: str, *states: Tensor) -> Call | None:
+        states = tuple(x.to(robot.device) for x in states)
         if quantity == "jacobians":
             return lambda: compiled["forward_dynamics_derivatives"](*states).shape and None
         return torch_call(quantity, compiled["mass_matrix"], compiled["forward_dynamics"], *states)
 
-    table = {"forcegp": eager_on(robot), "forcegp compiled": prepare_compiled}
-    if torch.cuda.is_available():
-        table["forcegp on CUDA"] = eager_on(robot.to("cuda"))
-    return table
+    return prepare
 
 
 def peers(robot: forcegp.RobotModel, urdf: Path) -> dict[str, Prepare]:
@@ -94,6 +101,7 @@ def peers(robot: forcegp.RobotModel, urdf: Path) -> dict[str, Prepare]:
     makers: dict[str, Callable[[], dict[str, Prepare]]] = {
         "pin": lambda: _pinocchio(urdf),
         "mujoco": lambda: {"MuJoCo (loop)": Mujoco(urdf).prepare},
+        "frax": lambda: {"frax on CUDA" if torch.cuda.is_available() else "frax": Frax(urdf).prepare},
         "adam-robotics": lambda: {"adam-robotics": Adam(urdf, robot.joint_names).prepare},
         "differentiable-robot-model": lambda: {
             "differentiable-robot-model": DifferentiableRobotModel(urdf).prepare
@@ -158,8 +166,8 @@ def measure(robot: forcegp.RobotModel, table: dict[str, Prepare], batches: tuple
                 if call is None or before.get((quantity, name), 0.0) > LONGEST_CALL:
                     continue
                 result, error = call(), None
-                if isinstance(result, Tensor | np.ndarray):
-                    value = torch.as_tensor(result).detach().cpu()
+                if quantity in ("forward_dynamics", "mass_matrix"):
+                    value = result.cpu() if isinstance(result, Tensor) else torch.from_numpy(np.array(result))
                     reference = value if reference is None else reference
                     error = float((value - reference).abs().max() / reference.abs().max())
                 took = seconds(call)
@@ -233,7 +241,7 @@ def markdown(result: dict) -> str:
     host = result["machine"]
     packages = ", ".join(f"{name} {v}" for name, v in host["packages"].items() if v)
     lines = [
-        "## Dynamics",
+        "## Dynamics on CUDA" if host["cuda"] else "## Dynamics",
         "",
         f"KUKA iiwa, 7 joints, float64, {host['cpu']}, {host['threads']} threads"
         + (f", {host['cuda']}" if host["cuda"] else ", no CUDA device")
@@ -263,7 +271,7 @@ def main() -> None:
     urdf = Path(str(files("forcegp.robot") / "bundled" / "kuka_iiwa.urdf"))
     robot = forcegp.load_robot("kuka_iiwa")
     table = ours(robot) | peers(robot, urdf)
-    largest = max(options.batches)
+    largest = min(max(options.batches), BATCHES[-1])
     result = {
         "machine": machine(),
         "rows": measure(robot, table, tuple(options.batches)),
@@ -273,7 +281,8 @@ def main() -> None:
     if options.json:
         options.json.write_text(json.dumps(result, indent=2) + "\n", encoding="utf-8")
     if options.docs:
-        write_section(options.docs, "dynamics", markdown(result))
+        section = "dynamics on CUDA" if result["machine"]["cuda"] else "dynamics"
+        write_section(options.docs, section, markdown(result))
     print(markdown(result))
 
 

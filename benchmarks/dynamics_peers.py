@@ -6,6 +6,9 @@ import contextlib
 import importlib
 import io
 import logging
+import os
+import re
+import tempfile
 from collections.abc import Callable
 from pathlib import Path
 from typing import Any
@@ -158,6 +161,41 @@ class Mujoco:
         if quantity != "forward_dynamics":
             return None
         return lambda: np.stack([acceleration(i) for i in range(len(q))])
+
+
+class Frax:
+    """frax on JAX, compiled for a batch, in float64, on the GPU if JAX has one."""
+
+    def __init__(self, urdf: Path) -> None:
+        os.environ.setdefault("XLA_PYTHON_CLIENT_PREALLOCATE", "false")
+        jax: Any = importlib.import_module("jax")
+        jax.config.update("jax_enable_x64", True)
+        # It refuses a base without inertia, though the inertia of a base that is fixed has no effect.
+        base = (
+            '<inertial><mass value="1"/><inertia ixx="1" iyy="1" izz="1" ixy="0" ixz="0" iyz="0"/></inertial>'
+        )
+        text = re.sub(r"(<link [^>]*>)(?!\s*<inertial)", rf"\1{base}", urdf.read_text(encoding="utf-8"))
+        with tempfile.TemporaryDirectory() as folder:
+            copy = Path(folder) / urdf.name
+            copy.write_text(text, encoding="utf-8")
+            robot, self.jax = importlib.import_module("frax").Robot(str(copy)), jax
+
+        def acceleration(q: Any, qd: Any, force: Any) -> Any:
+            return robot.forward_dynamics(q, qd, force, None)
+
+        each = jax.vmap(acceleration)
+        self.functions = {
+            "forward_dynamics": jax.jit(each),
+            "mass_matrix": jax.jit(jax.vmap(lambda q, qd, force: robot.crba(q))),
+            "gradient": jax.jit(jax.grad(lambda *x: each(*x).sum(), (0, 1, 2))),
+            "jacobians": jax.jit(jax.vmap(jax.jacfwd(acceleration, (0, 1, 2)))),
+        }
+
+    def prepare(self, quantity: str, *states: Tensor) -> Call | None:
+        if quantity not in self.functions:
+            return None
+        function, arrays = self.functions[quantity], [self.jax.device_put(x.numpy()) for x in states]
+        return lambda: self.jax.block_until_ready(function(*arrays))
 
 
 def torch_call(

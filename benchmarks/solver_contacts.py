@@ -32,7 +32,7 @@ from forcegp.models.structured_fit import StructuredFit
 from forcegp.scene import load_scene
 from forcegp.simulate import Sensors, simulate
 
-MODEL = "sgp-real"
+MODEL = "sgp"
 
 
 @dataclass(frozen=True)

@@ -72,7 +72,7 @@ def identify_rigid(system: ConstrainedSystem, train: Dataset) -> LeastSquares:
     noise, identified = (y2 / len(train)).sqrt(), robot
     for _ in range(NOISE_PASSES):
         weight = noise.clamp(min=1e-9) ** -2
-        gram = torch.einsum("j,jkl->kl", weight, G) + torch.eye(len(prior), dtype=prior.dtype)
+        gram = torch.einsum("j,jkl->kl", weight, G) + torch.eye(len(prior)).to(prior)
         identified, x = _minimised(robot, gram, weight @ g, prior[:split])
         square_error = y2 - 2.0 * g @ x + torch.einsum("k,jkl,l->j", x, G, x)
         noise = (square_error.clamp(min=0.0) / len(train)).sqrt()
