@@ -136,6 +136,8 @@ def measured(name: str, seed: int, wrong: Imperfections, folder: Path, *, sysid:
     """Errors of the original file, the calibrated one and the peers on another motion."""
     robot = forcegp.load_robot(name)
     arm = Arm(robot, wrong, np.random.default_rng(seed))
+    if wrong is RIGHT:  # the friction of the file is right too
+        arm.true.dof_damping[:], arm.true.dof_frictionloss[:] = robot.damping.numpy(), robot.friction.numpy()
     case = case_of(name, arm, folder)
     test = case.tests["test"]
     fit = forcegp.StructuredGP(case.system, "analytical").fit(case.train)
