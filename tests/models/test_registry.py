@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import re
+from pathlib import Path
+
 import pytest
 
 import forcegp
@@ -9,6 +12,7 @@ from forcegp.errors import UnknownNameError
 from forcegp.models.registry import MODELS, create
 from random_data import table_system
 
+ROOT = Path(__file__).resolve().parents[2]
 system = table_system()
 
 
@@ -57,3 +61,12 @@ def test_noise_seed_and_options_arrive() -> None:
 def test_an_unknown_name_lists_the_models() -> None:
     with pytest.raises(UnknownNameError, match=r"unknown model 'spg-mean'(.|\n)*analytical(.|\n)*'sgp-mean'"):
         create("spg-mean", system)
+
+
+def test_scripts_name_models_that_exist() -> None:
+    named = {}
+    for folder in ("benchmarks", "examples", "reproduction", "scenes"):
+        for path in (x for kind in ("py", "toml") for x in (ROOT / folder).rglob(f"*.{kind}")):
+            for name in re.findall(r'"(sgp(?:-[a-z]+)*)"', path.read_text(encoding="utf-8")):
+                named[name] = path
+    assert named and {name: path for name, path in named.items() if name not in MODELS} == {}
