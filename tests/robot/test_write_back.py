@@ -179,3 +179,14 @@ def test_an_edit_of_text_with_other_alphabets_and_quotes() -> None:
     )
     with pytest.raises(RobotFileError, match="cannot be edited in place"):
         EditableXml("<r a='ä'/>".encode("utf-16"), "file")
+
+
+@pytest.mark.parametrize("size", [1e-9, 1e-7, 1e-6, 1e-5])
+@pytest.mark.parametrize("source", ["kuka_iiwa14", "ur5"])
+def test_a_small_change_is_written_or_left_but_not_refused(source: str, size: float, tmp_path: Path) -> None:
+    """A mass of kilograms does not hide changes of a wrist's inertia."""
+    wanted = changed(forcegp.load_robot(source), size)
+    write_robot(wanted, source, tmp_path / "small.urdf")
+    found = forcegp.load_robot(tmp_path / "small.urdf")
+    sizes = wanted.inertia.abs().flatten(1).amax(-1) + 1e-7
+    assert bool(((found.inertia - wanted.inertia).abs().flatten(1).amax(-1) <= 1e-5 * sizes).all())

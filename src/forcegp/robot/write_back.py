@@ -39,6 +39,8 @@ CHANGED = 1e-6
 """Relative change in a parameter below which the text in the file is preserved."""
 SAME = 1e-6
 """Relative tolerance for parameters read back from a written file."""
+FLOORS = {"mass": 1e-6, "com": 1e-2, "inertia": 1e-7}
+"""Parameters of a link, and the sizes below which their differences count as absolute ones."""
 ORIENTATIONS = ("axisangle", "euler", "xyaxes", "zaxis")
 """Attributes for the orientation of an inertial frame in MJCF, apart from a quaternion."""
 
@@ -144,8 +146,9 @@ def _link_changes(writer: _Urdf | _Mjcf, tree: Tree, robot: RobotModel, file: Ro
     J_old = pseudo_inertia(file.mass, file.com, file.inertia)
     J_new = pseudo_inertia(robot.mass, robot.com, robot.inertia)
     changes: list[Change] = []
+    differing = set().union(*(_differing(figure, file, robot, CHANGED) for figure in FLOORS))
     for i, joint in enumerate(robot.joint_names):
-        if bool(((J_new[i] - J_old[i]).abs() <= CHANGED * J_old[i].diagonal().abs().sum()).all()):
+        if i not in differing:
             continue
         for name, body in _shared(_parts(file, i, old), J_old[i], J_new[i], joint).items():
             writer.set_inertial(name, body)
@@ -235,19 +238,22 @@ def _losses(robot: RobotModel, figures: Mapping[str, str]) -> tuple[str, ...]:
 
 def _check(robot: RobotModel, read: RobotModel, writer: _Urdf | _Mjcf) -> None:
     """Compare a robot with the robot read from the written text; raise `RobotFileError` if they differ."""
-    for figure in ("mass", "com", "inertia", *writer.figures):
-        wanted, got = getattr(robot, figure), getattr(read, figure)
-        error = (wanted - got).abs().flatten(1).amax(-1) if wanted.ndim > 1 else (wanted - got).abs()
-        size = wanted.abs().flatten(1).amax(-1) if wanted.ndim > 1 else wanted.abs()
-        floor = {"com": 1e-2, "mass": 1e-6, "inertia": 1e-7}.get(figure, 0.0)
-        wrong = (error > 10.0 * SAME * (size + floor)).nonzero()[:, 0].tolist()
+    for figure in (*FLOORS, *writer.figures):
+        wrong = _differing(figure, robot, read, 10.0 * SAME)
         if wrong:
             raise RobotFileError(
                 f"{writer.label}: this would change the {figure} of joint {robot.joint_names[wrong[0]]!r}",
-                expected=wanted[wrong[0]].tolist(),
-                got=got[wrong[0]].tolist(),
+                expected=getattr(robot, figure)[wrong[0]].tolist(),
+                got=getattr(read, figure)[wrong[0]].tolist(),
                 hint="<compiler> settings such as boundmass, inertiafromgeom or settotalmass alter values",
             )
+
+
+def _differing(figure: str, one: RobotModel, other: RobotModel, tolerance: float) -> list[int]:
+    """Return the joints whose parameters differ by more than a fraction of their size."""
+    wanted, got = (getattr(robot, figure).reshape(robot.nq, -1) for robot in (one, other))
+    size = wanted.abs().amax(-1) + FLOORS.get(figure, 0.0)
+    return ((wanted - got).abs().amax(-1) > tolerance * size).nonzero()[:, 0].tolist()
 
 
 def _text(values: float | np.ndarray) -> str:
