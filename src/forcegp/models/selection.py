@@ -5,14 +5,16 @@ the log and tested on the other, and vice versa. Each half consists of contiguou
 any set would score well if training and test samples were neighbours. The score is the mean log predictive
 density of the measurements, including noise,
 
-    S = 1/N Σ_i log N(y_i; E z(x_i), Var z(x_i) + Σ),
+    S = 1/N Σ_i log[(1 − ε) N(y_i; m_i, V_i) + ε N(y_i; ȳ, diag(s² + V_i))]
 
-Candidates are compared by the differences of S over blocks of rows, which also give a standard error. The
-simplest candidate within one standard error of the best is selected. If the residuals of the best are
-correlated so much that there are only κ n < `FEWEST` independent samples, each of its additional k parameters
-must also gain ½ ln(κ n)/κ n nats per sample (Schwarz, *Estimating the dimension of a model*, 1978). No
-candidate depends on the motor torque. In closed loop, such a residual learns to cancel the torque and appears
-to have the best density.
+with m_i = E z(x_i), V_i = Var z(x_i) + Σ, and the mean ȳ and variance s² of all measurements. The second term
+limits the weight of a row that no candidate explains, such as one with a wrong contact label. Candidates are
+compared by the differences of S over blocks of rows, which also give a standard error. The simplest candidate
+within one standard error of the best is selected. If the residuals of the best are correlated so much that
+there are only κ n < `FEWEST` independent samples, each of its additional k parameters must also gain
+½ ln(κ n)/κ n nats per sample (Schwarz, *Estimating the dimension of a model*, 1978). No candidate depends on
+the motor torque. In closed loop, such a residual learns to cancel the torque and appears to have the best
+density.
 """
 
 from __future__ import annotations
@@ -53,6 +55,8 @@ ROWS = 400
 """Number of evenly spaced rows in each half on which a candidate is conditioned or tested."""
 LEARN_ROWS = 150
 """Number of rows for learning hyperparameters if a prior has infinitely many features."""
+OUTLIERS = 1e-3
+"""Fraction ε of rows that the model is not expected to explain."""
 QUICK = LearningOptions(tolerance=1e-5, max_evaluations=150)
 """Learning options for candidates. The tolerance can be loose, since their scores differ clearly."""
 DROPPED = 2.0
@@ -280,7 +284,7 @@ def trained(
 
 @torch.no_grad()
 def log_density(fit: StructuredFit, test: Training) -> tuple[Tensor, float]:
-    """Return log N(y_i; E z, Var z + Σ) of each sample `(n,)`, and the fraction of values within ±2σ.
+    """Return the log density of each sample `(n,)`, and the fraction of values within ±2σ.
 
     If accelerations were measured, other measurements are ignored.
 
@@ -296,7 +300,11 @@ def log_density(fit: StructuredFit, test: Training) -> tuple[Tensor, float]:
         if bool(info.any()):
             raise NumericalError("a predictive covariance is not positive definite")
         normal = torch.distributions.MultivariateNormal(prediction.mean, scale_tril=L, validate_args=False)
-        densities.append(normal.log_prob(m.values))
+        spread = (m.values.var(0) + prediction.variance).sqrt()
+        any_row = torch.distributions.Normal(m.values.mean(0), spread).log_prob(m.values).sum(-1)
+        # log[(1 − ε) N(y; m, V) + ε N(y; ȳ, diag(s² + V))]
+        own = normal.log_prob(m.values) + math.log1p(-OUTLIERS)
+        densities.append(torch.logaddexp(own, any_row + math.log(OUTLIERS)))
         assert prediction.std is not None
         within.append(((m.values - prediction.mean).abs() <= 2.0 * prediction.std).flatten())
     return torch.cat(densities), float(torch.cat(within).double().mean())
