@@ -91,6 +91,20 @@ def test_a_row_that_nothing_explains_does_not_choose() -> None:
     assert all(each.behind < 100.0 for each in fit.result.comparison if each.behind is not None)
 
 
+def test_a_soft_contact_does_not_choose() -> None:
+    """Accelerations along the normal, which no candidate predicts, change neither choice nor score."""
+    system, data = scene_log("kuka_plane")
+    A = system.equations(data.q, data.qd, data.active(system.contact_names)).A
+    generator = torch.Generator().manual_seed(0)
+    bounce = torch.randn(len(data), 1, 1, generator=generator, dtype=torch.float64)
+    soft = data.replace(qdd=data.qdd + (A.mT @ (5.0 * bounce))[..., 0])
+    rigid, found = (fitted(system, each).result.comparison for each in (data, soft))
+    assert [(x.name, x.chosen) for x in rigid] == [(x.name, x.chosen) for x in found]
+    for one, other in zip(rigid, found, strict=True):
+        if one.behind is not None:
+            assert other.behind == pytest.approx(one.behind, abs=0.05)
+
+
 def test_rows_without_order_are_halved_by_distance() -> None:
     system, data = pendulum_log("spring")
     shuffled = data[torch.randperm(ROWS, generator=torch.Generator().manual_seed(1))]

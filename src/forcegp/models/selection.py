@@ -5,16 +5,19 @@ the log and tested on the other, and vice versa. Each half consists of contiguou
 any set would score well if training and test samples were neighbours. The score is the mean log predictive
 density of the measurements, including noise,
 
-    S = 1/N Σ_i log[(1 − ε) N(y_i; m_i, V_i) + ε N(y_i; ȳ, diag(s² + V_i))]
+    S = 1/N Σ_i log[(1 − ε) N(P r_i; 0, P V_i P) + ε N(P s_i; 0, P diag(v + V_i) P)],  r_i = y_i − E z(x_i),
 
-with m_i = E z(x_i), V_i = Var z(x_i) + Σ, and the mean ȳ and variance s² of all measurements. The second term
-limits the weight of a row that no candidate explains, such as one with a wrong contact label. Candidates are
-compared by the differences of S over blocks of rows, which also give a standard error. The simplest candidate
-within one standard error of the best is selected. If the residuals of the best are correlated so much that
-there are only κ n < `FEWEST` independent samples, each of its additional k parameters must also gain
-½ ln(κ n)/κ n nats per sample (Schwarz, *Estimating the dimension of a model*, 1978). No candidate depends on
-the motor torque. In closed loop, such a residual learns to cancel the torque and appears to have the best
-density.
+with V_i = Var z(x_i) + Σ, the mean ȳ and variance v of all measurements, and s_i = y_i − ȳ. P = 1 − A⁺A
+removes the accelerations that closed contacts fix. Training omits them too: all candidates predict the same,
+and a contact that is not perfectly rigid misses it by thousands of σ. The second term limits the weight of a
+row that no candidate explains, such as one with a wrong contact label.
+
+Candidates are compared by the differences of S over blocks of rows, which also give a standard error. The
+simplest candidate within one standard error of the best is selected. If the residuals of the best are
+correlated so much that there are only κ n < `FEWEST` independent samples, each of its additional k parameters
+must also gain ½ ln(κ n)/κ n nats per sample (Schwarz, *Estimating the dimension of a model*, 1978). No
+candidate depends on the motor torque. In closed loop, such a residual learns to cancel the torque and appears
+to have the best density.
 """
 
 from __future__ import annotations
@@ -55,8 +58,8 @@ ROWS = 400
 """Number of evenly spaced rows in each half on which a candidate is conditioned or tested."""
 LEARN_ROWS = 150
 """Number of rows for learning hyperparameters if a prior has infinitely many features."""
-OUTLIERS = 1e-3
-"""Fraction ε of rows that the model is not expected to explain."""
+OUTLIERS = 1e-12
+"""Fraction ε of rows that no candidate explains. It is so small that only impossible rows lose weight."""
 QUICK = LearningOptions(tolerance=1e-5, max_evaluations=150)
 """Learning options for candidates. The tolerance can be loose, since their scores differ clearly."""
 DROPPED = 2.0
@@ -295,19 +298,26 @@ def log_density(fit: StructuredFit, test: Training) -> tuple[Tensor, float]:
     densities, within = [], []
     for m in judged:
         prediction = fit.predict(m.q, m.qd, m.tau, m.quantity, active=m.active, noise=True)
-        # Σ = L Lᵀ
-        L, info = torch.linalg.cholesky_ex(prediction.covariance)
-        if bool(info.any()):
-            raise NumericalError("a predictive covariance is not positive definite")
-        normal = torch.distributions.MultivariateNormal(prediction.mean, scale_tril=L, validate_args=False)
-        spread = (m.values.var(0) + prediction.variance).sqrt()
-        any_row = torch.distributions.Normal(m.values.mean(0), spread).log_prob(m.values).sum(-1)
-        # log[(1 − ε) N(y; m, V) + ε N(y; ȳ, diag(s² + V))]
-        own = normal.log_prob(m.values) + math.log1p(-OUTLIERS)
-        densities.append(torch.logaddexp(own, any_row + math.log(OUTLIERS)))
+        P = torch.eye(m.values.shape[-1], dtype=m.values.dtype, device=m.values.device)
+        if m.quantity == "qdd" and fit.system.m:
+            A = fit.system.equations(m.q, m.qd, m.active).A
+            P = P - torch.linalg.pinv(A) @ A
+        own = _density(m.values - prediction.mean, prediction.covariance, P)
+        spread = torch.diag_embed(m.values.var(0) + prediction.variance)
+        any_row = _density(m.values - m.values.mean(0), spread, P)
+        densities.append(torch.logaddexp(own + math.log1p(-OUTLIERS), any_row + math.log(OUTLIERS)))
         assert prediction.std is not None
         within.append(((m.values - prediction.mean).abs() <= 2.0 * prediction.std).flatten())
     return torch.cat(densities), float(torch.cat(within).double().mean())
+
+
+def _density(r: Tensor, V: Tensor, P: Tensor) -> Tensor:
+    """Return log N(P r; 0, P V P + 1 − P) `(n,)`, which is constant in the directions that P removes."""
+    L, info = torch.linalg.cholesky_ex(P @ V @ P + torch.eye(P.shape[-1], dtype=P.dtype, device=P.device) - P)
+    if bool(info.any()):
+        raise NumericalError("a predictive covariance is not positive definite")
+    normal = torch.distributions.MultivariateNormal(torch.zeros_like(r), scale_tril=L, validate_args=False)
+    return normal.log_prob((P @ r[..., None])[..., 0])
 
 
 def blocks_of(density: Tensor) -> Tensor:
