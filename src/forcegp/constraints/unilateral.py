@@ -169,12 +169,7 @@ def land(system: ConstrainedSystem, q: Tensor, qd: Tensor, closed: Tensor) -> La
 
 
 def contact_forces(
-    system: ConstrainedSystem,
-    q: Tensor,
-    qd: Tensor,
-    landing: Landing,
-    Q_u: Tensor,
-    viscous_friction: float,
+    system: ConstrainedSystem, q: Tensor, qd: Tensor, landing: Landing, Q_u: Tensor, viscous_friction: float
 ) -> ContactForces:
     """Return the normal and friction forces at a state `(nq,)` under the torque Q_u [N m].
 

@@ -301,10 +301,7 @@ class Search:
     recorded: Callable[[Objective], Objective] = lambda objective: objective
 
     def solve(
-        self,
-        problem: Problem,
-        progress: Progress | None = None,
-        begin: Mapping[str, Tensor] | None = None,
+        self, problem: Problem, progress: Progress | None = None, begin: Mapping[str, Tensor] | None = None
     ) -> Learned:
         """Learn the hyperparameters, with warm starts and restarts as requested by the options.
 

@@ -312,10 +312,7 @@ class LatentBasis:
 
 
 def latent_basis(
-    processes: Sequence[Process],
-    params: Parameters,
-    inducing: Sequence[Features],
-    components: Sequence[int],
+    processes: Sequence[Process], params: Parameters, inducing: Sequence[Features], components: Sequence[int]
 ) -> LatentBasis:
     """Return the basis functions of processes with given inducing points.
 

@@ -35,12 +35,7 @@ from forcegp.forces.priors.joint import AnalyticalMean, JointFrictionPrior
 from forcegp.forces.quantities import States, states_at
 from forcegp.identification import regressor
 from forcegp.models.structured_fit import StructuredFit
-from forcegp.robot.inertia import (
-    from_pseudo_inertia,
-    inertial_parameters,
-    pseudo_inertia,
-    pseudo_inertia_of,
-)
+from forcegp.robot.inertia import from_pseudo_inertia, inertial_parameters, pseudo_inertia, pseudo_inertia_of
 from forcegp.robot.model import RobotModel
 from forcegp.robot.write_back import is_mjcf, write_robot
 

@@ -16,13 +16,7 @@ from forcegp.models.base import FittedModel
 from forcegp.models.independent_gp import IndependentFit
 from forcegp.models.neural import NetworkFit
 from forcegp.models.structured_fit import StructuredFit
-from forcegp.storage.model_file import (
-    ModelHeader,
-    model_bytes,
-    model_path,
-    parse_model,
-    read_model,
-)
+from forcegp.storage.model_file import ModelHeader, model_bytes, model_path, parse_model, read_model
 from forcegp.storage.system import PREFIX, unpack_system
 
 KINDS: dict[str, type[FittedModel]] = {

@@ -322,13 +322,7 @@ class Predictor(ForwardModel):
         return linearize_field(force, system or self.system, q, qd, tau, active)
 
     def rollout(
-        self,
-        q0: Tensor,
-        qd0: Tensor,
-        tau: Torque,
-        duration: float = 10.0,
-        samples: int = 0,
-        **settings: Any,
+        self, q0: Tensor, qd0: Tensor, tau: Torque, duration: float = 10.0, samples: int = 0, **settings: Any
     ) -> Rollout:
         """Predict trajectories from initial states (section 4), as in `forcegp.rollout.rollout_model`.
 

@@ -208,10 +208,7 @@ class StructuredFit(FittedModel):
         return external_wrench(self, data, WrenchFrame(frame, **components), method, external)
 
     def _exported(
-        self,
-        functions: int | None,
-        wrench: WrenchFrame | None = None,
-        dtype: torch.dtype = torch.float64,
+        self, functions: int | None, wrench: WrenchFrame | None = None, dtype: torch.dtype = torch.float64
     ) -> ExportedModel:
         if functions is not None and functions < 1:
             raise ModelError("at least one function must be drawn", expected="1 or more", got=functions)

@@ -356,11 +356,7 @@ class LearnedMotion(Mean):
         return M_inv, S, M_inv @ self.A.T @ S
 
     def _motion(
-        self,
-        rest: Scalars,
-        terms: Sequence[str],
-        U: Scalars | None = None,
-        pulled: bool = True,
+        self, rest: Scalars, terms: Sequence[str], U: Scalars | None = None, pulled: bool = True
     ) -> Motion:
         """Return the motion M q̈ = Q_C + Q_G + rest + (A + U)ᵀ λ, A q̈ = b, and its derivatives.
 
