@@ -87,8 +87,7 @@ class FlatStates(NamedTuple):
 
     def with_equations(self, system: ConstrainedSystem) -> States:
         """Return the states with their equations of motion."""
-        eom = system.equations(self.q, self.qd, self.active)
-        return States(self.q, self.qd, self.tau, self.active, eom)
+        return states(system, self.q, self.qd, self.tau, self.active)
 
 
 def flat_states(

@@ -128,8 +128,7 @@ def accumulate(basis: LatentBasis, blocks: Iterable[Block], chunk: int = CHUNK_S
         total = Sums.zero(basis, block.target) if total is None else total
         _add(basis, block, total)
     if total is None:
-        like = next(iter(basis.params.values()))
-        return Sums.zero(basis, like)
+        return Sums.zero(basis, next(iter(basis.params.values())))
     # G = Gᵀ, from its upper triangle
     total.G.copy_(torch.triu(total.G) + torch.triu(total.G, 1).mT)
     return total

@@ -104,10 +104,8 @@ class AnalyticalModel(Model["AnalyticalFit"]):
         start = {name: value.detach().clone() for name, value in theta.named_parameters()}
 
         def loss(tensors: Mapping[str, Tensor], rows: Tensor) -> Tensor:
-            system, part = (
-                self.system.with_robot(torch.func.functional_call(theta, dict(tensors), ())),
-                measured[rows],
-            )
+            system = self.system.with_robot(torch.func.functional_call(theta, dict(tensors), ()))
+            part = measured[rows]
             eom = system.equations(part.q, part.qd, part.active)
             return ((eom.acceleration(eom.Q_K + part.tau) - part.values) ** 2).mean()
 

@@ -38,7 +38,6 @@ LEAST_NOISE = 1e-9
 """Minimum velocity noise, which exceeds rounding errors [rad/s, m/s]."""
 THRESHOLD = 5.0
 """Number of standard deviations beyond which a contact is detected."""
-
 BLOCK, LEAST_BLOCKS = 0.5, 20
 """Length of blocks with independent maxima of d² [s]; minimum number of blocks for estimating a tail."""
 

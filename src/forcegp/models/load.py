@@ -87,9 +87,5 @@ def register() -> None:
 
 
 def _sent(model: FittedModel) -> tuple[Any, ...]:
-    """Return a function and its arguments, which restore a model from the content of its file.
-
-    Raises:
-        ModelError: a part of the model is defined in Python.
-    """
+    """Return a function and its arguments, which restore a model from the content of its file."""
     return model_of_bytes, (model_bytes(model.kind, model.system, *model.record()),)

@@ -34,8 +34,6 @@ CHECKED = 1 << 16
 """Number of covariances checked at a time."""
 MOST_SAMPLES = 2000
 """Maximum number of samples in a plot; more would be indistinguishable."""
-
-
 NEGATIVE = 0.01
 """Magnitude, relative to the variances, below which a negative eigenvalue counts as a rounding error."""
 ROUNDING = 1e-12

@@ -509,11 +509,7 @@ class StructuredFit(FittedModel):
 
 
 def _without(added: tuple[Tensor, ...], removed: Tensor) -> tuple[Tensor, ...]:
-    """Return the digests of the samples that remain after some have been removed.
-
-    Raises:
-        ModelError: a removed sample is not in `added`.
-    """
+    """Return the digests of the samples that remain after some have been removed."""
     values, counts = torch.cat([*added, removed]).unique(return_counts=True)
     _, own = torch.cat([values, removed]).unique(return_counts=True)
     left = counts - 2 * (own - 1)

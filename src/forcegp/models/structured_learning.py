@@ -70,7 +70,6 @@ FEWEST_MOVING = 20
 """Number of samples in motion below which samples at rest are also kept."""
 FIRST_POWER = 0.25
 """Exponent of the tempered likelihood before the correlation of the residuals is known."""
-
 ROUNDS = 3
 """Maximum number of times that hyperparameters are relearned after updates based on the residuals."""
 

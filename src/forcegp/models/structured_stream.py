@@ -163,9 +163,7 @@ class Pass:
             NumericalError: the sums are not finite.
         """
         basis, begin = basis_of(problem, hyperparameters), None
-        saved = None
-        if self.checkpoint is not None:
-            saved = Checkpoint(self._own_file(), self._key(problem, hyperparameters))
+        saved = Checkpoint(self._own_file(), self._key(problem, hyperparameters)) if self.checkpoint else None
         kept, refused = {}, None
         if saved is not None:
             try:

@@ -229,11 +229,7 @@ class SlidingFrictionPrior(SurfaceForcePrior):
         return torch.stack([columns[term] for term in self.terms], dim=-1)
 
     def _load(self, system: ConstrainedSystem, at: States, u: Tensor) -> Tensor:
-        """Return the multiplier `(n, 1)` under the analytical forces and the friction μ̂ λ u.
-
-        Raises:
-            ModelError: this friction jams the contact.
-        """
+        """Return the multiplier `(n, 1)` under the analytical forces and the friction μ̂ λ u."""
         contact = system.contact_names.index(self.contact)
         row = system.rows[self.contact].start
         free = at.eom.multiplier(at.eom.Q_K + at.tau)[:, row].clamp(min=0.0)
@@ -299,8 +295,6 @@ class NormalForcePrior(ForcePrior):
 
 SHARP = 1e-6
 """Smoothing speed at which friction has almost its full magnitude [m/s]."""
-
-
 FRICTION_COEFFICIENT = 0.2
 """Initial value of a learned friction coefficient."""
 NEARLY_JAMMED = 0.95
@@ -382,10 +376,8 @@ class CoulombErrorPrior(ConstantForcePrior):
         if self.contact not in system.contact_names:
             return at.q.new_zeros(*at.q.shape, LEARNED)
         law = next(f for f in self.friction if f.contact == self.contact)
-        v, u = (
-            at.eom.contact_points[self.contact].sliding[1],
-            against_sliding(at, self.contact, law.smoothing),
-        )
+        v = at.eom.contact_points[self.contact].sliding[1]
+        u = against_sliding(at, self.contact, law.smoothing)
         # μ λ̂, with λ̂ under Q_C + Q_G + Q_D + Q_u and all friction
         Q_bar = with_coulomb(system, at, at.eom.Q_K + at.tau, self.friction)
         load = law.coefficient * at.eom.multiplier(Q_bar)[:, system.rows[self.contact].start]

@@ -79,13 +79,9 @@ def write_export(
     where = "training" if training.samples else "random"
     loss = f"It is reduced: at {where} states, σ of q̈ and λ increases by a fraction\n"
     loss += f"of at most {result.widest:.2g} (median: {result.wider:.2g}). The mean is unchanged."
-    rounding = (
-        "Single precision: at {} states, the mean of q̈ and λ errs by at most {:.2g} of max(|mean|, σ),\n"
-    )
-    rounding = (
-        rounding.format(where, result.rounding[0])
-        + f"and σ by at most a fraction of {result.rounding[1]:.2g}."
-    )
+    in_mean, in_std = result.rounding
+    rounding = f"Single precision: at {where} states, the mean of q̈ and λ errs by at most {in_mean:.2g} "
+    rounding += f"of max(|mean|, σ),\nand σ by at most a fraction of {in_std:.2g}."
     coarse = model.dtype == torch.float32
     fields = {
         "real": "float" if coarse else "double",
@@ -216,11 +212,8 @@ class _Posterior(torch.nn.Module):
         self.fit = fit
 
     def forward(self, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor) -> tuple[Tensor | None, ...]:
-        flat, query = (
-            FlatStates(q, qd, tau, active, q.shape[:-1]),
-            Query(("qdd", "multiplier"), None, True, False),
-        )
-        return self.fit.at(flat, query)[0][:3]
+        query = Query(("qdd", "multiplier"), None, True, False)
+        return self.fit.at(FlatStates(q, qd, tau, active, q.shape[:-1]), query)[0][:3]
 
 
 @torch.no_grad()

@@ -39,16 +39,8 @@ from forcegp.rollout import law
 
 NO_FRICTION = 10
 """Error code of the C code if no dry friction solves the problem in `rollout/law.py`."""
-LAW = (
-    "REGULARIZATION",
-    "CONTRADICTION",
-    "BLOCK_TRIALS",
-    "MAX_EXCHANGES",
-    "INSTANT",
-    "STILL",
-    "SMOOTH",
-    "NUDGE",
-)
+LAW = ("REGULARIZATION", "CONTRADICTION", "BLOCK_TRIALS", "MAX_EXCHANGES")
+LAW += ("INSTANT", "STILL", "SMOOTH", "NUDGE")
 READ = (*QUANTITIES, "joint_friction")
 """Quantities of the C code, in the order of their bits. Only the last is not in `QUANTITIES`."""
 STEPS = 2e-5, 1e-3
@@ -70,9 +62,8 @@ def c_source(model: ExportedModel, name: str, rollout: bool = False) -> tuple[st
     helpers, after = rest.split("/* PRIORS */\n")
     writer = Writer(model, rollout)
     priors = writer.priors()
-    used = (
-        text for text in helpers.strip().split("\n\n")[1:] if any(f" {_called(text)}(" in x for x in priors)
-    )
+    each = helpers.strip().split("\n\n")[1:]
+    used = (text for text in each if any(f" {_called(text)}(" in x for x in priors))
     head = GUIDE + '#include <math.h>\n#include <string.h>\n#include "forcegp.h"\n'
     head += "#ifdef __cplusplus\n#define restrict __restrict__\n#endif\n"
     blocks = [head, "\n".join(writer.lines), *_programs(writer.mean, rollout), before, *used, *priors, after]
@@ -467,10 +458,8 @@ class KernelCode:
         if isinstance(kernel, kernels.Stationary):
             return f"{leaf.size!r} * {leaf.u}[j]", repr(leaf.size)
         square = " + ".join(f"({a}) * ({a})" for a in self._x(leaf, k))
-        return (
-            f"({leaf.size!r} * {leaf.u}[j] + {leaf.bias!r})",
-            f"({leaf.size!r} * ({square}) + {leaf.bias!r})",
-        )
+        both = (f"({leaf.size!r} * {x} + {leaf.bias!r})" for x in (f"{leaf.u}[j]", f"({square})"))
+        return next(both), next(both)
 
     def slopes(self, part: KernelPart, k: int, value: str, f: str, slope: str) -> list[str]:
         """Return the code for f = Σ w_j k(x, z_j) and ∂f/∂x for component k."""
