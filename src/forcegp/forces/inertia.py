@@ -337,10 +337,8 @@ def _drives(given: NormalEquations, noise: Tensor, M: Tensor, weight: float) -> 
         slope = np.linalg.inv(moved).diagonal(axis1=-2, axis2=-1).mean(0)
         return float(value), H @ x - h - weight * slope
 
-    start = np.zeros(len(h))
-    found = scipy.optimize.minimize(
-        objective, start, jac=True, method="L-BFGS-B", bounds=[(0.0, None)] * len(h)
-    )
+    start, bounds = np.zeros(len(h)), [(0.0, None)] * len(h)
+    found = scipy.optimize.minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds)
     return torch.from_numpy(found.x).to(scale) * scale
 
 

@@ -72,9 +72,8 @@ def initial(problem: Problem, learn_noise: bool, learn_torque_noise: bool = Fals
     if problem.has_coulomb:
         start = _with_friction(few, noise)
     else:
-        start = initial_hyperparameters(
-            problem.priors, few.fixed_rows.blocks, problem.external_std is not None
-        )
+        beyond_noise = problem.external_std is not None
+        start = initial_hyperparameters(problem.priors, few.fixed_rows.blocks, beyond_noise)
     for prior in problem.priors:
         parameters = prior.initial_parameters(problem.system.robot)
         start |= {f"{prior.name}.{name}": value for name, value in parameters.items()}

@@ -181,11 +181,9 @@ def _common(
     if isinstance(kernel, Product):
         left, right = (_common(side, theta, X) for side, theta in kernel.parts(params))
         if left is not None and right is not None:
-            functions_of = (left[0], right[0])
-            return (
-                lambda x: [a * b for a, b in product(*(functions(x) for functions in functions_of))],
-                [a * b for a, b in product(left[1], right[1])],
-            )
+            f, g = left[0], right[0]
+            sizes = [a * b for a, b in product(left[1], right[1])]
+            return lambda x: [a * b for a, b in product(f(x), g(x))], sizes
     return None
 
 

@@ -141,9 +141,7 @@ def _add(basis: LatentBasis, block: Block, into: Sums) -> None:
     W = torch.cat(block.operators, dim=-1)
     S, c = (W.mT @ W).permute(1, 2, 0).contiguous(), (W.mT @ block.target[..., None])[..., 0]
     weighted = torch.empty_like(V)
-    active = [
-        k for k in range(len(S)) if basis.columns[k].stop > basis.columns[k].start and bool(S[k, k].any())
-    ]
+    active = [k for k, at in enumerate(basis.columns) if at.stop > at.start and bool(S[k, k].any())]
     for position, k in enumerate(active):
         # G_kl += Σ_i V_k S_kl V_lᵀ, v_k += Σ_i V_k c_k
         of_k = basis.columns[k]

@@ -174,10 +174,8 @@ class AnalyticalFit(FittedModel):
         with ModelError.within(f"{source}: field 'settings.analytical_parameters'"):
             model = AnalyticalModel(original, settings.analytical_parameters, window, settings.seed)
         theta = model.parameters
-        state = {
-            name: take(tensors, name, tuple(old.shape), old.dtype, source)
-            for name, old in theta.state_dict().items()
-        }
+        old = theta.state_dict()
+        state = {key: take(tensors, key, tuple(x.shape), x.dtype, source) for key, x in old.items()}
         theta.load_state_dict(state)
         result = FitResult(True, 0, 0.0, 0.0, message="loaded")
         return cls(system, theta, window, settings.seed, result)

@@ -459,9 +459,8 @@ class _Reader:
             if isinstance(prior, kind):
                 one = {name: x[:1] for name, x in self._features(p).items()}
                 mean = self.fit.posterior.means.latent_mean(p, one)
-                return torch.cat(
-                    [mean, drawn.functions.latent(p, one)[:, 0] + self.fit.posterior.shift(p, one)]
-                )
+                samples = drawn.functions.latent(p, one)[:, 0]
+                return torch.cat([mean, samples + self.fit.posterior.shift(p, one)])
         return self.speeds.new_zeros(1 + drawn.count, 0)
 
     def _gain_errors(self, draws: int) -> Tensor:

@@ -266,11 +266,9 @@ class Reading:
                 hint='fit more samples in time order, with force_priors="friction"',
             )
         noise, segment = velocity_noise(self.data), self.data.segment
-        logs = [
-            self.momenta((segment == own).nonzero()[:, 0], noise, correlation)
-            for own in segment.unique_consecutive()
-        ]
-        mean, covariance = zip(*(observe(log) for log in logs), strict=True)
+        rows = ((segment == own).nonzero()[:, 0] for own in segment.unique_consecutive())
+        logs = (self.momenta(own, noise, correlation) for own in rows)
+        mean, covariance = zip(*map(observe, logs), strict=True)
         mean, covariance = (torch.from_numpy(np.concatenate(x)).to(self.data.q) for x in (mean, covariance))
         return mean, covariance
 

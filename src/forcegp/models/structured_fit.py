@@ -259,9 +259,8 @@ class StructuredFit(FittedModel):
             DestinationError: the folder cannot be written, or contains other files.
             MissingDependencyError: CasADi is not installed.
         """
-        return write_export(
-            self._exported(functions, wrench, dtype), self, self.training, path, language, name
-        )
+        model = self._exported(functions, wrench, dtype)
+        return write_export(model, self, self.training, path, language, name)
 
     def compiled(self, *, functions: int | None = None, wrench: WrenchFrame | None = None) -> CompiledFit:
         """Compile the fit to a fast predictor in C with the local compiler.

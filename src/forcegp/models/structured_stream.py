@@ -205,9 +205,8 @@ class Pass:
             if len(piece) == 0:
                 yield problem.training.of_rows([torch.arange(0)] * len(problem.training.measurements))
             else:
-                rows = training_of(
-                    piece, self.spec.system, problem.priors, self.spec.noise.acceleration, kept
-                )
+                noise_std = self.spec.noise.acceleration
+                rows = training_of(piece, self.spec.system, problem.priors, noise_std, kept)
                 yield without_delay(rows, problem.priors)
 
     def _own_file(self) -> Path:

@@ -32,8 +32,6 @@ FEW = 8
 """Number of trajectories up to which one thread is used. More threads are slower on small tensors."""
 COMPILED_STEPS = 1000
 """Number of steps above which compiled mechanics save more time than their compilation takes."""
-STABILIZATIONS = ("none", "baumgarte", "projection")
-ON_DIVERGENCE = ("raise", "keep")
 
 
 @dataclass(frozen=True)
@@ -85,9 +83,9 @@ class RolloutOptions:
                     f"the rollout's {name} is out of range", expected="a positive finite number", got=value
                 )
         check_name("method of integration", self.method, METHODS)
-        check_name("on_divergence", self.on_divergence, ON_DIVERGENCE)
+        check_name("on_divergence", self.on_divergence, ("raise", "keep"))
         if not isinstance(self.stabilization, Baumgarte):
-            check_name("stabilization", self.stabilization, STABILIZATIONS)
+            check_name("stabilization", self.stabilization, ("none", "baumgarte", "projection"))
 
     def stabilized(self, system: ConstrainedSystem) -> ConstrainedSystem:
         """Return the system with the stabilization terms of the rollout on the right-hand side."""

@@ -245,10 +245,8 @@ class SlidingFrictionPrior(SurfaceForcePrior):
         """Return the generalized force `(n, nq)` of a unit moment that opposes rotation about the normal."""
         contact = system.contact(self.contact)
         assert isinstance(contact, SurfaceContact)
-        index, origin = (
-            system.robot.frame_index(contact.frame),
-            kinematics.as_point(system.robot, contact.point),
-        )
+        index = system.robot.frame_index(contact.frame)
+        origin = kinematics.as_point(system.robot, contact.point)
         angular = kinematics.jacobian_of_poses(system.robot, at.eom.poses, index, origin)[..., :3, :]
         about = (at.eom.contact_points[self.contact].unit_normal[..., None, :] @ angular)[..., 0, :]
         rate = (about * at.qd).sum(-1, keepdim=True)
@@ -450,9 +448,8 @@ def below_jamming(
         if key in changed:
             # Lᵀu, the load relief by a unit friction force
             states = (m.at(system) for m in measurements)
-            gains = [
-                (at.eom.L[..., row] * against_sliding(at, prior.contact, SHARP)).sum(-1) for at in states
-            ]
+            pairs = ((at.eom.L[..., row], against_sliding(at, prior.contact, SHARP)) for at in states)
+            gains = [(L * u).sum(-1) for L, u in pairs]
             # 1 + μ Lᵀu > 0, so μ < −1/Lᵀu wherever Lᵀu < 0
             worst = float(torch.cat(gains).min())
             low, high = changed[key]

@@ -141,10 +141,8 @@ def _programs(mean: LearnedMotion, rollout: bool) -> list[str]:
     blocks = [mean.M, mean.Q_C, mean.Q_G, mean.Q_D, *(x for at in mean.touching for x in at), *mean.x]
     outputs = [x for block in blocks for x in block.flat]
     outputs += [x for features in mean.phi for phi in features for x in phi]
-    programs = {
-        "mechanics": mean.program(outputs, ARGUMENTS[:3]),
-        "forward_dynamics": trace(robot, "forward_dynamics"),
-    }
+    programs = {"mechanics": mean.program(outputs, ARGUMENTS[:3])}
+    programs["forward_dynamics"] = trace(robot, "forward_dynamics")
     if any(isinstance(part.prior, InertialPrior | PayloadPrior) for part in mean.parts):
         programs["regressor"] = regressor_program(Links(robot))
     if mean.model.wrench is not None and not rollout:
@@ -276,9 +274,8 @@ class Writer:
         self.array([part.size for part in parts for _ in range(part.components)], "POINTS", "int")
         self.array(self.starts, "FIRST_COMPONENT", "int")
         self.array(variance, "LEARNED_TORQUE_VARIANCE")
-        self.lines.append(
-            f"enum {{ PRIOR_COUNT = {len(parts)}, GROUP = CONTACTS * 3 > NQ ? CONTACTS * 3 : NQ }};"
-        )
+        group = "CONTACTS * 3 > NQ ? CONTACTS * 3 : NQ"
+        self.lines.append(f"enum {{ PRIOR_COUNT = {len(parts)}, GROUP = {group} }};")
         self.lines.append(f"static const double REST_SPEED = {REST_SPEED if moving else -1.0!r};")
         self.lines.append(f"static const double TEMPERING = {power**0.5!r};")
 
@@ -524,7 +521,6 @@ class KernelCode:
             return [*lines, f"  combine({leaf.table}, x_{u}, {len(x)}, {m}, {u});"]
         lines.append(f"  squares(x_{u}, {leaf.table}, {len(x)}, {m}, {u});")
         if self.differentiate:
-            lines.append(
-                f"  double d_{u}[{m}];\n  memcpy(d_{u}, {u}, sizeof {u});\n  {kind}_slope(d_{u}, {m});"
-            )
+            lines.append(f"  double d_{u}[{m}];\n  memcpy(d_{u}, {u}, sizeof {u});")
+            lines.append(f"  {kind}_slope(d_{u}, {m});")
         return [*lines, f"  {kind}({u}, {m});"]
