@@ -114,8 +114,7 @@ def _model(model: Path | None, scene: str | None, config: Path | None, train: Pa
         return forcegp.load_model(model)
     if scene is None or train is None:
         raise ForceGPError(
-            "no model to evaluate was given",
-            expected="--model FILE, or --scene and --train to fit one",
+            "no model to evaluate was given", expected="--model FILE, or --scene and --train to fit one"
         )
     system = forcegp.load_scene(scene).system()
     regression = configured(model_table(config, scene), system)

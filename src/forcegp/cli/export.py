@@ -109,8 +109,7 @@ def _written_back(
 
     if robot is None:
         raise ModelError(
-            "no robot file was given",
-            expected="--robot my.urdf, the file that the robot was loaded from",
+            "no robot file was given", expected="--robot my.urdf, the file that the robot was loaded from"
         )
     if is_mjcf(robot) != (to == "mjcf"):
         raise RobotFileError(

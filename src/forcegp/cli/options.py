@@ -26,12 +26,10 @@ SimulatedTime = Annotated[
     float | None, typer.Option("--duration", help="Simulated time in seconds; default: from the scene.")
 ]
 Config = Annotated[
-    Path | None,
-    typer.Option(help="TOML file with a \\[model] table that replaces the one in the scene."),
+    Path | None, typer.Option(help="TOML file with a \\[model] table that replaces the one in the scene.")
 ]
 DataFiles = Annotated[
-    list[Path],
-    typer.Option("--data", "-d", help="Data set (.parquet or .csv); may be given several times."),
+    list[Path], typer.Option("--data", "-d", help="Data set (.parquet or .csv); may be given several times.")
 ]
 Differentiate = Annotated[
     int | None,

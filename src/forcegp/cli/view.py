@@ -35,8 +35,7 @@ def view(
     start: Annotated[int, typer.Option(min=0, help="Row of the log to start from.")] = 0,
     seconds: Annotated[float, typer.Option(min=0.05, help="Duration of the motion in seconds.")] = 10.0,
     samples: Annotated[
-        int,
-        typer.Option(min=0, help="Number of sampled tip paths to draw (structured models only)."),
+        int, typer.Option(min=0, help="Number of sampled tip paths to draw (structured models only).")
     ] = 8,
     horizon: Annotated[
         float, typer.Option(min=0.01, help="Duration of the predicted paths in seconds.")

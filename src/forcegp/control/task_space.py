@@ -124,13 +124,7 @@ def joint_acceleration(tool: PointMotion, task: Tensor, posture: Tensor) -> Tens
 
 
 def control_torque(
-    tool: PointMotion,
-    eom: Any,
-    q: Tensor,
-    qd: Tensor,
-    target: Target,
-    press: Tensor,
-    gains: Gains,
+    tool: PointMotion, eom: Any, q: Tensor, qd: Tensor, target: Target, press: Tensor, gains: Gains
 ) -> Tensor:
     """Return the motor torque Q_u = M y − Q_K − Q_n F of inverse-dynamics control, before limits [N m].
 

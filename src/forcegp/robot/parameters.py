@@ -78,12 +78,7 @@ class AnalyticalParameters(nn.Module):
         return self.start.replace(**fields)
 
     def reset(
-        self,
-        generator: torch.Generator,
-        *,
-        relative: float = 0.0,
-        length: float = 0.0,
-        angle: float = 0.0,
+        self, generator: torch.Generator, *, relative: float = 0.0, length: float = 0.0, angle: float = 0.0
     ) -> None:
         """Draw all coordinates uniformly from intervals around the initial robot.
 

@@ -25,15 +25,7 @@ from forcegp.robot.inertia import from_pseudo_inertia, pseudo_inertia
 from forcegp.robot.load import read_tree, robot_of, robot_path
 from forcegp.robot.model import RobotModel
 from forcegp.robot.safety import parse_xml, read_bytes
-from forcegp.robot.tree import (
-    Inertial,
-    Tree,
-    checked,
-    inertia_doubt,
-    inertia_error,
-    lock_joints,
-    transform,
-)
+from forcegp.robot.tree import Inertial, Tree, checked, inertia_doubt, inertia_error, lock_joints, transform
 
 CHANGED = 1e-6
 """Relative change in a parameter below which the text in the file is preserved."""

@@ -177,11 +177,7 @@ def simulate(
 
 
 def _follow(
-    system: ConstrainedSystem,
-    config: SimulationConfig,
-    plan: Plan,
-    engine: Engine,
-    progress: Progress | None,
+    system: ConstrainedSystem, config: SimulationConfig, plan: Plan, engine: Engine, progress: Progress | None
 ) -> RunLog:
     """Step the engine through the plan."""
     log, limit = RunLog.empty(config.steps, system), _torque_limit(system, config)

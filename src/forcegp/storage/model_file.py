@@ -98,11 +98,7 @@ def model_bytes(
 
 
 def write_model(
-    path: str | Path,
-    kind: str,
-    system: ConstrainedSystem,
-    settings: Record,
-    tensors: Mapping[str, Tensor],
+    path: str | Path, kind: str, system: ConstrainedSystem, settings: Record, tensors: Mapping[str, Tensor]
 ) -> None:
     """Write a model file atomically; raise `DestinationError` if the path is not writable."""
     data = model_bytes(kind, system, settings, tensors)
