@@ -6,7 +6,7 @@ from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Option
 
 import forcegp
 from forcegp.cli.common import check_data_destination, progress_bar, read_data, save, show, warn_beyond
@@ -28,10 +28,10 @@ WRENCH = "external_wrench"
 def predict(
     model: ModelFile,
     data: DataFile,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Output file for the predictions (.parquet).")],
+    out: Annotated[Path, Option("--out", "-o", help="Output file for the predictions (.parquet).")],
     quantity: Annotated[
         str,
-        typer.Option(
+        Option(
             "--quantity",
             "-q",
             help="qdd, qdd_free, multiplier, constraint_force, contact_force, total_force, joint_force, "
@@ -39,19 +39,18 @@ def predict(
         ),
     ] = "qdd",
     frame: Annotated[
-        str | None,
-        typer.Option(help="Frame on which an external_wrench acts; no declared contact is needed."),
+        str | None, Option(help="Frame on which an external_wrench acts; no declared contact is needed.")
     ] = None,
-    reference: Annotated[str, typer.Option(help="Axes of an external_wrench: world or local.")] = "world",
+    reference: Annotated[str, Option(help="Axes of an external_wrench: world or local.")] = "world",
     momentum: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--momentum", help="Estimate external_wrench with a causal filter that needs no accelerations."
         ),
     ] = False,
     noise: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--noise/--no-noise",
             help="Whether the standard deviation is that of a measurement and includes motor-torque and "
             "sensor noise (for models with such noise).",
@@ -59,9 +58,7 @@ def predict(
     ] = True,
     sensor: Annotated[
         bool,
-        typer.Option(
-            "--sensor", help="Predict λ using also the log's force sensor (fit with sensor_noise_std)."
-        ),
+        Option("--sensor", help="Predict λ using also the log's force sensor (fit with sensor_noise_std)."),
     ] = False,
     as_json: AsJson = False,
 ) -> None:

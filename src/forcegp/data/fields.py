@@ -203,18 +203,14 @@ def _check_names(data: Fields) -> None:
 def _check_type(name: str, value: Tensor, like: Tensor) -> None:
     if not value.is_floating_point() or value.dtype != like.dtype or value.device != like.device:
         wanted = f"{like.dtype} on {like.device}" if like.is_floating_point() else "a floating-point type"
-        raise DataError(
-            f"column {name!r} is of another type or on another device than 't'",
-            expected=wanted,
-            got=f"{value.dtype} on {value.device}",
-        )
+        text = f"column {name!r} is of another type or on another device than 't'"
+        raise DataError(text, expected=wanted, got=f"{value.dtype} on {value.device}")
 
 
 def _check_shape(name: str, value: Tensor, shape: tuple[int, ...], meaning: str) -> None:
     if tuple(value.shape) != shape:
-        raise DataError(
-            f"column {name!r} has the wrong shape", expected=f"{shape}, {meaning}", got=tuple(value.shape)
-        )
+        text = f"column {name!r} has the wrong shape"
+        raise DataError(text, expected=f"{shape}, {meaning}", got=tuple(value.shape))
 
 
 def check_values(data: Fields) -> None:
@@ -314,10 +310,8 @@ def check_robot(data: Fields, robot: RobotModel) -> None:
     """Check that joints match, and warn if robot parameters differ or if angles may be in degrees."""
     check_joints(data.joint_names, robot.joint_names, robot.name)
     q, free = data.q.to(robot.lower) * robot.revolute, torch.full_like(robot.lower, MOST_RADIANS)
-    low, high = (
-        robot.lower.where(robot.lower.isfinite(), -free),
-        robot.upper.where(robot.upper.isfinite(), free),
-    )
+    low = robot.lower.where(robot.lower.isfinite(), -free)
+    high = robot.upper.where(robot.upper.isfinite(), free)
     beyond, most = int(((q < low) | (q > high)).any(-1).sum()), float(q.abs().max()) if len(data) else 0.0
     if most > TURN and 2 * beyond > len(data):
         warnings.warn(
@@ -379,11 +373,8 @@ def check_alike(parts: Sequence[Fields]) -> None:
     for number, part in enumerate(parts[1:], start=1):
         for what, value in layout(part).items():
             if value != first[what]:
-                raise DataError(
-                    f"the {what} of data set {number} differ from those of data set 0",
-                    expected=first[what],
-                    got=value,
-                )
+                text = f"the {what} of data set {number} differ from those of data set 0"
+                raise DataError(text, expected=first[what], got=value)
 
 
 def common_stick_speeds(headers: Sequence[DataHeader]) -> dict[str, float]:

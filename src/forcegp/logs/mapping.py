@@ -83,10 +83,9 @@ class Draft:
 
     def toml(self) -> str:
         """Return the text of the mapping file."""
-        lines = [f"# Mapping of {_plain(self.source)}, proposed from its headings and values."]
-        lines += [
-            "# Check it, delete the mark CHECK of each line that is right, and import with --mapping.",
-            "",
+        lines = [
+            f"# Mapping of {_plain(self.source)}, proposed from its headings and values.",
+            "# Check it, delete the mark CHECK of each line that is right, and import with --mapping.\n",
         ]
         quantities = {name: self.families[name].table() for name in SYMBOLS if name in self.families}
         tables = {"time": self.time, "joints": self.joints, **quantities, **self.further}

@@ -114,21 +114,18 @@ class Limits:
 
 def _given(robot: RobotModel, name: str, values: Sequence[float], default: Tensor) -> Tensor:
     """Return the limits of all joints, which are the given values or those of the robot."""
-    option = f"give --{name}, as one number or one per joint"
     if len(values) not in (0, 1, robot.nq):
         raise ParameterError(
             f"limits of {name} do not match the robot", expected=f"1 or {robot.nq} numbers", got=values
         )
     limit = default.new_tensor(values).expand(robot.nq) if len(values) else default
-    missing = [
-        n for n, x in zip(robot.joint_names, limit.tolist(), strict=True) if not 0.0 < x < float("inf")
-    ]
+    missing = [n for n, x in zip(robot.joint_names, limit.tolist(), strict=True) if not 0.0 < x < np.inf]
     if missing:
         raise ParameterError(
             f"no limit of {name} for {', '.join(missing)} of robot {robot.name!r}",
             expected="positive finite limits",
             got=[round(x, 4) for x in limit.tolist()],
-            hint=f"{option}, or add it to the robot file",
+            hint=f"give --{name}, as one number or one per joint, or add it to the robot file",
         )
     return limit
 
@@ -137,9 +134,7 @@ def random_states(robot: RobotModel, limits: Limits, count: int = REGION, seed: 
     """Draw states uniformly within the limits, and slow down the states that need too much torque."""
     share = torch.rand(3, count, robot.nq, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
     q = limits.low + share[0] * (limits.high - limits.low)
-    qd, qdd = (
-        (2.0 * x - 1.0) * y for x, y in zip(share[1:], (limits.velocity, limits.acceleration), strict=True)
-    )
+    qd, qdd = (2.0 * share[1] - 1.0) * limits.velocity, (2.0 * share[2] - 1.0) * limits.acceleration
     for factor in (0.7, 0.7, 0.7, 0.5, 0.5, 0.0):
         beyond = (rigid_torque(robot, q, qd, qdd).abs() > limits.torque).any(-1)[:, None]
         qd, qdd = torch.where(beyond, factor * qd, qd), torch.where(beyond, factor * qdd, qdd)
@@ -207,10 +202,8 @@ class Spline:
         """Draw control points `(free, nq)` of a sum of sine functions within the kinematic limits."""
         t = np.arange(1, self.free + 1)[:, None, None] * self.h
         shape = (1, len(self.start), SINES)
-        w, phase = (
-            2.0 * np.pi * random.uniform(SLOWEST, QUICKEST, shape),
-            random.uniform(0.0, 2.0 * np.pi, shape),
-        )
+        w = 2.0 * np.pi * random.uniform(SLOWEST, QUICKEST, shape)
+        phase = random.uniform(0.0, 2.0 * np.pi, shape)
         size = random.uniform(0.2, 1.0, shape)
         wave = (size * np.sin(w * t + phase)).sum(-1) / size.sum(-1)
         low, high = limits.low.numpy(), limits.high.numpy()
@@ -244,9 +237,8 @@ class Search:
     def look(self, times: Array) -> None:
         """Apply the hinges at additional times as well."""
         self.extra = np.union1d(self.extra, times)
-        self.matrices = [
-            torch.from_numpy(m) for m in self.spline.at(np.concatenate([self.nodes, self.extra]))
-        ]
+        every = np.concatenate([self.nodes, self.extra])
+        self.matrices = [torch.from_numpy(m) for m in self.spline.at(every)]
 
     def states(self, x: Tensor) -> States:
         """Return positions, velocities and accelerations at the nodes and the additional times."""
@@ -442,8 +434,7 @@ def excite(
         spline = Spline(_start_of(start, robot, limits, collisions), seconds)
         search = Search(spline, limits, unknowns, collisions, criterion)
         found = _searched(search, restarts, np.random.default_rng(seed), progress or (lambda *_: None))
-        values, x, used = found
-        return _result(system, search, x, used, values, rate, seed)
+        return _result(system, search, *found, rate, seed)
 
 
 def _searched(
@@ -477,15 +468,14 @@ def _searched(
 def _result(
     system: ConstrainedSystem,
     search: Search,
+    values: tuple[float, ...],
     x: Array,
     used: dict[str, float],
-    values: tuple[float, ...],
     rate: float,
     seed: int,
 ) -> Excitation:
     robot, spline, unknowns = search.unknowns.robot, search.spline, search.unknowns
-    count = round(spline.seconds * rate) + 1
-    t = np.linspace(0.0, spline.seconds, count)
+    t = np.linspace(0.0, spline.seconds, round(spline.seconds * rate) + 1)
     q, qd, qdd = (torch.from_numpy(m @ x) for m in spline.at(t))
     q = q + torch.from_numpy(spline.start)
     header = DataHeader(
@@ -501,6 +491,5 @@ def _result(
     states = search.states(torch.from_numpy(x))
     Y, Phi = unknowns.columns(*states)
     after = unknowns.after(search.information(Phi, rigid_torque(robot, *states, Y)))
-    clearance = search.collisions.clearance
-    kept = {name: value for name, value in used.items() if name != "clearance"}
-    return Excitation(motion, search.limits, kept | {"clearance_m": clearance}, unknowns, after, values)
+    used = {n: x for n, x in used.items() if n != "clearance"} | {"clearance_m": search.collisions.clearance}
+    return Excitation(motion, search.limits, used, unknowns, after, values)
