@@ -112,9 +112,7 @@ def _model(model: Path | None, scene: str | None, config: Path | None, train: Pa
             raise ForceGPError("a fitted model contains its scene and settings", hint="pass only --model")
         return forcegp.load_model(model)
     if scene is None or train is None:
-        raise ForceGPError(
-            "no model to evaluate was given", expected="--model FILE, or --scene and --train to fit one"
-        )
+        text = "no model to evaluate was given"
+        raise ForceGPError(text, expected="--model FILE, or --scene and --train to fit one")
     system = forcegp.load_scene(scene).system()
-    regression = configured(model_table(config, scene), system)
-    return fitted(regression, read_data(train, system.robot))
+    return fitted(configured(model_table(config, scene), system), read_data(train, system.robot))

@@ -88,9 +88,8 @@ def excite(
     fit = None if model is None else load_model(model)
     if fit is not None:
         if not isinstance(fit, StructuredFit):
-            raise ModelError(
-                f"{model} has no forces to continue from", expected="a structured GP", got=fit.kind
-            )
+            text = f"{model} has no forces to continue from"
+            raise ModelError(text, expected="a structured GP", got=fit.kind)
         fit.specified.robot.check_state(start=system.robot.lower)
         system = system.with_robot(fit.system.robot)
     limits = Limits.of(
@@ -132,9 +131,8 @@ def _numbers(option: str, text: str | None) -> list[float]:
     try:
         return [float(word) for word in (text or "").split(",") if word.strip()]
     except ValueError:
-        raise ParameterError(
-            f"--{option} is not a list of numbers", expected="comma-separated numbers", got=text
-        ) from None
+        message = f"--{option} is not a list of numbers"
+        raise ParameterError(message, expected="comma-separated numbers", got=text) from None
 
 
 def _summary(result: Excitation) -> dict[str, object]:

@@ -105,13 +105,11 @@ def _written_back(
     from forcegp.robot.write_back import is_mjcf
 
     if robot is None:
-        raise ModelError(
-            "no robot file was given", expected="--robot my.urdf, the file that the robot was loaded from"
-        )
+        text = "no robot file was given"
+        raise ModelError(text, expected="--robot my.urdf, the file that the robot was loaded from")
     if is_mjcf(robot) != (to == "mjcf"):
-        raise RobotFileError(
-            f"{robot} has a different format", expected=to, got="mjcf" if to == "urdf" else "urdf"
-        )
+        text = f"{robot} has a different format"
+        raise RobotFileError(text, expected=to, got="mjcf" if to == "urdf" else "urdf")
     found = write_calibrated(fit, robot, out, samples=samples, seed=seed, gain_std=gain_std)
     determined = sum(parameter.determined for parameter in found.parameters)
     result: dict[str, object] = {"file": str(out), "report": str(out.with_name(f"{out.stem}.report.json"))}

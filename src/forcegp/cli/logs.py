@@ -182,8 +182,7 @@ def check(
     if out is not None:
         from forcegp.report.check import write_check
 
-        title = f"{data} on {scene or robot}"
-        save(lambda path: write_check(path, title, report, system, log), out)
+        save(lambda path: write_check(path, f"{data} on {scene or robot}", report, system, log), out)
     if as_json:
         show({**report.to_dict(), "page": str(out) if out else None}, as_json)
     else:
@@ -211,9 +210,8 @@ def _print(report: Report) -> None:
             rows = re.sub("^rows? ", "", describe(finding.intervals, most=2))
             rows = "all" if finding.intervals == ((0, report.samples),) else rows
             # Joint and parameter names may contain brackets, which must not be read as markup.
-            body = Text(printable(f"{finding.message}\n")).append(
-                printable(f"→ {finding.remedy}"), style="dim"
-            )
+            remedy = printable(f"→ {finding.remedy}")
+            body = Text(printable(f"{finding.message}\n")).append(remedy, style="dim")
             kinds = "\nor ".join(finding.kinds)
             table.add_row(Text(finding.severity, style=COLOURS[finding.severity]), kinds, rows, body)
         Console().print(table)

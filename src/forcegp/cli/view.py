@@ -64,8 +64,7 @@ def view(
     if data is not None and rollout is not None:
         raise ParameterError("--data and --rollout cannot be combined", hint="choose one motion to display")
     system, model, shapes = _target(target)
-    log = data or rollout
-    motion = at_rest(system)
+    log, motion = data or rollout, at_rest(system)
     if log is not None:
         stretch = _stretch(log, system if model is None else model.specified, start, seconds)
         motion = of_log(system, stretch, model)

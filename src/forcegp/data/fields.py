@@ -158,9 +158,8 @@ def check_layout(data: Fields) -> None:
     if n < 0:
         raise DataError("column 't' has the wrong shape", expected="(n,)", got=tuple(data.t.shape))
     if nq == 0 or len(set(data.joint_names)) < nq:
-        raise DataError(
-            "the joint names are not valid", expected="one or more distinct", got=data.joint_names
-        )
+        text = "the joint names are not valid"
+        raise DataError(text, expected="one or more distinct", got=data.joint_names)
     shared = sorted(set(data.joint_names) & set(data.contact))
     if shared:
         raise DataError(f"{shared[0]!r} is the name of a joint and of a contact", hint="rename the contact")
@@ -192,11 +191,9 @@ def _check_names(data: Fields) -> None:
     taken = set(vars(data))
     for name in (*data.extras, *data.contact_extras):
         if name in taken or "." in name or not name:
-            raise DataError(
-                f"{name!r} cannot be the name of an additional quantity",
-                expected="a unique name without a dot",
-                hint=f"{', '.join(sorted(taken))} are taken",
-            )
+            text = f"{name!r} cannot be the name of an additional quantity"
+            hint = f"{', '.join(sorted(taken))} are taken"
+            raise DataError(text, expected="a unique name without a dot", hint=hint)
         taken.add(name)
 
 
@@ -250,9 +247,8 @@ def check_time(data: Fields) -> None:
     if len(runs.unique()) < len(runs):
         seen, values = set(), runs.tolist()
         twice = next(value for value in values if value in seen or seen.add(value))
-        raise DataError(
-            f"the rows of segment {twice} are not contiguous", hint="sort the log by 'segment' and 't'"
-        )
+        text = f"the rows of segment {twice} are not contiguous"
+        raise DataError(text, hint="sort the log by 'segment' and 't'")
 
 
 def row_indices(rows: object, n: int, device: torch.device) -> Tensor:

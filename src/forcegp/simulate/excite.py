@@ -92,9 +92,8 @@ class Limits:
             ParameterError: a limit is missing or not positive. The message names the joint and the option.
         """
         if not 0.0 < share <= 1.0:
-            raise ParameterError(
-                "the share of the limits is out of range", expected="above 0, up to 1", got=share
-            )
+            text = "the share of the limits is out of range"
+            raise ParameterError(text, expected="above 0, up to 1", got=share)
         speed = _given(robot, "velocity", velocity, robot.velocity_limit)
         effort = _given(robot, "torque", torque, robot.effort_limit)
         rate = _given(robot, "acceleration", acceleration, 4.0 * speed)
@@ -115,9 +114,8 @@ class Limits:
 def _given(robot: RobotModel, name: str, values: Sequence[float], default: Tensor) -> Tensor:
     """Return the limits of all joints, which are the given values or those of the robot."""
     if len(values) not in (0, 1, robot.nq):
-        raise ParameterError(
-            f"limits of {name} do not match the robot", expected=f"1 or {robot.nq} numbers", got=values
-        )
+        text = f"limits of {name} do not match the robot"
+        raise ParameterError(text, expected=f"1 or {robot.nq} numbers", got=values)
     limit = default.new_tensor(values).expand(robot.nq) if len(values) else default
     missing = [n for n, x in zip(robot.joint_names, limit.tolist(), strict=True) if not 0.0 < x < np.inf]
     if missing:
@@ -187,8 +185,7 @@ class Spline:
 
     def at(self, t: Array) -> tuple[Array, Array, Array]:
         """Return the matrices `(n, free)` that map control points, relative to the start, to q, q̇ and q̈."""
-        knots = self.h * np.arange(-3, self.spans + 4)
-        spline = BSpline(knots, np.eye(self.free + 6), 3)
+        spline = BSpline(self.h * np.arange(-3, self.spans + 4), np.eye(self.free + 6), 3)
         q, qd, qdd = (spline(t, order)[:, 3:-3] for order in range(3))
         return q, qd, qdd
 
@@ -252,10 +249,8 @@ class Search:
         """
         limits, eye = self.limits, torch.eye(self.spline.free, dtype=torch.float64)
         D1, D2 = self.spline.differences(eye)
-        r, v, a = (
-            (1.0 / x)[:, None, None] ** 2
-            for x in (limits.high - limits.low, limits.velocity, limits.acceleration)
-        )
+        sizes = limits.high - limits.low, limits.velocity, limits.acceleration
+        r, v, a = ((1.0 / x)[:, None, None] ** 2 for x in sizes)
         L = torch.linalg.cholesky(4.0 * r * eye + v * (D1.mT @ D1) + a * (D2.mT @ D2))
         return torch.linalg.solve_triangular(L, eye.expand_as(L), upper=False).mT
 
@@ -306,8 +301,7 @@ class Search:
         for rows in np.split(t, range(CHUNK, len(t), CHUNK)):
             q, qd, qdd = (torch.from_numpy(m @ x) for m in self.spline.at(rows))
             q = q + torch.from_numpy(self.spline.start)
-            torque = rigid_torque(self.unknowns.robot, q, qd, qdd)
-            shares = limits.shares(q, qd, qdd, torque)
+            shares = limits.shares(q, qd, qdd, rigid_torque(self.unknowns.robot, q, qd, qdd))
             shares["clearance"] = 1.0 + torch.from_numpy(near.depth(q.numpy()))[:, None] / near.clearance
             found = {name: share.abs().amax(-1).numpy() for name, share in shares.items()}
             worst = {name: max(worst.get(name, 0.0), float(share.max())) for name, share in found.items()}
@@ -337,11 +331,7 @@ class Search:
 def _start_of(
     start: Sequence[float] | None, robot: RobotModel, limits: Limits, collisions: Collisions
 ) -> Array:
-    """Return the given start, or the collision-free position closest to the middle of the limits.
-
-    Raises:
-        ParameterError: the start does not match the robot, exceeds its limits, or is in collision.
-    """
+    """Return the given start if it is valid, or the collision-free position closest to the middle."""
     low, high = limits.low.numpy(), limits.high.numpy()
     if start is None:
         middle = 0.5 * (low + high)
@@ -350,20 +340,16 @@ def _start_of(
         torque = rigid_torque(robot, torch.from_numpy(tried), still, still)
         free = (collisions.depth(tried) == 0.0) & (torque.abs() < INSIDE * limits.torque).all(-1).numpy()
         if not free.any():
-            raise ParameterError(
-                "no collision-free position within the torque limits was found",
-                expected=f"one of {len(tried)} positions within the limits",
-                hint="give --start, smaller boxes, or less --clearance",
-            )
+            text = "no collision-free position within the torque limits was found"
+            hint = "give --start, smaller boxes, or less --clearance"
+            raise ParameterError(text, expected=f"one of {len(tried)} positions within the limits", hint=hint)
         distance = np.abs((tried - middle) / (high - low)).sum(-1)
         return tried[np.where(free, distance, np.inf).argmin()]
     q = np.array(start, dtype=float)
     if q.shape != (robot.nq,) or not ((q >= low) & (q <= high)).all():
-        raise ParameterError(
-            "the start is not within the limits of the robot",
-            expected=[(round(a, 4), round(b, 4)) for a, b in zip(low.tolist(), high.tolist(), strict=True)],
-            got=q.tolist(),
-        )
+        text = "the start is not within the limits of the robot"
+        expected = [(round(a, 4), round(b, 4)) for a, b in zip(low.tolist(), high.tolist(), strict=True)]
+        raise ParameterError(text, expected=expected, got=q.tolist())
     if near := collisions.pairs(q):
         pairs = ", ".join(f"{pair} ({1e3 * gap:.3g} mm)" for pair, gap in near.items())
         raise ParameterError(
@@ -434,13 +420,15 @@ def excite(
         spline = Spline(_start_of(start, robot, limits, collisions), seconds)
         search = Search(spline, limits, unknowns, collisions, criterion)
         found = _searched(search, restarts, np.random.default_rng(seed), progress or (lambda *_: None))
-        return _result(system, search, *found, rate, seed)
+        return _result(system, search, found, rate, seed)
 
 
-def _searched(
-    search: Search, restarts: int, random: np.random.Generator, progress: Progress
-) -> tuple[tuple[float, ...], Array, dict[str, float]]:
-    """Optimise random starts; return the objectives (best first), control points and used limits."""
+Found = tuple[tuple[float, ...], Array, dict[str, float]]
+"""Objectives of the optimised starts (best first), control points of the best, and used limits."""
+
+
+def _searched(search: Search, restarts: int, random: np.random.Generator, progress: Progress) -> Found:
+    """Optimise random starts."""
     rounds = restarts + ROUNDS
     drawn = (search.spline.random(search.limits, random) for _ in range(4 * restarts))
     starts = [search.shrunk(x, NODE)[0] for x in drawn]
@@ -465,16 +453,9 @@ def _searched(
 
 
 @torch.no_grad()
-def _result(
-    system: ConstrainedSystem,
-    search: Search,
-    values: tuple[float, ...],
-    x: Array,
-    used: dict[str, float],
-    rate: float,
-    seed: int,
-) -> Excitation:
+def _result(system: ConstrainedSystem, search: Search, found: Found, rate: float, seed: int) -> Excitation:
     robot, spline, unknowns = search.unknowns.robot, search.spline, search.unknowns
+    values, x, used = found
     t = np.linspace(0.0, spline.seconds, round(spline.seconds * rate) + 1)
     q, qd, qdd = (torch.from_numpy(m @ x) for m in spline.at(t))
     q = q + torch.from_numpy(spline.start)
