@@ -130,7 +130,8 @@ class NormalEquations:
 
     def _each(self, part: Callable[[Tensor], Tensor]) -> NormalEquations:
         sums = (self.gram, self.right, self.torque, self.square, self.count)
-        return NormalEquations(*map(part, sums), self.unknowns)
+        gram, right, torque, square, count = map(part, sums)
+        return NormalEquations(gram, right, torque, square, count, self.unknowns)
 
     def friction(self, delta: Tensor) -> Tensor:
         """Return the friction weights w `(nq, f)` that best fit the residual for given δ."""
