@@ -36,13 +36,9 @@ def cross(a: Tensor, b: Tensor) -> Tensor:
     if a.numel() < _SMALL:
         return torch.linalg.cross(*torch.broadcast_tensors(a, b), dim=0)
     (ax, ay, az), (bx, by, bz) = a, b
-    return torch.stack(
-        [
-            torch.addcmul(ay * bz, az, by, value=-1),
-            torch.addcmul(az * bx, ax, bz, value=-1),
-            torch.addcmul(ax * by, ay, bx, value=-1),
-        ]
-    )
+    x = torch.addcmul(ay * bz, az, by, value=-1)
+    y = torch.addcmul(az * bx, ax, bz, value=-1)
+    return torch.stack([x, y, torch.addcmul(ax * by, ay, bx, value=-1)])
 
 
 def skew(v: Tensor) -> Tensor:

@@ -74,12 +74,9 @@ def _inverse_derivatives(
         return torch.cat(dynamics.momentum(whole, angular, linear))
 
     rate = torch.cat([cross(omega, z), cross(omega, l) + cross(v, z)])
-    bend = torch.cat(
-        [
-            cross(alpha, z) + cross(omega, rate[:3]),
-            cross(alpha, l) + cross(a, z) + cross(omega, rate[3:]) + cross(v, rate[:3]),
-        ]
-    )
+    bend_z = cross(alpha, z) + cross(omega, rate[:3])
+    bend_l = cross(alpha, l) + cross(a, z) + cross(omega, rate[3:]) + cross(v, rate[:3])
+    bend = torch.cat([bend_z, bend_l])
     S = torch.cat([z, l])
     row = apply(N.transpose(0, 1), z) + 2.0 * cross(momentum, l)
     weight = weigh(z, l)
@@ -88,15 +85,14 @@ def _inverse_derivatives(
         return torch.cat([apply(N, x), 2.0 * cross(x, momentum)])
 
     carried = torch.cat([cross(z, torque) + cross(l, force), cross(z, force)])
-    column_q = turned(rate[:3]) + weigh(bend[:3], bend[3:]) + carried
+    column_q = turned(rate[:3]) + weigh(bend_z, bend_l) + carried
     column_v = turned(z) + 2.0 * weigh(rate[:3], rate[3:])
 
     def each(left: Tensor, right: Tensor) -> Tensor:
         return dot(left.unsqueeze(2), right.unsqueeze(1))
 
     dq = _pairs(robot, each(row, rate[:3]) + each(weight, bend), each(S, column_q))
-    dqd = _pairs(robot, each(row, z) + 2.0 * each(weight, rate), each(S, column_v))
-    return dq, dqd
+    return dq, _pairs(robot, each(row, z) + 2.0 * each(weight, rate), each(S, column_v))
 
 
 def inverse_dynamics_derivatives(

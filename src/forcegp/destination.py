@@ -51,11 +51,9 @@ def write_or_keep(write: Callable[[Path], object], path: str | Path) -> None:
     if kept is None:
         raise cause
     reason = cause.message if isinstance(cause, ForceGPError) else (cause.strerror or str(cause))
-    raise DestinationError(
-        f"{target}: the result could not be written",
-        got=reason,
-        hint=f"it was saved to {kept}; move it to its destination",
-    ) from cause
+    text = f"{target}: the result could not be written"
+    hint = f"it was saved to {kept}; move it to its destination"
+    raise DestinationError(text, got=reason, hint=hint) from cause
 
 
 def folder_or_keep(fill: Callable[[Path], object], path: str | Path) -> None:

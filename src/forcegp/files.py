@@ -122,11 +122,8 @@ def writable(target: Path) -> Iterator[None]:
     except DestinationError:
         raise
     except OSError as cause:
-        raise DestinationError(
-            f"{target}: cannot be written",
-            got=cause.strerror or str(cause),
-            hint="choose an existing, writable location with free space",
-        ) from cause
+        text, hint = f"{target}: cannot be written", "choose an existing, writable location with free space"
+        raise DestinationError(text, got=cause.strerror or str(cause), hint=hint) from cause
 
 
 def check_kind(target: Path, *, folder: bool) -> None:
@@ -280,12 +277,9 @@ class Header(Record):
         if name != cls.FORMAT:
             raise error(f"{source} has a different format", expected=cls.FORMAT, got=repr(name))
         if version != cls.VERSION:
-            raise error(
-                f"{source} has a version of the {cls.FORMAT} format that this release cannot read",
-                expected=f"version {cls.VERSION}",
-                got=f"version {version!r}",
-                hint="read it with the release of forcegp that wrote it, or update forcegp",
-            )
+            message = f"{source} has a version of the {cls.FORMAT} format that this release cannot read"
+            hint = "read it with the release of forcegp that wrote it, or update forcegp"
+            raise error(message, expected=f"version {cls.VERSION}", got=f"version {version!r}", hint=hint)
         return validated(cls, fields, source, error, what="header field")
 
 

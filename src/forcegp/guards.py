@@ -28,24 +28,18 @@ def check_count(source: str, what: str, count: int, most: int) -> None:
     >>> check_count("run.csv", "columns", 12, limits.COLUMNS)
     """
     if count > most:
-        raise DataError(
-            f"{source}: the log declares too many {what}",
-            expected=f"at most {most:,}",
-            got=f"{count:,}",
-            hint="split the log, or export only the columns that are needed",
-        )
+        text = f"{source}: the log declares too many {what}"
+        hint = "split the log, or export only the columns that are needed"
+        raise DataError(text, expected=f"at most {most:,}", got=f"{count:,}", hint=hint)
 
 
 def check_expansion(source: str, size: int, file: int, free: int | None = None) -> None:
     """Raise `DataError` if the declared `size` of the content far exceeds `file`, the size of the file."""
     allowed = allowed_bytes(file, free)
     if size > allowed:
-        raise DataError(
-            f"{source}: the declared size of the file exceeds the limit",
-            expected=f"at most {allowed:,} bytes in a file of this size",
-            got=f"{size:,}",
-            hint="split the log into several files",
-        )
+        text = f"{source}: the declared size of the file exceeds the limit"
+        expected = f"at most {allowed:,} bytes in a file of this size"
+        raise DataError(text, expected=expected, got=f"{size:,}", hint="split the log into several files")
 
 
 def allowed_bytes(file: int, free: int | None = None) -> int:
@@ -176,10 +170,8 @@ def within(folder: Path, files: Iterable[Path]) -> list[Path]:
     files, root = list(files), folder.resolve()
     for file in files:
         if not file.resolve().is_relative_to(root):
-            raise DataError(
-                f"{file}: a link to a path outside {folder} is not followed",
-                hint="copy the folder with the linked files: cp -rL",
-            )
+            text = f"{file}: a link to a path outside {folder} is not followed"
+            raise DataError(text, hint="copy the folder with the linked files: cp -rL")
     return files
 
 
@@ -200,8 +192,6 @@ def foreign(source: str, kind: str) -> Iterator[None]:
 def damaged(source: str, kind: str, cause: BaseException) -> DataError:
     """Return the error for a file that cannot be parsed."""
     lines = str(cause).splitlines()
-    return DataError(
-        f"{source}: the file is damaged, truncated or not {kind}",
-        got=lines[0][:300] if lines else type(cause).__name__,
-        hint="create it again from its source; the usual cause is an interrupted copy",
-    )
+    text = f"{source}: the file is damaged, truncated or not {kind}"
+    hint = "create it again from its source; the usual cause is an interrupted copy"
+    return DataError(text, got=lines[0][:300] if lines else type(cause).__name__, hint=hint)

@@ -217,9 +217,8 @@ def identify(
     W, y = W.detach().numpy(), (tau - robot.armature * qdd).detach().numpy()
     n, nq, unknowns = W.shape
     if n * nq <= unknowns or n < 2:
-        raise DataError(
-            "too few samples to identify the robot", expected=f"more than {unknowns // nq + 1}", got=n
-        )
+        text = "too few samples to identify the robot"
+        raise DataError(text, expected=f"more than {unknowns // nq + 1}", got=n)
     freedom = n - unknowns / nq
     x, _, _ = _least_squares(W, y, np.ones(nq))
     # A noise-free log leaves no residuals from which weights can be computed.

@@ -106,11 +106,9 @@ def common_states(robot: RobotModel, **states: Tensor) -> tuple[Tensor, ...]:
         return torch.broadcast_tensors(*states.values())
     except RuntimeError:
         shapes = ", ".join(f"{name} {tuple(value.shape)}" for name, value in states.items())
-        raise ShapeError(
-            f"the batch shapes of {', '.join(states)} do not broadcast",
-            expected=f"batch shapes that broadcast, each followed by {robot.nq}",
-            got=shapes,
-        ) from None
+        text = f"the batch shapes of {', '.join(states)} do not broadcast"
+        expected = f"batch shapes that broadcast, each followed by {robot.nq}"
+        raise ShapeError(text, expected=expected, got=shapes) from None
 
 
 def _local_poses(robot: RobotModel, q: Tensor) -> Tensor:
@@ -146,8 +144,7 @@ def _chain(robot: RobotModel, levels: Sequence[Sequence[int]], q: JointVector) -
         blocks.append(turned)
         order += [*level]
         parents = list(level)
-    joined = torch.cat(blocks, dim=2)
-    return take(joined, [order.index(i) for i in range(robot.nq)])
+    return take(torch.cat(blocks, dim=2), [order.index(i) for i in range(robot.nq)])
 
 
 def link_poses(robot: RobotModel, q: JointVector) -> LinkPoses:

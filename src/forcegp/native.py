@@ -34,11 +34,9 @@ def find_compiler() -> str:
     for name in wanted:
         if path := shutil.which(name):
             return os.path.abspath(path)
-    raise MissingDependencyError(
-        "compiled kernels need a C++ compiler and none was found",
-        expected=" or ".join(wanted) + " on the PATH",
-        hint="install one (for example: apt install g++), or set CXX",
-    )
+    text = "compiled kernels need a C++ compiler and none was found"
+    hint = "install one (for example: apt install g++), or set CXX"
+    raise MissingDependencyError(text, expected=" or ".join(wanted) + " on the PATH", hint=hint)
 
 
 def _machine() -> str:
@@ -58,11 +56,9 @@ def load_library(source: str, level: str = "-O2") -> ctypes.CDLL:
         version = subprocess.run([compiler, "--version"], capture_output=True, text=True, check=False).stdout
         place = cache_directory()
     except (OSError, RuntimeError) as cause:
-        raise MissingDependencyError(
-            "the C++ compiler or its output folder cannot be used",
-            got=str(cause),
-            hint="set CXX to a C++ compiler, and FORCEGP_CACHE to a writable folder",
-        ) from cause
+        text = "the C++ compiler or its output folder cannot be used"
+        hint = "set CXX to a C++ compiler, and FORCEGP_CACHE to a writable folder"
+        raise MissingDependencyError(text, got=str(cause), hint=hint) from cause
     key = hashlib.sha256("\0".join([source, version, _machine(), level, *FLAGS]).encode()).hexdigest()[:32]
     try:
         folder = private_folder(place)
@@ -74,11 +70,8 @@ def load_library(source: str, level: str = "-O2") -> ctypes.CDLL:
                 discard(kept)
         return ctypes.CDLL(str(store(folder, key, _compiled([compiler, level], source, folder))))
     except OSError as cause:
-        raise MissingDependencyError(
-            f"the kernel cannot be written to {place}",
-            got=str(cause),
-            hint="set FORCEGP_CACHE to a writable folder",
-        ) from cause
+        text, hint = f"the kernel cannot be written to {place}", "set FORCEGP_CACHE to a writable folder"
+        raise MissingDependencyError(text, got=str(cause), hint=hint) from cause
 
 
 def _compiled(compiler: Sequence[str], source: str, folder: Path) -> bytes:
@@ -114,11 +107,9 @@ def _run_compiler(compiler: Sequence[str], source: str, folder: Path) -> None:
     command = [*compiler, *FLAGS, "-x", "c++", "-", "-o", LIBRARY, "-pthread"]
     done = subprocess.run(command, input=source, capture_output=True, text=True, check=False, cwd=folder)
     if done.returncode != 0:
-        raise MissingDependencyError(
-            f"the C++ compiler {compiler[0]} could not build the kernel",
-            got=done.stderr.strip()[-2000:],
-            hint="set CXX to a recent GCC or Clang",
-        )
+        text = f"the C++ compiler {compiler[0]} could not build the kernel"
+        hint = "set CXX to a recent GCC or Clang"
+        raise MissingDependencyError(text, got=done.stderr.strip()[-2000:], hint=hint)
 
 
 def cache_directory() -> Path:
@@ -193,9 +184,8 @@ def _trusted(path: Path) -> bool:
         status = os.fstat(descriptor)
         if not stat.S_ISREG(status.st_mode):
             return False
-        if os.name == "posix" and (
-            status.st_uid != os.geteuid() or status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
-        ):
+        shared = status.st_mode & (stat.S_IWGRP | stat.S_IWOTH)
+        if os.name == "posix" and (status.st_uid != os.geteuid() or shared):
             return False
         return path.stem.partition("-")[2] == hashlib.sha256(file.read()).hexdigest()
 

@@ -108,8 +108,7 @@ class Timeline:
         typical = float(np.median(steps[~changes])) if len(steps[~changes]) else 0.0
         joined = bool((steps[changes] <= 0).any())
         if joined:
-            shift = np.where(changes, typical - steps, 0.0)
-            x = x + np.concatenate([[0.0], np.cumsum(shift)])
+            x = x + np.concatenate([[0.0], np.cumsum(np.where(changes, typical - steps, 0.0))])
         breaks = np.flatnonzero(changes | (steps > GAP * typical)) + 1
         label = "time, segments one after another [s]" if joined else "time [s]"
         return cls(x, order, breaks, ordered, label)
@@ -200,12 +199,9 @@ def _axes(count: int, ax: Target) -> list[Axes]:
         return list(made[:, 0])
     axes = [ax] if isinstance(ax, Axes) else list(np.asarray(ax, dtype=object).ravel())
     if len(axes) != count:
-        raise ParameterError(
-            "the number of axes differs from the number of panels",
-            expected=f"{count} axes, one per panel",
-            got=len(axes),
-            hint="pass ax=None for a new figure, or choose joints",
-        )
+        text = "the number of axes differs from the number of panels"
+        hint = "pass ax=None for a new figure, or choose joints"
+        raise ParameterError(text, expected=f"{count} axes, one per panel", got=len(axes), hint=hint)
     return axes
 
 

@@ -45,12 +45,9 @@ def announce_memory(needed: int, what: str, *, certain: int | None = None) -> No
         return
     least = needed if certain is None else certain
     if least > free:
-        raise MemoryLimitError(
-            f"{what} needs more memory than is free",
-            expected=f"at most {_gib(free)}",
-            got=_gib(least),
-            hint="use less data or a smaller model, or free memory",
-        )
+        text = f"{what} needs more memory than is free"
+        hint = "use less data or a smaller model, or free memory"
+        raise MemoryLimitError(text, expected=f"at most {_gib(free)}", got=_gib(least), hint=hint)
     bound = "" if certain is None else "up to "
     sentence = f"{what} needs {bound}{_gib(needed)} of {_gib(free)} of free memory"
     warnings.warn(sentence, MemoryNeedWarning, stacklevel=2)

@@ -111,8 +111,7 @@ def sweep(
         if address is None:
             local = dask.LocalCluster(n_workers=processes, threads_per_worker=1, dashboard_address=None)
             address = stack.enter_context(local).scheduler_address
-        client = stack.enter_context(dask.Client(address))
-        futures = client.map(run_fit, fits, out=root, pure=False)
+        futures = stack.enter_context(dask.Client(address)).map(run_fit, fits, out=root, pure=False)
         place = {future.key: i for i, future in enumerate(futures)}
         for future in dask.as_completed(futures):
             scores[place[future.key]] = future.result()

@@ -124,8 +124,7 @@ def _beside(contact: SurfaceContact, path: Path, usable: np.ndarray) -> list[Fin
     )
     # A tip may hover over a surface, but not move inside the solid.
     weight = "error" if level < 0.0 else "warning"
-    evidence = {"offset_m": level}
-    return [Finding("contact-far", text, intervals(rows), (), contact.name, evidence, weight)]
+    return [Finding("contact-far", text, intervals(rows), (), contact.name, {"offset_m": level}, weight)]
 
 
 def _placement(contact: SurfaceContact, path: Path, closed: np.ndarray) -> tuple[list[Finding], Array]:
@@ -188,8 +187,7 @@ def _labels(
             where = f"by up to {1e3 * most:.3g} mm, in {describe(rows)}"
             text = f"contact {contact.name!r} is {OFF[kind]}, {where}"
             findings.append(Finding(kind, text, rows, contact=contact.name, evidence={"distance_m": most}))
-    slides = usable & ~closed & (path.approach <= slow)
-    return [*findings, *_missed(contact, path, slides, c, touch, log)]
+    return [*findings, *_missed(contact, path, usable & ~closed & (path.approach <= slow), c, touch, log)]
 
 
 def _runs_off(

@@ -101,8 +101,7 @@ def _sharpness(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> tuple[A
     # Neighbouring rows are redundant, so the log counts as one row per tenth of a second.
     looks = int(log.usable.sum()) * log.dt / LOOK if log.header.ordered else len(rows)
     gram = A.T @ A * (looks / len(rows))
-    after = np.linalg.inv(gram + np.eye(len(columns)))
-    return np.sqrt(np.diag(after)), base.names, columns
+    return np.sqrt(np.diag(np.linalg.inv(gram + np.eye(len(columns))))), base.names, columns
 
 
 LARGEST = 1e3

@@ -240,8 +240,7 @@ def _currents(model: Explanation) -> Iterator[Tried]:
     determined = np.flatnonzero(np.abs(gains) > fit.spread[:nq])
     # A current has the sign of its torque, so gains of both signs have another cause.
     if 2 * len(determined) > nq and (gains[determined] > 0.0).all():
-        joints = tuple(determined.tolist())
-        hypothesis = hypotheses.current_hypothesis(log, rows, model.problem, joints)
+        hypothesis = hypotheses.current_hypothesis(log, rows, model.problem, tuple(determined.tolist()))
         yield hypothesis, model.with_(hypothesis)
 
 

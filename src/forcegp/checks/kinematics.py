@@ -106,8 +106,7 @@ def check_clock_unit(system: ConstrainedSystem, log: Log) -> Outcome:
         return [], log
     if "qd" in log.derived:  # only the length of a step can be judged
         step = f"{log.dt:.4g} apart, which in seconds is an implausible sampling period of a robot's log"
-        long = log.finding("time-unit", f"rows are {step}", period=log.dt)
-        return [long] if log.dt >= 1.0 else [], log
+        return [log.finding("time-unit", f"rows are {step}", period=log.dt)] if log.dt >= 1.0 else [], log
     first = match(log, "q", "qd")
     if first is None or not first.moving.any():
         return [], log

@@ -78,11 +78,10 @@ def _enough(log: Log) -> bool:
 
 def _without_torque(log: Log) -> list[Finding]:
     """Find torques that are constant although the joint moves."""
-    rows = log.usable
-    still = (np.ptp(log.tau[rows], axis=0) == 0.0) & (np.ptp(log.q[rows], axis=0) > 0.0)
+    tau = log.tau[log.usable]
+    still = (np.ptp(tau, axis=0) == 0.0) & (np.ptp(log.q[log.usable], axis=0) > 0.0)
     still[log.unmeasured] = False
-    zero = still & (log.tau[rows] == 0.0).all(axis=0)
-    word = "zero" if zero[still].all() else "constant"
+    word = "constant" if tau[:, still].any() else "zero"
     findings = log.on_joints("torque-zero", still, f"the torque of {{}} is {word} throughout")
     # One passive joint is a design; an arm without any torque is a missing column.
     return [replace(finding, weight="error" if still.all() else "warning") for finding in findings]
@@ -178,8 +177,7 @@ def _unexplained(explanation: Explanation) -> list[Finding]:
     error = np.median(explanation.fit.error, axis=0) * explanation.problem.scale
     share = float(np.sqrt((error**2).sum() / (explanation.problem.size**2).sum()))
     text = f"robot file, friction and offsets leave {100 * share:.0f} % of the torque unexplained"
-    finding = explanation.log.finding("torque-unexplained", text, share=share)
-    return [finding] if share > UNEXPLAINED else []
+    return [explanation.log.finding("torque-unexplained", text, share=share)] if share > UNEXPLAINED else []
 
 
 def _disturbances(explanation: Explanation) -> tuple[list[Finding], np.ndarray]:

@@ -11,6 +11,7 @@ import time
 import warnings
 
 import typer
+from typer import Option
 
 from forcegp.cli.common import say, warn
 from forcegp.cli.evaluate import evaluate
@@ -54,7 +55,7 @@ def _version(wanted: bool) -> bool:
 
 @app.callback()
 def _options(
-    version: bool = typer.Option(
+    version: bool = Option(
         False, "--version", callback=_version, is_eager=True, help="Show the version and exit."
     ),
 ) -> None:

@@ -137,11 +137,8 @@ def read_data(
 def trajectory_from(data: forcegp.Dataset, start: int, purpose: str) -> forcegp.Dataset:
     """Return the rows from `start` to the end of their trajectory."""
     if not data.header.ordered:
-        raise DataError(
-            f"a {purpose} needs a log in time order",
-            got="points in order of selection",
-            hint="pass the log from which they were selected",
-        )
+        text, hint = f"a {purpose} needs a log in time order", "pass the log from which they were selected"
+        raise DataError(text, got="points in order of selection", hint=hint)
     if start >= len(data):
         raise DataError("there is no such row to start from", expected=f"0 to {len(data) - 1}", got=start)
     rest = data[start:]

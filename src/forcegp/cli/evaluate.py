@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Option
 
 import forcegp
 from forcegp.cli.common import fitted, model_table, progress_bar, read_data, show, warn_beyond
@@ -22,19 +22,18 @@ WINDOW_SECONDS = 3.0
 def evaluate(
     data: DataFile,
     model: Annotated[
-        Path | None,
-        typer.Option("--model", "-m", help="File of a fitted model; if omitted, a model is fitted."),
+        Path | None, Option("--model", "-m", help="File of a fitted model; if omitted, a model is fitted.")
     ] = None,
-    out: Annotated[Path | None, typer.Option("--out", "-o", help="Folder for the page and its data.")] = None,
+    out: Annotated[Path | None, Option("--out", "-o", help="Folder for the page and its data.")] = None,
     train: Annotated[
         Path | None,
-        typer.Option(
+        Option(
             help="Data to fit the trivial predictors to (default: the other half of the data) and, without "
             "--model, the model."
         ),
     ] = None,
     scene: Annotated[
-        str | None, typer.Option("--scene", "-s", help="Scene of the model to fit, if --model is omitted.")
+        str | None, Option("--scene", "-s", help="Scene of the model to fit, if --model is omitted.")
     ] = None,
     config: Config = None,
     as_json: AsJson = False,
@@ -68,8 +67,8 @@ def evaluate(
     with progress_bar("evaluating", len(test)) as progress:
         evaluation = forcegp.evaluate(regression, test, train=training, progress=progress)
     warn_beyond(regression, test)
-    result: dict[str, object] = {"verdict": evaluation.verdict or "too few samples"}
-    result |= {
+    result: dict[str, object] = {
+        "verdict": evaluation.verdict or "too few samples",
         "doubts": evaluation.doubts,
         "comparison": evaluation.comparison or None,
         **evaluation.summary(),
@@ -113,10 +112,7 @@ def _model(model: Path | None, scene: str | None, config: Path | None, train: Pa
             raise ForceGPError("a fitted model contains its scene and settings", hint="pass only --model")
         return forcegp.load_model(model)
     if scene is None or train is None:
-        raise ForceGPError(
-            "no model to evaluate was given",
-            expected="--model FILE, or --scene and --train to fit one",
-        )
+        text = "no model to evaluate was given"
+        raise ForceGPError(text, expected="--model FILE, or --scene and --train to fit one")
     system = forcegp.load_scene(scene).system()
-    regression = configured(model_table(config, scene), system)
-    return fitted(regression, read_data(train, system.robot))
+    return fitted(configured(model_table(config, scene), system), read_data(train, system.robot))

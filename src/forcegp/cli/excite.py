@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Option
 
 from forcegp.cli.common import check_data_destination, check_output, progress_bar, read_data, save, show
 from forcegp.cli.options import AsJson, SceneName
@@ -13,47 +13,45 @@ from forcegp.cli.options import AsJson, SceneName
 if TYPE_CHECKING:
     from forcegp.simulate.excite import Excitation
 
-Numbers = Annotated[
-    str | None, typer.Option(metavar="X[,X...]", help="Maximum, as one number or one per joint.")
-]
+Numbers = Annotated[str | None, Option(metavar="X[,X...]", help="Maximum, as one number or one per joint.")]
 
 
 def excite(
     scene: SceneName,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Output file for the motion (.csv or .parquet).")],
-    seconds: Annotated[float, typer.Option(help="Duration of the motion in seconds.")] = 30.0,
+    out: Annotated[Path, Option("--out", "-o", help="Output file for the motion (.csv or .parquet).")],
+    seconds: Annotated[float, Option(help="Duration of the motion in seconds.")] = 30.0,
     model: Annotated[
-        Path | None, typer.Option("--model", "-m", help="Fitted model with the posterior to start from.")
+        Path | None, Option("--model", "-m", help="Fitted model with the posterior to start from.")
     ] = None,
     region: Annotated[
         Path | None,
-        typer.Option(help="Data set with the states at which to predict the torque; default: all states."),
+        Option(help="Data set with the states at which to predict the torque; default: all states."),
     ] = None,
     start: Annotated[
         str | None,
-        typer.Option(
+        Option(
             metavar="Q,Q...", help="Initial and final joint positions; default: a collision-free posture."
         ),
     ] = None,
     velocity: Numbers = None,
     acceleration: Numbers = None,
     torque: Numbers = None,
-    share: Annotated[float, typer.Option(help="Fraction of the limits that the motion may use.")] = 0.9,
+    share: Annotated[float, Option(help="Fraction of the limits that the motion may use.")] = 0.9,
     box: Annotated[
         list[str] | None,
-        typer.Option(metavar="X,Y,Z,A,B,C", help="Box to avoid: centre and side lengths [m]; repeatable."),
+        Option(metavar="X,Y,Z,A,B,C", help="Box to avoid: centre and side lengths [m]; repeatable."),
     ] = None,
-    clearance: Annotated[float, typer.Option(min=1e-4, help="Minimum distance between parts [m].")] = 0.01,
+    clearance: Annotated[float, Option(min=1e-4, help="Minimum distance between parts [m].")] = 0.01,
     criterion: Annotated[
         str,
-        typer.Option(
+        Option(
             help="A: expected standard deviation of the torque; V: expected torque error of least squares "
             "with link inertia, viscous and dry friction alone; D: determinant of the covariance."
         ),
     ] = "A",
-    rate: Annotated[float, typer.Option(help="Samples per second.")] = 1000.0,
-    restarts: Annotated[int, typer.Option(min=1, help="Number of random starts to optimise from.")] = 2,
-    seed: Annotated[int, typer.Option(help="Seed for the random starts.")] = 0,
+    rate: Annotated[float, Option(help="Samples per second.")] = 1000.0,
+    restarts: Annotated[int, Option(min=1, help="Number of random starts to optimise from.")] = 2,
+    seed: Annotated[int, Option(help="Seed for the random starts.")] = 0,
     as_json: AsJson = False,
 ) -> None:
     """Plan a motion in free space that identifies inertia and friction as well as possible.
@@ -90,9 +88,8 @@ def excite(
     fit = None if model is None else load_model(model)
     if fit is not None:
         if not isinstance(fit, StructuredFit):
-            raise ModelError(
-                f"{model} has no forces to continue from", expected="a structured GP", got=fit.kind
-            )
+            text = f"{model} has no forces to continue from"
+            raise ModelError(text, expected="a structured GP", got=fit.kind)
         fit.specified.robot.check_state(start=system.robot.lower)
         system = system.with_robot(fit.system.robot)
     limits = Limits.of(
@@ -134,9 +131,8 @@ def _numbers(option: str, text: str | None) -> list[float]:
     try:
         return [float(word) for word in (text or "").split(",") if word.strip()]
     except ValueError:
-        raise ParameterError(
-            f"--{option} is not a list of numbers", expected="comma-separated numbers", got=text
-        ) from None
+        message = f"--{option} is not a list of numbers"
+        raise ParameterError(message, expected="comma-separated numbers", got=text) from None
 
 
 def _summary(result: Excitation) -> dict[str, object]:

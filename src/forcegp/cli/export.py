@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Option
 
 import forcegp
 from forcegp.cli.common import show
@@ -21,36 +21,33 @@ TARGETS = ("c", "casadi", "torch", "urdf", "mjcf")
 def export(
     model: ModelFile,
     out: Annotated[
-        Path, typer.Option("--out", "-o", help="Folder for the code and its test, or path of the robot file.")
+        Path, Option("--out", "-o", help="Folder for the code and its test, or path of the robot file.")
     ],
-    to: Annotated[str, typer.Option("--to", help="Format: c, casadi, torch, urdf or mjcf.")] = "c",
-    name: Annotated[
-        str, typer.Option(help="For C: name of the files and prefix of the functions.")
-    ] = "controller",
+    to: Annotated[str, Option("--to", help="Format: c, casadi, torch, urdf or mjcf.")] = "c",
+    name: Annotated[str, Option(help="For C: name of the files and prefix of the functions.")] = "controller",
     functions: Annotated[
         int | None,
-        typer.Option(
+        Option(
             min=1,
             help="For C: number of basis functions in a reduced covariance, which widens the error bars.",
         ),
     ] = None,
     frame: Annotated[
-        str | None, typer.Option(help="For C: frame of an external wrench to estimate from accelerations.")
+        str | None, Option(help="For C: frame of an external wrench to estimate from accelerations.")
     ] = None,
-    reference: Annotated[str, typer.Option(help="Axes of the external wrench: world or local.")] = "world",
+    reference: Annotated[str, Option(help="Axes of the external wrench: world or local.")] = "world",
     float32: Annotated[
-        bool, typer.Option("--float32", help="For C: use single precision and report its rounding error.")
+        bool, Option("--float32", help="For C: use single precision and report its rounding error.")
     ] = False,
     robot: Annotated[
-        str | None, typer.Option(help="URDF or MJCF file of the robot, or name of a bundled robot.")
+        str | None, Option(help="URDF or MJCF file of the robot, or name of a bundled robot.")
     ] = None,
     samples: Annotated[
-        int, typer.Option(min=0, help="For robot files: number of robots to draw from the posterior.")
+        int, Option(min=0, help="For robot files: number of robots to draw from the posterior.")
     ] = 0,
-    seed: Annotated[int, typer.Option(help="Seed for drawing these robots.")] = 0,
+    seed: Annotated[int, Option(help="Seed for drawing these robots.")] = 0,
     gain_std: Annotated[
-        float,
-        typer.Option(min=0.0, help="Robot file: relative standard deviation of the torque sensors' gains."),
+        float, Option(min=0.0, help="Robot file: relative standard deviation of the torque sensors' gains.")
     ] = 0.0,
     as_json: AsJson = False,
 ) -> None:
@@ -108,14 +105,11 @@ def _written_back(
     from forcegp.robot.write_back import is_mjcf
 
     if robot is None:
-        raise ModelError(
-            "no robot file was given",
-            expected="--robot my.urdf, the file that the robot was loaded from",
-        )
+        text = "no robot file was given"
+        raise ModelError(text, expected="--robot my.urdf, the file that the robot was loaded from")
     if is_mjcf(robot) != (to == "mjcf"):
-        raise RobotFileError(
-            f"{robot} has a different format", expected=to, got="mjcf" if to == "urdf" else "urdf"
-        )
+        text = f"{robot} has a different format"
+        raise RobotFileError(text, expected=to, got="mjcf" if to == "urdf" else "urdf")
     found = write_calibrated(fit, robot, out, samples=samples, seed=seed, gain_std=gain_std)
     determined = sum(parameter.determined for parameter in found.parameters)
     result: dict[str, object] = {"file": str(out), "report": str(out.with_name(f"{out.stem}.report.json"))}

@@ -6,7 +6,7 @@ from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Option
 
 import forcegp
 from forcegp.cli import common, options
@@ -22,12 +22,12 @@ STREAM_ROWS = 100_000
 
 def fit(
     data: options.DataFiles,
-    out: Annotated[Path, typer.Option("--out", "-o", help="File for the fitted model (.safetensors).")],
+    out: Annotated[Path, Option("--out", "-o", help="File for the fitted model (.safetensors).")],
     scene: options.SceneOrNone = None,
     robot: options.RobotName = None,
     model: Annotated[
         str | None,
-        typer.Option(
+        Option(
             "--model",
             "-m",
             help="analytical, nn, gp, sgp or sgp-zero; from the paper: sgp-mean, sgp-contact or, with the "
@@ -37,16 +37,13 @@ def fit(
     config: options.Config = None,
     noise_std: Annotated[
         float | None,
-        typer.Option(
-            help="Standard deviation of acceleration noise [rad/s²]; default: from the file or data."
-        ),
+        Option(help="Standard deviation of acceleration noise [rad/s²]; default: from the file or data."),
     ] = None,
     differentiate: options.Differentiate = None,
     checkpoint: Annotated[
-        Path | None,
-        typer.Option(help="File that stores the progress of a long fit, which resumes if it exists."),
+        Path | None, Option(help="File that stores the progress of a long fit, which resumes if it exists.")
     ] = None,
-    seed: Annotated[int | None, typer.Option(help="Seed for random initial values.")] = None,
+    seed: Annotated[int | None, Option(help="Seed for random initial values.")] = None,
     as_json: options.AsJson = False,
 ) -> None:
     """Fit a model of the forward dynamics to logged motion.
@@ -112,16 +109,14 @@ def _training(
 
 
 def sweep(
-    scene: Annotated[list[str], typer.Option("--scene", "-s", help="Scene; may be given several times.")],
-    model: Annotated[list[str], typer.Option("--model", "-m", help="Model; may be given several times.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the fits.")],
-    seeds: Annotated[int, typer.Option(min=1, help="Number of seeds, starting from 0.")] = 1,
+    scene: Annotated[list[str], Option("--scene", "-s", help="Scene; may be given several times.")],
+    model: Annotated[list[str], Option("--model", "-m", help="Model; may be given several times.")],
+    out: Annotated[Path, Option("--out", "-o", help="Folder for the fits.")],
+    seeds: Annotated[int, Option(min=1, help="Number of seeds, starting from 0.")] = 1,
     duration: options.SimulatedTime = None,
-    processes: Annotated[
-        int, typer.Option(min=1, help="Number of single-threaded workers on this machine.")
-    ] = 2,
+    processes: Annotated[int, Option(min=1, help="Number of single-threaded workers on this machine.")] = 2,
     address: Annotated[
-        str | None, typer.Option(help="Scheduler of a running cluster, instead of local workers.")
+        str | None, Option(help="Scheduler of a running cluster, instead of local workers.")
     ] = None,
     as_json: options.AsJson = False,
 ) -> None:

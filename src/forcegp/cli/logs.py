@@ -8,6 +8,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
+from typer import Argument, Option
 
 import forcegp
 from forcegp.cli import common
@@ -22,25 +23,25 @@ if TYPE_CHECKING:
 
 
 def import_(
-    log: Annotated[Path, typer.Argument(help="Log file or folder.")],
+    log: Annotated[Path, Argument(help="Log file or folder.")],
     scene: SceneOrNone = None,
     robot: RobotName = None,
     mapping: Annotated[
-        str | None, typer.Option("--mapping", "-m", help="Mapping file, or name of a bundled mapping.")
+        str | None, Option("--mapping", "-m", help="Mapping file, or name of a bundled mapping.")
     ] = None,
     out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="Output file for the data set (.parquet).")
+        Path | None, Option("--out", "-o", help="Output file for the data set (.parquet).")
     ] = None,
     guess: Annotated[
-        Path | None, typer.Option(help="Write a proposed mapping to this file instead of importing.")
+        Path | None, Option(help="Write a proposed mapping to this file instead of importing.")
     ] = None,
     fit_surface: Annotated[
         Literal["plane", "sphere"] | None,
-        typer.Option(help="Fit a surface to the path of each contact point and propose it for the scene."),
+        Option(help="Fit a surface to the path of each contact point and propose it for the scene."),
     ] = None,
     tip_radius: Annotated[
         str | None,
-        typer.Option(
+        Option(
             help="With --fit-surface: radius of a rounded tip that ends at the scene's point, in metres, or "
             "'fit' to estimate it; default: the radius in the scene."
         ),
@@ -149,13 +150,11 @@ COLOURS = {"error": "bold red", "warning": "yellow", "note": "cyan"}
 
 def check(
     data: Annotated[
-        Path, typer.Option("--data", "-d", help="Log (.parquet or .csv); NaN and gaps become findings.")
+        Path, Option("--data", "-d", help="Log (.parquet or .csv); NaN and gaps become findings.")
     ],
     scene: SceneOrNone = None,
     robot: RobotName = None,
-    out: Annotated[
-        Path | None, typer.Option("--out", "-o", help="HTML page with a plot of each finding.")
-    ] = None,
+    out: Annotated[Path | None, Option("--out", "-o", help="HTML page with a plot of each finding.")] = None,
     as_json: AsJson = False,
 ) -> None:
     """Check a log against a scene before fitting: clock, units, signs, masses, contact, noise and motion.
@@ -183,8 +182,7 @@ def check(
     if out is not None:
         from forcegp.report.check import write_check
 
-        title = f"{data} on {scene or robot}"
-        save(lambda path: write_check(path, title, report, system, log), out)
+        save(lambda path: write_check(path, f"{data} on {scene or robot}", report, system, log), out)
     if as_json:
         show({**report.to_dict(), "page": str(out) if out else None}, as_json)
     else:
@@ -212,9 +210,8 @@ def _print(report: Report) -> None:
             rows = re.sub("^rows? ", "", describe(finding.intervals, most=2))
             rows = "all" if finding.intervals == ((0, report.samples),) else rows
             # Joint and parameter names may contain brackets, which must not be read as markup.
-            body = Text(printable(f"{finding.message}\n")).append(
-                printable(f"→ {finding.remedy}"), style="dim"
-            )
+            remedy = printable(f"→ {finding.remedy}")
+            body = Text(printable(f"{finding.message}\n")).append(remedy, style="dim")
             kinds = "\nor ".join(finding.kinds)
             table.add_row(Text(finding.severity, style=COLOURS[finding.severity]), kinds, rows, body)
         Console().print(table)
@@ -223,27 +220,27 @@ def _print(report: Report) -> None:
 
 
 def select(
-    log: Annotated[Path, typer.Argument(help="Data set to select from (.parquet or .csv).")],
-    count: Annotated[int, typer.Option("--count", "-n", min=1, help="Number of training points.")],
-    out: Annotated[Path, typer.Option("--out", "-o", help="Output file for the training points (.parquet).")],
-    rest: Annotated[Path | None, typer.Option(help="Output file for the test points (.parquet).")] = None,
+    log: Annotated[Path, Argument(help="Data set to select from (.parquet or .csv).")],
+    count: Annotated[int, Option("--count", "-n", min=1, help="Number of training points.")],
+    out: Annotated[Path, Option("--out", "-o", help="Output file for the training points (.parquet).")],
+    rest: Annotated[Path | None, Option(help="Output file for the test points (.parquet).")] = None,
     split: Annotated[
         Literal["selection", "stretches"],
-        typer.Option(help="Test on all unselected points (as in the paper) or on held-out stretches."),
+        Option(help="Test on all unselected points (as in the paper) or on held-out stretches."),
     ] = "selection",
-    stretch: Annotated[float, typer.Option(help="Duration of a held-out stretch in seconds.")] = 3.0,
-    fraction: Annotated[float, typer.Option(help="Fraction of the motion to hold out.")] = 0.2,
+    stretch: Annotated[float, Option(help="Duration of a held-out stretch in seconds.")] = 3.0,
+    fraction: Annotated[float, Option(help="Fraction of the motion to hold out.")] = 0.2,
     margin: Annotated[
-        float, typer.Option(help="Gap between held-out stretches and training points in seconds.")
+        float, Option(help="Gap between held-out stretches and training points in seconds.")
     ] = 0.0,
     method: Annotated[
-        Literal["farthest", "even", "random"], typer.Option(help="Method for selecting training points.")
+        Literal["farthest", "even", "random"], Option(help="Method for selecting training points.")
     ] = "farthest",
     keep_impacts: Annotated[
-        bool, typer.Option("--keep-impacts", help="Keep rows that are marked as close to an impact.")
+        bool, Option("--keep-impacts", help="Keep rows that are marked as close to an impact.")
     ] = False,
     differentiate: Differentiate = None,
-    seed: Annotated[int, typer.Option(help="Seed for held-out stretches and random selection.")] = 0,
+    seed: Annotated[int, Option(help="Seed for held-out stretches and random selection.")] = 0,
     as_json: AsJson = False,
 ) -> None:
     """Select training points that cover a log, and keep the rest for testing.

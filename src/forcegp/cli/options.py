@@ -6,36 +6,33 @@ from importlib.resources import files
 from pathlib import Path
 from typing import Annotated
 
-import typer
+from typer import Option
 
-AsJson = Annotated[bool, typer.Option("--json", help="Print the result as JSON on stdout.")]
+AsJson = Annotated[bool, Option("--json", help="Print the result as JSON on stdout.")]
 SCENES = sorted(
     entry.name.removesuffix(".toml") for entry in (files("forcegp") / "scene" / "bundled").iterdir()
 )
 """Names of the bundled scenes, which are listed without loading the library."""
-_SCENE = typer.Option("--scene", "-s", help=f"Scene file, or name of a bundled scene: {', '.join(SCENES)}.")
+_SCENE = Option("--scene", "-s", help=f"Scene file, or name of a bundled scene: {', '.join(SCENES)}.")
 SceneName = Annotated[str, _SCENE]
 SceneOrNone = Annotated[str | None, _SCENE]
 RobotName = Annotated[
-    str | None,
-    typer.Option("--robot", help="URDF or MJCF file, or name of a bundled robot, instead of a scene."),
+    str | None, Option("--robot", help="URDF or MJCF file, or name of a bundled robot, instead of a scene.")
 ]
-ModelFile = Annotated[Path, typer.Option("--model", "-m", help="File of a fitted model.")]
-DataFile = Annotated[Path, typer.Option("--data", "-d", help="Data set (.parquet or .csv).")]
+ModelFile = Annotated[Path, Option("--model", "-m", help="File of a fitted model.")]
+DataFile = Annotated[Path, Option("--data", "-d", help="Data set (.parquet or .csv).")]
 SimulatedTime = Annotated[
-    float | None, typer.Option("--duration", help="Simulated time in seconds; default: from the scene.")
+    float | None, Option("--duration", help="Simulated time in seconds; default: from the scene.")
 ]
 Config = Annotated[
-    Path | None,
-    typer.Option(help="TOML file with a \\[model] table that replaces the one in the scene."),
+    Path | None, Option(help="TOML file with a \\[model] table that replaces the one in the scene.")
 ]
 DataFiles = Annotated[
-    list[Path],
-    typer.Option("--data", "-d", help="Data set (.parquet or .csv); may be given several times."),
+    list[Path], Option("--data", "-d", help="Data set (.parquet or .csv); may be given several times.")
 ]
 Differentiate = Annotated[
     int | None,
-    typer.Option(
+    Option(
         metavar="WINDOW",
         help="Compute missing velocities and accelerations with a Savitzky-Golay filter over this (odd) "
         "number of samples.",

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import TYPE_CHECKING, Annotated, Any
 
-import typer
+from typer import Option
 
 import forcegp
 from forcegp.cli.common import check_data_destination, progress_bar, read_data, save, show, warn_beyond
@@ -28,10 +28,10 @@ WRENCH = "external_wrench"
 def predict(
     model: ModelFile,
     data: DataFile,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Output file for the predictions (.parquet).")],
+    out: Annotated[Path, Option("--out", "-o", help="Output file for the predictions (.parquet).")],
     quantity: Annotated[
         str,
-        typer.Option(
+        Option(
             "--quantity",
             "-q",
             help="qdd, qdd_free, multiplier, constraint_force, contact_force, total_force, joint_force, "
@@ -39,19 +39,18 @@ def predict(
         ),
     ] = "qdd",
     frame: Annotated[
-        str | None,
-        typer.Option(help="Frame on which an external_wrench acts; no declared contact is needed."),
+        str | None, Option(help="Frame on which an external_wrench acts; no declared contact is needed.")
     ] = None,
-    reference: Annotated[str, typer.Option(help="Axes of an external_wrench: world or local.")] = "world",
+    reference: Annotated[str, Option(help="Axes of an external_wrench: world or local.")] = "world",
     momentum: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--momentum", help="Estimate external_wrench with a causal filter that needs no accelerations."
         ),
     ] = False,
     noise: Annotated[
         bool,
-        typer.Option(
+        Option(
             "--noise/--no-noise",
             help="Whether the standard deviation is that of a measurement and includes motor-torque and "
             "sensor noise (for models with such noise).",
@@ -59,9 +58,7 @@ def predict(
     ] = True,
     sensor: Annotated[
         bool,
-        typer.Option(
-            "--sensor", help="Predict λ using also the log's force sensor (fit with sensor_noise_std)."
-        ),
+        Option("--sensor", help="Predict λ using also the log's force sensor (fit with sensor_noise_std)."),
     ] = False,
     as_json: AsJson = False,
 ) -> None:
@@ -86,22 +83,20 @@ def predict(
     test = read_data(data, regression.specified.robot)
     if quantity == WRENCH:
         test, result = _with_wrench(regression, test, frame, reference, momentum)
-        save(test.with_step(f"predicted {quantity} by the model in {model}").write, out)
-        show({"quantity": quantity, "samples": len(test), **result, "file": str(out)}, as_json)
-        return
-    if sensor and quantity != "multiplier":
+    elif sensor and quantity != "multiplier":
         raise ModelError("the force sensor measures the multiplier", got=quantity, hint="-q multiplier")
-    with progress_bar(f"predicting {quantity}", len(test)) as progress:
-        doubts: dict[str, None] = {}
-        predicted = partial(_predicted, regression, doubts, quantity=quantity, noise=noise, sensor=sensor)
-        mean, std = in_chunks(predicted, test, progress)
-    warn_beyond(regression, test, doubts)
-    test = _with_columns(test, regression.system, quantity, f"predicted_{quantity}", mean)
-    if std is not None:
-        test = _with_columns(test, regression.system, quantity, f"predicted_{quantity}_std", std)
+    else:
+        with progress_bar(f"predicting {quantity}", len(test)) as progress:
+            doubts: dict[str, None] = {}
+            predicted = partial(_predicted, regression, doubts, quantity=quantity, noise=noise, sensor=sensor)
+            mean, std = in_chunks(predicted, test, progress)
+        warn_beyond(regression, test, doubts)
+        test = _with_columns(test, regression.system, quantity, f"predicted_{quantity}", mean)
+        if std is not None:
+            test = _with_columns(test, regression.system, quantity, f"predicted_{quantity}_std", std)
+        result = {"uncertainty": std is not None}
     save(test.with_step(f"predicted {quantity} by the model in {model}").write, out)
-    result = {"quantity": quantity, "samples": len(test), "uncertainty": std is not None}
-    show({**result, "file": str(out)}, as_json)
+    show({"quantity": quantity, "samples": len(test), **result, "file": str(out)}, as_json)
 
 
 def _predicted(
@@ -117,10 +112,8 @@ def _predicted(
         mean, std = force_from_sensor(model, part)  # pyright: ignore[reportArgumentType]
         return mean[:, None], std[:, None]
     states, active = (part.q, part.qd, part.tau), part.active(model.system.contact_names)
-    if noise and isinstance(model, StructuredFit):
-        prediction = model.predict(*states, quantity, active=active, noise=True)
-    else:
-        prediction = model.predict(*states, quantity, active=active)
+    options: dict[str, Any] = {"noise": True} if noise and isinstance(model, StructuredFit) else {}
+    prediction = model.predict(*states, quantity, active=active, **options)
     doubts.update(dict.fromkeys(prediction.doubts))
     return prediction.mean, prediction.std
 
@@ -128,10 +121,7 @@ def _predicted(
 def _with_wrench(
     model: Predictor, test: forcegp.Dataset, frame: str | None, reference: str, momentum: bool
 ) -> tuple[forcegp.Dataset, dict[str, object]]:
-    """Add the external wrench on a frame, and the detected contact, as a contact named after the frame.
-
-    Return the data set and a summary with the fraction of samples in contact.
-    """
+    """Add the wrench on a frame and the detected contact, named after the frame, and return a summary too."""
     from forcegp.models.structured_fit import StructuredFit
 
     if not isinstance(model, StructuredFit):

@@ -7,7 +7,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
-import typer
+from typer import Option
 
 import forcegp
 from forcegp.cli.common import check_data_destination, progress_bar, read_data, save, show, trajectory_from
@@ -23,22 +23,20 @@ if TYPE_CHECKING:
 def rollout(
     model: ModelFile,
     data: DataFile,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Folder for the trajectories and the page.")],
-    start: Annotated[int, typer.Option(min=0, help="Row of the data to start from.")] = 0,
+    out: Annotated[Path, Option("--out", "-o", help="Folder for the trajectories and the page.")],
+    start: Annotated[int, Option(min=0, help="Row of the data to start from.")] = 0,
     duration: Annotated[
-        float | None, typer.Option(help="Simulated time in seconds; default: to the end of the trajectory.")
+        float | None, Option(help="Simulated time in seconds; default: to the end of the trajectory.")
     ] = None,
-    samples: Annotated[int, typer.Option(min=0, help="Number of functions to draw from the posterior.")] = 0,
-    stabilization: Annotated[
-        str, typer.Option(help="Stabilization: none, baumgarte or projection.")
-    ] = "baumgarte",
+    samples: Annotated[int, Option(min=0, help="Number of functions to draw from the posterior.")] = 0,
+    stabilization: Annotated[str, Option(help="Stabilization: none, baumgarte or projection.")] = "baumgarte",
     method: Annotated[
-        str, typer.Option(help="Integrator: semi_implicit_euler, rk4, rk45 or dop853.")
+        str, Option(help="Integrator: semi_implicit_euler, rk4, rk45 or dop853.")
     ] = "semi_implicit_euler",
     unilateral: Annotated[
-        bool, typer.Option("--unilateral", help="Let contacts open instead of pulling, and close again.")
+        bool, Option("--unilateral", help="Let contacts open instead of pulling, and close again.")
     ] = False,
-    seed: Annotated[int, typer.Option(help="Seed for the samples.")] = 0,
+    seed: Annotated[int, Option(help="Seed for the samples.")] = 0,
     as_json: AsJson = False,
 ) -> None:
     """Simulate motion with a model, starting from a logged state and applying the logged torques.
@@ -176,29 +174,27 @@ def _learned(path: Path, sample: bool, seed: int) -> PassiveForces:
 
 def simulate(
     scene: SceneName,
-    out: Annotated[Path, typer.Option("--out", "-o", help="Output file for the log (.parquet).")],
+    out: Annotated[Path, Option("--out", "-o", help="Output file for the log (.parquet).")],
     duration: SimulatedTime = None,
     seed: Annotated[
-        int | None, typer.Option(help="Seed for the motion and the noise; default: from the scene.")
+        int | None, Option(help="Seed for the motion and the noise; default: from the scene.")
     ] = None,
     engine: Annotated[
-        str | None, typer.Option(help="Engine: pybullet, mujoco or auto; default: from the scene.")
+        str | None, Option(help="Engine: pybullet, mujoco or auto; default: from the scene.")
     ] = None,
     contact: Annotated[
         str | None,
-        typer.Option(help="rigid, or solver for MuJoCo's contacts and friction; default: from the scene."),
+        Option(help="rigid, or solver for MuJoCo's contacts and friction; default: from the scene."),
     ] = None,
     motion: Annotated[
-        Path | None,
-        typer.Option(help="Data set with the motion to follow, such as that of `forcegp excite`."),
+        Path | None, Option(help="Data set with the motion to follow, such as that of `forcegp excite`.")
     ] = None,
     model: Annotated[
         Path | None,
-        typer.Option("--model", "-m", help="Fitted model: simulate its robot with the learned joint forces."),
+        Option("--model", "-m", help="Fitted model: simulate its robot with the learned joint forces."),
     ] = None,
     sample: Annotated[
-        bool,
-        typer.Option("--sample", help="Use a posterior sample, drawn with the seed, instead of the mean."),
+        bool, Option("--sample", help="Use a posterior sample, drawn with the seed, instead of the mean.")
     ] = False,
     as_json: AsJson = False,
 ) -> None:

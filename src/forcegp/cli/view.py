@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
 import typer
+from typer import Argument, Option
 
 import forcegp
 from forcegp.cli.common import printable, progress_bar, read_data, show, trajectory_from
@@ -18,30 +19,23 @@ if TYPE_CHECKING:
 
 
 def view(
-    target: Annotated[
-        str, typer.Argument(help="Scene file, name of a bundled scene, or file of a fitted model.")
-    ],
-    data: Annotated[Path | None, typer.Option("--data", "-d", help="Log with the motion to display.")] = None,
+    target: Annotated[str, Argument(help="Scene file, name of a bundled scene, or file of a fitted model.")],
+    data: Annotated[Path | None, Option("--data", "-d", help="Log with the motion to display.")] = None,
     rollout: Annotated[
         Path | None,
-        typer.Option(
-            "--rollout", "-r", help="rollout.parquet from `forcegp rollout`, to display its motion."
-        ),
+        Option("--rollout", "-r", help="rollout.parquet from `forcegp rollout`, to display its motion."),
     ] = None,
     out: Annotated[
         Path | None,
-        typer.Option("--out", "-o", help="HTML file that works offline; if omitted, the page is served."),
+        Option("--out", "-o", help="HTML file that works offline; if omitted, the page is served."),
     ] = None,
-    start: Annotated[int, typer.Option(min=0, help="Row of the log to start from.")] = 0,
-    seconds: Annotated[float, typer.Option(min=0.05, help="Duration of the motion in seconds.")] = 10.0,
+    start: Annotated[int, Option(min=0, help="Row of the log to start from.")] = 0,
+    seconds: Annotated[float, Option(min=0.05, help="Duration of the motion in seconds.")] = 10.0,
     samples: Annotated[
-        int,
-        typer.Option(min=0, help="Number of sampled tip paths to draw (structured models only)."),
+        int, Option(min=0, help="Number of sampled tip paths to draw (structured models only).")
     ] = 8,
-    horizon: Annotated[
-        float, typer.Option(min=0.01, help="Duration of the predicted paths in seconds.")
-    ] = 1.0,
-    port: Annotated[int, typer.Option(min=1024, max=65535, help="Port of the page.")] = 8080,
+    horizon: Annotated[float, Option(min=0.01, help="Duration of the predicted paths in seconds.")] = 1.0,
+    port: Annotated[int, Option(min=1024, max=65535, help="Port of the page.")] = 8080,
     as_json: AsJson = False,
 ) -> None:
     """View a robot, its surfaces, contact forces and predicted paths in 3D.
@@ -70,8 +64,7 @@ def view(
     if data is not None and rollout is not None:
         raise ParameterError("--data and --rollout cannot be combined", hint="choose one motion to display")
     system, model, shapes = _target(target)
-    log = data or rollout
-    motion = at_rest(system)
+    log, motion = data or rollout, at_rest(system)
     if log is not None:
         stretch = _stretch(log, system if model is None else model.specified, start, seconds)
         motion = of_log(system, stretch, model)

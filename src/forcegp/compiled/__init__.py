@@ -41,11 +41,8 @@ class CompiledDynamics:
         source = (cuda_source if on_cuda else cpu_source)(program, robot.nq, robot.dtype)
         self._kernel: Kernel = (cuda_kernel if on_cuda else cpu_kernel)(source.text)
         self._arrays, self._arguments, self._shape = source.arrays, program.arguments, program.shape
-        self._eager: Callable[..., Tensor] = (
-            _stacked_derivatives
-            if quantity == "forward_dynamics_derivatives"
-            else getattr(dynamics, quantity)
-        )
+        stacked = quantity == "forward_dynamics_derivatives"
+        self._eager: Callable[..., Tensor] = _stacked_derivatives if stacked else getattr(dynamics, quantity)
 
     @cached_property
     def _jacobians(self) -> CompiledDynamics:
@@ -58,11 +55,8 @@ class CompiledDynamics:
             ShapeError: an argument is missing or does not match the robot.
         """
         if len(states) != len(self._arguments):
-            raise ShapeError(
-                f"compiled {self.quantity} takes {len(self._arguments)} arguments",
-                expected=", ".join(self._arguments),
-                got=len(states),
-            )
+            text = f"compiled {self.quantity} takes {len(self._arguments)} arguments"
+            raise ShapeError(text, expected=", ".join(self._arguments), got=len(states))
         common = common_states(self.robot, **dict(zip(self._arguments, states, strict=True)))
         return _Kernel.apply(self, *common)  # pyright: ignore[reportReturnType]
 
@@ -164,9 +158,6 @@ def compile_dynamics(robot: RobotModel, quantity: str = "forward_dynamics") -> C
             hint="use forcegp.dynamics while learning, and compile a detached robot afterwards",
         )
     if robot.dtype not in (torch.float64, torch.float32):
-        raise ModelError(
-            "the compiled dynamics do not support this precision",
-            expected="float64 or float32",
-            got=robot.dtype,
-        )
+        text = "the compiled dynamics do not support this precision"
+        raise ModelError(text, expected="float64 or float32", got=robot.dtype)
     return CompiledDynamics(robot, quantity)

@@ -83,5 +83,4 @@ def _point_blocks(links: Links, robot: RobotModel, index: int, point: np.ndarray
     omega, v, alpha, a = moves
     bias = a + cross(alpha, x) + cross(omega, v + cross(omega, x))
     rotation = R @ graph.constants(numbers(robot.frame_rotation[index]))
-    position = x + graph.constants(numbers(robot.base_position))
-    return [rotation, position, J, np.concatenate([alpha, bias])]
+    return [rotation, x + graph.constants(numbers(robot.base_position)), J, np.concatenate([alpha, bias])]

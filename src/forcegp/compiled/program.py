@@ -255,10 +255,8 @@ def _inverse_dynamics_derivatives(
 def _bend(motion: _Motion, screw: tuple, rate: tuple) -> tuple[np.ndarray, np.ndarray]:
     """Return S̈ = a × S + V × Ṡ for one joint."""
     (omega, v, alpha, a), (z, l) = motion, screw
-    return (
-        cross(alpha, z) + cross(omega, rate[0]),
-        cross(alpha, l) + cross(a, z) + cross(omega, rate[1]) + cross(v, rate[0]),
-    )
+    turned = cross(alpha, z) + cross(omega, rate[0])
+    return turned, cross(alpha, l) + cross(a, z) + cross(omega, rate[1]) + cross(v, rate[0])
 
 
 def _columns(

@@ -123,17 +123,14 @@ def cpu_source(program: Program, nq: int, dtype: torch.dtype) -> Source:
         f"    entry[{k}][lane] = in[{arrays.index(name)}][row * {nq} + {index}];"
         for k, (name, index) in enumerate(entries)
     )
+    load_of = {entry: f"*(const V*)entry[{k}]" for k, entry in enumerate(entries)}
     text = _CPU.format(
         type=_type(dtype),
         bytes=LANES_BYTES,
         inputs=len(entries),
         outputs=len(program.outputs),
         load=load,
-        body=statements(
-            program,
-            {entry: f"*(const V*)entry[{k}]" for k, entry in enumerate(entries)},
-            "*(V*)result[{k}] = {value};",
-        ),
+        body=statements(program, load_of, "*(V*)result[{k}] = {value};"),
         shifted=", ".join(f"in[{k}] + start * {nq}" for k in range(len(arrays))),
     )
     return Source(text, arrays)
@@ -188,9 +185,8 @@ def c_function(name: str, program: Program) -> str:
             lines += [f"  out[{k}] = {value_of(position)};" for k in stored.get(position, ())]
             lines += [f"  kept[{slot[position]}] = x{position};"] if position in slot else []
         unread = "".join(f"(void){x}, " for x in (*names, "kept"))
-        texts.append(
-            f"static void {name}_{i}({arguments}) {{\n  {unread}(void)out;\n{chr(10).join(lines)}\n}}\n"
-        )
+        code = "\n".join(lines)
+        texts.append(f"static void {name}_{i}({arguments}) {{\n  {unread}(void)out;\n{code}\n}}\n")
     calls = ", ".join(f"{name}_{i}" for i in range(len(steps)))
     passed = ", ".join((*names, "kept", "out"))
     texts.append(
@@ -204,14 +200,11 @@ def c_function(name: str, program: Program) -> str:
 def cuda_source(program: Program, nq: int, dtype: torch.dtype) -> Source:
     """Return CUDA C++ code that computes one sample per thread."""
     arrays, entries = inputs_of(program)
+    load = {(name, index): f"in_{name}[row * {nq} + {index}]" for name, index in entries}
     text = _CUDA.format(
         type=_type(dtype),
         parameters=", ".join(f"const T* in_{name}" for name in arrays),
-        body=statements(
-            program,
-            {(name, index): f"in_{name}[row * {nq} + {index}]" for name, index in entries},
-            f"out[row * {len(program.outputs)} + {{k}}] = {{value}};",
-        ),
+        body=statements(program, load, f"out[row * {len(program.outputs)} + {{k}}] = {{value}};"),
     )
     return Source(text, arrays)
 

@@ -317,9 +317,7 @@ def _residuals(
         A, b = rows(q, qd)
         along = b - (A @ qdd[..., None])[..., 0]
         force = (A.mT @ multiplier[..., None])[..., 0] + dynamics.damping_force(robot, qd)
-        slopes = [
-            torch.autograd.grad(component.sum(), state, retain_graph=True)[0]
-            for component in torch.cat([along, force], dim=-1).unbind(-1)
-        ]
+        sums = (component.sum() for component in torch.cat([along, force], dim=-1).unbind(-1))
+        slopes = [torch.autograd.grad(x, state, retain_graph=True)[0] for x in sums]
     jacobian = torch.stack(slopes, dim=-2)
     return jacobian[..., : b.shape[-1], :], jacobian[..., b.shape[-1] :, :]

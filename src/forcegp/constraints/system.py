@@ -207,10 +207,8 @@ class ConstrainedSystem:
         if not isinstance(active, Tensor):
             raise ShapeError("active is not a tensor", expected="a bool tensor", got=type(active).__name__)
         sizes = zip(reversed(active.shape), reversed((*batch, n)), strict=False)
-        fits = (
-            0 < active.ndim <= len(batch) + 1 and active.shape[-1] == n and all(a in (1, b) for a, b in sizes)
-        )
-        if not fits or active.dtype != torch.bool:
+        fits = 0 < active.ndim <= len(batch) + 1 and active.shape[-1] == n
+        if not fits or not all(a in (1, b) for a, b in sizes) or active.dtype != torch.bool:
             raise ShapeError(
                 f"active does not match the contacts {', '.join(self.contact_names) or '(none)'}",
                 expected=f"bool of shape {(*batch, n)}",

@@ -20,7 +20,6 @@ PULL = 1e-9
 """Value of −λ above which a contact pulls [N]; rounding errors must not open an unloaded contact."""
 APPROACH = 1e-9
 """Value of −ċ above which a contact closes [m/s]; after an impact, ċ is zero up to rounding error."""
-
 POSITION_TOLERANCE = 1e-12
 """Largest constraint error considered zero [m]; rounding errors in an arm's kinematics are near 1e-15 m."""
 ROUNDING = 100.0
@@ -169,12 +168,7 @@ def land(system: ConstrainedSystem, q: Tensor, qd: Tensor, closed: Tensor) -> La
 
 
 def contact_forces(
-    system: ConstrainedSystem,
-    q: Tensor,
-    qd: Tensor,
-    landing: Landing,
-    Q_u: Tensor,
-    viscous_friction: float,
+    system: ConstrainedSystem, q: Tensor, qd: Tensor, landing: Landing, Q_u: Tensor, viscous_friction: float
 ) -> ContactForces:
     """Return the normal and friction forces at a state `(nq,)` under the torque Q_u [N m].
 

@@ -85,16 +85,10 @@ def orientation_error(rotation: Tensor, target: Tensor) -> Tensor:
 def task_acceleration(tool: PointMotion, target: Target, gains: Gains) -> Tensor:
     """Return [ω̇; p̈] `(*batch, 6)` for which both errors satisfy ë + k_D ė + k_P e = 0."""
     omega, velocity = tool.twist[..., :3], tool.twist[..., 3:]
-    turning = (
-        gains.orientation_stiffness * orientation_error(tool.rotation, target.rotation)
-        - gains.orientation_damping * omega
-    )
-    moving = (
-        target.acceleration
-        + gains.position_damping * (target.velocity - velocity)
-        + gains.position_stiffness * (target.position - tool.position)
-    )
-    return torch.cat([turning, moving], -1)
+    turning = gains.orientation_stiffness * orientation_error(tool.rotation, target.rotation)
+    moving = target.acceleration + gains.position_damping * (target.velocity - velocity)
+    moving = moving + gains.position_stiffness * (target.position - tool.position)
+    return torch.cat([turning - gains.orientation_damping * omega, moving], -1)
 
 
 def joint_acceleration(tool: PointMotion, task: Tensor, posture: Tensor) -> Tensor:
@@ -124,13 +118,7 @@ def joint_acceleration(tool: PointMotion, task: Tensor, posture: Tensor) -> Tens
 
 
 def control_torque(
-    tool: PointMotion,
-    eom: Any,
-    q: Tensor,
-    qd: Tensor,
-    target: Target,
-    press: Tensor,
-    gains: Gains,
+    tool: PointMotion, eom: Any, q: Tensor, qd: Tensor, target: Target, press: Tensor, gains: Gains
 ) -> Tensor:
     """Return the motor torque Q_u = M y − Q_K − Q_n F of inverse-dynamics control, before limits [N m].
 

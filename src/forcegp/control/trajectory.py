@@ -48,8 +48,7 @@ class Trapezoid(NamedTuple):
         cruise = a * blend
         distance = pick(0.5 * a * t**2, self.length - 0.5 * a * remaining**2, cruise * (t - 0.5 * blend))
         speed = pick(a * t, a * remaining, cruise)
-        rate = pick(a, -a, torch.zeros_like(a))
-        return distance, speed, rate
+        return distance, speed, pick(a, -a, torch.zeros_like(a))
 
 
 def trapezoid(length: Tensor, travel_time: float, max_acceleration: float) -> Trapezoid:
@@ -181,8 +180,7 @@ def straight_lines(
     refer to the chart, and on a plane or in free space also to the end-effector. The motion ends at rest.
     """
     lines = waypoints.diff(dim=0)
-    length = torch.linalg.vector_norm(lines, dim=-1)
-    profile = trapezoid(length, travel_time, max_acceleration)
+    profile = trapezoid(torch.linalg.vector_norm(lines, dim=-1), travel_time, max_acceleration)
     ends = profile.travel_time.cumsum(0)
     segment = torch.searchsorted(ends, t, right=True).clamp(max=len(lines) - 1)
     since = t - (ends - profile.travel_time)[segment]

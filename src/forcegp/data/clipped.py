@@ -45,9 +45,8 @@ def limits_of(values: Array) -> tuple[float, float]:
     """Return the most frequent values near the maximum and minimum, which a filter's overshoot may exceed."""
     limits = []
     for extreme in (values.max(), values.min()):
-        near, counts = np.unique(
-            values[np.abs(values - extreme) <= BAND * np.ptp(values)], return_counts=True
-        )
+        band = values[np.abs(values - extreme) <= BAND * np.ptp(values)]
+        near, counts = np.unique(band, return_counts=True)
         often = near[counts == counts.max()]
         limits.append(float(often[np.abs(often - extreme).argmin()]))
     return limits[0], limits[1]

@@ -50,11 +50,8 @@ def parse(source: str, raw: Columns, header: DataHeader, method: SavitzkyGolay |
     fields["segment"] = _segment(source, unread, len(fields["t"]))
     fields["extras"], fields["contact_extras"] = _extras(source, unread, joints, contacts)
     if unread:
-        warnings.warn(
-            f"{source}: columns of unknown meaning are ignored: {', '.join(unread)}",
-            IgnoredColumnsWarning,
-            stacklevel=4,
-        )
+        text = f"{source}: columns of unknown meaning are ignored: {', '.join(unread)}"
+        warnings.warn(text, IgnoredColumnsWarning, stacklevel=4)
     if method and absent:
         header = _fill_in(source, fields, absent, method, header)
     # Without a header in the file, the names follow from the columns.
@@ -70,8 +67,7 @@ def as_tensors(fields: Arrays, dtype: torch.dtype, device: torch.device) -> Arra
             return {name: convert(item) for name, item in value.items()}
         if not isinstance(value, np.ndarray):
             return value
-        kind = dtype if value.dtype.kind == "f" else None
-        return torch.tensor(value, dtype=kind, device=device)
+        return torch.tensor(value, dtype=dtype if value.dtype.kind == "f" else None, device=device)
 
     return {name: convert(value) for name, value in fields.items()}
 
@@ -86,12 +82,9 @@ def _take(source: str, unread: Columns, name: str, remedy: str | None = None) ->
         return unread.pop(name)
     kin = [other for other in unread if other.split(".", 1)[0] == name.split(".", 1)[0]]
     near = near_names(name, kin or unread, cutoff=0.75)
-    raise DataError(
-        f"{source}: column {name!r} is missing",
-        expected=name,
-        got=_listing(unread),
-        hint=remedy or (f"did you mean column {near[0]!r}?" if near else None),
-    )
+    text = f"{source}: column {name!r} is missing"
+    hint = remedy or (f"did you mean column {near[0]!r}?" if near else None)
+    raise DataError(text, expected=name, got=_listing(unread), hint=hint)
 
 
 def _joint_vector(source: str, unread: Columns, name: str, joints: Sequence[str]) -> NDArray[np.float64]:
@@ -106,11 +99,8 @@ def _contact(source: str, unread: Columns, name: str) -> NDArray[np.bool_]:
     values = _take(source, unread, name)
     wrong = np.flatnonzero((values != 0) & (values != 1))
     if len(wrong):
-        raise DataError(
-            f"{source}: column {name!r} is not a flag in row {wrong[0]}",
-            expected="true or false, or 1 or 0",
-            got=values[wrong[0]],
-        )
+        text = f"{source}: column {name!r} is not a flag in row {wrong[0]}"
+        raise DataError(text, expected="true or false, or 1 or 0", got=values[wrong[0]])
     return values.astype(bool)
 
 
@@ -119,11 +109,8 @@ def _segment(source: str, unread: Columns, n: int) -> NDArray[np.int64]:
     numbers = np.asarray(values, float)
     wrong = np.flatnonzero(~(np.abs(numbers) <= SEGMENT_NUMBER) | (numbers != np.floor(numbers)))
     if len(wrong):
-        raise DataError(
-            f"{source}: column 'segment' is not a trajectory number in row {wrong[0]}",
-            expected=f"an integer between ±{SEGMENT_NUMBER}",
-            got=values[wrong[0]],
-        )
+        text = f"{source}: column 'segment' is not a trajectory number in row {wrong[0]}"
+        raise DataError(text, expected=f"an integer between ±{SEGMENT_NUMBER}", got=values[wrong[0]])
     return values.astype(np.int64)
 
 

@@ -100,10 +100,8 @@ class Dataset(Fields):
             return contact_extras[name]
         if name.startswith("_"):
             raise AttributeError(name)
-        raise NotLoggedError(
-            f"{name!r} is not logged in this data set",
-            expected="one of " + ", ".join([*JOINT_VECTORS, *extras, *contact_extras]),
-        )
+        text = f"{name!r} is not logged in this data set"
+        raise NotLoggedError(text, expected="one of " + ", ".join([*JOINT_VECTORS, *extras, *contact_extras]))
 
     def __getitem__(self, rows: object) -> Dataset:
         """Return a data set with the given rows, which are a slice, a mask `(n,)` or indices in any order.

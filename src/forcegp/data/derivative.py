@@ -38,11 +38,9 @@ class SavitzkyGolay:
 
     def __post_init__(self) -> None:
         if self.window % 2 == 0 or not 2 <= self.order < self.window:
-            raise DataError(
-                "the Savitzky-Golay filter is not defined",
-                expected="an odd window, and 2 ≤ order < window",
-                got=f"window {self.window}, order {self.order}",
-            )
+            text = "the Savitzky-Golay filter is not defined"
+            got = f"window {self.window}, order {self.order}"
+            raise DataError(text, expected="an odd window, and 2 ≤ order < window", got=got)
 
 
 def cross_validated_window(
@@ -73,11 +71,8 @@ def cross_validated_window(
 
     best = []
     if any(len(x) <= WINDOWS[0] for x in signals):
-        raise DataError(
-            "the signal is too short for a filter",
-            expected=f"more than {WINDOWS[0]} samples",
-            got=min(map(len, signals)),
-        )
+        text = "the signal is too short for a filter"
+        raise DataError(text, expected=f"more than {WINDOWS[0]} samples", got=min(map(len, signals)))
     for x in signals:
         windows = [w for w in WINDOWS if order < w < len(x) and w <= max(most or w, WINDOWS[0])]
         weights = [savgol_coeffs(w, order)[w // 2] for w in windows]
@@ -129,19 +124,14 @@ def differentiate(
 def _time_step(t: NDArray[np.float64], rows: slice, window: int) -> float:
     steps = np.diff(t[rows])
     if len(steps) + 1 < window:
-        raise DataError(
-            f"the trajectory in rows {rows.start} to {rows.stop - 1} is too short to differentiate",
-            expected=f"at least {window} samples, the filter's window",
-            got=f"{len(steps) + 1}",
-        )
+        text = f"the trajectory in rows {rows.start} to {rows.stop - 1} is too short to differentiate"
+        got = f"{len(steps) + 1}"
+        raise DataError(text, expected=f"at least {window} samples, the filter's window", got=got)
     dt = float(np.median(steps))
     uneven = np.flatnonzero(~(np.abs(steps - dt) <= UNIFORM_TOLERANCE * dt))
     if len(uneven) or not dt > 0.0:
         row = rows.start + int(uneven[0] if len(uneven) else 0) + 1
-        raise DataError(
-            f"the time steps are uneven at row {row} and the log cannot be differentiated",
-            expected=f"steps of {dt:.6g} s",
-            got=f"{t[row] - t[row - 1]:.6g} s",
-            hint="resample the log, or number its parts without gaps in a column 'segment'",
-        )
+        text = f"the time steps are uneven at row {row} and the log cannot be differentiated"
+        hint = "resample the log, or number its parts without gaps in a column 'segment'"
+        raise DataError(text, expected=f"steps of {dt:.6g} s", got=f"{t[row] - t[row - 1]:.6g} s", hint=hint)
     return dt

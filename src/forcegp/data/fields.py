@@ -158,9 +158,8 @@ def check_layout(data: Fields) -> None:
     if n < 0:
         raise DataError("column 't' has the wrong shape", expected="(n,)", got=tuple(data.t.shape))
     if nq == 0 or len(set(data.joint_names)) < nq:
-        raise DataError(
-            "the joint names are not valid", expected="one or more distinct", got=data.joint_names
-        )
+        text = "the joint names are not valid"
+        raise DataError(text, expected="one or more distinct", got=data.joint_names)
     shared = sorted(set(data.joint_names) & set(data.contact))
     if shared:
         raise DataError(f"{shared[0]!r} is the name of a joint and of a contact", hint="rename the contact")
@@ -192,29 +191,23 @@ def _check_names(data: Fields) -> None:
     taken = set(vars(data))
     for name in (*data.extras, *data.contact_extras):
         if name in taken or "." in name or not name:
-            raise DataError(
-                f"{name!r} cannot be the name of an additional quantity",
-                expected="a unique name without a dot",
-                hint=f"{', '.join(sorted(taken))} are taken",
-            )
+            text = f"{name!r} cannot be the name of an additional quantity"
+            hint = f"{', '.join(sorted(taken))} are taken"
+            raise DataError(text, expected="a unique name without a dot", hint=hint)
         taken.add(name)
 
 
 def _check_type(name: str, value: Tensor, like: Tensor) -> None:
     if not value.is_floating_point() or value.dtype != like.dtype or value.device != like.device:
         wanted = f"{like.dtype} on {like.device}" if like.is_floating_point() else "a floating-point type"
-        raise DataError(
-            f"column {name!r} is of another type or on another device than 't'",
-            expected=wanted,
-            got=f"{value.dtype} on {value.device}",
-        )
+        text = f"column {name!r} is of another type or on another device than 't'"
+        raise DataError(text, expected=wanted, got=f"{value.dtype} on {value.device}")
 
 
 def _check_shape(name: str, value: Tensor, shape: tuple[int, ...], meaning: str) -> None:
     if tuple(value.shape) != shape:
-        raise DataError(
-            f"column {name!r} has the wrong shape", expected=f"{shape}, {meaning}", got=tuple(value.shape)
-        )
+        text = f"column {name!r} has the wrong shape"
+        raise DataError(text, expected=f"{shape}, {meaning}", got=tuple(value.shape))
 
 
 def check_values(data: Fields) -> None:
@@ -254,9 +247,8 @@ def check_time(data: Fields) -> None:
     if len(runs.unique()) < len(runs):
         seen, values = set(), runs.tolist()
         twice = next(value for value in values if value in seen or seen.add(value))
-        raise DataError(
-            f"the rows of segment {twice} are not contiguous", hint="sort the log by 'segment' and 't'"
-        )
+        text = f"the rows of segment {twice} are not contiguous"
+        raise DataError(text, hint="sort the log by 'segment' and 't'")
 
 
 def row_indices(rows: object, n: int, device: torch.device) -> Tensor:
@@ -314,10 +306,8 @@ def check_robot(data: Fields, robot: RobotModel) -> None:
     """Check that joints match, and warn if robot parameters differ or if angles may be in degrees."""
     check_joints(data.joint_names, robot.joint_names, robot.name)
     q, free = data.q.to(robot.lower) * robot.revolute, torch.full_like(robot.lower, MOST_RADIANS)
-    low, high = (
-        robot.lower.where(robot.lower.isfinite(), -free),
-        robot.upper.where(robot.upper.isfinite(), free),
-    )
+    low = robot.lower.where(robot.lower.isfinite(), -free)
+    high = robot.upper.where(robot.upper.isfinite(), free)
     beyond, most = int(((q < low) | (q > high)).any(-1).sum()), float(q.abs().max()) if len(data) else 0.0
     if most > TURN and 2 * beyond > len(data):
         warnings.warn(
@@ -379,11 +369,8 @@ def check_alike(parts: Sequence[Fields]) -> None:
     for number, part in enumerate(parts[1:], start=1):
         for what, value in layout(part).items():
             if value != first[what]:
-                raise DataError(
-                    f"the {what} of data set {number} differ from those of data set 0",
-                    expected=first[what],
-                    got=value,
-                )
+                text = f"the {what} of data set {number} differ from those of data set 0"
+                raise DataError(text, expected=first[what], got=value)
 
 
 def common_stick_speeds(headers: Sequence[DataHeader]) -> dict[str, float]:

@@ -8,17 +8,7 @@ from matplotlib.axes import Axes
 
 from forcegp.data.fields import AXES, JOINT_VECTORS, Fields
 from forcegp.errors import UnknownNameError
-from forcegp.plots import (
-    CYCLE,
-    MEASURED,
-    Curve,
-    Panel,
-    Target,
-    Timeline,
-    axis_label,
-    chosen,
-    draw_panels,
-)
+from forcegp.plots import CYCLE, MEASURED, Curve, Panel, Target, Timeline, axis_label, chosen, draw_panels
 
 
 def plot(

@@ -205,11 +205,9 @@ def split_by_stretches(
 def _stretches(data: Dataset, stretch: float) -> list[tuple[int, int]]:
     """Divide the trajectories into parts of equal duration, and return their row ranges."""
     if not data.header.ordered:
-        raise DataError(
-            "held-out blocks require a log in time order",
-            got="points in order of selection",
-            hint="split the log before selecting points from it",
-        )
+        text = "held-out blocks require a log in time order"
+        hint = "split the log before selecting points from it"
+        raise DataError(text, got="points in order of selection", hint=hint)
     if not 0.0 < stretch < float("inf"):
         raise DataError("the duration of a stretch is invalid", expected="a positive time [s]", got=stretch)
     _, counts = torch.unique_consecutive(data.segment, return_counts=True)

@@ -105,22 +105,17 @@ class _Trajectories:
         """Renumber the segments of the next rows, continuing the numbering of the previous rows."""
         raw, t = columns["segment"], columns.get("t")
         if ordered and t is not None and raw[0] == self.raw and t[0] <= self.time:
-            raise DataError(
-                f"{self.source}: column 't' does not increase",
-                expected=f"more than {self.time:.9g} s",
-                got=f"{t[0]:.9g} s",
-                hint="sort the log by time, or number its trajectories in a column 'segment'",
-            )
+            text = f"{self.source}: column 't' does not increase"
+            hint = "sort the log by time, or number its trajectories in a column 'segment'"
+            raise DataError(text, expected=f"more than {self.time:.9g} s", got=f"{t[0]:.9g} s", hint=hint)
         starts = self._starts(raw)
         fresh = set(raw[starts].astype(float).tolist())
         repeated = fresh & self.segments
         if ordered and (repeated or len(fresh) < int(starts.sum())):
             which = next(iter(repeated), None)
-            raise DataError(
-                f"{self.source}: the rows of a segment are not contiguous",
-                got=None if which is None else f"segment {which:g} again",
-                hint="sort the log by 'segment' and 't'",
-            )
+            text = f"{self.source}: the rows of a segment are not contiguous"
+            hint = "sort the log by 'segment' and 't'"
+            raise DataError(text, got=None if which is None else f"segment {which:g} again", hint=hint)
         self.segments |= fresh
         columns["segment"] = self.last_number + np.cumsum(starts)
         self.raw, self.last_number = float(raw[-1]), int(columns["segment"][-1])

@@ -52,10 +52,7 @@ def write_parquet(path: str | Path, columns: Columns, header: DataHeader) -> Non
     schema = pa.schema({name: pa.from_numpy_dtype(values.dtype) for name, values in columns.items()})
     schema = schema.with_metadata({HEADER_KEY: header.to_json().encode()})
     rows = max(map(len, columns.values()), default=0)
-    with (
-        atomic_file(path) as temporary,
-        pq.ParquetWriter(temporary.absolute(), schema, compression="zstd") as writer,
-    ):
+    with atomic_file(path) as file, pq.ParquetWriter(file.absolute(), schema, compression="zstd") as writer:
         for start in range(0, rows, GROUP_ROWS):
             group = {name: pa.array(values[start : start + GROUP_ROWS]) for name, values in columns.items()}
             writer.write_table(pa.table(group, schema=schema))
@@ -182,11 +179,8 @@ def _usable(file: Path, schema: pa.Schema) -> list[str]:
     ignored = sorted(set(names) - set(numeric), key=names.index)
     # Text columns that should be numeric are reported by name when they are needed; others are harmless.
     if ignored:
-        warnings.warn(
-            f"{file}: non-numeric columns are ignored: {', '.join(ignored)}",
-            IgnoredColumnsWarning,
-            stacklevel=5,
-        )
+        text = f"{file}: non-numeric columns are ignored: {', '.join(ignored)}"
+        warnings.warn(text, IgnoredColumnsWarning, stacklevel=5)
     return numeric
 
 
@@ -194,9 +188,6 @@ def numeric(file: Path, name: str, column: pa.ChunkedArray, missing: str) -> NDA
     """Return the values of a column. Missing values raise `DataError` or become NaN."""
     if column.null_count and missing == "refuse":
         row = int(np.flatnonzero(column.is_null().to_numpy())[0])
-        raise DataError(
-            f"{file}: column {name!r} has {column.null_count} missing values, the first in row {row}",
-            expected="a number in every row",
-            got="an empty value",
-        )
+        text = f"{file}: column {name!r} has {column.null_count} missing values, the first in row {row}"
+        raise DataError(text, expected="a number in every row", got="an empty value")
     return column.to_numpy()

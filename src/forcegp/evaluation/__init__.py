@@ -88,9 +88,7 @@ class Evaluation:
         """One-sentence verdict on non-gravitational torque, open-loop motion and contact forces."""
         parts, shares = [], {p.name: p.beyond_gravity for p in self.predictors}
         if (share := shares.pop("model", None)) is not None:
-            others = [
-                f"{name} {_percent(x)}" for name, x in shares.items() if x is not None and name != "mean"
-            ]
+            others = [f"{n} {_percent(x)}" for n, x in shares.items() if x is not None and n != "mean"]
             parts.append(
                 f"the model explains {_percent(share)} of the non-gravitational torque ({', '.join(others)})"
             )
@@ -130,11 +128,8 @@ class Evaluation:
                 f"Gravity alone explains {share} of the torque, so the data hardly test anything else."
             )
         if self.response is not None and min(self.response) < LEAST_RESPONSE:
-            weak = [
-                f"{j} {x:.2f}"
-                for j, x in zip(self.joint_names, self.response, strict=True)
-                if x < LEAST_RESPONSE
-            ]
+            pairs = zip(self.joint_names, self.response, strict=True)
+            weak = [f"{joint} {x:.2f}" for joint, x in pairs if x < LEAST_RESPONSE]
             text = f"An added torque has too small an effect (expected: 1): {', '.join(weak)}."
             found.append(f"{text} The model has learned the controller, not the arm.")
         return tuple(found)

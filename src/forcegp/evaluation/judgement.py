@@ -102,8 +102,7 @@ def torque_response(model: FittedModel, data: Dataset) -> tuple[float, ...] | No
         model.predict(data.q, data.qd, tau, active=closed[rows], covariance=False).mean
         for tau in (data.tau, data.tau + added)
     )
-    M = dynamics.mass_matrix(model.system.robot, data.q)
-    acts = (M @ (after - before)[..., None])[..., 0]
+    acts = (dynamics.mass_matrix(model.system.robot, data.q) @ (after - before)[..., None])[..., 0]
     return tuple(((acts * added).sum(0) / added.square().sum(0).clamp(min=1e-300)).tolist())
 
 

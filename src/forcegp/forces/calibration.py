@@ -273,9 +273,8 @@ def _held_out(
     """Return held-out torque residuals `(n, nq)` of measurement i, their variance without noise, and P."""
     training, std = problem.training, problem.noise_at(hyperparameters, i)
     m, system = training.measurements[i][own], problem.system
-    posterior = force_posterior(
-        dataclasses.replace(problem, training=training.without(i, own)), hyperparameters
-    )
+    rest = dataclasses.replace(problem, training=training.without(i, own))
+    posterior = force_posterior(rest, hyperparameters)
     at = m.at(system)
     z, M = affine_map(system, at, m.quantity), at.eom.M
     if m.quantity == "joint_force":

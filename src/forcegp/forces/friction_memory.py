@@ -122,9 +122,8 @@ def memory_of(
         white = (M.square() @ std[rows].square()[..., None])[..., 0]
         residual = (M @ part.values[..., None])[..., 0] - mean
         parts.append((residual, white, S.diagonal(dim1=-2, dim2=-1), noise))
-    memory = learn_memory(
-        problem.system.robot, m[free], *(torch.cat(columns) for columns in zip(*parts, strict=True))
-    )
+    columns = (torch.cat(column) for column in zip(*parts, strict=True))
+    memory = learn_memory(problem.system.robot, m[free], *columns)
     if memory is None:
         return {}
     return {WEIGHTS: memory.weights, SHARE: memory.share, CORRELATION: memory.correlation}

@@ -58,7 +58,7 @@ from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import ForceMean
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import JointFrictionPrior
-from forcegp.forces.problem import Problem, force_posterior
+from forcegp.forces.problem import Problem, force_posterior, typical
 from forcegp.gp.features import Block
 from forcegp.identification import regressor
 from forcegp.robot.model import RobotModel
@@ -125,9 +125,6 @@ def _consistent(
     The links are updated with the drives marginalised, and the drives are then updated given the links.
     Drives whose inertia would be negative are removed. To first order, these steps minimise
     ½ (u − û)ᵀ P (u − û) + V(u) with the divergence V of the links, so ∂u/∂g = (P + V″)⁻¹ P ∂û/∂g.
-
-    Args:
-        size: units of the drive inertias `(nq,)`.
     """
     every, n = found.by_stretch.total(), len(size)
     _, precision, per_gain = found.normal()
@@ -178,11 +175,7 @@ class _Regression:
         return h, precision + eye, per_gain
 
     def estimate(self, given: NormalEquations, kept: Tensor, n: int, known: Tensor | None = None) -> Tensor:
-        """Return the most probable values of the unknowns `kept`, with nonnegative drives (the first n).
-
-        Args:
-            known: values of the other unknowns; zero by default.
-        """
+        """Return the most probable values of the unknowns `kept`, with nonnegative drives (the first n)."""
         h, precision, _ = self.normal(given)
         known = torch.zeros_like(h) if known is None else known
         h = h - precision @ known
@@ -201,12 +194,7 @@ def _marginal(precision: Tensor, kept: Tensor, others: Tensor) -> Tensor:
 
 
 def _over_widths(rows: Rows, inertial: Tensor, M: Tensor) -> Iterator[_Regression]:
-    """Yield, for each averaging width, a regression on equations averaged over time.
-
-    Args:
-        inertial: columns `(n, nq, p)` of drives and links.
-        M: mass matrix of the robot file.
-    """
+    """Yield, for each averaging width, a regression on equations averaged over time."""
     accelerating, n = (M @ rows.qdd[..., None])[..., 0], M.shape[-1]
     for width in WIDTHS if rows.step else WIDTHS[:1]:
         used, columns = averaged(rows, inertial, accelerating, width) if rows.step else (rows, inertial)
@@ -317,11 +305,7 @@ def _damped(rows: Rows, M: Tensor, found: Tensor) -> Tensor:
     """Return the drive inertia `(nq,)` to add to the robot file.
 
     If torques predict accelerations far worse than the mean acceleration does, even with friction with memory
-    included, drive inertia is increased until both predict equally well.
-
-    Args:
-        M: mass matrix of the robot file at the samples.
-        found: drive inertia identified from the torques.
+    included, drive inertia is increased from `found` until both predict equally well.
     """
     remembering, C = rows.with_memory(), torch.diag_embed(rows.qdd)
     if _excess(remembering, sums(remembering, C).total(), M, found) <= math.log(FAR_LARGER):
@@ -353,10 +337,8 @@ def _drives(given: NormalEquations, noise: Tensor, M: Tensor, weight: float) -> 
         slope = np.linalg.inv(moved).diagonal(axis1=-2, axis2=-1).mean(0)
         return float(value), H @ x - h - weight * slope
 
-    start = np.zeros(len(h))
-    found = scipy.optimize.minimize(
-        objective, start, jac=True, method="L-BFGS-B", bounds=[(0.0, None)] * len(h)
-    )
+    start, bounds = np.zeros(len(h)), [(0.0, None)] * len(h)
+    found = scipy.optimize.minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds)
     return torch.from_numpy(found.x).to(scale) * scale
 
 
@@ -400,8 +382,7 @@ def _log_volume(problem: Problem, values: Mapping[str, Tensor]) -> Callable[[Rob
         if not len(free):
             continue
         q = m.q[free[torch.linspace(0, len(free) - 1, min(VOLUME_STATES, len(free))).round().long()]]
-        noise = problem.noise_at(values, i)
-        spread = (noise if noise.ndim == 1 else noise.square().mean(0).sqrt()).detach() ** 2
+        spread = typical(problem.noise_at(values, i)).detach() ** 2
         terms.append((q, problem.power * len(free) / len(q), spread))
 
     def volume(robot: RobotModel) -> Tensor:

@@ -240,9 +240,8 @@ def torque_rate(m: Measurement) -> Tensor:
                 ends[side] = torch.where(segment[next_] == segment, next_, ends[side])
         before, after = ends
         span = (t[after] - t[before])[:, None]
-        rate[order] = torch.where(
-            (span > 0.0) & (span <= WIDEST), (tau[after] - tau[before]) / span.clamp(min=1e-300), 0.0
-        )
+        slope = (tau[after] - tau[before]) / span.clamp(min=1e-300)
+        rate[order] = torch.where((span > 0.0) & (span <= WIDEST), slope, 0.0)
     return rate
 
 
@@ -319,10 +318,8 @@ def sliding(speed: Tensor, slowest: float, Phi: Tensor, residual: Tensor) -> Ten
         weighted = moving[..., None] * Phi
         w = torch.linalg.lstsq(weighted.transpose(0, 1), (moving * residual).mT[..., None]).solution[..., 0]
         square = (residual - (Phi * w).sum(-1)).square()
-        at_rest, in_motion = (
-            (part * square).sum(0) / part.sum(0).clamp(min=1)
-            for part in ((~moving).double(), moving.double())
-        )
+        parts = (~moving).double(), moving.double()
+        at_rest, in_motion = ((part * square).sum(0) / part.sum(0).clamp(min=1) for part in parts)
         scatter = at_rest / in_motion.clamp(min=LEAST_SQUARE)
         sticks = (scatter > ratio) & (moving.double().mean(0) >= MOVES)
         slides = torch.where(sticks, moving, slides)

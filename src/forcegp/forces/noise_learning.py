@@ -80,13 +80,10 @@ def weighted(problem: Problem, values: Mapping[str, Tensor], degrees: float) -> 
     """
     for _ in range(STEPS):
         posterior = force_posterior(problem, values)
-        weights = tuple(
-            _weights(problem, posterior, values, i, degrees)
-            for i in range(len(problem.training.measurements))
-        )
-        problem = dataclasses.replace(
-            problem, training=dataclasses.replace(problem.training, weights=weights)
-        )
+        count = len(problem.training.measurements)
+        weights = tuple(_weights(problem, posterior, values, i, degrees) for i in range(count))
+        training = dataclasses.replace(problem.training, weights=weights)
+        problem = dataclasses.replace(problem, training=training)
     return problem
 
 
@@ -101,8 +98,7 @@ def _weights(
     """Return the weights `(n,)` of the samples in measurement i."""
     m, system, weights = problem.training.measurements[i], problem.system_at(values), []
     noise = problem.sample_noise(values, system, i)
-    for first in range(0, len(m.q), CHUNK_STATES):
-        rows = torch.arange(first, min(first + CHUNK_STATES, len(m.q)), device=m.q.device)
+    for rows in torch.arange(len(m.q), device=m.q.device).split(CHUNK_STATES):
         part = m[rows]
         at = part.at(system)
         z = affine_map(system, at, m.quantity)

@@ -290,18 +290,11 @@ class ForceSamples:
         chunks = [range(i, min(i + step, self.count)) for i in range(0, self.count, step)]
         for p in priors:
             prior, features = self.posterior.priors[p], self.posterior.process.features(p, system, at)
-            force = torch.cat(
-                [
-                    self.functions.by_runs(
-                        p,
-                        {n: x[chunk.start * runs : chunk.stop * runs] for n, x in features.items()},
-                        chunk,
-                        runs,
-                    )
-                    for chunk in chunks
-                ]
-            )
-            force = force + self.posterior.shift(p, features)
+            parts = []
+            for chunk in chunks:
+                own = {n: x[chunk.start * runs : chunk.stop * runs] for n, x in features.items()}
+                parts.append(self.functions.by_runs(p, own, chunk, runs))
+            force = torch.cat(parts) + self.posterior.shift(p, features)
             unknown = unknown + (prior.operator(system, at) @ force[..., None])[..., 0]
         return unknown
 

@@ -42,7 +42,6 @@ SHOWN = 10.0
 UNSHOWN = 0.1
 """Uncertainty of a joint's torque and friction, relative to the load, if no measurement is sensitive to them.
 It is also the growth per training standard deviation outside the trained region; 0.08 for a real iiwa 14."""
-
 REGION_STATES = 10_000
 """Maximum number of training states used to compute the trained region."""
 

@@ -124,13 +124,8 @@ def _by_rank(rank: Tensor) -> list[tuple[int, Tensor | slice]]:
 
 @dataclass(frozen=True)
 class _Rows:
-    """Samples with the same number of rows.
-
-    Attributes:
-        features: kernel inputs of each prior.
-        widths: number of columns of each operator.
-        rows: concatenated operators, residual, and noise factor N `(n, r, ·)`. The noise of the rows has
-            covariance I + N Nᵀ.
+    """Samples with the same number of rows: kernel inputs of each prior, number of columns of each operator,
+    and concatenated operators, residual, and noise factor N `(n, r, ·)` for noise of covariance I + N Nᵀ.
     """
 
     features: tuple[Features, ...]
@@ -180,14 +175,9 @@ def whiten(
     for p, value in process.pinned.items():
         expected = expected - rows.operators[p] @ value
     # (W, y − E[z], N)/σ
-    everything = _Rows(
-        rows.features,
-        tuple(W.shape[-1] for W in rows.operators),
-        torch.cat(
-            [*rows.operators, (measurement.values - expected)[..., None], *noise.factors(at, z)], dim=-1
-        )
-        / std[..., None],
-    )
+    parts = [*rows.operators, (measurement.values - expected)[..., None], *noise.factors(at, z)]
+    widths = tuple(W.shape[-1] for W in rows.operators)
+    everything = _Rows(rows.features, widths, torch.cat(parts, dim=-1) / std[..., None])
     # State noise also affects the directions fixed by the constraint, so these are not projected out.
     if measurement.quantity == "qdd" and system.m > 0 and noise.state is None:
         return _without_fixed(everything, at.eom, measurement.values, std, noise.weight)

@@ -87,8 +87,7 @@ class FlatStates(NamedTuple):
 
     def with_equations(self, system: ConstrainedSystem) -> States:
         """Return the states with their equations of motion."""
-        eom = system.equations(self.q, self.qd, self.active)
-        return States(self.q, self.qd, self.tau, self.active, eom)
+        return states(system, self.q, self.qd, self.tau, self.active)
 
 
 def flat_states(
@@ -145,12 +144,6 @@ class AffineMap(NamedTuple):
     o: Tensor
 
 
-def _identity(at: States) -> tuple[Tensor, Tensor, Tensor]:
-    """Return the identity, a zero operator and a zero offset in joint space."""
-    eye = torch.eye(at.q.shape[-1], dtype=at.q.dtype, device=at.q.device).expand(len(at.q), -1, -1)
-    return eye, torch.zeros_like(eye), torch.zeros_like(at.q)
-
-
 def _times(C: Tensor, z: AffineMap) -> AffineMap:
     """Return C z for matrices C `(n, c, d)`."""
     # C z = C B_Q Q + C B_z Q_z + C o
@@ -166,8 +159,7 @@ def _acceleration(system: ConstrainedSystem, at: States) -> AffineMap:
 
 def _free_acceleration(system: ConstrainedSystem, at: States) -> AffineMap:
     """Return q̈′ = M⁻¹ Q (eq. 1)."""
-    _, zero, nothing = _identity(at)
-    return AffineMap(at.eom.M_inv, zero, at.eom.M_inv, nothing)
+    return _joint_force(system, at)._replace(B_Q=at.eom.M_inv, B_N=at.eom.M_inv)
 
 
 def _multiplier(system: ConstrainedSystem, at: States) -> AffineMap:
@@ -198,20 +190,20 @@ def _directions(system: ConstrainedSystem, at: States) -> Tensor:
 
 def _total_force(system: ConstrainedSystem, at: States) -> AffineMap:
     """Return Q̄ = Q + Q_z (eq. 18)."""
-    eye, _, nothing = _identity(at)
-    return AffineMap(eye, eye, eye, nothing)
+    Q = _joint_force(system, at)
+    return Q._replace(B_z=Q.B_Q)
 
 
 def _joint_force(system: ConstrainedSystem, at: States) -> AffineMap:
     """Return Q."""
-    eye, zero, nothing = _identity(at)
-    return AffineMap(eye, zero, eye, nothing)
+    eye = torch.eye(at.q.shape[-1], dtype=at.q.dtype, device=at.q.device).expand(len(at.q), -1, -1)
+    return AffineMap(eye, torch.zeros_like(eye), eye, torch.zeros_like(at.q))
 
 
 def _contact_friction(system: ConstrainedSystem, at: States) -> AffineMap:
     """Return Q_z."""
-    eye, zero, nothing = _identity(at)
-    return AffineMap(zero, eye, zero, nothing)
+    Q = _joint_force(system, at)
+    return AffineMap(Q.B_z, Q.B_Q, Q.B_z, Q.o)
 
 
 QUANTITIES: dict[str, Callable[[ConstrainedSystem, States], AffineMap]] = {

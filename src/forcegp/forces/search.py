@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import scipy
@@ -72,9 +72,8 @@ def initial(problem: Problem, learn_noise: bool, learn_torque_noise: bool = Fals
     if problem.has_coulomb:
         start = _with_friction(few, noise)
     else:
-        start = initial_hyperparameters(
-            problem.priors, few.fixed_rows.blocks, problem.external_std is not None
-        )
+        beyond_noise = problem.external_std is not None
+        start = initial_hyperparameters(problem.priors, few.fixed_rows.blocks, beyond_noise)
     for prior in problem.priors:
         parameters = prior.initial_parameters(problem.system.robot)
         start |= {f"{prior.name}.{name}": value for name, value in parameters.items()}
@@ -105,10 +104,8 @@ def _with_friction(problem: Problem, noise: Tensors) -> Tensors:
             for key, value in friction.items()
         }
         rows = few.rows({**trial, **noise})
-        return {
-            **initial_hyperparameters(few.priors, rows.blocks, few.external_std is not None),
-            **trial,
-        }, rows
+        start = initial_hyperparameters(few.priors, rows.blocks, few.external_std is not None)
+        return start | trial, rows
 
     def value(x: float) -> float:
         start, rows = start_at(x)
@@ -301,10 +298,7 @@ class Search:
     recorded: Callable[[Objective], Objective] = lambda objective: objective
 
     def solve(
-        self,
-        problem: Problem,
-        progress: Progress | None = None,
-        begin: Mapping[str, Tensor] | None = None,
+        self, problem: Problem, progress: Progress | None = None, begin: Mapping[str, Tensor] | None = None
     ) -> Learned:
         """Learn the hyperparameters, with warm starts and restarts as requested by the options.
 
@@ -340,12 +334,11 @@ class Search:
         first = cold
         for samples in warm_start_sizes(problem.training.samples, self.options.warm_start):
             small = dataclasses.replace(problem, training=problem.training.thinned(samples))
-            first = self._minimise(small, self._better(small, (first, cold)), None).tensors
-        return self._better(problem, (first, cold))
+            first = self._minimise(small, self._better(small, first, cold), None).tensors
+        return self._better(problem, first, cold)
 
     @torch.no_grad()
-    def _better(self, problem: Problem, starts: Iterable[Tensors]) -> Tensors:
-        one, two = starts
+    def _better(self, problem: Problem, one: Tensors, two: Tensors) -> Tensors:
         if one is two:
             return one
         return min((one, two), key=lambda tensors: float(self.objective(problem, tensors)))
@@ -363,11 +356,7 @@ class Search:
         def objective(tensors: Tensors) -> Tensor:
             return self.objective(problem, tensors) - constant
 
-        def whole(evaluations: int, value: float, best: Tensors) -> None:
-            assert progress is not None
-            progress(evaluations, value + constant, best)
-
-        report = None if progress is None else whole
+        report = None if progress is None else lambda n, value, best: progress(n, value + constant, best)
         # The entries of a mixing matrix are not logarithms. With Coulomb friction, neither rule leads to the
         # better optimum on all logs (benchmarks/notes/inference.md), so the first step is not limited.
         free = problem.has_coulomb or any(_kind(key) == MIXING for key in hyper)

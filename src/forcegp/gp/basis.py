@@ -163,12 +163,7 @@ class ProcessBasis:
         # Φ_i = W_i V_iᵀ
         whole = W[..., None] * values.transpose(0, 1)[:, None]
         whole = whole.reshape(W.shape[0] * W.shape[1], self.used.numel())
-        return whole if self._filled else whole.index_select(1, self.columns)
-
-    @cached_property
-    def _filled(self) -> bool:
-        """Whether all values are basis functions, without padding."""
-        return bool(self.used.all())
+        return whole if bool(self.used.all()) else whole.index_select(1, self.columns)
 
     def fold(self, weights: Tensor) -> tuple[Tensor, Tensor]:
         """Convert weights of basis functions to weights of k(x, Z) and of the exact features.
@@ -312,10 +307,7 @@ class LatentBasis:
 
 
 def latent_basis(
-    processes: Sequence[Process],
-    params: Parameters,
-    inducing: Sequence[Features],
-    components: Sequence[int],
+    processes: Sequence[Process], params: Parameters, inducing: Sequence[Features], components: Sequence[int]
 ) -> LatentBasis:
     """Return the basis functions of processes with given inducing points.
 

@@ -118,17 +118,13 @@ def draw_priors(
     at_rows = like.new_zeros(sum(block.rows for block in blocks), count)
     for p, process in enumerate(processes):
         feature_count = features if measured[p] else max(1, features // UNMEASURED)
-        draw = process.kernel.draw(
-            sub(params, process.prefix), blocks[0].features[p], feature_count, generator
-        )
-        size = draw.basis(blocks[0].features[p]).shape
+        x = blocks[0].features[p]
+        draw = process.kernel.draw(sub(params, process.prefix), x, feature_count, generator)
+        size = draw.basis(x).shape
         # f = φᵀw with w ~ N(0, I); W f(X) at the rows
         w = torch.randn(size[0], size[2], count, dtype=torch.float64, generator=generator).to(like)
-        latent = (draw.basis(block.features[p]) @ w for block in blocks)
-        pairs = zip(blocks, latent, strict=True)
-        at_rows += torch.cat(
-            [torch.einsum("nak,kns->nas", block.operators[p], f).flatten(0, 1) for block, f in pairs]
-        )
+        latent = ((block.operators[p], draw.basis(block.features[p]) @ w) for block in blocks)
+        at_rows += torch.cat([torch.einsum("nak,kns->nas", W, f).flatten(0, 1) for W, f in latent])
         terms.append(draw.weighted(w))
     return terms, at_rows
 
@@ -185,11 +181,9 @@ def _common(
     if isinstance(kernel, Product):
         left, right = (_common(side, theta, X) for side, theta in kernel.parts(params))
         if left is not None and right is not None:
-            functions_of = (left[0], right[0])
-            return (
-                lambda x: [a * b for a, b in product(*(functions(x) for functions in functions_of))],
-                [a * b for a, b in product(left[1], right[1])],
-            )
+            f, g = left[0], right[0]
+            sizes = [a * b for a, b in product(left[1], right[1])]
+            return lambda x: [a * b for a, b in product(f(x), g(x))], sizes
     return None
 
 

@@ -160,10 +160,8 @@ class ExactPosterior:
             x, components = next(iter(features.values())), self.blocks[0].operators[p].shape[-1]
             return x.new_zeros(len(x), components)
         # μ(x) = k(x, X) Wᵀα (eqs. 11 and 23)
-        parts = [
-            (kernel(features) @ w)[..., 0]
-            for kernel, w in zip(self.kernels_to_data[p], self._weights[p], strict=True)
-        ]
+        pairs = zip(self.kernels_to_data[p], self._weights[p], strict=True)
+        parts = [(kernel(features) @ w)[..., 0] for kernel, w in pairs]
         return sum(parts[1:], start=parts[0]).mT
 
     def mean(self, block: Block) -> Tensor:

@@ -23,7 +23,6 @@ PRIOR_TO_NOISE = 1e6
 """Largest prior standard deviation of a row, in units of its noise."""
 SMALLEST_FRACTION = 1e-13
 """Smallest ratio of posterior to prior variance that double precision resolves."""
-
 Features = Mapping[str, Tensor]
 """Named kernel inputs: `(n, w)` if shared by all components, or `(n, k, w)` with one row per component."""
 

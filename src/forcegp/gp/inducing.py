@@ -20,10 +20,8 @@ from forcegp.gp.kernels import Parameters, Process, sub
 
 CANDIDATES = 4000
 """Number of samples from which inducing points are selected."""
-
 LIMIT = 100
 """Maximum number of inducing points per process."""
-
 SHARE = 0.02
 """Ratio of the residual to the posterior variance of all rows at which selection stops. In units of the noise
 variance, M basis functions learned from noisy rows have a total posterior variance of at most M over all
@@ -77,9 +75,8 @@ def select_inducing(
 
 def _greedy(rest: KernelPart | None, x: Features, weight: Tensor, limit: int, tolerance: float) -> Selection:
     """Compute pivoted partial Cholesky factorisations of all components with common pivots."""
-    none = Selection({name: value[:0] for name, value in x.items()}, weight.new_zeros(1))
     if rest is None or not bool(weight.any()):
-        return none
+        return Selection({name: value[:0] for name, value in x.items()}, weight.new_zeros(1))
     prior = rest.kernel.diagonal(rest.params, x)
     residual = prior.clone()
     columns = prior.new_zeros(len(prior), min(limit, points(x)), points(x))
@@ -87,9 +84,8 @@ def _greedy(rest: KernelPart | None, x: Features, weight: Tensor, limit: int, to
     while len(kept) < columns.shape[1] and missed[-1] > tolerance * functions:
         # i = argmax Σ_k S_kk Var(f_k(x_i) | f(Z))
         i = int((weight * residual).sum(0).argmax())
-        k = rest.kernel.covariance(rest.params, x, {name: value[i : i + 1] for name, value in x.items()})[
-            ..., 0
-        ]
+        one = {name: value[i : i + 1] for name, value in x.items()}
+        k = rest.kernel.covariance(rest.params, x, one)[..., 0]
         # ℓ = (k(X, x_i) − Lᵀ L_i) / √d_i
         so_far = columns[:, : len(kept)]
         k = k - (so_far[..., i, None].mT @ so_far)[:, 0]

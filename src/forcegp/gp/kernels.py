@@ -210,11 +210,9 @@ class Stationary(Kernel):
 
     def initial(self, outputs: int, widths: Mapping[str, int], log_std: Tensor | float = 0.0) -> Initial:
         width = width_of(self.inputs, widths)
-        scale = math.log(math.sqrt(width))
-        return {
-            "log_lengthscale": torch.full((1 if self.shared else outputs, width), scale, dtype=torch.float64),
-            "log_std": torch.zeros(outputs, dtype=torch.float64) + log_std,
-        }
+        shape, scale = (1 if self.shared else outputs, width), math.log(math.sqrt(width))
+        std = torch.zeros(outputs, dtype=torch.float64) + log_std
+        return {"log_lengthscale": torch.full(shape, scale, dtype=torch.float64), "log_std": std}
 
     @abstractmethod
     def profile(self, r2: Tensor) -> Tensor:
@@ -420,10 +418,8 @@ class OrnsteinUhlenbeck(Kernel):
             )
 
     def initial(self, outputs: int, widths: Mapping[str, int], log_std: Tensor | float = 0.0) -> Initial:
-        return {
-            "log_time": torch.full((outputs,), math.log(self.time), dtype=torch.float64),
-            "log_std": torch.zeros(outputs, dtype=torch.float64) + log_std,
-        }
+        like = torch.zeros(outputs, dtype=torch.float64)
+        return {"log_time": torch.full_like(like, math.log(self.time)), "log_std": like + log_std}
 
     def towards(self, params: Parameters, x2: Features) -> Callable[[Features], Tensor]:
         rate = torch.exp(-params["log_time"])[:, None, None]

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
-from itertools import pairwise
+from itertools import accumulate, pairwise
 from typing import Any
 
 import numpy as np
@@ -30,21 +30,15 @@ from forcegp.resources import threads_of_pytorch
 
 CHUNK_ELEMENTS = 400_000
 """Size of the intermediate arrays for a chunk of samples, chosen to fit into the processor cache."""
-
-
 Place = tuple[Any, ...]
 """("param", name), ("feature", block, process, name), ("operator", block, process) or ("target", block)."""
-
 Gradient = dict[Place, Tensor]
 """Derivatives, keyed by place."""
 
 
 def offsets(blocks: Sequence[Block]) -> list[int]:
     """Return the index of the first row of each block, followed by the total number of rows."""
-    starts = [0]
-    for block in blocks:
-        starts.append(starts[-1] + block.rows)
-    return starts
+    return list(accumulate((block.rows for block in blocks), initial=0))
 
 
 def _chunks(n: int, size: int) -> Iterator[tuple[int, int]]:
@@ -261,7 +255,6 @@ def negative_log_likelihood(priors: Sequence[Process], params: Parameters, block
     Raises:
         NumericalError: the covariance is not positive definite.
     """
-
     named: dict[Place, Tensor] = {("param", key): x for key, x in params.items()}
     for g, block in enumerate(blocks):
         for p, (features, W) in enumerate(zip(block.features, block.operators, strict=True)):

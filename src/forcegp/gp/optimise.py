@@ -23,7 +23,6 @@ FitProgress = Callable[[int, int, float], None]
 Bounds = Mapping[str, tuple[float | Tensor, float | Tensor]]
 """Lower and upper bounds on each tensor, either common to all its entries or separate for each entry."""
 
-OPTIMIZERS = ("lbfgs", "adam")
 FIRST_STEP = 2.0
 """Largest change in an entry in the first step of bounded L-BFGS; for logarithms, this is two e-folds."""
 STOPPED = ("converged", "stopped at the iteration limit", "the line search found no smaller objective")
@@ -65,7 +64,7 @@ class LearningOptions:
     hyperpriors: bool = True
 
     def __post_init__(self) -> None:
-        check_name("optimizer", self.optimizer, OPTIMIZERS)
+        check_name("optimizer", self.optimizer, ("lbfgs", "adam"))
         if self.max_evaluations < 1:
             raise ModelError(
                 "learning needs at least one evaluation",
@@ -172,10 +171,8 @@ def minimise(
         converged, message = _adam(recorder, start, options, analytical, bounds or {})
     if not np.isfinite(recorder.value):
         raise NumericalError("the objective is not finite at the start", got=recorder.history[:1])
-    seconds = time.perf_counter() - began
-    return Learned(
-        recorder.best, recorder.value, converged, len(recorder.history), seconds, message, recorder.history
-    )
+    seconds, history = time.perf_counter() - began, recorder.history
+    return Learned(recorder.best, recorder.value, converged, len(history), seconds, message, history)
 
 
 def _lbfgs(

@@ -101,7 +101,6 @@ MOMENTS = tuple(field.name for field in fields(Moments))
 """Names of the sums in a saved posterior."""
 CHUNK_PREDICTIONS = 256
 """Number of samples for which covariances are computed at a time."""
-
 UPDATE_FRACTION = 0.25
 """Ratio of the numbers of new rows and basis functions above which the factor is recomputed."""
 

@@ -128,8 +128,7 @@ def accumulate(basis: LatentBasis, blocks: Iterable[Block], chunk: int = CHUNK_S
         total = Sums.zero(basis, block.target) if total is None else total
         _add(basis, block, total)
     if total is None:
-        like = next(iter(basis.params.values()))
-        return Sums.zero(basis, like)
+        return Sums.zero(basis, next(iter(basis.params.values())))
     # G = Gᵀ, from its upper triangle
     total.G.copy_(torch.triu(total.G) + torch.triu(total.G, 1).mT)
     return total
@@ -142,9 +141,7 @@ def _add(basis: LatentBasis, block: Block, into: Sums) -> None:
     W = torch.cat(block.operators, dim=-1)
     S, c = (W.mT @ W).permute(1, 2, 0).contiguous(), (W.mT @ block.target[..., None])[..., 0]
     weighted = torch.empty_like(V)
-    active = [
-        k for k in range(len(S)) if basis.columns[k].stop > basis.columns[k].start and bool(S[k, k].any())
-    ]
+    active = [k for k, at in enumerate(basis.columns) if at.stop > at.start and bool(S[k, k].any())]
     for position, k in enumerate(active):
         # G_kl += Σ_i V_k S_kl V_lᵀ, v_k += Σ_i V_k c_k
         of_k = basis.columns[k]

@@ -103,7 +103,6 @@ def import_log(
 ) -> Imported:
     """Read a log as in `read_log`, and report the import. If `displaced`, accept a displaced surface."""
     system = system_of(scene)
-    robot = system.robot
     log_mapping = default_mapping(path, system) if mapping is None else mapping
     log_mapping = log_mapping if isinstance(log_mapping, Mapping) else load_mapping(log_mapping)
     report = ImportReport(str(path))
@@ -112,9 +111,8 @@ def import_log(
         report.find("doubt", doubt)
     try:
         with foreign(str(path), "a log that can be imported"):
-            signals = gather(path, log_mapping, robot.joint_names, report, progress)
-            numbers = NUMBERS * len(signals.joint_names) * len(signals)
-            announce_memory(8 * numbers, f"importing {len(signals):,} rows")
+            signals = gather(path, log_mapping, system.robot.joint_names, report, progress)
+            announce_memory(8 * NUMBERS * system.robot.nq * len(signals), f"importing {len(signals):,} rows")
             even_clock(signals, log_mapping.sections.time.period, report)
             derive_joints(signals, system, log_mapping, report)
             _find_clipped(signals, log_mapping)
@@ -190,9 +188,7 @@ def _dataset(
     signals: Signals, std: Array | None, mapping: Mapping, system: ConstrainedSystem, report: ImportReport
 ) -> Dataset:
     """Return the data set built from the processed signals."""
-    robot = system.robot
-    settings = mapping.sections.derivatives
-    dt = usual_step(signals.t)
+    robot, settings, dt = system.robot, mapping.sections.derivatives, usual_step(signals.t)
     margin = settings.impact_margin if settings.impact_margin is not None else 0.5 * settings.window * dt
     of_contacts = {"impact": impact_mask(signals, margin)} if signals.contact else {}
     if "wrench" in signals.vectors and signals.contact:

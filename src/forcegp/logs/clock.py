@@ -27,11 +27,9 @@ def usual_step(t: Array) -> float:
     steps = np.diff(t)
     steps = steps[steps > 0.0]
     if not len(steps):
-        raise DataError(
-            "time never increases in the log",
-            expected="a column of time stamps",
-            got=", ".join(f"{stamp:.6g}" for stamp in t[:5]) + (", …" if len(t) > 5 else ""),
-        )
+        text = "time never increases in the log"
+        got = ", ".join(f"{stamp:.6g}" for stamp in t[:5]) + (", …" if len(t) > 5 else "")
+        raise DataError(text, expected="a column of time stamps", got=got)
     return float(np.median(steps))
 
 

@@ -124,8 +124,7 @@ class _Gathering:
         """Return the flags of closed and sticking contacts, keyed by `CLOSED` or `STICKS` plus the name."""
         flags = {}
         for name, section in self.mapping.sections.contact.items():
-            closed = section.column if section.source == "column" else None
-            columns = {CLOSED: closed, STICKS: section.sticks}
+            columns = {CLOSED: section.column if section.source == "column" else None, STICKS: section.sticks}
             for key, column in ((key, column) for key, column in columns.items() if column is not None):
                 stream = self.table.stream_of(column, section.stream)
                 values = self._take(stream, column)

@@ -72,11 +72,9 @@ def find_time(table: LogTable, draft: Draft) -> Stream:
         candidates.append((2.0 * named + even + (name == "header"), name, step))
     if not candidates:
         rows = (f"{name} ({len(other)} rows)" for other in table.streams for name in other.columns)
-        raise MappingError(
-            f"{table.source}: no column increases like time, with {len(stream)} rows as the joints",
-            expected="a column of time stamps with as many rows",
-            got=", ".join(sorted(rows, key=lambda name: not _TIME.match(name)))[:300],
-        )
+        text = f"{table.source}: no column increases like time, with {len(stream)} rows as the joints"
+        got = ", ".join(sorted(rows, key=lambda name: not _TIME.match(name)))[:300]
+        raise MappingError(text, expected="a column of time stamps with as many rows", got=got)
     _, column, step = max(candidates)
     unit, doubt = declared_unit(column, stream), False
     if unit in units.TIME:
@@ -205,8 +203,7 @@ def _match_joints(robot: RobotModel, draft: Draft) -> None:
 def _likeness(joint: str, name: str) -> float:
     a, b = joint.lower(), name.lower()
     numbers = re.findall(r"\d+", a) == re.findall(r"\d+", b)
-    shared = len(set(tokens(a)) & set(tokens(b)))
-    return shared + 0.3 * numbers + SequenceMatcher(None, a, b).ratio()
+    return len(set(tokens(a)) & set(tokens(b))) + 0.3 * numbers + SequenceMatcher(None, a, b).ratio()
 
 
 def find_wrench(table: LogTable, robot: RobotModel, draft: Draft) -> None:

@@ -83,10 +83,9 @@ class Draft:
 
     def toml(self) -> str:
         """Return the text of the mapping file."""
-        lines = [f"# Mapping of {_plain(self.source)}, proposed from its headings and values."]
-        lines += [
-            "# Check it, delete the mark CHECK of each line that is right, and import with --mapping.",
-            "",
+        lines = [
+            f"# Mapping of {_plain(self.source)}, proposed from its headings and values.",
+            "# Check it, delete the mark CHECK of each line that is right, and import with --mapping.\n",
         ]
         quantities = {name: self.families[name].table() for name in SYMBOLS if name in self.families}
         tables = {"time": self.time, "joints": self.joints, **quantities, **self.further}
@@ -268,10 +267,8 @@ class Mapping:
         measured = self.measured(name, joints)
         lacking = [joint for joint in measured if not named.get(joint)]
         if lacking:
-            text, expected = (
-                f"joint {lacking[0]!r} has no column",
-                f'{quoted(lacking[0])} = "…" under columns',
-            )
+            text = f"joint {lacking[0]!r} has no column"
+            expected = f'{quoted(lacking[0])} = "…" under columns'
             raise self.error((name,), text, expected=expected, hint=lock_hint(lacking))
         columns = [named[joint] for joint in measured]
         if len(set(columns)) < len(columns):
@@ -294,8 +291,7 @@ class Mapping:
         self, key: Key, message: str, expected: object = None, got: object = None, hint: str | None = None
     ) -> MappingError:
         """Return an error that refers to a key in the mapping file."""
-        place = self.document.place(key)
-        return MappingError(f"{place}: {message}", expected=expected, got=got, hint=hint)
+        return MappingError(f"{self.document.place(key)}: {message}", expected=expected, got=got, hint=hint)
 
     def _check_joints(self, key: Key, named: Iterable[str], joints: Sequence[str]) -> None:
         for joint in named:
@@ -325,8 +321,7 @@ def load_mapping(source: str | Path) -> Mapping:
 def parse_mapping(content: bytes, source: str) -> Mapping:
     """Parse the bytes of a mapping file; raise a `MappingError` that names the line and key if invalid."""
     document = Document(content, source, MappingError)
-    lines = content.decode().splitlines()
-    doubts = tuple(line[len(CHECK) :] for line in lines if line.startswith(CHECK))
+    doubts = tuple(line[len(CHECK) :] for line in content.decode().splitlines() if line.startswith(CHECK))
     mapping = Mapping(document.validated(MappingSections), document, doubts)
     _check(mapping)
     return mapping

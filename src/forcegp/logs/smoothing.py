@@ -180,11 +180,9 @@ def _pieces(signals: Signals, least: int, report: ImportReport) -> NDArray[np.in
     lengths = np.array([rows.stop - rows.start for rows in signals.runs(*signals.contact.values())], int)
     length = np.repeat(lengths, lengths)
     if not (keep := length >= least).any():
-        raise DataError(
-            "no stretch of the log is long enough to compute accelerations",
-            expected=f"{least} rows without a contact switch",
-            got=f"{len(signals)} rows, cut by the clock and by contact switches",
-        )
+        text = "no stretch of the log is long enough to compute accelerations"
+        got = f"{len(signals)} rows, cut by the clock and by contact switches"
+        raise DataError(text, expected=f"{least} rows without a contact switch", got=got)
     if not keep.all():
         message = f"{(~keep).sum()} rows in stretches shorter than {least} rows were dropped"
         report.find("short", message, signals.row[~keep])

@@ -236,5 +236,4 @@ def _sphere(contact: str, points: Array, towards: Array, tip: Tip) -> SurfaceFit
         text, got = "the path does not determine a sphere for contact from outside", f"radius {radius:.4g}"
         hint = "fit a plane, or slide over a larger part of the sphere"
         raise DataError(text, got=f"{got} ± {std['radius']:.2g} m", hint=hint)
-    sphere = Sphere(tuple(float(c) for c in center), radius)
-    return SurfaceFit(contact, sphere, std, solution, tip.of(x))
+    return SurfaceFit(contact, Sphere(tuple(float(c) for c in center), radius), std, solution, tip.of(x))

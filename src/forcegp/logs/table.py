@@ -86,11 +86,9 @@ def streams_by_length(groups: Mapping[int, Mapping[str, Column]], common: int) -
 def missing(source: str, kind: str, name: str, names: list[str]) -> DataError:
     """Return the error for a missing stream or column."""
     shown = ", ".join(repr(k) for k in names[:16]) + (f", … ({len(names)})" if len(names) > 16 else "")
-    return DataError(
-        f"{source}: the log has no {kind} {name!r}",
-        expected=f"one of {shown}" if names else "a log with columns of numbers",
-        hint=did_you_mean(name, names, 0.5),
-    )
+    text = f"{source}: the log has no {kind} {name!r}"
+    expected = f"one of {shown}" if names else "a log with columns of numbers"
+    return DataError(text, expected=expected, hint=did_you_mean(name, names, 0.5))
 
 
 def table_of_arrays(

@@ -104,10 +104,8 @@ class AnalyticalModel(Model["AnalyticalFit"]):
         start = {name: value.detach().clone() for name, value in theta.named_parameters()}
 
         def loss(tensors: Mapping[str, Tensor], rows: Tensor) -> Tensor:
-            system, part = (
-                self.system.with_robot(torch.func.functional_call(theta, dict(tensors), ())),
-                measured[rows],
-            )
+            system = self.system.with_robot(torch.func.functional_call(theta, dict(tensors), ()))
+            part = measured[rows]
             eom = system.equations(part.q, part.qd, part.active)
             return ((eom.acceleration(eom.Q_K + part.tau) - part.values) ** 2).mean()
 
@@ -176,10 +174,8 @@ class AnalyticalFit(FittedModel):
         with ModelError.within(f"{source}: field 'settings.analytical_parameters'"):
             model = AnalyticalModel(original, settings.analytical_parameters, window, settings.seed)
         theta = model.parameters
-        state = {
-            name: take(tensors, name, tuple(old.shape), old.dtype, source)
-            for name, old in theta.state_dict().items()
-        }
+        old = theta.state_dict()
+        state = {key: take(tensors, key, tuple(x.shape), x.dtype, source) for key, x in old.items()}
         theta.load_state_dict(state)
         result = FitResult(True, 0, 0.0, 0.0, message="loaded")
         return cls(system, theta, window, settings.seed, result)

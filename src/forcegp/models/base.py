@@ -105,11 +105,7 @@ class Model(ABC, Generic[F]):
 
     @abstractmethod
     def fit(
-        self,
-        data: Dataset,
-        *,
-        progress: FitProgress | None = None,
-        checkpoint: str | Path | None = None,
+        self, data: Dataset, *, progress: FitProgress | None = None, checkpoint: str | Path | None = None
     ) -> F:
         """Learn from a data set.
 

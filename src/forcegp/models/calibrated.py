@@ -21,7 +21,6 @@ from pathlib import Path
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from scipy.optimize import lsq_linear
 from torch import Tensor
 
@@ -35,12 +34,7 @@ from forcegp.forces.priors.joint import AnalyticalMean, JointFrictionPrior
 from forcegp.forces.quantities import States, states_at
 from forcegp.identification import regressor
 from forcegp.models.structured_fit import StructuredFit
-from forcegp.robot.inertia import (
-    from_pseudo_inertia,
-    inertial_parameters,
-    pseudo_inertia,
-    pseudo_inertia_of,
-)
+from forcegp.robot.inertia import from_pseudo_inertia, inertial_parameters, pseudo_inertia, pseudo_inertia_of
 from forcegp.robot.model import RobotModel
 from forcegp.robot.write_back import is_mjcf, write_robot
 
@@ -298,15 +292,7 @@ Curve = tuple[Tensor, Tensor, Tensor]
 
 @dataclass(frozen=True, eq=False)
 class _Reader:
-    """Computation of robots from the posterior of a fit.
-
-    Attributes:
-        fit: the fit.
-        speeds: speeds at which friction is evaluated, `(k, nq)`.
-        at: states that combine all poses with these speeds.
-        seed: random seed.
-        gain_std: relative standard deviation of the torque sensors' gains.
-    """
+    """Computation of robots from a fit. The states `at` combine all poses with the `speeds` `(k, nq)`."""
 
     fit: StructuredFit
     speeds: Tensor
@@ -333,9 +319,8 @@ class _Reader:
         up = torch.linspace(SLOWEST, 1.0, SPEEDS, dtype=robot.dtype, device=robot.device)
         speeds = torch.cat([-up.flip(0), up])[:, None] * fastest
         low, high = (x.clamp(-np.pi, np.pi) for x in (robot.lower, robot.upper))
-        share = torch.rand(
-            POSES, 1, robot.nq, generator=torch.Generator().manual_seed(seed), dtype=robot.dtype
-        )
+        generator = torch.Generator().manual_seed(seed)
+        share = torch.rand(POSES, 1, robot.nq, generator=generator, dtype=robot.dtype)
         q = (low + share.to(robot.device) * (high - low)).expand(-1, len(speeds), -1).flatten(0, 1)
         qd = speeds.expand(POSES, -1, -1).flatten(0, 1)
         open_ = torch.zeros(len(q), len(fit.system.contacts), dtype=torch.bool, device=robot.device)
@@ -365,9 +350,8 @@ class _Reader:
         offset, kept, b = self._offsets(curves), self._offsets(self._kept()[None]), self._disagreement()
         gain = _offset_gain(offset, offset[0] - kept[0], values)
         free, b = values - offset @ gain, b - kept @ gain
-        random = torch.randn(
-            draws, 1, generator=torch.Generator().manual_seed(self.seed), dtype=torch.float64
-        )
+        generator = torch.Generator().manual_seed(self.seed)
+        random = torch.randn(draws, 1, generator=generator, dtype=torch.float64)
         spread = torch.cat([free[:1], free[1 : 1 + draws] + random.to(b) * b])
         rows = (row.split(sizes) for row in self._consistent(spread, sizes[0], free[1:]))
         return [self._robot(curve.view_as(self.speeds), delta, load) for curve, delta, load in rows]
@@ -475,17 +459,12 @@ class _Reader:
             if isinstance(prior, kind):
                 one = {name: x[:1] for name, x in self._features(p).items()}
                 mean = self.fit.posterior.means.latent_mean(p, one)
-                return torch.cat(
-                    [mean, drawn.functions.latent(p, one)[:, 0] + self.fit.posterior.shift(p, one)]
-                )
+                samples = drawn.functions.latent(p, one)[:, 0]
+                return torch.cat([mean, samples + self.fit.posterior.shift(p, one)])
         return self.speeds.new_zeros(1 + drawn.count, 0)
 
     def _gain_errors(self, draws: int) -> Tensor:
-        """Return samples of the errors of δ due to errors of the gains, `(draws, d)` or zeros `(draws, 1)`.
-
-        Raises:
-            ModelError: the inertia was learned in a way for which they are unknown.
-        """
+        """Return samples of the errors of δ due to those of the gains, `(draws, d)` or zeros `(draws, 1)`."""
         robot = self.fit.system.robot
         prior = next((p for p in self.fit.force_priors if isinstance(p, InertialPrior)), None)
         if prior is None or self.gain_std == 0.0:
@@ -531,27 +510,22 @@ def _scale_of(precision: Tensor, n: int) -> Tensor:
 def _offset_gain(offset: Tensor, mean: Tensor, values: Tensor) -> Tensor:
     """Return the gain G `(nq, d)` that conditions values z − c G on zero offsets c where undetermined.
 
-    E[z | c = 0] = z − Cov(z, c) Cov(c)⁻¹ c, with sample covariances.
-
-    Args:
-        offset: offsets at the identified inertia, and of samples around it, `(1 + samples, nq)`.
-        mean: `(nq,)` posterior mean of the offsets, which is compared with zero.
-        values: mean and samples of the values `(1 + samples, d)`.
+    E[z | c = 0] = z − Cov(z, c) Cov(c)⁻¹ c, with the covariances of the samples, which are the rows of
+    `offset` and `values` after the first. The posterior mean `(nq,)` of the offsets is compared with zero.
     """
     c = (offset[1:] - offset[1:].mean(0)) * (mean.abs() <= OPEN * offset[1:].std(0))
     return torch.linalg.pinv(c.mT @ c, hermitian=True) @ c.mT @ (values[1:] - values[1:].mean(0))
 
 
-def _projected(speeds: Tensor, curve: Tensor) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+def _projected(speeds: Tensor, curve: Tensor) -> tuple[Tensor, ...]:
     """Return damping d, dry friction f, residual, and offset c of each joint, `(nq,)`."""
-    found: list[NDArray[np.float64]] = []
+    found = []
     for v, force in zip(speeds.T.cpu().numpy(), curve.T.cpu().numpy(), strict=True):
         # −Q_D = d v + f sign v − c
         X = np.stack([v, np.sign(v), -np.ones_like(v)], axis=1)
         fitted = lsq_linear(X, -force, bounds=([0.0, 0.0, -np.inf], np.inf))
         found.append(np.array([*fitted.x[:2], np.sqrt(np.mean(fitted.fun**2)), fitted.x[2]]))
-    damping, friction, left, offset = torch.from_numpy(np.stack(found, axis=1)).to(curve)
-    return damping, friction, left, offset
+    return torch.from_numpy(np.stack(found, axis=1)).to(curve).unbind()
 
 
 def _moved(robot: RobotModel, change: Tensor) -> RobotModel:
@@ -580,9 +554,8 @@ def without_armature(robot: RobotModel, fastest: Tensor) -> RobotModel:
     size = dynamics.inverse_dynamics(robot, q, qd, qdd).square().mean(0).sqrt() * WANTED
     A = (regressor(held, q, qd, qdd) * (errors.scale(held) / size[:, None])).flatten(0, 1)
     precision = A.mT @ A
-    mean = torch.linalg.pinv(precision, rtol=1e-12, hermitian=True) @ (
-        A.mT @ (robot.armature * qdd / size).flatten()
-    )
+    torque = (robot.armature * qdd / size).flatten()
+    mean = torch.linalg.pinv(precision, rtol=1e-12, hermitian=True) @ (A.mT @ torque)
     return errors.updated(held, mean, precision)[0]
 
 

@@ -132,9 +132,8 @@ def _noise(section: NoiseSection, acceleration: NoiseStd | None) -> NoiseStd | N
     given = section.given() | ({} if acceleration is None else {"acceleration": acceleration})
     if set(given) <= {"acceleration"}:
         return given.get("acceleration")
-    return Noise(
-        **{**given, "torque": None if given.get("torque") == "none" else given.get("torque", "auto")}
-    )
+    torque = given.get("torque", "auto")
+    return Noise(**{**given, "torque": None if torque == "none" else torque})
 
 
 def _priors(table: ModelTable, written: Sequence[dict[str, Any]]) -> tuple[ForcePrior, ...]:

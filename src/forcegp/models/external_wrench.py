@@ -38,7 +38,6 @@ LEAST_NOISE = 1e-9
 """Minimum velocity noise, which exceeds rounding errors [rad/s, m/s]."""
 THRESHOLD = 5.0
 """Number of standard deviations beyond which a contact is detected."""
-
 BLOCK, LEAST_BLOCKS = 0.5, 20
 """Length of blocks with independent maxima of d² [s]; minimum number of blocks for estimating a tail."""
 
@@ -267,11 +266,9 @@ class Reading:
                 hint='fit more samples in time order, with force_priors="friction"',
             )
         noise, segment = velocity_noise(self.data), self.data.segment
-        logs = [
-            self.momenta((segment == own).nonzero()[:, 0], noise, correlation)
-            for own in segment.unique_consecutive()
-        ]
-        mean, covariance = zip(*(observe(log) for log in logs), strict=True)
+        rows = ((segment == own).nonzero()[:, 0] for own in segment.unique_consecutive())
+        logs = (self.momenta(own, noise, correlation) for own in rows)
+        mean, covariance = zip(*map(observe, logs), strict=True)
         mean, covariance = (torch.from_numpy(np.concatenate(x)).to(self.data.q) for x in (mean, covariance))
         return mean, covariance
 

@@ -129,10 +129,8 @@ def fit_table(title: str, result: FitResult | None, learned: Sequence[tuple[str,
     rows: list[tuple[object, ...]] = []
     notes: Sequence[str] = ()
     if result is not None:
-        rows += [
-            ("log marginal likelihood", _number(result.log_marginal_likelihood)),
-            ("jitter", result.jitter),
-        ]
+        rows.append(("log marginal likelihood", _number(result.log_marginal_likelihood)))
+        rows.append(("jitter", result.jitter))
         notes = [f"Warning: {warning}" for warning in result.warnings]
     rows += [(name, _number(value)) for name, value in learned]
     return html_table(title.strip("<>"), (), rows, notes)

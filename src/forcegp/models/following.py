@@ -83,14 +83,7 @@ def follow(
 def _knowing(
     fit: StructuredFit, estimate: StructuredFit, priors: Sequence[str], begin: bool = True
 ) -> StructuredFit:
-    """Linearize payload priors around an estimate.
-
-    Args:
-        fit: the fit with the priors to replace.
-        estimate: the fit with the estimated payloads.
-        priors: names of the tracked priors.
-        begin: whether to replace also priors without a known payload.
-    """
+    """Linearize payload priors of a fit around an estimate, if they have a known payload or if `begin`."""
     one = {"one": torch.zeros(1, 1, dtype=torch.float64)}
     updated_priors = tuple(
         prior.around(estimate.posterior.latent.latent_mean(p, one)[0])

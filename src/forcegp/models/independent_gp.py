@@ -249,9 +249,7 @@ class IndependentFit(AccelerationFit):
         model = IndependentGP(system, settings.noise_std, settings.standardize)
         nq, dtype = system.robot.nq, system.robot.dtype
         n = next(iter(take(tensors, "training.q", None, dtype, source).shape), 0)
-        features = {
-            name: take(tensors, f"training.{name}", (n, nq), dtype, source) for name in ("q", "qd", "tau")
-        }
+        features = {x: take(tensors, f"training.{x}", (n, nq), dtype, source) for x in ("q", "qd", "tau")}
         noise = take(tensors, "training.noise_std", None, dtype, source)
         if noise.shape not in ((nq,), (n, nq)):
             raise ModelError(

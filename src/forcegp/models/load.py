@@ -16,13 +16,7 @@ from forcegp.models.base import FittedModel
 from forcegp.models.independent_gp import IndependentFit
 from forcegp.models.neural import NetworkFit
 from forcegp.models.structured_fit import StructuredFit
-from forcegp.storage.model_file import (
-    ModelHeader,
-    model_bytes,
-    model_path,
-    parse_model,
-    read_model,
-)
+from forcegp.storage.model_file import ModelHeader, model_bytes, model_path, parse_model, read_model
 from forcegp.storage.system import PREFIX, unpack_system
 
 KINDS: dict[str, type[FittedModel]] = {
@@ -93,9 +87,5 @@ def register() -> None:
 
 
 def _sent(model: FittedModel) -> tuple[Any, ...]:
-    """Return a function and its arguments, which restore a model from the content of its file.
-
-    Raises:
-        ModelError: a part of the model is defined in Python.
-    """
+    """Return a function and its arguments, which restore a model from the content of its file."""
     return model_of_bytes, (model_bytes(model.kind, model.system, *model.record()),)

@@ -164,11 +164,7 @@ class _State:
         return len(self.history) - 1 - self.history.index(self.value) if self.history else 0
 
     def note(self, held_out: float) -> None:
-        """Record the held-out loss at the end of an epoch.
-
-        Raises:
-            NumericalError: the loss is not finite.
-        """
+        """Record the held-out loss at the end of an epoch."""
         if not math.isfinite(held_out):
             raise NumericalError(
                 f"training diverged in epoch {len(self.history) + 1}",
@@ -188,11 +184,7 @@ class _State:
         return tensors
 
     def restore(self, tensors: Mapping[str, Tensor], source: Path) -> None:
-        """Resume from a saved state.
-
-        Raises:
-            ModelError: the state of the generator is damaged.
-        """
+        """Resume from a saved state."""
         for name, value in self.tensors().items():
             if name not in (HISTORY, "generator"):
                 value.copy_(tensors[name])

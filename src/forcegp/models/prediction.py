@@ -34,8 +34,6 @@ CHECKED = 1 << 16
 """Number of covariances checked at a time."""
 MOST_SAMPLES = 2000
 """Maximum number of samples in a plot; more would be indistinguishable."""
-
-
 NEGATIVE = 0.01
 """Magnitude, relative to the variances, below which a negative eigenvalue counts as a rounding error."""
 ROUNDING = 1e-12
@@ -322,13 +320,7 @@ class Predictor(ForwardModel):
         return linearize_field(force, system or self.system, q, qd, tau, active)
 
     def rollout(
-        self,
-        q0: Tensor,
-        qd0: Tensor,
-        tau: Torque,
-        duration: float = 10.0,
-        samples: int = 0,
-        **settings: Any,
+        self, q0: Tensor, qd0: Tensor, tau: Torque, duration: float = 10.0, samples: int = 0, **settings: Any
     ) -> Rollout:
         """Predict trajectories from initial states (section 4), as in `forcegp.rollout.rollout_model`.
 

@@ -218,10 +218,8 @@ def unpack(
 def _specification(
     settings: StructuredSettings, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
 ) -> Specification:
-    priors = tuple(
-        decode(dict(prior), CLASSES, f"{source}: settings.priors.{i}")
-        for i, prior in enumerate(settings.priors)
-    )
+    named = ((f"{source}: settings.priors.{i}", prior) for i, prior in enumerate(settings.priors))
+    priors = tuple(decode(dict(prior), CLASSES, name) for name, prior in named)
     original, parameters = take_robot(tensors, "start.", system.robot, source), None
     system = system.with_robot(original)
     if settings.analytical_parameters is not None:

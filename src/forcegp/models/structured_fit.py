@@ -208,10 +208,7 @@ class StructuredFit(FittedModel):
         return external_wrench(self, data, WrenchFrame(frame, **components), method, external)
 
     def _exported(
-        self,
-        functions: int | None,
-        wrench: WrenchFrame | None = None,
-        dtype: torch.dtype = torch.float64,
+        self, functions: int | None, wrench: WrenchFrame | None = None, dtype: torch.dtype = torch.float64
     ) -> ExportedModel:
         if functions is not None and functions < 1:
             raise ModelError("at least one function must be drawn", expected="1 or more", got=functions)
@@ -262,9 +259,8 @@ class StructuredFit(FittedModel):
             DestinationError: the folder cannot be written, or contains other files.
             MissingDependencyError: CasADi is not installed.
         """
-        return write_export(
-            self._exported(functions, wrench, dtype), self, self.training, path, language, name
-        )
+        model = self._exported(functions, wrench, dtype)
+        return write_export(model, self, self.training, path, language, name)
 
     def compiled(self, *, functions: int | None = None, wrench: WrenchFrame | None = None) -> CompiledFit:
         """Compile the fit to a fast predictor in C with the local compiler.
@@ -512,11 +508,7 @@ class StructuredFit(FittedModel):
 
 
 def _without(added: tuple[Tensor, ...], removed: Tensor) -> tuple[Tensor, ...]:
-    """Return the digests of the samples that remain after some have been removed.
-
-    Raises:
-        ModelError: a removed sample is not in `added`.
-    """
+    """Return the digests of the samples that remain after some have been removed."""
     values, counts = torch.cat([*added, removed]).unique(return_counts=True)
     _, own = torch.cat([values, removed]).unique(return_counts=True)
     left = counts - 2 * (own - 1)

@@ -197,11 +197,7 @@ class StructuredGP(Model[StructuredFit]):
             yield f'inertia="auto" has no effect: the model lacks {lacks}'
 
     def _continued(self, after: StructuredFit) -> Specification:
-        """Return this model with the priors of an earlier fit, including automatically selected priors.
-
-        Raises:
-            ModelError: the fit belongs to a model with different priors or contacts.
-        """
+        """Return this model with the priors of an earlier fit, including automatically selected priors."""
         spec = self.specification
         own = () if self.specification.automatic else tuple(prior.name for prior in self.force_priors)
         names = tuple(prior.name for prior in after.force_priors)

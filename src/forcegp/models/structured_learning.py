@@ -70,7 +70,6 @@ FEWEST_MOVING = 20
 """Number of samples in motion below which samples at rest are also kept."""
 FIRST_POWER = 0.25
 """Exponent of the tempered likelihood before the correlation of the residuals is known."""
-
 ROUNDS = 3
 """Maximum number of times that hyperparameters are relearned after updates based on the residuals."""
 
@@ -262,9 +261,8 @@ def training_for(
     if before is not None and learned is not None:
         scales = zip(spec.priors, before.training.scales, strict=True)
         kept = {prior.name: scale for prior, scale in scales if prior.name not in learned}
-    training = training_of(
-        data, spec.system, spec.priors, spec.noise.acceleration, kept, spec.options.standardize
-    )
+    noise_std, standardize = spec.noise.acceleration, spec.options.standardize
+    training = training_of(data, spec.system, spec.priors, noise_std, kept, standardize)
     if any(prior.delay for prior in spec.priors):
         training = without_delay(training, spec.priors)
     return in_motion(spec.system, training, fewest) if spec.noise.learns_torque else (training, ())
@@ -313,16 +311,13 @@ def in_motion(
     """Return the samples in motion and without impacts, and warnings about them."""
     moving = training.moving(REST_SPEED)
     if moving.samples < fewest:
-        return training, (
-            f"only {moving.samples} samples are in motion: friction cannot be separated from noise at rest",
-        )
+        text = "samples are in motion: friction cannot be separated from noise at rest"
+        return training, (f"only {moving.samples} {text}",)
     moving, impacts = without_impacts(moving, system)
     if not impacts:
         return moving, ()
-    return moving, (
-        f"{impacts} samples in contact were excluded as impacts: they accelerate away from the surface or "
-        "into it",
-    )
+    text = "samples in contact were excluded as impacts: they accelerate away from the surface or into it"
+    return moving, (f"{impacts} {text}",)
 
 
 def subset(spec: Specification, problem: Problem) -> Problem:

@@ -163,9 +163,7 @@ class Pass:
             NumericalError: the sums are not finite.
         """
         basis, begin = basis_of(problem, hyperparameters), None
-        saved = None
-        if self.checkpoint is not None:
-            saved = Checkpoint(self._own_file(), self._key(problem, hyperparameters))
+        saved = Checkpoint(self._own_file(), self._key(problem, hyperparameters)) if self.checkpoint else None
         kept, refused = {}, None
         if saved is not None:
             try:
@@ -207,9 +205,8 @@ class Pass:
             if len(piece) == 0:
                 yield problem.training.of_rows([torch.arange(0)] * len(problem.training.measurements))
             else:
-                rows = training_of(
-                    piece, self.spec.system, problem.priors, self.spec.noise.acceleration, kept
-                )
+                noise_std = self.spec.noise.acceleration
+                rows = training_of(piece, self.spec.system, problem.priors, noise_std, kept)
                 yield without_delay(rows, problem.priors)
 
     def _own_file(self) -> Path:

@@ -99,8 +99,7 @@ def _window(finding: Finding, log: Log) -> slice:
 
 def _largest(log: Log) -> list[int]:
     """Return the joints with the largest torques."""
-    size = np.nan_to_num(np.nanmean(log.tau**2, axis=0))
-    return sorted(np.argsort(-size)[:FEW].tolist())
+    return sorted(np.argsort(-np.nan_to_num(np.nanmean(log.tau**2, axis=0)))[:FEW].tolist())
 
 
 def _panels(
@@ -119,8 +118,7 @@ def _panels(
         for axes, j in zip(panels, joints, strict=True):
             _shade(axes, finding, rows, log)
             paint(axes, log, rows, j)
-            kind = [system.robot.joint_types[j]]
-            axes.set_ylabel(f"{quantity} [{unit(quantity, kind) or 's'}]")
+            axes.set_ylabel(f"{quantity} [{unit(quantity, [system.robot.joint_types[j]]) or 's'}]")
             axes.margins(x=0.0)
             if quantity != "time step":
                 axes.set_title(log.joint_names[j], loc="left")

@@ -43,6 +43,7 @@ def write_evaluation(
     write_text(folder / WINDOW, window.to_json())
     # The name `model` would add no information to the title.
     name = "" if Path(model).name.lower() in ("", "model") else f" “{Path(model).name}”"
+    tables = *error_tables(scores), *uncertainty_tables(scores), score_table(scores)
     page = render(
         "evaluation.html.j2",
         title=f"{label(scores.kind)}{name} on {Path(data).name}",
@@ -50,12 +51,7 @@ def write_evaluation(
         data=data,
         scores=scores,
         baseline_data=fitted_to or "the other half of the data",
-        tables=(
-            *error_tables(scores),
-            *uncertainty_tables(scores),
-            score_table(scores),
-            *comparison_tables(comparison),
-        ),
+        tables=(*tables, *comparison_tables(comparison)),
         blocks=_blocks(window, pictures, force),
     )
     write_text(folder / PAGE, page)
@@ -101,9 +97,8 @@ def draw_calibration(evaluation: Evaluation) -> Picture:
         figure.legend(loc="outside upper center", ncols=2)
 
     listed = ", ".join(f"{share:.2f} at {level:g}" for level, share in levels.items())
-    return draw(
-        paint, (4.1, 3.4), f"Calibration, fraction of samples inside: {listed}.", label(evaluation.kind)
-    )
+    alt = f"Calibration, fraction of samples inside: {listed}."
+    return draw(paint, (4.1, 3.4), alt, label(evaluation.kind))
 
 
 def error_tables(evaluation: Evaluation) -> tuple[Table, ...]:
@@ -139,10 +134,8 @@ def uncertainty_tables(evaluation: Evaluation) -> tuple[Table, ...]:
         caption = "Mean log density of a measured joint acceleration [nats], higher is better"
         tables.append(Table(caption, ("predictor", "log density"), rows))
     head = ("contact", "samples", "bias [N]", "standard deviation [N]", "correlation", "±2σ coverage")
-    titles = (
-        "Multiplier λ: predicted minus logged",
-        "Multiplier λ: predicted minus logged, with the force sensor",
-    )
+    plain = "Multiplier λ: predicted minus logged"
+    titles = plain, f"{plain}, with the force sensor"
     for title, scores in zip(titles, (evaluation.multipliers, evaluation.sensed), strict=True):
         values = [(m.contact, m.samples, m.bias, m.spread, m.correlation, m.coverage) for m in scores]
         if values:
@@ -153,9 +146,7 @@ def uncertainty_tables(evaluation: Evaluation) -> tuple[Table, ...]:
 def score_table(evaluation: Evaluation) -> Table:
     """Return a table of the overall scores, with units."""
     scores = evaluation.summary()
-    rows = tuple(
-        (name, cell(scores[key])) for key, name in NAMES["scores"].items() if scores[key] is not None
-    )
+    rows = tuple((name, cell(scores[k])) for k, name in NAMES["scores"].items() if scores[k] is not None)
     return Table("Scores over all joints", ("score", "value"), rows)
 
 

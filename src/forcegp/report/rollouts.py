@@ -122,8 +122,7 @@ def rollout_data(comparison: Comparison, calibration: Comparison | None = None) 
     joints = arm_points(comparison.system.robot, comparison.q[0, ::stride], *tip)
     films = [Film(label="logged", points=rounded(joints))]
     for name, rolled in comparison.predicted.items():
-        sound = _sound(rolled.q[0])
-        points = arm_points(rolled.system.robot, rolled.q[0, :sound:stride], *tip)
+        points = arm_points(rolled.system.robot, rolled.q[0, : _sound(rolled.q[0]) : stride], *tip)
         films.append(Film(label=name, points=rounded(points)))
     logged = comparison.multiplier
     return RolloutData(

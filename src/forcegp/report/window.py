@@ -118,8 +118,7 @@ def draw_forces(window: WindowData) -> Picture:
     def paint(figure: Figure) -> None:
         panels = figure.subplots(len(window.forces), 1, sharex=True, squeeze=False)[:, 0]
         for axes, force in zip(panels, window.forces, strict=True):
-            open_ = ~torch.tensor(force.closed)
-            mean = as_tensor(force.mean).masked_fill(open_, torch.nan)
+            mean = as_tensor(force.mean).masked_fill(~torch.tensor(force.closed), torch.nan)
             if force.std is not None:
                 spread, style = 2.0 * as_tensor(force.std), {"color": colour(window.model), "alpha": 0.3}
                 axes.fill_between(window.t, mean - spread, mean + spread, linewidth=0, label="±2σ", **style)
@@ -177,8 +176,7 @@ def _rows(figure: Figure, window: WindowData, centre: Tensor, limit: float | Non
     measured, mean = as_tensor(window.measured) - centre, as_tensor(window.mean) - centre
     relative, model_colour = centre.dim() > 1, colour(window.model)
     for i, axes in enumerate(rows):
-        ink = GREY if relative else INK
-        axes.plot(window.t, measured[i], color=ink, linewidth=0.7, label="measured")
+        axes.plot(window.t, measured[i], color=GREY if relative else INK, linewidth=0.7, label="measured")
         if window.std is not None:
             spread = 2.0 * as_tensor(window.std[i])
             band, style = (mean[i] - spread, mean[i] + spread), {"color": model_colour, "alpha": 0.3}

@@ -69,9 +69,8 @@ class EditableXml:
         try:
             data.decode("utf-8")
         except UnicodeDecodeError as error:
-            raise RobotFileError(
-                f"{label}: cannot be edited in place", expected="UTF-8 text", got=str(error)
-            ) from error
+            text = f"{label}: cannot be edited in place"
+            raise RobotFileError(text, expected="UTF-8 text", got=str(error)) from error
         self._data, self._edits, open_ = data, list[tuple[int, int, bytes]](), list[Span]()
         roots: list[Span] = []
         parser = expat.ParserCreate("utf-8")
@@ -96,9 +95,8 @@ class EditableXml:
         close = self._data.index(b">", end) + 1
         line = self._data[self._data.rfind(b"\n", 0, at) + 1 : at]
         indent = line if not line.strip() else b""
-        return Span(
-            tag, attributes, values, name.end(), close, self._data[close - 2 : close] == b"/>", indent
-        )
+        empty = self._data[close - 2 : close] == b"/>"
+        return Span(tag, attributes, values, name.end(), close, empty, indent)
 
     def set(self, element: Span, name: str, text: str) -> None:
         """Set an attribute. A new attribute is added after the existing attributes."""
@@ -107,8 +105,7 @@ class EditableXml:
             first, last, _ = element.values[name]
             self._edits.append((first, last, quoted))
         else:
-            ends = [last for _, last, _ in element.values.values()]
-            at = max(ends, default=element.head)
+            at = max((last for _, last, _ in element.values.values()), default=element.head)
             self._edits.append((at, at, b" " + name.encode() + b"=" + quoted))
 
     def drop(self, element: Span, name: str) -> None:

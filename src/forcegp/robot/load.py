@@ -158,9 +158,7 @@ def _check_mass_matrix(tree: Tree, placed: _Placed, bodies: list[Inertial]) -> N
 def _mass_matrix(placed: _Placed, bodies: list[Inertial]) -> np.ndarray:
     n = len(placed.moving)
     axes, origins = np.zeros((n, 3)), np.zeros((n, 3))
-    poses: list[np.ndarray] = []
-    moves = np.zeros((n, n), dtype=bool)
-    M = np.zeros((n, n))
+    poses, moves, M = list[np.ndarray](), np.zeros((n, n), dtype=bool), np.zeros((n, n))
     turns = np.array([joint.kind == "revolute" for joint in placed.moving])
     for i, joint in enumerate(placed.moving):
         parent = placed.parents[i]

@@ -120,8 +120,7 @@ def _chain(
         joint = _joint(model, j, joint_names[j], names[b], coupled.get(joint_names[j]), label)
         chain.append(replace(joint, parent=parent, placement=placement @ step @ joint.placement))
         parent, placement, anchor = joint.child, np.eye(4), model.jnt_pos[j].copy()
-    last = transform(np.eye(3), -anchor)
-    chain.append(Joint("", "fixed", parent, names[b], placement @ last))
+    chain.append(Joint("", "fixed", parent, names[b], placement @ transform(np.eye(3), -anchor)))
     return chain
 
 
@@ -130,12 +129,9 @@ def _joint(model: Any, j: int, name: str, body: str, follows: Coupling | None, l
     kind, dof = _KINDS.get(int(model.jnt_type[j])), model.jnt_dofadr[j]
     if kind is None:
         word = "free (floating)" if model.jnt_type[j] == mujoco.mjtJoint.mjJNT_FREE else "ball"
-        raise UnsupportedRobotError(
-            f"{label}: joint {name!r} of link {body!r} is a {word} joint",
-            expected="hinge and slide joints",
-            got=word,
-            hint="remove the free joint to hold the robot by its base" if "free" in word else None,
-        )
+        text = f"{label}: joint {name!r} of link {body!r} is a {word} joint"
+        hint = "remove the free joint to hold the robot by its base" if "free" in word else None
+        raise UnsupportedRobotError(text, expected="hinge and slide joints", got=word, hint=hint)
     relation = f"mimics joint {follows.leader!r}" if follows and follows.leader else "is held in place"
     refused = f"{relation} by an equality constraint" if follows else ""
     if model.jnt_stiffness[j] or model.jnt_stiffnesspoly[j].any() or model.dof_dampingpoly[dof].any():

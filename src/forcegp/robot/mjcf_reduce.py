@@ -63,9 +63,8 @@ def reduce_mjcf(root: Element, path: Path) -> tuple[Element, dict[str, Coupling]
         elif section.tag == "equality":
             coupled.update(_couplings(section, path))
         elif section.tag not in _IGNORED_SECTIONS:
-            raise UnsupportedRobotError(
-                f"{where} is not supported", expected="bodies with joints", got=section.tag
-            )
+            text = f"{where} is not supported"
+            raise UnsupportedRobotError(text, expected="bodies with joints", got=section.tag)
         elif section.tag == "tendon" and len(section):
             remarks.append(f"{path}: the forces of tendons are ignored")
     _check_numbers(document, path)
@@ -168,8 +167,7 @@ def _copy_parts(source: Element, copy: Element, keep_geoms: bool, from_geoms: bo
         if part.tag == "body":
             copy.append(_copy_body(part, from_geoms, where.rsplit(" ", 1)[0]))
         elif part.tag == "frame":
-            frame = SubElement(copy, "frame", part.attrib)
-            _copy_parts(part, frame, keep_geoms, from_geoms, where)
+            _copy_parts(part, SubElement(copy, "frame", part.attrib), keep_geoms, from_geoms, where)
         elif part.tag == "geom":
             if keep_geoms and part.get("mass") != "0":
                 _refuse_mesh(part, where)
@@ -177,11 +175,9 @@ def _copy_parts(source: Element, copy: Element, keep_geoms: bool, from_geoms: bo
         elif part.tag in _BODY_PARTS:
             SubElement(copy, part.tag, _without(part, ("user",)))
         elif part.tag not in _IGNORED_PARTS:
-            raise UnsupportedRobotError(
-                f"{where} has a <{part.tag[:60]}>, which is not supported",
-                expected=", ".join(_BODY_PARTS),
-                hint="save the compiled model with MuJoCo, which expands such elements",
-            )
+            text = f"{where} has a <{part.tag[:60]}>, which is not supported"
+            hint = "save the compiled model with MuJoCo, which expands such elements"
+            raise UnsupportedRobotError(text, expected=", ".join(_BODY_PARTS), hint=hint)
 
 
 def _refuse_mesh(geom: Element, where: str) -> None:

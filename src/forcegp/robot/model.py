@@ -99,8 +99,7 @@ class RobotModel:
         numbers = torch.stack([self.lower, self.upper, self.mass, self.damping, self.friction], dim=1)
         parents = ["base" if parent == BASE else self.joint_names[parent] for parent in self.parents]
         columns = self.joint_names, self.joint_types, parents, *numbers.detach().T.tolist()
-        rows = list(zip(*columns, strict=True))
-        return html_table(repr(self).strip("<>"), head, rows, self.remarks)
+        return html_table(repr(self).strip("<>"), head, list(zip(*columns, strict=True)), self.remarks)
 
     @cached_property
     def nq(self) -> int:
@@ -205,11 +204,9 @@ class RobotModel:
                     hint=f"call torch.tensor({name}, dtype={self.dtype})",
                 )
             if value.ndim == 0 or value.shape[-1] != self.nq:
-                raise ShapeError(
-                    f"{name} has the wrong shape for robot {self.name!r}",
-                    expected=f"shape (*batch, {self.nq}) for joints {', '.join(self.joint_names)}",
-                    got=tuple(value.shape),
-                )
+                text = f"{name} has the wrong shape for robot {self.name!r}"
+                expected = f"shape (*batch, {self.nq}) for joints {', '.join(self.joint_names)}"
+                raise ShapeError(text, expected=expected, got=tuple(value.shape))
             if value.dtype != self.dtype or value.device != self.device:
                 raise ShapeError(
                     f"{name} is not in the precision or on the device of robot {self.name!r}",

@@ -78,12 +78,7 @@ class AnalyticalParameters(nn.Module):
         return self.start.replace(**fields)
 
     def reset(
-        self,
-        generator: torch.Generator,
-        *,
-        relative: float = 0.0,
-        length: float = 0.0,
-        angle: float = 0.0,
+        self, generator: torch.Generator, *, relative: float = 0.0, length: float = 0.0, angle: float = 0.0
     ) -> None:
         """Draw all coordinates uniformly from intervals around the initial robot.
 
@@ -145,20 +140,15 @@ def _check(joints: Mapping[str, tuple[str, ...]]) -> None:
     for part in ("mass", "com"):
         twice = set(joints.get("inertia", ())) & set(joints.get(part, ()))
         if twice:
-            raise ModelError(
-                f"{part} and inertia of the link of joint {min(twice)!r} are both selected",
-                expected="one of them",
-                hint=f"inertia contains {part}: remove {part} for this joint",
-            )
+            text = f"{part} and inertia of the link of joint {min(twice)!r} are both selected"
+            hint = f"inertia contains {part}: remove {part} for this joint"
+            raise ModelError(text, expected="one of them", hint=hint)
 
 
 def _log_cholesky(joint: str, mass: Tensor, com: Tensor, inertia: Tensor) -> Tensor:
     try:
         return log_cholesky(pseudo_inertia(mass, com, inertia))
     except InertiaError as error:
-        raise InertiaError(
-            f"the inertia of the link of joint {joint!r} is not physical, so it has no log-Cholesky form",
-            expected=error.expected,
-            got=error.got,
-            hint="learn its mass or com alone, or start from a robot with a physical inertia",
-        ) from error
+        text = f"the inertia of the link of joint {joint!r} is not physical, so it has no log-Cholesky form"
+        hint = "learn its mass or com alone, or start from a robot with a physical inertia"
+        raise InertiaError(text, expected=error.expected, got=error.got, hint=hint) from error

@@ -29,18 +29,11 @@ class _BoundedBuilder(TreeBuilder):
         self._count += 1
         self._depth += 1
         if self._count > MAX_ELEMENTS:
-            raise RobotFileError(
-                f"{self._label}: too many elements",
-                expected=f"at most {MAX_ELEMENTS} XML elements",
-                got="more",
-                hint="keep only links, joints and bodies",
-            )
+            text, hint = f"{self._label}: too many elements", "keep only links, joints and bodies"
+            raise RobotFileError(text, expected=f"at most {MAX_ELEMENTS} XML elements", got="more", hint=hint)
         if self._depth > MAX_DEPTH:
-            raise RobotFileError(
-                f"{self._label}: elements are nested too deeply",
-                expected=f"at most {MAX_DEPTH} levels",
-                got=f"more, at <{tag[:60]}>",
-            )
+            text = f"{self._label}: elements are nested too deeply"
+            raise RobotFileError(text, expected=f"at most {MAX_DEPTH} levels", got=f"more, at <{tag[:60]}>")
         return super().start(tag, attrs)
 
     def end(self, tag: str, /) -> Element:
@@ -62,9 +55,8 @@ def read_bytes(path: Path) -> bytes:
         reason = getattr(error, "strerror", None) or error
         raise RobotFileError(f"{path}: cannot be read", expected="a readable file", got=reason) from error
     if len(data) > MAX_BYTES:
-        raise RobotFileError(
-            f"{path}: the file is too large", expected=f"at most {MAX_BYTES} bytes", got="more"
-        )
+        text = f"{path}: the file is too large"
+        raise RobotFileError(text, expected=f"at most {MAX_BYTES} bytes", got="more")
     return data
 
 
@@ -102,12 +94,9 @@ def parse_xml(data: bytes, label: str) -> Element:
 
 def xacro_error(label: str, got: str) -> RobotFileError:
     """Return the error for a file that contains unexpanded xacro macros."""
-    return RobotFileError(
-        f"{label}: the file has xacro macros that are not expanded",
-        expected="plain URDF",
-        got=got,
-        hint="expand them first: xacro robot.urdf.xacro > robot.urdf",
-    )
+    text = f"{label}: the file has xacro macros that are not expanded"
+    hint = "expand them first: xacro robot.urdf.xacro > robot.urdf"
+    return RobotFileError(text, expected="plain URDF", got=got, hint=hint)
 
 
 def parse_numbers(
@@ -123,7 +112,6 @@ def parse_numbers(
         raise error(f"{where} is not valid", expected=expected, got=repr(text[:80]))
     for value in values:
         if math.isnan(value) or (not infinite and abs(value) > MAX_NUMBER):
-            raise error(
-                f"{where} is not valid", expected=f"{expected} below {MAX_NUMBER:g}", got=repr(text[:80])
-            )
+            message = f"{where} is not valid"
+            raise error(message, expected=f"{expected} below {MAX_NUMBER:g}", got=repr(text[:80]))
     return values

@@ -206,27 +206,21 @@ def _check_names(tree: Tree) -> None:
     for kind, names in (("link", [link.name for link in tree.links]), ("joint", joints)):
         name, count = Counter(names).most_common(1)[0] if names else ("", 0)
         if count > 1:
-            raise RobotFileError(
-                f"{tree.label}: {kind} name {name!r} is not unique", expected="unique names", got=count
-            )
+            text = f"{tree.label}: {kind} name {name!r} is not unique"
+            raise RobotFileError(text, expected="unique names", got=count)
     links = {link.name for link in tree.links}
     for joint in tree.joints:
         for role, link in (("parent", joint.parent), ("child", joint.child)):
             if link not in links:
-                raise RobotFileError(
-                    f"{tree.label}: joint {joint.name!r} has an unknown {role} link {link!r}",
-                    expected="one of " + _shown([link.name for link in tree.links]),
-                    hint=did_you_mean(link, links),
-                )
+                text = f"{tree.label}: joint {joint.name!r} has an unknown {role} link {link!r}"
+                expected = "one of " + _shown([link.name for link in tree.links])
+                raise RobotFileError(text, expected=expected, hint=did_you_mean(link, links))
     for name, count in Counter(joint.child for joint in tree.joints).items():
         if count > 1:
             several = [joint.name for joint in tree.joints if joint.child == name]
-            raise RobotFileError(
-                f"{tree.label}: link {name!r} is the child of several joints",
-                expected="one parent joint per link",
-                got=_shown(several),
-                hint="open the loop and close it with a point constraint",
-            )
+            text = f"{tree.label}: link {name!r} is the child of several joints"
+            hint = "open the loop and close it with a point constraint"
+            raise RobotFileError(text, expected="one parent joint per link", got=_shown(several), hint=hint)
 
 
 def _root(tree: Tree) -> str:
@@ -237,11 +231,9 @@ def _root(tree: Tree) -> str:
     if not tree.links:
         raise RobotFileError(f"{tree.label}: the file has no links", expected="at least one link", got=0)
     if not roots:
-        raise RobotFileError(
-            f"{tree.label}: joint {tree.joints[0].name!r} is part of a cycle",
-            expected="one link without a parent joint, the base",
-            got="every link is the child of a joint",
-        )
+        text = f"{tree.label}: joint {tree.joints[0].name!r} is part of a cycle"
+        got = "every link is the child of a joint"
+        raise RobotFileError(text, expected="one link without a parent joint, the base", got=got)
     raise RobotFileError(
         f"{tree.label}: the links form several trees",
         expected="one link without a parent joint, the base",
@@ -261,13 +253,9 @@ def _check_kinds(tree: Tree) -> None:
         )
     moving = sum(joint.kind != "fixed" for joint in tree.joints)
     if not 1 <= moving <= MAX_JOINTS:
-        what = "too many moving joints" if moving else "nothing in this file moves"
-        raise RobotFileError(
-            f"{tree.label}: {what}",
-            expected=f"1 to {MAX_JOINTS} moving joints",
-            got=moving,
-            hint=None if moving else "the file describes an object; a robot has revolute or prismatic joints",
-        )
+        text = f"{tree.label}: {'too many moving joints' if moving else 'nothing in this file moves'}"
+        hint = None if moving else "the file describes an object; a robot has revolute or prismatic joints"
+        raise RobotFileError(text, expected=f"1 to {MAX_JOINTS} moving joints", got=moving, hint=hint)
 
 
 def _lock(tree: Tree, refused: list[Joint]) -> dict[str, float]:

@@ -59,11 +59,8 @@ def read_urdf(root: Element, label: str) -> Tree:
 def _name(element: Element, label: str) -> str:
     name = element.get("name")
     if not name or not name.isprintable() or len(name) > 200:
-        raise RobotFileError(
-            f"{label}: a <{element.tag}> has no usable name",
-            expected="name=... of 1 to 200 printable characters",
-            got=repr(name and name[:40]),
-        )
+        text, got = f"{label}: a <{element.tag}> has no usable name", repr(name and name[:40])
+        raise RobotFileError(text, expected="name=... of 1 to 200 printable characters", got=got)
     return name
 
 
@@ -118,12 +115,8 @@ def _joint(element: Element, label: str) -> Joint:
     if kind is None:
         raise RobotFileError(f"{where} has no type", expected="type=revolute, prismatic, ...")
     if kind not in _KINDS:
-        raise UnsupportedRobotError(
-            f"{where} is of type {kind!r}",
-            expected="revolute, continuous, prismatic or fixed",
-            got=kind,
-            hint=_INSTEAD.get(kind),
-        )
+        text, expected = f"{where} is of type {kind!r}", "revolute, continuous, prismatic or fixed"
+        raise UnsupportedRobotError(text, expected=expected, got=kind, hint=_INSTEAD.get(kind))
     tags = ("parent", "child", "axis", "limit", "dynamics", "mimic")
     parent, child, axis, limit, dynamics, mimic = (_part(element, tag, where) for tag in tags)
     for part, values in (("parent", parent), ("child", child)):
@@ -134,9 +127,8 @@ def _joint(element: Element, label: str) -> Joint:
         return Joint(name, "fixed", *ends)
     damping, friction = dynamics.get("damping", 0.0), dynamics.get("friction", 0.0)
     if min(damping, friction) < 0.0:
-        raise RobotFileError(
-            f"{where} has negative friction", expected="damping and friction ≥ 0", got=(damping, friction)
-        )
+        text = f"{where} has negative friction"
+        raise RobotFileError(text, expected="damping and friction ≥ 0", got=(damping, friction))
     return Joint(
         name,
         "prismatic" if kind == "prismatic" else "revolute",
@@ -153,9 +145,8 @@ def _joint(element: Element, label: str) -> Joint:
 def _unit(axis: np.ndarray, where: str) -> np.ndarray:
     length = float(np.linalg.norm(axis))
     if length < 1e-9:
-        raise RobotFileError(
-            f"{where} has an axis of length zero", expected="a direction such as 0 0 1", got=axis.tolist()
-        )
+        text = f"{where} has an axis of length zero"
+        raise RobotFileError(text, expected="a direction such as 0 0 1", got=axis.tolist())
     return axis / length
 
 
@@ -163,15 +154,13 @@ def _limits(limit: dict[str, Any], kind: str, where: str) -> dict[str, float]:
     """Return the limits of a joint. Missing or zero effort and velocity limits become infinite."""
     effort, velocity = (limit.get(name) or np.inf for name in ("effort", "velocity"))
     if min(effort, velocity) < 0.0:
-        raise RobotFileError(
-            f"{where} has a negative limit", expected="effort and velocity ≥ 0", got=(effort, velocity)
-        )
+        text = f"{where} has a negative limit"
+        raise RobotFileError(text, expected="effort and velocity ≥ 0", got=(effort, velocity))
     limits = {"effort_limit": effort, "velocity_limit": velocity}
     if kind == "continuous" or not ("lower" in limit or "upper" in limit):
         return limits
     lower, upper = limit.get("lower", 0.0), limit.get("upper", 0.0)
     if lower > upper:
-        raise RobotFileError(
-            f"{where} has its lower limit above its upper limit", expected="lower ≤ upper", got=(lower, upper)
-        )
+        text = f"{where} has its lower limit above its upper limit"
+        raise RobotFileError(text, expected="lower ≤ upper", got=(lower, upper))
     return limits | {"lower": lower, "upper": upper}

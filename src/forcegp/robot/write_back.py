@@ -25,15 +25,7 @@ from forcegp.robot.inertia import from_pseudo_inertia, pseudo_inertia
 from forcegp.robot.load import read_tree, robot_of, robot_path
 from forcegp.robot.model import RobotModel
 from forcegp.robot.safety import parse_xml, read_bytes
-from forcegp.robot.tree import (
-    Inertial,
-    Tree,
-    checked,
-    inertia_doubt,
-    inertia_error,
-    lock_joints,
-    transform,
-)
+from forcegp.robot.tree import Inertial, Tree, checked, inertia_doubt, inertia_error, lock_joints, transform
 
 CHANGED = 1e-6
 """Relative change in a parameter below which the text in the file is preserved."""
@@ -301,8 +293,7 @@ class _Urdf:
 
 
 def _urdf_moments(inertia: np.ndarray) -> list[tuple[str, float]]:
-    names = ("ixx", "iyy", "izz", "ixy", "ixz", "iyz")
-    return list(zip(names, inertia[_PLACES].tolist(), strict=True))
+    return list(zip(("ixx", "iyy", "izz", "ixy", "ixz", "iyz"), inertia[_PLACES].tolist(), strict=True))
 
 
 class _Mjcf:
@@ -321,11 +312,9 @@ class _Mjcf:
 
     def _element(self, kind: str, name: str, among: Mapping[str, Span]) -> Span:
         if name not in among:
-            raise RobotFileError(
-                f"{self.label}: the {kind} {name!r} is not in this file",
-                expected=f"one of {', '.join(among) or 'none'}",
-                hint="write to the included file, or expand the includes first",
-            )
+            text = f"{self.label}: the {kind} {name!r} is not in this file"
+            hint = "write to the included file, or expand the includes first"
+            raise RobotFileError(text, expected=f"one of {', '.join(among) or 'none'}", hint=hint)
         return among[name]
 
     def set_joint(self, joint: str, values: dict[str, str]) -> None:

@@ -30,11 +30,8 @@ STEPS_PER_STATE = 4
 """Number of recorded steps that need as much memory as the equations of motion at one state, as measured."""
 FEW = 8
 """Number of trajectories up to which one thread is used. More threads are slower on small tensors."""
-
 COMPILED_STEPS = 1000
 """Number of steps above which compiled mechanics save more time than their compilation takes."""
-STABILIZATIONS = ("none", "baumgarte", "projection")
-ON_DIVERGENCE = ("raise", "keep")
 
 
 @dataclass(frozen=True)
@@ -86,9 +83,9 @@ class RolloutOptions:
                     f"the rollout's {name} is out of range", expected="a positive finite number", got=value
                 )
         check_name("method of integration", self.method, METHODS)
-        check_name("on_divergence", self.on_divergence, ON_DIVERGENCE)
+        check_name("on_divergence", self.on_divergence, ("raise", "keep"))
         if not isinstance(self.stabilization, Baumgarte):
-            check_name("stabilization", self.stabilization, STABILIZATIONS)
+            check_name("stabilization", self.stabilization, ("none", "baumgarte", "projection"))
 
     def stabilized(self, system: ConstrainedSystem) -> ConstrainedSystem:
         """Return the system with the stabilization terms of the rollout on the right-hand side."""
@@ -269,22 +266,18 @@ def _initial(
     problem: RolloutProblem, start: tuple[Tensor, Tensor], whole: torch.Size, active: Tensor | None
 ) -> State:
     """Return the initial states of all trajectories, and the initially closed contacts."""
-    n, contacts = whole.numel(), len(problem.system.contacts)
+    n, system = whole.numel(), problem.system
     q, qd = (x.expand(*whole, x.shape[-1]).reshape(n, -1) for x in start)
     if active is not None:
         closed = active.expand(*whole, -1).reshape(n, -1)
     elif problem.unilateral:
-        closed = _touching(problem.system, q, qd)
+        # Contacts are closed if they touch their surface or cannot open.
+        with torch.no_grad():
+            away = any_row(system, system.equations(q, qd).c.abs() > CLOSED)
+        closed = ~(away & system.can_open)
     else:
-        closed = torch.ones(n, contacts, dtype=torch.bool, device=q.device)
+        closed = torch.ones(n, len(system.contacts), dtype=torch.bool, device=q.device)
     return State(q.new_zeros(n, 1), q, qd, closed)
-
-
-def _touching(system: ConstrainedSystem, q: Tensor, qd: Tensor) -> Tensor:
-    """Return a mask `(n, n_contacts)` of the contacts that touch their surface or cannot open."""
-    with torch.no_grad():
-        is_open = any_row(system, system.equations(q, qd).c.abs() > CLOSED)
-    return ~(is_open & system.can_open)
 
 
 def share_of(progress: Progress | None, part: int, parts: int) -> Progress | None:

@@ -23,8 +23,6 @@ EDGE = 1e-6
 """Fraction of a sampling period within which a time counts as a sampling time, to allow for rounding."""
 EVEN = 0.02
 """Largest relative deviation of a time step from the sampling period in a log that is replayed."""
-
-
 CompiledMotion = Callable[[Tensor, Tensor, Tensor, Tensor, Tensor, bool], tuple[Tensor, ...]]
 """A function without gradients. It maps q, q̇, τ, closed contacts, step lengths h `(n, 1)` and whether joints
 may stick to q̈, λ, the constraint error and its rate, and the joints held by friction."""

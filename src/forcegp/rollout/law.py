@@ -208,8 +208,7 @@ def dry_friction_force(qdd: Tensor, G: Tensor, limit: Tensor, qd: Tensor, h: Ten
         exchanged = torch.where((trials >= 0)[:, None], wrong, last)
         direction = torch.where(exchanged, over, direction)
     # Coulomb friction at contacts makes G asymmetric, so exchanges may cycle although a solution exists.
-    unsolved = count.nonzero()[:, 0].tolist()
-    for row in unsolved:
+    for row in count.nonzero()[:, 0].tolist():
         direction[row] = _enumerated(*(x[row] for x in problem))
     force, _, wrong = _tried(direction, *problem)
     if not bool(wrong.any()):

@@ -52,9 +52,8 @@ class Document:
         except (ValueError, RecursionError) as cause:
             match = re.search(r"line (\d+)", str(cause))
             line = int(match[1]) if match else text.count("\n") + 1
-            raise error(
-                f"{source}:{line}: not valid TOML", got=str(cause) or "brackets nested too deeply"
-            ) from cause
+            text = f"{source}:{line}: not valid TOML"
+            raise error(text, got=str(cause) or "brackets nested too deeply") from cause
         self._lines = _lines_of_keys(text)
 
     def validated(self, schema: type[Schema]) -> Schema:
@@ -120,8 +119,7 @@ class Document:
         for part in key:
             members: Any = dict(enumerate(table)) if isinstance(table, list) else table
             table = members.get(part, table)
-        matches = (name for name in table if re.search(rf"\b{re.escape(name)}\b", message))
-        name = next(matches, None)
+        name = next((name for name in table if re.search(rf"\b{re.escape(name)}\b", message)), None)
         return key if name is None else (*key, name)
 
 

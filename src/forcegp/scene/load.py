@@ -93,17 +93,13 @@ def load_scene(source: str | Path) -> Scene:
     Raises:
         SceneError: the scene does not exist or is invalid. The message names the file, line and key.
     """
-    bundled = str(source) in BUNDLED
-    path = FOLDER / f"{source}.toml" if bundled else Path(source)
+    path = FOLDER / f"{source}.toml" if str(source) in BUNDLED else Path(source)
     if not is_file(path):
         beside = []
         with suppress(OSError, ValueError):
             beside = [str(p) for p in path.parent.glob("*.toml")]
-        raise SceneError(
-            f"{path}: no such scene",
-            expected=f"a TOML file, or one of {', '.join(BUNDLED)}",
-            hint=did_you_mean(source, [*BUNDLED, *beside]),
-        )
+        text, hint = f"{path}: no such scene", did_you_mean(source, [*BUNDLED, *beside])
+        raise SceneError(text, expected=f"a TOML file, or one of {', '.join(BUNDLED)}", hint=hint)
     document = Document(path.read_bytes(), str(path))
     return Scene(document.validated(SceneSections), document, path.parent)
 

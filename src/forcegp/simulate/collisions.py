@@ -92,12 +92,8 @@ class Collisions:
 
     def depth(self, q: Array) -> Array:
         """Return the violation of the clearance `(n,)` [m] at positions `(n, nq)`, or 0 if there is none."""
-        return np.array(
-            [
-                max((self.clearance - self._data.contact.dist[k] for k, _ in self._near(x)), default=0.0)
-                for x in q
-            ]
-        )
+        lacks = ((self.clearance - self._data.contact.dist[k] for k, _ in self._near(x)) for x in q)
+        return np.array([max(lack, default=0.0) for lack in lacks])
 
     def penalty(self, q: Array, margin: float) -> tuple[float, Array]:
         """Return Σ (1 − distance/margin)² over positions `(n, nq)` and close pairs, and its gradient."""
@@ -136,9 +132,8 @@ class Collisions:
         ]
 
     def _always_touching(self, robot: RobotModel) -> set[tuple[int, ...]]:
-        low, high = (
-            np.nan_to_num(x.cpu().numpy(), posinf=np.pi, neginf=-np.pi) for x in (robot.lower, robot.upper)
-        )
+        ends = robot.lower.cpu().numpy(), robot.upper.cpu().numpy()
+        low, high = (np.nan_to_num(x, posinf=np.pi, neginf=-np.pi) for x in ends)
         counts: dict[tuple[int, ...], int] = {}
         for q in np.random.default_rng(0).uniform(low, high, (POSITIONS, robot.nq)):
             for pair in {tuple(sorted(pair)) for _, pair in self._near(q)}:

@@ -125,11 +125,9 @@ def _compile(mujoco: Any, system: ConstrainedSystem, solver: ContactSolver) -> A
     spec = mujoco.MjSpec.from_string(write_urdf(robot))
     for i, contact in enumerate(system.contacts):
         if not isinstance(contact, SurfaceContact):
-            raise ForceGPError(
-                f"the contact solver has no geometry for the constraint {contact.name!r}",
-                expected="contacts of a point with a surface",
-                hint='use contact = "rigid"',
-            )
+            text = f"the contact solver has no geometry for the constraint {contact.name!r}"
+            hint = 'use contact = "rigid"'
+            raise ForceGPError(text, expected="contacts of a point with a surface", hint=hint)
         body, position, radius = tip_of(robot, contact, solver.tip_radius)
         ghost = {"contype": 0, "conaffinity": 0, "mass": 0.0}
         link = spec.worldbody if body == BASE else spec.body(link_name(robot, body))
@@ -147,14 +145,11 @@ def _compile(mujoco: Any, system: ConstrainedSystem, solver: ContactSolver) -> A
 def _per_joint(robot: RobotModel, solver: ContactSolver, name: str) -> np.ndarray:
     values = getattr(solver, name)
     if len(values) not in (0, robot.nq):
-        raise ForceGPError(
-            f"{name} has the wrong length for the robot", expected=f"{robot.nq} numbers", got=values
-        )
+        text = f"{name} has the wrong length for the robot"
+        raise ForceGPError(text, expected=f"{robot.nq} numbers", got=values)
     if bool((robot.stribeck != 0.0).any()):
-        raise UnsupportedRobotError(
-            f"robot {robot.name!r} declares Stribeck friction, which MuJoCo does not model",
-            hint='use contact = "rigid"',
-        )
+        text = f"robot {robot.name!r} declares Stribeck friction, which MuJoCo does not model"
+        raise UnsupportedRobotError(text, hint='use contact = "rigid"')
     return np.array(values or [0.0] * robot.nq)
 
 
@@ -184,8 +179,7 @@ def geometry_of(mujoco: Any, contact: SurfaceContact) -> dict[str, Any]:
         return Rotation.from_matrix(turn_z(np.array(axis))).as_quat()[[3, 0, 1, 2]]
 
     if isinstance(surface, Plane):
-        position = surface.offset * np.array(surface.normal)
-        pose = {"pos": position, "quat": along(surface.normal)}
+        pose = {"pos": surface.offset * np.array(surface.normal), "quat": along(surface.normal)}
         return {"type": geom.mjGEOM_PLANE, "size": [0.0, 0.0, 1.0], **pose}
     if isinstance(surface, Sphere):
         return {"type": geom.mjGEOM_SPHERE, "size": [surface.radius, 0.0, 0.0], "pos": [*surface.center]}
@@ -193,9 +187,6 @@ def geometry_of(mujoco: Any, contact: SurfaceContact) -> dict[str, Any]:
         size = [surface.radius, CYLINDER_LENGTH, 0.0]
         pose = {"pos": [*surface.center], "quat": along(surface.axis)}
         return {"type": geom.mjGEOM_CYLINDER, "size": size, **pose}
-    raise ForceGPError(
-        f"the contact solver has no geometry for the surface of {contact.name!r}",
-        expected="a plane, a sphere or a cylinder",
-        got=type(surface).__name__,
-        hint='use contact = "rigid"',
-    )
+    text = f"the contact solver has no geometry for the surface of {contact.name!r}"
+    expected = "a plane, a sphere or a cylinder"
+    raise ForceGPError(text, expected=expected, got=type(surface).__name__, hint='use contact = "rigid"')

@@ -110,14 +110,12 @@ def check_engine(
         free = dynamics.forward_dynamics(robot, q, qd, force)
         constrained = eom.acceleration(Q_bar)
         held = force + eom.Q_D + eom.constraint_force(Q_bar)
+        needed = torch.stack([engine.inverse_dynamics(*x) for x in zip(q, qd, qdd, strict=True)])
         return EngineCheck(
             engine=engine.name,
             states=states,
             mass_matrix=_largest(torch.stack([engine.mass_matrix(x) for x in q]) - eom.M),
-            inverse_dynamics=_largest(
-                torch.stack([engine.inverse_dynamics(*x) for x in zip(q, qd, qdd, strict=True)])
-                - dynamics.inverse_dynamics(robot, q, qd, qdd)
-            ),
+            inverse_dynamics=_largest(needed - dynamics.inverse_dynamics(robot, q, qd, qdd)),
             free_acceleration=_largest(_step(engine, q, qd, force) - free),
             constrained_acceleration=_largest(_step(engine, q, qd, held) - constrained),
             largest_acceleration=max(_largest(free), _largest(constrained)),

@@ -90,8 +90,7 @@ class PyBulletEngine(Engine):
         return torch.tensor(M, dtype=self._robot.dtype)[self._order][:, self._order]
 
     def inverse_dynamics(self, q: JointVector, qd: JointVector, qdd: JointVector) -> JointVector:
-        state = (self._ordered(x) for x in (q, qd, qdd))
-        force = self._bullet.calculateInverseDynamics(self._body, *state)
+        force = self._bullet.calculateInverseDynamics(self._body, *map(self._ordered, (q, qd, qdd)))
         return torch.tensor(force, dtype=self._robot.dtype)[self._order]
 
     def close(self) -> None:

@@ -92,9 +92,8 @@ class Limits:
             ParameterError: a limit is missing or not positive. The message names the joint and the option.
         """
         if not 0.0 < share <= 1.0:
-            raise ParameterError(
-                "the share of the limits is out of range", expected="above 0, up to 1", got=share
-            )
+            text = "the share of the limits is out of range"
+            raise ParameterError(text, expected="above 0, up to 1", got=share)
         speed = _given(robot, "velocity", velocity, robot.velocity_limit)
         effort = _given(robot, "torque", torque, robot.effort_limit)
         rate = _given(robot, "acceleration", acceleration, 4.0 * speed)
@@ -114,21 +113,17 @@ class Limits:
 
 def _given(robot: RobotModel, name: str, values: Sequence[float], default: Tensor) -> Tensor:
     """Return the limits of all joints, which are the given values or those of the robot."""
-    option = f"give --{name}, as one number or one per joint"
     if len(values) not in (0, 1, robot.nq):
-        raise ParameterError(
-            f"limits of {name} do not match the robot", expected=f"1 or {robot.nq} numbers", got=values
-        )
+        text = f"limits of {name} do not match the robot"
+        raise ParameterError(text, expected=f"1 or {robot.nq} numbers", got=values)
     limit = default.new_tensor(values).expand(robot.nq) if len(values) else default
-    missing = [
-        n for n, x in zip(robot.joint_names, limit.tolist(), strict=True) if not 0.0 < x < float("inf")
-    ]
+    missing = [n for n, x in zip(robot.joint_names, limit.tolist(), strict=True) if not 0.0 < x < np.inf]
     if missing:
         raise ParameterError(
             f"no limit of {name} for {', '.join(missing)} of robot {robot.name!r}",
             expected="positive finite limits",
             got=[round(x, 4) for x in limit.tolist()],
-            hint=f"{option}, or add it to the robot file",
+            hint=f"give --{name}, as one number or one per joint, or add it to the robot file",
         )
     return limit
 
@@ -137,9 +132,7 @@ def random_states(robot: RobotModel, limits: Limits, count: int = REGION, seed: 
     """Draw states uniformly within the limits, and slow down the states that need too much torque."""
     share = torch.rand(3, count, robot.nq, dtype=torch.float64, generator=torch.Generator().manual_seed(seed))
     q = limits.low + share[0] * (limits.high - limits.low)
-    qd, qdd = (
-        (2.0 * x - 1.0) * y for x, y in zip(share[1:], (limits.velocity, limits.acceleration), strict=True)
-    )
+    qd, qdd = (2.0 * share[1] - 1.0) * limits.velocity, (2.0 * share[2] - 1.0) * limits.acceleration
     for factor in (0.7, 0.7, 0.7, 0.5, 0.5, 0.0):
         beyond = (rigid_torque(robot, q, qd, qdd).abs() > limits.torque).any(-1)[:, None]
         qd, qdd = torch.where(beyond, factor * qd, qd), torch.where(beyond, factor * qdd, qdd)
@@ -192,8 +185,7 @@ class Spline:
 
     def at(self, t: Array) -> tuple[Array, Array, Array]:
         """Return the matrices `(n, free)` that map control points, relative to the start, to q, q̇ and q̈."""
-        knots = self.h * np.arange(-3, self.spans + 4)
-        spline = BSpline(knots, np.eye(self.free + 6), 3)
+        spline = BSpline(self.h * np.arange(-3, self.spans + 4), np.eye(self.free + 6), 3)
         q, qd, qdd = (spline(t, order)[:, 3:-3] for order in range(3))
         return q, qd, qdd
 
@@ -207,10 +199,8 @@ class Spline:
         """Draw control points `(free, nq)` of a sum of sine functions within the kinematic limits."""
         t = np.arange(1, self.free + 1)[:, None, None] * self.h
         shape = (1, len(self.start), SINES)
-        w, phase = (
-            2.0 * np.pi * random.uniform(SLOWEST, QUICKEST, shape),
-            random.uniform(0.0, 2.0 * np.pi, shape),
-        )
+        w = 2.0 * np.pi * random.uniform(SLOWEST, QUICKEST, shape)
+        phase = random.uniform(0.0, 2.0 * np.pi, shape)
         size = random.uniform(0.2, 1.0, shape)
         wave = (size * np.sin(w * t + phase)).sum(-1) / size.sum(-1)
         low, high = limits.low.numpy(), limits.high.numpy()
@@ -244,9 +234,8 @@ class Search:
     def look(self, times: Array) -> None:
         """Apply the hinges at additional times as well."""
         self.extra = np.union1d(self.extra, times)
-        self.matrices = [
-            torch.from_numpy(m) for m in self.spline.at(np.concatenate([self.nodes, self.extra]))
-        ]
+        every = np.concatenate([self.nodes, self.extra])
+        self.matrices = [torch.from_numpy(m) for m in self.spline.at(every)]
 
     def states(self, x: Tensor) -> States:
         """Return positions, velocities and accelerations at the nodes and the additional times."""
@@ -260,10 +249,8 @@ class Search:
         """
         limits, eye = self.limits, torch.eye(self.spline.free, dtype=torch.float64)
         D1, D2 = self.spline.differences(eye)
-        r, v, a = (
-            (1.0 / x)[:, None, None] ** 2
-            for x in (limits.high - limits.low, limits.velocity, limits.acceleration)
-        )
+        sizes = limits.high - limits.low, limits.velocity, limits.acceleration
+        r, v, a = ((1.0 / x)[:, None, None] ** 2 for x in sizes)
         L = torch.linalg.cholesky(4.0 * r * eye + v * (D1.mT @ D1) + a * (D2.mT @ D2))
         return torch.linalg.solve_triangular(L, eye.expand_as(L), upper=False).mT
 
@@ -314,8 +301,7 @@ class Search:
         for rows in np.split(t, range(CHUNK, len(t), CHUNK)):
             q, qd, qdd = (torch.from_numpy(m @ x) for m in self.spline.at(rows))
             q = q + torch.from_numpy(self.spline.start)
-            torque = rigid_torque(self.unknowns.robot, q, qd, qdd)
-            shares = limits.shares(q, qd, qdd, torque)
+            shares = limits.shares(q, qd, qdd, rigid_torque(self.unknowns.robot, q, qd, qdd))
             shares["clearance"] = 1.0 + torch.from_numpy(near.depth(q.numpy()))[:, None] / near.clearance
             found = {name: share.abs().amax(-1).numpy() for name, share in shares.items()}
             worst = {name: max(worst.get(name, 0.0), float(share.max())) for name, share in found.items()}
@@ -345,11 +331,7 @@ class Search:
 def _start_of(
     start: Sequence[float] | None, robot: RobotModel, limits: Limits, collisions: Collisions
 ) -> Array:
-    """Return the given start, or the collision-free position closest to the middle of the limits.
-
-    Raises:
-        ParameterError: the start does not match the robot, exceeds its limits, or is in collision.
-    """
+    """Return the given start if it is valid, or the collision-free position closest to the middle."""
     low, high = limits.low.numpy(), limits.high.numpy()
     if start is None:
         middle = 0.5 * (low + high)
@@ -358,20 +340,16 @@ def _start_of(
         torque = rigid_torque(robot, torch.from_numpy(tried), still, still)
         free = (collisions.depth(tried) == 0.0) & (torque.abs() < INSIDE * limits.torque).all(-1).numpy()
         if not free.any():
-            raise ParameterError(
-                "no collision-free position within the torque limits was found",
-                expected=f"one of {len(tried)} positions within the limits",
-                hint="give --start, smaller boxes, or less --clearance",
-            )
+            text = "no collision-free position within the torque limits was found"
+            hint = "give --start, smaller boxes, or less --clearance"
+            raise ParameterError(text, expected=f"one of {len(tried)} positions within the limits", hint=hint)
         distance = np.abs((tried - middle) / (high - low)).sum(-1)
         return tried[np.where(free, distance, np.inf).argmin()]
     q = np.array(start, dtype=float)
     if q.shape != (robot.nq,) or not ((q >= low) & (q <= high)).all():
-        raise ParameterError(
-            "the start is not within the limits of the robot",
-            expected=[(round(a, 4), round(b, 4)) for a, b in zip(low.tolist(), high.tolist(), strict=True)],
-            got=q.tolist(),
-        )
+        text = "the start is not within the limits of the robot"
+        expected = [(round(a, 4), round(b, 4)) for a, b in zip(low.tolist(), high.tolist(), strict=True)]
+        raise ParameterError(text, expected=expected, got=q.tolist())
     if near := collisions.pairs(q):
         pairs = ", ".join(f"{pair} ({1e3 * gap:.3g} mm)" for pair, gap in near.items())
         raise ParameterError(
@@ -442,14 +420,15 @@ def excite(
         spline = Spline(_start_of(start, robot, limits, collisions), seconds)
         search = Search(spline, limits, unknowns, collisions, criterion)
         found = _searched(search, restarts, np.random.default_rng(seed), progress or (lambda *_: None))
-        values, x, used = found
-        return _result(system, search, x, used, values, rate, seed)
+        return _result(system, search, found, rate, seed)
 
 
-def _searched(
-    search: Search, restarts: int, random: np.random.Generator, progress: Progress
-) -> tuple[tuple[float, ...], Array, dict[str, float]]:
-    """Optimise random starts; return the objectives (best first), control points and used limits."""
+Found = tuple[tuple[float, ...], Array, dict[str, float]]
+"""Objectives of the optimised starts (best first), control points of the best, and used limits."""
+
+
+def _searched(search: Search, restarts: int, random: np.random.Generator, progress: Progress) -> Found:
+    """Optimise random starts."""
     rounds = restarts + ROUNDS
     drawn = (search.spline.random(search.limits, random) for _ in range(4 * restarts))
     starts = [search.shrunk(x, NODE)[0] for x in drawn]
@@ -474,18 +453,10 @@ def _searched(
 
 
 @torch.no_grad()
-def _result(
-    system: ConstrainedSystem,
-    search: Search,
-    x: Array,
-    used: dict[str, float],
-    values: tuple[float, ...],
-    rate: float,
-    seed: int,
-) -> Excitation:
+def _result(system: ConstrainedSystem, search: Search, found: Found, rate: float, seed: int) -> Excitation:
     robot, spline, unknowns = search.unknowns.robot, search.spline, search.unknowns
-    count = round(spline.seconds * rate) + 1
-    t = np.linspace(0.0, spline.seconds, count)
+    values, x, used = found
+    t = np.linspace(0.0, spline.seconds, round(spline.seconds * rate) + 1)
     q, qd, qdd = (torch.from_numpy(m @ x) for m in spline.at(t))
     q = q + torch.from_numpy(spline.start)
     header = DataHeader(
@@ -501,6 +472,5 @@ def _result(
     states = search.states(torch.from_numpy(x))
     Y, Phi = unknowns.columns(*states)
     after = unknowns.after(search.information(Phi, rigid_torque(robot, *states, Y)))
-    clearance = search.collisions.clearance
-    kept = {name: value for name, value in used.items() if name != "clearance"}
-    return Excitation(motion, search.limits, kept | {"clearance_m": clearance}, unknowns, after, values)
+    used = {n: x for n, x in used.items() if n != "clearance"} | {"clearance_m": search.collisions.clearance}
+    return Excitation(motion, search.limits, used, unknowns, after, values)

@@ -41,11 +41,9 @@ class PassiveForces:
         self.system, self.field = system, field
         self.joint_names = tuple(joint_names or system.robot.joint_names)
         if len(self.joint_names) != system.robot.nq:
-            raise ModelError(
-                "the joint names do not match the robot",
-                expected=f"{system.robot.nq} names in the order of {', '.join(system.robot.joint_names)}",
-                got=", ".join(self.joint_names),
-            )
+            text = "the joint names do not match the robot"
+            expected = f"{system.robot.nq} names in the order of {', '.join(system.robot.joint_names)}"
+            raise ModelError(text, expected=expected, got=", ".join(self.joint_names))
 
     def __call__(self, model: Any, data: Any) -> None:
         """Add the forces at the current state of `data`."""

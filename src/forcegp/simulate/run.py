@@ -47,11 +47,7 @@ def _torque_limit(system: ConstrainedSystem, config: MotionConfig) -> Tensor:
 
 
 def _check_speed(t: float, q: Tensor, qd: Tensor) -> None:
-    """Stop a run that diverges.
-
-    Raises:
-        NumericalError: a joint is too fast, or the state is not finite. The message gives the time and state.
-    """
+    """Raise `NumericalError` if a joint is too fast or the state is not finite."""
     if not (bool(q.isfinite().all()) and float(qd.abs().max()) < RUNAWAY_SPEED):
         raise NumericalError(
             f"the simulation diverges at t = {t:.4f} s",
@@ -159,8 +155,7 @@ def simulate(
             plan = make_plan(system, config, generator)
         else:
             followed = motion.select(system.robot.joint_names)
-            joints = JointTarget(followed.q, followed.qd, followed.qdd)
-            plan = joint_plan(system, config, followed.t, joints)
+            plan = joint_plan(system, config, followed.t, JointTarget(followed.q, followed.qd, followed.qdd))
         if config.contact == "solver":
             engine = ContactSolverEngine(system, config.dt, config.solver)
             with nullcontext() if forces is None else forces.installed(engine.model):
@@ -168,20 +163,15 @@ def simulate(
             name = engine.name if forces is None else f"{engine.name}, learned forces of joints"
             return make_result(system, config, plan, log, name, generator)
         if forces is not None:
-            raise ParameterError(
-                "learned forces need MuJoCo's solver", expected='contact = "solver"', got=config.contact
-            )
+            text = "learned forces need MuJoCo's solver"
+            raise ParameterError(text, expected='contact = "solver"', got=config.contact)
         with closing(make_engine(system.robot, config.dt, config.engine)) as engine:
             log = _follow(system, config, plan, engine, progress)
             return make_result(system, config, plan, log, engine.name, generator)
 
 
 def _follow(
-    system: ConstrainedSystem,
-    config: SimulationConfig,
-    plan: Plan,
-    engine: Engine,
-    progress: Progress | None,
+    system: ConstrainedSystem, config: SimulationConfig, plan: Plan, engine: Engine, progress: Progress | None
 ) -> RunLog:
     """Step the engine through the plan."""
     log, limit = RunLog.empty(config.steps, system), _torque_limit(system, config)

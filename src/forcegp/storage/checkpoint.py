@@ -50,8 +50,7 @@ class Checkpoint:
             if isinstance(value, Tensor):
                 # The type and shape distinguish tensors that consist of the same bytes.
                 digest.update(f"{value.dtype}{tuple(value.shape)}".encode())
-                flat = value.detach().cpu().contiguous().flatten().view(torch.uint8)
-                digest.update(flat.numpy().tobytes())
+                digest.update(value.detach().cpu().contiguous().flatten().view(torch.uint8).numpy().tobytes())
             else:
                 digest.update(repr(value).encode())
         return digest.hexdigest()[:16]
@@ -70,19 +69,14 @@ class Checkpoint:
             return {}
         tensors, key = _read(self.path)
         if key != self.key or _layout(tensors, growing) != _layout(like, growing):
-            raise ModelError(
-                f"{self.path}: the checkpoint belongs to a different fit",
-                expected=f"data, settings and system with key {self.key}",
-                got=key,
-                hint="remove it, or name another file",
-            )
+            text = f"{self.path}: the checkpoint belongs to a different fit"
+            expected = f"data, settings and system with key {self.key}"
+            raise ModelError(text, expected=expected, got=key, hint="remove it, or name another file")
         for name, value in tensors.items():
             if value.is_floating_point() and not bool((value.abs() <= LOGGED_VALUE).all()):
-                raise ModelError(
-                    f"{self.path}: {name!r} contains an implausible value",
-                    expected=f"finite numbers up to ±{LOGGED_VALUE:g}",
-                    hint="remove the checkpoint to start again",
-                )
+                text = f"{self.path}: {name!r} contains an implausible value"
+                hint = "remove the checkpoint to start again"
+                raise ModelError(text, expected=f"finite numbers up to ±{LOGGED_VALUE:g}", hint=hint)
         return {name: tensors[name] for name in like}
 
     def write_now_and_then(self, tensors: Callable[[], Mapping[str, Tensor]]) -> None:
@@ -126,8 +120,7 @@ class Evaluations:
     def read(self, start: Mapping[str, Tensor]) -> int:
         """Load the evaluations from the file if it exists, and return their number."""
         assert self.checkpoint is not None
-        size = sum(value.numel() for value in start.values())
-        rows = torch.zeros(0, size, dtype=torch.float64)
+        rows = torch.zeros(0, sum(value.numel() for value in start.values()), dtype=torch.float64)
         record = self.checkpoint.read(dict(zip(NAMES, (rows, rows[:, 0], rows), strict=True)), NAMES)
         if not record:
             return 0
@@ -233,6 +226,5 @@ def _read(path: Path) -> tuple[dict[str, Tensor], str | None]:
     except (safetensors.SafetensorError, OSError, KeyError, TypeError, ValueError, RuntimeError) as cause:
         if isinstance(cause, ModelError):
             raise
-        raise ModelError(
-            f"{path}: the checkpoint is damaged", got=str(cause), hint="remove it to start again"
-        ) from cause
+        text = f"{path}: the checkpoint is damaged"
+        raise ModelError(text, got=str(cause), hint="remove it to start again") from cause

@@ -33,10 +33,8 @@ def encode(value: Any, classes: Classes) -> Any:
         return [encode(part, classes) for part in value]
     if value is None or isinstance(value, str | int | float | bool):
         return value
-    raise ModelError(
-        f"a {type(value).__name__} contains Python code and cannot be saved",
-        expected=", ".join(sorted(classes)),
-    )
+    text = f"a {type(value).__name__} contains Python code and cannot be saved"
+    raise ModelError(text, expected=", ".join(sorted(classes)))
 
 
 def decode(json: Any, classes: Classes, place: str, depth: int = 0, *, whole: bool = True) -> Any:
@@ -82,12 +80,8 @@ def _check_fields(kind: type, name: str, members: Mapping[str, Any], place: str,
     if needed <= set(members) <= names:
         return
     near = [other for key in members if key not in names for other in near_names(key, names)]
-    raise ModelError(
-        f"{place}: wrong fields of {name!r}",
-        expected=sorted(names),
-        got=sorted(members),
-        hint=f"did you mean {near[0]!r}?" if near else None,
-    )
+    text, hint = f"{place}: wrong fields of {name!r}", f"did you mean {near[0]!r}?" if near else None
+    raise ModelError(text, expected=sorted(names), got=sorted(members), hint=hint)
 
 
 def _checked(value: Any, hint: Any, place: str) -> Any:

@@ -40,19 +40,14 @@ def check_tensors(tensors: Mapping[str, Tensor], source: str) -> None:
         raise ModelError(f"{source}: too many tensors", expected=f"at most {TENSORS}", got=len(tensors))
     for name, value in tensors.items():
         if value.dtype not in TYPES:
-            raise ModelError(
-                f"{source}: tensor {name!r} has an unsupported type",
-                expected=", ".join(str(dtype) for dtype in TYPES),
-                got=value.dtype,
-            )
+            text = f"{source}: tensor {name!r} has an unsupported type"
+            raise ModelError(text, expected=", ".join(str(dtype) for dtype in TYPES), got=value.dtype)
         infinite = _MAY_BE_INFINITE.fullmatch(name) is not None
         if bool(value.isnan().any()) or not (infinite or bool(torch.isfinite(value).all())):
             raise ModelError(f"{source}: tensor {name!r} contains values that are not finite")
         if _POSITIVE.fullmatch(name) and not bool((value > 0.0).all()):
-            raise ModelError(
-                f"{source}: tensor {name!r} contains a standard deviation that is not positive",
-                got=value.min().item(),
-            )
+            text = f"{source}: tensor {name!r} contains a standard deviation that is not positive"
+            raise ModelError(text, got=value.min().item())
 
 
 SUFFIX = ".safetensors"
@@ -98,11 +93,7 @@ def model_bytes(
 
 
 def write_model(
-    path: str | Path,
-    kind: str,
-    system: ConstrainedSystem,
-    settings: Record,
-    tensors: Mapping[str, Tensor],
+    path: str | Path, kind: str, system: ConstrainedSystem, settings: Record, tensors: Mapping[str, Tensor]
 ) -> None:
     """Write a model file atomically; raise `DestinationError` if the path is not writable."""
     data = model_bytes(kind, system, settings, tensors)
@@ -134,12 +125,8 @@ def parse_model(data: bytes, source: str) -> tuple[ModelHeader, dict[str, Tensor
     stated, _, text = _metadata(data, source).partition("\n")
     digest = _digest(data, stated)
     if digest != stated:
-        raise ModelError(
-            f"{source}: the file is damaged or truncated",
-            expected=f"SHA-256 {stated[:12]!a}…",
-            got=f"{digest[:12]}…",
-            hint="copy the file again from its source",
-        )
+        text, hint = f"{source}: the file is damaged or truncated", "copy the file again from its source"
+        raise ModelError(text, expected=f"SHA-256 {stated[:12]!a}…", got=f"{digest[:12]}…", hint=hint)
     header = ModelHeader.from_json(text, source, ModelError)
     try:
         tensors = safetensors.torch.load(data)
@@ -160,9 +147,8 @@ def _metadata(data: bytes, source: str) -> str:
         if not isinstance(text, str):
             raise ValueError("the metadata are not text")
     except (ValueError, KeyError, TypeError, RecursionError) as cause:
-        raise ModelError(
-            f"{source}: not a model of forcegp, or damaged", expected="a safetensors file", got=str(cause)
-        ) from cause
+        text = f"{source}: not a model of forcegp, or damaged"
+        raise ModelError(text, expected="a safetensors file", got=str(cause)) from cause
     return text
 
 

@@ -144,15 +144,10 @@ MAY_BE_INFINITE = ("lower", "upper", "velocity_limit", "effort_limit")
 
 def pack_system(system: ConstrainedSystem) -> tuple[dict[str, Any], dict[str, Tensor]]:
     """Return a system as a JSON object, and CPU copies of its robot's tensors, named `system.<field>`."""
-    record = SystemRecord(
-        robot=RobotRecord.model_validate(system.robot),
-        contacts=tuple(map(_record, system.contacts)),
-        baumgarte=system.baumgarte,
-    )
-    tensors = {
-        PREFIX + name: x.detach().to("cpu", copy=True).contiguous()
-        for name, x in system.robot.tensors.items()
-    }
+    robot, contacts = RobotRecord.model_validate(system.robot), tuple(map(_record, system.contacts))
+    record = SystemRecord(robot=robot, contacts=contacts, baumgarte=system.baumgarte)
+    live = system.robot.tensors.items()
+    tensors = {PREFIX + name: x.detach().to("cpu", copy=True).contiguous() for name, x in live}
     return record.model_dump(mode="json"), tensors
 
 
@@ -178,10 +173,8 @@ def _constraint(record: ConstraintRecord, fallback: ConstrainedSystem | None) ->
     if not isinstance(record, UnsavedRecord):
         return record.build()
     if fallback is None:
-        raise ModelError(
-            f"contact {record.name!r} is a {record.described_by} defined in Python, which is not saved",
-            hint="pass the original system: load_model(path, system=…)",
-        )
+        text = f"contact {record.name!r} is a {record.described_by} defined in Python, which is not saved"
+        raise ModelError(text, hint="pass the original system: load_model(path, system=…)")
     return fallback.contact(record.name)
 
 
@@ -190,19 +183,15 @@ def _robot(record: RobotRecord, tensors: Mapping[str, Tensor], source: str) -> R
     joints = {"joint_types": sizes["nq"], "parents": sizes["nq"], "frame_parents": sizes["nf"]}
     for name, length in joints.items():
         if len(getattr(record, name)) != length:
-            raise ModelError(
-                f"{source}: field 'system.robot.{name}' has the wrong length",
-                expected=length,
-                got=len(getattr(record, name)),
-            )
+            text = f"{source}: field 'system.robot.{name}' has the wrong length"
+            raise ModelError(text, expected=length, got=len(getattr(record, name)))
     # Parents come before their children, and frames belong to joints that exist.
     limits = {"parents": range(sizes["nq"]), "frame_parents": [sizes["nq"]] * sizes["nf"]}
     for name, limit in limits.items():
         for i, (parent, below) in enumerate(zip(getattr(record, name), limit, strict=True)):
             if not -1 <= parent < below:
-                raise ModelError(
-                    f"{source}: field 'system.robot.{name}.{i}' does not name a joint", got=parent
-                )
+                text = f"{source}: field 'system.robot.{name}.{i}' does not name a joint"
+                raise ModelError(text, got=parent)
     axis = tensors.get(PREFIX + "axis")
     dtype = axis.dtype if axis is not None and axis.is_floating_point() else torch.float64
     arrays = {}
@@ -228,11 +217,8 @@ def take(
         raise ModelError(f"{source}: tensor {name!r} is missing")
     value = tensors[name]
     if (shape is not None and tuple(value.shape) != tuple(shape)) or value.dtype != dtype:
-        raise ModelError(
-            f"{source}: tensor {name!r} does not fit",
-            expected=f"{dtype} of shape {shape if shape is not None else 'any'}",
-            got=f"{value.dtype} of shape {tuple(value.shape)}",
-        )
+        text, got = f"{source}: tensor {name!r} does not fit", f"{value.dtype} of shape {tuple(value.shape)}"
+        raise ModelError(text, expected=f"{dtype} of shape {shape if shape is not None else 'any'}", got=got)
     if bool(value.isnan().any()) or (finite and not bool(torch.isfinite(value).all())):
         raise ModelError(f"{source}: tensor {name!r} contains values that are not finite")
     return value

@@ -51,10 +51,8 @@ def expected_table(result: Excitation) -> Table:
         for when, unknowns in (("before", result.before), ("after", result.after)):
             head.append(f"{'torque' if part == 'all' else part} {when}")
             columns.append(unknowns.torque_std()[part].tolist())
-    rows = [
-        (joint, *(f"{x:.3g}" for x in row))
-        for joint, row in zip(result.motion.joint_names, zip(*columns, strict=True), strict=True)
-    ]
+    pairs = zip(result.motion.joint_names, zip(*columns, strict=True), strict=True)
+    rows = [(joint, *(f"{x:.3g}" for x in row)) for joint, row in pairs]
     return Table("Expected standard deviation of the torque in the region [N m, N]", tuple(head), tuple(rows))
 
 

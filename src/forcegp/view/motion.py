@@ -72,8 +72,7 @@ def of_log(system: ConstrainedSystem, data: Dataset, model: Predictor | None = N
     data = data.select(system.robot.joint_names)
     if not len(data):
         raise DataError("there is no motion to display", expected="one row or more", got="none")
-    rows = pictures(data.t)
-    frames = data[rows]
+    frames = data[pictures(data.t)]
     path = Path3D(LOGGED, tip_path(system, data.q))
     return Motion(system, as_array(frames.t - data.t[0]), frames.q, _forces(system, frames, model), [path])
 

@@ -23,10 +23,8 @@ constraint (in the range of Aᵀ), which does not affect accelerations in contac
 NOISE, ANALYTICAL, COULOMB = "noise", "analytical_parameters", "coulomb"
 RESERVED = (NOISE, ANALYTICAL, COULOMB)
 """Prefixes of learned parameters other than the hyperparameters of the priors."""
-
 MIXING = "mixing"
 """Suffix of the names of learned operator parameters."""
-
 ForceMean = Callable[[ConstrainedSystem, States], Tensor]
 """Function that returns the prior mean of the joint force Q at states, `(n, nq)`."""
 

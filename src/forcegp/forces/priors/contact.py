@@ -229,11 +229,7 @@ class SlidingFrictionPrior(SurfaceForcePrior):
         return torch.stack([columns[term] for term in self.terms], dim=-1)
 
     def _load(self, system: ConstrainedSystem, at: States, u: Tensor) -> Tensor:
-        """Return the multiplier `(n, 1)` under the analytical forces and the friction μ̂ λ u.
-
-        Raises:
-            ModelError: this friction jams the contact.
-        """
+        """Return the multiplier `(n, 1)` under the analytical forces and the friction μ̂ λ u."""
         contact = system.contact_names.index(self.contact)
         row = system.rows[self.contact].start
         free = at.eom.multiplier(at.eom.Q_K + at.tau)[:, row].clamp(min=0.0)
@@ -249,10 +245,8 @@ class SlidingFrictionPrior(SurfaceForcePrior):
         """Return the generalized force `(n, nq)` of a unit moment that opposes rotation about the normal."""
         contact = system.contact(self.contact)
         assert isinstance(contact, SurfaceContact)
-        index, origin = (
-            system.robot.frame_index(contact.frame),
-            kinematics.as_point(system.robot, contact.point),
-        )
+        index = system.robot.frame_index(contact.frame)
+        origin = kinematics.as_point(system.robot, contact.point)
         angular = kinematics.jacobian_of_poses(system.robot, at.eom.poses, index, origin)[..., :3, :]
         about = (at.eom.contact_points[self.contact].unit_normal[..., None, :] @ angular)[..., 0, :]
         rate = (about * at.qd).sum(-1, keepdim=True)
@@ -299,8 +293,6 @@ class NormalForcePrior(ForcePrior):
 
 SHARP = 1e-6
 """Smoothing speed at which friction has almost its full magnitude [m/s]."""
-
-
 FRICTION_COEFFICIENT = 0.2
 """Initial value of a learned friction coefficient."""
 NEARLY_JAMMED = 0.95
@@ -382,10 +374,8 @@ class CoulombErrorPrior(ConstantForcePrior):
         if self.contact not in system.contact_names:
             return at.q.new_zeros(*at.q.shape, LEARNED)
         law = next(f for f in self.friction if f.contact == self.contact)
-        v, u = (
-            at.eom.contact_points[self.contact].sliding[1],
-            against_sliding(at, self.contact, law.smoothing),
-        )
+        v = at.eom.contact_points[self.contact].sliding[1]
+        u = against_sliding(at, self.contact, law.smoothing)
         # μ λ̂, with λ̂ under Q_C + Q_G + Q_D + Q_u and all friction
         Q_bar = with_coulomb(system, at, at.eom.Q_K + at.tau, self.friction)
         load = law.coefficient * at.eom.multiplier(Q_bar)[:, system.rows[self.contact].start]
@@ -458,9 +448,8 @@ def below_jamming(
         if key in changed:
             # Lᵀu, the load relief by a unit friction force
             states = (m.at(system) for m in measurements)
-            gains = [
-                (at.eom.L[..., row] * against_sliding(at, prior.contact, SHARP)).sum(-1) for at in states
-            ]
+            pairs = ((at.eom.L[..., row], against_sliding(at, prior.contact, SHARP)) for at in states)
+            gains = [(L * u).sum(-1) for L, u in pairs]
             # 1 + μ Lᵀu > 0, so μ < −1/Lᵀu wherever Lᵀu < 0
             worst = float(torch.cat(gains).min())
             low, high = changed[key]

@@ -87,9 +87,7 @@ class InertialPrior(ConstantForcePrior):
 
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
         # Without a measured acceleration, that of the analytical model is used.
-        qdd = at.qdd
-        if qdd is None:
-            qdd = at.eom.acceleration(at.eom.Q_K + at.tau)
+        qdd = at.eom.acceleration(at.eom.Q_K + at.tau) if at.qdd is None else at.qdd
         columns = regressor(system.robot, at.q, at.qd, qdd)
         if self.drives:
             columns = torch.cat([columns, torch.diag_embed(qdd)], dim=-1)
@@ -101,10 +99,9 @@ class InertialPrior(ConstantForcePrior):
             return robot.mass.new_tensor((*self.scales, *self.drives))
         m, J = robot.mass[:, None], inertial_parameters(robot.mass, robot.com, robot.inertia)
         gyration = J[:, [4, 7, 9]].clamp(min=0.0).sqrt()
-        products = [
-            gyration[:, a] * gyration[:, b] for a, b in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-        ]
-        parts = [self.mass * m, (self.length * m).expand(-1, 3), self.inertia * torch.stack(products, dim=-1)]
+        row, column = torch.triu_indices(3, 3)
+        products = gyration[:, row] * gyration[:, column]
+        parts = [self.mass * m, (self.length * m).expand(-1, 3), self.inertia * products]
         return torch.cat([torch.cat(parts, dim=-1).flatten().detach(), m.new_tensor(self.drives)])
 
     def curvature(self, robot: RobotModel) -> Tensor:
@@ -181,12 +178,6 @@ def _most_probable(
     The logarithm is the barrier of an interior-point method: γ decreases from a value at which x = 0 is close
     to the minimum. Steps of Newton's method are J ← L (1 + Y) Lᵀ with J = L Lᵀ, since the barrier has unit
     curvature at Y = 0. Source: Boyd and Vandenberghe, *Convex Optimization* (2004), section 11.3.
-
-    Args:
-        volume: function that returns V and its gradient.
-
-    Returns:
-        x and J.
     """
     row, column = torch.triu_indices(4, 4)
     one, D = torch.eye(4).to(J0), torch.zeros(PER_LINK, 4, 4).to(J0)
@@ -320,9 +311,8 @@ class PayloadPrior(ConstantForcePrior):
             return robot
         J = pseudo_inertia(robot.mass, robot.com, robot.inertia)
         point = J.new_tensor([*self.known[1:], self.known[0]])
-        J = J.index_add(
-            0, torch.tensor([self.link(robot)], device=J.device), (point.outer(point) / point[3])[None]
-        )
+        body = (point.outer(point) / point[3])[None]
+        J = J.index_add(0, torch.tensor([self.link(robot)], device=J.device), body)
         mass, com, inertia = from_pseudo_inertia(J)
         return robot.replace(mass=mass, com=com, inertia=inertia)
 

@@ -66,8 +66,7 @@ def read(
     with foreign(str(path), "a log"):
         module, _, name = _READERS[format_of(place)][1].partition(".")
     reader: Callable[..., LogTable] = getattr(import_module(f"forcegp.logs.readers.{module}"), name)
-    keep: Wanted = wanted if wanted is not None else lambda name: True
-    return reader(place, wanted=keep, rows=rows, progress=progress)
+    return reader(place, wanted=wanted or (lambda name: True), rows=rows, progress=progress)
 
 
 def format_of(path: Path) -> str:

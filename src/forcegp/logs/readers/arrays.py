@@ -56,8 +56,7 @@ def _array(source: str, name: str, file: Any, size: int) -> Arrays:
     shape, fortran, dtype = read_header(file)  # pyright: ignore[reportArgumentType]
     if dtype.hasobject:
         text = f"{source}: refused, because an array of Python objects is a pickle, which can run code"
-        hint = "save each quantity as a separate array"
-        raise DataError(text, expected="an array of numbers", hint=hint)
+        raise DataError(text, expected="an array of numbers", hint="save each quantity as a separate array")
     count = int(np.prod(shape, dtype=object)) if shape else 1
     guards.check_count(source, "numbers", count, limits.LOG_VALUES)
     if count * dtype.itemsize > size:

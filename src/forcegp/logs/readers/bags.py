@@ -126,8 +126,7 @@ class Collector:
         streams = []
         for topic, group in groupby(found, key=lambda stream: stream.topic):
             for number, stream in enumerate(group, start=1):
-                name = f"{topic}#{number}" if number > 1 else topic
-                streams.append(stream.stream(name, origin, wanted))
+                streams.append(stream.stream(f"{topic}#{number}" if number > 1 else topic, origin, wanted))
                 stream.rows.clear()
         unread = [f"{t} ({k})" for t, k in topics.items() if canonical(k) not in KINDS]
         remarks = [f"topics of other types were not read: {', '.join(unread)[:600]}"] if unread else []

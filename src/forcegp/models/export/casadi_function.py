@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-import operator
 from collections.abc import Iterable, Mapping
+from operator import add, mul, neg, sub, truediv
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +14,7 @@ from forcegp.models.export.mean import ARGUMENTS, DIFFERENTIATED, LearnedMotion
 from forcegp.models.export.model import ExportedModel
 from forcegp.models.export.source import template
 
-OPERATORS = {
-    "neg": operator.neg,
-    "+": operator.add,
-    "-": operator.sub,
-    "*": operator.mul,
-    "/": operator.truediv,
-}
+OPERATORS = {"neg": neg, "+": add, "-": sub, "*": mul, "/": truediv}
 
 
 def casadi_function(model: ExportedModel, name: str = "forcegp") -> Any:

@@ -73,19 +73,14 @@ def write_export(
         return Export(Path(path), model.parts()[0].rank)
     header, source = c_source(model, name)
     exact = dataclasses.replace(model, dtype=torch.float64)
-    result = Export(
-        Path(path), model.parts()[0].rank, *loss_of(exact, fit, training), rounding_of(model, training)
-    )
+    growth, rank = loss_of(exact, fit, training), model.parts()[0].rank
+    result = Export(Path(path), rank, *growth, rounding_of(model, training))
     where = "training" if training.samples else "random"
     loss = f"It is reduced: at {where} states, σ of q̈ and λ increases by a fraction\n"
     loss += f"of at most {result.widest:.2g} (median: {result.wider:.2g}). The mean is unchanged."
-    rounding = (
-        "Single precision: at {} states, the mean of q̈ and λ errs by at most {:.2g} of max(|mean|, σ),\n"
-    )
-    rounding = (
-        rounding.format(where, result.rounding[0])
-        + f"and σ by at most a fraction of {result.rounding[1]:.2g}."
-    )
+    in_mean, in_std = result.rounding
+    rounding = f"Single precision: at {where} states, the mean of q̈ and λ errs by at most {in_mean:.2g} "
+    rounding += f"of max(|mean|, σ),\nand σ by at most a fraction of {in_std:.2g}."
     coarse = model.dtype == torch.float32
     fields = {
         "real": "float" if coarse else "double",
@@ -180,9 +175,8 @@ def _reference(model: ExportedModel, fit: Predictor, name: str) -> str:
     assert read.covariance is not None
     wanted = " | ".join(f"{name.upper()}_{x.upper()}" for x in READ[:-1])
     reduced, real = int(model.functions is not None), "float" if model.dtype == torch.float32 else "double"
-    lines = [
-        f"enum {{ STATES = {STATES}, D = {read.mean.shape[1]}, REDUCED = {reduced}, WANTED = {wanted} }};"
-    ]
+    sizes = f"STATES = {STATES}, D = {read.mean.shape[1]}, REDUCED = {reduced}, WANTED = {wanted}"
+    lines = [f"enum {{ {sizes} }};"]
     tolerance = TOLERANCE * torch.finfo(model.dtype).eps / torch.finfo(torch.float64).eps
     lines.append(f"static const double TOLERANCE = {tolerance!r}, ZERO = {ZERO!r};")
     flags = torch.nn.functional.pad(active, (0, int(not active.shape[1]))).int()
@@ -216,11 +210,8 @@ class _Posterior(torch.nn.Module):
         self.fit = fit
 
     def forward(self, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor) -> tuple[Tensor | None, ...]:
-        flat, query = (
-            FlatStates(q, qd, tau, active, q.shape[:-1]),
-            Query(("qdd", "multiplier"), None, True, False),
-        )
-        return self.fit.at(flat, query)[0][:3]
+        query = Query(("qdd", "multiplier"), None, True, False)
+        return self.fit.at(FlatStates(q, qd, tau, active, q.shape[:-1]), query)[0][:3]
 
 
 @torch.no_grad()

@@ -206,9 +206,8 @@ class CompiledFit(Predictor):
             )
         read = self._read(quantity if isinstance(quantity, str) else tuple(quantity))
         nq, (arrays, batch) = self.system.robot.nq, self._states(q, qd, tau, active)
-        new = self._new
-        mean, beyond = new(*batch, read.size), new(*batch, nq)
-        spread = new(*batch, read.size, read.size) if covariance else None
+        mean, beyond = self._new(*batch, read.size), self._new(*batch, nq)
+        spread = self._new(*batch, read.size, read.size) if covariance else None
         pointers = [None if x is None else x.data_ptr() for x in (*arrays, mean, spread, beyond)]
         status = self._many(self._memory, batch.numel(), *pointers[:4], read.bits, noise, *pointers[4:])
         if status not in (0, UNDETERMINED):
@@ -222,11 +221,7 @@ class CompiledFit(Predictor):
         return self._doubted(result, flat_states(self.system, q, qd, tau, active)) if status else result
 
     def _doubted(self, prediction: Prediction, flat: FlatStates) -> Prediction:
-        """Return a prediction with descriptions of its undetermined components.
-
-        Raises:
-            ModelError: all requested quantities are forces of contacts that are never closed in the data.
-        """
+        """Return a prediction with descriptions of its undetermined components."""
         names, doubts = self.system.contact_names, dict[str, None]()
         closed = self._learned[-1 - len(names) : -1] if self._learned is not None else torch.zeros(len(names))
         never = [name for name, own in zip(names, closed, strict=True) if own == 0.0]
@@ -305,7 +300,7 @@ class CompiledFit(Predictor):
             ModelError: the fit was compiled without a wrench, or friction jams a contact.
             ShapeError: an argument has the wrong shape for the system, or is not finite.
         """
-        mean, covariance, beyond, _ = self._wrench(q, qd, tau, qdd, active, qdd_std, False)
+        mean, covariance, beyond, _ = self._wrench((q, qd, tau, qdd), active, qdd_std, False)
         frame, joints = self.model.wrench, self.system.robot.joint_names
         assert frame is not None
         parts = {"external_wrench": slice(0, len(frame.axes))}
@@ -326,20 +321,14 @@ class CompiledFit(Predictor):
 
         The arguments and errors are those of `external_wrench`.
         """
-        mean, _, _, slopes = self._wrench(q, qd, tau, qdd, active, qdd_std, True)
+        mean, _, _, slopes = self._wrench((q, qd, tau, qdd), active, qdd_std, True)
         return WrenchJacobian(mean, *slopes.unbind(-2))
 
     def _wrench(
-        self,
-        q: Tensor,
-        qd: Tensor,
-        tau: Tensor,
-        qdd: Tensor,
-        active: Tensor | None,
-        qdd_std: Tensor | None,
-        differentiate: bool,
+        self, state: Sequence[Tensor], active: Tensor | None, qdd_std: Tensor | None, differentiate: bool
     ) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return mean, covariance, distance beyond the training data, and slopes `(*batch, k, 4, nq)`."""
+        q, qd, tau, qdd = state
         if self.model.wrench is None:
             raise ModelError(
                 "this fit was compiled without an external wrench",

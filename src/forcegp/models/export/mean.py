@@ -356,19 +356,11 @@ class LearnedMotion(Mean):
         return M_inv, S, M_inv @ self.A.T @ S
 
     def _motion(
-        self,
-        rest: Scalars,
-        terms: Sequence[str],
-        U: Scalars | None = None,
-        pulled: bool = True,
+        self, rest: Scalars, terms: Sequence[str], U: Scalars | None = None, pulled: bool = True
     ) -> Motion:
         """Return the motion M q̈ = Q_C + Q_G + rest + (A + U)ᵀ λ, A q̈ = b, and its derivatives.
 
-        Args:
-            rest: impressed forces other than Q_C and Q_G.
-            terms: names of the acting terms, such as `"bias"` for Q_C and `"gravity"` for Q_G.
-            U: friction per unit of the multiplier.
-            pulled: whether A q̈ equals b rather than 0.
+        Q_C acts if `"bias"` is in `terms`, and Q_G if `"gravity"` is. A q̈ = 0 unless `pulled`.
         """
         M_inv, S, L = self._inverses
         zero, m = self.zeros(self.robot.nq), len(self.names)

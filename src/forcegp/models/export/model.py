@@ -91,9 +91,8 @@ class Functions:
         """Return the columns of the named inputs, or of all inputs."""
         widths = {name: x.shape[-1] for name, x in self.support.items()}
         starts = dict(zip(widths, accumulate(widths.values(), initial=0), strict=False))
-        return [
-            starts[name] + i for name in (widths if names is None else names) for i in range(widths[name])
-        ]
+        chosen = widths if names is None else names
+        return [starts[name] + i for name in chosen for i in range(widths[name])]
 
 
 @dataclass(frozen=True, eq=False)

@@ -51,9 +51,8 @@ class CompiledMotion:
             if posterior.process.pinned:
                 assert isinstance(posterior.latent, SparsePosterior)
                 # Samples of the latent posterior are shifted to the mean given the forces in the robot.
-                weights = (
-                    weights + (part.weights - torch.cat(posterior.latent.folded[p], 1)[..., 0])[..., None]
-                )
+                mean = torch.cat(posterior.latent.folded[p], 1)[..., 0]
+                weights = weights + (part.weights - mean)[..., None]
             rows.append(weights.flatten(0, 1).mT)
             if drawn.missed is not None:
                 waves[p] = self._missed(part, *drawn.missed)

@@ -39,16 +39,8 @@ from forcegp.rollout import law
 
 NO_FRICTION = 10
 """Error code of the C code if no dry friction solves the problem in `rollout/law.py`."""
-LAW = (
-    "REGULARIZATION",
-    "CONTRADICTION",
-    "BLOCK_TRIALS",
-    "MAX_EXCHANGES",
-    "INSTANT",
-    "STILL",
-    "SMOOTH",
-    "NUDGE",
-)
+LAW = ("REGULARIZATION", "CONTRADICTION", "BLOCK_TRIALS", "MAX_EXCHANGES")
+LAW += ("INSTANT", "STILL", "SMOOTH", "NUDGE")
 READ = (*QUANTITIES, "joint_friction")
 """Quantities of the C code, in the order of their bits. Only the last is not in `QUANTITIES`."""
 STEPS = 2e-5, 1e-3
@@ -70,9 +62,8 @@ def c_source(model: ExportedModel, name: str, rollout: bool = False) -> tuple[st
     helpers, after = rest.split("/* PRIORS */\n")
     writer = Writer(model, rollout)
     priors = writer.priors()
-    used = (
-        text for text in helpers.strip().split("\n\n")[1:] if any(f" {_called(text)}(" in x for x in priors)
-    )
+    each = helpers.strip().split("\n\n")[1:]
+    used = (text for text in each if any(f" {_called(text)}(" in x for x in priors))
     head = GUIDE + '#include <math.h>\n#include <string.h>\n#include "forcegp.h"\n'
     head += "#ifdef __cplusplus\n#define restrict __restrict__\n#endif\n"
     blocks = [head, "\n".join(writer.lines), *_programs(writer.mean, rollout), before, *used, *priors, after]
@@ -150,10 +141,8 @@ def _programs(mean: LearnedMotion, rollout: bool) -> list[str]:
     blocks = [mean.M, mean.Q_C, mean.Q_G, mean.Q_D, *(x for at in mean.touching for x in at), *mean.x]
     outputs = [x for block in blocks for x in block.flat]
     outputs += [x for features in mean.phi for phi in features for x in phi]
-    programs = {
-        "mechanics": mean.program(outputs, ARGUMENTS[:3]),
-        "forward_dynamics": trace(robot, "forward_dynamics"),
-    }
+    programs = {"mechanics": mean.program(outputs, ARGUMENTS[:3])}
+    programs["forward_dynamics"] = trace(robot, "forward_dynamics")
     if any(isinstance(part.prior, InertialPrior | PayloadPrior) for part in mean.parts):
         programs["regressor"] = regressor_program(Links(robot))
     if mean.model.wrench is not None and not rollout:
@@ -285,9 +274,8 @@ class Writer:
         self.array([part.size for part in parts for _ in range(part.components)], "POINTS", "int")
         self.array(self.starts, "FIRST_COMPONENT", "int")
         self.array(variance, "LEARNED_TORQUE_VARIANCE")
-        self.lines.append(
-            f"enum {{ PRIOR_COUNT = {len(parts)}, GROUP = CONTACTS * 3 > NQ ? CONTACTS * 3 : NQ }};"
-        )
+        group = "CONTACTS * 3 > NQ ? CONTACTS * 3 : NQ"
+        self.lines.append(f"enum {{ PRIOR_COUNT = {len(parts)}, GROUP = {group} }};")
         self.lines.append(f"static const double REST_SPEED = {REST_SPEED if moving else -1.0!r};")
         self.lines.append(f"static const double TEMPERING = {power**0.5!r};")
 
@@ -467,10 +455,8 @@ class KernelCode:
         if isinstance(kernel, kernels.Stationary):
             return f"{leaf.size!r} * {leaf.u}[j]", repr(leaf.size)
         square = " + ".join(f"({a}) * ({a})" for a in self._x(leaf, k))
-        return (
-            f"({leaf.size!r} * {leaf.u}[j] + {leaf.bias!r})",
-            f"({leaf.size!r} * ({square}) + {leaf.bias!r})",
-        )
+        both = (f"({leaf.size!r} * {x} + {leaf.bias!r})" for x in (f"{leaf.u}[j]", f"({square})"))
+        return next(both), next(both)
 
     def slopes(self, part: KernelPart, k: int, value: str, f: str, slope: str) -> list[str]:
         """Return the code for f = Σ w_j k(x, z_j) and ∂f/∂x for component k."""
@@ -535,7 +521,6 @@ class KernelCode:
             return [*lines, f"  combine({leaf.table}, x_{u}, {len(x)}, {m}, {u});"]
         lines.append(f"  squares(x_{u}, {leaf.table}, {len(x)}, {m}, {u});")
         if self.differentiate:
-            lines.append(
-                f"  double d_{u}[{m}];\n  memcpy(d_{u}, {u}, sizeof {u});\n  {kind}_slope(d_{u}, {m});"
-            )
+            lines.append(f"  double d_{u}[{m}];\n  memcpy(d_{u}, {u}, sizeof {u});")
+            lines.append(f"  {kind}_slope(d_{u}, {m});")
         return [*lines, f"  {kind}({u}, {m});"]
