@@ -180,7 +180,7 @@ def test_held_out_stretches_show_a_model_that_misses_the_log(
     data: forcegp.Dataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     log = simulate(SYSTEM, replace(SCENE.simulation, duration=6.0)).data[::10]
-    monkeypatch.setattr(selection, "candidates_of", lambda _: [selection.Candidate(SETS["sliding"])])
+    monkeypatch.setattr(selection, "candidates_of", lambda *_: [selection.Candidate(SETS["sliding"])])
     for push, misses in ((0.0, False), (2.0, True)):
         pushed = log.replace(tau=log.tau + push * torch.eye(7, dtype=torch.float64)[1])
         result = forcegp.StructuredGP(SYSTEM, "analytical", noise=0.1).fit(pushed).result

@@ -12,8 +12,9 @@ import torch
 import forcegp
 from forcegp.data import DataHeader
 from forcegp.errors import NumericalError, UnknownNameError
+from forcegp.forces.measurements import training_of
 from forcegp.forces.priors.sets import SETS
-from forcegp.models.selection import Candidate, Trial, behind_best, candidates_of, halves_of
+from forcegp.models.selection import Candidate, Trial, behind_best, candidates_of, halves_of, log_density
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.simulate import simulate
 
@@ -92,17 +93,30 @@ def test_a_row_that_nothing_explains_does_not_choose() -> None:
 
 
 def test_a_soft_contact_does_not_choose() -> None:
-    """Accelerations along the normal, which no candidate predicts, change neither choice nor score."""
+    """Accelerations along the normal, which no candidate predicts, are no evidence."""
     system, data = scene_log("kuka_plane")
     A = system.equations(data.q, data.qd, data.active(system.contact_names)).A
     generator = torch.Generator().manual_seed(0)
-    bounce = torch.randn(len(data), 1, 1, generator=generator, dtype=torch.float64)
-    soft = data.replace(qdd=data.qdd + (A.mT @ (5.0 * bounce))[..., 0])
-    rigid, found = (fitted(system, each).result.comparison for each in (data, soft))
-    assert [(x.name, x.chosen) for x in rigid] == [(x.name, x.chosen) for x in found]
-    for one, other in zip(rigid, found, strict=True):
-        if one.behind is not None:
-            assert other.behind == pytest.approx(one.behind, abs=0.05)
+    bounce = 100.0 * torch.randn(len(data), 1, 1, generator=generator, dtype=torch.float64)
+    fit = forcegp.StructuredGP(system, "analytical", "friction", noise=0.1).fit(data[::2], learn=[])
+    rigid, soft = (
+        log_density(fit, training_of(each, system, (), 0.1, {}))[0]
+        for each in (data, data.replace(qdd=data.qdd + (A.mT @ bounce)[..., 0]))
+    )
+    torch.testing.assert_close(soft, rigid, rtol=0.0, atol=1e-6)
+
+
+def test_a_residual_is_no_candidate_where_contact_hides_forces() -> None:
+    system, data = scene_log("kuka_plane")
+    spec = forcegp.StructuredGP(system, "analytical").specification
+
+    def names(rows: forcegp.Dataset | list[forcegp.Observation]) -> set[str]:
+        return {each.set.name for each in candidates_of(spec, training_of(rows, system, (), 0.1, {}))}
+
+    force = forcegp.Observation(data, "multiplier", noise_std=0.5)
+    free = data.replace(contact={"table": torch.zeros(len(data), dtype=torch.bool)})
+    assert names(data) == {"sliding", "friction"}
+    assert names(free) == names([forcegp.Observation(data), force]) == set(SETS)
 
 
 def test_rows_without_order_are_halved_by_distance() -> None:
@@ -161,7 +175,8 @@ def test_the_comparison_is_saved(tmp_path: Path) -> None:
 def test_no_candidate_reads_the_motor_torque() -> None:
     system, data = scene_log("kuka_plane")
     spec = forcegp.StructuredGP(system, "analytical").specification
-    assert {each.set.name for each in candidates_of(spec)} == set(SETS)
+    log = training_of(data, system, (), 0.1, {})
+    assert {each.set.name for each in candidates_of(spec, log)} == {"sliding", "friction"}
     for each in SETS.values():
         fit = forcegp.StructuredGP(system, "analytical", each.name).fit(data[::6], learn=[])
         q, qd, tau = data.q[::40], data.qd[::40], data.tau[::40]

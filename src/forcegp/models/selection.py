@@ -79,10 +79,15 @@ class Candidate:
         return f"{self.set.name}, inertia identified" if self.inertia else self.set.name
 
 
-def candidates_of(spec: Specification) -> list[Candidate]:
-    """Return the candidates, simplest first. All include torque noise if joint forces are unknown."""
+def candidates_of(spec: Specification, log: Training) -> list[Candidate]:
+    """Return the candidates, simplest first. All include torque noise if joint forces are unknown.
+
+    Accelerations do not show forces along Aᵀ. If most rows are in contact and no force was measured, a
+    residual on (q, q̇) is arbitrary in these directions, and no candidate has one.
+    """
     candidates = []
-    sets = [each for each in SETS.values() if each.fits(spec.system)]
+    hidden = set(log.quantities) == {"qdd"} and 2 * log.free_motions < log.samples
+    sets = [each for each in SETS.values() if each.fits(spec.system) and not (hidden and each.has_residual)]
     for chosen in sets if not spec.noise.external else [each for each in sets if each.has_joint_friction]:
         asks = (
             spec.options.inertia != "file"
@@ -121,7 +126,7 @@ def with_priors(
     log, _ = in_motion(spec.system, training_of(data, spec.system, (), spec.noise.acceleration, {}))
     if min(len(m.q) for m in log.measurements) < FEWEST:
         return without_comparison(spec, f"fewer than {FEWEST} samples")
-    trials = [Trial(candidate) for candidate in candidates_of(spec)]
+    trials = [Trial(candidate) for candidate in candidates_of(spec, log)]
     halves = [halves_of(m.q, m.qd, log.period > 0.0) for m in log.measurements]
     for half in range(HALVES):
         rows = [(own == half).nonzero()[:, 0] for own in halves]

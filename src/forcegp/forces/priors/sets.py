@@ -89,6 +89,7 @@ class PriorSet:
         has_joint_friction: whether joint friction and torque noise are modelled, which is required to
             identify inertia.
         needs_surface: whether the set requires a surface contact.
+        has_residual: whether any joint force that depends on (q, q̇) is modelled.
     """
 
     name: str
@@ -96,6 +97,7 @@ class PriorSet:
     priors: Callable[[ConstrainedSystem], tuple[ForcePrior, ...]]
     has_joint_friction: bool = True
     needs_surface: bool = False
+    has_residual: bool = False
 
     def fits(self, system: ConstrainedSystem) -> bool:
         """Return whether the set is applicable to the given system."""
@@ -137,6 +139,7 @@ SETS: dict[str, PriorSet] = {
             "friction+residual",
             "the same, and any joint force that depends on (q, q̇)",
             friction_and_residual_priors,
+            has_residual=True,
         ),
     )
 }
