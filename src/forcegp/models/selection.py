@@ -307,11 +307,11 @@ def log_density(fit: StructuredFit, test: Training) -> tuple[Tensor, float]:
         if m.quantity == "qdd" and fit.system.m:
             A = fit.system.equations(m.q, m.qd, m.active).A
             P = P - torch.linalg.pinv(A) @ A
+        assert prediction.covariance is not None and prediction.std is not None
         own = _density(m.values - prediction.mean, prediction.covariance, P)
-        spread = torch.diag_embed(m.values.var(0) + prediction.variance)
+        spread = torch.diag_embed(m.values.var(0) + prediction.std**2)
         any_row = _density(m.values - m.values.mean(0), spread, P)
         densities.append(torch.logaddexp(own + math.log1p(-OUTLIERS), any_row + math.log(OUTLIERS)))
-        assert prediction.std is not None
         within.append(((m.values - prediction.mean).abs() <= 2.0 * prediction.std).flatten())
     return torch.cat(densities), float(torch.cat(within).double().mean())
 
