@@ -27,15 +27,41 @@ def template(node: ast.expr | None) -> str:
     return ""
 
 
+def assigned(function: ast.AST) -> dict[str, list[tuple[int, ast.expr]]]:
+    """Lines and values of the assignments to each name in a function."""
+    values: dict[str, list[tuple[int, ast.expr]]] = defaultdict(list)
+    for node in ast.walk(function):
+        if isinstance(node, ast.Assign):
+            for target in node.targets:
+                pairs = [(target, node.value)]
+                if isinstance(target, ast.Tuple) and isinstance(node.value, ast.Tuple):
+                    pairs = list(zip(target.elts, node.value.elts, strict=True))
+                for name, value in pairs:
+                    if isinstance(name, ast.Name):
+                        values[name.id].append((node.lineno, value))
+    return values
+
+
 def raised(source: Path = SOURCE) -> Iterator[tuple[str, str, str]]:
-    """Class, message and hint of each error that is constructed with its message written out."""
+    """Class, message and hint of each error whose text is written out, there or in a name just before."""
     for path in sorted(source.rglob("*.py")):
-        for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
-            if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in TYPED:
-                message = template(node.args[0]) if node.args else ""
-                hints = [template(keyword.value) for keyword in node.keywords if keyword.arg == "hint"]
-                if message:
-                    yield node.func.id, message, "".join(hints)
+        functions = ast.walk(ast.parse(path.read_text(encoding="utf-8")))
+        for function in (x for x in functions if isinstance(x, ast.FunctionDef)):
+            values = assigned(function)
+            for node in ast.walk(function):
+                if isinstance(node, ast.Call) and isinstance(node.func, ast.Name) and node.func.id in TYPED:
+                    hints = [keyword.value for keyword in node.keywords if keyword.arg == "hint"]
+                    message, hint = (
+                        template(latest(x[0], values, node.lineno) if x else None) for x in (node.args, hints)
+                    )
+                    if message:
+                        yield node.func.id, message, hint
+
+
+def latest(node: ast.expr, values: dict[str, list[tuple[int, ast.expr]]], line: int) -> ast.expr:
+    """An expression, or for a name, what was assigned to it last before a line."""
+    known = values.get(node.id, []) if isinstance(node, ast.Name) else []
+    return max(((at, x) for at, x in known if at <= line), key=lambda pair: pair[0], default=(line, node))[1]
 
 
 def cell(text: str) -> str:
