@@ -207,7 +207,7 @@ def differences(ours: Prediction, theirs: Prediction) -> tuple[float, float]:
     return float(in_mean.max()), 0.5 * float(in_covariance.max())
 
 
-@pytest.mark.parametrize("name", slow_except(CASES, "free_friction", "one_contact", "zero_mean", "exact"))
+@pytest.mark.parametrize("name", slow_except(CASES, "free_friction", "one_contact", "exact"))
 def test_the_numbers_of_predict(name: str) -> None:
     fit, fast = fitted(name), compiled(name)
     state, active = states(fit)
@@ -242,6 +242,7 @@ def test_the_models_are_what_they_are_meant_to_be() -> None:
     assert float((means[0] - means[1]).abs().max()) > 0.1
 
 
+@pytest.mark.slow
 def test_batches_and_single_states() -> None:
     fit, fast = fitted("sparse"), compiled("sparse")
     state, active = states(fit)
@@ -340,6 +341,7 @@ def test_the_trained_region_is_that_of_the_last_fit() -> None:
     assert float(before.max()) > 2.0 and float(after.max()) < 1.0
 
 
+@pytest.mark.slow
 def test_friction_of_the_joints() -> None:
     fit = fitted("free_inertial")
     state, _ = states(fit)
@@ -620,6 +622,7 @@ int check(const double *covariance, int n) { return semidefinite(covariance, n);
 """
 
 
+@pytest.mark.slow
 @needs_gcc
 def test_the_c_code_finds_negative_eigenvalues(tmp_path: Path) -> None:
     """The check of `Prediction`, on covariances of variables of very different sizes."""
@@ -661,6 +664,7 @@ def test_a_contact_that_jams_is_an_error_in_both() -> None:
             predictor.predict(*state)
 
 
+@pytest.mark.slow
 @needs_gcc
 def test_the_command(tmp_path: Path) -> None:
     fitted("one_contact").save(tmp_path / "model")

@@ -170,6 +170,7 @@ def payload_model() -> StructuredFit:
     return model.fit(free_log(robot, 80), learn=[])
 
 
+@pytest.mark.slow
 def test_a_payload_that_appears_is_followed() -> None:
     fit = payload_model()
     fast, robot = fit.compiled(), fit.system.robot

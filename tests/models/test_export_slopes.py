@@ -45,9 +45,7 @@ def finite_differences(fast: CompiledFit, state: tuple[Tensor, ...], active: Ten
     return found
 
 
-@pytest.mark.parametrize(
-    "name", slow_except(CASES, "free_friction", "one_contact", "every_friction", "rounded_tip")
-)
+@pytest.mark.parametrize("name", slow_except(CASES, "free_friction", "one_contact", "every_friction"))
 def test_jacobians_are_those_of_autograd_and_of_finite_differences(name: str) -> None:
     fit, fast = fitted(name), compiled(name)
     state, active = states(fit)
@@ -111,6 +109,7 @@ def test_contacts_that_hold_the_same_direction_have_no_jacobian() -> None:
     assert bool(one.dq.isfinite().all())
 
 
+@pytest.mark.slow
 def test_jacobians_with_a_payload() -> None:
     robot = forcegp.load_robot("kuka_iiwa")
     model = forcegp.StructuredGP(

@@ -51,7 +51,7 @@ def rounding(fit: StructuredFit, data: forcegp.Dataset, frame: forcegp.WrenchFra
 CASES = ["free_friction", "free_inertial", "contained_inertia", "one_contact", "sparse", "exact", "zero_mean"]
 
 
-@pytest.mark.parametrize("frame", [TOOL, ELBOW], ids=["world", "local"])
+@pytest.mark.parametrize("frame", [TOOL, pytest.param(ELBOW, marks=pytest.mark.slow)], ids=["world", "local"])
 @pytest.mark.parametrize("name", slow_except(CASES, "one_contact"))
 def test_the_wrench_of_the_fit_and_its_jacobian(name: str, frame: forcegp.WrenchFrame) -> None:
     fit, fast = fitted(name), fitted(name).compiled(wrench=frame)
