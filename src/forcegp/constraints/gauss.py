@@ -218,6 +218,12 @@ class Equations:
         """The oblique projector P = Tᵀ."""
         return self.T.mT
 
+    @property
+    def N(self) -> JointMatrix:
+        """The orthogonal projector N = I − A⁺A onto the null space of A, the free directions."""
+        eye = torch.eye(self.A.shape[-1], dtype=self.A.dtype, device=self.A.device)
+        return eye - torch.linalg.pinv(self.A) @ self.A
+
     @cached_property
     def H(self) -> JointMatrix:
         """Symmetric map H = M⁻¹P = T M⁻¹ = M⁻¹ − L A M⁻¹ from forces to constrained accelerations."""

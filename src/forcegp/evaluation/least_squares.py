@@ -130,11 +130,9 @@ def without_constraint(system: ConstrainedSystem, data: Dataset, torque: Tensor)
 
 def free_directions(system: ConstrainedSystem, data: Dataset) -> Tensor:
     """Return N = 1 − A⁺A `(n, nq, nq)` or `(nq, nq)`, which removes forces in the range of Aᵀ."""
-    one = torch.eye(data.nq).to(data.q)
     if not system.m:
-        return one
-    A = system.equations(data.q, data.qd, data.active(system.contact_names)).A
-    return one - torch.linalg.pinv(A) @ A
+        return torch.eye(data.nq).to(data.q)
+    return system.equations(data.q, data.qd, data.active(system.contact_names)).N
 
 
 def _minimised(robot: RobotModel, gram: Tensor, right: Tensor, prior: Tensor) -> tuple[RobotModel, Tensor]:

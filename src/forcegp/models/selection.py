@@ -5,12 +5,12 @@ the log and tested on the other, and vice versa. Each half consists of contiguou
 any set would score well if training and test samples were neighbours. The score is the mean log predictive
 density of the measurements, including noise,
 
-    S = 1/N Σ_i log[(1 − ε) N(P r_i; 0, P V_i P) + ε N(P s_i; 0, P diag(v + V_i) P)],  r_i = y_i − E z(x_i),
+    S = 1/n Σ_i log[(1 − ε) p(N r_i; N V_i N) + ε p(N s_i; N diag(v + V_i) N)],  r_i = y_i − E z(x_i),
 
-with V_i = Var z(x_i) + Σ, the mean ȳ and variance v of all measurements, and s_i = y_i − ȳ. P = 1 − A⁺A
-removes the accelerations that closed contacts fix. Training omits them too: all candidates predict the same,
-and a contact that is not perfectly rigid misses it by thousands of σ. The second term limits the weight of a
-row that no candidate explains, such as one with a wrong contact label.
+with the density p of a normal distribution of mean zero, V_i = Var z(x_i) + Σ, the mean ȳ and variance v of
+all measurements, and s_i = y_i − ȳ. N = 1 − A⁺A removes the accelerations that closed contacts fix, which all
+candidates predict alike, and from which a contact that is not perfectly rigid deviates by thousands of σ. The
+second term limits the weight of a sample that no candidate explains, such as one with a wrong contact label.
 
 Candidates are compared by the differences of S over blocks of rows, which also give a standard error. The
 simplest candidate within one standard error of the best is selected. If the residuals of the best are
@@ -59,7 +59,7 @@ ROWS = 400
 LEARN_ROWS = 150
 """Number of rows for learning hyperparameters if a prior has infinitely many features."""
 OUTLIERS = 1e-12
-"""Fraction ε of rows that no candidate explains. It is so small that only impossible rows lose weight."""
+"""Fraction ε of samples that no candidate explains, so small that it affects only impossible samples."""
 QUICK = LearningOptions(tolerance=1e-5, max_evaluations=150)
 """Learning options for candidates. The tolerance can be loose, since their scores differ clearly."""
 DROPPED = 2.0
@@ -82,8 +82,8 @@ class Candidate:
 def candidates_of(spec: Specification, log: Training) -> list[Candidate]:
     """Return the candidates, simplest first. All include torque noise if joint forces are unknown.
 
-    Accelerations do not show forces along Aᵀ. If most rows are in contact and no force was measured, a
-    residual on (q, q̇) is arbitrary in these directions, and no candidate has one.
+    Accelerations do not show forces in the range of Aᵀ. A residual on (q, q̇) would be arbitrary there, so it
+    is not a candidate if most samples are in contact and no force was measured.
     """
     candidates = []
     hidden = set(log.quantities) == {"qdd"} and 2 * log.free_motions < log.samples
@@ -303,26 +303,26 @@ def log_density(fit: StructuredFit, test: Training) -> tuple[Tensor, float]:
     densities, within = [], []
     for m in judged:
         prediction = fit.predict(m.q, m.qd, m.tau, m.quantity, active=m.active, noise=True)
-        P = torch.eye(m.values.shape[-1], dtype=m.values.dtype, device=m.values.device)
+        N = torch.eye(m.values.shape[-1], dtype=m.values.dtype, device=m.values.device)
         if m.quantity == "qdd" and fit.system.m:
-            A = fit.system.equations(m.q, m.qd, m.active).A
-            P = P - torch.linalg.pinv(A) @ A
+            N = fit.system.equations(m.q, m.qd, m.active).N
         assert prediction.covariance is not None and prediction.std is not None
-        own = _density(m.values - prediction.mean, prediction.covariance, P)
+        own = _density(m.values - prediction.mean, prediction.covariance, N)
         spread = torch.diag_embed(m.values.var(0) + prediction.std**2)
-        any_row = _density(m.values - m.values.mean(0), spread, P)
+        any_row = _density(m.values - m.values.mean(0), spread, N)
         densities.append(torch.logaddexp(own + math.log1p(-OUTLIERS), any_row + math.log(OUTLIERS)))
         within.append(((m.values - prediction.mean).abs() <= 2.0 * prediction.std).flatten())
     return torch.cat(densities), float(torch.cat(within).double().mean())
 
 
-def _density(r: Tensor, V: Tensor, P: Tensor) -> Tensor:
-    """Return log N(P r; 0, P V P + 1 − P) `(n,)`, which is constant in the directions that P removes."""
-    L, info = torch.linalg.cholesky_ex(P @ V @ P + torch.eye(P.shape[-1], dtype=P.dtype, device=P.device) - P)
+def _density(r: Tensor, V: Tensor, N: Tensor) -> Tensor:
+    """Return log p(N r; N V N + 1 − N) `(n,)`, which is constant in the directions that N removes."""
+    # N V N + 1 − N = L Lᵀ
+    L, info = torch.linalg.cholesky_ex(N @ V @ N + torch.eye(N.shape[-1], dtype=N.dtype, device=N.device) - N)
     if bool(info.any()):
         raise NumericalError("a predictive covariance is not positive definite")
     normal = torch.distributions.MultivariateNormal(torch.zeros_like(r), scale_tril=L, validate_args=False)
-    return normal.log_prob((P @ r[..., None])[..., 0])
+    return normal.log_prob((N @ r[..., None])[..., 0])
 
 
 def blocks_of(density: Tensor) -> Tensor:
