@@ -31,8 +31,6 @@ from .forces.priors.contact import SlidingFrictionPrior as SlidingFrictionPrior
 from .forces.priors.inertial import InertialPrior as InertialPrior
 from .forces.priors.inertial import PayloadPrior as PayloadPrior
 from .forces.priors.joint import AnalyticalMean as AnalyticalMean
-from .forces.priors.joint import CoregionalPrior as CoregionalPrior
-from .forces.priors.joint import DisturbancePrior as DisturbancePrior
 from .forces.priors.joint import JointForcePrior as JointForcePrior
 from .forces.priors.joint import JointFrictionPrior as JointFrictionPrior
 from .gp.optimise import LearningOptions as LearningOptions

@@ -92,12 +92,12 @@ def _written(
     from forcegp.report.evaluation import PAGE, write_evaluation
     from forcegp.report.window import opening, predicted_window
 
-    comparison = getattr(getattr(model, "result", None), "comparison", ())
+    worth = getattr(getattr(model, "result", None), "worth", {})
     window = predicted_window(model, opening(test, WINDOW_SECONDS), model.kind)
 
     def fill(folder: Path) -> None:
         write_json(folder / "evaluation.json", scores.to_dict())
-        write_evaluation(folder, *names, scores, window, comparison)
+        write_evaluation(folder, *names, scores, window, worth)
 
     folder_or_keep(fill, out)
     return {"file": str(out / "evaluation.json"), "page": str(out / PAGE)}

@@ -91,7 +91,7 @@ def _figures(result: FitResult, as_json: bool) -> dict[str, object]:
     figures = {name: value for name, value in asdict(result).items() if name != "history"}
     if as_json:
         return figures
-    figures["comparison"] = "".join(f"\n  {each}" for each in result.comparison)
+    figures["worth"] = "".join(f"\n  {name}: {nats:.3g} nats" for name, nats in result.worth.items())
     return {name: value for name, value in figures.items() if name != "warnings" and value != ""}
 
 

@@ -11,12 +11,6 @@ leads the motion by half of it. Milliseconds bias the inertia of a light joint a
 along periodic motions, viscous friction. The delay is therefore an additional unknown, and if links are
 identified, the model is trained on torques shifted by it.
 
-Torques alone are not sufficient. In closed loop, torque-sensor noise exceeds the torque that accelerates a
-light joint. Divided by the inertia in the file, this noise predicts accelerations far larger than the
-measured ones. If the mean squared error is ten times the variance of the accelerations, the drive inertia is
-set to the maximum of −½ Σ ε²/s² + v Σ log |M|. Here v ≤ 1 is the smallest value for which accelerations are
-predicted as well as by their mean. No joint's torque error on held-out blocks may increase by more than 2 %.
-
 If an `InertialPrior` is given, the inertial parameters of the robot are set to their posterior mean in one
 physically consistent Gauss–Newton step.
 """
@@ -28,7 +22,6 @@ import math
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass
 
-import numpy as np
 import scipy
 import torch
 from torch import Tensor
@@ -39,6 +32,7 @@ from forcegp.forces.calibration import autocorrelation_time
 from forcegp.forces.inverse_dynamics import (
     LATE,
     LEAST,
+    SIGNIFICANT,
     Estimate,
     NormalEquations,
     Rows,
@@ -50,7 +44,6 @@ from forcegp.forces.inverse_dynamics import (
     is_harmless,
     is_less,
     products,
-    sums,
 )
 from forcegp.forces.measurements import Training
 from forcegp.forces.noise import TORQUE_NOISE
@@ -69,28 +62,29 @@ WIDTHS = (0.0, 0.02, 0.05, 0.12)
 """Widths of the time averages to try (standard deviations) [s]; the narrowest posterior is used."""
 
 
-def rigid_robot(robot: RobotModel, rows: Rows) -> tuple[RobotModel, float, Tensor | None]:
-    """Return the best predictor of held-out torques, and the delay and ∂(π, a)/∂g if links were identified.
+def rigid_robot(robot: RobotModel, rows: Rows) -> Inertia:
+    """Return the robot with the inertia that a log determines.
 
-    The candidates are the robot file, the robot file with added drive inertia, and a robot with identified,
-    physically consistent links and drives. Each candidate must outperform the previous ones by two standard
-    errors over blocks of the log, without increasing the held-out acceleration error of any joint.
+    The candidates are the robot file, the robot file with the drives that the evidence carries, and a robot
+    with identified, physically consistent links and drives. The last must predict held-out torques better
+    than the others by two standard errors over blocks of the log. No candidate may increase the held-out
+    acceleration error of any joint.
 
     Args:
         robot: robot from the robot file.
         rows: samples in free motion.
     """
     prior, n = InertialPrior(), robot.nq
-    M = mass_matrix(robot, rows.q)
-    size = M.diagonal(dim1=-2, dim2=-1).mean(0)
+    M, size = mass_matrix(robot, rows.q), drive_scale(robot, rows.q)
     links = regressor(robot, rows.q, rows.qd, rows.qdd) * prior.scale(robot)
     inertial = torch.cat([size * torch.diag_embed(rows.qdd), links], dim=-1)
     C = with_delay(rows, inertial)
     regressions, judged = tuple(_over_widths(rows, inertial, M)), products(rows, C)
     single = regressions[0]
     found = max(regressions, key=lambda each: float(torch.logdet(each.normal()[1])))
-    delay = torch.tensor([C.shape[-1] - 1])
-    driving, everything = torch.cat([torch.arange(n), delay]), torch.arange(C.shape[-1])
+    delay, everything = torch.tensor([C.shape[-1] - 1]), torch.arange(C.shape[-1])
+    kept, std = found.carried_drives(n)
+    driving = torch.cat([kept, delay])
 
     def compared(estimate: Estimate) -> Tensor:
         """Return held-out errors of single samples in units of noise. Averages would hide sharp friction."""
@@ -110,10 +104,12 @@ def rigid_robot(robot: RobotModel, rows: Rows) -> tuple[RobotModel, float, Tenso
         consistent, delta, change = _consistent(robot, prior, found, size)
         better = _is_better(compared(lambda _: delta), known)
         if better and is_harmless(accelerations(consistent, delta), before):
-            return consistent, LATE * float(delta[-1]), change
+            told = _told(robot, consistent.armature - robot.armature, size * std)
+            return Inertia(consistent, change, LATE * float(delta[-1]), (IDENTIFIED, *told))
     with_drives = robot.replace(armature=robot.armature + size * drives[:n])
-    better = _is_better(driven, file) and is_harmless(accelerations(with_drives, drives), before)
-    return with_drives if better else robot, 0.0, None
+    if len(kept) and is_harmless(accelerations(with_drives, drives), before):
+        return Inertia(with_drives, doubts=_told(robot, size * drives[:n], size * std))
+    return Inertia(robot)
 
 
 def _consistent(
@@ -174,6 +170,20 @@ class _Regression:
         h, per_gain = (self.power * shown @ (vectors.mT @ x) for x in (h, per_gain))
         return h, precision + eye, per_gain
 
+    def carried_drives(self, n: int) -> tuple[Tensor, Tensor]:
+        """Return the drives (of the first n unknowns) that the evidence carries, and all deviations `(n,)`.
+
+        With all links at the file, a drive u ~ N(û, V) with prior N(0, 1) is worth ½ û²/V + ½ log V nats. It
+        must also be significant, since this is little for a drive that the log hardly determines.
+        """
+        h, precision, _ = self.normal()
+        own = torch.cat([torch.arange(n), torch.tensor([len(h) - 1])])
+        V = torch.linalg.inv(precision[own][:, own])
+        u, variance = (V @ h[own])[:n], V.diagonal()[:n]
+        worth = 0.5 * u.square() / variance + 0.5 * variance.log()
+        kept = (u > SIGNIFICANT * variance.sqrt()) & (worth > 0.0)
+        return kept.nonzero()[:, 0], variance.sqrt()
+
     def estimate(self, given: NormalEquations, kept: Tensor, n: int, known: Tensor | None = None) -> Tensor:
         """Return the most probable values of the unknowns `kept`, with nonnegative drives (the first n)."""
         h, precision, _ = self.normal(given)
@@ -226,12 +236,9 @@ def _is_better(after: Tensor, before: Tensor) -> bool:
 
 VOLUME_STATES = 100
 """Number of states over which log |M| or the noise volume is averaged."""
-FAR_LARGER = 10.0
-"""Mean squared acceleration error, relative to that of the mean, above which drive inertia is increased."""
-NEGLIGIBLE = 0.02
-"""Ratio of drive to joint inertia below which drives are neglected; a sensor gain error can explain them."""
-WEIGHTS = tuple(2.0 ** (-k / 2) for k in range(20, -1, -1))
-"""Weights v of the volume term, from 1/1024 to 1."""
+IDENTIFIED = "identified inertia replaces that of the robot file, since it predicts held-out torques better"
+GEARED = 0.3
+"""Smallest prior standard deviation of a drive, relative to the largest joint inertia."""
 
 
 @dataclass(frozen=True)
@@ -264,82 +271,30 @@ def inertia_of(
         mean: prior mean of Q, including the motor torque.
         training: samples in motion, at least `LEAST` of them in free motion.
     """
-    robot = system.robot
     rows = free_rows(system, friction, mean, training)
-    better, delay, per_gain = rigid_robot(robot, rows.with_memory())
-    if per_gain is not None:
-        text = "identified inertia replaces that of the robot file, since it predicts held-out torques better"
-        return Inertia(better, per_gain, delay, (text, *_told(robot, better.armature - robot.armature)))
-    M = mass_matrix(robot, rows.q)
-    armature = _damped(rows, M, better.armature - robot.armature)
-    armature = armature * (armature > NEGLIGIBLE * M.diagonal(dim1=-2, dim2=-1).mean(0))
-    if not bool(armature.any()):
-        return Inertia(robot)
-    return Inertia(robot.replace(armature=robot.armature + armature), doubts=_told(robot, armature))
+    return rigid_robot(system.robot, rows.with_memory())
 
 
-def _told(robot: RobotModel, armature: Tensor) -> tuple[str, ...]:
-    """Return a message about drives with identified inertia `(nq,)`, if there are any."""
-    pairs = zip(robot.joint_names, armature.tolist(), strict=True)
-    found = ", ".join(f"{name} {a:.2g}" for name, a in pairs if a > 0.0)
-    lacks = "the drives have inertia that the robot file lacks [kg m², kg for sliding joints]"
-    return (f"{lacks}: {found}",) if found else ()
+def drive_scale(robot: RobotModel, q: Tensor) -> Tensor:
+    """Return the prior deviation `(nq,)` of drive inertia, gear ratio² times rotor inertia [kg m², kg].
 
-
-def _noise(every: NormalEquations) -> Tensor:
-    """Return the root mean square `(nq,)` of the torque that the robot file and friction do not explain."""
-    none = every.gram.new_zeros(every.unknowns)
-    return every.error(none, every.friction(none)).clamp(min=1e-300).sqrt()
-
-
-def _excess(rows: Rows, every: NormalEquations, M: Tensor, armature: Tensor) -> float:
-    """Return the log ratio of mean squared acceleration error to variance, averaged over the joints."""
-    friction = every.friction(armature)
-    left = rows.slides * (rows.residual - armature * rows.qdd - (rows.friction * friction).sum(-1))
-    missed = torch.linalg.solve(M + torch.diag(armature), left[..., None])[..., 0]
-    spread = rows.qdd - rows.qdd.mean(0)
-    return float((missed.square().mean(0) / spread.square().mean(0)).log().mean())
-
-
-def _damped(rows: Rows, M: Tensor, found: Tensor) -> Tensor:
-    """Return the drive inertia `(nq,)` to add to the robot file.
-
-    If torques predict accelerations far worse than the mean acceleration does, even with friction with memory
-    included, drive inertia is increased from `found` until both predict equally well.
+    It is the mean inertia of the joint in the robot file, and at least `GEARED` of the largest among joints
+    of the same type. A geared drive of a wrist exceeds its links by far (12 to 2500 times on a UR10e).
     """
-    remembering, C = rows.with_memory(), torch.diag_embed(rows.qdd)
-    if _excess(remembering, sums(remembering, C).total(), M, found) <= math.log(FAR_LARGER):
-        return found
-    by_stretch = sums(rows, C)
-    every = by_stretch.total()
-    noise = _noise(every)
-    alone = held_out(by_stretch, lambda given: _drives(given, noise, M, 0.0))
-    for weight in WEIGHTS:
-        if _excess(rows, every, M, found) <= 0.0:
-            break
-        if not is_harmless(held_out(by_stretch, lambda given, v=weight: _drives(given, noise, M, v)), alone):
-            break
-        found = _drives(every, noise, M, weight)
-    return found
+    M = mass_matrix(robot, q).diagonal(dim1=-2, dim2=-1).mean(0)
+    scale = M.clone()
+    for alike in (robot.revolute > 0.0, robot.revolute == 0.0):
+        if bool(alike.any()):
+            scale[alike] = M[alike].clamp(min=GEARED * float(M[alike].max()))
+    return scale
 
 
-def _drives(given: NormalEquations, noise: Tensor, M: Tensor, weight: float) -> Tensor:
-    """Return the drive inertia a ≥ 0 that minimises ½ Σ ε²/s² − v Σ log |M + diag a| over all samples."""
-    H, h, _ = given.quadratic(noise)
-    n, M = float(given.count.max()), M[:: max(1, len(M) // VOLUME_STATES)]
-    scale = M.diagonal(dim1=-2, dim2=-1).mean(0)
-    H, h = (H * scale[:, None] * scale / n).cpu().numpy(), (h * scale / n).cpu().numpy()
-    relative = (M / (scale[:, None] * scale).sqrt()).cpu().numpy()
-
-    def objective(x: np.ndarray) -> tuple[float, np.ndarray]:
-        moved = relative + np.diag(x)
-        value = 0.5 * x @ H @ x - h @ x - weight * np.linalg.slogdet(moved)[1].mean()
-        slope = np.linalg.inv(moved).diagonal(axis1=-2, axis2=-1).mean(0)
-        return float(value), H @ x - h - weight * slope
-
-    start, bounds = np.zeros(len(h)), [(0.0, None)] * len(h)
-    found = scipy.optimize.minimize(objective, start, jac=True, method="L-BFGS-B", bounds=bounds)
-    return torch.from_numpy(found.x).to(scale) * scale
+def _told(robot: RobotModel, armature: Tensor, std: Tensor) -> tuple[str, ...]:
+    """Return a message about drives with identified inertia `(nq,)` and its deviations, if there are any."""
+    columns = robot.joint_names, armature.tolist(), std.tolist()
+    named = [f"{name} {a:.2g} ± {2.0 * s:.1g}" for name, a, s in zip(*columns, strict=True) if a > 0.0]
+    lacks = "the drives have inertia that the robot file lacks [kg m², kg for sliding joints; ± 2σ]"
+    return (f"{lacks}: {', '.join(named)}",) if named else ()
 
 
 @torch.no_grad()

@@ -23,6 +23,7 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.forces.calibration import stretches
 from forcegp.forces.measurements import Measurement, Training
+from forcegp.forces.priors import memory
 from forcegp.forces.priors.base import ForceMean, ForcePrior
 from forcegp.forces.priors.joint import JointFrictionPrior
 
@@ -40,8 +41,6 @@ SIGNIFICANT = 2.0
 """Number of standard errors over blocks above which a difference is significant."""
 APART = 0.05
 """Time between a sample and its partner [s], unless the acceleration filter spans a longer time."""
-DISTANCES = (0.01, 0.03, 0.1)
-"""Distances over which friction with memory develops [rad, m]."""
 REACH = 3.0
 """Number of standard deviations at which Gaussian weights are truncated."""
 LEAST_SQUARE = 1e-300
@@ -190,35 +189,17 @@ def free_rows(
     return dataclasses.replace(rows, step=step, filter_variance=training.filter_variance)
 
 
-def _in_time(m: Measurement | Dataset) -> Tensor:
-    """Return the indices that sort the samples by segment, then by time."""
-    order = torch.argsort(m.t, stable=True)
-    return order[torch.argsort(m.segment[order], stable=True)]
-
-
 def bristles(m: Measurement | Dataset) -> Tensor:
-    """Return z `(n, nq, k)` in Dahl's friction model dz/dt = q̇/δ − |q̇| z/δ for each δ in `DISTANCES`.
+    """Return the state of bristles `(n, nq, k)`.
 
     Within a distance δ of a reversal, this friction acts like a spring, with a torque that is roughly
     proportional to −q̈. Without these columns, friction would be mistaken for negative inertia.
     """
-    order = _in_time(m)
-    t, qd, segment = m.t[order], m.qd[order], m.segment[order]
-    # Unlike position differences, velocities are not noisier at a higher sampling rate.
-    step = (t.diff(prepend=t[:1])[:, None] * 0.5 * (qd + qd.roll(1, 0)))[..., None]
-    # z⁺ = a z + b with a = exp(−|Δq|/δ), b = (1 − a) sgn Δq, composed over 1, 2, 4, … steps
-    a = torch.exp(-step.abs() / qd.new_tensor(DISTANCES))
-    b = (1.0 - a) * step.sign()
-    starts = segment.diff(prepend=segment[:1] - 1) != 0
-    a[starts], b[starts] = 0.0, 0.0
-    lag = 1
-    while lag < len(a):
-        b[lag:] = b[lag:] + a[lag:] * b[:-lag].clone()
-        a[lag:] = a[lag:] * a[:-lag].clone()
-        lag *= 2
-    z = torch.empty_like(b)
-    z[order] = b
-    return z
+    return memory.bristles(m.t, m.qd, m.segment)[..., : len(memory.DISTANCES)]
+
+
+def _in_time(m: Measurement | Dataset) -> Tensor:
+    return memory.in_time(m.t, m.segment)
 
 
 def torque_rate(m: Measurement) -> Tensor:

@@ -20,6 +20,7 @@ from forcegp.data import Dataset, farthest_points, standardized
 from forcegp.data.fields import check_robot, contact_table
 from forcegp.errors import ModelError, UnknownNameError
 from forcegp.forces.priors.base import ForcePrior
+from forcegp.forces.priors.memory import LONGEST_STEP, bristles
 from forcegp.forces.quantities import QUANTITIES, States, states
 from forcegp.gp.features import Standardization
 from forcegp.robust import MAD_TO_STD
@@ -37,6 +38,7 @@ class Measurement:
         segment: `(n,)` trajectory number of each sample; by default, there is one trajectory.
         t: `(n,)` time of each sample [s]; zero by default.
         tau_std: `(n, nq)` additional standard deviation of each torque [N m, N]; `None` for zero.
+        history: `(n, nq, k)` states of bristles, if a prior depends on the past and the log is in time order.
     """
 
     quantity: str
@@ -48,6 +50,7 @@ class Measurement:
     segment: Tensor = None  # pyright: ignore[reportAssignmentType]  # filled in below
     t: Tensor = None  # pyright: ignore[reportAssignmentType]  # filled in below
     tau_std: Tensor | None = None
+    history: Tensor | None = None
 
     def __post_init__(self) -> None:
         if self.segment is None:
@@ -69,7 +72,8 @@ class Measurement:
     def at(self, system: ConstrainedSystem) -> States:
         """Return the states with their equations of motion and, if available, the measured accelerations."""
         time = torch.stack([self.t, self.segment.to(self.t)], dim=-1)
-        return states(system, *self.states, qdd=self.values if self.quantity == "qdd" else None, time=time)
+        at = states(system, *self.states, qdd=self.values if self.quantity == "qdd" else None, time=time)
+        return at if self.history is None else dataclasses.replace(at, history=self.history)
 
     @property
     def digests(self) -> Tensor:
@@ -80,9 +84,9 @@ class Measurement:
 
     def __getitem__(self, rows: Tensor) -> Measurement:
         """Return the values at the given rows."""
-        tau_std = None if self.tau_std is None else self.tau_std[rows]
         parts = (part[rows] for part in (*self.tensors, self.segment, self.t))
-        return Measurement(self.quantity, *parts, tau_std=tau_std)
+        more = (None if part is None else part[rows] for part in (self.tau_std, self.history))
+        return Measurement(self.quantity, *parts, *more)
 
 
 @dataclass(frozen=True)
@@ -442,15 +446,26 @@ def training_of(
     """
     observations = observations_of(data)
     pairs = [measurement_of(o, system, noise_std) for o in observations]
+    measurements = (m for m, _ in pairs)
+    if any(prior.remembers for prior in priors):
+        measurements = (with_history(m, o.data) for (m, _), o in zip(pairs, observations, strict=True))
     training = Training(
-        measurements=tuple(m for m, _ in pairs),
+        measurements=tuple(measurements),
         noise_std=tuple(std for _, std in pairs),
         scales=(),
-        period=_period(observations[0].data),
+        period=period_of(observations[0].data),
         filter_span=max(o.data.header.filter_span or 0.0 for o in observations),
         filter_variance=max(o.data.header.filter_variance for o in observations),
     )
     return scaled(training, system, priors, kept, standardize)
+
+
+def with_history(m: Measurement, data: Dataset) -> Measurement:
+    """Return the measurement with the states of bristles along its log, if they can be followed."""
+    period = period_of(data)
+    if not 0.0 < period <= LONGEST_STEP:
+        return m
+    return dataclasses.replace(m, history=bristles(m.t, m.qd, m.segment))
 
 
 def scaled(
@@ -471,7 +486,7 @@ def scaled(
     return dataclasses.replace(training, scales=tuple(scales[prior.name] for prior in priors))
 
 
-def _period(data: Dataset) -> float:
+def period_of(data: Dataset) -> float:
     """Return the median time step within the trajectories of a log [s]; 0 if it is not in time order."""
     if not data.header.ordered or len(data.t) < 2:
         return 0.0

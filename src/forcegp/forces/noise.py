@@ -26,6 +26,7 @@ from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import JointFrictionPrior
 from forcegp.forces.quantities import AffineMap, ForceField, States, linearize_field
 from forcegp.robot.model import RobotModel
+from forcegp.robust import MAD_TO_STD
 
 
 @dataclass(frozen=True)
@@ -216,3 +217,15 @@ def state_std_of(given: Sequence[NoiseStd] | None, robot: RobotModel) -> Tensor 
             got=given,
         )
     return torch.cat(std)
+
+
+def white_noise_std(x: Tensor, whole: Tensor) -> Tensor:
+    """Return the standard deviation σ `(d,)` of the white noise in each column of a smooth signal `(n, d)`.
+
+    The deviation from the cubic through the neighbours, x_i − (−x_{i−2} + 4 x_{i−1} + 4 x_{i+1} − x_{i+2})/6,
+    has variance 35/18 σ². Its median absolute value is robust to jumps. `whole`, shape `(n − 4,)`, marks the
+    first of every five samples that are consecutive.
+    """
+    a, b, middle, c, d = (x[k : len(x) - 4 + k][whole] for k in range(5))
+    departure = middle - (4.0 * (b + c) - a - d) / 6.0
+    return MAD_TO_STD * departure.abs().median(0).values / (35.0 / 18.0) ** 0.5

@@ -38,6 +38,8 @@ from forcegp.gp.sparse import SparsePosterior
 
 STICK_NOISE, STICK_SPEED = f"{NOISE}.stick.log_noise_std", f"{NOISE}.stick.log_speed"
 """Names of the learned parameters σ_s and v_s of each joint."""
+MEMORY = f"{NOISE}.memory.log_std"
+"""Name of the standard deviation `(nq,)` of friction with memory at a state without past [N m, N]."""
 STICKING = 0.02
 """Initial value of v_s [rad/s, m/s]."""
 REGION = f"{NOISE}.region."
@@ -236,6 +238,8 @@ def warnings_beyond(distance: Tensor, joints: Sequence[str]) -> tuple[str, ...]:
 def hidden_variance(tensors: Mapping[str, Tensor], at: States, external: Tensor | None) -> Tensor:
     """Return the variance `(n, nq)` of static friction and of unknown forces with std `external` `(nq,)`."""
     variance = stick_variance(tensors, at)
+    if MEMORY in tensors and at.history is None:
+        variance = variance + (2.0 * tensors[MEMORY]).exp()
     return variance if external is None else variance + external**2
 
 

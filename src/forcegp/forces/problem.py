@@ -20,14 +20,13 @@ from forcegp.errors import ModelError
 from forcegp.forces.measurements import Training
 from forcegp.forces.noise import TORQUE_NOISE, ForceNoise, SampleNoise, state_jacobian
 from forcegp.forces.posterior import ForcePosterior, ForceProcess, hidden_variance, trained_region
-from forcegp.forces.priors.base import ANALYTICAL, MIXING, NOISE, RESERVED, ForceMean, ForcePrior
+from forcegp.forces.priors.base import ANALYTICAL, NOISE, RESERVED, ForceMean, ForcePrior
 from forcegp.forces.priors.contact import CoulombErrorPrior, CoulombFriction, coulomb_of
 from forcegp.forces.projection import WhitenedRows, combine, whiten
 from forcegp.gp.basis import LatentBasis, latent_basis
 from forcegp.gp.exact import ExactPosterior, require_exact_fits
 from forcegp.gp.features import Features, Standardization
 from forcegp.gp.inducing import CANDIDATES, LIMIT, select_inducing
-from forcegp.gp.kernels import sub
 from forcegp.gp.likelihood import negative_log_likelihood, negative_log_likelihood_of_weights
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.gp.sums import Sums, accumulate, add_over_processes, reduce_sums
@@ -35,8 +34,6 @@ from forcegp.gp.sums import Sums, accumulate, add_over_processes, reduce_sums
 Tensors = dict[str, Tensor]
 OWN = tuple(name + "." for name in RESERVED)
 """Prefixes of learned parameters other than the hyperparameters of the priors."""
-MIXED = "." + MIXING
-"""Suffix of the names of learned operator parameters."""
 SHOWN = 10.0
 """Number of independent samples, with accelerations sensitive to a torque, needed to learn torque noise."""
 UNSHOWN = 0.1
@@ -48,7 +45,7 @@ REGION_STATES = 10_000
 
 def kernel_parameters(tensors: Mapping[str, Tensor]) -> Tensors:
     """Extract the hyperparameters of the priors from the learned tensors."""
-    return {key: x for key, x in tensors.items() if not key.startswith(OWN) and not key.endswith(MIXED)}
+    return {key: x for key, x in tensors.items() if not key.startswith(OWN)}
 
 
 def analytical_parameters(tensors: Mapping[str, Tensor]) -> Tensors:
@@ -158,8 +155,7 @@ class Problem:
         """Return the prior on the forces, with learned operators and Coulomb friction."""
         names = [prior.name for prior in self.priors]
         pinned = {names.index(name): value for name, value in self.pinned.items()}
-        priors = tuple(prior.with_parameters(sub(tensors, prior.name)) for prior in self.priors)
-        return ForceProcess(priors, self.training.scales, self.mean, self.coulomb(tensors), pinned)
+        return ForceProcess(self.priors, self.training.scales, self.mean, self.coulomb(tensors), pinned)
 
     def sample_noise(
         self, tensors: Mapping[str, Tensor], system: ConstrainedSystem, measurement: int
@@ -259,7 +255,7 @@ class Problem:
     def rows_for(self, tensors: Tensors, held: Tensors) -> WhitenedRows:
         """Return the rows for given tensors. They are cached if they do not depend on the tensors."""
         keys = [*tensors, *held]
-        own = any(key.startswith(OWN) or key.endswith(MIXED) for key in keys)
+        own = any(key.startswith(OWN) for key in keys)
         return self.rows({**held, **tensors}) if own else self.fixed_rows
 
 
@@ -382,20 +378,7 @@ def is_finite(priors: Sequence[ForcePrior]) -> bool:
 
 
 def is_sparse(inference: str, priors: Sequence[ForcePrior], samples: int) -> bool:
-    """Return whether inference is sparse. By default, it is sparse for finite priors and large data sets.
-
-    Raises:
-        ModelError: sparse inference is requested, but a force is a function of time.
-    """
-    if any(prior.in_time for prior in priors):
-        if inference == "sparse":
-            raise ModelError(
-                "sparse inference assumes independent samples, which a function of time couples",
-                expected="exact inference",
-                got=", ".join(prior.name for prior in priors if prior.in_time),
-                hint='use inference="exact" on evenly spaced rows (`forcegp select --method even`)',
-            )
-        return False
+    """Return whether inference is sparse. By default, it is sparse for finite priors and large data sets."""
     return inference == "sparse" or (inference == "auto" and (is_finite(priors) or samples > EXACT_SAMPLES))
 
 

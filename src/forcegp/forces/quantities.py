@@ -15,7 +15,7 @@ The mechanics are differentiated in closed form, and the force field is differen
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import NamedTuple
 
 import torch
@@ -37,6 +37,7 @@ class States:
         qdd: `(n, nq)` measured accelerations, if known.
         slip: `(n, nq)` sliding direction of each joint, which replaces tanh(q̇/v₀) in dry friction.
         time: `(n, 2)` time [s] and trajectory number, for states in a training log.
+        history: `(n, nq, 2 k)` states of bristles for states along a log (`forces/priors/memory.py`).
     """
 
     q: Tensor
@@ -47,6 +48,7 @@ class States:
     qdd: Tensor | None = None
     slip: Tensor | None = None
     time: Tensor | None = None
+    history: Tensor | None = None
 
 
 def states(
@@ -73,6 +75,7 @@ class FlatStates(NamedTuple):
         q, qd, tau: `(n, nq)` positions, velocities and motor torques.
         active: `(n, n_contacts)` bool, closed contacts.
         batch: original batch shape; its product is n.
+        history: `(n, nq, k)` states of bristles, for states along a log.
     """
 
     q: Tensor
@@ -80,14 +83,18 @@ class FlatStates(NamedTuple):
     tau: Tensor
     active: Tensor
     batch: torch.Size
+    history: Tensor | None = None
 
     def rows(self, index: slice) -> FlatStates:
         """Return the states in the given slice."""
-        return FlatStates(self.q[index], self.qd[index], self.tau[index], self.active[index], self.batch)
+        past = None if self.history is None else self.history[index]
+        q, qd, tau, active = (x[index] for x in (self.q, self.qd, self.tau, self.active))
+        return FlatStates(q, qd, tau, active, self.batch, past)
 
     def with_equations(self, system: ConstrainedSystem) -> States:
         """Return the states with their equations of motion."""
-        return states(system, self.q, self.qd, self.tau, self.active)
+        at = states(system, self.q, self.qd, self.tau, self.active)
+        return at if self.history is None else replace(at, history=self.history)
 
 
 def flat_states(

@@ -20,7 +20,7 @@ from torch import Tensor
 
 from forcegp.errors import ModelError
 from forcegp.forces.noise import initial_torque_noise
-from forcegp.forces.priors.base import ANALYTICAL, MIXING, ForcePrior
+from forcegp.forces.priors.base import ANALYTICAL, ForcePrior
 from forcegp.forces.priors.contact import below_jamming, initial_coulomb
 from forcegp.forces.problem import OWN, Problem, Tensors, kernel_parameters, noise_key, typical
 from forcegp.forces.projection import WhitenedRows
@@ -31,9 +31,7 @@ from forcegp.gp.optimise import FIRST_STEP, Bounds, Learned, LearningOptions, Ob
 LIMITS = {
     "log_coefficient": (math.log(1e-3), math.log(2.0)),
     "log_speed": (math.log(1e-3), math.log(1.0)),
-    "log_time": (math.log(1e-3), math.log(1e4)),
     "log_smoothing": (math.log(1e-4), math.log(0.1)),
-    MIXING: (-10.0, 10.0),
 }
 """Bounds on the hyperparameters that have an absolute scale."""
 REACH = {"log_lengthscale": (4.0, 8.0)}
@@ -50,7 +48,6 @@ WIDTH = {
     "log_noise_std": (5.0, 5.0),
     "log_scale": (1.0, 1.0),
     "log_offset": (1.0, 1.0),
-    "log_time": (1.0, 1.0),
 }
 """Standard deviations of log-normal priors below and above the initial value, in e-folds (default 3)."""
 START_SAMPLES = 5000
@@ -74,9 +71,6 @@ def initial(problem: Problem, learn_noise: bool, learn_torque_noise: bool = Fals
     else:
         beyond_noise = problem.external_std is not None
         start = initial_hyperparameters(problem.priors, few.fixed_rows.blocks, beyond_noise)
-    for prior in problem.priors:
-        parameters = prior.initial_parameters(problem.system.robot)
-        start |= {f"{prior.name}.{name}": value for name, value in parameters.items()}
     start |= noise
     if learn_noise:
         stds = problem.training.noise_std
@@ -357,10 +351,9 @@ class Search:
             return self.objective(problem, tensors) - constant
 
         report = None if progress is None else lambda n, value, best: progress(n, value + constant, best)
-        # The entries of a mixing matrix are not logarithms. With Coulomb friction, neither rule leads to the
-        # better optimum on all logs (benchmarks/notes/inference.md), so the first step is not limited.
-        free = problem.has_coulomb or any(_kind(key) == MIXING for key in hyper)
-        step = math.inf if free else FIRST_STEP
+        # With Coulomb friction, neither rule leads to the better optimum on all logs
+        # (benchmarks/notes/inference.md), so the first step is not limited.
+        step = math.inf if problem.has_coulomb else FIRST_STEP
         learned = minimise(self.recorded(objective), begin, self.options, analytical, bounds, report, step)
         history = [value + constant for value in learned.history]
         doubts = doubts_at_bounds(learned.tensors, bounds)

@@ -291,8 +291,10 @@ def fourier_features(inputs: tuple[str, ...] | None, omega: Tensor, phase: Tenso
     return FeatureMap((FeatureTerm(lambda x: torch.cos(stacked(x, inputs) @ turn + shift), scale, waves),))
 
 
-def linear_features(x: Features, inputs: tuple[str, ...] | None, slope: Tensor, bias: Tensor) -> FeatureMap:
-    """Return the features of a linear kernel, which are slopes and a bias.
+def linear_features(
+    x: Features, inputs: tuple[str, ...] | None, slope: Tensor, bias: Tensor | None = None
+) -> FeatureMap:
+    """Return the features of a linear kernel, which are slopes and, if given, a bias.
 
     Args:
         x: kernel inputs; only their widths are used.
@@ -304,10 +306,10 @@ def linear_features(x: Features, inputs: tuple[str, ...] | None, slope: Tensor, 
     def values(x: Features) -> Tensor:
         line = stacked(x, inputs)
         line = line if line.ndim == 3 else line[None]
-        return torch.cat([line, line.new_ones(*line.shape[:2], 1)], dim=-1)
+        return line if bias is None else torch.cat([line, line.new_ones(*line.shape[:2], 1)], dim=-1)
 
-    width = stacked(x, inputs).shape[-1]
-    scale = torch.cat([slope.expand(-1, width), bias[:, None]], dim=-1)
+    scale = slope.expand(-1, stacked(x, inputs).shape[-1])
+    scale = scale if bias is None else torch.cat([scale, bias[:, None]], dim=-1)
     return FeatureMap((FeatureTerm(values, scale),))
 
 

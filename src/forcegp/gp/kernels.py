@@ -171,6 +171,22 @@ class Linear(Kernel):
 
 
 @dataclass(frozen=True)
+class Columns(Linear):
+    """Functions that are linear in the inputs, without a constant: k = Σ_d σ_d² x_d x′_d for each output."""
+
+    def initial(self, outputs: int, widths: Mapping[str, int], log_std: Tensor | float = 0.0) -> Initial:
+        width = width_of(self.inputs, widths)
+        share = torch.zeros(outputs, dtype=torch.float64) + log_std - 0.5 * math.log(width)
+        return {"log_slope_std": share[:, None].repeat(1, width)}
+
+    def bias_std(self, params: Parameters) -> Tensor:
+        return torch.zeros_like(self.slope_std(params)[:, 0])
+
+    def draw(self, params: Parameters, x: Features, features: int, generator: torch.Generator) -> FeatureMap:
+        return linear_features(x, self.inputs, self.slope_std(params))
+
+
+@dataclass(frozen=True)
 class Constant(Kernel):
     """Constants: k = s², with one standard deviation s (initially 1) per `group` of outputs."""
 
@@ -385,64 +401,3 @@ class Process(Protocol):
     def prefix(self) -> str:
         """Prefix of the hyperparameters. Processes with the same prefix share their hyperparameters."""
         ...
-
-
-TIME, SEGMENT = "time", "segment"
-"""Names of the inputs of `OrnsteinUhlenbeck`: time [s] and trajectory number, each `(n, 1)`."""
-
-
-@dataclass(frozen=True)
-class OrnsteinUhlenbeck(Kernel):
-    """k = σ² exp(−|t − t′|/T) within a trajectory, and 0 otherwise (Rasmussen and Williams, eq. B.28).
-
-    Args:
-        time: initial value of the correlation time T [s].
-
-    Example:
-        >>> import torch
-        >>> kernel = OrnsteinUhlenbeck(time=2.0)
-        >>> x = {"time": torch.tensor([[0.0], [2.0], [2.0]]), "segment": torch.tensor([[0.0], [0.0], [1.0]])}
-        >>> kernel.covariance(kernel.initial(1, {}), x, x)[0, 0].tolist()
-        [1.0, 0.36787944117144233, 0.0]
-
-    Raises:
-        ModelError: the time is not positive.
-    """
-
-    time: float = 1.0
-
-    def __post_init__(self) -> None:
-        if not 0.0 < self.time < float("inf"):
-            raise ModelError(
-                "a correlation time must be positive", expected="a positive finite time [s]", got=self.time
-            )
-
-    def initial(self, outputs: int, widths: Mapping[str, int], log_std: Tensor | float = 0.0) -> Initial:
-        like = torch.zeros(outputs, dtype=torch.float64)
-        return {"log_time": torch.full_like(like, math.log(self.time)), "log_std": like + log_std}
-
-    def towards(self, params: Parameters, x2: Features) -> Callable[[Features], Tensor]:
-        rate = torch.exp(-params["log_time"])[:, None, None]
-        variance = torch.exp(2.0 * params["log_std"])[:, None, None]
-
-        def covariance(x1: Features) -> Tensor:
-            interval = (x1[TIME] - x2[TIME].mT).abs()
-            same_segment = x1[SEGMENT] == x2[SEGMENT].mT
-            decay = torch.exp(-(interval * rate).clamp(max=LARGEST_EXPONENT))
-            return variance * torch.where(same_segment, decay, 0.0)
-
-        return covariance
-
-    def variance(self, params: Parameters) -> Callable[[Features], Tensor]:
-        variance = torch.exp(2.0 * params["log_std"])[:, None]
-        return lambda x: variance.expand(-1, points(x))
-
-    def draw(self, params: Parameters, x: Features, features: int, generator: torch.Generator) -> FeatureMap:
-        # The spectral density is a Cauchy density. Averaged over uniform frequencies u, cos(u(s − s′)) is
-        # zero for integers s ≠ s′, so trajectories are independent.
-        rate = torch.exp(-params["log_time"])
-        uniform = torch.rand(len(rate), features, 3, dtype=torch.float64, generator=generator).to(rate)
-        in_time = torch.tan(math.pi * (uniform[..., 0] - 0.5)) * rate[:, None]
-        omega = torch.stack([in_time, 2.0 * math.pi * uniform[..., 1]], dim=-1)
-        phase = 2.0 * math.pi * uniform[..., 2]
-        return fourier_features((TIME, SEGMENT), omega, phase, params["log_std"].exp())

@@ -22,7 +22,7 @@ from forcegp.models.minibatch import BatchOptions
 from forcegp.models.neural import DEEP, SHALLOW, NeuralNetwork
 from forcegp.models.registry import MODELS, create
 from forcegp.models.sensed import with_sensor
-from forcegp.models.structured_file import CLASSES
+from forcegp.models.structured_file import classes
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.models.structured_learning import WITH_PARAMETERS
 from forcegp.robot.parameters import AnalyticalParameters
@@ -141,9 +141,9 @@ def _priors(table: ModelTable, written: Sequence[dict[str, Any]]) -> tuple[Force
     priors = []
     for i, described in enumerate(written):
         key = ("model", "priors", i)
-        prior = table.document.at(key, decode, described, CLASSES, "prior", whole=False)
+        prior = table.document.at(key, decode, described, classes(), "prior", whole=False)
         if not isinstance(prior, ForcePrior):
-            known = [name for name, part in CLASSES.items() if issubclass(part, ForcePrior)]
+            known = [name for name, part in classes().items() if issubclass(part, ForcePrior)]
             raise SceneError(
                 f"{table.document.place(key)}: not a force prior",
                 expected=f"type = one of {', '.join(known)}",

@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from typing import NamedTuple, Protocol, runtime_checkable
 
 import numpy as np
-import scipy.stats
+import scipy.special
 import torch
 from torch import Tensor
 
@@ -25,13 +25,12 @@ from forcegp.forces.external_wrench import (
     observe,
     over_levers,
 )
-from forcegp.forces.friction_memory import FrictionMemory
-from forcegp.forces.noise import external_std
-from forcegp.forces.posterior import ForcePosterior, stick_variance, unknown_variance
+from forcegp.forces.noise import external_std, white_noise_std
+from forcegp.forces.posterior import ForcePosterior, unknown_variance
+from forcegp.forces.priors.memory import bristles
 from forcegp.forces.problem import Problem
 from forcegp.forces.quantities import affine_map, states_at
 from forcegp.models.prediction import CHUNK, Prediction
-from forcegp.robust import MAD_TO_STD
 
 METHODS = ("acceleration", "momentum")
 LEAST_NOISE = 1e-9
@@ -75,7 +74,7 @@ class ExternalWrench(Prediction):
             raise ParameterError(
                 "invalid detection", expected="threshold > 0 [σ] and hold ≥ 1", got=(threshold, hold)
             )
-        quantile = float(scipy.stats.chi2.isf(false_alarm_rate(threshold), self.mean.shape[-1]))
+        quantile = float(scipy.special.chdtri(self.mean.shape[-1], false_alarm_rate(threshold)))
         far = self.distance_squared > max(quantile, limit)
         held = far.clone()
         for lag in range(1, hold):
@@ -198,48 +197,42 @@ class Reading:
 
     Attributes:
         fit, data, frame: the learned forces, the log, and the frame with the components to estimate.
-        memory: friction with memory if the log is in time order, otherwise `None`.
-        remembered: force caused by this friction `(n, nq)`, or zero.
+        history: states of bristles along the log if a force depends on the past, otherwise `None`.
         external: standard deviation of other unknown joint forces `(nq,)`, or `None`.
     """
 
     fit: LearnedForces
     data: Dataset
     frame: WrenchFrame
-    memory: FrictionMemory | None
-    remembered: Tensor
+    history: Tensor | None
     external: Tensor | None = None
 
     @classmethod
     def of(
         cls, fit: LearnedForces, data: Dataset, frame: WrenchFrame, external: Mapping[str, float] | None
     ) -> Reading:
-        """Prepare a log, including any friction with memory that was learned from the training log."""
-        memory = FrictionMemory.of(fit.hyperparameters) if data.header.ordered else None
-        force = torch.zeros_like(data.q) if memory is None else memory.force(fit.system.robot, data)
-        return cls(fit, data, frame, memory, force, external_std(external, fit.system.robot))
+        """Prepare a log. Friction with memory follows from the velocities of a log in time order."""
+        history, remembers = None, any(prior.remembers for prior in fit.posterior.priors)
+        if remembers and data.header.ordered:
+            history = bristles(data.t, data.qd, data.segment)
+        return cls(fit, data, frame, history, external_std(external, fit.system.robot))
 
     def forces(self, rows: Tensor, qdd: Tensor) -> JointForces:
         """Return the forces at the given rows, including inertia errors at accelerations qdd `(n, nq)`."""
         data, fit, system = self.data[rows], self.fit, self.fit.system
         active = data.active(system.contact_names)
         at, _ = states_at(system, data.q, data.qd, data.tau, active)
-        at = dataclasses.replace(at, qdd=qdd)
+        at = dataclasses.replace(at, qdd=qdd, history=None if self.history is None else self.history[rows])
         mean, S = fit.posterior.read(system, at, affine_map(system, at, "total_force"))
-        stick = stick_variance(fit.hyperparameters, at)
-        beyond = unknown_variance(fit.hyperparameters, at, fit.problem.external_std) - stick
-        beyond = beyond if self.external is None else beyond + self.external**2
+        unknown = unknown_variance(fit.hyperparameters, at, fit.problem.external_std)
         stated = data.extras.get("tau_std")
-        beyond = beyond if stated is None else beyond + stated**2
-        torque = torch.zeros_like(stick) if fit.torque_std is None else fit.torque_std.square() + 0.0 * stick
-        noise = torch.stack([torque, stick], dim=-1)
-        noise = noise if self.memory is None else noise * self.memory.share
+        for std in (self.external, stated, fit.torque_std):
+            unknown = unknown if std is None else unknown + std**2
         # Multipliers of closed contacts are additional unknowns; the rows of open contacts are zero.
         A = at.eom.A
         prior = torch.cat([self.frame.prior.to(data.q), data.q.new_full((A.shape[-2],), MULTIPLIER_STD)])
         J = torch.cat([self.frame.jacobian(system.robot, data.q), A], dim=-2)
-        S = S + torch.diag_embed(noise.sum(-1) + beyond)
-        return JointForces(mean + self.remembered[rows], S, at.eom, J, prior)
+        return JointForces(mean, S + torch.diag_embed(unknown), at.eom, J, prior)
 
     def from_accelerations(self) -> tuple[Tensor, Tensor]:
         """Estimate the mean and covariance for each sample by generalized least squares."""
@@ -259,7 +252,7 @@ class Reading:
         """Estimate the mean and covariance along each trajectory with the momentum filter."""
         if not self.data.header.ordered:
             raise DataError("the momentum filter needs a log in time order", got="points in another order")
-        correlation = self.fit.problem.correlation if self.memory is None else self.memory.correlation
+        correlation = self.fit.problem.correlation
         if self.fit.torque_std is None or correlation is None:
             raise ModelError(
                 "this fit has no learned torque noise, which the momentum filter needs",
@@ -302,15 +295,3 @@ def velocity_noise(data: Dataset) -> Tensor:
     if not bool(whole.any()):
         raise DataError("velocity noise cannot be estimated", expected="five samples of one trajectory")
     return white_noise_std(data.qd, whole).clamp(min=LEAST_NOISE)
-
-
-def white_noise_std(x: Tensor, whole: Tensor) -> Tensor:
-    """Return the standard deviation σ `(d,)` of the white noise in each column of a smooth signal `(n, d)`.
-
-    The deviation from the cubic through the neighbours, x_i − (−x_{i−2} + 4 x_{i−1} + 4 x_{i+1} − x_{i+2})/6,
-    has variance 35/18 σ². Its median absolute value is robust to jumps. `whole`, shape `(n − 4,)`, marks the
-    first of every five samples that are consecutive.
-    """
-    a, b, middle, c, d = (x[k : len(x) - 4 + k][whole] for k in range(5))
-    departure = middle - (4.0 * (b + c) - a - d) / 6.0
-    return MAD_TO_STD * departure.abs().median(0).values / (35.0 / 18.0) ** 0.5

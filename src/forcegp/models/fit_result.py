@@ -11,50 +11,6 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.notebook import html_table
 
-COVERED = 0.8
-"""Held-out ±2σ coverage below which a fit issues a warning. It corresponds to a σ that is 36 % too small."""
-
-
-@dataclass(frozen=True)
-class Compared:
-    """Score of a set of force priors in the comparison on held-out blocks of the training log.
-
-    Attributes:
-        name: name of the set.
-        log_density: mean log predictive density of held-out samples [nats per sample], or `None` if not
-            computed.
-        behind: deficit relative to the best set [nats per sample].
-        standard_error: standard error of this deficit.
-        chosen: whether this set was selected.
-        note: reason why the set was not tested, or was not tested on both halves of the log.
-        coverage: fraction of held-out values within ±2σ, which is 0.95 for correct error bars.
-    """
-
-    name: str
-    log_density: float | None = None
-    behind: float | None = None
-    standard_error: float | None = None
-    chosen: bool = False
-    note: str = ""
-    coverage: float | None = None
-
-    @property
-    def doubt(self) -> str:
-        """Warning if the held-out coverage is far too low, otherwise an empty string."""
-        if self.coverage is None or self.coverage >= COVERED:
-            return ""
-        return (
-            f"the model predicts held-out blocks of this log poorly: ±2σ coverage is {self.coverage:.0%} "
-            "instead of 95%; check the log and the robot file (`forcegp check`)"
-        )
-
-    def __str__(self) -> str:
-        name = f"{self.name} (chosen)" if self.chosen else self.name
-        if self.log_density is None:
-            return f"{name}: {self.note}"
-        note = f", {self.note}" if self.note else ""
-        return f"{name}: {self.log_density:.2f} ({self.behind:.2f} ± {self.standard_error:.2f} behind){note}"
-
 
 @dataclass(frozen=True)
 class FitResult:
@@ -83,7 +39,7 @@ class FitResult:
         missed: total residual prior variance of all rows, given the inducing points, in units of the noise
             variance. In the same units, `determined` is the total posterior variance.
         more_points_would_help: whether `missed` is at least a tenth of `determined`.
-        comparison: scores of the compared sets of force priors. It is empty if the priors were specified.
+        worth: log evidence of the columns of each prior and joint over their absence [nats].
         never_closed: contacts that are never closed in the training data. Their forces are undetermined.
     """
 
@@ -105,7 +61,7 @@ class FitResult:
     determined: float | None = None
     missed: float | None = None
     more_points_would_help: bool | None = None
-    comparison: tuple[Compared, ...] = ()
+    worth: dict[str, float] = field(default_factory=dict)
     never_closed: tuple[str, ...] = ()
 
 

@@ -267,8 +267,11 @@ class Predictor(ForwardModel):
         """
         if noise and not self.has_noise:
             raise ModelError(f"a {self.kind!r} model has no noise of measurements", hint="use StructuredGP")
-        query, parts = Query(quantity, system, covariance, noise), dict[str, slice]()
-        doubts = dict[str, None]()
+        flat = flat_states(system or self.system, q, qd, tau, active)
+        return self._answered(flat, Query(quantity, system, covariance, noise))
+
+    def _answered(self, flat: FlatStates, query: Query) -> Prediction:
+        parts, doubts = dict[str, slice](), dict[str, None]()
 
         def read(flat: FlatStates) -> tuple[Tensor | None, ...]:
             values, slices, own = self.at(flat, query)
@@ -276,10 +279,9 @@ class Predictor(ForwardModel):
             doubts.update(dict.fromkeys(own))
             return values
 
-        own = system or self.system
-        mean, spread, beyond, determined = in_pieces(flat_states(own, q, qd, tau, active), read)
+        mean, spread, beyond, determined = in_pieces(flat, read)
         assert mean is not None
-        joints, known = own.robot.joint_names, determined if doubts else None
+        joints, known = (query.system or self.system).robot.joint_names, determined if doubts else None
         return Prediction(mean, spread, parts, beyond, joints, determined=known, doubts=tuple(doubts))
 
     def at(self, flat: FlatStates, query: Query) -> Answer:

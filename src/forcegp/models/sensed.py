@@ -15,7 +15,7 @@ from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.data import Dataset
 from forcegp.errors import ModelError
 from forcegp.forces.measurements import Observation
-from forcegp.models.external_wrench import white_noise_std
+from forcegp.forces.noise import white_noise_std
 from forcegp.models.structured_fit import StructuredFit
 
 SENSOR = "F_sensor"

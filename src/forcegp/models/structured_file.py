@@ -25,15 +25,11 @@ from forcegp.forces.priors.base import ANALYTICAL
 from forcegp.forces.priors.constants import DrivePrior, PerRecording
 from forcegp.forces.priors.contact import ContactForcePrior, NormalForcePrior, SlidingFrictionPrior
 from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
-from forcegp.forces.priors.joint import (
-    AnalyticalMean,
-    CoregionalPrior,
-    DisturbancePrior,
-    JointForcePrior,
-    JointFrictionPrior,
-)
+from forcegp.forces.priors.joint import AnalyticalMean, JointForcePrior
+from forcegp.forces.priors.memory import BristlePrior  # noqa: F401  (registers itself)
 from forcegp.forces.problem import Problem, analytical_parameters, kernel_parameters
 from forcegp.forces.quantities import states
+from forcegp.forces.term import JointTerm
 from forcegp.gp import kernels
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.features import Standardization
@@ -53,14 +49,11 @@ CLASSES: dict[str, type] = {
     "matern32": kernels.Matern32,
     "matern52": kernels.Matern52,
     "linear": kernels.Linear,
+    "columns": kernels.Columns,
     "sum": kernels.Sum,
     "product": kernels.Product,
     "constant": kernels.Constant,
-    "ornstein_uhlenbeck": kernels.OrnsteinUhlenbeck,
     "joint": JointForcePrior,
-    "joint_friction": JointFrictionPrior,
-    "disturbance": DisturbancePrior,
-    "coregional": CoregionalPrior,
     "inertial": InertialPrior,
     "normal": NormalForcePrior,
     "payload": PayloadPrior,
@@ -69,7 +62,14 @@ CLASSES: dict[str, type] = {
     "contact": ContactForcePrior,
     "sliding_friction": SlidingFrictionPrior,
 }
-"""Classes that can be saved, by their names in the file."""
+"""Classes that can be saved, by their names in the file, besides the terms in `JointTerm.laws`."""
+
+
+def classes() -> dict[str, type]:
+    """Return the classes that can be saved, by their names in the file."""
+    return {**CLASSES, **JointTerm.laws}
+
+
 COLUMNS = ("q", "qd", "tau", "active", "values")
 """Saved parts of each measurement."""
 IN_TIME = ("segment", "t")
@@ -152,7 +152,7 @@ def pack(
         mean=spec.mean.terms,
         noise=NoiseSettings(**noise),
         power=problem.power,
-        priors=tuple(encode(prior, CLASSES) for prior in problem.priors),
+        priors=tuple(encode(prior, classes()) for prior in problem.priors),
         measured=problem.training.quantities if isinstance(posterior.latent, ExactPosterior) else (),
         constant=tuple(scale.constant for scale in problem.training.scales),
         analytical_parameters=None if own is None else own.joints,
@@ -179,7 +179,7 @@ def _conditioned_on(spec: Specification, training: Training, posterior: ForcePos
 
 def _columns(spec: Specification) -> tuple[str, ...]:
     """Return the saved parts of each measurement."""
-    dated = any(prior.in_time or isinstance(prior, PerRecording) for prior in spec.priors)
+    dated = any(isinstance(prior, PerRecording) for prior in spec.priors)
     return COLUMNS + (IN_TIME if dated else ())
 
 
@@ -219,7 +219,7 @@ def _specification(
     settings: StructuredSettings, tensors: Mapping[str, Tensor], system: ConstrainedSystem, source: str
 ) -> Specification:
     named = ((f"{source}: settings.priors.{i}", prior) for i, prior in enumerate(settings.priors))
-    priors = tuple(decode(dict(prior), CLASSES, name) for name, prior in named)
+    priors = tuple(decode(dict(prior), classes(), name) for name, prior in named)
     original, parameters = take_robot(tensors, "start.", system.robot, source), None
     system = system.with_robot(original)
     if settings.analytical_parameters is not None:
@@ -278,7 +278,7 @@ def _check_hyperparameters(spec: Specification, training: Training, hyper: Mappi
     for prior, scale in zip(spec.priors, training.scales, strict=True):
         widths = {name: x.shape[-1] for name, x in scale.mean.items()}
         expected = prior.kernel.initial(prior.outputs(spec.system.robot), widths)
-        for key, value in {**expected, **prior.initial_parameters(spec.system.robot)}.items():
+        for key, value in expected.items():
             found = hyper[f"{prior.prefix}.{key}"]
             if found.shape != value.shape:
                 raise ValueError(f"hyperparameter '{prior.prefix}.{key}' has shape {tuple(found.shape)}")

@@ -17,7 +17,6 @@ from forcegp.data import Dataset
 from forcegp.errors import DataError, ModelError, check_name
 from forcegp.files import Record
 from forcegp.forces.external_wrench import WrenchFrame
-from forcegp.forces.friction_memory import FrictionMemory
 from forcegp.forces.measurements import Observation, Training
 from forcegp.forces.noise import TORQUE_NOISE, learned_slopes
 from forcegp.forces.posterior import (
@@ -31,6 +30,7 @@ from forcegp.forces.posterior import (
 )
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior
+from forcegp.forces.priors.memory import bristles
 from forcegp.forces.problem import Problem, forces_and_constant, is_sparse, lost_by_inducing, typical
 from forcegp.forces.quantities import (
     AffineMap,
@@ -97,7 +97,7 @@ class StructuredFit(FittedModel):
             *((f"prior {prior.name}", type(prior).__name__) for prior in self.posterior.priors),
             *((f"noise of {name}", std) for name, std in self.noise.items()),
             *([] if self.torque_std is None else [("noise of the torque", self.torque_std)]),
-            *(("held-out log density", str(each)) for each in self.result.comparison),
+            *((f"log evidence of {name}", f"{worth:.1f}") for name, worth in self.result.worth.items()),
         ]
 
     @property
@@ -138,17 +138,21 @@ class StructuredFit(FittedModel):
         return mean, spread + self._noise_covariance(z, parts) if noise else spread
 
     def predict_log(
-        self, data: Dataset, quantity: str | Sequence[str] = "qdd", **settings: Any
+        self,
+        data: Dataset,
+        quantity: str | Sequence[str] = "qdd",
+        *,
+        covariance: bool = True,
+        noise: bool = False,
     ) -> Prediction:
-        """Predict quantities along a log in time order, including the friction with memory that the training
-        log determined (`forces/friction_memory.py`), which a single state does not.
+        """Predict quantities along a log in time order, including friction with memory.
 
-        It acts as an additional torque, which leaves less torque noise and static friction. Without such
-        friction, the prediction is that of `predict`.
+        The state of a bristle follows from the velocities before a sample (`forces/priors/memory.py`), which
+        a single state does not contain.
 
         Args:
             data: the log, with the measured torques.
-            quantity, **settings: see `predict`.
+            quantity, covariance, noise: see `predict`.
 
         Raises:
             DataError: the log does not match the robot, or is not in time order.
@@ -159,12 +163,12 @@ class StructuredFit(FittedModel):
         data.check_robot(self.specified.robot)
         if not data.header.ordered:
             raise DataError("friction with memory needs a log in time order", got="points in another order")
-        memory = FrictionMemory.of(self.hyperparameters)
-        if memory is None:
-            return self._at_logged(data, quantity, **settings)
-        tau = data.tau + memory.force(self.system.robot, data)
-        fit = dataclasses.replace(self, hyperparameters=memory.less_noise(self.hyperparameters))
-        return fit._at_logged(data.replace(tau=tau), quantity, **settings)
+        active, history = data.active(self.system.contact_names), None
+        if any(prior.remembers for prior in self.force_priors):
+            history = bristles(data.t, data.qd, data.segment)
+        flat = flat_states(self.system, data.q, data.qd, data.tau, active)._replace(history=history)
+        with torch.no_grad():
+            return self._answered(flat, Query(quantity, None, covariance, noise))
 
     def external_wrench(
         self,

@@ -25,7 +25,6 @@ from forcegp.forces.problem import require_double
 from forcegp.gp.inducing import LIMIT
 from forcegp.gp.optimise import LearningOptions
 from forcegp.models.base import FitProgress, Model
-from forcegp.models.selection import with_priors
 from forcegp.models.structured_fit import KIND, StructuredFit, conditioned
 from forcegp.models.structured_learning import Specification, check_learned, learned, problem_for, search_of
 from forcegp.models.structured_stream import Pass, Sample, sample_of
@@ -156,9 +155,7 @@ class StructuredGP(Model[StructuredFit]):
         spec = self.specification if after is None else self._continued(after)
         sample = sample_of(spec, data) if isinstance(data, StreamedDataset) else Sample(data)
         chosen = None if learn is None else tuple(learn)
-        spec, comparison = spec.for_data(sample.data), ()
-        if spec.automatic:
-            spec, comparison = with_priors(spec, sample.data, chosen, progress)
+        spec = spec.for_data(sample.data)
         check_learned(spec, chosen or ())
         if chosen == () and after is not None and sample.log is None:
             return dataclasses.replace(after, specification=spec).condition(sample.data)
@@ -180,9 +177,8 @@ class StructuredGP(Model[StructuredFit]):
         fit = conditioned(spec, lesson.problem, values, lesson.learned, warnings, lesson.learned_on, forces)
         if progress is not None:
             progress(fit.result.evaluations, fit.result.evaluations, fit.result.objective)
-        missed = (each.doubt for each in comparison if each.chosen and each.doubt)
-        warnings = (*fit.result.warnings, *missed, *self._without_effect(fit))
-        result = dataclasses.replace(fit.result, comparison=comparison, warnings=warnings)
+        warnings = (*fit.result.warnings, *self._without_effect(fit))
+        result = dataclasses.replace(fit.result, worth=dict(lesson.worth), warnings=warnings)
         return dataclasses.replace(fit, result=result)
 
     def _without_effect(self, fit: StructuredFit) -> Iterator[str]:

@@ -16,10 +16,10 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
 
 import torch
 from torch import Tensor, nn
@@ -27,16 +27,15 @@ from torch import Tensor, nn
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.data.fields import common_stick_speeds
-from forcegp.dynamics import mass_matrix
 from forcegp.errors import check_name
 from forcegp.forces.calibration import calibrated_noise, residual_times
-from forcegp.forces.friction_memory import MEMORY, memory_of
-from forcegp.forces.inertia import VOLUME_STATES, Inertia, inertia_of, with_updated_robot
+from forcegp.forces.inertia import VOLUME_STATES, Inertia, drive_scale, inertia_of, with_updated_robot
 from forcegp.forces.inverse_dynamics import LEAST, without_delay
 from forcegp.forces.measurements import (
     Observation,
     Training,
     observations_of,
+    period_of,
     states_noise,
     training_of,
     unmeasured_forces,
@@ -48,11 +47,12 @@ from forcegp.forces.posterior import REGION
 from forcegp.forces.priors.base import ANALYTICAL, COULOMB, NOISE, ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import AnalyticalMean, JointFrictionPrior
-from forcegp.forces.priors.sets import PriorSet
+from forcegp.forces.priors.memory import LONGEST_STEP, BristlePrior
 from forcegp.forces.problem import Problem, is_finite, is_sparse, with_inducing, without_inducing
 from forcegp.forces.search import Search, initial
 from forcegp.gp.exact import require_exact_fits
 from forcegp.gp.optimise import FitProgress, Learned, LearningOptions, Progress, reported
+from forcegp.learning.fit import are_columns, regression, with_acceleration_noise, with_expectations
 from forcegp.robot.model import RobotModel
 from forcegp.storage.checkpoint import Evaluations
 from forcegp.storage.options import StructuredOptions
@@ -84,7 +84,7 @@ class Specification:
         priors: the priors on the unknown forces.
         noise: the noise of measured accelerations, torques and states.
         analytical_parameters: a module with a `forward()` method that returns the robot at θ_A, or `None`.
-        automatic: whether the priors are selected from `SETS` based on the data.
+        automatic: whether all terms that apply to the data take part.
         options: options with plain values.
     """
 
@@ -111,18 +111,17 @@ class Specification:
         unmeasured = unmeasured_forces(system, observations)
         if unmeasured:
             noise = dataclasses.replace(noise, external={**unmeasured, **(noise.external or {})})
-        return dataclasses.replace(self, system=system, noise=noise)
+        spec = dataclasses.replace(self, system=system, noise=noise)
+        return spec.with_terms(observations) if self.automatic else spec
 
-    def with_options(self, **changed: Any) -> Specification:
-        """Return the specification with changed options."""
-        return dataclasses.replace(self, options=self.options.model_copy(update=changed))
-
-    def with_set(self, chosen: PriorSet) -> Specification:
-        """Return the specification with a given set of priors, and with the torque noise for this set."""
-        priors, noise = chosen.priors(self.system), self.noise
-        if isinstance(noise.torque, str) and noise.torque == "auto":
-            noise = noise.for_priors(priors)
-        return dataclasses.replace(self, priors=priors, noise=noise, automatic=False)
+    def with_terms(self, observations: Sequence[Observation]) -> Specification:
+        """Return the specification with all terms that apply to a log, and with the noise of these terms."""
+        past = any(0.0 < period_of(o.data) <= LONGEST_STEP for o in observations)
+        known = any(prior.remembers for prior in self.priors)
+        priors = (*self.priors, BristlePrior()) if past and not known else self.priors
+        options = self.options.model_copy(update={"inertia": self.options.inertia or "auto"})
+        noise = self.noise.for_priors(priors)
+        return dataclasses.replace(self, priors=priors, noise=noise, options=options)
 
     def inertia_of(self, training: Training) -> Inertia:
         """Return the inertia identified from the training samples if requested, or that of the robot file."""
@@ -192,6 +191,7 @@ class Lesson:
         learned: the result of the optimisation.
         learned_on: number of samples used for learning.
         warnings: warnings about the result.
+        worth: log evidence of each group of columns over its absence [nats].
     """
 
     problem: Problem
@@ -199,6 +199,7 @@ class Lesson:
     learned: Learned | None = None
     learned_on: int | None = None
     warnings: tuple[str, ...] = ()
+    worth: Mapping[str, float] = field(default_factory=dict)
 
 
 def problem_for(
@@ -236,7 +237,7 @@ def identified(
     """Return the model for the robot with identified inertia and with inertia errors of zero mean."""
     robot = spec.system.robot
     q = torch.cat([m.q for m in training.evenly(VOLUME_STATES).measurements])
-    size = mass_matrix(robot, q).diagonal(dim1=-2, dim2=-1).mean(0)
+    size = drive_scale(robot, q)
     assert inertia.per_gain is not None
     per_gain = tuple(map(tuple, inertia.per_gain.tolist()))
     errors = InertialPrior().around(robot).with_drives(size)
@@ -295,7 +296,7 @@ def search_of(
     known = {} if chosen is None else known
     current = {key: known.get(key, value) for key, value in start.items()}
     if chosen is not None and NOISE not in chosen:
-        current |= {key: value for key, value in known.items() if key.startswith((REGION, MEMORY))}
+        current |= {key: value for key, value in known.items() if key.startswith(REGION)}
 
     def is_held(name: str) -> bool:
         # If the robot includes a force, the scale of that force cannot be learned from the residuals.
@@ -353,26 +354,58 @@ def learned(
     """
     if not search.start:
         return Lesson(prepared(spec, problem, search.held), search.held)
+    if is_regression(spec, problem):
+        return _regressed(spec, problem, search, progress, begin, neighbours)
     saved = None
     if file is not None:
         saved = Evaluations.resumed(file, search.start, *_key(spec, problem, search, begin))
         search = dataclasses.replace(search, recorded=saved.recorded)
     report = reported(progress, search.options.max_evaluations)
     lesson = solve(spec, problem, search, report, begin, neighbours)
-    if TORQUE_NOISE in search.start:
-        lesson = _with_memory(lesson, neighbours)
     if saved is not None:
         saved.write()
     return lesson
 
 
-def _with_memory(lesson: Lesson, neighbours: Training | None) -> Lesson:
-    """Add friction with memory to the result if the log contains enough free motion."""
-    training = neighbours or lesson.problem.training
-    if training.free_motions < LEAST:
-        return lesson
-    memory = memory_of(lesson.problem, lesson.hyperparameters, training)
-    return dataclasses.replace(lesson, hyperparameters={**lesson.hyperparameters, **memory})
+def is_regression(spec: Specification, problem: Problem) -> bool:
+    """Return whether all unknowns are columns or variances of rows, so that no search is needed."""
+    plain = spec.analytical_parameters is None and problem.state_std is None
+    return plain and spec.noise.learns_torque and are_columns(problem.priors)
+
+
+def _regressed(
+    spec: Specification,
+    problem: Problem,
+    search: Search,
+    progress: FitProgress | None,
+    begin: Mapping[str, Tensor] | None,
+    neighbours: Training | None,
+) -> Lesson:
+    """Learn columns and noise from the evidence (`learning/fit.py`)."""
+    began, free = time.perf_counter(), {key.split(".")[0] for key in search.start}
+    start = {**search.start, **search.held, **(begin or {})}
+    if spec.noise.learn and NOISE in free:
+        problem, noise = with_acceleration_noise(problem)
+        start |= noise
+    problem = with_expectations(problem, spec.options.standardize)
+    degrees = spec.noise.degrees_of_freedom
+    found = regression(problem, start, free.__contains__, spec.automatic, degrees, progress)
+    part, values = found.problem, found.values
+    if any(isinstance(prior, InertialPrior) for prior in part.priors):
+        part = with_updated_robot(part, values)
+        values = {**values}
+    if NOISE in free:
+        values |= calibrated_noise(part, values)
+    part = _at_the_rate_of_the_log(part, values, neighbours or problem.training)
+    whole = dataclasses.replace(part, training=problem.training, inducing=None)
+    whole, warnings = prepared(spec, whole, values), ()
+    if degrees is not None and (count := left_out(whole)):
+        text = f"{count} of {whole.training.samples} samples are far outside the noise and have little weight"
+        warnings = (text,)
+    seconds = time.perf_counter() - began
+    message = "the evidence is stationary" if found.converged else "stopped at the limit of alternations"
+    learned = Learned(values, found.objective, found.converged, found.rounds, seconds, message)
+    return Lesson(whole, values, learned, found.samples, warnings, found.worth)
 
 
 def identity(problem: Problem) -> tuple[object, ...]:
@@ -418,11 +451,11 @@ def solve(
     if part.inducing is None:
         require_exact_fits(part.fixed_rows.blocks)
     calibrated = spec.noise.learns_torque and TORQUE_NOISE in search.start
-    correlated = calibrated and not any(prior.in_time for prior in part.priors)
+    correlated = calibrated
     if correlated:
         part = dataclasses.replace(part, power=FIRST_POWER)
     learned, learned_on = search.solve(part, progress, begin), part.training.samples
-    sloped = part.state_std is not None and not any(prior.in_time for prior in part.priors)
+    sloped = part.state_std is not None
     sloped &= not is_sparse(spec.options.inference, part.priors, problem.training.all_samples)
     warnings: list[str] = []
     for number in range(ROUNDS):

@@ -115,12 +115,11 @@ def _check_inference(spec: Specification, count: int, held: int) -> None:
             got=f"{count:,}",
             hint="select rows, or omit degrees_of_freedom",
         )
-    coupled = any(prior.in_time for prior in spec.priors)
-    if (spec.options.inference == "exact" or coupled) and count > held:
+    if spec.options.inference == "exact" and count > held:
         raise ModelError(
             f"exact inference on a log of {count:,} samples that is streamed",
             expected=f"at most {2 * SAMPLE_ROWS - 1:,} samples",
-            hint="select rows" if coupled else 'use inference="sparse"',
+            hint='use inference="sparse"',
         )
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Sequence
+from collections.abc import Mapping
 from pathlib import Path
 
 from matplotlib.figure import Figure
@@ -11,7 +11,6 @@ from matplotlib.figure import Figure
 from forcegp.evaluation import Evaluation
 from forcegp.evaluation.scores import JointErrors
 from forcegp.files import write_text
-from forcegp.models.fit_result import Compared
 from forcegp.report.page import INK, NAMES, Picture, PictureBlock, Table, cell, colour, draw, label, render
 from forcegp.report.window import WindowData, draw_errors, draw_forces, draw_predictions
 
@@ -26,12 +25,12 @@ def write_evaluation(
     fitted_to: str | None,
     scores: Evaluation,
     window: WindowData,
-    comparison: Sequence[Compared] = (),
+    worth: Mapping[str, float] | None = None,
 ) -> Path:
     """Write the page on a model together with its plots and their data, and return the path of the page.
 
     `model`, `data` and `fitted_to` are file names shown on the page. If `fitted_to` is `None`, the trivial
-    predictors were fitted to halves of the data. `comparison` contains the compared sets of force priors.
+    predictors were fitted to halves of the data. `worth` is the log evidence of the learned forces by name.
     """
     drawn = {"Predictions": draw_predictions(window), "Errors": draw_errors(window)}
     pictures = [dataclasses.replace(picture, title=title) for title, picture in drawn.items()]
@@ -51,7 +50,7 @@ def write_evaluation(
         data=data,
         scores=scores,
         baseline_data=fitted_to or "the other half of the data",
-        tables=(*tables, *comparison_tables(comparison)),
+        tables=(*tables, *worth_tables(worth or {})),
         blocks=_blocks(window, pictures, force),
     )
     write_text(folder / PAGE, page)
@@ -150,12 +149,8 @@ def score_table(evaluation: Evaluation) -> Table:
     return Table("Scores over all joints", ("score", "value"), rows)
 
 
-def comparison_tables(comparison: Sequence[Compared]) -> tuple[Table, ...]:
-    """Return a table of the compared sets of force priors, or no table if the priors were given."""
-    rows = tuple(
-        tuple(cell(x, 3) for x in (each.name, each.log_density, each.behind, each.standard_error, note))
-        for each in comparison
-        for note in [", ".join(part for part in ("chosen" if each.chosen else "", each.note) if part)]
-    )
-    caption = "Force priors, compared on held-out blocks of the training log [nats per sample]"
-    return (Table(caption, ("set", "log density", "behind", "standard error", ""), rows),) if rows else ()
+def worth_tables(worth: Mapping[str, float]) -> tuple[Table, ...]:
+    """Return a table of what the learned columns are worth, or no table if the model has none."""
+    rows = tuple((name, cell(value, 3)) for name, value in worth.items())
+    caption = "Log evidence of the learned forces over their absence [nats]"
+    return (Table(caption, ("force", "log evidence"), rows),) if rows else ()

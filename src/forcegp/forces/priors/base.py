@@ -6,7 +6,7 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from dataclasses import dataclass, field
 
 from torch import Tensor
@@ -23,8 +23,6 @@ constraint (in the range of Aᵀ), which does not affect accelerations in contac
 NOISE, ANALYTICAL, COULOMB = "noise", "analytical_parameters", "coulomb"
 RESERVED = (NOISE, ANALYTICAL, COULOMB)
 """Prefixes of learned parameters other than the hyperparameters of the priors."""
-MIXING = "mixing"
-"""Suffix of the names of learned operator parameters."""
 ForceMean = Callable[[ConstrainedSystem, States], Tensor]
 """Function that returns the prior mean of the joint force Q at states, `(n, nq)`."""
 
@@ -48,8 +46,8 @@ class ForcePrior(ABC):
     """Whether all components of f have the same physical unit."""
     sticks: bool = False
     """Whether the force includes dry joint friction, for which `States.slip` is needed."""
-    in_time: bool = False
-    """Whether the force is a function of time, which makes the samples of a trajectory correlated."""
+    remembers: bool = False
+    """Whether the force depends on the past, for which `States.history` is needed."""
     scaled: bool = True
     """Whether to standardize the kernel inputs."""
     per_joint: bool = False
@@ -75,14 +73,6 @@ class ForcePrior(ABC):
     @abstractmethod
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
         """Return E(x) `(n, nq, outputs)`."""
-
-    def initial_parameters(self, robot: RobotModel) -> dict[str, Tensor]:
-        """Return initial values of the learned parameters of E, keyed by name. Most priors have none."""
-        return {}
-
-    def with_parameters(self, params: Mapping[str, Tensor]) -> ForcePrior:
-        """Return the prior with the given parameters of its operator (see `initial_parameters`)."""
-        return self
 
     def check(self, system: ConstrainedSystem) -> None:  # noqa: B027  (most priors fit every system)
         """Raise a typed error if the prior does not match the system."""

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.errors import check_name
@@ -78,32 +77,6 @@ def friction_and_residual_priors(system: ConstrainedSystem) -> tuple[ForcePrior,
     return (*friction_priors(system), residual, *normal)
 
 
-@dataclass(frozen=True)
-class PriorSet:
-    """A named set of force priors for the analytical mean.
-
-    Attributes:
-        name: name of the set.
-        description: description of the forces that are modelled.
-        priors: function that returns the priors for a system.
-        has_joint_friction: whether joint friction and torque noise are modelled, which is required to
-            identify inertia.
-        needs_surface: whether the set requires a surface contact.
-        has_residual: whether any joint force that depends on (q, q̇) is modelled.
-    """
-
-    name: str
-    description: str
-    priors: Callable[[ConstrainedSystem], tuple[ForcePrior, ...]]
-    has_joint_friction: bool = True
-    needs_surface: bool = False
-    has_residual: bool = False
-
-    def fits(self, system: ConstrainedSystem) -> bool:
-        """Return whether the set is applicable to the given system."""
-        return not self.needs_surface or bool(_surfaces(system))
-
-
 def contact_priors(system: ConstrainedSystem, kernel: Kernel | None = None) -> tuple[ForcePrior, ...]:
     """Return priors on the friction of each surface contact, or a joint force prior if there are no contacts.
 
@@ -130,28 +103,18 @@ def _surfaces(system: ConstrainedSystem) -> list[str]:
     return [contact.name for contact in system.contacts if isinstance(contact, SurfaceContact)]
 
 
-SETS: dict[str, PriorSet] = {
-    each.name: each
-    for each in (
-        PriorSet("sliding", "contact friction", contact_priors, False, needs_surface=True),
-        PriorSet("friction", "joint and contact friction, torque noise", friction_priors),
-        PriorSet(
-            "friction+residual",
-            "the same, and any joint force that depends on (q, q̇)",
-            friction_and_residual_priors,
-            has_residual=True,
-        ),
-    )
+SETS: dict[str, Callable[[ConstrainedSystem], tuple[ForcePrior, ...]]] = {
+    "sliding": contact_priors,
+    "friction": friction_priors,
+    "friction+residual": friction_and_residual_priors,
 }
-"""Sets for automatic selection with the analytical mean, from the simplest to the most complex."""
-FEW = SETS["friction"]
-"""The set for small data sets."""
+"""Named sets for the analytical mean, from the simplest to the most complex."""
 
 
 def priors_of(
     system: ConstrainedSystem, mean: AnalyticalMean, force_priors: str | Sequence[ForcePrior]
 ) -> tuple[ForcePrior, ...]:
-    """Return the given force priors, or those of a named set. `"auto"` names the set for small data sets.
+    """Return the given force priors, or those of a named set. `"auto"` names those that apply to every log.
 
     Raises:
         UnknownNameError: the set does not exist.
@@ -159,6 +122,6 @@ def priors_of(
     if not isinstance(force_priors, str):
         return tuple(force_priors)
     if force_priors == "auto":
-        return FEW.priors(system) if "actuation" in mean.terms else default_priors(system, mean)
+        return friction_priors(system) if "actuation" in mean.terms else default_priors(system, mean)
     check_name("set of force priors", force_priors, ("auto", *SETS))
-    return SETS[force_priors].priors(system)
+    return SETS[force_priors](system)

@@ -377,9 +377,9 @@ class CompiledFit(Predictor):
         """Return the arrays of states for the C code, and the batch shape."""
         if active is None and self._plain(q, qd, tau):
             return (q, qd, tau, None), q.shape[:-1]
-        *given, batch = flat_states(self.system, q, qd, tau, active)
-        given[:3] = (x.to(self.model.dtype) for x in given[:3])
-        return tuple(x.contiguous() for x in given), batch
+        flat = flat_states(self.system, q, qd, tau, active)
+        given = *(x.to(self.model.dtype) for x in flat[:3]), flat.active
+        return tuple(x.contiguous() for x in given), flat.batch
 
     def _new(self, *shape: int) -> Tensor:
         """Return a new array with the precision of the C code."""

@@ -37,7 +37,8 @@ from forcegp.forces.external_wrench import ROWS, WrenchFrame
 from forcegp.forces.priors import contact
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.inertial import MASS_AND_MOMENT, InertialPrior, PayloadPrior
-from forcegp.forces.priors.joint import TERMS, JointForcePrior, JointFrictionPrior
+from forcegp.forces.priors.joint import TERMS, JointForcePrior
+from forcegp.forces.term import JointState, JointTerm
 from forcegp.gp import kernels
 from forcegp.gp.basis import KernelPart
 from forcegp.gp.features import stacked
@@ -226,16 +227,11 @@ class Mean:
         """Return the inputs, keyed by name. Joint friction has one input per joint."""
         if isinstance(prior, contact.NormalForcePrior):
             return self._raw_inputs(prior.like, slip)
-        if isinstance(prior, JointFrictionPrior):
-            raw = {"velocity": list(self.qd)}
-            for n, speed in enumerate(prior.speeds):
-                raw[f"coulomb_{n}"] = [(v / float(speed)).tanh() for v in self.qd]
-            if slip is not None:
-                raw[f"coulomb_{prior.sharpest}"] = list(slip)
-            if prior.load:
-                signs = [(x.step() * 2.0 - 1.0) * x for x in self.Q_G]
-                raw["load"] = [x * c for x, c in zip(signs, raw["coulomb_0"], strict=True)]
-            return raw
+        if isinstance(prior, JointTerm):
+            load = np.array([(x.step() * 2.0 - 1.0) * x for x in self.Q_G], dtype=object)
+            direction = None if slip is None else np.array(slip, dtype=object)
+            columns = prior.columns(JointState(self.q, self.qd, load, direction))
+            return {name: list(column) for name, column in columns.items()}
         if isinstance(prior, contact.SurfaceForcePrior):
             at = self.touching[self.names.index(prior.contact)]
             square = at.sliding @ at.sliding
@@ -258,8 +254,10 @@ class Mean:
         if isinstance(kernel, kernels.Linear):
             columns = self.parts[p].columns(kernel.inputs)
             slopes = row_of(kernel.slope_std(params), k).expand(len(columns)).tolist()
-            bias = float(row_of(kernel.bias_std(params), k))
-            return [*(x[c] * s for c, s in zip(columns, slopes, strict=True)), self.graph.constant(bias)]
+            lines = [x[c] * s for c, s in zip(columns, slopes, strict=True)]
+            if isinstance(kernel, kernels.Columns):
+                return lines
+            return [*lines, self.graph.constant(float(row_of(kernel.bias_std(params), k)))]
         if isinstance(kernel, kernels.Constant):
             return [self.graph.constant(float(row_of(kernel.std(params), k)))]
         assert isinstance(kernel, kernels.Sum)
@@ -416,9 +414,9 @@ class LearnedMotion(Mean):
             elif isinstance(prior, contact.CoulombErrorPrior | contact.SurfaceForcePrior):
                 Q_z = Q_z + self._contact_operator(prior) @ f
             else:
-                assert isinstance(prior, JointForcePrior | JointFrictionPrior)
+                assert isinstance(prior, JointForcePrior | JointTerm)
                 Q = Q + f
-                Q_F = Q_F + f if isinstance(prior, JointFrictionPrior) else Q_F
+                Q_F = Q_F + f if isinstance(prior, JointTerm) else Q_F
         return Q, Q_z, Q_F
 
     def _latent(self, p: int, first: int, slope: int) -> Scalars:

@@ -26,19 +26,28 @@ from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors import contact, joint
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
+from forcegp.forces.term import JointTerm
 from forcegp.gp.basis import KernelPart, split
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.features import Features, points
-from forcegp.gp.kernels import Constant, Kernel, Linear, Matern32, Matern52, SquaredExponential, Sum, sub
+from forcegp.gp.kernels import (
+    Columns,
+    Constant,
+    Kernel,
+    Linear,
+    Matern32,
+    Matern52,
+    SquaredExponential,
+    Sum,
+    sub,
+)
 from forcegp.gp.sparse import SparsePosterior
 
-PRIORS = (joint.JointForcePrior, joint.JointFrictionPrior, InertialPrior, PayloadPrior)
+PRIORS = (joint.JointForcePrior, InertialPrior, PayloadPrior)
 PRIORS += (contact.NormalForcePrior, contact.SlidingFrictionPrior, contact.ContactForcePrior)
 PRIORS += (contact.CoulombErrorPrior,)
-KERNELS = (Linear, Constant, SquaredExponential, Matern32, Matern52)
+KERNELS = (Linear, Columns, Constant, SquaredExponential, Matern32, Matern52)
 WHY = {
-    "DisturbancePrior": "its force depends on time",
-    "CoregionalPrior": "its components share functions",
     "OperatorForcePrior": "its operator is Python code",
     "PayloadPrior": "it has a known payload, but the code contains only the mechanics of the bare arm",
     "ImplicitSurface": "it is Python code",
@@ -156,7 +165,8 @@ class ExportedModel:
         if not isinstance(self.posterior.process.mean, joint.AnalyticalMean):
             raise _no_c("mean", "Q", self.posterior.process.mean, "an AnalyticalMean")
         for prior in self.posterior.priors:
-            if type(prior) not in PRIORS or (isinstance(prior, PayloadPrior) and prior.known):
+            law = isinstance(prior, JointTerm) or type(prior) in PRIORS
+            if not law or (isinstance(prior, PayloadPrior) and prior.known):
                 raise _no_c("force prior", prior.name, prior, ", ".join(x.__name__ for x in PRIORS))
             _check_kernel(prior.name, prior.kernel)
         for kind, what in ((InertialPrior, "the inertia"), (PayloadPrior, "a payload")):

@@ -1,0 +1,128 @@
+"""Terms: forces that are linear in named columns of the state, Q_i = Σ_c w_ic φ_c(x_i), written once.
+
+A law of joint friction, for example, is a function from the state x_i of a joint to its columns φ. The same
+lines evaluate it for a batch of states in PyTorch and for the scalars of a program
+(`compiled/expression.py`), from which the C code, its Jacobians and the CasADi function are derived. The
+weights w are Gaussian, and their standard deviations follow from the evidence (`learning/evidence.py`).
+"""
+
+from __future__ import annotations
+
+from abc import abstractmethod
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any, ClassVar
+
+import numpy as np
+import torch
+from torch import Tensor
+
+from forcegp.constraints import ConstrainedSystem
+from forcegp.forces.priors.base import JOINT, ForcePrior
+from forcegp.forces.quantities import States
+from forcegp.robot.model import RobotModel
+
+Array = Any
+"""A tensor `(n, nq)`, or a NumPy array `(nq,)` of scalars in a program."""
+SPEEDS = (0.02, 0.1, 0.5)
+"""Saturation speeds of dry friction [rad/s, m/s]: a sharp step and two more gradual transitions."""
+SHARPEST = SPEEDS[0]
+
+
+def exp(x: Array) -> Array:
+    """Return eˣ."""
+    return x.exp() if isinstance(x, Tensor) else np.exp(x)
+
+
+def sqrt(x: Array) -> Array:
+    """Return √x."""
+    return x.sqrt() if isinstance(x, Tensor) else np.sqrt(x)
+
+
+def tanh(x: Array) -> Array:
+    """Return tanh x."""
+    return x.tanh() if isinstance(x, Tensor) else np.tanh(x)
+
+
+def constants(like: Array, values: object) -> Array:
+    """Return constants as a tensor or as a NumPy array, as `like` is."""
+    return like.new_tensor(values) if isinstance(like, Tensor) else np.asarray(values)
+
+
+@dataclass(frozen=True)
+class JointState:
+    """The state of each joint, from which a term computes its columns.
+
+    Attributes:
+        q, qd: positions and velocities [rad, rad/s; m, m/s].
+        load: |Q_G|, the magnitude of the gravity force [N m, N].
+        slip: direction of motion of a joint that may stick, which replaces tanh(q̇/v) in dry friction.
+        history: states z of bristles along a log, one array per distance, or `None` for a state without past.
+    """
+
+    q: Array
+    qd: Array
+    load: Array
+    slip: Array | None = None
+    history: Sequence[Array] | None = None
+
+    def direction(self, speed: float = SHARPEST) -> Array:
+        """Return the direction of motion, tanh(q̇/v) for a saturation speed v [rad/s, m/s]."""
+        return tanh(self.qd / speed) if self.slip is None or speed > SHARPEST else self.slip
+
+
+class PerJointPrior(ForcePrior):
+    """A prior on one force per joint with E = I; subclasses may have a different operator."""
+
+    per_joint = True
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        cls.per_joint = cls.operator is PerJointPrior.operator
+
+    def outputs(self, robot: RobotModel) -> int:
+        return robot.nq
+
+    def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
+        return torch.eye(at.q.shape[-1], dtype=at.q.dtype, device=at.q.device).expand(len(at.q), -1, -1)
+
+
+class JointTerm(PerJointPrior):
+    """A force of each joint that is linear in columns of the state of that joint.
+
+    A subclass is a frozen dataclass with plain fields, a `name`, a kernel such as `Columns()`, and `columns`.
+    It works in fits, predictions, rollouts, wrenches, C, CasADi, written-back robot files and saved models.
+
+    Example:
+        >>> from dataclasses import dataclass, field
+        >>> from forcegp.gp.kernels import Columns
+        >>> @dataclass(frozen=True)
+        ... class Drag(JointTerm):
+        ...     kernel: Columns = field(default_factory=Columns)
+        ...     name: str = "drag"
+        ...
+        ...     def columns(self, x):
+        ...         return {"quadratic": x.qd * x.qd * x.direction(0.1)}
+        >>> JointTerm.laws["drag"] is Drag
+        True
+    """
+
+    target = JOINT
+    centred = False
+    sticks = True
+    laws: ClassVar[dict[str, type[JointTerm]]] = {}
+    """All terms, by the names under which they are saved."""
+
+    def __init_subclass__(cls, **options: Any) -> None:
+        super().__init_subclass__(**options)
+        if isinstance(getattr(cls, "name", None), str):
+            JointTerm.laws[cls.name] = cls
+
+    @abstractmethod
+    def columns(self, x: JointState) -> dict[str, Array]:
+        """Return the named columns φ_c(x_i), each of the shape of `x.qd`."""
+
+    def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
+        history = None if at.history is None else at.history.unbind(-1)
+        x = JointState(at.q, at.qd, at.eom.Q_G.abs(), at.slip, history)
+        return {name: column[..., None] for name, column in self.columns(x).items()}

@@ -1,0 +1,253 @@
+"""Hyperparameters of priors with finitely many columns: scales and noise alternate until neither changes.
+
+1. For given torque noise, the rows of the samples are whitened, and sums over them determine the scales
+   (`evidence.py`).
+2. Torque noise and static friction are unknown forces ε ~ N(0, S) of single rows, with S_j = σ_j² + σ_s,j² k
+   and k = e^{−(q̇/v_s)²}. The residual of a row is r = B ε + e with e ~ N(0, Σ), so Cov r = C = Σ + B S Bᵀ is
+   linear in the variances θ = (σ², σ_s²). One step of Fisher scoring for θ ≥ 0 solves
+
+       min ½ (θ⁺ − θ)ᵀ F (θ⁺ − θ) − gᵀ(θ⁺ − θ),  g_i = ½ Σ c_i [(Bᵀ C⁻¹ r)_i² − (Bᵀ C⁻¹ B)_ii],
+       F_ij = ½ Σ c_i c_j (Bᵀ C⁻¹ B)_ij²   with   c = (1, k),
+
+   in the directions that closed contacts leave free. A variance that the data do not show is zero.
+3. Residuals are correlated in time. If τ is their autocorrelation time, n samples contain as much information
+   as κ n independent ones, κ = 1/τ.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, replace
+from typing import NamedTuple
+
+import scipy.optimize
+import torch
+from torch import Tensor
+
+from forcegp.forces.calibration import autocorrelation_time
+from forcegp.forces.noise import TORQUE_NOISE
+from forcegp.forces.posterior import STICK_NOISE, STICK_SPEED, hidden_variance
+from forcegp.forces.priors.memory import in_time
+from forcegp.forces.problem import Problem, Tensors, basis_of
+from forcegp.forces.quantities import affine_map
+from forcegp.gp.sums import Sums, accumulate
+from forcegp.learning.evidence import (
+    Evidence,
+    Group,
+    families_of,
+    fixed_point,
+    groups_of,
+    with_scales,
+    without_idle,
+)
+
+ROUNDS, SETTLED, NEGLIGIBLE = 20, 0.02, 1e-3
+"""Maximum number of alternations, and largest changes of σ_j at their end, relative to σ_j and to all σ."""
+STEPS, ACCURACY = 20, 1e-3
+"""Maximum number of steps of Fisher scoring in one alternation, and relative change at which they end."""
+LEAST_VARIANCE = 1e-16
+"""Variance of torques that is stored in place of zero [N² m², N²]."""
+LEAST_SHARE = 0.2
+"""Smallest share of the samples that remains after the determined directions are subtracted."""
+MOTIONS = ("qdd", "joint_force")
+"""Quantities that show torque noise: accelerations, and joint forces computed with a force sensor."""
+
+
+@dataclass(frozen=True)
+class Scales:
+    """Columns with their scales, and the noise of rows, after some alternations.
+
+    Attributes:
+        problem: the problem with the likelihood exponent κ.
+        values: the hyperparameters.
+        groups, evidence: the groups of columns, and their evidence.
+        stated: logarithm of the stated scale of each group over its scale in `values` `(g,)`.
+        kept: mask `(g,)` of the groups that are learned and were not dropped.
+        idle: prior and component of the families that were dropped.
+        rounds: number of alternations.
+        converged: whether they ended by themselves.
+    """
+
+    problem: Problem
+    values: Tensors
+    groups: list[Group]
+    evidence: Evidence
+    stated: Tensor
+    kept: Tensor
+    idle: tuple[tuple[int, int], ...] = ()
+    rounds: int = 0
+    converged: bool = False
+
+
+@torch.no_grad()
+def learned_scales(
+    problem: Problem, start: Mapping[str, Tensor], learns: Callable[[str], bool], noisy: bool, prunes: bool
+) -> Scales:
+    """Return the scales of all columns and the torque noise of a problem.
+
+    Args:
+        problem: the problem; all priors have finitely many columns or inducing points.
+        start: initial hyperparameters, whose scales are the stated ones.
+        learns: function that returns whether the scales with a given prefix are learned.
+        noisy: whether torque noise is learned.
+        prunes: whether to drop columns that the evidence does not carry.
+    """
+    groups, sums = _sums(problem, dict(start))
+    kept = torch.tensor([learns(group.key.split(".")[0]) for group in groups])
+    none = fixed_point(sums, groups, sums.v.new_zeros(len(groups)), torch.zeros_like(kept))
+    begin = Scales(problem, dict(start), groups, none, torch.zeros_like(none.log_scales), kept)
+    found = _alternated(begin, noisy)
+    if not prunes:
+        return found
+    families = {key: f for key, f in families_of(groups).items() if bool(kept[f].all())}
+    _, sums = _sums(found.problem, found.values)
+    evidence, left = without_idle(sums, groups, found.stated, kept, list(families.values()))
+    idle = tuple(key for key, family in families.items() if not bool(left[family].any()))
+    return _alternated(_moved(replace(found, kept=left, idle=idle), evidence), noisy)
+
+
+def _sums(problem: Problem, values: Tensors) -> tuple[list[Group], Sums]:
+    basis = basis_of(problem, values)
+    return groups_of(problem.priors, basis), accumulate(basis, problem.rows(values).blocks)
+
+
+def _moved(found: Scales, evidence: Evidence) -> Scales:
+    """Return the columns with the scales of a new fixed point."""
+    values = with_scales(found.values, found.groups, evidence.log_scales)
+    return replace(found, values=values, evidence=evidence, stated=found.stated - evidence.log_scales)
+
+
+def _alternated(found: Scales, noisy: bool) -> Scales:
+    """Alternate between scales and noise until neither changes."""
+    for _ in range(ROUNDS):
+        _, sums = _sums(found.problem, found.values)
+        found = _moved(found, fixed_point(sums, found.groups, found.stated, found.kept))
+        found = replace(found, rounds=found.rounds + 1, converged=not noisy)
+        if not noisy:
+            break
+        before = _noise(found.values)
+        values, power = _with_noise(found.problem, found.values, found.groups, found.evidence)
+        found = replace(found, problem=replace(found.problem, power=power), values=values)
+        size = before.maximum(_noise(values))
+        change = (_noise(values) - before).abs()
+        if bool((change <= SETTLED * size + NEGLIGIBLE * size.amax()).all()):
+            return replace(found, converged=True)
+    return found
+
+
+def _noise(values: Mapping[str, Tensor]) -> Tensor:
+    return values[TORQUE_NOISE].exp()
+
+
+class Residuals(NamedTuple):
+    """Rows of one measurement in units of the noise, projected onto the directions that contacts leave free.
+
+    Attributes:
+        r: residuals `(n, d)`.
+        B: operators `(n, d, nq)` on the joint force.
+        slow: k `(n, nq)`.
+        external: variance `(n, nq)` of unknown forces of given size.
+    """
+
+    r: Tensor
+    B: Tensor
+    slow: Tensor
+    external: Tensor
+
+    def read(self, torque: Tensor, stick: Tensor) -> tuple[Tensor, Tensor]:
+        """Return Bᵀ C⁻¹ r `(n, nq)` and Bᵀ C⁻¹ B `(n, nq, nq)` for variances σ² and σ_s² `(nq,)`."""
+        S = torque + stick * self.slow + self.external
+        C = (self.B * S[:, None]) @ self.B.mT + torch.eye(self.r.shape[-1]).to(S)
+        both = torch.linalg.solve(C, torch.cat([self.B, self.r[..., None]], dim=-1))
+        both = self.B.mT @ both
+        return both[..., -1], both[..., :-1]
+
+
+def residuals(problem: Problem, values: Mapping[str, Tensor], weights: Tensor, i: int) -> Residuals:
+    """Return the residuals of measurement i, given the weights of the basis functions."""
+    m, system, std = problem.training.measurements[i], problem.system, problem.noise_at(values, i)
+    at, process, basis = m.at(system), problem.process_at(values), basis_of(problem, values)
+    z = process.coupled(system, at, affine_map(system, at, m.quantity))
+    rows = process.rows(system, at, z)
+    parts = zip(basis.parts, rows.operators, rows.features, strict=True)
+    Phi = torch.cat([part.rows(W, part.values(x)[0]) for part, W, x in parts], dim=-1)
+    std, weight = std.expand_as(m.values), problem.training.weights
+    r = (m.values - rows.target - (Phi @ weights).view_as(rows.target)) / std
+    B = z.B_Q / std[..., None]
+    if m.quantity == "qdd" and system.m:
+        # 1 − Ã⁺Ã with Ã = A σ
+        A = at.eom.A * std[:, None]
+        N = torch.eye(A.shape[-1]).to(A) - torch.linalg.pinv(A, rtol=1e-9) @ A
+        r, B = (N @ r[..., None])[..., 0], N @ B
+    r = r if weight is None else weight[i].sqrt()[:, None] * r
+    slow = torch.exp(-((m.qd / values[STICK_SPEED].exp()) ** 2))
+    external = hidden_variance({}, at, problem.external_std)
+    return Residuals(r, B, slow, external if m.tau_std is None else external + m.tau_std**2)
+
+
+def _with_noise(
+    problem: Problem, values: Tensors, groups: list[Group], evidence: Evidence
+) -> tuple[Tensors, float]:
+    """Return the hyperparameters with updated torque noise and static friction, and the exponent κ."""
+    motions = [i for i, m in enumerate(problem.training.measurements) if m.quantity in MOTIONS]
+    each = [residuals(problem, values, evidence.weights, i) for i in motions]
+    whole = Residuals(*(torch.cat(part) for part in zip(*each, strict=True)))
+    theta = torch.cat([(2.0 * values[TORQUE_NOISE]).exp(), (2.0 * values[STICK_NOISE]).exp()])
+    gamma = determined_by_joint(problem, groups, evidence)
+    share = (1.0 - gamma / (problem.power * len(whole.r))).clamp(min=LEAST_SHARE).repeat(2)
+    for _ in range(STEPS):
+        new = _scored(whole, theta, share)
+        change = float((new - theta).abs().max() / theta.max())
+        theta = new
+        if change < ACCURACY:
+            break
+    torque, stick = theta.maximum(values[TORQUE_NOISE].new_tensor(LEAST_VARIANCE)).chunk(2)
+    changed = {TORQUE_NOISE: 0.5 * torque.log(), STICK_NOISE: 0.5 * stick.log()}
+    return {**values, **changed}, exponent(problem, motions, each, torque, stick)
+
+
+def _scored(rows: Residuals, theta: Tensor, share: Tensor) -> Tensor:
+    """Return the variances `(2 nq,)` after a step of Fisher scoring."""
+    a, D = rows.read(*theta.chunk(2))
+    c = torch.cat([torch.ones_like(rows.slow), rows.slow], dim=-1)
+    D = D.repeat(1, 2, 2)
+    g = 0.5 * (c * (a.repeat(1, 2).square() / share - D.diagonal(dim1=-2, dim2=-1))).sum(0)
+    F = 0.5 * torch.einsum("ni,nij,nj->ij", c, D.square(), c)
+    # in units of 1/√F_ii, with a small ridge for variances that no row shows
+    unit = F.diagonal().clamp(min=1e-300).rsqrt()
+    F = F * unit[:, None] * unit + 1e-9 * torch.eye(len(F)).to(F)
+    L = torch.linalg.cholesky(F)
+    x = torch.linalg.solve_triangular(L, (F @ (theta / unit) + g * unit)[:, None], upper=False)[:, 0]
+    return torch.from_numpy(scipy.optimize.nnls(L.mT.numpy(), x.numpy())[0]).to(theta) * unit
+
+
+def exponent(
+    problem: Problem, motions: list[int], each: list[Residuals], torque: Tensor, stick: Tensor
+) -> float:
+    """Return κ ≤ 1, one over the autocorrelation time of the residual torque, averaged over the joints.
+
+    ε is estimated by S Bᵀ C⁻¹ r, to whose variance white noise contributes S Bᵀ C⁻² B S.
+    """
+    logs = []
+    for i, rows in zip(motions, each, strict=True):
+        m = problem.training.measurements[i]
+        order = in_time(m.t, m.segment)
+        a, D = rows.read(torque, stick)
+        S = torque + stick * rows.slow + rows.external
+        # Bᵀ C⁻² B = D − D S D, since C⁻¹ = 1 − C⁻¹ B S Bᵀ
+        white = S * (D.diagonal(dim1=-2, dim2=-1) - (D.square() * S[:, None]).sum(-1))
+        signal = (S.sqrt() * a)[order]
+        logs.append(autocorrelation_time(signal, m.segment[order], white.mean(0)).log())
+    return min(1.0, math.exp(-float(torch.stack(logs).mean())))
+
+
+def determined_by_joint(problem: Problem, groups: list[Group], evidence: Evidence) -> Tensor:
+    """Return the number γ `(nq,)` of directions that the data determine, for each joint."""
+    gamma = evidence.weights.new_zeros(problem.system.robot.nq)
+    for group, g in zip(groups, evidence.determined.tolist(), strict=True):
+        if problem.priors[group.prior].per_joint:
+            gamma[group.index[0]] += g
+        else:
+            gamma += g / len(gamma)
+    return gamma
