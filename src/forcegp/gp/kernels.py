@@ -124,12 +124,14 @@ class Linear(Kernel):
     learning cannot set individual slopes to zero. With `shared=True`, all outputs share the σ_d but have
     separate s and σ_0. If `offset` is given, σ_0 is a learned fraction (initially `offset`) of the root mean
     square of the σ_d. All outputs share this fraction, since a single constant does not determine σ_0.
+    Otherwise, `constant` is the ratio of the initial σ_0 and σ_d.
     """
 
     inputs: tuple[str, ...] | None = None
     ard: bool = True
     shared: bool = False
     offset: float | None = None
+    constant: float = 1.0
 
     is_finite = True
 
@@ -142,7 +144,7 @@ class Linear(Kernel):
         slopes = share.new_zeros(1, columns) if self.shared else share[:, None].repeat(1, columns)
         sizes = {"log_slope_std": slopes} | ({"log_std": share} if self.shared else {})
         if self.offset is None:
-            return sizes | {"log_bias_std": share}
+            return sizes | {"log_bias_std": share + math.log(self.constant)}
         return sizes | {"log_offset": share.new_tensor([math.log(self.offset)])}
 
     def slope_std(self, params: Parameters) -> Tensor:

@@ -114,17 +114,20 @@ class JointForcePrior(PerJointPrior):
         return x
 
 
+OFFSET = 0.3
+"""Stated standard deviation of an offset, relative to that of a friction weight. The two are collinear for a
+joint that moves one way, and friction is the likelier cause."""
+
+
 @dataclass(frozen=True)
 class JointFrictionPrior(JointTerm):
     """A prior on the viscous, Coulomb and load-dependent friction and the offset of each joint.
 
     Q_i = w_i·φ(q̇_i) + c_i with φ = (q̇_i, tanh(q̇_i/v_1), tanh(q̇_i/v_2), …, |Q_G,i| tanh(q̇_i/v_1)). The
-    weights w_i and the offset c_i are Gaussian and are marginalised. Three kinds of scales are learned: the
-    friction of each joint, the relevance of each feature, and the ratio of offsets to friction. All joints
-    share the last two. If a joint moved in only one direction, its offset and friction cannot be separated,
-    but the other joints indicate which is likely. With a separate standard deviation for each weight,
-    learning would set most of them to zero, and the model would be overconfident on new motions. A kernel
-    such as `Linear(shared=True, offset=0.3) + SquaredExponential(("velocity",))` adds a smooth remainder.
+    weights w_i and the offset c_i are Gaussian. The evidence determines the standard deviation of each
+    (`learning/evidence.py`). If a joint moved in only one direction, its offset and friction cannot be
+    separated, and the stated deviations divide their sum. A kernel such as `Linear() +
+    SquaredExponential(("velocity",))` adds a smooth remainder.
 
     Args:
         kernel: covariance of each component; linear in the features by default.
@@ -143,7 +146,7 @@ class JointFrictionPrior(JointTerm):
         ModelError: a speed is not positive and finite.
     """
 
-    kernel: Kernel = field(default_factory=Linear)
+    kernel: Kernel = field(default_factory=lambda: Linear(constant=OFFSET))
     speeds: tuple[float, ...] = SPEEDS
     load: bool = True
     name: str = "joint_friction"

@@ -60,8 +60,8 @@ class BristlePrior(JointTerm):
         e, functions = constants(x.qd, self.expected), [*map(x.direction, SPEEDS)]
         columns = {}
         for k in range(count):
-            mean = sum((e[:, v, k] * f for v, f in enumerate(functions)), start=0.0 * x.qd)
-            columns[f"z_{k}"] = z[k] - (1.0 - unknown[k]) * torch.clamp(mean, -1.0, 1.0)
+            mean = torch.stack([e[:, v, k] * f for v, f in enumerate(functions)]).sum(0)
+            columns[f"z_{k}"] = z[k] - (1.0 - unknown[k]) * mean.clamp(-1.0, 1.0)
         return columns
 
     def expecting(self, qd: Tensor, history: Tensor) -> BristlePrior:
