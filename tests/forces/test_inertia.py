@@ -403,29 +403,6 @@ def test_a_partner_is_later_in_the_same_trajectory(file: RobotModel) -> None:
     assert not bool((partners(m[torch.arange(0, len(m.t), 50)]) >= 0).any()), "half a second apart is too far"
 
 
-def test_accelerations_below_the_noise_of_the_torque_damp_the_drives_without_harm_to_torques(
-    file: RobotModel,
-) -> None:
-    """A slow motion: the noise of the torque over the inertia is ten times what was measured."""
-    light = file.replace(mass=0.02 * file.mass, inertia=0.02 * file.inertia)
-    data, test = log(light, speed=0.15), log(light, speed=0.15, seed=1)
-    result = found(light, data)
-    assert (
-        result.per_gain is None
-        and float(result.robot.armature.min()) > 0.0
-        and "the drives have inertia" in result.doubts[0]
-    )
-
-    def errors(robot: RobotModel) -> tuple[Tensor, Tensor]:
-        friction = 0.3 * test.qd + 0.4 * torch.tanh(test.qd / 0.02)
-        torque = test.tau - friction - dynamics.inverse_dynamics(robot, test.q, test.qd, test.qdd)
-        M = dynamics.mass_matrix(robot, test.q)
-        return torque.square().mean(0), torch.linalg.solve(M, torque[..., None])[..., 0].square().mean(0)
-
-    before, after = errors(light), errors(result.robot)
-    assert bool((after[1] < 0.5 * before[1]).all()) and bool((after[0] < 1.1 * before[0]).all())
-
-
 @pytest.mark.parametrize(("free", "warns"), [(20, True), (400, False)])
 def test_a_log_that_cannot_check_the_inertia_says_so(file: RobotModel, free: int, warns: bool) -> None:
     """In contact the multiplier takes what the masses of the file are wrong by."""

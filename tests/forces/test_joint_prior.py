@@ -11,7 +11,8 @@ from forcegp.errors import ModelError
 from forcegp.forces.posterior import ForceProcess
 from forcegp.forces.priors.base import ForcePrior, check_priors
 from forcegp.forces.priors.contact import NormalForcePrior
-from forcegp.forces.priors.joint import AnalyticalMean, DisturbancePrior, JointForcePrior, JointFrictionPrior
+from forcegp.forces.priors.joint import AnalyticalMean, JointForcePrior, JointFrictionPrior
+from forcegp.forces.priors.memory import BristlePrior
 from forcegp.forces.quantities import QUANTITIES, States, affine_map, states
 from forcegp.gp.features import Standardization
 from forces.cases import draw, mixed_contacts, two_contacts
@@ -33,7 +34,7 @@ def operators_of(prior: ForcePrior, quantity: str | list[str]) -> Tensor:
     return ForceProcess((prior,), (scale,), AnalyticalMean()).rows(system, at, z).operators[0]
 
 
-@pytest.mark.parametrize("prior", [JointForcePrior(), JointFrictionPrior(), DisturbancePrior(), Geared()])
+@pytest.mark.parametrize("prior", [JointForcePrior(), JointFrictionPrior(), BristlePrior(), Geared()])
 @pytest.mark.parametrize("quantity", QUANTITIES)
 def test_the_operator_is_that_of_the_quantity_times_that_of_the_prior(
     prior: ForcePrior, quantity: str

@@ -13,6 +13,7 @@ import forcegp
 from forcegp.forces import noise_learning
 from forcegp.forces.measurements import Measurement, Training
 from forcegp.forces.noise import learned_slopes, state_jacobian
+from forcegp.forces.priors.sets import default_priors
 from forcegp.forces.quantities import States, states
 from forcegp.models import structured_learning
 from forcegp.models.structured_fit import StructuredFit
@@ -83,7 +84,8 @@ def measured(seed: int, samples: int = SAMPLES, noisy: bool = True) -> tuple[for
 
 def model(mean: str = "analytical", inference: str = "auto") -> forcegp.StructuredGP:
     noise = forcegp.Noise(0.1, torque=None, state=(Q_STD, QD_STD))
-    return forcegp.StructuredGP(pendulum(), mean, noise=noise, inference=inference)
+    priors = default_priors(pendulum(), mean)
+    return forcegp.StructuredGP(pendulum(), mean, priors, noise=noise, inference=inference)
 
 
 def fitted(seed: int, mean: str = "analytical", inference: str = "auto") -> StructuredFit:

@@ -11,20 +11,21 @@ from pathlib import Path
 
 import pytest
 
-from forcegp import CoregionalPrior, DisturbancePrior, LearningOptions, Noise
+from forcegp import LearningOptions, Noise
 from forcegp.errors import SceneError, UnknownNameError
 from forcegp.forces import priors
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.contact import ContactForcePrior, SlidingFrictionPrior
-from forcegp.forces.priors.joint import AnalyticalMean, JointForcePrior
+from forcegp.forces.priors.joint import AnalyticalMean, JointForcePrior, JointFrictionPrior
+from forcegp.forces.priors.memory import BristlePrior
 from forcegp.gp import kernels
-from forcegp.gp.kernels import Linear, Matern52, OrnsteinUhlenbeck, SquaredExponential, Sum
+from forcegp.gp.kernels import Linear, Matern52, SquaredExponential, Sum
 from forcegp.models.analytical import ADAM, AnalyticalModel, Window
 from forcegp.models.configured import Configured, configured, keys_of
 from forcegp.models.independent_gp import IndependentGP
 from forcegp.models.minibatch import BatchOptions
 from forcegp.models.neural import SHALLOW, NeuralNetwork
-from forcegp.models.structured_file import CLASSES
+from forcegp.models.structured_file import classes
 from forcegp.models.structured_gp import StructuredGP
 from forcegp.models.structured_learning import WITH_PARAMETERS
 from forcegp.scene import load_model_table, load_scene
@@ -97,22 +98,21 @@ learning = { optimizer = "adam", restarts = 3, warm_start = false }
     assert found.options == expected
 
 
-def test_noise_with_tails_disturbances_and_causes(made) -> None:
+def test_noise_with_tails_and_terms(made) -> None:
     found = made("""
 noise = { degrees_of_freedom = 4.0 }
 standardize = false
 [[model.priors]]
-type = "disturbance"
-kernel = { type = "ornstein_uhlenbeck", time = 2.0 }
+type = "joint_friction"
+speeds = [0.05]
 [[model.priors]]
-type = "coregional"
-causes = 2
+type = "bristles"
 [model.learning]
 hyperpriors = false
 """)
     spec = found.model.specification
     assert (spec.noise.degrees_of_freedom, spec.options.standardize) == (4.0, False)
-    assert spec.priors == (DisturbancePrior(OrnsteinUhlenbeck(2.0)), CoregionalPrior(causes=2))
+    assert spec.priors == (JointFrictionPrior(speeds=(0.05,)), BristlePrior())
     assert found.options == LearningOptions(hyperpriors=False)
 
 
@@ -217,7 +217,7 @@ def test_every_option_of_learning_has_a_key(options: type) -> None:
 
 def test_every_prior_and_kernel_of_the_library_can_be_described() -> None:
     """Those that take a function of Python's aside, and what a fit adds of its own."""
-    described = set(CLASSES.values())
+    described = set(classes().values())
     for module, base in ((priors, ForcePrior), (kernels, kernels.Kernel)):
         names = [info.name for info in pkgutil.iter_modules(getattr(module, "__path__", []))]
         found = [module, *(importlib.import_module(f"{module.__name__}.{name}") for name in names)]

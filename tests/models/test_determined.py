@@ -18,8 +18,6 @@ from forcegp.constraints.contact import Constraint
 from forcegp.data import RobotMismatchWarning
 from forcegp.errors import ModelError, NumericalError
 from forcegp.evaluation.predicted import multiplier_scores
-from forcegp.forces.priors.sets import SETS
-from forcegp.models import selection
 from forcegp.models.prediction import Prediction
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.simulate import simulate
@@ -173,20 +171,6 @@ def test_a_model_that_misses_its_data_by_far_says_by_how_much(data: forcegp.Data
         r"fits its training data poorly: residuals are ([\d.]+) times", doubts_of(pushed, **settings)
     )
     assert found is not None and float(found[1]) > 3.0
-
-
-@pytest.mark.slow
-def test_held_out_stretches_show_a_model_that_misses_the_log(
-    data: forcegp.Dataset, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    log = simulate(SYSTEM, replace(SCENE.simulation, duration=6.0)).data[::10]
-    monkeypatch.setattr(selection, "candidates_of", lambda *_: [selection.Candidate(SETS["sliding"])])
-    for push, misses in ((0.0, False), (2.0, True)):
-        pushed = log.replace(tau=log.tau + push * torch.eye(7, dtype=torch.float64)[1])
-        result = forcegp.StructuredGP(SYSTEM, "analytical", noise=0.1).fit(pushed).result
-        (chosen,) = (each for each in result.comparison if each.chosen)
-        assert chosen.coverage is not None and (chosen.coverage < 0.8) == misses
-        assert any(f"±2σ coverage is {chosen.coverage:.0%}" in text for text in result.warnings) == misses
 
 
 def test_options_without_effect_are_said(data: forcegp.Dataset) -> None:

@@ -509,15 +509,13 @@ class Bowl(forcegp.ImplicitSurface):
 @pytest.mark.parametrize(
     ("priors", "named"),
     [
-        ([forcegp.DisturbancePrior()], "'disturbance' cannot .*depends on time.*DisturbancePrior"),
         (
             [JointFrictionPrior(), forcegp.PayloadPrior(known=(1.0, 0.0, 0.0, 0.0))],
             "'payload' cannot .* known payload.*PayloadPrior",
         ),
-        ([forcegp.CoregionalPrior()], "'coregional' cannot .*share functions.*CoregionalPrior"),
         ([forcegp.OperatorForcePrior("wind", 7, lambda s, at: at.eom.M)], "'wind' cannot .*Python code"),
     ],
-    ids=["disturbance", "payload", "coregional", "operator"],
+    ids=["payload", "operator"],
 )
 def test_a_prior_without_a_c_form_is_named(priors: list, named: str, tmp_path: Path) -> None:
     robot = forcegp.load_robot("kuka_iiwa")

@@ -57,7 +57,6 @@ def test_options_are_kept_for_the_fit() -> None:
         SYSTEM, "zero", inference="sparse", inducing_points=7, standardize=False
     ).specification
     assert spec.options == StructuredOptions(inference="sparse", inducing_points=7, standardize=False)
-    assert spec.with_options(inertia="auto").options.inducing_points == 7
 
 
 def test_the_mean_is_analytical_unless_another_is_named() -> None:

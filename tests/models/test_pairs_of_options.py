@@ -15,7 +15,7 @@ import forcegp
 from forcegp.data import DataHeader
 from forcegp.errors import ForceGPError
 from forcegp.forces.priors.inertial import InertialPrior
-from forcegp.forces.priors.joint import CoregionalPrior, DisturbancePrior, JointForcePrior
+from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.gp.kernels import SquaredExponential
 from forcegp.gp.optimise import LearningOptions
 from forcegp.robot.parameters import AnalyticalParameters
@@ -67,8 +67,6 @@ OPTIONS: dict[str, Callable[[Settings], Settings]] = {
     "zero mean": lambda s: s | {"mean": "zero"},
     "joint friction": with_prior(forcegp.JointFrictionPrior),
     "inertial prior": with_prior(InertialPrior),
-    "disturbance": with_prior(DisturbancePrior),
-    "coregional prior": with_prior(CoregionalPrior),
     "analytical parameters": lambda s: s | {"analytical_parameters": theta()},
     "sparse": lambda s: s | {"inference": "sparse", "inducing_points": 6},
     "units": lambda s: s | {"standardize": False},

@@ -105,7 +105,8 @@ def test_a_noise_below_rounding_is_refused(noise: float) -> None:
 def test_noise_learned_from_noise_free_accelerations_warns_and_is_right() -> None:
     system, data, test = drawn("pendulum_wire", 40)
     clean = dataclasses.replace(data, qdd=data.extras["qdd_clean"])
-    fit = forcegp.StructuredGP(system, "analytical", noise=forcegp.Noise(learn=True)).fit(clean)
+    priors = default_priors(system)
+    fit = forcegp.StructuredGP(system, "analytical", priors, noise=forcegp.Noise(learn=True)).fit(clean)
     assert any("ended at their lower bound" in doubt for doubt in fit.result.warnings)
     assert deviation_errors(fit, test) < WITHIN
 

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 
 from forcegp import AnalyticalModel, evaluate
-from forcegp.models.fit_result import Compared
 from forcegp.report.evaluation import error_tables, score_table, write_evaluation
 from forcegp.report.window import opening, predicted_window
 from random_data import random_data, table_system
@@ -73,11 +72,9 @@ def test_logs_that_count_seconds_from_1970_keep_their_digits() -> None:
     assert all(b > a for a, b in pairwise(shown.t))
 
 
-def test_the_comparison_of_force_priors_is_on_the_page(tmp_path: Path) -> None:
-    compared = (
-        Compared("friction", -8.1, 0.88, 0.2, note="dropped after the first half"),
-        Compared("friction, inertia identified", -7.2, 0.0, 0.0, chosen=True),
-    )
-    text = write_evaluation(tmp_path, "m", "d", None, found, window, compared).read_text("utf-8")
-    assert re.search(r"friction, inertia identified(.|\n)*-7\.2(.|\n)*chosen", text)
-    assert "nats per sample" in text and "nats per sample" not in page(tmp_path / "named")
+def test_what_the_learned_forces_are_worth_is_on_the_page(tmp_path: Path) -> None:
+    worth = {"joint_friction of elbow": 12.3, "bristles of elbow": -0.4}
+    text = write_evaluation(tmp_path, "m", "d", None, found, window, worth).read_text("utf-8")
+    assert re.search(r"joint_friction of elbow(.|\n)*12\.3", text)
+    caption = "Log evidence of the learned forces"
+    assert caption in text and caption not in page(tmp_path / "named")
