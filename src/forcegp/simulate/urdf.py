@@ -24,12 +24,27 @@ def write_urdf(robot: RobotModel) -> str:
     root = Element("robot", name=robot.name)
     _link(root, WORLD, 1.0, torch.zeros(3), torch.eye(3), torch.ones(3))
     for i, joint in enumerate(robot.joint_names):
-        moments, axes = torch.linalg.eigh(robot.inertia[i])
-        axes = axes * torch.linalg.det(axes).sign()
+        moments, axes = principal_axes(robot.inertia[i])
         _link(root, link_name(robot, i), float(robot.mass[i]), robot.com[i], axes, moments)
         _joint(root, robot, i, joint)
     indent(root)
     return tostring(root, encoding="unicode")
+
+
+ROUNDING = 1e-12
+"""Relative rounding error of principal moments."""
+
+
+def principal_axes(inertia: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the principal moments in ascending order, and right-handed axes as columns.
+
+    Engines reject a thin plate if rounding makes its largest moment exceed the sum of the others.
+    """
+    moments, axes = torch.linalg.eigh(inertia)
+    low, mid, high = moments.unbind()
+    if low + mid < high <= (low + mid) * (1.0 + ROUNDING):
+        moments = torch.stack([low, mid, low + mid])
+    return moments, axes * torch.linalg.det(axes).sign()
 
 
 def compile_spec(spec: Any, robot: RobotModel) -> Any:
