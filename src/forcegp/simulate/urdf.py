@@ -38,12 +38,13 @@ ROUNDING = 1e-12
 def principal_axes(inertia: Tensor) -> tuple[Tensor, Tensor]:
     """Return the principal moments in ascending order, and right-handed axes as columns.
 
-    Engines reject a thin plate if rounding makes its largest moment exceed the sum of the others.
+    The largest moment of a thin plate is the sum of the others. It is reduced by `ROUNDING`, since engines
+    reject a plate whose largest moment exceeds the sum by rounding.
     """
     moments, axes = torch.linalg.eigh(inertia)
     low, mid, high = moments.unbind()
-    if low + mid < high <= (low + mid) * (1.0 + ROUNDING):
-        moments = torch.stack([low, mid, low + mid])
+    if abs(high - low - mid) <= ROUNDING * high:
+        moments = torch.stack([low, mid, (low + mid) * (1.0 - ROUNDING)])
     return moments, axes * torch.linalg.det(axes).sign()
 
 
