@@ -22,7 +22,7 @@ from importlib.util import find_spec
 from pathlib import Path
 from typing import Any
 
-import mujoco
+import mujoco as mujoco_
 import numpy as np
 import pinocchio
 import torch
@@ -32,9 +32,12 @@ from forcegp import dynamics
 from forcegp.errors import ForceGPError, UnsupportedRobotError
 
 pin: Any = pinocchio
+mujoco: Any = mujoco_
 STATES = 3
 RELATIVE = 1e-6
 """Largest relative difference per joint, scaled by the diagonal of M and the largest force."""
+FLOOR = 1e-6
+"""Force added to the scale, so that the rounding of vanishing forces is no difference [N m, N]."""
 PACKAGES = ("cmeel", "pybullet_data", "mujoco")
 
 
@@ -45,7 +48,9 @@ def folders() -> list[Path]:
         spec = find_spec(name)
         if spec is not None and spec.submodule_search_locations:
             folder = Path(next(iter(spec.submodule_search_locations)))
-            found.append(folder.parent / "cmeel.prefix/share/example-robot-data" if name == "cmeel" else folder)
+            found.append(
+                folder.parent / "cmeel.prefix/share/example-robot-data" if name == "cmeel" else folder
+            )
     return found
 
 
@@ -153,7 +158,7 @@ def compare(path: Path) -> dict[str, Any]:
         scale = np.sqrt(np.diag(reference[0]))
         worst = np.maximum(worst, (np.abs(ours[0] - reference[0]) / np.outer(scale, scale)).max(-1))
         for one, other in zip(ours[1:], reference[1:], strict=True):
-            worst = np.maximum(worst, np.abs(one - other) / (np.abs(other).max() + 1e-9))
+            worst = np.maximum(worst, np.abs(one - other) / (np.abs(other).max() + FLOOR))
     differing = {robot.joint_names[i]: float(worst[i]) for i in np.flatnonzero(~(worst <= RELATIVE))}
     return {
         "outcome": "different" if differing else "equal",

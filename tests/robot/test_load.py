@@ -468,7 +468,9 @@ def test_default_and_undeclared_namespaces_have_no_meaning(tmp_path: Path, head:
     plain = forcegp.load_robot(path)
     path.write_text(path.read_text().replace('<robot name="r">', head + extra))
     assert forcegp.load_robot(path).fingerprint == plain.fingerprint
-    written = forcegp.robot.write_back.write_robot(plain.replace(mass=2.0 * plain.mass), path, tmp_path / "out.urdf")
+    written = forcegp.robot.write_back.write_robot(
+        plain.replace(mass=2.0 * plain.mass), path, tmp_path / "out.urdf"
+    )
     assert {change.figure for change in written.changes} >= {"mass"}
     assert head + extra in (tmp_path / "out.urdf").read_text()
 
@@ -484,9 +486,19 @@ def _on_axis(turn: str, mounted: str) -> list[str]:
         link("upper"),
         link("wrist", ZERO if mounted == "direct" else BALL) if mounted != "tool" else '<link name="wrist"/>',
         link("tool", tool) if mounted == "tool" else "",
-        joint("s", "base", "upper", f'<origin xyz="0.3 0.2 0.7" rpy="{turn}"/><axis xyz="0 0 1"/>', "continuous"),
-        joint("w", "upper", "wrist", f'<origin xyz="0.1 0 0.31" rpy="{turn}"/><axis xyz="0.6 0 0.8"/>', "continuous"),
-        joint("f", "wrist", "tool", '<origin xyz="0.072 -0.12 0.096"/>', "fixed") if mounted == "tool" else "",
+        joint(
+            "s", "base", "upper", f'<origin xyz="0.3 0.2 0.7" rpy="{turn}"/><axis xyz="0 0 1"/>', "continuous"
+        ),
+        joint(
+            "w",
+            "upper",
+            "wrist",
+            f'<origin xyz="0.1 0 0.31" rpy="{turn}"/><axis xyz="0.6 0 0.8"/>',
+            "continuous",
+        ),
+        joint("f", "wrist", "tool", '<origin xyz="0.072 -0.12 0.096"/>', "fixed")
+        if mounted == "tool"
+        else "",
     ]
 
 
@@ -501,3 +513,13 @@ def test_mass_on_the_axis_of_a_joint_is_no_inertia(tmp_path: Path, turn: str, mo
     small = ZERO.replace('"0"', '"1e-7"').replace('xy="1e-7"', 'xy="0"').replace('xz="1e-7"', 'xz="0"')
     path.write_text(path.read_text().replace(ZERO, small.replace('yz="1e-7"', 'yz="0"')))
     assert forcegp.load_robot(path).nq == 2
+
+
+def test_a_robot_without_masses_is_refused_and_no_page_promises_otherwise(tmp_path: Path) -> None:
+    links = (f'<link name="{name}"/>' for name in ("base", "upper", "lower"))
+    path = write(tmp_path, *links, joint("a", "base", "upper"), joint("b", "upper", "lower"))
+    with pytest.raises(InertiaError, match=r"moves without inertia(.|\n)*<inertial>, at least an estimate"):
+        forcegp.load_robot(path)
+    pages = Path(__file__).resolve().parents[2] / "docs"
+    lines = [line for page in pages.rglob("*.md") for line in page.read_text(encoding="utf-8").splitlines()]
+    assert not [line for line in lines if "sgp-zero" in line and "kinematics" in line]

@@ -9,7 +9,6 @@ from typing import Any
 
 import numpy as np
 import pytest
-import torch
 
 import forcegp
 from forcegp import dynamics
@@ -44,7 +43,7 @@ def assert_equal(robot: forcegp.RobotModel, path: Path, held: dict[str, float] |
     for name, q in (held or {}).items():
         data.qpos[model.joint(name).qposadr] = q
     dofs = [int(model.joint(name).dofadr[0]) for name in robot.joint_names]
-    q, qd, qdd, _ = random_states(robot, 3)
+    q, qd = random_states(robot, 3)[:2]
     for k in range(3):
         data.qpos[dofs], data.qvel[dofs] = q[k], qd[k]
         mujoco.mj_forward(model, data)
@@ -61,7 +60,7 @@ def assert_equal(robot: forcegp.RobotModel, path: Path, held: dict[str, float] |
 
 ACTUATORS = {
     "gear": '<motor joint="a" gear="3" armature="0.2" damping="0.3"/>',
-    "several": '<motor joint="a" armature="0.1" damping="1"/><position joint="a" gear="-2" armature="0.1" kp="9"/>',
+    "several": '<motor joint="a" armature="0.1" damping="1"/><position joint="a" gear="-2" armature="0.1"/>',
     "parent": '<velocity jointinparent="c" gear="5" armature="0.02" damping="0.1"/>',
     "classes": '<general joint="b" class="strong"/><motor joint="c"/>',
     "tendon": '<motor tendon="t" gear="3" armature="0.02" damping="0.4"/>',
@@ -73,7 +72,8 @@ ACTUATORS = {
 @pytest.mark.parametrize("kind", ACTUATORS)
 def test_armature_and_damping_of_actuators_act_on_joints(tmp_path: Path, kind: str) -> None:
     rest = (
-        '<default><motor damping="0.05"/><default class="strong"><motor armature="0.4" gear="2"/></default></default>'
+        '<default><motor damping="0.05"/><default class="strong"><motor armature="0.4" gear="2"/></default>'
+        "</default>"
         '<tendon><fixed name="t"><joint joint="b" coef="-2"/></fixed></tendon>'
         f"<actuator>{ACTUATORS[kind]}</actuator>"
     )
@@ -113,8 +113,11 @@ def test_a_tendon_that_couples_joints_is_refused_by_name(tmp_path: Path, attribu
     with pytest.raises(UnsupportedRobotError, match=rf"the {attribute} of tendon 'belt'"):
         forcegp.load_robot(path)
     assert_equal(forcegp.load_robot(path, locked_joints={"a": 0.2}), path, {"a": 0.2})
-    actuated = write(tmp_path, f'<tendon><fixed name="t">{COUPLED}</fixed></tendon><actuator>'
-                     f'<motor name="m" tendon="t" {attribute}="0.1"/></actuator>')
+    actuated = write(
+        tmp_path,
+        f'<tendon><fixed name="t">{COUPLED}</fixed></tendon><actuator>'
+        f'<motor name="m" tendon="t" {attribute}="0.1"/></actuator>',
+    )
     with pytest.raises(UnsupportedRobotError, match=rf"the {attribute} of actuator 'm'"):
         forcegp.load_robot(actuated)
 
@@ -131,7 +134,7 @@ def test_what_the_reader_would_miss_is_found_by_the_comparison(
 ) -> None:
     """A polynomial damping of an actuator, and a reader that forgets armature, gravity or damping."""
     poly = write(tmp_path, '<actuator><motor name="m" joint="b" damping="0.1 0.4"/></actuator>')
-    with pytest.raises(UnsupportedRobotError, match="damping of actuator 'm'|damping at joint 'b'"):
+    with pytest.raises(UnsupportedRobotError, match=r"damping of actuator 'm'|damping at joint 'b'"):
         forcegp.load_robot(poly)
     path = write(tmp_path, '<actuator><motor name="m" joint="b" armature="0.1"/></actuator>')
     monkeypatch.setattr("forcegp.robot.mjcf._drives", lambda *_: iter(()))
@@ -139,8 +142,10 @@ def test_what_the_reader_would_miss_is_found_by_the_comparison(
         forcegp.load_robot(path)
     monkeypatch.undo()
     equations = _Compiled.equations
-    monkeypatch.setattr(_Compiled, "equations", lambda self, state, joints, g: equations(self, state, joints, -g))
-    with pytest.raises(UnsupportedRobotError, match="gravity at joint '[abc]' differs"):
+    monkeypatch.setattr(
+        _Compiled, "equations", lambda self, state, joints, g: equations(self, state, joints, -g)
+    )
+    with pytest.raises(UnsupportedRobotError, match=r"gravity at joint '[abc]' differs"):
         forcegp.load_robot(path)
 
 
@@ -174,7 +179,8 @@ def test_chains_classes_and_held_values_of_equalities(tmp_path: Path) -> None:
         forcegp.load_robot(path)
     # A class switches a constraint off, and a switched-off one may be of any kind.
     off = '<default><default class="off"><equality active="false"/></default></default>'
-    for constraint in ('<joint class="off" joint1="c" joint2="b"/>', '<weld body1="one" body2="two" active="false"/>'):
+    weld = '<weld body1="one" body2="two" active="false"/>'
+    for constraint in ('<joint class="off" joint1="c" joint2="b"/>', weld):
         path = write(tmp_path, f"{off}<equality>{constraint}</equality>")
         assert forcegp.load_robot(path).nq == 3
     held = THREE.replace('name="c"', 'name="c" ref="0.2"')
@@ -198,22 +204,23 @@ def stl(path: Path) -> None:
 
 
 MESHES = {
-    "mass": ("", "", '<geom type="mesh" mesh="v" mass="0"/>'),
-    "density": ("", "", '<geom type="mesh" mesh="v" density="0"/>'),
-    "class": ("", 'mass="0"', '<geom type="mesh" mesh="v" class="visual"/>'),
-    "mesh in class": ("", 'mass="0" type="mesh" mesh="v"', '<geom class="visual"/>'),
-    "group": ("", "", '<geom type="mesh" mesh="v" group="4"/>'),
-    "group in class": ("", 'group="5"', '<geom type="mesh" mesh="v" class="visual"/>'),
-    "fitted": ("", 'density="0"', '<geom type="box" mesh="v" class="visual"/>'),
-    "childclass": ("", 'mass="0"', '<frame childclass="visual"><geom type="mesh" mesh="v"/></frame>'),
+    "mass": ("", '<geom type="mesh" mesh="v" mass="0"/>'),
+    "density": ("", '<geom type="mesh" mesh="v" density="0"/>'),
+    "class": ('mass="0"', '<geom type="mesh" mesh="v" class="visual"/>'),
+    "mesh in class": ('mass="0" type="mesh" mesh="v"', '<geom class="visual"/>'),
+    "group": ("", '<geom type="mesh" mesh="v" group="4"/>'),
+    "group in class": ('group="5"', '<geom type="mesh" mesh="v" class="visual"/>'),
+    "fitted": ('density="0"', '<geom type="box" mesh="v" class="visual"/>'),
+    "childclass": ('mass="0"', '<frame childclass="visual"><geom type="mesh" mesh="v"/></frame>'),
 }
 
 
 @pytest.mark.parametrize("kind", MESHES)
 def test_meshes_without_mass_are_not_needed(tmp_path: Path, kind: str) -> None:
-    _, visual, geom = MESHES[kind]
+    visual, geom = MESHES[kind]
     rest = (
-        f'<compiler inertiagrouprange="0 3"/><default><default class="visual"><geom {visual}/></default></default>'
+        '<compiler inertiagrouprange="0 3"/>'
+        f'<default><default class="visual"><geom {visual}/></default></default>'
         '<asset><mesh name="v" file="v.stl"/></asset>'
     )
     body = f'<body name="arm"><joint name="j" axis="0 1 0"/>{geom}<geom size="0.1" pos="0.2 0 0"/></body>'
@@ -241,7 +248,7 @@ def test_materials_and_several_sections(tmp_path: Path) -> None:
         '<asset><material name="red" rgba="1 0 0 1"/></asset>'
         '<worldbody><site name="s" material="red"/><geom size="0.1" material="red"/></worldbody>'
         f"<worldbody>{THREE}</worldbody>"
-        f'<worldbody><body name="other" pos="1 0 0"><joint name="d" axis="0 1 0"/>{INERTIAL}</body></worldbody>'
+        f'<worldbody><body name="four" pos="1 0 0"><joint name="d"/>{INERTIAL}</body></worldbody>'
         '<tendon><fixed name="t"><joint joint="a" coef="1"/></fixed></tendon>'
         '<actuator><motor name="m" joint="a" armature="0.1"/></actuator>'
         '<actuator><motor name="n" joint="b" armature="0.2"/></actuator>'
@@ -288,6 +295,7 @@ def test_gravity_is_that_of_the_file_unless_stated(tmp_path: Path, option: str, 
 
 def test_a_body_without_inertia_is_named_with_its_joint(tmp_path: Path) -> None:
     """MuJoCo rejects a body without mass; the library rejects mass on the axis of a joint."""
-    light = '<body name="arm"><joint name="j" axis="0 1 0"/><inertial pos="0 0 0" mass="0" diaginertia="0 0 0"/></body>'
+    nothing = '<inertial pos="0 0 0" mass="0" diaginertia="0 0 0"/>'
+    light = f'<body name="arm"><joint name="j" axis="0 1 0"/>{nothing}</body>'
     with pytest.raises(InertiaError, match="at the body of joint 'j'"):
         forcegp.load_robot(write(tmp_path, "", light))

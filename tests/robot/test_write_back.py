@@ -224,7 +224,9 @@ def test_mjcf_with_frames_unnamed_bodies_actuators_and_two_worldbodies(tmp_path:
     for figure in ("mass", "com", "inertia", "damping", "friction", "armature"):
         torch.testing.assert_close(getattr(read, figure), getattr(robot, figure), rtol=1e-8, atol=1e-10)
     model = mujoco.MjModel.from_xml_path(str(out))  # pyright: ignore[reportAttributeAccessIssue]
-    torch.testing.assert_close(torch.from_numpy(model.dof_armature), robot.armature - torch.tensor([0, 0.4, 0]))
+    torch.testing.assert_close(
+        torch.from_numpy(model.dof_armature), robot.armature - torch.tensor([0, 0.4, 0])
+    )
     with pytest.raises(RobotFileError, match="armature of joint 'joint_0' is below that of its actuators"):
         write_robot(robot.replace(armature=0.1 * robot.armature), path, out)
     inside = FRAMES.replace("<inertial", '<frame pos="1 0 0"><inertial').replace('.05"/>', '.05"/></frame>')

@@ -131,7 +131,7 @@ def test_an_unknown_engine_is_named() -> None:
 
 
 def test_a_robot_that_one_engine_cannot_simulate_is_refused_or_simulated_by_the_other() -> None:
-    """Bullet sets moments that violate the triangle inequality to zero, also if rounding alone violates it."""
+    """Bullet sets moments that violate the triangle inequality to zero, even by rounding."""
     pytest.importorskip("pybullet")
     robot = forcegp.load_robot("kuka_iiwa")
     geared = robot.replace(armature=torch.full_like(robot.armature, 0.3))

@@ -187,7 +187,7 @@ def _check_mass_matrix(tree: Tree, placed: _Placed, bodies: list[Inertial]) -> N
         f"{tree.label}: link {joint.child!r} of joint {joint.name!r} moves without inertia",
         expected="mass beyond every moving joint, for a positive definite mass matrix",
         got=f"link mass {mass:g} kg, and no link beyond it that resists the motion",
-        hint="give the link an <inertial>, or lock the joint with locked_joints",
+        hint="give the link an <inertial>, at least an estimate, or lock the joint with locked_joints",
     )
 
 
@@ -223,17 +223,19 @@ def _rigid_body(
 
 
 def _compare(tree: Tree, placed: _Placed, bodies: list[Inertial]) -> None:
-    """Compare M, Q_G and Q_D with the reference of the file at random states; raise `UnsupportedRobotError`."""
+    """Compare M, Q_G and Q_D with the reference at random states; raise `UnsupportedRobotError`."""
     if tree.reference is None:
         return
     random, moving = np.random.default_rng(0), placed.moving
     held = {joint.name: (joint.locked, 0.0) for joint in tree.joints if joint.locked is not None}
-    armature, damping = (np.array([getattr(joint, name) for joint in moving]) for name in ("armature", "damping"))
+    armature, damping = (
+        np.array([getattr(joint, name) for joint in moving]) for name in ("armature", "damping")
+    )
     for _ in range(COMPARED):
         q, qd, gravity = (random.uniform(-1.0, 1.0, n) for n in (len(moving), len(moving), 3))
         state = {joint.name: (x, xd) for joint, x, xd in zip(moving, q, qd, strict=True)}
         theirs = tree.reference.equations(state | held, list(state), gravity)
-        M, Q_G, size = _rigid_body(placed, bodies, q, gravity)
+        M, Q_G, _ = _rigid_body(placed, bodies, q, gravity)
         M += np.diag(armature)
         scale = np.sqrt(np.diag(M))
         checks = {
@@ -246,9 +248,7 @@ def _compare(tree: Tree, placed: _Placed, bodies: list[Inertial]) -> None:
                 raise _different(tree, moving, name, difference)
 
 
-def _different(
-    tree: Tree, moving: list[Joint], name: str, difference: np.ndarray
-) -> UnsupportedRobotError:
+def _different(tree: Tree, moving: list[Joint], name: str, difference: np.ndarray) -> UnsupportedRobotError:
     """Return the error for a force or inertia in the file that the robot does not have."""
     names = {joint.name for joint in moving}
     acting = [d for d in tree.drives if not d.ratios or len(names & d.ratios.keys()) > 1]

@@ -96,7 +96,7 @@ def _names(kind: str, names: list[str]) -> list[str]:
 
 
 class _Compiled:
-    """MuJoCo's model of a file as the `Reference` of the robot, without contacts, limits and tendon springs."""
+    """MuJoCo's model of a file as the `Reference`, without contacts, limits and tendon springs."""
 
     def __init__(self, model: Any, joint_names: list[str]) -> None:
         disabled = mujoco.mjtDisableBit
@@ -185,7 +185,7 @@ def _compile(document: Element, path: Path) -> Any:
 
 
 def _drop_meshes(spec: Any, path: Path) -> None:
-    """Delete geoms that need a file; raise `UnsupportedRobotError` if a moving body takes inertia from one."""
+    """Delete geoms that need a file; raise `UnsupportedRobotError` if a body takes its inertia from one."""
     compiler = spec.compiler
     for body, moves in _bodies(spec.worldbody, False):
         for geom in list(body.geoms):
@@ -193,8 +193,9 @@ def _drop_meshes(spec: Any, path: Path) -> None:
             if not from_file:
                 continue
             if (moves or compiler.settotalmass > 0.0) and _has_mass(geom, body, compiler):
+                name = body.name or "(unnamed)"
                 raise UnsupportedRobotError(
-                    f"{path}: body {body.name or '(unnamed)'!r} takes its inertia from the mesh {from_file!r}",
+                    f"{path}: body {name!r} takes its inertia from the mesh {from_file!r}",
                     expected="an <inertial>, or geoms that are primitive shapes",
                     hint="copy the inertia that MuJoCo computes from the mesh into an <inertial>",
                 )
@@ -275,7 +276,11 @@ def _drives(model: Any, names: list[str]) -> Iterator[Drive]:
             _parameter(model, "tendon_frictionloss", t),
         )
     for a in range(model.nu):
-        kind, target, gear = int(model.actuator_trntype[a]), model.actuator_trnid[a, 0], model.actuator_gear[a, 0]
+        kind, target, gear = (
+            int(model.actuator_trntype[a]),
+            model.actuator_trnid[a, 0],
+            model.actuator_gear[a, 0],
+        )
         ratios = {names[target]: 1.0} if kind in joint_types else {}
         ratios = tendons[target] if kind == int(mujoco.mjtTrn.mjTRN_TENDON) else ratios
         yield Drive(

@@ -22,15 +22,16 @@ _COMPILER = (
     "eulerseq", "inertiafromgeom", "inertiagrouprange", "alignfree",
 )  # fmt: skip
 _OF_PLUGINS = (
-    "name", "class", "joint", "jointinparent", "tendon", "gear", "forcerange", "forcelimited", "armature", "damping",
+    "name", "class", "joint", "jointinparent", "tendon", "gear", "forcerange", "forcelimited", "armature",
+    "damping",
 )  # fmt: skip
 """Attributes that an actuator of a plugin shares with other actuators."""
 _LOOKS = ("user", "material")
 _EQUALITIES = ("joint", "tendon", "connect", "weld")
 _WORDS = (
-    "name", "class", "childclass", "joint", "joint1", "joint2", "jointinparent", "tendon", "tendon1", "tendon2",
-    "body", "body1", "body2", "site", "site1", "site2", "refsite", "cranksite", "slidersite", "sidesite", "geom",
-    "mesh", "hfield",
+    "name", "class", "childclass", "joint", "joint1", "joint2", "jointinparent", "tendon", "tendon1",
+    "tendon2", "body", "body1", "body2", "site", "site1", "site2", "refsite", "cranksite", "slidersite",
+    "sidesite", "geom", "mesh", "hfield",
 )  # fmt: skip
 """Attributes that are names and not numbers."""
 

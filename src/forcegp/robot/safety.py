@@ -33,7 +33,7 @@ class _BoundedBuilder(ContentHandler):
         super().__init__()
         self.tree, self._label, self._count, self._depth = TreeBuilder(), label, 0, 0
 
-    def startElement(self, name: str, attrs: AttributesImpl) -> None:  # noqa: N802
+    def startElement(self, name: str, attrs: AttributesImpl) -> None:
         self._count += 1
         self._depth += 1
         if self._count > MAX_ELEMENTS:
@@ -44,7 +44,7 @@ class _BoundedBuilder(ContentHandler):
             raise RobotFileError(text, expected=f"at most {MAX_DEPTH} levels", got=f"more, at <{name[:60]}>")
         self.tree.start(name, dict(attrs))
 
-    def endElement(self, name: str) -> None:  # noqa: N802
+    def endElement(self, name: str) -> None:
         self._depth -= 1
         self.tree.end(name)
 

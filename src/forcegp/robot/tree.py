@@ -175,7 +175,9 @@ def lock_joints(tree: Tree, locked: Mapping[str, float]) -> Tree:
         if name in locked and (follows.leader in held or not follows.leader):
             q = follows.position(held.get(follows.leader, 0.0))
             if abs(held[name] - q) > ROUNDING * max(1.0, abs(q)):
-                remarks.append(f"{tree.label}: joint {name!r} is locked at {held[name]:g}; the file says {q:g}")
+                remarks.append(
+                    f"{tree.label}: joint {name!r} is locked at {held[name]:g}; the file says {q:g}"
+                )
 
     def lock(joint: Joint) -> Joint:
         if joint.kind == "fixed" or joint.name not in held:

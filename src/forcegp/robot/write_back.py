@@ -119,9 +119,7 @@ def _world(robot: RobotModel) -> dict[str, np.ndarray]:
     return {name: getattr(robot, name).numpy() for name in ("base_rotation", "base_position", "gravity")}
 
 
-def _joint_changes(
-    writer: _Urdf | _Mjcf, tree: Tree, robot: RobotModel, file: RobotModel
-) -> list[Change]:
+def _joint_changes(writer: _Urdf | _Mjcf, tree: Tree, robot: RobotModel, file: RobotModel) -> list[Change]:
     """Write changed joint parameters, without those of other drives, and return the changes."""
     changes, joints = [], {joint.name: joint for joint in tree.joints}
     for i, joint in enumerate(robot.joint_names):

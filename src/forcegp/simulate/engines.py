@@ -33,7 +33,9 @@ COMPARED, DIFFERENT = 2, 1e-6
 """Number of random states at which an engine is compared with the robot; largest relative difference."""
 
 
-def compare(robot: RobotModel, engine: str, equations: Callable[[JointVector], tuple[Tensor, Tensor]]) -> None:
+def compare(
+    robot: RobotModel, engine: str, equations: Callable[[JointVector], tuple[Tensor, Tensor]]
+) -> None:
     """Compare an engine's M and Q_G as functions of q with those of the robot at random positions.
 
     Raises:
@@ -264,8 +266,8 @@ def make_engine(robot: RobotModel, dt: float, name: str = "auto") -> Engine:
     Args:
         robot: the robot.
         dt: step size [s].
-        name: `"pybullet"`, `"mujoco"`, or `"auto"` for PyBullet if it is installed and supports the robot, and
-            MuJoCo otherwise.
+        name: `"pybullet"`, `"mujoco"`, or `"auto"` for PyBullet if it is installed and supports the robot,
+            and MuJoCo otherwise.
 
     Example:
         >>> import torch, forcegp
