@@ -188,7 +188,7 @@ def test_chains_classes_and_held_values_of_equalities(tmp_path: Path) -> None:
     with pytest.raises(UnsupportedRobotError, match=r"'c' is held in place(.|\n)*\{'c': 0.5\}"):
         forcegp.load_robot(path)
     assert_equal(forcegp.load_robot(path, locked_joints={"c": 0.5}), path, {"c": 0.5})
-    with pytest.warns(RobotFileWarning, match=r"'c' is locked at 0.4; the file says 0.5"):
+    with pytest.warns(RobotFileWarning, match=r"'c' is locked at 0.4, and in the file at 0.5"):
         forcegp.load_robot(path, locked_joints={"c": 0.4})
     twice = '<joint joint1="c" joint2="b"/><joint joint1="c" joint2="a"/>'
     with pytest.raises(UnsupportedRobotError, match="'c' has several equality constraints"):

@@ -176,7 +176,7 @@ def lock_joints(tree: Tree, locked: Mapping[str, float]) -> Tree:
             q = follows.position(held.get(follows.leader, 0.0))
             if abs(held[name] - q) > ROUNDING * max(1.0, abs(q)):
                 remarks.append(
-                    f"{tree.label}: joint {name!r} is locked at {held[name]:g}; the file says {q:g}"
+                    f"{tree.label}: joint {name!r} is locked at {held[name]:g}, and in the file at {q:g}"
                 )
 
     def lock(joint: Joint) -> Joint:
