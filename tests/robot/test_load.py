@@ -16,6 +16,7 @@ import torch
 from scipy.spatial.transform import Rotation
 
 import forcegp
+import forcegp.robot.write_back
 from forcegp import dynamics, kinematics
 from forcegp.errors import (
     InertiaError,
@@ -339,6 +340,7 @@ def test_urdf_needs_no_mujoco(tmp_path: Path) -> None:
 import sys
 sys.modules["mujoco"] = None  # as if it were not installed
 import forcegp
+import forcegp.robot.write_back
 assert forcegp.load_robot("kuka_iiwa").nq == 7
 try:
     forcegp.load_robot({str(tmp_path / "arm.xml")!r})
@@ -450,3 +452,74 @@ def test_a_walking_robot_without_a_base_joint_is_said_to_be_held(file: str, limb
     assert len(held) == (1 if limbs else 0)
     assert all(f"with {limbs} limbs" in text and "floating base" in text for text in held)
     assert [text for text in robot.remarks if "no joint connects" in text] == held
+
+
+@pytest.mark.parametrize(
+    ("head", "extra"),
+    [
+        ('<robot name="r" xmlns="http://www.ros.org">', ""),
+        ('<robot name="r" xmlns:xacro="http://www.ros.org/wiki/xacro">', ""),
+        ('<robot name="r">', '<gazebo><sensor:camera name="c"><a:b c:d="1"/></sensor:camera></gazebo>'),
+        ('<robot name="r" xsi:schemaLocation="x y">', '<controller:gripper controller:name="g"/>'),
+    ],
+)
+def test_default_and_undeclared_namespaces_have_no_meaning(tmp_path: Path, head: str, extra: str) -> None:
+    path = arm(tmp_path)
+    plain = forcegp.load_robot(path)
+    path.write_text(path.read_text().replace('<robot name="r">', head + extra))
+    assert forcegp.load_robot(path).fingerprint == plain.fingerprint
+    written = forcegp.robot.write_back.write_robot(
+        plain.replace(mass=2.0 * plain.mass), path, tmp_path / "out.urdf"
+    )
+    assert {change.figure for change in written.changes} >= {"mass"}
+    assert head + extra in (tmp_path / "out.urdf").read_text()
+
+
+ZERO = '<inertia ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"/>'
+
+
+def _on_axis(turn: str, mounted: str) -> list[str]:
+    """An arm whose last link is a point mass on the axis of the last joint `w`, up to rounding."""
+    tool = f'<origin xyz="0 0.12 0" rpy="0 0 0"/>{ZERO}'
+    return [
+        '<link name="base"/>',
+        link("upper"),
+        link("wrist", ZERO if mounted == "direct" else BALL) if mounted != "tool" else '<link name="wrist"/>',
+        link("tool", tool) if mounted == "tool" else "",
+        joint(
+            "s", "base", "upper", f'<origin xyz="0.3 0.2 0.7" rpy="{turn}"/><axis xyz="0 0 1"/>', "continuous"
+        ),
+        joint(
+            "w",
+            "upper",
+            "wrist",
+            f'<origin xyz="0.1 0 0.31" rpy="{turn}"/><axis xyz="0.6 0 0.8"/>',
+            "continuous",
+        ),
+        joint("f", "wrist", "tool", '<origin xyz="0.072 -0.12 0.096"/>', "fixed")
+        if mounted == "tool"
+        else "",
+    ]
+
+
+@pytest.mark.parametrize("turn", ["0 0 0", "1.5707963267948966 0 0.3", "1.5708 -1.5708 0", "0.1 0.7 -2.3"])
+@pytest.mark.parametrize("mounted", ["direct", "tool"])
+def test_mass_on_the_axis_of_a_joint_is_no_inertia(tmp_path: Path, turn: str, mounted: str) -> None:
+    """Its moment is zero up to rounding. With an inertia of 1e-7 kg m² the arm loads."""
+    path = write(tmp_path, *_on_axis(turn, mounted))
+    with pytest.raises(InertiaError, match="of joint 'w' moves without inertia"):
+        forcegp.load_robot(path)
+    assert forcegp.load_robot(path, locked_joints={"w": 0.1}).nq == 1
+    small = ZERO.replace('"0"', '"1e-7"').replace('xy="1e-7"', 'xy="0"').replace('xz="1e-7"', 'xz="0"')
+    path.write_text(path.read_text().replace(ZERO, small.replace('yz="1e-7"', 'yz="0"')))
+    assert forcegp.load_robot(path).nq == 2
+
+
+def test_a_robot_without_masses_is_refused_and_no_page_promises_otherwise(tmp_path: Path) -> None:
+    links = (f'<link name="{name}"/>' for name in ("base", "upper", "lower"))
+    path = write(tmp_path, *links, joint("a", "base", "upper"), joint("b", "upper", "lower"))
+    with pytest.raises(InertiaError, match=r"moves without inertia(.|\n)*<inertial>, at least an estimate"):
+        forcegp.load_robot(path)
+    pages = Path(__file__).resolve().parents[2] / "docs"
+    lines = [line for page in pages.rglob("*.md") for line in page.read_text(encoding="utf-8").splitlines()]
+    assert not [line for line in lines if "sgp-zero" in line and "kinematics" in line]

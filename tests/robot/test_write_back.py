@@ -190,3 +190,46 @@ def test_a_small_change_is_written_or_left_but_not_refused(source: str, size: fl
     found = forcegp.load_robot(tmp_path / "small.urdf")
     sizes = wanted.inertia.abs().flatten(1).amax(-1) + 1e-7
     assert bool(((found.inertia - wanted.inertia).abs().flatten(1).amax(-1) <= 1e-5 * sizes).all())
+
+
+FRAMES = """<mujoco model="two_arms">
+  <worldbody>
+    <frame pos="0.5 0 0" euler="0 0 30">
+      <body>
+        <frame euler="0 90 0"><joint axis="0 0 1"/></frame>
+        <inertial pos="0 0 .1" mass="1" diaginertia=".1 .1 .05"/>
+        <body name="body_1" pos="0 0 .2">
+          <joint name="joint_0" axis="0 1 0" armature="0.02"/><geom size="0.1" pos="0 0.1 0"/>
+        </body>
+      </body>
+    </frame>
+  </worldbody>
+  <worldbody>
+    <body name="other" pos="1 0 0"><joint name="j" axis="0 1 0"/><geom size="0.1" pos="0 0.1 0"/></body>
+  </worldbody>
+  <actuator><motor joint="joint_0" gear="2" armature="0.1" damping="0.2"/></actuator>
+</mujoco>
+"""
+
+
+def test_mjcf_with_frames_unnamed_bodies_actuators_and_two_worldbodies(tmp_path: Path) -> None:
+    """Names of unnamed bodies do not hide others, and what an actuator adds is not written to its joint."""
+    path, out = tmp_path / "arm.xml", tmp_path / "out.xml"
+    path.write_text(FRAMES)
+    file = forcegp.load_robot(path)
+    robot = changed(file, 0.02)
+    robot = robot.replace(armature=robot.armature + 0.05)
+    write_robot(robot, path, out)
+    read = forcegp.load_robot(out)
+    for figure in ("mass", "com", "inertia", "damping", "friction", "armature"):
+        torch.testing.assert_close(getattr(read, figure), getattr(robot, figure), rtol=1e-8, atol=1e-10)
+    model = mujoco.MjModel.from_xml_path(str(out))  # pyright: ignore[reportAttributeAccessIssue]
+    torch.testing.assert_close(
+        torch.from_numpy(model.dof_armature), robot.armature - torch.tensor([0, 0.4, 0])
+    )
+    with pytest.raises(RobotFileError, match="armature of joint 'joint_0' is below that of its actuators"):
+        write_robot(robot.replace(armature=0.1 * robot.armature), path, out)
+    inside = FRAMES.replace("<inertial", '<frame pos="1 0 0"><inertial').replace('.05"/>', '.05"/></frame>')
+    path.write_text(inside)
+    with pytest.raises(RobotFileError, match="<inertial> of body 'body_1_' is inside a <frame>"):
+        write_robot(changed(forcegp.load_robot(path), 0.02), path, out)

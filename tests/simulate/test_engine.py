@@ -128,3 +128,41 @@ def test_impossible_inertia_is_an_error_that_names_the_link() -> None:
 def test_an_unknown_engine_is_named() -> None:
     with pytest.raises(UnknownNameError, match="did you mean 'mujoco'"):
         make_engine(forcegp.load_robot("kuka_iiwa"), DT, "mujoko")
+
+
+def test_a_robot_that_one_engine_cannot_simulate_is_refused_or_simulated_by_the_other() -> None:
+    """Bullet sets moments that violate the triangle inequality to zero, even by rounding."""
+    pytest.importorskip("pybullet")
+    robot = forcegp.load_robot("kuka_iiwa")
+    geared = robot.replace(armature=torch.full_like(robot.armature, 0.3))
+    with closing(make_engine(geared, DT, "auto")) as engine:
+        assert engine.name.startswith("mujoco")
+    inertia = robot.inertia.clone()
+    inertia[5] = torch.diag(torch.tensor([0.1, 0.1, 0.201], dtype=torch.float64))
+    for name in ("auto", *ENGINES):
+        with pytest.raises(InertiaError, match=robot.joint_names[5]):
+            make_engine(robot.replace(inertia=inertia), DT, name)
+
+
+@pytest.mark.parametrize("engine_name", ENGINES)
+def test_a_thin_plate_is_simulated_in_any_orientation(engine_name: str) -> None:
+    """Moments (a, b, a + b) in turned axes obey the triangle inequality only up to rounding."""
+    pytest.importorskip(engine_name)
+    robot = forcegp.load_robot("kuka_iiwa")
+    generator = torch.Generator().manual_seed(2)
+    axes = torch.linalg.qr(torch.randn(7, 3, 3, dtype=torch.float64, generator=generator))[0]
+    moments = torch.tensor([[0.02, 0.02, 0.04], [0.01, 0.02, 0.03]], dtype=torch.float64).repeat(4, 1)[:7]
+    inertia = axes @ torch.diag_embed(moments) @ axes.mT
+    flat = robot.replace(inertia=0.5 * (inertia + inertia.mT))
+    with closing(make_engine(flat, DT, engine_name)) as engine:
+        report = check_engine(ConstrainedSystem(flat), engine, torch.Generator().manual_seed(0), states=5)
+    assert report.mass_matrix < FORCES
+
+
+def test_an_engine_with_another_robot_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Whatever an engine makes of a file, its dynamics are compared with the robot before it is used."""
+    robot = forcegp.load_robot("kuka_iiwa")
+    heavier = robot.replace(mass=robot.mass * torch.tensor([1.0] * 6 + [1.001], dtype=torch.float64))
+    monkeypatch.setattr("forcegp.simulate.engines.write_urdf", lambda _: write_urdf(heavier))
+    with pytest.raises(UnsupportedRobotError, match=r"simulates a different robot(.|\n)*relative"):
+        make_engine(robot, DT, "mujoco")

@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import warnings
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -30,11 +30,18 @@ from forcegp.robot.urdf import read_urdf
 
 FRICTION_VELOCITY = 0.1
 """Default speed scale of Coulomb friction [rad/s, m/s], which robot files do not specify."""
-SINGULAR = 1e-12
-"""Eigenvalue of the scaled mass matrix below which the matrix counts as singular in double precision."""
+SINGULAR, WEIGHTLESS = 1e-12, 1e-10
+"""Eigenvalue of the scaled mass matrix below which the matrix counts as singular in double precision; inertia
+of a joint below which it counts as zero, relative to the mass that it moves times its distance squared. Axes
+in files have about six digits, so mass on the axis of a joint contributes about 1e-11."""
+COMPARED, DIFFERENT = 3, 1e-6
+"""Number of random states at which a robot is compared with MuJoCo's model of the file; largest relative
+difference. MuJoCo's rounding of inertias is about 1e-9."""
 LIMB_JOINTS, WALKING_JOINTS, BODY_MASS = 2, 6, 1.0
 """Minimum number of joints in a limb; minimum number of joints and base mass [kg] of a robot that may walk
 (hands are lighter)."""
+GRAVITY, UNUSUAL = (0.0, 0.0, -9.81), 0.1
+"""Gravitational acceleration unless the caller or the file states it; deviation that causes a note [m/s²]."""
 OF_JOINTS = ("axis", "damping", "friction", "armature", "lower", "upper", "velocity_limit", "effort_limit")
 """Joint attributes that are copied unchanged from the file."""
 
@@ -52,9 +59,11 @@ class _Placed:
 def robot_of(tree: Tree, world: Mapping[str, np.ndarray]) -> RobotModel:
     """Build the robot from a tree; raise typed errors for ambiguous frames and for motion without inertia."""
     remarks, placed = list(tree.remarks), _place(tree.joints)
+    remarks += _apply_drives(tree, placed)
     bodies = _merge(tree, placed)
     remarks += _held_base(tree, placed)
     _check_mass_matrix(tree, placed, bodies)
+    _compare(tree, placed, bodies)
     frames = _frames(tree, placed, remarks)
     for remark in remarks:
         warnings.warn(remark, RobotFileWarning, stacklevel=3)
@@ -135,46 +144,125 @@ def _sum(bodies: list[Inertial]) -> Inertial:
     return Inertial(mass, com, 0.5 * (inertia + inertia.T))
 
 
+def _apply_drives(tree: Tree, placed: _Placed) -> list[str]:
+    """Add drives that act on one moving joint to that joint. Return a note for each friction that is lost.
+
+    Armature and damping of other drives are left out, so `_compare` finds them.
+    """
+    index = {joint.name: i for i, joint in enumerate(placed.moving)}
+    remarks = []
+    for drive in tree.drives:
+        ratios = {index[name]: ratio for name, ratio in drive.ratios.items() if ratio and name in index}
+        if len(ratios) == 1:
+            ((i, ratio),) = ratios.items()
+            joint, square = placed.moving[i], ratio * ratio
+            placed.moving[i] = replace(
+                joint,
+                armature=joint.armature + square * drive.armature,
+                damping=joint.damping + square * drive.damping,
+                friction=joint.friction + abs(ratio) * drive.friction,
+            )
+        elif drive.friction and (ratios or not drive.ratios):
+            remarks.append(f"{tree.label}: the frictionloss of {drive.name} is ignored")
+    return remarks
+
+
 def _check_mass_matrix(tree: Tree, placed: _Placed, bodies: list[Inertial]) -> None:
     """Reject robots that can move without kinetic energy. The test uses a generic configuration."""
-    M = _mass_matrix(placed, bodies) + np.diag([joint.armature for joint in placed.moving])
-    scale = np.sqrt(np.diag(M))
-    if scale.min() > 0.0:
+    # The golden ratio spreads the joint positions, so that no axes are aligned by coincidence.
+    q = 0.3 + (0.618034 * np.arange(1, len(bodies) + 1)) % 1.0
+    rigid, _, size = _rigid_body(placed, bodies, q, np.zeros(3))
+    M = rigid + np.diag([joint.armature for joint in placed.moving])
+    light = np.flatnonzero(np.diag(M) <= WEIGHTLESS * size)
+    if len(light) == 0:
+        scale = np.sqrt(np.diag(M))
         values, vectors = np.linalg.eigh(M / np.outer(scale, scale))
         if values[0] > SINGULAR:
             return
         index = int(np.abs(vectors[:, 0]).argmax())
     else:
-        index = int(scale.argmin())
+        index = int(light[-1])
     joint, mass = placed.moving[index], bodies[index].mass
     raise InertiaError(
         f"{tree.label}: link {joint.child!r} of joint {joint.name!r} moves without inertia",
         expected="mass beyond every moving joint, for a positive definite mass matrix",
         got=f"link mass {mass:g} kg, and no link beyond it that resists the motion",
-        hint="give the link an <inertial>, or lock the joint with locked_joints",
+        hint="give the link an <inertial>, at least an estimate, or lock the joint with locked_joints",
     )
 
 
-def _mass_matrix(placed: _Placed, bodies: list[Inertial]) -> np.ndarray:
+def _rigid_body(
+    placed: _Placed, bodies: list[Inertial], q: np.ndarray, gravity: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Return M without armature, Q_G, and Σ m d² of the mass beyond each joint at distance d from its origin.
+
+    The distance includes those of both points from the base, since they determine the rounding error.
+    """
     n = len(placed.moving)
     axes, origins = np.zeros((n, 3)), np.zeros((n, 3))
     poses, moves, M = list[np.ndarray](), np.zeros((n, n), dtype=bool), np.zeros((n, n))
+    Q_G, size = np.zeros(n), np.zeros(n)
     turns = np.array([joint.kind == "revolute" for joint in placed.moving])
     for i, joint in enumerate(placed.moving):
         parent = placed.parents[i]
         start = placed.placements[i] if parent == BASE else poses[parent] @ placed.placements[i]
-        # The golden ratio spreads the joint positions, so that no axes are aligned by coincidence.
-        poses.append(start @ joint_motion(joint.kind, joint.axis, 0.3 + (0.618034 * (i + 1)) % 1.0))
+        poses.append(start @ joint_motion(joint.kind, joint.axis, float(q[i])))
         axes[i], origins[i] = start[:3, :3] @ joint.axis, start[:3, 3]
         moves[i] = moves[parent] if parent != BASE else False
         moves[i, i] = True
         J = np.flatnonzero(moves[i])
         R, body = poses[i][:3, :3], bodies[i]
-        arm = R @ body.com + poses[i][:3, 3] - origins[J]
+        com = R @ body.com + poses[i][:3, 3]
         w = axes[J] * turns[J, None]
-        v = np.where(turns[J, None], np.cross(axes[J], arm), axes[J])
+        v = np.where(turns[J, None], np.cross(axes[J], com - origins[J]), axes[J])
         M[np.ix_(J, J)] += body.mass * v @ v.T + w @ (R @ body.inertia @ R.T) @ w.T
-    return M
+        Q_G[J] += body.mass * v @ gravity
+        distance = np.linalg.norm(com) + np.linalg.norm(origins[J], axis=-1)
+        size[J] += body.mass * np.where(turns[J], distance**2, 1.0)
+    return M, Q_G, size
+
+
+def _compare(tree: Tree, placed: _Placed, bodies: list[Inertial]) -> None:
+    """Compare M, Q_G and Q_D with the reference at random states; raise `UnsupportedRobotError`."""
+    if tree.reference is None:
+        return
+    random, moving = np.random.default_rng(0), placed.moving
+    held = {joint.name: (joint.locked, 0.0) for joint in tree.joints if joint.locked is not None}
+    armature, damping = (
+        np.array([getattr(joint, name) for joint in moving]) for name in ("armature", "damping")
+    )
+    for _ in range(COMPARED):
+        q, qd, gravity = (random.uniform(-1.0, 1.0, n) for n in (len(moving), len(moving), 3))
+        state = {joint.name: (x, xd) for joint, x, xd in zip(moving, q, qd, strict=True)}
+        theirs = tree.reference.equations(state | held, list(state), gravity)
+        M, Q_G, _ = _rigid_body(placed, bodies, q, gravity)
+        M += np.diag(armature)
+        scale = np.sqrt(np.diag(M))
+        checks = {
+            "armature": np.abs(theirs[0] - M) / np.outer(scale, scale),
+            "gravity": np.abs(theirs[1] - Q_G) / (np.abs(Q_G).max() + 1e-9),
+            "damping": np.abs(theirs[2] + damping * qd) / (np.abs(damping * qd).max() + 1e-9),
+        }
+        for name, difference in checks.items():
+            if difference.max() > DIFFERENT:
+                raise _different(tree, moving, name, difference)
+
+
+def _different(tree: Tree, moving: list[Joint], name: str, difference: np.ndarray) -> UnsupportedRobotError:
+    """Return the error for a force or inertia in the file that the robot does not have."""
+    names = {joint.name for joint in moving}
+    acting = [d for d in tree.drives if not d.ratios or len(names & d.ratios.keys()) > 1]
+    among = [drive.name for drive in acting if getattr(drive, name, 0.0)]
+    joint = moving[int(np.unravel_index(difference.argmax(), difference.shape)[0])].name
+    what = "mass matrix" if name == "armature" else name
+    return UnsupportedRobotError(
+        f"{tree.label}: the {name} of {', '.join(among)} couples joints or depends on the configuration"
+        if among
+        else f"{tree.label}: the {what} at joint {joint!r} differs from that in MuJoCo",
+        expected="armature and damping of single joints, and no other passive forces",
+        got=f"a relative difference of {difference.max():.3g} at joint {joint!r}",
+        hint=f"remove the {name}, or lock all but one of the joints with locked_joints",
+    )
 
 
 def _frames(tree: Tree, placed: _Placed, remarks: list[str]) -> list[tuple[str, int, np.ndarray]]:
@@ -201,7 +289,7 @@ def load_robot(
     *,
     base_position: Sequence[float | int] = (0.0, 0.0, 0.0),
     base_rpy: Sequence[float | int] = (0.0, 0.0, 0.0),
-    gravity: Sequence[float | int] = (0.0, 0.0, -9.81),
+    gravity: Sequence[float | int] | None = None,
     locked_joints: Mapping[str, float] | None = None,
     dtype: torch.dtype = torch.float64,
     device: torch.device | str = "cpu",
@@ -215,7 +303,8 @@ def load_robot(
             path.
         base_position: position of the root link in the world [m].
         base_rpy: roll, pitch and yaw of the root link about the world axes [rad].
-        gravity: gravitational acceleration in the world [m/s²]. The value in an MJCF file is ignored.
+        gravity: gravitational acceleration in the world [m/s²]. The default is that of an MJCF file, and
+            (0, 0, −9.81) for other files.
         locked_joints: positions [rad, m] of joints to treat as fixed, such as those of a gripper.
         dtype: floating-point type of all constants.
         device: device of all constants.
@@ -237,13 +326,16 @@ def load_robot(
         ShapeError: base_position, base_rpy or gravity is not a vector of three finite numbers.
     """
     turn = scipy.spatial.transform.Rotation.from_euler("xyz", _vector(base_rpy, "base_rpy"))
-    world = {
-        "base_rotation": turn.as_matrix(),
-        "base_position": _vector(base_position, "base_position"),
-        "gravity": _vector(gravity, "gravity"),
-    }
+    world = {"base_rotation": turn.as_matrix(), "base_position": _vector(base_position, "base_position")}
+    world["gravity"] = _vector(GRAVITY if gravity is None else gravity, "gravity")
     path = robot_path(source)
     tree = checked(lock_joints(read_tree(read_bytes(path), path), locked_joints or {}))
+    if gravity is None and tree.gravity is not None:
+        world["gravity"] = np.array(tree.gravity)
+        if abs(np.linalg.norm(tree.gravity) - np.linalg.norm(GRAVITY)) > UNUSUAL:
+            listed = ", ".join(f"{x:g}" for x in tree.gravity)
+            text = f"{tree.label}: the gravity of the file is used, ({listed}) m/s²"
+            tree = replace(tree, remarks=(*tree.remarks, text))
     return robot_of(tree, world).to(device, dtype)
 
 

@@ -1,13 +1,16 @@
 """Reading of MJCF files, which are reduced to their mechanics and compiled by MuJoCo.
 
-This module is imported only to read MJCF files, since it requires the optional package `mujoco`.
+Classes, defaults and frames are resolved by MuJoCo. Its compiled model is the reference for the robot: the
+loader compares both at random states. This module is imported only to read MJCF files, since it requires the
+optional package `mujoco`.
 """
 
 from __future__ import annotations
 
 import re
 import threading
-from collections.abc import Iterator
+import warnings
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import replace
 from pathlib import Path
@@ -18,8 +21,19 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from forcegp.errors import InertiaError, RobotFileError, UnsupportedRobotError, optional_module
-from forcegp.robot.mjcf_reduce import Coupling, reduce_mjcf
-from forcegp.robot.tree import Inertial, Joint, JointKind, Link, Site, Tree, joint_motion, transform
+from forcegp.robot.mjcf_reduce import reduce_mjcf, unsupported_equality
+from forcegp.robot.tree import (
+    Coupling,
+    Drive,
+    Inertial,
+    Joint,
+    JointKind,
+    Link,
+    Site,
+    Tree,
+    joint_motion,
+    transform,
+)
 
 mujoco = optional_module("mujoco", "Reading MJCF files")
 _KINDS: dict[int, JointKind] = {
@@ -34,11 +48,12 @@ def read_mjcf(root: Element, path: Path) -> Tree:
     Bodies become links, and bodies and sites become frames. Multiple joints of a body are separated by
     massless links. Typed errors quote MuJoCo's compiler, or name unsupported or unphysical elements.
     """
-    document, coupled, remarks = reduce_mjcf(root, path)
+    document, remarks = reduce_mjcf(root, path)
     with _warnings_of_mujoco(str(path), remarks):
-        model = _compile(document, str(path))
-    names = [model.body(i).name or f"body_{i}" for i in range(model.nbody)]
-    joint_names = [model.joint(i).name or f"joint_{i}" for i in range(model.njnt)]
+        model = _compile(document, path)
+    names = _names("body", [model.body(i).name for i in range(model.nbody)])
+    joint_names = _names("joint", [model.joint(i).name for i in range(model.njnt)])
+    coupled = _couplings(model, joint_names, path)
     links = [Link(names[0])]
     joints: list[Joint] = []
     for b in range(1, model.nbody):
@@ -53,8 +68,68 @@ def read_mjcf(root: Element, path: Path) -> Tree:
         for i in range(model.nsite)
         if (name := model.site(i).name)
     )
-    name = root.get("model", path.stem)
-    return Tree(name, str(path), tuple(links), tuple(joints), sites, tuple(remarks))
+    weightless = model.opt.disableflags & mujoco.mjtDisableBit.mjDSBL_GRAVITY
+    return Tree(
+        name=root.get("model", path.stem),
+        label=str(path),
+        links=tuple(links),
+        joints=tuple(joints),
+        sites=sites,
+        remarks=(*remarks, *_tendon_forces(model, path)),
+        drives=tuple(_drives(model, joint_names)),
+        gravity=(0.0, 0.0, 0.0) if weightless else tuple(model.opt.gravity.tolist()),
+        reference=_Compiled(model, joint_names),
+    )
+
+
+def _names(kind: str, names: list[str]) -> list[str]:
+    """Return names in which unnamed elements have their number, as in `body_3`, made unique by `_`."""
+    taken = set(names)
+    for i, name in enumerate(names):
+        if not name:
+            name = f"{kind}_{i}"
+            while name in taken:
+                name += "_"
+            names[i] = name
+            taken.add(name)
+    return names
+
+
+class _Compiled:
+    """MuJoCo's model of a file as the `Reference`, without contacts, limits and tendon springs."""
+
+    def __init__(self, model: Any, joint_names: list[str]) -> None:
+        disabled = mujoco.mjtDisableBit
+        model.opt.disableflags &= ~int(disabled.mjDSBL_GRAVITY)
+        model.opt.disableflags |= int(disabled.mjDSBL_CONSTRAINT) | int(disabled.mjDSBL_CONTACT)
+        model.tendon_stiffness[:] = 0.0
+        self._model, self._data = model, mujoco.MjData(model)
+        self._joints = {name: model.joint(i) for i, name in enumerate(joint_names)}
+
+    def equations(
+        self, state: Mapping[str, tuple[float, float]], joints: Sequence[str], gravity: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        with _warnings_of_mujoco("", []):
+            return self._equations(state, joints, gravity)
+
+    def _equations(
+        self, state: Mapping[str, tuple[float, float]], joints: Sequence[str], gravity: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        model, data = self._model, self._data
+        for name, (q, _) in state.items():
+            data.qpos[self._joints[name].qposadr] = q
+        data.qvel[:] = 0.0
+        model.opt.gravity[:] = gravity
+        mujoco.mj_forward(model, data)
+        Q_G = -data.qfrc_bias
+        for name, (_, qd) in state.items():
+            data.qvel[self._joints[name].dofadr] = qd
+        mujoco.mj_forward(model, data)
+        dofs = np.concatenate([self._joints[name].dofadr for name in joints])
+        M = np.zeros((len(dofs), model.nv))
+        for row, unit in zip(M, np.eye(model.nv)[dofs], strict=True):
+            mujoco.mj_mulM(model, data, row, unit)
+        return M[:, dofs], Q_G[dofs], data.qfrc_passive[dofs].copy()
 
 
 _HANDLER = threading.RLock()
@@ -66,7 +141,7 @@ def _warnings_of_mujoco(label: str, remarks: list[str]) -> Iterator[None]:
     """Collect MuJoCo's warnings, which would otherwise be written to a log file in the working directory.
 
     The handler is global to the process. Only one reader at a time replaces and restores it. Warnings from
-    other threads are passed on.
+    other threads are passed on. `MjSpec.compile` issues Python warnings instead.
     """
     thread = threading.get_ident()
     with _HANDLER:
@@ -80,19 +155,155 @@ def _warnings_of_mujoco(label: str, remarks: list[str]) -> Iterator[None]:
 
         mujoco.set_mju_user_warning(note)
         try:
-            yield
+            with warnings.catch_warnings(record=True) as issued:
+                warnings.simplefilter("always")
+                yield
+            remarks += [f"{label}: MuJoCo warns: {warning.message}" for warning in issued]
         finally:
             mujoco.set_mju_user_warning(before)
 
 
-def _compile(document: Element, label: str) -> Any:
+def _compile(document: Element, path: Path) -> Any:
+    """Return MuJoCo's model of the document without meshes; raise typed errors with the compiler's text."""
+    spec = None
     try:
-        return mujoco.MjModel.from_xml_string(tostring(document, encoding="unicode"))
+        spec = mujoco.MjSpec.from_string(tostring(document, encoding="unicode"))
+        _drop_meshes(spec, path)
+        _reduce_constraints(spec, path)
+        return spec.compile()
     except (ValueError, RuntimeError, mujoco.FatalError) as error:
+        if isinstance(error, UnsupportedRobotError):
+            raise
         text = " ".join(str(error).split())
-        kind = InertiaError if re.search(r"mass|inertia", text) else RobotFileError
-        message = f"{label}: MuJoCo's compiler rejects the file"
+        message, kind = f"{path}: MuJoCo's compiler rejects the file", RobotFileError
+        if re.search(r"mass|inertia", text):
+            kind = InertiaError
+            bodies = [] if spec is None else [b for b in spec.bodies if f"name '{b.name}'" in text]
+            joints = [repr(joint.name) for body in bodies for joint in body.joints]
+            message += f", at the body of joint {', '.join(joints)}" if joints else ""
         raise kind(message, expected="a valid MJCF model", got=text) from error
+
+
+def _drop_meshes(spec: Any, path: Path) -> None:
+    """Delete geoms that need a file; raise `UnsupportedRobotError` if a body takes its inertia from one."""
+    compiler = spec.compiler
+    for body, moves in _bodies(spec.worldbody, False):
+        for geom in list(body.geoms):
+            from_file = geom.meshname or geom.hfieldname or geom.type == mujoco.mjtGeom.mjGEOM_SDF
+            if not from_file:
+                continue
+            if (moves or compiler.settotalmass > 0.0) and _has_mass(geom, body, compiler):
+                name = body.name or "(unnamed)"
+                raise UnsupportedRobotError(
+                    f"{path}: body {name!r} takes its inertia from the mesh {from_file!r}",
+                    expected="an <inertial>, or geoms that are primitive shapes",
+                    hint="copy the inertia that MuJoCo computes from the mesh into an <inertial>",
+                )
+            spec.delete(geom)
+
+
+def _bodies(parent: Any, moves: bool) -> Iterator[tuple[Any, bool]]:
+    """Yield a body and its descendants, each with whether a joint moves it."""
+    moves = moves or len(parent.joints) > 0
+    yield parent, moves
+    for body in parent.bodies:
+        yield from _bodies(body, moves)
+
+
+def _has_mass(geom: Any, body: Any, compiler: Any) -> bool:
+    """Return whether the compiler would add the mass of a geom to its body."""
+    always = compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_TRUE
+    never = compiler.inertiafromgeom == mujoco.mjtInertiaFromGeom.mjINERTIAFROMGEOM_FALSE
+    first, last = compiler.inertiagrouprange
+    if never or (body.explicitinertial and not always) or not first <= geom.group <= last:
+        return False
+    return geom.density != 0.0 if np.isnan(geom.mass) else geom.mass != 0.0
+
+
+def _reduce_constraints(spec: Any, path: Path) -> None:
+    """Delete inactive equalities, refuse those that do not couple joints, and make motors of all actuators.
+
+    The gain of a motor is that of an actuator whose control is a force, and 0 otherwise.
+    """
+    for equality in list(spec.equalities):
+        if not equality.active:
+            spec.delete(equality)
+        elif equality.type != mujoco.mjtEq.mjEQ_JOINT:
+            kind = equality.type.name.removeprefix("mjEQ_").lower()
+            raise unsupported_equality(path, kind, equality.name1)
+    plain = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtDyn.mjDYN_NONE
+    for actuator in spec.actuators:
+        of_force = (actuator.gaintype, actuator.biastype, actuator.dyntype) == plain
+        gain = actuator.gainprm[0] if of_force else 0.0
+        actuator.set_to_motor()
+        actuator.gainprm[0], actuator.inheritrange, actuator.actdim = gain, 0.0, -1
+        actuator.actlimited = mujoco.mjtLimited.mjLIMITED_FALSE
+
+
+def _couplings(model: Any, names: list[str], path: Path) -> dict[str, Coupling]:
+    """Return y = y₀ + Σ aᵢ (x − x₀)ⁱ by the name of joint y. The references are the joints' `qpos0`."""
+    coupled: dict[str, Coupling] = {}
+    for e in range(model.neq):
+        y, x, a = int(model.eq_obj1id[e]), int(model.eq_obj2id[e]), model.eq_data[e, :5].tolist()
+        y0 = float(model.qpos0[model.jnt_qposadr[y]])
+        if names[y] in coupled:
+            text = f"{path}: joint {names[y]!r} has several equality constraints"
+            raise UnsupportedRobotError(text, expected="at most one for each joint")
+        if x < 0:
+            coupled[names[y]] = Coupling("", (a[0],), y0)
+        else:
+            coupled[names[y]] = Coupling(names[x], tuple(a), y0, float(model.qpos0[model.jnt_qposadr[x]]))
+    return coupled
+
+
+def _drives(model: Any, names: list[str]) -> Iterator[Drive]:
+    """Yield the armature and damping of actuators and tendons, which act on the joints besides their own."""
+    joint_types = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
+    tendons: list[dict[str, float]] = []
+    for t in range(model.ntendon):
+        wraps = range(model.tendon_adr[t], model.tendon_adr[t] + model.tendon_num[t])
+        fixed = all(model.wrap_type[w] == mujoco.mjtWrap.mjWRAP_JOINT for w in wraps)
+        ratios: dict[str, float] = {}
+        for w in wraps if fixed else ():
+            joint = names[model.wrap_objid[w]]
+            ratios[joint] = ratios.get(joint, 0.0) + float(model.wrap_prm[w])
+        tendons.append(ratios)
+        yield Drive(
+            f"tendon {model.tendon(t).name or t!r}",
+            ratios,
+            _parameter(model, "tendon_armature", t),
+            _parameter(model, "tendon_damping", t),
+            _parameter(model, "tendon_frictionloss", t),
+        )
+    for a in range(model.nu):
+        kind, target, gear = (
+            int(model.actuator_trntype[a]),
+            model.actuator_trnid[a, 0],
+            model.actuator_gear[a, 0],
+        )
+        ratios = {names[target]: 1.0} if kind in joint_types else {}
+        ratios = tendons[target] if kind == int(mujoco.mjtTrn.mjTRN_TENDON) else ratios
+        yield Drive(
+            f"actuator {model.actuator(a).name or a!r}",
+            {joint: float(gear) * ratio for joint, ratio in ratios.items()},
+            _parameter(model, "actuator_armature", a),
+            _parameter(model, "actuator_damping", a),
+        )
+
+
+def _parameter(model: Any, name: str, index: int) -> float:
+    """Return a parameter of an actuator or tendon, which is 0 in versions of MuJoCo that do not have it."""
+    values = getattr(model, name, None)
+    return 0.0 if values is None else float(values[index])
+
+
+def _tendon_forces(model: Any, path: Path) -> Iterator[str]:
+    """Yield a note for each tendon whose spring or limit is ignored."""
+    for t in range(model.ntendon):
+        forces = {"stiffness": model.tendon_stiffness[t] != 0.0, "limit": model.tendon_limited[t]}
+        ignored = " and ".join(name for name, acts in forces.items() if acts)
+        if ignored:
+            yield f"{path}: the {ignored} of tendon {model.tendon(t).name or t!r} is ignored"
 
 
 def _pose(position: np.ndarray, quaternion: np.ndarray) -> np.ndarray:
@@ -166,7 +377,8 @@ def _effort(model: Any, j: int) -> float:
         gear, limit = abs(float(model.actuator_gear[a, 0])), np.inf
         if model.actuator_forcelimited[a]:
             limit = float(np.abs(model.actuator_forcerange[a]).max())
-        if model.actuator_ctrllimited[a] and model.actuator(a).name.startswith("motor"):
-            limit = min(limit, float(np.abs(model.actuator_ctrlrange[a]).max()))
+        gain = abs(float(model.actuator_gainprm[a, 0]))
+        if model.actuator_ctrllimited[a] and gain > 0.0:
+            limit = min(limit, gain * float(np.abs(model.actuator_ctrlrange[a]).max()))
         efforts.append(gear * limit if limit < np.inf else np.inf)
     return min(effort, sum(efforts)) if efforts else effort

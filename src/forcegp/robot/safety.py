@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import math
+from io import BytesIO
 from pathlib import Path
-from xml.etree.ElementTree import Element, ParseError, TreeBuilder
+from xml.etree.ElementTree import Element, TreeBuilder
+from xml.sax import SAXParseException
+from xml.sax.handler import ContentHandler
+from xml.sax.xmlreader import AttributesImpl
 
 from defusedxml import DefusedXmlException
-from defusedxml.ElementTree import DefusedXMLParser
+from defusedxml.sax import make_parser
 
 from forcegp.errors import RobotFileError
 
@@ -18,14 +22,18 @@ MAX_NUMBER = 1e12
 """Upper bound on lengths, masses and moments, which prevents overflow in their products."""
 
 
-class _BoundedBuilder(TreeBuilder):
-    """A tree builder that rejects files that are too large or too deeply nested."""
+class _BoundedBuilder(ContentHandler):
+    """A handler that builds a tree, and rejects files that are too large or too deeply nested.
+
+    Tags and attributes keep their prefixes as text: robot files often lack the declaration of a prefix, and a
+    default namespace has no meaning in them.
+    """
 
     def __init__(self, label: str) -> None:
         super().__init__()
-        self._label, self._count, self._depth = label, 0, 0
+        self.tree, self._label, self._count, self._depth = TreeBuilder(), label, 0, 0
 
-    def start(self, tag: str, attrs: dict[str, str], /) -> Element:
+    def startElement(self, name: str, attrs: AttributesImpl) -> None:
         self._count += 1
         self._depth += 1
         if self._count > MAX_ELEMENTS:
@@ -33,12 +41,15 @@ class _BoundedBuilder(TreeBuilder):
             raise RobotFileError(text, expected=f"at most {MAX_ELEMENTS} XML elements", got="more", hint=hint)
         if self._depth > MAX_DEPTH:
             text = f"{self._label}: elements are nested too deeply"
-            raise RobotFileError(text, expected=f"at most {MAX_DEPTH} levels", got=f"more, at <{tag[:60]}>")
-        return super().start(tag, attrs)
+            raise RobotFileError(text, expected=f"at most {MAX_DEPTH} levels", got=f"more, at <{name[:60]}>")
+        self.tree.start(name, dict(attrs))
 
-    def end(self, tag: str, /) -> Element:
+    def endElement(self, name: str) -> None:
         self._depth -= 1
-        return super().end(tag)
+        self.tree.end(name)
+
+    def characters(self, content: str) -> None:
+        self.tree.data(content)
 
 
 def read_bytes(path: Path) -> bytes:
@@ -62,12 +73,12 @@ def read_bytes(path: Path) -> bytes:
 
 def parse_xml(data: bytes, label: str) -> Element:
     """Parse an XML document; raise `RobotFileError` if it is malformed, malicious, too large or too deep."""
-    parser = DefusedXMLParser(
-        target=_BoundedBuilder(label), forbid_dtd=True, forbid_entities=True, forbid_external=True
-    )
+    parser, builder = make_parser(), _BoundedBuilder(label)
+    parser.forbid_dtd = True
+    parser.setContentHandler(builder)
     try:
-        parser.feed(data)
-        return parser.close()
+        parser.parse(BytesIO(data))
+        return builder.tree.close()
     except DefusedXmlException as error:
         raise RobotFileError(
             f"{label}: document types and entities are not allowed",
@@ -75,15 +86,14 @@ def parse_xml(data: bytes, label: str) -> Element:
             got=type(error).__name__,
             hint="replace entities by their text",
         ) from error
-    except ParseError as error:
-        if b"<xacro:" in data:
-            raise xacro_error(label, str(error)) from error
+    except SAXParseException as error:
+        got = f"{error.getMessage()}: line {error.getLineNumber()}, column {error.getColumnNumber()}"
         raise RobotFileError(
             f"{label}: not well-formed XML",
             expected="a complete URDF or MJCF document",
-            got=str(error),
+            got=got,
             hint="delete everything before <?xml"
-            if "not at start" in str(error)
+            if "not at start" in got
             else "the file may be truncated, or may not be XML",
         ) from error
     except (LookupError, UnicodeError, ValueError, AssertionError) as error:

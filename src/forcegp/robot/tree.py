@@ -3,10 +3,10 @@
 from __future__ import annotations
 
 from collections import Counter
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from itertools import product
-from typing import Literal
+from typing import Literal, Protocol, runtime_checkable
 
 import numpy as np
 import scipy
@@ -35,12 +35,52 @@ class Link:
 
 
 @dataclass(frozen=True)
+class Coupling:
+    """The position of a joint as a polynomial of the position of another, y = y₀ + Σ aᵢ (x − x₀)ⁱ.
+
+    Attributes:
+        leader: the other joint. If empty, the joint is held at y₀ + a₀.
+        coefficients: a₀, a₁, … [rad, m].
+        reference: y₀ [rad, m].
+        leader_reference: x₀ [rad, m].
+    """
+
+    leader: str
+    coefficients: tuple[float, ...]
+    reference: float = 0.0
+    leader_reference: float = 0.0
+
+    def position(self, x: float) -> float:
+        """Return y [rad, m]."""
+        powers = enumerate(self.coefficients)
+        return self.reference + sum(a * (x - self.leader_reference) ** i for i, a in powers)
+
+
+@dataclass(frozen=True)
+class Drive:
+    """Armature, damping and dry friction that act on joints through a transmission, such as a gear.
+
+    Attributes:
+        name: description of the element in the file, used in messages.
+        ratios: speed of the drive per joint speed; empty if it depends on the configuration.
+        armature, damping, friction: parameters of the drive. A joint has ratio² times the first two.
+    """
+
+    name: str
+    ratios: Mapping[str, float]
+    armature: float = 0.0
+    damping: float = 0.0
+    friction: float = 0.0
+
+
+@dataclass(frozen=True)
 class Joint:
     """A joint between two links.
 
     Attributes:
         refused: the reason why the joint must be locked, or an empty string.
-        follows: the joint that this joint mimics, with a multiplier and an offset.
+        follows: the position that this joint has if it mimics another joint.
+        locked: position at which the joint was locked [rad, m].
     """
 
     name: str
@@ -57,7 +97,8 @@ class Joint:
     velocity_limit: float = np.inf
     effort_limit: float = np.inf
     refused: str = ""
-    follows: tuple[str, float, float] | None = None
+    follows: Coupling | None = None
+    locked: float | None = None
 
 
 @dataclass(frozen=True)
@@ -69,9 +110,26 @@ class Site:
     placement: np.ndarray
 
 
+@runtime_checkable
+class Reference(Protocol):
+    """The model that another library makes of the same file."""
+
+    def equations(
+        self, state: Mapping[str, tuple[float, float]], joints: Sequence[str], gravity: np.ndarray
+    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Return M, Q_G and Q_D of the joints at positions and velocities of all joints."""
+        ...
+
+
 @dataclass(frozen=True)
 class Tree:
-    """All links, joints and sites in a file. `label` is the file name used in messages."""
+    """All links, joints, drives and sites in a file.
+
+    Attributes:
+        label: the file name used in messages.
+        gravity: gravitational acceleration in the file [m/s²], or `None` if the format has none.
+        reference: another library's model of the file, with which the robot is compared.
+    """
 
     name: str
     label: str
@@ -79,6 +137,9 @@ class Tree:
     joints: tuple[Joint, ...]
     sites: tuple[Site, ...] = ()
     remarks: tuple[str, ...] = ()
+    drives: tuple[Drive, ...] = ()
+    gravity: tuple[float, ...] | None = None
+    reference: Reference | None = None
 
 
 def transform(rotation: np.ndarray, position: np.ndarray) -> np.ndarray:
@@ -103,20 +164,29 @@ def lock_joints(tree: Tree, locked: Mapping[str, float]) -> Tree:
         if not np.isfinite(q):
             raise RobotFileError(f"{tree.label}: joint {name!r} cannot be locked", expected="a number", got=q)
 
-    # q = multiplier · leader + offset; a follower may itself be the leader of another joint.
     held = {name: float(q) for name, q in locked.items()}
-    followers = [(joint.name, *joint.follows) for joint in tree.joints if joint.follows is not None]
-    for _, (name, leader, multiplier, offset) in product(followers, followers):
-        if leader in held:
-            held.setdefault(name, multiplier * held[leader] + offset)
+    followers = [(joint.name, joint.follows) for joint in tree.joints if joint.follows is not None]
+    remarks = list(tree.remarks)
+    # A follower may itself be the leader of another joint.
+    for _, (name, follows) in product(followers, followers):
+        if follows.leader in held:
+            held.setdefault(name, follows.position(held[follows.leader]))
+    for name, follows in followers:
+        if name in locked and (follows.leader in held or not follows.leader):
+            q = follows.position(held.get(follows.leader, 0.0))
+            if abs(held[name] - q) > ROUNDING * max(1.0, abs(q)):
+                remarks.append(
+                    f"{tree.label}: joint {name!r} is locked at {held[name]:g}, and in the file at {q:g}"
+                )
 
     def lock(joint: Joint) -> Joint:
         if joint.kind == "fixed" or joint.name not in held:
             return joint
-        motion = joint_motion(joint.kind, joint.axis, held[joint.name])
-        return replace(joint, kind="fixed", placement=joint.placement @ motion, refused="")
+        q = held[joint.name]
+        placement = joint.placement @ joint_motion(joint.kind, joint.axis, q)
+        return replace(joint, kind="fixed", placement=placement, refused="", locked=q)
 
-    return replace(tree, joints=tuple(lock(joint) for joint in tree.joints))
+    return replace(tree, joints=tuple(lock(joint) for joint in tree.joints), remarks=tuple(remarks))
 
 
 MAX_JOINTS = 500
@@ -262,13 +332,18 @@ def _lock(tree: Tree, refused: list[Joint]) -> dict[str, float]:
     """Return positions at which to lock the unsupported joints and the joints that they follow."""
     joints = {joint.name: joint for joint in tree.joints if joint.kind != "fixed"}
     lock: dict[str, float] = {}
+
+    def position(name: str, followers: tuple[str, ...] = ()) -> float:
+        joint, follows = joints[name], joints[name].follows
+        q = float(np.clip(0.0, joint.lower, joint.upper))
+        if follows is not None and not follows.leader:
+            q = follows.position(0.0)
+        elif follows is not None and follows.leader in joints and follows.leader not in followers:
+            q = follows.position(position(follows.leader, (*followers, name)))
+        return lock.setdefault(name, q)
+
     for joint in refused:
-        if joint.follows is None or joint.follows[0] not in joints:
-            lock[joint.name] = float(np.clip(0.0, joint.lower, joint.upper))
-            continue
-        leader, multiplier, offset = joint.follows
-        lock[leader] = float(np.clip(0.0, joints[leader].lower, joints[leader].upper))
-        lock[joint.name] = multiplier * lock[leader] + offset
+        position(joint.name)
     return lock
 
 

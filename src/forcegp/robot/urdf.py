@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 
 from forcegp.errors import InertiaError, RobotFileError, UnsupportedRobotError
 from forcegp.robot.safety import parse_numbers, xacro_error
-from forcegp.robot.tree import Inertial, Joint, Link, Tree, transform
+from forcegp.robot.tree import Coupling, Inertial, Joint, Link, Tree, transform
 
 _NUMBERS = {
     "origin": {"xyz": 3, "rpy": 3},
@@ -44,7 +44,7 @@ def read_urdf(root: Element, label: str) -> Tree:
     for element in root.iter():
         macros = [text for text in element.attrib.values() if "${" in text or "$(" in text]
         if macros or "xacro" in element.tag:
-            raise xacro_error(label, macros[0][:80] if macros else f"<{element.tag.rpartition('}')[2]}>")
+            raise xacro_error(label, macros[0][:80] if macros else f"<{element.tag.rpartition(':')[2]}>")
     links = tuple(_link(element, label) for element in root.findall("link"))
     joints = tuple(_joint(element, label) for element in root.findall("joint"))
     remarks: tuple[str, ...] = ()
@@ -138,8 +138,13 @@ def _joint(element: Element, label: str) -> Joint:
         friction=friction,
         **_limits(limit, kind, where),
         refused=f"mimics joint {mimic['joint']!r}" if mimic else "",
-        follows=(mimic["joint"], mimic.get("multiplier", 1.0), mimic.get("offset", 0.0)) if mimic else None,
+        follows=_coupling(mimic) if mimic else None,
     )
+
+
+def _coupling(mimic: dict[str, Any]) -> Coupling:
+    """Return q = offset + multiplier · leader."""
+    return Coupling(mimic["joint"], (mimic.get("offset", 0.0), mimic.get("multiplier", 1.0)))
 
 
 def _unit(axis: np.ndarray, where: str) -> np.ndarray:

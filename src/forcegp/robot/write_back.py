@@ -8,7 +8,7 @@ each J_k changes to E J_k Eᵀ, where E satisfies E J₀ Eᵀ = J. The edited te
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import ClassVar, NamedTuple
@@ -87,7 +87,8 @@ def write_robot(
     """
     path, robot = robot_path(source), robot.to("cpu", torch.float64)
     data, locked = read_bytes(path), locked_joints or {}
-    tree = checked(lock_joints(read_tree(data, path), locked))
+    content = read_tree(data, path)
+    tree = checked(lock_joints(content, locked))
     file = robot_of(tree, _world(robot))
     if file.joint_names != robot.joint_names:
         raise RobotFileError(
@@ -97,8 +98,9 @@ def write_robot(
             hint="pass the file from which the robot was loaded, with the same locked_joints",
         )
     document = EditableXml(data, str(path))
-    writer = (_Urdf if document.root.tag == "robot" else _Mjcf)(document, str(path))
-    changes = [*_joint_changes(writer, robot, file), *_link_changes(writer, tree, robot, file)]
+    label, is_urdf = str(path), document.root.tag == "robot"
+    writer = _Urdf(document, label) if is_urdf else _Mjcf(document, label, content)
+    changes = [*_joint_changes(writer, tree, robot, file), *_link_changes(writer, tree, robot, file)]
     written = document.written()
     losses = _losses(robot, writer.figures)
     _check(robot, robot_of(checked(lock_joints(read_tree(written, path), locked)), _world(robot)), writer)
@@ -117,15 +119,19 @@ def _world(robot: RobotModel) -> dict[str, np.ndarray]:
     return {name: getattr(robot, name).numpy() for name in ("base_rotation", "base_position", "gravity")}
 
 
-def _joint_changes(writer: _Urdf | _Mjcf, robot: RobotModel, file: RobotModel) -> list[Change]:
-    """Write changed joint parameters, and return the changes."""
-    changes = []
+def _joint_changes(writer: _Urdf | _Mjcf, tree: Tree, robot: RobotModel, file: RobotModel) -> list[Change]:
+    """Write changed joint parameters, without those of other drives, and return the changes."""
+    changes, joints = [], {joint.name: joint for joint in tree.joints}
     for i, joint in enumerate(robot.joint_names):
         values = {}
         for figure, attribute in writer.figures.items():
             before, after = float(getattr(file, figure)[i]), float(getattr(robot, figure)[i])
             if abs(after - before) > CHANGED * abs(before):
-                values[attribute] = _text(after)
+                of_drives = before - getattr(joints[joint], figure)
+                if after < of_drives:
+                    text = f"{writer.label}: the {figure} of joint {joint!r} is below that of its actuators"
+                    raise RobotFileError(text, expected=f"at least {of_drives:g}", got=after)
+                values[attribute] = _text(after - of_drives)
                 changes.append(Change(joint, figure, before, after))
         if values:
             writer.set_joint(joint, values)
@@ -301,14 +307,15 @@ class _Mjcf:
 
     figures: ClassVar = {"damping": "damping", "friction": "frictionloss", "armature": "armature"}
 
-    def __init__(self, document: EditableXml, label: str) -> None:
+    def __init__(self, document: EditableXml, label: str, content: Tree) -> None:
         self.document, self.label = document, label
-        world = document.root.find("worldbody")
-        bodies = [e for e in world.iter() if e.tag == "body"] if world else []
-        joints = [joint for body in bodies for joint in body.children if joint.tag == "joint"]
-        # MuJoCo numbers the world as body 0, and joints in the order of the document.
-        self._bodies = {body.attributes.get("name", f"body_{i + 1}"): body for i, body in enumerate(bodies)}
-        self._joints = {joint.attributes.get("name", f"joint_{i}"): joint for i, joint in enumerate(joints)}
+        worlds = [section for section in document.root.children if section.tag == "worldbody"]
+        bodies = [e for world in worlds for e in world.iter() if e.tag == "body"]
+        joints = [part for body in bodies for part in _inside(body) if part.tag == "joint"]
+        # The compiled model has the order of the document, and the world as its first link.
+        links = [link.name for link in content.links if link.frame][1:]
+        self._bodies = _named(bodies, links)
+        self._joints = _named(joints, [joint.name for joint in content.joints if joint.kind != "fixed"])
 
     def _element(self, kind: str, name: str, among: Mapping[str, Span]) -> Span:
         if name not in among:
@@ -325,6 +332,9 @@ class _Mjcf:
     def set_inertial(self, link: str, body: Inertial) -> None:
         element = self._element("body", link, self._bodies)
         inertial, edit = element.find("inertial"), self.document
+        if inertial is None and any(part.tag == "inertial" for part in _inside(element)):
+            text = f"{self.label}: the <inertial> of body {link!r} is inside a <frame>"
+            raise RobotFileError(text, expected="<inertial> as a child of <body>", hint="move it to the body")
         full = _text(body.inertia[_PLACES])
         if inertial is None:
             values = {"pos": _text(body.com), "mass": _text(body.mass), "fullinertia": full}
@@ -344,6 +354,21 @@ class _Mjcf:
                 edit.drop(inertial, name)
             edit.set(inertial, "quat", _text(np.roll(Rotation.from_matrix(axes).as_quat(), 1)))
             edit.set(inertial, "diaginertia", _text(moments))
+
+
+def _inside(body: Span) -> Iterator[Span]:
+    """Yield the elements of a body, including those inside frames but excluding those of child bodies."""
+    for child in body.children:
+        yield child
+        if child.tag == "frame":
+            yield from _inside(child)
+
+
+def _named(elements: list[Span], names: list[str]) -> dict[str, Span]:
+    """Return elements by the names in the model, or by their own if some are in included files."""
+    if len(elements) != len(names):
+        names = [element.attributes.get("name", "") for element in elements]
+    return {name: element for name, element in zip(names, elements, strict=True) if name}
 
 
 def _principal(inertia: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

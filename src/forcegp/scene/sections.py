@@ -101,7 +101,7 @@ class RobotSection(Section):
     model: str
     base_position: Point = (0.0, 0.0, 0.0)
     base_rpy: Point = (0.0, 0.0, 0.0)
-    gravity: Point = (0.0, 0.0, -9.81)
+    gravity: Point | None = None
     locked_joints: dict[str, float] = Field(default_factory=dict)
 
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import os
 import tempfile
+from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 from typing import Any
@@ -12,15 +13,52 @@ import numpy as np
 import torch
 from torch import Tensor
 
-from forcegp.errors import MissingDependencyError, UnsupportedRobotError, check_name, optional_module
+from forcegp import dynamics
+from forcegp.errors import (
+    InertiaError,
+    MissingDependencyError,
+    UnsupportedRobotError,
+    check_name,
+    optional_module,
+)
 from forcegp.robot.model import RobotModel
 from forcegp.simulate.engine import Engine
-from forcegp.simulate.urdf import compile_spec, write_urdf
+from forcegp.simulate.urdf import compile_spec, principal_axes, write_urdf
 from forcegp.types import JointMatrix, JointVector
 
 NEEDS_MUJOCO = "the engine 'mujoco'"
 MAX_JOINT_VELOCITY = 1e6
 """Joint velocity limit for Bullet. By default, Bullet clamps at 100 rad/s, which adds an unwanted force."""
+COMPARED, DIFFERENT = 2, 1e-6
+"""Number of random states at which an engine is compared with the robot; largest relative difference."""
+
+
+def compare(
+    robot: RobotModel, engine: str, equations: Callable[[JointVector], tuple[Tensor, Tensor]]
+) -> None:
+    """Compare an engine's M and Q_G as functions of q with those of the robot at random positions.
+
+    Raises:
+        UnsupportedRobotError: the engine simulates a different robot.
+    """
+    generator, exact = torch.Generator().manual_seed(0), robot.to(dtype=torch.float64)
+    tolerance = max(DIFFERENT, 100.0 * torch.finfo(robot.dtype).eps)
+    for _ in range(COMPARED):
+        q = 2.0 * torch.rand(robot.nq, dtype=torch.float64, generator=generator) - 1.0
+        M, Q_G = dynamics.mass_matrix(exact, q), dynamics.gravity_force(exact, q)
+        theirs_M, theirs_G = equations(q.to(robot.dtype))
+        scale = M.diagonal().sqrt()
+        difference = (theirs_M - M).abs() / (scale[:, None] * scale)
+        difference_G = (theirs_G - Q_G).abs() / (Q_G.abs().max() + 1e-9)
+        worst = torch.maximum(difference.amax(-1), difference_G)
+        if not float(worst.max()) <= tolerance:
+            joint = robot.joint_names[int(worst.argmax())]
+            raise UnsupportedRobotError(
+                f"{engine} simulates a different robot: its dynamics differ at joint {joint!r}",
+                expected=f"relative differences in M and gravity below {tolerance:.0e}",
+                got=f"{float(worst.max()):.3g}",
+                hint="use another engine",
+            )
 
 
 class PyBulletEngine(Engine):
@@ -29,6 +67,8 @@ class PyBulletEngine(Engine):
     Raises:
         MissingDependencyError: PyBullet is not installed.
         UnsupportedRobotError: a drive has inertia, which PyBullet does not support.
+        InertiaError: the principal moments of a link violate the triangle inequality. PyBullet would set them
+            to zero.
     """
 
     def __init__(self, robot: RobotModel, dt: float) -> None:
@@ -40,14 +80,7 @@ class PyBulletEngine(Engine):
                 "the engine 'pybullet' needs the package pybullet",
                 hint='pip install "forcegp[pybullet]" (Python 3.11 or older), or use the engine "mujoco"',
             ) from None
-        for joint, armature in zip(robot.joint_names, robot.armature.tolist(), strict=True):
-            if armature != 0.0:
-                raise UnsupportedRobotError(
-                    f"joint {joint!r} of robot {robot.name!r} has a drive with inertia",
-                    expected="armature 0, since PyBullet does not support it",
-                    got=armature,
-                    hint='use the engine "mujoco"',
-                )
+        _check_for_bullet(robot)
         self._robot, self._dt = robot, dt
         # The constructor of a client passes options, and PyBullet prints a line if there are any.
         self._bullet: Any = BulletClient.__new__(BulletClient)
@@ -62,6 +95,8 @@ class PyBulletEngine(Engine):
         # PyBullet's vectors are ordered by joint index.
         self._order = np.argsort(np.argsort(self._joints)).tolist()
         self._silence()
+        still = torch.zeros(robot.nq, dtype=robot.dtype)
+        compare(robot, self.name, lambda q: (self.mass_matrix(q), -self.inverse_dynamics(q, still, still)))
 
     @property
     def name(self) -> str:
@@ -115,6 +150,26 @@ class PyBulletEngine(Engine):
         return values[np.argsort(self._joints)].tolist()
 
 
+def _check_for_bullet(robot: RobotModel) -> None:
+    """Raise typed errors for drives and inertias that PyBullet does not support."""
+    for i, (joint, armature) in enumerate(zip(robot.joint_names, robot.armature.tolist(), strict=True)):
+        if armature != 0.0:
+            raise UnsupportedRobotError(
+                f"joint {joint!r} of robot {robot.name!r} has a drive with inertia",
+                expected="armature 0, since PyBullet does not support it",
+                got=armature,
+                hint='use the engine "mujoco"',
+            )
+        low, mid, high = principal_axes(robot.inertia[i])[0].tolist()
+        if high > low + mid:
+            raise InertiaError(
+                f"PyBullet would set the inertia of the link of joint {joint!r} to zero",
+                expected="principal moments that obey the triangle inequality",
+                got=f"{low:.6g} + {mid:.6g} < {high:.6g} kg m²",
+                hint="correct the <inertial> of the link in the robot file",
+            )
+
+
 class MuJoCoWorld:
     """A robot in a compiled MuJoCo model, which has the robot's joint names, gravity and armature."""
 
@@ -125,6 +180,7 @@ class MuJoCoWorld:
         self._dof = np.array([model.joint(name).dofadr[0] for name in robot.joint_names])
         model.dof_armature[self._dof] = robot.armature.numpy()
         self._data = self._mujoco.MjData(model)
+        compare(robot, self.name, self._equations)
 
     @property
     def name(self) -> str:
@@ -148,6 +204,14 @@ class MuJoCoWorld:
 
     def _tensor(self, values: np.ndarray) -> Tensor:
         return torch.tensor(values, dtype=self._robot.dtype)
+
+    def _equations(self, q: JointVector) -> tuple[Tensor, Tensor]:
+        """Return M and Q_G at rest."""
+        data = self._mujoco.MjData(self.model)
+        self._set(data, q, torch.zeros_like(q))
+        self._mujoco.mj_forward(self.model, data)
+        M = self._mass_matrix(data)[np.ix_(self._dof, self._dof)]
+        return self._tensor(M), self._tensor(-data.qfrc_bias[self._dof])
 
     def _mass_matrix(self, data: Any) -> np.ndarray:
         """Return M `(nv, nv)` after positions were updated. `mj_fullM` differs between versions of MuJoCo."""
@@ -202,7 +266,8 @@ def make_engine(robot: RobotModel, dt: float, name: str = "auto") -> Engine:
     Args:
         robot: the robot.
         dt: step size [s].
-        name: `"pybullet"`, `"mujoco"`, or `"auto"` for PyBullet if it is installed and MuJoCo otherwise.
+        name: `"pybullet"`, `"mujoco"`, or `"auto"` for PyBullet if it is installed and supports the robot,
+            and MuJoCo otherwise.
 
     Example:
         >>> import torch, forcegp
@@ -214,12 +279,13 @@ def make_engine(robot: RobotModel, dt: float, name: str = "auto") -> Engine:
     Raises:
         UnknownNameError: the engine does not exist.
         MissingDependencyError: the engine's package is not installed.
-        InertiaError: MuJoCo rejects the inertia of a link.
+        InertiaError: the principal moments of a link violate the triangle inequality.
+        UnsupportedRobotError: the engine does not support the robot, or simulates a different one.
     """
     check_name("engine", name, ["auto", *MAKERS])
     if name != "auto":
         return MAKERS[name](robot, dt)
     try:
         return PyBulletEngine(robot, dt)
-    except MissingDependencyError:
+    except (MissingDependencyError, UnsupportedRobotError, InertiaError):
         return MuJoCoEngine(robot, dt)

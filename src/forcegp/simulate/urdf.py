@@ -24,12 +24,28 @@ def write_urdf(robot: RobotModel) -> str:
     root = Element("robot", name=robot.name)
     _link(root, WORLD, 1.0, torch.zeros(3), torch.eye(3), torch.ones(3))
     for i, joint in enumerate(robot.joint_names):
-        moments, axes = torch.linalg.eigh(robot.inertia[i])
-        axes = axes * torch.linalg.det(axes).sign()
+        moments, axes = principal_axes(robot.inertia[i])
         _link(root, link_name(robot, i), float(robot.mass[i]), robot.com[i], axes, moments)
         _joint(root, robot, i, joint)
     indent(root)
     return tostring(root, encoding="unicode")
+
+
+ROUNDING = 1e-12
+"""Relative rounding error of principal moments."""
+
+
+def principal_axes(inertia: Tensor) -> tuple[Tensor, Tensor]:
+    """Return the principal moments in ascending order, and right-handed axes as columns.
+
+    The largest moment of a thin plate is the sum of the others. It is reduced by `ROUNDING`, since engines
+    reject a plate whose largest moment exceeds the sum by rounding.
+    """
+    moments, axes = torch.linalg.eigh(inertia)
+    low, mid, high = moments.unbind()
+    if abs(high - low - mid) <= ROUNDING * high:
+        moments = torch.stack([low, mid, (low + mid) * (1.0 - ROUNDING)])
+    return moments, axes * torch.linalg.det(axes).sign()
 
 
 def compile_spec(spec: Any, robot: RobotModel) -> Any:
