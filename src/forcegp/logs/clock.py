@@ -20,6 +20,8 @@ RESTART_STEPS, SHORTEST_TRAJECTORY = 2.0, 10
 trajectory has at least this many rows. Otherwise, the time stamps are out of order."""
 GAP_STEPS = 5.0
 """A step longer than this multiple of the usual step counts as a gap."""
+BURST_ROWS = 50
+"""Mean number of rows between gaps below which the clock is at fault, not the recording."""
 
 
 def usual_step(t: Array) -> float:
@@ -81,6 +83,10 @@ def split_trajectories(signals: Signals, gap: float | None, report: ImportReport
     if gaps.any():
         message = f"{gaps.sum()} gaps longer than {longest:.4g} s: a new trajectory begins after each"
         report.find("gap", message, signals.row[gaps])
+        if len(t) < BURST_ROWS * gaps.sum():
+            rows = len(t) / (gaps.sum() + 1)
+            text = f"time stamps come in bursts of about {rows:.2g} rows: the clock of a receiver or a buffer"
+            report.find("bursts", f"{text}, not of the robot", signals.row[gaps])
     signals.segment = np.cumsum(new | back | gaps) - 1
 
 

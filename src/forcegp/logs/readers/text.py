@@ -45,7 +45,7 @@ _OF_DAY = (
 )
 DATE = re.compile(rf"^(?:{_DAY}(?:[T ,]+{_OF_DAY})?)$")
 TIME_OF_DAY = re.compile(f"^(?:{_OF_DAY})$")
-"""Dates, with or without a time of day, in the order of ISO 8601 or of a country; and times without a date."""
+"""Dates in the order of ISO 8601 or of a country, with or without a time of day; and times without a date."""
 _UNIT = re.compile(r"^[\[(]?\s*([A-Za-zµ°%][\w°²^/*·. -]{0,15}|-|1)?\s*[\])]?$")
 
 
