@@ -222,8 +222,8 @@ def _print(report: Report) -> None:
 
 
 ORDER_LOST = (
-    "the points have no regular order in time, which delays, averages over time and friction memory are learned "
-    "from; --method even keeps it"
+    "the points are not evenly spaced in time, which delays, averages over time and friction memory require: "
+    "use --method even"
 )
 """Note about points that are not evenly spaced."""
 

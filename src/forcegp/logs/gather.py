@@ -48,31 +48,31 @@ def gather(
     report.format = table.format
     for remark in table.remarks:
         report.find("reader", remark)
-    _find_names(mapping, joints, report)
+    _find_names(table, mapping, joints, report)
     return _Gathering(table, mapping, tuple(joints), report).run()
 
 
-def _find_names(mapping: Mapping, joints: Sequence[str], report: ImportReport) -> None:
-    """Find columns and streams that are named like commands or model outputs, and currents without a motor."""
+def _find_names(table: LogTable, mapping: Mapping, joints: Sequence[str], report: ImportReport) -> None:
+    """Find columns and streams named like commands or model outputs, and currents without a motor."""
     for quantity in (name for name in SYMBOLS if mapping.quantity(name) is not None):
         section = mapping.quantity(quantity)
         assert section is not None
-        for name in (mapping.columns_of(quantity, joints)[0], section.stream or ""):
+        column = next(iter(mapping.columns_of(quantity, joints)), "")
+        streams = [stream.name for stream in table.streams if column in stream.columns]
+        for name in (column, section.stream or next(iter(streams), "")):
             if (reason := doubtful(name)) is not None:
                 report.find("named", named_like(name, reason, quantity))
     torque = mapping.sections.torque
-    column = mapping.columns_of("torque", joints)[0]
+    column = next(iter(mapping.columns_of("torque", joints)), "")
     if torque.unit in units.CURRENT:
         factors = mapping.per_joint("torque", "torque_constant", joints)
         if torque.side == "motor":
             factors = factors * mapping.per_joint("torque", "gear_ratio", joints)
-        if (factors == 1.0).all():
+        if len(factors) and (factors == 1.0).all():
             text = "torques are currents at 1 N m/A: give torque_constant and gear_ratio under [torque]"
             report.find("current", text)
     elif {"current", "currents"}.intersection(tokens(column)):
-        report.find(
-            "current", f"{column!r} is named like a current, and is read as a torque in {torque.unit}"
-        )
+        report.find("current", f"{column!r} is named like a current, but is read as a torque")
 
 
 class _Gathering:

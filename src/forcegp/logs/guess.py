@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from forcegp import dynamics
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
@@ -25,7 +26,7 @@ from forcegp.logs.clock import even_clock
 from forcegp.logs.contact import force_levels, multiplier
 from forcegp.logs.gather import gather
 from forcegp.logs.headings import find_families, find_time, find_wrench, tokens
-from forcegp.logs.mapping import ROWS, ContactStateSection, Draft, parse_mapping, quoted
+from forcegp.logs.mapping import ROWS, ContactStateSection, Draft, Family, parse_mapping, quoted
 from forcegp.logs.motion import TURNS, wrapped
 from forcegp.logs.readers import read
 from forcegp.logs.smoothing import add_derivatives
@@ -107,9 +108,9 @@ def _find_wraps(stream: Stream, draft: Draft, possible: list[str]) -> None:
 def _find_missing(stream: Stream, draft: Draft) -> None:
     """Propose to drop rows that lack a value, such as messages of another node on the same topic."""
 
-    def lacking(family: Family) -> Array:
+    def lacking(family: Family) -> NDArray[np.bool_]:
         values = np.stack([stream.columns[column] for column in family.columns.values()], axis=1)
-        return ~np.isfinite(values).all(axis=1)
+        return np.asarray(~np.isfinite(values).all(axis=1))
 
     for name in ("velocity", "acceleration"):
         if name in draft.families and lacking(draft.families[name]).mean() > 0.5:

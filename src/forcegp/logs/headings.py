@@ -30,7 +30,8 @@ MEASURED, COMMANDED, MODELLED, AVOIDED = (
 """Words for measured columns, for commands, for outputs of a model, and for other columns to avoid."""
 UNMEASURED = {*COMMANDED, *MODELLED, *AVOIDED}
 _TIME = re.compile(
-    r"^(.*[ _./])?(t|mt|time|times|timestamp|stamp|clock|sec|secs|seconds|ms|millis|zeit|uhrzeit)([ _./\[(].*)?$"
+    r"^(.*[ _./])?(t|mt|time|times|timestamp|stamp|clock|sec|secs|seconds|ms|millis|zeit|uhrzeit)"
+    r"([ _./\[(].*)?$"
 )
 _DECLARED = re.compile(
     r"(?i)[\[(]([^\])]*)[\])]|^(deg|rad|rpm|nm|mnm|ma)[_ ]"
@@ -98,7 +99,7 @@ def find_time(table: LogTable, draft: Draft) -> Stream:
     _, column, unit, step = max(candidates, key=lambda found: found[0])
     if unit is not None:
         shown = " and ".join([unit] if isinstance(unit, str) else unit)
-        seconds = step if isinstance(unit, tuple) else step * units.TIME[unit]
+        seconds = step * units.TIME[unit] if isinstance(unit, str) else step
         draft.say("time", f"the unit {shown} is declared; steps are {seconds:.6g} s")
     else:
         # Robots are logged at 10 Hz to 20 kHz, so the step alone distinguishes most units.

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.ndimage import median_filter, uniform_filter1d
+from scipy.ndimage import maximum_filter1d, median_filter, uniform_filter1d
 
 from forcegp.data.derivative import UNIFORM_TOLERANCE
 from forcegp.errors import DataError
@@ -125,7 +125,8 @@ def find_lost(signals: Signals, report: ImportReport) -> None:
         small[:] = False
     # A spike jumps back; the positions after lost rows do not.
     stays = (e * uniform_filter1d(e, 7, axis=0) * 7.0).sum(axis=1) > 0.5 * size
-    large = (size > MANY_STEPS**2 * np.maximum(power, CLEAR**2)) & stays
+    usual = maximum_filter1d(power, NEIGHBOURS)  # an impact changes q̇ by at most twice its size
+    large = (size > MANY_STEPS**2 * np.maximum(usual, CLEAR**2)) & stays
     jumps = np.flatnonzero(inner & (small | large)) + 1
     if len(jumps):
         text = f"q jumps by more than q̇ Δt explains, in {len(jumps)} rows"
