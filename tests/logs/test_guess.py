@@ -310,7 +310,7 @@ NANOSECONDS = 1_700_000_000_700_000_000 + np.round(1e9 * SECONDS).astype(np.int6
     ],
 )
 def test_clocks(tmp_path: Path, time: dict[str, np.ndarray], column: object, unit: object) -> None:
-    system, log = two_joints()
+    system, _ = two_joints()
     path = two_joint_csv(tmp_path, time)
     proposal = guess.guess_mapping(path, system)
     assert (proposal.time["column"], proposal.time["unit"]) == (column, unit)
@@ -320,13 +320,13 @@ def test_clocks(tmp_path: Path, time: dict[str, np.ndarray], column: object, uni
 
 
 def test_a_date_and_a_time_of_day_are_one_clock(tmp_path: Path) -> None:
-    system, log = two_joints()
+    system, _ = two_joints()
     path = two_joint_csv(tmp_path, {"q0": SECONDS})
     lines = path.read_text().splitlines()
     stamps = [86_398.5 + x for x in SECONDS]
     days = ["27.11.2025", "28.11.2025"]
     body = [
-        f"{days[int(x // 86400)]},{int(x % 86400 // 3600):02d}:{int(x % 3600 // 60):02d}:{x % 60:06.3f},{line}"
+        f"{days[int(x // 86400)]},{x % 86400 // 3600:02.0f}:{x % 3600 // 60:02.0f}:{x % 60:06.3f},{line}"
         for x, line in zip(stamps, lines[1:], strict=True)
     ]
     path.write_text("\n".join(["Date,Time," + lines[0].replace("q0", "n"), *body]))
@@ -409,9 +409,10 @@ def test_arrays_with_an_axis_of_length_one_and_what_the_reader_leaves_out(tmp_pa
     omitted = f"'tau' of shape (2, 2, {ROWS}) and type float64 was left out"
     assert omitted in proposal.toml() and any(omitted in doubt for doubt in proposal.doubts)
     assert "unused columns: (none)" in " ".join(proposal.doubts)
+    text = proposal.toml().replace('columns = { shoulder = "", elbow = "" }', 'column = "tau[{joint}]"')
+    mapping = parse_mapping(text.encode(), "m.toml")
     with pytest.raises(DataError, match=r"the log has no column 'tau\[0\]'; not read: 'tau' of shape"):
-        text = proposal.toml().replace('columns = { shoulder = "", elbow = "" }', 'column = "tau[{joint}]"')
-        read_log(tmp_path / "cube.npz", system, parse_mapping(text.encode(), "m.toml"))
+        read_log(tmp_path / "cube.npz", system, mapping)
 
 
 def test_a_joint_without_torque_is_proposed_as_unmeasured(tmp_path: Path) -> None:
