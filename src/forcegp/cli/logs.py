@@ -279,7 +279,7 @@ def select(
             parts = split_by_stretches(data, count, **held_out, method=method, seed=seed, progress=progress)
     how = f"of {len(data)} rows by {method} points, split by {split}, seed {seed}"
     result = _written(data, parts, how, out, rest)
-    if method != "even":
+    if method == "random":
         result["note"] = ORDER_LOST
     if len(data) < len(whole):
         result["rows_at_impacts_left_out"] = len(whole) - len(data)

@@ -438,7 +438,11 @@ def default_mapping(path: str | Path, system: ConstrainedSystem) -> Mapping:
         logged = {n: word for n, word in words.items() if names >= {f"{word}.{joint}" for joint in joints}}
         if not {"position", "torque"} <= set(logged) or time not in names:
             continue
-        draft = Draft(str(path), {"column": time, "segment": "segment" if "segment" in names else None})
+        # On a topic of joint states, messages of other nodes lack joints or efforts.
+        more = {"missing": "drop"} if time == "header" else {}
+        draft = Draft(
+            str(path), {"column": time, "segment": "segment" if "segment" in names else None, **more}
+        )
         for name, word in logged.items():
             draft.families[name] = Family(f"{word}.{{joint}}", {}, unit=units.SI[name])
         draft.families["position"].unwrap = True
