@@ -249,7 +249,8 @@ def _numbers(chunks: list[pa.Array], kind: str, dialect: Dialect) -> Column:
     if kind in ("date", "time of day"):
         return _seconds(values, DATE if kind == "date" else TIME_OF_DAY, "date" not in dialect.kinds)
     if kind == "empty":
-        text = pc.replace_substring(pc.utf8_trim_whitespace(values), dialect.decimal, ".")
+        decimal = dialect.decimal if dialect.separator == "," else ","
+        text = pc.replace_substring(pc.utf8_trim_whitespace(values), decimal, ".")
         usable = pc.match_substring_regex(text, f"^(?i:{_NUMBER.pattern})")
         values = pc.if_else(usable, text, None)
     # A copy, since the array of a chunk cannot be written to.
