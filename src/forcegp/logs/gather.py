@@ -65,9 +65,10 @@ def _find_names(table: LogTable, mapping: Mapping, joints: Sequence[str], report
     torque = mapping.sections.torque
     column = next(iter(mapping.columns_of("torque", joints)), "")
     if torque.unit in units.CURRENT:
-        factors = mapping.per_joint("torque", "torque_constant", joints)
+        measured = mapping.measured("torque", joints)
+        factors = mapping.per_joint("torque", "torque_constant", measured)
         if torque.side == "motor":
-            factors = factors * mapping.per_joint("torque", "gear_ratio", joints)
+            factors = factors * mapping.per_joint("torque", "gear_ratio", measured)
         if len(factors) and (factors == 1.0).all():
             text = "torques are currents at 1 N m/A: give torque_constant and gear_ratio under [torque]"
             report.find("current", text)
