@@ -398,11 +398,18 @@ def test_commands_and_model_outputs_are_no_measurements(
 
 
 def test_arrays_with_an_axis_of_length_one_and_what_the_reader_leaves_out(tmp_path: Path) -> None:
+    import h5py
+
     system, log = two_joints()
     flat = {name: log[name].T[:, None, :] for name in ("q", "qd", "tau")}
     np.savez(tmp_path / "run.npz", t=log["t"], **flat)
     proposal = guess.guess_mapping(tmp_path / "run.npz", system)
     np.testing.assert_array_equal(read_log(tmp_path / "run.npz", system, mapping_of(proposal)).q, log["q"])
+    with h5py.File(tmp_path / "run.h5", "w") as file:
+        for name, values in {"t": log["t"], **flat}.items():
+            file[name] = values
+    proposal = guess.guess_mapping(tmp_path / "run.h5", system)
+    np.testing.assert_array_equal(read_log(tmp_path / "run.h5", system, mapping_of(proposal)).q, log["q"])
     cube = np.stack([log["tau"].T, log["tau"].T], axis=1)
     np.savez(tmp_path / "cube.npz", t=log["t"], q=log["q"], tau=cube)
     proposal = guess.guess_mapping(tmp_path / "cube.npz", system)

@@ -135,6 +135,25 @@ def test_stamps_in_bursts_are_the_fault_of_the_clock(tmp_path: Path) -> None:
     assert "contact" not in str(caught.value)
 
 
+@pytest.mark.parametrize("velocity", [True, False])
+def test_a_clock_that_jumps_is_told_from_a_pause_of_the_logger(tmp_path: Path, velocity: bool) -> None:
+    m = motion(1500, 0.004)
+    t = m.t + 3.0 * (np.arange(1500) >= 500) + 0.5 * (np.arange(1500) >= 900)
+    result = imported(tmp_path, Motion(t, m.q, m.qd, m.tau), velocity=velocity)
+    assert kinds(result) == ["gap", "clock"]
+    assert "jumps by up to 3 s in 2 rows" in result.report.findings[1].message
+    assert result.report.findings[1].rows == ((500, 500), (900, 900))
+    kept = (np.arange(1500) < 500) | (np.arange(1500) >= 640)
+    pause = Motion(m.t[kept], m.q[kept], m.qd[kept], m.tau[kept])
+    assert kinds(imported(tmp_path, pause, velocity=velocity)) == ["gap"]
+
+
+def test_nanoseconds_without_seconds_are_named(tmp_path: Path) -> None:
+    m = motion(350)
+    result = imported(tmp_path, Motion(m.t % 1.0, m.q, m.qd, m.tau))
+    assert "the column of whole seconds is missing" in result.report.findings[0].message
+
+
 @pytest.mark.parametrize("name", ["velocity", "unmapped"])
 def test_velocities_are_not_required(tmp_path: Path, name: str) -> None:
     m = motion()

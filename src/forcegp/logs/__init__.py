@@ -23,7 +23,7 @@ from forcegp.logs.contact import Evidence, detect, per_contact
 from forcegp.logs.from_contact import derive_joints, stick_speeds
 from forcegp.logs.gather import gather
 from forcegp.logs.mapping import Mapping, default_mapping, load_mapping, parse_mapping
-from forcegp.logs.motion import check_clock, find_lost
+from forcegp.logs.motion import check_clock, find_jumps
 from forcegp.logs.smoothing import add_derivatives, impact_mask
 from forcegp.logs.table import Array, ImportFinding, ImportReport, Signals
 from forcegp.resources import announce_memory
@@ -115,7 +115,7 @@ def import_log(
             signals = gather(path, log_mapping, system.robot.joint_names, report, progress)
             announce_memory(8 * NUMBERS * system.robot.nq * len(signals), f"importing {len(signals):,} rows")
             check_clock(signals, system.robot.revolute.numpy() > 0.0, report)
-            find_lost(signals, report)
+            find_jumps(signals, report)
             derived = tuple(name for name in ("qd", "qdd") if name not in signals.vectors)
             even_clock(signals, log_mapping.sections.time.period, report)
             derive_joints(signals, system, log_mapping, report)

@@ -77,6 +77,11 @@ def split_trajectories(signals: Signals, gap: float | None, report: ImportReport
                 hint="sort the log by time, or use a time column that increases within a trajectory",
             )
         message = f"the clock restarts {back.sum()} times: each restart begins a trajectory"
+        fallen = t[:-1][back[1:]] - t[1:][back[1:]]
+        if back.sum() > 1 and (np.abs(fallen + step - 1.0) < 2.0 * step).all() and step < 0.1:
+            message += (
+                ". It counts fractions of a second: the column of whole seconds is missing under [time]"
+            )
         report.find("restart", message, signals.row[back])
     longest = gap if gap is not None else GAP_STEPS * step
     gaps = np.append(False, np.diff(t) > longest) & ~new & ~back

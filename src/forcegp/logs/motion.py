@@ -9,7 +9,7 @@ from scipy.ndimage import maximum_filter1d, median_filter, uniform_filter1d
 from forcegp.data.derivative import UNIFORM_TOLERANCE
 from forcegp.errors import DataError
 from forcegp.logs import units
-from forcegp.logs.clock import usual_step
+from forcegp.logs.clock import GAP_STEPS, usual_step
 from forcegp.logs.table import Array, ImportReport, Signals
 from forcegp.robust import robust_std
 
@@ -102,8 +102,9 @@ def _velocity_ratio(signals: Signals, rows: NDArray[np.int64], lag: int, moved: 
     return float(np.median(np.sqrt(expected[clear] / power[clear]))) if clear.any() else None
 
 
-def find_lost(signals: Signals, report: ImportReport) -> None:
-    """Find rows between which the position moves on by more than the velocity explains.
+def find_jumps(signals: Signals, report: ImportReport) -> None:
+    """Find rows between which the position moves on by more than the velocity explains, since rows were lost,
+    and jumps of the clock over which the position moves on by one usual step.
 
     With residuals r = Δq − q̇ Δt and noise σ per joint, a row is m = (r·q̇)/(q̇·q̇ Δt) steps late, weighted by
     1/σ². Without logged velocities, q̇ is the running median of Δq/Δt.
@@ -127,6 +128,11 @@ def find_lost(signals: Signals, report: ImportReport) -> None:
     stays = (e * uniform_filter1d(e, 7, axis=0) * 7.0).sum(axis=1) > 0.5 * size
     usual = maximum_filter1d(power, NEIGHBOURS)  # an impact changes q̇ by at most twice its size
     large = (size > MANY_STEPS**2 * np.maximum(usual, CLEAR**2)) & stays
+    clock = np.flatnonzero((steps > GAP_STEPS * step) & (size < 0.25 * power) & (power > CLEAR**2)) + 1
+    if len(clock):
+        text = f"the clock jumps by up to {steps[clock - 1].max():.3g} s in {len(clock)} rows"
+        message = f"{text}, over which q moves on by one usual step: the stamps are wrong there"
+        report.find("clock", message, signals.row[clock])
     jumps = np.flatnonzero(inner & (small | large)) + 1
     if len(jumps):
         text = f"q jumps by more than q̇ Δt explains, in {len(jumps)} rows"
