@@ -45,7 +45,7 @@ def test_wrapped_angles_are_named_and_made_continuous(tmp_path: Path, unit: str)
     toml = mapping().replace('unit = "rad"\n', f'unit = "{unit}"\nunwrap = true\n')
     result = imported(tmp_path, logged, toml)
     assert (
-        kinds(result) == ["wrapped"]
+        kinds(result) == ["unwrapped"]
         and "shoulder, elbow jump by one turn" in result.report.findings[0].message
     )
     np.testing.assert_allclose(result.data.q.numpy(), m.q, atol=1e-12)

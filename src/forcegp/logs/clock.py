@@ -20,7 +20,7 @@ RESTART_STEPS, SHORTEST_TRAJECTORY = 2.0, 10
 trajectory has at least this many rows. Otherwise, the time stamps are out of order."""
 GAP_STEPS = 5.0
 """A step longer than this multiple of the usual step counts as a gap."""
-BURST_ROWS = 50
+BURST_ROWS = 20
 """Mean number of rows between gaps below which the clock is at fault, not the recording."""
 
 

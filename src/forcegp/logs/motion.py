@@ -52,9 +52,8 @@ def find_wrapped(signals: Signals, turn: Array, unwrap: bool, report: ImportRepo
     joints = ", ".join(np.array(signals.joint_names)[jumps.any(axis=0)])
     rows = np.flatnonzero(jumps.any(axis=1))
     done = "were made continuous" if unwrap else "unwrap = true under [position] makes them continuous"
-    report.find(
-        "wrapped", f"angles of {joints} jump by one turn in {len(rows)} rows: {done}", signals.row[rows]
-    )
+    message = f"angles of {joints} jump by one turn in {len(rows)} rows: {done}"
+    report.find("unwrapped" if unwrap else "wrapped", message, signals.row[rows])
     if unwrap:
         whole = np.where(jumps, np.sign(np.diff(q, axis=0, prepend=q[:1])), 0.0)
         for part in signals.runs():
