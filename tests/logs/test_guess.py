@@ -319,7 +319,8 @@ def test_clocks(tmp_path: Path, time: dict[str, np.ndarray], column: object, uni
     assert float(data.t.diff().median()) == pytest.approx(DT, rel=1e-3)
 
 
-def test_a_date_and_a_time_of_day_are_one_clock(tmp_path: Path) -> None:
+@pytest.mark.parametrize("names", [["Date", "Time"], ["date", "time of day"], ["Datum", "Uhrzeit"]])
+def test_a_date_and_a_time_of_day_are_one_clock(tmp_path: Path, names: list[str]) -> None:
     system, _ = two_joints()
     path = two_joint_csv(tmp_path, {"q0": SECONDS})
     lines = path.read_text().splitlines()
@@ -329,9 +330,9 @@ def test_a_date_and_a_time_of_day_are_one_clock(tmp_path: Path) -> None:
         f"{days[int(x // 86400)]},{x % 86400 // 3600:02.0f}:{x % 3600 // 60:02.0f}:{x % 60:06.3f},{line}"
         for x, line in zip(stamps, lines[1:], strict=True)
     ]
-    path.write_text("\n".join(["Date,Time," + lines[0].replace("q0", "n"), *body]))
+    path.write_text("\n".join([f"{names[0]},{names[1]}," + lines[0].replace("q0", "n"), *body]))
     proposal = guess.guess_mapping(path, system)
-    assert proposal.time["column"] == ["Date", "Time"]
+    assert proposal.time["column"] == names
     data = read_log(path, system, mapping_of(proposal))
     np.testing.assert_allclose(data.t.numpy() - data.t[0].item(), SECONDS, atol=1e-6)
 

@@ -156,7 +156,8 @@ def _split_clocks(stream: Stream) -> Iterator[Clock]:
         if not date and not _TIME.match(coarse.lower()) and _unit_of_time(coarse, stream) != "s":
             continue
         for fine in (name for name in stream.columns if name != coarse):
-            unit = _unit_of_time(fine, stream) or "s"
+            unit = _unit_of_time(fine, stream)
+            unit = unit if unit in SPLIT else "s"
             seconds = stream.columns[fine] * units.TIME[unit]
             named = _TIME.match(fine.lower()) if date else unit in SPLIT and _same_clock(coarse, fine)
             if not named or not ((seconds >= 0.0) & (seconds < (DAY if date else 1.0))).all():
