@@ -117,6 +117,8 @@ def test_a_spike_an_impact_and_a_lag_are_no_lost_rows(tmp_path: Path) -> None:
     spiky = m.q.copy()
     spiky[700] += 0.3
     assert not kinds(imported(tmp_path, Motion(m.t, spiky, m.qd, m.tau)))
+    held = np.where((np.arange(1500) % 40 == 20)[:, None], np.roll(m.q, 1, axis=0), m.q)
+    assert not kinds(imported(tmp_path, Motion(m.t, held, m.qd, m.tau)))
     late = np.concatenate([m.qd[:1].repeat(5, axis=0), m.qd[:-5]])
     assert not kinds(imported(tmp_path, Motion(m.t, m.q, late, m.tau)))
     rate = np.where(m.t < 3.0, 1.0, -0.8)[:, None] * np.array([1.0, -0.5])

@@ -121,10 +121,11 @@ def find_jumps(signals: Signals, report: ImportReport) -> None:
     power, size = (u**2).sum(axis=1), (e**2).sum(axis=1)
     late = (e * u).sum(axis=1) / np.maximum(power, 1e-300)
     small = (late > LOST_STEP) & (size - late**2 * power < 0.25 * size) & (power > CLEAR**2)
+    # A spike jumps back and a held value catches up; the positions after lost rows do not.
+    stays = (e * uniform_filter1d(e, 7, axis=0) * 7.0).sum(axis=1) > 0.5 * size
+    small &= stays
     if small.sum() < LOST_SHARE * (power > CLEAR**2).sum():
         small[:] = False
-    # A spike jumps back; the positions after lost rows do not.
-    stays = (e * uniform_filter1d(e, 7, axis=0) * 7.0).sum(axis=1) > 0.5 * size
     usual = maximum_filter1d(power, NEIGHBOURS)  # an impact changes q̇ by at most twice its size
     large = (size > MANY_STEPS**2 * np.maximum(usual, CLEAR**2)) & stays
     clock = np.flatnonzero((steps > GAP_STEPS * step) & (size < 0.25 * power) & (power > CLEAR**2)) + 1
