@@ -179,6 +179,31 @@ def write_rosbag2(folder: Path, m: Motion) -> tuple[Path, str]:
     return folder / "run2", ROS
 
 
+def joint_state_bag(folder: Path, m: Motion, late: bool) -> Path:
+    """A ROS 2 bag without velocities. Either the first 20 messages lack efforts, or a gripper comes first."""
+    from rosbags.rosbag2 import Writer
+    from rosbags.typesys import Stores, get_typestore
+
+    store, kind = get_typestore(Stores.ROS2_HUMBLE), "sensor_msgs/msg/JointState"
+    types, empty = store.types, np.zeros(0)
+    gripper = types[kind](
+        header=types["std_msgs/msg/Header"](
+            stamp=types["builtin_interfaces/msg/Time"](sec=1_699_999_999, nanosec=0), frame_id=""
+        ),
+        name=["finger"], position=np.ones(1), velocity=np.zeros(1), effort=np.zeros(1),
+    )  # fmt: skip
+    with Writer(folder / "bag", version=9) as bag:
+        topic = bag.add_connection("/joint_states", kind, typestore=store)
+        if not late:
+            bag.write(topic, 1_699_999_999_000_000_000, store.serialize_cdr(gripper, kind))
+        for k, (ns, message) in enumerate(joint_states(m, store, ros1=False)):
+            message.velocity = empty  # type: ignore[attr-defined]
+            if late and k < 20:
+                message.effort = empty  # type: ignore[attr-defined]
+            bag.write(topic, ns, store.serialize_cdr(message, kind))
+    return folder / "bag"
+
+
 def write_bare_db3(folder: Path, m: Motion) -> tuple[Path, str]:
     bag, toml = write_rosbag2(folder, m)
     (bag / "metadata.yaml").unlink()

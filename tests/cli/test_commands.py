@@ -96,6 +96,14 @@ def test_select_writes_both_parts_and_their_provenance(log: Path, tmp_path: Path
     assert torch.equal(Dataset.read(again).q, chosen.q[:10])
 
 
+def test_select_says_that_random_rows_have_no_order(log: Path, tmp_path: Path) -> None:
+    for method in ("random", "even"):
+        result = json.loads(
+            run("select", log, "-n", 50, "--method", method, "-o", tmp_path / "a.parquet", "--json")
+        )
+        assert ("--method even" in result.get("note", "")) == (method == "random")
+
+
 def test_select_holds_out_stretches(log: Path, tmp_path: Path) -> None:
     train, rest = tmp_path / "train.parquet", tmp_path / "rest.parquet"
     options = ("--split", "stretches", "--stretch", 0.2, "--seed", 4, "--json")

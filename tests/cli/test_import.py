@@ -95,3 +95,12 @@ def test_what_is_missing_is_said_in_one_message(
     (tmp_path / "run.pkl").write_bytes(b"\x80\x04.")
     said = fail(monkeypatch, capfd, tmp_path / "run.pkl", "--robot", "double_pendulum", "--out", out)
     assert "refused" in said
+
+
+def test_guess_names_what_the_reader_left_out(tmp_path: Path) -> None:
+    m = motion()
+    log, mapping = tmp_path / "run.npz", tmp_path / "m.toml"
+    np.savez(log, t=m.t, q=m.q, images=np.zeros((3, 4, 5)))
+    told = json.loads(run(log, "--robot", "double_pendulum", "--guess", mapping, "--json"))
+    assert told["not_read"] == "'images' of shape (3, 4, 5) and type float64 was left out"
+    assert f"# The reader: {told['not_read']}" in mapping.read_text()

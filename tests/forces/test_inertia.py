@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import time
 import warnings
 
 import numpy as np
@@ -383,6 +384,15 @@ def test_averaged_equations_are_sums_of_neighbours_within_a_stretch() -> None:
     inside = torch.tensor([15 <= c % 60 < 45 for c in range(15, n - 15, 2)]).repeat(2)
     assert bool((mean.slides[:, 1] == inside).all()), "no average reaches across stretches"
     assert not bool(mean.slides[: len(inside) // 2, 0][:15].any()), "nor over a joint that sticks"
+
+
+@pytest.mark.parametrize("factor", [1e-3, 1e-6])
+def test_work_is_bounded_by_the_rows_whatever_the_unit_of_time(file: RobotModel, factor: float) -> None:
+    """Fixed times over a step of 10 ns are millions of rows, of which the log has 1600."""
+    data = log(file)
+    start = time.process_time()
+    found(file, data.replace(t=factor * data.t))
+    assert time.process_time() - start < 60.0
 
 
 def test_a_partner_is_later_in_the_same_trajectory(file: RobotModel) -> None:

@@ -9,7 +9,7 @@ import pytest
 import torch
 
 import forcegp
-from forcegp.errors import MappingError
+from forcegp.errors import DataError, MappingError
 from forcegp.logs import Mapping, guess, parse_mapping, read_log
 from forcegp.logs.headings import declared_unit
 from forcegp.logs.mapping import Draft
@@ -275,3 +275,206 @@ def test_a_file_of_times_that_does_not_fit_is_named(tmp_path: Path, rest: tuple[
     else:
         proposal = guess.guess_mapping(tmp_path / "run", system)
         assert any("time[0] was left out: 601 rows" in doubt for doubt in proposal.doubts)
+
+
+def two_joint_csv(folder: Path, time: dict[str, np.ndarray], **more: np.ndarray) -> Path:
+    """A log of the double pendulum with the given columns of time, and further columns by name."""
+    _, log = two_joints()
+    columns = dict(time)
+    for name in ("q", "qd", "tau"):
+        columns |= {f"{name}_{joint}": log[name][:, i] for i, joint in enumerate(("shoulder", "elbow"))}
+    return written(folder, {k: v for k, v in (columns | more).items() if v is not None}, ",", ".")
+
+
+SECONDS = np.arange(ROWS) * DT
+NANOSECONDS = 1_700_000_000_700_000_000 + np.round(1e9 * SECONDS).astype(np.int64)
+
+
+@pytest.mark.parametrize(
+    ("time", "column", "unit"),
+    [
+        (
+            {"stamp.sec": NANOSECONDS // 10**9, "stamp.nanosec": NANOSECONDS % 10**9},
+            ["stamp.sec", "stamp.nanosec"],
+            ["s", "ns"],
+        ),
+        (
+            {"tv_sec": NANOSECONDS // 10**9, "tv_usec": NANOSECONDS % 10**9 / 1e3},
+            ["tv_sec", "tv_usec"],
+            ["s", "us"],
+        ),
+        ({"time": 45987.5 + SECONDS / 86400.0}, "time", "d"),
+        ({"time": SECONDS / 3600.0}, "time", "h"),
+        ({"time": 1e3 * SECONDS}, "time", "ms"),
+        ({"time": NANOSECONDS}, "time", "ns"),
+    ],
+)
+def test_clocks(tmp_path: Path, time: dict[str, np.ndarray], column: object, unit: object) -> None:
+    system, _ = two_joints()
+    path = two_joint_csv(tmp_path, time)
+    proposal = guess.guess_mapping(path, system)
+    assert (proposal.time["column"], proposal.time["unit"]) == (column, unit)
+    data = read_log(path, system, mapping_of(proposal))
+    assert len(data) == ROWS and int(data.segment[-1]) == 0
+    assert float(data.t.diff().median()) == pytest.approx(DT, rel=1e-3)
+
+
+@pytest.mark.parametrize("names", [["Date", "Time"], ["date", "time of day"], ["Datum", "Uhrzeit"]])
+def test_a_date_and_a_time_of_day_are_one_clock(tmp_path: Path, names: list[str]) -> None:
+    system, _ = two_joints()
+    path = two_joint_csv(tmp_path, {"q0": SECONDS})
+    lines = path.read_text().splitlines()
+    stamps = [86_398.5 + x for x in SECONDS]
+    days = ["27.11.2025", "28.11.2025"]
+    body = [
+        f"{days[int(x // 86400)]},{x % 86400 // 3600:02.0f}:{x % 3600 // 60:02.0f}:{x % 60:06.3f},{line}"
+        for x, line in zip(stamps, lines[1:], strict=True)
+    ]
+    path.write_text("\n".join([f"{names[0]},{names[1]}," + lines[0].replace("q0", "n"), *body]))
+    proposal = guess.guess_mapping(path, system)
+    assert proposal.time["column"] == names
+    data = read_log(path, system, mapping_of(proposal))
+    np.testing.assert_allclose(data.t.numpy() - data.t[0].item(), SECONDS, atol=1e-6)
+
+
+def test_the_velocity_tells_the_unit_of_time(tmp_path: Path) -> None:
+    """Steps of 0.06 could be seconds; the velocity in rad/s shows that they are milliseconds."""
+    system, log = two_joints()
+    fast = 100.0 * log["qd"]
+    t = 0.06 * np.arange(ROWS)
+    path = two_joint_csv(tmp_path, {"t": t}, qd_shoulder=fast[:, 0], qd_elbow=fast[:, 1])
+    proposal = guess.guess_mapping(path, system)
+    assert proposal.time["unit"] == "ms" and proposal.families["velocity"].unit == "rad/s"
+    assert any("time is in ms, not s" in doubt for doubt in proposal.doubts)
+
+
+@pytest.mark.parametrize("factor", [1.0, 180.0 / np.pi])
+def test_wrapped_angles_are_unwrapped_and_the_velocity_keeps_its_sign(tmp_path: Path, factor: float) -> None:
+    system, log = kuka_log()
+    q = log["q"] + np.array([3.0, 0, 0, 0, 2.9, 0, 0])
+    columns = {"t": log["t"]}
+    for i in range(7):
+        columns[f"pos_{i + 1}"] = factor * ((q[:, i] + np.pi) % (2.0 * np.pi) - np.pi)
+        columns[f"vel_{i + 1}"] = factor * log["qd"][:, i]
+        columns[f"trq_{i + 1}"] = log["tau"][:, i]
+    path = written(tmp_path, columns, ",", ".")
+    proposal = guess.guess_mapping(path, system)
+    sections = mapping_of(proposal).sections
+    assert sections.position.unwrap and sections.position.unit == ("rad" if factor == 1.0 else "deg")
+    assert sections.velocity is not None and sections.velocity.sign == 1.0
+    assert any("jump by one turn" in doubt and "pos_1" in doubt for doubt in proposal.doubts)
+    data = read_log(path, system, mapping_of(proposal))
+    np.testing.assert_allclose(np.diff(data.q.numpy(), axis=0), np.diff(q, axis=0), atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    ("pattern", "kind"),
+    [
+        ("target_moment_{}", "a command ('target')"),
+        ("tau{}_cmd", "a command ('cmd')"),
+        ("tau_J_d_{}", "a command ('d')"),
+        ("tauref{}", "a command ('ref')"),
+        ("SollMoment{}", "a command ('soll')"),
+        ("desiredTorque{}", "a command ('desired')"),
+        ("tau_ext_hat_filtered_{}", "the output of a model ('ext')"),
+        ("model_torque_{}", "the output of a model ('model')"),
+    ],
+)
+@pytest.mark.parametrize("alone", [True, False])
+def test_commands_and_model_outputs_are_no_measurements(
+    tmp_path: Path, pattern: str, kind: str, alone: bool
+) -> None:
+    system, log = two_joints()
+    columns = {"t": log["t"]} | {f"q{i + 1}": log["q"][:, i] for i in range(2)}
+    columns |= {pattern.format(i + 1): log["tau"][:, i] for i in range(2)}
+    if not alone:
+        columns |= {f"effort{i + 1}": log["tau"][:, i] for i in range(2)}
+    proposal = guess.guess_mapping(written(tmp_path, columns, ",", "."), system)
+    chosen = list(proposal.families["torque"].columns.values())
+    assert chosen == [(pattern if alone else "effort{}").format(i + 1) for i in range(2)]
+    marked = any(
+        f"is named like {kind}, which is not a measured torque" in doubt for doubt in proposal.doubts
+    )
+    assert marked == alone
+
+
+def test_arrays_with_an_axis_of_length_one_and_what_the_reader_leaves_out(tmp_path: Path) -> None:
+    import h5py
+
+    system, log = two_joints()
+    flat = {name: log[name].T[:, None, :] for name in ("q", "qd", "tau")}
+    np.savez(tmp_path / "run.npz", t=log["t"], **flat)
+    proposal = guess.guess_mapping(tmp_path / "run.npz", system)
+    np.testing.assert_array_equal(read_log(tmp_path / "run.npz", system, mapping_of(proposal)).q, log["q"])
+    with h5py.File(tmp_path / "run.h5", "w") as file:
+        for name, values in {"t": log["t"], **flat}.items():
+            file[name] = values
+    proposal = guess.guess_mapping(tmp_path / "run.h5", system)
+    np.testing.assert_array_equal(read_log(tmp_path / "run.h5", system, mapping_of(proposal)).q, log["q"])
+    cube = np.stack([log["tau"].T, log["tau"].T], axis=1)
+    np.savez(tmp_path / "cube.npz", t=log["t"], q=log["q"], tau=cube)
+    proposal = guess.guess_mapping(tmp_path / "cube.npz", system)
+    omitted = f"'tau' of shape (2, 2, {ROWS}) and type float64 was left out"
+    assert omitted in proposal.toml() and any(omitted in doubt for doubt in proposal.doubts)
+    assert "unused columns: (none)" in " ".join(proposal.doubts)
+    text = proposal.toml().replace('columns = { shoulder = "", elbow = "" }', 'column = "tau[{joint}]"')
+    mapping = parse_mapping(text.encode(), "m.toml")
+    with pytest.raises(DataError, match=r"the log has no column 'tau\[0\]'; not read: 'tau' of shape"):
+        read_log(tmp_path / "cube.npz", system, mapping)
+
+
+def test_a_joint_without_torque_is_proposed_as_unmeasured(tmp_path: Path) -> None:
+    system, log = two_joints()
+    columns = (
+        {"t": log["t"]} | {f"q{i + 1}": log["q"][:, i] for i in range(2)} | {"effort2": log["tau"][:, 1]}
+    )
+    path = written(tmp_path, columns, ",", ".")
+    proposal = guess.guess_mapping(path, system)
+    assert not proposal.incomplete and proposal.families["torque"].unmeasured == ["shoulder"]
+    assert any("no torque of shoulder" in doubt for doubt in proposal.doubts)
+    data = read_log(path, system, mapping_of(proposal))
+    np.testing.assert_allclose(data.q.numpy(), log["q"], atol=1e-12)
+    assert data.header.unmeasured_torques == ("shoulder",)
+
+
+@pytest.mark.parametrize(
+    ("pattern", "factor", "unit"), [("pos_rad_m{}", 1.0, "rad"), ("pos_m{}", 57.3, "deg")]
+)
+def test_units_of_positions_without_torques(tmp_path: Path, pattern: str, factor: float, unit: str) -> None:
+    system, log = kuka_log()
+    columns = {"t": log["t"]} | {pattern.format(i + 1): factor * log["q"][:, i] for i in range(7)}
+    proposal = guess.guess_mapping(written(tmp_path, columns, ",", "."), system)
+    assert proposal.incomplete == ["torque"] and proposal.families["position"].unit == unit
+    assert not any("rad was assumed" in doubt for doubt in proposal.doubts)
+
+
+@pytest.mark.parametrize("period", [0.002, 0.0008, 0.001])
+def test_the_window_is_at_most_60_ms(period: float) -> None:
+    from forcegp.logs.table import Signals
+
+    t = np.arange(4000) * period
+    noise = np.random.default_rng(0).standard_normal((4000, 1))
+    trial = Signals(
+        ("a",), t, np.arange(4000), np.zeros(4000, np.int64), {"q": np.sin(t)[:, None] + 0.1 * noise}
+    )
+    draft = Draft("log")
+    guess._window(draft, trial)
+    assert draft.window % 2 == 1 and 0.055 < draft.window * period <= 0.06 + 1e-12
+
+
+@pytest.mark.parametrize("late", [True, False])
+def test_the_first_messages_decide_nothing(tmp_path: Path, late: bool) -> None:
+    """Torques that start late, and messages of a gripper before those of the arm."""
+    import forcegp.logs.mapping as of_mapping
+    from log_files import joint_state_bag
+
+    m = motion()
+    system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
+    path = joint_state_bag(tmp_path, m, late)
+    mapping = of_mapping.default_mapping(path, system)
+    assert mapping.sections.torque.column == "effort.{joint}" and mapping.sections.velocity is None
+    proposal = guess.guess_mapping(path, system)
+    assert proposal.time.get("missing") == ("drop" if late else None)
+    data = read_log(path, system, mapping_of(proposal))
+    assert len(data) == len(m.t) - 20 * late
+    np.testing.assert_allclose(data.q.numpy(), m.q[20 * late :], atol=1e-12)

@@ -90,6 +90,8 @@ def _guess(log: Path, system: forcegp.ConstrainedSystem, out: Path) -> dict[str,
     save(lambda path: write_text(path, guessed.toml()), out)
     doubts = {f"doubt_{i + 1}": text for i, text in enumerate(guessed.doubts)}
     step = f"fill in [{'] and ['.join(guessed.incomplete)}] in" if guessed.incomplete else "check"
+    if guessed.left_out:
+        doubts["not_read"] = guessed.left_out.removeprefix("; not read: ")
     return {"mapping": str(out), **doubts, "next": f"{step} {out}, then import with --mapping {out}"}
 
 
@@ -219,6 +221,13 @@ def _print(report: Report) -> None:
         say(f"not checked: {name} ({reason})")
 
 
+ORDER_LOST = (
+    "the points are not evenly spaced in time, which delays, averages over time and friction memory require: "
+    "use --method even"
+)
+"""Note about points that are not evenly spaced."""
+
+
 def select(
     log: Annotated[Path, Argument(help="Data set to select from (.parquet or .csv).")],
     count: Annotated[int, Option("--count", "-n", min=1, help="Number of training points.")],
@@ -270,6 +279,8 @@ def select(
             parts = split_by_stretches(data, count, **held_out, method=method, seed=seed, progress=progress)
     how = f"of {len(data)} rows by {method} points, split by {split}, seed {seed}"
     result = _written(data, parts, how, out, rest)
+    if method == "random":
+        result["note"] = ORDER_LOST
     if len(data) < len(whole):
         result["rows_at_impacts_left_out"] = len(whole) - len(data)
     show(result, as_json)

@@ -213,13 +213,11 @@ def torque_rate(m: Measurement) -> Tensor:
     step = float(t.diff()[segment[1:] == segment[:-1]].median()) if len(t) > 1 else 0.0
     rate = torch.zeros_like(tau)
     if step > 0.0:
-        i, reach = torch.arange(len(t), device=t.device), max(1, round(LATE / step))
-        ends = [i, i]
-        for _ in range(reach):
-            for side, move in enumerate((-1, 1)):
-                next_ = (ends[side] + move).clamp(0, len(t) - 1)
-                ends[side] = torch.where(segment[next_] == segment, next_, ends[side])
-        before, after = ends
+        i, reach = torch.arange(len(t), device=t.device), max(1, round(min(LATE / step, len(t))))
+        _, inverse, counts = segment.unique_consecutive(return_inverse=True, return_counts=True)
+        stop = counts.cumsum(0)
+        before = torch.maximum(i - reach, (stop - counts)[inverse])
+        after = torch.minimum(i + reach, stop[inverse] - 1)
         span = (t[after] - t[before])[:, None]
         slope = (tau[after] - tau[before]) / span.clamp(min=1e-300)
         rate[order] = torch.where((span > 0.0) & (span <= WIDEST), slope, 0.0)
@@ -324,10 +322,10 @@ def averaged(rows: Rows, columns: Tensor, inertial: Tensor, width: float) -> tup
         window moves and lies within one block.
     """
     stds = [x / rows.step for x in (width, math.hypot(width, math.sqrt(rows.filter_variance)))]
-    reach, stride = math.ceil(REACH * stds[1]), max(1, int(0.5 * stds[0]))
+    n = rows.leading
+    reach, stride = min(math.ceil(REACH * stds[1]), (n - 1) // 2), max(1, int(0.5 * stds[0]))
     offset = torch.arange(-reach, reach + 1).to(columns)
     narrow, wide = (torch.softmax(-0.5 * (offset / max(std, 1e-9)) ** 2, 0) for std in stds)
-    n = rows.leading
     starts = range(0, len(rows.q), n)
     count = len(range(reach, n - reach, stride))
 

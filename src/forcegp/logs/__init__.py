@@ -22,7 +22,8 @@ from forcegp.logs.clock import even_clock, usual_step
 from forcegp.logs.contact import Evidence, detect, per_contact
 from forcegp.logs.from_contact import derive_joints, stick_speeds
 from forcegp.logs.gather import gather
-from forcegp.logs.mapping import SYMBOLS, Mapping, default_mapping, load_mapping, parse_mapping
+from forcegp.logs.mapping import Mapping, default_mapping, load_mapping, parse_mapping
+from forcegp.logs.motion import check_clock, find_jumps
 from forcegp.logs.smoothing import add_derivatives, impact_mask
 from forcegp.logs.table import Array, ImportFinding, ImportReport, Signals
 from forcegp.resources import announce_memory
@@ -113,13 +114,16 @@ def import_log(
         with foreign(str(path), "a log that can be imported"):
             signals = gather(path, log_mapping, system.robot.joint_names, report, progress)
             announce_memory(8 * NUMBERS * system.robot.nq * len(signals), f"importing {len(signals):,} rows")
+            check_clock(signals, system.robot.revolute.numpy() > 0.0, report)
+            find_jumps(signals, report)
+            derived = tuple(name for name in ("qd", "qdd") if name not in signals.vectors)
             even_clock(signals, log_mapping.sections.time.period, report)
             derive_joints(signals, system, log_mapping, report)
             _find_clipped(signals, log_mapping)
             evidence = _contacts(signals, system, log_mapping, report, displaced)
             std = add_derivatives(signals, log_mapping.sections.derivatives, report)
             std = _treat_clipped(signals, std, log_mapping, report)
-            data = _dataset(signals, std, log_mapping, system, report)
+            data = _dataset(signals, std, log_mapping, system, report, derived)
     except DataError as error:
         raise error if str(path) in error.message else DataError.at(str(path), error) from None
     return Imported(data, report, tuple(evidence))
@@ -185,7 +189,12 @@ def _treat_clipped(
 
 
 def _dataset(
-    signals: Signals, std: Array | None, mapping: Mapping, system: ConstrainedSystem, report: ImportReport
+    signals: Signals,
+    std: Array | None,
+    mapping: Mapping,
+    system: ConstrainedSystem,
+    report: ImportReport,
+    derived: tuple[str, ...],
 ) -> Dataset:
     """Return the data set built from the processed signals."""
     robot, settings, dt = system.robot, mapping.sections.derivatives, usual_step(signals.t)
@@ -208,7 +217,7 @@ def _dataset(
         robot=robot.name,
         robot_fingerprint=robot.fingerprint,
         provenance=tuple(report.steps),
-        derived=tuple(SYMBOLS[n] for n in ("velocity", "acceleration") if mapping.quantity(n) is None),
+        derived=derived,
         imported=tuple((found.kind, found.message) for found in report.findings),
         unmeasured_torques=mapping.sections.torque.unmeasured,
         stick_speeds=sticking,

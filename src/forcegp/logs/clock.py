@@ -20,6 +20,10 @@ RESTART_STEPS, SHORTEST_TRAJECTORY = 2.0, 10
 trajectory has at least this many rows. Otherwise, the time stamps are out of order."""
 GAP_STEPS = 5.0
 """A step longer than this multiple of the usual step counts as a gap."""
+PARTS_OF_CLOCK = {1.0: ("fractions of a second", "whole seconds"), 60.0: ("seconds", "minutes")}
+"""Periods of columns that are the last part of a clock [s], and names of this part and of the missing one."""
+BURST_ROWS = 20
+"""Mean number of rows between gaps below which the clock is at fault, not the recording."""
 
 
 def usual_step(t: Array) -> float:
@@ -75,12 +79,20 @@ def split_trajectories(signals: Signals, gap: float | None, report: ImportReport
                 hint="sort the log by time, or use a time column that increases within a trajectory",
             )
         message = f"the clock restarts {back.sum()} times: each restart begins a trajectory"
+        period = t[:-1][back[1:]] - t[1:][back[1:]] + step
+        for seconds, (part, whole) in PARTS_OF_CLOCK.items():
+            if back.sum() > 1 and (np.abs(period - seconds) < 2.0 * step).all() and step < 0.1:
+                message += f". It counts {part}: the column of {whole} is missing under [time]"
         report.find("restart", message, signals.row[back])
     longest = gap if gap is not None else GAP_STEPS * step
     gaps = np.append(False, np.diff(t) > longest) & ~new & ~back
     if gaps.any():
         message = f"{gaps.sum()} gaps longer than {longest:.4g} s: a new trajectory begins after each"
         report.find("gap", message, signals.row[gaps])
+        if len(t) < BURST_ROWS * gaps.sum():
+            rows = len(t) / (gaps.sum() + 1)
+            text = f"time stamps come in bursts of about {rows:.2g} rows: the clock of a receiver or a buffer"
+            report.find("bursts", f"{text}, not of the robot", signals.row[gaps])
     signals.segment = np.cumsum(new | back | gaps) - 1
 
 

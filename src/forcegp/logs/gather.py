@@ -16,7 +16,9 @@ import numpy as np
 from forcegp.errors import DataError
 from forcegp.logs import units
 from forcegp.logs.clock import drop_repeated, find_held, join_stream, split_trajectories
+from forcegp.logs.headings import doubtful, named_like, tokens
 from forcegp.logs.mapping import SYMBOLS, Mapping
+from forcegp.logs.motion import TURNS, find_wrapped
 from forcegp.logs.readers import read
 from forcegp.logs.table import Array, ImportReport, LogTable, Progress, Signals, Stream
 from forcegp.rows import describe, numbered
@@ -35,7 +37,7 @@ def gather(
 ) -> Signals:
     """Read the mapped columns of a log onto a common clock, with at most `rows` rows if possible."""
     sections = mapping.sections
-    needed = {sections.time.column, sections.time.segment or sections.time.column}
+    needed = {*sections.time.columns, sections.time.segment or sections.time.columns[0]}
     for name in SYMBOLS:
         if mapping.quantity(name) is not None:
             needed |= set(mapping.columns_of(name, joints))
@@ -46,7 +48,32 @@ def gather(
     report.format = table.format
     for remark in table.remarks:
         report.find("reader", remark)
+    _find_names(table, mapping, joints, report)
     return _Gathering(table, mapping, tuple(joints), report).run()
+
+
+def _find_names(table: LogTable, mapping: Mapping, joints: Sequence[str], report: ImportReport) -> None:
+    """Find columns and streams named like commands or model outputs, and currents without a motor."""
+    for quantity in (name for name in SYMBOLS if mapping.quantity(name) is not None):
+        section = mapping.quantity(quantity)
+        assert section is not None
+        column = next(iter(mapping.columns_of(quantity, joints)), "")
+        streams = [stream.name for stream in table.streams if column in stream.columns]
+        for name in (column, section.stream or next(iter(streams), "")):
+            if (reason := doubtful(name)) is not None:
+                report.find("named", named_like(name, reason, quantity))
+    torque = mapping.sections.torque
+    column = next(iter(mapping.columns_of("torque", joints)), "")
+    if torque.unit in units.CURRENT:
+        measured = mapping.measured("torque", joints)
+        factors = mapping.per_joint("torque", "torque_constant", measured)
+        if torque.side == "motor":
+            factors = factors * mapping.per_joint("torque", "gear_ratio", measured)
+        if len(factors) and (factors == 1.0).all():
+            text = "torques are currents at 1 N m/A: give torque_constant and gear_ratio under [torque]"
+            report.find("current", text)
+    elif {"current", "currents"}.intersection(tokens(column)):
+        report.find("current", f"{column!r} is named like a current, but is read as a torque")
 
 
 class _Gathering:
@@ -57,11 +84,12 @@ class _Gathering:
     ) -> None:
         self.table, self.mapping, self.joints, self.report = table, mapping, joints, report
         self.time, position = mapping.sections.time, mapping.columns_of("position", joints)
+        self.origin: list[float] = []
         self.reference = table.stream_of(position[0], mapping.sections.position.stream)
 
     def run(self) -> Signals:
         """Return the quantities, interpolating those of other streams onto the reference stream."""
-        quantities = [name for name in SYMBOLS if self.mapping.quantity(name) is not None]
+        quantities = [name for name in SYMBOLS if self._is_logged(name)]
         vectors = {SYMBOLS[name]: self._vector(name) for name in quantities}
         if self.mapping.sections.wrench is not None:
             vectors["wrench"] = self._wrench()
@@ -76,36 +104,54 @@ class _Gathering:
             signals.contact[key.removeprefix(CLOSED)] = signals.vectors.pop(key)[:, 0] >= 0.5
         return signals
 
+    def _is_logged(self, name: str) -> bool:
+        """Return whether a quantity is mapped and logged. Velocities and accelerations are not required."""
+        if self.mapping.quantity(name) is None:
+            return False
+        columns = self.mapping.columns_of(name, self.joints)
+        absent = [column for column in columns if column not in self.table.names]
+        if name in ("position", "torque") or not absent:
+            return True
+        self.report.find("computed", f"the log has no column {absent[0]!r}: the {name} is computed")
+        return False
+
     def _take(self, stream: Stream, column: str) -> Array:
         return self.table.stream_of(column, stream.name).columns[column]
 
     def _vector(self, name: str) -> tuple[Stream, Array]:
         """Return a joint vector in SI units on the joint side. Joints that are not logged are zero."""
-        joints = self.mapping.measured(name, self.joints)
-
-        def numbers(key: str) -> Array:
-            return self.mapping.per_joint(name, key, joints)
-
-        section = self.mapping.quantity(name)
+        joints, section = self.mapping.measured(name, self.joints), self.mapping.quantity(name)
         assert section is not None
         columns = self.mapping.columns_of(name, self.joints)
         if not columns:
             raise self.mapping.error((name, "unmeasured"), "no joint is left", expected="some joints")
         stream = self.table.stream_of(columns[0], section.stream)
-        # The factor s k converts to SI units on the joint side; o is in the unit of the column.
-        scale, offset = numbers("sign") * units.QUANTITY[name][section.unit], numbers("offset")
-        if section.side == "motor":
-            scale *= numbers("gear_ratio") ** (1.0 if name == "torque" else -1.0)
-        if name == "torque" and self.mapping.sections.torque.torque_constant is not None:
-            scale *= numbers("torque_constant")
+        scale, offset = self._scale(name), self.mapping.per_joint(name, "offset", joints)
         result = np.zeros((len(stream), len(self.joints)))
         for i, (joint, column) in enumerate(zip(joints, columns, strict=True)):
             own = result[:, self.joints.index(joint)]
             np.subtract(self._take(stream, column), offset[i], out=own)
-            own *= scale[i]
+            own *= scale[self.joints.index(joint)]
             if isinstance(stream.columns, dict) and len(stream.columns) > 1:
                 del stream.columns[column]  # hold only one copy in memory
         return stream, result
+
+    def _scale(self, name: str) -> Array:
+        """Return the factors s k (nq,) that convert a joint vector to SI units on the joint side."""
+        joints, section = self.mapping.measured(name, self.joints), self.mapping.quantity(name)
+        assert section is not None
+
+        def numbers(key: str) -> Array:
+            return self.mapping.per_joint(name, key, joints)
+
+        scale = numbers("sign") * units.QUANTITY[name][section.unit]
+        if section.side == "motor":
+            scale *= numbers("gear_ratio") ** (1.0 if name == "torque" else -1.0)
+        if name == "torque" and self.mapping.sections.torque.torque_constant is not None:
+            scale *= numbers("torque_constant")
+        result = np.ones(len(self.joints))
+        result[[self.joints.index(joint) for joint in joints]] = scale
+        return result
 
     def _wrench(self) -> tuple[Stream, Array]:
         """Return force and moment (n, 6) in SI units without offsets, with zeros for missing components."""
@@ -137,13 +183,21 @@ class _Gathering:
 
     def _stamps(self, stream: Stream) -> Array:
         """Return the time stamps of a stream [s]."""
-        holder = stream
-        if self.time.column not in stream.columns:
+        columns, holder = self.time.columns, stream
+        if columns[0] not in stream.columns:
             if len(self.table.streams) > 1 and stream is not self.reference:
-                text = f"{self.table.source}: stream {stream.name!r} has no column {self.time.column!r}"
+                text = f"{self.table.source}: stream {stream.name!r} has no column {columns[0]!r}"
                 raise DataError(text, expected="a time stamp in every stream that is used")
-            holder = self.table.stream_of(self.time.column, self.time.stream)
-        return holder.columns[self.time.column] * units.TIME[self.time.unit]
+            holder = self.table.stream_of(columns[0], self.time.stream)
+        parts = [self.table.stream_of(column, holder.name).columns[column] for column in columns]
+        if len(parts) > 1 and not self.origin:
+            # Seconds since 1970 leave float64 no room for nanoseconds.
+            self.origin = [float(np.nanmin(values)) for values in parts[:-1]]
+            origin = sum(o * k for o, k in zip(self.origin, self.time.factors, strict=False))
+            self.report.steps.append(f"added up {' and '.join(columns)}; time 0 is {origin:.9g} s")
+        origins = [*self.origin, *[0.0] * (len(parts) - len(self.origin))]
+        scaled = [k * (x - o) for x, o, k in zip(parts, origins, self.time.factors, strict=True)]
+        return np.sum(scaled, axis=0) if len(scaled) > 1 else scaled[0]
 
     def _reference(self, vectors: dict[str, Array]) -> Signals:
         """Return the complete, cropped rows of the stream with the positions, and their trajectories."""
@@ -158,6 +212,9 @@ class _Gathering:
         drop_repeated(signals, self.report)
         self._crop(signals)
         split_trajectories(signals, self.time.gap, self.report)
+        position = self.mapping.sections.position
+        turn = np.abs(self._scale("position")) * TURNS.get(position.unit, np.inf)
+        find_wrapped(signals, turn, position.unwrap, self.report)
         if "tau" in signals.vectors:
             find_held(signals, self.time.held == "drop", self.report)
         return signals

@@ -13,6 +13,7 @@ from pathlib import Path
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from forcegp import dynamics
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
@@ -25,15 +26,19 @@ from forcegp.logs.clock import even_clock
 from forcegp.logs.contact import force_levels, multiplier
 from forcegp.logs.gather import gather
 from forcegp.logs.headings import find_families, find_time, find_wrench, tokens
-from forcegp.logs.mapping import ContactStateSection, Draft, parse_mapping, quoted
+from forcegp.logs.mapping import ROWS, ContactStateSection, Draft, Family, parse_mapping, quoted
+from forcegp.logs.motion import TURNS, wrapped
 from forcegp.logs.readers import read
 from forcegp.logs.smoothing import add_derivatives
-from forcegp.logs.table import Array, ImportReport, LogTable, Progress, Signals
+from forcegp.logs.table import Array, ImportReport, LogTable, Progress, Signals, Stream
+from forcegp.robot import RobotModel
 from forcegp.robust import level_and_spread
 from forcegp.rows import runs
 
-ROWS, TRIED_ROWS = 100_000, 3000
-"""Maximum number of rows read; maximum number of rows on which the inverse dynamics are evaluated."""
+TRIED_ROWS = 3000
+"""Maximum number of rows on which the inverse dynamics are evaluated."""
+BEYOND_LIMIT = 3.0
+"""Multiple of a joint limit that angles in radians do not reach."""
 LEAST_DEGREES = 3.2
 """If no position exceeds this value, the unit is not degrees, since the arm would hardly move [°]."""
 CLEARER, NEAR = 1.5, 1.3
@@ -45,27 +50,76 @@ TRAJECTORY, LONGEST, LEAST_FORCE = 10, 0.06, 1.0
 def guess_mapping(path: str | Path, system: ConstrainedSystem, progress: Progress | None = None) -> Draft:
     """Propose a mapping for a log, with empty entries for a position or torque that is not recognised."""
     table = read(path, rows=ROWS, progress=progress)
-    draft = Draft(str(path))
+    draft = Draft(str(path), remarks=table.remarks)
     with foreign(str(path), "a log that can be imported"):
         stream = find_time(table, draft)
         find_families(stream, system.robot, draft)
         find_wrench(table, system.robot, draft)
+        possible = _position_units(stream, draft, system.robot) if draft.families["position"].columns else []
         for quantity, family in draft.families.items():
             if draft.incomplete and not family.unit:
-                draft.say(quantity, f"the unit {units.SI[quantity]} was assumed", doubt=True)
+                family.unit = possible[0] if quantity == "position" and possible else units.SI[quantity]
+                text = f"the unit {family.unit} was assumed"
+                draft.say(quantity, text, doubt=len(possible) != 1 or quantity != "position")
             family.unit = family.unit or units.SI[quantity]
+        _find_wraps(stream, draft, possible)
+        _find_missing(stream, draft)
         if draft.incomplete:
             return draft
-        family = draft.families["position"]
-        if family.declared and family.unit is not None:
-            possible = [family.unit]
-        else:
-            reach = max(float(np.nanmax(np.abs(stream.columns[c]))) for c in family.columns.values())
-            draft.say("position", f"values up to {reach:.4g}")
-            possible = ["rad"] * (not reach > MOST_RADIANS) + ["deg"] * (not reach < LEAST_DEGREES)
         _try(path, draft, system, possible)
         propose_contacts(table, draft, system, cache(lambda: _signals(path, draft, system)))
     return draft
+
+
+def _position_units(stream: Stream, draft: Draft, robot: RobotModel) -> list[str]:
+    """Return the units of the positions that their values and the joint limits permit, likeliest first."""
+    family = draft.families["position"]
+    if family.declared and family.unit is not None:
+        return [family.unit]
+    columns = draft.columns_of("position", robot.joint_names)
+    reach = np.array([np.nanmax(np.abs(stream.columns[columns[joint]])) for joint in robot.joint_names])
+    draft.say("position", f"values up to {reach.max():.4g}")
+    limit = torch.maximum(robot.lower.abs(), robot.upper.abs()).numpy()
+    limit = np.where(np.isfinite(limit), limit, MOST_RADIANS)
+    beyond = reach > BEYOND_LIMIT * limit
+    if reach.max() > MOST_RADIANS or beyond[reach.argmax()]:
+        k = int(reach.argmax())
+        text = f"values of {robot.joint_names[k]} up to {reach[k]:.4g} exceed {limit[k]:.3g} rad: degrees"
+        draft.say("position", text, doubt=bool(np.radians(reach[k]) > BEYOND_LIMIT * limit[k]))
+        return ["deg"]
+    return ["rad"] + ["deg"] * (not reach.max() < LEAST_DEGREES)
+
+
+def _find_wraps(stream: Stream, draft: Draft, possible: list[str]) -> None:
+    """Propose to make angles continuous that jump by one turn."""
+    family = draft.families["position"]
+    for unit in [unit for unit in possible if unit in TURNS]:
+        jumps = {
+            c: int(wrapped(stream.columns[c][:, None], TURNS[unit]).sum()) for c in family.columns.values()
+        }
+        if listing := ", ".join(f"{column} ({count})" for column, count in jumps.items() if count):
+            family.unwrap = True
+            if not family.declared:
+                possible[:] = [unit]
+            text = f"angles jump by one turn ({unit}) and are made continuous: {listing}"
+            return draft.say("position", text, doubt=True)
+
+
+def _find_missing(stream: Stream, draft: Draft) -> None:
+    """Propose to drop rows that lack a value, such as messages of another node on the same topic."""
+
+    def lacking(family: Family) -> NDArray[np.bool_]:
+        values = np.stack([stream.columns[column] for column in family.columns.values()], axis=1)
+        return np.asarray(~np.isfinite(values).all(axis=1))
+
+    for name in ("velocity", "acceleration"):
+        if name in draft.families and lacking(draft.families[name]).mean() > 0.5:
+            del draft.families[name]
+            draft.say("position", f"most rows lack a value of the {name}, which is computed", doubt=True)
+    masks = [lacking(family) for family in draft.families.values() if family.columns]
+    if masks and (bad := np.any(masks, axis=0)).any():
+        draft.time["missing"] = "drop"
+        draft.say("time", f"{bad.sum()} of {len(bad)} rows lack a value and are dropped", doubt=True)
 
 
 def _try(path: str | Path, draft: Draft, system: ConstrainedSystem, possible: list[str]) -> None:
@@ -96,7 +150,8 @@ def _window(draft: Draft, trial: Signals) -> None:
     samples, most = [trial.vectors[name][rows] for name in names], (rows.stop - rows.start) // TRAJECTORY
     asked = cross_validated_window(samples, most=most)
     period = float(np.median(np.diff(trial.t[rows])))
-    draft.window = max(draft.window, min(asked, 1 + 2 * int(0.5 * LONGEST / period)))
+    most = int(LONGEST / period * (1.0 + 1e-9))
+    draft.window = max(draft.window, min(asked, most - (most + 1) % 2))
     text = f"window of {1e3 * period * draft.window:.3g} ms (at most 60, or 11 samples): "
     draft.say("derivatives", f"{text}cross-validation asks for {asked} samples")
 
@@ -127,6 +182,10 @@ def _velocity_unit(draft: Draft, trial: Signals) -> None:
     ratios = {u: 1.0 / units.VELOCITY[u] for u in ("rad/s", "deg/s", "rpm", "rev/s", "mrad/s")}
     unit = min(ratios, key=lambda u: abs(np.log(ratios[u]) - np.log(max(abs(slope / current), 1e-12))))
     miss = abs(slope) / current / ratios[unit]
+    if (time := _time_unit(draft, abs(slope))) is not None:
+        text = f"the velocity is {slope:.3g} times the derivative of the position: time is in {time}, not"
+        draft.say("time", f"{text} {draft.time['unit']}", doubt=True)
+        draft.time["unit"], unit, miss, slope = time, family.unit or "rad/s", 1.0, slope / abs(slope)
     if family.declared and unit != family.unit:
         text = f"{family.unit} is declared; it is {slope:.3g} times the derivative of q"
         draft.say("velocity", text, doubt=True)
@@ -139,6 +198,18 @@ def _velocity_unit(draft: Draft, trial: Signals) -> None:
     if family.sign != 1.0:
         turned = "all joints" if family.sign == -1.0 else "some joints"
         draft.say("velocity", f"the velocity of {turned} is minus the derivative of the position", doubt=True)
+
+
+def _time_unit(draft: Draft, slope: float) -> str | None:
+    """Return the unit of time with which a velocity in rad/s, or in its declared unit, is the derivative of
+    the position, if it is not the unit in the draft.
+    """
+    unit = draft.time["unit"]
+    if not isinstance(unit, str) or not slope > 0.0:
+        return None
+    off = {u: slope * units.TIME[u] / units.TIME[unit] for u in units.TIME}
+    best = min(off, key=lambda u: abs(np.log(off[u])))
+    return best if best != unit and 1.0 / NEAR < off[best] < NEAR else None
 
 
 def _signs(slopes: Array, clear: np.ndarray, joints: tuple[str, ...]) -> float | dict[str, float]:
@@ -163,12 +234,12 @@ def _torque(draft: Draft, trial: Signals, system: ConstrainedSystem) -> None:
         family.unit = family.unit if family.declared else "A"
         text = "a current: give the gear ratio and the torque constant [N m/A]; DrivePrior learns its error"
         draft.say("torque", text, doubt=True)
-    if clear.mean() < 0.5:
+    if clear.sum() < 0.5 * (len(clear) - len(family.unmeasured)):
         return draft.say("torque", "few torques follow the inverse dynamics: sign unknown", doubt=True)
     family.sign = _signs(slopes, clear, trial.joint_names)
     if isinstance(family.sign, dict):
         draft.say("torque", "the sign differs between joints; are the joints in the right order?", doubt=True)
-    elif not clear.all():
+    elif clear.sum() < len(clear) - len(family.unmeasured):
         draft.say("torque", f"the sign is that of {clear.sum()} of {len(clear)} joints", doubt=True)
     size = float(np.median(np.abs(slopes[clear])))
     if not family.declared and not current and 1000.0 / NEAR**2 < size < 1000.0 * NEAR**2:

@@ -6,7 +6,9 @@ Columns without headings are identified by their values.
 from __future__ import annotations
 
 import re
+from collections.abc import Iterator
 from difflib import SequenceMatcher
+from functools import cache
 from itertools import permutations
 from os.path import commonprefix
 
@@ -22,17 +24,29 @@ from forcegp.robust import robust_std
 
 WORDS: dict[str, list[str]] = units.VOCABULARY["words"]
 """Words for each quantity, in the order in which they are tried."""
-MEASURED, COMMANDED = (units.VOCABULARY["columns"][kind] for kind in ("measured", "commanded"))
-"""Words for measured columns, and words for columns to avoid, such as commands."""
+MEASURED, COMMANDED, MODELLED, AVOIDED = (
+    units.VOCABULARY["columns"][kind] for kind in ("measured", "commanded", "modelled", "avoided")
+)
+"""Words for measured columns, for commands, for outputs of a model, and for other columns to avoid."""
+UNMEASURED = {*COMMANDED, *MODELLED, *AVOIDED}
 _TIME = re.compile(
-    r"^(.*[ _./])?(t|mt|time|times|timestamp|stamp|clock|sec|secs|seconds|ms|millis|zeit)([ _./\[(].*)?$"
+    r"^(.*[ _./])?(t|mt|time|times|timestamp|stamp|clock|sec|secs|seconds|ms|millis|zeit|uhrzeit)"
+    r"([ _./\[(].*)?$"
 )
 _DECLARED = re.compile(
     r"(?i)[\[(]([^\])]*)[\])]|^(deg|rad|rpm|nm|mnm|ma)[_ ]"
     r"|[_ ](deg|rad|ms|us|ns|s|nm|mnm|a|ma|rpm|degps|radps|(?:deg|rad)[_/]s2?)$"
+    r"|[_ .]((?:deg|rad)[_/]s2?(?=[_ .\[])|(?:degps|radps|deg|rad|rpm|mnm|nm)(?=[_ .\[(\d]))"
 )
-_KNOWN = {word for words in WORDS.values() for word in words}.union(MEASURED, COMMANDED)
+_NAMED = {word for words in WORDS.values() for word in words}
+_KNOWN = _NAMED.union(MEASURED, UNMEASURED)
 _DERIVATIVE = re.compile(r"\b(?:d |dd )+(?=q\b)|\bq (?=d*dot\b)")
+SPLIT = ("ms", "us", "ns")
+"""Units of the second column of a clock with whole seconds."""
+LOGGED, DAY = (5e-5, 0.1), 86_400.0
+"""Range of the usual step of a log [s], and a day [s]."""
+COMMAND_SHARE = 0.6
+"""Weight of the columns of a stream that is named like a command."""
 _AXES = (("force", "f"), ("torque", "m", "t", "moment"))
 _SEGMENTS = ("segment", "episode_index", "episode", "trial", "run")
 
@@ -44,10 +58,24 @@ def tokens(name: str) -> list[str]:
     ['actual', 'joint', 'pos', '3', 'deg']
     >>> tokens("d_d_q_3"), tokens("qDot1")
     (['ddq', '3'], ['qdot', '1'])
+    >>> tokens("targetQ2"), tokens("dqref")
+    (['target', 'q', '2'], ['dq', 'ref'])
     """
     spaced = re.sub(r"([a-z])([A-Z])", r"\1 \2", name)
     words = " ".join(re.findall(r"[a-z]+|\d+", spaced.lower()))
-    return _DERIVATIVE.sub(lambda part: part[0].replace(" ", ""), words).split()
+    words = _DERIVATIVE.sub(lambda part: part[0].replace(" ", ""), words).split()
+    return [part for word in words for part in _parts(word)]
+
+
+@cache
+def _parts(word: str) -> tuple[str, ...]:
+    """Return a quantity and a command or model written as one word, such as `qdes`, as two words."""
+    pairs = ((word[:k], word[k:]) for k in range(1, 0 if word in _KNOWN else len(word)))
+    for start, end in pairs:
+        for quantity, kind in ((start, end), (end, start)):
+            if quantity in _NAMED - {"w"} and len(kind) > 2 and kind in UNMEASURED:
+                return start, end
+    return (word,)
 
 
 def declared_unit(name: str, stream: Stream) -> str | None:
@@ -60,30 +88,26 @@ def declared_unit(name: str, stream: Stream) -> str | None:
 
 def find_time(table: LogTable, draft: Draft) -> Stream:
     """Return the stream that contains the joint columns, and add its time column to the draft."""
-    stream = max(table.streams, key=lambda s: (len(s.columns), len(s)))
-    candidates = []
-    for name, values in stream.columns.items():
-        steps = np.diff(values[np.isfinite(values)])
-        if not len(steps) or not (steps > 0.0).mean() > 0.95:
-            continue
-        step = float(np.median(steps[steps > 0.0]))
-        even = float((np.abs(steps - step) < 0.5 * step).mean())
-        named = bool(_TIME.match(name.lower())) or name == "header"
-        candidates.append((2.0 * named + even + (name == "header"), name, step))
+    stream = max(table.streams, key=_likeness_to_joints)
+    candidates = [*_clocks(stream), *_split_clocks(stream)]
     if not candidates:
         rows = (f"{name} ({len(other)} rows)" for other in table.streams for name in other.columns)
         text = f"{table.source}: no column increases like time, with {len(stream)} rows as the joints"
-        got = ", ".join(sorted(rows, key=lambda name: not _TIME.match(name)))[:300]
-        raise MappingError(text, expected="a column of time stamps with as many rows", got=got)
-    _, column, step = max(candidates)
-    unit, doubt = declared_unit(column, stream), False
-    if unit in units.TIME:
-        text = f"the unit {unit} is declared; steps are {step:.6g} {unit}"
+        got = ", ".join(sorted(rows, key=lambda name: not _TIME.match(name)))[:300] + table.left_out
+        hint = "times as numbers, as 2025-11-27 14:03:22.008 or as 27.11.2025 14:03:22,008 are read"
+        raise MappingError(text, expected="a column of time stamps with as many rows", got=got, hint=hint)
+    _, column, unit, step = max(candidates, key=lambda found: found[0])
+    if unit is not None:
+        shown = " and ".join([unit] if isinstance(unit, str) else unit)
+        seconds = step * units.TIME[unit] if isinstance(unit, str) else step
+        draft.say("time", f"the unit {shown} is declared; steps are {seconds:.6g} s")
     else:
-        # Robots are logged at 10 Hz to 10 kHz, so the step alone distinguishes s, ms, µs and ns.
-        unit = "s" if step <= 0.1 else "ms" if step <= 100.0 else "us" if step <= 1e5 else "ns"
-        text, doubt = f"steps of {step:.6g} were interpreted as {unit}", unit != "s"
-    draft.say("time", text, doubt)
+        # Robots are logged at 10 Hz to 20 kHz, so the step alone distinguishes most units.
+        scales = ("s", "ms", "us", "ns", "d", "h", "min")
+        possible = [u for u in scales if LOGGED[0] <= step * units.TIME[u] <= LOGGED[1]]
+        unit = next(iter(possible), "s")
+        doubt = unit != "s" or not possible
+        draft.say("time", f"steps of {step:.6g} were interpreted as {unit}", doubt)
     for other in (s for s in table.streams if s is not stream and len(s) != len(stream)):
         stamps = [name for name in other.columns if _TIME.match(re.sub(r"\[\d+\]$", "", name.lower()))]
         if stamps and len(stamps) == len(other.columns):
@@ -92,6 +116,80 @@ def find_time(table: LogTable, draft: Draft) -> Stream:
     segment = next((name for name in _SEGMENTS if name in stream.columns), None)
     draft.time = {"column": column, "unit": unit, "segment": segment}
     return stream
+
+
+def _likeness_to_joints(stream: Stream) -> tuple[bool, float, int]:
+    """Return a key by which the stream with the measured joints is the largest."""
+    positions = any(_quantity(column) == "position" for column in stream.columns)
+    return positions, len(stream.columns) * (COMMAND_SHARE if doubtful(stream.name) else 1.0), len(stream)
+
+
+Clock = tuple[float, str | list[str], str | list[str] | None, float]
+"""Score, columns, declared units and usual step of a candidate for the clock."""
+
+
+def _evenness(values: np.ndarray) -> tuple[float, float] | None:
+    """Return the usual step, and the share of steps close to it, of a column that increases like time."""
+    steps = np.diff(values[np.isfinite(values)])
+    if not len(steps) or not (steps > 0.0).mean() > 0.95:
+        return None
+    step = float(np.median(steps[steps > 0.0]))
+    return step, float((np.abs(steps - step) < 0.5 * step).mean())
+
+
+def _clocks(stream: Stream) -> Iterator[Clock]:
+    """Yield the columns that increase like time."""
+    for name, values in stream.columns.items():
+        if (found := _evenness(values)) is not None:
+            step, even = found
+            score = 2.0 * (bool(_TIME.match(name.lower())) or name == "header") + even + (name == "header")
+            unit = declared_unit(name, stream)
+            yield score, name, unit if unit in units.TIME else None, step
+
+
+def _split_clocks(stream: Stream) -> Iterator[Clock]:
+    """Yield pairs of columns that form a clock: seconds and their fraction, or a date and a time of day."""
+    for coarse, whole in stream.columns.items():
+        if len(whole) < 2 or not np.isfinite(whole).all() or (whole % 1.0).any():
+            continue
+        date = bool((whole % DAY == 0.0).all() and np.abs(whole).min() >= DAY)
+        if not date and not _TIME.match(coarse.lower()) and _unit_of_time(coarse, stream) != "s":
+            continue
+        for fine in (name for name in stream.columns if name != coarse):
+            unit = _unit_of_time(fine, stream)
+            unit = unit if unit in SPLIT else "s"
+            seconds = stream.columns[fine] * units.TIME[unit]
+            named = _TIME.match(fine.lower()) if date else unit in SPLIT and _same_clock(coarse, fine)
+            if not named or not ((seconds >= 0.0) & (seconds < (DAY if date else 1.0))).all():
+                continue
+            if (found := _evenness(whole - whole[0] + seconds)) is not None:
+                yield 3.5 + found[1], [coarse, fine], ["s", unit], found[0]
+
+
+def _unit_of_time(name: str, stream: Stream) -> str | None:
+    """Return the unit of time in a heading, or at its end as in `tv_usec`, or `None`."""
+    words = tokens(name)
+    unit = declared_unit(name, stream) or (units.spelled(words[-1]) if words else None)
+    return unit if unit in units.TIME else None
+
+
+def _same_clock(coarse: str, fine: str) -> bool:
+    """Return whether two headings differ only in their last word, such as `stamp.sec` and `stamp.nanosec`."""
+    a, b = tokens(coarse), tokens(fine)
+    return b[:-1] in (a[:-1], a)
+
+
+def named_like(name: str, reason: str, quantity: str) -> str:
+    """Return the sentence about a name that is not that of a measurement."""
+    return f"{name.strip()!r} is named like {reason}, which is not a measured {quantity}"
+
+
+def doubtful(name: str) -> str | None:
+    """Return why a name is not that of a measurement, or `None`."""
+    words = tokens(name)
+    kinds = (("a command", COMMANDED), ("the output of a model", MODELLED))
+    found = ((kind, word) for kind, listed in kinds for word in words if word in listed)
+    return next((f"{kind} ({word!r})" for kind, word in found), None)
 
 
 def find_families(stream: Stream, robot: RobotModel, draft: Draft) -> None:
@@ -106,25 +204,47 @@ def find_families(stream: Stream, robot: RobotModel, draft: Draft) -> None:
                 draft.say(quantity, f"{best.pattern!r} was selected; also available: {listing}", doubt=True)
             if _quantity(best.pattern) is None:
                 draft.say(quantity, f"the {quantity} was recognised by its unit alone", doubt=True)
+            for name in (best.pattern.replace("{joint}", " "), stream.name):
+                if (reason := doubtful(name)) is not None:
+                    draft.say(quantity, named_like(name, reason, quantity), doubt=True)
     if not draft.families:
         find_by_values(stream, robot.joint_names, draft)
     _match_joints(robot, draft)
+    _partly_measured(stream, robot, draft)
     for quantity, family in draft.families.items():
         if len(valid := _units(family, stream) & set(units.QUANTITY[quantity])) == 1:
             family.unit, family.declared = valid.pop(), True
             draft.say(quantity, f"the unit {family.unit} is declared")
-    used = {draft.time["column"]}.union(*(f.columns.values() for f in draft.families.values()))
-    unused = ", ".join(column for column in stream.columns if column not in used)
+    clock = draft.time["column"]
+    used = {*([clock] if isinstance(clock, str) else clock)}
+    used.update(*(f.columns.values() for f in draft.families.values()))
+    unused = ", ".join(column for column in stream.columns if column not in used) or "(none)"
     for quantity in ("position", "torque"):
         if quantity not in draft.families:
             empty = dict.fromkeys(robot.joint_names, "")
             draft.families[quantity] = Family("", {}, stream.name, units.SI[quantity], by_joint=empty)
             text = f"no {quantity} was recognised: fill in columns and unit; unused columns: {unused[:300]}"
-            draft.say(quantity, text, doubt=True)
+            draft.say(quantity, text + draft.left_out, doubt=True)
 
 
-def _families(stream: Stream, robot: RobotModel) -> list[Family]:
-    """Return groups of columns that differ in a joint name or a number."""
+def _partly_measured(stream: Stream, robot: RobotModel, draft: Draft) -> None:
+    """Take a torque that is logged for some of the joints; the others are unmeasured."""
+    position = draft.families.get("position")
+    if "torque" in draft.families or position is None:
+        return
+    called = draft.joints or dict(zip(robot.joint_names, robot.joint_names, strict=True))
+    names = {joint: name for joint, name in called.items() if name in position.columns}
+    some = [f for f in _families(stream, robot, partly=True) if set(f.columns) < set(names.values())]
+    if rated := _rated(some, "torque", stream):
+        draft.families["torque"] = best = rated[0]
+        best.by_joint = {j: best.columns[name] for j, name in names.items() if name in best.columns}
+        best.unmeasured = [joint for joint, name in names.items() if name not in best.columns]
+        listing = ", ".join(best.unmeasured)
+        draft.say("torque", f"no torque of {listing}: unmeasured, which means an unknown force", doubt=True)
+
+
+def _families(stream: Stream, robot: RobotModel, partly: bool = False) -> list[Family]:
+    """Return groups of columns that differ in a joint name or a number, for all joints or for some."""
     groups: dict[str, dict[str, str]] = {}
     names = "|".join(re.escape(name) for name in sorted(robot.joint_names, key=len, reverse=True))
     for column in stream.columns:
@@ -134,7 +254,8 @@ def _families(stream: Stream, robot: RobotModel) -> list[Family]:
             groups.setdefault(pattern, {})[found[0]] = column
             if found is joint and _quantity(pattern) is not None:
                 break
-    return [Family(pattern, of, stream.name) for pattern, of in groups.items() if len(of) == robot.nq]
+    complete = ((p, of) for p, of in groups.items() if len(of) == robot.nq or (partly and len(of) < robot.nq))
+    return [Family(pattern, of, stream.name) for pattern, of in complete]
 
 
 def _alike(stream: Stream, robot: RobotModel) -> list[Family]:
@@ -171,7 +292,7 @@ def _rated(families: list[Family], quantity: str, stream: Stream) -> list[Family
         words, named = tokens(family.pattern.replace("{joint}", " ")), _quantity(family.pattern)
         unit = _units(family, stream) - set(units.FORCE)
         if named == quantity or (not named and unit and unit <= set(units.QUANTITY[quantity])):
-            score = 1.0 + 0.5 * any(w in MEASURED for w in words) - 0.8 * any(w in COMMANDED for w in words)
+            score = 1.0 + 0.5 * any(w in MEASURED for w in words) - 0.8 * any(w in UNMEASURED for w in words)
             score -= 0.01 * len(words) + 0.2 * ("current" in words or "currents" in words) + 0.3 * (not named)
             scored.append((score, family))
     return [family for score, family in sorted(scored, key=lambda pair: -pair[0]) if score > 0.0]
@@ -229,6 +350,8 @@ def find_wrench(table: LogTable, robot: RobotModel, draft: Draft) -> None:
 
 def find_by_values(stream: Stream, joints: tuple[str, ...], draft: Draft) -> None:
     """Propose families for columns without headings: blocks of one column per joint, and their rates."""
+    if not isinstance(draft.time["column"], str):
+        return
     nq = len(joints)
     names = [name for name in stream.columns if name != draft.time["column"]]
     blocks = [names[k : k + nq] for k in range(0, len(names) - nq + 1, nq)]

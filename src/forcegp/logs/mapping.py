@@ -24,6 +24,7 @@ from forcegp.errors import MappingError, did_you_mean
 from forcegp.guards import is_file
 from forcegp.logs import units
 from forcegp.logs.readers import read
+from forcegp.logs.table import left_out
 from forcegp.scene.document import Document, Key
 from forcegp.scene.sections import Section
 
@@ -46,19 +47,23 @@ class Family:
     declared: bool = False
     sign: float | dict[str, float] = 1.0
     by_joint: dict[str, str] = field(default_factory=dict)
+    unwrap: bool = False
+    unmeasured: list[str] = field(default_factory=list)
 
     def table(self) -> dict[str, Any]:
         """Return the table for this family in the mapping file."""
         columns = {"columns": self.by_joint} if self.by_joint else {"column": self.pattern}
         sign = None if self.sign == 1.0 else self.sign
         current = CURRENT if self.unit in ("A", "mA") else {}
-        return {**columns, "stream": self.stream or None, "unit": self.unit, "sign": sign, **current}
+        more = {"unwrap": self.unwrap or None, "unmeasured": self.unmeasured or None}
+        return {**columns, "stream": self.stream or None, "unit": self.unit, "sign": sign, **more, **current}
 
 
 @dataclass
 class Draft:
     """A proposed mapping: tables (keys with value `None` are omitted), families of columns by quantity,
-    comments placed above each table, entries that the user must check, and the filter window for derivatives.
+    comments placed above each table, entries that the user must check, notes of the reader, and the filter
+    window for derivatives.
     """
 
     source: str
@@ -68,12 +73,24 @@ class Draft:
     further: dict[str, dict[str, Any]] = field(default_factory=dict)
     comments: dict[str, list[str]] = field(default_factory=dict)
     doubts: list[str] = field(default_factory=list)
+    remarks: tuple[str, ...] = ()
     window: int = 11
+
+    @property
+    def left_out(self) -> str:
+        """The omissions of the reader, to be appended to a sentence."""
+        return left_out(self.remarks)
 
     @property
     def incomplete(self) -> list[str]:
         """Names of the quantities whose columns the user must fill in."""
         return [name for name, family in self.families.items() if not family.columns]
+
+    def columns_of(self, quantity: str, joints: Sequence[str]) -> dict[str, str]:
+        """Return the column of each joint for which a quantity was found."""
+        family = self.families[quantity]
+        named = {joint: family.columns.get(self.joints.get(joint, joint), "") for joint in joints}
+        return {joint: column for joint, column in (named | family.by_joint).items() if column}
 
     def say(self, table: str, sentence: str, doubt: bool = False) -> None:
         """Add a comment to a table. If `doubt` is set, mark the comment CHECK and add it to `doubts`."""
@@ -85,7 +102,9 @@ class Draft:
         """Return the text of the mapping file."""
         lines = [
             f"# Mapping of {_plain(self.source)}, proposed from its headings and values.",
-            "# Check it, delete the mark CHECK of each line that is right, and import with --mapping.\n",
+            "# Check it, delete the mark CHECK of each line that is right, and import with --mapping.",
+            *(f"# The reader: {_plain(remark)}" for remark in self.remarks),
+            "",
         ]
         quantities = {name: self.families[name].table() for name in SYMBOLS if name in self.families}
         tables = {"time": self.time, "joints": self.joints, **quantities, **self.further}
@@ -119,16 +138,27 @@ def _value(value: object) -> str:
 
 SYMBOLS = {"position": "q", "velocity": "qd", "acceleration": "qdd", "torque": "tau"}
 """Names of the mapped quantities in a data set."""
+ROS_NAMES = {"position": "position", "velocity": "velocity", "torque": "effort"}
+"""Names of the mapped quantities in ROS joint states."""
+KNOWN_NAMES = {"t": "a data set", "header": "ROS joint states"}
+"""Sources of the column names that need no mapping, by their column of time."""
+ROWS = 100_000
+"""Maximum number of rows from which a mapping is proposed. One message may lack joints or quantities."""
 PerJoint = float | dict[str, float]
 """One number for all joints, or one number for each joint name."""
 
 
-class TimeSection(Section):
-    """`[time]`: the clock."""
+TimeUnit = Literal["s", "ms", "us", "ns", "min", "h", "d"]
+"""Units of time; a day has 86,400 s."""
 
-    column: str
+
+class TimeSection(Section):
+    """`[time]`: the clock, in one column, or in several with one unit each that are added up, such as seconds
+    and nanoseconds."""
+
+    column: str | tuple[str, ...]
     stream: str | None = None
-    unit: Literal["s", "ms", "us", "ns", "min"] = "s"
+    unit: TimeUnit | tuple[TimeUnit, ...] = "s"
     start: float = -np.inf
     stop: float = np.inf
     segment: str | None = None
@@ -136,6 +166,16 @@ class TimeSection(Section):
     gap: float | None = Field(default=None, gt=0.0)
     missing: Literal["error", "drop"] = "error"
     held: Literal["keep", "drop"] = "keep"
+
+    @property
+    def columns(self) -> tuple[str, ...]:
+        """The columns of the clock."""
+        return (self.column,) if isinstance(self.column, str) else self.column
+
+    @property
+    def factors(self) -> tuple[float, ...]:
+        """The factors that convert the columns of the clock to seconds."""
+        return tuple(units.TIME[unit] for unit in ([self.unit] if isinstance(self.unit, str) else self.unit))
 
 
 class QuantitySection(Section):
@@ -161,8 +201,10 @@ class TorqueSection(QuantitySection):
 
 
 class PositionSection(QuantitySection):
-    """`[position]`: for each joint without a column, `from_contact` names the contact that determines it."""
+    """`[position]`: for each joint without a column, `from_contact` names the contact that determines it. If
+    `unwrap` is set, angles that jump by one turn are made continuous."""
 
+    unwrap: bool = False
     from_contact: dict[str, str] = Field(default_factory=dict)
 
 
@@ -269,7 +311,10 @@ class Mapping:
         if lacking:
             text = f"joint {lacking[0]!r} has no column"
             expected = f'{quoted(lacking[0])} = "…" under columns'
-            raise self.error((name,), text, expected=expected, hint=lock_hint(lacking))
+            unmeasured = f"if it has no torque sensor, unmeasured = {json.dumps(lacking)} under [torque]"
+            raise self.error(
+                (name,), text, expected, hint=unmeasured if name == "torque" else lock_hint(lacking)
+            )
         columns = [named[joint] for joint in measured]
         if len(set(columns)) < len(columns):
             twice = next(c for c in columns if columns.count(c) > 1)
@@ -348,6 +393,9 @@ def _check(mapping: Mapping) -> None:
         got = f"{len(wrench.force)} columns{', and those of a torque' if wrench.torque else ''}"
         raise mapping.error(("wrench", "force"), "not a force", "one column, or three, of x, y and z", got)
     time, derivatives = sections.time, sections.derivatives
+    if len(time.columns) != len(time.factors) or not time.columns:
+        text, got = "the columns of the clock need one unit each", f"{len(time.factors)} units"
+        raise mapping.error(("time", "unit"), text, f"{len(time.columns)} units", got)
     if time.start >= time.stop:
         raise mapping.error(("time", "stop"), "the log would be empty", f"more than {time.start}", time.stop)
     if derivatives.window % 2 == 0 or derivatives.order >= derivatives.window:
@@ -365,6 +413,8 @@ def _check_quantity(mapping: Mapping, name: str, section: QuantitySection) -> No
         raise mapping.error((name, "unit"), "unknown unit", listing, repr(section.unit), hint)
     if section.column is None and not section.columns:
         raise mapping.error((name,), "no column", expected='column = "…{joint}…", or columns = {…}')
+    if getattr(section, "unwrap", False) and section.unit in ("m", "mm"):
+        raise mapping.error((name, "unwrap"), "a distance does not wrap", "a unit of angle", section.unit)
     if section.side == "motor" and section.gear_ratio is None:
         raise mapping.error((name, "side"), "the motor's side needs a gear ratio", expected="gear_ratio = …")
     valid: dict[str, tuple[str, Callable[[float], bool]]] = {
@@ -382,19 +432,24 @@ def _check_quantity(mapping: Mapping, name: str, section: QuantitySection) -> No
 
 def default_mapping(path: str | Path, system: ConstrainedSystem) -> Mapping:
     """Return the mapping for a log with unambiguous column names; raise `MappingError` otherwise."""
-    table, robot = read(path, rows=1), system.robot
+    table, robot = read(path, rows=ROWS), system.robot
     names, joints = set(table.names), robot.joint_names
-    logged = {n: s for n, s in SYMBOLS.items() if names >= {f"{s}.{joint}" for joint in joints}}
-    if {"position", "torque"} <= set(logged) and "t" in names:
-        draft = Draft(str(path), {"column": "t", "segment": "segment" if "segment" in names else None})
-        for name, symbol in logged.items():
-            draft.families[name] = Family(f"{symbol}.{{joint}}", {}, unit=units.SI[name])
+    for time, words in (("t", SYMBOLS), ("header", ROS_NAMES)):
+        logged = {n: word for n, word in words.items() if names >= {f"{word}.{joint}" for joint in joints}}
+        if not {"position", "torque"} <= set(logged) or time not in names:
+            continue
+        # On a topic of joint states, messages of other nodes lack joints or efforts.
+        more = {"missing": "drop"} if time == "header" else {}
+        draft = Draft(
+            str(path), {"column": time, "segment": "segment" if "segment" in names else None, **more}
+        )
+        for name, word in logged.items():
+            draft.families[name] = Family(f"{word}.{{joint}}", {}, unit=units.SI[name])
+        draft.families["position"].unwrap = True
         for contact in system.contact_names:
             if (column := f"contact.{contact}") in names:
                 draft.further[f"contact.{quoted(contact)}"] = {"source": "column", "column": column}
-        return parse_mapping(draft.toml().encode(), "columns named as in a data set")
-    if "header" in names and names >= {f"{n}.{joint}" for n in ("position", "effort") for joint in joints}:
-        return load_mapping("ros_joint_states")
+        return parse_mapping(draft.toml().encode(), f"columns named as in {KNOWN_NAMES[time]}")
     raise MappingError(
         f"{path}: the quantities of the columns are unclear",
         expected=f"t, q.{joints[0]}, tau.{joints[0]}, …, or a mapping",

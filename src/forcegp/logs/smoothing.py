@@ -181,8 +181,9 @@ def _pieces(signals: Signals, least: int, report: ImportReport) -> NDArray[np.in
     length = np.repeat(lengths, lengths)
     if not (keep := length >= least).any():
         text = "no stretch of the log is long enough to compute accelerations"
-        got = f"{len(signals)} rows, cut by the clock and by contact switches"
-        raise DataError(text, expected=f"{least} rows without a contact switch", got=got)
+        text = next((found.message for found in report.findings if found.kind == "bursts"), text)
+        expected = f"{least} rows without a gap in time{' or a contact switch' * bool(signals.contact)}"
+        raise DataError(text, expected=expected, got=f"{len(signals)} rows in {len(lengths)} stretches")
     if not keep.all():
         message = f"{(~keep).sum()} rows in stretches shorter than {least} rows were dropped"
         report.find("short", message, signals.row[~keep])

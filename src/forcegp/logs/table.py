@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -57,14 +58,19 @@ class LogTable:
         """Names of all columns, stream by stream."""
         return [name for stream in self.streams for name in stream.columns]
 
+    @property
+    def left_out(self) -> str:
+        """The omissions of the reader, to be appended to a sentence."""
+        return left_out(self.remarks)
+
     def stream_of(self, column: str, stream: str | None = None) -> Stream:
         """Return the stream that contains a column; raise `DataError` if there is none, or more than one."""
         among = [s for s in self.streams if stream is None or s.name == stream]
         if not among:
-            raise missing(self.source, "stream", stream or "", [s.name for s in self.streams])
+            raise missing(self, "stream", stream or "", [s.name for s in self.streams])
         holding = [s for s in among if column in s.columns]
         if not holding:
-            raise missing(self.source, "column", column, [n for s in among for n in s.columns])
+            raise missing(self, "column", column, [n for s in among for n in s.columns])
         if len(holding) > 1:
             text, got = f"several streams have a column {column!r}", [s.name or "(unnamed)" for s in holding]
             expected = "a key 'stream' that names one of them"
@@ -83,10 +89,20 @@ def streams_by_length(groups: Mapping[int, Mapping[str, Column]], common: int) -
     return tuple(Stream("" if rows == common else f"{rows} rows", groups[rows]) for rows in ordered)
 
 
-def missing(source: str, kind: str, name: str, names: list[str]) -> DataError:
+def left_out(remarks: Sequence[str]) -> str:
+    """Return the notes of a reader about omissions, to be appended to a sentence.
+
+    >>> left_out(["'q' of shape (2, 3, 4) and type float64 was left out", "'t' was transposed"])
+    "; not read: 'q' of shape (2, 3, 4) and type float64 was left out"
+    """
+    omitted = [note for note in remarks if re.search(r"left out|ignored|not read|not followed", note)]
+    return f"; not read: {'; '.join(omitted)[:600]}" if omitted else ""
+
+
+def missing(table: LogTable, kind: str, name: str, names: list[str]) -> DataError:
     """Return the error for a missing stream or column."""
     shown = ", ".join(repr(k) for k in names[:16]) + (f", … ({len(names)})" if len(names) > 16 else "")
-    text = f"{source}: the log has no {kind} {name!r}"
+    text = f"{table.source}: the log has no {kind} {name!r}{table.left_out}"
     expected = f"one of {shown}" if names else "a log with columns of numbers"
     return DataError(text, expected=expected, hint=did_you_mean(name, names, 0.5))
 
@@ -103,7 +119,8 @@ def table_of_arrays(
     usable, remarks, source = {}, list(remarks), str(path)
     check_expansion(source, 8 * sum(array.size for array in arrays.values()), path.stat().st_size)
     for name, array in arrays.items():
-        squeezed = array.reshape(-1) if array.ndim == 2 and 1 in array.shape else array
+        # Simulink logs a signal as d × 1 × n.
+        squeezed = array.squeeze() if array.size > 1 else array
         if squeezed.dtype.kind not in "fiub" or squeezed.ndim not in (1, 2) or squeezed.size < 2:
             remarks.append(f"{name!r} of shape {array.shape} and type {array.dtype} was left out")
         else:

@@ -72,6 +72,67 @@ def test_decimal_commas_are_not_separators(tmp_path: Path) -> None:
     assert read(path).streams[0].columns["q"].tolist() == [1.5, 1.75]
 
 
+@pytest.mark.parametrize("quote", ['"', "'"])
+@pytest.mark.parametrize("separator", [",", ";", ", ", "\t", " "])
+@pytest.mark.parametrize("decimal", [".", ","])
+def test_quoted_fields_with_decimal_commas(tmp_path: Path, quote: str, separator: str, decimal: str) -> None:
+    """Headings in quotes may contain separators, and so may numbers with a decimal comma."""
+    names = ["Zeit [s]", "Winkel, A1 [°]", "Moment; A1"]
+    rows = [names, *(line.split(" ") for line in lines(" ", decimal))]
+    text = "\n".join(separator.join(f"{quote}{field}{quote}" for field in row) for row in rows)
+    columns = read(written(tmp_path, text)).streams[0].columns
+    assert list(columns) == names
+    np.testing.assert_array_equal(np.column_stack(list(columns.values())), VALUES)
+
+
+def test_quotes_in_the_heading_only(tmp_path: Path) -> None:
+    columns = read(written(tmp_path, '"t","a, b","c"\n' + "\n".join(lines(",")))).streams[0].columns
+    assert list(columns) == ["t", "a, b", "c"]
+
+
+@pytest.mark.parametrize(
+    ("start", "end", "seconds"),
+    [
+        ("27.11.2025 23:59:59,250", "28.11.2025 00:00:01,5", 2.25),
+        ("2025-11-27T23:59:59.250Z", "2025-11-28T01:00:01.5+01:00", 2.25),
+        ("2025/11/27 23:59:59.250", "2025/11/28 0:00:01.5", 2.25),
+        ("11/27/2025 11:59:59.250 PM", "11/28/2025 12:00:01.5 AM", 2.25),
+        ("11/12/2025 23:59:59.250", "12/12/2025 00:00:01.5", 2.25),
+        ("11/12/2025 23:59:59.250", "11/13/2025 00:00:01.5", 2.25),
+        ("27-11-25 23:59:59.250", "28-11-25 00:00:01.5", 2.25),
+        ("23:59:59.250", "00:00:01.5", 2.25),
+        ("23:59:59.250000001", "00:00:01.5", 2.249999999),
+        ("2024-02-28", "2024-03-01", 2 * 86400.0),
+    ],
+)
+def test_dates_of_countries(tmp_path: Path, start: str, end: str, seconds: float) -> None:
+    columns = read(written(tmp_path, f"when;q\n{start};0\n{start};1\n{end};2\n")).streams[0].columns
+    assert columns["when"][2] - columns["when"][0] == pytest.approx(seconds, abs=1e-7)
+
+
+def test_a_date_and_a_time_of_day_are_not_added_twice(tmp_path: Path) -> None:
+    rows = ["27.11.2025;23:59:59,5;0", "28.11.2025;00:00:00,5;1"]
+    columns = read(written(tmp_path, "\n".join(["Datum;Uhrzeit;q", *rows]))).streams[0].columns
+    np.testing.assert_allclose(np.diff(columns["Datum"] + columns["Uhrzeit"]), 1.0, atol=1e-7)
+
+
+def test_an_impossible_date_names_its_row_and_the_formats(tmp_path: Path) -> None:
+    rows = [f"27.11.2025 14:03:{k % 60:02d};{k}" for k in range(300)]
+    rows[250] = "yesterday;250"
+    with pytest.raises(DataError, match=r"invalid date or time in row 250(?s:.*)27.11.2025(?s:.*)yesterday"):
+        read(written(tmp_path, "\n".join(["when;q", *rows])))
+
+
+def test_a_column_that_starts_empty_is_read(tmp_path: Path) -> None:
+    """The first rows decide nothing: a sensor may start later than the logger."""
+    rows = [f"{k};;;{'' if k < 400 else '1,5'};{'' if k < 400 else 'off'}" for k in range(500)]
+    table = read(written(tmp_path, "\n".join(["t;never;;late;word", *rows])))
+    late = table.streams[0].columns["late"]
+    assert np.isnan(late[:400]).all() and (late[400:] == 1.5).all()
+    assert list(table.streams[0].columns) == ["t", "late"]
+    assert any("'never' contains no numbers" in remark for remark in table.remarks)
+
+
 def test_only_the_columns_and_rows_that_are_wanted(tmp_path: Path) -> None:
     path = written(tmp_path, "\n".join(["t,a,b", *lines(",")]))
     table = read(path, wanted=lambda name: name != "a", rows=7)

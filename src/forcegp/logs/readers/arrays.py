@@ -108,7 +108,7 @@ def _walk(
 
 def _take(item: Any, name: str, arrays: Arrays, remarks: list[str]) -> None:
     text = item.attrs.get("MATLAB_class", b"") in (b"char", b"cell", b"struct", b"function_handle")
-    if item.dtype.kind not in "fiub" or item.ndim not in (1, 2) or text:
+    if item.dtype.kind not in "fiub" or not 1 <= sum(n > 1 for n in item.shape) <= 2 or text:
         remarks.append(f"{name!r} of shape {item.shape} and type {item.dtype} was left out")
     elif item.external or item.is_virtual:
         remarks.append(f"{name!r} lies outside the file and was left out")
