@@ -13,6 +13,7 @@ import warnings
 import typer
 from typer import Option
 
+from forcegp.cli.command import keeping_inputs
 from forcegp.cli.common import say, warn
 from forcegp.cli.evaluate import evaluate
 from forcegp.cli.excite import excite
@@ -40,8 +41,8 @@ app = typer.Typer(
     context_settings={"help_option_names": ["-h", "--help"]},
 )
 for command in (simulate, check, select, fit, predict, evaluate, rollout, export, excite, sweep, view):
-    app.command()(command)
-app.command("import")(import_)
+    app.command()(keeping_inputs(command))
+app.command("import")(keeping_inputs(import_))
 
 
 def _version(wanted: bool) -> bool:

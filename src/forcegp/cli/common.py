@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import typer
 
 import forcegp
-from forcegp.errors import DataError, DestinationError, ForceGPError
+from forcegp.errors import DataError, ForceGPError
 
 if TYPE_CHECKING:
     from forcegp.models.base import FittedModel, Predictor
@@ -93,15 +93,6 @@ def show(result: Mapping[str, object], as_json: bool) -> None:
         say(text, f"{name.replace('_', ' '):<{width}}  ", indent=width + 2)
 
 
-def check_output(out: Path, *inputs: Path) -> None:
-    """Check, before long computations, that a file can be written and is not an input."""
-    from forcegp.destination import check_destination
-
-    check_destination(out)
-    if out.resolve() in (path.resolve() for path in inputs):
-        raise DestinationError(f"{out} would be overwritten", hint="choose another file for the result")
-
-
 def save(write: Callable[[Path], object], out: Path) -> None:
     """Write a result by `write(out)` or, if that fails, to a different path that the error names."""
     from forcegp.destination import write_or_keep
@@ -109,12 +100,13 @@ def save(write: Callable[[Path], object], out: Path) -> None:
     write_or_keep(write, out)
 
 
-def check_data_destination(path: Path, *inputs: Path) -> None:
-    """Check, before long computations, that a data set can be written without overwriting an input."""
+def check_data_destination(path: Path) -> None:
+    """Check, before long computations, that a data set can be written."""
     from forcegp.data.table import check_ending
+    from forcegp.destination import check_destination
 
     check_ending(path)
-    check_output(path, *inputs)
+    check_destination(path)
 
 
 def derivatives(window: int | None) -> forcegp.SavitzkyGolay | None:

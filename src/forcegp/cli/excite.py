@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from typer import Option
 
-from forcegp.cli.common import check_data_destination, check_output, progress_bar, read_data, save, show
+from forcegp.cli.common import check_data_destination, progress_bar, read_data, save, show
 from forcegp.cli.options import AsJson, SceneName
 
 if TYPE_CHECKING:
@@ -18,7 +18,9 @@ Numbers = Annotated[str | None, Option(metavar="X[,X...]", help="Maximum, as one
 
 def excite(
     scene: SceneName,
-    out: Annotated[Path, Option("--out", "-o", help="Output file for the motion (.csv or .parquet).")],
+    out: Annotated[
+        Path, Option("--out", "-o", writable=True, help="Output file for the motion (.csv or .parquet).")
+    ],
     seconds: Annotated[float, Option(help="Duration of the motion in seconds.")] = 30.0,
     model: Annotated[
         Path | None, Option("--model", "-m", help="Fitted model with the posterior to start from.")
@@ -68,6 +70,7 @@ def excite(
     forcegp excite -s ur5_free --model model --box 0.5,0,0.1,0.3,0.3,0.2 -o motion.csv
     """
     from forcegp.control.information import Unknowns
+    from forcegp.destination import check_destination
     from forcegp.errors import ModelError
     from forcegp.models.calibrated import unknowns_after
     from forcegp.models.load import load_model
@@ -78,10 +81,9 @@ def excite(
     from forcegp.simulate.excite import Limits, excite, random_states
     from forcegp.view.excitation import write_excitation
 
-    inputs = [path for path in (model, region) if path is not None]
-    (check_output if out.suffix.lower() == ".csv" else check_data_destination)(out, *inputs)
+    (check_destination if out.suffix.lower() == ".csv" else check_data_destination)(out)
     page = out.with_suffix(".html")
-    check_output(page)
+    check_destination(page)
     read = load_scene(scene)
     system = read.system()
     shapes = shapes_of(system.robot, read.robot_source, ("collision", "visual"))

@@ -21,7 +21,10 @@ TARGETS = ("c", "casadi", "torch", "urdf", "mjcf")
 def export(
     model: ModelFile,
     out: Annotated[
-        Path, Option("--out", "-o", help="Folder for the code and its test, or path of the robot file.")
+        Path,
+        Option(
+            "--out", "-o", writable=True, help="Folder for the code and its test, or path of the robot file."
+        ),
     ],
     to: Annotated[str, Option("--to", help="Format: c, casadi, torch, urdf or mjcf.")] = "c",
     name: Annotated[str, Option(help="For C: name of the files and prefix of the functions.")] = "controller",
@@ -78,10 +81,12 @@ def export(
     """
     import torch
 
+    from forcegp.destination import check_destination, check_folder
     from forcegp.forces.external_wrench import WrenchFrame
     from forcegp.models.structured_fit import StructuredFit
 
     check_name("format to export to", to, TARGETS)
+    (check_destination if to in ("urdf", "mjcf") else check_folder)(out)
     fit = forcegp.load_model(model)
     if not isinstance(fit, StructuredFit):
         raise ModelError("only a structured Gaussian process can be exported", expected="sgp", got=fit.kind)

@@ -28,7 +28,9 @@ WRENCH = "external_wrench"
 def predict(
     model: ModelFile,
     data: DataFile,
-    out: Annotated[Path, Option("--out", "-o", help="Output file for the predictions (.parquet).")],
+    out: Annotated[
+        Path, Option("--out", "-o", writable=True, help="Output file for the predictions (.parquet).")
+    ],
     quantity: Annotated[
         str,
         Option(
@@ -78,7 +80,7 @@ def predict(
     """
     from forcegp.evaluation.predicted import in_chunks
 
-    check_data_destination(out, data)
+    check_data_destination(out)
     regression = forcegp.load_model(model)
     test = read_data(data, regression.specified.robot)
     if quantity == WRENCH:
