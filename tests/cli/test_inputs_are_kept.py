@@ -140,7 +140,7 @@ def test_the_current_folder_is_no_place_for_a_result(
     command = COMMANDS[name]
     words = [name, *arguments(command, "data", tmp_path / "inputs"), *others(command, result, tmp_path)]
     done = CliRunner().invoke(app, [*words, option(command, result), place])
-    with pytest.raises(ForceGPError, match="current folder|is a folder|no name|as Parquet|no output path"):
+    with pytest.raises(ForceGPError, match=r"current folder|is a folder|no name|as Parquet|no output path"):
         raise done.exception or AssertionError(done.output)
 
 

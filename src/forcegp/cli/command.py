@@ -105,18 +105,22 @@ def _meant(name: str, value: str) -> Iterator[Path]:
 
 def _with_named(paths: Iterable[Path]) -> Iterator[Path]:
     """Yield paths, and the files that scenes and robot files among them name."""
-    queue, seen = list(paths), set[Path]()
+    queue, seen, roots = list(paths), set[Path](), list[Path]()
     while queue:
         path = queue.pop()
         if path not in seen:
             seen.add(path)
             yield path
             with suppress(OSError, ValueError, ForceGPError):  # the reader of the file reports its errors
-                queue += _named(path)
+                queue += _named(path, roots)
 
 
-def _named(path: Path) -> list[Path]:
-    """Return the files that a scene or a robot file names."""
+def _named(path: Path, roots: list[Path]) -> list[Path]:
+    """Return the existing files that a scene or a robot file names.
+
+    Names in an included file start at the folders of the file that includes it as well; `roots` collects
+    these folders. Names of packages start at a parent of the folder.
+    """
     from forcegp.robot.safety import parse_xml, read_bytes
 
     if path.suffix.lower() == ".toml":
@@ -124,19 +128,15 @@ def _named(path: Path) -> list[Path]:
         return [path.parent / robot["model"]] if isinstance(robot, dict) and "model" in robot else []
     if path.suffix.lower() not in (".urdf", ".xml", ".mjcf"):
         return []
-    elements = list(parse_xml(read_bytes(path), str(path)).iter())
-    folders = ["", *(x for e in elements for name in MESH_FOLDERS if (x := e.get(name)))]
-    named = [e.get(name, "") for e in elements for name in ("file", "filename")]
-    return [place for name in filter(None, named) for place in _places(name, path.parent, folders)]
-
-
-def _places(name: str, folder: Path, folders: list[str]) -> list[Path]:
-    """Return the existing files that a name in a robot file may mean, in its folder or in a package."""
-    package, _, rest = name.partition("://")[2].partition("/")
-    roots = [folder / each for each in folders]
-    if package:
-        roots, name = [parent / package for parent in (folder, *folder.resolve().parents)] + [folder], rest
-    return [place for root in roots if (place := root / name).is_file()]
+    folder, elements = path.parent, list(parse_xml(read_bytes(path), str(path)).iter())
+    roots += [folder, *(folder / x for e in elements for name in MESH_FOLDERS if (x := e.get(name)))]
+    names = [x for e in elements for name in ("file", "filename") if (x := e.get(name))]
+    packages = [folder, *folder.resolve().parents]
+    found = [name.rpartition("://")[2] for name in names if "://" in name]
+    places = [root / name for name in found for root in packages]
+    places += [folder / name.partition("/")[2] for name in found]
+    places += [root / name for name in names for root in roots]
+    return list(filter(Path.is_file, places))
 
 
 Places = Callable[[Path, Mapping[str, Any]], Iterable[Path]]
