@@ -16,6 +16,7 @@ import typer
 
 import forcegp
 from forcegp.errors import DataError, ForceGPError
+from forcegp.files import finite
 
 if TYPE_CHECKING:
     from forcegp.models.base import FittedModel, Predictor
@@ -83,7 +84,7 @@ def progress_bar(description: str, total: int) -> Iterator[Advance]:
 def show(result: Mapping[str, object], as_json: bool) -> None:
     """Print the nonempty values of a result, one per line, or print all values as JSON."""
     if as_json:
-        typer.echo(json.dumps(dict(result), default=str))
+        typer.echo(json.dumps(finite(dict(result)), default=str, allow_nan=False))
         return
     fields = {name: value for name, value in result.items() if value is not None and value != ()}
     width = max(len(name) for name in fields)

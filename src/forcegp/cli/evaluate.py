@@ -73,6 +73,7 @@ def evaluate(
         "verdict": evaluation.verdict or "too few samples",
         "doubts": evaluation.doubts,
         "comparison": evaluation.comparison or None,
+        "left_out": evaluation.left_out,
         **evaluation.summary(),
     }
     if out is not None:

@@ -64,11 +64,11 @@ def import_(
     from forcegp.destination import check_destination
     from forcegp.logs import import_log
 
-    common.check_robot_named(scene, robot)
     place = guess or out
     if place is None or (guess is None and place.suffix.lower() != ".parquet"):
         raise ForceGPError("no output path was given", expected="--out log.parquet", got=out)
     check_destination(place)
+    common.check_robot_named(scene, robot)
     system = common.system_of(scene, robot)
     if guess is not None:
         show(_guess(log, system, guess), as_json)
