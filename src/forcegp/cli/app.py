@@ -8,6 +8,7 @@ import warnings
 import typer
 from typer import Option
 
+import forcegp
 from forcegp.cli.command import keeping_inputs
 from forcegp.cli.common import say, warn
 from forcegp.cli.evaluate import evaluate
@@ -39,9 +40,7 @@ app.command("import")(keeping_inputs(import_))
 
 def _version(wanted: bool) -> bool:
     if wanted:
-        from importlib.metadata import version
-
-        typer.echo(f"forcegp {version('forcegp')}")
+        typer.echo(f"forcegp {forcegp.__version__}")
         raise typer.Exit
     return wanted
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Protocol
 import typer
 
 import forcegp
-from forcegp.errors import DataError, ForceGPError
+from forcegp.errors import DataError, ForceGPError, ParameterError
 from forcegp.files import finite
 
 if TYPE_CHECKING:
@@ -147,6 +147,27 @@ def fitted(model: Configured, data: Any, **options: Any) -> FittedModel:
             advance(done, most, "" if math.isnan(value) else f"objective {value:.4g}")
 
         return model.fit(data, progress=progress, **options)
+
+
+def words(text: str | None) -> tuple[str, ...]:
+    """Return the words in a comma-separated list.
+
+    >>> words("fx, fz")
+    ('fx', 'fz')
+    """
+    return tuple(word.strip() for word in (text or "").split(",") if word.strip())
+
+
+def numbers(option: str, text: str | None, count: int | None = None) -> tuple[float, ...]:
+    """Return the numbers in a comma-separated list; raise `ParameterError` unless there are `count`."""
+    try:
+        found = tuple(map(float, words(text)))
+    except ValueError:
+        found = (math.nan,)
+    if any(map(math.isnan, found)) or count not in (None, len(found)):
+        expected = "comma-separated numbers" if count is None else f"{count} comma-separated numbers"
+        raise ParameterError(f"--{option} is not a list of numbers", expected=expected, got=text)
+    return found
 
 
 def check_robot_named(scene: str | None, robot: str | None) -> None:

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from typer import Option
 
-from forcegp.cli.common import check_data_destination, progress_bar, read_data, save, show
+from forcegp.cli.common import check_data_destination, numbers, progress_bar, read_data, save, show
 from forcegp.cli.options import AsJson, SceneName
 
 if TYPE_CHECKING:
@@ -96,9 +96,9 @@ def excite(
         system = system.with_robot(fit.system.robot)
     limits = Limits.of(
         system.robot,
-        velocity=_numbers("velocity", velocity),
-        acceleration=_numbers("acceleration", acceleration),
-        torque=_numbers("torque", torque),
+        velocity=numbers("velocity", velocity),
+        acceleration=numbers("acceleration", acceleration),
+        torque=numbers("torque", torque),
         share=share,
     )
     states = random_states(system.robot, limits)
@@ -107,7 +107,7 @@ def excite(
         log = log[:: max(1, len(log) // len(states[0]))]
         states = log.q, log.qd, log.qdd
     unknowns = Unknowns.of(system.robot, limits.low, limits.high, limits.velocity, states)
-    collisions = Collisions(system, shapes, [_numbers("box", text) for text in box or ()], clearance)
+    collisions = Collisions(system, shapes, [numbers("box", text) for text in box or ()], clearance)
     with progress_bar("searching", 1) as advance:
         result = excite(
             system,
@@ -115,7 +115,7 @@ def excite(
             limits=limits,
             unknowns=unknowns if fit is None else unknowns_after(fit, unknowns),
             collisions=collisions,
-            start=_numbers("start", start) or None,
+            start=numbers("start", start) or None,
             criterion=criterion,
             rate=rate,
             restarts=restarts,
@@ -125,16 +125,6 @@ def excite(
     save(result.write, out)
     write_excitation(page, result, system, shapes, collisions.boxes, f"{scene}: the next motion")
     show({**_summary(result), "page": str(page), "file": str(out)}, as_json)
-
-
-def _numbers(option: str, text: str | None) -> list[float]:
-    from forcegp.errors import ParameterError
-
-    try:
-        return [float(word) for word in (text or "").split(",") if word.strip()]
-    except ValueError:
-        message = f"--{option} is not a list of numbers"
-        raise ParameterError(message, expected="comma-separated numbers", got=text) from None
 
 
 def _summary(result: Excitation) -> dict[str, object]:
