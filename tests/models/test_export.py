@@ -354,6 +354,9 @@ def test_friction_of_the_joints() -> None:
     spread = fit.posterior.latent.covariance(type(rows)(rows.features, only, rows.target))
     spread = spread + torch.diag_embed(unknown_variance(fit.hyperparameters, at, None))
     torch.testing.assert_close(ours.covariance, spread, rtol=1e-9, atol=1e-12)
+    same = fit.predict(*state, "joint_friction")
+    torch.testing.assert_close(same.mean, ours.mean, rtol=1e-10, atol=1e-12)
+    torch.testing.assert_close(same.covariance, ours.covariance, rtol=1e-9, atol=1e-12)
 
 
 def test_forward_dynamics_of_the_robot_alone() -> None:

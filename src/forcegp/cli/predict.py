@@ -55,7 +55,7 @@ def predict(
             "--quantity",
             "-q",
             help="qdd, qdd_free, multiplier, constraint_force, contact_force, total_force, joint_force, "
-            "contact_friction or external_wrench.",
+            "joint_friction, contact_friction or external_wrench.",
         ),
     ] = "qdd",
     frame: Frame = None,

@@ -134,7 +134,10 @@ class StructuredFit(FittedModel):
         """Return the mean and covariance of quantities, including unknown forces and, if requested, noise."""
         mean, spread = self.posterior.read(system, at, z)
         z = self.posterior.process.coupled(system, at, z)
-        spread = spread + _carried(z, unknown_variance(self.hyperparameters, at, self.problem.external_std))
+        of_all = z if z.B_F is None else z._replace(B_Q=z.B_Q + z.B_F)
+        spread = spread + _carried(
+            of_all, unknown_variance(self.hyperparameters, at, self.problem.external_std)
+        )
         return mean, spread + self._noise_covariance(z, parts) if noise else spread
 
     def predict_log(
