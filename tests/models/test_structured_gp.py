@@ -31,6 +31,7 @@ from forcegp.models.structured_gp import StructuredGP
 from forcegp.storage.checkpoint import Checkpoint, Evaluations
 from forces.cases import all_priors, conditioned, draw, logged, mixed_contacts, two_contacts
 from forces.textbook import Textbook
+from logs import random_log
 from model_files import rewritten
 from random_data import random_data, table_system
 
@@ -152,7 +153,7 @@ def test_joint_friction_is_a_part_of_the_joint_force() -> None:
     """With the forces of the other prior, of the motors and of the links, it is the whole."""
     robot = forcegp.load_robot("double_pendulum")
     robot = robot.replace(damping=torch.tensor([0.3, 0.2], dtype=torch.float64))
-    free, log = ConstrainedSystem(robot), random_data(ConstrainedSystem(robot), 30)
+    free, log = ConstrainedSystem(robot), random_log(30, joints=robot.joint_names)
     fit = StructuredGP(free, "analytical", [JointFrictionPrior(), JointForcePrior()], noise=0.1).fit(log)
     state = log.q[:5], log.qd[:5], log.tau[:5]
     found = fit.predict(*state, "joint_friction")

@@ -1,0 +1,94 @@
+"""Error bars of learned robot parameters, from the curvature of the likelihood."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+import torch
+
+import forcegp
+from forcegp.dynamics import forward_dynamics
+from forcegp.errors import ModelError, NumericalError
+from forcegp.forces.priors.joint import JointFrictionPrior
+from forcegp.gp.optimise import LearningOptions
+from forcegp.models.structured_fit import StructuredFit
+from forces.test_inference import gradients
+from logs import random_log
+
+ROBOT = forcegp.load_robot("double_pendulum")
+FREE, FRICTION = forcegp.ConstrainedSystem(ROBOT), [JointFrictionPrior()]
+HEAVIER, NOISE = 1.3, 0.3
+SMOOTH = 1e-3
+"""Relative error of the differences of the dense formula, in a step of 1e-4."""
+
+
+def fitted(n: int, seed: int = 0, learn: dict | None = None) -> StructuredFit:
+    """A log of a robot with a heavier last link, whose mass is learned."""
+    true = ROBOT.replace(mass=ROBOT.mass * torch.tensor([1.0, HEAVIER]).to(ROBOT.mass))
+    generator = torch.Generator().manual_seed(seed)
+    q, qd, tau = 2.0 * torch.rand(3, n, 2, generator=generator, dtype=torch.float64) - 1.0
+    qdd = forward_dynamics(true, q, qd, 5.0 * tau - 0.5 * qd)
+    qdd = qdd + NOISE * torch.randn(n, 2, generator=generator, dtype=torch.float64)
+    data = forcegp.Dataset(0.1 * torch.arange(n).double(), q, qd, 5.0 * tau, qdd, ROBOT.joint_names)
+    theta = forcegp.AnalyticalParameters(ROBOT, learn or {"mass": ROBOT.joint_names[-1:]})
+    model = forcegp.StructuredGP(
+        forcegp.ConstrainedSystem(ROBOT),
+        "analytical",
+        [JointFrictionPrior()],
+        NOISE,
+        analytical_parameters=theta,
+    )
+    return model.fit(data, options=LearningOptions(max_evaluations=60))
+
+
+def test_a_learned_mass_has_a_bar_that_holds_it() -> None:
+    few, many = fitted(60), fitted(240, seed=1)
+    bars = []
+    for fit in (few, many):
+        std = fit.parameter_std()["mass"]
+        assert float(std[0]) == 0.0, "this mass is not learned"
+        assert abs(float(fit.system.robot.mass[1] - HEAVIER * ROBOT.mass[1])) < 3.0 * float(std[1])
+        bars.append(float(std[1] / ROBOT.mass[1]))
+    assert bars[0] < 0.2 and bars[1] == pytest.approx(0.5 * bars[0], rel=0.35), "σ falls with √n"
+
+
+def test_the_bars_are_those_of_the_dense_likelihood() -> None:
+    """Second differences of the textbook formula."""
+    fit, name, step = fitted(20), "analytical_parameters.coordinates.mass", 1e-4
+    mass = fit.system.robot.mass[1]
+
+    def dense(log_mass: torch.Tensor) -> torch.Tensor:
+        return gradients(fit, {**fit.hyperparameters, name: log_mass.view(1)})[1][name]
+
+    curvature = (dense(mass.log() + step) - dense(mass.log() - step)) / (2.0 * step)
+    std = mass * curvature.rsqrt()
+    torch.testing.assert_close(fit.parameter_std()["mass"][1:], std, rtol=SMOOTH, atol=0.0)
+
+
+def test_parameters_that_the_data_do_not_determine_are_no_number() -> None:
+    """The first joint turns about the vertical axis through its own mass."""
+    fit = fitted(20)
+    still = fit.problem.training.measurements[0]
+    flat = dataclasses.replace(still, values=still.values * 0.0, tau=still.tau * 0.0, qd=still.qd * 0.0)
+    training = dataclasses.replace(fit.problem.training, measurements=(flat,))
+    lost = dataclasses.replace(fit, problem=dataclasses.replace(fit.problem, training=training))
+    light = {"analytical_parameters.coordinates.mass": torch.tensor([-20.0], dtype=torch.float64)}
+    lost = dataclasses.replace(lost, hyperparameters={**fit.hyperparameters, **light})
+    with pytest.raises(NumericalError, match="do not determine all robot parameters"):
+        lost.parameter_std()
+
+
+def test_the_fields_are_those_of_the_robot() -> None:
+    fit = fitted(60, learn={"com": ROBOT.joint_names[-1:], "damping": "all"})
+    std = fit.parameter_std()
+    assert {name: x.shape for name, x in std.items()} == {"com": (2, 3), "damping": (2,)}
+
+
+def test_a_fit_without_learned_parameters_has_no_bars() -> None:
+    model = forcegp.StructuredGP(
+        forcegp.ConstrainedSystem(ROBOT), "analytical", [JointFrictionPrior()], NOISE
+    )
+    fit = model.fit(random_log(30, joints=ROBOT.joint_names), options=LearningOptions(max_evaluations=2))
+    with pytest.raises(ModelError, match="no robot parameters"):
+        fit.parameter_std()
