@@ -2,23 +2,24 @@
 
 from __future__ import annotations
 
+import math
+
 import pytest
 import torch
+from scipy.stats import chi2
 
 import forcegp
 from forcegp.dynamics import forward_dynamics
-from forcegp.errors import ModelError, NumericalError
+from forcegp.errors import ModelError
 from forcegp.forces.priors.joint import JointFrictionPrior
 from forcegp.gp.optimise import LearningOptions
 from forcegp.models.structured_fit import StructuredFit
-from forces.test_inference import gradients
 from logs import random_log
 
 ROBOT = forcegp.load_robot("double_pendulum")
 FREE, FRICTION = forcegp.ConstrainedSystem(ROBOT), [JointFrictionPrior()]
 HEAVIER, NOISE = 1.3, 0.3
-SMOOTH = 1e-3
-"""Relative error of the differences of the dense formula, in a step of 1e-4."""
+LOGS = 8
 
 
 def fitted(n: int, seed: int = 0, learn: dict | None = None) -> StructuredFit:
@@ -51,30 +52,23 @@ def test_a_learned_mass_has_a_bar_that_holds_it() -> None:
     assert bars[0] < 0.2 and bars[1] == pytest.approx(0.5 * bars[0], rel=0.35), "σ falls with √n"
 
 
-def test_the_bars_are_those_of_the_dense_likelihood() -> None:
-    """Second differences of the textbook formula."""
-    fit, name, step = fitted(20), "analytical_parameters.coordinates.mass", 1e-4
-    mass = fit.system.robot.mass[1]
-
-    def dense(log_mass: torch.Tensor) -> torch.Tensor:
-        return gradients(fit, {**fit.hyperparameters, name: log_mass.view(1)})[1][name]
-
-    curvature = (dense(mass.log() + step) - dense(mass.log() - step)) / (2.0 * step)
-    std = mass * curvature.rsqrt()
-    torch.testing.assert_close(fit.parameter_std()["mass"][1:], std, rtol=SMOOTH, atol=0.0)
+def test_the_bars_are_as_wide_as_the_errors() -> None:
+    """Over the noise of several logs, the squared errors in units of σ² are those of a normal distribution."""
+    scores = []
+    for seed in range(2, 2 + LOGS):
+        fit = fitted(60, seed=seed)
+        error = fit.system.robot.mass[1] - HEAVIER * ROBOT.mass[1]
+        scores.append(float((error / fit.parameter_std()["mass"][1]) ** 2))
+    low, high = chi2.ppf([0.005, 0.995], LOGS)
+    assert low < sum(scores) < high, scores
 
 
-def test_parameters_that_the_data_do_not_determine_are_no_number() -> None:
-    """The robot has no Stribeck friction, so that its speed scale has no effect."""
-    fit = fitted(20, learn={"stribeck_velocity": "all"})
-    with pytest.raises(NumericalError, match="do not determine all robot parameters"):
-        fit.parameter_std()
-
-
-def test_the_fields_are_those_of_the_robot() -> None:
-    fit = fitted(60, learn={"com": ROBOT.joint_names[-1:], "damping": "all"})
-    std = fit.parameter_std()
-    assert {name: x.shape for name, x in std.items()} == {"com": (2, 3), "damping": (2,)}
+def test_parameters_that_the_data_do_not_determine_have_infinite_bars() -> None:
+    """In its plane, a pendulum shows nothing of its centre of mass beside the plane."""
+    std = fitted(60, learn={"com": ROBOT.joint_names[-1:]}).parameter_std()["com"]
+    assert std.shape == (2, 3) and std[0].tolist() == [0.0, 0.0, 0.0]
+    assert [math.isinf(x) for x in std[1].tolist()] == [False, True, False]
+    assert float(std[1, [0, 2]].min()) > 0.0 and float(std[1, [0, 2]].max()) < 0.05
 
 
 def test_a_fit_without_learned_parameters_has_no_bars() -> None:

@@ -149,16 +149,15 @@ class StructuredFit(FittedModel):
 
         Returns:
             σ of each learned field of `fit.system.robot`, keyed by its name and of its shape, in SI units. It
-            is zero for parameters that are not learned.
+            is zero for parameters that are not learned, and infinite if the data do not determine them.
 
         Raises:
             ModelError: no robot parameters were learned, or the training data were not saved.
-            NumericalError: the data do not determine the parameters.
 
         Example:
             `mass, std = fit.system.robot.mass[-1], fit.parameter_std()["mass"][-1]`
         """
-        return parameter_std(self)
+        return parameter_std(self.problem, self.hyperparameters)
 
     def predict_log(
         self, data: Dataset, quantity: str | Sequence[str] = "qdd", **settings: Any
