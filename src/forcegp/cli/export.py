@@ -93,7 +93,8 @@ def export(
     if to in ("urdf", "mjcf"):
         show(_written_back(fit, to, robot, out, samples, seed, gain_std), as_json)
         return
-    wrench = None if frame is None else WrenchFrame(frame, reference, words(axes), numbers("point", point, 3))
+    x, y, z = numbers("point", point, 3)
+    wrench = None if frame is None else WrenchFrame(frame, reference, words(axes), (x, y, z))
     dtype = torch.float32 if float32 else torch.float64
     written = fit.export(out, language=to, name=name, functions=functions, wrench=wrench, dtype=dtype)
     lost = {"widest": written.widest, "wider": written.wider} if functions is not None else {}

@@ -91,15 +91,15 @@ def _check(model: FittedModel) -> None:
 
     Their number differs from all other dimensions. An exact posterior is not factorised at this point.
     """
-    robot, structured = model.system.robot, isinstance(model, StructuredFit)
+    robot = model.system.robot
     n = 1 + max(robot.nq, len(model.system.contacts), model.system.m)
     state = torch.zeros(n, robot.nq, dtype=robot.dtype, device=robot.device)
     closed = torch.arange(n, device=robot.device)[:, None].expand(n, len(model.system.contacts)) % 2 == 0
-    exact = structured and isinstance(model.posterior.latent, ExactPosterior)
+    exact = isinstance(model, StructuredFit) and isinstance(model.posterior.latent, ExactPosterior)
+    options = {"covariance": not exact, "noise": isinstance(model, StructuredFit) and not exact}
     for quantity in ("qdd", "multiplier"):
         with suppress(ForceGPError):  # a valid model may not determine a force in this position
-            options = {"noise": True} if structured and not exact else {}
-            model.predict(state, state, state, quantity, active=closed, covariance=not exact, **options)
+            model.predict(state, state, state, quantity, active=closed, **options)
 
 
 def register() -> None:
