@@ -18,6 +18,7 @@ from typer.testing import CliRunner
 
 from forcegp.cli import app
 from forcegp.cli.command import BUNDLED, inputs_of, outputs_of, paths_of
+from forcegp.destination import check_kept
 from forcegp.errors import DestinationError, ForceGPError
 
 Function = Callable[..., object]
@@ -257,6 +258,26 @@ def test_results_beside_the_inputs_are_allowed(tmp_path: Path) -> None:
     assert set(outputs_of(fit, values)).isdisjoint(inputs_of(fit, values))
     sweep = {"scene": [str(tmp_path / "a.toml")], "model": ["sgp"], "seeds": 2, "out": tmp_path}
     assert list(outputs_of(COMMANDS["sweep"], sweep)) == [tmp_path / f"a/sgp/seed-{k}" for k in range(2)]
+
+
+def test_a_folder_with_the_name_of_an_input_is_none(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """A model without its suffix, and a robot by its name, beside folders with results of the same name."""
+    monkeypatch.chdir(tmp_path)
+    made(tmp_path, "model")
+    for name in ("model", "ur5"):
+        (tmp_path / name).mkdir()
+        (tmp_path / name / "out.urdf").write_text("an earlier result")
+    values = {"model": Path("model"), "out": Path("model")}
+    check_kept(outputs_of(COMMANDS["evaluate"], values), inputs_of(COMMANDS["evaluate"], values))
+    export = {"model": Path("model"), "robot": "ur5", "out": Path("ur5/out.urdf"), "to": "urdf", "samples": 0}
+    check_kept(outputs_of(COMMANDS["export"], export), inputs_of(COMMANDS["export"], export))
+
+
+def test_a_folder_that_is_read_is_an_input_with_its_files(tmp_path: Path) -> None:
+    (tmp_path / "bag" / "parts").mkdir(parents=True)
+    part = tmp_path / "bag" / "parts" / "0.parquet"
+    part.write_text("damaged")
+    refused(["import", str(tmp_path / "bag"), "-s", "ur5_free", "-o", str(part)])
 
 
 def test_every_name_that_may_be_bundled_is_an_option() -> None:

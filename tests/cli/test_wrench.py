@@ -71,7 +71,7 @@ def test_all_components_at_the_origin_are_the_default(
     [
         (("--point", "0,0"), ParameterError, "3 comma-separated numbers"),
         (("--point", "0,0,up"), ParameterError, "--point is not a list of numbers"),
-        (("--point", "0,0,inf"), ForceGPError, "point"),
+        (("--point", "0,0,inf"), ParameterError, "invalid point of application"),
         (("--axes", "fx,fw"), UnknownNameError, "unknown component of a wrench 'fw'"),
         (("--axes", ""), ParameterError, "invalid components of a wrench"),
     ],

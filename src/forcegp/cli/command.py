@@ -19,6 +19,7 @@ from typing import Any, TypeVar, get_args, get_type_hints
 from typer.models import ParameterInfo
 
 from forcegp.errors import ForceGPError
+from forcegp.guards import is_file
 
 if sys.version_info >= (3, 11):
     import tomllib
@@ -34,6 +35,8 @@ BUNDLED = {
 """Files of bundled names, by the options that accept a name or a path."""
 MODELS = ("model", "target")
 """Options that accept the path of a model without its suffix."""
+FOLDERS = ("log",)
+"""Options that accept a folder; elsewhere, a folder of the same name is no input."""
 MESH_FOLDERS = ("meshdir", "assetdir", "texturedir")
 """Attributes in an MJCF file that name folders of other files."""
 
@@ -88,7 +91,8 @@ def inputs_of(function: Callable[..., Any], values: Mapping[str, Any]) -> Iterat
         value = values.get(name)
         if not written and value is not None:
             for each in value if isinstance(value, list | tuple) else [value]:
-                yield from _with_named(_meant(name, str(each)))
+                paths = _meant(name, str(each))
+                yield from _with_named(paths if name in FOLDERS else filter(is_file, paths))
 
 
 def _meant(name: str, value: str) -> Iterator[Path]:
