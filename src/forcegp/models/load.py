@@ -96,7 +96,8 @@ def _check(model: FittedModel) -> None:
     state = torch.zeros(n, robot.nq, dtype=robot.dtype, device=robot.device)
     closed = torch.arange(n, device=robot.device)[:, None].expand(n, len(model.system.contacts)) % 2 == 0
     exact = isinstance(model, StructuredFit) and isinstance(model.posterior.latent, ExactPosterior)
-    options = {"covariance": not exact, "noise": isinstance(model, StructuredFit) and not exact}
+    noise = isinstance(model, StructuredFit) and not exact
+    options: dict[str, Any] = {"covariance": not exact, "noise": noise}
     for quantity in ("qdd", "multiplier"):
         with suppress(ForceGPError):  # a valid model may not determine a force in this position
             model.predict(state, state, state, quantity, active=closed, **options)
