@@ -30,6 +30,7 @@ LAYERS = (
         "batchlast",
         "native",
         "notebook",
+        "interrupt",
     ),
     ("plots",),
     ("robot",),

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 
 from forcegp import destination
-from forcegp.destination import check_destination, write_or_keep
+from forcegp.destination import MANIFEST, check_destination, check_folder, folder_or_keep, write_or_keep
 from forcegp.errors import DestinationError, ModelError
 from forcegp.files import write_text, written_folder
 
@@ -33,17 +33,52 @@ def test_kinds_that_do_not_fit_are_refused(tmp_path: Path) -> None:
 
 
 def test_a_foreign_folder_is_refused(tmp_path: Path) -> None:
-    own = ("model.json",)
-    check_destination(tmp_path, folder=True, own_files=own)
-    (tmp_path / "thesis.tex").write_text("years of work")
-    with pytest.raises(DestinationError, match=r"other files(.|\n)*model\.json(.|\n)*thesis\.tex"):
-        check_destination(tmp_path, folder=True, own_files=own)
-    (tmp_path / "model.json").write_text("{}")
+    target = tmp_path / "results"
+    for _ in range(2):
+        check_folder(target)
+        folder_or_keep(lambda folder: (folder / "README.md").write_text("ours"), target)
+    (target / "thesis.tex").write_text("years of work")
     with pytest.raises(DestinationError, match=r"would be lost(.|\n)*got: thesis\.tex"):
-        check_destination(tmp_path, folder=True, own_files=own)
-    (tmp_path / "thesis.tex").unlink()
-    check_destination(tmp_path, folder=True, own_files=own)
-    check_destination(tmp_path, folder=True, own_files=["*.json"])
+        check_folder(target)
+    (target / "thesis.tex").unlink()
+    check_folder(target)
+    (target / "build").mkdir()
+    with pytest.raises(DestinationError, match="got: build"):
+        check_folder(target)
+    (target / "build").rmdir()
+    (target / "README.md").write_text("changed by the user")
+    with pytest.raises(DestinationError, match=r"got: README\.md"):
+        check_folder(target)
+
+
+@pytest.mark.parametrize(
+    "manifest", [None, "", "{}", '{"format": "forcegp-folder", "version": 1, "files": {}}']
+)
+def test_a_folder_with_the_names_of_a_result_is_foreign(manifest: str | None, tmp_path: Path) -> None:
+    (tmp_path / "README.md").write_text("years of work")
+    if manifest is not None:
+        (tmp_path / MANIFEST).write_text(manifest)
+    with pytest.raises(DestinationError, match=r"would be lost(.|\n)*README\.md"):
+        check_folder(tmp_path)
+
+
+def test_files_that_came_during_the_computation_are_not_lost(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    target, spare = tmp_path / "results", tmp_path / "spare"
+    spare.mkdir()
+    monkeypatch.setattr(tempfile, "tempdir", str(spare))
+
+    def fill(folder: Path) -> None:
+        target.mkdir(exist_ok=True)
+        (target / "thesis.tex").write_text("years of work")
+        (folder / "a").write_text("the result")
+
+    with pytest.raises(DestinationError, match="it was saved to"):
+        folder_or_keep(fill, target)
+    assert (target / "thesis.tex").read_text() == "years of work"
+    [kept] = spare.iterdir()
+    assert (kept / "results" / "a").read_text() == "the result"
 
 
 @pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="named pipes")

@@ -11,6 +11,8 @@ from types import ModuleType
 
 import pytest
 
+import forcegp
+
 if sys.version_info >= (3, 11):
     import tomllib
 else:
@@ -253,6 +255,7 @@ def test_pages_do_not_edit_files_by_patterns() -> None:
 def test_the_version_is_the_same_everywhere() -> None:
     root = DOCS.parent
     version = tomllib.loads((root / "pyproject.toml").read_text(encoding="utf-8"))["project"]["version"]
+    assert forcegp.__version__ == version
     assert f"\n## [{version}] - " in (root / "CHANGELOG.md").read_text(encoding="utf-8")
     assert f"\nversion: {version}\n" in (root / "CITATION.cff").read_text(encoding="utf-8")
     for page in (root / "README.md", DOCS / "index.md"):

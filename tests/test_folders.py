@@ -1,13 +1,16 @@
-"""Files take their places in a folder one by one, the last one with all others there."""
+"""A folder takes its place in one step."""
 
 from __future__ import annotations
 
 import os
 import threading
+from contextlib import suppress
 from pathlib import Path
 
 import pytest
 
+from forcegp import files
+from forcegp.destination import check_folder
 from forcegp.errors import DestinationError
 from forcegp.files import NEW, atomic_file, check_kind, write_text, written_folder
 
@@ -31,19 +34,61 @@ def content_of(path: Path) -> str:
     return a
 
 
-def test_the_last_file_is_there_only_with_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Seen before and after each step; every file is the old one or the new one."""
-    target, seen = folder(tmp_path / "page", "old"), []
-    original = os.replace
+def test_files_of_two_versions_are_never_in_one_folder(tmp_path: Path) -> None:
+    """Another thread opens the folder again and again while two versions replace each other."""
+    target, done = folder(tmp_path / "page", "0"), threading.Event()
+    seen: set[str] = set()
 
-    def watched(*args: object) -> None:
-        seen.append(((target / "a").read_text(), (target / "b").read_text()))
-        original(*args)  # type: ignore[arg-type]
+    def look() -> None:
+        while not done.is_set():
+            held = os.open(target, os.O_RDONLY | os.O_DIRECTORY)
+            with suppress(FileNotFoundError):  # the folder that was opened is being deleted
+                seen.add("".join(text_in(held, name) for name in "ab"))
+            os.close(held)
 
-    monkeypatch.setattr(os, "replace", watched)
-    write(target, "new")
-    assert seen == [("old", "old"), ("new", "old")]
-    assert content_of(target) == "new"
+    reader = threading.Thread(target=look)
+    reader.start()
+    for number in range(1, 100):
+        write(target, str(number % 10))
+    done.set()
+    reader.join()
+    assert len(seen) > 1 and all(a == b for a, b in seen)
+
+
+def text_in(folder: int, name: str) -> str:
+    with os.fdopen(os.open(name, os.O_RDONLY, dir_fd=folder)) as file:
+        return file.read()
+
+
+@pytest.mark.parametrize("before", [True, False])
+def test_a_system_that_cannot_exchange_folders_replaces_them_too(
+    before: bool, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(files, "_exchange", lambda *_: False)
+    if before:
+        folder(tmp_path / "page", "old")
+    write(tmp_path / "page", "new")
+    assert content_of(tmp_path / "page") == "new" and os.listdir(tmp_path) == ["page"]
+
+
+def test_permissions_of_a_folder_are_kept(tmp_path: Path) -> None:
+    folder(tmp_path / "shared", "old").chmod(0o2775)
+    write(tmp_path / "shared", "new")
+    assert (tmp_path / "shared").stat().st_mode & 0o7777 == 0o2775
+
+
+@pytest.mark.parametrize("name", [".", "..", "../here", "", "link"])
+def test_the_current_folder_is_not_replaced(
+    name: str, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    here = tmp_path / "here"
+    here.mkdir()
+    (here / "link").symlink_to(here)
+    monkeypatch.chdir(here)
+    for replace in (lambda: write(Path(name), "new"), lambda: check_folder(name)):
+        with pytest.raises(DestinationError, match="the current folder cannot be replaced"):
+            replace()
+    assert os.listdir(here) == ["link"]
 
 
 def test_litter_of_killed_writers_is_removed_and_work_of_live_ones_is_not(tmp_path: Path) -> None:

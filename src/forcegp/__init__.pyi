@@ -1,4 +1,5 @@
 __all__: list[str]
+__version__: str
 
 from . import compiled as compiled
 from . import derivatives as derivatives

@@ -7,8 +7,11 @@ ends. Without flock (on Windows and some network file systems), such files remai
 
 from __future__ import annotations
 
+import ctypes
+import errno
 import hashlib
 import json
+import math
 import os
 import re
 import secrets
@@ -203,16 +206,17 @@ def atomic_file(path: str | Path, mode: int = 0o666) -> Iterator[Path]:
 
 @contextmanager
 def written_folder(path: str | Path) -> Iterator[Path]:
-    """Yield a temporary folder whose files are moved to the target folder if the block ends without an error.
+    """Yield a temporary folder that replaces the target folder if the block ends without an error.
 
-    Files atomically replace those with the same name, in the order of writing, so the last file exists only
-    if all others do. All other files in the target folder are deleted. Symbolic links are followed.
+    The two folders are exchanged in one step, so that a reader sees either the old files or the new ones, and
+    the old folder is deleted. Systems other than Linux, and some network file systems, cannot exchange
+    folders: a crash between the two steps that they need leaves no folder. Symbolic links are followed.
 
     Yields:
         The temporary folder.
 
     Raises:
-        DestinationError: the path cannot be written, or is a file.
+        DestinationError: the path cannot be written, is a file, or contains the current folder.
 
     Example:
         >>> import os, tempfile
@@ -222,19 +226,54 @@ def written_folder(path: str | Path) -> Iterator[Path]:
         ...     os.listdir(f"{parent}/run")
         ['a.txt']
     """
-    target = Path(path).resolve() if Path(path).is_symlink() else Path(path)
+    check_not_current(Path(path))
+    target = Path(path).resolve()
     with _temporary(target, folder=True, mode=0o777) as temporary:
         with writable(target):
             yield temporary
-            written = sorted(temporary.iterdir(), key=lambda file: file.stat().st_mtime_ns)
-            target.mkdir(exist_ok=True)
-            for file in written:
+            for file in (*temporary.rglob("*"), temporary):
                 _sync(file)
-                os.replace(file, target / file.name)
-            for old in set(target.iterdir()) - {target / file.name for file in written}:
-                discard(old)
+            with suppress(FileNotFoundError):
+                shutil.copymode(target, temporary)
+            _replace_folder(temporary, target)
         with suppress(OSError):
-            _sync(target)
+            _sync(target.parent)
+
+
+def check_not_current(target: Path) -> None:
+    """Check that a folder to be replaced is not the current folder, which programs in it would lose."""
+    if Path.cwd().is_relative_to(target.resolve()):
+        text, hint = f"{target}: the current folder cannot be replaced", "name a new folder, such as results"
+        raise DestinationError(text, expected="a folder that is new or below the current one", hint=hint)
+
+
+def _replace_folder(new: Path, target: Path) -> None:
+    """Move a folder to a target; the old target, if there is one, is deleted or takes the place of `new`."""
+    try:
+        os.rename(new, target)  # possible if there is no target or, on POSIX systems, if it is empty
+        return
+    except OSError:
+        if not target.is_dir():
+            raise
+    if not _exchange(new, target):
+        old = target.with_name(f"{NEW}{secrets.token_hex(6)}-{_short(target)}")
+        os.rename(target, old)
+        os.rename(new, target)
+        discard(old)
+
+
+def _exchange(one: Path, other: Path) -> bool:
+    """Exchange two paths in one step; return whether the system supports this."""
+    function = getattr(ctypes.CDLL(None, use_errno=True), "renameat2", None) if os.name == "posix" else None
+    if function is None:
+        return False
+    current, exchange = -100, 2  # AT_FDCWD, RENAME_EXCHANGE
+    if function(current, os.fsencode(one), current, os.fsencode(other), exchange) == 0:
+        return True
+    code = ctypes.get_errno()
+    if code in (errno.ENOSYS, errno.EINVAL):
+        return False
+    raise OSError(code, os.strerror(code), str(other))
 
 
 def write_text(path: str | Path, text: str) -> None:
@@ -246,6 +285,19 @@ def write_text(path: str | Path, text: str) -> None:
 def write_json(path: str | Path, value: object) -> None:
     """Write a value atomically as indented JSON. NaN and infinity are rejected."""
     write_text(path, json.dumps(value, indent=2, allow_nan=False) + "\n")
+
+
+def finite(value: Any) -> Any:
+    """Return JSON-compatible values with `None` in place of numbers that are not finite.
+
+    >>> finite({"a": [1.0, float("nan")]})
+    {'a': [1.0, None]}
+    """
+    if isinstance(value, dict):
+        return {name: finite(part) for name, part in value.items()}
+    if isinstance(value, list | tuple):
+        return [finite(part) for part in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
 
 
 class Record(BaseModel):

@@ -15,6 +15,7 @@ import os
 import platform
 import shutil
 import stat
+import struct
 import subprocess
 from collections.abc import Sequence
 from pathlib import Path
@@ -24,6 +25,10 @@ from forcegp.files import Temporary, atomic_file, discard, sweep
 
 FLAGS = ["-std=c++17", "-march=native", "-ffp-contract=fast", "-fno-math-errno", "-w", "-shared", "-fPIC"]
 LIBRARY = "kernel.so"
+ACL = "system.posix_acl_access"
+"""Extended attribute with the access control list of a file or folder."""
+BASE_ENTRIES = (0x01, 0x04, 0x20)
+"""Tags of the entries for the owner, the group and all others (ACL_USER_OBJ, ACL_GROUP_OBJ, ACL_OTHER)."""
 PROC = Path("/proc/self/fd")
 """Folder in which Linux lists open files and folders by descriptor."""
 
@@ -142,6 +147,23 @@ def _check_owner(folder: Path) -> None:
         shared = bool(status.st_mode & stat.S_IWGRP) and not (place != folder and _is_alone_in(status.st_gid))
         if (shared or status.st_mode & stat.S_IWOTH) and not sticky:
             raise _untrusted(folder, place, f"permissions {stat.S_IMODE(status.st_mode):04o}")
+        if not sticky and _has_acl(place):
+            raise _untrusted(folder, place, "an access control list with entries for further users or groups")
+
+
+def _has_acl(place: Path) -> bool:
+    """Return whether a path has an ACL (Linux) with entries beside those of its owner, group and others.
+
+    The group bits of its mode are then those of the mask, which applies to all further entries.
+    """
+    if not hasattr(os, "getxattr"):
+        return False
+    try:
+        acl = os.getxattr(place, ACL)
+    except OSError:  # no ACL, or a file system without them
+        return False
+    # A version of four bytes precedes entries of eight bytes: tag, permissions and number of a user or group.
+    return any(tag not in BASE_ENTRIES for tag, _, _ in struct.iter_unpack("<HHI", acl[4:]))
 
 
 def _is_alone_in(group: int) -> bool:
@@ -162,7 +184,7 @@ def _untrusted(folder: Path, place: Path, got: str) -> MissingDependencyError:
         f"compiled kernels are not stored in {folder}, since other users could place code there",
         expected=f"{place} owned by you and not writable by others",
         got=got,
-        hint="set FORCEGP_CACHE to a private folder, or call chmod 700 on it",
+        hint="set FORCEGP_CACHE to a private folder, or call chmod 700 (and setfacl -b) on it",
     )
 
 

@@ -5,13 +5,84 @@ from __future__ import annotations
 import json
 import warnings
 from pathlib import Path
+from typing import Any
 
+import pytest
+import torch
 from typer.testing import CliRunner
 
 import forcegp
 from forcegp.cli import app
 from forcegp.data import RobotMismatchWarning
+from forcegp.evaluation.scores import outliers
 from logs import random_log
+
+
+@pytest.fixture(scope="module")
+def arm(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, forcegp.Dataset]:
+    """The file of a fitted model, and a log of its robot."""
+    folder = tmp_path_factory.mktemp("arm")
+    system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
+    log = random_log(200, joints=system.robot.joint_names)
+    forcegp.StructuredGP(system, "analytical", noise=0.1).fit(log[::4]).save(folder / "model")
+    return folder / "model", log
+
+
+def evaluated(model: Path, log: forcegp.Dataset, folder: Path) -> dict[str, Any]:
+    """The scores in JSON, on stdout and in the file, without NaN or infinity."""
+    log.write(folder / "log.parquet")
+    words = [
+        "evaluate",
+        "-m",
+        str(model),
+        "-d",
+        str(folder / "log.parquet"),
+        "-o",
+        str(folder / "page"),
+        "--json",
+    ]
+    done = CliRunner().invoke(app, words)
+    assert done.exit_code == 0, (done.output, done.exception)
+    for text in (done.stdout, (folder / "page" / "evaluation.json").read_text()):
+        json.loads(text, parse_constant=pytest.fail)
+    return json.loads(done.stdout)
+
+
+@pytest.mark.parametrize("size", [1e4, -1e6, 1e12, 1e18])
+def test_an_impossible_acceleration_is_left_out_and_named(
+    size: float, arm: tuple[Path, forcegp.Dataset], tmp_path: Path
+) -> None:
+    model, log = arm
+    qdd = log.qdd.clone()
+    qdd[37, 1] = size
+    found = evaluated(model, log.replace(qdd=qdd), tmp_path)
+    assert found["left_out"] == [37] and any("Row 37: left out" in text for text in found["doubts"])
+    rest = evaluated(model, log[[k for k in range(200) if k != 37]], tmp_path)
+    assert found["noisy_rmse"] == pytest.approx(rest["noisy_rmse"]) and rest["left_out"] == []
+
+
+@pytest.mark.parametrize("rows", [1, 2, 3, 9])
+@pytest.mark.parametrize("size", [None, 1e18])
+def test_few_rows_are_scored_and_compared_with_nothing(
+    rows: int, size: float | None, arm: tuple[Path, forcegp.Dataset], tmp_path: Path
+) -> None:
+    model, log = arm
+    qdd = log.qdd.clone()
+    if size is not None:
+        qdd[0] = size
+    found = evaluated(model, log.replace(qdd=qdd)[:rows], tmp_path)
+    assert found["verdict"] == "too few samples" and found["noisy_rmse"] >= 0.0
+
+
+def test_accelerations_of_a_collision_are_kept() -> None:
+    qdd = torch.full((500, 3), 1e-3, dtype=torch.float64)
+    qdd[200, 1] = -900.0
+    assert not bool(outliers(qdd).any())
+    qdd[:, 1] = 50.0
+    qdd[200, 1] = 4000.0
+    assert not bool(outliers(qdd).any())
+    qdd[[3, 5], 2] = torch.tensor([1e4, 1e18], dtype=qdd.dtype)
+    assert outliers(qdd).nonzero()[:, 0].tolist() == [3, 5]
 
 
 def test_a_learned_robot_is_no_other_robot(tmp_path: Path) -> None:

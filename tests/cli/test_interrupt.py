@@ -61,6 +61,48 @@ if __name__ == "__main__":
 """
 
 
+IMPORTING = """
+import os, signal, sys
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
+
+class Interrupting:
+    \"\"\"Sends an interrupt at an import, and replaces its exception, as a compiled module does.\"\"\"
+
+    def find_spec(self, name, path=None, target=None):
+        if name == os.environ["MODULE"]:
+            try:
+                os.kill(os.getpid(), signal.SIGINT)
+                os.getpid()
+            except BaseException as error:
+                raise ImportError("initialization failed") from error
+
+sys.meta_path.insert(0, Interrupting())
+from forcegp.__main__ import main
+main()
+"""
+IMPORTED = (
+    "forcegp.cli",
+    "typer",
+    "forcegp.checks",
+    "torch",
+    "torch.autograd",
+    "scipy.optimize",
+    "forcegp.gp",
+)
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+@pytest.mark.parametrize("module", IMPORTED)
+def test_an_interrupt_during_an_import_ends_the_program(module: str, tmp_path: Path) -> None:
+    script = tmp_path / "command.py"
+    script.write_text(IMPORTING)
+    environment = os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "MODULE": module}
+    arguments = [sys.executable, script, "check", "-s", "kuka_plane", "-d", tmp_path / "run.parquet"]
+    done = subprocess.run(arguments, capture_output=True, env=environment, timeout=60.0, check=False)
+    assert (done.returncode, done.stderr) == (130, b"")
+
+
 @pytest.mark.skipif(os.name != "posix", reason="signals")
 @pytest.mark.parametrize("command", ["orderly", "swallowing", "within-c", "with-worker"])
 def test_an_interrupt_ends_a_command(command: str, tmp_path: Path) -> None:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import struct
 import subprocess
 import sys
 from pathlib import Path
@@ -98,6 +99,24 @@ def test_a_folder_below_one_that_others_write_is_refused(tmp_path: Path, folder:
         compiled()
     tmp_path.chmod(0o1777)
     compiled()
+
+
+@pytest.mark.skipif(not hasattr(os, "setxattr"), reason="access control lists of Linux")
+@pytest.mark.parametrize("above", [True, False])
+@pytest.mark.parametrize(("tag", "permissions"), [(0x02, 7), (0x08, 7), (0x02, 5)])
+def test_a_folder_with_an_access_control_list_is_refused(
+    above: bool, tag: int, permissions: int, tmp_path: Path, folder: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also where the group bits, which are those of the mask, could belong to a group of our own."""
+    monkeypatch.setattr(native, "_is_alone_in", lambda _: True)
+    entries = sorted([(0x01, 7), (tag, permissions), (0x04, 5), (0x10, 7 if above else 5), (0x20, 0)])
+    acl = b"".join(struct.pack("<HHI", *entry, OTHER if entry[0] == tag else 2**32 - 1) for entry in entries)
+    try:
+        os.setxattr(tmp_path if above else folder, native.ACL, struct.pack("<I", 2) + acl)
+    except OSError:
+        pytest.skip("this file system has no access control lists")
+    with pytest.raises(MissingDependencyError, match="access control list"):
+        compiled()
 
 
 @pytest.mark.skipif(os.name != "posix" or os.geteuid() != 0, reason="only root can give files away")

@@ -15,6 +15,7 @@ from safetensors.torch import load_file
 import forcegp
 from forcegp.cli import app, main
 from forcegp.data import Dataset
+from forcegp.destination import MANIFEST
 from forcegp.forces.priors.sets import default_priors
 from forcegp.storage import checkpoint
 from reproduction import profiles
@@ -177,6 +178,8 @@ def stages(folder: Path) -> dict[str, int]:
 def _content(path: Path) -> object:
     if path.suffix == ".safetensors":
         return {name: value.numpy().tobytes() for name, value in load_file(path).items()}
+    if path.name == MANIFEST:
+        return None
     if path.suffix == ".json":
         return _fixed(json.loads(path.read_bytes()))
     return None if path.suffix in (".html", ".md", ".svg") else path.read_bytes()

@@ -55,11 +55,8 @@ def write_folder(path: Path, version: int) -> None:
 
 
 def read_folder(path: Path) -> int:
-    """The version of the last file, beside which all others are of that version or a later one."""
-    if not (path / "b").exists():
-        return 0
     a, b = (path / "a").read_text(), (path / "b").read_text()
-    assert int(a) >= int(b)
+    assert a == b, "files of two versions"
     return int(b)
 
 
@@ -103,7 +100,7 @@ def read_checkpoint(path: Path) -> int:
 
 WRITERS = (
     Writer("text", ".txt", write_text_file, read_text_file),
-    Writer("folder", "", write_folder, read_folder, also=0),
+    Writer("folder", "", write_folder, read_folder),
     Writer("log", ".parquet", lambda path, version: LOGS[version].write(path), read_log),
     Writer("model", ".safetensors", lambda path, version: model(version).save(path), read_model),
     Writer("checkpoint", ".ckpt", write_checkpoint, read_checkpoint, also=1),

@@ -19,6 +19,7 @@ from typer.testing import CliRunner
 import forcegp
 from forcegp import dynamics
 from forcegp.cli.app import app
+from forcegp.destination import MANIFEST
 from forcegp.errors import (
     DestinationError,
     ForceGPError,
@@ -354,6 +355,9 @@ def test_friction_of_the_joints() -> None:
     spread = fit.posterior.latent.covariance(type(rows)(rows.features, only, rows.target))
     spread = spread + torch.diag_embed(unknown_variance(fit.hyperparameters, at, None))
     torch.testing.assert_close(ours.covariance, spread, rtol=1e-9, atol=1e-12)
+    same = fit.predict(*state, "joint_friction")
+    torch.testing.assert_close(same.mean, ours.mean, rtol=1e-10, atol=1e-12)
+    torch.testing.assert_close(same.covariance, ours.covariance, rtol=1e-9, atol=1e-12)
 
 
 def test_forward_dynamics_of_the_robot_alone() -> None:
@@ -383,7 +387,7 @@ def test_the_folder_compiles_without_warnings_and_passes_its_test(
     name: str, compiler: str, tmp_path: Path
 ) -> None:
     written = fitted(name).export(tmp_path / "c")
-    names = {"controller.h", "controller.c", "test_controller.c", "CMakeLists.txt", "README.md"}
+    names = {"controller.h", "controller.c", "test_controller.c", "CMakeLists.txt", "README.md", MANIFEST}
     assert {path.name for path in written.folder.iterdir()} == names
     assert len((written.folder / "README.md").read_text().splitlines()) <= 10
     ran = built(written.folder, "-O2")
@@ -493,7 +497,7 @@ def test_single_precision_errs_by_what_the_export_states(name: str, compiler: st
 def test_a_torch_program_has_the_mean_and_covariance(tmp_path: Path) -> None:
     fit = fitted("one_contact")
     folder = fit.export(tmp_path / "program", language="torch", name="arm").folder
-    assert [path.name for path in folder.iterdir()] == ["arm.pt2"]
+    assert {path.name for path in folder.iterdir()} == {"arm.pt2", MANIFEST}
     program = torch.export.load(str(folder / "arm.pt2")).module()
     (q, qd, tau), active = states(fit, 8)
     theirs = fit.predict(q, qd, tau, ["qdd", "multiplier"], active=active)

@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 import forcegp
+from forcegp.destination import MANIFEST
 from forcegp.errors import ModelError, NumericalError, ShapeError, UnknownNameError
 from forcegp.forces.priors.inertial import PayloadPrior
 from forcegp.forces.priors.joint import JointFrictionPrior
@@ -68,7 +69,7 @@ def test_a_casadi_function_has_the_mean_its_jacobians_and_its_hessian(name: str,
     casadi = pytest.importorskip("casadi")
     fit, (state, active) = fitted(name), states(fitted(name), 4)
     folder = fit.export(tmp_path / "mpc", language="casadi", name="arm").folder
-    assert {path.name for path in folder.iterdir()} == {"arm.casadi", "README.md"}
+    assert {path.name for path in folder.iterdir()} == {"arm.casadi", "README.md", MANIFEST}
     f = casadi.Function.load(str(folder / "arm.casadi"))
     ours = f.map(4)(*(x.mT.numpy() for x in (*state, active.double())))
     mean = compiled(name).predict(*state, DIFFERENTIATED, active=active, covariance=False)

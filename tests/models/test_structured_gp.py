@@ -18,9 +18,9 @@ from forcegp.errors import DataError, ForceGPError, ModelError, NumericalError, 
 from forcegp.forces.measurements import Observation
 from forcegp.forces.priors.base import OperatorForcePrior
 from forcegp.forces.priors.contact import ContactForcePrior, SlidingFrictionPrior
-from forcegp.forces.priors.joint import JointForcePrior
+from forcegp.forces.priors.joint import JointForcePrior, JointFrictionPrior
 from forcegp.forces.priors.sets import default_priors
-from forcegp.forces.quantities import QUANTITIES
+from forcegp.forces.quantities import QUANTITIES, states
 from forcegp.forces.search import negative_log_prior
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.kernels import Linear, Matern52, SquaredExponential
@@ -31,6 +31,7 @@ from forcegp.models.structured_gp import StructuredGP
 from forcegp.storage.checkpoint import Checkpoint, Evaluations
 from forces.cases import all_priors, conditioned, draw, logged, mixed_contacts, two_contacts
 from forces.textbook import Textbook
+from logs import random_log
 from model_files import rewritten
 from random_data import random_data, table_system
 
@@ -146,6 +147,24 @@ def test_batch_shapes(model: StructuredFit, batch: tuple[int, ...], quantity: st
     without = model.predict(q, qd, tau, quantity, covariance=False)
     assert torch.equal(without.mean, found.mean)
     assert without.covariance is None and without.variance is None and without.std is None
+
+
+def test_joint_friction_is_a_part_of_the_joint_force() -> None:
+    """With the forces of the other prior, of the motors and of the links, it is the whole."""
+    robot = forcegp.load_robot("double_pendulum")
+    robot = robot.replace(damping=torch.tensor([0.3, 0.2], dtype=torch.float64))
+    free, log = ConstrainedSystem(robot), random_log(30, joints=robot.joint_names)
+    fit = StructuredGP(free, "analytical", [JointFrictionPrior(), JointForcePrior()], noise=0.1).fit(log)
+    state = log.q[:5], log.qd[:5], log.tau[:5]
+    found = fit.predict(*state, "joint_friction")
+    at = states(free, *state, torch.zeros(5, 0, dtype=torch.bool))
+    rest = fit.posterior.unknown_force(free, at, [1]) + at.eom.Q_C + at.eom.Q_G + log.tau[:5]
+    torch.testing.assert_close(found.mean + rest, fit.predict(*state, "joint_force").mean)
+    both = fit.predict(*state, ["joint_friction", "joint_force"])
+    torch.testing.assert_close(both.mean[:, both.parts["joint_friction"]], found.mean)
+    assert both.covariance is not None and found.covariance is not None
+    torch.testing.assert_close(both.covariance[:, :2, :2], found.covariance)
+    assert bool((found.std > 0.0).all())  # type: ignore[operator]
 
 
 def test_states_broadcast_and_each_is_predicted_by_itself(model: StructuredFit) -> None:

@@ -35,6 +35,11 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
     from forcegp.models.registry import create
 
     root, found = tmp_path_factory.mktemp("models"), {}
+    sparse = forcegp.StructuredGP(
+        SYSTEM, "analytical", "friction", 0.1, inference="sparse", inducing_points=6
+    )
+    sparse.fit(random_data(SYSTEM, 40), options=LearningOptions(max_evaluations=1)).save(root / "sparse")
+    found["sparse"] = model_path(root / "sparse")
     for name in ("nn", "gp", "sgp-mean"):
         model = create(name, SYSTEM, noise=0.1, seed=2)
         options = BatchOptions(epochs=1) if name == "nn" else LearningOptions(max_evaluations=1)
@@ -100,6 +105,54 @@ def test_a_changed_tensor_is_refused_or_predicts_finite_numbers(
                 assert bool(torch.isfinite(prediction.mean).all()), f"{key} {kind}: silent NaN"
             refused, answered = refused + (prediction is None), answered + (prediction is not None)
     assert refused > 5 * len(tensors) and answered > 0
+
+
+def reshaped(value: torch.Tensor) -> dict[str, torch.Tensor | None]:
+    """The same numbers in other shapes and types, and a missing tensor."""
+    found: dict[str, torch.Tensor | None] = {
+        "missing": None,
+        "row": torch.cat([value.flatten(), value.flatten()]),
+    }
+    if value.is_floating_point():
+        found["single"] = value.float()
+    if value.ndim:
+        found |= {"less": value[:-1], "column": value[..., None]}
+    if value.ndim > 1:
+        found |= {"transposed": value.mT, "flat": value.flatten(), "narrow": value[..., :-1]}
+        found["wide"] = torch.cat([value, value[..., :1]], dim=-1)
+    return found
+
+
+@pytest.mark.parametrize("name", ["sgp-mean", "sparse"])
+def test_tensors_that_contradict_each_other_are_refused_when_they_are_read(
+    name: str, saved: dict[str, Path], tmp_path: Path
+) -> None:
+    """Every tensor of the forces in every other shape; what is read predicts without a raw error."""
+    tensors = safetensors.torch.load_file(saved[name])
+    refused, read = 0, 0
+    for key in (key for key in tensors if not key.startswith(("system.", "start."))):
+        for kind, changed in reshaped(tensors[key]).items():
+
+            def change(header: dict, own: dict[str, torch.Tensor]) -> None:
+                del own[key]  # noqa: B023
+                if changed is not None:  # noqa: B023
+                    own[key] = changed.contiguous()  # noqa: B023
+
+            place = rewritten(saved[name], tmp_path / "model", change)
+            try:
+                model = forcegp.load_model(place)
+            except ForceGPError:
+                refused += 1
+                continue
+            read += 1
+            for active in (None, torch.zeros(len(DATA), 1, dtype=torch.bool)):
+                try:
+                    model.predict(DATA.q, DATA.qd, DATA.tau, active=active)
+                except ForceGPError:
+                    pass
+                except Exception as error:
+                    pytest.fail(f"{key} {kind}: {error!r}")
+    assert refused > 2 * read > 0
 
 
 @pytest.mark.parametrize("tensor", ["data.0.noise_std", "training.noise_std", "std.q"])

@@ -15,7 +15,8 @@ from typing import TYPE_CHECKING, Any, Protocol
 import typer
 
 import forcegp
-from forcegp.errors import DataError, DestinationError, ForceGPError
+from forcegp.errors import DataError, ForceGPError, ParameterError
+from forcegp.files import finite
 
 if TYPE_CHECKING:
     from forcegp.models.base import FittedModel, Predictor
@@ -83,7 +84,7 @@ def progress_bar(description: str, total: int) -> Iterator[Advance]:
 def show(result: Mapping[str, object], as_json: bool) -> None:
     """Print the nonempty values of a result, one per line, or print all values as JSON."""
     if as_json:
-        typer.echo(json.dumps(dict(result), default=str))
+        typer.echo(json.dumps(finite(dict(result)), default=str, allow_nan=False))
         return
     fields = {name: value for name, value in result.items() if value is not None and value != ()}
     width = max(len(name) for name in fields)
@@ -93,15 +94,6 @@ def show(result: Mapping[str, object], as_json: bool) -> None:
         say(text, f"{name.replace('_', ' '):<{width}}  ", indent=width + 2)
 
 
-def check_output(out: Path, *inputs: Path) -> None:
-    """Check, before long computations, that a file can be written and is not an input."""
-    from forcegp.destination import check_destination
-
-    check_destination(out)
-    if out.resolve() in (path.resolve() for path in inputs):
-        raise DestinationError(f"{out} would be overwritten", hint="choose another file for the result")
-
-
 def save(write: Callable[[Path], object], out: Path) -> None:
     """Write a result by `write(out)` or, if that fails, to a different path that the error names."""
     from forcegp.destination import write_or_keep
@@ -109,12 +101,13 @@ def save(write: Callable[[Path], object], out: Path) -> None:
     write_or_keep(write, out)
 
 
-def check_data_destination(path: Path, *inputs: Path) -> None:
-    """Check, before long computations, that a data set can be written without overwriting an input."""
+def check_data_destination(path: Path) -> None:
+    """Check, before long computations, that a data set can be written."""
     from forcegp.data.table import check_ending
+    from forcegp.destination import check_destination
 
     check_ending(path)
-    check_output(path, *inputs)
+    check_destination(path)
 
 
 def derivatives(window: int | None) -> forcegp.SavitzkyGolay | None:
@@ -154,6 +147,27 @@ def fitted(model: Configured, data: Any, **options: Any) -> FittedModel:
             advance(done, most, "" if math.isnan(value) else f"objective {value:.4g}")
 
         return model.fit(data, progress=progress, **options)
+
+
+def words(text: str | None) -> tuple[str, ...]:
+    """Return the words in a comma-separated list.
+
+    >>> words("fx, fz")
+    ('fx', 'fz')
+    """
+    return tuple(word.strip() for word in (text or "").split(",") if word.strip())
+
+
+def numbers(option: str, text: str | None, count: int | None = None) -> tuple[float, ...]:
+    """Return the numbers in a comma-separated list; raise `ParameterError` unless there are `count`."""
+    try:
+        found = tuple(map(float, words(text)))
+    except ValueError:
+        found = (math.nan,)
+    if any(map(math.isnan, found)) or count not in (None, len(found)):
+        expected = "comma-separated numbers" if count is None else f"{count} comma-separated numbers"
+        raise ParameterError(f"--{option} is not a list of numbers", expected=expected, got=text)
+    return found
 
 
 def check_robot_named(scene: str | None, robot: str | None) -> None:

@@ -24,7 +24,9 @@ def evaluate(
     model: Annotated[
         Path | None, Option("--model", "-m", help="File of a fitted model; if omitted, a model is fitted.")
     ] = None,
-    out: Annotated[Path | None, Option("--out", "-o", help="Folder for the page and its data.")] = None,
+    out: Annotated[
+        Path | None, Option("--out", "-o", writable=True, help="Folder for the page and its data.")
+    ] = None,
     train: Annotated[
         Path | None,
         Option(
@@ -56,10 +58,10 @@ def evaluate(
 
     forcegp evaluate --scene my_scene.toml --config model.toml --train train.parquet --data test.parquet
     """
-    from forcegp.destination import check_destination
+    from forcegp.destination import check_folder
 
     if out is not None:
-        check_destination(out, folder=True, own_files=["*.json", "*.html", "*.svg", "*.png"])
+        check_folder(out)
     regression = _model(model, scene, config, train)
     robot = regression.specified.robot
     test = read_data(data, robot)
@@ -71,6 +73,7 @@ def evaluate(
         "verdict": evaluation.verdict or "too few samples",
         "doubts": evaluation.doubts,
         "comparison": evaluation.comparison or None,
+        "left_out": evaluation.left_out,
         **evaluation.summary(),
     }
     if out is not None:

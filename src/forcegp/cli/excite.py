@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING, Annotated
 
 from typer import Option
 
-from forcegp.cli.common import check_data_destination, check_output, progress_bar, read_data, save, show
+from forcegp.cli.common import check_data_destination, numbers, progress_bar, read_data, save, show
 from forcegp.cli.options import AsJson, SceneName
 
 if TYPE_CHECKING:
@@ -18,7 +18,9 @@ Numbers = Annotated[str | None, Option(metavar="X[,X...]", help="Maximum, as one
 
 def excite(
     scene: SceneName,
-    out: Annotated[Path, Option("--out", "-o", help="Output file for the motion (.csv or .parquet).")],
+    out: Annotated[
+        Path, Option("--out", "-o", writable=True, help="Output file for the motion (.csv or .parquet).")
+    ],
     seconds: Annotated[float, Option(help="Duration of the motion in seconds.")] = 30.0,
     model: Annotated[
         Path | None, Option("--model", "-m", help="Fitted model with the posterior to start from.")
@@ -68,6 +70,7 @@ def excite(
     forcegp excite -s ur5_free --model model --box 0.5,0,0.1,0.3,0.3,0.2 -o motion.csv
     """
     from forcegp.control.information import Unknowns
+    from forcegp.destination import check_destination
     from forcegp.errors import ModelError
     from forcegp.models.calibrated import unknowns_after
     from forcegp.models.load import load_model
@@ -78,10 +81,9 @@ def excite(
     from forcegp.simulate.excite import Limits, excite, random_states
     from forcegp.view.excitation import write_excitation
 
-    inputs = [path for path in (model, region) if path is not None]
-    (check_output if out.suffix.lower() == ".csv" else check_data_destination)(out, *inputs)
+    (check_destination if out.suffix.lower() == ".csv" else check_data_destination)(out)
     page = out.with_suffix(".html")
-    check_output(page)
+    check_destination(page)
     read = load_scene(scene)
     system = read.system()
     shapes = shapes_of(system.robot, read.robot_source, ("collision", "visual"))
@@ -94,9 +96,9 @@ def excite(
         system = system.with_robot(fit.system.robot)
     limits = Limits.of(
         system.robot,
-        velocity=_numbers("velocity", velocity),
-        acceleration=_numbers("acceleration", acceleration),
-        torque=_numbers("torque", torque),
+        velocity=numbers("velocity", velocity),
+        acceleration=numbers("acceleration", acceleration),
+        torque=numbers("torque", torque),
         share=share,
     )
     states = random_states(system.robot, limits)
@@ -105,7 +107,7 @@ def excite(
         log = log[:: max(1, len(log) // len(states[0]))]
         states = log.q, log.qd, log.qdd
     unknowns = Unknowns.of(system.robot, limits.low, limits.high, limits.velocity, states)
-    collisions = Collisions(system, shapes, [_numbers("box", text) for text in box or ()], clearance)
+    collisions = Collisions(system, shapes, [numbers("box", text) for text in box or ()], clearance)
     with progress_bar("searching", 1) as advance:
         result = excite(
             system,
@@ -113,7 +115,7 @@ def excite(
             limits=limits,
             unknowns=unknowns if fit is None else unknowns_after(fit, unknowns),
             collisions=collisions,
-            start=_numbers("start", start) or None,
+            start=numbers("start", start) or None,
             criterion=criterion,
             rate=rate,
             restarts=restarts,
@@ -123,16 +125,6 @@ def excite(
     save(result.write, out)
     write_excitation(page, result, system, shapes, collisions.boxes, f"{scene}: the next motion")
     show({**_summary(result), "page": str(page), "file": str(out)}, as_json)
-
-
-def _numbers(option: str, text: str | None) -> list[float]:
-    from forcegp.errors import ParameterError
-
-    try:
-        return [float(word) for word in (text or "").split(",") if word.strip()]
-    except ValueError:
-        message = f"--{option} is not a list of numbers"
-        raise ParameterError(message, expected="comma-separated numbers", got=text) from None
 
 
 def _summary(result: Excitation) -> dict[str, object]:

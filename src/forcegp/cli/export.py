@@ -8,8 +8,8 @@ from typing import TYPE_CHECKING, Annotated
 from typer import Option
 
 import forcegp
-from forcegp.cli.common import show
-from forcegp.cli.options import AsJson, ModelFile
+from forcegp.cli.common import numbers, show, words
+from forcegp.cli.options import ALL, AsJson, Frame, ModelFile, Reference, WrenchAxes, WrenchPoint
 from forcegp.errors import ModelError, RobotFileError, check_name
 
 if TYPE_CHECKING:
@@ -21,7 +21,10 @@ TARGETS = ("c", "casadi", "torch", "urdf", "mjcf")
 def export(
     model: ModelFile,
     out: Annotated[
-        Path, Option("--out", "-o", help="Folder for the code and its test, or path of the robot file.")
+        Path,
+        Option(
+            "--out", "-o", writable=True, help="Folder for the code and its test, or path of the robot file."
+        ),
     ],
     to: Annotated[str, Option("--to", help="Format: c, casadi, torch, urdf or mjcf.")] = "c",
     name: Annotated[str, Option(help="For C: name of the files and prefix of the functions.")] = "controller",
@@ -32,10 +35,10 @@ def export(
             help="For C: number of basis functions in a reduced covariance, which widens the error bars.",
         ),
     ] = None,
-    frame: Annotated[
-        str | None, Option(help="For C: frame of an external wrench to estimate from accelerations.")
-    ] = None,
-    reference: Annotated[str, Option(help="Axes of the external wrench: world or local.")] = "world",
+    frame: Frame = None,
+    point: WrenchPoint = "0,0,0",
+    axes: WrenchAxes = ALL,
+    reference: Reference = "world",
     float32: Annotated[
         bool, Option("--float32", help="For C: use single precision and report its rounding error.")
     ] = False,
@@ -78,17 +81,20 @@ def export(
     """
     import torch
 
+    from forcegp.destination import check_destination, check_folder
     from forcegp.forces.external_wrench import WrenchFrame
     from forcegp.models.structured_fit import StructuredFit
 
     check_name("format to export to", to, TARGETS)
+    (check_destination if to in ("urdf", "mjcf") else check_folder)(out)
     fit = forcegp.load_model(model)
     if not isinstance(fit, StructuredFit):
         raise ModelError("only a structured Gaussian process can be exported", expected="sgp", got=fit.kind)
     if to in ("urdf", "mjcf"):
         show(_written_back(fit, to, robot, out, samples, seed, gain_std), as_json)
         return
-    wrench = None if frame is None else WrenchFrame(frame, reference)
+    x, y, z = numbers("point", point, 3)
+    wrench = None if frame is None else WrenchFrame(frame, reference, words(axes), (x, y, z))
     dtype = torch.float32 if float32 else torch.float64
     written = fit.export(out, language=to, name=name, functions=functions, wrench=wrench, dtype=dtype)
     lost = {"widest": written.widest, "wider": written.wider} if functions is not None else {}

@@ -22,7 +22,9 @@ STREAM_ROWS = 100_000
 
 def fit(
     data: options.DataFiles,
-    out: Annotated[Path, Option("--out", "-o", help="File for the fitted model (.safetensors).")],
+    out: Annotated[
+        Path, Option("--out", "-o", writable=True, help="File for the fitted model (.safetensors).")
+    ],
     scene: options.SceneOrNone = None,
     robot: options.RobotName = None,
     model: Annotated[
@@ -41,7 +43,10 @@ def fit(
     ] = None,
     differentiate: options.Differentiate = None,
     checkpoint: Annotated[
-        Path | None, Option(help="File that stores the progress of a long fit, which resumes if it exists.")
+        Path | None,
+        Option(
+            writable=True, help="File that stores the progress of a long fit, which resumes if it exists."
+        ),
     ] = None,
     seed: Annotated[int | None, Option(help="Seed for random initial values.")] = None,
     as_json: options.AsJson = False,
@@ -69,7 +74,7 @@ def fit(
 
     check_destination(model_path(out))
     if checkpoint is not None:
-        common.check_output(checkpoint, model_path(out), *data)
+        check_destination(checkpoint)
     system = common.system_of(scene, robot)
     table = common.model_table(config, scene)
     regression = configured(table, system, name=model, noise_std=noise_std, seed=seed)
@@ -111,7 +116,7 @@ def _training(
 def sweep(
     scene: Annotated[list[str], Option("--scene", "-s", help="Scene; may be given several times.")],
     model: Annotated[list[str], Option("--model", "-m", help="Model; may be given several times.")],
-    out: Annotated[Path, Option("--out", "-o", help="Folder for the fits.")],
+    out: Annotated[Path, Option("--out", "-o", writable=True, help="Folder for the fits.")],
     seeds: Annotated[int, Option(min=1, help="Number of seeds, starting from 0.")] = 1,
     duration: options.SimulatedTime = None,
     processes: Annotated[int, Option(min=1, help="Number of single-threaded workers on this machine.")] = 2,

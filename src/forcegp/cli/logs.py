@@ -30,10 +30,10 @@ def import_(
         str | None, Option("--mapping", "-m", help="Mapping file, or name of a bundled mapping.")
     ] = None,
     out: Annotated[
-        Path | None, Option("--out", "-o", help="Output file for the data set (.parquet).")
+        Path | None, Option("--out", "-o", writable=True, help="Output file for the data set (.parquet).")
     ] = None,
     guess: Annotated[
-        Path | None, Option(help="Write a proposed mapping to this file instead of importing.")
+        Path | None, Option(writable=True, help="Write a proposed mapping to this file instead of importing.")
     ] = None,
     fit_surface: Annotated[
         Literal["plane", "sphere"] | None,
@@ -61,13 +61,14 @@ def import_(
 
     forcegp import run.bag --robot ur3.urdf --mapping ur3_bag --out log.parquet
     """
+    from forcegp.destination import check_destination
     from forcegp.logs import import_log
 
-    common.check_robot_named(scene, robot)
     place = guess or out
     if place is None or (guess is None and place.suffix.lower() != ".parquet"):
         raise ForceGPError("no output path was given", expected="--out log.parquet", got=out)
-    common.check_output(place, log)
+    check_destination(place)
+    common.check_robot_named(scene, robot)
     system = common.system_of(scene, robot)
     if guess is not None:
         show(_guess(log, system, guess), as_json)
@@ -156,7 +157,9 @@ def check(
     ],
     scene: SceneOrNone = None,
     robot: RobotName = None,
-    out: Annotated[Path | None, Option("--out", "-o", help="HTML page with a plot of each finding.")] = None,
+    out: Annotated[
+        Path | None, Option("--out", "-o", writable=True, help="HTML page with a plot of each finding.")
+    ] = None,
     as_json: AsJson = False,
 ) -> None:
     """Check a log against a scene before fitting: clock, units, signs, masses, contact, noise and motion.
@@ -173,9 +176,10 @@ def check(
     from threadpoolctl import threadpool_limits
 
     from forcegp import checks
+    from forcegp.destination import check_destination
 
     if out is not None:
-        common.check_output(out, data)
+        check_destination(out)
     system = common.system_of(scene, robot)
     log = checks.read_log(data)
     # Matrices are small, so BLAS threads cost more than they save, and concurrent checks would compete.
@@ -231,8 +235,12 @@ ORDER_LOST = (
 def select(
     log: Annotated[Path, Argument(help="Data set to select from (.parquet or .csv).")],
     count: Annotated[int, Option("--count", "-n", min=1, help="Number of training points.")],
-    out: Annotated[Path, Option("--out", "-o", help="Output file for the training points (.parquet).")],
-    rest: Annotated[Path | None, Option(help="Output file for the test points (.parquet).")] = None,
+    out: Annotated[
+        Path, Option("--out", "-o", writable=True, help="Output file for the training points (.parquet).")
+    ],
+    rest: Annotated[
+        Path | None, Option(writable=True, help="Output file for the test points (.parquet).")
+    ] = None,
     split: Annotated[
         Literal["selection", "stretches"],
         Option(help="Test on all unselected points (as in the paper) or on held-out stretches."),
@@ -266,9 +274,9 @@ def select(
     """
     from forcegp.data import split_by_selection, split_by_stretches, without_marked_impacts
 
-    common.check_data_destination(out, log)
-    if rest is not None:
-        common.check_data_destination(rest, log, out)
+    for path in (out, rest):
+        if path is not None:
+            common.check_data_destination(path)
     whole = common.read_data(log, differentiate=differentiate)
     data = whole if keep_impacts else without_marked_impacts(whole)
     held_out = {"stretch": stretch, "fraction": fraction, "margin": margin}

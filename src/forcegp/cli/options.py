@@ -19,8 +19,20 @@ SceneOrNone = Annotated[str | None, _SCENE]
 RobotName = Annotated[
     str | None, Option("--robot", help="URDF or MJCF file, or name of a bundled robot, instead of a scene.")
 ]
+ALL = "fx,fy,fz,mx,my,mz"
+"""All components of a wrench."""
 ModelFile = Annotated[Path, Option("--model", "-m", help="File of a fitted model.")]
 DataFile = Annotated[Path, Option("--data", "-d", help="Data set (.parquet or .csv).")]
+Frame = Annotated[
+    str | None, Option(help="Frame on which an external wrench acts; no declared contact is needed.")
+]
+WrenchPoint = Annotated[
+    str, Option(metavar="X,Y,Z", help="Where the external wrench acts, in coordinates of the frame [m].")
+]
+WrenchAxes = Annotated[
+    str, Option(help="Components of the external wrench to estimate; all others are zero.")
+]
+Reference = Annotated[str, Option(help="Directions of these components: world or local.")]
 SimulatedTime = Annotated[
     float | None, Option("--duration", help="Simulated time in seconds; default: from the scene.")
 ]

@@ -9,8 +9,26 @@ from typing import TYPE_CHECKING, Annotated, Any
 from typer import Option
 
 import forcegp
-from forcegp.cli.common import check_data_destination, progress_bar, read_data, save, show, warn_beyond
-from forcegp.cli.options import AsJson, DataFile, ModelFile
+from forcegp.cli.common import (
+    check_data_destination,
+    numbers,
+    progress_bar,
+    read_data,
+    save,
+    show,
+    warn_beyond,
+    words,
+)
+from forcegp.cli.options import (
+    ALL,
+    AsJson,
+    DataFile,
+    Frame,
+    ModelFile,
+    Reference,
+    WrenchAxes,
+    WrenchPoint,
+)
 from forcegp.errors import ModelError
 
 if TYPE_CHECKING:
@@ -28,20 +46,22 @@ WRENCH = "external_wrench"
 def predict(
     model: ModelFile,
     data: DataFile,
-    out: Annotated[Path, Option("--out", "-o", help="Output file for the predictions (.parquet).")],
+    out: Annotated[
+        Path, Option("--out", "-o", writable=True, help="Output file for the predictions (.parquet).")
+    ],
     quantity: Annotated[
         str,
         Option(
             "--quantity",
             "-q",
             help="qdd, qdd_free, multiplier, constraint_force, contact_force, total_force, joint_force, "
-            "contact_friction or external_wrench.",
+            "joint_friction, contact_friction or external_wrench.",
         ),
     ] = "qdd",
-    frame: Annotated[
-        str | None, Option(help="Frame on which an external_wrench acts; no declared contact is needed.")
-    ] = None,
-    reference: Annotated[str, Option(help="Axes of an external_wrench: world or local.")] = "world",
+    frame: Frame = None,
+    point: WrenchPoint = "0,0,0",
+    axes: WrenchAxes = ALL,
+    reference: Reference = "world",
     momentum: Annotated[
         bool,
         Option(
@@ -75,14 +95,18 @@ def predict(
     forcegp predict -m model -d test.parquet --quantity multiplier -o force.parquet
 
     forcegp predict -m model -d test.parquet -q external_wrench --frame tool -o wrench.parquet
+
+    forcegp predict -m model -d test.parquet -q external_wrench --frame tool --point 0,0,0.1 --axes fx,fy,fz
+    -o wrench.parquet
     """
     from forcegp.evaluation.predicted import in_chunks
 
-    check_data_destination(out, data)
+    check_data_destination(out)
     regression = forcegp.load_model(model)
     test = read_data(data, regression.specified.robot)
     if quantity == WRENCH:
-        test, result = _with_wrench(regression, test, frame, reference, momentum)
+        at = {"point": numbers("point", point, 3), "axes": words(axes), "reference": reference}
+        test, result = _with_wrench(regression, test, frame, at, momentum)
     elif sensor and quantity != "multiplier":
         raise ModelError("the force sensor measures the multiplier", got=quantity, hint="-q multiplier")
     else:
@@ -119,9 +143,12 @@ def _predicted(
 
 
 def _with_wrench(
-    model: Predictor, test: forcegp.Dataset, frame: str | None, reference: str, momentum: bool
+    model: Predictor, test: forcegp.Dataset, frame: str | None, at: dict[str, Any], momentum: bool
 ) -> tuple[forcegp.Dataset, dict[str, object]]:
     """Add the wrench on a frame and the detected contact, named after the frame, and return a summary too."""
+    import torch
+
+    from forcegp.forces.external_wrench import AXES
     from forcegp.models.structured_fit import StructuredFit
 
     if not isinstance(model, StructuredFit):
@@ -130,12 +157,14 @@ def _with_wrench(
         names = ", ".join(model.system.robot.frame_names)
         raise ModelError("an external wrench acts on a frame", expected=f"--frame, one of {names}")
     method = "momentum" if momentum else "acceleration"
-    wrench = model.external_wrench(test, frame, method=method, reference=reference)
+    wrench = model.external_wrench(test, frame, method=method, **at)
     assert wrench.std is not None
+    places = [AXES.index(axis) for axis in at["axes"]]
     found, columns = wrench.detect(), {}
-    for part, rows in (("force", slice(0, 3)), ("moment", slice(3, 6))):
-        columns[f"predicted_external_{part}"] = {frame: wrench.mean[:, rows]}
-        columns[f"predicted_external_{part}_std"] = {frame: wrench.std[:, rows]}
+    for ending, values in (("", wrench.mean), ("_std", wrench.std)):
+        whole = values.new_zeros(len(values), len(AXES)).index_copy(1, torch.tensor(places), values)
+        for part, own in zip(("force", "moment"), whole.split(3, dim=1), strict=True):
+            columns[f"predicted_external_{part}{ending}"] = {frame: own}
     contact = {**test.contact, frame: test.contact.get(frame, found)}
     test = test.replace(contact=contact, contact_extras={**test.contact_extras, **columns})
     return test, {"frame": frame, "detected": float(found.double().mean())}

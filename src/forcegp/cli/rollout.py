@@ -23,7 +23,9 @@ if TYPE_CHECKING:
 def rollout(
     model: ModelFile,
     data: DataFile,
-    out: Annotated[Path, Option("--out", "-o", help="Folder for the trajectories and the page.")],
+    out: Annotated[
+        Path, Option("--out", "-o", writable=True, help="Folder for the trajectories and the page.")
+    ],
     start: Annotated[int, Option(min=0, help="Row of the data to start from.")] = 0,
     duration: Annotated[
         float | None, Option(help="Simulated time in seconds; default: to the end of the trajectory.")
@@ -51,14 +53,14 @@ def rollout(
 
     forcegp rollout -m model -d run.parquet --start 2400 --samples 50 -o rollout/
     """
-    from forcegp.destination import check_destination, folder_or_keep
+    from forcegp.destination import check_folder, folder_or_keep
     from forcegp.report.page import label
     from forcegp.report.rollouts import rollout_data, write_rollouts
     from forcegp.rollout import beside_log
     from forcegp.rollout.forward import replayed
     from forcegp.rollout.inputs import sampling_period
 
-    check_destination(out, folder=True, own_files=["rollout*", "*.svg", "*.png"])
+    check_folder(out)
     regression = forcegp.load_model(model)
     log = _stretch(read_data(data, regression.specified.robot), start, duration)
     _say_contact(log, unilateral)
@@ -174,7 +176,7 @@ def _learned(path: Path, sample: bool, seed: int) -> PassiveForces:
 
 def simulate(
     scene: SceneName,
-    out: Annotated[Path, Option("--out", "-o", help="Output file for the log (.parquet).")],
+    out: Annotated[Path, Option("--out", "-o", writable=True, help="Output file for the log (.parquet).")],
     duration: SimulatedTime = None,
     seed: Annotated[
         int | None, Option(help="Seed for the motion and the noise; default: from the scene.")
@@ -216,7 +218,7 @@ def simulate(
     from forcegp.errors import ParameterError
     from forcegp.simulate import simulate as run
 
-    check_data_destination(out, *(path for path in (motion, model) if path is not None))
+    check_data_destination(out)
     if sample and model is None:
         raise ParameterError("--sample needs a model to draw from", hint="give --model")
     read = forcegp.load_scene(scene)

@@ -27,7 +27,9 @@ def view(
     ] = None,
     out: Annotated[
         Path | None,
-        Option("--out", "-o", help="HTML file that works offline; if omitted, the page is served."),
+        Option(
+            "--out", "-o", writable=True, help="HTML file that works offline; if omitted, the page is served."
+        ),
     ] = None,
     start: Annotated[int, Option(min=0, help="Row of the log to start from.")] = 0,
     seconds: Annotated[float, Option(min=0.05, help="Duration of the motion in seconds.")] = 10.0,

@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any
 
+import numpy as np
 import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
-from forcegp.errors import DataError
+from forcegp.errors import DataError, NumericalError
 from forcegp.evaluation.judgement import Motion, beyond_gravity, explained, open_loop, torque_response
 from forcegp.evaluation.least_squares import FEWEST_TRAINING, as_torque, baselines, without_constraint
 from forcegp.evaluation.predicted import (
@@ -22,6 +23,7 @@ from forcegp.evaluation.predicted import (
     sensed_scores,
 )
 from forcegp.evaluation.scores import (
+    FEWEST,
     Errors,
     JointErrors,
     PredictorScores,
@@ -29,10 +31,13 @@ from forcegp.evaluation.scores import (
     Verdict,
     moving_joints,
     nlpd,
+    outliers,
     sentence,
     verdicts,
 )
+from forcegp.files import finite
 from forcegp.models.base import FittedModel, Predictor
+from forcegp.rows import describe, numbered
 
 __all__ = ["Evaluation", "evaluate"]
 
@@ -63,6 +68,7 @@ class Evaluation:
         response: fraction of an added torque that takes effect at each joint. It is 1 for a rigid robot, and
             0 for a model that has learned the controller. It is `None` if there is no free motion.
         motion: open-loop motion if the model predicts forces and the data are in time order.
+        left_out: rows of the data that are not evaluated, since their accelerations are impossible.
     """
 
     kind: str
@@ -82,6 +88,7 @@ class Evaluation:
     gravity: float | None = None
     response: tuple[float, ...] | None = None
     motion: Motion | None = None
+    left_out: tuple[int, ...] = ()
 
     @property
     def verdict(self) -> str:
@@ -132,13 +139,16 @@ class Evaluation:
             weak = [f"{joint} {x:.2f}" for joint, x in pairs if x < LEAST_RESPONSE]
             text = f"An added torque has too small an effect (expected: 1): {', '.join(weak)}."
             found.append(f"{text} The model has learned the controller, not the arm.")
+        if self.left_out:
+            rows = describe(numbered(np.array(self.left_out))).capitalize()
+            found.append(f"{rows}: left out, since an acceleration is impossible.")
         return tuple(found)
 
     def to_dict(self) -> dict[str, Any]:
         """Return all scores as JSON-compatible values."""
         texts = [verdict.text() for verdict in self.verdicts]
         said = {"verdict": self.verdict, "comparison": self.comparison, "doubts": self.doubts}
-        return asdict(self) | said | {"verdict_texts": texts}
+        return finite(asdict(self) | said | {"verdict_texts": texts})
 
     def summary(self) -> dict[str, float | int | str | None]:
         """Return the overall scores, keyed by name."""
@@ -180,12 +190,39 @@ def evaluate(
             predictors. The default is the system of the model before learning.
         progress: a function called with the number of states predicted so far and the total number.
 
+    Rows with impossible accelerations are left out, and named in `left_out`. Fewer than ten rows are compared
+    with no trivial predictor.
+
     Raises:
         ForceGPError: the data are empty, their joints differ from those of the robot, or they lack a contact.
+        NumericalError: the data are too extreme for least squares.
     """
     if len(data) == 0:
         raise DataError("there is nothing to evaluate on", expected="at least one sample", got="none")
     data.check_robot(model.specified.robot)
+    impossible = outliers(data.qdd)
+    if bool(impossible.any()):
+        scored = evaluate(
+            model, data[~impossible], train=train, compare=compare, system=system, progress=progress
+        )
+        return replace(scored, left_out=tuple(impossible.nonzero()[:, 0].tolist()))
+    try:
+        return _evaluated(model, data, train, compare, system, progress)
+    except torch.linalg.LinAlgError as cause:  # pyright: ignore[reportPrivateImportUsage]
+        text, hint = "a linear system of the evaluation is singular", "look for outliers with forcegp check"
+        raise NumericalError(text, got=str(cause)[:200], hint=hint) from cause
+
+
+def _evaluated(
+    model: Predictor,
+    data: Dataset,
+    train: Dataset | None,
+    compare: bool,
+    system: ConstrainedSystem | None,
+    progress: Progress | None,
+) -> Evaluation:
+    """Return the scores on data without outliers."""
+    compare = compare and len(data) >= FEWEST
     model.system.announce_states(len(data), 2.0, f"an evaluation on {len(data):,} samples")
     before = system or model.specified
     predicted = predict_all(model, data, system or model.system, progress)
@@ -253,6 +290,7 @@ def _trivial(
     system: ConstrainedSystem, data: Dataset, train: Dataset | None
 ) -> dict[str, tuple[Tensor, Tensor, Tensor]]:
     """Return errors, torque errors and standard deviations `(n, nq)` on data not used for training."""
+    train = None if train is None else train[~outliers(train.qdd)]
     half = len(data) // 2
     parts = [(train, data)] if train is not None else [(data[half:], data[:half]), (data[:half], data[half:])]
     errors: dict[str, list[tuple[Tensor, Tensor, Tensor]]] = {}

@@ -18,6 +18,26 @@ FEWEST = 10
 """Minimum number of samples required to compute an error in motion or at rest."""
 
 
+POSSIBLE, APART, COMMON = 1e3, 100.0, 0.99
+"""An acceleration that no arm exceeds [rad/s², m/s²], and a multiple of the quantile `COMMON` of all rows."""
+
+
+def outliers(qdd: Tensor) -> Tensor:
+    """Return a mask `(n,)` of rows with an impossible acceleration among accelerations `(n, nq)`.
+
+    It exceeds both `POSSIBLE` and `APART` times the quantile of |q̈| of all other rows.
+    """
+    found = torch.zeros(len(qdd), dtype=torch.bool, device=qdd.device)
+    while int((~found).sum()) > 1:
+        size = qdd[~found].abs()
+        k = min(math.ceil(COMMON * len(size)), len(size) - 1)
+        new = (size > (APART * size.kthvalue(k, dim=0).values).clamp(min=POSSIBLE)).any(-1)
+        if not bool(new.any()):
+            break
+        found[~found] = new
+    return found
+
+
 @dataclass(frozen=True)
 class Errors:
     """Differences between predicted and reference accelerations [rad/s², m/s²].

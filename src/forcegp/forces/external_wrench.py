@@ -71,8 +71,8 @@ class WrenchFrame:
 
     Raises:
         UnknownNameError: the reference or a component does not exist.
-        ParameterError: there are no components, a component is repeated, or a standard deviation is not
-            positive and finite.
+        ParameterError: there are no components, a component is repeated, the point is not finite, or a
+            standard deviation is not positive and finite.
     """
 
     frame: str
@@ -88,6 +88,9 @@ class WrenchFrame:
             check_name("component of a wrench", axis, AXES)
         if not self.axes or len(set(self.axes)) < len(self.axes):
             raise ParameterError("invalid components of a wrench", expected="some of AXES", got=self.axes)
+        if len(self.point) != 3 or not all(map(math.isfinite, self.point)):
+            text = "invalid point of application of a wrench"
+            raise ParameterError(text, expected="three finite coordinates [m]", got=self.point)
         for name, pair in (("prior_std", self.prior_std), ("change", self.change)):
             if len(pair) != 2 or not all(0.0 < std < math.inf for std in pair):
                 raise ParameterError(

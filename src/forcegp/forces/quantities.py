@@ -143,12 +143,14 @@ class AffineMap(NamedTuple):
         B_N: `(n, d, nq)` operator on the part of Q in the range of Aᵀ. It equals B_Q for all quantities
             except q̈, for which it is `None` because H Aᵀ = 0.
         o: `(n, d)` offset.
+        B_F: `(n, d, nq)` operator that acts on the joint friction alone, in addition to B_Q.
     """
 
     B_Q: Tensor
     B_z: Tensor
     B_N: Tensor | None
     o: Tensor
+    B_F: Tensor | None = None
 
 
 def _times(C: Tensor, z: AffineMap) -> AffineMap:
@@ -226,6 +228,16 @@ QUANTITIES: dict[str, Callable[[ConstrainedSystem, States], AffineMap]] = {
 """Quantities that can be measured and predicted, keyed by name."""
 
 
+def _joint_friction(system: ConstrainedSystem, at: States) -> AffineMap:
+    """Return the friction in the joints, which is Q_D of the robot file plus the learned friction."""
+    Q = _joint_force(system, at)
+    return AffineMap(Q.B_z, Q.B_z, Q.B_z, at.eom.Q_D, Q.B_Q)
+
+
+PREDICTED = QUANTITIES | {"joint_friction": _joint_friction}
+"""Quantities that can be predicted; joint friction cannot be measured separately."""
+
+
 def affine_maps(
     system: ConstrainedSystem, at: States, quantity: str | Sequence[str]
 ) -> tuple[AffineMap, dict[str, slice]]:
@@ -237,18 +249,21 @@ def affine_maps(
     """
     names = list(quantity) if isinstance(quantity, Sequence) and not isinstance(quantity, str) else [quantity]
     if not names:
-        raise ModelError("no quantity is named", expected="one of " + ", ".join(QUANTITIES))
+        raise ModelError("no quantity is named", expected="one of " + ", ".join(PREDICTED))
     for name in names:
-        if not isinstance(name, str) or name not in QUANTITIES:
-            raise UnknownNameError("quantity", name, QUANTITIES)
-    maps = {name: QUANTITIES[name](system, at) for name in names}
+        if not isinstance(name, str) or name not in PREDICTED:
+            raise UnknownNameError("quantity", name, PREDICTED)
+    maps = {name: PREDICTED[name](system, at) for name in names}
     rows, first = {}, 0
     for name, z in maps.items():
         rows[name] = slice(first, first + z.o.shape[-1])
         first += z.o.shape[-1]
     if len(maps) == 1:
         return next(iter(maps.values())), rows
-    filled = [z._replace(B_N=torch.zeros_like(z.B_Q)) if z.B_N is None else z for z in maps.values()]
+    filled = [
+        z._replace(**{x: torch.zeros_like(z.B_Q) for x in ("B_N", "B_F") if getattr(z, x) is None})
+        for z in maps.values()
+    ]
     return AffineMap(*(torch.cat(parts, dim=1) for parts in zip(*filled, strict=True))), rows
 
 

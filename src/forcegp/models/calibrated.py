@@ -207,8 +207,8 @@ def write_calibrated(
     robots = [found.robot, *drawn]
     drives = not is_mjcf(source) and bool((found.robot.armature != 0.0).any())
     losses: tuple[str, ...] = ()
-    for k, robot in enumerate(robots):
-        path = out.with_name(f"{out.stem}.sample_{k - 1:03d}{out.suffix}") if k else out
+    *paths, page = written_files(out, samples)
+    for robot, path in zip(robots, paths, strict=True):
         holding = without_armature(robot, found.speeds[-1]) if drives else robot
         losses = losses or write_robot(holding, source, path, locked_joints=locked_joints).losses
     if drives:
@@ -229,8 +229,14 @@ def write_calibrated(
             for j, joint in enumerate(found.robot.joint_names)
         },
     }
-    write_json(out.with_name(f"{out.stem}.report.json"), report)
+    write_json(page, report)
     return found
+
+
+def written_files(out: Path, samples: int) -> list[Path]:
+    """Return the paths that `write_calibrated` writes: the robot, the samples, and the report."""
+    drawn = [out.with_name(f"{out.stem}.sample_{k:03d}{out.suffix}") for k in range(samples)]
+    return [out, *drawn, out.with_name(f"{out.stem}.report.json")]
 
 
 @torch.no_grad()

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import copyreg
 from collections.abc import Mapping
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
+import torch
 from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ForceGPError, ModelError, check_name
+from forcegp.gp.exact import ExactPosterior
 from forcegp.models.analytical import AnalyticalFit
 from forcegp.models.base import FittedModel
 from forcegp.models.independent_gp import IndependentFit
@@ -72,12 +75,32 @@ def _restored(
     own = {name: value for name, value in tensors.items() if not name.startswith(PREFIX)}
     try:
         model_system = unpack_system(header.system, tensors, source, system)
-        return KINDS[header.kind].restored(header, own, model_system, source)
+        model = KINDS[header.kind].restored(header, own, model_system, source)
+        _check(model)
+        return model
     except ForceGPError:
         raise
-    except (ArithmeticError, LookupError, RuntimeError, TypeError, ValueError) as cause:
+    except Exception as cause:
         got = f"{type(cause).__name__}: {cause}"[:300]
         raise ModelError(f"{source}: the parts of the model contradict each other", got=got) from cause
+
+
+@torch.no_grad()
+def _check(model: FittedModel) -> None:
+    """Predict at some states, which raises an error if the shapes or types of the tensors do not match.
+
+    Their number differs from all other dimensions. An exact posterior is not factorised at this point.
+    """
+    robot = model.system.robot
+    n = 1 + max(robot.nq, len(model.system.contacts), model.system.m)
+    state = torch.zeros(n, robot.nq, dtype=robot.dtype, device=robot.device)
+    closed = torch.arange(n, device=robot.device)[:, None].expand(n, len(model.system.contacts)) % 2 == 0
+    exact = isinstance(model, StructuredFit) and isinstance(model.posterior.latent, ExactPosterior)
+    noise = isinstance(model, StructuredFit) and not exact
+    options: dict[str, Any] = {"covariance": not exact, "noise": noise}
+    for quantity in ("qdd", "multiplier"):
+        with suppress(ForceGPError):  # a valid model may not determine a force in this position
+            model.predict(state, state, state, quantity, active=closed, **options)
 
 
 def register() -> None:

@@ -248,8 +248,9 @@ class Predictor(ForwardModel):
 
         Args:
             q, qd, tau: states, `(*batch, nq)`.
-            quantity: a name in `QUANTITIES`. If the model has forces, several names give their joint
-                distribution.
+            quantity: a name in `PREDICTED`. If the model has forces, several names give their joint
+                distribution. `"joint_friction"` is the friction of the joints [N m, N], which includes the
+                friction in the robot file.
             active: mask `(*batch, n_contacts)` of closed contacts. By default, all contacts are closed.
             covariance: whether to compute the covariance, which is more expensive than the mean.
             system: a different system, such as one with a different surface, if the model predicts forces. On

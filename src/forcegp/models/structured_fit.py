@@ -52,6 +52,7 @@ from forcegp.models.export.model import ExportedModel
 from forcegp.models.export.motion import CompiledMotion, compiled_motion
 from forcegp.models.external_wrench import ExternalWrench, external_wrench
 from forcegp.models.fit_result import FitResult
+from forcegp.models.parameter_std import parameter_std
 from forcegp.models.prediction import Answer, Prediction, Query, in_pieces
 from forcegp.models.structured_file import pack, unpack
 from forcegp.models.structured_learning import Specification, constant_inputs, prepared, training_for
@@ -134,8 +135,29 @@ class StructuredFit(FittedModel):
         """Return the mean and covariance of quantities, including unknown forces and, if requested, noise."""
         mean, spread = self.posterior.read(system, at, z)
         z = self.posterior.process.coupled(system, at, z)
-        spread = spread + _carried(z, unknown_variance(self.hyperparameters, at, self.problem.external_std))
+        of_all = z if z.B_F is None else z._replace(B_Q=z.B_Q + z.B_F)
+        spread = spread + _carried(
+            of_all, unknown_variance(self.hyperparameters, at, self.problem.external_std)
+        )
         return mean, spread + self._noise_covariance(z, parts) if noise else spread
+
+    def parameter_std(self) -> dict[str, Tensor]:
+        """Return the standard deviations of the robot parameters learned as `analytical_parameters`.
+
+        They are those of the Laplace approximation (`models/parameter_std.py`), at the learned kernels and
+        noise. The unknown forces are marginalised.
+
+        Returns:
+            σ of each learned field of `fit.system.robot`, keyed by its name and of its shape, in SI units. It
+            is zero for parameters that are not learned, and infinite if the data do not determine them.
+
+        Raises:
+            ModelError: no robot parameters were learned, or the training data were not saved.
+
+        Example:
+            `mass, std = fit.system.robot.mass[-1], fit.parameter_std()["mass"][-1]`
+        """
+        return parameter_std(self.problem, self.hyperparameters)
 
     def predict_log(
         self,

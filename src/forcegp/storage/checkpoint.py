@@ -7,7 +7,6 @@ import json
 import time
 from collections.abc import Callable, Container, Mapping, Sequence
 from dataclasses import dataclass, field
-from importlib.metadata import version
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +15,7 @@ import safetensors.torch
 import torch
 from torch import Tensor
 
+from forcegp import __version__
 from forcegp.errors import ModelError
 from forcegp.files import atomic_file
 from forcegp.gp.optimise import Objective
@@ -45,7 +45,7 @@ class Checkpoint:
     @staticmethod
     def key_of(*values: object) -> str:
         """Return a short hash of settings, tensors and the release of this library."""
-        digest = hashlib.sha256(version("forcegp").encode())
+        digest = hashlib.sha256(__version__.encode())
         for value in values:
             if isinstance(value, Tensor):
                 # The type and shape distinguish tensors that consist of the same bytes.

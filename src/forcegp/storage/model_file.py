@@ -76,7 +76,7 @@ class ModelHeader(Header):
 def model_path(path: str | Path) -> Path:
     """Return the path of a model, with the suffix `.safetensors` appended if it is missing."""
     path = Path(path)
-    if not path.name:
+    if path.name in ("", ".."):
         raise ModelError("the path of a model has no name", expected="a file", got=repr(str(path)))
     return path if path.suffix == SUFFIX else path.with_name(path.name + SUFFIX)
 

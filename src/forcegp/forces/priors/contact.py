@@ -410,7 +410,8 @@ def coupled(
     G = z.B_z @ gain
     back = G @ at.eom.L.mT
     offset = (G @ (at.eom.constraint_inertia @ at.eom.b[..., None]))[..., 0]
-    return AffineMap(z.B_Q - back, z.B_z - back, -back if z.B_N is None else z.B_N - back, z.o + offset)
+    B_N = -back if z.B_N is None else z.B_N - back
+    return AffineMap(z.B_Q - back, z.B_z - back, B_N, z.o + offset, z.B_F)
 
 
 def with_coulomb(

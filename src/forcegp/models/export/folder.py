@@ -12,7 +12,7 @@ from torch import Tensor
 
 from forcegp.data import Dataset
 from forcegp.data.fields import DataHeader
-from forcegp.destination import check_destination, folder_or_keep
+from forcegp.destination import check_folder, folder_or_keep
 from forcegp.errors import ParameterError, check_name
 from forcegp.forces.measurements import Training
 from forcegp.forces.posterior import HIGH, LOW
@@ -62,9 +62,7 @@ def write_export(
             f"{name!r} cannot be the prefix of C functions",
             expected="lower-case letters, digits and underscores, a letter first",
         )
-    own = [f"{name}{suffix}" for suffix in (".h", ".c", ".casadi", ".pt2")]
-    own += [f"test_{name}.c", "CMakeLists.txt", "README.md", "build"]
-    check_destination(path, folder=True, own_files=own)
+    check_folder(path)
     if language != "c":
         if language == "casadi":
             write_casadi(model, Path(path), name)

@@ -194,8 +194,7 @@ class CompiledFit(Predictor):
     ) -> Prediction:
         """Return the posterior mean and covariance of a quantity, as in `StructuredFit.predict`.
 
-        The arguments and errors are those of that method. `quantity` may also be `"joint_friction"`, the
-        friction of the joints [N m, N], which includes the friction in the robot file.
+        The arguments and errors are those of that method.
 
         Raises:
             ModelError: `system` is not the system of the fit, or friction jams a contact.

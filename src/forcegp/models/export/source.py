@@ -25,7 +25,7 @@ from forcegp.forces.priors import contact
 from forcegp.forces.priors.base import CONSTRAINT, CONTACT, JOINT
 from forcegp.forces.priors.inertial import PER_PAYLOAD, InertialPrior, PayloadPrior
 from forcegp.forces.priors.joint import TERMS, JointFrictionPrior
-from forcegp.forces.quantities import QUANTITIES, ROUNDED
+from forcegp.forces.quantities import PREDICTED, ROUNDED
 from forcegp.gp import kernels
 from forcegp.gp.basis import KernelPart
 from forcegp.gp.draws import MISSED_FEATURES
@@ -41,8 +41,8 @@ NO_FRICTION = 10
 """Error code of the C code if no dry friction solves the problem in `rollout/law.py`."""
 LAW = ("REGULARIZATION", "CONTRADICTION", "BLOCK_TRIALS", "MAX_EXCHANGES")
 LAW += ("INSTANT", "STILL", "SMOOTH", "NUDGE")
-READ = (*QUANTITIES, "joint_friction")
-"""Quantities of the C code, in the order of their bits. Only the last is not in `QUANTITIES`."""
+READ = tuple(PREDICTED)
+"""Quantities of the C code, in the order of their bits."""
 STEPS = 2e-5, 1e-3
 """Steps of fourth-order differences in q and q̇, and in τ and q̈. Friction changes within 0.01 rad/s."""
 TARGETS = (JOINT, CONTACT, CONSTRAINT)
