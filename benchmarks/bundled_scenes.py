@@ -57,7 +57,7 @@ def main() -> None:
         model = create("sgp", system)
         assert isinstance(model, StructuredGP)
         fit = model.fit(train, options=options)
-        chosen = next(each.name for each in fit.result.comparison if each.chosen)
+        chosen = ", ".join(name for name, worth in fit.result.worth.items() if worth > 0.0)
         after = evaluate(fit, test, compare=False)
         before = evaluate(AnalyticalModel(system).nominal(), test, compare=False)
         print(report(name, before, after), f"  {chosen}", flush=True)

@@ -79,10 +79,9 @@ def main() -> None:
         "passes": CountedLog.passes,
         "mebibytes": (resource.getrusage(resource.RUSAGE_SELF).ru_maxrss - before) / 1024,
         "samples": fit.result.samples,
-        "comparison": [str(each) for each in fit.result.comparison],
+        "worth": fit.result.worth,
     }
     print(f"{result['seconds']:.1f} s, {result['passes']} passes, {result['mebibytes']:.0f} MiB")
-    print(*fit.result.comparison, sep="\n")
     if arguments.json:
         write_text(arguments.json, json.dumps(result, indent=1))
 

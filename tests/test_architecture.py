@@ -40,6 +40,7 @@ LAYERS = (
     ("data",),
     ("gp",),
     ("forces",),
+    ("learning",),
     ("storage",),
     ("control",),
     ("simulate",),

@@ -41,11 +41,12 @@ class StructuredGP(Model[StructuredFit]):
         system: the robot and its contacts.
         mean: `"analytical"`, `"zero"`, or an `AnalyticalMean` with a subset of its terms.
         force_priors: priors on the unknown forces, the name of a set in `SETS` (`"sliding"`, `"friction"`,
-            `"friction+residual"`), or `"auto"`. With `"auto"` and the analytical mean, the set is selected on
-            held-out blocks of the training log (`models/selection.py`), and `fit.result.comparison` contains
-            the scores. Logs with fewer than 100 samples, and fits with `learn=`, use `"friction"`. If the
-            mean does not include the motor torque, `"auto"` selects `default_priors`: a `JointForcePrior`
-            and, in contact, a `NormalForcePrior` that affects only multipliers.
+            `"friction+residual"`), or `"auto"`. With `"auto"` and the analytical mean, all terms that apply
+            to the log take part: friction of joints, bristles for logs in time order, friction of contacts,
+            and torque noise. `fit.result.worth` contains their log evidence, and those that the evidence speaks
+            against are dropped (`learning/evidence.py`). If the mean does not include the motor torque,
+            `"auto"` selects `default_priors`: a `JointForcePrior` and, in contact, a `NormalForcePrior` that
+            affects only multipliers.
         noise: standard deviation of measured accelerations [rad/s², m/s²], as one value or one per joint, or
             a `Noise` for accelerations, torques and states. The default is the value in the log, or 0.1.
         analytical_parameters: a module with a `forward()` method that returns the robot with learned
@@ -54,7 +55,7 @@ class StructuredGP(Model[StructuredFit]):
         inducing_points: maximum number of inducing points per prior. Fewer points are used if they suffice.
             The result of the fit indicates whether more points would help.
         inertia: `"file"` keeps the inertia of the robot. `"auto"` identifies the inertia of links and drives
-            if this improves the score on held-out parts of the log (`forces/inertia.py`). It requires a
+            that the log determines (`forces/inertia.py`). It requires a
             `JointFrictionPrior` and a mean that includes the motor torque. `None` means `"auto"` for
             automatically selected priors, and `"file"` otherwise.
         standardize: whether to standardize kernel inputs, which the paper does not do.

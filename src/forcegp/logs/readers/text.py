@@ -7,6 +7,7 @@ contains one quantity (for example, `q.txt`).
 from __future__ import annotations
 
 import csv
+import importlib
 import io
 import re
 from collections.abc import Callable, Iterator
@@ -243,7 +244,8 @@ def _numbers(chunks: list[pa.Array], kind: str, dialect: Dialect) -> Column:
     A column that is empty at the start of the file has numbers, or NaN where it has text.
     """
     import pyarrow as pa
-    import pyarrow.compute as pc
+
+    pc: Any = importlib.import_module("pyarrow.compute")
 
     values = pa.chunked_array(chunks, None if chunks else pa.float64())
     if kind in ("date", "time of day"):
@@ -263,7 +265,8 @@ def _seconds(values: pa.ChunkedArray, form: re.Pattern[str], alone: bool) -> Col
     `alone` states that no column has the date of a time of day, so that it increases past midnight.
     """
     import pyarrow as pa
-    import pyarrow.compute as pc
+
+    pc: Any = importlib.import_module("pyarrow.compute")
 
     parts = pc.extract_regex(pc.utf8_trim_whitespace(values), form.pattern).combine_chunks()
     missing = pc.is_null(parts).to_numpy(zero_copy_only=False)
