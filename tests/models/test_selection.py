@@ -92,6 +92,28 @@ def test_a_row_that_nothing_explains_does_not_choose() -> None:
     assert all(each.behind < 100.0 for each in fit.result.comparison if each.behind is not None)
 
 
+def test_scores_of_different_halves_do_not_stand_side_by_side() -> None:
+    """A candidate that was tested on one half has a deficit on that half, and no density to compare."""
+    one_half = Trial(Candidate(SETS["sliding"]), scores=[torch.tensor([-8.0, -6.0])], note="dropped")
+    both = Trial(
+        Candidate(SETS["friction"]), scores=[torch.tensor([-5.0, -4.0]), torch.tensor([-20.0, -30.0])]
+    )
+    best = torch.cat(both.scores)
+    dropped, chosen = one_half.row(best, False), both.row(best, True)
+    assert dropped.log_density is None and dropped.behind == 2.5
+    assert str(dropped) == "sliding: 2.50 ± 0.35 behind, dropped"
+    assert chosen.log_density == -14.75 and chosen.behind == 0.0
+
+
+def test_the_table_states_whether_links_or_only_drives_were_identified() -> None:
+    trial = Trial(Candidate(SETS["friction"], inertia=True))
+    assert trial.name == "friction, inertia identified"
+    trial.inertia_found = True
+    assert trial.name == "friction, drives identified"
+    trial.links_found = True
+    assert trial.name == "friction, inertia identified"
+
+
 def test_a_soft_contact_does_not_choose() -> None:
     """Accelerations along the normal, which no candidate predicts, are no evidence."""
     system, data = scene_log("kuka_plane")

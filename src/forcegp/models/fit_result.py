@@ -21,9 +21,9 @@ class Compared:
 
     Attributes:
         name: name of the set.
-        log_density: mean log predictive density of held-out samples [nats per sample], or `None` if not
-            computed.
-        behind: deficit relative to the best set [nats per sample].
+        log_density: mean log predictive density of held-out samples [nats per sample], or `None` if it was
+            not computed on both halves of the log. Densities on different samples are not comparable.
+        behind: deficit relative to the best set on the same samples [nats per sample].
         standard_error: standard error of this deficit.
         chosen: whether this set was selected.
         note: reason why the set was not tested, or was not tested on both halves of the log.
@@ -50,10 +50,11 @@ class Compared:
 
     def __str__(self) -> str:
         name = f"{self.name} (chosen)" if self.chosen else self.name
-        if self.log_density is None:
+        if self.behind is None:
             return f"{name}: {self.note}"
-        note = f", {self.note}" if self.note else ""
-        return f"{name}: {self.log_density:.2f} ({self.behind:.2f} ± {self.standard_error:.2f} behind){note}"
+        behind = f"{self.behind:.2f} ± {self.standard_error:.2f} behind"
+        score = behind if self.log_density is None else f"{self.log_density:.2f} ({behind})"
+        return f"{name}: {score}, {self.note}" if self.note else f"{name}: {score}"
 
 
 @dataclass(frozen=True)

@@ -157,6 +157,7 @@ class Trial:
         independent: number of independent samples κ n in the halves on which the candidate was trained.
         begin: the hyperparameters learned on the first half.
         inertia_found: whether the identified inertia differs from that of the robot file.
+        links_found: whether that of the links differs too, and not only that of the drives.
         note: the reason why the candidate was dropped.
     """
 
@@ -166,6 +167,7 @@ class Trial:
     independent: float = 0.0
     begin: Mapping[str, Tensor] | None = None
     inertia_found: bool = False
+    links_found: bool = False
     note: str = ""
 
     @property
@@ -173,14 +175,21 @@ class Trial:
         """Number of learned parameters of the kernels."""
         return sum(x.numel() for x in kernel_parameters(self.begin or {}).values())
 
+    @property
+    def name(self) -> str:
+        """Name in the comparison table, which states whether inertia of links or only drives was found."""
+        only_drives = self.inertia_found and not self.links_found
+        return f"{self.candidate.set.name}, drives identified" if only_drives else self.candidate.name
+
     def row(self, best: Tensor, chosen: bool) -> Compared:
         """Return the row for this candidate in the comparison table."""
         if not self.scores:
-            return Compared(self.candidate.name, note=self.note)
+            return Compared(self.name, note=self.note)
         own = torch.cat(self.scores)
         behind, error = difference(best[: len(own)], own)
         coverage = sum(self.coverage) / len(self.coverage)
-        return Compared(self.candidate.name, float(own.mean()), behind, error, chosen, self.note, coverage)
+        density = float(own.mean()) if len(own) == len(best) else None
+        return Compared(self.name, density, behind, error, chosen, self.note, coverage)
 
 
 def _score(
@@ -196,6 +205,7 @@ def _score(
     if not candidate.inertia or inertia is None:
         inertia = Inertia(robot)
     trial.inertia_found |= inertia.robot is not robot
+    trial.links_found |= inertia.per_gain is not None
     if candidate.inertia and inertia.robot is robot:
         # The model is the same as that without identification.
         for other in trials:

@@ -8,6 +8,7 @@ data (`structured_fit.conditioned`). `gram` in `gp/likelihood.py` computes the c
 from __future__ import annotations
 
 import dataclasses
+import time
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
@@ -153,6 +154,7 @@ class StructuredGP(Model[StructuredFit]):
                 not match the model.
             NumericalError: the likelihood cannot be computed.
         """
+        began = time.perf_counter()
         spec = self.specification if after is None else self._continued(after)
         sample = sample_of(spec, data) if isinstance(data, StreamedDataset) else Sample(data)
         chosen = None if learn is None else tuple(learn)
@@ -182,7 +184,8 @@ class StructuredGP(Model[StructuredFit]):
             progress(fit.result.evaluations, fit.result.evaluations, fit.result.objective)
         missed = (each.doubt for each in comparison if each.chosen and each.doubt)
         warnings = (*fit.result.warnings, *missed, *self._without_effect(fit))
-        result = dataclasses.replace(fit.result, comparison=comparison, warnings=warnings)
+        seconds = time.perf_counter() - began
+        result = dataclasses.replace(fit.result, seconds=seconds, comparison=comparison, warnings=warnings)
         return dataclasses.replace(fit, result=result)
 
     def _without_effect(self, fit: StructuredFit) -> Iterator[str]:
