@@ -94,14 +94,13 @@ def test_a_row_that_nothing_explains_does_not_choose() -> None:
 
 def test_scores_of_different_halves_do_not_stand_side_by_side() -> None:
     """A candidate that was tested on one half has a deficit on that half, and no density to compare."""
-    one_half = Trial(Candidate(SETS["sliding"]), scores=[torch.tensor([-8.0, -6.0])], note="dropped")
-    both = Trial(
-        Candidate(SETS["friction"]), scores=[torch.tensor([-5.0, -4.0]), torch.tensor([-20.0, -30.0])]
-    )
+    halves = [torch.tensor([-5.0, -4.0]), torch.tensor([-20.0, -30.0])]
+    one_half = Trial(Candidate(SETS["sliding"]), [torch.tensor([-8.0, -6.0])], [0.9], note="dropped")
+    both = Trial(Candidate(SETS["friction"]), halves, [0.9, 0.9])
     best = torch.cat(both.scores)
     dropped, chosen = one_half.row(best, False), both.row(best, True)
     assert dropped.log_density is None and dropped.behind == 2.5
-    assert str(dropped) == "sliding: 2.50 ± 0.35 behind, dropped"
+    assert str(dropped) == "sliding: 2.50 ± 0.50 behind, dropped"
     assert chosen.log_density == -14.75 and chosen.behind == 0.0
 
 

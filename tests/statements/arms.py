@@ -1,0 +1,154 @@
+"""Arms in MuJoCo that differ from their robot files in a known way, logged and imported as a user would."""
+
+from __future__ import annotations
+
+import tempfile
+from dataclasses import dataclass
+from functools import cache
+from pathlib import Path
+from typing import Any
+
+import mujoco
+import numpy as np
+import torch
+
+import forcegp
+from forcegp.logs import parse_mapping
+from forcegp.robot.model import RobotModel
+from forcegp.simulate.urdf import write_urdf
+from robots import ARMS
+
+STEP, PERIOD = 0.001, 0.004
+ENCODER, SPEED_NOISE, TORQUE_NOISE = 2e-5, 1e-3, 0.005
+"""Resolution [rad], noise of the velocity [rad/s], and of the torque over the largest torque of a joint."""
+MAPPING = b"""
+time = { column = "t" }
+position = { column = "q.{joint}", unit = "rad" }
+velocity = { column = "qd.{joint}", unit = "rad/s" }
+torque = { column = "tau.{joint}", unit = "Nm" }
+derivatives = { window = 21 }
+"""
+
+
+@dataclass(frozen=True)
+class Truth:
+    """What the robot file does not say.
+
+    Attributes:
+        arm: name of the arm in `robots.ARMS`.
+        heavier: factor of the mass and the inertia of each link.
+        drives: inertia of each drive [kg m²].
+        dry, viscous: friction of each joint [N m, N m s/rad].
+        payload: point mass at the origin of the last frame [kg].
+    """
+
+    arm: str
+    heavier: float = 1.0
+    drives: tuple[float, ...] = ()
+    dry: tuple[float, ...] = ()
+    viscous: tuple[float, ...] = ()
+    payload: float = 0.0
+
+
+@cache
+def file_of(arm: str) -> RobotModel:
+    """The robot file, without friction."""
+    robot = next(each for each in ARMS if each.name == arm).load()
+    return robot.replace(damping=torch.zeros_like(robot.damping), friction=torch.zeros_like(robot.friction))
+
+
+def true_robot(truth: Truth) -> RobotModel:
+    """The robot with its true links and drives."""
+    robot = file_of(truth.arm)
+    armature = robot.armature + torch.tensor(truth.drives or (0.0,) * robot.nq, dtype=robot.mass.dtype)
+    links = {"mass": truth.heavier * robot.mass, "inertia": truth.heavier * robot.inertia}
+    return robot.replace(armature=armature, **links)
+
+
+def _engine(truth: Truth) -> Any:
+    robot = true_robot(truth)
+    model = mujoco.MjModel.from_xml_string(write_urdf(robot))
+    model.opt.timestep, model.opt.gravity[:] = STEP, robot.gravity.numpy()
+    model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
+    model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_LIMIT
+    model.dof_armature[:] = robot.armature.numpy()
+    model.dof_frictionloss[:] = truth.dry or (0.0,) * robot.nq
+    model.dof_damping[:] = truth.viscous or (0.0,) * robot.nq
+    if truth.payload:
+        _attach(model, robot, truth.payload)
+    return model
+
+
+def _attach(model: Any, robot: RobotModel, mass: float) -> None:
+    """Add a point mass at the origin of the last frame to the last body."""
+    body, place = model.nbody - 1, robot.frame_position[-1].numpy()
+    rotation = np.empty(9)
+    mujoco.mju_quat2Mat(rotation, model.body_iquat[body])
+    R, own, c = rotation.reshape(3, 3), model.body_mass[body], model.body_ipos[body].copy()
+    centre = (own * c + mass * place) / (own + mass)
+    inertia = R @ np.diag(model.body_inertia[body]) @ R.T
+    for m, d in ((own, c - centre), (mass, place - centre)):
+        inertia = inertia + m * (d @ d * np.eye(3) - np.outer(d, d))
+    moments, axes = np.linalg.eigh(inertia)
+    mujoco.mju_mat2Quat(model.body_iquat[body], (axes * np.sign(np.linalg.det(axes))).flatten())
+    model.body_mass[body], model.body_ipos[body], model.body_inertia[body] = own + mass, centre, moments
+    mujoco.mj_setConst(model, mujoco.MjData(model))
+
+
+def motion(robot: RobotModel, seconds: float, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Positions, velocities and accelerations of five sines about the middle of the joints' ranges."""
+    t, random = np.arange(round(seconds / STEP)) * STEP, np.random.default_rng(seed)
+    low = np.maximum(np.nan_to_num(robot.lower.numpy(), neginf=-2.0), -2.0)
+    high = np.minimum(np.nan_to_num(robot.upper.numpy(), posinf=2.0), 2.0)
+    q = np.tile((low + high) / 2.0, (len(t), 1))
+    qd, qdd = np.zeros_like(q), np.zeros_like(q)
+    for k in range(1, 6):
+        w = 0.3 * np.pi * k * random.uniform(0.8, 1.2, robot.nq)
+        size = 0.35 * (high - low) / 5.0 * random.uniform(0.4, 1.0, robot.nq) / k**0.5
+        angle = w * t[:, None] + random.uniform(0.0, 2.0 * np.pi, robot.nq)
+        q, qd = q + size * np.sin(angle), qd + size * w * np.cos(angle)
+        qdd = qdd - size * w * w * np.sin(angle)
+    return q, qd, qdd
+
+
+def recorded(truth: Truth, path: Path, seconds: float, seed: int) -> None:
+    """Write a log of the arm under a computed-torque controller that knows the robot file alone."""
+    robot, random = file_of(truth.arm), np.random.default_rng(seed + 1000)
+    file, true = mujoco.MjModel.from_xml_string(write_urdf(robot)), _engine(truth)
+    file.opt.gravity[:] = robot.gravity.numpy()
+    known, data = mujoco.MjData(file), mujoco.MjData(true)
+    q, qd, qdd = motion(robot, seconds, seed)
+    data.qpos[:], data.qvel[:] = q[0], qd[0]
+    drives = np.array(truth.drives or (0.0,) * robot.nq)
+    rows, every = [], round(PERIOD / STEP)
+    for k in range(len(q)):
+        if k % every == 0:
+            wanted = qdd[k] + 400.0 * (q[k] - data.qpos) + 40.0 * (qd[k] - data.qvel)
+            known.qpos[:], known.qvel[:], known.qacc[:] = q[k], qd[k], wanted
+            mujoco.mj_inverse(file, known)
+            tau = known.qfrc_inverse + drives * wanted + true.dof_damping * qd[k]
+            tau += true.dof_frictionloss * np.tanh(qd[k] / 0.02)
+            rows.append([k * STEP, *data.qpos, *data.qvel, *tau])
+        data.qfrc_applied[:] = tau
+        mujoco.mj_step(true, data)
+    table, n = np.array(rows), robot.nq
+    table[:, 1 : n + 1] = ENCODER * np.round(table[:, 1 : n + 1] / ENCODER)
+    table[:, n + 1 : 2 * n + 1] += SPEED_NOISE * random.normal(size=(len(table), n))
+    size = np.abs(table[:, 2 * n + 1 :]).max(0)
+    table[:, 2 * n + 1 :] += TORQUE_NOISE * size * random.normal(size=(len(table), n))
+    header = ",".join(["t", *(f"{x}.{name}" for x in ("q", "qd", "tau") for name in robot.joint_names)])
+    np.savetxt(path, table, fmt="%.9g", delimiter=",", header=header, comments="")
+
+
+@cache
+def log_of(truth: Truth, seconds: float = 20.0, seed: int = 0) -> forcegp.Dataset:
+    """The imported log of an arm."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "log.csv"
+        recorded(truth, path, seconds, seed)
+        return forcegp.read_log(path, file_of(truth.arm), parse_mapping(MAPPING, "mapping"))
+
+
+def inertia(robot: RobotModel, data: forcegp.Dataset) -> torch.Tensor:
+    """Mean diagonal of the mass matrix over a log `(nq,)` [kg m²]."""
+    return forcegp.dynamics.mass_matrix(robot, data.q[::20]).diagonal(dim1=-2, dim2=-1).mean(0)
