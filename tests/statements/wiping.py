@@ -1,4 +1,4 @@
-"""The bundled log of a UR5 that wipes a table, logs of its simulator, and forces read as a user reads them."""
+"""The bundled log of a wiping UR5, logs of its simulator, and forces read as a user reads them."""
 
 from __future__ import annotations
 
