@@ -95,12 +95,14 @@ def _attach(model: Any, robot: RobotModel, mass: float) -> None:
     mujoco.mj_setConst(model, mujoco.MjData(model))
 
 
-def motion(robot: RobotModel, seconds: float, seed: int) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Positions, velocities and accelerations of five sines about the middle of the joints' ranges."""
+def motion(
+    robot: RobotModel, seconds: float, seed: int, home: tuple[float, ...] = ()
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Positions, velocities and accelerations of five sines about the middle of the ranges, or a pose."""
     t, random = np.arange(round(seconds / STEP)) * STEP, np.random.default_rng(seed)
     low = np.maximum(np.nan_to_num(robot.lower.numpy(), neginf=-2.0), -2.0)
     high = np.minimum(np.nan_to_num(robot.upper.numpy(), posinf=2.0), 2.0)
-    q = np.tile((low + high) / 2.0, (len(t), 1))
+    q = np.tile(home or (low + high) / 2.0, (len(t), 1))
     qd, qdd = np.zeros_like(q), np.zeros_like(q)
     for k in range(1, 6):
         w = 0.3 * np.pi * k * random.uniform(0.8, 1.2, robot.nq)
@@ -111,27 +113,54 @@ def motion(robot: RobotModel, seconds: float, seed: int) -> tuple[np.ndarray, np
     return q, qd, qdd
 
 
-def recorded(truth: Truth, path: Path, seconds: float, seed: int) -> None:
-    """Write a log of the arm under a computed-torque controller that knows the robot file alone."""
+def recorded(
+    truth: Truth, path: Path, seconds: float, seed: int, home: tuple[float, ...] = (), push: float = 0.0
+) -> torch.Tensor:
+    """Write a log of the arm under a computed-torque controller that knows the links of the robot file alone.
+
+    In every other second, a random force of up to `push` [N] per axis acts at the origin of the last frame.
+
+    Returns:
+        The force at each row, `(n, 3)` [N].
+    """
     robot, random = file_of(truth.arm), np.random.default_rng(seed + 1000)
     file, true = mujoco.MjModel.from_xml_string(write_urdf(robot)), _engine(truth)
     file.opt.gravity[:] = robot.gravity.numpy()
     known, data = mujoco.MjData(file), mujoco.MjData(true)
-    q, qd, qdd = motion(robot, seconds, seed)
+    q, qd, qdd = motion(robot, seconds, seed, home)
     data.qpos[:], data.qvel[:] = q[0], qd[0]
     drives = np.array(truth.drives or (0.0,) * robot.nq)
-    rows, every = [], round(PERIOD / STEP)
+    rows, forces, force = [], [], np.zeros(3)
     for k in range(len(q)):
-        if k % every == 0:
+        if push and k % round(1.0 / STEP) == 0:
+            force = random.uniform(-push, push, 3) if k // round(1.0 / STEP) % 2 else np.zeros(3)
+        if k % round(PERIOD / STEP) == 0:
             wanted = qdd[k] + 400.0 * (q[k] - data.qpos) + 40.0 * (qd[k] - data.qvel)
             known.qpos[:], known.qvel[:], known.qacc[:] = q[k], qd[k], wanted
             mujoco.mj_inverse(file, known)
             tau = known.qfrc_inverse + drives * wanted + true.dof_damping * qd[k]
             tau += true.dof_frictionloss * np.tanh(qd[k] / 0.02)
             rows.append([k * STEP, *data.qpos, *data.qvel, *tau])
+            forces.append(force)
         data.qfrc_applied[:] = tau
+        if push:
+            _push(true, data, robot, force)
         mujoco.mj_step(true, data)
-    table, n = np.array(rows), robot.nq
+    _write(path, robot, np.array(rows), random)
+    return torch.from_numpy(np.array(forces))
+
+
+def _push(model: Any, data: Any, robot: RobotModel, force: np.ndarray) -> None:
+    """Apply a force at the origin of the last frame."""
+    mujoco.mj_kinematics(model, data)
+    mujoco.mj_comPos(model, data)
+    place = data.xmat[-1].reshape(3, 3) @ robot.frame_position[-1].numpy() + data.xpos[-1]
+    data.xfrc_applied[-1] = np.concatenate([force, np.cross(place - data.xipos[-1], force)])
+
+
+def _write(path: Path, robot: RobotModel, table: np.ndarray, random: np.random.Generator) -> None:
+    """Write the log with the resolution and noise of sensors."""
+    n = robot.nq
     table[:, 1 : n + 1] = ENCODER * np.round(table[:, 1 : n + 1] / ENCODER)
     table[:, n + 1 : 2 * n + 1] += SPEED_NOISE * random.normal(size=(len(table), n))
     size = np.abs(table[:, 2 * n + 1 :]).max(0)
@@ -140,13 +169,28 @@ def recorded(truth: Truth, path: Path, seconds: float, seed: int) -> None:
     np.savetxt(path, table, fmt="%.9g", delimiter=",", header=header, comments="")
 
 
+def imported(path: Path, arm: str) -> forcegp.Dataset:
+    """A log as a user imports it."""
+    return forcegp.read_log(path, file_of(arm), parse_mapping(MAPPING, "mapping"))
+
+
 @cache
 def log_of(truth: Truth, seconds: float = 20.0, seed: int = 0) -> forcegp.Dataset:
-    """The imported log of an arm."""
+    """The imported log of free motion of an arm."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "log.csv"
         recorded(truth, path, seconds, seed)
-        return forcegp.read_log(path, file_of(truth.arm), parse_mapping(MAPPING, "mapping"))
+        return imported(path, truth.arm)
+
+
+def pushed(
+    truth: Truth, home: tuple[float, ...], seconds: float = 20.0, seed: int = 5, push: float = 30.0
+) -> tuple[forcegp.Dataset, torch.Tensor]:
+    """The imported log of an arm that is pushed, and the force on its last frame `(n, 3)` [N]."""
+    with tempfile.TemporaryDirectory() as folder:
+        path = Path(folder) / "log.csv"
+        forces = recorded(truth, path, seconds, seed, home, push)
+        return imported(path, truth.arm), forces
 
 
 def inertia(robot: RobotModel, data: forcegp.Dataset) -> torch.Tensor:
