@@ -40,6 +40,7 @@ class Truth:
         drives: inertia of each drive [kg m²].
         dry, viscous: friction of each joint [N m, N m s/rad].
         payload: point mass at the origin of the last frame [kg].
+        memory: distance over which dry friction builds up after a reversal [rad] (Dahl's model).
     """
 
     arm: str
@@ -48,6 +49,7 @@ class Truth:
     dry: tuple[float, ...] = ()
     viscous: tuple[float, ...] = ()
     payload: float = 0.0
+    memory: float = 0.0
 
 
 @cache
@@ -72,7 +74,8 @@ def _engine(truth: Truth) -> Any:
     model.opt.integrator = mujoco.mjtIntegrator.mjINT_IMPLICITFAST
     model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_CONTACT | mujoco.mjtDisableBit.mjDSBL_LIMIT
     model.dof_armature[:] = robot.armature.numpy()
-    model.dof_frictionloss[:] = truth.dry or (0.0,) * robot.nq
+    if not truth.memory:
+        model.dof_frictionloss[:] = truth.dry or (0.0,) * robot.nq
     model.dof_damping[:] = truth.viscous or (0.0,) * robot.nq
     if truth.payload:
         _attach(model, robot, truth.payload)
@@ -130,6 +133,7 @@ def recorded(
     q, qd, qdd = motion(robot, seconds, seed, home)
     data.qpos[:], data.qvel[:] = q[0], qd[0]
     drives = np.array(truth.drives or (0.0,) * robot.nq)
+    dry, bristle = np.array(truth.dry or (0.0,) * robot.nq), np.zeros(robot.nq)
     rows, forces, force = [], [], np.zeros(3)
     for k in range(len(q)):
         if push and k % round(1.0 / STEP) == 0:
@@ -139,10 +143,14 @@ def recorded(
             known.qpos[:], known.qvel[:], known.qacc[:] = q[k], qd[k], wanted
             mujoco.mj_inverse(file, known)
             tau = known.qfrc_inverse + drives * wanted + true.dof_damping * qd[k]
-            tau += true.dof_frictionloss * np.tanh(qd[k] / 0.02)
+            tau += dry * np.tanh(qd[k] / 0.02)
             rows.append([k * STEP, *data.qpos, *data.qvel, *tau])
             forces.append(force)
         data.qfrc_applied[:] = tau
+        if truth.memory:  # dz/dt = (q̇ − |q̇| z)/δ
+            end = np.sign(data.qvel)
+            bristle = end + (bristle - end) * np.exp(-np.abs(data.qvel) * STEP / truth.memory)
+            data.qfrc_applied[:] -= dry * bristle
         if push:
             _push(true, data, robot, force)
         mujoco.mj_step(true, data)
