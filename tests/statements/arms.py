@@ -39,7 +39,7 @@ class Truth:
         heavier: factor of the mass and the inertia of each link.
         drives: inertia of each drive [kg m²].
         dry, viscous: friction of each joint [N m, N m s/rad].
-        payload: point mass at the origin of the last frame [kg].
+        payload: point mass at the origin of the last link's frame [kg].
         memory: distance over which dry friction builds up after a reversal [rad] (Dahl's model).
     """
 
@@ -67,6 +67,12 @@ def true_robot(truth: Truth) -> RobotModel:
     return robot.replace(armature=armature, **links)
 
 
+def last_frame(robot: RobotModel) -> str:
+    """Name of the last frame of the last link."""
+    pairs = zip(robot.frame_names, robot.frame_parents, strict=True)
+    return [name for name, parent in pairs if parent == robot.nq - 1][-1]
+
+
 def _engine(truth: Truth) -> Any:
     robot = true_robot(truth)
     model = mujoco.MjModel.from_xml_string(write_urdf(robot))
@@ -83,8 +89,8 @@ def _engine(truth: Truth) -> Any:
 
 
 def _attach(model: Any, robot: RobotModel, mass: float) -> None:
-    """Add a point mass at the origin of the last frame to the last body."""
-    body, place = model.nbody - 1, robot.frame_position[-1].numpy()
+    """Add a point mass at the origin of the last link's frame to the last body."""
+    body, place = model.nbody - 1, robot.frame_position[robot.frame_index(last_frame(robot))].numpy()
     rotation = np.empty(9)
     mujoco.mju_quat2Mat(rotation, model.body_iquat[body])
     R, own, c = rotation.reshape(3, 3), model.body_mass[body], model.body_ipos[body].copy()
@@ -121,7 +127,7 @@ def recorded(
 ) -> torch.Tensor:
     """Write a log of the arm under a computed-torque controller that knows the links of the robot file alone.
 
-    In every other second, a random force of up to `push` [N] per axis acts at the origin of the last frame.
+    In every other second, a random force of up to `push` [N] per axis acts at the last frame.
 
     Returns:
         The force at each row, `(n, 3)` [N].
@@ -144,6 +150,7 @@ def recorded(
             mujoco.mj_inverse(file, known)
             tau = known.qfrc_inverse + drives * wanted + true.dof_damping * qd[k]
             tau += dry * np.tanh(qd[k] / 0.02)
+        elif k % round(PERIOD / STEP) == round(0.5 * PERIOD / STEP):  # halfway
             rows.append([k * STEP, *data.qpos, *data.qvel, *tau])
             forces.append(force)
         data.qfrc_applied[:] = tau
@@ -159,10 +166,11 @@ def recorded(
 
 
 def _push(model: Any, data: Any, robot: RobotModel, force: np.ndarray) -> None:
-    """Apply a force at the origin of the last frame."""
+    """Apply a force at the origin of the last link's frame."""
     mujoco.mj_kinematics(model, data)
     mujoco.mj_comPos(model, data)
-    place = data.xmat[-1].reshape(3, 3) @ robot.frame_position[-1].numpy() + data.xpos[-1]
+    frame = robot.frame_position[robot.frame_index(last_frame(robot))].numpy()
+    place = data.xmat[-1].reshape(3, 3) @ frame + data.xpos[-1]
     data.xfrc_applied[-1] = np.concatenate([force, np.cross(place - data.xipos[-1], force)])
 
 

@@ -18,7 +18,8 @@ import torch
 import forcegp
 from forcegp.checks import Report
 from forcegp.models.calibrated import Calibration, calibrated
-from statements.arms import Truth, file_of, inertia, log_of, pushed, true_robot
+from forcegp.simulate import Sensors, simulate
+from statements.arms import Truth, file_of, inertia, last_frame, log_of, pushed, true_robot
 from statements.stated import friction_of, values
 
 XARM = Truth(
@@ -38,6 +39,33 @@ UR10 = Truth(
 UR5 = Truth("ur5", dry=(4.0, 4.0, 3.0, 0.8, 0.8, 0.6), viscous=(3.0, 3.0, 2.0, 0.4, 0.4, 0.3))
 SIGMAS = 4.0
 """Largest accepted error of a printed value in its printed standard deviations."""
+
+
+TIP = forcegp.SurfaceContact(
+    name="table",
+    frame="tool0",
+    point=(0.0, 0.0, 0.1),
+    surface=forcegp.Plane(normal=(0.0, 0.0, 1.0), offset=0.05),
+)
+TABLE = forcegp.ConstrainedSystem(
+    file_of("ur10"), [TIP], baumgarte=forcegp.Baumgarte(natural_frequency=10.0, damping_ratio=1.0)
+)
+
+
+def wiped(seed: int) -> forcegp.Dataset:
+    """Twelve seconds of the UR10 on a table, by MuJoCo's contact solver."""
+    config = forcegp.load_scene("ur5_wiping").simulation
+    solver = dataclasses.replace(config.solver, joint_friction=UR10.dry, joint_damping=UR10.viscous)
+    config = dataclasses.replace(
+        config,
+        duration=12.0,
+        seed=seed,
+        solver=solver,
+        sensors=Sensors(encoder_resolution=2e-5, velocity_noise=5e-4, torque_noise=0.3),
+        pressing_force=(25.0, 25.0),
+        center=(0.6, 0.15, 0.05),
+    )
+    return simulate(TABLE.with_robot(true_robot(UR10)), config).data
 
 
 def free(arm: str) -> forcegp.ConstrainedSystem:
@@ -102,38 +130,34 @@ def test_the_drives_of_geared_wrists_are_found() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="drives of '0.0000 ± 0.0001' (true: 0.12), written back as determined")
-def test_drives_and_friction_that_are_written_back_lie_within_their_bars() -> None:
+@pytest.mark.xfail(strict=True, reason="drives of '0.0000 ± 0.0001' (true: 0.12 kg m²) are written back")
+def test_drives_that_are_written_back_lie_within_their_bars() -> None:
     names, drives = file_of("xarm7").joint_names, true_robot(XARM).armature.tolist()
-    true = {(joint, "armature"): x for joint, x in zip(names, drives, strict=True)}
-    found = {(p.element, p.name): p for p in parameters(XARM).parameters if p.determined}
-    judged = {key: found[key] for key in true if key in found}
-    assert judged, "drives are stated"
-    wrong = {k: (p.estimate, p.std) for k, p in judged.items() if abs(p.estimate - true[k]) > SIGMAS * p.std}
-    assert not wrong
-
-
-@pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="'joint5 mass 0.5014 ± 0.1402, determined' (true: 1.52)")
-def test_masses_that_are_called_determined_lie_within_their_bars() -> None:
-    file, robot = file_of("xarm7"), true_robot(XARM)
-    true = dict(zip(file.joint_names, robot.mass.tolist(), strict=True))
-    masses = [p for p in parameters(XARM).parameters if p.name == "mass"]
-    assert masses, "masses are listed"
-    wrong = {
-        p.element: (p.estimate, p.std)
-        for p in masses
-        if p.determined and p.element in true and abs(p.estimate - true[p.element]) > SIGMAS * p.std
+    found = {p.element: p for p in parameters(XARM).parameters if p.name == "armature"}
+    errors = {
+        name: abs(found[name].estimate - x) / found[name].std for name, x in zip(names, drives, strict=True)
     }
-    assert not wrong
+    assert max(errors.values()) <= SIGMAS, errors
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="'0.779 ± 0.041 kg more on the last link' (true: 0.46)")
-def test_a_payload_beside_heavy_links_is_within_its_bar() -> None:
-    truth = Truth("ur5", heavier=1.15, dry=UR5.dry, viscous=UR5.viscous, payload=0.46)
+@pytest.mark.xfail(strict=True, reason="dry friction of 0.04 ± 0.07 N m (true: 0.8) is written back")
+def test_friction_that_is_written_back_lies_within_its_bars() -> None:
+    names = file_of("xarm7").joint_names
+    found = {p.element: p for p in parameters(XARM).parameters if p.name == "friction"}
+    pairs = zip(names, XARM.dry, strict=True)
+    errors = {name: abs(found[name].estimate - x) / found[name].std for name, x in pairs}
+    assert max(errors.values()) <= SIGMAS, errors
+
+
+@pytest.mark.xfail(
+    strict=True, reason="1.04 ± 0.0076 kg on the last link (true: 1.0): the bar holds if all else is right"
+)
+def test_a_payload_that_check_prints_lies_within_its_bar() -> None:
+    truth = dataclasses.replace(UR5, payload=1.0)
     stated = [pair for each in report(truth).findings for pair in values(each.message, "kg")]
-    assert all(abs(x - truth.payload) <= SIGMAS * bar for x, bar in stated) and stated
+    assert stated, "a payload is stated"
+    assert all(abs(x - truth.payload) <= SIGMAS * bar for x, bar in stated), stated
 
 
 @pytest.mark.slow
@@ -170,14 +194,26 @@ def test_a_fit_of_1200_rows_takes_less_than_a_minute(truth: Truth, tmp_path: Pat
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="a wrench near a singular pose passed in motion is covered 72 %")
-def test_bars_of_a_wrench_hold_near_singular_poses() -> None:
-    """Over the tenth of the rows whose Jacobian has the smallest singular value."""
-    frame = file_of("ur5").frame_names[-1]
-    test, force = pushed(UR5, home=(0.0, -1.2, 0.3, -1.9, -0.2, 0.0))
-    wrench = fitted(UR5, 1000).external_wrench(test, frame)
-    J = forcegp.kinematics.point_jacobian(file_of("ur5"), test.q, frame, (0.0, 0.0, 0.0))
-    smallest = torch.linalg.svdvals(J)[:, -1]
-    near = (force.abs().sum(-1) > 0.0) & (smallest <= smallest.quantile(0.1))
-    inside = (wrench.mean[near, :3] - force[near]).abs() <= 2.0 * wrench.std[near, :3]
-    assert float(inside.double().mean()) >= 0.85
+@pytest.mark.xfail(strict=True, reason="the exported wrench has no friction memory: up to 27 N from Python's")
+def test_the_exported_wrench_is_that_of_python() -> None:
+    """Along a log of an arm whose dry friction builds up over 0.05 rad after a reversal."""
+    truth = dataclasses.replace(UR5, dry=(8.0, 8.0, 6.0, 1.6, 1.6, 1.2), memory=0.05)
+    frame, fit = last_frame(file_of("ur5")), fitted(truth, 1000)
+    log, force = pushed(truth, home=(0.0, -1.2, 1.6, -1.9, -1.57, 0.0), seconds=10.0)
+    python = fit.external_wrench(log, frame).mean[:, :3]
+    exported = fit.compiled(wrench=forcegp.WrenchFrame(frame))
+    c = exported.external_wrench(log.q, log.qd, log.tau, log.qdd).mean[:, :3]
+    assert float((python - force).square().mean().sqrt()) < 2.0
+    assert float((c - python).abs().max()) < 1.0
+
+
+@pytest.mark.slow
+@pytest.mark.xfail(strict=True, reason="contact on a plane: 3 to 5 N, where 0.5 to 2 N at 25 N are promised")
+def test_the_force_of_an_arm_that_slides_on_a_plane_is_as_promised() -> None:
+    """A UR10 with heavier links, drives and friction that its file lacks, pressed with 25 N."""
+    train, test = (wiped(seed) for seed in (1, 2))
+    fit = forcegp.StructuredGP(TABLE, "analytical").fit(train[::3])
+    rows = test[test.contact["table"]]
+    force = fit.predict(rows.q, rows.qd, rows.tau, "multiplier", active=rows.active(["table"]))
+    error = force.mean[:, 0] - rows.multiplier["table"]
+    assert float(error.square().mean().sqrt()) <= 2.0
