@@ -8,8 +8,8 @@ from functools import cache
 from pathlib import Path
 from typing import Any
 
-import mujoco
 import numpy as np
+import pytest
 import torch
 
 import forcegp
@@ -18,6 +18,7 @@ from forcegp.robot.model import RobotModel
 from forcegp.simulate.urdf import write_urdf
 from robots import ARMS
 
+mujoco: Any = pytest.importorskip("mujoco")
 STEP, PERIOD = 0.001, 0.004
 ENCODER, SPEED_NOISE, TORQUE_NOISE = 2e-5, 1e-3, 0.005
 """Resolution [rad], noise of the velocity [rad/s], and of the torque over the largest torque of a joint."""
@@ -140,7 +141,7 @@ def recorded(
     data.qpos[:], data.qvel[:] = q[0], qd[0]
     drives = np.array(truth.drives or (0.0,) * robot.nq)
     dry, bristle = np.array(truth.dry or (0.0,) * robot.nq), np.zeros(robot.nq)
-    rows, forces, force = [], [], np.zeros(3)
+    rows, forces, force, tau = [], [], np.zeros(3), np.zeros(robot.nq)
     for k in range(len(q)):
         if push and k % round(1.0 / STEP) == 0:
             force = random.uniform(-push, push, 3) if k // round(1.0 / STEP) % 2 else np.zeros(3)

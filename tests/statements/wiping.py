@@ -13,6 +13,7 @@ from torch import Tensor
 
 import forcegp
 from forcegp.logs import parse_mapping
+from forcegp.models.structured_fit import StructuredFit
 from forcegp.robot.inertia import from_pseudo_inertia, pseudo_inertia
 from forcegp.robot.model import RobotModel
 from forcegp.simulate import Sensors, simulate
@@ -95,7 +96,7 @@ class Force:
         return float((self.mean - self.truth).square().mean().sqrt())
 
 
-def normal_force(fit: forcegp.StructuredFit, data: forcegp.Dataset, truth: Tensor) -> Force:
+def normal_force(fit: StructuredFit, data: forcegp.Dataset, truth: Tensor) -> Force:
     """Predict the force at the table as the guide does."""
     rows = (data.contact[TABLE] & (data.impact[TABLE] == 0)).nonzero()[:, 0]
     part = data[rows]
@@ -104,6 +105,6 @@ def normal_force(fit: forcegp.StructuredFit, data: forcegp.Dataset, truth: Tenso
     return Force(force.mean[:, 0], force.std[:, 0], truth[rows])
 
 
-def fitted(data: forcegp.Dataset) -> forcegp.StructuredFit:
+def fitted(data: forcegp.Dataset) -> StructuredFit:
     """A fit with the defaults of the command line."""
     return forcegp.StructuredGP(system(), "analytical").fit(data)
