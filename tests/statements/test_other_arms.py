@@ -6,7 +6,9 @@ Each is false today and belongs to what is learned from a log, so it is expected
 from __future__ import annotations
 
 import dataclasses
+import os
 import resource
+import signal
 import subprocess
 import sys
 from functools import cache
@@ -54,12 +56,12 @@ TABLE = forcegp.ConstrainedSystem(
 
 
 def wiped(seed: int) -> forcegp.Dataset:
-    """Twelve seconds of the UR10 on a table, by MuJoCo's contact solver."""
+    """Six seconds of the UR10 on a table, by MuJoCo's contact solver."""
     config = forcegp.load_scene("ur5_wiping").simulation
     solver = dataclasses.replace(config.solver, joint_friction=UR10.dry, joint_damping=UR10.viscous)
     config = dataclasses.replace(
         config,
-        duration=12.0,
+        duration=6.0,
         seed=seed,
         solver=solver,
         sensors=Sensors(encoder_resolution=2e-5, velocity_noise=5e-4, torque_noise=0.3),
@@ -173,7 +175,9 @@ def test_a_payload_in_one_segment_of_two_is_found() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("truth", [XARM, UR10], ids=lambda x: x.arm)
-@pytest.mark.xfail(strict=True, reason="fits of 1200 rows take 328 s (xArm 7) and 123 s (UR10)")
+@pytest.mark.xfail(
+    strict=True, raises=AssertionError, reason="fits of 1200 rows take 328 s (xArm 7) and 123 s (UR10)"
+)
 def test_a_fit_of_1200_rows_takes_less_than_a_minute(truth: Truth, tmp_path: Path) -> None:
     """Processor time of the command, which the operating system ends after a minute."""
     log = log_of(truth)
@@ -190,8 +194,11 @@ def test_a_fit_of_1200_rows_takes_less_than_a_minute(truth: Truth, tmp_path: Pat
         check=False,
         capture_output=True,
         text=True,
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path)},
     )
-    assert done.returncode == 0, done.stderr[-500:]
+    if done.returncode not in (0, -signal.SIGXCPU, -signal.SIGKILL):
+        raise RuntimeError(done.stderr)
+    assert done.returncode == 0
 
 
 @pytest.mark.slow
@@ -223,11 +230,13 @@ def test_the_force_of_an_arm_that_slides_on_a_plane_is_as_promised() -> None:
 @pytest.mark.slow
 @pytest.mark.xfail(strict=True, reason="a wrench near a singular pose that is passed is covered 55 to 72 %")
 def test_bars_of_a_wrench_hold_while_a_singular_pose_is_passed() -> None:
-    """Over the tenth of the rows in which the axes of the wrist are nearest to parallel."""
+    """Over the tenth of the rows in which the last link is hardest to move in some direction."""
     truth = dataclasses.replace(UR5, dry=(8.0, 8.0, 6.0, 1.6, 1.6, 1.2))
+    frame = last_frame(file_of("ur5"))
     log, force = pushed(truth, home=(0.0, -1.2, 1.6, -1.9, 0.0, 0.0), seconds=12.0, seed=6)
-    wrench = fitted(truth, 1000).external_wrench(log, last_frame(file_of("ur5")))
-    distance = log.q[:, 4].sin().abs()
-    near = distance <= distance.quantile(0.1)
+    wrench = fitted(truth, 1000).external_wrench(log, frame)
+    J = forcegp.kinematics.point_jacobian(file_of("ur5"), log.q, frame, (0.0, 0.0, 0.0))
+    smallest = torch.linalg.svdvals(J)[:, -1]
+    near = smallest <= smallest.quantile(0.1)
     inside = (wrench.mean[near, :3] - force[near]).abs() <= 2.0 * wrench.std[near, :3]
     assert float(inside.double().mean()) >= 0.85
