@@ -13,7 +13,9 @@ import pytest
 import torch
 from typer.testing import CliRunner
 
+import forcegp
 from forcegp.cli import app, main
+from forcegp.cli.fit import readable_input
 from forcegp.data import Dataset
 from logs import JOINTS, random_log
 
@@ -242,3 +244,32 @@ def test_from_simulation_to_evaluation(fail: Fail, tmp_path: Path) -> None:
         "fit", "-s", "kuka_plane", "-d", train, "-m", "sgp-men", "-o", model
     )
     assert "is not a saved model" in fail("evaluate", "-m", tmp_path, "-d", test)
+
+
+def test_fit_prints_words_and_json_prints_names(tmp_path: Path) -> None:
+    """A joint that does not move, in words of the robot; programs read the names of the inputs."""
+    joints = forcegp.load_robot("double_pendulum").joint_names
+    log = random_log(200, joints=joints)
+    still = torch.tensor([1.0, 0.0], dtype=log.q.dtype)
+    log.replace(q=still * log.q, qd=still * log.qd, contact={}, contact_extras={}).write(
+        tmp_path / "log.parquet"
+    )
+    arguments = ["fit", "--robot", "double_pendulum", "--data", tmp_path / "log.parquet", "--model", "nn"]
+    text = run(*arguments, "--out", tmp_path / "text")
+    assert f"position of {joints[1]}, velocity of {joints[1]}" in text and "[1]" not in text
+    found = json.loads(run(*arguments, "--out", tmp_path / "json", "--json"))
+    assert found["constant_inputs"] == ["q[1]", "qd[1]"]
+    assert found["seconds"] > 0.0
+
+
+@pytest.mark.parametrize(
+    ("name", "words"),
+    [
+        ("joint_friction.load[0]", "gravity load of shoulder (joint_friction)"),
+        ("joint_friction.coulomb_1[1]", "direction of motion of elbow (joint_friction)"),
+        ("contact_table.slip[2]", "slip, component 3 (contact_table)"),
+        ("mine.reading[7]", "reading, component 8 (mine)"),
+    ],
+)
+def test_inputs_are_named_by_joints_where_they_belong_to_joints(name: str, words: str) -> None:
+    assert readable_input(name, ["shoulder", "elbow"]) == words

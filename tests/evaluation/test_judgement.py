@@ -43,17 +43,73 @@ def test_the_right_robot_explains_all_the_torque_and_the_motion() -> None:
     assert found.response == pytest.approx((1.0, 1.0), abs=1e-9) and found.doubts == () and not found.poor
 
 
-def test_a_robot_that_is_too_heavy_is_measured_by_its_own_mass_matrix() -> None:
-    """The torque that it lacks is that of its own inverse dynamics, whatever robot the others have."""
-    data, system = swinging(), forcegp.ConstrainedSystem(heavy(2.0))
-    found = evaluate(forcegp.AnalyticalModel(system).nominal(), data, system=FREE)
-    needed = dynamics.inverse_dynamics(system.robot, data.q, data.qd, data.qdd)
-    lacks = needed - dynamics.damping_force(system.robot, data.qd) - data.tau
-    model = found.predictors[0]
-    assert model.torque.all == pytest.approx(lacks.square().mean(0).sqrt().tolist(), rel=1e-6)
+def test_all_predictors_are_measured_by_the_mass_matrix_of_the_robot_file() -> None:
+    """A mass matrix that is far too small or too large would hide the error of its own predictor."""
+    data = swinging()
     rest, _ = beyond_gravity(FREE, data)
-    assert model.explained == pytest.approx(explained(lacks, rest), rel=1e-6)
-    assert found.poor, "the page of a model that is worse than the robot file opens in red"
+    for factor in (2.0, 0.01):
+        model = forcegp.AnalyticalModel(forcegp.ConstrainedSystem(heavy(factor))).nominal()
+        error = model.predict(data.q, data.qd, data.tau).mean - data.qdd
+        torque = (dynamics.mass_matrix(ROBOT, data.q) @ error[..., None])[..., 0]
+        found = evaluate(model, data, system=FREE)
+        scores = found.predictors[0]
+        assert scores.torque.all == pytest.approx(torque.square().mean(0).sqrt().tolist(), rel=1e-6)
+        assert scores.explained == pytest.approx(explained(torque, rest), rel=1e-6)
+        assert found.poor, "the page of a model that is worse than the robot file opens in red"
+
+
+ARM = forcegp.load_robot("ur5").replace(friction=torch.zeros(6, dtype=torch.float64))
+
+
+def with_wrist(factor: float) -> forcegp.ConstrainedSystem:
+    """The arm with another inertia of its last drive, as a factor of the inertia of the joint."""
+    inertia = dynamics.mass_matrix(ARM, torch.zeros(6, dtype=torch.float64))[5, 5]
+    extra = torch.zeros(6, dtype=torch.float64)
+    extra[5] = (factor - 1.0) * inertia
+    return forcegp.ConstrainedSystem(ARM.replace(armature=ARM.armature + extra))
+
+
+def moving_arm(robot: forcegp.RobotModel) -> Dataset:
+    """Free motion of the arm, with noisy torques."""
+    t = 0.005 * torch.arange(1600, dtype=torch.float64)
+    w = torch.tensor([2.0, 1.4, 2.6, 3.1, 2.2, 3.7], dtype=torch.float64)
+    q, qd = torch.sin(t[:, None] * w), w * torch.cos(t[:, None] * w)
+    qdd = -(w**2) * q
+    tau = dynamics.inverse_dynamics(robot, q, qd, qdd) - dynamics.damping_force(robot, qd)
+    noise = 1e-3 * torch.randn(q.shape, generator=torch.Generator().manual_seed(0)).to(q)
+    header = DataHeader(dt=0.005, joint_names=robot.joint_names)
+    return Dataset(
+        t=t, q=q, qd=qd, qdd=qdd, tau=tau + noise, joint_names=robot.joint_names, contact={}, header=header
+    )
+
+
+def test_a_wrist_with_far_too_much_inertia_is_red_however_well_the_other_joints_do() -> None:
+    data, file = moving_arm(ARM), with_wrist(1.0)
+    found = evaluate(forcegp.AnalyticalModel(with_wrist(125.0)).nominal(), data, system=file)
+    assert found.response is not None and found.own_response is not None
+    assert found.response[5] == pytest.approx(1.0 / 125.0, rel=0.1)
+    assert found.response[:5] == pytest.approx((1.0,) * 5, rel=0.1)
+    assert found.own_response == pytest.approx((1.0,) * 6)
+    (doubt,) = found.doubts
+    assert "An added torque has another effect" in doubt and "wrist_3_joint 0.00" in doubt
+    assert "shoulder" not in doubt and found.poor
+
+
+def test_a_drive_that_the_log_supports_is_no_reason_for_doubt() -> None:
+    """The robot file may lack a drive: the response differs from 1, and the accelerations fit."""
+    true = with_wrist(125.0)
+    found = evaluate(forcegp.AnalyticalModel(true).nominal(), moving_arm(true.robot), system=with_wrist(1.0))
+    assert found.response is not None and found.response[5] < 0.01
+    assert found.doubts == () and not found.poor
+
+
+def test_a_joint_that_is_far_worse_than_the_mean_is_red() -> None:
+    """A wrist without its drive: small torque errors of most joints, and wild accelerations."""
+    robot, small = with_wrist(125.0), with_wrist(1.0)
+    found = evaluate(forcegp.AnalyticalModel(small).nominal(), moving_arm(robot.robot), system=robot)
+    assert found.predictors[0].beyond_gravity == pytest.approx(1.0, abs=0.05), "most joints are right"
+    (doubt,) = [text for text in found.doubts if "far larger than those of the mean" in text]
+    assert "wrist_3_joint" in doubt and "(mean: " in doubt and "shoulder" not in doubt and found.poor
 
 
 def test_a_log_whose_torque_is_gravity_is_named() -> None:
@@ -69,12 +125,13 @@ def test_a_model_that_has_learned_the_controller_is_named() -> None:
     data = swinging()
     fit = forcegp.NeuralNetwork(FREE).fit(data[::8])
     found = evaluate(fit, data)
-    assert found.response == torque_response(fit, data) and found.response is not None
+    assert found.response == torque_response(fit, ROBOT, data) and found.response is not None
     weak = min(found.response) < 0.5
     assert weak == any("learned the controller" in doubt for doubt in found.doubts)
     assert found.predictors[0].explained == () and "explains" not in found.verdict
-    cancelled = replace(found, response=(0.02, 0.97))
-    assert "(expected: 1): shoulder 0.02." in cancelled.doubts[-1] and "elbow" not in cancelled.doubts[-1]
+    cancelled = replace(found, own_response=(0.02, 0.97), response=None)
+    (doubt,) = [text for text in cancelled.doubts if "learned the controller" in text]
+    assert "(expected: 1): shoulder 0.02." in doubt and "elbow" not in doubt
 
 
 def test_a_joint_that_bears_next_to_nothing_does_not_count() -> None:

@@ -46,7 +46,7 @@ def test_what_the_robot_file_gets_wrong_is_found(constrained: bool) -> None:
     friction = torch.tensor([VISCOUS, COULOMB, OFFSET], dtype=torch.float64).repeat_interleave(7)
     zero, truth = 0.0 * friction, true_system(constrained)
     error, before, floor = (
-        as_torque(p.system, test.q, p.predict(test) - test.qdd).square().mean().sqrt()
+        as_torque(own, test.q, p.predict(test) - test.qdd).square().mean().sqrt()
         for p in (found, LeastSquares(own, zero), LeastSquares(truth, friction))
     )
     # The truth itself is off by the noise of the torque.

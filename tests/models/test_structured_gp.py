@@ -6,6 +6,7 @@ import dataclasses
 import math
 import subprocess
 import sys
+import time
 from collections.abc import Callable
 from pathlib import Path
 
@@ -251,12 +252,15 @@ def test_learned_noise_and_honest_flags() -> None:
         both,
         noise=forcegp.Noise(acceleration=0.3, learn=True),
     )
+    began = time.perf_counter()
     fit = model.fit(rows, options=LearningOptions(max_evaluations=40))
+    elapsed = time.perf_counter() - began
     noise = fit.hyperparameters["noise.0.log_noise_std"].exp()
     assert noise.shape == (7,)
     # Sixty samples leave room to take some noise of single joints for force.
     assert abs(float(noise.log().mean()) - math.log(0.1)) < 0.4, "the data have noise of 0.1"
     assert fit.result.evaluations == len(fit.result.history) and fit.result.seconds > 0.0
+    assert 0.5 * elapsed < fit.result.seconds < elapsed, "the duration is that of the whole fit"
     again = fit.condition(rows)
     assert again.result.log_marginal_likelihood == pytest.approx(fit.result.log_marginal_likelihood)
     assert (

@@ -185,6 +185,16 @@ def test_columns_of_the_links_are_torques_of_other_links() -> None:
     assert torch.allclose(Phi[..., before.parts["links"]] @ delta, change, atol=1e-8)
 
 
+def test_the_share_holds_for_positions_as_for_the_other_limits() -> None:
+    """Distances from the middle of the range, which need not be zero."""
+    robot = ROBOT.replace(lower=torch.full((6,), -1.0).double(), upper=torch.full((6,), 2.0).double())
+    limits = Limits.of(robot, velocity=[2.0], acceleration=[6.0], share=0.5)
+    assert limits.low.tolist() == [-0.25] * 6 and limits.high.tolist() == [1.25] * 6
+    assert limits.velocity.tolist() == [1.0] * 6 and limits.acceleration.tolist() == [3.0] * 6
+    with pytest.raises(ParameterError, match="a larger --share"):
+        excite(forcegp.ConstrainedSystem(robot), 4.0, limits=limits, start=[1.3] + [0.0] * 5)
+
+
 def test_missing_limits_are_named_with_their_option() -> None:
     robot = ROBOT.replace(
         velocity_limit=ROBOT.velocity_limit.clone().index_fill(0, torch.tensor([1]), torch.inf)

@@ -45,8 +45,9 @@ def evaluate(
     The trivial predictors are the mean, the robot file alone, and a least-squares fit of inertial parameters,
     viscous and Coulomb friction, and offsets. The verdict states which fraction of the non-gravitational
     torque the model explains, and the errors in open-loop motion and, if logged, in the contact force. A
-    comparison of the model with each predictor in torque and acceleration follows. Errors are in rad/s² (m/s²
-    for prismatic joints). Coverage is the fraction of samples within two standard deviations.
+    comparison of the model with each predictor in torque and acceleration follows. The response is the effect
+    of an added torque on each joint, which is 1 if the model has the inertia of the robot file. Errors are in
+    rad/s² (m/s² for prismatic joints). Coverage is the fraction of samples within two standard deviations.
 
     With --out, the command writes a page that shows the verdict, the errors by joint, the calibration and
     the predictions over the first seconds. It prints the path of the page, and writes all scores to
@@ -74,12 +75,20 @@ def evaluate(
         "doubts": evaluation.doubts,
         "comparison": evaluation.comparison or None,
         "left_out": evaluation.left_out,
+        "response": _response(evaluation, as_json),
         **evaluation.summary(),
     }
     if out is not None:
         names = str(model or config or scene), str(data), str(train) if train else None
         result |= _written(out, evaluation, regression, test, names)
     show(result, as_json)
+
+
+def _response(scores: forcegp.Evaluation, as_json: bool) -> object:
+    """Return the effect of an added torque by joint, as numbers for JSON or as text."""
+    if scores.response is None or as_json:
+        return scores.response
+    return [f"{joint} {x:.2g}" for joint, x in zip(scores.joint_names, scores.response, strict=True)]
 
 
 def _written(

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -88,15 +89,45 @@ def fit(
     for doubt in (*doubts, *learned.result.warnings):
         common.warn(doubt)
     result: dict[str, object] = {"model": regression.name, "training_points": len(training)}
-    show({**result, **_figures(learned.result, as_json), "file": str(model_path(out))}, as_json)
+    joints = () if as_json else system.robot.joint_names
+    show({**result, **_figures(learned.result, joints), "file": str(model_path(out))}, as_json)
 
 
-def _figures(result: FitResult, as_json: bool) -> dict[str, object]:
-    """Return the fields of the result by name. For text output, omit empty fields and printed warnings."""
+INPUTS = {
+    "q": "position",
+    "qd": "velocity",
+    "tau": "torque",
+    "load": "gravity load",
+    "velocity": "velocity",
+    "coulomb": "direction of motion",
+}
+"""Display names of the inputs of priors and models."""
+
+
+def readable_input(name: str, joints: Sequence[str]) -> str:
+    """Return the name of an input of a model in words.
+
+    >>> readable_input("joint_friction.load[0]", ["shoulder", "elbow"])
+    'gravity load of shoulder (joint_friction)'
+    """
+    head, _, number = name.removesuffix("]").partition("[")
+    prior, _, kind = head.rpartition(".")
+    word, index = INPUTS.get(kind.rstrip("_0123456789")), int(number)
+    per_joint = word and index < len(joints) and not prior.startswith("contact")
+    text = f"{word} of {joints[index]}" if per_joint else f"{word or kind}, component {index + 1}"
+    return f"{text} ({prior})" if prior else text
+
+
+def _figures(result: FitResult, joints: Sequence[str]) -> dict[str, object]:
+    """Return the fields of the result by name.
+
+    If names of joints are given, the fields are texts for readers, without empty fields and printed warnings.
+    """
     figures = {name: value for name, value in asdict(result).items() if name != "history"}
-    if as_json:
+    if not joints:
         return figures
     figures["worth"] = "".join(f"\n  {name}: {nats:.3g} nats" for name, nats in result.worth.items())
+    figures["constant_inputs"] = tuple(readable_input(each, joints) for each in result.constant_inputs)
     return {name: value for name, value in figures.items() if name != "warnings" and value != ""}
 
 

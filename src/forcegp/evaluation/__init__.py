@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+from collections.abc import Mapping
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -43,6 +45,9 @@ __all__ = ["Evaluation", "evaluate"]
 
 GRAVITY_ALONE, LEAST_RESPONSE = 0.99, 0.5
 """Fraction of torque due to gravity above which data are a weak test; minimum response to an added torque."""
+FAR, SUPPORTED = 2.0, 0.7
+"""Acceleration errors relative to the error of the mean: above `FAR`, a joint is far worse than the mean;
+below `SUPPORTED`, the log supports an inertia that differs from that of the robot file."""
 
 
 @dataclass(frozen=True)
@@ -65,8 +70,10 @@ class Evaluation:
         multipliers: comparison of λ with logged values if the model predicts forces and the log contains λ.
         sensed: the same comparison for predictions that use the force sensor, if the fit included the sensor.
         gravity: fraction R² of the torque that gravity alone explains. If near 1, the log is a weak test.
-        response: fraction of an added torque that takes effect at each joint. It is 1 for a rigid robot, and
-            0 for a model that has learned the controller. It is `None` if there is no free motion.
+        response: effect of an added torque at each joint, M(q) Δq̈ relative to the torque, with M of the robot
+            file. It is 1 if the model has the inertia of the file, and `None` if there is no free motion.
+        own_response: the same with the mass matrix of the model. It is 1 for a rigid robot, and 0 for a model
+            that has learned the controller.
         motion: open-loop motion if the model predicts forces and the data are in time order.
         left_out: rows of the data that are not evaluated, since their accelerations are impossible.
     """
@@ -87,6 +94,7 @@ class Evaluation:
     sensed: tuple[MultiplierScore, ...] = ()
     gravity: float | None = None
     response: tuple[float, ...] | None = None
+    own_response: tuple[float, ...] | None = None
     motion: Motion | None = None
     left_out: tuple[int, ...] = ()
 
@@ -134,15 +142,40 @@ class Evaluation:
             found.append(
                 f"Gravity alone explains {share} of the torque, so the data hardly test anything else."
             )
-        if self.response is not None and min(self.response) < LEAST_RESPONSE:
-            pairs = zip(self.joint_names, self.response, strict=True)
-            weak = [f"{joint} {x:.2f}" for joint, x in pairs if x < LEAST_RESPONSE]
-            text = f"An added torque has too small an effect (expected: 1): {', '.join(weak)}."
+        if far := self._beyond_mean(FAR):
+            units = "rad/s², or m/s² for sliding joints"
+            text = ", ".join(
+                f"{joint} {model:.3g} (mean: {mean:.3g})" for joint, (model, mean) in far.items()
+            )
+            found.append(f"Acceleration errors are far larger than those of the mean [{units}]: {text}.")
+        if weak := self._responding(self.own_response, LEAST_RESPONSE, math.inf):
+            text = f"An added torque has too small an effect (expected: 1): {_values(weak)}."
             found.append(f"{text} The model has learned the controller, not the arm.")
         if self.left_out:
             rows = describe(numbered(np.array(self.left_out))).capitalize()
             found.append(f"{rows}: left out, since an acceleration is impossible.")
+        changed = self._responding(self.response, LEAST_RESPONSE, 1.0 / LEAST_RESPONSE)
+        doubtful = changed.keys() & self._beyond_mean(SUPPORTED).keys() - weak.keys()
+        if other := {joint: x for joint, x in changed.items() if joint in doubtful}:
+            text = (
+                f"An added torque has another effect than in the robot file (expected: 1): {_values(other)}."
+            )
+            found.append(f"{text} The logged accelerations of these joints do not support the inertia.")
         return tuple(found)
+
+    def _beyond_mean(self, factor: float) -> dict[str, tuple[float, float]]:
+        """Return the errors of the model and of the mean in q̈, for joints with a ratio above `factor`."""
+        errors = {p.name: p.acceleration.in_motion for p in self.predictors}
+        if "mean" not in errors:
+            return {}
+        pairs = zip(self.joint_names, errors["model"], errors["mean"], strict=True)
+        known = {joint: (x, mean) for joint, x, mean in pairs if x is not None and mean is not None}
+        return {joint: (x, mean) for joint, (x, mean) in known.items() if x > factor * mean}
+
+    def _responding(self, response: tuple[float, ...] | None, low: float, high: float) -> dict[str, float]:
+        """Return the joints with a response to an added torque outside an interval."""
+        pairs = () if response is None else zip(self.joint_names, response, strict=True)
+        return {joint: x for joint, x in pairs if not low <= x <= high}
 
     def to_dict(self) -> dict[str, Any]:
         """Return all scores as JSON-compatible values."""
@@ -250,9 +283,14 @@ def _evaluated(
         multipliers=multiplier_scores(model, data) if model.force_field() else (),
         sensed=sensed_scores(model, data),
         gravity=gravity,
-        response=None if real is None else torque_response(real, data),
+        response=None if real is None else torque_response(real, before.robot, data),
+        own_response=None if real is None else torque_response(real, real.system.robot, data),
         motion=None if real is None else open_loop(real, before, data),
     )
+
+
+def _values(by_joint: Mapping[str, float]) -> str:
+    return ", ".join(f"{joint} {x:.2g}" for joint, x in by_joint.items())
 
 
 def _percent(share: float) -> str:
@@ -278,7 +316,7 @@ def _predictors(
         return PredictorScores(name, *by_joint, density, shares)
 
     error = predicted.mean - data.qdd
-    torque = as_torque(model.system, data.q, error)
+    torque = as_torque(system, data.q, error)
     scores = [score("model", error, torque, None if spread is None else spread.nlpd)]
     for name, (error, torque, std) in _trivial(system, data, train).items():
         certain = bool((std == 0.0).any())
@@ -299,6 +337,6 @@ def _trivial(
             return {}
         for baseline in baselines(system, training):
             error = baseline.predict(new) - new.qdd
-            torque = as_torque(baseline.system, new.q, error)
+            torque = as_torque(system, new.q, error)
             errors.setdefault(baseline.name, []).append((error, torque, baseline.std.expand_as(error)))
     return {name: tuple(map(torch.cat, zip(*rows, strict=True))) for name, rows in errors.items()}  # pyright: ignore[reportReturnType]

@@ -1,8 +1,9 @@
 """Criteria for a good model: non-gravitational torque, open-loop motion, and response to a torque.
 
-The torque error is M(q)(predicted − measured q̈), with the mass matrix of the predictor's robot. The
-explained fraction of the non-gravitational torque is R² = 1 − Σ (N M Δq̈)² / Σ (N (τ − τ_g))². Here, τ_g is
-gravity plus a constant, fitted to the torques, and N = 1 − A⁺A removes constraint forces.
+The torque error is M(q)(predicted − measured q̈), with the mass matrix of the robot file for all predictors,
+since a predictor's own mass matrix would hide its errors. The explained fraction of the non-gravitational
+torque is R² = 1 − Σ (N M Δq̈)² / Σ (N (τ − τ_g))². Here, τ_g is gravity plus a constant, fitted to the
+torques, and N = 1 − A⁺A removes constraint forces.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from forcegp.evaluation.least_squares import data_chunks, free_directions
 from forcegp.identification import regressor
 from forcegp.models.analytical import AnalyticalModel
 from forcegp.models.base import FittedModel
+from forcegp.robot.model import RobotModel
 from forcegp.rollout.comparison import Comparison, compare
 from forcegp.rollout.forward import RolloutOptions
 
@@ -84,26 +86,27 @@ def explained(error: Tensor, rest: Tensor) -> tuple[float | None, ...]:
 
 
 @torch.no_grad()
-def torque_response(model: FittedModel, data: Dataset) -> tuple[float, ...] | None:
+def torque_response(model: FittedModel, robot: RobotModel, data: Dataset) -> tuple[float, ...] | None:
     """Return the fraction of an added torque that takes effect at each joint, or `None` without free motion.
 
-    The fraction is 1 for a rigid robot, and 0 if the model cancels the torque. Random torques of a tenth of
-    the logged standard deviation are added to states in free motion. The effective torque is M(q) times the
-    change in the predicted acceleration.
+    The fraction is 1 for a model with the inertia of `robot`, and 0 if the model cancels the torque. A tenth
+    of the standard deviation of the logged torque is added to one joint at a time, at states in free motion.
+    The effective torque is M(q), the mass matrix of `robot`, times the change in the predicted acceleration.
     """
-    closed = data.active(model.system.contact_names)
+    closed, nq = data.active(model.system.contact_names), data.nq
     free = (~closed.any(-1)).nonzero()[:, 0]
     if len(free) < FEWEST_FREE:
         return None
-    rows = free[torch.linspace(0, len(free) - 1, min(len(free), RESPONSE_SAMPLES)).round().long().unique()]
-    data, generator = data[rows], torch.Generator().manual_seed(0)
-    added = torch.randn(data.tau.shape, generator=generator).to(data.tau) * (0.1 * data.tau.std(0))
-    before, after = (
-        model.predict(data.q, data.qd, tau, active=closed[rows], covariance=False).mean
-        for tau in (data.tau, data.tau + added)
-    )
-    acts = (dynamics.mass_matrix(model.system.robot, data.q) @ (after - before)[..., None])[..., 0]
-    return tuple(((acts * added).sum(0) / added.square().sum(0).clamp(min=1e-300)).tolist())
+    count = min(len(free), max(RESPONSE_SAMPLES // nq, FEWEST_FREE))
+    rows = free[torch.linspace(0, len(free) - 1, count).round().long().unique()]
+    data, n, joints = data[rows], len(rows), torch.arange(nq)
+    step = 0.1 * data.tau.std(0).clamp(min=1e-9)
+    added = torch.cat([torch.zeros(1, nq).to(step), torch.diag(step)])[:, None]
+    q, qd, tau = (x.expand(nq + 1, n, nq).flatten(0, 1) for x in (data.q, data.qd, data.tau + added))
+    active = closed[rows].expand(nq + 1, n, -1).flatten(0, 1)
+    qdd = model.predict(q, qd, tau, active=active, covariance=False).mean.unflatten(0, (nq + 1, n))
+    acts = (dynamics.mass_matrix(robot, data.q) @ (qdd[1:] - qdd[0])[..., None])[..., 0]
+    return tuple((acts[joints, :, joints].mean(-1) / step).tolist())
 
 
 @torch.no_grad()

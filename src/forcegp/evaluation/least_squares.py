@@ -167,14 +167,12 @@ class Baseline:
     """A trivial predictor of accelerations.
 
     Attributes:
-        name: name of the predictor. system: the robot with the mass matrix that converts its errors to
-            torques.
+        name: name of the predictor.
         predict: a function that returns the predicted accelerations `(n, nq)` for a data set.
         std: RMS error on the training data, which is used as the uncertainty, `(nq,)`.
     """
 
     name: str
-    system: ConstrainedSystem
     predict: Callable[[Dataset], Tensor]
     std: Tensor
 
@@ -184,13 +182,13 @@ def baselines(system: ConstrainedSystem, train: Dataset) -> list[Baseline]:
     mean, nothing = train.qdd.mean(0), train.qdd.new_zeros(3 * train.nq)
     identified = identify_rigid(system, train)
 
-    def baseline(name: str, mechanics: ConstrainedSystem, predict: Callable[[Dataset], Tensor]) -> Baseline:
-        return Baseline(name, mechanics, predict, ((predict(train) - train.qdd) ** 2).mean(0).sqrt())
+    def baseline(name: str, predict: Callable[[Dataset], Tensor]) -> Baseline:
+        return Baseline(name, predict, ((predict(train) - train.qdd) ** 2).mean(0).sqrt())
 
     return [
-        baseline("mean", system, lambda data: mean.expand_as(data.qdd)),
-        baseline("robot file", system, LeastSquares(system, nothing).predict),
-        baseline("least squares", identified.system, identified.predict),
+        baseline("mean", lambda data: mean.expand_as(data.qdd)),
+        baseline("robot file", LeastSquares(system, nothing).predict),
+        baseline("least squares", identified.predict),
     ]
 
 

@@ -76,7 +76,7 @@ class JointErrors:
         all: error over all samples.
         moving: error over the samples at which the joint moves.
         rest: error over the samples at which the joint is at rest.
-        normalised: `all` divided by the standard deviation of the measured quantity (nRMSE).
+        normalised: `all` divided by the standard deviation of the measured quantity.
     """
 
     all: ByJoint
@@ -172,7 +172,7 @@ class PredictorScores:
 
     Attributes:
         name: `model`, `mean`, `robot file` or `least squares`.
-        torque: error M(q)(predicted − measured q̈) [N m, N], with the mass matrix M of the predictor's robot.
+        torque: error M(q)(predicted − measured q̈) [N m, N], with the mass matrix M of the robot file.
         acceleration: error in q̈ [rad/s², m/s²].
         nlpd: mean negative log predictive density of the measured joint accelerations [nats]. The standard
             deviation of a trivial predictor is constant and equal to its training error.

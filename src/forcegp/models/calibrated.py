@@ -107,14 +107,13 @@ class Calibration:
     @property
     def losses(self) -> tuple[str, ...]:
         """Learned forces that a robot file cannot represent, described by one sentence per joint."""
-        forces = (x.round(decimals=9).tolist() for x in (self.left, self.offset))  # no rounding errors
-        joints = zip(self.robot.joint_names, *forces, strict=True)
-        return tuple(
-            f"joint {joint!r}: friction beyond d q̇ + f sign q̇ of {left:.3g} (root mean square), and a "
-            f"constant force of {offset:.3g} (N m or N)"
-            for joint, left, offset in joints
-            if max(left, abs(offset)) > 0.0
-        )
+        left, offset = (x.round(decimals=9).tolist() for x in (self.left, self.offset))  # no rounding errors
+        texts = "friction beyond d q̇ + f sign q̇ of {:.3g} (root mean square)", "a constant force of {:.3g}"
+        sentences = []
+        for joint, *sizes in zip(self.robot.joint_names, left, offset, strict=True):
+            parts = [text.format(size) for text, size in zip(texts, sizes, strict=True) if size]
+            sentences += [f"joint {joint!r}: {' and '.join(parts)} (N m or N)"] if parts else []
+        return tuple(sentences)
 
 
 @torch.no_grad()

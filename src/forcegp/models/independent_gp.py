@@ -6,6 +6,7 @@ q̈_j ~ GP(0, k_j(x, x′)) with x = (q, q̇, τ) and squared-exponential k_j (s
 from __future__ import annotations
 
 import dataclasses
+import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -139,7 +140,7 @@ class IndependentGP(Model["IndependentFit"]):
             ModelError, DataError: the data are incompatible with the model.
             NumericalError: the likelihood cannot be computed.
         """
-        options = options or LearningOptions()
+        options, began = options or LearningOptions(), time.perf_counter()
         measured, noise_std = measurement_of(Observation(data), self.system, self.noise)
         features = {"q": measured.q, "qd": measured.qd, "tau": measured.tau}
         training = self.training(features, measured.values, noise_std)
@@ -159,7 +160,9 @@ class IndependentGP(Model["IndependentFit"]):
             parts.append(dataclasses.replace(learned, doubts=doubts_at_bounds(learned.tensors, box)))
         saved.write()
         hyperparameters = {key: x for part in parts for key, x in part.tensors.items()}
-        return fitted(self, training, hyperparameters, parts)
+        fit = fitted(self, training, hyperparameters, parts)
+        result = dataclasses.replace(fit.result, seconds=time.perf_counter() - began)
+        return dataclasses.replace(fit, result=result)
 
     def training(self, features: dict[str, Tensor], qdd: Tensor, noise_std: Tensor) -> IndependentTraining:
         """Return the training data, including the standardization of the inputs."""

@@ -8,6 +8,7 @@ data (`structured_fit.conditioned`). `gram` in `gp/likelihood.py` computes the c
 from __future__ import annotations
 
 import dataclasses
+import time
 from collections.abc import Iterable, Iterator, Sequence
 from pathlib import Path
 
@@ -42,11 +43,11 @@ class StructuredGP(Model[StructuredFit]):
         mean: `"analytical"`, `"zero"`, or an `AnalyticalMean` with a subset of its terms.
         force_priors: priors on the unknown forces, the name of a set in `SETS` (`"sliding"`, `"friction"`,
             `"friction+residual"`), or `"auto"`. With `"auto"` and the analytical mean, all terms that apply
-            to the log take part: friction of joints, bristles for logs in time order, friction of contacts,
-            and torque noise. `fit.result.worth` contains their log evidence, and those that the evidence speaks
-            against are dropped (`learning/evidence.py`). If the mean does not include the motor torque,
-            `"auto"` selects `default_priors`: a `JointForcePrior` and, in contact, a `NormalForcePrior` that
-            affects only multipliers.
+            to the log take part: friction of joints and contacts, bristles for logs in time order, and torque
+            noise. `fit.result.worth` contains their log evidence. Terms that the evidence speaks against are
+            dropped (`learning/evidence.py`). If the mean does not include the motor torque, `"auto"` selects
+            `default_priors`: a `JointForcePrior` and, in contact, a `NormalForcePrior` that affects only
+            multipliers.
         noise: standard deviation of measured accelerations [rad/s², m/s²], as one value or one per joint, or
             a `Noise` for accelerations, torques and states. The default is the value in the log, or 0.1.
         analytical_parameters: a module with a `forward()` method that returns the robot with learned
@@ -153,6 +154,7 @@ class StructuredGP(Model[StructuredFit]):
                 not match the model.
             NumericalError: the likelihood cannot be computed.
         """
+        began = time.perf_counter()
         spec = self.specification if after is None else self._continued(after)
         sample = sample_of(spec, data) if isinstance(data, StreamedDataset) else Sample(data)
         chosen = None if learn is None else tuple(learn)
@@ -178,8 +180,8 @@ class StructuredGP(Model[StructuredFit]):
         fit = conditioned(spec, lesson.problem, values, lesson.learned, warnings, lesson.learned_on, forces)
         if progress is not None:
             progress(fit.result.evaluations, fit.result.evaluations, fit.result.objective)
-        warnings = (*fit.result.warnings, *self._without_effect(fit))
-        result = dataclasses.replace(fit.result, worth=dict(lesson.worth), warnings=warnings)
+        warnings, seconds = (*fit.result.warnings, *self._without_effect(fit)), time.perf_counter() - began
+        result = dataclasses.replace(fit.result, seconds=seconds, worth=dict(lesson.worth), warnings=warnings)
         return dataclasses.replace(fit, result=result)
 
     def _without_effect(self, fit: StructuredFit) -> Iterator[str]:

@@ -107,7 +107,7 @@ def error_tables(evaluation: Evaluation) -> tuple[Table, ...]:
     for unit, names in units.items() if evaluation.predictors else ():
         errors: dict[str, JointErrors] = {p.name: getattr(p, unit) for p in evaluation.predictors}
         model_errors, *others = errors.values()
-        head = ("joint", *errors, "model, at rest", "model, nRMSE")
+        head = ("joint", *errors, "model, at rest", "model, relative to spread")
         rows, bad = [], set()
         for i, joint in enumerate(evaluation.joint_names):
             shown = [e.in_motion[i] for e in errors.values()]
@@ -115,13 +115,16 @@ def error_tables(evaluation: Evaluation) -> tuple[Table, ...]:
             rows.append((joint, *(cell(x, 3) for x in values)))
             if any((shown[0] or 0.0) > (e.in_motion[i] or 0.0) for e in others):
                 bad.add((i, 1))
-        caption = f"{unit.capitalize()} error in motion, root mean square {names}; red: not the lowest"
+        caption = (
+            f"{unit.capitalize()} error in motion, root mean square {names}; red: not the lowest. Relative "
+            "to spread: divided by the standard deviation of the measured quantity"
+        )
         tables.append(Table(caption, head, tuple(rows), frozenset(bad)))
     return tuple(tables)
 
 
 def uncertainty_tables(evaluation: Evaluation) -> tuple[Table, ...]:
-    """Return tables of coverage by joint, log densities of all predictors, and λ compared with the log."""
+    """Return tables of coverage and torque response by joint, log densities, and λ compared with the log."""
     tables = []
     if evaluation.uncertainty is not None:
         shares = zip(evaluation.joint_names, evaluation.uncertainty.coverage_by_joint, strict=True)
@@ -132,6 +135,12 @@ def uncertainty_tables(evaluation: Evaluation) -> tuple[Table, ...]:
         rows = tuple((p.name, "–" if p.nlpd is None else f"{-p.nlpd:.3f}") for p in evaluation.predictors)
         caption = "Mean log density of a measured joint acceleration [nats], higher is better"
         tables.append(Table(caption, ("predictor", "log density"), rows))
+    if evaluation.response is not None:
+        rows = tuple(
+            (joint, f"{x:.3g}") for joint, x in zip(evaluation.joint_names, evaluation.response, strict=True)
+        )
+        caption = "Effect of an added torque, relative to the inertia of the robot file"
+        tables.append(Table(caption, ("joint", "M(q) Δq̈ / Δτ"), rows))
     head = ("contact", "samples", "bias [N]", "standard deviation [N]", "correlation", "±2σ coverage")
     plain = "Multiplier λ: predicted minus logged"
     titles = plain, f"{plain}, with the force sensor"

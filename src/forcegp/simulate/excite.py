@@ -57,7 +57,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class Limits:
-    """Limits of a motion, with shape `(nq,)`. Positions without a limit are limited to ±π.
+    """Limits of a motion, with shape `(nq,)`. Positions without a limit in the file are limited to ±π.
 
     Attributes:
         low, high: position limits [rad, m].
@@ -86,7 +86,8 @@ class Limits:
             robot: the robot, which defines the limits that are not given.
             velocity, acceleration, torque: one number for all joints, or one per joint. By default, velocity
                 and torque limits are those in the file, and accelerations reach the velocity limit in 0.25 s.
-            share: fraction of these limits to use. The rest is reserved for the controller.
+            share: fraction of these limits, and of the position range about its middle, to use. The rest is
+                reserved for the controller.
 
         Raises:
             ParameterError: a limit is missing or not positive. The message names the joint and the option.
@@ -98,7 +99,8 @@ class Limits:
         effort = _given(robot, "torque", torque, robot.effort_limit)
         rate = _given(robot, "acceleration", acceleration, 4.0 * speed)
         low, high = robot.lower.clamp(min=-torch.pi), robot.upper.clamp(max=torch.pi)
-        return cls(low, high, share * speed, share * rate, share * effort)
+        middle, half = 0.5 * (low + high), 0.5 * share * (high - low)
+        return cls(middle - half, middle + half, share * speed, share * rate, share * effort)
 
     def shares(self, q: Tensor, qd: Tensor, qdd: Tensor, torque: Tensor) -> dict[str, Tensor]:
         """Return the signed fractions of the limits that a motion uses, `(n, nq)` each."""
@@ -347,9 +349,10 @@ def _start_of(
         return tried[np.where(free, distance, np.inf).argmin()]
     q = np.array(start, dtype=float)
     if q.shape != (robot.nq,) or not ((q >= low) & (q <= high)).all():
-        text = "the start is not within the limits of the robot"
+        text = "the start is not within the limits of the motion"
         expected = [(round(a, 4), round(b, 4)) for a, b in zip(low.tolist(), high.tolist(), strict=True)]
-        raise ParameterError(text, expected=expected, got=q.tolist())
+        hint = "give another --start, or a larger --share of the limits"
+        raise ParameterError(text, expected=expected, got=q.tolist(), hint=hint)
     if near := collisions.pairs(q):
         pairs = ", ".join(f"{pair} ({1e3 * gap:.3g} mm)" for pair, gap in near.items())
         raise ParameterError(
