@@ -186,7 +186,7 @@ def _disturbances(explanation: Explanation) -> tuple[list[Finding], np.ndarray]:
     trace = residual_trace(explanation, rows)
     scale = np.maximum(explanation.problem.scale, FLOOR * explanation.problem.size)
     stride = np.median(np.diff(rows)) * log.dt
-    width = max(1, round(DISTURBANCE_SECONDS / stride))
+    width = min(max(1, round(DISTURBANCE_SECONDS / stride)), len(rows))
     energy = np.convolve(((trace / scale) ** 2).mean(axis=1), np.ones(width) / width, mode="same")
     level = np.log(energy + FLOOR**2)
     # Dry friction of joints that rest or reverse within the window may be as large as this.

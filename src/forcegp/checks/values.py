@@ -1,4 +1,4 @@
-"""Checks of individual columns for irregular time stamps, implausible values and jumps in the state."""
+"""Checks of individual columns for implausible values, wrapped angles and jumps in the state."""
 
 from __future__ import annotations
 
@@ -12,52 +12,9 @@ from forcegp.checks.finding import Finding, at_rows
 from forcegp.checks.log import DEPARTURE, Array, Log, Outcome, spikes
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data.clipped import limits_of
-from forcegp.data.derivative import UNIFORM_TOLERANCE
 from forcegp.data.fields import JOINT_VECTORS, resolution
 from forcegp.robust import robust_std
 from forcegp.rows import describe, intervals, repeats
-
-
-def check_order(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find time stamps that repeat or go backward within a segment."""
-    repeated, backward = (np.append(False, wrong) for wrong in (log.steps == 0.0, log.steps < 0.0))
-    findings = at_rows(repeated, "time-repeated", "time repeats in", steps=repeated.sum())
-    findings += at_rows(backward, "time-backward", "time runs backward in", steps=backward.sum())
-    return findings, log.mask(repeated | backward) if findings else log
-
-
-def check_gaps(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find missing samples, indicated by time steps longer than clock jitter can explain."""
-    gaps = log.steps > log.longest_step
-    if log.masked is not None:
-        # The step after a wrong time stamp is long because of that stamp.
-        gaps &= ~log.masked[:-1]
-    if not gaps.any():
-        return [], log
-    rows, longest = intervals(np.append(False, gaps)), float(np.nanmax(log.steps))
-    missing = int(np.round(log.steps[gaps] / log.dt - 1.0).sum())
-    gap = f"the longest gap takes {longest:.4g} s"
-    text = f"about {missing} samples are missing before {describe(rows)}; {gap}"
-    evidence = {"missing_samples": missing, "longest_s": longest, "period_s": log.dt}
-    return [Finding("time-gap", text, rows, evidence=evidence)], log
-
-
-def check_jitter(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find time steps that are too uneven for filters that assume even sampling."""
-    regular = log.steps[(log.steps > 0.0) & (log.steps <= log.longest_step)]
-    spread = float(robust_std(regular) / log.dt) if len(regular) > 1 else 0.0
-    text = f"the time steps vary by {100 * spread:.2g} % around {log.dt:.4g} s"
-    jitter = log.finding("time-jitter", text, relative_spread=spread, period_s=log.dt)
-    return [jitter] if spread > UNIFORM_TOLERANCE else [], log
-
-
-def check_period(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Compare the sampling period with the period stated in the header."""
-    stated = log.header.dt
-    if stated is None or not abs(log.dt / stated - 1.0) > UNIFORM_TOLERANCE:
-        return [], log
-    text = f"the header states a period of {stated:.4g} s, and the rows are {log.dt:.4g} s apart"
-    return [log.finding("period-header", text, stated_s=stated, period_s=log.dt)], log
 
 
 HELD_RUN = 2
