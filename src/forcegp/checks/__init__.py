@@ -43,10 +43,13 @@ Progress = Callable[[int, int], None]
 
 def check_robot(system: ConstrainedSystem, log: Log) -> Outcome:
     """Compare the robot named in the header with the robot of the scene."""
-    logged = log.header.robot_fingerprint
-    if logged is None or logged == system.robot.fingerprint:
+    logged, robot = log.header, system.robot
+    if logged.robot_fingerprint in (None, robot.fingerprint):
         return [], log
-    text = f"logged on robot {log.header.robot!r} ({logged}), and the scene has {system.robot.name!r}"
+    if logged.robot == robot.name:
+        text = f"the base, gravity or parameters of {robot.name!r} differ from those at import"
+        return [log.finding("robot-changed", text)], log
+    text = f"logged on robot {logged.robot!r} ({logged.robot_fingerprint}), and the scene has {robot.name!r}"
     return [log.finding("robot-mismatch", text)], log
 
 
@@ -71,6 +74,7 @@ CHECKS: tuple[tuple[str, Check], ...] = (
     ("gaps", clock.check_gaps),
     ("jitter", clock.check_jitter),
     ("degrees", limits.check_degrees),
+    ("wrapped angles", values.check_wrapped),
     ("lost rows", clock.check_lost),
     ("unit of time", clock.check_clock_unit),
     ("sampling period", clock.check_period),

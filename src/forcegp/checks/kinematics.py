@@ -35,9 +35,11 @@ RELATED = 0.7
 EXCHANGED, CLEARLY = 0.9, 5.0
 """Correlation with another joint's rate that indicates swapped columns; factor by which the swapped order
 must reduce the unexplained variance."""
-LATE, PERSISTS = 0.05, 0.5
-"""Fraction of the motion that a delayed velocity misses; correlation of the missing motion between adjacent
-windows, which is zero for noise."""
+PROPORTIONAL, HALF_STEP = 0.5, 0.75
+"""Share of the missing motion that a delay must explain; smallest delay that is reported, in sampling periods."""
+MOVES, TRIMMED, KEPT = 0.2, 10, 0.8
+"""Change in a window, relative to its RMS, above which a joint moves; number of times that windows with outliers
+are left out of the fit of a delay; share of the windows that are always kept."""
 JUMPS = 0.05
 """Largest fraction of windows excluded because of impacts, at which velocity jumps without acceleration."""
 INERTIA_ROWS = 200
@@ -125,17 +127,30 @@ def check_velocity(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def _late(log: Log, level: Match) -> list[Finding]:
-    """Find velocities delayed by a filter. A delay L causes a persistent error Δq − ∫q̇ dt = L Δq̇."""
+    """Find velocities delayed by a filter. A delay L causes an error Δq − ∫q̇ dt = L Δq̇ in each window."""
     rates = match(log, "qd", "qdd")
     if rates is None or "qd" in log.header.derived:
         return []
-    misfit, step = level.change - level.integral, rates.whole[0]
-    square, change = (misfit**2).sum(axis=0), (level.change**2).sum(axis=0)
-    delay = (misfit * step).sum(axis=0) / np.maximum((step**2).sum(axis=0), 1e-300)
-    persists = (misfit[1:] * misfit[:-1]).sum(axis=0) > PERSISTS * square
-    late = level.moving & persists & (square > LATE**2 * change) & (np.abs(delay) > log.dt)
+    (change, integral), step = level.whole, rates.whole[0]
+    pairs = [_delay(*columns) for columns in zip(change.T, (change - integral).T, step.T, strict=True)]
+    delay, share = np.array(pairs).T
+    # A velocity from neighbouring samples, or of a semi-implicit integrator, is half a step off by itself.
+    late = level.moving & (share > PROPORTIONAL) & (np.abs(delay) > HALF_STEP * log.dt)
     shown = ", ".join(f"{1e3 * abs(x):.2g} ms {'behind' if x > 0 else 'ahead of'}" for x in delay[late])
     return log.on_joints("velocity-delay", late, f"qd of {{}} is {shown} the rate of change of q")
+
+
+def _delay(change: Array, misfit: Array, step: Array) -> tuple[float, float]:
+    """Return the delay [s] of one joint, and the share of the misfit that it explains. Impacts are trimmed."""
+    moves = np.abs(change) > MOVES * np.sqrt((change**2).mean())
+    x, y, keep, delay = step[moves], misfit[moves], np.ones(int(moves.sum()), bool), 0.0
+    if len(x) < LEAST_WINDOWS // 2:
+        return 0.0, 0.0
+    for _ in range(TRIMMED):
+        delay = float(x[keep] @ y[keep] / max(x[keep] @ x[keep], 1e-300))
+        rest = np.abs(y - delay * x)
+        keep = rest <= max(4.0 * float(robust_std((y - delay * x)[keep])), float(np.quantile(rest, KEPT)))
+    return delay, 1.0 - float((rest[keep] ** 2).sum() / max((y[keep] ** 2).sum(), 1e-300))
 
 
 def _velocity_findings(log: Log, level: Match, wrong: np.ndarray) -> tuple[list[Finding], Array]:

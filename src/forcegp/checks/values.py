@@ -9,7 +9,7 @@ from scipy.ndimage import maximum_filter1d
 from forcegp import dynamics
 from forcegp.checks.excitation import still_joints
 from forcegp.checks.finding import Finding, at_rows
-from forcegp.checks.log import DEPARTURE, Array, Log, Outcome, spikes
+from forcegp.checks.log import DEPARTURE, Array, Log, Outcome, recomputed, spikes
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data.clipped import limits_of
 from forcegp.data.fields import JOINT_VECTORS, resolution
@@ -231,8 +231,42 @@ def _jumps(log: Log, value: str, derivative: str) -> tuple[np.ndarray, tuple[str
     return np.asarray(jumps.any(axis=1)), log.named(jumps.any(axis=0))
 
 
+TURN, SMOOTH = 2.0 * np.pi, 3.0
+"""Full turn [rad]; ratio to the fastest usual change within which a change is smooth but for full turns."""
+
+
+def check_wrapped(system: ConstrainedSystem, log: Log) -> Outcome:
+    """Find angles that jump by full turns since they are confined to an interval of one turn."""
+    steps, linked = np.diff(log.q, axis=0), log.finite[1:] & log.finite[:-1]
+    forward = np.diff(log.t)
+    linked &= (forward > 0.0) & (forward <= log.longest_step)  # an import may start a segment at each jump
+    if not log.header.ordered or not linked.any():
+        return [], log
+    turns = np.round(np.where(linked[:, None], steps, 0.0) / TURN)
+    rest = np.abs(steps - TURN * turns)
+    confined = np.ptp(log.q[log.finite], axis=0) <= TURN * (1.0 + 1e-3)
+    revolute = system.robot.revolute.cpu().numpy() > 0.0
+    turns *= (rest <= SMOOTH * np.quantile(rest[linked], 0.99, axis=0)) & confined & revolute
+    at = np.append(False, turns.any(axis=1))
+    joints = log.named(turns.any(axis=0))
+    findings = at_rows(at, "angle-wrapped", f"the position of {', '.join(joints)} jumps by a full turn at", joints)
+    return findings, _unwrapped(system, log, turns, at) if findings else log
+
+
+def _unwrapped(system: ConstrainedSystem, log: Log, turns: Array, at: np.ndarray) -> Log:
+    """Return the log with continuous angles, near the middle of the joint range in each segment."""
+    segment = np.append(0, np.cumsum((np.diff(log.segment) != 0) & ~at[1:]))
+    q = log.q - TURN * np.append(np.zeros((1, log.nq)), np.cumsum(turns, axis=0), axis=0)
+    middle = 0.5 * (system.robot.lower + system.robot.upper).cpu().numpy()
+    for number in np.unique(segment):
+        rows = segment == number
+        away = np.nan_to_num(np.nanmedian(q[rows], axis=0) - np.where(np.isfinite(middle), middle, 0.0))
+        q[rows] -= TURN * np.round(away / TURN) * turns.any(axis=0)
+    return recomputed(log.replace(q=q, segment=segment))
+
+
 def check_jumps(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find position jumps that the velocity does not explain, due to missing rows or wrapped angles."""
+    """Find position jumps that the velocity does not explain, due to missing rows."""
     at, joints = _jumps(log, "q", "qd")
     findings = at_rows(at, "position-jump", f"the position of {', '.join(joints)} jumps at", joints)
     return findings, log.replace(segment=log.segment + np.cumsum(at))
