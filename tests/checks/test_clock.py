@@ -18,7 +18,7 @@ DT = 1.0 / 240.0
 @pytest.fixture(scope="module")
 def pendulum() -> Case:
     robot = forcegp.load_robot("double_pendulum")
-    return ConstrainedSystem(robot, []), free_log(robot, seconds=20.0)
+    return ConstrainedSystem(robot, []), free_log(robot, seconds=10.0)
 
 
 def _derived(log: Log, *names: str) -> Log:
@@ -114,8 +114,8 @@ def test_clean_logs_have_a_clean_clock(pendulum: Case) -> None:
     assert not kinds & {"time-bursts", "rows-lost", "time-unit"}
 
 
-@pytest.mark.parametrize("rows", [1, 2, 5, 9, 30, 120, 400, 800])
-@pytest.mark.parametrize("rate", [10.0, 1e3, 1e4])
+@pytest.mark.parametrize("rows", [1, 5, 30, 400, 800])
+@pytest.mark.parametrize("rate", [1e3, 1e4])
 @pytest.mark.parametrize("derived", [(), ("qd", "qdd")], ids=", ".join)
 def test_short_logs_are_checked_or_too_short(rows: int, rate: float, derived: tuple[str, ...]) -> None:
     robot = forcegp.load_robot("double_pendulum")
@@ -123,5 +123,5 @@ def test_short_logs_are_checked_or_too_short(rows: int, rate: float, derived: tu
     log = _keep(log, np.arange(len(log)) < rows)
     log = _derived(log.replace(t=np.arange(rows) / rate), *derived)
     report = check(ConstrainedSystem(robot, []), log)
-    if rows / rate < 1.9:
-        assert "log-short" in {finding.kind for finding in report.findings}
+    kinds = {finding.kind for finding in report.findings}
+    assert rows / rate > 1.9 or kinds & {"log-short", "time-scale"}

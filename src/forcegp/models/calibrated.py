@@ -107,7 +107,8 @@ class Calibration:
     @property
     def losses(self) -> tuple[str, ...]:
         """Learned forces that a robot file cannot represent, described by one sentence per joint."""
-        forces = (x.round(decimals=9).tolist() for x in (self.left, self.offset))  # no rounding errors
+        # Adding zero turns −0 into 0.
+        forces = (x.round(decimals=9).add(0.0).tolist() for x in (self.left, self.offset))
         joints = zip(self.robot.joint_names, *forces, strict=True)
         return tuple(
             f"joint {joint!r}: friction beyond d q̇ + f sign q̇ of {left:.3g} (root mean square), and a "

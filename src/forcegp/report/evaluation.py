@@ -108,7 +108,7 @@ def error_tables(evaluation: Evaluation) -> tuple[Table, ...]:
     for unit, names in units.items() if evaluation.predictors else ():
         errors: dict[str, JointErrors] = {p.name: getattr(p, unit) for p in evaluation.predictors}
         model_errors, *others = errors.values()
-        head = ("joint", *errors, "model, at rest", "model, nRMSE")
+        head = ("joint", *errors, "model, at rest", "model, error / standard deviation")
         rows, bad = [], set()
         for i, joint in enumerate(evaluation.joint_names):
             shown = [e.in_motion[i] for e in errors.values()]
