@@ -103,7 +103,16 @@ _ROBOT = frozenset(
     {"gravity-direction", "base-tilted", "payload-missing", "masses-mismatch", "torque-unexplained"}
 )
 _RATES = (
-    *("unit of time", "sampling period", "spikes", "jumps", "velocity", "acceleration", "impacts", "resolution"),
+    *(
+        "unit of time",
+        "sampling period",
+        "spikes",
+        "jumps",
+        "velocity",
+        "acceleration",
+        "impacts",
+        "resolution",
+    ),
     *("noise", "length", "dynamics", "contact force", "excitation"),
 )
 VOIDS = {name: frozenset({"rows-lost"}) for name in _RATES}

@@ -7,8 +7,6 @@ usual distance, whatever the stamps are.
 
 from __future__ import annotations
 
-from dataclasses import replace
-
 import numpy as np
 from scipy.ndimage import median_filter
 
@@ -30,17 +28,17 @@ UNIT_TOLERANCE = 0.1
 PERIODS, TYPICAL = (2e-5, 1.0), 4e-3
 """Plausible and typical sampling periods of a robot's log [s]."""
 BURSTS, UNEVEN, FEWEST = 0.9, 0.5, 10
-"""Share of the time that passes in the longer half of the steps if a clock comes in bursts; relative difference
-of two steps that count as uneven; minimum number of such pairs."""
+"""Share of the time that passes in the longer half of the steps if a clock comes in bursts; relative
+difference of two steps that count as uneven; minimum number of such pairs."""
 SMOOTHER = 0.5
 """Ratio of the deviations of positions from the line through their neighbours, without and with the stamps,
 below which the stamps are wrong."""
 NEIGHBOURS, NEAR, RESOLVED = 9, 0.25, 8.0
-"""Number of rows whose median change estimates a velocity that is not logged; distance from an integer that
+"""Number of rows whose median change is the usual one; distance from an integer that
 still counts as one; size of a change in noise standard deviations that determines a multiple."""
 JUDGED, REGULAR, LOST = 50, 0.8, 0.005
-"""Minimum number of rows with a determined multiple, share of multiples near an integer, and share of lost rows
-above which rows are reported as lost."""
+"""Minimum number of rows with a determined multiple, share of multiples near an integer, and share of lost
+rows above which rows are reported as lost."""
 
 
 def check_stamps(system: ConstrainedSystem, log: Log) -> Outcome:
@@ -146,17 +144,12 @@ def check_lost(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def _multiples(log: Log) -> tuple[Array, np.ndarray]:
-    """Return by which multiple of q̇ Δt positions change in each row `(n,)`, and where it is determined."""
+    """Return by which multiple of the usual distance positions change in each row `(n,)`, and where it is determined."""
     multiple, judged = np.ones(len(log)), np.zeros(len(log), bool)
     for s in log.stretches:
         change, steps = np.diff(log.q[s], axis=0), np.diff(log.t[s])[:, None]
-        if "qd" in computed(log):
-            usual = median_filter(change / steps, (NEIGHBOURS, 1)) * steps
-        else:
-            usual = 0.5 * (log.qd[s][1:] + log.qd[s][:-1]) * steps
-        square = (usual**2).sum(axis=0)
-        slope = np.median(np.where(square > 0.0, change / np.where(usual != 0.0, usual, np.inf), 1.0), axis=0)
-        usual = usual * slope
+        # Not by q̇, which may have faults of its own.
+        usual = median_filter(change / steps, (NEIGHBOURS, 1)) * steps
         noise = robust_std(change - usual) + resolution(log.q[s]) + 1e-12
         scaled = np.where(np.abs(usual) > RESOLVED * noise, usual / noise, 0.0)
         size = (scaled**2).sum(axis=1)
@@ -223,5 +216,3 @@ def _one_factor(level: Match, factor: float) -> bool:
         return False
     related = np.abs(level.correlation[level.moving]) >= EXCHANGED
     return bool(related.all() and level.right(factor, ALIKE)[level.moving].all())
-
-

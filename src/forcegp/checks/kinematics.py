@@ -36,10 +36,10 @@ EXCHANGED, CLEARLY = 0.9, 5.0
 """Correlation with another joint's rate that indicates swapped columns; factor by which the swapped order
 must reduce the unexplained variance."""
 PROPORTIONAL, HALF_STEP = 0.5, 0.75
-"""Share of the missing motion that a delay must explain; smallest delay that is reported, in sampling periods."""
+"""Share of the missing motion that a delay must explain; smallest reported delay, in sampling periods."""
 MOVES, TRIMMED, KEPT = 0.2, 10, 0.8
-"""Change in a window, relative to its RMS, above which a joint moves; number of times that windows with outliers
-are left out of the fit of a delay; share of the windows that are always kept."""
+"""Change in a window, relative to its RMS, above which a joint moves; number of times that windows with
+outliers are left out of the fit of a delay; share of the windows that are always kept."""
 JUMPS = 0.05
 """Largest fraction of windows excluded because of impacts, at which velocity jumps without acceleration."""
 INERTIA_ROWS = 200
@@ -141,7 +141,7 @@ def _late(log: Log, level: Match) -> list[Finding]:
 
 
 def _delay(change: Array, misfit: Array, step: Array) -> tuple[float, float]:
-    """Return the delay [s] of one joint, and the share of the misfit that it explains. Impacts are trimmed."""
+    """Return the delay [s] of one joint, and the share of the misfit explained. Impacts are trimmed."""
     moves = np.abs(change) > MOVES * np.sqrt((change**2).mean())
     x, y, keep, delay = step[moves], misfit[moves], np.ones(int(moves.sum()), bool), 0.0
     if len(x) < LEAST_WINDOWS // 2:

@@ -19,8 +19,8 @@ from forcegp.robust import robust_std
 from forcegp.rows import describe, intervals
 
 MODELLED, TOUCHED = 0.02, 0.1
-"""Largest difference between a modelled torque and the inverse dynamics, relative to the torque; share of rows
-in contact, or with friction above twice that difference, that would show in a measured torque."""
+"""Largest difference between a modelled torque and the inverse dynamics, relative to the torque; share of
+rows in contact, or with friction above twice that difference, that would show in a measured torque."""
 LEAST_ROWS = 200
 """Minimum number of rows for checking the dynamics."""
 SIGNIFICANT, MATERIAL = 3.0, 0.1
@@ -100,7 +100,7 @@ def _modelled(system: ConstrainedSystem, log: Log) -> list[Finding]:
     """
     rows = log.rows(2 * LEAST_ROWS)
     r, _ = residual(system, log, rows)
-    q, qd = log.tensors(rows, "q", "qd")
+    (qd,) = log.tensors(rows, "qd")
     damping = dynamics.damping_force(system.robot, qd).detach().numpy()
     size = np.sqrt((log.tau[rows] ** 2).mean(axis=0))
     measured = np.setdiff1d(np.flatnonzero(size > 0.0), log.unmeasured)
@@ -209,11 +209,34 @@ def _offsets(explanation: Explanation) -> list[Finding]:
         for h, fit in fits
         if hypotheses.plausible(system, h, fit) and not any(_worse(explanation, fit, j) for j in off)
     ]
+    if (weightless := _weightless(explanation, list(off))) is not None:
+        rivals = [weightless, *(f for f in rivals if f.kind != weightless.kind)]
     # One cause that takes the place of the offsets of several joints is named before them.
     found = [log.finding("torque-offset", text, names, **evidence), *rivals]
     single = [f for f in rivals if f.kind == "torque-without-gravity" or "factor" in f.evidence]
     first = (single or found)[0]
     return [with_alternatives(first, [f for f in found if f is not first])]
+
+
+def _weightless(explanation: Explanation, off: list[int]) -> Finding | None:
+    """Return the finding that adding the gravity torque explains as much as the offsets of these joints."""
+    robot, log, nq = explanation.system.robot, explanation.log, explanation.log.nq
+    gravity = np.concatenate(
+        [
+            dynamics.gravity_force(robot, log.tensors(part, "q")[0]).detach().numpy()
+            for part in np.array_split(np.arange(len(log)), max(1, len(log) // 8192))
+        ]
+    )
+    offset = -explanation.fit.nuisance[2 * nq :][off]
+    usual = gravity[explanation.rows][:, off].mean(axis=0)
+    added = replace(explanation, problem=explanation.on(log.replace(tau=log.tau - gravity)))
+    fit = added.without([2 * nq + j for j in off]).fit
+    if (np.abs(offset - usual) > UNEXPLAINED * np.abs(offset)).any() or any(
+        _worse(explanation, fit, j) for j in off
+    ):
+        return None
+    text = "the torque contains no gravity: gravity compensation was subtracted"
+    return log.finding("torque-without-gravity", text, log.joint_names)
 
 
 def _unexplained(explanation: Explanation) -> list[Finding]:

@@ -8,14 +8,13 @@ from scipy.ndimage import maximum_filter1d
 
 from forcegp import dynamics
 from forcegp.checks.excitation import still_joints
-from forcegp.checks.finding import Finding, at_rows
+from forcegp.checks.finding import at_rows
 from forcegp.checks.log import DEPARTURE, Array, Log, Outcome, recomputed, spikes
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data.clipped import limits_of
 from forcegp.data.fields import JOINT_VECTORS, resolution
 from forcegp.robust import robust_std
-from forcegp.rows import describe, intervals, repeats
-
+from forcegp.rows import intervals, repeats
 
 HELD_RUN = 2
 """Minimum number of repeated rows for which the logger is reported to have missed updates."""
@@ -249,7 +248,9 @@ def check_wrapped(system: ConstrainedSystem, log: Log) -> Outcome:
     turns *= (rest <= SMOOTH * np.quantile(rest[linked], 0.99, axis=0)) & confined & revolute
     at = np.append(False, turns.any(axis=1))
     joints = log.named(turns.any(axis=0))
-    findings = at_rows(at, "angle-wrapped", f"the position of {', '.join(joints)} jumps by a full turn at", joints)
+    findings = at_rows(
+        at, "angle-wrapped", f"the position of {', '.join(joints)} jumps by a full turn at", joints
+    )
     return findings, _unwrapped(system, log, turns, at) if findings else log
 
 

@@ -11,7 +11,7 @@ from typer import Argument, Option
 
 import forcegp
 from forcegp.cli import common
-from forcegp.cli.common import Verbatim, printable, progress_bar, save, say, show
+from forcegp.cli.common import Verbatim, progress_bar, save, say, show
 from forcegp.cli.options import AsJson, Differentiate, RobotName, SceneOrNone
 from forcegp.errors import ForceGPError
 
@@ -187,7 +187,10 @@ def check(
             from forcegp.report.check import write_check
 
             title = f"{path} on {scene or robot}"
-            save(lambda to, title=title, report=report, log=log: write_check(to, title, report, system, log), out)
+            save(
+                lambda to, title=title, report=report, log=log: write_check(to, title, report, system, log),
+                out,
+            )
         if not as_json:
             if len(data) > 1:
                 say(path, "log: ", bold=True)
@@ -209,7 +212,11 @@ def _print(report: Report) -> None:
 
     for finding in report.findings:
         named = [joint for joint in finding.joints if joint not in finding.message]
-        where = "all joints: " if len(named) == len(report.joint_names) > 1 else f"{', '.join(named)}: " * bool(named)
+        where = (
+            "all joints: "
+            if len(named) == len(report.joint_names) > 1
+            else f"{', '.join(named)}: " * bool(named)
+        )
         every = finding.intervals == ((0, report.samples),)
         rows = "all rows" if every else describe(finding.intervals, most=2)
         kinds = " or ".join(finding.kinds)
