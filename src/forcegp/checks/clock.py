@@ -50,13 +50,19 @@ def check_stamps(system: ConstrainedSystem, log: Log) -> Outcome:
     share = float(forward[len(forward) // 2 :].sum() / forward.sum())
     if share < BURSTS or not _even_by_row(log, steps):
         return [], log
-    span = max(1, len(log) // 20)
-    over = log.t[span:] - log.t[:-span]
-    period = float(np.median(over[over > 0.0])) / span
+    period = _period(steps)
     half = "time stamps come in bursts, or stand still and jump: "
     text = f"{half}{100 * share:.3g} % of the time passes in half of the steps, but the motion takes "
     finding = log.finding("time-bursts", f"{text}{1e3 * period:.4g} ms per row throughout", period=period)
     return [finding], _numbered(log, steps, period)
+
+
+def _period(steps: Array) -> float:
+    """Return the mean step between the first and the last long one, without pauses [s]."""
+    long = np.flatnonzero(steps > steps[steps >= 0.0].mean())
+    between = steps[long[0] + 1 : long[-1] + 1]
+    usual = (between >= 0.0) & (between <= 3.0 * np.median(steps[long]))
+    return float(between[usual].mean()) if usual.any() else float(steps[steps >= 0.0].mean())
 
 
 def _even_by_row(log: Log, steps: Array) -> bool:
@@ -144,7 +150,7 @@ def check_lost(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def _multiples(log: Log) -> tuple[Array, np.ndarray]:
-    """Return by which multiple of the usual distance positions change in each row `(n,)`, and where it is determined."""
+    """Return the change of positions relative to the usual one `(n,)`, and the mask of rows that determine it."""
     multiple, judged = np.ones(len(log)), np.zeros(len(log), bool)
     for s in log.stretches:
         change, steps = np.diff(log.q[s], axis=0), np.diff(log.t[s])[:, None]
