@@ -36,9 +36,9 @@ below which the stamps are wrong."""
 NEIGHBOURS, NEAR, RESOLVED = 9, 0.25, 8.0
 """Number of rows whose median change is the usual one; distance from an integer that
 still counts as one; size of a change in noise standard deviations that determines a multiple."""
-JUDGED, REGULAR, LOST = 50, 0.8, 0.005
-"""Minimum number of rows with a determined multiple, share of multiples near an integer, and share of lost
-rows above which rows are reported as lost."""
+JUDGED, REGULAR, SINGLE, LOST = 50, 0.8, 0.4, 0.005
+"""Minimum number of rows with a determined multiple, share of multiples near an integer, share of single steps
+around a lost row, and share of lost rows above which rows are reported as lost."""
 
 
 def check_stamps(system: ConstrainedSystem, log: Log) -> Outcome:
@@ -139,8 +139,11 @@ def check_lost(system: ConstrainedSystem, log: Log) -> Outcome:
     multiple, judged = _multiples(log)
     whole = np.round(multiple)
     near = judged & (np.abs(multiple - whole) <= NEAR)
-    lost = near & (whole >= 2.0)
-    regular = near.sum() >= REGULAR * judged.sum() and 2 * (near & (whole == 1.0)).sum() > judged.sum()
+    single = near & (whole == 1.0)
+    # A joint that starts or bounces changes its speed for good, and passes through other multiples.
+    lost = near & (whole >= 2.0) & np.append(False, near[:-1]) & np.append(near[1:], False)
+    lost &= np.convolve(single, np.ones(NEIGHBOURS), "same") >= SINGLE * NEIGHBOURS
+    regular = near.sum() >= REGULAR * judged.sum() and 2 * single.sum() > judged.sum()
     if judged.sum() < JUDGED or not regular or lost.sum() < LOST * judged.sum() or lost.sum() < FEWEST:
         return [], log
     count, share = int((whole[lost] - 1.0).sum()), lost.sum() / judged.sum()
@@ -150,7 +153,7 @@ def check_lost(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def _multiples(log: Log) -> tuple[Array, np.ndarray]:
-    """Return the change of positions relative to the usual one `(n,)`, and the mask of rows that determine it."""
+    """Return the change of positions relative to the usual one `(n,)`, and the rows that determine it."""
     multiple, judged = np.ones(len(log)), np.zeros(len(log), bool)
     for s in log.stretches:
         change, steps = np.diff(log.q[s], axis=0), np.diff(log.t[s])[:, None]

@@ -143,7 +143,8 @@ def _late(log: Log, level: Match) -> list[Finding]:
 def _delay(change: Array, misfit: Array, step: Array) -> tuple[float, float]:
     """Return the delay [s] of one joint, and the share of the misfit explained. Impacts are trimmed."""
     moves = np.abs(change) > MOVES * np.sqrt((change**2).mean())
-    x, y, keep, delay = step[moves], misfit[moves], np.ones(int(moves.sum()), bool), 0.0
+    x, y, delay = step[moves], misfit[moves], 0.0
+    keep, rest = np.ones(len(x), bool), np.zeros(len(x))
     if len(x) < LEAST_WINDOWS // 2:
         return 0.0, 0.0
     for _ in range(TRIMMED):
