@@ -119,3 +119,28 @@ def test_a_log_in_order_may_go_on_and_a_robot_without_contacts_needs_no_scene(fo
         for command in (["check"], ["fit", "-o", str(folder / "other")]):
             done = CliRunner().invoke(app, [*command, *data, *named])
             assert done.exit_code != 0 and "either --scene or --robot" in str(done.exception), done.output
+
+
+def test_every_log_that_is_given_is_reported(folder: Path, log: Log) -> None:
+    """The faulty one decides the exit code wherever it stands."""
+    write(log, folder / "good.parquet")
+    write(log.replace(tau=-log.tau), folder / "bad.parquet")
+    paths = [str(folder / name) for name in ("bad.parquet", "good.parquet")]
+    scene = ["check", "-s", str(folder / "scene.toml")]
+    done = CliRunner().invoke(app, [*scene, "-d", paths[0], "-d", paths[1]])
+    assert done.exit_code == 1 and all(f"log: {path}" in done.stdout for path in paths), done.output
+    assert [line.partition(";")[0] for line in done.stdout.splitlines() if line.startswith("verdict")] == [
+        "verdict: stop",
+        "verdict: go on",
+    ]
+    done = CliRunner().invoke(app, [*scene, "-d", paths[0], "-d", paths[1], "--json"])
+    assert [one["usable"] for one in json.loads(done.stdout)["logs"]] == [False, True]
+    done = CliRunner().invoke(app, [*scene, "-d", paths[0], "-d", paths[1], "-o", str(folder / "a.html")])
+    assert "a page shows one log" in str(done.exception)
+
+
+def test_a_finding_is_one_paragraph(folder: Path, log: Log) -> None:
+    done = run(folder, log.replace(tau=log.tau * [1.0, -1.0]))
+    (line,) = (line for line in done.stdout.splitlines() if "torque-sign" in line)
+    assert line.startswith("error: ") and log.joint_names[1] in line and "→" in line
+    assert not any("50526" in line or "e+" in line for line in done.stdout.splitlines())

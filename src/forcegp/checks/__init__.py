@@ -9,7 +9,7 @@ from dataclasses import replace
 import numpy as np
 import torch
 
-from forcegp.checks import contact, excitation, kinematics, limits, mechanics, placement, values
+from forcegp.checks import clock, contact, excitation, kinematics, limits, mechanics, placement, values
 from forcegp.checks.finding import KINDS, SEVERITIES, Finding, NotJudgedError, Report
 from forcegp.checks.limits import clipped_torques
 from forcegp.checks.log import Log, Outcome, log_of, of_robot, read_log
@@ -23,7 +23,12 @@ NUMBERS = 24
 """Upper bound on the number of values held in memory per joint and row. About twenty were measured."""
 OF_CONTACTS = frozenset({"contact", "contact force"})
 """Names of the checks that are skipped if there are no contacts."""
-OF_TIME = frozenset({"order of time", "held rows", "gaps", "jitter", "sampling period", "standing channels"})
+OF_TIME = frozenset(
+    {
+        *("time stamps", "order of time", "held rows", "gaps", "jitter", "sampling period", "lost rows"),
+        "standing channels",
+    }
+)
 """Names of the checks that require the rows to be in time order."""
 IMPORTED = {
     "doubt": "import-doubt",
@@ -38,10 +43,13 @@ Progress = Callable[[int, int], None]
 
 def check_robot(system: ConstrainedSystem, log: Log) -> Outcome:
     """Compare the robot named in the header with the robot of the scene."""
-    logged = log.header.robot_fingerprint
-    if logged is None or logged == system.robot.fingerprint:
+    logged, robot = log.header, system.robot
+    if logged.robot_fingerprint in (None, robot.fingerprint):
         return [], log
-    text = f"logged on robot {log.header.robot!r} ({logged}), and the scene has {system.robot.name!r}"
+    if logged.robot == robot.name:
+        text = f"the base, gravity or parameters of {robot.name!r} differ from those at import"
+        return [log.finding("robot-changed", text)], log
+    text = f"logged on robot {logged.robot!r} ({logged.robot_fingerprint}), and the scene has {robot.name!r}"
     return [log.finding("robot-mismatch", text)], log
 
 
@@ -58,15 +66,18 @@ def check_import(system: ConstrainedSystem, log: Log) -> Outcome:
 
 CHECKS: tuple[tuple[str, Check], ...] = (
     ("finite values", values.check_finite),
-    ("order of time", values.check_order),
+    ("time stamps", clock.check_stamps),
+    ("order of time", clock.check_order),
     ("robot", check_robot),
     ("import", check_import),
     ("held rows", values.check_held),
-    ("gaps", values.check_gaps),
-    ("jitter", values.check_jitter),
+    ("gaps", clock.check_gaps),
+    ("jitter", clock.check_jitter),
     ("degrees", limits.check_degrees),
-    ("unit of time", kinematics.check_clock_unit),
-    ("sampling period", values.check_period),
+    ("wrapped angles", values.check_wrapped),
+    ("lost rows", clock.check_lost),
+    ("unit of time", clock.check_clock_unit),
+    ("sampling period", clock.check_period),
     ("spikes", values.check_spikes),
     ("standing channels", values.check_stuck),
     ("jumps", values.check_jumps),
@@ -91,7 +102,22 @@ _MOTION = frozenset({"velocity-mismatch"})
 _ROBOT = frozenset(
     {"gravity-direction", "base-tilted", "payload-missing", "masses-mismatch", "torque-unexplained"}
 )
-VOIDS = {"dynamics": _MOTION, "contact force": _MOTION | _ROBOT, "excitation": _MOTION}
+_RATES = (
+    *(
+        "unit of time",
+        "sampling period",
+        "spikes",
+        "jumps",
+        "velocity",
+        "acceleration",
+        "impacts",
+        "resolution",
+    ),
+    *("noise", "length", "dynamics", "contact force", "excitation"),
+)
+VOIDS = {name: frozenset({"rows-lost"}) for name in _RATES}
+VOIDS |= {name: VOIDS[name] | _MOTION for name in ("dynamics", "contact force", "excitation")}
+VOIDS["contact force"] |= _ROBOT
 """For each check, the findings that invalidate its result."""
 
 

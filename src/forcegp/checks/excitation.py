@@ -110,11 +110,11 @@ SIZES = np.geomspace(1e-3, LARGEST, 200)
 SPAN = 1
 """Number of rows on either side for computing the torque rate; smaller than the margin in `explain`."""
 EXPECTED = {
-    "torque-delay": (0.02, LARGEST, 1e3, "a delay of the torque", "{:.0f} ms"),
+    "torque-delay": (0.02, 1.0, 1e3, "a delay of the torque", "{:.0f} ms"),
     "base-tilted": (3.0, 180.0, 1.0, "a tilt of the base", "{:.2g}°"),
     "masses-mismatch": (0.2, 1.0, 100.0, "errors of all masses", "{:.0f} %"),
     "heavier-link": (0.2, 10.0, 100.0, "a heavier link", "{:.0f} %"),
-    "torque-gain": (0.5, LARGEST, 100.0, "a wrong gain", "{:.0f} %"),
+    "torque-gain": (0.5, 2.0, 100.0, "a wrong gain", "{:.0f} %"),
     "encoder-offset": (0.1, np.pi, 1.0, "an encoder offset", "{:.2g} {unit}"),
 }
 """For each kind of fault, the size that a user expects to be detected and the largest size [s, degrees,
@@ -141,16 +141,18 @@ def check_visibility(explanation: Explanation) -> list[Finding]:
         alike, parts = [fault for fault in hidden if fault.kind == kind], []
         if not alike:
             continue
-        for fault in alike:
+        for fault in (fault for fault in alike if sizes[fault] < most):
             size = words.format(scale * sizes[fault], unit=units.get(fault.joint))
-            parts.append(f"{fault.joint} {size if sizes[fault] < most else 'never'}".strip())
+            parts.append(f"{fault.joint} from {size}".strip())
+        if never := [fault.joint for fault in alike if sizes[fault] >= most]:
+            parts.append(f"never at {', '.join(never)}" if any(never) else "never")
         force = max(force_of(explanation, fault) for fault in alike) * expected
         size = words.format(scale * expected, unit=units.get(alike[0].joint))
         changed = f" ({size}: force at the contact off by about {force:.2g} N)" if force else ""
         texts.append(f"{what}{': ' if alike[0].joint else ' '}{', '.join(parts)}{changed}")
     joints = tuple(dict.fromkeys(fault.joint for fault in hidden if fault.joint))
     evidence = {f"{fault.kind} {fault.joint}".strip(): size for fault, size in sizes.items()}
-    text = f"seen only from: {'; '.join(texts)}"
+    text = f"smaller faults cannot be seen in this log: {'; '.join(texts)}"
     return [explanation.log.finding("faults-hidden", text, joints, **evidence)]
 
 

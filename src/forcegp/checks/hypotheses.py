@@ -139,6 +139,13 @@ def gain_hypothesis(log: Log, rows: np.ndarray, joints: tuple[int, ...]) -> Hypo
     return Hypothesis("gains", len(joints), unchanged, columns, np.full(len(joints), 100.0), joints)
 
 
+def common_gain_hypothesis(log: Log, rows: np.ndarray, problem: TorqueProblem) -> Hypothesis:
+    """Return the hypothesis of one factor for all torques, with the required torque as the instrument."""
+    every, needed = tuple(range(log.nq)), (problem.r + log.tau[rows])[..., None]
+    columns = log.tau[rows][..., None]
+    return Hypothesis("common-gain", 1, unchanged, columns, np.full(1, 100.0), every, instruments=needed)
+
+
 def drift_hypothesis(log: Log, rows: np.ndarray, j: int) -> Hypothesis:
     """Return the hypothesis that the torque of joint j drifts over the log: u − τ = −θ s with |s| ≤ 1/2."""
     columns = -_elapsed(log)[rows, None, None] * np.eye(log.nq)[:, [j]]
@@ -210,6 +217,8 @@ SMALL_ANGLE, LARGEST_ANGLE = np.radians(0.5), 1.0
 linearisation cannot determine the offset [rad, m]."""
 SMALL_GAIN, EXPLAINED = 0.2, 0.5
 """Deviation of a gain from 1 that wrong masses may cause; accepted fraction of unexplained torque."""
+SMALL_COMMON_GAIN = 0.05
+"""Deviation from 1 of the gain of all torques that is reported."""
 SMALL_TILT, EARTH = 1.0, 9.81
 """Tilt that wrong masses may cause [degrees]; magnitude assumed if the scene has no gravity [m/s²]."""
 SAME_GRAVITY = 0.2, 0.5
@@ -233,6 +242,9 @@ def plausible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit)
         explained = float(np.median(np.median(fit.shares[:, joints], axis=0))) < EXPLAINED
         size, spread = (np.abs(x[: len(joints)]) for x in (fit.theta, fit.spread))
         return explained and bool((size > np.maximum(SMALL_GAIN, spread)).any())
+    if hypothesis.name == "common-gain":
+        least = max(SMALL_COMMON_GAIN, SIGNIFICANT * fit.spread[0])
+        return bool(least < abs(fit.theta[0]) and fit.theta[0] > -1.0)
     if hypothesis.name == "gravity":
         angle, size = _turn(system.robot, fit.theta[:3])
         # No place on earth has another size of gravity: such a fit has masses or gains that are wrong.
@@ -253,6 +265,8 @@ def corrected(log: Log, hypothesis: Hypothesis, theta: Array) -> Log:
         factor = np.ones(log.nq)
         factor[list(hypothesis.joints)] += theta[: len(hypothesis.joints)]
         return log.replace(tau=log.tau * factor)
+    if hypothesis.name == "common-gain":
+        return log.replace(tau=log.tau * (1.0 + theta[0]))
     if hypothesis.name == "drift":
         return log.replace(tau=log.tau - theta[0] * _elapsed(log)[:, None] * concerned)
     if hypothesis.name == "encoder-offset":
@@ -273,6 +287,9 @@ def finding_of(
         return _gains(log, names, 1.0 + theta[: len(names)])
     if name == "gravity":
         return _gravity(system, log, theta[:3])
+    if name == "common-gain":
+        text = f"all torques fit when multiplied by {1.0 + theta[0]:.3g} ± {spread[0]:.2g}"
+        return log.finding("torque-gain", text, names, factor=1.0 + theta[0])
     if name in DISCRETE:
         text = DISCRETE[name].format(listed)
     elif name == "torque-delay":

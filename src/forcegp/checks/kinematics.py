@@ -26,6 +26,8 @@ from forcegp.robust import robust_std
 
 WINDOW = 0.05
 """Length of a window [s], long enough to average out noise and short compared with the motion."""
+LEAST_WINDOWS = 40
+"""Number of windows below which they are shortened. Half as many suffice for a comparison."""
 TOLERANCE, INSTANT = 0.05, 0.15
 """Accepted deviations of a slope from 1: for filters, and for accelerations that change within a period."""
 RELATED = 0.7
@@ -33,20 +35,17 @@ RELATED = 0.7
 EXCHANGED, CLEARLY = 0.9, 5.0
 """Correlation with another joint's rate that indicates swapped columns; factor by which the swapped order
 must reduce the unexplained variance."""
-LATE, PERSISTS = 0.05, 0.5
-"""Fraction of the motion that a delayed velocity misses; correlation of the missing motion between adjacent
-windows, which is zero for noise."""
+PROPORTIONAL, HALF_STEP = 0.5, 0.75
+"""Share of the missing motion that a delay must explain; smallest reported delay, in sampling periods."""
+MOVES, TRIMMED, KEPT = 0.2, 10, 0.8
+"""Change in a window, relative to its RMS, above which a joint moves; number of times that windows with
+outliers are left out of the fit of a delay; share of the windows that are always kept."""
 JUMPS = 0.05
 """Largest fraction of windows excluded because of impacts, at which velocity jumps without acceleration."""
 INERTIA_ROWS = 200
 """Maximum number of rows at which inertias are computed."""
 FRICTION_ROWS, LEAST_ROWS = 4000, 20
 """Maximum and minimum number of rows from which viscous friction is estimated."""
-ALIKE = 0.02
-"""Tolerance within which all joints have the same slope, which indicates an incorrect clock rate."""
-UNITS = (1e-9, 1e-6, 1e-3, 1e3)
-"""Lengths of 1 ns, 1 µs, 1 ms and 1 ks, the possible units of a clock [s]."""
-UNIT_TOLERANCE = 0.1
 
 
 @dataclass(frozen=True)
@@ -74,14 +73,16 @@ class Match:
 def match(log: Log, value: str, rate: str) -> Match | None:
     """Compare changes of a column with integrals of its rate; return `None` if there are too few windows."""
     x, v = getattr(log, value), getattr(log, rate)
-    width = max(2, round(WINDOW / log.dt)) if log.dt < WINDOW else 2
+    # With a wrong unit of time, a window of a fixed duration might be longer than the log.
+    most = max(2, sum(s.stop - s.start for s in log.stretches) // LEAST_WINDOWS)
+    width = min(max(2, round(WINDOW / log.dt)), most) if log.dt < WINDOW else 2
     changes, integrals = [], []
     for s in log.stretches:
         dt = np.diff(log.t[s])[:, None]
         total = np.concatenate([np.zeros((1, log.nq)), np.cumsum(0.5 * (v[s][1:] + v[s][:-1]) * dt, axis=0)])
         changes.append(np.diff(x[s][::width], axis=0))
         integrals.append(np.diff(total[::width], axis=0))
-    if sum(map(len, changes)) < 20:
+    if sum(map(len, changes)) < LEAST_WINDOWS // 2:
         return None
     whole = change, integral = np.concatenate(changes), np.concatenate(integrals)
     # Windows that an impact crosses, `JUMPS` of them at most, are left out.
@@ -98,56 +99,6 @@ def match(log: Log, value: str, rate: str) -> Match | None:
     moving = speed > 1e-3 * speed.max()
     low, high, correlation = np.nan_to_num((low, high, correlation))
     return Match(change, integral, whole, low, high, correlation, moving)
-
-
-def check_clock_unit(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find a factor common to all joints and both derivatives, which indicates an incorrect clock rate."""
-    if not log.stretches:
-        return [], log
-    if "qd" in log.derived:  # only the length of a step can be judged
-        step = f"{log.dt:.4g} apart, which in seconds is an implausible sampling period of a robot's log"
-        return [log.finding("time-unit", f"rows are {step}", period=log.dt)] if log.dt >= 1.0 else [], log
-    first = match(log, "q", "qd")
-    if first is None or not first.moving.any():
-        return [], log
-    factor = float(np.median(first.low[first.moving]))
-    if log.derived or "qdd" in log.header.derived:
-        near = any(abs(factor / unit - 1.0) <= UNIT_TOLERANCE for unit in UNITS)
-        return _clock_finding(log, factor) if near or _one_factor(first, factor) else ([], log)
-    second = match(log, "qd", "qdd")
-    if second is None or not (both := first.moving & second.moving).any():
-        return [], log
-    off = factor > 0.0 and abs(factor - 1.0) > TOLERANCE and first.right(factor)[first.moving].all()
-    # The velocity alone being off leaves the acceleration its derivative.
-    off = off and second.right()[both].mean() <= 0.5 <= second.right(factor)[both].mean()
-    return _clock_finding(log, factor) if off else ([], log)
-
-
-def _clock_finding(log: Log, factor: float) -> Outcome:
-    unit = next((unit for unit in UNITS if abs(factor / unit - 1.0) <= UNIT_TOLERANCE), None)
-    if unit is not None:
-        kind, scale = "time-unit", unit
-        text = f"time advances by {log.dt:.4g} per row, and by the motion {factor * log.dt:.4g} s"
-    else:
-        kind, scale = "time-scale", factor
-        text = f"positions and velocities change {factor:.4g} times as far as the clock allows"
-    found = log.finding(kind, text, seconds_per_unit=factor, period=log.dt)
-    log = log.replace(t=log.t * scale)
-    second = match(log, "qd", "qdd")
-    if "qdd" in log.derived | {*log.header.derived} and second is not None and second.moving.any():
-        slope = max(float(np.median(second.low[second.moving])), 1e-300)
-        if abs(np.log(slope * scale)) < abs(np.log(slope)):  # derived by the wrong clock
-            log = log.replace(qdd=log.qdd / scale)
-    return [found], log
-
-
-def _one_factor(level: Match, factor: float) -> bool:
-    """Return whether several joints share a slope that is wrong and that degrees do not explain."""
-    degrees = any(abs(np.log(abs(factor) * unit)) <= UNIT_TOLERANCE for unit in (DEGREE, 1.0 / DEGREE))
-    if factor <= 0.0 or abs(factor - 1.0) <= TOLERANCE or degrees or level.moving.sum() < 2:
-        return False
-    related = np.abs(level.correlation[level.moving]) >= EXCHANGED
-    return bool(related.all() and level.right(factor, ALIKE)[level.moving].all())
 
 
 def check_velocity(system: ConstrainedSystem, log: Log) -> Outcome:
@@ -176,17 +127,31 @@ def check_velocity(system: ConstrainedSystem, log: Log) -> Outcome:
 
 
 def _late(log: Log, level: Match) -> list[Finding]:
-    """Find velocities delayed by a filter. A delay L causes a persistent error Δq − ∫q̇ dt = L Δq̇."""
+    """Find velocities delayed by a filter. A delay L causes an error Δq − ∫q̇ dt = L Δq̇ in each window."""
     rates = match(log, "qd", "qdd")
     if rates is None or "qd" in log.header.derived:
         return []
-    misfit, step = level.change - level.integral, rates.whole[0]
-    square, change = (misfit**2).sum(axis=0), (level.change**2).sum(axis=0)
-    delay = (misfit * step).sum(axis=0) / np.maximum((step**2).sum(axis=0), 1e-300)
-    persists = (misfit[1:] * misfit[:-1]).sum(axis=0) > PERSISTS * square
-    late = level.moving & persists & (square > LATE**2 * change) & (np.abs(delay) > log.dt)
+    (change, integral), step = level.whole, rates.whole[0]
+    pairs = [_delay(*columns) for columns in zip(change.T, (change - integral).T, step.T, strict=True)]
+    delay, share = np.array(pairs).T
+    # A velocity from neighbouring samples, or of a semi-implicit integrator, is half a step off by itself.
+    late = level.moving & (share > PROPORTIONAL) & (np.abs(delay) > HALF_STEP * log.dt)
     shown = ", ".join(f"{1e3 * abs(x):.2g} ms {'behind' if x > 0 else 'ahead of'}" for x in delay[late])
     return log.on_joints("velocity-delay", late, f"qd of {{}} is {shown} the rate of change of q")
+
+
+def _delay(change: Array, misfit: Array, step: Array) -> tuple[float, float]:
+    """Return the delay [s] of one joint, and the share of the misfit explained. Impacts are trimmed."""
+    moves = np.abs(change) > MOVES * np.sqrt((change**2).mean())
+    x, y, delay = step[moves], misfit[moves], 0.0
+    keep, rest = np.ones(len(x), bool), np.zeros(len(x))
+    if len(x) < LEAST_WINDOWS // 2:
+        return 0.0, 0.0
+    for _ in range(TRIMMED):
+        delay = float(x[keep] @ y[keep] / max(x[keep] @ x[keep], 1e-300))
+        rest = np.abs(y - delay * x)
+        keep = rest <= max(4.0 * float(robust_std((y - delay * x)[keep])), float(np.quantile(rest, KEPT)))
+    return delay, 1.0 - float((rest[keep] ** 2).sum() / max((y[keep] ** 2).sum(), 1e-300))
 
 
 def _velocity_findings(log: Log, level: Match, wrong: np.ndarray) -> tuple[list[Finding], Array]:

@@ -236,7 +236,10 @@ def derive(log: Log, absent: list[str]) -> Log:
     """Return the log with missing derivatives computed in each contiguous run of rows, and NaN elsewhere."""
     filled = log.replace(**{name: np.zeros_like(log.q) for name in absent})
     values = {name: np.full_like(log.q, np.nan) for name in absent}
-    window = 2 * max(3, round(FILTER_SECONDS / log.dt / 2.0)) + 1 if np.isfinite(log.dt) else 7
+    # With a wrong unit of time, a window of a fixed duration might be longer than the log.
+    longest = max((s.stop - s.start for s in filled.stretches), default=0)
+    half = min(FILTER_SECONDS / log.dt, longest / 4.0) / 2.0 if np.isfinite(log.dt) else 0.0
+    window = 2 * max(3, round(half)) + 1
     method = SavitzkyGolay(window, FILTER_ORDER)
     for rows in filled.stretches:
         even = filled.dt * np.arange(rows.stop - rows.start)
@@ -245,6 +248,17 @@ def derive(log: Log, absent: list[str]) -> Log:
             one = np.zeros(len(even), np.int64)
             values[name][rows] = differentiate(even, getattr(log, source)[rows], one, method, degree)[0]
     return log.replace(**values, derived=log.derived | set(absent))
+
+
+def computed(log: Log) -> set[str]:
+    """Return the names of the joint vectors that were computed by a filter, here or at import."""
+    return set(log.derived) | set(log.header.derived)
+
+
+def recomputed(log: Log) -> Log:
+    """Return the log with its computed derivatives computed again, after a change of positions or times."""
+    names = [name for name in ("qd", "qdd") if name in computed(log)]
+    return derive(log, names) if names else log
 
 
 def of_robot(log: Log, robot: RobotModel) -> Log:

@@ -7,16 +7,20 @@ from dataclasses import replace
 import numpy as np
 from scipy.ndimage import minimum_filter1d
 
+from forcegp import dynamics
 from forcegp.checks import hypotheses
 from forcegp.checks.excitation import check_visibility, still_joints
 from forcegp.checks.explain import Explanation, explain
 from forcegp.checks.finding import Finding, NotJudgedError, with_alternatives
-from forcegp.checks.fit import FLOOR, TorqueFit, gain_of, robust_parameters
+from forcegp.checks.fit import FLOOR, TorqueFit, gain_of, labelled_contacts, residual, robust_parameters
 from forcegp.checks.log import Array, Log, Outcome, force_unit, position_unit, smoothed
 from forcegp.constraints import ConstrainedSystem
 from forcegp.robust import robust_std
 from forcegp.rows import describe, intervals
 
+MODELLED, TOUCHED = 0.02, 0.1
+"""Largest difference between a modelled torque and the inverse dynamics, relative to the torque; share of
+rows in contact, or with friction above twice that difference, that would show in a measured torque."""
 LEAST_ROWS = 200
 """Minimum number of rows for checking the dynamics."""
 SIGNIFICANT, MATERIAL = 3.0, 0.1
@@ -45,6 +49,8 @@ def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
     if not _enough(smooth):
         inner = f"rows that lie {max(hypotheses.LAGS)} from the ends of a stretch"
         raise NotJudgedError(f"fewer than {LEAST_ROWS} {inner}")
+    if modelled := _modelled(system, smooth):
+        return [*passive, *modelled], log
     explanation = explain(system, smooth)
     disturbed, rows = _disturbances(explanation) if log.header.ordered else ([], np.zeros(0, bool))
     if disturbed and _enough(smooth.mask(rows)):
@@ -85,6 +91,37 @@ def _without_torque(log: Log) -> list[Finding]:
     findings = log.on_joints("torque-zero", still, f"the torque of {{}} is {word} throughout")
     # One passive joint is a design; an arm without any torque is a missing column.
     return [replace(finding, weight="error" if still.all() else "warning") for finding in findings]
+
+
+def _modelled(system: ConstrainedSystem, log: Log) -> list[Finding]:
+    """Find torques that are the inverse dynamics of the robot file: no drive is free of friction.
+
+    In free motion of a robot file without damping, a simulated torque is the same, so this is a note.
+    """
+    rows = log.rows(2 * LEAST_ROWS)
+    r, _ = residual(system, log, rows)
+    (qd,) = log.tensors(rows, "qd")
+    damping = dynamics.damping_force(system.robot, qd).detach().numpy()
+    size = np.sqrt((log.tau[rows] ** 2).mean(axis=0))
+    measured = np.setdiff1d(np.flatnonzero(size > 0.0), log.unmeasured)
+
+    def equal(rest: Array) -> bool:
+        scale = np.maximum(size, 0.1 * size.max())[measured]
+        return bool((np.sqrt(np.median(rest[:, measured] ** 2, axis=0)) <= MODELLED * scale).all())
+
+    closed = np.any([log.contact[c.name][rows] for c in labelled_contacts(system, log)], axis=0)
+    touching = bool(np.mean(closed) > TOUCHED)
+    rest = r + damping
+    if not len(measured) or not equal(rest):
+        return []
+    damped = bool((np.abs(damping) > 2.0 * MODELLED * np.maximum(size, 0.1 * size.max())).mean() > TOUCHED)
+    if not touching and not damped:
+        return []
+    signs = {"no contact force in contact": touching, "none of the declared friction": damped}
+    reasons = [sign for sign, seen in signs.items() if seen]
+    text = "the logged torque is the inverse dynamics of the robot file to within "
+    text += f"{100 * MODELLED:.0f} %, with {' and '.join(reasons)}: a model's output, not a measurement"
+    return [log.finding("torque-modelled", text, log.named(np.isin(np.arange(log.nq), measured)))]
 
 
 def _worse(explanation: Explanation, other: TorqueFit, j: int) -> bool:
@@ -162,7 +199,9 @@ def _offsets(explanation: Explanation) -> list[Finding]:
     evidence = {f"offset {joint}": offset[j] for j, joint in off.items()}
     evidence["largest_torque"] = max(abs(offset[j]) for j in off)
     text, names = f"the logged torque is off by a constant: {listed}", tuple(off.values())
-    tried = *hypotheses.robot_hypotheses(system, log, rows), hypotheses.gain_hypothesis(log, rows, tuple(off))
+    common = [hypotheses.common_gain_hypothesis(log, rows, explanation.problem)] if nq > 1 else []
+    one_each = hypotheses.gain_hypothesis(log, rows, tuple(off))
+    tried = *common, *hypotheses.robot_hypotheses(system, log, rows), one_each
     without = explanation.without([2 * nq + j for j in off])
     fits = ((h, without.with_(h)) for h in tried if h.name not in explanation.robot)
     rivals = [
@@ -170,7 +209,34 @@ def _offsets(explanation: Explanation) -> list[Finding]:
         for h, fit in fits
         if hypotheses.plausible(system, h, fit) and not any(_worse(explanation, fit, j) for j in off)
     ]
-    return [with_alternatives(log.finding("torque-offset", text, names, **evidence), rivals)]
+    if (weightless := _weightless(explanation, list(off))) is not None:
+        rivals = [weightless, *(f for f in rivals if f.kind != weightless.kind)]
+    # One cause that takes the place of the offsets of several joints is named before them.
+    found = [log.finding("torque-offset", text, names, **evidence), *rivals]
+    single = [f for f in rivals if f.kind == "torque-without-gravity" or "factor" in f.evidence]
+    first = (single or found)[0]
+    return [with_alternatives(first, [f for f in found if f is not first])]
+
+
+def _weightless(explanation: Explanation, off: list[int]) -> Finding | None:
+    """Return the finding that adding the gravity torque explains as much as the offsets of these joints."""
+    robot, log, nq = explanation.system.robot, explanation.log, explanation.log.nq
+    gravity = np.concatenate(
+        [
+            dynamics.gravity_force(robot, log.tensors(part, "q")[0]).detach().numpy()
+            for part in np.array_split(np.arange(len(log)), max(1, len(log) // 8192))
+        ]
+    )
+    offset = -explanation.fit.nuisance[2 * nq :][off]
+    usual = gravity[explanation.rows][:, off].mean(axis=0)
+    added = replace(explanation, problem=explanation.on(log.replace(tau=log.tau - gravity)))
+    fit = added.without([2 * nq + j for j in off]).fit
+    if (np.abs(offset - usual) > UNEXPLAINED * np.abs(offset)).any() or any(
+        _worse(explanation, fit, j) for j in off
+    ):
+        return None
+    text = "the torque contains no gravity: gravity compensation was subtracted"
+    return log.finding("torque-without-gravity", text, log.joint_names)
 
 
 def _unexplained(explanation: Explanation) -> list[Finding]:
@@ -186,7 +252,7 @@ def _disturbances(explanation: Explanation) -> tuple[list[Finding], np.ndarray]:
     trace = residual_trace(explanation, rows)
     scale = np.maximum(explanation.problem.scale, FLOOR * explanation.problem.size)
     stride = np.median(np.diff(rows)) * log.dt
-    width = max(1, round(DISTURBANCE_SECONDS / stride))
+    width = min(max(1, round(DISTURBANCE_SECONDS / stride)), len(rows))
     energy = np.convolve(((trace / scale) ** 2).mean(axis=1), np.ones(width) / width, mode="same")
     level = np.log(energy + FLOOR**2)
     # Dry friction of joints that rest or reverse within the window may be as large as this.
@@ -207,7 +273,8 @@ def _disturbances(explanation: Explanation) -> tuple[list[Finding], np.ndarray]:
     peak = float(np.abs(trace[bad][:, worst]).max())
     text = (
         f"torque of up to {peak:.3g} {force_unit(robot, worst)} at {log.joint_names[worst]} that "
-        f"neither robot nor labelled contacts explain, in {describe(whole)}"
+        f"{'neither robot nor labelled contacts explain' if log.contact else 'the robot does not explain'}, "
+        f"in {describe(whole)}"
     )
     return [Finding("disturbance", text, whole, (log.joint_names[worst],), evidence={"peak": peak})], mask
 

@@ -12,8 +12,8 @@ from dataclasses import replace
 import numpy as np
 
 from forcegp.checks import hypotheses
-from forcegp.checks.contact import FAR, OFFSET, SLIDING_SLOW, fit_surface, tip_path, touching
-from forcegp.checks.finding import Finding
+from forcegp.checks.contact import FAR, OFFSET, SLIDING_SLOW, Path, fit_surface, tip_path, touching
+from forcegp.checks.finding import Finding, at_rows
 from forcegp.checks.fit import cross_validate, labelled_contacts
 from forcegp.checks.hypotheses import Hypothesis, corrected, discrete, unchanged
 from forcegp.checks.log import Log, Outcome, displacement, evenly
@@ -45,6 +45,9 @@ def check_placement(system: ConstrainedSystem, log: Log) -> Outcome:
         if not isinstance(contact, SurfaceContact) or log.contact[contact.name].any():
             continue
         path = tip_path(system, contact, log)
+        if on := _on_surface(contact, log, path):
+            closed = np.isfinite(path.c) & (np.abs(path.c) <= TOUCHING)
+            return [on], log.replace(contact={**log.contact, contact.name: closed})
         moves = log.usable & (np.linalg.norm(path.v, axis=1) > SLIDING_SLOW)
         c = path.c[moves]
         if (np.abs(c) <= TOUCHING).sum() > LEVEL * len(c):
@@ -60,6 +63,18 @@ def check_placement(system: ConstrainedSystem, log: Log) -> Outcome:
             if (outcome := _never_closed(system, contact, log, rows)) is not None:
                 return outcome
     return [], log
+
+
+def _on_surface(contact: SurfaceContact, log: Log, path: Path) -> Finding | None:
+    """Return the finding that a tip stays on the surface in many rows although the contact never closes."""
+    level = level_of(path.c[log.usable], TOUCHING, LEVEL)
+    if level is None or abs(level) > TOUCHING:
+        return None
+    rows = log.usable & (np.abs(path.c - level) <= TOUCHING)
+    text = f"contact {contact.name!r} is never closed, but the tip lies on its surface in "
+    text += f"{100 * rows.sum() / log.usable.sum():.0f} % of the rows:"
+    found = at_rows(rows, "contact-missed", text, rows=rows.sum())[0]
+    return replace(found, contact=contact.name, weight="error")
 
 
 def _never_closed(

@@ -1,4 +1,4 @@
-"""Checks of individual columns for irregular time stamps, implausible values and jumps in the state."""
+"""Checks of individual columns for implausible values, wrapped angles and jumps in the state."""
 
 from __future__ import annotations
 
@@ -8,57 +8,13 @@ from scipy.ndimage import maximum_filter1d
 
 from forcegp import dynamics
 from forcegp.checks.excitation import still_joints
-from forcegp.checks.finding import Finding, at_rows
-from forcegp.checks.log import DEPARTURE, Array, Log, Outcome, spikes
+from forcegp.checks.finding import at_rows
+from forcegp.checks.log import DEPARTURE, Array, Log, Outcome, recomputed, spikes
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data.clipped import limits_of
-from forcegp.data.derivative import UNIFORM_TOLERANCE
 from forcegp.data.fields import JOINT_VECTORS, resolution
 from forcegp.robust import robust_std
-from forcegp.rows import describe, intervals, repeats
-
-
-def check_order(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find time stamps that repeat or go backward within a segment."""
-    repeated, backward = (np.append(False, wrong) for wrong in (log.steps == 0.0, log.steps < 0.0))
-    findings = at_rows(repeated, "time-repeated", "time repeats in", steps=repeated.sum())
-    findings += at_rows(backward, "time-backward", "time runs backward in", steps=backward.sum())
-    return findings, log.mask(repeated | backward) if findings else log
-
-
-def check_gaps(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find missing samples, indicated by time steps longer than clock jitter can explain."""
-    gaps = log.steps > log.longest_step
-    if log.masked is not None:
-        # The step after a wrong time stamp is long because of that stamp.
-        gaps &= ~log.masked[:-1]
-    if not gaps.any():
-        return [], log
-    rows, longest = intervals(np.append(False, gaps)), float(np.nanmax(log.steps))
-    missing = int(np.round(log.steps[gaps] / log.dt - 1.0).sum())
-    gap = f"the longest gap takes {longest:.4g} s"
-    text = f"about {missing} samples are missing before {describe(rows)}; {gap}"
-    evidence = {"missing_samples": missing, "longest_s": longest, "period_s": log.dt}
-    return [Finding("time-gap", text, rows, evidence=evidence)], log
-
-
-def check_jitter(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find time steps that are too uneven for filters that assume even sampling."""
-    regular = log.steps[(log.steps > 0.0) & (log.steps <= log.longest_step)]
-    spread = float(robust_std(regular) / log.dt) if len(regular) > 1 else 0.0
-    text = f"the time steps vary by {100 * spread:.2g} % around {log.dt:.4g} s"
-    jitter = log.finding("time-jitter", text, relative_spread=spread, period_s=log.dt)
-    return [jitter] if spread > UNIFORM_TOLERANCE else [], log
-
-
-def check_period(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Compare the sampling period with the period stated in the header."""
-    stated = log.header.dt
-    if stated is None or not abs(log.dt / stated - 1.0) > UNIFORM_TOLERANCE:
-        return [], log
-    text = f"the header states a period of {stated:.4g} s, and the rows are {log.dt:.4g} s apart"
-    return [log.finding("period-header", text, stated_s=stated, period_s=log.dt)], log
-
+from forcegp.rows import intervals, repeats
 
 HELD_RUN = 2
 """Minimum number of repeated rows for which the logger is reported to have missed updates."""
@@ -274,8 +230,44 @@ def _jumps(log: Log, value: str, derivative: str) -> tuple[np.ndarray, tuple[str
     return np.asarray(jumps.any(axis=1)), log.named(jumps.any(axis=0))
 
 
+TURN, SMOOTH = 2.0 * np.pi, 3.0
+"""Full turn [rad]; ratio to the fastest usual change within which a change is smooth but for full turns."""
+
+
+def check_wrapped(system: ConstrainedSystem, log: Log) -> Outcome:
+    """Find angles that jump by full turns since they are confined to an interval of one turn."""
+    steps, linked = np.diff(log.q, axis=0), log.finite[1:] & log.finite[:-1]
+    forward = np.diff(log.t)
+    linked &= (forward > 0.0) & (forward <= log.longest_step)  # an import may start a segment at each jump
+    if not log.header.ordered or not linked.any():
+        return [], log
+    turns = np.round(np.where(linked[:, None], steps, 0.0) / TURN)
+    rest = np.abs(steps - TURN * turns)
+    confined = np.ptp(log.q[log.finite], axis=0) <= TURN * (1.0 + 1e-3)
+    revolute = system.robot.revolute.cpu().numpy() > 0.0
+    turns *= (rest <= SMOOTH * np.quantile(rest[linked], 0.99, axis=0)) & confined & revolute
+    at = np.append(False, turns.any(axis=1))
+    joints = log.named(turns.any(axis=0))
+    findings = at_rows(
+        at, "angle-wrapped", f"the position of {', '.join(joints)} jumps by a full turn at", joints
+    )
+    return findings, _unwrapped(system, log, turns, at) if findings else log
+
+
+def _unwrapped(system: ConstrainedSystem, log: Log, turns: Array, at: np.ndarray) -> Log:
+    """Return the log with continuous angles, near the middle of the joint range in each segment."""
+    segment = np.append(0, np.cumsum((np.diff(log.segment) != 0) & ~at[1:]))
+    q = log.q - TURN * np.append(np.zeros((1, log.nq)), np.cumsum(turns, axis=0), axis=0)
+    middle = 0.5 * (system.robot.lower + system.robot.upper).cpu().numpy()
+    for number in np.unique(segment):
+        rows = segment == number
+        away = np.nan_to_num(np.nanmedian(q[rows], axis=0) - np.where(np.isfinite(middle), middle, 0.0))
+        q[rows] -= TURN * np.round(away / TURN) * turns.any(axis=0)
+    return recomputed(log.replace(q=q, segment=segment))
+
+
 def check_jumps(system: ConstrainedSystem, log: Log) -> Outcome:
-    """Find position jumps that the velocity does not explain, due to missing rows or wrapped angles."""
+    """Find position jumps that the velocity does not explain, due to missing rows."""
     at, joints = _jumps(log, "q", "qd")
     findings = at_rows(at, "position-jump", f"the position of {', '.join(joints)} jumps at", joints)
     return findings, log.replace(segment=log.segment + np.cumsum(at))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import re
 from contextlib import suppress
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
@@ -12,7 +11,7 @@ from typer import Argument, Option
 
 import forcegp
 from forcegp.cli import common
-from forcegp.cli.common import Verbatim, printable, progress_bar, save, say, show
+from forcegp.cli.common import Verbatim, progress_bar, save, say, show
 from forcegp.cli.options import AsJson, Differentiate, RobotName, SceneOrNone
 from forcegp.errors import ForceGPError
 
@@ -148,12 +147,13 @@ def _json(imported: Imported) -> dict[str, object]:
 
 NOT_USABLE = 1
 """Exit code if a finding makes a fit worthless."""
-COLOURS = {"error": "bold red", "warning": "yellow", "note": "cyan"}
+COLOURS = {"error": "red", "warning": "yellow", "note": "cyan"}
 
 
 def check(
     data: Annotated[
-        Path, Option("--data", "-d", help="Log (.parquet or .csv); NaN and gaps become findings.")
+        list[Path],
+        Option("--data", "-d", help="Log (.parquet or .csv), or several; NaN and gaps become findings."),
     ],
     scene: SceneOrNone = None,
     robot: RobotName = None,
@@ -178,51 +178,59 @@ def check(
     from forcegp import checks
     from forcegp.destination import check_destination
 
+    if out is not None and len(data) > 1:
+        text, hint = "a page shows one log", "check the logs one by one, or leave out --out"
+        raise ForceGPError(text, expected="one --data", got=f"{len(data)}", hint=hint)
     if out is not None:
         check_destination(out)
-    system = common.system_of(scene, robot)
-    log = checks.read_log(data)
-    # Matrices are small, so BLAS threads cost more than they save, and concurrent checks would compete.
-    with progress_bar("checking", 1) as progress, threadpool_limits(1, user_api="blas"):
-        report = checks.check(system, log, progress=progress)
-    if out is not None:
-        from forcegp.report.check import write_check
-
-        save(lambda path: write_check(path, f"{data} on {scene or robot}", report, system, log), out)
-    if as_json:
-        show({**report.to_dict(), "page": str(out) if out else None}, as_json)
-    else:
-        _print(report)
+    system, reports = common.system_of(scene, robot), {}
+    for path in data:
+        log = checks.read_log(path)
+        # Matrices are small, so BLAS threads cost more than they save, and concurrent checks would compete.
+        with progress_bar("checking", 1) as progress, threadpool_limits(1, user_api="blas"):
+            reports[path] = report = checks.check(system, log, progress=progress)
         if out is not None:
-            say(out, "page: ")
-        say("", report.verdict, bold=True)
-    if not report.usable:
+            from forcegp.report.check import write_check
+
+            title = f"{path} on {scene or robot}"
+            save(
+                lambda to, title=title, report=report, log=log: write_check(to, title, report, system, log),
+                out,
+            )
+        if not as_json:
+            if len(data) > 1:
+                say(path, "log: ", bold=True)
+            _print(report)
+            if out is not None:
+                say(out, "page: ")
+            say("", report.verdict, bold=True)
+    if as_json:
+        each = [{**report.to_dict(), "page": str(out) if out else None} for report in reports.values()]
+        logs = [{"data": str(path), **one} for path, one in zip(reports, each, strict=True)]
+        show(each[0] if len(each) == 1 else {"logs": logs}, as_json)
+    if not all(report.usable for report in reports.values()):
         raise typer.Exit(NOT_USABLE)
 
 
 def _print(report: Report) -> None:
-    """Print the findings as a table."""
-    from rich.console import Console
-    from rich.table import Table
-    from rich.text import Text
-
+    """Print each finding as one paragraph that starts with its severity and joints."""
     from forcegp.rows import describe
 
-    if report.findings:
-        table = Table(box=None, pad_edge=False)
-        for heading in ("severity", "kind", "rows", "finding and remedy"):
-            table.add_column(heading, no_wrap=heading in ("severity", "kind"), overflow="fold")
-        for finding in report.findings:
-            rows = re.sub("^rows? ", "", describe(finding.intervals, most=2))
-            rows = "all" if finding.intervals == ((0, report.samples),) else rows
-            # Joint and parameter names may contain brackets, which must not be read as markup.
-            remedy = printable(f"→ {finding.remedy}")
-            body = Text(printable(f"{finding.message}\n")).append(remedy, style="dim")
-            kinds = "\nor ".join(finding.kinds)
-            table.add_row(Text(finding.severity, style=COLOURS[finding.severity]), kinds, rows, body)
-        Console().print(table)
-    for name, reason in report.skipped.items():
-        say(f"not checked: {name} ({reason})")
+    for finding in report.findings:
+        named = [joint for joint in finding.joints if joint not in finding.message]
+        where = (
+            "all joints: "
+            if len(named) == len(report.joint_names) > 1
+            else f"{', '.join(named)}: " * bool(named)
+        )
+        every = finding.intervals == ((0, report.samples),)
+        rows = "all rows" if every else describe(finding.intervals, most=2)
+        kinds = " or ".join(finding.kinds)
+        text = f"{where}{finding.message} → {finding.remedy} [{kinds}, {rows}]"
+        say(text, f"{finding.severity}: ", fg=COLOURS[finding.severity])
+    for reason in dict.fromkeys(report.skipped.values()):
+        names = ", ".join(name for name, why in report.skipped.items() if why == reason)
+        say(f"not checked: {names} ({reason})")
 
 
 ORDER_LOST = (

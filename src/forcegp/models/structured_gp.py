@@ -207,6 +207,14 @@ class StructuredGP(Model[StructuredFit]):
                 expected=f"priors {', '.join(own)} and contacts {', '.join(self.system.contact_names)}",
                 got=f"priors {', '.join(names)} and contacts {', '.join(contacts)}",
             )
+        robots = [system.robot for system in (self.system, after.specified)]
+        if robots[0].fingerprint != robots[1].fingerprint:
+            raise ModelError(
+                "`after` is a fit of another robot",
+                expected=f"{robots[0].name!r} with the parameters, base and gravity of this model",
+                got=f"{robots[1].name!r}, which differs in them",
+                hint="fit this model to the data of its own robot first",
+            )
         if spec.automatic:
             return after.specification
         return dataclasses.replace(spec, priors=after.specification.priors)
