@@ -4,7 +4,7 @@
 2. Inertia is identified with instruments, if held-out parts of the log confirm it (`forces/inertia.py`).
 3. Scales of all columns, torque noise and static friction follow from the evidence (`scales.py`), and the
    Coulomb friction of contacts, which is not linear in its parameters, from a search given these scales.
-4. Torque noise is raised to what blocks of the log show that are left out (`forces/calibration.py`).
+4. Torque noise is raised to the level observed on held-out blocks of the log (`forces/calibration.py`).
 5. The posterior is conditioned on all samples (`models/structured_fit.py`).
 """
 
