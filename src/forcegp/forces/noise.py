@@ -23,8 +23,8 @@ from forcegp.forces.measurements import Measurement, NoiseStd, Training
 from forcegp.forces.posterior import STICK_NOISE, STICK_SPEED, STICKING
 from forcegp.forces.priors.base import NOISE, ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior
-from forcegp.forces.priors.joint import JointFrictionPrior
 from forcegp.forces.quantities import AffineMap, ForceField, States, linearize_field
+from forcegp.forces.term import JointTerm
 from forcegp.robot.model import RobotModel
 from forcegp.robust import MAD_TO_STD
 
@@ -99,7 +99,7 @@ class Noise:
         """Resolve `torque="auto"`. Torque noise is learned if there are friction or inertial priors."""
         if not isinstance(self.torque, str) or self.torque != "auto":
             return self
-        measured = any(isinstance(prior, JointFrictionPrior | InertialPrior) for prior in priors)
+        measured = any(isinstance(prior, JointTerm | InertialPrior) for prior in priors)
         return dataclasses.replace(self, torque="learn" if measured else None)
 
 

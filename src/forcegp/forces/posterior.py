@@ -30,8 +30,8 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.forces.measurements import Training
 from forcegp.forces.priors.base import CONSTRAINT, CONTACT, JOINT, NOISE, ForceMean, ForcePrior
 from forcegp.forces.priors.contact import CoulombFriction, coupled, with_coulomb
-from forcegp.forces.priors.joint import JointFrictionPrior
 from forcegp.forces.quantities import OPEN, AffineMap, States, affine_map, hidden_forces
+from forcegp.forces.term import JointTerm
 from forcegp.gp.draws import FunctionSamples
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.features import Block, Features, Standardization
@@ -101,7 +101,7 @@ class ForceProcess:
             # W = B E (eq. 12), where E is the identity for a prior per joint
             features.append(self.features(p, system, at))
             B = by_target.get(prior.target, z.B_Q)
-            if B is not None and z.B_F is not None and isinstance(prior, JointFrictionPrior):
+            if B is not None and z.B_F is not None and isinstance(prior, JointTerm):
                 B = B + z.B_F
             if B is None:
                 operators.append(z.o.new_zeros(*z.o.shape, prior.outputs(system.robot)))

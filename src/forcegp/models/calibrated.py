@@ -30,8 +30,9 @@ from forcegp.errors import ModelError, ParameterError
 from forcegp.files import write_json
 from forcegp.forces.posterior import HIGH, LOW, ForceSamples
 from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
-from forcegp.forces.priors.joint import AnalyticalMean, JointFrictionPrior
+from forcegp.forces.priors.joint import AnalyticalMean
 from forcegp.forces.quantities import States, states_at
+from forcegp.forces.term import JointTerm
 from forcegp.identification import regressor
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.robot.inertia import from_pseudo_inertia, inertial_parameters, pseudo_inertia, pseudo_inertia_of
@@ -271,7 +272,7 @@ def unknowns_after(fit: StructuredFit, unknowns: Unknowns, *, draws: int = DRAWS
         delta[:, first : first + load.shape[1]] += load
     if prior is not None:
         found |= dict(enumerate((delta @ torch.from_numpy(unknowns.base.combination).mT).mT))
-    if any(isinstance(prior, JointFrictionPrior) for prior in fit.force_priors):
+    if any(isinstance(prior, JointTerm) for prior in fit.force_priors):
         curves = reader._curves(drawn)[1:]
         basis = unknowns.basis(torch.zeros_like(reader.speeds), reader.speeds)
         spread, each = (curves - curves.mean(0)).permute(2, 1, 0), basis.shape[-1]
@@ -435,7 +436,7 @@ class _Reader:
         """Return the friction at the identified inertia minus the friction at the joint posterior mean."""
         fit, at, force = self.fit, self.at, torch.zeros_like(self.at.q)
         for p, prior in enumerate(fit.force_priors):
-            if isinstance(prior, JointFrictionPrior) and fit.posterior.process.pinned:
+            if isinstance(prior, JointTerm) and fit.posterior.process.pinned:
                 latent = fit.posterior.shift(p, fit.posterior.process.features(p, fit.system, at))
                 force = force + torch.einsum("nij,nj->ni", prior.operator(fit.system, at), latent)
         return self._over_poses(force)
@@ -443,7 +444,7 @@ class _Reader:
     def _curves(self, drawn: ForceSamples) -> Tensor:
         """Return the friction Q_D `(1 + samples, k, nq)` of the posterior mean and samples, over poses."""
         fit, at = self.fit, self.at
-        priors = [p for p, prior in enumerate(fit.force_priors) if isinstance(prior, JointFrictionPrior)]
+        priors = [p for p, prior in enumerate(fit.force_priors) if isinstance(prior, JointTerm)]
         known = dynamics.damping_force(fit.system.robot, at.qd)
         curves = self._over_poses(known).expand(drawn.count, -1, -1)
         for p in priors:

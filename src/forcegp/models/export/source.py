@@ -24,7 +24,7 @@ from forcegp.forces.posterior import GROWTH, HIGH, LOW, SPREAD, STICK_NOISE, STI
 from forcegp.forces.priors import contact
 from forcegp.forces.priors.base import CONSTRAINT, CONTACT, JOINT
 from forcegp.forces.priors.inertial import PER_PAYLOAD, InertialPrior, PayloadPrior
-from forcegp.forces.priors.joint import TERMS, JointFrictionPrior
+from forcegp.forces.priors.joint import TERMS
 from forcegp.forces.quantities import PREDICTED, ROUNDED
 from forcegp.gp import kernels
 from forcegp.gp.basis import KernelPart
@@ -227,7 +227,7 @@ class Writer:
         self.array(accumulate((len(w) for x in self.parts for w in x.weights), initial=0), "FOLDED", "int")
         owners = [part.prior for part in self.parts for _ in range(part.components)]
         self.array([TARGETS.index(prior.target) for prior in owners], "TARGET", "int")
-        self.array([float(isinstance(prior, JointFrictionPrior)) for prior in owners], "IS_FRICTION", "int")
+        self.array([float(isinstance(prior, JointTerm)) for prior in owners], "IS_FRICTION", "int")
         terms = process.mean.terms  # pyright: ignore[reportFunctionMemberAccess]
         self.array([float(term in terms) for term in TERMS], "MEAN_TERMS")
         for part, start in zip(self.parts, self.starts, strict=False):
