@@ -179,7 +179,8 @@ def check(system: ConstrainedSystem, data: Dataset | Log, *, progress: Progress 
         # Findings on a few rows follow those on the whole log. Effects that a fit learns are sorted by size.
         family = KINDS[f.kind].family
         isolated = family in ("clock", "values") and 2 * f.rows < samples
-        place = order.index(first.get(family, f.kind))
+        # A filter that delays all velocities alike hides no other fault, and is named after them.
+        place = len(order) if f.evidence.get("common") else order.index(first.get(family, f.kind))
         return SEVERITIES.index(f.severity), isolated, place, -float(f.evidence.get("largest_torque", 0.0))
 
     findings.sort(key=rank)

@@ -138,7 +138,7 @@ def check_lost(system: ConstrainedSystem, log: Log) -> Outcome:
     """Find rows that are missing without a gap in the time stamps, so that positions advance by multiples."""
     multiple, judged = _multiples(log)
     whole = np.round(multiple)
-    near = judged & (np.abs(multiple - whole) <= NEAR)
+    near = judged & (np.abs(multiple - whole) <= NEAR) & (whole >= 1.0)
     single = near & (whole == 1.0)
     # A joint that starts or bounces changes its speed for good, and passes through other multiples.
     lost = near & (whole >= 2.0) & np.append(False, near[:-1]) & np.append(near[1:], False)
@@ -163,7 +163,11 @@ def _multiples(log: Log) -> tuple[Array, np.ndarray]:
         scaled = np.where(np.abs(usual) > RESOLVED * noise, usual / noise, 0.0)
         size = (scaled**2).sum(axis=1)
         rows = slice(s.start + 1, s.stop)
-        judged[rows] = size > 0.0
+        # A lost row affects all joints alike.
+        resolved = scaled != 0.0
+        each = np.where(resolved, change / np.where(resolved, usual, 1.0), np.nan)
+        agree = np.nanmax(each, axis=1) - np.nanmin(each, axis=1) <= 2.0 * NEAR * np.nanmax(each, axis=1)
+        judged[rows] = agree & (resolved.sum(axis=1) >= min(2, log.nq))
         multiple[rows] = (scaled * change / noise).sum(axis=1) / np.where(size > 0.0, size, np.inf)
     return multiple, judged
 

@@ -35,6 +35,8 @@ RELATED = 0.7
 EXCHANGED, CLEARLY = 0.9, 5.0
 """Correlation with another joint's rate that indicates swapped columns; factor by which the swapped order
 must reduce the unexplained variance."""
+ALIKE_DELAY = 0.5
+"""Relative difference up to which the delays of all joints are those of a common filter."""
 PROPORTIONAL, HALF_STEP = 0.5, 0.75
 """Share of the missing motion that a delay must explain; smallest reported delay, in sampling periods."""
 MOVES, TRIMMED, KEPT = 0.2, 10, 0.8
@@ -110,7 +112,9 @@ def check_velocity(system: ConstrainedSystem, log: Log) -> Outcome:
         return [], log
     wrong = level.moving & (~level.right() | (np.abs(level.correlation) < RELATED)) & ~_coarse(log, level)
     if not wrong.any():
-        if late := _late(log, level):
+        late = _late(log, level)
+        # A filter of all velocities is in the torques as well, so that these stay in step.
+        if late and not late[0].evidence["common"]:
             log = derive(log, ["qd", "qdd"] if "qdd" in log.derived | {*log.header.derived} else ["qd"])
         return late, log
     if "qd" in log.header.derived:
@@ -137,7 +141,13 @@ def _late(log: Log, level: Match) -> list[Finding]:
     # A velocity from neighbouring samples, or of a semi-implicit integrator, is half a step off by itself.
     late = level.moving & (share > PROPORTIONAL) & (np.abs(delay) > HALF_STEP * log.dt)
     shown = ", ".join(f"{1e3 * abs(x):.2g} ms {'behind' if x > 0 else 'ahead of'}" for x in delay[late])
-    return log.on_joints("velocity-delay", late, f"qd of {{}} is {shown} the rate of change of q")
+    text = f"qd of {{}} is {shown} the rate of change of q"
+    common = (
+        bool(late.any())
+        and late[level.moving].all()
+        and np.ptp(delay[late]) <= ALIKE_DELAY * delay[late].max()
+    )
+    return log.on_joints("velocity-delay", late, text, common=common)
 
 
 def _delay(change: Array, misfit: Array, step: Array) -> tuple[float, float]:
