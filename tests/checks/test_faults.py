@@ -217,7 +217,7 @@ def test_what_no_fault_can_reach_is_not_given_as_a_size(free: Case, monkeypatch:
     assert "an encoder offset: " in note.message and " rad" not in note.message and " never" in note.message
     monkeypatch.setattr(excitation, "visible_size", lambda told, fault: 3.0)
     (note,) = [finding for finding in check(*free).findings if finding.kind == "faults-hidden"]
-    assert "a tilt of the base 3°" in note.message and " 3 rad" in note.message
+    assert "a tilt of the base from 3°" in note.message and " 3 rad" in note.message
 
 
 def test_an_empty_or_broken_log_is_refused_or_stopped(free: Case) -> None:

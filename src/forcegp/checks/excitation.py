@@ -144,8 +144,8 @@ def check_visibility(explanation: Explanation) -> list[Finding]:
         for fault in (fault for fault in alike if sizes[fault] < most):
             size = words.format(scale * sizes[fault], unit=units.get(fault.joint))
             parts.append(f"{fault.joint} from {size}".strip())
-        if never := [fault.joint for fault in alike if sizes[fault] >= most]:
-            parts.append(f"never at {', '.join(never)}" if any(never) else "never")
+        if never := [fault.joint or "all joints" for fault in alike if sizes[fault] >= most]:
+            parts.append(f"never at {', '.join(never)}")
         force = max(force_of(explanation, fault) for fault in alike) * expected
         size = words.format(scale * expected, unit=units.get(alike[0].joint))
         changed = f" ({size}: force at the contact off by about {force:.2g} N)" if force else ""

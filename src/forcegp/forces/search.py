@@ -134,7 +134,7 @@ def initial_hyperparameters(
     for p, prior in [(p, prior) for p, prior in enumerate(priors) if prior.prefix == prior.name]:
         widths = {name: x.shape[-1] for name, x in blocks[0].features[p].items()}
         scale = _force_scale(p, blocks, prior.commensurate, beyond_noise)
-        initial = prior.kernel.initial(len(scale), widths, scale.log().cpu().double())
+        initial = prior.stated(prior.kernel.initial(len(scale), widths, scale.log().cpu().double()))
         params |= {f"{prior.name}.{name}": value.to(scale.device) for name, value in initial.items()}
     return params
 

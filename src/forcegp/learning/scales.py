@@ -48,6 +48,8 @@ STEPS, ACCURACY = 20, 1e-3
 """Maximum number of steps of Fisher scoring in one alternation, and relative change at which they end."""
 LEAST_VARIANCE = 1e-16
 """Variance of torques that is stored in place of zero [N² m², N²]."""
+FEWEST_AT_REST = 10.0
+"""Number of independent samples at rest below which the static friction of a joint keeps its stated value."""
 LEAST_SHARE = 0.2
 """Smallest share of the samples that remains after the determined directions are subtracted."""
 MOTIONS = ("qdd", "joint_force")
@@ -196,8 +198,10 @@ def _with_noise(
     theta = torch.cat([(2.0 * values[TORQUE_NOISE]).exp(), (2.0 * values[STICK_NOISE]).exp()])
     gamma = determined_by_joint(problem, groups, evidence)
     share = (1.0 - gamma / (problem.power * len(whole.r))).clamp(min=LEAST_SHARE).repeat(2)
+    rests = problem.power * whole.slow.sum(0) >= FEWEST_AT_REST
+    free = torch.cat([torch.ones_like(rests), rests])
     for _ in range(STEPS):
-        new = _scored(whole, theta, share)
+        new = torch.where(free, _scored(whole, theta, share, free), theta)
         change = float((new - theta).abs().max() / theta.max())
         theta = new
         if change < ACCURACY:
@@ -207,8 +211,8 @@ def _with_noise(
     return {**values, **changed}, exponent(problem, motions, each, torque, stick)
 
 
-def _scored(rows: Residuals, theta: Tensor, share: Tensor) -> Tensor:
-    """Return the variances `(2 nq,)` after a step of Fisher scoring."""
+def _scored(rows: Residuals, theta: Tensor, share: Tensor, free: Tensor) -> Tensor:
+    """Return the variances `(2 nq,)` after a step of Fisher scoring, zero for those that are not free."""
     a, D = rows.read(*theta.chunk(2))
     c = torch.cat([torch.ones_like(rows.slow), rows.slow], dim=-1)
     D = D.repeat(1, 2, 2)
@@ -216,10 +220,12 @@ def _scored(rows: Residuals, theta: Tensor, share: Tensor) -> Tensor:
     F = 0.5 * torch.einsum("ni,nij,nj->ij", c, D.square(), c)
     # in units of 1/√F_ii, with a small ridge for variances that no row shows
     unit = F.diagonal().clamp(min=1e-300).rsqrt()
-    F = F * unit[:, None] * unit + 1e-9 * torch.eye(len(F)).to(F)
+    F = (F * unit[:, None] * unit + 1e-9 * torch.eye(len(F)).to(F))[free][:, free]
     L = torch.linalg.cholesky(F)
-    x = torch.linalg.solve_triangular(L, (F @ (theta / unit) + g * unit)[:, None], upper=False)[:, 0]
-    return torch.from_numpy(scipy.optimize.nnls(L.mT.numpy(), x.numpy())[0]).to(theta) * unit
+    right = (F @ (theta / unit)[free] + (g * unit)[free])[:, None]
+    x = torch.linalg.solve_triangular(L, right, upper=False)[:, 0]
+    found = torch.from_numpy(scipy.optimize.nnls(L.mT.cpu().numpy(), x.cpu().numpy())[0]).to(theta)
+    return torch.zeros_like(theta).masked_scatter(free, found) * unit
 
 
 def exponent(

@@ -74,6 +74,10 @@ class ForcePrior(ABC):
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
         """Return E(x) `(n, nq, outputs)`."""
 
+    def stated(self, initial: dict[str, Tensor]) -> dict[str, Tensor]:
+        """Return initial log-hyperparameters of the kernel, changed by what is known of the force."""
+        return initial
+
     def check(self, system: ConstrainedSystem) -> None:  # noqa: B027  (most priors fit every system)
         """Raise a typed error if the prior does not match the system."""
 

@@ -9,6 +9,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, field
 
 import torch
@@ -119,6 +120,11 @@ OFFSET = 0.3
 joint that moves one way, and friction is the likelier cause."""
 
 
+SHAPE = 0.1
+"""Stated deviation of gradual transitions and of the load, relative to that of viscous and dry friction, of which
+they are corrections. Without it, forces from 40 samples of a double pendulum have 3 times the error."""
+
+
 @dataclass(frozen=True)
 class JointFrictionPrior(JointTerm):
     """A prior on the viscous, Coulomb and load-dependent friction and the offset of each joint.
@@ -159,6 +165,13 @@ class JointFrictionPrior(JointTerm):
                 expected="positive finite speeds [rad/s]",
                 got=self.speeds,
             )
+
+    def stated(self, initial: dict[str, Tensor]) -> dict[str, Tensor]:
+        if type(self.kernel) is not Linear or self.kernel.shared or not self.kernel.ard:
+            return initial
+        slopes = initial["log_slope_std"].clone()
+        slopes[:, 2:] += math.log(SHAPE)
+        return {**initial, "log_slope_std": slopes}
 
     def columns(self, x: JointState) -> dict[str, Array]:
         dry = {f"coulomb_{i}": x.direction(speed) for i, speed in enumerate(self.speeds)}
