@@ -48,6 +48,9 @@ STEPS, ACCURACY = 20, 1e-3
 """Maximum number of steps of Fisher scoring in one alternation, and relative change at which they end."""
 LEAST_VARIANCE = 1e-16
 """Variance of torques that is stored in place of zero [N² m², N²]."""
+AT_REST = (0.02, 0.05, 0.1)
+"""Speeds v_s below which a joint counts as nearly at rest, of which the likeliest is chosen [rad/s, m/s]: the
+resolution of common encoders, and speeds at which joints reverse within a sampling period."""
 FEWEST_AT_REST = 10.0
 """Number of independent samples at rest below which the static friction of a joint keeps its stated value."""
 LEAST_SHARE = 0.2
@@ -157,6 +160,14 @@ class Residuals(NamedTuple):
     slow: Tensor
     external: Tensor
 
+    def log_density(self, torque: Tensor, stick: Tensor) -> float:
+        """Return Σ log N(r; 0, C) up to a constant."""
+        S = torque + stick * self.slow + self.external
+        C = (self.B * S[:, None]) @ self.B.mT + torch.eye(self.r.shape[-1]).to(S)
+        L = torch.linalg.cholesky(C)
+        white = torch.linalg.solve_triangular(L, self.r[..., None], upper=False)
+        return -float(L.diagonal(dim1=-2, dim2=-1).log().sum() + 0.5 * white.square().sum())
+
     def read(self, torque: Tensor, stick: Tensor) -> tuple[Tensor, Tensor]:
         """Return Bᵀ C⁻¹ r `(n, nq)` and Bᵀ C⁻¹ B `(n, nq, nq)` for variances σ² and σ_s² `(nq,)`."""
         S = torque + stick * self.slow + self.external
@@ -198,17 +209,30 @@ def _with_noise(
     theta = torch.cat([(2.0 * values[TORQUE_NOISE]).exp(), (2.0 * values[STICK_NOISE]).exp()])
     gamma = determined_by_joint(problem, groups, evidence)
     share = (1.0 - gamma / (problem.power * len(whole.r))).clamp(min=LEAST_SHARE).repeat(2)
-    rests = problem.power * whole.slow.sum(0) >= FEWEST_AT_REST
-    free = torch.cat([torch.ones_like(rests), rests])
+    tried = []
+    for speed in AT_REST:
+        # k = e^{−(q̇/v)²} for another speed v
+        ratio = (values[STICK_SPEED].exp() / speed).square()
+        rows = whole._replace(slow=whole.slow**ratio)
+        rests = problem.power * rows.slow.sum(0) >= FEWEST_AT_REST
+        found = _settled(rows, theta, share, torch.cat([torch.ones_like(rests), rests]))
+        tried.append((rows.log_density(*found.chunk(2)), speed, found))
+    _, speed, theta = max(tried, key=lambda each: each[0])
+    torque, stick = theta.maximum(values[TORQUE_NOISE].new_tensor(LEAST_VARIANCE)).chunk(2)
+    slowest = torch.full_like(torque, math.log(speed))
+    changed = {TORQUE_NOISE: 0.5 * torque.log(), STICK_NOISE: 0.5 * stick.log(), STICK_SPEED: slowest}
+    return {**values, **changed}, exponent(problem, motions, each, torque, stick)
+
+
+def _settled(rows: Residuals, theta: Tensor, share: Tensor, free: Tensor) -> Tensor:
+    """Return the variances `(2 nq,)` after scoring until they no longer change."""
     for _ in range(STEPS):
-        new = torch.where(free, _scored(whole, theta, share, free), theta)
+        new = torch.where(free, _scored(rows, theta, share, free), theta)
         change = float((new - theta).abs().max() / theta.max())
         theta = new
         if change < ACCURACY:
             break
-    torque, stick = theta.maximum(values[TORQUE_NOISE].new_tensor(LEAST_VARIANCE)).chunk(2)
-    changed = {TORQUE_NOISE: 0.5 * torque.log(), STICK_NOISE: 0.5 * stick.log()}
-    return {**values, **changed}, exponent(problem, motions, each, torque, stick)
+    return theta
 
 
 def _scored(rows: Residuals, theta: Tensor, share: Tensor, free: Tensor) -> Tensor:
