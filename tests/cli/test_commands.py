@@ -228,7 +228,7 @@ def test_from_simulation_to_evaluation(fail: Fail, tmp_path: Path) -> None:
     path = json.loads(
         run("rollout", "-m", model, "-d", log, "-o", motion, "--start", 24, "--duration", 0.25, "--json")
     )
-    assert "contains other files" in fail("rollout", "-m", model, "-d", log, "-o", tmp_path)
+    assert "an input of this command" in fail("rollout", "-m", model, "-d", log, "-o", tmp_path)
     # Open loop for a quarter of a second, with a model that knows all but the friction at the contact.
     assert path["duration_s"] == pytest.approx(0.25) and path["largest_joint_error"] < 0.01
     assert path["largest_constraint_error_m"] < 1e-3

@@ -67,7 +67,7 @@ def fit() -> StructuredFit:
     system = forcegp.ConstrainedSystem(robot)
     true = robot.replace(mass=1.2 * robot.mass, inertia=1.2 * robot.inertia)
     model = forcegp.StructuredGP(
-        system, "analytical", force_priors=[JointFrictionPrior(), InertialPrior()], noise=0.2
+        system, "analytical", force_priors=[JointFrictionPrior(), InertialPrior()], noise=0.01
     )
     return model.fit(log_of(true, 1500, 0))
 

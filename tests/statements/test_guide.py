@@ -41,7 +41,6 @@ def guide(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, str]:
     return folder, run("fit", "--scene", SCENE, "--data", train, "--out", folder / "model")
 
 
-@pytest.mark.xfail(strict=True, reason="the guide's wrists have 15.6 and 125 times their inertia")
 def test_the_wrists_have_their_inertia(guide: tuple[Path, str]) -> None:
     fit = forcegp.load_model(guide[0] / "model")
     q = log()[0].q[::100]
@@ -52,7 +51,6 @@ def test_the_wrists_have_their_inertia(guide: tuple[Path, str]) -> None:
     assert bool((found / true < 1.5).all()) and bool((found / true > 0.67).all()), (found / true).tolist()
 
 
-@pytest.mark.xfail(strict=True, reason="the guide's fit prints drives of 0.17 and 0.055 kg m²; true: none")
 def test_no_drives_are_printed_where_there_are_none(guide: tuple[Path, str]) -> None:
     joints = "|".join(system().robot.joint_names)
     assert not re.search(rf"drives? .*(?:{joints}) [\d.]+", guide[1])

@@ -109,7 +109,6 @@ def test_friction_that_check_prints_lies_within_its_bars(truth: Truth) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="a torque offset of -1.62 N m where masses are wrong")
 def test_no_torque_offset_is_stated_where_masses_are_wrong() -> None:
     assert not [each.message for each in report(UR10).findings if each.kind == "torque-offset"]
 
@@ -125,7 +124,6 @@ def test_friction_that_is_less_than_declared_is_printed_as_friction() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="drives of wrists vanish: 0.02, 0.10, 0.00 of 0.2, 0.15, 0.12")
 def test_the_drives_of_geared_wrists_are_found() -> None:
     """From the mass matrix of the fit, as drives and links are only known by their sum."""
     log, file = log_of(XARM), file_of("xarm7")
@@ -177,7 +175,6 @@ def test_a_payload_in_one_segment_of_two_is_found() -> None:
 
 @pytest.mark.slow
 @pytest.mark.parametrize("truth", [XARM, UR10], ids=lambda x: x.arm)
-@pytest.mark.xfail(strict=True, raises=AssertionError, reason="1200 rows take 328 s (xArm 7), 123 s (UR10)")
 def test_a_fit_of_1200_rows_takes_less_than_a_minute(truth: Truth, tmp_path: Path) -> None:
     """Processor time of the command, which the operating system ends after a minute."""
     log = log_of(truth)
@@ -231,7 +228,6 @@ def test_the_force_of_an_arm_that_slides_on_a_plane_is_as_promised() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="a wrench near a singular pose that is passed is covered 55 to 72 %")
 def test_bars_of_a_wrench_hold_while_a_singular_pose_is_passed() -> None:
     """Over the tenth of the rows in which the last link is hardest to move in some direction."""
     truth = dataclasses.replace(UR5, dry=(8.0, 8.0, 6.0, 1.6, 1.6, 1.2))

@@ -93,7 +93,6 @@ def test_bars_hold_while_a_torque_is_stuck() -> None:
     assert holds(train, stuck(test), truth)
 
 
-@pytest.mark.xfail(strict=True, reason="gravity-compensated torques: 28.4 N for 26.8 N, σ 1.6; no bias")
 def test_gravity_that_is_missing_from_the_torques_is_no_force() -> None:
     train, test, truth = (*(without_gravity(each) for each in parts()[:2]), parts()[2])
     force = normal_force(fitted(train), test, truth)
@@ -110,15 +109,11 @@ def test_bars_hold_for_a_payload_that_is_picked_up_after_training() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(
-    strict=True, reason="2 kg missing and never lifted: 7.7 N for 28.0 N, σ 6.5, ±2σ holds 1 %"
-)
 def test_bars_hold_for_a_missing_payload_that_is_never_lifted() -> None:
     """Without free motion, the prior of the masses must be wide enough for a payload."""
     assert holds(simulated(2.0, 1, 0.0)[0][::3], *simulated(2.0, 2, 0.0))
 
 
-@pytest.mark.xfail(strict=True, reason="`after` takes a fit of another robot with the same joint names")
 def test_a_fit_of_another_robot_is_no_start() -> None:
     train = parts()[0][::8]
     other = system().robot.replace(mass=1.5 * system().robot.mass)

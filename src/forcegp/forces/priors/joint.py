@@ -122,8 +122,8 @@ joint that moves one way, and friction is the likelier cause."""
 
 SHAPE = 0.1
 """Stated deviation of gradual transitions and of the load, relative to that of viscous and dry friction, of
-which they are corrections. With 1, the force on a pendulum learned from 40 samples has 2.8 times the error, and the
-torque error on half of the iiwa's `motion_b` rises by 7 to 11 %."""
+which they are corrections. With 1, the force on a pendulum learned from 40 samples has 2.8 times the error,
+and the torque error on half of the iiwa's `motion_b` rises by 7 to 11 %."""
 
 
 @dataclass(frozen=True)
