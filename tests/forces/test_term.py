@@ -103,6 +103,28 @@ def test_the_robot_file_holds_what_it_can_of_the_law(fit) -> None:
     assert bool((found.robot.damping > 0.2).all()), "the parabola is best met by a line"
 
 
+def test_parameters_are_the_weights_of_the_columns(fit) -> None:
+    """Their sum is the force, and each is the true one within its bars."""
+    table = {each.name: each for each in fit.parameters()}
+    names = ("dry", "square", "bump")
+    assert set(table) == {
+        f"drag.{name} of {joint}" for name in names for joint in fit.system.robot.joint_names
+    }
+    for joint in fit.system.robot.joint_names:
+        for name, true in zip(names, (-DRY, -DRAG, -BUMP), strict=True):
+            found = table[f"drag.{name} of {joint}"]
+            assert abs(found.value - true) < 4.0 * found.std + 0.02
+            assert found.unit == "N m" and found.determined
+    qd = torch.tensor([[0.3, -1.2]], dtype=torch.float64)
+    columns = Drag().columns(JointState(qd, qd, qd))
+    sums = [
+        sum(float(columns[name][0, j]) * table[f"drag.{name} of {joint}"].value for name in names)
+        for j, joint in enumerate(fit.system.robot.joint_names)
+    ]
+    read = fit.predict(0.0 * qd, qd, 0.0 * qd, "joint_friction").mean[0]
+    torch.testing.assert_close(torch.tensor(sums, dtype=torch.float64), read, rtol=1e-9, atol=1e-12)
+
+
 def test_bristles_follow_dahls_law_along_a_log() -> None:
     generator = torch.Generator().manual_seed(0)
     n = 400

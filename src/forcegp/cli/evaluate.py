@@ -60,6 +60,7 @@ def evaluate(
     forcegp evaluate --scene my_scene.toml --config model.toml --train train.parquet --data test.parquet
     """
     from forcegp.destination import check_folder
+    from forcegp.models.structured_fit import StructuredFit
 
     if out is not None:
         check_folder(out)
@@ -78,6 +79,8 @@ def evaluate(
         "response": _response(evaluation, as_json),
         **evaluation.summary(),
     }
+    if as_json and isinstance(regression, StructuredFit):
+        result["parameters"] = [vars(each) for each in regression.parameters()]
     if out is not None:
         names = str(model or config or scene), str(data), str(train) if train else None
         result |= _written(out, evaluation, regression, test, names)

@@ -1,10 +1,11 @@
 """Inertia of a real robot: that of the robot file, the same with added drive inertia, or identified inertia.
 
-Estimates are accepted if they predict torques on held-out blocks of the log better than the robot file does
-(`inverse_dynamics.py`). With noisy accelerations, least squares underestimates inertia. With noisy torques in
-closed loop, the likelihood of accelerations given torques overestimates it. Using the equations of motion at
-slightly earlier and later times as instruments avoids both biases. The unknowns have Gaussian priors centred
-on the robot file. Links stay physically consistent, and drive inertia is nonnegative.
+Identified links are accepted if they predict torques on held-out blocks of the log better than the robot
+file does (`inverse_dynamics.py`), and drives if they are clearly above zero. With noisy accelerations, least
+squares underestimates inertia. With noisy torques in closed loop, the likelihood of accelerations given
+torques overestimates it. Using the equations of motion at slightly earlier and later times as instruments
+avoids both biases. The unknowns have Gaussian priors centred on the robot file. Links stay physically
+consistent, and drive inertia is nonnegative.
 
 Torque and motion are seldom sampled at the same instant: a controller that holds each torque for a period
 leads the motion by half of it. Milliseconds bias the inertia of a light joint and, since −dτ/dt resembles q̇

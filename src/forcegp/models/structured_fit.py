@@ -53,6 +53,7 @@ from forcegp.models.export.motion import CompiledMotion, compiled_motion
 from forcegp.models.external_wrench import ExternalWrench, external_wrench
 from forcegp.models.fit_result import FitResult
 from forcegp.models.parameter_std import parameter_std
+from forcegp.models.parameters import LearnedParameter, learned_parameters
 from forcegp.models.prediction import Answer, Prediction, Query, in_pieces
 from forcegp.models.structured_file import pack, unpack
 from forcegp.models.structured_learning import Specification, constant_inputs, prepared, training_for
@@ -191,6 +192,16 @@ class StructuredFit(FittedModel):
         flat = flat_states(self.system, data.q, data.qd, data.tau, active)._replace(history=history)
         with torch.no_grad():
             return self._answered(flat, Query(quantity, None, covariance, noise))
+
+    def parameters(self) -> tuple[LearnedParameter, ...]:
+        """Return the learned weights of all columns in SI units, with standard deviations.
+
+        The columns of a law are nearly collinear, so that their sum is often known far better than each.
+
+        Example:
+            `for each in fit.parameters(): print(each.name, each.value, each.std, each.unit)`
+        """
+        return learned_parameters(self)
 
     def external_wrench(
         self,

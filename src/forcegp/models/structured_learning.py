@@ -2,14 +2,13 @@
 
 1. Samples at rest only provide a bound on friction, and impacts violate the equations of motion. If torque
    noise is learned, only samples in motion and without impacts are used.
-2. Hyperparameters are learned from part of a long log, or from all of a short log.
-3. If residuals are correlated in time, the likelihood is tempered, unless a `DisturbancePrior` explains them.
-   Residuals also determine slopes and weights (`forces/noise_learning.py`). Hyperparameters are then learned
-   again.
+2. If all unknowns are columns, their scales and the variances of rows follow from the evidence
+   (`learning/fit.py`). Other hyperparameters are searched on part of a long log, or on all of a short log.
+3. If residuals are correlated in time, the likelihood is tempered. For kernels, residuals also determine
+   slopes and weights (`forces/noise_learning.py`), and hyperparameters are then learned again.
 4. Inertial parameters move to their posterior mean in one physically consistent Gauss–Newton step.
 5. Torque noise is increased to the level observed on held-out blocks of the training log. Its growth beyond
-   the trained speeds and torques is learned from held-out regimes. Dry friction with memory is learned from
-   the residuals of logs in time order.
+   the trained speeds and torques is learned from held-out regimes.
 6. The posterior is conditioned on all samples.
 """
 

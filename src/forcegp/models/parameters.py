@@ -1,0 +1,99 @@
+"""Learned parameters of a fit: weights of columns with their standard deviations, in SI units.
+
+A term has the force Σ_c θ_c φ_c(x) with columns φ_c in SI units. Basis functions of the posterior are
+s_c φ_c/r_c with the root mean square r_c of a column and its scale s_c, so θ_c = s_c w_c/r_c with w ~
+N(A⁻¹v, A⁻¹).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import torch
+from torch import Tensor
+
+from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
+from forcegp.forces.term import JointTerm
+from forcegp.gp.kernels import Constant, Linear, sub
+from forcegp.gp.sparse import SparsePosterior
+from forcegp.identification import PARAMETER_NAMES
+
+if TYPE_CHECKING:
+    from forcegp.models.structured_fit import StructuredFit
+
+DETERMINED = 0.5
+"""Standard deviation relative to that of the prior, below which a parameter is determined by the data."""
+PER_SPEED = {"velocity": ("N m s/rad", "N s/m")}
+"""Units of columns other than those of a force, for revolute and for sliding joints."""
+INERTIAL = ("kg", "kg m", "kg m", "kg m", *6 * ("kg m²",))
+
+
+@dataclass(frozen=True)
+class LearnedParameter:
+    """A learned parameter of a term.
+
+    Attributes:
+        name: name of the prior, the parameter, and the joint, if any.
+        value, std: posterior mean and standard deviation; zero mean if the robot includes the parameter.
+        unit: SI unit.
+        determined: whether the data reduce the standard deviation to less than half that of the prior.
+    """
+
+    name: str
+    value: float
+    std: float
+    unit: str
+    determined: bool
+
+
+@torch.no_grad()
+def learned_parameters(fit: StructuredFit) -> tuple[LearnedParameter, ...]:
+    """Return the parameters of all terms with finitely many columns (see `StructuredFit.parameters`)."""
+    latent = fit.posterior.means
+    if not isinstance(latent, SparsePosterior):
+        return ()
+    inverse = torch.linalg.solve_triangular(latent.L, torch.eye(len(latent.L)).to(latent.L), upper=False)
+    deviation, found = inverse.square().sum(0).sqrt(), []
+    for p, part in enumerate(latent.basis.parts):
+        if part.split.rest is None:
+            own = latent.basis.of_process(p)
+            shape = part.components, -1
+            rows = latent.weights[own].view(shape), deviation[own].view(shape)
+            found += _of_prior(fit, p, *rows)
+    return tuple(found)
+
+
+def _of_prior(fit: StructuredFit, p: int, w: Tensor, std: Tensor) -> Iterator[LearnedParameter]:
+    prior, robot = fit.posterior.priors[p], fit.system.robot
+    if isinstance(prior, JointTerm) and isinstance(prior.kernel, Linear):
+        params, scale = sub(fit.hyperparameters, prior.prefix), fit.posterior.process.scales[p].std
+        names = [*scale, *(["offset"] if w.shape[-1] > len(scale) else [])]
+        root = torch.stack([x.reshape(-1).expand(robot.nq) for x in scale.values()], dim=-1)
+        unit = prior.kernel.slope_std(params).expand(robot.nq, -1) / root
+        if len(names) > len(scale):
+            unit = torch.cat([unit, prior.kernel.bias_std(params)[:, None]], dim=-1)
+        for j, joint in enumerate(robot.joint_names):
+            kind = int(robot.joint_types[j] != "revolute")
+            for c, name in enumerate(names):
+                units = PER_SPEED.get(name, ("N m", "N"))
+                yield _parameter(
+                    f"{prior.name}.{name} of {joint}", w[j, c], std[j, c], unit[j, c], units[kind]
+                )
+    if isinstance(prior, PayloadPrior | InertialPrior) and isinstance(prior.kernel, Constant):
+        links, params = robot.nq * len(PARAMETER_NAMES), sub(fit.hyperparameters, prior.prefix)
+        sizes = prior.units(w) if isinstance(prior, PayloadPrior) else prior.scale(robot)
+        for k, unit in enumerate(sizes * prior.kernel.std(params)):
+            link, index = divmod(k, len(PARAMETER_NAMES))
+            name, units = PARAMETER_NAMES[index], INERTIAL[index]
+            if isinstance(prior, PayloadPrior):
+                link = prior.link(robot)
+            elif k >= links:
+                link, name, units = k - links, "drive", "kg m²"
+            name = f"{prior.name}.{name} of {robot.joint_names[link]}"
+            yield _parameter(name, w[k, 0], std[k, 0], unit, units)
+
+
+def _parameter(name: str, w: Tensor, std: Tensor, unit: Tensor, text: str) -> LearnedParameter:
+    return LearnedParameter(name, float(w * unit), float(std * unit), text, float(std) < DETERMINED)
