@@ -93,7 +93,10 @@ def correlation_times(x: Tensor, segment: Tensor, length: int, white: Tensor | f
         part = x[segment == s]
         windows = len(part) // length
         squares.append(part[: windows * length].unflatten(0, (windows, length)).mean(1).square())
-    return length * torch.cat(squares).mean(0) / _variance_in_time(x, segment, white)[0]
+    variance = _variance_in_time(x, segment, white)[0]
+    ratio = torch.cat(squares).mean(0) / variance
+    # If white noise hides the signal, its correlation is unknown, and it counts as white too.
+    return torch.where(variance > NEGLIGIBLE * x.square().mean(0), length * ratio.clamp(max=1.0), 1.0)
 
 
 def _variance_in_time(x: Tensor, segment: Tensor, white: Tensor | float) -> tuple[Tensor, Tensor]:
