@@ -137,6 +137,8 @@ def check_period(system: ConstrainedSystem, log: Log) -> Outcome:
 def check_lost(system: ConstrainedSystem, log: Log) -> Outcome:
     """Find rows that are missing without a gap in the time stamps, so that positions advance by multiples."""
     multiple, judged = _multiples(log)
+    if judged.sum() < JUDGED:
+        return [], log
     whole = np.round(multiple)
     near = judged & (np.abs(multiple - whole) <= NEAR) & (whole >= 1.0)
     single = near & (whole == 1.0)
@@ -144,7 +146,7 @@ def check_lost(system: ConstrainedSystem, log: Log) -> Outcome:
     lost = near & (whole >= 2.0) & np.append(False, near[:-1]) & np.append(near[1:], False)
     lost &= np.convolve(single, np.ones(NEIGHBOURS), "same") >= SINGLE * NEIGHBOURS
     regular = near.sum() >= REGULAR * judged.sum() and 2 * single.sum() > judged.sum()
-    if judged.sum() < JUDGED or not regular or lost.sum() < LOST * judged.sum() or lost.sum() < FEWEST:
+    if not regular or lost.sum() < LOST * judged.sum() or lost.sum() < FEWEST:
         return [], log
     count, share = int((whole[lost] - 1.0).sum()), lost.sum() / judged.sum()
     text = f"at least {count} rows are missing that the time stamps do not show: the position advances by "
