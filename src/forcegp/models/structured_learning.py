@@ -69,6 +69,8 @@ FEWEST_MOVING = 20
 """Number of samples in motion below which samples at rest are also kept."""
 FIRST_POWER = 0.25
 """Exponent of the tempered likelihood before the correlation of the residuals is known."""
+UNSEEN_TIME = 1e-6
+"""Correlation time of torque noise that was not observed [s]."""
 ROUNDS = 3
 """Maximum number of times that hyperparameters are relearned after updates based on the residuals."""
 
@@ -396,6 +398,10 @@ def _regressed(
     if NOISE in free:
         values |= calibrated_noise(part, values)
     part = _at_the_rate_of_the_log(part, values, neighbours or problem.training)
+    if part.correlation is not None and NOISE in free:
+        # Noise that contact hides widens multipliers, but it was not observed and shakes no trajectory.
+        unseen = part.hidden_torque() > 0.0
+        part = dataclasses.replace(part, correlation=torch.where(unseen, UNSEEN_TIME, part.correlation))
     whole = dataclasses.replace(part, training=problem.training, inducing=None)
     whole, warnings = prepared(spec, whole, values), ()
     if degrees is not None and (count := left_out(whole)):
