@@ -103,7 +103,8 @@ def test_rows_that_are_lost_and_renumbered_are_found(
     report = check(system, less.replace(t=log.t[: len(less)]))
     assert serious(report) == {"rows-lost"}
     missing = report.findings[0].evidence["missing_samples"]
-    assert 0.5 * (~keep).sum() < missing <= 1.05 * (~keep).sum()
+    # A lower limit: a lost row is counted only beside rows that are one step apart.
+    assert 0.45 * (~keep).sum() < missing <= 1.05 * (~keep).sum()
 
 
 def test_clean_logs_have_a_clean_clock(pendulum: Case) -> None:
