@@ -688,6 +688,7 @@ def test_the_command(tmp_path: Path) -> None:
     nominal = forcegp.AnalyticalModel(two_contacts()).nominal()
     nominal.save(tmp_path / "file")
     arguments[2] = str(tmp_path / "file")
+    arguments[arguments.index("--out") + 1] = str(tmp_path / "other")
     done = CliRunner().invoke(app, arguments)
     assert isinstance(done.exception, ForceGPError)
     assert "only a structured Gaussian process can be exported" in str(done.exception)
