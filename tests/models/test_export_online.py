@@ -162,7 +162,7 @@ def test_another_measured_quantity() -> None:
 
 def payload_model() -> StructuredFit:
     robot = forcegp.load_robot("kuka_iiwa")
-    priors = [JointFrictionPrior(), PayloadPrior(mass=2.0)]
+    priors = [JointFrictionPrior(speeds=(0.1, 0.5)), PayloadPrior(mass=2.0)]
     noise = forcegp.Noise(0.05, torque=0.2)
     model = forcegp.StructuredGP(
         forcegp.ConstrainedSystem(robot), "analytical", priors, noise, inference="sparse"
