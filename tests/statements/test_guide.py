@@ -16,6 +16,7 @@ from typer.testing import CliRunner
 
 import forcegp
 from forcegp.cli import app
+from forcegp.models.structured_fit import StructuredFit
 from statements.stated import friction_of
 from statements.wiping import CSV, DRY, FOLDER, SCENE, VISCOUS, log, system
 
@@ -75,6 +76,7 @@ def test_each_learned_term_has_a_table_of_its_parameters(guide: tuple[Path, str]
     """In Python and in JSON, with names of joints, values, standard deviations and units."""
     folder, _ = guide
     fit = forcegp.load_model(folder / "model")
+    assert isinstance(fit, StructuredFit)
     table = fit.parameters()
     assert len(table) >= 2 * system().robot.nq, "viscous and dry friction of each joint at least"
     for each in table:
