@@ -114,7 +114,7 @@ def test_parameters_are_the_weights_of_the_columns(fit) -> None:
         for name, true in zip(names, (-DRY, -DRAG, -BUMP), strict=True):
             found = table[f"drag.{name} of {joint}"]
             assert abs(found.value - true) < 4.0 * found.std + 0.02
-            assert found.unit == "N m" and found.determined
+            assert found.unit == f"N m per unit of {name}" and found.determined
     qd = torch.tensor([[0.3, -1.2]], dtype=torch.float64)
     columns = Drag().columns(JointState(qd, qd, qd))
     sums = [

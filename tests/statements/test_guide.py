@@ -1,6 +1,6 @@
 """What the guide `docs/howto/log_to_model.md` prints about the wiping UR5, beside the simulator's truth.
 
-Each statement is false today and belongs to what is learned from a log, so it is expected to fail.
+Statements that are false today belong to what is learned from a log, and are expected to fail.
 """
 
 from __future__ import annotations

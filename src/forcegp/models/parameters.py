@@ -7,26 +7,26 @@ N(A⁻¹v, A⁻¹).
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import torch
 from torch import Tensor
 
+from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
 from forcegp.forces.term import JointTerm
 from forcegp.gp.kernels import Constant, Linear, sub
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.identification import PARAMETER_NAMES
-
-if TYPE_CHECKING:
-    from forcegp.models.structured_fit import StructuredFit
+from forcegp.robot.model import RobotModel
 
 DETERMINED = 0.5
 """Standard deviation relative to that of the prior, below which a parameter is determined by the data."""
-PER_SPEED = {"velocity": ("N m s/rad", "N s/m")}
-"""Units of columns other than those of a force, for revolute and for sliding joints."""
+UNITS = {"velocity": ("N m s/rad", "N s/m"), "load": ("1", "1")}
+"""Units of weights of columns with a unit, for revolute and for sliding joints."""
+WITHOUT_UNIT = ("coulomb_", "z_", "offset")
+"""First letters of columns without a unit, whose weights are forces."""
 INERTIAL = ("kg", "kg m", "kg m", "kg m", *6 * ("kg m²",))
 
 
@@ -49,9 +49,11 @@ class LearnedParameter:
 
 
 @torch.no_grad()
-def learned_parameters(fit: StructuredFit) -> tuple[LearnedParameter, ...]:
+def learned_parameters(
+    posterior: ForcePosterior, hyperparameters: Mapping[str, Tensor], robot: RobotModel
+) -> tuple[LearnedParameter, ...]:
     """Return the parameters of all terms with finitely many columns (see `StructuredFit.parameters`)."""
-    latent = fit.posterior.means
+    latent = posterior.means
     if not isinstance(latent, SparsePosterior):
         return ()
     inverse = torch.linalg.solve_triangular(latent.L, torch.eye(len(latent.L)).to(latent.L), upper=False)
@@ -61,14 +63,22 @@ def learned_parameters(fit: StructuredFit) -> tuple[LearnedParameter, ...]:
             own = latent.basis.of_process(p)
             shape = part.components, -1
             rows = latent.weights[own].view(shape), deviation[own].view(shape)
-            found += _of_prior(fit, p, *rows)
+            found += _of_prior(posterior, hyperparameters, robot, p, *rows)
     return tuple(found)
 
 
-def _of_prior(fit: StructuredFit, p: int, w: Tensor, std: Tensor) -> Iterator[LearnedParameter]:
-    prior, robot = fit.posterior.priors[p], fit.system.robot
+def _of_prior(
+    posterior: ForcePosterior,
+    hyperparameters: Mapping[str, Tensor],
+    robot: RobotModel,
+    p: int,
+    w: Tensor,
+    std: Tensor,
+) -> Iterator[LearnedParameter]:
+    prior = posterior.priors[p]
+    params = sub(hyperparameters, prior.prefix)
     if isinstance(prior, JointTerm) and isinstance(prior.kernel, Linear):
-        params, scale = sub(fit.hyperparameters, prior.prefix), fit.posterior.process.scales[p].std
+        scale = posterior.process.scales[p].std
         names = [*scale, *(["offset"] if w.shape[-1] > len(scale) else [])]
         root = torch.stack([x.reshape(-1).expand(robot.nq) for x in scale.values()], dim=-1)
         unit = prior.kernel.slope_std(params).expand(robot.nq, -1) / root
@@ -77,12 +87,12 @@ def _of_prior(fit: StructuredFit, p: int, w: Tensor, std: Tensor) -> Iterator[Le
         for j, joint in enumerate(robot.joint_names):
             kind = int(robot.joint_types[j] != "revolute")
             for c, name in enumerate(names):
-                units = PER_SPEED.get(name, ("N m", "N"))
-                yield _parameter(
-                    f"{prior.name}.{name} of {joint}", w[j, c], std[j, c], unit[j, c], units[kind]
-                )
+                units = UNITS.get(name, ("N m", "N"))[kind]
+                if name not in UNITS and not name.startswith(WITHOUT_UNIT):
+                    units = f"{units} per unit of {name}"
+                yield _parameter(f"{prior.name}.{name} of {joint}", w[j, c], std[j, c], unit[j, c], units)
     if isinstance(prior, PayloadPrior | InertialPrior) and isinstance(prior.kernel, Constant):
-        links, params = robot.nq * len(PARAMETER_NAMES), sub(fit.hyperparameters, prior.prefix)
+        links = robot.nq * len(PARAMETER_NAMES)
         sizes = prior.units(w) if isinstance(prior, PayloadPrior) else prior.scale(robot)
         for k, unit in enumerate(sizes * prior.kernel.std(params)):
             link, index = divmod(k, len(PARAMETER_NAMES))

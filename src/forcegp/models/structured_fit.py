@@ -201,7 +201,7 @@ class StructuredFit(FittedModel):
         Example:
             `for each in fit.parameters(): print(each.name, each.value, each.std, each.unit)`
         """
-        return learned_parameters(self)
+        return learned_parameters(self.posterior, self.hyperparameters, self.system.robot)
 
     def external_wrench(
         self,
