@@ -122,8 +122,9 @@ joint that moves one way, and friction is the likelier cause."""
 
 SHAPE = 0.1
 """Stated deviation of gradual transitions and of the load, relative to that of viscous and dry friction, of
-which they are corrections. With 1, the force on a pendulum learned from 40 samples has 2.8 times the error,
-and the torque error on half of the iiwa's `motion_b` rises by 7 to 11 %."""
+which they are corrections. The log evidence of the training data, summed over an iiwa in two motions, a
+pendulum with two robot files, and a simulated UR5 in contact, is within 1 nat of that with 0.1 for 0.03, and
+9 and 42 nats lower for 0.3 and 1."""
 
 
 @dataclass(frozen=True)
