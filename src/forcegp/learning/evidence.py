@@ -39,7 +39,7 @@ SMALLEST = 1e-6
 """Scale of a dropped group, relative to its stated scale."""
 DECISIVE = 5.0
 """Log evidence against a family at which it is dropped [nats]: very strong (Kass and Raftery, *Bayes
-factors*, 1995). Without it, friction of half of the joints of a real iiwa is dropped, with larger errors."""
+factors*, 1995). With 0, the friction of half of the joints of a real iiwa is dropped."""
 DETERMINED = 0.5
 """Share of the directions of a family that the data must determine before it can be dropped."""
 
