@@ -34,8 +34,8 @@ SMOOTHER = 0.5
 """Ratio of the deviations of positions from the line through their neighbours, without and with the stamps,
 below which the stamps are wrong."""
 NEIGHBOURS, NEAR, RESOLVED = 9, 0.25, 8.0
-"""Number of rows whose median change is the usual one; distance from an integer that
-still counts as one; size of a change in noise standard deviations that determines a multiple."""
+"""Number of rows whose median change is the usual one; distance from an integer that still counts as one;
+size of a change in noise standard deviations that determines a multiple."""
 JUDGED, REGULAR, SINGLE, LOST = 50, 0.8, 0.4, 0.005
 """Minimum number of rows with a determined multiple, share of multiples near an integer, share of single
 steps around a lost row, and share of lost rows above which rows are reported as lost."""

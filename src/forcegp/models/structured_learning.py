@@ -391,10 +391,9 @@ def _regressed(
     problem = with_expectations(problem, spec.options.standardize)
     degrees = spec.noise.degrees_of_freedom
     found = regression(problem, start, free.__contains__, spec.automatic, degrees, progress)
-    part, values = found.problem, found.values
+    part, values = found.problem, dict(found.values)
     if any(isinstance(prior, InertialPrior) for prior in part.priors):
         part = with_updated_robot(part, values)
-        values = {**values}
     if NOISE in free:
         values |= calibrated_noise(part, values)
     part = _at_the_rate_of_the_log(part, values, neighbours or problem.training)
