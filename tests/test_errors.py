@@ -20,7 +20,8 @@ from forcegp.rollout.trajectory import DivergedError, Divergence
 
 def error_classes() -> list[type[ForceGPError]]:
     for module in pkgutil.walk_packages(forcegp.__path__, "forcegp."):
-        importlib.import_module(module.name)
+        if not module.name.endswith("__main__"):  # the program, which takes over interrupts
+            importlib.import_module(module.name)
     found, todo = [], [ForceGPError]
     while todo:
         kind = todo.pop()

@@ -31,8 +31,8 @@ def end_when_interrupted() -> None:
     signal.signal(signal.SIGINT, _interrupt)
 
     def watch() -> None:
-        while os.read(wake, 1) != bytes([signal.SIGINT]):
-            pass
+        while os.read(wake, 1) != bytes([signal.SIGINT]) or signal.getsignal(signal.SIGINT) is not _interrupt:
+            pass  # another signal, or an interrupt for which the program has installed another handler
         time.sleep(GRACE)
         end()
 

@@ -86,15 +86,7 @@ PUSH, CURRENT = "a push of 120 rows, 20 to 0.3 N m", "current, at 14 to 6 N m/A"
 @pytest.mark.slow
 @pytest.mark.parametrize(
     ("scene", "solver", "name"),
-    [
-        pytest.param(
-            "pendulum_wire",
-            {},
-            PUSH,
-            marks=pytest.mark.xfail(strict=True, reason="says 'torque-modelled' instead of the push"),
-        ),
-        ("panda_tilted", SOLVER, CURRENT),
-    ],
+    [("pendulum_wire", {}, PUSH), ("panda_tilted", SOLVER, CURRENT)],
 )
 def test_a_fault_is_found_where_little_torque_is_left(scene: str, solver: dict, name: str) -> None:
     """A push along a wire leaves one torque of two; friction makes most of the torque of light wrists."""

@@ -103,6 +103,28 @@ def test_an_interrupt_during_an_import_ends_the_program(module: str, tmp_path: P
     assert (done.returncode, done.stderr) == (130, b"")
 
 
+REPLACED = """
+import signal, time
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
+import forcegp.__main__
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
+try:
+    signal.raise_signal(signal.SIGINT)
+except KeyboardInterrupt:
+    time.sleep(1.0)
+    print("alive")
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+def test_an_interrupt_with_another_handler_does_not_end_the_program() -> None:
+    arguments = [sys.executable, "-c", REPLACED]
+    done = subprocess.run(arguments, capture_output=True, text=True, timeout=60.0, check=False)
+    assert (done.returncode, done.stdout) == (0, "alive\n"), done.stderr
+
+
 @pytest.mark.skipif(os.name != "posix", reason="signals")
 @pytest.mark.parametrize("command", ["orderly", "swallowing", "within-c", "with-worker"])
 def test_an_interrupt_ends_a_command(command: str, tmp_path: Path) -> None:

@@ -110,11 +110,12 @@ def _modelled(system: ConstrainedSystem, log: Log) -> list[Finding]:
         return bool((np.sqrt(np.median(rest[:, measured] ** 2, axis=0)) <= MODELLED * scale).all())
 
     closed = np.any([log.contact[c.name][rows] for c in labelled_contacts(system, log)], axis=0)
-    touching = bool(np.mean(closed) > TOUCHED)
     rest = r + damping
     if not len(measured) or not equal(rest):
         return []
-    damped = bool((np.abs(damping) > 2.0 * MODELLED * np.maximum(size, 0.1 * size.max())).mean() > TOUCHED)
+    touching = bool(np.mean(closed) > TOUCHED) and equal(rest[closed])
+    fast = np.abs(damping) > 2.0 * MODELLED * np.maximum(size, 0.1 * size.max())
+    damped = bool(fast.mean() > TOUCHED) and equal(rest[fast.any(axis=1)])
     if not touching and not damped:
         return []
     signs = {"no contact force in contact": touching, "none of the declared friction": damped}
