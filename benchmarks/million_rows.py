@@ -54,9 +54,9 @@ class CountedLog(StreamedDataset):
 
     passes = 0
 
-    def pieces(self, start: int = 0, share: tuple[int, int] = (0, 1)) -> Iterator[forcegp.Dataset]:
+    def pieces(self, share: tuple[int, int] = (0, 1)) -> Iterator[forcegp.Dataset]:
         CountedLog.passes += 1
-        return super().pieces(start, share)
+        return super().pieces(share)
 
 
 def main() -> None:

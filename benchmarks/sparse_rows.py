@@ -12,7 +12,6 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import torch
-import torch.distributed as dist
 from torch import Tensor
 
 from forcegp.forces.priors.sets import REMAINING
@@ -21,7 +20,7 @@ from forcegp.gp.features import Block
 from forcegp.gp.inducing import select_inducing
 from forcegp.gp.kernels import Kernel
 from forcegp.gp.sparse import SparsePosterior
-from forcegp.gp.sums import accumulate, reduce_sums
+from forcegp.gp.sums import accumulate
 
 JOINTS, CHUNK = 7, 4096
 POINTS = 70
@@ -115,16 +114,3 @@ def predictions(samples: int) -> dict:
         "thousand_covariances_ms": median_ms(lambda: posterior.covariance(many), 5),
         "update_one_sample_ms": median_ms(lambda: posterior.updated([one])),
     }
-
-
-def shards(samples: int, rank: int, processes: int, store: str) -> dict:
-    """Seconds of the sums over one process's shard and their reduction."""
-    dist.init_process_group("gloo", init_method=f"file://{store}", rank=rank, world_size=processes)
-    functions, own = basis(), torch.arange(samples).tensor_split(processes)[rank]
-    accumulate(functions, stream(0, CHUNK))
-    dist.barrier()
-    began, used = time.perf_counter(), time.process_time()
-    total = reduce_sums(accumulate(functions, stream(int(own[0]), int(own[-1]) + 1)))
-    seconds, processor = time.perf_counter() - began, time.process_time() - used
-    dist.destroy_process_group()
-    return {"seconds": seconds, "processor_seconds": processor, "rows": float(total.rows)}

@@ -12,14 +12,13 @@ from pathlib import Path
 import safetensors
 import safetensors.torch
 import torch
-from targets import CORPORA, START
+from targets import CORPORA
 
 import forcegp
 from forcegp.gp.optimise import LearningOptions
 from forcegp.models.minibatch import BatchOptions
 from forcegp.models.registry import create
 from forcegp.robot.load import BUNDLED
-from forcegp.storage.checkpoint import Checkpoint, Evaluations
 from forcegp.storage.model_file import HEADER, model_path
 from logs import random_log
 from random_data import random_data, table_system
@@ -74,17 +73,6 @@ def models() -> None:
         keep("model", name, len(header).to_bytes(4, "little") + header + tensors)
 
 
-def checkpoints() -> None:
-    """Two evaluations."""
-    with tempfile.TemporaryDirectory() as folder:
-        checkpoint = Evaluations(Checkpoint(Path(folder) / "fit.ckpt", "key"))
-        objective = checkpoint.recorded(lambda tensors: tensors["a"].square().sum())
-        for number in range(2):
-            objective({"a": START["a"] + number})
-        checkpoint.write()
-        keep("checkpoint", "two", checkpoint.checkpoint.path.read_bytes())
-
-
 def logs() -> None:
     """Logs of other programs, where their writers are installed."""
     import log_files
@@ -113,5 +101,4 @@ if __name__ == "__main__":
     tables()
     scenes_and_robots()
     models()
-    checkpoints()
     logs()

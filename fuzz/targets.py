@@ -14,12 +14,9 @@ import torch
 import forcegp
 from forcegp.data import Dataset
 from forcegp.errors import ForceGPError
-from forcegp.storage.checkpoint import Checkpoint, Evaluations
 from forcegp.storage.model_file import HEADER, NO_HASH, SUFFIX
 
 CORPORA = Path(__file__).parent / "corpora"
-
-START = {"a": torch.zeros(3, dtype=torch.float64)}
 
 
 def answered(reader: Callable[[bytes, Path], None], data: bytes, folder: Path) -> str:
@@ -80,16 +77,11 @@ def model_of(data: bytes, folder: Path) -> None:
     assert bool(torch.isfinite(prediction.mean).all())
 
 
-def _checkpoint(path: Path) -> None:
-    Evaluations(Checkpoint(path, "key")).read(START)
-
-
 TARGETS: dict[str, Callable[[bytes, Path], None]] = {
     "csv": _file(".csv", Dataset.read),
     "parquet": _file(".parquet", Dataset.read),
     "scene": _file(".toml", _scene),
     "model": model_of,
-    "checkpoint": _file(".ckpt", _checkpoint),
     "urdf": _file(".urdf", forcegp.load_robot),
     "mjcf": _file(".xml", forcegp.load_robot),
     "log-text": _file(".txt", _log),

@@ -31,6 +31,7 @@ LAYERS = (
         "native",
         "notebook",
         "interrupt",
+        "cluster",
     ),
     ("plots",),
     ("robot",),

@@ -23,7 +23,7 @@ PAGES = sorted(path for path in DOCS.rglob("*.md"))
 OTHERS = [DOCS.parent / name for name in ("README.md", "CHANGELOG.md", "CONTRIBUTING.md")]
 EXECUTED = "{code-cell} python"
 DIRECTIVES = ("{toctree}", "{include}", "{eval-rst}")
-INSTALLED = ("pip install", "make ", "torchrun --nnodes", "python benchmarks/", "python -W")
+INSTALLED = ("pip install", "make ", "python benchmarks/", "python -W")
 """Commands that cannot run while the site is built: they install, take hours, or need several machines."""
 
 

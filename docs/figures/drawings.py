@@ -132,7 +132,7 @@ LAYERS = (
     ("rollout", "integrates forces forward in time", ORANGE),
     ("logs, checks", "logs of other programs; faults in a log", GREEN),
     ("scene, simulate, control", "scene files; physics engines; planned motion", GREEN),
-    ("storage", "files of models, checkpoints", GREEN),
+    ("storage", "files of models", GREEN),
     ("forces", "the paper: unknown forces as Gaussian processes", ORANGE),
     ("gp", "kernels and inference, without a robot", ORANGE),
     ("data", "Dataset: columns, splits, derivatives", GREEN),

@@ -65,11 +65,7 @@ SCENE_KEYS = 2000
 MODEL_BYTES = 16 * GIB
 """Maximum size of the tensors of a saved model."""
 TENSORS = 10_000
-"""Maximum number of tensors in a saved model or checkpoint."""
-CHECKPOINT_BYTES = GIB
-"""Maximum size of a checkpoint, which contains the learned tensors but no data."""
-CHECKPOINT_VALUE = 1e12
-"""Largest value in a checkpoint; hyperparameters are logarithms, and analytical parameters in SI units."""
+"""Maximum number of tensors in a saved model."""
 
 LOGGED_VALUE = 1e100
 """Largest number in a log or a state; its fourth power is finite."""

@@ -7,17 +7,17 @@ from __future__ import annotations
 
 import json
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from itertools import product
 from pathlib import Path
 from typing import Any
 
 import torch
 
+from forcegp.cluster import cluster, on_cluster
 from forcegp.data import split_by_stretches
 from forcegp.data.selection import complement
-from forcegp.errors import optional_module
 from forcegp.evaluation import evaluate
 from forcegp.files import write_json, written_folder
 from forcegp.models.configured import configured
@@ -105,15 +105,9 @@ def sweep(
     Returns:
         The scores in the order of the fits.
     """
-    dask = optional_module("distributed", "A sweep", "sweep")
-    root, scores = str(Path(out).resolve()), {}
-    with ExitStack() as stack:
-        if address is None:
-            local = dask.LocalCluster(n_workers=processes, threads_per_worker=1, dashboard_address=None)
-            address = stack.enter_context(local).scheduler_address
-        futures = stack.enter_context(dask.Client(address)).map(run_fit, fits, out=root, pure=False)
-        place = {future.key: i for i, future in enumerate(futures)}
-        for future in dask.as_completed(futures):
-            scores[place[future.key]] = future.result()
-            say(len(scores), scores[place[future.key]])
-    return [scores[i] for i in range(len(fits))]
+    scores = list[dict[str, Any]]()
+    with cluster(processes, address) as client:
+        for score in on_cluster(client, partial(run_fit, out=str(Path(out).resolve())), fits):
+            scores.append(score)
+            say(len(scores), score)
+    return scores

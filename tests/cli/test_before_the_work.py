@@ -51,7 +51,6 @@ def arguments(command: str, made: Path, out: Path) -> list[object]:
         "select --rest": ["select", log, "-n", 5, "-o", made / "x.parquet", "--rest", out],
         "fit": ["fit", "-s", scene, "-d", made / "train.parquet", "-m", "sgp-zero", "-o", out],
         "fit gp": ["fit", "-s", scene, "-d", made / "train.parquet", "-m", "gp", "-o", out],
-        "fit --checkpoint": ["fit", "-s", scene, "-d", log, "-o", made / "m", "--checkpoint", out],
         "predict": ["predict", "-m", model, "-d", log, "-o", out],
         "evaluate": ["evaluate", "-m", model, "-d", log, "-o", out],
         "rollout": ["rollout", "-m", model, "-d", log, "-o", out],
@@ -60,7 +59,7 @@ def arguments(command: str, made: Path, out: Path) -> list[object]:
 
 
 COMMANDS = (
-    *("simulate", "import", "guess", "check", "select", "select --rest", "fit", "fit --checkpoint"),
+    *("simulate", "import", "guess", "check", "select", "select --rest", "fit"),
     *("predict", "evaluate", "rollout", "reproduce"),
 )
 
@@ -97,12 +96,6 @@ def test_both_parts_of_a_selection_are_not_one_file(made: Path, tmp_path: Path) 
     out = tmp_path / "part.parquet"
     with pytest.raises(DestinationError, match="would be overwritten"):
         run("select", made / "run.parquet", "-n", 5, "-o", out, "--rest", tmp_path / "." / "part.parquet")
-
-
-def test_a_checkpoint_in_the_place_of_the_model_is_refused(made: Path, tmp_path: Path) -> None:
-    fit = arguments("fit", made, tmp_path / "model")
-    with pytest.raises(DestinationError, match="would be overwritten"):
-        run(*fit, "--checkpoint", tmp_path / "model.safetensors")
 
 
 @pytest.mark.parametrize("command", ["simulate", "select", "select --rest", "predict"])

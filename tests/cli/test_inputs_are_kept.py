@@ -237,17 +237,6 @@ def test_two_results_have_two_places(tmp_path: Path) -> None:
         "--rest",
     ]
     refused([*words, str(tmp_path / "." / "part.parquet")], "by another result")
-    words = [
-        "fit",
-        "-s",
-        "ur5_free",
-        "-d",
-        str(made(tmp_path, "data")),
-        "-o",
-        str(tmp_path / "k"),
-        "--checkpoint",
-    ]
-    refused([*words, str(tmp_path / "k.safetensors")], "by another result")
 
 
 def test_results_beside_the_inputs_are_allowed(tmp_path: Path) -> None:

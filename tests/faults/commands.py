@@ -17,7 +17,6 @@ from forcegp.cli import app, main
 from forcegp.data import Dataset
 from forcegp.destination import MANIFEST
 from forcegp.forces.priors.sets import default_priors
-from forcegp.storage import checkpoint
 from reproduction import profiles
 from reproduction.__main__ import app as study
 from reproduction.profiles import Profile
@@ -101,10 +100,9 @@ COMMANDS = {
             "fit",
             lambda i, o: [
                 *("-s", i / "scene.toml", "-d", i / "train.parquet", "-m", "sgp-zero"),
-                *("-o", o / "model", "--checkpoint", o / "fit.ckpt"),
+                *("-o", o / "model"),
             ],
             "model",
-            resumes=True,
         ),
         Command(
             "rollout",
@@ -140,8 +138,7 @@ def prepare(folder: Path) -> None:
 
 
 def execute(name: str, inputs: Path, out: Path) -> None:
-    """Run a command in this process; every evaluation of a fit is recorded at once."""
-    checkpoint.INTERVAL = 0.0
+    """Run a command in this process."""
     profiles.PROFILES["quick"] = SMALL
     program, names = (study, ["reproduction"]) if name == "reproduce" else (app, ["forcegp", name])
     sys.argv = [*names, *map(str, COMMANDS[name].arguments(inputs, out))]

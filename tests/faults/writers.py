@@ -6,21 +6,17 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
-import torch
-
 import forcegp
 from forcegp import native
 from forcegp.data import Dataset
 from forcegp.files import write_text, written_folder
 from forcegp.models.base import FittedModel
-from forcegp.storage.checkpoint import Checkpoint, Evaluations
 from logs import random_log
 from random_data import table_system
 
 Write = Callable[[Path, int], None]
 Read = Callable[[Path], int]
 
-START = {"a": torch.zeros(3, dtype=torch.float64)}
 LOGS = {version: random_log(seed=version) for version in (1, 2)}
 SYSTEM = table_system()
 
@@ -77,14 +73,6 @@ def read_model(path: Path) -> int:
     return int((mass / SYSTEM.robot.mass).mean().round())
 
 
-def write_checkpoint(path: Path, version: int) -> None:
-    checkpoint = Evaluations(Checkpoint(path, "key"))
-    objective = checkpoint.recorded(lambda tensors: tensors["a"].sum())
-    for number in range(version):
-        objective({"a": START["a"] + number})
-    checkpoint.write()
-
-
 def write_kernel(path: Path, version: int) -> None:
     native.store(native.private_folder(path), f"key{version}", b"library" * version)
 
@@ -94,15 +82,10 @@ def read_kernel(path: Path) -> int:
     return max(found, default=0)
 
 
-def read_checkpoint(path: Path) -> int:
-    return Evaluations(Checkpoint(path, "key")).read(START)
-
-
 WRITERS = (
     Writer("text", ".txt", write_text_file, read_text_file),
     Writer("folder", "", write_folder, read_folder),
     Writer("log", ".parquet", lambda path, version: LOGS[version].write(path), read_log),
     Writer("model", ".safetensors", lambda path, version: model(version).save(path), read_model),
-    Writer("checkpoint", ".ckpt", write_checkpoint, read_checkpoint, also=1),
     Writer("kernels", "", write_kernel, read_kernel, also=0),
 )

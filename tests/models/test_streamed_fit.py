@@ -2,15 +2,19 @@
 
 from __future__ import annotations
 
+import os
+import signal
+from collections.abc import Iterator
+from functools import partial
 from pathlib import Path
+from typing import Any
 
 import pytest
 import torch
-import torch.multiprocessing
-from safetensors.torch import load_file
 
 import forcegp
 from forcegp import LearningOptions, StreamedDataset
+from forcegp.cluster import cluster, on_cluster
 from forcegp.data import stream
 from forcegp.errors import ModelError
 from forcegp.forces.priors.inertial import InertialPrior
@@ -18,23 +22,26 @@ from forcegp.forces.priors.joint import JointFrictionPrior
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.models import structured_stream
 from forcegp.models.structured_fit import StructuredFit
-from forcegp.storage import checkpoint
-from forcegp.storage.checkpoint import beside
 from forces.cases import draw, logged, mixed_contacts, two_contacts
-from models.stream_worker import PIECE, model, run
 
 SAME = 1e-8
 """Of sums in another order, through a factorisation of some dozens of basis functions."""
 ADDED = 1e-9
 """Relative: the same sums in another order."""
+PIECE = 16
 SHORT = LearningOptions(max_evaluations=3)
 data = logged(two_contacts(), 100)
+
+
+def model(inference: str = "sparse") -> forcegp.StructuredGP:
+    """A model with finite priors, whose fits are exact and fast."""
+    priors, noise = [JointFrictionPrior()], forcegp.Noise(acceleration=0.1, torque=0.2)
+    return forcegp.StructuredGP(two_contacts(), "analytical", priors, noise=noise, inference=inference)
 
 
 @pytest.fixture
 def files(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> StreamedDataset:
     monkeypatch.setattr(stream, "PIECE_ROWS", PIECE)
-    monkeypatch.setattr(checkpoint, "INTERVAL", 0.0)
     data[:70].write(tmp_path / "a.parquet")
     data[70:].write(tmp_path / "b.parquet")
     return StreamedDataset((tmp_path / "a.parquet", tmp_path / "b.parquet"))
@@ -88,42 +95,6 @@ def test_a_part_of_a_long_log_is_learned_from(
     assert float(fit.posterior.latent.moments.rows) > 400
 
 
-class Interrupted(Exception):
-    """Stands for the end of the process."""
-
-
-@pytest.mark.parametrize("after", [1, 3, 7])
-def test_a_fit_goes_on_where_it_stopped(files: StreamedDataset, tmp_path: Path, after: int) -> None:
-    reference = model().fit(files, options=SHORT)
-    seen: list[int] = []
-
-    def stop(done: int, most: int, value: float) -> None:
-        if value != value:
-            seen.append(done)
-            if len(seen) == after:
-                raise Interrupted
-
-    file = tmp_path / "checkpoint"
-    with pytest.raises(Interrupted):
-        model().fit(files, options=SHORT, checkpoint=file, progress=stop)
-    assert beside(file).is_file()
-    again = model().fit(files, options=SHORT, checkpoint=file, progress=stop)
-    assert seen == [16, 32, 48, 64, 70, 86, 100]
-    assert file.is_file() and beside(file).is_file(), "kept until the caller has saved the fit"
-    assert_same(again, reference, 0.0)
-
-
-def test_a_checkpoint_of_another_log(files: StreamedDataset, tmp_path: Path) -> None:
-    file = tmp_path / "checkpoint"
-    model().fit(files, learn=[], checkpoint=file)
-    data[5:].write(files.paths[1])
-    with pytest.raises(ModelError, match="belongs to a different fit"):
-        model().fit(StreamedDataset(files.paths), learn=[], checkpoint=file)
-    beside(file).write_bytes(b"cut off")
-    with pytest.raises(ModelError, match="damaged"):
-        model().fit(files, learn=[], checkpoint=file)
-
-
 def test_exact_inference_needs_the_whole_log(files: StreamedDataset, monkeypatch: pytest.MonkeyPatch) -> None:
     assert model("exact").fit(files, learn=[]).result.inference == "exact"
     monkeypatch.setattr(structured_stream, "SAMPLE_ROWS", 20)
@@ -131,57 +102,45 @@ def test_exact_inference_needs_the_whole_log(files: StreamedDataset, monkeypatch
         model("exact").fit(files, learn=[])
 
 
-def test_two_processes_equal_one(tmp_path: Path) -> None:
-    data.write(tmp_path / "log.parquet")
-    torch.multiprocessing.spawn(run, args=(2, str(tmp_path)), nprocs=2)
-    fit = model().fit(data, learn=[])
-    for rank in range(2):
-        got = load_file(tmp_path / f"{rank}.safetensors")
-        want = fit.posterior.latent.weights  # type: ignore[attr-defined]
-        assert float((got["weights"] - want).abs().max()) < ADDED * float(want.abs().max())
-        assert float(got["likelihood"]) == pytest.approx(fit.result.log_marginal_likelihood, rel=ADDED)
+def weights(fit: StructuredFit) -> torch.Tensor:
+    assert isinstance(fit.posterior.latent, SparsePosterior)
+    return fit.posterior.latent.weights
 
 
-def refusals(folder: Path, processes: int, stops: bool = False) -> list[str]:
-    """What each of some processes says of a fit that cannot be made; none of them hangs."""
-    (folder / "store").unlink(missing_ok=True)
-    for file in folder.glob("*.error"):
-        file.unlink()
-    torch.multiprocessing.spawn(run, args=(processes, str(folder), stops), nprocs=processes)
-    return [file.read_text() for file in sorted(folder.glob("*.error"))]
+@pytest.fixture(scope="module")
+def client() -> Iterator[Any]:
+    pytest.importorskip("distributed")
+    with cluster(2) as client:
+        yield client
 
 
-def test_processes_with_different_files_refuse_the_fit(tmp_path: Path) -> None:
-    data.write(tmp_path / "log.parquet")
-    data.replace(tau=data.tau + 1.0).write(tmp_path / "log.1.parquet")
-    said = refusals(tmp_path, 2)
-    assert len(said) == 2 and all("differ in the log" in text and "process 1" in text for text in said)
+@pytest.mark.parametrize("file_count", [1, 2])
+def test_two_workers_equal_one_process(client: Any, tmp_path: Path, file_count: int) -> None:
+    """A file is shared piece by piece, and several files file by file."""
+    rows = [data] if file_count == 1 else [data[:70], data[70:]]
+    for number, part in enumerate(rows):
+        part.write(tmp_path / f"{number}.parquet")
+    log = StreamedDataset(tuple(tmp_path / f"{number}.parquet" for number in range(file_count)))
+    alone, shared = model().fit(log, learn=[]), model().fit(log, learn=[], client=client)
+    difference = (weights(shared) - weights(alone)).abs().max()
+    assert float(difference) < ADDED * float(weights(alone).abs().max())
+    assert shared.result.log_marginal_likelihood == pytest.approx(
+        alone.result.log_marginal_likelihood, rel=ADDED
+    )
 
 
-OTHERS = [pytest.param(3, False, marks=pytest.mark.slow), pytest.param(2, True, marks=pytest.mark.slow)]
+def once_killed(folder: str, item: int) -> int:
+    """Ends its process without notice at the first call."""
+    mark = Path(folder) / "killed"
+    if item == 1 and not mark.exists():
+        mark.touch()
+        os.kill(os.getpid(), signal.SIGKILL)
+    return item
 
 
-@pytest.mark.parametrize(("processes", "missing"), [(1, False), *OTHERS])
-def test_a_distributed_fit_resumes_with_its_own_processes_only(
-    tmp_path: Path, processes: int, missing: bool
-) -> None:
-    data.write(tmp_path / "log.parquet")
-    (tmp_path / "recorded").touch()
-    assert len(refusals(tmp_path, 2, stops=True)) == 2
-    parts = sorted(tmp_path.glob("fit.part.sums.*"))
-    assert len(parts) == 2
-    if missing:
-        parts[1].unlink()
-    said = refusals(tmp_path, processes)
-    assert len(said) == processes and all("checkpoint" in text for text in said)
-    assert not list(tmp_path.glob("*.safetensors"))
-
-
-def test_a_distributed_fit_resumes(tmp_path: Path) -> None:
-    data.write(tmp_path / "log.parquet")
-    (tmp_path / "recorded").touch()
-    assert len(refusals(tmp_path, 2, stops=True)) == 2
-    assert not refusals(tmp_path, 2)
-    want = model().fit(data, learn=[]).posterior.latent.weights  # type: ignore[attr-defined]
-    got = load_file(tmp_path / "1.safetensors")["weights"]
-    assert float((got - want).abs().max()) < ADDED * float(want.abs().max())
+@pytest.mark.slow
+def test_the_tasks_of_a_killed_worker_are_repeated(tmp_path: Path) -> None:
+    pytest.importorskip("distributed")
+    with cluster(2) as own:
+        assert list(on_cluster(own, partial(once_killed, str(tmp_path)), range(4))) == [0, 1, 2, 3]
+    assert (tmp_path / "killed").exists()

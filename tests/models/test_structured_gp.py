@@ -29,7 +29,6 @@ from forcegp.gp.optimise import LearningOptions
 from forcegp.models.prediction import CHUNK
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.models.structured_gp import StructuredGP
-from forcegp.storage.checkpoint import Checkpoint, Evaluations
 from forces.cases import all_priors, conditioned, draw, logged, mixed_contacts, two_contacts
 from forces.textbook import Textbook
 from logs import random_log
@@ -480,45 +479,6 @@ def test_states_that_do_not_fit_are_refused(model: StructuredFit) -> None:
         model.predict(q, qd, tau, "qddd")
     with pytest.raises(ModelError, match="no quantity is named"):
         model.predict(q, qd, tau, [])
-
-
-class Interrupted(Exception):
-    pass
-
-
-def test_a_fit_resumes_from_its_checkpoint(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    data, path = logged(two_contacts(), 12), tmp_path / "fit.safetensors"
-    monkeypatch.setattr("forcegp.storage.checkpoint.INTERVAL", 0.0)
-    options, seen = forcegp.LearningOptions(max_evaluations=12), list[float]()
-
-    def stop(evaluations: int, most: int, value: float) -> None:
-        seen.append(value)
-        if evaluations == 6:
-            raise Interrupted
-
-    model = forcegp.StructuredGP(two_contacts(), "zero")
-    with pytest.raises(Interrupted):
-        model.fit(data, options=options, progress=stop, checkpoint=path)
-    assert path.is_file()
-    again: list[float] = []
-    note = lambda done, most, value: again.append(value)  # noqa: E731
-    resumed = model.fit(data, options=options, progress=note, checkpoint=path)
-    assert again[: len(seen)] == seen
-    assert path.is_file(), "kept until the caller has saved the fit"
-    whole = forcegp.StructuredGP(two_contacts(), "zero").fit(data, options=options)
-    assert resumed.result.history == whole.result.history
-    assert all(torch.equal(x, resumed.hyperparameters[key]) for key, x in whole.hyperparameters.items())
-
-
-def test_a_checkpoint_of_another_fit_is_refused(tmp_path: Path) -> None:
-    path = tmp_path / "fit.safetensors"
-    start = {"joint.log_std": torch.zeros(7, dtype=torch.float64)}
-    Evaluations(Checkpoint(path, "another")).recorded(lambda tensors: tensors["joint.log_std"].sum())(start)
-    with pytest.raises(ModelError, match="belongs to a different fit"):
-        forcegp.StructuredGP(two_contacts(), "zero").fit(logged(two_contacts(), 5), checkpoint=path)
-    path.write_bytes(b"not a checkpoint")
-    with pytest.raises(ModelError, match="damaged"):
-        forcegp.StructuredGP(two_contacts(), "zero").fit(logged(two_contacts(), 5), checkpoint=path)
 
 
 @pytest.mark.slow

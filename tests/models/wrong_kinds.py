@@ -50,7 +50,6 @@ CALLS = {
     "noise=[None]": lambda: fit_with(noise=[None] * 7),
     "data=list": lambda: forcegp.StructuredGP(SYSTEM, "zero", noise=0.1).fit([1, 2]),
     "data=None": lambda: forcegp.StructuredGP(SYSTEM, "zero", noise=0.1).fit(None),
-    "checkpoint=folder": lambda: MODEL.fit(DATA, checkpoint=tempfile.gettempdir()),
     "mass_matrix(list)": lambda: forcegp.dynamics.mass_matrix(ROBOT, [0.0] * 7),
     "frame_pose(list)": lambda: forcegp.kinematics.frame_pose(ROBOT, [0.0] * 7, ROBOT.frame_names[-1]),
     "load_model(5)": lambda: forcegp.load_model("/dev/null"),

@@ -158,12 +158,6 @@ def _robot_files(out: Path, values: Mapping[str, Any]) -> list[Path]:
     return [out] if values["to"] not in ("urdf", "mjcf") else written_files(out, values["samples"])
 
 
-def _checkpoint(out: Path, _: Mapping[str, Any]) -> list[Path]:
-    from forcegp.storage.checkpoint import beside
-
-    return [out, beside(out)]
-
-
 def _fits(out: Path, values: Mapping[str, Any]) -> list[Path]:
     from forcegp.sweep import fits_of
 
@@ -173,7 +167,6 @@ def _fits(out: Path, values: Mapping[str, Any]) -> list[Path]:
 
 PLACES: dict[tuple[str, str], Places] = {
     ("fit", "out"): _model,
-    ("fit", "checkpoint"): _checkpoint,
     ("excite", "out"): lambda out, _: [out, out.with_suffix(".html")],
     ("export", "out"): _robot_files,
     ("sweep", "out"): _fits,

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from contextlib import nullcontext
 from dataclasses import asdict
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
@@ -12,6 +13,7 @@ from typer import Option
 import forcegp
 from forcegp.cli import common, options
 from forcegp.cli.common import progress_bar, show
+from forcegp.errors import ParameterError
 
 if TYPE_CHECKING:
     from forcegp.models.base import Model
@@ -43,11 +45,9 @@ def fit(
         Option(help="Standard deviation of acceleration noise [rad/s²]; default: from the file or data."),
     ] = None,
     differentiate: options.Differentiate = None,
-    checkpoint: Annotated[
-        Path | None,
-        Option(
-            writable=True, help="File that stores the progress of a long fit, which resumes if it exists."
-        ),
+    workers: Annotated[
+        int | None,
+        Option(min=1, help="Number of processes that share the reading of a long log (needs Dask)."),
     ] = None,
     seed: Annotated[int | None, Option(help="Seed for random initial values.")] = None,
     as_json: options.AsJson = False,
@@ -66,25 +66,27 @@ def fit(
 
     forcegp fit --robot ur3.urdf -d train.parquet --config model.toml --noise-std 0.2 -o model --json
 
-    forcegp fit -s my_scene.toml -d monday.parquet -d tuesday.parquet --checkpoint fit.part -o model
+    forcegp fit -s my_scene.toml -d monday.parquet -d tuesday.parquet --workers 2 -o model
     """
+    from forcegp.cluster import cluster
     from forcegp.destination import check_destination
     from forcegp.models.configured import configured
-    from forcegp.storage.checkpoint import beside
     from forcegp.storage.model_file import model_path
 
     check_destination(model_path(out))
-    if checkpoint is not None:
-        check_destination(checkpoint)
     system = common.system_of(scene, robot)
     table = common.model_table(config, scene)
     regression = configured(table, system, name=model, noise_std=noise_std, seed=seed)
     training = _training(regression.model, data, differentiate, system.robot)
-    learned = common.fitted(regression, training, checkpoint=checkpoint)
+    if workers is not None and not isinstance(training, forcegp.StreamedDataset):
+        raise ParameterError(
+            "--workers has no effect on this fit, which reads its log at once",
+            expected=f"a structured model, and several Parquet files or one over {STREAM_ROWS:,} rows",
+            hint="omit --workers",
+        )
+    with nullcontext() if workers is None else cluster(workers) as client:
+        learned = common.fitted(regression, training, **({} if client is None else {"client": client}))
     common.save(learned.save, out)
-    if checkpoint is not None:
-        for file in (checkpoint, beside(checkpoint)):
-            file.unlink(missing_ok=True)
     doubts = () if learned.result.converged else (f"the fit did not converge: {learned.result.message}",)
     for doubt in (*doubts, *learned.result.warnings):
         common.warn(doubt)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import dataclasses
-import hashlib
 import warnings
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass
@@ -146,8 +145,6 @@ class StreamedDataset:
         differentiate: the method for computing `qd` and `qdd` if they are missing.
         joints: the joints to read, in this order. The default is the joints of the files.
         dtype, device: data type and device of the tensors.
-        distributed: whether the processes of `torch.distributed` share the pieces in a fit. Each process
-            makes the same call and obtains the same result.
 
     Example:
         >>> import tempfile, torch
@@ -166,7 +163,6 @@ class StreamedDataset:
     joints: tuple[str, ...] | None = None
     dtype: torch.dtype = torch.float64
     device: torch.device | str = "cpu"
-    distributed: bool = False
 
     def __post_init__(self) -> None:
         if not self.files:
@@ -177,16 +173,6 @@ class StreamedDataset:
     def files(self) -> tuple[Path, ...]:
         """The files as paths."""
         return tuple(map(Path, (self.paths,) if isinstance(self.paths, str | Path) else self.paths))
-
-    @property
-    def digest(self) -> int:
-        """Hash of the contents of all files."""
-        digest = hashlib.sha256()
-        for path in self.files:
-            with path.open("rb") as file:
-                for part in iter(lambda file=file: file.read(1 << 20), b""):
-                    digest.update(part)
-        return int.from_bytes(digest.digest()[:8], "little", signed=True)
 
     @cached_property
     def _shapes(self) -> tuple[tuple[int, DataHeader], ...]:
@@ -212,12 +198,11 @@ class StreamedDataset:
         """Return the log with only the given joints, in the given order."""
         return dataclasses.replace(self, joints=tuple(joints))
 
-    def pieces(self, start: int = 0, share: tuple[int, int] = (0, 1)) -> Iterator[Dataset]:
+    def pieces(self, share: tuple[int, int] = (0, 1)) -> Iterator[Dataset]:
         """Yield the log in order, `PIECE_ROWS` rows at a time, with consecutive segment numbers.
 
         Args:
-            start: number of pieces to skip.
-            share: (r, k) yields data only for piece r of every k. The others belong to other processes.
+            share: (r, k) yields only piece r of every k. The others belong to other processes.
 
         Raises:
             DataError: a file is damaged, is not a valid log, or has different columns from the first file.
@@ -227,11 +212,10 @@ class StreamedDataset:
         for path in self.files:
             for piece in pieces_of(path, PIECE_ROWS, window, number):
                 number = piece.last_segment
-                in_share = count >= start and count % share[1] == share[0]
-                data = self._dataset(path, piece, first) if in_share or first is None else first
-                first = data[:1] if first is None else first
-                if count >= start:
-                    yield data if in_share else first[:0]
+                if count % share[1] == share[0]:
+                    data = self._dataset(path, piece, first)
+                    first = data[:1] if first is None else first
+                    yield data
                 count += 1
             number += 1
 

@@ -29,7 +29,7 @@ from forcegp.gp.features import Features, Standardization
 from forcegp.gp.inducing import CANDIDATES, LIMIT, select_inducing
 from forcegp.gp.likelihood import negative_log_likelihood, negative_log_likelihood_of_weights
 from forcegp.gp.sparse import SparsePosterior
-from forcegp.gp.sums import Sums, accumulate, add_over_processes, reduce_sums
+from forcegp.gp.sums import Sums, accumulate
 
 Tensors = dict[str, Tensor]
 OWN = tuple(name + "." for name in RESERVED)
@@ -275,25 +275,23 @@ class Totals:
     Attributes:
         sums: sums over the whitened rows.
         constant: part `()` of the negative log likelihood that is independent of the latent forces.
-        samples: number of samples `()`.
-        pieces: number of pieces.
+        samples: number of samples.
     """
 
     sums: Sums
     constant: Tensor
-    samples: Tensor
-    pieces: int
+    samples: int
 
     @classmethod
     def zero(cls, problem: Problem, basis: LatentBasis) -> Totals:
         """Return the totals of an empty log."""
         like = next(iter(basis.params.values()))
-        return cls(Sums.zero(basis, like), like.new_zeros(()), like.new_zeros(()), 0)
+        return cls(Sums.zero(basis, like), like.new_zeros(()), 0)
 
-    def over_processes(self) -> Totals:
-        """Sum the totals over all `torch.distributed` processes. Every process obtains the same result."""
-        constant, samples = add_over_processes(torch.stack([self.constant, self.samples])).unbind()
-        return Totals(reduce_sums(self.sums), constant, samples, self.pieces)
+    def __add__(self, other: Totals) -> Totals:
+        """Return the totals over the samples of both."""
+        samples = self.samples + other.samples
+        return Totals(self.sums + other.sums, self.constant + other.constant, samples)
 
 
 def basis_of(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> LatentBasis:
@@ -314,7 +312,6 @@ def total_over(
     hyperparameters: Mapping[str, Tensor],
     basis: LatentBasis,
     pieces: Iterable[Training],
-    begin: Totals | None = None,
     after: Callable[[Totals], None] = lambda _: None,
 ) -> Totals:
     """Return the totals over the pieces of a log. The memory needed does not depend on their number.
@@ -322,19 +319,13 @@ def total_over(
     Args:
         problem: source of the robot, priors and noise; its training data are not used.
         pieces: the samples, possibly from a generator.
-        begin: totals over previous pieces.
         after: function called after each piece.
     """
-    total = begin or Totals.zero(problem, basis)
+    total = Totals.zero(problem, basis)
     for piece in pieces:
         piece_problem = dataclasses.replace(problem, training=piece)
         rows = piece_problem.rows(hyperparameters)
-        total = Totals(
-            total.sums + accumulate(basis, rows.blocks),
-            total.constant + rows.constant,
-            total.samples + piece.samples,
-            total.pieces + 1,
-        )
+        total += Totals(accumulate(basis, rows.blocks), rows.constant, piece.samples)
         after(total)
     return total
 

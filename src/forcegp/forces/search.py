@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import scipy
@@ -26,7 +26,7 @@ from forcegp.forces.problem import OWN, Problem, Tensors, kernel_parameters, noi
 from forcegp.forces.projection import WhitenedRows
 from forcegp.gp.features import Block
 from forcegp.gp.kernels import Parameters
-from forcegp.gp.optimise import FIRST_STEP, Bounds, Learned, LearningOptions, Objective, Progress, minimise
+from forcegp.gp.optimise import FIRST_STEP, Bounds, Learned, LearningOptions, Progress, minimise
 
 LIMITS = {
     "log_coefficient": (math.log(1e-3), math.log(2.0)),
@@ -283,13 +283,11 @@ class Search:
         start: default initial values, on which the weak priors are centred.
         held: fixed values, which are not learned.
         options: optimiser options.
-        recorded: function that wraps the objective, such as `Checkpoint.recorded`.
     """
 
     start: Tensors
     held: Tensors
     options: LearningOptions
-    recorded: Callable[[Objective], Objective] = lambda objective: objective
 
     def solve(
         self, problem: Problem, progress: Progress | None = None, begin: Mapping[str, Tensor] | None = None
@@ -354,7 +352,7 @@ class Search:
         # With Coulomb friction, neither rule leads to the better optimum on all logs
         # (benchmarks/notes/inference.md), so the first step is not limited.
         step = math.inf if problem.has_coulomb else FIRST_STEP
-        learned = minimise(self.recorded(objective), begin, self.options, analytical, bounds, report, step)
+        learned = minimise(objective, begin, self.options, analytical, bounds, report, step)
         history = [value + constant for value in learned.history]
         doubts = doubts_at_bounds(learned.tensors, bounds)
         return dataclasses.replace(learned, value=learned.value + constant, history=history, doubts=doubts)

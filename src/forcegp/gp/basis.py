@@ -9,9 +9,10 @@ truncated square root of the inverse of their covariance, R Rᵀ = K_zz⁺. Then
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, fields, replace
 from functools import cached_property, reduce
 from itertools import pairwise
+from typing import Any
 
 import torch
 from torch import Tensor
@@ -95,6 +96,10 @@ class ProcessBasis:
     components: int
     inducing: Features
     spectra: tuple[Spectrum, ...]
+
+    def __getstate__(self) -> dict[str, Any]:
+        """Return the fields without cached functions, which other processes compute anew."""
+        return {field.name: getattr(self, field.name) for field in fields(self)}
 
     @cached_property
     def split(self) -> KernelSplit:

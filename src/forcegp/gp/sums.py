@@ -2,30 +2,19 @@
 
 Only S_i = W_iᵀW_i and c_i = W_iᵀy_i of whitened rows y_i = W_i f(x_i) + ε enter the sums G = Σ V_i S_i V_iᵀ
 and v = Σ V_i c_i, where V_i contains the basis functions of each component at sample i.
-
-With `torch.distributed` (gloo on CPUs, NCCL on GPUs), each process sums over different samples, but all
-processes share the inducing points and hyperparameters.
-
-    torchrun --standalone --nproc-per-node 2 script.py
-
-The script must first call `dist.init_process_group("gloo")`.
 """
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass, fields, replace
+from collections.abc import Iterable, Sequence
+from dataclasses import dataclass, fields
 
 import torch
-import torch.distributed as dist
 from torch import Tensor
 
 from forcegp.errors import ModelError
 from forcegp.gp.basis import LatentBasis
-from forcegp.gp.factor import Spectrum
-from forcegp.gp.features import Block, Features, chunked
-from forcegp.gp.kernels import Parameters
+from forcegp.gp.features import Block, chunked
 
 CHUNK_SAMPLES = 1024
 """Number of samples whose basis functions are kept in memory at a time."""
@@ -203,84 +192,3 @@ def _runs(columns: list[slice]) -> list[slice]:
         else:
             runs.append(part)
     return runs
-
-
-def reduce_sums(sums: Sums) -> Sums:
-    """Add the sums of all processes. Every process obtains the same result.
-
-    All must use the basis from `share_basis`, since eigenvectors are unique only up to sign and rotation.
-
-    Raises:
-        ModelError: no process group has been initialised.
-    """
-    flat = add_over_processes(torch.cat([part.reshape(-1) for part in sums.tensors]))
-    pieces = flat.split([part.numel() for part in sums.tensors])
-    return Sums(*(new.reshape(old.shape) for new, old in zip(pieces, sums.tensors, strict=True)))
-
-
-def add_over_processes(x: Tensor) -> Tensor:
-    """Add the tensors of all processes. Every process obtains the same result."""
-    total = x.detach().clone()
-    with _processes():
-        dist.all_reduce(total, op=dist.ReduceOp.SUM)
-    return total
-
-
-def require_agreement(what: str, *values: int, hint: str | None = None) -> None:
-    """Check that all processes have the same values. If not, every process raises the error.
-
-    Raises:
-        ModelError: the values differ, or no process group has been initialised.
-    """
-    own = torch.tensor(values, dtype=torch.int64)
-    with _processes():
-        every = [torch.empty_like(own) for _ in range(dist.get_world_size())]
-        dist.all_gather(every, own)
-    differ = [str(rank) for rank, x in enumerate(every) if not torch.equal(x, every[0])]
-    if differ:
-        got = f"a different one in process {', '.join(differ)} than in process 0"
-        raise ModelError(f"the processes of a distributed fit differ in {what}", got=got, hint=hint)
-
-
-def share_basis(basis: LatentBasis) -> LatentBasis:
-    """Send the basis of the first process to all others. Their bases must have the same shapes.
-
-    Raises:
-        ModelError: no process group has been initialised.
-    """
-    dropped = [s.dropped for part in basis.parts for s in part.spectra]
-    counts = iter(_broadcast(torch.tensor(dropped)).tolist())
-    parts = []
-    for part in basis.parts:
-        spectra = tuple(
-            Spectrum(_broadcast(s.values), _broadcast(s.vectors), next(counts)) for s in part.spectra
-        )
-        params, Z = _shared(part.params), _shared(part.inducing)
-        parts.append(replace(part, params=params, inducing=Z, spectra=spectra))
-    return LatentBasis(basis.processes, _shared(basis.params), tuple(parts))
-
-
-def _shared(tensors: Parameters | Features) -> dict[str, Tensor]:
-    return {key: _broadcast(tensors[key]) for key in sorted(tensors)}
-
-
-def _broadcast(x: Tensor) -> Tensor:
-    copy = x.detach().clone(memory_format=torch.contiguous_format)
-    with _processes():
-        dist.broadcast(copy, src=0)
-    return copy
-
-
-@contextmanager
-def _processes() -> Iterator[None]:
-    """Exchange data with the other processes; raise `ModelError` if there are none or one has failed."""
-    if not (dist.is_available() and dist.is_initialized()):
-        raise ModelError(
-            "no group of processes has been initialised",
-            hint='start with torchrun, and call torch.distributed.init_process_group("gloo") first',
-        )
-    try:
-        yield
-    except RuntimeError as cause:
-        hint = "restart all processes; a fit with a checkpoint resumes"
-        raise ModelError("another process of the fit was lost", got=str(cause)[:300], hint=hint) from cause

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from pathlib import Path
 from typing import Literal
 
 import torch
@@ -29,7 +28,7 @@ from forcegp.models.prediction import Answer, Query
 from forcegp.robot.parameters import AnalyticalParameters
 from forcegp.storage.model_file import ModelHeader
 from forcegp.storage.options import Window
-from forcegp.storage.system import pack_system, take, take_robot
+from forcegp.storage.system import take, take_robot
 
 KIND = "analytical"
 LearnedParameters = Mapping[str, Sequence[str] | Literal["all"]]
@@ -83,7 +82,6 @@ class AnalyticalModel(Model["AnalyticalFit"]):
         *,
         options: BatchOptions | LearningOptions | None = None,
         progress: FitProgress | None = None,
-        checkpoint: str | Path | None = None,
     ) -> AnalyticalFit:
         """Minimise the mean squared acceleration error, starting from random parameters in the window.
 
@@ -92,7 +90,6 @@ class AnalyticalModel(Model["AnalyticalFit"]):
             options: learning options. `BatchOptions` (the default) select ADAM on batches with early
                 stopping. `LearningOptions` select L-BFGS or ADAM on all samples.
             progress: a function called after each epoch or evaluation.
-            checkpoint: see `Model.fit`.
 
         Raises:
             ModelError, DataError: the data are incompatible with the model.
@@ -109,9 +106,7 @@ class AnalyticalModel(Model["AnalyticalFit"]):
             eom = system.equations(part.q, part.qd, part.active)
             return ((eom.acceleration(eom.Q_K + part.tau) - part.values) ** 2).mean()
 
-        record, robot = pack_system(self.system)
-        key = (self.seed, record, *robot.values(), *measured.tensors)
-        learned = train(loss, start, len(measured.q), options or ADAM, generator, progress, checkpoint, key)
+        learned = train(loss, start, len(measured.q), options or ADAM, generator, progress)
         theta.load_state_dict(learned.tensors)
         with torch.no_grad():
             system = self.system.with_robot(theta())

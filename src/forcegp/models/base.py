@@ -104,16 +104,12 @@ class Model(ABC, Generic[F]):
         return dict(self._params)
 
     @abstractmethod
-    def fit(
-        self, data: Dataset, *, progress: FitProgress | None = None, checkpoint: str | Path | None = None
-    ) -> F:
+    def fit(self, data: Dataset, *, progress: FitProgress | None = None) -> F:
         """Learn from a data set.
 
         Args:
             data: states and measurements.
             progress: a function called during the fit.
-            checkpoint: a file that records the progress of a long fit. If the file exists, the fit resumes
-                from it and gives a bit-identical result. Delete the file once the fitted model is saved.
 
         Returns:
             The fitted model. Repeated fits give bit-identical results.

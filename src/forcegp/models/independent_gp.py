@@ -10,7 +10,6 @@ import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import partial
-from pathlib import Path
 
 import torch
 from pydantic import PositiveFloat
@@ -33,7 +32,6 @@ from forcegp.gp.optimise import Learned, LearningOptions, minimise, reported
 from forcegp.models.base import AccelerationFit, FitProgress, Model
 from forcegp.models.fit_result import FitResult
 from forcegp.resources import announce_memory
-from forcegp.storage.checkpoint import Evaluations
 from forcegp.storage.model_file import ModelHeader
 from forcegp.storage.options import KernelOptions
 from forcegp.storage.system import take
@@ -126,7 +124,6 @@ class IndependentGP(Model["IndependentFit"]):
         *,
         options: LearningOptions | None = None,
         progress: FitProgress | None = None,
-        checkpoint: str | Path | None = None,
     ) -> IndependentFit:
         """Learn the hyperparameters by maximum a posteriori estimation, one joint after the other.
 
@@ -134,7 +131,6 @@ class IndependentGP(Model["IndependentFit"]):
             data: states and measured accelerations.
             options: the optimiser and its limits, which apply to each joint.
             progress: a function called after each evaluation. Evaluations are counted over all joints.
-            checkpoint: see `Model.fit`.
 
         Raises:
             ModelError, DataError: the data are incompatible with the model.
@@ -146,9 +142,6 @@ class IndependentGP(Model["IndependentFit"]):
         training = self.training(features, measured.values, noise_std)
         training.announce(LEARNING)
         processes, parts = training.processes(), list[Learned]()
-        first = initial_hyperparameters([processes[0][0]], [processes[0][1]])
-        known = (*features.values(), training.qdd, noise_std)
-        saved = Evaluations.resumed(checkpoint, first, KIND, options, len(processes), *known)
         for prior, block, constant in processes:
             start = initial_hyperparameters([prior], [block])
             centre = start if options.hyperpriors else {}
@@ -156,9 +149,8 @@ class IndependentGP(Model["IndependentFit"]):
             before = sum(part.evaluations for part in parts)
             report = reported(progress, options.max_evaluations * len(processes), before)
             box = box_around(start)
-            learned = minimise(saved.recorded(objective), start, options, bounds=box, progress=report)
+            learned = minimise(objective, start, options, bounds=box, progress=report)
             parts.append(dataclasses.replace(learned, doubts=doubts_at_bounds(learned.tensors, box)))
-        saved.write()
         hyperparameters = {key: x for part in parts for key, x in part.tensors.items()}
         fit = fitted(self, training, hyperparameters, parts)
         result = dataclasses.replace(fit.result, seconds=time.perf_counter() - began)

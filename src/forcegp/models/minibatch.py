@@ -4,19 +4,15 @@ from __future__ import annotations
 
 import math
 import time
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
-from pathlib import Path
 
 import torch
 from torch import Tensor
 
 from forcegp.errors import ModelError, NumericalError
 from forcegp.gp.optimise import FitProgress, Learned, LearningOptions, minimise, reported
-from forcegp.storage.checkpoint import Checkpoint, Evaluations
 
-HISTORY = "history"
-"""Name of the tensor with one entry per epoch, which is the only tensor of variable length."""
 Loss = Callable[[Mapping[str, Tensor], Tensor], Tensor]
 """A function that maps tensors and row numbers `(k,)` to the mean squared error over these rows."""
 
@@ -61,8 +57,6 @@ def train(
     options: BatchOptions | LearningOptions,
     generator: torch.Generator,
     progress: FitProgress | None = None,
-    checkpoint: str | Path | None = None,
-    key: Iterable[object] = (),
 ) -> Learned:
     """Minimise a mean loss over samples.
 
@@ -74,26 +68,19 @@ def train(
             tensors of the epoch with the smallest held-out loss.
         generator: random generator that selects the held-out samples and the order of the rows.
         progress: a function called after each epoch or evaluation with its number, the maximum and the loss.
-        checkpoint: a file that contains the state of training. If the file exists, training resumes from it.
-        key: identifier of the loss for the checkpoint.
 
     Returns:
         The tensors, their loss, and a history with one entry per epoch or evaluation.
 
     Raises:
-        ModelError: there are too few samples to hold any out, or the checkpoint belongs to a different fit.
+        ModelError: there are too few samples to hold any out.
         NumericalError: the loss is not finite.
     """
-    key = (options, *key, *(part for pair in start.items() for part in pair))
     if isinstance(options, BatchOptions):
-        saved = None if checkpoint is None else Checkpoint(Path(checkpoint), Checkpoint.key_of(*key))
-        return _on_batches(loss, start, samples, options, generator, progress, saved)
+        return _on_batches(loss, start, samples, options, generator, progress)
     rows = torch.arange(samples, device=next(iter(start.values())).device)
-    evaluations = Evaluations.resumed(checkpoint, start, *key)
-    objective = evaluations.recorded(lambda tensors: loss(tensors, rows))
-    learned = minimise(objective, start, options, progress=reported(progress, options.max_evaluations))
-    evaluations.write()
-    return learned
+    report = reported(progress, options.max_evaluations)
+    return minimise(lambda tensors: loss(tensors, rows), start, options, progress=report)
 
 
 def _on_batches(
@@ -103,13 +90,10 @@ def _on_batches(
     options: BatchOptions,
     generator: torch.Generator,
     progress: FitProgress | None,
-    saved: Checkpoint | None,
 ) -> Learned:
     began = time.perf_counter()
     held, rows = _split(samples, options.held_out, generator, next(iter(start.values())).device)
-    state = _State.at(start, options.learning_rate, generator)
-    if saved is not None and (tensors := saved.read(state.tensors(), (HISTORY,))):
-        state.restore(tensors, saved.path)
+    state = _State.at(start, options.learning_rate)
     while len(state.history) < options.epochs and state.since < options.patience:
         epoch = len(state.history)
         for group in state.optimizer.param_groups:
@@ -122,10 +106,6 @@ def _on_batches(
             state.note(float(loss(state.weights, held)))
         if progress is not None:
             progress(epoch + 1, options.epochs, state.history[-1])
-        if saved is not None:
-            saved.write_now_and_then(state.tensors)
-    if saved is not None:
-        saved.write(state.tensors())
     history, since = state.history, state.since
     converged = since >= options.patience or _flat(history)
     message = f"{len(history)} epochs, the best on the held-out samples was {len(history) - since}"
@@ -135,23 +115,19 @@ def _on_batches(
 
 @dataclass
 class _State:
-    """Complete state of training on batches."""
+    """State of training on batches."""
 
     weights: dict[str, Tensor]
     optimizer: torch.optim.Adam
-    generator: torch.Generator
     best: dict[str, Tensor]
     history: list[float]
 
     @classmethod
-    def at(cls, start: Mapping[str, Tensor], learning_rate: float, generator: torch.Generator) -> _State:
+    def at(cls, start: Mapping[str, Tensor], learning_rate: float) -> _State:
         """Return the state before the first epoch."""
         weights = {name: value.detach().clone().requires_grad_() for name, value in start.items()}
         optimizer = torch.optim.Adam(weights.values(), lr=learning_rate)
-        for x in weights.values():
-            moments = {name: torch.zeros_like(x, requires_grad=False) for name in ("exp_avg", "exp_avg_sq")}
-            optimizer.state[x] = {"step": torch.zeros(()), **moments}
-        return cls(weights, optimizer, generator, {k: x.detach().clone() for k, x in start.items()}, [])
+        return cls(weights, optimizer, {k: x.detach().clone() for k, x in start.items()}, [])
 
     @property
     def value(self) -> float:
@@ -173,26 +149,6 @@ class _State:
         if held_out < self.value:
             self.best = {name: x.detach().clone() for name, x in self.weights.items()}
         self.history.append(held_out)
-
-    def tensors(self) -> dict[str, Tensor]:
-        """Return the tensors of the state by name."""
-        tensors = {HISTORY: torch.tensor(self.history, dtype=torch.float64)}
-        tensors["generator"] = self.generator.get_state()
-        for name, x in self.weights.items():
-            parts = {"weights": x.detach(), "best": self.best[name], **self.optimizer.state[x]}
-            tensors |= {f"{part}.{name}": value for part, value in parts.items()}
-        return tensors
-
-    def restore(self, tensors: Mapping[str, Tensor], source: Path) -> None:
-        """Resume from a saved state."""
-        for name, value in self.tensors().items():
-            if name not in (HISTORY, "generator"):
-                value.copy_(tensors[name])
-        try:
-            self.generator.set_state(tensors["generator"])
-        except RuntimeError as cause:
-            raise ModelError(f"{source}: the checkpoint is damaged", got=str(cause)) from cause
-        self.history = tensors[HISTORY].tolist()
 
 
 FLAT = 0.05

@@ -5,7 +5,6 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
-from pathlib import Path
 
 import torch
 from torch import Tensor, nn
@@ -67,7 +66,6 @@ class NeuralNetwork(Model["NetworkFit"]):
         *,
         options: BatchOptions | None = None,
         progress: FitProgress | None = None,
-        checkpoint: str | Path | None = None,
     ) -> NetworkFit:
         """Train with ADAM on batches, and keep the weights of the epoch with the smallest held-out error.
 
@@ -75,7 +73,6 @@ class NeuralNetwork(Model["NetworkFit"]):
             data: states and measured accelerations.
             options: training options. The default is `SHALLOW` or `DEEP`, depending on the number of layers.
             progress: a function called after each epoch.
-            checkpoint: see `Model.fit`.
 
         Returns:
             The fitted network. In its result, `evaluations` is the number of epochs, and `objective` is the
@@ -99,7 +96,7 @@ class NeuralNetwork(Model["NetworkFit"]):
 
         options = options or (DEEP if len(self.hidden) > 2 else SHALLOW)
         start = dict(network.named_parameters())
-        learned = train(loss, start, len(x), options, generator, progress, checkpoint, (self.seed, x, y))
+        learned = train(loss, start, len(x), options, generator, progress)
         network.load_state_dict(learned.tensors)
         result = FitResult(**learned.outcome, constant_inputs=inputs.constant)
         network.requires_grad_(False)

@@ -10,7 +10,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Iterable, Iterator, Sequence
-from pathlib import Path
+from typing import TYPE_CHECKING
 
 from torch import nn
 
@@ -30,6 +30,9 @@ from forcegp.models.structured_fit import KIND, StructuredFit, conditioned
 from forcegp.models.structured_learning import Specification, check_learned, learned, problem_for, search_of
 from forcegp.models.structured_stream import Pass, Sample, sample_of
 from forcegp.storage.options import StructuredOptions
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 FIT_COPIES = 3.0
 """Memory of a fit besides its inference matrices, relative to the memory of the equations of motion."""
@@ -126,7 +129,7 @@ class StructuredGP(Model[StructuredFit]):
         after: StructuredFit | None = None,
         options: LearningOptions | None = None,
         progress: FitProgress | None = None,
-        checkpoint: str | Path | None = None,
+        client: Client | None = None,
     ) -> StructuredFit:
         """Learn the hyperparameters by maximum a posteriori estimation, and condition the forces on the data.
 
@@ -142,16 +145,15 @@ class StructuredGP(Model[StructuredFit]):
                 learned.
             progress: a function called after each evaluation. For a streamed log, it is also called after
                 each piece with the number of processed samples, the total number, and NaN.
-            checkpoint: a file that records the evaluations of a long fit. A second file contains the sums
-                over a streamed log. If the files exist, the fit resumes from them and gives a bit-identical
-                result. Delete them once the fitted model is saved.
+            client: a client of a Dask cluster, whose workers share the pass over a streamed log and can read
+                its files. By default, this process reads the log alone.
 
         Returns:
             The fitted model. Repeated fits give bit-identical results.
 
         Raises:
-            ModelError, DataError, UnknownNameError: the data, the earlier fit, `learn` or the checkpoint do
-                not match the model.
+            ModelError, DataError, UnknownNameError: the data, the earlier fit, or `learn` do not match the
+                model.
             NumericalError: the likelihood cannot be computed.
         """
         began = time.perf_counter()
@@ -169,12 +171,11 @@ class StructuredGP(Model[StructuredFit]):
         search = search_of(spec, problem, before, chosen, options)
         begins = chosen is None and after is not None
         begin = {key: before[key] for key in search.start if key in before} if begins else None
-        file = None if checkpoint is None else Path(checkpoint)
         neighbours = None if sample.log is None else sample.neighbours(spec, problem.training)
-        lesson = learned(spec, problem, search, file, progress, begin, neighbours)
+        lesson = learned(spec, problem, search, progress, begin, neighbours)
         values, forces = lesson.hyperparameters, None
         if sample.log is not None and lesson.problem.inducing is not None:
-            whole = Pass(spec, sample.log, sample, file, progress)
+            whole = Pass(spec, sample.log, sample, client, progress)
             forces = whole.forces(*lesson.problem.with_coulomb_errors(values))
         warnings = (*doubts, *lesson.warnings)
         fit = conditioned(spec, lesson.problem, values, lesson.learned, warnings, lesson.learned_on, forces)

@@ -18,7 +18,6 @@ import dataclasses
 import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import torch
 from torch import Tensor, nn
@@ -53,9 +52,7 @@ from forcegp.gp.exact import require_exact_fits
 from forcegp.gp.optimise import FitProgress, Learned, LearningOptions, Progress, reported
 from forcegp.learning.fit import are_columns, regression, with_acceleration_noise, with_expectations
 from forcegp.robot.model import RobotModel
-from forcegp.storage.checkpoint import Evaluations
 from forcegp.storage.options import StructuredOptions
-from forcegp.storage.system import pack_system
 
 OPTIONS, WITH_PARAMETERS = LearningOptions(), LearningOptions(tolerance=1e-9)
 """Default options, and options for learning θ_A, for which L-BFGS may stall for a step or two."""
@@ -340,32 +337,17 @@ def learned(
     spec: Specification,
     problem: Problem,
     search: Search,
-    file: Path | None,
     progress: FitProgress | None,
     begin: Mapping[str, Tensor] | None,
     neighbours: Training | None,
 ) -> Lesson:
-    """Learn the free parameters of a search, and record the evaluations.
-
-    Args:
-        file: a record of the evaluations. Learning resumes from it with a bit-identical result.
-
-    Raises:
-        ModelError: the file belongs to a different fit.
-    """
+    """Learn the free parameters of a search, from the evidence of columns or by an optimiser."""
     if not search.start:
         return Lesson(prepared(spec, problem, search.held), search.held)
     if is_regression(spec, problem):
         return _regressed(spec, problem, search, progress, begin, neighbours)
-    saved = None
-    if file is not None:
-        saved = Evaluations.resumed(file, search.start, *_key(spec, problem, search, begin))
-        search = dataclasses.replace(search, recorded=saved.recorded)
     report = reported(progress, search.options.max_evaluations)
-    lesson = solve(spec, problem, search, report, begin, neighbours)
-    if saved is not None:
-        saved.write()
-    return lesson
+    return solve(spec, problem, search, report, begin, neighbours)
 
 
 def is_regression(spec: Specification, problem: Problem) -> bool:
@@ -410,29 +392,6 @@ def _regressed(
     message = "the evidence is stationary" if found.converged else "stopped at the limit of alternations"
     learned = Learned(values, found.objective, found.converged, found.rounds, seconds, message)
     return Lesson(whole, values, learned, found.samples, warnings, found.worth)
-
-
-def identity(problem: Problem) -> tuple[object, ...]:
-    """Return the mean, priors, data, noise and system of a problem, as part of a checkpoint key."""
-    training, (record, robot) = problem.training, pack_system(problem.system)
-    data = (value for m in training.measurements for value in m.tensors)
-    priors = [(type(prior).__name__, prior) for prior in problem.priors]
-    return problem.mean, priors, training.part_of, *data, *training.noise_std, record, *robot.values()
-
-
-def _key(
-    spec: Specification, problem: Problem, search: Search, begin: Mapping[str, Tensor] | None
-) -> tuple[object, ...]:
-    """Return an identifier for a search on a problem with these options."""
-    named = [pair for group in (search.start, search.held, begin or {}) for pair in group.items()]
-    sides = [side for scale in problem.training.scales for side in (scale.mean, scale.std)]
-    stated = problem.state_std, problem.torque_std, problem.external_std
-    noise = ["none" if x is None else x for x in stated]
-    return (
-        *identity(problem), *problem.pinned, *problem.pinned.values(), problem.training.quantities,
-        spec.options, spec.noise.degrees_of_freedom, search.options,
-        *noise, *(x for side in sides for x in side.values()), *(part for pair in named for part in pair),
-    )  # fmt: skip
 
 
 def solve(

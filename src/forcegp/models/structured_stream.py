@@ -6,15 +6,16 @@ points. In a second pass, the sums over all samples are computed.
 
 from __future__ import annotations
 
+import dataclasses
 import math
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass, fields
-from pathlib import Path
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
 
 import torch
-import torch.distributed as dist
 from torch import Tensor
 
+from forcegp.cluster import on_cluster, worker_count
 from forcegp.data import Dataset
 from forcegp.data.stream import Keep, StreamedDataset, spaced_sample
 from forcegp.errors import ModelError
@@ -26,11 +27,11 @@ from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.problem import Problem, Totals, basis_of, posterior_of, total_over
 from forcegp.gp.basis import LatentBasis
 from forcegp.gp.features import Standardization
-from forcegp.gp.kernels import sub
-from forcegp.gp.sums import Sums, require_agreement, share_basis
 from forcegp.models.base import FitProgress
-from forcegp.models.structured_learning import FEWEST_MOVING, REST_SPEED, Specification, identity
-from forcegp.storage.checkpoint import Checkpoint, beside
+from forcegp.models.structured_learning import FEWEST_MOVING, REST_SPEED, Specification
+
+if TYPE_CHECKING:
+    from distributed import Client
 
 SAMPLE_ROWS = 20_000
 """Number of evenly spaced rows for learning. Fewer than twice this number are in memory at a time."""
@@ -76,10 +77,8 @@ def sample_of(spec: Specification, data: StreamedDataset) -> Sample:
 
     Raises:
         DataError: a file is damaged or contains no samples.
-        ModelError: the processes read different logs, or exact inference is requested for a streamed log.
+        ModelError: exact inference is requested for a streamed log.
     """
-    if data.distributed:
-        require_agreement("the log", data.digest, len(data), hint="pass the same files to each")
     moving = spec.automatic or spec.noise.learns_torque
     rows, stretches, count = _rows_of(data, moving_rows if moving else None)
     if moving and count < FEWEST_MOVING:
@@ -135,20 +134,20 @@ def moving_rows(data: Dataset) -> Tensor:
 
 @dataclass(frozen=True)
 class Pass:
-    """A resumable pass over a streamed log in one or several processes.
+    """A pass over a streamed log, by this process or by the workers of a cluster.
 
     Attributes:
         spec: the model.
         log: the log.
         sample: the sample used for learning.
-        checkpoint: the file that records the sums, or `None`.
+        client: client of a Dask cluster, or `None`.
         progress: a function called with the number of processed samples, the total number, and NaN.
     """
 
     spec: Specification
     log: StreamedDataset
     sample: Sample
-    checkpoint: Path | None = None
+    client: Client | None = None
     progress: FitProgress | None = None
 
     @torch.no_grad()
@@ -158,81 +157,63 @@ class Pass:
         """Return the forces conditioned on the whole log, and the likelihood terms independent of them.
 
         Raises:
-            ModelError: the checkpoint belongs to a different fit.
             NumericalError: the sums are not finite.
         """
-        basis, begin = basis_of(problem, hyperparameters), None
-        saved = Checkpoint(self._own_file(), self._key(problem, hyperparameters)) if self.checkpoint else None
-        kept, refused = {}, None
-        if saved is not None:
-            try:
-                kept = saved.read(_tensors(basis, Totals.zero(problem, basis)))
-            except ModelError as cause:
-                refused = cause
-            if self.log.distributed:
-                # If one process stops, the others must not wait for it.
-                hint = "resume with the original number of processes, or remove all parts of the checkpoint"
-                require_agreement("their parts of the checkpoint", 2 if refused else bool(kept), hint=hint)
-            if refused is not None:
-                raise refused
-        if kept:
-            basis, begin = _restored(basis, kept)
-        elif self.log.distributed:
-            basis = share_basis(basis)
-        processes = dist.get_world_size() if self.log.distributed else 1
-
-        def after(total: Totals) -> None:
-            if saved is not None:
-                saved.write_now_and_then(lambda: _tensors(basis, total))
+        basis, kept = basis_of(problem, hyperparameters), kept_scales(problem.priors, problem.training)
+        rows = [torch.arange(0)] * len(problem.training.measurements)
+        bare = dataclasses.replace(problem, training=problem.training.of_rows(rows))
+        part = Part(self.spec, bare, dict(hyperparameters), basis, kept, self.sample.moving)
+        if self.client is None:
+            totals = map(part.piece, self.log.pieces())
+        else:
+            totals = on_cluster(self.client, part.share, shares(self.log, worker_count(self.client)))
+        total = Totals.zero(problem, basis)
+        for each in totals:
+            total += each
             if self.progress is not None:
-                done = processes * int(total.samples)
-                self.progress(done, self.sample.count, math.nan)
-
-        pieces = self._pieces(problem, 0 if begin is None else begin.pieces)
-        total = total_over(problem, hyperparameters, basis, pieces, begin, after)
-        if self.log.distributed:
-            total = total.over_processes()
+                self.progress(total.samples, self.sample.count, math.nan)
         return posterior_of(problem, hyperparameters, basis, total), total.constant
 
-    def _pieces(self, problem: Problem, start: int) -> Iterator[Training]:
-        """Yield the samples of this process piece by piece. Pieces of other processes are empty."""
-        rank, processes = (dist.get_rank(), dist.get_world_size()) if self.log.distributed else (0, 1)
-        kept = kept_scales(problem.priors, problem.training)
-        for piece in self.log.pieces(start, (rank, processes)):
-            if self.sample.moving:
-                piece = piece[moving_rows(piece)]
-            if len(piece) == 0:
-                yield problem.training.of_rows([torch.arange(0)] * len(problem.training.measurements))
-            else:
-                noise_std = self.spec.noise.acceleration
-                rows = training_of(piece, self.spec.system, problem.priors, noise_std, kept)
-                yield without_delay(rows, problem.priors)
 
-    def _own_file(self) -> Path:
-        assert self.checkpoint is not None
-        path = beside(self.checkpoint)
-        return path.with_name(f"{path.name}.{dist.get_rank()}") if self.log.distributed else path
+@dataclass(frozen=True)
+class Part:
+    """What a worker needs to add up its part of a log.
 
-    def _key(self, problem: Problem, hyperparameters: Mapping[str, Tensor]) -> str:
-        """Return an identifier for the sums over a log with a given basis, system and noise."""
-        files = [(path.name, path.stat().st_size) for path in self.log.files]
-        points = [x for Z in problem.inducing or () for x in Z.values()]
-        named = [part for pair in sorted(hyperparameters.items()) for part in pair]
-        processes = dist.get_world_size() if self.log.distributed else 1
-        streamed = (problem.power, files, self.log.differentiate, processes)
-        return Checkpoint.key_of(*identity(problem), *streamed, *points, *named)
+    Attributes:
+        spec: the model.
+        problem: the problem without samples.
+        hyperparameters: the hyperparameters.
+        basis: the basis functions of all workers.
+        scales: input scales, keyed by prior.
+        moving: whether samples at rest are ignored.
+    """
+
+    spec: Specification
+    problem: Problem
+    hyperparameters: dict[str, Tensor]
+    basis: LatentBasis
+    scales: dict[str, Standardization]
+    moving: bool
+
+    @torch.no_grad()
+    def piece(self, piece: Dataset) -> Totals:
+        """Return the totals over the samples of a piece."""
+        if self.moving:
+            piece = piece[moving_rows(piece)]
+        if len(piece) == 0:
+            return Totals.zero(self.problem, self.basis)
+        noise_std, priors = self.spec.noise.acceleration, self.problem.priors
+        rows = training_of(piece, self.spec.system, priors, noise_std, self.scales)
+        return total_over(self.problem, self.hyperparameters, self.basis, [without_delay(rows, priors)])
+
+    def share(self, share: tuple[StreamedDataset, int, int]) -> Totals:
+        """Return the totals over every k-th piece of a log from piece r, on one thread."""
+        torch.set_num_threads(1)
+        log, r, k = share
+        return sum(map(self.piece, log.pieces((r, k))), Totals.zero(self.problem, self.basis))
 
 
-def _tensors(basis: LatentBasis, total: Totals) -> dict[str, Tensor]:
-    """Return the intermediate results of a pass, keyed by name."""
-    tensors = {f"basis.{name}": value for name, value in basis.tensors().items()}
-    tensors |= {f"sums.{i}": value for i, value in enumerate(total.sums.tensors)}
-    counts = {"constant": total.constant, "samples": total.samples, "pieces": torch.tensor(total.pieces)}
-    return tensors | counts
-
-
-def _restored(basis: LatentBasis, tensors: Mapping[str, Tensor]) -> tuple[LatentBasis, Totals]:
-    """Restore the basis and totals from `_tensors`, with kernel inputs in the order of the prior."""
-    own = LatentBasis.of_tensors(basis.processes, basis.params, sub(tensors, "basis"))
-    sums = Sums(*(tensors[f"sums.{i}"] for i in range(len(fields(Sums)))))
-    return own, Totals(sums, tensors["constant"], tensors["samples"], int(tensors["pieces"]))
+def shares(log: StreamedDataset, workers: int) -> list[tuple[StreamedDataset, int, int]]:
+    """Return the parts of a log for some workers: its files, or every k-th piece of a file."""
+    files, k = log.files, math.ceil(workers / len(log.files))
+    return [(dataclasses.replace(log, paths=(file,)), r, k) for file in files for r in range(k)]
