@@ -25,7 +25,6 @@ from torch import Tensor
 
 import forcegp
 from forcegp.errors import DataError
-from forcegp.forces.priors.sets import SETS
 
 MOTIONS = ("motion_a", "motion_b")
 HALVES: dict[str, Callable[[Tensor], Tensor]] = {
@@ -50,9 +49,9 @@ def cases_of(data: forcegp.Dataset, name: str, robot: forcegp.RobotModel) -> lis
     return found
 
 
-def run(case: Case, priors: str) -> dict:
+def run(case: Case) -> dict:
     """Scores of a model on the other half."""
-    fitted, test = structured(case, priors=priors), moving(case.tests["other half"])
+    fitted, test = structured(case), moving(case.tests["other half"])
     found = scores(fitted.predict(test), test, case.system.robot)
     assert fitted.fit is not None
     learned = {key: value.tolist() for key, value in fitted.fit.hyperparameters.items()}
@@ -67,7 +66,6 @@ def main() -> None:
         "--logs", type=Path, default=LOGS, help="folder of the logs (default: ../shared/real)"
     )
     parser.add_argument("--log", choices=MOTIONS, nargs="*", default=list(MOTIONS))
-    parser.add_argument("--priors", choices=("auto", *SETS), default="auto", help="set of force priors")
     parser.add_argument("--json", type=Path, help="write all results to this file")
     options = parser.parse_args()
     result: dict[str, dict] = {}
@@ -78,7 +76,7 @@ def main() -> None:
             for case in cases_of(forcegp.read_log(path, robot, "iiwa14_txt"), name, robot):
                 with warnings.catch_warnings():
                     warnings.simplefilter("ignore")
-                    result[case.name] = found = run(case, options.priors)
+                    result[case.name] = found = run(case)
                 coverage = found["torque_coverage"]
                 geometric = float(torch.tensor(found["torque_rmse"]).log().mean().exp())
                 print(

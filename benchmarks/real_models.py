@@ -63,7 +63,7 @@ def constant(case: Case) -> Fitted:
     return Fitted(lambda data: Predicted(mean.expand_as(data.qdd), None, case.system), 0.0)
 
 
-def structured(case: Case, samples: int | None = None, priors: str | Sequence[ForcePrior] = "auto") -> Fitted:
+def structured(case: Case, samples: int | None = None, priors: Sequence[ForcePrior] | None = None) -> Fitted:
     """The structured GP with the priors that the log asks for, or with given ones."""
     train = case.train if samples is None else evenly(moving(case.train), samples)
     fit = forcegp.StructuredGP(case.system, "analytical", force_priors=priors).fit(train)

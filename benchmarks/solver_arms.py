@@ -289,8 +289,8 @@ def mass_matrices(arm: Arm, fit: StructuredFit, q: Tensor) -> dict:
 
 
 def inertia_alone(arm: Arm, case: Case) -> dict:
-    """The mass matrix of a fit with friction priors, without any other score."""
-    model = forcegp.StructuredGP(case.system, "analytical", force_priors="friction", inertia="auto")
+    """The mass matrix of a default fit, without any other score."""
+    model = forcegp.StructuredGP(case.system, "analytical")
     q = moving(case.tests["test"]).q
     found = mass_matrices(arm, model.fit(case.train), q[:: max(1, len(q) // STATES)])
     return {"ratios": {}, "mass_matrix": found}

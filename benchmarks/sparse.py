@@ -1,7 +1,7 @@
 """Sparse posterior: each bound on time, memory and accuracy beside what is measured.
 
     python benchmarks/sparse.py --json result.json                      # everything, a quarter of an hour
-    python benchmarks/sparse.py --section stream predict processes      # synthetic rows only
+    python benchmarks/sparse.py --section stream predict      # synthetic rows only
     python benchmarks/sparse.py --logs FOLDER                           # keep the simulated logs there
 
 Each measurement runs in a process of its own, with one thread, so that peak memory is its own; ratios are of
@@ -100,25 +100,6 @@ def predict(options: argparse.Namespace) -> tuple[object, list[Bound]]:
         "update_one_sample_ms": (f"update with one sample, {found['basis_functions']} basis functions", 2.0),
     }
     return found, [Bound(what, found[key]["wall"], "ms", most=most) for key, (what, most) in limits.items()]
-
-
-def processes(options: argparse.Namespace) -> tuple[object, list[Bound]]:
-    """How much faster two processes of one thread are than one."""
-    samples, seconds, used = min(options.samples), [], []
-    for count in (1, 2):
-        with tempfile.TemporaryDirectory() as folder:
-            store = str(Path(folder) / "store")
-            found = alone(sparse_rows.shards, *((samples, rank, count, store) for rank in range(count)))
-        seconds.append(max(result["seconds"] for result in found))
-        used.append(max(result["processor_seconds"] for result in found))
-    result = {
-        "samples": samples,
-        "one": seconds[0],
-        "two": seconds[1],
-        "ratio": seconds[0] / seconds[1],
-        "ratio_of_processor_time": used[0] / used[1],
-    }
-    return result, [Bound("two processes against one", result["ratio"], least=1.7)]
 
 
 def accuracy(options: argparse.Namespace) -> tuple[object, list[Bound]]:

@@ -116,7 +116,7 @@ def make_fit(folder: Path, run: Path, log: Path, *, scene: str, variant: str) ->
 def _model(variant: str, system: ConstrainedSystem, train: Dataset) -> FittedModel:
     if variant == "file":
         return AnalyticalModel(system).nominal()
-    model = create("sgp", system, force_priors="friction", inertia="auto")
+    model = create("sgp", system)
     assert isinstance(model, StructuredGP)
     if variant == "sensor":
         return model.fit(with_sensor(train, system, sensor_noise_std(train, system)))

@@ -21,8 +21,6 @@ pytest.importorskip("mujoco")
 MODEL = """
 [model]
 name = "sgp"
-priors = "friction"
-inertia = "auto"
 sensor_noise_std = 0.5
 [model.learning]
 max_evaluations = 40

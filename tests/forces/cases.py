@@ -12,9 +12,14 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data.fields import DataHeader
 from forcegp.forces.posterior import ForceSamples
 from forcegp.forces.priors.base import ForcePrior
-from forcegp.forces.priors.contact import ContactForcePrior, SlidingFrictionPrior, with_coulomb
+from forcegp.forces.priors.contact import (
+    ContactForcePrior,
+    NormalForcePrior,
+    SlidingFrictionPrior,
+    with_coulomb,
+)
 from forcegp.forces.priors.joint import JointForcePrior
-from forcegp.forces.priors.sets import REMAINING
+from forcegp.forces.priors.sets import REMAINING, friction_priors
 from forcegp.forces.quantities import States
 from forcegp.gp.kernels import Linear, SquaredExponential
 from forcegp.models.structured_fit import StructuredFit
@@ -84,6 +89,12 @@ def all_priors() -> list[ForcePrior]:
         ContactForcePrior("table", Linear(("velocity",)) + SquaredExponential()),
         SlidingFrictionPrior("ball"),
     ]
+
+
+def friction_and_residual() -> list[ForcePrior]:
+    """Friction, and a joint force without a law, in two contacts."""
+    residual = JointForcePrior(SquaredExponential(("q", "qd"), shared=True), inputs=("q", "qd"))
+    return [*friction_priors(two_contacts()), residual, NormalForcePrior(residual)]
 
 
 def conditioned(

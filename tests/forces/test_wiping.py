@@ -43,7 +43,7 @@ def test_the_normal_force_is_found_without_a_force_sensor() -> None:
         log = simulate(scene.system(), replace(scene.simulation, duration=24.0, seed=seed)).data
         train, test = log[: 18 * 250 : EVERY], log[18 * 250 :]
         test = test[in_contact(test)]
-        model = create("sgp", scene.system(), force_priors="friction", inertia="auto")
+        model = create("sgp", scene.system())
         fit = model.fit(train)
         found = fit.predict(
             test.q, test.qd, test.tau, "multiplier", active=test.active(("table",)), noise=True

@@ -18,6 +18,7 @@ from forcegp.constraints.contact import Constraint
 from forcegp.data import RobotMismatchWarning
 from forcegp.errors import ModelError, NumericalError
 from forcegp.evaluation.predicted import multiplier_scores
+from forcegp.forces.priors.sets import contact_priors
 from forcegp.models.prediction import Prediction
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.simulate import simulate
@@ -163,7 +164,7 @@ def doubts_of(data: forcegp.Dataset, **settings: object) -> str:
 
 @pytest.mark.parametrize("inference", ["exact", "sparse"])
 def test_a_model_that_misses_its_data_by_far_says_by_how_much(data: forcegp.Dataset, inference: str) -> None:
-    settings = {"force_priors": "sliding", "inference": inference}
+    settings = {"force_priors": contact_priors(SYSTEM), "inference": inference}
     assert "misses" not in doubts_of(data, **settings)
     # Two newton metres at one joint that nothing in the model explains.
     pushed = data.replace(tau=data.tau + 2.0 * torch.eye(7, dtype=torch.float64)[1])

@@ -33,7 +33,7 @@ from forcegp.forces.posterior import unknown_variance
 from forcegp.forces.priors.contact import ContactForcePrior, NormalForcePrior, SlidingFrictionPrior
 from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
 from forcegp.forces.priors.joint import JointForcePrior, JointFrictionPrior
-from forcegp.forces.priors.sets import WHOLE, default_priors
+from forcegp.forces.priors.sets import WHOLE, default_priors, friction_priors
 from forcegp.forces.quantities import QUANTITIES, states_at
 from forcegp.gp.kernels import Linear, Matern32, Matern52, SquaredExponential
 from forcegp.gp.sparse import SparsePosterior
@@ -41,7 +41,7 @@ from forcegp.models.export.library import CompiledFit
 from forcegp.models.export.source import c_source
 from forcegp.models.prediction import Prediction
 from forcegp.models.structured_fit import StructuredFit
-from forces.cases import draw, logged, mixed_contacts, two_contacts
+from forces.cases import draw, friction_and_residual, logged, mixed_contacts, two_contacts
 from slow import slow_except
 
 SAME = 1e-10  # of max(|mean|, σ); the sums are the same in another order
@@ -67,7 +67,7 @@ def free_friction() -> StructuredFit:
     """The default model of a measured robot, with everything that it learns."""
     robot = forcegp.load_robot("kuka_iiwa")
     system = forcegp.ConstrainedSystem(robot)
-    model = forcegp.StructuredGP(system, mean="analytical", force_priors="friction")
+    model = forcegp.StructuredGP(system, mean="analytical", force_priors=friction_priors(system))
     return model.fit(free_log(robot, 120), options=forcegp.LearningOptions(max_evaluations=15))
 
 
@@ -91,21 +91,20 @@ def one_contact() -> StructuredFit:
     """Friction of the joints and, coupled with the multiplier, of a contact."""
     system = forcegp.ConstrainedSystem(two_contacts().robot, two_contacts().contacts[:1], forcegp.Baumgarte())
     noise = forcegp.Noise(0.1, torque=0.3, external={"lbr_iiwa_joint_2": 0.5})
-    model = forcegp.StructuredGP(system, "analytical", "friction", noise=noise)
+    model = forcegp.StructuredGP(system, "analytical", friction_priors(system), noise=noise)
     return model.fit(logged(two_contacts(), 60), learn=[])
 
 
 def sparse() -> StructuredFit:
     """Inducing points of a residual force, in two contacts."""
-    model = forcegp.StructuredGP(
-        two_contacts(), "analytical", "friction+residual", inference="sparse", inducing_points=12
-    )
+    priors = friction_and_residual()
+    model = forcegp.StructuredGP(two_contacts(), "analytical", priors, inference="sparse", inducing_points=12)
     return model.fit(logged(two_contacts(), 80), learn=[])
 
 
 def exact() -> StructuredFit:
     """The same by exact inference."""
-    model = forcegp.StructuredGP(two_contacts(), "analytical", "friction+residual", inference="exact")
+    model = forcegp.StructuredGP(two_contacts(), "analytical", friction_and_residual(), inference="exact")
     return model.fit(logged(two_contacts(), 16), learn=[])
 
 

@@ -22,7 +22,7 @@ from forcegp.forces.priors.joint import JointFrictionPrior
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.models import structured_stream
 from forcegp.models.structured_fit import StructuredFit
-from forces.cases import draw, logged, mixed_contacts, two_contacts
+from forces.cases import draw, friction_and_residual, logged, mixed_contacts, two_contacts
 
 SAME = 1e-8
 """Of sums in another order, through a factorisation of some dozens of basis functions."""
@@ -63,9 +63,8 @@ def test_as_in_memory(files: StreamedDataset) -> None:
 
 
 def test_inducing_points(files: StreamedDataset) -> None:
-    small = forcegp.StructuredGP(
-        two_contacts(), "analytical", "friction+residual", 0.1, inference="sparse", inducing_points=12
-    )
+    priors, points = friction_and_residual(), {"inference": "sparse", "inducing_points": 12}
+    small = forcegp.StructuredGP(two_contacts(), "analytical", priors, 0.1, **points)
     fit = small.fit(files, learn=[])
     assert_same(fit, small.fit(data, learn=[]), SAME)
     assert isinstance(fit.posterior.latent, SparsePosterior)

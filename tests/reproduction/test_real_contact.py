@@ -121,7 +121,7 @@ def test_with_the_sensor_at_each_state_the_force_is_better_than_either(logs: dic
     train, test = log[rows[(rows // 200) % 2 == 0]], log[rows[(rows // 200) % 2 == 1]]
     logged = {"ball": truth.contact_extras["multiplier"]["ball"][rows_of(test, truth)]}
     test = test.replace(contact_extras={**test.contact_extras, "multiplier": logged})
-    model = create("sgp", SYSTEM, force_priors="friction", inertia="auto")
+    model = create("sgp", SYSTEM)
     assert isinstance(model, StructuredGP)
     few = LearningOptions(max_evaluations=15)
     model = model.fit(with_sensor(train[::8], SYSTEM, FORCE_NOISE), options=few)

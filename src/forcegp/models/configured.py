@@ -117,8 +117,8 @@ def _arguments(table: ModelTable, system: ConstrainedSystem, name: str) -> dict[
         _check_key(table, ("model", key), keys_of(made), f"the model {name!r}")
         if key == "mean" and not isinstance(value, str):
             value = at(("model", "mean"), AnalyticalMean, value)
-        elif key == "priors" and not isinstance(value, str):
-            value = _priors(table, value)
+        elif key == "priors":
+            value = _priors(table, table.section.priors)
         elif key == "analytical_parameters":
             theta = at(("model", key), AnalyticalParameters, system.robot, value)
             value = theta if made is StructuredGP else value

@@ -256,7 +256,7 @@ class Reading:
         if self.fit.torque_std is None or correlation is None:
             raise ModelError(
                 "this fit has no learned torque noise, which the momentum filter needs",
-                hint='fit more samples in time order, with force_priors="friction"',
+                hint="fit more samples in time order, with the default priors",
             )
         noise, segment = velocity_noise(self.data), self.data.segment
         rows = ((segment == own).nonzero()[:, 0] for own in segment.unique_consecutive())

@@ -21,7 +21,7 @@ from forcegp.forces.measurements import NoiseStd, Observation
 from forcegp.forces.noise import Noise, state_std_of
 from forcegp.forces.priors.base import ForcePrior, check_priors
 from forcegp.forces.priors.joint import AnalyticalMean, JointFrictionPrior, mean_of
-from forcegp.forces.priors.sets import priors_of
+from forcegp.forces.priors.sets import default_priors, friction_priors
 from forcegp.forces.problem import require_double
 from forcegp.gp.inducing import LIMIT
 from forcegp.gp.optimise import LearningOptions
@@ -44,11 +44,10 @@ class StructuredGP(Model[StructuredFit]):
     Args:
         system: the robot and its contacts.
         mean: `"analytical"`, `"zero"`, or an `AnalyticalMean` with a subset of its terms.
-        force_priors: priors on the unknown forces, the name of a set in `SETS` (`"sliding"`, `"friction"`,
-            `"friction+residual"`), or `"auto"`. With `"auto"` and the analytical mean, all terms that apply
+        force_priors: priors on the unknown forces. By default, with the analytical mean, all terms that apply
             to the log take part: friction of joints and contacts, bristles for logs in time order, and torque
             noise. `fit.result.worth` contains their log evidence. Terms that the evidence speaks against are
-            dropped (`learning/evidence.py`). If the mean does not include the motor torque, `"auto"` selects
+            dropped (`learning/evidence.py`). If the mean does not include the motor torque, the default is
             `default_priors`: a `JointForcePrior` and, in contact, a `NormalForcePrior` that affects only
             multipliers.
         noise: standard deviation of measured accelerations [rad/s², m/s²], as one value or one per joint, or
@@ -85,7 +84,7 @@ class StructuredGP(Model[StructuredFit]):
         self,
         system: ConstrainedSystem,
         mean: str | AnalyticalMean = "analytical",
-        force_priors: str | Sequence[ForcePrior] = "auto",
+        force_priors: Sequence[ForcePrior] | None = None,
         noise: NoiseStd | Noise | None = None,
         analytical_parameters: nn.Module | None = None,
         inference: str = "auto",
@@ -96,8 +95,11 @@ class StructuredGP(Model[StructuredFit]):
         self._keep(locals())
         require_double(system)
         form, stated, options = mean_of(mean), Noise.of(noise), StructuredOptions.of(self._params)
-        automatic = force_priors == "auto" and "actuation" in form.terms
-        priors = priors_of(system, form, force_priors)
+        around = "actuation" in form.terms
+        automatic = force_priors is None and around
+        if force_priors is None:
+            force_priors = friction_priors(system) if around else default_priors(system, form)
+        priors = tuple(force_priors)
         check_priors(priors, system)
         state_std_of(stated.state, system.robot)
         self.system = system

@@ -68,7 +68,7 @@ class ModelSection(Section, StructuredOptions):
     noise: NoiseSection = NoiseSection()
     sensor_noise_std: PositiveFloat | None = None
     mean: Literal["zero", "analytical"] | tuple[str, ...] = "analytical"
-    priors: str | tuple[dict[str, Any], ...] = ()
+    priors: tuple[dict[str, Any], ...] = ()
     analytical_parameters: dict[str, Literal["all"] | tuple[str, ...]] = Field(default_factory=dict)
     hidden: tuple[PositiveInt, ...] = ()
     window: Window = Window()

@@ -1,11 +1,8 @@
-"""Named sets of force priors: the candidates for automatic selection, and the priors of the paper."""
+"""Sets of force priors: those of real robots, and those of the paper."""
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
-from forcegp.errors import check_name
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.contact import ContactForcePrior, NormalForcePrior, SlidingFrictionPrior
 from forcegp.forces.priors.joint import AnalyticalMean, JointForcePrior, JointFrictionPrior, mean_of
@@ -20,9 +17,6 @@ WHOLE = Linear(("tau",)) + ANGLES + RATES * RATES * ANGLES + SquaredExponential(
 and damping forces (quadratic and linear in the velocity), and any joint friction."""
 REMAINING = RATES * ANGLES + SquaredExponential(shared=True)
 """Kernel for a force without the motor torque: configuration-dependent damping and an arbitrary remainder."""
-STATE_RESIDUAL = SquaredExponential(("q", "qd"), shared=True)
-"""Kernel for a residual force in addition to friction. It does not depend on the motor torque, because in
-closed loop the residual would learn to cancel this torque."""
 
 
 def default_priors(
@@ -70,13 +64,6 @@ def friction_priors(system: ConstrainedSystem) -> tuple[ForcePrior, ...]:
     return (JointFrictionPrior(), *sliding)
 
 
-def friction_and_residual_priors(system: ConstrainedSystem) -> tuple[ForcePrior, ...]:
-    """Return `friction_priors` together with a prior on an arbitrary joint force that depends on (q, q̇)."""
-    residual = JointForcePrior(STATE_RESIDUAL, inputs=("q", "qd"))
-    normal = (NormalForcePrior(residual),) if system.m else ()
-    return (*friction_priors(system), residual, *normal)
-
-
 def contact_priors(system: ConstrainedSystem, kernel: Kernel | None = None) -> tuple[ForcePrior, ...]:
     """Return priors on the friction of each surface contact, or a joint force prior if there are no contacts.
 
@@ -101,27 +88,3 @@ def contact_priors(system: ConstrainedSystem, kernel: Kernel | None = None) -> t
 def _surfaces(system: ConstrainedSystem) -> list[str]:
     """Return the names of the contacts with a surface."""
     return [contact.name for contact in system.contacts if isinstance(contact, SurfaceContact)]
-
-
-SETS: dict[str, Callable[[ConstrainedSystem], tuple[ForcePrior, ...]]] = {
-    "sliding": contact_priors,
-    "friction": friction_priors,
-    "friction+residual": friction_and_residual_priors,
-}
-"""Named sets for the analytical mean, from the simplest to the most complex."""
-
-
-def priors_of(
-    system: ConstrainedSystem, mean: AnalyticalMean, force_priors: str | Sequence[ForcePrior]
-) -> tuple[ForcePrior, ...]:
-    """Return the given force priors, or those of a named set. `"auto"` names those that apply to every log.
-
-    Raises:
-        UnknownNameError: the set does not exist.
-    """
-    if not isinstance(force_priors, str):
-        return tuple(force_priors)
-    if force_priors == "auto":
-        return friction_priors(system) if "actuation" in mean.terms else default_priors(system, mean)
-    check_name("set of force priors", force_priors, ("auto", *SETS))
-    return SETS[force_priors](system)
