@@ -156,7 +156,7 @@ def real(options: argparse.Namespace) -> tuple[object, list[Bound]]:
 
 SECTIONS = {
     section.__name__: section
-    for section in (stream, predict, processes, update, rollout, accuracy, exact, real)
+    for section in (stream, predict, update, rollout, accuracy, exact, real)
 }
 
 
