@@ -155,8 +155,7 @@ def real(options: argparse.Namespace) -> tuple[object, list[Bound]]:
 
 
 SECTIONS = {
-    section.__name__: section
-    for section in (stream, predict, update, rollout, accuracy, exact, real)
+    section.__name__: section for section in (stream, predict, update, rollout, accuracy, exact, real)
 }
 
 

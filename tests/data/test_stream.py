@@ -49,27 +49,15 @@ def test_pieces_are_the_rows_of_the_files(tmp_path: Path, group: int) -> None:
     assert torch.equal(joined(pieces, "segment"), torch.cat([expected, 4 + expected]))
 
 
-def test_a_pass_goes_on_where_it_stopped(tmp_path: Path) -> None:
-    segmented().write(tmp_path / "a.parquet")
-    read = StreamedDataset((tmp_path / "a.parquet",) * 2)
-    whole, rest = list(read.pieces()), list(read.pieces(start=11))
-    assert len(rest) == 5
-    for a, b in zip(whole[11:], rest, strict=True):
-        assert torch.equal(a.q, b.q) and torch.equal(a.segment, b.segment)
-
-
 def test_the_shares_of_processes_are_the_log(tmp_path: Path) -> None:
     log = segmented()
     log.write(tmp_path / "a.parquet")
     read = StreamedDataset((tmp_path / "a.parquet",))
-    whole = list(read.pieces(start=1))
-    shares = [list(read.pieces(1, (rank, 2))) for rank in (0, 1)]
-    assert [len(piece) for piece in shares[0]][:2] == [0, len(whole[1])], "pieces are counted from the first"
-    for own, *both in zip(whole, *shares, strict=True):
-        filled = [piece for piece in both if len(piece)]
-        assert len(filled) == 1
-        assert torch.equal(filled[0].q, own.q)
-        assert torch.equal(filled[0].segment, own.segment)
+    shares = [list(read.pieces((rank, 2))) for rank in (0, 1)]
+    for number, own in enumerate(read.pieces()):
+        found = shares[number % 2][number // 2]
+        assert torch.equal(found.q, own.q)
+        assert torch.equal(found.segment, own.segment)
 
 
 @pytest.mark.parametrize("length", [77, 41, 13])

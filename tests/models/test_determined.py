@@ -18,7 +18,7 @@ from forcegp.constraints.contact import Constraint
 from forcegp.data import RobotMismatchWarning
 from forcegp.errors import ModelError, NumericalError
 from forcegp.evaluation.predicted import multiplier_scores
-from forcegp.forces.priors.sets import contact_priors
+from forcegp.forces.priors.sets import contact_priors, friction_priors
 from forcegp.models.prediction import Prediction
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.simulate import simulate
@@ -120,9 +120,9 @@ def test_a_contact_that_was_never_closed_has_no_force(data: forcegp.Dataset, tmp
 
 def test_a_contact_that_an_update_closes_has_a_force(data: forcegp.Dataset) -> None:
     never, states = closed_on(data, ["table"], closed=False), (data.q, data.qd, data.tau)
-    fit = forcegp.StructuredGP(SYSTEM, "analytical", "friction", noise=0.1, inference="sparse").fit(
-        never, learn=[]
-    )
+    fit = forcegp.StructuredGP(
+        SYSTEM, "analytical", friction_priors(SYSTEM), noise=0.1, inference="sparse"
+    ).fit(never, learn=[])
     assert fit.update(never[:4]).result.never_closed == ("table",)
     fit = fit.update(data)
     assert fit.result.never_closed == () and fit.predict(*states, "multiplier").mean.isfinite().all()
@@ -185,7 +185,7 @@ def test_options_without_effect_are_said(data: forcegp.Dataset) -> None:
     finite = {"force_priors": friction, "inference": "sparse", "inducing_points": 50}
     assert "priors with finitely many features" in doubts_of(data, **finite)
     used = {"force_priors": joint, "inference": "sparse", "inducing_points": 20}
-    for settings in (exact, used, {"force_priors": "friction", "inertia": "auto"}):
+    for settings in (exact, used, {"force_priors": friction_priors(SYSTEM), "inertia": "auto"}):
         assert "no effect" not in doubts_of(data, **settings)
 
 
@@ -222,4 +222,4 @@ def test_an_arm_that_contacts_hold_at_every_joint_is_a_typed_error() -> None:
     )
     system = forcegp.ConstrainedSystem(robot, (pin,))
     with pytest.raises(ModelError, match="contacts that hold all joints"):
-        forcegp.StructuredGP(system, "analytical", "friction").fit(held)
+        forcegp.StructuredGP(system, "analytical", friction_priors(system)).fit(held)

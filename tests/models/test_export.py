@@ -143,7 +143,7 @@ def rounded_tip() -> StructuredFit:
     pipe = forcegp.Cylinder((0.3, -0.2, 0.1), (0.1, 1.0, 0.3), 0.1)
     side = forcegp.SurfaceContact("side", "lbr_iiwa_link_5", (0.05, 0, 0.1), pipe, radius=0.03)
     system = forcegp.ConstrainedSystem(robot, [tip, side])
-    model = forcegp.StructuredGP(system, "analytical", "friction", noise=0.1)
+    model = forcegp.StructuredGP(system, "analytical", friction_priors(system), noise=0.1)
     contact = {"tip": mixed_contacts(40)[:, 0], "side": mixed_contacts(40)[:, 1]}
     return model.fit(free_log(robot, 40).replace(contact=contact), learn=[])
 
@@ -156,7 +156,8 @@ def undetermined() -> StructuredFit:
     contacts = [forcegp.SurfaceContact(name, frame, (0, 0, z), up) for name, (frame, z) in at.items()]
     closed = {name: mixed_contacts(40)[:, int(name == "b")] for name in at}
     closed["never"] = torch.zeros(40, dtype=torch.bool)
-    model = forcegp.StructuredGP(forcegp.ConstrainedSystem(robot, contacts), "analytical", "friction", 0.1)
+    system = forcegp.ConstrainedSystem(robot, contacts)
+    model = forcegp.StructuredGP(system, "analytical", friction_priors(system), 0.1)
     return model.fit(free_log(robot, 40).replace(contact=closed), learn=[])
 
 

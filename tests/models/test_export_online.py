@@ -16,6 +16,7 @@ from forcegp.errors import ModelError, ShapeError, UnknownNameError
 from forcegp.forces.measurements import Observation
 from forcegp.forces.priors.inertial import PayloadPrior
 from forcegp.forces.priors.joint import JointFrictionPrior
+from forcegp.forces.priors.sets import friction_priors
 from forcegp.models.export.library import CompiledFit
 from forcegp.models.prediction import Predictor
 from forcegp.models.structured_fit import StructuredFit
@@ -146,7 +147,7 @@ def test_another_measured_quantity() -> None:
     def observed(data: forcegp.Dataset) -> list[Observation]:
         return [Observation(data, noise_std=0.2), Observation(data, "multiplier", noise_std=1.5)]
 
-    fit = forcegp.StructuredGP(system, "analytical", "friction").fit(observed(first), learn=[])
+    fit = forcegp.StructuredGP(system, "analytical", friction_priors(system)).fit(observed(first), learn=[])
     state, active = (later.q, later.qd, later.tau), later.active(names)
     fast = fit.compiled().update(*state, later.qdd, active=active)
     fast = fast.update(*state, values[30:], "multiplier", active=active)

@@ -18,6 +18,7 @@ from benchmarks.classical_wrench import momentum_residual, quasi_static, wrench_
 from forcegp.cli import app
 from forcegp.errors import DataError, ModelError, UnknownNameError
 from forcegp.forces.external_wrench import WrenchFrame
+from forcegp.forces.priors.sets import friction_priors
 from forcegp.models.external_wrench import ExternalWrench, false_alarm_rate
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.simulate.urdf import write_urdf
@@ -76,7 +77,7 @@ def simulated(seconds: float, seed: int, pushed: bool) -> tuple[forcegp.Dataset,
 def fitted() -> StructuredFit:
     """Trained on free motion."""
     system = forcegp.ConstrainedSystem(forcegp.load_robot("ur5"))
-    model = forcegp.StructuredGP(system, "analytical", "friction", noise=QDD_NOISE)
+    model = forcegp.StructuredGP(system, "analytical", friction_priors(system), noise=QDD_NOISE)
     return model.fit(simulated(12.0, 0, pushed=False)[0])
 
 

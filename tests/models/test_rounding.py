@@ -11,7 +11,7 @@ import torch
 import forcegp
 from extended import deviation_errors, is_extended
 from forcegp.errors import NumericalError
-from forcegp.forces.priors.sets import default_priors
+from forcegp.forces.priors.sets import default_priors, friction_priors
 from forcegp.gp.kernels import Matern52
 from forcegp.models.prediction import Prediction, require_semidefinite
 from forcegp.models.registry import create
@@ -47,27 +47,28 @@ CASES = [
     ("pendulum_wire", "sgp-zero", 60, {}),
     ("pendulum_wire", "sgp-mean", 40, {"noise": forcegp.Noise(learn=True)}),
     ("pendulum_wire", "sgp-zero-se", 60, {}),
-    ("pendulum_wire", "sgp", 40, {"force_priors": "friction"}),
+    ("pendulum_wire", "sgp", 40, {"force_priors": friction_priors}),
     pytest.param("kuka_plane", "sgp-zero", 20, {}, marks=pytest.mark.slow),
     ("kuka_plane", "sgp-zero", 40, {"noise": 1e-3}),
     ("kuka_plane", "sgp-mean", 40, {}),
     ("kuka_plane", "sgp-mean", 25, {"noise": 1e-4}),
     ("kuka_plane", "sgp-contact", 40, {}),
-    pytest.param("kuka_plane", "sgp", 40, {"force_priors": "friction"}, marks=pytest.mark.slow),
+    pytest.param("kuka_plane", "sgp", 40, {"force_priors": friction_priors}, marks=pytest.mark.slow),
     ("kuka_plane", "sgp-mean-se", 20, {}),
     pytest.param("ur5_free", "sgp-zero", 30, {}, marks=pytest.mark.slow),
     ("ur5_free", "sgp-mean", 40, {"force_priors": (forcegp.JointForcePrior(Matern52()),)}),
-    ("ur5_free", "sgp", 60, {"force_priors": "friction"}),
+    ("ur5_free", "sgp", 60, {"force_priors": friction_priors}),
     pytest.param("ur5_wiping", "sgp-zero", 30, {}, marks=pytest.mark.slow),
     ("ur5_wiping", "sgp-mean", 30, {}),
-    ("ur5_wiping", "sgp", 60, {"force_priors": "friction"}),
+    ("ur5_wiping", "sgp", 60, {"force_priors": friction_priors}),
 ]
 
 
 @pytest.mark.parametrize(("scene", "model", "count", "options"), CASES)
 def test_standard_deviations_are_right(scene: str, model: str, count: int, options: dict) -> None:
     system, train, test = drawn(scene, count)
-    fit = create(model, system, **options).fit(train, options=FEW)
+    given = {key: value(system) if callable(value) else value for key, value in options.items()}
+    fit = create(model, system, **given).fit(train, options=FEW)
     assert isinstance(fit, StructuredFit)
     assert deviation_errors(fit, test) < WITHIN
 
@@ -88,7 +89,7 @@ def test_an_acceleration_of_1e8_is_noise_of_the_torque_if_that_is_learned(scene:
     system, train, test = drawn(scene, 40)
     qdd = train.qdd.clone()
     qdd[7, 1] = OUTLIER
-    model = forcegp.StructuredGP(system, "analytical", "friction")
+    model = forcegp.StructuredGP(system, "analytical", friction_priors(system))
     fit = model.fit(dataclasses.replace(train, qdd=qdd), options=FEW)
     assert deviation_errors(fit, test) < WITHIN
     p = fit.predict(test.q, test.qd, test.tau, active=test.active(system.contact_names), noise=True)

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-CALLS = 21
+CALLS = 20
 
 
 @pytest.fixture(scope="module")

@@ -97,7 +97,6 @@ def parameters(truth: Truth) -> Calibration:
 
 
 @pytest.mark.parametrize("truth", [XARM, pytest.param(UR10, marks=pytest.mark.slow)], ids=lambda x: x.arm)
-@pytest.mark.xfail(strict=True, reason="bars of friction that hold only if all else is right: up to 20 σ off")
 def test_friction_that_check_prints_lies_within_its_bars(truth: Truth) -> None:
     names = file_of(truth.arm).joint_names
     true = {(name, "N m"): x for name, x in zip(names, truth.dry, strict=True)}
@@ -114,7 +113,6 @@ def test_no_torque_offset_is_stated_where_masses_are_wrong() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="differences printed as values: less than declared, -5.96")
 def test_friction_that_is_less_than_declared_is_printed_as_friction() -> None:
     """The file declares more friction than the arm has; friction is never negative."""
     declared = torch.full((6,), 8.0, dtype=torch.float64)
@@ -133,7 +131,6 @@ def test_the_drives_of_geared_wrists_are_found() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="drives of '0.0000 ± 0.0001' (true: 0.12 kg m²) are written back")
 def test_drives_that_are_written_back_lie_within_their_bars() -> None:
     names, drives = file_of("xarm7").joint_names, true_robot(XARM).armature.tolist()
     found = {p.element: p for p in parameters(XARM).parameters if p.name == "armature"}
@@ -144,7 +141,6 @@ def test_drives_that_are_written_back_lie_within_their_bars() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="dry friction of 0.04 ± 0.07 N m (true: 0.8) is written back")
 def test_friction_that_is_written_back_lies_within_its_bars() -> None:
     names = file_of("xarm7").joint_names
     found = {p.element: p for p in parameters(XARM).parameters if p.name == "friction"}
@@ -153,9 +149,6 @@ def test_friction_that_is_written_back_lies_within_its_bars() -> None:
     assert max(errors.values()) <= SIGMAS, errors
 
 
-@pytest.mark.xfail(
-    strict=True, reason="1.04 ± 0.0076 kg on the last link (true: 1.0): the bar holds if all else is right"
-)
 def test_a_payload_that_check_prints_lies_within_its_bar() -> None:
     truth = dataclasses.replace(UR5, payload=1.0)
     stated = [pair for each in report(truth).findings for pair in values(each.message, "kg")]

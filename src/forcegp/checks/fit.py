@@ -106,16 +106,22 @@ class TorqueFit:
     """A hypothesis that was fitted to a log and tested on held-out blocks.
 
     `error` and `shares`, both (blocks, nq), are RMS held-out residuals relative to `scale` and to `size`.
-    `theta` and `nuisance`, both (p,), are parameters. `spread` contains their jackknife standard errors.
+    `theta` and `nuisance`, both (p,), are parameters. `spread` contains their jackknife standard errors, and
+    `nuisance_without` (blocks, p) the nuisance parameters fitted without each block.
     """
 
     error: Array
     theta: Array
     spread: Array
     nuisance: Array
-    nuisance_spread: Array
+    nuisance_without: Array
     shares: Array
     score: Array
+
+    @property
+    def nuisance_spread(self) -> Array:
+        """Jackknife standard errors of the nuisance parameters (p,)."""
+        return jackknife(self.nuisance_without)
 
 
 def blocks_of(n: int) -> list[np.ndarray]:
@@ -147,14 +153,19 @@ def cross_validate(
         Z = np.concatenate([Z / np.where(size > 0.0, size, np.inf), A[..., Z.shape[-1] :]], axis=-1)
     rest, thetas, whole = _held_out(A, y, weight, Z)
     error = np.stack([np.sqrt((rest[rows] ** 2).mean(axis=0)) for rows in blocks_of(len(y))])
-    # Jackknife: (K − 1)/K Σ (θ_k − mean)².
-    spread = np.sqrt(BLOCKS - 1.0) * np.std(thetas, axis=0) / unit
     theta = (whole / unit)[:p]
     # Errors are relative to the scaled torque: a gain of zero would fit a noisy torque but explain nothing.
     factor = np.ones(len(problem.size))
     factor[list(gains)] += theta[: len(gains)]
     shares = error * problem.scale / (problem.size * np.abs(factor) + 1e-12)
-    return TorqueFit(error, theta, spread[:p], (whole / unit)[p:], spread[p:], shares, score_of(shares))
+    without = thetas / unit
+    spread, rest = jackknife(without[:, :p]), (whole / unit)[p:]
+    return TorqueFit(error, theta, spread, rest, without[:, p:], shares, score_of(shares))
+
+
+def jackknife(without: Array) -> Array:
+    """Return the standard errors √((K − 1)/K Σ (θ_k − mean)²) of values fitted without each of K blocks."""
+    return np.sqrt(BLOCKS - 1.0) * np.std(without, axis=0)
 
 
 def _equations(

@@ -12,7 +12,15 @@ from forcegp.checks import hypotheses
 from forcegp.checks.excitation import check_visibility, still_joints
 from forcegp.checks.explain import Explanation, explain
 from forcegp.checks.finding import Finding, NotJudgedError, with_alternatives
-from forcegp.checks.fit import FLOOR, TorqueFit, gain_of, labelled_contacts, residual, robust_parameters
+from forcegp.checks.fit import (
+    FLOOR,
+    TorqueFit,
+    gain_of,
+    jackknife,
+    labelled_contacts,
+    residual,
+    robust_parameters,
+)
 from forcegp.checks.log import Array, Log, Outcome, force_unit, position_unit, smoothed
 from forcegp.constraints import ConstrainedSystem
 from forcegp.robust import robust_std
@@ -63,7 +71,7 @@ def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
     findings = [
         *passive,
         *_confounded(explanation),
-        *_friction(_determined(explanation.with_nuisance(*shapes))),
+        *_friction(_determined(explanation.with_nuisance(*shapes)), _with_any_rise(explanation)),
         *_offsets(losses),
         *_unexplained(explanation),
         *check_visibility(explanation),
@@ -156,7 +164,42 @@ def _confounded(explanation: Explanation) -> list[Finding]:
     return findings
 
 
-def _friction(explanation: Explanation) -> list[Finding]:
+def _with_any_rise(explanation: Explanation) -> Explanation:
+    """Return the explanation in which dry friction of joints and contacts may have any slope near rest.
+
+    The slopes do not change the friction of a fast joint, whose value and error then hold for any of them.
+    Dry friction is at most as large as the torque.
+    """
+    system, log, rows = explanation.system, explanation.log, explanation.rows
+    count = len(hypotheses.RISES)
+    rises = hypotheses.shape_columns(system, log, rows)[..., : count * log.nq]
+    prior = np.tile(explanation.problem.size, count)
+    wider = replace(
+        explanation,
+        columns=np.concatenate([rises, explanation.columns], axis=-1),
+        prior=np.concatenate([prior, explanation.prior]),
+    )
+    return wider.with_nuisance(hypotheses.contact_friction_columns(system, log, rows))
+
+
+def _stated(stated: Explanation, j: int, speed: float) -> tuple[dict[str, float], str]:
+    """Return the viscous and Coulomb friction of a joint if determined, otherwise their sum at a speed."""
+    robot, nq, fit = stated.system.robot, stated.log.nq, stated.fit
+    declared = np.array([float(robot.damping[j]), float(robot.friction[j])])
+    total, without = (declared - x[..., [j, nq + j]] for x in (fit.nuisance, fit.nuisance_without))
+    unit, per = force_unit(robot, j), position_unit(robot, j)
+    kinds, errors, units = ("viscous", "coulomb"), jackknife(without), (f"{unit} s/{per}", unit)
+    known = [k for k in range(2) if total[k] > 2.0 * errors[k]]
+    texts = [f"{total[k]:.3g} ± {float(f'{errors[k]:.1g}'):g} {units[k]}" for k in known]
+    if len(known) < 2:
+        at = np.array([speed, 1.0])
+        together, error = float(total @ at), float(jackknife(without @ at))
+        texts.append(f"together {together:.3g} {unit} (± {error:.1g}) at {speed:.2g} {per}/s")
+    return {kinds[k]: float(total[k]) for k in known}, ", ".join(texts)
+
+
+def _friction(explanation: Explanation, stated: Explanation) -> list[Finding]:
+    """Return the joints whose friction is not that of the robot file, with the friction in a `stated` fit."""
     robot, log, nq = explanation.system.robot, explanation.log, explanation.log.nq
     viscous, coulomb = -explanation.fit.nuisance[:nq], -explanation.fit.nuisance[nq : 2 * nq]
     rows = log.qd[explanation.rows]
@@ -165,7 +208,6 @@ def _friction(explanation: Explanation) -> list[Finding]:
     speeds = np.percentile(np.abs(rows), SPEEDS, axis=0)
     damping, declared = robot.damping.numpy(), robot.friction.numpy()
     resists = ((viscous + damping) * speeds + coulomb + declared > 0.0).all(axis=0)
-    spread = explanation.fit.nuisance_spread
     significant = np.array([_worse(explanation, explanation.without([j, nq + j]).fit, j) for j in range(nq)])
     # At speeds where declared friction is still rising, additional friction cannot be distinguished from it.
     rising = (speeds[1] <= robot.friction_velocity.numpy()) & (declared > 0.0)
@@ -175,15 +217,11 @@ def _friction(explanation: Explanation) -> list[Finding]:
         largest = (np.abs(viscous) * speeds[1] + np.abs(coulomb))[hit].max(initial=0.0)
         evidence, parts = {"largest_torque": largest}, []
         for j in np.flatnonzero(hit):
-            unit, name, sizes = force_unit(robot, j), log.joint_names[j], []
-            units = f"{unit} s/{position_unit(robot, j)}", unit
-            for k, kind in enumerate(("viscous", "coulomb")):
-                x, s = -explanation.fit.nuisance[k * nq + j], spread[k * nq + j]
-                sizes.append(f"{x:.3g} ± {s:.1g} {units[k]}" if s else "not determined")
-                evidence |= {f"{kind} {name}": x} if x else {}
-            parts.append(f"{name} {', '.join(sizes)}")
-        what = f"{word} friction than the robot file declares (viscous, Coulomb)"
-        text = f"joints have {what}: {'; '.join(parts)}"
+            sizes, text = _stated(stated, j, float(np.sqrt((rows[:, j] ** 2).mean())))
+            evidence |= {f"{kind} {log.joint_names[j]}": x for kind, x in sizes.items()}
+            parts.append(f"{log.joint_names[j]} {text}")
+        what = f"{word} friction than the robot file declares"
+        text = f"joints have {what}, in all (viscous, Coulomb): {'; '.join(parts)}"
         findings += [log.finding("friction-undeclared", text, log.named(hit), **evidence)] if parts else []
     return findings
 

@@ -177,7 +177,7 @@ class Pass:
 
 @dataclass(frozen=True)
 class Part:
-    """What a worker needs to add up its part of a log.
+    """Settings with which a worker computes the sums over its part of a log.
 
     Attributes:
         spec: the model.
