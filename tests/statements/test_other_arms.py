@@ -157,7 +157,6 @@ def test_a_payload_that_check_prints_lies_within_its_bar() -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="two payloads in two segments of one log are not found")
 def test_a_payload_in_one_segment_of_two_is_found() -> None:
     loaded = log_of(dataclasses.replace(UR5, payload=1.5), seed=1)
     both = forcegp.Dataset.concatenate([log_of(UR5), loaded])

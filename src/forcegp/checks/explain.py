@@ -39,9 +39,9 @@ Tried = tuple[Hypothesis, TorqueFit]
 class Explanation:
     """Faults that explain the torque.
 
-    Faults of the log are corrected in `log`. Hypotheses about the robot file, named in `robot`, stay in the
-    model with their `columns` and `prior`. `problem` holds the remaining torques at `rows`. Calling `repairs`
-    in order corrects the faults of any log.
+    Faults of the log are corrected in `log`. Hypotheses about the robot file, with their first rows in
+    `robot`, stay in the model with their `columns` and `prior`. `problem` holds the remaining torques at
+    `rows`. Calling `repairs` in order corrects the faults of any log.
     """
 
     system: ConstrainedSystem
@@ -50,7 +50,7 @@ class Explanation:
     problem: TorqueProblem
     columns: Array
     prior: Array
-    robot: tuple[str, ...] = ()
+    robot: tuple[tuple[str, int], ...] = ()
     findings: tuple[Finding, ...] = ()
     repairs: tuple[Callable[[Log], Log], ...] = ()
     taken: frozenset[tuple[str, tuple[int, ...]]] = frozenset()
@@ -152,8 +152,9 @@ def _accepted(model: Explanation, hypothesis: Hypothesis, theta: Array, finding:
     """Return the explanation with the fault corrected, or with its parameters added to the model."""
     taken = model.taken | {(hypothesis.name, hypothesis.joints)}
     model = replace(model, findings=(*model.findings, finding), taken=taken)
-    if hypothesis.name in hypotheses.ROBOT:
-        return replace(model.beside(hypothesis), robot=(hypothesis.name, *model.robot)).weighed()
+    if hypothesis.name in (*hypotheses.ROBOT, hypotheses.CHANGE):
+        own = hypothesis.name, hypothesis.first
+        return replace(model.beside(hypothesis), robot=(own, *model.robot)).weighed()
     repair = partial(corrected, hypothesis=hypothesis, theta=theta)
     log = repair(model.log)
     problem = hypotheses.problem_of(model.system, log, model.rows)

@@ -31,6 +31,9 @@ SLOW, GRAVITY, LARGEST_DRIFT = 0.01, 10.0, 100.0
 possible drift of a torque sensor [N m, N]."""
 ROBOT = ("gravity", "payload", "masses")
 """Hypotheses about the robot file. These do not change the log."""
+CHANGE, MOST_CHANGES = "payload-change", 8
+"""Hypothesis about a payload that is not that of the whole log; maximum number of times at which trajectories
+begin for which it is tried, since each is cross-validated."""
 
 
 @dataclass(frozen=True)
@@ -40,7 +43,8 @@ class Hypothesis:
     `change` corrects the log under this hypothesis, except for the effects of its parameters. `size` is the
     number of parameters, not counting discrete choices. `columns` (n, nq, p) are the torques added to r per
     unit of each parameter, and `prior` (p,) contains their prior standard deviations. `instruments` have the
-    shape of `columns` and allow for errors in them. `shift` is a delay of the torque in samples.
+    shape of `columns` and allow for errors in them. `shift` is a delay of the torque in samples. `first` is
+    the row from which the columns apply.
     """
 
     name: str
@@ -51,6 +55,7 @@ class Hypothesis:
     joints: tuple[int, ...] = ()
     shift: int = 0
     instruments: Array | None = None
+    first: int = 0
 
 
 def problem_of(
@@ -171,10 +176,19 @@ def robot_hypotheses(system: ConstrainedSystem, log: Log, rows: np.ndarray) -> I
     for name in ROBOT:
         columns, prior = robot_columns(system, log, rows, name)
         yield Hypothesis(name, columns.shape[-1], unchanged, columns, prior)
+    starts = np.flatnonzero(np.diff(log.segment)) + 1
+    for first in starts.tolist() if len(starts) <= MOST_CHANGES else ():
+        columns, prior = robot_columns(system, log, rows, CHANGE, first)
+        yield Hypothesis(CHANGE, columns.shape[-1], unchanged, columns, prior, first=first)
 
 
-def robot_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray, name: str) -> tuple[Array, Array]:
-    """Return the torque (n, nq, p) per unit of each uncertain parameter, and the tolerances (p,)."""
+def robot_columns(
+    system: ConstrainedSystem, log: Log, rows: np.ndarray, name: str, first: int = 0
+) -> tuple[Array, Array]:
+    """Return the torque (n, nq, p) per unit of each uncertain parameter, and the tolerances (p,).
+
+    Before row `first`, the torque is zero.
+    """
     robot = system.robot
     q, qd, qdd = log.tensors(rows, "q", "qd", "qdd")
     with torch.no_grad():
@@ -184,8 +198,10 @@ def robot_columns(system: ConstrainedSystem, log: Log, rows: np.ndarray, name: s
             return torch.stack(columns, dim=-1).numpy(), np.full(3, GRAVITY)
         Y = regressor(robot, q, qd, qdd).numpy()
     # r = Y π₀ − τ = −Y δ for parameters that are off by δ.
-    if name == "payload":
-        return -Y[..., -10:], TOOL_MASS * np.repeat([1.0, MOMENT_ARM, MOMENT_ARM**2], (1, 3, 6))
+    if name in ("payload", CHANGE):
+        return -Y[..., -10:] * (rows >= first)[:, None, None], TOOL_MASS * np.repeat(
+            [1.0, MOMENT_ARM, MOMENT_ARM**2], (1, 3, 6)
+        )
     return -Y, inertial_spread(robot)
 
 
@@ -252,6 +268,8 @@ def plausible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit)
         return bool(size < WEIGHTLESS) or (angle > SMALL_TILT and same)
     if hypothesis.name == "drift":
         return bool(abs(fit.theta[0]) > SIGNIFICANT * fit.spread[0])
+    if hypothesis.name == CHANGE:
+        return bool(abs(fit.theta[0]) > SIGNIFICANT * fit.spread[0])
     if hypothesis.name == "payload":
         known = abs(fit.theta[0]) > SIGNIFICANT * fit.spread[0]
         return bool(known and fit.theta[0] > -float(system.robot.mass[-1]))
@@ -308,11 +326,14 @@ def finding_of(
         name = "torque-offset"
         text = f"the logged torque of {listed} drifts by {theta[0]:+.3g} ± {spread[0]:.2g} {unit}"
         evidence = {f"drift {listed}": theta[0], "largest_torque": 0.5 * abs(theta[0])}
-    elif name == "payload":
-        name, names = "payload-missing", (log.joint_names[-1],)
-        more = "more" if theta[0] > 0.0 else "less"
+    elif name in ("payload", CHANGE):
+        names, more = (log.joint_names[-1],), "more" if theta[0] > 0.0 else "less"
         text = f"the torque fits with {abs(theta[0]):.3g} ± {spread[0]:.2g} kg {more} on the last link"
         evidence = {"mass_kg": float(theta[0]), "spread_kg": spread[0]}
+        if name == CHANGE:
+            text, whole = f"{text} from row {hypothesis.first} on", ((hypothesis.first, len(log)),)
+            return Finding("payload-missing", text, whole, names, evidence=evidence)
+        name = "payload-missing"
     else:
         text = "the torque fits better with other masses and centres of mass than those of the robot file"
         worst = int(np.argmax(np.abs(theta[: 10 * log.nq : 10])))

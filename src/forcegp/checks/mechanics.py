@@ -157,7 +157,7 @@ def _determined(explanation: Explanation) -> Explanation:
 def _confounded(explanation: Explanation) -> list[Finding]:
     """Return the findings. Currents become warnings if masses are wrong, since gains depend on masses."""
     findings = list(explanation.findings)
-    for k, finding in enumerate(findings if "masses" in explanation.robot else ()):
+    for k, finding in enumerate(findings if ("masses", 0) in explanation.robot else ()):
         if finding.kind == "torque-current" and "masses-mismatch" not in finding.kinds:
             text = f"{finding.message}; or the masses, which do not fit either, are to blame for both"
             findings[k] = replace(finding, message=text, weight="warning")
@@ -216,7 +216,7 @@ def _friction(explanation: Explanation, stated: Explanation) -> list[Finding]:
     for hit, word in ((significant & (power > 0.0), "more"), (significant & (power <= 0.0), "less")):
         largest = (np.abs(viscous) * speeds[1] + np.abs(coulomb))[hit].max(initial=0.0)
         evidence, parts = {"largest_torque": largest}, []
-        for j in np.flatnonzero(hit):
+        for j in np.flatnonzero(hit).tolist():
             sizes, text = _stated(stated, j, float(np.sqrt((rows[:, j] ** 2).mean())))
             evidence |= {f"{kind} {log.joint_names[j]}": x for kind, x in sizes.items()}
             parts.append(f"{log.joint_names[j]} {text}")
@@ -242,7 +242,7 @@ def _offsets(explanation: Explanation) -> list[Finding]:
     one_each = hypotheses.gain_hypothesis(log, rows, tuple(off))
     tried = *common, *hypotheses.robot_hypotheses(system, log, rows), one_each
     without = explanation.without([2 * nq + j for j in off])
-    fits = ((h, without.with_(h)) for h in tried if h.name not in explanation.robot)
+    fits = ((h, without.with_(h)) for h in tried if (h.name, h.first) not in explanation.robot)
     rivals = [
         hypotheses.finding_of(system, log, h, fit)
         for h, fit in fits
@@ -349,7 +349,7 @@ def residual_trace(explanation: Explanation, rows: np.ndarray) -> Array:
     parts, coefficients = [], robust_parameters(explanation.problem, explanation.columns, explanation.prior)
     for index in np.array_split(rows, max(1, len(rows) // 2048)):
         part = explanation.on(log, index)
-        columns = [hypotheses.robot_columns(system, log, index, name)[0] for name in explanation.robot]
+        columns = [hypotheses.robot_columns(system, log, index, *own)[0] for own in explanation.robot]
         r = part.r - np.concatenate([*columns, part.nuisance], axis=-1) @ coefficients
         parts.append(part.without_contact(r[..., None])[..., 0] * part.scale)
     return np.concatenate(parts)
