@@ -15,10 +15,11 @@ from typing import Any
 import torch
 from torch import Tensor
 
+from forcegp import dynamics
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset, farthest_points, standardized
 from forcegp.data.fields import check_robot, contact_table
-from forcegp.errors import ModelError, UnknownNameError
+from forcegp.errors import DataError, ModelError, UnknownNameError
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.memory import LONGEST_STEP, bristles
 from forcegp.forces.quantities import QUANTITIES, States, states
@@ -241,6 +242,38 @@ def _persists(system: ConstrainedSystem, m: Measurement, std: Tensor) -> Tensor:
             scale = max(1.0, MAD_TO_STD * float(ratio[in_contact, row].median()))
             good &= ratio[:, row] <= FAR * scale
     return good
+
+
+MODELLED, FEWEST_IN_CONTACT = 0.02, 20
+"""Share of the torque of each joint to which a modelled torque equals the inverse dynamics, as in `forcegp
+check`; minimum number of samples in contact for this comparison. A measured torque balances the contact force."""
+
+
+def require_measured(training: Training, system: ConstrainedSystem) -> None:
+    """Check that the torques in contact are not the inverse dynamics of the robot file.
+
+    In contact, M q̈ − Q_C − Q_G − Q_D − τ = Aᵀλ + Q_z contains the contact force and friction.
+
+    Raises:
+        DataError: the torques are those of a model, with which every contact force would be zero.
+    """
+    for m in training.measurements:
+        rows = m.active.any(-1).nonzero()[:, 0]
+        if m.quantity != "qdd" or len(rows) < FEWEST_IN_CONTACT:
+            continue
+        rows = rows[:: max(1, len(rows) // 400)]
+        q, qd, qdd, tau = (x[rows] for x in (m.q, m.qd, m.values, m.tau))
+        needed = dynamics.inverse_dynamics(system.robot, q, qd, qdd) - dynamics.damping_force(
+            system.robot, qd
+        )
+        rest, size = ((x.square().mean(0)).sqrt() for x in (needed - tau, tau))
+        if bool((rest <= MODELLED * size).all()):
+            raise DataError(
+                f"the torques in contact are the inverse dynamics of {system.robot.name!r} to within "
+                f"{100.0 * MODELLED:.0f} %: the output of a model, which does not contain the contact force",
+                expected="measured torques, or motor currents",
+                hint="map the column with the measurement, and see `forcegp check`",
+            )
 
 
 NoiseStd = float | Sequence[float] | Tensor

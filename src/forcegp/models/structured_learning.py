@@ -34,6 +34,7 @@ from forcegp.forces.measurements import (
     Training,
     observations_of,
     period_of,
+    require_measured,
     states_noise,
     training_of,
     unmeasured_forces,
@@ -264,6 +265,8 @@ def training_for(
     training = training_of(data, spec.system, spec.priors, noise_std, kept, standardize)
     if any(prior.delay for prior in spec.priors):
         training = without_delay(training, spec.priors)
+    if spec.automatic:
+        require_measured(training, spec.system)
     return in_motion(spec.system, training, fewest) if spec.noise.learns_torque else (training, ())
 
 
