@@ -246,7 +246,7 @@ def _persists(system: ConstrainedSystem, m: Measurement, std: Tensor) -> Tensor:
 
 MODELLED, FEWEST_IN_CONTACT = 0.02, 20
 """Share of the torque of each joint to which a modelled torque equals the inverse dynamics, as in `forcegp
-check`; minimum number of samples in contact for this comparison. A measured torque balances the contact force."""
+check`; minimum number of samples in contact for this comparison. Measured torques balance friction too."""
 
 
 def require_measured(training: Training, system: ConstrainedSystem) -> None:
