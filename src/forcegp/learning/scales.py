@@ -2,12 +2,13 @@
 
 1. For given torque noise, the rows of the samples are whitened, and sums over them determine the scales
    (`evidence.py`).
-2. Torque noise and static friction are unknown forces ε ~ N(0, S) of single rows, with S_j = σ_j² + σ_s,j² k
-   and k = e^{−(q̇/v_s)²}. The residual of a row is r = B ε + e with e ~ N(0, Σ), so Cov r = C = Σ + B S Bᵀ is
-   linear in the variances θ = (σ², σ_s²). One step of Fisher scoring for θ ≥ 0 solves
+2. Torque noise, static friction and tangential forces of contacts (`forces/unknowns.py`) are unknown forces
+   ε ~ N(0, S) of single rows, with S_j = σ_j² + σ_s,j² k and k = e^{−(q̇/v_s)²}, and likewise for contacts.
+   The residual of a row is r = B ε + e with e ~ N(0, Σ), so Cov r = C = Σ + B S Bᵀ is linear in the variances
+   θ = (σ², σ_s²), S_i = Σ_p c_pi θ_p. One step of Fisher scoring for θ ≥ 0 solves
 
-       min ½ (θ⁺ − θ)ᵀ F (θ⁺ − θ) − gᵀ(θ⁺ − θ),  g_i = ½ Σ c_i [(Bᵀ C⁻¹ r)_i² − (Bᵀ C⁻¹ B)_ii],
-       F_ij = ½ Σ c_i c_j (Bᵀ C⁻¹ B)_ij²   with   c = (1, k),
+       min ½ (θ⁺ − θ)ᵀ F (θ⁺ − θ) − gᵀ(θ⁺ − θ),  g_p = ½ Σ c_pi [(Bᵀ C⁻¹ r)_i² − (Bᵀ C⁻¹ B)_ii],
+       F_pq = ½ Σ c_pi c_qj (Bᵀ C⁻¹ B)_ij²   over rows, i and j,
 
    in the directions that closed contacts leave free. A variance that the data do not show is zero.
 3. Residuals are correlated in time. If τ is their autocorrelation time, n samples contain as much information
@@ -31,6 +32,7 @@ from forcegp.forces.posterior import STICK_NOISE, STICK_SPEED, hidden_variance
 from forcegp.forces.priors.memory import in_time
 from forcegp.forces.problem import Problem, Tensors, basis_of
 from forcegp.forces.quantities import affine_map
+from forcegp.forces.unknowns import AXES, learned_tips, share_at_rest, tip_keys, tip_operator
 from forcegp.gp.sums import Sums, accumulate
 from forcegp.learning.evidence import (
     Evidence,
@@ -49,8 +51,8 @@ STEPS, ACCURACY = 20, 1e-3
 LEAST_VARIANCE = 1e-16
 """Variance of torques that is stored in place of zero [N² m², N²]."""
 AT_REST = (0.02, 0.05, 0.1)
-"""Speeds v_s below which a joint counts as nearly at rest, of which the likeliest is chosen [rad/s, m/s]: the
-resolution of common encoders, and speeds at which joints reverse within a sampling period."""
+"""Speeds v_s below which a joint or contact is nearly at rest, of which the likeliest is taken [rad/s, m/s]:
+the resolution of common encoders, and speeds at which joints reverse within a sampling period."""
 FEWEST_AT_REST = 10.0
 """Number of independent samples at rest below which the static friction of a joint keeps its stated value."""
 LEAST_SHARE = 0.2
@@ -150,30 +152,54 @@ class Residuals(NamedTuple):
 
     Attributes:
         r: residuals `(n, d)`.
-        B: operators `(n, d, nq)` on the joint force.
+        B: operators `(n, d, nq + 3 c)` on the joint force and on the forces of c contacts at rest.
         slow: k `(n, nq)`.
         external: variance `(n, nq)` of unknown forces of given size.
+        rests: k `(n, c)` of the contacts.
     """
 
     r: Tensor
     B: Tensor
     slow: Tensor
     external: Tensor
+    rests: Tensor = torch.zeros(0, 0)
 
-    def log_density(self, torque: Tensor, stick: Tensor) -> float:
+    @property
+    def shares(self) -> Tensor:
+        """Shares c `(n, 2 (nq + c), nq + 3 c)` of the variances θ in those of the unknown forces."""
+        (n, nq), tips = self.slow.shape, self.rests.shape[-1]
+        c = self.slow.new_zeros(n, 2 * (nq + tips), nq + AXES * tips)
+        joints = torch.arange(nq)
+        c[:, joints, joints], c[:, nq + joints, joints] = 1.0, self.slow
+        for k in range(tips):
+            own = slice(nq + AXES * k, nq + AXES * (k + 1))
+            c[:, 2 * nq + k, own], c[:, 2 * nq + tips + k, own] = 1.0, self.rests[:, k, None]
+        return c
+
+    @property
+    def closed(self) -> Tensor:
+        """Whether each contact is closed `(n, c)`."""
+        nq, tips = self.slow.shape[-1], self.rests.shape[-1]
+        return (self.B[..., nq:] != 0.0).any(-2).view(len(self.B), tips, AXES).any(-1)
+
+    def variances(self, theta: Tensor) -> Tensor:
+        """Return S `(n, nq + 3 c)` for variances θ."""
+        known = torch.nn.functional.pad(self.external, (0, self.B.shape[-1] - self.external.shape[-1]))
+        return torch.einsum("p,npk->nk", theta, self.shares) + known
+
+    def _covariance(self, theta: Tensor) -> Tensor:
+        return (self.B * self.variances(theta)[:, None]) @ self.B.mT + torch.eye(self.r.shape[-1]).to(theta)
+
+    def log_density(self, theta: Tensor) -> float:
         """Return Σ log N(r; 0, C) up to a constant."""
-        S = torque + stick * self.slow + self.external
-        C = (self.B * S[:, None]) @ self.B.mT + torch.eye(self.r.shape[-1]).to(S)
-        L = torch.linalg.cholesky(C)
+        L = torch.linalg.cholesky(self._covariance(theta))
         white = torch.linalg.solve_triangular(L, self.r[..., None], upper=False)
         return -float(L.diagonal(dim1=-2, dim2=-1).log().sum() + 0.5 * white.square().sum())
 
-    def read(self, torque: Tensor, stick: Tensor) -> tuple[Tensor, Tensor]:
-        """Return Bᵀ C⁻¹ r `(n, nq)` and Bᵀ C⁻¹ B `(n, nq, nq)` for variances σ² and σ_s² `(nq,)`."""
-        S = torque + stick * self.slow + self.external
-        C = (self.B * S[:, None]) @ self.B.mT + torch.eye(self.r.shape[-1]).to(S)
-        both = torch.linalg.solve(C, torch.cat([self.B, self.r[..., None]], dim=-1))
-        both = self.B.mT @ both
+    def read(self, theta: Tensor) -> tuple[Tensor, Tensor]:
+        """Return Bᵀ C⁻¹ r `(n, nq + 3 c)` and Bᵀ C⁻¹ B `(n, nq + 3 c, nq + 3 c)` for variances θ."""
+        both = torch.cat([self.B, self.r[..., None]], dim=-1)
+        both = self.B.mT @ torch.linalg.solve(self._covariance(theta), both)
         return both[..., -1], both[..., :-1]
 
 
@@ -187,7 +213,9 @@ def residuals(problem: Problem, values: Mapping[str, Tensor], weights: Tensor, i
     Phi = torch.cat([part.rows(W, part.values(x)[0]) for part, W, x in parts], dim=-1)
     std, weight = std.expand_as(m.values), problem.training.weights
     r = (m.values - rows.target - (Phi @ weights).view_as(rows.target)) / std
-    B = z.B_Q / std[..., None]
+    tips = learned_tips(system, values)
+    operators = (z.B_z @ tip_operator(system, at, name) for name in tips)
+    B = torch.cat([z.B_Q, *operators], dim=-1) / std[..., None]
     if m.quantity == "qdd" and system.m:
         # 1 − Ã⁺Ã with Ã = A σ
         A = at.eom.A * std[:, None]
@@ -196,7 +224,12 @@ def residuals(problem: Problem, values: Mapping[str, Tensor], weights: Tensor, i
     r = r if weight is None else weight[i].sqrt()[:, None] * r
     slow = torch.exp(-((m.qd / values[STICK_SPEED].exp()) ** 2))
     external = hidden_variance({}, at, problem.external_std)
-    return Residuals(r, B, slow, external if m.tau_std is None else external + m.tau_std**2)
+    external = external if m.tau_std is None else external + m.tau_std**2
+    rests = r.new_zeros(len(r), len(tips))
+    for k, name in enumerate(tips):
+        closed = m.active[:, system.contact_names.index(name)]
+        rests[:, k] = share_at_rest(values, at, name).masked_fill(~closed, 0.0)
+    return Residuals(r, B, slow, external, rests)
 
 
 def _with_noise(
@@ -206,29 +239,52 @@ def _with_noise(
     motions = [i for i, m in enumerate(problem.training.measurements) if m.quantity in MOTIONS]
     each = [residuals(problem, values, evidence.weights, i) for i in motions]
     whole = Residuals(*(torch.cat(part) for part in zip(*each, strict=True)))
-    theta = torch.cat([(2.0 * values[TORQUE_NOISE]).exp(), (2.0 * values[STICK_NOISE]).exp()])
+    tips = [tip_keys(name) for name in learned_tips(problem.system, values)]
+    keys = [TORQUE_NOISE, STICK_NOISE, *(each.slides for each in tips), *(each.rests for each in tips)]
+    theta = torch.cat([(2.0 * values[key]).exp().view(-1) for key in keys])
     gamma = determined_by_joint(problem, groups, evidence)
     share = (1.0 - gamma / (problem.power * len(whole.r))).clamp(min=LEAST_SHARE).repeat(2)
+    share = torch.nn.functional.pad(share, (0, 2 * len(tips)), value=1.0)
+    # k = e^{−(v/v_s)²} for other speeds v_s, first of the joints and then of the contacts
+    rows, speed, theta = _at_likeliest_speed(whole, "slow", values[STICK_SPEED], theta, share, problem.power)
+    changed = {STICK_SPEED: torch.full_like(values[STICK_NOISE], speed)}
+    if tips:
+        now = torch.stack([values[each.speed] for each in tips])
+        rows, speed, theta = _at_likeliest_speed(rows, "rests", now, theta, share, problem.power)
+        changed |= {each.speed: torch.full_like(x, speed) for each, x in zip(tips, now, strict=True)}
+    theta = theta.clamp(min=LEAST_VARIANCE)
+    joints, own = theta.log().mul(0.5).split([2 * whole.slow.shape[-1], 2 * len(tips)])
+    changed |= dict(zip(keys, (*joints.chunk(2), *own.unbind()), strict=True))
+    return {**values, **changed}, exponent(problem, motions, each, theta)
+
+
+def _at_likeliest_speed(
+    whole: Residuals, what: str, now: Tensor, theta: Tensor, share: Tensor, power: float
+) -> tuple[Residuals, float, Tensor]:
+    """Return the rows, log v_s and the variances θ for the likeliest speed of `slow` or `rests`.
+
+    Args:
+        now: current log v_s of each joint or contact.
+    """
     tried = []
-    for speed in AT_REST:
-        # k = e^{−(q̇/v)²} for another speed v
-        ratio = (values[STICK_SPEED].exp() / speed).square()
-        rows = whole._replace(slow=whole.slow**ratio)
-        rests = problem.power * rows.slow.sum(0) >= FEWEST_AT_REST
-        found = _settled(rows, theta, share, torch.cat([torch.ones_like(rests), rests]))
-        tried.append((rows.log_density(*found.chunk(2)), speed, found))
-    _, speed, theta = max(tried, key=lambda each: each[0])
-    torque, stick = theta.maximum(values[TORQUE_NOISE].new_tensor(LEAST_VARIANCE)).chunk(2)
-    slowest = torch.full_like(torque, math.log(speed))
-    changed = {TORQUE_NOISE: 0.5 * torque.log(), STICK_NOISE: 0.5 * stick.log(), STICK_SPEED: slowest}
-    return {**values, **changed}, exponent(problem, motions, each, torque, stick)
+    for speed in map(math.log, AT_REST):
+        rows = whole._replace(**{what: getattr(whole, what) ** (2.0 * (now - speed)).exp()})
+        counts = (rows.slow.sum(0), rows.closed.sum(0), rows.rests.sum(0))
+        enough = power * torch.cat(counts) >= FEWEST_AT_REST
+        found = _settled(
+            rows, theta, share, torch.nn.functional.pad(enough, (rows.slow.shape[-1], 0), value=True)
+        )
+        tried.append((rows.log_density(found), rows, speed, found))
+    return max(tried, key=lambda each: each[0])[1:]
 
 
 def _settled(rows: Residuals, theta: Tensor, share: Tensor, free: Tensor) -> Tensor:
-    """Return the variances `(2 nq,)` after scoring until they no longer change."""
+    """Return the variances θ after scoring until they no longer change."""
+    joints = 2 * rows.slow.shape[-1]
     for _ in range(STEPS):
         new = torch.where(free, _scored(rows, theta, share, free), theta)
-        change = float((new - theta).abs().max() / theta.max())
+        size = torch.cat([theta[:joints].max().expand(joints), theta[joints:]])
+        change = float(((new - theta).abs() / size.clamp(min=LEAST_VARIANCE)).max())
         theta = new
         if change < ACCURACY:
             break
@@ -236,12 +292,12 @@ def _settled(rows: Residuals, theta: Tensor, share: Tensor, free: Tensor) -> Ten
 
 
 def _scored(rows: Residuals, theta: Tensor, share: Tensor, free: Tensor) -> Tensor:
-    """Return the variances `(2 nq,)` after a step of Fisher scoring, zero for those that are not free."""
-    a, D = rows.read(*theta.chunk(2))
-    c = torch.cat([torch.ones_like(rows.slow), rows.slow], dim=-1)
-    D = D.repeat(1, 2, 2)
-    g = 0.5 * (c * (a.repeat(1, 2).square() / share - D.diagonal(dim1=-2, dim2=-1))).sum(0)
-    F = 0.5 * torch.einsum("ni,nij,nj->ij", c, D.square(), c)
+    """Return the variances θ after a step of Fisher scoring, zero for those that are not free."""
+    a, D = rows.read(theta)
+    c = rows.shares
+    square, expected = (torch.einsum("npk,nk->p", c, x) for x in (a.square(), D.diagonal(dim1=-2, dim2=-1)))
+    g = 0.5 * (square / share - expected)
+    F = 0.5 * torch.einsum("npl,nql->pq", c @ D.square(), c)
     # in units of 1/√F_ii, with a small ridge for variances that no row shows
     unit = F.diagonal().clamp(min=1e-300).rsqrt()
     F = (F * unit[:, None] * unit + 1e-9 * torch.eye(len(F)).to(F))[free][:, free]
@@ -252,23 +308,22 @@ def _scored(rows: Residuals, theta: Tensor, share: Tensor, free: Tensor) -> Tens
     return torch.zeros_like(theta).masked_scatter(free, found) * unit
 
 
-def exponent(
-    problem: Problem, motions: list[int], each: list[Residuals], torque: Tensor, stick: Tensor
-) -> float:
+def exponent(problem: Problem, motions: list[int], each: list[Residuals], theta: Tensor) -> float:
     """Return κ ≤ 1, one over the autocorrelation time of the residual torque, averaged over the joints.
 
-    ε is estimated by S Bᵀ C⁻¹ r, to whose variance white noise contributes S Bᵀ C⁻² B S.
+    ε of the joints is estimated by S Bᵀ C⁻¹ r, to whose variance white noise contributes S Bᵀ C⁻² B S.
     """
     logs = []
     for i, rows in zip(motions, each, strict=True):
         m = problem.training.measurements[i]
         order = in_time(m.t, m.segment)
-        a, D = rows.read(torque, stick)
-        S = torque + stick * rows.slow + rows.external
+        a, D = rows.read(theta)
+        S = rows.variances(theta)
         # Bᵀ C⁻² B = D − D S D, since C⁻¹ = 1 − C⁻¹ B S Bᵀ
         white = S * (D.diagonal(dim1=-2, dim2=-1) - (D.square() * S[:, None]).sum(-1))
-        signal = (S.sqrt() * a)[order]
-        logs.append(autocorrelation_time(signal, m.segment[order], white.mean(0)).log())
+        joints = slice(0, rows.slow.shape[-1])
+        signal = (S.sqrt() * a)[order, joints]
+        logs.append(autocorrelation_time(signal, m.segment[order], white.mean(0)[joints]).log())
     return min(1.0, math.exp(-float(torch.stack(logs).mean())))
 
 
