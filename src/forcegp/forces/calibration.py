@@ -28,6 +28,7 @@ from forcegp.forces.posterior import (
 )
 from forcegp.forces.problem import UNSHOWN, Problem, force_posterior, typical
 from forcegp.forces.quantities import affine_map
+from forcegp.forces.unknowns import tip_factor
 
 STRETCHES = 8
 """Number of contiguous blocks into which a log with fewer than three segments is divided."""
@@ -181,7 +182,11 @@ def _torque_noise(
     S, B = force_noise(at), z.B_Q
     white = std.square().expand_as(r)
     SB = S[..., None] * B.mT
-    G = torch.linalg.solve(B @ SB + torch.diag_embed(white), SB, left=False)
+    C = B @ SB + torch.diag_embed(white)
+    tips = tip_factor(hyperparameters, system, at)
+    if tips is not None:
+        C = C + (z.B_z @ tips) @ (z.B_z @ tips).mT
+    G = torch.linalg.solve(C, SB, left=False)
     return (G @ r[..., None])[..., 0] / S.sqrt(), (G.square() @ white[..., None])[..., 0] / S
 
 
@@ -297,6 +302,9 @@ def _held_out(
         residual = training.weights[i][own].sqrt()[:, None] * residual
     spread = (M @ covariance @ M.mT).diagonal(dim1=-2, dim2=-1)
     stick = (P**2 @ hidden_variance(hyperparameters, at, problem.external_std)[..., None])[..., 0]
+    tips = tip_factor(hyperparameters, system, at)
+    if tips is not None:
+        stick = stick + (M @ z.B_z @ tips).square().sum(-1)
     return residual, spread + (M**2 @ typical(std) ** 2) + stick, P
 
 

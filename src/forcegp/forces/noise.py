@@ -142,6 +142,7 @@ class SampleNoise:
     Attributes:
         std: standard deviation σ of each component, `(d,)` or `(n, d)`.
         force: function that returns the variance Σ_τ of the joint force.
+        tips: function that returns the factor of the covariance of contact forces at rest, if there are any.
         torque: `(n, nq)` standard deviation of individual torques in addition to Σ_τ.
         state: factor G Σ_x½ `(n, d, 2 nq)` of the state noise.
         weight: weight w of each sample `(n,)`; `None` if all are 1.
@@ -152,11 +153,15 @@ class SampleNoise:
     state: Tensor | None = None
     weight: Tensor | None = None
     torque: Tensor | None = None
+    tips: Callable[[States], Tensor | None] | None = None
 
     def factors(self, at: States, z: AffineMap) -> list[Tensor]:
         """Return the factors N_k `(n, d, ·)` for the measured quantity."""
-        # N = (G Σ_x½, B_Q Σ_τ½)
+        # N = (G Σ_x½, B_Q Σ_τ½, B_z Σ_z½)
         terms = [] if self.state is None else [self.state]
+        tips = None if self.tips is None else self.tips(at)
+        if tips is not None:
+            terms.append(z.B_z @ tips)
         if self.torque is not None:
             terms.append(z.B_Q * self.torque[:, None, :])
         return terms if self.force is None else [*terms, z.B_Q * self.force(at).sqrt()[:, None, :]]
@@ -170,7 +175,7 @@ class SampleNoise:
         """Return the noise of the given samples."""
         std = self.std if self.std.ndim == 1 else self.std[rows]
         parts = (None if x is None else x[rows] for x in (self.state, self.weight, self.torque))
-        return SampleNoise(std, self.force, *parts)
+        return SampleNoise(std, self.force, *parts, tips=self.tips)
 
 
 def state_jacobian(

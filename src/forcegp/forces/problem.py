@@ -23,6 +23,7 @@ from forcegp.forces.posterior import ForcePosterior, ForceProcess, hidden_varian
 from forcegp.forces.priors.base import ANALYTICAL, NOISE, RESERVED, ForceMean, ForcePrior
 from forcegp.forces.priors.contact import CoulombErrorPrior, CoulombFriction, coulomb_of
 from forcegp.forces.projection import WhitenedRows, combine, whiten
+from forcegp.forces.unknowns import tip_factor
 from forcegp.gp.basis import LatentBasis, latent_basis
 from forcegp.gp.exact import ExactPosterior, require_exact_fits
 from forcegp.gp.features import Features, Standardization
@@ -168,6 +169,7 @@ class Problem:
             self.state_factor(system, measurement),
             None if weights is None else weights[measurement],
             self.training.measurements[measurement].tau_std,
+            lambda at: tip_factor(tensors, system, at),
         )
 
     def rows(self, tensors: Mapping[str, Tensor]) -> WhitenedRows:

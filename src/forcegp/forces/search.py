@@ -24,6 +24,7 @@ from forcegp.forces.priors.base import ANALYTICAL, ForcePrior
 from forcegp.forces.priors.contact import below_jamming, initial_coulomb
 from forcegp.forces.problem import OWN, Problem, Tensors, kernel_parameters, noise_key, typical
 from forcegp.forces.projection import WhitenedRows
+from forcegp.forces.unknowns import stated_tips
 from forcegp.gp.features import Block
 from forcegp.gp.kernels import Parameters
 from forcegp.gp.optimise import FIRST_STEP, Bounds, Learned, LearningOptions, Progress, minimise
@@ -65,7 +66,10 @@ def initial(problem: Problem, learn_noise: bool, learn_torque_noise: bool = Fals
     few = problem
     if problem.training.samples > START_SAMPLES:
         few = dataclasses.replace(problem, training=problem.training.evenly(START_SAMPLES))
-    noise = initial_torque_noise(few.torque_residual()) if learn_torque_noise else {}
+    noise = {}
+    if learn_torque_noise:
+        closed = (m.at(few.system) for m in few.training.measurements)
+        noise = initial_torque_noise(few.torque_residual()) | stated_tips(few.system, closed)
     if problem.has_coulomb:
         start = _with_friction(few, noise)
     else:

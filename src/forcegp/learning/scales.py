@@ -3,13 +3,15 @@
 1. For given torque noise, the rows of the samples are whitened, and sums over them determine the scales
    (`evidence.py`).
 2. Torque noise and static friction are unknown forces ε ~ N(0, S) of single rows, with S_j = σ_j² + σ_s,j² k
-   and k = e^{−(q̇/v_s)²}. The residual of a row is r = B ε + e with e ~ N(0, Σ), so Cov r = C = Σ + B S Bᵀ is
-   linear in the variances θ = (σ², σ_s²). One step of Fisher scoring for θ ≥ 0 solves
+   and k = e^{−(q̇/v_s)²}, and likewise for the tangential forces of contacts (`forces/unknowns.py`). The
+   residual of a row is r = B ε + e with e ~ N(0, Σ), so Cov r = C = Σ + B S Bᵀ is linear in the variances
+   θ = (σ², σ_s²). One step of Fisher scoring for θ ≥ 0 solves
 
        min ½ (θ⁺ − θ)ᵀ F (θ⁺ − θ) − gᵀ(θ⁺ − θ),  g_i = ½ Σ c_i [(Bᵀ C⁻¹ r)_i² − (Bᵀ C⁻¹ B)_ii],
        F_ij = ½ Σ c_i c_j (Bᵀ C⁻¹ B)_ij²   with   c = (1, k),
 
-   in the directions that closed contacts leave free. A variance that the data do not show is zero.
+   in the directions that closed contacts leave free, where the three components of a contact force have one
+   variance, over which its squares are summed. A variance that the data do not show is zero.
 3. Residuals are correlated in time. If τ is their autocorrelation time, n samples contain as much information
    as κ n independent ones, κ = 1/τ.
 """
@@ -31,6 +33,7 @@ from forcegp.forces.posterior import STICK_NOISE, STICK_SPEED, hidden_variance
 from forcegp.forces.priors.memory import in_time
 from forcegp.forces.problem import Problem, Tensors, basis_of
 from forcegp.forces.quantities import affine_map
+from forcegp.forces.unknowns import AXES, learned_tips, share_at_rest, tip_keys, tip_operator
 from forcegp.gp.sums import Sums, accumulate
 from forcegp.learning.evidence import (
     Evidence,
@@ -49,10 +52,11 @@ STEPS, ACCURACY = 20, 1e-3
 LEAST_VARIANCE = 1e-16
 """Variance of torques that is stored in place of zero [N² m², N²]."""
 AT_REST = (0.02, 0.05, 0.1)
-"""Speeds v_s below which a joint counts as nearly at rest, of which the likeliest is chosen [rad/s, m/s]: the
-resolution of common encoders, and speeds at which joints reverse within a sampling period."""
+"""Speeds v_s below which a joint or contact is nearly at rest, of which the likeliest is taken [rad/s, m/s]:
+the resolution of common encoders, and speeds at which joints reverse within a sampling period."""
 FEWEST_AT_REST = 10.0
-"""Number of independent samples at rest below which the static friction of a joint keeps its stated value."""
+"""Number of independent samples at rest below which static friction keeps its stated value, and of samples in
+contact below which the unknown force of a contact that slides does."""
 LEAST_SHARE = 0.2
 """Smallest share of the samples that remains after the determined directions are subtracted."""
 MOTIONS = ("qdd", "joint_force")
@@ -150,8 +154,8 @@ class Residuals(NamedTuple):
 
     Attributes:
         r: residuals `(n, d)`.
-        B: operators `(n, d, nq)` on the joint force.
-        slow: k `(n, nq)`.
+        B: operators `(n, d, nq + 3 c)` on the joint force and on the tangential forces of c contacts.
+        slow: k `(n, nq + c)` of the joints and contacts.
         external: variance `(n, nq)` of unknown forces of given size.
     """
 
@@ -160,17 +164,34 @@ class Residuals(NamedTuple):
     slow: Tensor
     external: Tensor
 
+    @property
+    def owners(self) -> Tensor:
+        """Matrix `(nq + 3 c, nq + c)` of ones in the joint or contact of each component of the forces."""
+        nq, forces = self.external.shape[-1], self.slow.shape[-1]
+        index = torch.arange(nq, forces).repeat_interleave(AXES)
+        return torch.eye(forces).to(self.r)[torch.cat([torch.arange(nq), index])]
+
+    @property
+    def closed(self) -> Tensor:
+        """Whether each contact is closed `(n, c)`."""
+        return (self.B != 0.0).any(-2).to(self.r) @ self.owners[:, self.external.shape[-1] :] > 0.0
+
+    def variances(self, torque: Tensor, stick: Tensor) -> Tensor:
+        """Return S `(n, nq + 3 c)` for variances σ² and σ_s² `(nq + c,)`."""
+        known = torch.nn.functional.pad(self.external, (0, len(torque) - self.external.shape[-1]))
+        return (torque + stick * self.slow + known) @ self.owners.mT
+
     def log_density(self, torque: Tensor, stick: Tensor) -> float:
         """Return Σ log N(r; 0, C) up to a constant."""
-        S = torque + stick * self.slow + self.external
+        S = self.variances(torque, stick)
         C = (self.B * S[:, None]) @ self.B.mT + torch.eye(self.r.shape[-1]).to(S)
         L = torch.linalg.cholesky(C)
         white = torch.linalg.solve_triangular(L, self.r[..., None], upper=False)
         return -float(L.diagonal(dim1=-2, dim2=-1).log().sum() + 0.5 * white.square().sum())
 
     def read(self, torque: Tensor, stick: Tensor) -> tuple[Tensor, Tensor]:
-        """Return Bᵀ C⁻¹ r `(n, nq)` and Bᵀ C⁻¹ B `(n, nq, nq)` for variances σ² and σ_s² `(nq,)`."""
-        S = torque + stick * self.slow + self.external
+        """Return Bᵀ C⁻¹ r `(n, nq + 3 c)` and Bᵀ C⁻¹ B for variances σ² and σ_s² `(nq + c,)`."""
+        S = self.variances(torque, stick)
         C = (self.B * S[:, None]) @ self.B.mT + torch.eye(self.r.shape[-1]).to(S)
         both = torch.linalg.solve(C, torch.cat([self.B, self.r[..., None]], dim=-1))
         both = self.B.mT @ both
@@ -187,7 +208,9 @@ def residuals(problem: Problem, values: Mapping[str, Tensor], weights: Tensor, i
     Phi = torch.cat([part.rows(W, part.values(x)[0]) for part, W, x in parts], dim=-1)
     std, weight = std.expand_as(m.values), problem.training.weights
     r = (m.values - rows.target - (Phi @ weights).view_as(rows.target)) / std
-    B = z.B_Q / std[..., None]
+    tips = learned_tips(system, values)
+    operators = (z.B_z @ tip_operator(system, at, name) for name in tips)
+    B = torch.cat([z.B_Q, *operators], dim=-1) / std[..., None]
     if m.quantity == "qdd" and system.m:
         # 1 − Ã⁺Ã with Ã = A σ
         A = at.eom.A * std[:, None]
@@ -195,6 +218,9 @@ def residuals(problem: Problem, values: Mapping[str, Tensor], weights: Tensor, i
         r, B = (N @ r[..., None])[..., 0], N @ B
     r = r if weight is None else weight[i].sqrt()[:, None] * r
     slow = torch.exp(-((m.qd / values[STICK_SPEED].exp()) ** 2))
+    closed = [m.active[:, system.contact_names.index(name)] for name in tips]
+    rests = (share_at_rest(values, at, name).where(c, 0.0) for name, c in zip(tips, closed, strict=True))
+    slow = torch.cat([slow, *(k[:, None] for k in rests)], dim=-1)
     external = hidden_variance({}, at, problem.external_std)
     return Residuals(r, B, slow, external if m.tau_std is None else external + m.tau_std**2)
 
@@ -206,29 +232,55 @@ def _with_noise(
     motions = [i for i, m in enumerate(problem.training.measurements) if m.quantity in MOTIONS]
     each = [residuals(problem, values, evidence.weights, i) for i in motions]
     whole = Residuals(*(torch.cat(part) for part in zip(*each, strict=True)))
-    theta = torch.cat([(2.0 * values[TORQUE_NOISE]).exp(), (2.0 * values[STICK_NOISE]).exp()])
+    nq, tips = whole.external.shape[-1], [tip_keys(name) for name in learned_tips(problem.system, values)]
+    keys = (TORQUE_NOISE, *(tip.slides for tip in tips)), (STICK_NOISE, *(tip.rests for tip in tips))
+    theta = torch.cat([(2.0 * values[key]).exp().view(-1) for each in keys for key in each])
     gamma = determined_by_joint(problem, groups, evidence)
-    share = (1.0 - gamma / (problem.power * len(whole.r))).clamp(min=LEAST_SHARE).repeat(2)
-    tried = []
-    for speed in AT_REST:
-        # k = e^{−(q̇/v)²} for another speed v
-        ratio = (values[STICK_SPEED].exp() / speed).square()
-        rows = whole._replace(slow=whole.slow**ratio)
-        rests = problem.power * rows.slow.sum(0) >= FEWEST_AT_REST
-        found = _settled(rows, theta, share, torch.cat([torch.ones_like(rests), rests]))
-        tried.append((rows.log_density(*found.chunk(2)), speed, found))
-    _, speed, theta = max(tried, key=lambda each: each[0])
-    torque, stick = theta.maximum(values[TORQUE_NOISE].new_tensor(LEAST_VARIANCE)).chunk(2)
-    slowest = torch.full_like(torque, math.log(speed))
-    changed = {TORQUE_NOISE: 0.5 * torque.log(), STICK_NOISE: 0.5 * stick.log(), STICK_SPEED: slowest}
+    share = (1.0 - gamma / (problem.power * len(whole.r))).clamp(min=LEAST_SHARE)
+    share = torch.nn.functional.pad(share, (0, len(tips)), value=1.0).repeat(2)
+    # k = e^{−(v/v_s)²} for other speeds v_s, first of the joints and then of the contacts
+    rows, speed, theta = _at_likeliest_speed(
+        whole, slice(0, nq), values[STICK_SPEED], theta, share, problem.power
+    )
+    changed = {STICK_SPEED: torch.full_like(values[STICK_NOISE], speed)}
+    if tips:
+        now = torch.stack([values[tip.speed] for tip in tips])
+        _, speed, theta = _at_likeliest_speed(rows, slice(nq, None), now, theta, share, problem.power)
+        changed |= {tip.speed: torch.full_like(x, speed) for tip, x in zip(tips, now, strict=True)}
+    torque, stick = theta.clamp(min=LEAST_VARIANCE).chunk(2)
+    for (joints, *contacts), x in zip(keys, (0.5 * torque.log(), 0.5 * stick.log()), strict=True):
+        changed |= {joints: x[:nq], **dict(zip(contacts, x[nq:].unbind(), strict=True))}
     return {**values, **changed}, exponent(problem, motions, each, torque, stick)
 
 
+def _at_likeliest_speed(
+    whole: Residuals, own: slice, now: Tensor, theta: Tensor, share: Tensor, power: float
+) -> tuple[Residuals, float, Tensor]:
+    """Return the rows, log v_s and the variances θ for the likeliest speed of some joints or contacts.
+
+    Args:
+        own: the columns of these joints or contacts in `slow`.
+        now: current log v_s of each.
+    """
+    tried, joints = [], torch.ones(whole.external.shape[-1], dtype=torch.bool)
+    for speed in map(math.log, AT_REST):
+        slow = whole.slow.clone()
+        slow[:, own] = slow[:, own] ** (2.0 * (now - speed)).exp()
+        rows = whole._replace(slow=slow)
+        enough = power * torch.cat([rows.closed.sum(0), slow.sum(0)]) >= FEWEST_AT_REST
+        found = _settled(rows, theta, share, torch.cat([joints.to(enough.device), enough]))
+        tried.append((rows.log_density(*found.chunk(2)), rows, speed, found))
+    return max(tried, key=lambda each: each[0])[1:]
+
+
 def _settled(rows: Residuals, theta: Tensor, share: Tensor, free: Tensor) -> Tensor:
-    """Return the variances `(2 nq,)` after scoring until they no longer change."""
+    """Return the variances θ after scoring until they no longer change."""
+    nq, count = rows.external.shape[-1], rows.slow.shape[-1]
+    joints = (torch.arange(count) < nq).repeat(2).to(theta.device)
     for _ in range(STEPS):
         new = torch.where(free, _scored(rows, theta, share, free), theta)
-        change = float((new - theta).abs().max() / theta.max())
+        size = torch.where(joints, theta[joints].max(), theta).clamp(min=LEAST_VARIANCE)
+        change = float(((new - theta).abs() / size).max())
         theta = new
         if change < ACCURACY:
             break
@@ -236,12 +288,12 @@ def _settled(rows: Residuals, theta: Tensor, share: Tensor, free: Tensor) -> Ten
 
 
 def _scored(rows: Residuals, theta: Tensor, share: Tensor, free: Tensor) -> Tensor:
-    """Return the variances `(2 nq,)` after a step of Fisher scoring, zero for those that are not free."""
+    """Return the variances θ after a step of Fisher scoring, zero for those that are not free."""
     a, D = rows.read(*theta.chunk(2))
-    c = torch.cat([torch.ones_like(rows.slow), rows.slow], dim=-1)
-    D = D.repeat(1, 2, 2)
-    g = 0.5 * (c * (a.repeat(1, 2).square() / share - D.diagonal(dim1=-2, dim2=-1))).sum(0)
-    F = 0.5 * torch.einsum("ni,nij,nj->ij", c, D.square(), c)
+    c, R = torch.cat([torch.ones_like(rows.slow), rows.slow], dim=-1), rows.owners
+    square, expected = a.square() @ R, D.diagonal(dim1=-2, dim2=-1) @ R
+    g = 0.5 * (c * (square.repeat(1, 2) / share - expected.repeat(1, 2))).sum(0)
+    F = 0.5 * torch.einsum("ni,nij,nj->ij", c, (R.mT @ D.square() @ R).repeat(1, 2, 2), c)
     # in units of 1/√F_ii, with a small ridge for variances that no row shows
     unit = F.diagonal().clamp(min=1e-300).rsqrt()
     F = (F * unit[:, None] * unit + 1e-9 * torch.eye(len(F)).to(F))[free][:, free]
@@ -257,18 +309,18 @@ def exponent(
 ) -> float:
     """Return κ ≤ 1, one over the autocorrelation time of the residual torque, averaged over the joints.
 
-    ε is estimated by S Bᵀ C⁻¹ r, to whose variance white noise contributes S Bᵀ C⁻² B S.
+    ε of the joints is estimated by S Bᵀ C⁻¹ r, to whose variance white noise contributes S Bᵀ C⁻² B S.
     """
     logs = []
     for i, rows in zip(motions, each, strict=True):
         m = problem.training.measurements[i]
         order = in_time(m.t, m.segment)
         a, D = rows.read(torque, stick)
-        S = torque + stick * rows.slow + rows.external
+        S, joints = rows.variances(torque, stick), slice(0, rows.external.shape[-1])
         # Bᵀ C⁻² B = D − D S D, since C⁻¹ = 1 − C⁻¹ B S Bᵀ
         white = S * (D.diagonal(dim1=-2, dim2=-1) - (D.square() * S[:, None]).sum(-1))
-        signal = (S.sqrt() * a)[order]
-        logs.append(autocorrelation_time(signal, m.segment[order], white.mean(0)).log())
+        signal = (S.sqrt() * a)[order, joints]
+        logs.append(autocorrelation_time(signal, m.segment[order], white.mean(0)[joints]).log())
     return min(1.0, math.exp(-float(torch.stack(logs).mean())))
 
 

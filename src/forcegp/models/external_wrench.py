@@ -13,10 +13,12 @@ import scipy.special
 import torch
 from torch import Tensor
 
-from forcegp.constraints import ConstrainedSystem, Equations
+from forcegp.constraints import ConstrainedSystem, Equations, SurfaceContact
+from forcegp.constraints.gauss import tangent_frame
 from forcegp.data import Dataset
 from forcegp.errors import DataError, ModelError, ParameterError, check_name
 from forcegp.forces.external_wrench import (
+    FORCE_STD,
     MULTIPLIER_STD,
     MomentumLog,
     WrenchFrame,
@@ -29,10 +31,13 @@ from forcegp.forces.noise import external_std, white_noise_std
 from forcegp.forces.posterior import ForcePosterior, unknown_variance
 from forcegp.forces.priors.memory import bristles
 from forcegp.forces.problem import Problem
-from forcegp.forces.quantities import affine_map, states_at
+from forcegp.forces.quantities import AffineMap, States, affine_map, states_at
+from forcegp.forces.unknowns import AXES, share_at_rest, tip_factor, tip_keys, tip_variance
 from forcegp.models.prediction import CHUNK, Prediction
 
 METHODS = ("acceleration", "momentum")
+LEAST_VARIANCE = 1e-12
+"""Variance that is added to that of the friction of a contact, which exceeds rounding errors [N²]."""
 LEAST_NOISE = 1e-9
 """Minimum velocity noise, which exceeds rounding errors [rad/s, m/s]."""
 THRESHOLD = 5.0
@@ -166,7 +171,7 @@ def external_wrench(
     else:
         mean, covariance = reading.from_momenta()
     k = len(frame.axes)
-    pairs = zip(mean[:, :k].split(CHUNK), covariance[:, :k, :k].split(CHUNK), strict=True)
+    pairs = zip(mean.split(CHUNK), covariance.split(CHUNK), strict=True)
     prior, levers = frame.prior.to(mean), [lever.to(mean) for lever in frame.levers]
     parts = (over_levers(m, C, prior, levers) for m, C in pairs)
     mean, covariance = map(torch.cat, zip(*parts, strict=True))
@@ -180,15 +185,119 @@ def external_wrench(
     )
 
 
+@torch.no_grad()
+def contact_force(
+    fit: LearnedForces, data: Dataset, contact: str | None, prior_std: tuple[float, float] | None
+) -> Prediction:
+    """Return the force of a contact at each sample of a log, as in `StructuredFit.contact_force`."""
+    name = surface_contact(fit.system, contact).name
+    own = ContactUnknown(name, prior_std)
+    mean, covariance = Reading.of(fit, data, own, None).from_accelerations()
+    open_ = ~data.active((name,))[:, 0]
+    mean = mean.masked_fill(open_[:, None], 0.0)
+    covariance = covariance.masked_fill(open_[:, None, None], 0.0)
+    beyond, joints = fit.beyond(data.qd, data.tau), fit.system.robot.joint_names
+    return Prediction(mean, covariance, {"contact_force": slice(0, AXES)}, beyond, joints)
+
+
+def surface_contact(system: ConstrainedSystem, name: str | None) -> SurfaceContact:
+    """Return the named surface contact, or the only one.
+
+    Raises:
+        UnknownNameError: the contact does not exist.
+        ModelError: no contact is named and there is not exactly one, or it has no surface.
+    """
+    if name is None:
+        if len(system.contacts) != 1:
+            raise ModelError(
+                "the contact must be named",
+                expected="one of " + ", ".join(system.contact_names) or "a contact",
+            )
+        name = system.contact_names[0]
+    contact = system.contact(name)
+    if not isinstance(contact, SurfaceContact):
+        raise ModelError(
+            f"contact {name!r} has no surface", expected="a SurfaceContact", got=type(contact).__name__
+        )
+    return contact
+
+
+class Unknown(NamedTuple):
+    """An unknown force F = m + D w of each row with w ~ N(0, diag prior²), which acts on the joints as Jᵀ F.
+
+    Attributes:
+        J: `(n, k, nq)` Jacobian.
+        prior: `(u,)` standard deviations of w.
+        offset: m `(n, k)`, or `None` for zero.
+        directions: D `(n, k, u)`, or `None` for w = F.
+    """
+
+    J: Tensor
+    prior: Tensor
+    offset: Tensor | None = None
+    directions: Tensor | None = None
+
+    def force(self, w: Tensor, covariance: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the mean `(n, k)` and covariance `(n, k, k)` of F from those of w."""
+        if self.offset is None or self.directions is None:
+            return w, covariance
+        D = self.directions
+        return self.offset + (D @ w[..., None])[..., 0], D @ covariance @ D.mT
+
+
+@dataclass(frozen=True)
+class ContactUnknown:
+    """The force at a closed surface contact, F = λ (n − μ s(v)) + F_z + u (`StructuredFit.contact_force`).
+
+    Attributes:
+        contact: name of the contact.
+        prior_std: prior standard deviations of λ and u [N], or `None` for a free λ and the learned size of u.
+    """
+
+    contact: str
+    prior_std: tuple[float, float] | None = None
+
+    def separated(self, posterior: ForcePosterior) -> ForcePosterior:
+        """Return the posterior without Coulomb friction at this contact, which is proportional to λ."""
+        coulomb = tuple(law for law in posterior.process.coulomb if law.contact != self.contact)
+        return dataclasses.replace(posterior, process=dataclasses.replace(posterior.process, coulomb=coulomb))
+
+    def unknown(self, fit: LearnedForces, at: States, friction: tuple[Tensor, Tensor]) -> Unknown:
+        """Return the unknown force, given the mean and covariance of J_EᵀF_z."""
+        point = at.eom.contact_points[self.contact]
+        n, v, t = point.unit_normal, point.sliding[1], tangent_frame(point.unit_normal)
+        normal, s = self.prior_std or (MULTIPLIER_STD, FORCE_STD)
+        if self.prior_std is None and tip_keys(self.contact).rests in fit.hyperparameters:
+            variance = tip_variance(fit.hyperparameters, at, self.contact)
+        else:
+            variance = s**2 * share_at_rest(fit.hyperparameters, at, self.contact)
+        # F_z + u in the tangent frame, with the covariance R Rᵀ
+        to_tangent = torch.linalg.pinv((t.mT @ point.jacobian).mT)
+        mean, covariance = friction
+        C = to_tangent @ covariance @ to_tangent.mT + torch.diag_embed(variance[:, None].expand(-1, 2))
+        R = torch.linalg.cholesky(C + LEAST_VARIANCE * torch.eye(2).to(C))
+        # n − μ s(v)
+        direction = n
+        for law in fit.posterior.process.coulomb:
+            if law.contact == self.contact:
+                size = (v.square().sum(-1, keepdim=True) + law.smoothing**2).sqrt()
+                direction = direction - law.coefficient * v / size
+        offset = (t @ (to_tangent @ mean[..., None]))[..., 0]
+        directions = torch.cat([direction[..., None], t @ R], dim=-1)
+        return Unknown(point.jacobian, n.new_tensor([normal, 1.0, 1.0]), offset, directions)
+
+
 class JointForces(NamedTuple):
-    """Forces at n states: mean of Q̄ `(n, nq)`, its covariance with torque noise `(n, nq, nq)`, the equations
-    of motion, J for the wrench and multipliers `(n, k, nq)`, and their prior standard deviations `(k,)`."""
+    """Forces at n states: mean of Q̄ `(n, nq)`, which includes that of the unknown force, its covariance with
+    torque noise `(n, nq, nq)`, the equations of motion, J for w and multipliers `(n, u, nq)`, their prior
+    standard deviations `(u,)`, and the unknown force."""
 
     mean: Tensor
     covariance: Tensor
     eom: Equations
     J: Tensor
     prior: Tensor
+    unknown: Unknown
 
 
 @dataclass(frozen=True)
@@ -196,26 +305,31 @@ class Reading:
     """A log prepared for wrench estimation.
 
     Attributes:
-        fit, data, frame: the learned forces, the log, and the frame with the components to estimate.
+        fit, data: the learned forces and the log.
+        source: the frame with the components to estimate, or the contact.
         history: states of bristles along the log if a force depends on the past, otherwise `None`.
         external: standard deviation of other unknown joint forces `(nq,)`, or `None`.
     """
 
     fit: LearnedForces
     data: Dataset
-    frame: WrenchFrame
+    source: WrenchFrame | ContactUnknown
     history: Tensor | None
     external: Tensor | None = None
 
     @classmethod
     def of(
-        cls, fit: LearnedForces, data: Dataset, frame: WrenchFrame, external: Mapping[str, float] | None
+        cls,
+        fit: LearnedForces,
+        data: Dataset,
+        source: WrenchFrame | ContactUnknown,
+        external: Mapping[str, float] | None,
     ) -> Reading:
         """Prepare a log. Friction with memory follows from the velocities of a log in time order."""
         history, remembers = None, any(prior.remembers for prior in fit.posterior.priors)
         if remembers and data.header.ordered:
             history = bristles(data.t, data.qd, data.segment)
-        return cls(fit, data, frame, history, external_std(external, fit.system.robot))
+        return cls(fit, data, source, history, external_std(external, fit.system.robot))
 
     def forces(self, rows: Tensor, qdd: Tensor) -> JointForces:
         """Return the forces at the given rows, including inertia errors at accelerations qdd `(n, nq)`."""
@@ -223,16 +337,48 @@ class Reading:
         active = data.active(system.contact_names)
         at, _ = states_at(system, data.q, data.qd, data.tau, active)
         at = dataclasses.replace(at, qdd=qdd, history=None if self.history is None else self.history[rows])
-        mean, S = fit.posterior.read(system, at, affine_map(system, at, "total_force"))
+        mean, S, force, A = self._learned(at)
         unknown = unknown_variance(fit.hyperparameters, at, fit.problem.external_std)
         stated = data.extras.get("tau_std")
         for std in (self.external, stated, fit.torque_std):
             unknown = unknown if std is None else unknown + std**2
+        S = S + torch.diag_embed(unknown)
         # Multipliers of closed contacts are additional unknowns; the rows of open contacts are zero.
-        A = at.eom.A
-        prior = torch.cat([self.frame.prior.to(data.q), data.q.new_full((A.shape[-2],), MULTIPLIER_STD)])
-        J = torch.cat([self.frame.jacobian(system.robot, data.q), A], dim=-2)
-        return JointForces(mean, S + torch.diag_embed(unknown), at.eom, J, prior)
+        prior = torch.cat([force.prior, data.q.new_full((A.shape[-2],), MULTIPLIER_STD)])
+        J = force.J if force.directions is None else force.directions.mT @ force.J
+        return JointForces(mean, S, at.eom, torch.cat([J, A], dim=-2), prior, force)
+
+    def _learned(self, at: States) -> tuple[Tensor, Tensor, Unknown, Tensor]:
+        """Return the mean and covariance of learned forces, the unknown force, and A of other contacts."""
+        system, posterior = self.fit.system, self.fit.posterior
+        z, A = affine_map(system, at, "total_force"), at.eom.A
+        values = self.fit.hyperparameters
+        if isinstance(self.source, WrenchFrame):
+            J = self.source.jacobian(system.robot, at.q)
+            mean, S = posterior.read(system, at, z)
+            S = S + _of_tips(posterior, values, system, at, z)
+            return mean, S, Unknown(J, self.source.prior.to(at.q)), A
+        contact = self.source.contact
+        posterior = self.source.separated(posterior)
+        values = {key: x for key, x in values.items() if key not in tip_keys(contact)}
+        own = [getattr(prior, "contact", None) == contact for prior in posterior.priors]
+        rows = posterior.rows(system, at, z)
+
+        def part(keep: bool) -> tuple[Tensor, Tensor]:
+            pairs = zip(own, rows.operators, strict=True)
+            chosen = tuple(W if mine is keep else torch.zeros_like(W) for mine, W in pairs)
+            block = dataclasses.replace(rows, operators=chosen)
+            return posterior.means.mean(block), posterior.latent.covariance(block)
+
+        force = self.source.unknown(self.fit, at, part(True))
+        mean, S = part(False)
+        mean = mean + rows.target
+        if force.offset is not None:
+            mean = mean + (force.J.mT @ force.offset[..., None])[..., 0]
+        others = torch.ones(A.shape[-2], dtype=torch.bool)
+        others[system.rows[contact]] = False
+        S = S + _of_tips(posterior, values, system, at, z)
+        return mean, S, force, A[:, others.to(A.device)]
 
     def from_accelerations(self) -> tuple[Tensor, Tensor]:
         """Estimate the mean and covariance for each sample by generalized least squares."""
@@ -244,7 +390,9 @@ class Reading:
             M, std = forces.eom.M, learned.expand_as(qdd) if stated is None else stated[rows]
             S = forces.covariance + M @ torch.diag_embed(std**2) @ M.mT
             r = (M @ qdd[..., None])[..., 0] - forces.mean
-            parts.append(least_squares(forces.J, r, S, forces.prior))
+            w, covariance = least_squares(forces.J, r, S, forces.prior)
+            u = len(forces.unknown.prior)
+            parts.append(forces.unknown.force(w[:, :u], covariance[:, :u, :u]))
         mean, covariance = zip(*parts, strict=True)
         return torch.cat(mean), torch.cat(covariance)
 
@@ -258,16 +406,19 @@ class Reading:
                 "this fit has no learned torque noise, which the momentum filter needs",
                 hint="fit more samples in time order, with the default priors",
             )
+        assert isinstance(self.source, WrenchFrame)
         noise, segment = velocity_noise(self.data), self.data.segment
         rows = ((segment == own).nonzero()[:, 0] for own in segment.unique_consecutive())
         logs = (self.momenta(own, noise, correlation) for own in rows)
         mean, covariance = zip(*map(observe, logs), strict=True)
         mean, covariance = (torch.from_numpy(np.concatenate(x)).to(self.data.q) for x in (mean, covariance))
-        return mean, covariance
+        k = len(self.source.axes)
+        return mean[:, :k], covariance[:, :k, :k]
 
     def momenta(self, trajectory: Tensor, noise: Tensor, correlation: Tensor) -> MomentumLog:
         """Return the inputs to the momentum filter for the rows of one trajectory."""
-        robot, columns, prior = self.fit.system.robot, [], self.frame.prior
+        assert isinstance(self.source, WrenchFrame)
+        robot, columns, prior = self.fit.system.robot, [], self.source.prior
         for rows in trajectory.split(CHUNK):
             q, qd = self.data.q[rows], self.data.qd[rows]
             # Without accelerations, only the gravity forces due to inertia errors are included.
@@ -279,10 +430,25 @@ class Reading:
             factor = torch.linalg.cholesky(forces.covariance)
             columns.append((p, p_noise, forces.mean - forces.eom.Q_C + added, forces.J, factor))
         p, p_noise, u, J, factor = (torch.cat(parts).cpu().numpy() for parts in zip(*columns, strict=True))
-        t, open_ = self.data.t[trajectory].cpu().numpy(), prior[len(self.frame.axes) :]
-        change = torch.cat([self.frame.changes.to(open_), open_])
+        t, open_ = self.data.t[trajectory].cpu().numpy(), prior[len(self.source.axes) :]
+        change = torch.cat([self.source.changes.to(open_), open_])
         known = [x.cpu().numpy() for x in (prior, change, correlation)]
         return MomentumLog(t, p, p_noise, u, J, known[0], known[1], factor, known[2])
+
+
+def _of_tips(
+    posterior: ForcePosterior,
+    values: Mapping[str, Tensor],
+    system: ConstrainedSystem,
+    at: States,
+    z: AffineMap,
+) -> Tensor:
+    """Return the covariance of z due to unknown tangential forces at contacts `(n, d, d)`."""
+    tips = tip_factor(values, system, at)
+    if tips is None:
+        return torch.zeros_like(at.eom.M)
+    W = posterior.process.coupled(system, at, z).B_z @ tips
+    return W @ W.mT
 
 
 def velocity_noise(data: Dataset) -> Tensor:

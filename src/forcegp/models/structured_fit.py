@@ -42,6 +42,7 @@ from forcegp.forces.quantities import (
     flat_states,
     hidden_forces,
 )
+from forcegp.forces.unknowns import tip_factor
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.optimise import Learned
 from forcegp.gp.sparse import SparsePosterior
@@ -50,7 +51,7 @@ from forcegp.models.export.folder import Export, write_export
 from forcegp.models.export.library import CompiledFit
 from forcegp.models.export.model import ExportedModel
 from forcegp.models.export.motion import CompiledMotion, compiled_motion
-from forcegp.models.external_wrench import ExternalWrench, external_wrench
+from forcegp.models.external_wrench import ExternalWrench, contact_force, external_wrench
 from forcegp.models.fit_result import FitResult
 from forcegp.models.parameter_std import parameter_std
 from forcegp.models.parameters import LearnedParameter, learned_parameters
@@ -140,6 +141,9 @@ class StructuredFit(FittedModel):
         spread = spread + _carried(
             of_all, unknown_variance(self.hyperparameters, at, self.problem.external_std)
         )
+        tips = tip_factor(self.hyperparameters, system, at)
+        if tips is not None:
+            spread = spread + (z.B_z @ tips) @ (z.B_z @ tips).mT
         return mean, spread + self._noise_covariance(z, parts) if noise else spread
 
     def parameter_std(self) -> dict[str, Tensor]:
@@ -243,6 +247,36 @@ class StructuredFit(FittedModel):
         """
         data.check_robot(self.specified.robot)
         return external_wrench(self, data, WrenchFrame(frame, **components), method, external)
+
+    def contact_force(
+        self, data: Dataset, contact: str | None = None, *, prior_std: tuple[float, float] | None = None
+    ) -> Prediction:
+        """Estimate the force on the robot at a closed contact along a log, from the measured accelerations.
+
+        The force F = λ (n − μ s(v)) + F_z + u acts in addition to the learned joint forces: M q̈ = Q + J_EᵀF.
+        Coulomb friction μ and other friction F_z at the contact are those of the fit. The tangential force u
+        of a contact at rest is unknown. λ and u are estimated by generalized least squares, as is an external
+        wrench (`forces/external_wrench.py`). `predict` does without accelerations and is less accurate.
+
+        Args:
+            data: a log with accelerations. Friction with memory is included if it is in time order.
+            contact: the name of a surface contact. It can be omitted if there is only one.
+            prior_std: prior standard deviations of the normal force and of the tangential force at rest [N].
+                By default, the normal force is free, and the tangential force has the learned size.
+
+        Returns:
+            The mean `(n, 3)` and covariance `(n, 3, 3)` in world axes [N], both zero for an open contact.
+
+        Raises:
+            UnknownNameError: the contact does not exist.
+            ModelError: no contact is named and there are several, or the contact has no surface.
+            DataError: the log does not match the robot.
+
+        Example:
+            `force = fit.contact_force(log)`
+        """
+        data.check_robot(self.specified.robot)
+        return contact_force(self, data, contact, prior_std)
 
     def _exported(
         self, functions: int | None, wrench: WrenchFrame | None = None, dtype: torch.dtype = torch.float64

@@ -517,10 +517,20 @@ static void operators(const affine *restrict z, const latent *restrict f, int si
     }
 }
 
+/* a column p = B_z J_E^T (1 - n n^T) sqrt(sigma^2 + s^2 k) for the tangential force of a contact along world axis x,
+ * which is no function of the state, with k = exp(-(v/v_s)^2); zero while the contact is open */
+static void contact_unknown(const affine *restrict z, const equations *restrict e, int contact, int x, int size,
+                            double *restrict p) {
+  const touching *at = &e->contact[contact];
+  const double slow = dot(at->sliding, at->sliding, 3) / (TIP_SPEED[contact] * TIP_SPEED[contact]);
+  const double std = e->closed[contact] ? sqrt(SLIDE_VARIANCE[contact] + REST_VARIANCE[contact] * exp(-slow)) : 0.0;
+  for (int a = 0; a < size; ++a) p[a] = std * dot(z->B_z[a], at->sliding_jacobian[x], NQ);
+}
+
 /* W D W^T + W T T^T W^T with W = B E, plus the variance of unknown forces; 0 if a variance is below rounding error */
-static int read_covariance(const affine *restrict z, const latent *restrict f, const double *restrict unknown,
-                           int size, double *restrict covariance) {
-  double root[SIZE_OF_ALL][RANK], W[SIZE_OF_ALL][COMPONENTS], scaled[COMPONENTS];
+static int read_covariance(const affine *restrict z, const equations *restrict e, const latent *restrict f,
+                           const double *restrict unknown, int size, double *restrict covariance) {
+  double root[SIZE_OF_ALL][RANK], W[SIZE_OF_ALL][COMPONENTS], scaled[COMPONENTS], p[SIZE_OF_ALL];
   int resolved = 1;
   operators(z, f, size, W);
   for (int a = 0; a < size; ++a) combine(&f->T[0][0], W[a], COMPONENTS, RANK, root[a]);
@@ -533,6 +543,11 @@ static int read_covariance(const affine *restrict z, const latent *restrict f, c
       if (a == b && learned < SMALLEST_FRACTION * before) resolved = 0;
       covariance[a * size + b] = learned + dot(carried, z->B_Q[b], NQ) + dot(carried, z->B_F[b], NQ);
     }
+  }
+  for (int k = 0; k < 3 * CONTACTS; ++k) {
+    contact_unknown(z, e, k / 3, k % 3, size, p);
+    for (int a = 0; a < size; ++a)
+      for (int b = 0; b <= a; ++b) covariance[a * size + b] += p[a] * p[b];
   }
   for (int a = 0; a < size; ++a)
     for (int b = a + 1; b < size; ++b) covariance[a * size + b] = covariance[b * size + a];
@@ -684,7 +699,7 @@ static int posterior(const forcegp_learned *learned, const double *q, const doub
   if (!all_finite(mean, size)) return FORCEGP_OVERFLOW;
   if (!covariance) return 0;
   unknown_forces(qd, s->far, noise, unknown);
-  resolved = read_covariance(&z, &s->f, unknown, size, covariance);
+  resolved = read_covariance(&z, &s->e, &s->f, unknown, size, covariance);
   if (noise)
     for (int bit = 0, row = 0; bit < QUANTITIES; ++bit)
       for (int i = 0; quantities >> bit & 1u && i < SIZES[bit]; ++i, ++row)

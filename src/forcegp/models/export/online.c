@@ -108,6 +108,11 @@ int forcegp_update(forcegp_learned *s, const double *q, const double *qd, const 
     for (int a = 0; a < size; ++a) p[a] = z.B_Q[a][i] * torque / std[a] / TEMPERING;
     grow(X_inv, p, 0, g);
   }
+  for (int k = 0; k < 3 * CONTACTS; ++k) {
+    contact_unknown(&z, &e, k / 3, k % 3, size, p);
+    for (int a = 0; a < size; ++a) p[a] /= std[a] * TEMPERING;
+    grow(X_inv, p, 0, g);
+  }
   for (int k = 0; k < GROUP; ++k)
     if (!isfinite(dot(Phi[k], Phi[k], RANK) + y[k] * y[k])) return FORCEGP_OVERFLOW;
   learn_rows(s, Phi, y, X_inv, 0);

@@ -5,6 +5,7 @@
 
 from __future__ import annotations
 
+import math
 import re
 from collections.abc import Iterable, Mapping
 from importlib.resources import files
@@ -27,6 +28,7 @@ from forcegp.forces.priors.inertial import PER_PAYLOAD, InertialPrior, PayloadPr
 from forcegp.forces.priors.joint import TERMS
 from forcegp.forces.quantities import PREDICTED, ROUNDED
 from forcegp.forces.term import JointTerm
+from forcegp.forces.unknowns import tip_keys
 from forcegp.gp import kernels
 from forcegp.gp.basis import KernelPart
 from forcegp.gp.draws import MISSED_FEATURES
@@ -257,6 +259,11 @@ class Writer:
         sticks = STICK_NOISE in values
         self.array((2.0 * values[STICK_NOISE]).exp() if sticks else zero, "STICK_VARIANCE")
         self.array(values[STICK_SPEED].exp() if sticks else zero + 1.0, "STICK_SPEED")
+        tips = [tip_keys(name) for name in self.model.system.contact_names]
+        for name, field in (("SLIDE", "slides"), ("REST", "rests")):
+            log = [float(values.get(getattr(tip, field), -math.inf)) for tip in tips]
+            self.array([math.exp(2.0 * x) for x in log] or [0.0], f"{name}_VARIANCE")
+        self.array([math.exp(float(values.get(tip.speed, 0.0))) for tip in tips] or [1.0], "TIP_SPEED")
         for name, std in (("TORQUE", self.model.torque_std), ("EXTERNAL", self.model.external_std)):
             self.array(zero if std is None else std.expand(nq) ** 2, f"{name}_VARIANCE")
         sensors = [self.array(self.model.noise[x] ** 2) if x in self.model.noise else "0" for x in READ]

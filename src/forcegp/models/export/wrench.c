@@ -64,7 +64,7 @@ static int estimate(const forcegp_learned *learned, const double *q, const doubl
   if (beyond) memcpy(beyond, s.far, sizeof s.far);
   maps(&s.e, s.gain, FORCEGP_TOTAL_FORCE, &z);
   read_mean(&z, &s.f, s.prior_mean, NQ, force);
-  if (!read_covariance(&z, &s.f, zero, NQ, S)) return FORCEGP_UNRESOLVED;
+  if (!read_covariance(&z, &s.e, &s.f, zero, NQ, S)) return FORCEGP_UNRESOLVED;
   unknown_forces(qd, s.far, 1, unknown);
   for (int i = 0; i < NQ; ++i) {
     r[i] = dot(s.e.M[i], qdd, NQ) - force[i], S[i * NQ + i] += unknown[i];
