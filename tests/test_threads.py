@@ -179,3 +179,24 @@ def test_the_blas_of_scipy_takes_the_threads_of_pytorch() -> None:
         pytest.skip("NumPy and SciPy come without OpenBLAS, or there is one processor")
     assert seen["inside"] == [1] * len(seen["before"])
     assert seen["after"] == seen["before"]
+
+
+def test_a_fit_of_columns_to_few_samples_runs_on_one_thread(monkeypatch: pytest.MonkeyPatch) -> None:
+    system, seen = table_system(), list[int]()
+    data = random_data(system, 60)
+    few = forcegp.LearningOptions(max_evaluations=2)
+    before = torch.get_num_threads()
+    torch.set_num_threads(2)
+
+    def progress(*_: object) -> None:
+        seen.append(torch.get_num_threads())
+
+    try:
+        forcegp.StructuredGP(system).fit(data, progress=progress)
+        columns, after = set(seen), torch.get_num_threads()
+        seen.clear()
+        forcegp.StructuredGP(system, "zero").fit(data[:12], options=few, progress=progress)
+    finally:
+        torch.set_num_threads(before)
+    assert columns == {1} and after == 2
+    assert set(seen) == {2}  # kernels factorise matrices that are large enough for threads

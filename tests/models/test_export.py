@@ -453,6 +453,40 @@ def test_a_reduced_covariance_is_wider_by_no_more_than_stated(name: str, tmp_pat
     assert float(growth.max()) == pytest.approx(written.widest, rel=1e-6)
 
 
+@needs_gcc
+def test_a_large_posterior_is_reduced_by_default_and_the_loss_is_stated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    fit = fitted("sparse")
+    monkeypatch.setattr("forcegp.models.export.model.LARGEST", 20)
+    monkeypatch.setattr("forcegp.models.export.model.REDUCED", 12)
+    written, size = fit.export(tmp_path / "own"), fit._exported(None).size
+    assert written.functions == 12 and f"keeps 12 of {size} functions: at training states" in written.loss
+    assert written.loss in (tmp_path / "own" / "README.md").read_text()
+    assert f"at most {written.widest:.2g} (median: {written.wider:.2g})" in written.loss
+
+    # The stated loss is that of the code at the training states, and the mean is that of the fit.
+    [m] = fit.training.evenly(200).measurements
+    ran, small = built(written.folder, "-O2"), fit.compiled(functions=12)
+    assert ran.returncode == 0, ran.stdout
+    read = [x.predict(m.q, m.qd, m.tau, ["qdd", "multiplier"], active=m.active) for x in (small, fit)]
+    torch.testing.assert_close(read[0].mean, read[1].mean, rtol=1e-9, atol=1e-9)
+    ours, theirs = (x.std for x in read)
+    assert ours is not None and theirs is not None
+    growth = (ours / theirs - 1.0)[theirs > ZERO * theirs.max()]
+    assert float(growth.max()) == pytest.approx(written.widest, rel=1e-6)
+    assert float(growth.median()) == pytest.approx(written.wider, rel=1e-6)
+
+    # A file with sums has no training states.
+    fit.save(tmp_path / "model")
+    command = ["export", "--model", str(tmp_path / "model"), "--out", str(tmp_path / "c"), "--json"]
+    done = CliRunner().invoke(app, command)
+    assert done.exit_code == 0, done.output
+    said = json.loads(done.stdout)
+    assert said["functions"] == 12 and f"keeps 12 of {size} functions: at random states" in said["loss"]
+    assert said["loss"] in " ".join((tmp_path / "c" / "README.md").read_text().split())
+
+
 @pytest.mark.slow
 def test_more_functions_lose_less() -> None:
     fit = fitted("sparse")
@@ -587,7 +621,7 @@ def test_what_else_is_refused(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -
         fit.export(tmp_path / "mine")
     monkeypatch.setattr("forcegp.models.export.model.LARGEST", 20)
     with pytest.raises(ModelError, match=r"(?s)48 functions is too large.*functions=200"):
-        fit.export(tmp_path / "c")
+        fit.compiled()
     (q, qd, tau), _ = states(fit)
     with pytest.raises(ShapeError, match="qd contains values that are not finite"):
         fast.predict(q, qd * float("nan"), tau)

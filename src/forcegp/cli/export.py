@@ -32,7 +32,8 @@ def export(
         int | None,
         Option(
             min=1,
-            help="For C: number of basis functions in a reduced covariance, which widens the error bars.",
+            help="For C: number of basis functions in a reduced covariance, which widens the error bars. "
+            "Default: all, or 200 if there are more than 1700.",
         ),
     ] = None,
     frame: Frame = None,
@@ -97,7 +98,9 @@ def export(
     wrench = None if frame is None else WrenchFrame(frame, reference, words(axes), (x, y, z))
     dtype = torch.float32 if float32 else torch.float64
     written = fit.export(out, language=to, name=name, functions=functions, wrench=wrench, dtype=dtype)
-    lost = {"widest": written.widest, "wider": written.wider} if functions is not None else {}
+    lost: dict[str, object] = {}
+    if written.loss:
+        lost = {"widest": written.widest, "wider": written.wider, "loss": written.loss.replace("\n", " ")}
     if float32:
         lost |= dict(zip(("rounding of the mean", "rounding of σ"), written.rounding, strict=True))
     show({"folder": str(out), "functions": written.functions, **lost}, as_json)

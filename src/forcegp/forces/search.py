@@ -22,7 +22,16 @@ from forcegp.errors import ModelError
 from forcegp.forces.noise import initial_torque_noise
 from forcegp.forces.priors.base import ANALYTICAL, ForcePrior
 from forcegp.forces.priors.contact import below_jamming, initial_coulomb
-from forcegp.forces.problem import OWN, Problem, Tensors, kernel_parameters, noise_key, typical
+from forcegp.forces.problem import (
+    OWN,
+    Problem,
+    Tensors,
+    is_finite,
+    kernel_parameters,
+    noise_key,
+    typical,
+    without_inducing,
+)
 from forcegp.forces.projection import WhitenedRows
 from forcegp.forces.unknowns import stated_tips
 from forcegp.gp.features import Block
@@ -92,6 +101,7 @@ def _with_friction(problem: Problem, noise: Tensors) -> Tensors:
     From a poor coefficient, learning may reach a local optimum in which friction depends on the state.
     """
     few = dataclasses.replace(problem, training=problem.training.evenly(FRICTION_SAMPLES), inducing=None)
+    few = without_inducing(few) if is_finite(problem.priors) else few
     like = problem.system.robot.mass
     friction = initial_coulomb(problem.priors, like)
     limits = below_jamming(problem.system, problem.training.measurements, problem.priors, limits_of(friction))

@@ -314,7 +314,8 @@ class StructuredFit(FittedModel):
             path: the folder to create.
             language: `"c"`, `"casadi"`, or `"torch"` for the mean and covariance as a `torch.export` program.
             name: name of the files, and prefix of all identifiers in them.
-            functions: number of basis functions in a reduced-rank covariance. `None` uses all of them.
+            functions: number of basis functions in a reduced-rank covariance. `None` uses all of them, or 200
+                in C code if there are more than 1700.
             wrench: frame and components of an external wrench to estimate from the state and accelerations.
             dtype: precision of the C code, `torch.float64` or `torch.float32`.
 
@@ -323,7 +324,7 @@ class StructuredFit(FittedModel):
             single precision. Both are measured at training states.
 
         Raises:
-            ModelError: a prior, kernel or contact cannot be exported to C, or the posterior is too large.
+            ModelError: a prior, kernel or contact cannot be exported to C.
             NumericalError: single precision cannot resolve a variance.
             UnknownNameError, ParameterError: the language or frame is unknown, or the name is not a C
                 identifier.

@@ -10,6 +10,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Iterable, Iterator, Sequence
+from contextlib import nullcontext
 from typing import TYPE_CHECKING
 
 from torch import nn
@@ -17,7 +18,7 @@ from torch import nn
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset, StreamedDataset
 from forcegp.errors import ModelError
-from forcegp.forces.measurements import NoiseStd, Observation
+from forcegp.forces.measurements import NoiseStd, Observation, observations_of
 from forcegp.forces.noise import Noise, state_std_of
 from forcegp.forces.priors.base import ForcePrior, check_priors
 from forcegp.forces.priors.joint import AnalyticalMean, JointFrictionPrior, mean_of
@@ -25,10 +26,12 @@ from forcegp.forces.priors.sets import default_priors, friction_priors
 from forcegp.forces.problem import require_double
 from forcegp.gp.inducing import LIMIT
 from forcegp.gp.optimise import LearningOptions
+from forcegp.learning.fit import SAMPLES, are_columns
 from forcegp.models.base import FitProgress, Model
 from forcegp.models.structured_fit import KIND, StructuredFit, conditioned
 from forcegp.models.structured_learning import Specification, check_learned, learned, problem_for, search_of
 from forcegp.models.structured_stream import Pass, Sample, sample_of
+from forcegp.resources import one_thread
 from forcegp.storage.options import StructuredOptions
 
 if TYPE_CHECKING:
@@ -166,6 +169,25 @@ class StructuredGP(Model[StructuredFit]):
         check_learned(spec, chosen or ())
         if chosen == () and after is not None and sample.log is None:
             return dataclasses.replace(after, specification=spec).condition(sample.data)
+        file = None if checkpoint is None else Path(checkpoint)
+        count = sample.count or sum(len(each.data) for each in observations_of(sample.data))
+        # Threads that wait for each other take longer than sums over few samples.
+        with one_thread() if are_columns(spec.priors) and count <= SAMPLES else nullcontext():
+            fit = self._learned_from(spec, sample, chosen, after, options, progress, file)
+        result = dataclasses.replace(fit.result, seconds=time.perf_counter() - began)
+        return dataclasses.replace(fit, result=result)
+
+    def _learned_from(
+        self,
+        spec: Specification,
+        sample: Sample,
+        chosen: tuple[str, ...] | None,
+        after: StructuredFit | None,
+        options: LearningOptions | None,
+        progress: FitProgress | None,
+        file: Path | None,
+    ) -> StructuredFit:
+        """Learn the chosen parts from a sample of the log, and condition the forces on the whole log."""
         earlier, before = (None, {}) if after is None else (after.problem, after.hyperparameters)
         spec, problem, doubts = problem_for(spec, earlier, sample.data, chosen, sample.count)
         count = problem.training.samples
@@ -183,8 +205,8 @@ class StructuredGP(Model[StructuredFit]):
         fit = conditioned(spec, lesson.problem, values, lesson.learned, warnings, lesson.learned_on, forces)
         if progress is not None:
             progress(fit.result.evaluations, fit.result.evaluations, fit.result.objective)
-        warnings, seconds = (*fit.result.warnings, *self._without_effect(fit)), time.perf_counter() - began
-        result = dataclasses.replace(fit.result, seconds=seconds, worth=dict(lesson.worth), warnings=warnings)
+        warnings = (*fit.result.warnings, *self._without_effect(fit))
+        result = dataclasses.replace(fit.result, worth=dict(lesson.worth), warnings=warnings)
         return dataclasses.replace(fit, result=result)
 
     def _without_effect(self, fit: StructuredFit) -> Iterator[str]:

@@ -43,6 +43,7 @@ class Export:
         rounding: largest errors caused by single precision at these states. The first is the error of the
             means of q̈ and λ in units of max(|mean|, σ). The second is the relative error of σ. Both are zero
             in double precision.
+        loss: what the reduced-rank covariance loses, in words; empty if it is not reduced.
     """
 
     folder: Path
@@ -50,6 +51,7 @@ class Export:
     widest: float = 0.0
     wider: float = 0.0
     rounding: tuple[float, float] = (0.0, 0.0)
+    loss: str = ""
 
 
 def write_export(
@@ -69,13 +71,15 @@ def write_export(
         else:
             write_torch(fit, Path(path), name)
         return Export(Path(path), model.parts()[0].rank)
+    model = model.reduced()
     header, source = c_source(model, name)
     exact = dataclasses.replace(model, dtype=torch.float64)
     growth, rank = loss_of(exact, fit, training), model.parts()[0].rank
-    result = Export(Path(path), rank, *growth, rounding_of(model, training))
     where = "training" if training.samples else "random"
-    loss = f"It is reduced: at {where} states, σ of q̈ and λ increases by a fraction\n"
-    loss += f"of at most {result.widest:.2g} (median: {result.wider:.2g}). The mean is unchanged."
+    loss = f"It keeps {rank} of {model.size} functions: at {where} states, σ of q̈ and λ increases\n"
+    loss += f"by a fraction of at most {growth[0]:.2g} (median: {growth[1]:.2g}). The mean is unchanged."
+    loss = "" if model.functions is None else loss
+    result = Export(Path(path), rank, *growth, rounding_of(model, training), loss)
     in_mean, in_std = result.rounding
     rounding = f"Single precision: at {where} states, the mean of q̈ and λ errs by at most {in_mean:.2g} "
     rounding += f"of max(|mean|, σ),\nand σ by at most a fraction of {in_std:.2g}."
@@ -87,7 +91,7 @@ def write_export(
         "NAME": name.upper(),
         "robot": model.system.robot.name,
         "functions": result.functions,
-        "loss": "" if model.functions is None else loss,
+        "loss": loss,
         "tables": _reference(model, fit, name),
     }
     texts = {f"{name}.h": header, f"{name}.c": source, f"test_{name}.c": template("test.c", fields)}

@@ -12,6 +12,7 @@ unchanged.
 
 from __future__ import annotations
 
+import dataclasses
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import accumulate
@@ -56,6 +57,9 @@ WHY = {
 LARGEST = 1700
 """Maximum number of functions of a posterior that is not reduced: about 30 MB of text, which a compiler
 translates in half a minute."""
+REDUCED = 200
+"""Number of functions that the covariance of a larger posterior keeps in an export, if no number is given. A
+covariance from C then takes less than the period of a loop at 1 kHz."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -174,14 +178,23 @@ class ExportedModel:
                 raise ModelError(
                     f"a fit with two priors on {what} cannot be exported", expected="at most one"
                 )
-        latent = self.posterior.latent
-        size = latent.basis.size if isinstance(latent, SparsePosterior) else len(latent.alpha)
-        if self.functions is None and size > LARGEST:
+        if self.functions is None and self.size > LARGEST:
             raise ModelError(
-                f"a posterior over {size} functions is too large for C code",
+                f"a posterior over {self.size} functions is too large for C code",
                 expected=f"at most {LARGEST}",
                 hint="reduce its covariance with functions=200 (--functions 200)",
             )
+
+    @property
+    def size(self) -> int:
+        """Number of basis functions or training rows of the posterior."""
+        latent = self.posterior.latent
+        return latent.basis.size if isinstance(latent, SparsePosterior) else len(latent.alpha)
+
+    def reduced(self) -> ExportedModel:
+        """Return the model with `REDUCED` functions if the posterior is too large and no number is given."""
+        too_large = self.functions is None and self.size > LARGEST
+        return dataclasses.replace(self, functions=REDUCED) if too_large else self
 
     @property
     def sign(self) -> int:
