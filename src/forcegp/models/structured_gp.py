@@ -169,11 +169,10 @@ class StructuredGP(Model[StructuredFit]):
         check_learned(spec, chosen or ())
         if chosen == () and after is not None and sample.log is None:
             return dataclasses.replace(after, specification=spec).condition(sample.data)
-        file = None if checkpoint is None else Path(checkpoint)
         count = sample.count or sum(len(each.data) for each in observations_of(sample.data))
         # Threads that wait for each other take longer than sums over few samples.
         with one_thread() if are_columns(spec.priors) and count <= SAMPLES else nullcontext():
-            fit = self._learned_from(spec, sample, chosen, after, options, progress, file)
+            fit = self._learned_from(spec, sample, chosen, after, options, progress, client)
         result = dataclasses.replace(fit.result, seconds=time.perf_counter() - began)
         return dataclasses.replace(fit, result=result)
 
@@ -185,7 +184,7 @@ class StructuredGP(Model[StructuredFit]):
         after: StructuredFit | None,
         options: LearningOptions | None,
         progress: FitProgress | None,
-        file: Path | None,
+        client: Client | None,
     ) -> StructuredFit:
         """Learn the chosen parts from a sample of the log, and condition the forces on the whole log."""
         earlier, before = (None, {}) if after is None else (after.problem, after.hyperparameters)
