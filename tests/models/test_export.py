@@ -528,18 +528,6 @@ def test_single_precision_errs_by_what_the_export_states(name: str, compiler: st
         assert 1e-8 < float(ours) < 4.0 * stated, "other compilers round differently, but not much worse"
 
 
-def test_a_torch_program_has_the_mean_and_covariance(tmp_path: Path) -> None:
-    fit = fitted("one_contact")
-    folder = fit.export(tmp_path / "program", language="torch", name="arm").folder
-    assert {path.name for path in folder.iterdir()} == {"arm.pt2", MANIFEST}
-    program = torch.export.load(str(folder / "arm.pt2")).module()
-    (q, qd, tau), active = states(fit, 8)
-    theirs = fit.predict(q, qd, tau, ["qdd", "multiplier"], active=active)
-    rows = [program(*(x[i : i + 1] for x in (q, qd, tau, active)))[:2] for i in range(len(q))]
-    ours = Prediction(*(torch.cat(x) for x in zip(*rows, strict=True)))
-    assert max(differences(ours, theirs)) < SAME
-
-
 class Bowl(forcegp.ImplicitSurface):
     """A surface without a C form."""
 

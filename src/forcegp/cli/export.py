@@ -15,7 +15,7 @@ from forcegp.errors import ModelError, RobotFileError, check_name
 if TYPE_CHECKING:
     from forcegp.models.structured_fit import StructuredFit
 
-TARGETS = ("c", "casadi", "torch", "urdf", "mjcf")
+TARGETS = ("c", "casadi", "urdf", "mjcf")
 
 
 def export(
@@ -55,15 +55,13 @@ def export(
     ] = 0.0,
     as_json: AsJson = False,
 ) -> None:
-    """Export a structured Gaussian process as C99, CasADi or torch code, or into a copy of its robot file.
+    """Export a structured Gaussian process as C99 or CasADi code, or into a copy of its robot file.
 
     C: the files compute the mean and covariance of accelerations, multipliers and forces, and the Jacobians
     of the mean, given the state and the closed contacts. They depend only on libm. A test program with
     reference values, a CMakeLists.txt and a README are included.
 
     CasADi: the file contains the mean as a function for `casadi.Function.load`, with exact derivatives.
-
-    torch: the file contains the mean and covariance as a program for `torch.export.load`.
 
     URDF, MJCF: the copy of the robot file contains the identified inertia, damping and friction. A report
     with standard deviations and losses, and robots drawn from the posterior, are also written.

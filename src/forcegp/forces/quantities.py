@@ -320,8 +320,6 @@ def hidden_forces(
     names = [c.name for c in system.contacts for _ in range(c.rows)]
     if not names or not {"multiplier", "contact_force", "constraint_force"} & set(parts):
         return None
-    if torch.compiler.is_compiling():  # a program cannot branch on the state
-        return None
     unseen = torch.tensor([name in never for name in names], device=at.q.device)
     R = at.eom.hidden
     part = R.diagonal(dim1=-2, dim2=-1)

@@ -260,8 +260,6 @@ def require_resolved_variance(covariance: Tensor, prior: Tensor) -> Tensor:
     Raises:
         NumericalError: rounding errors dominate a variance.
     """
-    if torch.compiler.is_compiling():  # a program cannot raise errors
-        return covariance
     variance = covariance.diagonal(dim1=-2, dim2=-1)
     lost = variance < SMALLEST_FRACTION * prior
     if bool(lost.any()):

@@ -312,7 +312,7 @@ class StructuredFit(FittedModel):
 
         Args:
             path: the folder to create.
-            language: `"c"`, `"casadi"`, or `"torch"` for the mean and covariance as a `torch.export` program.
+            language: `"c"` or `"casadi"`.
             name: name of the files, and prefix of all identifiers in them.
             functions: number of basis functions in a reduced-rank covariance. `None` uses all of them, or 200
                 in C code if there are more than 1700.

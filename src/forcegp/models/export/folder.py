@@ -16,15 +16,14 @@ from forcegp.destination import check_folder, folder_or_keep
 from forcegp.errors import ParameterError, check_name
 from forcegp.forces.measurements import Training
 from forcegp.forces.posterior import HIGH, LOW
-from forcegp.forces.quantities import FlatStates
 from forcegp.models.export.casadi_function import write_casadi
 from forcegp.models.export.library import CompiledFit
 from forcegp.models.export.model import ExportedModel
 from forcegp.models.export.source import READ, c_source, template
 from forcegp.models.external_wrench import LearnedForces, external_wrench
-from forcegp.models.prediction import Predictor, Query
+from forcegp.models.prediction import Predictor
 
-LANGUAGES = ("c", "casadi", "torch")
+LANGUAGES = ("c", "casadi")
 STATES, LOSS_STATES = 16, 200
 """Number of states in the test program; number of states at which the loss of a reduction is measured."""
 TOLERANCE, ZERO = 1e-10, 1e-5
@@ -65,11 +64,8 @@ def write_export(
             expected="lower-case letters, digits and underscores, a letter first",
         )
     check_folder(path)
-    if language != "c":
-        if language == "casadi":
-            write_casadi(model, Path(path), name)
-        else:
-            write_torch(fit, Path(path), name)
+    if language == "casadi":
+        write_casadi(model, Path(path), name)
         return Export(Path(path), model.parts()[0].rank)
     model = model.reduced()
     header, source = c_source(model, name)
@@ -204,25 +200,3 @@ def _reference(model: ExportedModel, fit: Predictor, name: str) -> str:
         rows = ",\n  ".join("{" + ", ".join(map(repr, row)) + "}" for row in x.tolist()).replace("nan", "NAN")
         lines.append(f"static const {kind} {key}[STATES][{x.shape[1]}] = {{{rows}}};")
     return "\n".join(lines)
-
-
-class _Posterior(torch.nn.Module):
-    def __init__(self, fit: Predictor) -> None:
-        super().__init__()
-        self.fit = fit
-
-    def forward(self, q: Tensor, qd: Tensor, tau: Tensor, active: Tensor) -> tuple[Tensor | None, ...]:
-        query = Query(("qdd", "multiplier"), None, True, False)
-        return self.fit.at(FlatStates(q, qd, tau, active, q.shape[:-1]), query)[0][:3]
-
-
-@torch.no_grad()
-def write_torch(fit: Predictor, path: Path, name: str) -> None:
-    """Write the program that maps q, q̇, τ `(1, nq)` and closed contacts `(1, n_contacts)` to the mean, the
-    covariance and the distance from the training data. The program raises no errors."""
-    system = fit.system
-    state = [torch.zeros(1, system.robot.nq, dtype=system.robot.dtype) for _ in range(3)]
-    closed = torch.ones(1, len(system.contacts), dtype=torch.bool)
-    program = torch.export.export(_Posterior(fit), (*state, closed), strict=False)
-
-    folder_or_keep(lambda folder: torch.export.save(program, str(folder / f"{name}.pt2")), path)
