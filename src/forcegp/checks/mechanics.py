@@ -193,7 +193,7 @@ def _stated(stated: Explanation, j: int, speed: float) -> tuple[dict[str, float]
     texts = [f"{total[k]:.3g} ± {float(f'{errors[k]:.1g}'):g} {units[k]}" for k in known]
     if len(known) < 2:
         at = np.array([speed, 1.0])
-        together, error = float(total @ at), float(jackknife(without @ at))
+        together, error = float(total @ at), float(jackknife(without @ at[:, None])[0])
         texts.append(f"together {together:.3g} {unit} (± {error:.1g}) at {speed:.2g} {per}/s")
     return {kinds[k]: float(total[k]) for k in known}, ", ".join(texts)
 
