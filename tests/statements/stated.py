@@ -12,7 +12,7 @@ NUMBER = r"(-?\d+(?:\.\d+)?(?:e[+-]?\d+)?)"
 
 def values(text: str, unit: str) -> list[tuple[float, float]]:
     """Return all "value ± bar unit" in a text."""
-    found = re.findall(rf"{NUMBER} ± {NUMBER} {re.escape(unit)}(?![\w/ ]*[s/])", text)
+    found = re.findall(rf"{NUMBER} ± {NUMBER} {re.escape(unit)}(?![\w/]| m\b| s\b)", text)
     return [(float(value), float(bar)) for value, bar in found]
 
 

@@ -182,6 +182,15 @@ def _with_any_rise(explanation: Explanation) -> Explanation:
     return wider.with_nuisance(hypotheses.contact_friction_columns(system, log, rows))
 
 
+def rounded(error: float) -> str:
+    """Return a standard error with two digits, without an exponent.
+
+    >>> rounded(14.3), rounded(0.0083)
+    ('14', '0.0083')
+    """
+    return f"{float(f'{error:.2g}'):g}"
+
+
 def _stated(stated: Explanation, j: int, speed: float) -> tuple[dict[str, float], str]:
     """Return the viscous and Coulomb friction of a joint if determined, otherwise their sum at a speed."""
     robot, nq, fit = stated.system.robot, stated.log.nq, stated.fit
@@ -189,12 +198,14 @@ def _stated(stated: Explanation, j: int, speed: float) -> tuple[dict[str, float]
     total, without = (declared - x[..., [j, nq + j]] for x in (fit.nuisance, fit.nuisance_without))
     unit, per = force_unit(robot, j), position_unit(robot, j)
     kinds, errors, units = ("viscous", "coulomb"), jackknife(without), (f"{unit} s/{per}", unit)
+    at = np.array([speed, 1.0])
+    together, error = float(total @ at), float(jackknife(without @ at[:, None])[0])
+    if together <= 2.0 * error:
+        return {}, "not determined"
     known = [k for k in range(2) if total[k] > 2.0 * errors[k]]
-    texts = [f"{total[k]:.3g} ± {float(f'{errors[k]:.1g}'):g} {units[k]}" for k in known]
+    texts = [f"{total[k]:.3g} ± {rounded(errors[k])} {units[k]}" for k in known]
     if len(known) < 2:
-        at = np.array([speed, 1.0])
-        together, error = float(total @ at), float(jackknife(without @ at[:, None])[0])
-        texts.append(f"together {together:.3g} {unit} (± {error:.1g}) at {speed:.2g} {per}/s")
+        texts.append(f"together {together:.3g} {unit} (± {rounded(error)}) at {speed:.2g} {per}/s")
     return {kinds[k]: float(total[k]) for k in known}, ", ".join(texts)
 
 
