@@ -219,7 +219,7 @@ SMALL_GAIN, EXPLAINED = 0.2, 0.5
 """Deviation of a gain from 1 that wrong masses may cause; accepted fraction of unexplained torque."""
 SMALL_COMMON_GAIN, KNOWN_GAIN = 0.05, 2.0
 """Deviation from 1 of the gain of all torques that is reported, and its least size in standard errors. It is
-tried only in place of offsets that are significant already. Torques × 0.9 of a UR5 give 2.3, and 0.8 gives 4.2."""
+tried only in place of offsets that are significant already. Torques × 0.9 of a UR5 give 2.3, × 0.8 4.2."""
 SMALL_TILT, EARTH = 1.0, 9.81
 """Tilt that wrong masses may cause [degrees]; magnitude assumed if the scene has no gravity [m/s²]."""
 SAME_GRAVITY = 0.2, 0.5
