@@ -125,6 +125,17 @@ def test_bars_hold_for_a_payload_that_is_picked_up_after_training() -> None:
 
 
 @pytest.mark.slow
+def test_evaluate_names_a_payload_that_is_picked_up_after_training() -> None:
+    """2 kg in free motion of the new log, and none where nothing was picked up."""
+    fit = fitted(simulated(0.0, 1)[0][::3])
+    same, loaded = (forcegp.evaluate(fit, simulated(mass, 2)[0][::3]) for mass in (0.0, 2.0))
+    assert same.payload is None and not any("payload" in doubt for doubt in same.doubts)
+    assert loaded.payload is not None and loaded.poor
+    assert abs(loaded.payload.mass - 2.0) < 4.0 * loaded.payload.std < 1.0
+    assert any("the payload changed" in doubt for doubt in loaded.doubts)
+
+
+@pytest.mark.slow
 def test_bars_hold_for_a_missing_payload_that_is_never_lifted() -> None:
     """Without free motion, the prior of the masses must be wide enough for a payload."""
     assert holds(simulated(2.0, 1, 0.0)[0][::3], *simulated(2.0, 2, 0.0))
