@@ -361,7 +361,6 @@ def test_the_robot_lies_halfway_between_identification_and_posterior(identified:
     q, C, known, _ = inertia_of(identified)
     half = 0.5 * C @ _Reader.of(identified, 0)._disagreement()[0, -C.shape[-1] :]
     exact, found = mean_inertia([identified.system.robot, calibrated(identified).robot], q)
-    print(exact - found, half, known.sqrt())
     torch.testing.assert_close(exact - found, half, rtol=0.3, atol=0.1 * float(known.sqrt().min()))
 
 
@@ -377,7 +376,6 @@ def test_each_sampled_robot_explains_another_motion_nearly_as_well(identified: S
 
     mean = error(calibrated(identified).robot)
     errors = torch.stack([error(robot) for robot in sampled_robots(identified, 100)])
-    print(error(file), mean, errors.median(0).values, errors.max(0).values)
     assert bool((errors.max(0).values < 1.5 * mean).all())
 
 

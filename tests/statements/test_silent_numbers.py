@@ -6,6 +6,7 @@ Each case is false today and belongs to what is learned from a log, so it is exp
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import pytest
 import torch
@@ -14,7 +15,7 @@ from torch import Tensor
 import forcegp
 from forcegp.dynamics import gravity_force, inverse_dynamics
 from forcegp.errors import ForceGPError
-from statements.wiping import HELD_OUT, Force, fitted, log, normal_force, simulated, system
+from statements.wiping import CSV, HELD_OUT, Force, fitted, imported, log, normal_force, simulated, system
 
 LEAST_COVERAGE = 0.8
 """Fraction of true forces within ±2σ, nominally 0.95; residuals of a log are correlated."""
@@ -101,6 +102,29 @@ def test_check_names_the_gain_of_all_torques(factor: float) -> None:
         assert finding.kind == "torque-gain" and "all torques" in finding.message
         assert float(finding.evidence["factor"]) == pytest.approx(1.0 / factor, abs=0.05)
         assert {"torque-offset"} <= set(finding.kinds)
+
+
+@pytest.mark.parametrize(
+    ("name", "lost", "kind", "text"),
+    [
+        ("half", lambda k: k % 2 == 1, "time-scale", "one of 2 rows"),
+        ("third", lambda k: k % 3 > 0, "time-scale", "one of 3 rows"),
+        ("bursts of 8", lambda k: k in {*range(1000, 1008), *range(2200, 2208)}, "time-gap", "in 2 rows"),
+        ("none", lambda _: False, "", ""),
+    ],
+)
+def test_rows_that_are_lost_and_renumbered_are_named(
+    name: str, lost: Callable[[int], bool], kind: str, text: str, tmp_path: Path
+) -> None:
+    heading, *rows = CSV.read_text(encoding="utf-8").splitlines()
+    stamps, kept = [row.split(",", 1)[0] for row in rows], [x for k, x in enumerate(rows) if not lost(k)]
+    renumbered = (f"{t},{row.split(',', 1)[1]}" for t, row in zip(stamps, kept, strict=False))
+    path = tmp_path / "log.csv"
+    path.write_text("\n".join([heading, *renumbered]) + "\n", encoding="utf-8")
+    findings = forcegp.check(system(), imported(path)[0]).findings
+    named = {f.kind: f.message for f in findings if f.kind in ("time-scale", "time-gap", "rows-lost")}
+    assert set(named) == ({kind} if kind else set()), name
+    assert text in named.get(kind, "")
 
 
 @pytest.mark.xfail(strict=True, reason="one torque stuck for 4 s in the tested part: ±2σ holds 51 % to 75 %")
