@@ -123,8 +123,7 @@ def test_rows_that_are_lost_and_renumbered_are_named(
     path.write_text("\n".join([heading, *renumbered]) + "\n", encoding="utf-8")
     findings = forcegp.check(system(), imported(path)[0]).findings
     named = {f.kind: f.message for f in findings if f.kind in ("time-scale", "time-gap", "rows-lost")}
-    assert set(named) == ({kind} if kind else set()), name
-    assert text in named.get(kind, "")
+    assert text in named.get(kind, "") if kind else not named, (name, named)
 
 
 @pytest.mark.xfail(strict=True, reason="one torque stuck for 4 s in the tested part: ±2σ holds 51 % to 75 %")
@@ -155,7 +154,7 @@ def test_evaluate_names_a_payload_that_is_picked_up_after_training() -> None:
     same, loaded = (forcegp.evaluate(fit, simulated(mass, 2)[0][::3]) for mass in (0.0, 2.0))
     assert same.payload is None and not any("payload" in doubt for doubt in same.doubts)
     assert loaded.payload is not None and loaded.poor
-    assert abs(loaded.payload.mass - 2.0) < 4.0 * loaded.payload.std < 1.0
+    assert abs(loaded.payload.mass - 2.0) < 2.0 * loaded.payload.std < 1.0
     assert any("the payload changed" in doubt for doubt in loaded.doubts)
 
 
