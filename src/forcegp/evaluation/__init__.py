@@ -83,7 +83,7 @@ class Evaluation:
         own_response: the same with the mass matrix of the model. It is 1 for a rigid robot, and 0 for a model
             that has learned the controller.
         motion: open-loop motion if the model predicts forces and the data are in time order.
-        payload: change of the payload since the training, if free motion shows one.
+        payload: change of the payload since the training, if one is found in free motion.
         left_out: rows of the data that are not evaluated, since their accelerations are impossible.
     """
 

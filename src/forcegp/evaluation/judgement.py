@@ -129,7 +129,7 @@ def torque_response(model: FittedModel, robot: RobotModel, data: Dataset) -> tup
 
 @torch.no_grad()
 def payload_change(model: FittedModel, error: Tensor, data: Dataset) -> PayloadChange | None:
-    """Return a change of the payload since the training if free motion shows one, given errors of q̈.
+    """Return a change of the payload since the training if one is found in free motion, given errors of q̈.
 
     With M and the regressor Y of the last link of the model, M (q̈ − q̈_model) = −Y δ. As in `forcegp.check`,
     friction and offsets are nuisances, δ must lower the held-out error, and its mass must be significant.
