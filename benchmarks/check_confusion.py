@@ -35,7 +35,10 @@ from planted_faults import (
 TRUE = {
     "simulated pendulum on a wire": {"force-directions"},
     "simulated Panda, MuJoCo's solver": {"joint-still"},
-    "real iiwa": {"friction-undeclared", "torque-offset", "joint-still", "disturbance", "base-tilted"},
+    "real iiwa": {
+        *("friction-undeclared", "torque-offset", "joint-still", "disturbance", "base-tilted"),
+        "velocity-delay",  # all velocities lag by 40 ms: the published ones were filtered
+    },
     "real pendulum": {"friction-undeclared", "masses-mismatch", "time-gap"},
 }
 """Findings on logs as published that are right, and the tilt that looks like the offsets of the iiwa: see

@@ -137,10 +137,12 @@ def test_what_an_import_saw_of_the_clock_is_a_finding(free: Case) -> None:
         ("faster than its source", "800 rows (80 %) repeat"),
         ("gap", "2 gaps"),
         ("jitter", "by up to 69 %"),
+        ("lost", "q jumps in 3 rows"),
     )
     header = log.header.model_copy(update={"imported": seen})
     findings = check(system, log.replace(header=header)).findings
     assert [f.kind for f in findings[:3]] == ["rows-held", "time-gap", "time-jitter"]
+    assert findings[1].message == "2 gaps; q jumps in 3 rows"
     assert findings[0].severity == "error"
 
 

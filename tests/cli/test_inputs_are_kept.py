@@ -167,6 +167,17 @@ def test_a_folder_that_holds_an_input_is_not_replaced(name: str, tmp_path: Path)
     assert sorted(path.name for path in below.iterdir())
 
 
+RESULTS = ("calibrated.urdf", "calibrated.sample_002.urdf", "calibrated.report.json")
+
+
+@pytest.mark.parametrize("result", RESULTS)
+def test_no_file_of_an_export_replaces_a_folder(result: str, tmp_path: Path) -> None:
+    """Refused before the model is read, which does not exist."""
+    (tmp_path / result).mkdir()
+    words = ["export", "--model", str(tmp_path / "model"), "--robot", "ur5", "--to", "urdf", "--samples", "3"]
+    refused([*words, "-o", str(tmp_path / "calibrated.urdf")], "is a folder, but a file")
+
+
 SCENE = '[robot]\nmodel = "robots/arm.urdf"\n'
 ARM = '<robot name="arm"><link name="base"><visual><geometry><mesh filename="{}"/></geometry></visual></link>'
 

@@ -43,6 +43,18 @@ def test_the_right_robot_explains_all_the_torque_and_the_motion() -> None:
     assert found.response == pytest.approx((1.0, 1.0), abs=1e-9) and found.doubts == () and not found.poor
 
 
+@pytest.mark.parametrize("mass", [0.0, 0.4, -0.3])
+def test_a_change_of_the_payload_is_named_with_its_size(mass: float) -> None:
+    added = mass * torch.tensor([0.0, 1.0], dtype=torch.float64)
+    loaded = ROBOT.replace(mass=ROBOT.mass + added)
+    found = evaluate(forcegp.AnalyticalModel(FREE).nominal(), swinging(loaded))
+    named = [doubt for doubt in found.doubts if "on the last link than the model has" in doubt]
+    assert bool(named) == bool(mass) and found.poor == bool(mass)
+    if mass:
+        assert found.payload is not None and ("more" if mass > 0.0 else "less") in named[0]
+        assert found.payload.mass == pytest.approx(mass, rel=0.05)
+
+
 def test_all_predictors_are_measured_by_the_mass_matrix_of_the_robot_file() -> None:
     """A mass matrix that is far too small or too large would hide the error of its own predictor."""
     data = swinging()

@@ -351,10 +351,32 @@ def test_drives_that_would_be_negative_leave_the_inertia_of_the_joint_as_it_was_
     drives = torch.stack([robot.armature for robot in robots])
     assert float(drives.min()) == 0.0 and float((drives[:, 0] == 0.0).double().mean()) > 0.3
     M, exact = mean_inertia(robots, q), mean_inertia([identified.system.robot], q)[0]
-    b = _Reader.of(identified, 0)._disagreement()[0, -C.shape[-1] :]
-    expected = (known + (C @ b).square()).sqrt()
+    half = 0.5 * C @ _Reader.of(identified, 0)._disagreement()[0, -C.shape[-1] :]
+    expected = (known + half.square()).sqrt()
     assert bool((0.8 * expected < M.std(0)).all() and (M.std(0) < 1.5 * expected).all())
-    assert bool(((M.mean(0) - exact).abs() < 0.5 * expected).all())
+    assert bool(((M.mean(0) - (exact - half)).abs() < 0.5 * expected).all())
+
+
+def test_the_robot_lies_halfway_between_identification_and_posterior(identified: StructuredFit) -> None:
+    q, C, known, _ = inertia_of(identified)
+    half = 0.5 * C @ _Reader.of(identified, 0)._disagreement()[0, -C.shape[-1] :]
+    exact, found = mean_inertia([identified.system.robot, calibrated(identified).robot], q)
+    torch.testing.assert_close(exact - found, half, rtol=0.3, atol=0.1 * float(known.sqrt().min()))
+
+
+def test_each_sampled_robot_explains_another_motion_nearly_as_well(identified: StructuredFit) -> None:
+    """Torques of another log of the true robot, which has no friction and no noise here."""
+    file = identified.specified.robot
+    other = log(file.replace(mass=1.3 * file.mass, com=0.9 * file.com), 400, seed=3)
+
+    def error(robot: forcegp.RobotModel) -> Tensor:
+        tau = inverse_dynamics(robot, other.q, other.qd, other.qdd)
+        tau = tau + robot.damping * other.qd + robot.friction * other.qd.sign()
+        return (tau - other.tau).square().mean(0).sqrt()
+
+    mean = error(calibrated(identified).robot)
+    errors = torch.stack([error(robot) for robot in sampled_robots(identified, 100)])
+    assert bool((errors.max(0).values < 1.5 * mean).all())
 
 
 def test_samples_are_spread_by_the_difference_between_identification_and_posterior(

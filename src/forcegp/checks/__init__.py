@@ -35,6 +35,7 @@ IMPORTED = {
     "faster than its source": "rows-held",
     "gap": "time-gap",
     "jitter": "time-jitter",
+    "lost": "time-gap",
 }
 """Kinds of findings made during import that are reported as a finding other than `import-found`."""
 Check = Callable[[ConstrainedSystem, Log], Outcome]

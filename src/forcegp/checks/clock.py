@@ -25,6 +25,8 @@ ALIKE = 0.02
 UNITS = (1e-9, 1e-6, 1e-3, 1e3, 3600.0, 86400.0, 1e6, 1e9)
 """Units that a clock may have instead of seconds, or by which it was divided or multiplied [s]."""
 UNIT_TOLERANCE = 0.1
+NEAR_WHOLE = 0.05
+"""Relative distance from an integer within which the rate of a clock may be that of rows left out evenly."""
 PERIODS, TYPICAL = (2e-5, 1.0), 4e-3
 """Plausible and typical sampling periods of a robot's log [s]."""
 BURSTS, UNEVEN, FEWEST = 0.9, 0.5, 10
@@ -214,6 +216,8 @@ def _clock_finding(log: Log, factor: float) -> Outcome:
     else:
         kind, scale = "time-scale", factor
         text = f"positions and velocities change {factor:.4g} times as far as the clock allows"
+        if (kept := round(factor)) > 1 and abs(factor - kept) <= NEAR_WHOLE * kept:
+            text += f"; or the log has only one of {kept} rows, evenly, with the stamps of all of them"
     found = log.finding(kind, text, seconds_per_unit=factor, period=log.dt)
     log = log.replace(t=log.t * scale)
     second = match(log, "qd", "qdd")

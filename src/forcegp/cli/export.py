@@ -82,10 +82,15 @@ def export(
 
     from forcegp.destination import check_destination, check_folder
     from forcegp.forces.external_wrench import WrenchFrame
+    from forcegp.models.calibrated import written_files
     from forcegp.models.structured_fit import StructuredFit
 
     check_name("format to export to", to, TARGETS)
-    (check_destination if to in ("urdf", "mjcf") else check_folder)(out)
+    if to in ("urdf", "mjcf"):
+        for path in written_files(out, samples):
+            check_destination(path)
+    else:
+        check_folder(out)
     fit = forcegp.load_model(model)
     if not isinstance(fit, StructuredFit):
         raise ModelError("only a structured Gaussian process can be exported", expected="sgp", got=fit.kind)

@@ -14,7 +14,15 @@ from torch import Tensor
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.errors import DataError, NumericalError
-from forcegp.evaluation.judgement import Motion, beyond_gravity, explained, open_loop, torque_response
+from forcegp.evaluation.judgement import (
+    Motion,
+    PayloadChange,
+    beyond_gravity,
+    explained,
+    open_loop,
+    payload_change,
+    torque_response,
+)
 from forcegp.evaluation.least_squares import FEWEST_TRAINING, as_torque, baselines, without_constraint
 from forcegp.evaluation.predicted import (
     MultiplierScore,
@@ -75,6 +83,7 @@ class Evaluation:
         own_response: the same with the mass matrix of the model. It is 1 for a rigid robot, and 0 for a model
             that has learned the controller.
         motion: open-loop motion if the model predicts forces and the data are in time order.
+        payload: change of the payload since the training, if one is found in free motion.
         left_out: rows of the data that are not evaluated, since their accelerations are impossible.
     """
 
@@ -96,6 +105,7 @@ class Evaluation:
     response: tuple[float, ...] | None = None
     own_response: tuple[float, ...] | None = None
     motion: Motion | None = None
+    payload: PayloadChange | None = None
     left_out: tuple[int, ...] = ()
 
     @property
@@ -151,6 +161,13 @@ class Evaluation:
         if weak := self._responding(self.own_response, LEAST_RESPONSE, math.inf):
             text = f"An added torque has too small an effect (expected: 1): {_values(weak)}."
             found.append(f"{text} The model has learned the controller, not the arm.")
+        if self.payload is not None:
+            mass, std = self.payload.mass, self.payload.std
+            size = f"{abs(mass):.3g} ± {2.0 * std:.1g} kg {'more' if mass > 0.0 else 'less'}"
+            found.append(
+                f"Free motion fits with {size} on the last link than the model has: the payload changed, "
+                "or the model has wrong masses. Contact forces include this weight."
+            )
         if self.left_out:
             rows = describe(numbered(np.array(self.left_out))).capitalize()
             found.append(f"{rows}: left out, since an acceleration is impossible.")
@@ -286,6 +303,7 @@ def _evaluated(
         response=None if real is None else torque_response(real, before.robot, data),
         own_response=None if real is None else torque_response(real, real.system.robot, data),
         motion=None if real is None else open_loop(real, before, data),
+        payload=None if real is None else payload_change(real, predicted.mean - data.qdd, data),
     )
 
 

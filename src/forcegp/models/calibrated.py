@@ -9,8 +9,9 @@ If friction depends on the load, Q_D is averaged over poses. The residual and th
 rarely separate an offset from the gravity force of the links. If an offset is within 2σ of zero, all other
 parameters are therefore conditioned on c = 0. URDF does not support armature, so drive inertia is added to
 the links as far as physically possible. Samples are computed in the same way from functions drawn from the
-posterior, with inertial parameters π + S δ (`forces/priors/inertial.py`), and spread by the difference
-between the identified inertia and its posterior mean.
+posterior, with inertial parameters π + S δ (`forces/priors/inertial.py`). If the inertia was identified
+first, there are two estimates, which differ by b. The robot lies halfway between them, and samples are
+spread by N(0, ¼ b bᵀ) in addition: mean and covariance of an estimate that is either one with probability ½.
 """
 
 from __future__ import annotations
@@ -26,6 +27,7 @@ from torch import Tensor
 
 from forcegp import dynamics
 from forcegp.control.information import PLACES, Unknowns
+from forcegp.destination import check_destination, check_kept
 from forcegp.errors import ModelError, ParameterError
 from forcegp.files import write_json
 from forcegp.forces.posterior import HIGH, LOW, ForceSamples
@@ -199,15 +201,20 @@ def write_calibrated(
         locked_joints: see `load_robot`.
 
     Raises:
+        DestinationError: one of the files would replace the robot file or a folder, or cannot be written.
         RobotFileError: the file does not match the robot, or cannot represent a change.
         ModelError: see `calibrated`.
     """
-    found, out = calibrated(fit, seed=seed, gain_std=gain_std), Path(out)
+    out = Path(out)
+    *paths, page = results = written_files(out, samples)
+    check_kept(results, [Path(source)])
+    for path in results:
+        check_destination(path)
+    found = calibrated(fit, seed=seed, gain_std=gain_std)
     drawn = sampled_robots(fit, samples, seed=seed, gain_std=gain_std) if samples else []
     robots = [found.robot, *drawn]
     drives = not is_mjcf(source) and bool((found.robot.armature != 0.0).any())
     losses: tuple[str, ...] = ()
-    *paths, page = written_files(out, samples)
     for robot, path in zip(robots, paths, strict=True):
         holding = without_armature(robot, found.speeds[-1]) if drives else robot
         losses = losses or write_robot(holding, source, path, locked_joints=locked_joints).losses
@@ -346,24 +353,27 @@ class _Reader:
 
     def robots(self, draws: int) -> list[tuple[RobotModel, Curve]]:
         """Return the robots for the posterior mean and for function samples, each with its friction curve."""
-        drawn = self.fit.force_samples(max(draws, DRAWN), torch.Generator().manual_seed(self.seed))
+        generator = torch.Generator().manual_seed(self.seed)
+        drawn = self.fit.force_samples(max(draws, DRAWN), generator)
         assert isinstance(drawn, ForceSamples)
         curves = self._curves(drawn)
         inertia = self._constants(drawn, InertialPrior)
-        inertia[1:] += self._gain_errors(drawn.count)
+        inertia[1:] += self._gain_errors(drawn.count, generator)
         parts = [curves.flatten(1), inertia, self._constants(drawn, PayloadPrior)]
         sizes, values = [part.shape[-1] for part in parts], torch.cat(parts, dim=-1)
         offset, kept, b = self._offsets(curves), self._offsets(self._kept()[None]), self._disagreement()
         gain = _offset_gain(offset, offset[0] - kept[0], values)
-        free, b = values - offset @ gain, b - kept @ gain
-        generator = torch.Generator().manual_seed(self.seed)
+        apart = self._offsets(b[:, : sizes[0]].unflatten(1, self.speeds.shape))
+        free, b = values - offset @ gain, b - apart @ gain
         random = torch.randn(draws, 1, generator=generator, dtype=torch.float64)
-        spread = torch.cat([free[:1], free[1 : 1 + draws] + random.to(b) * b])
+        # Mean and samples are those of the identified inertia, and the other estimate is b less.
+        along = torch.cat([random.new_zeros(1, 1), random]).to(b)
+        spread = free[: 1 + draws] + 0.5 * (along - 1.0) * b
         rows = (row.split(sizes) for row in self._consistent(spread, sizes[0], free[1:]))
         return [self._robot(curve.view_as(self.speeds), delta, load) for curve, delta, load in rows]
 
     def _disagreement(self) -> Tensor:
-        """Return b `(1, d)`, identified minus posterior mean; samples are spread by N(0, b bᵀ) in addition.
+        """Return b `(1, d)`, the identified inertia minus its posterior mean.
 
         Instruments identify inertia without bias by noisy accelerations, but from part of the samples; the
         posterior contains all samples, but regards accelerations in the regressor as exact. A robot at its
@@ -469,7 +479,7 @@ class _Reader:
                 return torch.cat([mean, samples + self.fit.posterior.shift(p, one)])
         return self.speeds.new_zeros(1 + drawn.count, 0)
 
-    def _gain_errors(self, draws: int) -> Tensor:
+    def _gain_errors(self, draws: int, generator: torch.Generator) -> Tensor:
         """Return samples of the errors of δ due to those of the gains, `(draws, d)` or zeros `(draws, 1)`."""
         robot = self.fit.system.robot
         prior = next((p for p in self.fit.force_priors if isinstance(p, InertialPrior)), None)
@@ -481,7 +491,6 @@ class _Reader:
                 expected='inertia identified by a model with inertia="auto"',
                 got=f"the prior {prior.name!r}",
             )
-        generator = torch.Generator().manual_seed(self.seed)
         errors = self.gain_std * torch.randn(draws, robot.nq, generator=generator, dtype=robot.dtype)
         shift = robot.mass.new_tensor(prior.per_gain) / prior.scale(robot).clamp(min=1e-300)[:, None]
         return errors.to(robot.device) @ shift.mT

@@ -103,6 +103,14 @@ def test_quotes_in_the_heading_only(tmp_path: Path) -> None:
         ("23:59:59.250", "00:00:01.5", 2.25),
         ("23:59:59.250000001", "00:00:01.5", 2.249999999),
         ("2024-02-28", "2024-03-01", 2 * 86400.0),
+        ("28-Feb-2026 23:59:59.250", "01-Mar-2026 00:00:01.5", 2.25),  # MATLAB
+        ("Nov 30 2026 23:59:59.250", "Dec 1 2026 00:00:01.5", 2.25),
+        ("April 30, 2026, 11:59:59.250 PM", "May 1, 2026, 12:00:01.5 AM", 2.25),
+        ("31. Dezember 2025 23:59:59,250", "1. Januar 2026 00:00:01,5", 2.25),
+        ("28.Feb.26 23:59:59,250", "1.März.26 00:00:01,5", 2.25),
+        ("30 juin 2026 23:59:59", "1 juillet 2026 00:00:01", 2.0),
+        ("31 août 2026 23:59:59", "1 sept. 2026 00:00:01", 2.0),
+        ("30 de septiembre de 2026 23:59:59", "1 de octubre de 2026 00:00:01", 2.0),
     ],
 )
 def test_dates_of_countries(tmp_path: Path, start: str, end: str, seconds: float) -> None:
@@ -121,6 +129,35 @@ def test_an_impossible_date_names_its_row_and_the_formats(tmp_path: Path) -> Non
     rows[250] = "yesterday;250"
     with pytest.raises(DataError, match=r"invalid date or time in row 250(?s:.*)27.11.2025(?s:.*)yesterday"):
         read(written(tmp_path, "\n".join(["when;q", *rows])))
+
+
+@pytest.mark.parametrize("month", range(1, 13))
+def test_every_month_has_its_number(tmp_path: Path, month: int) -> None:
+    """Names in full and in short, against the same date in digits."""
+    names = (
+        "jan feb mar apr may jun jul aug sep oct nov dec",
+        "January February March April May June July August September October November December",
+        "Jan. Feb. März Apr. Mai Juni Juli Aug. Sept. Okt. Nov. Dez.",
+        "Januar Februar Mrz April Mai Jun Jul August September Oktober November Dezember",
+        "janv. févr. mars avr. mai juin juil. août sept. oct. nov. déc.",
+        "janvier février mars avril mai juin juillet aout septembre octobre novembre décembre",
+        "ene feb mar abr may jun jul ago sep oct nov dic",
+        "enero febrero marzo abril mayo junio julio agosto septiembre octubre noviembre diciembre",
+        "gennaio febbraio marzo aprile maggio giugno luglio agosto settembre ottobre novembre dicembre",
+    )
+    for name in (language.split()[month - 1] for language in names):
+        text = f"when;q\n5 {name} 2026 01:02:03;0\n5.{month}.2026 01:02:03;1\n"
+        when = read(written(tmp_path, text)).streams[0].columns["when"]
+        assert when[0] == when[1], name
+
+
+def test_dates_of_other_forms_are_named_with_the_supported_ones(tmp_path: Path) -> None:
+    rows = [f"Sat 28 XI 01:02:{k:02d} MMXXVI;{k};1" for k in range(20)]
+    table = read(written(tmp_path, "\n".join(["when;q;tau", *rows])))
+    (remark,) = table.remarks
+    assert "'when' was ignored" in remark and "Sat 28 XI" in remark and "27-Nov-2025 14:03:22" in remark
+    with pytest.raises(DataError, match="27-Nov-2025"):
+        table.stream_of("when")
 
 
 def test_a_column_that_starts_empty_is_read(tmp_path: Path) -> None:

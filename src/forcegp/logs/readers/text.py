@@ -47,13 +47,29 @@ _OF_DAY = (
 DATE = re.compile(rf"^(?:{_DAY}(?:[T ,]+{_OF_DAY})?)$")
 TIME_OF_DAY = re.compile(f"^(?:{_OF_DAY})$")
 """Dates in the order of ISO 8601 or of a country, with or without a time of day; and times without a date."""
+_MONTHS = ("jan|ene|gen", "f[eé][bv]", "mar|m[äa]e?r|mrz", "apr|avr|abr", "ma[iy]|mag", "jun|juin|giu")
+_MONTHS = (*_MONTHS, "jul|juil|lug", "aug|ao[uû]|ago", "se[pt]", "o[ckt]t", "nov", "d[eéi][czk]")
+"""First letters of the months in English, German, French, Spanish and Italian."""
+_NAMED_DAY = (
+    r"^([0-9]{{1,2}})[-/. ]+(?:de )?(?i:{})[^0-9 ./,-]*[-/., ]+(?:de )?([0-9]{{4}}|[0-9]{{2}})\b",
+    r"^(?i:{})[^0-9 ./,-]*[-/. ]+([0-9]{{1,2}})[-/., ]+([0-9]{{4}}|[0-9]{{2}})\b",
+)
+"""A day before or after the name of its month, then the year; of one month each, they become 28.11.2026."""
+_NAMED_MONTHS = [(p.format(f"(?:{m})"), rf"\1.{k}.\2") for p in _NAMED_DAY for k, m in enumerate(_MONTHS, 1)]
+_ANY_NAMED = re.compile("|".join(p.format(f"(?:{'|'.join(_MONTHS)})") for p in _NAMED_DAY))
+SUPPORTED = (
+    "2025-11-27 14:03:22.008, 27.11.2025 14:03:22,008, 11/27/2025 2:03:22 PM, 27-Nov-2025 14:03:22, "
+    "or 14:03:22.008"
+)
+"""Examples of the supported dates."""
 _UNIT = re.compile(r"^[\[(]?\s*([A-Za-zµ°%][\w°²^/*·. -]{0,15}|-|1)?\s*[\])]?$")
 
 
 @dataclass(frozen=True)
 class Dialect:
     """Format of a text table from `first_line` on. Columns are of type `number`, `bool`, `date`, `time of
-    day`, `text` or `empty`. If `padded`, blanks surround quoted fields."""
+    day`, `text` or `empty`. If `padded`, blanks surround quoted fields. `unread` holds the first field of
+    columns of text that contain a time of day."""
 
     encoding: str
     quote: str
@@ -64,6 +80,7 @@ class Dialect:
     names: tuple[str, ...]
     kinds: tuple[str, ...]
     units: dict[str, str]
+    unread: dict[str, str]
 
 
 def sniff(path: Path) -> Dialect:
@@ -108,7 +125,20 @@ def kind_of(field: str, decimal: str = ".") -> str:
         return "number"
     if field.lower() in ("true", "false"):
         return "bool"
+    if _ANY_NAMED.match(field):
+        field = _with_numbers(field)
     return "date" if DATE.match(field) else "time of day" if TIME_OF_DAY.match(field) else "text"
+
+
+def _with_numbers(field: str) -> str:
+    """Replace the name of a month by its number.
+
+    >>> _with_numbers("28-Nov-2026 01:02:03"), _with_numbers("août 5, 2026")
+    ('28.11.2026 01:02:03', '5.8.2026')
+    """
+    for form, numbered in _NAMED_MONTHS:
+        field = re.sub(form, numbered, field)
+    return field
 
 
 def _decode(path: Path, head: bytes) -> tuple[str, str]:
@@ -169,8 +199,10 @@ def _dialect(
         raise DataError(text, hint="rename one of the columns")
     columns = ({kind_of(row[i], decimal) for row in rows if i < len(row)} - {"empty"} for i in range(width))
     kinds = tuple("text" if len(kinds) > 1 else next(iter(kinds), "empty") for kinds in columns)
+    first_text = ((n, f) for n, f, kind in zip(names, rows[0], kinds, strict=False) if kind == "text")
+    unread = {name: field for name, field in first_text if re.search(r"\d:\d\d", field)}
     padded = any(f"{separator} {quote}" in line for line in lines[first : first + SAMPLE_LINES])
-    return Dialect(encoding, quote, padded, separator, decimal, first, tuple(names), kinds, units)
+    return Dialect(encoding, quote, padded, separator, decimal, first, tuple(names), kinds, units, unread)
 
 
 BLOCK_BYTES = 4 << 20
@@ -186,7 +218,14 @@ def read_text(path: Path, *, wanted: Wanted, rows: int | None, progress: Progres
     """Read a text table, skipping text columns with a note."""
     dialect = sniff(path)
     kinds = {n: kind for n, kind in zip(dialect.names, dialect.kinds, strict=True) if wanted(n)}
-    remarks = [f"column {n!r} contains text and was ignored" for n, kind in kinds.items() if kind == "text"]
+    text = {name: dialect.unread.get(name) for name, kind in kinds.items() if kind == "text"}
+    known = f"is not one of the supported dates ({SUPPORTED})"
+    remarks = [
+        f"column {name!r} contains text and was ignored"
+        if date is None
+        else f"column {name!r} was ignored: {date[:40]!r} {known}"
+        for name, date in text.items()
+    ]
     kinds = {name: kind for name, kind in kinds.items() if kind != "text"}
     chunks: dict[str, list[pa.Array]] = {name: [] for name in kinds}
     done = 0
@@ -268,12 +307,15 @@ def _seconds(values: pa.ChunkedArray, form: re.Pattern[str], alone: bool) -> Col
 
     pc: Any = importlib.import_module("pyarrow.compute")
 
-    parts = pc.extract_regex(pc.utf8_trim_whitespace(values), form.pattern).combine_chunks()
+    values = pc.utf8_trim_whitespace(values)
+    if form is DATE and pc.any(pc.match_substring_regex(values, _ANY_NAMED.pattern)).as_py():
+        for named, numbered in _NAMED_MONTHS:
+            values = pc.replace_substring_regex(values, named, numbered)
+    parts = pc.extract_regex(values, form.pattern).combine_chunks()
     missing = pc.is_null(parts).to_numpy(zero_copy_only=False)
     if (~missing).sum() < len(values) - values.null_count:
         row = int(np.flatnonzero(missing & values.is_valid().to_numpy())[0])
-        expected = "2025-11-27 14:03:22.008, 27.11.2025 14:03:22,008, 11/27/2025 2:03:22 PM, or 14:03:22.008"
-        raise DataError(f"invalid date or time in row {row}", expected=expected, got=values[row].as_py())
+        raise DataError(f"invalid date or time in row {row}", expected=SUPPORTED, got=values[row].as_py())
 
     def text(name: str) -> pa.Array:
         return pc.fill_null(pc.struct_field(parts, name), "")
