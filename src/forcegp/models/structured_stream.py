@@ -7,7 +7,7 @@ points. In a second pass, the sums over all samples are computed.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 
@@ -20,9 +20,10 @@ from forcegp.data.stream import Keep, StreamedDataset, spaced_sample
 from forcegp.errors import ModelError
 from forcegp.forces.calibration import MOST_RESIDUALS, STRETCHES
 from forcegp.forces.inverse_dynamics import without_delay
-from forcegp.forces.measurements import Observation, Training, training_of
+from forcegp.forces.measurements import Observation, Training, period_of, training_of
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import ForcePrior
+from forcegp.forces.priors.memory import LONGEST_STEP, PAST, Past, bristles
 from forcegp.forces.problem import Problem, Totals, basis_of, posterior_of, total_over
 from forcegp.gp.basis import LatentBasis
 from forcegp.gp.features import Standardization
@@ -99,11 +100,27 @@ def _rows_of(log: StreamedDataset, keep: Keep | None) -> tuple[Dataset, Dataset,
 def _with_stretches(stream: StreamedDataset, parts: list[Dataset], keep: Keep | None) -> Iterator[Dataset]:
     """Yield the pieces of a log, and append the first rows of some pieces to `parts`."""
     last, length = stream.piece_count - 1, MOST_RESIDUALS // STRETCHES
+    pieces = (
+        followed(stream.pieces()) if stream.header.ordered and not stream.distributed else stream.pieces()
+    )
     wanted = {round(last * i / (STRETCHES - 1)) for i in range(STRETCHES)}
-    for number, piece in enumerate(stream.pieces()):
+    for number, piece in enumerate(pieces):
         if number in wanted:
             parts.append((piece if keep is None else piece[keep(piece)])[:length])
         yield piece
+
+
+def followed(pieces: Iterable[Dataset]) -> Iterator[Dataset]:
+    """Yield the pieces of a log with the states of bristles, which continue from piece to piece."""
+    past = None
+    for piece in pieces:
+        if len(piece) > 1 and not 0.0 < period_of(piece) <= LONGEST_STEP:
+            yield piece
+            continue
+        history = bristles(piece.t, piece.qd, piece.segment, past)
+        past = Past(piece.t[-1:], piece.qd[-1:], piece.segment[-1:], history[-1:])
+        states = {f"{PAST}{k}": x for k, x in enumerate(history.unbind(-1))}
+        yield piece.replace(extras={**piece.extras, **states})
 
 
 def _check_inference(spec: Specification, count: int, held: int) -> None:
@@ -198,7 +215,11 @@ class Pass:
         """Yield the samples of this process piece by piece. Pieces of other processes are empty."""
         rank, processes = (dist.get_rank(), dist.get_world_size()) if self.log.distributed else (0, 1)
         kept = kept_scales(problem.priors, problem.training)
-        for piece in self.log.pieces(start, (rank, processes)):
+        remembers = any(prior.remembers for prior in problem.priors) and processes == 1
+        pieces = self.log.pieces(0 if remembers else start, (rank, processes))
+        for number, piece in enumerate(followed(pieces) if remembers else pieces):
+            if remembers and number < start:
+                continue
             if self.sample.moving:
                 piece = piece[moving_rows(piece)]
             if len(piece) == 0:
