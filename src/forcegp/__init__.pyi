@@ -35,6 +35,8 @@ from .forces.priors.joint import AnalyticalMean as AnalyticalMean
 from .forces.priors.joint import JointForcePrior as JointForcePrior
 from .forces.priors.joint import JointFrictionPrior as JointFrictionPrior
 from .forces.priors.memory import BristlePrior as BristlePrior
+from .forces.priors.residual import ResidualPrior as ResidualPrior
+from .forces.priors.ripple import RipplePrior as RipplePrior
 from .gp.optimise import LearningOptions as LearningOptions
 from .logs import read_log as read_log
 from .models.analytical import AnalyticalModel as AnalyticalModel

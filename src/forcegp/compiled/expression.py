@@ -14,7 +14,7 @@ import numpy as np
 
 Node = tuple[str, object, object]
 """Operation and operands: ("const", value, None), ("input", name, index), or (op, left, right) positions."""
-UNARY = ("exp", "tanh", "sqrt", "step")
+UNARY = ("exp", "tanh", "sqrt", "sin", "cos", "step")
 """Functions of one operand. `step` is 1 for positive operands and 0 otherwise."""
 Tangents = dict[int, "Scalar"]
 """Derivatives of a scalar, keyed by direction. Missing derivatives are zero."""
@@ -81,6 +81,7 @@ class Graph:
         if j is None:
             factors = {"neg": lambda: self.constant(-1.0), "exp": lambda: value}
             factors |= {"tanh": lambda: 1.0 - value * value, "sqrt": lambda: 0.5 / value}
+            factors |= {"sin": lambda: a.cos(), "cos": lambda: -a.sin()}
             factor = factors[op]()
             return {d: t * factor for d, t in by_a.items()}
         b, by_b = Scalar(self, j), found[j]  # pyright: ignore
@@ -131,6 +132,14 @@ class Scalar:
     def sqrt(self) -> Scalar:
         """Return the square root."""
         return self._function("sqrt")
+
+    def sin(self) -> Scalar:
+        """Return the sine."""
+        return self._function("sin")
+
+    def cos(self) -> Scalar:
+        """Return the cosine."""
+        return self._function("cos")
 
     def step(self) -> Scalar:
         """Return 1 if the scalar is positive and 0 otherwise."""

@@ -10,6 +10,8 @@ from __future__ import annotations
 import dataclasses
 import math
 from collections.abc import Mapping
+from dataclasses import dataclass
+from functools import cached_property
 
 import scipy
 import torch
@@ -26,9 +28,20 @@ from forcegp.forces.posterior import (
     hidden_variance,
     trained_region,
 )
-from forcegp.forces.problem import UNSHOWN, Problem, force_posterior, typical
+from forcegp.forces.problem import (
+    PIECE_SAMPLES,
+    UNSHOWN,
+    Problem,
+    Totals,
+    basis_of,
+    force_posterior,
+    posterior_of,
+    total_over,
+    typical,
+)
 from forcegp.forces.quantities import affine_map
 from forcegp.forces.unknowns import tip_factor
+from forcegp.gp.basis import LatentBasis
 
 STRETCHES = 8
 """Number of contiguous blocks into which a log with fewer than three segments is divided."""
@@ -221,15 +234,29 @@ def held_out_torque_std(problem: Problem, hyperparameters: Mapping[str, Tensor],
     Args:
         least: the learned standard deviations, which are the lower bounds.
     """
-    parts = []
-    for i in _motions(problem.training):
-        group = stretches(problem.training.measurements[i].segment)
-        for g in group.unique().tolist():
-            parts.append(_held_out(problem, hyperparameters, i, (group == g).nonzero()[:, 0]))
+    parts = held_out_blocks(problem, hyperparameters)
     if sum(len(residual) for residual, _, _ in parts) < FEWEST:
         return least
     residual, variance, P = (torch.cat(part) for part in zip(*parts, strict=True))
     return unit_scales(residual**2, variance, P**2, least)
+
+
+def held_out_blocks(
+    problem: Problem, hyperparameters: Mapping[str, Tensor]
+) -> list[tuple[Tensor, Tensor, Tensor]]:
+    """Return the residuals, variances and P of each block of the log (see `_held_out`)."""
+    rest, parts = Rest(problem, hyperparameters), []
+    for i in _motions(problem.training):
+        group = stretches(problem.training.measurements[i].segment)
+        for g in group.unique().tolist():
+            parts.append(_held_out(rest, i, (group == g).nonzero()[:, 0]))
+    return parts
+
+
+def held_out_squares(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> Tensor:
+    """Return the mean squared torque error of each joint on each block of the log `(blocks, nq)`."""
+    parts = held_out_blocks(problem, hyperparameters)
+    return torch.stack([residual.square().mean(0) for residual, _, _ in parts])
 
 
 def growth(problem: Problem, hyperparameters: Mapping[str, Tensor], load: Tensor) -> Tensor:
@@ -246,6 +273,7 @@ def growth(problem: Problem, hyperparameters: Mapping[str, Tensor], load: Tensor
         load: typical torque of each joint `(nq,)` [N m, N].
     """
     s2, square, known, slope = hyperparameters[TORQUE_NOISE].exp() ** 2, [], [], []
+    other = Rest(problem, hyperparameters)
     for i in _motions(problem.training):
         m = problem.training.measurements[i]
         for x in (m.qd, m.tau):
@@ -255,7 +283,7 @@ def growth(problem: Problem, hyperparameters: Mapping[str, Tensor], load: Tensor
                 continue
             rest = trained_region(m.qd[~top], m.tau[~top], load)
             own = top.nonzero()[:, 0]
-            residual, V, P = _held_out(problem, hyperparameters, i, own)
+            residual, V, P = _held_out(other, i, own)
             D = distance_beyond(rest, m.qd[own], m.tau[own])
             reached = (P.diagonal(dim1=-2, dim2=-1) > 0.5) & (D > 0.0)
             square.append(residual.square()[reached])
@@ -283,14 +311,47 @@ def stretches(segment: Tensor) -> Tensor:
     return torch.arange(n, device=segment.device) * STRETCHES // max(n, 1)
 
 
-def _held_out(
-    problem: Problem, hyperparameters: Mapping[str, Tensor], i: int, own: Tensor
-) -> tuple[Tensor, Tensor, Tensor]:
+@dataclass(frozen=True)
+class Rest:
+    """Forces conditioned on all samples of a problem but some."""
+
+    problem: Problem
+    hyperparameters: Mapping[str, Tensor]
+
+    @cached_property
+    def basis(self) -> LatentBasis:
+        """The basis functions of sparse inference."""
+        return basis_of(self.problem, self.hyperparameters)
+
+    @cached_property
+    def whole(self) -> Totals:
+        """Sums over all samples."""
+        return self._over(self.problem.training)
+
+    def _over(self, training: Training) -> Totals:
+        pieces = training.pieces(PIECE_SAMPLES)
+        return total_over(self.problem, self.hyperparameters, self.basis, pieces)
+
+    def without(self, measurement: int, rows: Tensor) -> ForcePosterior:
+        """Return the forces conditioned on all samples but the given rows of one measurement."""
+        training = self.problem.training
+        if self.problem.inducing is None:
+            rest = dataclasses.replace(self.problem, training=training.without(measurement, rows))
+            return force_posterior(rest, self.hyperparameters)
+        none = rows[:0]
+        chosen = [rows if i == measurement else none for i in range(len(training.measurements))]
+        rest = dataclasses.replace(
+            self.whole, sums=self.whole.sums - self._over(training.of_rows(chosen)).sums
+        )
+        return posterior_of(self.problem, self.hyperparameters, self.basis, rest)
+
+
+def _held_out(rest: Rest, i: int, own: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Return held-out torque residuals `(n, nq)` of measurement i, their variance without noise, and P."""
+    problem, hyperparameters = rest.problem, rest.hyperparameters
     training, std = problem.training, problem.noise_at(hyperparameters, i)
     m, system = training.measurements[i][own], problem.system
-    rest = dataclasses.replace(problem, training=training.without(i, own))
-    posterior = force_posterior(rest, hyperparameters)
+    posterior = rest.without(i, own)
     at = m.at(system)
     z, M = affine_map(system, at, m.quantity), at.eom.M
     if m.quantity == "joint_force":

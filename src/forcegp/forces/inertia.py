@@ -33,6 +33,7 @@ from forcegp.forces.calibration import autocorrelation_time
 from forcegp.forces.inverse_dynamics import (
     LATE,
     LEAST,
+    RIDGE,
     TOLERATED,
     Estimate,
     NormalEquations,
@@ -53,7 +54,9 @@ from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import ForceMean
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import JointFrictionPrior
+from forcegp.forces.priors.ripple import ripple_of
 from forcegp.forces.problem import Problem, force_posterior, typical
+from forcegp.forces.term import JointState
 from forcegp.gp.features import Block
 from forcegp.identification import regressor
 from forcegp.robot.model import RobotModel
@@ -288,8 +291,24 @@ def inertia_of(
         mean: prior mean of Q, including the motor torque.
         training: samples in motion, at least `LEAST` of them in free motion.
     """
-    rows = free_rows(system, friction, mean, training)
-    return rigid_robot(system.robot, rows.with_memory())
+    rows = free_rows(system, friction, mean, training).with_memory()
+    return rigid_robot(system.robot, with_ripple(system.robot, rows))
+
+
+def with_ripple(robot: RobotModel, rows: Rows) -> Rows:
+    """Add the features of ripple to Φ. Without them, ripple of 2 % of the torque moves M by up to 8 %."""
+    eye = torch.eye(robot.nq).to(rows.q)
+    X = [regressor(robot, rows.q, rows.qd, rows.qdd), rows.qdd[..., None] * eye, rows.friction]
+    X, r = torch.cat(X, dim=-1).transpose(0, 1), rows.residual.T[..., None]
+    X = X / X.square().mean(1, keepdim=True).sqrt().clamp(min=1e-300)
+    gram = X.mT @ X + RIDGE * X.shape[1] * torch.eye(X.shape[-1]).to(X)
+    left = (r - X @ torch.linalg.solve(gram, X.mT @ r))[..., 0].T
+    n = rows.leading
+    ripple = ripple_of(rows.q[:n], left[:n])
+    if ripple is None:
+        return rows
+    waves = torch.stack([*ripple.columns(JointState(rows.q, rows.qd, rows.qd)).values()], dim=-1)
+    return dataclasses.replace(rows, friction=torch.cat([rows.friction, waves], dim=-1))
 
 
 def drive_scale(robot: RobotModel, q: Tensor) -> Tensor:

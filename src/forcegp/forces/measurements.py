@@ -21,7 +21,7 @@ from forcegp.data import Dataset, farthest_points, standardized
 from forcegp.data.fields import check_robot, contact_table
 from forcegp.errors import DataError, ModelError, UnknownNameError
 from forcegp.forces.priors.base import ForcePrior
-from forcegp.forces.priors.memory import LONGEST_STEP, bristles
+from forcegp.forces.priors.memory import DISTANCES, LONGEST_STEP, PAST, bristles
 from forcegp.forces.quantities import QUANTITIES, States, states
 from forcegp.gp.features import Standardization
 from forcegp.robust import MAD_TO_STD
@@ -495,6 +495,9 @@ def training_of(
 
 def with_history(m: Measurement, data: Dataset) -> Measurement:
     """Return the measurement with the states of bristles along its log, if they can be followed."""
+    known = [data.extras[f"{PAST}{k}"] for k in range(2 * len(DISTANCES)) if f"{PAST}{k}" in data.extras]
+    if known:
+        return dataclasses.replace(m, history=torch.stack(known, dim=-1))
     period = period_of(data)
     if not 0.0 < period <= LONGEST_STEP:
         return m

@@ -7,7 +7,7 @@ by piece, accumulating sums over the samples that determine the posterior.
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any
@@ -17,7 +17,7 @@ from torch import Tensor, nn
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.errors import ModelError
-from forcegp.forces.measurements import Training
+from forcegp.forces.measurements import Training, scaled
 from forcegp.forces.noise import TORQUE_NOISE, ForceNoise, SampleNoise, state_jacobian
 from forcegp.forces.posterior import ForcePosterior, ForceProcess, hidden_variance, trained_region
 from forcegp.forces.priors.base import ANALYTICAL, NOISE, RESERVED, ForceMean, ForcePrior
@@ -30,7 +30,7 @@ from forcegp.gp.features import Features, Standardization
 from forcegp.gp.inducing import CANDIDATES, LIMIT, select_inducing
 from forcegp.gp.likelihood import negative_log_likelihood, negative_log_likelihood_of_weights
 from forcegp.gp.sparse import SparsePosterior
-from forcegp.gp.sums import Sums, accumulate
+from forcegp.gp.sums import Sums, accumulate, without_feedback
 
 Tensors = dict[str, Tensor]
 OWN = tuple(name + "." for name in RESERVED)
@@ -93,6 +93,30 @@ class Problem:
     pinned: Mapping[str, Tensor] = field(default_factory=dict)
     state_std: Tensor | None = None
     external_std: Tensor | None = None
+
+    def without_priors(self, names: Collection[str]) -> Problem:
+        """Return the problem without the priors that have the given names."""
+        kept = [p for p, prior in enumerate(self.priors) if prior.name not in names]
+        inducing = None if self.inducing is None else tuple(self.inducing[p] for p in kept)
+        scales = tuple(self.training.scales[p] for p in kept)
+        training = dataclasses.replace(self.training, scales=scales)
+        priors = tuple(self.priors[p] for p in kept)
+        return dataclasses.replace(self, priors=priors, training=training, inducing=inducing)
+
+    def with_priors(self, priors: Sequence[ForcePrior], source: Problem | None = None) -> Problem:
+        """Return the problem with more priors, which have no inducing points.
+
+        Args:
+            source: a problem with the input scales of these priors; computed from the samples by default.
+        """
+        if source is None:
+            scales = scaled(self.training, self.system, priors, {}).scales
+        else:
+            known = {p.name: s for p, s in zip(source.priors, source.training.scales, strict=True)}
+            scales = tuple(known[prior.name] for prior in priors)
+        training = dataclasses.replace(self.training, scales=(*self.training.scales, *scales))
+        more = dataclasses.replace(self, priors=(*self.priors, *priors), training=training, inducing=None)
+        return more if self.inducing is None else without_inducing(more)
 
     def system_at(self, tensors: Mapping[str, Tensor]) -> ConstrainedSystem:
         """Return the system with the robot evaluated at the analytical parameters in the tensors."""
@@ -308,6 +332,12 @@ def basis_of(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> LatentB
     return latent_basis(problem.priors, kernel_parameters(hyperparameters), problem.inducing, components)
 
 
+def remainder(priors: Sequence[ForcePrior], basis: LatentBasis) -> Tensor:
+    """Return the positions of the weights that are learned from what all others leave."""
+    parts = [torch.arange(basis.size)[basis.of_process(p)] for p, f in enumerate(priors) if f.remainder]
+    return torch.cat([torch.arange(0), *parts]).to(next(iter(basis.params.values())).device)
+
+
 @torch.no_grad()
 def total_over(
     problem: Problem,
@@ -341,7 +371,7 @@ def posterior_of(
         NumericalError: the sums are not finite, or the noise is negligible compared with the prior variance.
     """
     # A = I + Σ V S Vᵀ, w ~ N(A⁻¹v, A⁻¹)
-    latent = SparsePosterior.of(basis, total.sums)
+    latent = SparsePosterior.of(basis, without_feedback(total.sums, remainder(problem.priors, basis), True))
     latent.require_resolved()
     return ForcePosterior(problem.process_at(hyperparameters), latent)
 

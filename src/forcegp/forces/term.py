@@ -44,6 +44,16 @@ def tanh(x: Array) -> Array:
     return x.tanh() if isinstance(x, Tensor) else np.tanh(x)
 
 
+def sin(x: Array) -> Array:
+    """Return sin x."""
+    return x.sin() if isinstance(x, Tensor) else np.sin(x)
+
+
+def cos(x: Array) -> Array:
+    """Return cos x."""
+    return x.cos() if isinstance(x, Tensor) else np.cos(x)
+
+
 def constants(like: Array, values: object) -> Array:
     """Return constants as a tensor or as a NumPy array, as `like` is."""
     return like.new_tensor(values) if isinstance(like, Tensor) else np.asarray(values)

@@ -7,7 +7,7 @@ and v = Σ V_i c_i, where V_i contains the basis functions of each component at 
 from __future__ import annotations
 
 from collections.abc import Iterable, Sequence
-from dataclasses import dataclass, fields
+from dataclasses import dataclass, fields, replace
 
 import torch
 from torch import Tensor
@@ -102,6 +102,38 @@ class Sums(Moments):
                 got=f"{len(other.v)} of {len(other.prior)}",
                 hint="compute both with the same inducing points and hyperparameters",
             )
+
+
+@torch.no_grad()
+def without_feedback(sums: Sums, later: Tensor, widens: bool = False) -> Sums:
+    """Return sums in which some weights are learned from what the others leave, and do not change them.
+
+    With weights o learned first and p later, A = I + G, and ŵ_o = A_oo⁻¹ v_o, the sums have G_op = 0 and
+    v_p − G_po ŵ_o: feedback from p is cut (Plummer, *Cuts in Bayesian graphical models*, 2015). Since w_p is
+    unknown, the covariance of w_o is that of both learned together, (A_oo − G_op A_pp⁻¹ G_po)⁻¹.
+
+    Args:
+        later: positions of the weights p `(k,)`.
+        widens: whether A_oo is replaced by the inverse of this covariance.
+    """
+    if not len(later):
+        return sums
+    first = torch.ones_like(sums.v, dtype=torch.bool)
+    first[later] = False
+    o = first.nonzero()[:, 0]
+    G, v = sums.G.clone(), sums.v.clone()
+    A = G[o[:, None], o] + torch.eye(len(o)).to(G)
+    w = torch.cholesky_solve(v[o, None], torch.linalg.cholesky(A))[:, 0]
+    B = G[o[:, None], later]
+    v[later] -= B.mT @ w
+    if widens:
+        # P = A_oo − B A_pp⁻¹ Bᵀ, A_pp = R Rᵀ
+        A_pp = sums.G[later[:, None], later] + torch.eye(len(later)).to(G)
+        half = torch.linalg.solve_triangular(torch.linalg.cholesky(A_pp), B.mT, upper=False)
+        P = A - half.mT @ half
+        G[o[:, None], o], v[o] = P - torch.eye(len(o)).to(G), P @ w
+    G[later[:, None], o], G[o[:, None], later] = 0.0, 0.0
+    return replace(sums, v=v, G=G)
 
 
 @torch.no_grad()

@@ -15,21 +15,24 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
+import scipy.stats
 import torch
 from torch import Tensor
 
+from forcegp.forces.calibration import held_out_squares
 from forcegp.forces.measurements import Training, scaled
 from forcegp.forces.noise import TORQUE_NOISE, white_noise_std
 from forcegp.forces.noise_learning import weighted
-from forcegp.forces.posterior import MEMORY
+from forcegp.forces.posterior import MEMORY, STICK_NOISE
 from forcegp.forces.priors.base import COULOMB, NOISE, ForcePrior
 from forcegp.forces.priors.memory import BristlePrior
-from forcegp.forces.problem import Problem, Tensors, basis_of, noise_key, without_inducing
-from forcegp.forces.search import Search
-from forcegp.gp.kernels import Columns, Constant, Kernel, Linear
+from forcegp.forces.priors.ripple import RipplePrior, ripple_of
+from forcegp.forces.problem import Problem, Tensors, basis_of, noise_key, with_inducing, without_inducing
+from forcegp.forces.search import Search, initial
+from forcegp.gp.kernels import Columns, Constant, Kernel, Linear, SquaredExponential
 from forcegp.gp.optimise import FitProgress, LearningOptions
 from forcegp.learning.evidence import families_of, worth
-from forcegp.learning.scales import Scales, learned_scales
+from forcegp.learning.scales import MOTIONS, Scales, learned_scales, residuals, without_components
 
 SAMPLES = 4000
 """Maximum number of evenly spaced samples from which scales and noise are learned. Ten parameters of a joint
@@ -38,6 +41,10 @@ FIRST_POWER = 0.1
 """Exponent of the likelihood before the correlation of the residuals is known."""
 FRICTION_SAMPLES = 400
 """Maximum number of samples for the search for Coulomb friction, which whitens all rows at each step."""
+CHANCE = 0.02
+"""Probability of keeping a residual force of any joint that does not exist, that of two standard errors."""
+SUPPORT = 64
+"""Maximum number of support points of a residual force."""
 PASSES = 3
 """Maximum number of searches for Coulomb friction, each followed by new scales."""
 SETTLED = 0.01
@@ -51,7 +58,11 @@ rest counts as torque noise."""
 def is_column(kernel: Kernel) -> bool:
     """Return whether the only hyperparameters of a kernel are scales of columns."""
     plain = type(kernel) is Linear and kernel.ard and not kernel.shared and kernel.offset is None
-    return plain or isinstance(kernel, Columns | Constant)
+    return (
+        plain
+        or isinstance(kernel, Columns | Constant)
+        or (type(kernel) is SquaredExponential and kernel.shared)
+    )
 
 
 def are_columns(priors: tuple[ForcePrior, ...]) -> bool:
@@ -118,7 +129,44 @@ def regression(
         progress: function called after each pass with its number, the total number, and NaN.
     """
     part = dataclasses.replace(problem, training=problem.training.evenly(SAMPLES), power=FIRST_POWER)
-    part, noisy = without_inducing(part), learns(NOISE) and TORQUE_NOISE in start
+    noisy = learns(NOISE) and TORQUE_NOISE in start
+    later = [prior.name for prior in part.priors if prior.remainder]
+    own = {key: value for key, value in start.items() if key.split(".")[0] in later}
+    rest = {key: value for key, value in start.items() if key not in own}
+    named = without_inducing(part.without_priors(later))
+
+    def of_laws(named: Problem, start: Tensors) -> Scales:
+        return _alternating(named, start, learns, noisy, prunes, degrees_of_freedom, progress)
+
+    found = of_laws(named, rest)
+    if prunes and noisy and (ripple := ripple_in(found)) is not None:
+        named = named.with_priors([ripple])
+        found = of_laws(named, {**initial(named, False), **rest})
+    if later:
+        found = with_remainder(part, found, own, learns, noisy, prunes)
+    values = {**found.values, **memory_noise(found)}
+    objective = -found.evidence.log_evidence
+    return Regression(
+        found.problem,
+        values,
+        found.problem.training.samples,
+        found.rounds,
+        found.converged,
+        objective,
+        worth_of(found),
+    )
+
+
+def _alternating(
+    part: Problem,
+    start: Tensors,
+    learns: Callable[[str], bool],
+    noisy: bool,
+    prunes: bool,
+    degrees_of_freedom: float | None,
+    progress: FitProgress | None,
+) -> Scales:
+    """Return scales and noise of laws, alternating with a search for Coulomb friction."""
     friction = [key for key in start if key.startswith(COULOMB + ".") and learns(COULOMB)]
     passes = PASSES if friction or degrees_of_freedom is not None else 1
     found = learned_scales(part, dict(start), learns, noisy, prunes)
@@ -137,11 +185,65 @@ def regression(
         # The scales start from the stated ones again.
         noise = {key: value for key, value in values.items() if key.startswith(NOISE + ".")}
         found = learned_scales(part, {**start, **noise, **searched}, learns, noisy, prunes)
-    values = {**found.values, **memory_noise(found)}
-    objective = -found.evidence.log_evidence
-    return Regression(
-        part, values, part.training.samples, found.rounds, found.converged, objective, worth_of(found)
+    return found
+
+
+def ripple_in(found: Scales) -> RipplePrior | None:
+    """Return the ripple in the residual torques, or `None` if there is none or it is known."""
+    problem, parts = found.problem, []
+    if any(isinstance(prior, RipplePrior) for prior in problem.priors):
+        return None
+    for i, m in enumerate(problem.training.measurements):
+        if m.quantity in MOTIONS:
+            rows = residuals(problem, found.values, found.evidence.weights, i)
+            noise = (found.values[key].exp().square() for key in (TORQUE_NOISE, STICK_NOISE))
+            parts.append((m.q, rows.torque(*noise)))
+    return ripple_of(*map(torch.cat, zip(*parts, strict=True))) if parts else None
+
+
+def with_remainder(
+    whole: Problem,
+    laws: Scales,
+    start: Tensors,
+    learns: Callable[[str], bool],
+    noisy: bool,
+    prunes: bool,
+) -> Scales:
+    """Return the columns with those of a residual force, learned from what all laws leave.
+
+    Errors of laws are correlated along a motion, so that a function of the state describes them on this
+    motion only. If `prunes`, the force of a joint is kept if it reduces the errors on held-out blocks.
+
+    Args:
+        whole: the problem with the residual force.
+        laws: the result without it.
+        start: initial hyperparameters of the residual force.
+    """
+    later = [prior for prior in whole.priors if prior.remainder]
+    names = {prior.name for prior in later}
+    problem = laws.problem.with_priors(later, whole)
+    values = {**laws.values, **start}
+    problem = with_inducing(problem, values, SUPPORT)
+    found = learned_scales(problem, values, lambda name: name in names and learns(name), noisy, False)
+    found = dataclasses.replace(found, idle=laws.idle)
+    if not prunes or not all(map(learns, names)):
+        return found
+    after, before = (held_out_squares(each.problem, each.values) for each in (found, laws))
+    kept = _are_smaller(after - before)
+    if not any(kept):
+        return laws
+    return without_components(
+        found, [p for p, prior in enumerate(problem.priors) if prior.remainder], kept, noisy
     )
+
+
+def _are_smaller(changes: Tensor) -> list[bool]:
+    """Return for each joint whether changes `(blocks, nq)` are below zero, by a t-test over the blocks."""
+    blocks, joints = changes.shape
+    if blocks < 2:
+        return [False] * joints
+    most = scipy.stats.t.ppf(CHANCE / joints, blocks - 1)
+    return (changes.mean(0) < most * changes.std(0) / math.sqrt(blocks)).tolist()
 
 
 def _coulomb(problem: Problem, values: Mapping[str, Tensor], keys: list[str]) -> Tensors:

@@ -19,7 +19,7 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import NamedTuple
 
@@ -31,11 +31,12 @@ from forcegp.forces.calibration import autocorrelation_time
 from forcegp.forces.noise import TORQUE_NOISE
 from forcegp.forces.posterior import STICK_NOISE, STICK_SPEED, hidden_variance
 from forcegp.forces.priors.memory import in_time
-from forcegp.forces.problem import Problem, Tensors, basis_of
+from forcegp.forces.problem import Problem, Tensors, basis_of, remainder
 from forcegp.forces.quantities import affine_map
 from forcegp.forces.unknowns import AXES, learned_tips, share_at_rest, tip_keys, tip_operator
-from forcegp.gp.sums import Sums, accumulate
+from forcegp.gp.sums import Sums, accumulate, without_feedback
 from forcegp.learning.evidence import (
+    SMALLEST,
     Evidence,
     Group,
     families_of,
@@ -118,7 +119,8 @@ def learned_scales(
 
 def _sums(problem: Problem, values: Tensors) -> tuple[list[Group], Sums]:
     basis = basis_of(problem, values)
-    return groups_of(problem.priors, basis), accumulate(basis, problem.rows(values).blocks)
+    sums = accumulate(basis, problem.rows(values).blocks)
+    return groups_of(problem.priors, basis), without_feedback(sums, remainder(problem.priors, basis))
 
 
 def _moved(found: Scales, evidence: Evidence) -> Scales:
@@ -189,6 +191,10 @@ class Residuals(NamedTuple):
         white = torch.linalg.solve_triangular(L, self.r[..., None], upper=False)
         return -float(L.diagonal(dim1=-2, dim2=-1).log().sum() + 0.5 * white.square().sum())
 
+    def torque(self, torque: Tensor, stick: Tensor) -> Tensor:
+        """Return the expected torque noise S Bᵀ C⁻¹ r `(n, nq)`."""
+        return (torque + stick * self.slow + self.external) * self.read(torque, stick)[0]
+
     def read(self, torque: Tensor, stick: Tensor) -> tuple[Tensor, Tensor]:
         """Return Bᵀ C⁻¹ r `(n, nq + 3 c)` and Bᵀ C⁻¹ B for variances σ² and σ_s² `(nq + c,)`."""
         S = self.variances(torque, stick)
@@ -196,6 +202,22 @@ class Residuals(NamedTuple):
         both = torch.linalg.solve(C, torch.cat([self.B, self.r[..., None]], dim=-1))
         both = self.B.mT @ both
         return both[..., -1], both[..., :-1]
+
+
+def without_components(found: Scales, priors: Sequence[int], kept: Sequence[bool], noisy: bool) -> Scales:
+    """Drop components, such as joints, of some priors, and learn the noise again.
+
+    Args:
+        priors: indices of the priors.
+        kept: whether to keep each component of these priors.
+    """
+    gone = [g.prior in priors and not kept[g.index[0]] for g in found.groups]
+    dropped = torch.tensor(gone)
+    change = torch.where(dropped, math.log(SMALLEST) + found.stated, 0.0)
+    values = with_scales(found.values, found.groups, change)
+    idle = (*found.idle, *((p, k) for p in priors for k, keep in enumerate(kept) if not keep))
+    found = replace(found, values=values, stated=found.stated - change, kept=found.kept & ~dropped, idle=idle)
+    return _alternated(found, noisy)
 
 
 def residuals(problem: Problem, values: Mapping[str, Tensor], weights: Tensor, i: int) -> Residuals:

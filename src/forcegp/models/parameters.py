@@ -25,7 +25,7 @@ DETERMINED = 0.5
 """Standard deviation relative to that of the prior, below which a parameter is determined by the data."""
 UNITS = {"velocity": ("N m s/rad", "N s/m"), "load": ("1", "1")}
 """Units of weights of columns with a unit, for revolute and for sliding joints."""
-WITHOUT_UNIT = ("coulomb_", "z_", "offset")
+WITHOUT_UNIT = ("coulomb_", "z_", "sin_", "cos_", "offset")
 """First letters of columns without a unit, whose weights are forces."""
 INERTIAL = ("kg", "kg m", "kg m", "kg m", *6 * ("kg m²",))
 

@@ -27,6 +27,7 @@ from forcegp.forces.priors.contact import ContactForcePrior, NormalForcePrior, S
 from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
 from forcegp.forces.priors.joint import AnalyticalMean, JointForcePrior
 from forcegp.forces.priors.memory import BristlePrior  # noqa: F401  (registers itself)
+from forcegp.forces.priors.residual import ResidualPrior
 from forcegp.forces.problem import Problem, analytical_parameters, kernel_parameters
 from forcegp.forces.quantities import states
 from forcegp.forces.term import JointTerm
@@ -54,6 +55,7 @@ CLASSES: dict[str, type] = {
     "product": kernels.Product,
     "constant": kernels.Constant,
     "joint": JointForcePrior,
+    "residual": ResidualPrior,
     "inertial": InertialPrior,
     "normal": NormalForcePrior,
     "payload": PayloadPrior,

@@ -48,11 +48,11 @@ class StructuredGP(Model[StructuredFit]):
         system: the robot and its contacts.
         mean: `"analytical"`, `"zero"`, or an `AnalyticalMean` with a subset of its terms.
         force_priors: priors on the unknown forces. By default, with the analytical mean, all terms that apply
-            to the log take part: friction of joints and contacts, bristles for logs in time order, and torque
-            noise. `fit.result.worth` contains their log evidence. Terms that the evidence speaks against are
-            dropped (`learning/evidence.py`). If the mean does not include the motor torque, the default is
-            `default_priors`: a `JointForcePrior` and, in contact, a `NormalForcePrior` that affects only
-            multipliers.
+            to the log take part: friction of joints and contacts, bristles for logs in time order, ripple, a
+            residual force on (q, q̇), and torque noise. `fit.result.worth` contains their log evidence. Terms
+            that the evidence speaks against are dropped (`learning/evidence.py`). If the mean does not
+            include the motor torque, the default is `default_priors`: a `JointForcePrior` and, in contact, a
+            `NormalForcePrior` that affects only multipliers.
         noise: standard deviation of measured accelerations [rad/s², m/s²], as one value or one per joint, or
             a `Noise` for accelerations, torques and states. The default is the value in the log, or 0.1.
         analytical_parameters: a module with a `forward()` method that returns the robot with learned
@@ -165,7 +165,7 @@ class StructuredGP(Model[StructuredFit]):
         spec = self.specification if after is None else self._continued(after)
         sample = sample_of(spec, data) if isinstance(data, StreamedDataset) else Sample(data)
         chosen = None if learn is None else tuple(learn)
-        spec = spec.for_data(sample.data)
+        spec = spec.for_data(sample.data, adds=after is None or chosen is None)
         check_learned(spec, chosen or ())
         if chosen == () and after is not None and sample.log is None:
             return dataclasses.replace(after, specification=spec).condition(sample.data)
@@ -196,7 +196,7 @@ class StructuredGP(Model[StructuredFit]):
         begin = {key: before[key] for key in search.start if key in before} if begins else None
         neighbours = None if sample.log is None else sample.neighbours(spec, problem.training)
         lesson = learned(spec, problem, search, progress, begin, neighbours)
-        values, forces = lesson.hyperparameters, None
+        spec, values, forces = spec.with_priors_of(lesson.problem), lesson.hyperparameters, None
         if sample.log is not None and lesson.problem.inducing is not None:
             whole = Pass(spec, sample.log, sample, client, progress)
             forces = whole.forces(*lesson.problem.with_coulomb_errors(values))

@@ -46,7 +46,8 @@ from forcegp.forces.posterior import REGION
 from forcegp.forces.priors.base import ANALYTICAL, COULOMB, NOISE, ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import AnalyticalMean, JointFrictionPrior
-from forcegp.forces.priors.memory import LONGEST_STEP, BristlePrior
+from forcegp.forces.priors.memory import LONGEST_STEP, PAST, BristlePrior
+from forcegp.forces.priors.residual import ResidualPrior
 from forcegp.forces.problem import Problem, is_finite, is_sparse, with_inducing, without_inducing
 from forcegp.forces.search import Search, initial
 from forcegp.gp.exact import require_exact_fits
@@ -95,12 +96,15 @@ class Specification:
     automatic: bool = False
     options: StructuredOptions = field(default_factory=StructuredOptions)
 
-    def for_data(self, data: Dataset | Sequence[Observation]) -> Specification:
+    def for_data(self, data: Dataset | Sequence[Observation], adds: bool = True) -> Specification:
         """Return the specification with the noise resolved for the given data.
 
         Unless given, the acceleration noise is learned if torque noise is learned or sets of priors are
         compared. Joints without a measured torque have an unknown force. Contacts stick below the speeds
         specified in the header of the log.
+
+        Args:
+            adds: whether an automatic model gets all terms that apply to the data.
         """
         observations, noise = observations_of(data), self.noise
         system = self.system.with_stick_speeds(common_stick_speeds([o.data.header for o in observations]))
@@ -111,16 +115,25 @@ class Specification:
         if unmeasured:
             noise = dataclasses.replace(noise, external={**unmeasured, **(noise.external or {})})
         spec = dataclasses.replace(self, system=system, noise=noise)
-        return spec.with_terms(observations) if self.automatic else spec
+        return spec.with_terms(observations) if self.automatic and adds else spec
 
     def with_terms(self, observations: Sequence[Observation]) -> Specification:
         """Return the specification with all terms that apply to a log, and with the noise of these terms."""
-        past = any(0.0 < period_of(o.data) <= LONGEST_STEP for o in observations)
+        past = any(
+            0.0 < period_of(o.data) <= LONGEST_STEP or f"{PAST}0" in o.data.extras for o in observations
+        )
         known = any(prior.remembers for prior in self.priors)
         priors = (*self.priors, BristlePrior()) if past and not known else self.priors
+        if self.options.inference != "exact" and not any(prior.remainder for prior in priors):
+            priors = (*priors, ResidualPrior())
         options = self.options.model_copy(update={"inertia": self.options.inertia or "auto"})
         noise = self.noise.for_priors(priors)
         return dataclasses.replace(self, priors=priors, noise=noise, options=options)
+
+    def with_priors_of(self, problem: Problem) -> Specification:
+        """Return the specification with the priors of a problem, without those that were dropped."""
+        own = {prior.name: prior for prior in self.priors}
+        return dataclasses.replace(self, priors=tuple(own.get(p.name, p) for p in problem.priors))
 
     def inertia_of(self, training: Training) -> Inertia:
         """Return the inertia identified from the training samples if requested, or that of the robot file."""
@@ -386,8 +399,11 @@ def _regressed(
         # Noise that contact hides widens multipliers, but it was not observed and shakes no trajectory.
         unseen = part.hidden_torque() > 0.0
         part = dataclasses.replace(part, correlation=torch.where(unseen, UNSEEN_TIME, part.correlation))
-    whole = dataclasses.replace(part, training=problem.training, inducing=None)
-    whole, warnings = prepared(spec, whole, values), ()
+    training = dataclasses.replace(problem.training, scales=part.training.scales)
+    whole, warnings = dataclasses.replace(part, training=training), ()
+    if spec.options.inference == "exact":
+        whole = dataclasses.replace(whole, inducing=None)
+    whole = prepared(spec, whole, values)
     if degrees is not None and (count := left_out(whole)):
         text = f"{count} of {whole.training.samples} samples are far outside the noise and have little weight"
         warnings = (text,)
@@ -469,12 +485,13 @@ def _at_the_rate_of_the_log(part: Problem, values: Mapping[str, Tensor], trainin
 
 def prepared(spec: Specification, problem: Problem, values: Mapping[str, Tensor]) -> Problem:
     """Return the problem with its inference method and, for heavy-tailed noise, its sample weights."""
-    if is_sparse(spec.options.inference, problem.priors, problem.training.all_samples):
+    pointed = problem.inducing is not None and any(prior.remainder for prior in problem.priors)
+    if pointed or is_sparse(spec.options.inference, problem.priors, problem.training.all_samples):
         # Sums over samples use the slopes of the model in the robot file.
         problem = dataclasses.replace(problem, training=dataclasses.replace(problem.training, slopes=None))
         if is_finite(problem.priors):
             problem = without_inducing(problem)
-        else:
+        elif not pointed:
             problem = with_inducing(problem, values, spec.options.inducing_points)
     if spec.noise.degrees_of_freedom is None:
         return problem

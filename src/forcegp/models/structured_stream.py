@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import islice
 from typing import TYPE_CHECKING
 
 import torch
@@ -21,9 +22,10 @@ from forcegp.data.stream import Keep, StreamedDataset, spaced_sample
 from forcegp.errors import ModelError
 from forcegp.forces.calibration import MOST_RESIDUALS, STRETCHES
 from forcegp.forces.inverse_dynamics import without_delay
-from forcegp.forces.measurements import Observation, Training, training_of
+from forcegp.forces.measurements import Observation, Training, period_of, training_of
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import ForcePrior
+from forcegp.forces.priors.memory import LONGEST_STEP, PAST, Past, bristles
 from forcegp.forces.problem import Problem, Totals, basis_of, posterior_of, total_over
 from forcegp.gp.basis import LatentBasis
 from forcegp.gp.features import Standardization
@@ -98,11 +100,25 @@ def _rows_of(log: StreamedDataset, keep: Keep | None) -> tuple[Dataset, Dataset,
 def _with_stretches(stream: StreamedDataset, parts: list[Dataset], keep: Keep | None) -> Iterator[Dataset]:
     """Yield the pieces of a log, and append the first rows of some pieces to `parts`."""
     last, length = stream.piece_count - 1, MOST_RESIDUALS // STRETCHES
+    pieces = followed(stream.pieces()) if stream.header.ordered else stream.pieces()
     wanted = {round(last * i / (STRETCHES - 1)) for i in range(STRETCHES)}
-    for number, piece in enumerate(stream.pieces()):
+    for number, piece in enumerate(pieces):
         if number in wanted:
             parts.append((piece if keep is None else piece[keep(piece)])[:length])
         yield piece
+
+
+def followed(pieces: Iterable[Dataset]) -> Iterator[Dataset]:
+    """Yield the pieces of a log with the states of bristles, which continue from piece to piece."""
+    past = None
+    for piece in pieces:
+        if len(piece) > 1 and not 0.0 < period_of(piece) <= LONGEST_STEP:
+            yield piece
+            continue
+        history = bristles(piece.t, piece.qd, piece.segment, past)
+        past = Past(piece.t[-1:], piece.qd[-1:], piece.segment[-1:], history[-1:])
+        states = {f"{PAST}{k}": x for k, x in enumerate(history.unbind(-1))}
+        yield piece.replace(extras={**piece.extras, **states})
 
 
 def _check_inference(spec: Specification, count: int, held: int) -> None:
@@ -164,7 +180,7 @@ class Pass:
         bare = dataclasses.replace(problem, training=problem.training.of_rows(rows))
         part = Part(self.spec, bare, dict(hyperparameters), basis, kept, self.sample.moving)
         if self.client is None:
-            totals = map(part.piece, self.log.pieces())
+            totals = map(part.piece, part.pieces(self.log))
         else:
             totals = on_cluster(self.client, part.share, shares(self.log, worker_count(self.client)))
         total = Totals.zero(problem, basis)
@@ -195,6 +211,12 @@ class Part:
     scales: dict[str, Standardization]
     moving: bool
 
+    def pieces(self, log: StreamedDataset, r: int = 0, k: int = 1) -> Iterator[Dataset]:
+        """Yield piece r of every k, with the states of bristles if a prior depends on the past."""
+        if any(prior.remembers for prior in self.problem.priors):
+            return islice(followed(log.pieces()), r, None, k)
+        return log.pieces((r, k))
+
     @torch.no_grad()
     def piece(self, piece: Dataset) -> Totals:
         """Return the totals over the samples of a piece."""
@@ -209,8 +231,7 @@ class Part:
     def share(self, share: tuple[StreamedDataset, int, int]) -> Totals:
         """Return the totals over every k-th piece of a log from piece r, on one thread."""
         torch.set_num_threads(1)
-        log, r, k = share
-        return sum(map(self.piece, log.pieces((r, k))), Totals.zero(self.problem, self.basis))
+        return sum(map(self.piece, self.pieces(*share)), Totals.zero(self.problem, self.basis))
 
 
 def shares(log: StreamedDataset, workers: int) -> list[tuple[StreamedDataset, int, int]]:

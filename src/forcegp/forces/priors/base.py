@@ -54,6 +54,8 @@ class ForcePrior(ABC):
     """Whether f has one component per joint and E = I, so that products with E can be skipped."""
     centred: bool = True
     """Whether to subtract the mean of the training data from the inputs before scaling."""
+    remainder: bool = False
+    """Whether the force is learned from what all other forces leave, and does not change them."""
     delay: float = 0.0
     """Time by which logged torques precede the motion, if it was identified with the force [s]."""
 

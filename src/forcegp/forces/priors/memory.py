@@ -25,6 +25,8 @@ DISTANCES = (0.003, 0.01, 0.03, 0.1)
 neighbouring distances are nearly collinear, so more of them change nothing."""
 RIDGE = 1e-3
 """Ridge penalty on the coefficients of E[z | q̇], per sample; slow joints have nearly collinear functions."""
+PAST = "bristle_"
+"""Start of the names of the states of bristles in the extras of a piece of a log, `(n, nq)` each."""
 LONGEST_STEP = 0.05
 """Longest time between samples over which the state of a bristle can be followed [s]."""
 
@@ -88,7 +90,22 @@ def in_time(t: Tensor, segment: Tensor) -> Tensor:
     return order[torch.argsort(segment[order], stable=True)]
 
 
-def bristles(t: Tensor, qd: Tensor, segment: Tensor) -> Tensor:
+@dataclass(frozen=True)
+class Past:
+    """The last row of a piece of a log.
+
+    Attributes:
+        t, qd, segment: its time `(1,)`, velocities `(1, nq)` and trajectory number `(1,)`.
+        history: states of its bristles `(1, nq, 2 k)`.
+    """
+
+    t: Tensor
+    qd: Tensor
+    segment: Tensor
+    history: Tensor
+
+
+def bristles(t: Tensor, qd: Tensor, segment: Tensor, past: Past | None = None) -> Tensor:
     """Return z and a `(n, nq, 2 k)`, first z and then a for each distance δ in `DISTANCES`, along a log.
 
     z is zero at the start of each trajectory, and a = e^{−s/δ} after a travel s.
@@ -97,7 +114,16 @@ def bristles(t: Tensor, qd: Tensor, segment: Tensor) -> Tensor:
         t: time of each sample `(n,)` [s].
         qd: velocities `(n, nq)` [rad/s, m/s].
         segment: trajectory number of each sample `(n,)`.
+        past: the row before this piece of a log, if its trajectory may continue.
     """
+    if past is not None:
+        t, qd, segment = torch.cat([past.t, t]), torch.cat([past.qd, qd]), torch.cat([past.segment, segment])
+        return _followed(t, qd, segment, past.history)[1:]
+    return _followed(t, qd, segment)
+
+
+def _followed(t: Tensor, qd: Tensor, segment: Tensor, begin: Tensor | None = None) -> Tensor:
+    """Return the states of bristles, given those of the first row; see `bristles`."""
     order = in_time(t, segment)
     t, qd, segment = t[order], qd[order], segment[order]
     starts = segment.diff(prepend=segment[:1] - 1) != 0
@@ -112,12 +138,17 @@ def bristles(t: Tensor, qd: Tensor, segment: Tensor) -> Tensor:
     a = torch.exp(-step[..., None].abs() / delta)
     b = (1.0 - a) * step[..., None].sign()
     a[starts] = 0.0
+    z, unknown = (None, None) if begin is None else begin.chunk(2, dim=-1)
+    if z is not None:
+        b[:1] = z
     lag = 1
     while lag < len(a):
         b[lag:] = b[lag:] + a[lag:] * b[:-lag].clone()
         a[lag:] = a[lag:] * a[:-lag].clone()
         lag *= 2
-    unknown = torch.exp(-(travel[..., None] / delta).clamp(max=300.0))
+    left = torch.exp(-(travel[..., None] / delta).clamp(max=300.0))
+    if unknown is not None:
+        left = torch.where((number == 0)[:, None, None], left * unknown, left)
     result = torch.empty(*qd.shape, 2 * len(DISTANCES), dtype=qd.dtype, device=qd.device)
-    result[order] = torch.cat([b, unknown], dim=-1)
+    result[order] = torch.cat([b, left], dim=-1)
     return result

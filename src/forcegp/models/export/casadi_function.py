@@ -7,7 +7,7 @@ from operator import add, mul, neg, sub, truediv
 from pathlib import Path
 from typing import Any
 
-from forcegp.compiled.expression import Graph, Scalar
+from forcegp.compiled.expression import UNARY, Graph, Scalar
 from forcegp.destination import folder_or_keep
 from forcegp.errors import optional_module
 from forcegp.models.export.mean import ARGUMENTS, DIFFERENTIATED, LearnedMotion
@@ -41,7 +41,8 @@ def casadi_function(model: ExportedModel, name: str = "forcegp") -> Any:
 def _vector(ca: Any, graph: Graph, given: Mapping[str, Any], outputs: Iterable[Scalar]) -> Any:
     """Return the output scalars as a single CasADi vector."""
     outputs, values = list(outputs), dict[int, Any]()
-    functions = {"step": lambda x: x > 0.0, "exp": ca.exp, "tanh": ca.tanh, "sqrt": ca.sqrt} | OPERATORS
+    functions = {"step": lambda x: x > 0.0} | OPERATORS
+    functions |= {op: getattr(ca, op) for op in UNARY if op != "step"}
     for position in graph.live(outputs):
         op, left, right = graph.nodes[position]
         if op == "const":

@@ -27,6 +27,7 @@ from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors import contact, joint
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
+from forcegp.forces.priors.residual import ResidualPrior
 from forcegp.forces.term import JointTerm
 from forcegp.gp.basis import KernelPart, split
 from forcegp.gp.exact import ExactPosterior
@@ -44,7 +45,7 @@ from forcegp.gp.kernels import (
 )
 from forcegp.gp.sparse import SparsePosterior
 
-PRIORS = (joint.JointForcePrior, InertialPrior, PayloadPrior)
+PRIORS = (joint.JointForcePrior, ResidualPrior, InertialPrior, PayloadPrior)
 PRIORS += (contact.NormalForcePrior, contact.SlidingFrictionPrior, contact.ContactForcePrior)
 PRIORS += (contact.CoulombErrorPrior,)
 KERNELS = (Linear, Columns, Constant, SquaredExponential, Matern32, Matern52)

@@ -21,7 +21,7 @@ from forcegp.compiled.source import c_function
 from forcegp.constraints import SurfaceContact
 from forcegp.constraints.gauss import rank_tolerance
 from forcegp.forces.external_wrench import MULTIPLIER_STD
-from forcegp.forces.posterior import GROWTH, HIGH, LOW, SPREAD, STICK_NOISE, STICK_SPEED
+from forcegp.forces.posterior import GROWTH, HIGH, LOW, MEMORY, SPREAD, STICK_NOISE, STICK_SPEED
 from forcegp.forces.priors import contact
 from forcegp.forces.priors.base import CONSTRAINT, CONTACT, JOINT
 from forcegp.forces.priors.inertial import PER_PAYLOAD, InertialPrior, PayloadPrior
@@ -265,7 +265,10 @@ class Writer:
             self.array([math.exp(2.0 * x) for x in log] or [0.0], f"{name}_VARIANCE")
         self.array([math.exp(float(values.get(tip.speed, 0.0))) for tip in tips] or [1.0], "TIP_SPEED")
         for name, std in (("TORQUE", self.model.torque_std), ("EXTERNAL", self.model.external_std)):
-            self.array(zero if std is None else std.expand(nq) ** 2, f"{name}_VARIANCE")
+            variance = zero if std is None else std.expand(nq) ** 2
+            if name == "EXTERNAL" and MEMORY in values:  # a program follows no bristles
+                variance = variance + (2.0 * values[MEMORY]).exp()
+            self.array(variance, f"{name}_VARIANCE")
         sensors = [self.array(self.model.noise[x] ** 2) if x in self.model.noise else "0" for x in READ]
         self.lines.append(f"static const double *const SENSOR_VARIANCE[] = {{{', '.join(sensors)}}};")
 
