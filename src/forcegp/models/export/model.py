@@ -58,8 +58,8 @@ LARGEST = 1700
 """Maximum number of functions of a posterior that is not reduced: about 30 MB of text, which a compiler
 translates in half a minute."""
 REDUCED = 200
-"""Number of functions that the covariance of a larger posterior keeps in an export, if no number is given. A
-covariance from C then takes less than the period of a loop at 1 kHz."""
+"""Number of functions that the covariance of a larger posterior keeps in an export, if no number is given. It
+is the number that the error of `check` recommends; each export measures what it loses."""
 
 
 @dataclass(frozen=True, eq=False)
