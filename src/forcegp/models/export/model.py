@@ -60,7 +60,7 @@ translates in half a minute."""
 REDUCED = 200
 """Number of functions that the covariance of a larger posterior keeps in an export, if no number is given. It
 is the number that the error of `check` recommends; each export measures what it loses. At the training states
-of 310 samples of `kuka_plane` (1860 rows), σ grows by at most 0.06 %, and with 100 functions by up to 100 %."""
+of 310 samples of `kuka_plane` (1860 rows), σ grows by at most 0.06 %, with 100 functions by up to 100 %."""
 
 
 @dataclass(frozen=True, eq=False)
