@@ -67,6 +67,8 @@ BOUNDS = {  # µs, at -O3
     "forward dynamics": 1.0,
     **{f"{name} mean python": 50.0 for name in ("friction", "friction+inertia", "residual")},
     **{f"{name} covariance python": 150.0 for name in ("friction", "friction+inertia", "residual")},
+    # without `compiled()`
+    "friction mean python predict": 1500.0,
     "residual update": 400.0,
     "python update": 600.0,
     # s of processor time for 100 trajectories of 10 s

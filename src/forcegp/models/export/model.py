@@ -59,8 +59,9 @@ LARGEST = 1700
 """Maximum number of functions of a posterior that is not reduced: about 30 MB of text, which a compiler
 translates in half a minute."""
 REDUCED = 200
-"""Number of functions that the covariance of a larger posterior keeps in an export, if no number is given. A
-covariance from C then takes less than the period of a loop at 1 kHz."""
+"""Number of functions that the covariance of a larger posterior keeps in an export, if no number is given. It
+is the number that the error of `check` recommends; each export measures what it loses. At the training states
+of 310 samples of `kuka_plane` (1860 rows), σ grows by at most 0.06 %, with 100 functions by up to 100 %."""
 
 
 @dataclass(frozen=True, eq=False)
