@@ -275,11 +275,11 @@ def _is_better(after: Tensor, before: Tensor) -> bool:
 
 
 LOOSE = 10.0
-"""Factor on the Gaussian prior of the links, which only keeps the equations regular. What is known of links is
-stated by the divergence from the robot file."""
+"""Factor on the Gaussian prior of the links, which only keeps the equations regular. What is known of links
+is stated by the divergence from the robot file."""
 STATED = 0.25 / MASS_SHARE**2
 """Weight γ of this divergence. That of a mass (1 + s) m is 4 γ (s − log (1 + s)) ≈ 2 γ s², so `MASS_SHARE` is
-the standard deviation of s. With γ = 0.01 and the Gaussian prior alone, the last wrist of a real UR3 keeps 0.15
+the standard deviation of s. With γ = 0.01 and the Gaussian prior, the last wrist of a real UR3 keeps 0.15
 of its inertia, and the torque error on another motion is 0.97 instead of 0.85 of that of least squares."""
 VOLUME_STATES = 100
 """Number of states over which log |M| or the noise volume is averaged."""

@@ -36,8 +36,8 @@ NOISY = (1.0, 2.0, 4.0)
 MOVES = 0.1
 """Minimum fraction of samples in which a joint must move so that sticking can be detected."""
 RIDGE = 1e-4
-"""Ridge penalty on the scaled friction columns, relative to the number of samples. With 1e-8, the torque error of
-joint 1 of a real iiwa, which hardly moves, is 0.55 instead of 0.41 N m on other recordings."""
+"""Ridge penalty on the scaled friction columns, relative to the number of samples. With 1e-8, the torque
+error of joint 1 of a real iiwa, which hardly moves, is 0.55 instead of 0.41 N m on other recordings."""
 SIGNIFICANT = 2.0
 """Number of standard errors over blocks above which a difference is significant."""
 APART = 0.05
