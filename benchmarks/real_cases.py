@@ -2,18 +2,24 @@
 
 from __future__ import annotations
 
+import tempfile
 from dataclasses import dataclass
+from importlib.util import find_spec
 from pathlib import Path
 
+import numpy as np
 import torch
 
 import forcegp
 from forcegp.errors import DataError
+from forcegp.logs import parse_mapping
 
 IN_MOTION = 0.01
 """A sample is in motion where a joint moves faster [rad/s]."""
 TRAINING_SEGMENTS = 7
 """Of the ten segments of `motion_a`; the last three test."""
+EARLY = 0.6
+"""Share of a single recording that trains; the rest tests."""
 OFF = 1.2
 """Factor on masses and lengths of the double pendulum whose robot file is wrong."""
 
@@ -78,7 +84,110 @@ def double_pendulum(logs: Path) -> list[Case]:
     return cases
 
 
-CASES = {"iiwa14": iiwa14, "double_pendulum": double_pendulum}
+def example_robot(name: str) -> forcegp.RobotModel:
+    """A robot file of example-robot-data, a test dependency.
+
+    Raises:
+        DataError: it is not installed.
+    """
+    spec = find_spec("cmeel")
+    if spec is None or spec.origin is None:
+        raise DataError(f"{name}: example-robot-data is not installed", hint="pip install example-robot-data")
+    return forcegp.load_robot(
+        existing(Path(spec.origin).parents[1] / "cmeel.prefix/share/example-robot-data/robots" / name)
+    )
+
+
+def halved(name: str, robot: forcegp.RobotModel, data: forcegp.Dataset) -> list[Case]:
+    """The early part of one recording trains, the late part tests."""
+    early = int(EARLY * len(data))
+    return [Case(name, forcegp.ConstrainedSystem(robot), data[:early], {"last part": data[early:]})]
+
+
+def ur3(logs: Path) -> list[Case]:
+    """Currents as torques at 125 Hz: one motion trains, another one tests, both ways."""
+    robot, folder = example_robot("ur_description/urdf/ur3_robot.urdf"), existing(logs / "ur3")
+    first, second = (forcegp.read_log(folder / f"{name}.mat", robot, "ur3_mat") for name in ("id1", "id2"))
+    system = forcegp.ConstrainedSystem(robot)
+    return [
+        Case("ur3, id1 trains", system, first, {"id2": second}),
+        Case("ur3, id2 trains", system, second, {"id1": first}),
+    ]
+
+
+def ur10(logs: Path) -> list[Case]:
+    """An exciting trajectory of 28 s at 125 Hz."""
+    robot = example_robot("ur_description/urdf/ur10_robot.urdf")
+    path = existing(logs / "ros2" / "ur10_exciting_trajectory.db3")
+    return halved("ur10", robot, forcegp.read_log(path, robot))
+
+
+KINOVA = """
+time = { column = "Time", unit = "ms" }
+position = { column = "Position{joint}", unit = "rad" }
+velocity = { column = "Velocity{joint}", unit = "rad/s" }
+torque = { column = "TorqueCur{joint}", unit = "Nm" }
+[joints]
+""" + "\n".join(f'joint_{i} = "{i}"' for i in range(1, 8))
+"""Torques are those of the currents; the column `Torque` of the log is computed by a model of the vendor."""
+
+
+def kinova(logs: Path) -> list[Case]:
+    """Currents at 1 kHz: motions of all joints and of single ones train (17 s), another one tests (2 s)."""
+    folder = existing(logs / "kinova_gen3")
+    robot = forcegp.load_robot(folder / "gen3.urdf")
+    mapping = parse_mapping(KINOVA.encode(), "kinova")
+    names = ("RecordTrajectory_quadratic", "joint_1_trapez", "joint_4_trapez", "RunTrajectory1")
+    *train, test = (forcegp.read_log(folder / f"{name}.csv", robot, mapping) for name in names)
+    system = forcegp.ConstrainedSystem(robot)
+    return [Case("kinova", system, forcegp.Dataset.concatenate(train), {"RunTrajectory1": test})]
+
+
+STAUBLI = """
+time = { column = "t" }
+joints = { joint_1 = "0", joint_2 = "1", joint_3 = "2", joint_4 = "3" }
+[position]
+column = "q[{joint}]"
+unit = "rad"
+side = "motor"
+gear_ratio = { joint_1 = 32.0, joint_2 = 32.0, joint_3 = 45.0, joint_4 = -48.0 }
+offset = { joint_1 = 0.0, joint_2 = 50.26548245743669, joint_3 = -70.68583470577035, joint_4 = 0.0 }
+[torque]
+column = "tau[{joint}]"
+unit = "Nm"
+side = "motor"
+gear_ratio = { joint_1 = 32.0, joint_2 = 32.0, joint_3 = 45.0, joint_4 = -48.0 }
+[derivatives]
+window = 151
+"""
+"""Motor side at 5 kHz; offsets are those of q₂ − π/2 and q₃ + π/2. The filter spans 30 ms."""
+STAUBLI_STEP = 2e-4
+"""Sampling time [s]; the files hold no clock."""
+
+
+def staubli(logs: Path) -> list[Case]:
+    """The first four joints of an arm with a coupled wrist, which is taken as locked."""
+    folder = existing(logs / "staubli_tx40")
+    robot = forcegp.load_robot(
+        existing(folder / "tx40_mdh_modified.urdf"), locked_joints={"joint_5": 0.0, "joint_6": 0.0}
+    )
+    names = "pos_read_data", "curr_data"
+    q, tau = (np.loadtxt(folder / f"{name}.csv", delimiter=",", skiprows=1) for name in names)
+    with tempfile.TemporaryDirectory() as made:
+        path = Path(made) / "log.npz"
+        np.savez(path, t=STAUBLI_STEP * np.arange(len(q)), q=q, tau=tau)
+        data = forcegp.read_log(path, robot, parse_mapping(STAUBLI.encode(), "staubli"))
+    return halved("staubli", robot, data)
+
+
+CASES = {
+    "iiwa14": iiwa14,
+    "double_pendulum": double_pendulum,
+    "ur3": ur3,
+    "ur10": ur10,
+    "kinova": kinova,
+    "staubli": staubli,
+}
 
 
 def moving(data: forcegp.Dataset) -> forcegp.Dataset:

@@ -35,8 +35,9 @@ NOISY = (1.0, 2.0, 4.0)
 """Apparent speeds of a joint at rest, relative to the saturation speed of the sharpest dry friction."""
 MOVES = 0.1
 """Minimum fraction of samples in which a joint must move so that sticking can be detected."""
-RIDGE = 1e-8
-"""Ridge penalty on the scaled friction columns, relative to the number of samples."""
+RIDGE = 1e-4
+"""Ridge penalty on the scaled friction columns, relative to the number of samples. With 1e-8, the torque
+error of joint 1 of a real iiwa, which hardly moves, is 0.55 instead of 0.41 N m on other recordings."""
 SIGNIFICANT = 2.0
 """Number of standard errors over blocks above which a difference is significant."""
 APART = 0.05
@@ -46,7 +47,7 @@ REACH = 3.0
 LEAST_SQUARE = 1e-300
 """Lower bound on mean squares, for joints that do not move during a block and therefore have no error."""
 TOLERATED = 0.02
-"""Tolerated relative increase in the held-out error of a joint."""
+"""Tolerated relative increase in the held-out error."""
 LATE = 0.01
 """Prior standard deviation of the delay between torque and motion [s]."""
 WIDEST = 4.0 * LATE
@@ -147,12 +148,17 @@ class NormalEquations:
         """Return H and h in H δ = h for optimal friction, and the change of h per relative error of each
         torque sensor's gain `(p, nq)`. Without instruments, δ minimises Σ |ε_j|²/s_j².
         """
+        H, h, per_gain = self.by_joint(noise)
+        return H.sum(0), h.sum(0), per_gain.mT
+
+    def by_joint(self, noise: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+        """Return the summands of `quadratic` of each joint."""
         # Friction is eliminated by a Schur complement: H_j = G_δδ − G_δf (G_ff + D)⁻¹ G_fδ, H = Σ_j H_j/s_j²
         p = self.unknowns
         columns = torch.cat([self.gram[..., :p], torch.stack([self.right, self.torque], dim=-1)], dim=-1)
         friction = torch.linalg.solve(self._stiff(), columns[:, p:])
         reduced = (columns[:, :p] - self.gram[:, :p, p:] @ friction) * (noise**-2)[:, None, None]
-        return reduced[..., :p].sum(0), reduced[..., p].sum(0), reduced[..., p + 1].mT
+        return reduced[..., :p], reduced[..., p], reduced[..., p + 1]
 
     def error(self, delta: Tensor, friction: Tensor) -> Tensor:
         """Return the mean `(nq,)` of ε², or of ε ε′ for `products`."""
@@ -439,8 +445,11 @@ def log_ratio(after: Tensor, before: Tensor) -> Tensor:
 
 
 def is_harmless(after: Tensor, before: Tensor) -> bool:
-    """Return whether the error of every joint stays within the tolerance."""
-    return bool((log_ratio(after, before).mean(0) <= TOLERATED).all())
+    """Return whether errors `(groups, nq)` rise by no more than the tolerance in the geometric mean.
+
+    Accelerations of a light joint may become worse by what those of the heavy joints gain many times over.
+    """
+    return float(log_ratio(after, before).mean()) <= TOLERATED
 
 
 def is_less(difference: Tensor) -> bool:

@@ -172,7 +172,21 @@ def add_derivatives(signals: Signals, settings: DerivativesSection, report: Impo
     report.steps.append(f"computed {' and '.join(missing)} by {how}")
     if "qdd" in missing and settings.filter_torque:
         report.steps.append("passed the torque through the same filter")
-    return std
+    return std if std is None else _above_zero(std, report)
+
+
+LEAST_STD = 1e-3
+"""Smallest standard deviation of an acceleration, relative to the root mean square of all in the log. A joint
+that rests throughout a log of a real Kinova has none otherwise, which a fit rejects."""
+
+
+def _above_zero(std: Array, report: ImportReport) -> Array:
+    """Raise σ of q̈ where a joint at rest shows no noise because its readings do not change by one step."""
+    least = LEAST_STD * np.sqrt(np.mean(std**2))
+    raised = int((std < least).sum())
+    if raised:
+        report.steps.append(f"raised the noise of {raised} accelerations at rest to {least:.2g}")
+    return np.maximum(std, least)
 
 
 def _pieces(signals: Signals, least: int, report: ImportReport) -> NDArray[np.int64]:

@@ -104,7 +104,7 @@ class InertialPrior(ConstantForcePrior):
         parts = [self.mass * m, (self.length * m).expand(-1, 3), self.inertia * products]
         return torch.cat([torch.cat(parts, dim=-1).flatten().detach(), m.new_tensor(self.drives)])
 
-    def curvature(self, robot: RobotModel) -> Tensor:
+    def curvature(self, robot: RobotModel, weight: float | None = None) -> Tensor:
         """Return the second derivative of the divergence in `updated` with respect to δ, `(10 nq, 10 nq)`.
 
         γ ∂²(−log |J|)/∂δ_a ∂δ_b = γ tr(J⁻¹ J_a J⁻¹ J_b), as J is linear in δ; it is 0 for unphysical links.
@@ -114,7 +114,8 @@ class InertialPrior(ConstantForcePrior):
         J = torch.where(sound[:, None, None], J, torch.eye(4).to(J))
         scale = sound[:, None] * self.scale(robot)[: PER_LINK * robot.nq].view(robot.nq, PER_LINK)
         each = torch.linalg.solve(J[:, None], pseudo_inertia_of(torch.diag_embed(scale)))
-        return torch.block_diag(*DIVERGENCE * torch.einsum("kaij,kbji->kab", each, each))
+        weight = DIVERGENCE if weight is None else weight
+        return torch.block_diag(*weight * torch.einsum("kaij,kbji->kab", each, each))
 
     def updated(
         self,
@@ -122,13 +123,14 @@ class InertialPrior(ConstantForcePrior):
         mean: Tensor,
         precision: Tensor,
         log_volume: Callable[[RobotModel], Tensor] | None = None,
+        weight: float | None = None,
     ) -> tuple[RobotModel, Tensor]:
         """Return the most probable physically consistent robot given δ ~ N(mean, precision⁻¹).
 
         The objective ½ (δ − mean)ᵀ precision (δ − mean) + γ Σ_k [tr(J₀⁻¹J) − log |J₀⁻¹J| − 4] − V(δ) is
         minimised over the pseudo-inertias J > 0 of the links, in which it is convex if V = 0. If the log does
         not determine the inertia of a link, the second term (the divergence of Lee, Wensing and Park, 2019,
-        with weight γ = 0.01) keeps this inertia from vanishing.
+        with weight γ = 0.01 by default) keeps this inertia from vanishing.
 
         Args:
             robot: robot with the parameters π₀.
@@ -136,6 +138,7 @@ class InertialPrior(ConstantForcePrior):
             precision: precision of δ `(10 nq, 10 nq)`.
             log_volume: function V that converts the density of torques to that of accelerations; zero by
                 default.
+            weight: weight γ of the divergence.
 
         Returns:
             The robot and its error δ `(10 nq,)`. Links that are not physically consistent in the robot file
@@ -161,7 +164,7 @@ class InertialPrior(ConstantForcePrior):
                 V = log_volume(robot_of(J0[links] + _change(x, E)))
                 return float(V.detach()), torch.autograd.grad(V, x)[0]
 
-        x, J = _most_probable(P, r, J0[links], E, volume)
+        x, J = _most_probable(P, r, J0[links], E, volume, DIVERGENCE if weight is None else weight)
         return robot_of(J), torch.zeros_like(mean).index_put((own,), x.to(mean))
 
 
@@ -171,7 +174,12 @@ def _change(x: Tensor, E: Tensor) -> Tensor:
 
 
 def _most_probable(
-    P: Tensor, r: Tensor, J0: Tensor, E: Tensor, volume: Callable[[Tensor], tuple[float, Tensor]]
+    P: Tensor,
+    r: Tensor,
+    J0: Tensor,
+    E: Tensor,
+    volume: Callable[[Tensor], tuple[float, Tensor]],
+    least: float,
 ) -> tuple[Tensor, Tensor]:
     """Minimise ½ xᵀP x − rᵀx + γ Σ_k [tr(J₀⁻¹J) − log |J|] − V(x) over J = J₀ + Σ_p x_p E_p > 0.
 
@@ -190,15 +198,15 @@ def _most_probable(
         moved = L[:, None] @ D @ L[:, None].mT
         T = torch.block_diag(*(coordinates @ moved[..., row, column].mT))
         slope, bend = T.mT @ (P @ x - r - rising), T.mT @ P @ T
-        weight = weight or max(DIVERGENCE, float(slope.norm()))
+        weight = weight or max(least, float(slope.norm()))
         divergence = (inverse[:, None] * moved - D * one).sum((-1, -2)).flatten()
         bend = bend + weight * torch.eye(len(r)).to(r)
         y = -torch.linalg.solve(bend, slope + weight * divergence)
         decrement = float(y @ bend @ y)
         if decrement <= CENTRAL * weight:
-            if weight <= DIVERGENCE:
+            if weight <= least:
                 break
-            weight = max(DIVERGENCE, REDUCED * weight)
+            weight = max(least, REDUCED * weight)
             continue
         Y, step = _change(y, D.expand_as(E)), T @ y
         stretch = torch.linalg.eigvalsh(Y)
