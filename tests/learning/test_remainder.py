@@ -10,6 +10,7 @@ from torch import Tensor
 
 import forcegp
 from forcegp.forces.priors.memory import Past, bristles
+from forcegp.forces.priors.sets import friction_priors
 from forcegp.gp.sums import Sums, without_feedback
 from forcegp.models.structured_fit import StructuredFit
 
@@ -82,7 +83,7 @@ def test_defaults_learn_ripple_and_an_unnamed_force(tmp_path: Path) -> None:
     assert {"ripple", "residual"} <= set(names)
     assert all(worth[f"ripple of {joint}"] > 5.0 for joint in data.joint_names)
     assert any(worth[f"residual of {joint}"] > 5.0 for joint in data.joint_names)
-    laws = forcegp.StructuredGP(system, force_priors="friction", inertia="auto").fit(data)
+    laws = forcegp.StructuredGP(system, force_priors=friction_priors(system), inertia="auto").fit(data)
     assert torque_error(fit, 1.0) < 0.8 * torque_error(laws, 1.0)
     # the learned terms survive a file, and conditioning on another log
     fit.save(tmp_path / "model")

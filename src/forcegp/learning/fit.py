@@ -23,7 +23,7 @@ from forcegp.forces.calibration import held_out_squares
 from forcegp.forces.measurements import Training, scaled
 from forcegp.forces.noise import TORQUE_NOISE, white_noise_std
 from forcegp.forces.noise_learning import weighted
-from forcegp.forces.posterior import MEMORY, STICK_NOISE
+from forcegp.forces.posterior import MEMORY
 from forcegp.forces.priors.base import COULOMB, NOISE, ForcePrior
 from forcegp.forces.priors.memory import BristlePrior
 from forcegp.forces.priors.ripple import RipplePrior, ripple_of
@@ -32,7 +32,14 @@ from forcegp.forces.search import Search, initial
 from forcegp.gp.kernels import Columns, Constant, Kernel, Linear, SquaredExponential
 from forcegp.gp.optimise import FitProgress, LearningOptions
 from forcegp.learning.evidence import families_of, worth
-from forcegp.learning.scales import MOTIONS, Scales, learned_scales, residuals, without_components
+from forcegp.learning.scales import (
+    MOTIONS,
+    Scales,
+    learned_scales,
+    residuals,
+    variances,
+    without_components,
+)
 
 SAMPLES = 4000
 """Maximum number of evenly spaced samples from which scales and noise are learned. Ten parameters of a joint
@@ -196,8 +203,7 @@ def ripple_in(found: Scales) -> RipplePrior | None:
     for i, m in enumerate(problem.training.measurements):
         if m.quantity in MOTIONS:
             rows = residuals(problem, found.values, found.evidence.weights, i)
-            noise = (found.values[key].exp().square() for key in (TORQUE_NOISE, STICK_NOISE))
-            parts.append((m.q, rows.torque(*noise)))
+            parts.append((m.q, rows.torque(*variances(problem, found.values))))
     return ripple_of(*map(torch.cat, zip(*parts, strict=True))) if parts else None
 
 

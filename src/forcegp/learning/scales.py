@@ -192,8 +192,9 @@ class Residuals(NamedTuple):
         return -float(L.diagonal(dim1=-2, dim2=-1).log().sum() + 0.5 * white.square().sum())
 
     def torque(self, torque: Tensor, stick: Tensor) -> Tensor:
-        """Return the expected torque noise S Bᵀ C⁻¹ r `(n, nq)`."""
-        return (torque + stick * self.slow + self.external) * self.read(torque, stick)[0]
+        """Return the expected torque noise S Bᵀ C⁻¹ r `(n, nq)` for variances σ² and σ_s² `(nq + c,)`."""
+        whole = self.variances(torque, stick) * self.read(torque, stick)[0]
+        return whole[:, : self.external.shape[-1]]
 
     def read(self, torque: Tensor, stick: Tensor) -> tuple[Tensor, Tensor]:
         """Return Bᵀ C⁻¹ r `(n, nq + 3 c)` and Bᵀ C⁻¹ B for variances σ² and σ_s² `(nq + c,)`."""
@@ -247,6 +248,21 @@ def residuals(problem: Problem, values: Mapping[str, Tensor], weights: Tensor, i
     return Residuals(r, B, slow, external if m.tau_std is None else external + m.tau_std**2)
 
 
+def variance_keys(problem: Problem, values: Tensors) -> tuple[tuple[str, ...], tuple[str, ...]]:
+    """Return the names of the standard deviations in motion and of those at rest, of joints and contacts."""
+    tips = [tip_keys(name) for name in learned_tips(problem.system, values)]
+    return (TORQUE_NOISE, *(tip.slides for tip in tips)), (STICK_NOISE, *(tip.rests for tip in tips))
+
+
+def variances(problem: Problem, values: Tensors) -> tuple[Tensor, Tensor]:
+    """Return the variances σ² and σ_s² `(nq + c,)` of the forces on joints and contacts."""
+    slides, rests = (
+        torch.cat([(2.0 * values[key]).exp().view(-1) for key in keys])
+        for keys in variance_keys(problem, values)
+    )
+    return slides, rests
+
+
 def _with_noise(
     problem: Problem, values: Tensors, groups: list[Group], evidence: Evidence
 ) -> tuple[Tensors, float]:
@@ -255,8 +271,7 @@ def _with_noise(
     each = [residuals(problem, values, evidence.weights, i) for i in motions]
     whole = Residuals(*(torch.cat(part) for part in zip(*each, strict=True)))
     nq, tips = whole.external.shape[-1], [tip_keys(name) for name in learned_tips(problem.system, values)]
-    keys = (TORQUE_NOISE, *(tip.slides for tip in tips)), (STICK_NOISE, *(tip.rests for tip in tips))
-    theta = torch.cat([(2.0 * values[key]).exp().view(-1) for each in keys for key in each])
+    keys, theta = variance_keys(problem, values), torch.cat(variances(problem, values))
     gamma = determined_by_joint(problem, groups, evidence)
     share = (1.0 - gamma / (problem.power * len(whole.r))).clamp(min=LEAST_SHARE)
     share = torch.nn.functional.pad(share, (0, len(tips)), value=1.0).repeat(2)
