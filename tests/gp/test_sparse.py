@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 import pytest
 import torch
@@ -12,13 +14,14 @@ from extended import posterior as dense
 from forcegp.errors import ModelError, NumericalError
 from forcegp.gp.basis import latent_basis
 from forcegp.gp.features import Block, rows_of
-from forcegp.gp.kernels import sub
+from forcegp.gp.kernels import Linear, sub
 from forcegp.gp.likelihood import condition, cross_gram
 from forcegp.gp.sparse import SparsePosterior
 from forcegp.gp.sums import accumulate
 from gp.sparse_cases import (
     COMPONENTS,
     PROCESSES,
+    Named,
     condition_sparse,
     first,
     latent_covariance,
@@ -220,3 +223,16 @@ def test_bound_follows_updates() -> None:
     dense = textbook([old, more], Z, params).negative_bound()
     updated = posterior.updated([more])
     assert -updated.log_likelihood == pytest.approx(dense, rel=1e-9)
+
+
+def test_a_wide_prior_of_an_exact_feature_is_resolved() -> None:
+    """The variance of a weight w ~ N(0, s²) seen through n rows of unit noise is 1/(1/s² + Σ φ²)."""
+    process, s, n = Named(Linear(("q",)), "wide"), 1e8, 30
+    generator = torch.Generator().manual_seed(0)
+    phi = torch.randn(n, 1, generator=generator, dtype=torch.float64)
+    params = {"wide.log_slope_std": torch.full((1, 1), math.log(s), dtype=torch.float64)}
+    params["wide.log_bias_std"] = torch.full((1,), -50.0, dtype=torch.float64)
+    block = Block(({"q": phi},), (torch.ones(n, 1, 1, dtype=torch.float64),), phi)
+    found = condition_sparse([process], params, [block], [{"q": phi[:0]}]).covariance(block)[:, 0, 0]
+    exact = phi[:, 0].square() / (s**-2 + float(phi.square().sum()))
+    torch.testing.assert_close(found, exact, rtol=1e-12, atol=0.0)

@@ -187,16 +187,6 @@ class ProcessBasis:
         on_kernel = self.roots @ filled[:, :width] if self.spectra else filled[:, :0]
         return on_kernel, filled[:, width:]
 
-    def prior_variance(self, features: Features, values: Tensor) -> Tensor:
-        """Return the variance k(x, x) of the whole kernel `(components, n)`.
-
-        Args:
-            values: V(x), as returned by `values`.
-        """
-        # k(x, x) = k_rest(x, x) + |φ(x)|²
-        exact = values[..., values.shape[-1] - self.finite_size :]
-        return self.rest_variance(features) + torch.linalg.vecdot(exact, exact)
-
     def missed(self, variance: Tensor, explained: Tensor) -> Tensor:
         """Return the residual variance k(x, x) − |V(x)|² ≥ 0 of the approximated part, `(components, n)`.
 

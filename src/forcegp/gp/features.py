@@ -3,6 +3,7 @@
 With unit noise variance, entries of the covariance K of whitened rows have rounding errors of about ε K_ii
 with ε = 2.2e-16. Relative errors of standard deviations are thus about ε K_ii, or ε/r if data reduce a prior
 variance to a fraction r. Compared with 80-bit results, they are 0.1 % at K_ii = 1e12, 0.5 % at r = 1e-13.
+Variances of exact features are sums of squares, which do not cancel: 2e-15 at r = 1e-13.
 """
 
 from __future__ import annotations

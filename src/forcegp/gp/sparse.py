@@ -261,14 +261,15 @@ class SparsePosterior:
 
     def _latent(self, features: Sequence[Features]) -> tuple[Tensor, Tensor, Tensor]:
         """Return T `(n, components, size)`, where T Tᵀ is the covariance represented by the basis, and the
-        residual and prior variances of all components, each `(n, components)`."""
+        residual and prior variances k(x, x) of the approximated part of all components, each `(n,
+        components)`. Squares of exact features do not cancel."""
         T, missed, prior = [], [], []
         for part, inverse, x in zip(self.basis.parts, self._inverse_factor, features, strict=True):
             # T = Vᵀ L⁻ᵀ, so that T Tᵀ = Vᵀ A⁻¹ V
             V, explained = part.values(x)
             T.append(V @ inverse)
-            missed.append(part.missed(part.rest_variance(x), explained))
-            prior.append(part.prior_variance(x, V))
+            prior.append(part.rest_variance(x))
+            missed.append(part.missed(prior[-1], explained))
         return torch.cat(T).transpose(0, 1), torch.cat(missed).mT, torch.cat(prior).mT
 
     def covariance(self, block: Block) -> Tensor:

@@ -321,8 +321,7 @@ static void component(const double *restrict V, int m, int features, double vari
   double white[MOST_FUNCTIONS];
   if (f->folded) weights = f->folded + FOLDED[k];
   f->mean[k] = dot(V, weights, m + features);
-  f->prior[k] = variance + more;
-  f->rest[k] = SIGN > 0.0 ? variance : variance + more;
+  f->prior[k] = f->rest[k] = SIGN > 0.0 ? variance : variance + more; /* squares of features do not cancel */
   if (!spread) return;
   if (whitening) { /* D = k - |R^T k(Z, x)|^2, the residual variance given the support points */
     combine(whitening, V, m, kept, white);
