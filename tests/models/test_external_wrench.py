@@ -197,7 +197,10 @@ def test_errors() -> None:
     with pytest.raises(DataError, match="in time order"):
         fitted().external_wrench(data[[3, 1, 2]], TOOL, method="momentum")
     plain = forcegp.StructuredGP(
-        fitted().specified, "analytical", "friction", noise=forcegp.Noise(0.05, torque=None)
+        fitted().specified,
+        "analytical",
+        friction_priors(fitted().specified),
+        noise=forcegp.Noise(0.05, torque=None),
     )
     with pytest.raises(ModelError, match="no learned torque noise"):
         plain.fit(data[:50], learn=[]).external_wrench(data, TOOL, method="momentum")

@@ -17,6 +17,7 @@ import torch
 import forcegp
 from forcegp.destination import check_destination
 from forcegp.errors import DestinationError, ForceGPError, ModelError
+from forcegp.forces.priors.sets import friction_priors
 from forcegp.storage import model_file as module
 from forcegp.storage.model_file import HEADER, model_path
 from model_files import header_of, rewritten
@@ -36,7 +37,7 @@ def saved(tmp_path_factory: pytest.TempPathFactory) -> dict[str, Path]:
 
     root, found = tmp_path_factory.mktemp("models"), {}
     sparse = forcegp.StructuredGP(
-        SYSTEM, "analytical", "friction", 0.1, inference="sparse", inducing_points=6
+        SYSTEM, "analytical", friction_priors(SYSTEM), 0.1, inference="sparse", inducing_points=6
     )
     sparse.fit(random_data(SYSTEM, 40), options=LearningOptions(max_evaluations=1)).save(root / "sparse")
     found["sparse"] = model_path(root / "sparse")

@@ -24,6 +24,8 @@ from forcegp.forces.posterior import RELATIVE, STICKING
 from forcegp.forces.priors.base import NOISE
 from forcegp.forces.quantities import States
 
+DETERMINED = 1e-6
+"""Smallest part 1 − R_ii of a multiplier that the motion determines, up to rounding."""
 AXES = 3
 """Components of a tangential force in world axes, of which the surface leaves two."""
 LARGEST_COEFFICIENT = 1.0
@@ -87,8 +89,18 @@ def tip_factor(tensors: Mapping[str, Tensor], system: ConstrainedSystem, at: Sta
 
 @torch.no_grad()
 def stated_tips(system: ConstrainedSystem, states: Iterable[States]) -> dict[str, Tensor]:
-    """Return initial values for each contact, from normal forces at states under the robot file and τ."""
-    found, loads = {}, [(at.active, at.eom.multiplier(at.eom.Q_K + at.tau).clamp(min=0.0)) for at in states]
+    """Return initial values for each contact, from normal forces at states under the robot file and τ.
+
+    Contacts that share a load have λ_i/√(1 − R_ii) with the projector R onto Aᵀμ = 0, so that the variance of
+    their common tangential force is that of one contact.
+    """
+    found, loads = {}, list[tuple[Tensor, Tensor]]()
+    for at in states:
+        own = 1.0 - at.eom.hidden.diagonal(dim1=-2, dim2=-1)
+        force = at.eom.multiplier(at.eom.Q_K + at.tau).clamp(min=0.0)
+        loads.append(
+            (at.active, torch.where(own > DETERMINED, force / own.clamp(min=DETERMINED).sqrt(), 0.0))
+        )
     for name in free_tips(system):
         index, row = system.contact_names.index(name), system.rows[name].start
         load = torch.cat([force[active[:, index], row] for active, force in loads])
