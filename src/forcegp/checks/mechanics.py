@@ -232,7 +232,7 @@ def _friction(explanation: Explanation, stated: Explanation) -> list[Finding]:
             evidence |= {f"{kind} {log.joint_names[j]}": x for kind, x in sizes.items()}
             parts.append(f"{log.joint_names[j]} {text}")
         what = f"{word} friction than the robot file declares"
-        text = f"joints have {what}, in all (viscous, Coulomb): {'; '.join(parts)}"
+        text = f"joints have {what}; total (viscous, Coulomb): {'; '.join(parts)}"
         findings += [log.finding("friction-undeclared", text, log.named(hit), **evidence)] if parts else []
     return findings
 
