@@ -9,20 +9,20 @@ torques, and N = 1 − A⁺A removes constraint forces.
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
-import numpy as np
 import torch
 from torch import Tensor
 
 from forcegp import dynamics
 from forcegp.checks.explain import significant
-from forcegp.checks.fit import TorqueProblem, cross_validate
-from forcegp.checks.hypotheses import SIGNIFICANT, TOOL_MASS
+from forcegp.checks.fit import cross_validate
+from forcegp.checks.hypotheses import SIGNIFICANT, problem_of, robot_columns
+from forcegp.checks.log import evenly, log_of
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.evaluation.least_squares import data_chunks, free_directions
-from forcegp.identification import MOMENT_ARM, regressor
+from forcegp.identification import regressor
 from forcegp.models.analytical import AnalyticalModel
 from forcegp.models.base import FittedModel
 from forcegp.robot.model import RobotModel
@@ -37,8 +37,6 @@ FAINT = 0.1
 """Joints are scored if their non-gravitational torque, or motion, exceeds this fraction of the largest."""
 RESPONSE_SAMPLES, FEWEST_FREE = 500, 20
 """Maximum and minimum number of states at which a torque is added."""
-LINK = 10
-"""Number of inertial parameters of a link."""
 GRAVITY_SAMPLES, RIDGE = 4000, 1e-9
 """Maximum number of samples for fitting gravity; relative ridge for undetermined directions."""
 
@@ -134,22 +132,15 @@ def payload_change(model: FittedModel, error: Tensor, data: Dataset) -> PayloadC
     With M and the regressor Y of the last link of the model, M (q̈ − q̈_model) = −Y δ. As in `forcegp.check`,
     friction and offsets are nuisances, δ must lower the held-out error, and its mass must be significant.
     """
-    free = (~data.active(model.system.contact_names).any(-1)).nonzero()[:, 0]
+    free = (~data.active(model.system.contact_names).any(-1)).nonzero()[:, 0].numpy(force=True)
     if len(free) < FEWEST_PAYLOAD or data.nq < 2:
         return None
-    some = torch.linspace(0, len(free) - 1, min(len(free), PAYLOAD_SAMPLES)).round().long().unique()
-    part, error, robot = data[free[some]], error[free[some]], model.system.robot
-    r = -(dynamics.mass_matrix(robot, part.q) @ error[..., None])[..., 0]
-    laws = part.qd, torch.tanh(part.qd / robot.friction_velocity), torch.ones_like(part.qd)
-    nuisance = torch.cat([torch.diag_embed(x) for x in laws], dim=-1)
-    columns = -regressor(robot, part.q, part.qd, part.qdd)[..., -LINK:]
-    prior = TOOL_MASS * np.repeat([1.0, MOMENT_ARM, MOMENT_ARM**2], (1, 3, 6))
-    size = part.tau.square().mean(0).sqrt()
-    size = size.maximum(1e-3 * size.max()).clamp(min=1e-9).double().numpy(force=True)
-    arrays = (x.double().numpy(force=True) for x in (r, nuisance, columns))
-    torque, common, unknown = arrays
-    problem = TorqueProblem(torque, np.zeros((len(torque), 1, data.nq)), common, size, size)
-    null, fit = cross_validate(problem), cross_validate(problem, unknown, prior)
+    system, log, rows = ConstrainedSystem(model.system.robot), log_of(data), evenly(free, PAYLOAD_SAMPLES)
+    M = dynamics.mass_matrix(system.robot, *log.tensors(rows, "q"))
+    r = -(M @ error.detach().cpu().double()[rows][..., None])[..., 0].numpy()
+    problem = replace(problem_of(system, log, rows), r=r)
+    columns, prior = robot_columns(system, log, rows, "payload")
+    null, fit = cross_validate(problem), cross_validate(problem, columns, prior)
     found = PayloadChange(float(fit.theta[0]), float(fit.spread[0]))
     clear = abs(found.mass) > SIGNIFICANT * found.std
     return found if clear and significant(fit.shares, null.shares, data.nq) else None

@@ -13,6 +13,7 @@ from dataclasses import dataclass, field
 
 import torch
 from torch import Tensor
+from torch.nn.functional import max_pool1d
 
 from forcegp.forces.term import Array, JointState, JointTerm, constants, cos, sin
 from forcegp.gp.kernels import Columns, Kernel
@@ -21,9 +22,10 @@ MOST_WAVES = 4
 """Maximum number of wave numbers of a joint: two sources, each with a harmonic."""
 SHORTEST = 640.0
 """Largest wave number [1/rad, 1/m]: two per input turn of the largest harmonic drives, of ratio 320."""
-FEWEST_PERIODS = 5.0
-"""Number of periods below which a wave is not told from a smooth function of the angle. Gears with 20 teeth
-are found if a joint moves by a quarter turn."""
+FEWEST_PERIODS = 3.0
+"""Number of periods below which a wave is not told from a smooth function of the angle. Of 40 waves of
+simulated arms, 37 are found (31 with 5 periods), and none is false. Twelve logs without ripple have two false
+lines, of more than 80 periods."""
 CERTAIN = 5.0
 """Log probability against a line among all wave numbers in noise with an even level [nats], as `DECISIVE` for
 columns. If the level is steep, as of strongly correlated noise, a few percent of joints get a false line."""
@@ -76,22 +78,30 @@ def ripple_of(q: Tensor, residual: Tensor) -> RipplePrior | None:
 
 def waves_of(q: Tensor, residual: Tensor) -> tuple[float, ...]:
     """Return the wave numbers of the ripple of one joint, the strongest first; see `ripple_of`."""
-    reach, waves, left = float(q.max() - q.min()), [], residual - residual.mean()
+    reach, waves, left = float(q.max() - q.min()), [], _without(q, residual, [])
     while len(waves) < MOST_WAVES and reach > 0.0:
         k, power = _periodogram(q, left, reach)
-        known = torch.tensor([abs(wave) for wave in waves]).to(k)
-        # A line is as wide as one over the angle, and strong lines have side lobes.
-        fresh = ((k[:, None] - known).abs() > 2.0 * math.pi / reach).all(-1)
-        if not bool(fresh.any()):
-            break
+        known, width = torch.tensor([abs(wave) for wave in waves]).to(k), 2.0 * math.pi / reach
+        # A line is as wide as one over the angle. Others are side lobes, or the slope of a smooth function.
+        fresh = ((k[:, None] - known).abs() > width).all(-1) & _is_highest(power)
+        fresh &= k >= FEWEST_PERIODS * width
         excess = torch.where(fresh, power / _level(power), 0.0)
         i = int(excess.argmax())
         if float(excess[i]) < math.log(len(k) / OVERSAMPLING) + CERTAIN:
             break
         waves.append(_refined(q, left, float(k[i]), reach))
-        X = torch.stack([f(wave * q) for wave in waves for f in (torch.sin, torch.cos)], dim=-1)
-        left = residual - residual.mean() - X @ torch.linalg.lstsq(X, residual[:, None]).solution[:, 0]
+        # The other waves move a wave, so each is refined again without them.
+        for m, wave in enumerate(waves[:-1]):
+            waves[m] = _refined(q, _without(q, residual, waves[:m] + waves[m + 1 :]), wave, reach)
+        left = _without(q, residual, waves)
     return tuple(waves)
+
+
+def _without(q: Tensor, residual: Tensor, waves: list[float]) -> Tensor:
+    """Return what waves and a constant leave of a residual, by least squares."""
+    X = [f(wave * q) for wave in waves for f in (torch.sin, torch.cos)]
+    X = torch.stack([*X, torch.ones_like(q)], dim=-1)
+    return residual - X @ torch.linalg.lstsq(X, residual[:, None]).solution[:, 0]
 
 
 def _periodogram(q: Tensor, e: Tensor, reach: float) -> tuple[Tensor, Tensor]:
@@ -101,18 +111,28 @@ def _periodogram(q: Tensor, e: Tensor, reach: float) -> tuple[Tensor, Tensor]:
     binned = e.new_zeros(size).index_add(0, ((q - q.min()) / width).long(), e)
     power = torch.fft.rfft(binned).abs().square()
     k = torch.arange(len(power)).to(power) * (BINS / size)
-    used = (k >= FEWEST_PERIODS * 2.0 * math.pi / reach) & (k <= SHORTEST)
-    return k[used], power[used]
+    return k[k <= SHORTEST], power[k <= SHORTEST]
+
+
+def _is_highest(power: Tensor) -> Tensor:
+    """Return whether the power at each wave number is the highest within the width of a resolved line."""
+    highest = max_pool1d(power[None], 2 * OVERSAMPLING + 1, 1, OVERSAMPLING)
+    return power == highest[0]
 
 
 def _level(power: Tensor) -> Tensor:
-    """Return the expected power at each wave number: a running median over ln 2, as it is exponential."""
+    """Return the expected power at each wave number, which is ln 2 times below the median of its neighbours.
+
+    At small wave numbers, there are fewer neighbours: the level is steep there, and the median of a monotone
+    function over a symmetric interval is its value in the middle.
+    """
     half = OVERSAMPLING * NEIGHBOURS // 2
-    if len(power) <= 2 * half:
-        return power.median().expand_as(power).clamp(min=1e-300) / math.log(2.0)
-    padded = torch.cat([power[:half].flip(0), power, power[-half:].flip(0)])
-    median = padded.unfold(0, 2 * half, OVERSAMPLING // 2).median(-1).values
-    return median.repeat_interleave(OVERSAMPLING // 2)[: len(power)].clamp(min=1e-300) / math.log(2.0)
+    padded = torch.cat([power, power[-half - 1 : -1].flip(0)])
+    median = [padded[:1], *(padded[: 2 * i + 1].median()[None] for i in range(1, min(half, len(power))))]
+    if len(power) > half:
+        rest = padded.unfold(0, 2 * half + 1, OVERSAMPLING // 2).median(-1).values
+        median.append(rest.repeat_interleave(OVERSAMPLING // 2)[: len(power) - half])
+    return torch.cat(median).clamp(min=1e-300) / math.log(2.0)
 
 
 def _refined(q: Tensor, e: Tensor, k: float, reach: float) -> float:
