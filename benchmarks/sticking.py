@@ -164,9 +164,7 @@ def recorded(
     return system, logs
 
 
-def scores(
-    scene: str, friction: str, seed: int, seconds: float, priors: str
-) -> dict[str, dict[str, dict[str, float]]]:
+def scores(scene: str, friction: str, seed: int, seconds: float) -> dict[str, dict[str, dict[str, float]]]:
     """Scores of each method, where the tip sticks and where it slides."""
     system, logs = recorded(scene, friction, seed, seconds)
     (contact,) = system.contacts
@@ -175,7 +173,7 @@ def scores(
     train = forcegp.Dataset.concatenate([log[: half[name]] for name, log in logs.items()])
     stick_speed = resting_speed(residual(system, train[train.contact[contact.name]])[2].numpy())
     assert stick_speed is not None
-    fit = forcegp.StructuredGP(system, "analytical", priors).fit(train[::EVERY])
+    fit = forcegp.StructuredGP(system, "analytical").fit(train[::EVERY])
     result = {}
     for name, log in logs.items():
         test = log[half[name] :: TESTED]
@@ -217,7 +215,6 @@ def main() -> None:
     parser.add_argument("--scene", choices=SCENES, action="append")
     parser.add_argument("--friction", choices=FRICTIONS, action="append")
     parser.add_argument("--seconds", type=float, default=DURATION, help="length of each log")
-    parser.add_argument("--priors", default="auto", help="of StructuredGP, such as friction")
     parser.add_argument("--seeds", type=int, nargs="*", default=list(range(5)))
     parser.add_argument("--json", type=Path)
     options = parser.parse_args()
@@ -226,7 +223,7 @@ def main() -> None:
     result: dict[str, list[dict[str, dict[str, dict[str, float]]]]] = {}
     cases = options.scene or SCENES, options.friction or FRICTIONS
     for seed, scene, friction in itertools.product(options.seeds, *cases):
-        found = scores(scene, friction, seed, options.seconds, options.priors)
+        found = scores(scene, friction, seed, options.seconds)
         result.setdefault(f"{scene}, {friction}", []).append(found)
         print(scene, friction, seed, json.dumps(found), flush=True)
     lines = []

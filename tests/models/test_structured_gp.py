@@ -380,6 +380,11 @@ REFUSED: dict[str, tuple[Callable[[], object], type[Exception], str]] = {
         ModelError,
         "distinct names, and at least one prior",
     ),
+    "a name": (
+        lambda: StructuredGP(table, "zero", force_priors="friction"),  # pyright: ignore[reportArgumentType]
+        ModelError,
+        "not a force prior",
+    ),
     "same names": (
         lambda: StructuredGP(table, "zero", force_priors=[both[0], both[0]]),
         ModelError,

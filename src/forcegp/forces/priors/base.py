@@ -99,10 +99,18 @@ def check_priors(priors: tuple[ForcePrior, ...], system: ConstrainedSystem) -> N
     """Check that priors match a system and have distinct names, since names are hyperparameter prefixes.
 
     Raises:
-        ModelError: there are no priors, two priors have the same name, a name is not a single word, or a
-            prior shares the hyperparameters of a missing prior.
+        ModelError: there are no priors, one is not a prior, two have the same name, a name is not a single
+            word, or a prior shares the hyperparameters of a missing prior.
         UnknownNameError: a prior names a contact that the system does not have.
     """
+    for prior in priors:
+        if not isinstance(prior, ForcePrior):
+            raise ModelError(
+                "not a force prior",
+                expected="objects such as forcegp.JointFrictionPrior()",
+                got=repr(prior),
+                hint="omit force_priors for all terms that apply to the log",
+            )
     names = [prior.name for prior in priors]
     if not names or len(set(names)) != len(names):
         raise ModelError("force priors need distinct names, and at least one prior", got=names)
