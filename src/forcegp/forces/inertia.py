@@ -211,16 +211,26 @@ class _Regression:
         """Return the drives that the evidence carries, and the standard deviations of all drives `(nq,)`.
 
         With all links at the file, a drive u ~ N(û, V) with prior N(0, 1) is worth ½ û²/V + ½ log V nats. It
-        must also be significant, since this is little for a drive that the log hardly determines.
+        must also be significant, since this is little for a drive that the log hardly determines. V is at
+        least the variance of a jackknife over blocks, between which errors of links and friction vary.
 
         Args:
             gain: standard deviation `(nq,)` due to gains of torque sensors, which no log determines.
             delay: index of the delay, if it is an unknown.
         """
-        (h, precision, _), n = self.normal(), len(gain)
-        own = torch.cat([torch.arange(n), delay])
-        V = torch.linalg.inv(precision[own][:, own])
-        u, variance = (V @ h[own])[:n], V.diagonal()[:n] + gain**2
+        blocks, own = len(self.by_stretch.gram), torch.cat([torch.arange(len(gain)), delay])
+
+        def read(given: NormalEquations) -> tuple[Tensor, Tensor]:
+            h, precision, _ = self.normal(given)
+            V = torch.linalg.inv(precision[own][:, own])
+            return (V @ h[own])[: len(gain)], V.diagonal()[: len(gain)]
+
+        (u, V), each = (
+            read(self.by_stretch.total()),
+            [read(self.by_stretch.without(g))[0] for g in range(blocks)],
+        )
+        between = (blocks - 1) * torch.stack(each).var(0, correction=0)
+        variance = V.maximum(between) + gain**2
         worth = 0.5 * u.square() / variance + 0.5 * variance.log()
         kept = (u > CLEAR * variance.sqrt()) & (worth > 0.0)
         return kept.nonzero()[:, 0], variance.sqrt()
