@@ -48,8 +48,9 @@ from forcegp.learning.evidence import (
 
 ROUNDS, SETTLED, NEGLIGIBLE = 20, 0.02, 1e-3
 """Maximum number of alternations, and largest changes of σ_j at their end, relative to σ_j and to all σ."""
-STEPS, ACCURACY = 20, 1e-3
-"""Maximum number of steps of Fisher scoring in one alternation, and relative change at which they end."""
+STEPS, ACCURACY, HALVINGS = 20, 1e-3, 40
+"""Maximum number of steps of Fisher scoring in one alternation, relative change at which they end, and most
+halvings of a step."""
 LEAST_VARIANCE = 1e-16
 """Variance of torques that is stored in place of zero [N² m², N²]."""
 AT_REST = (0.02, 0.05, 0.1)
@@ -184,10 +185,12 @@ class Residuals(NamedTuple):
         return (torque + stick * self.slow + known) @ self.owners.mT
 
     def log_density(self, torque: Tensor, stick: Tensor) -> float:
-        """Return Σ log N(r; 0, C) up to a constant."""
+        """Return Σ log N(r; 0, C) up to a constant, −∞ if C is not positive definite up to rounding."""
         S = self.variances(torque, stick)
         C = (self.B * S[:, None]) @ self.B.mT + torch.eye(self.r.shape[-1]).to(S)
-        L = torch.linalg.cholesky(C)
+        L, failed = torch.linalg.cholesky_ex(C)
+        if bool(failed.any()):
+            return -math.inf
         white = torch.linalg.solve_triangular(L, self.r[..., None], upper=False)
         return -float(L.diagonal(dim1=-2, dim2=-1).log().sum() + 0.5 * white.square().sum())
 
@@ -311,17 +314,33 @@ def _at_likeliest_speed(
 
 
 def _settled(rows: Residuals, theta: Tensor, share: Tensor, free: Tensor) -> Tensor:
-    """Return the variances θ after scoring until they no longer change."""
+    """Return the variances θ after scoring until they no longer change.
+
+    Rows that hardly show a variance have almost no information on it where it is small, so that a step can be
+    too long by far. Long steps are halved until the density rises.
+    """
     nq, count = rows.external.shape[-1], rows.slow.shape[-1]
     joints = (torch.arange(count) < nq).repeat(2).to(theta.device)
     for _ in range(STEPS):
-        new = torch.where(free, _scored(rows, theta, share, free), theta)
+        step = torch.where(free, _scored(rows, theta, share, free) - theta, 0.0)
         size = torch.where(joints, theta[joints].max(), theta).clamp(min=LEAST_VARIANCE)
-        change = float(((new - theta).abs() / size).max())
-        theta = new
+        change = float((step.abs() / size).max())
+        if bool((step.abs() > 0.5 * theta).any()):
+            step = _shortened(rows, theta, step)
+        theta = theta + step
         if change < ACCURACY:
             break
     return theta
+
+
+def _shortened(rows: Residuals, theta: Tensor, step: Tensor) -> Tensor:
+    """Return the step, halved until it does not lower the density, or none."""
+    before = rows.log_density(*theta.chunk(2))
+    for _ in range(HALVINGS):
+        if rows.log_density(*(theta + step).chunk(2)) >= before:
+            return step
+        step = 0.5 * step
+    return torch.zeros_like(step)
 
 
 def _scored(rows: Residuals, theta: Tensor, share: Tensor, free: Tensor) -> Tensor:
