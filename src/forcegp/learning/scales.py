@@ -48,9 +48,9 @@ from forcegp.learning.evidence import (
 
 ROUNDS, SETTLED, NEGLIGIBLE = 20, 0.02, 1e-3
 """Maximum number of alternations, and largest changes of σ_j at their end, relative to σ_j and to all σ."""
-STEPS, ACCURACY, HALVINGS = 20, 1e-3, 40
+STEPS, ACCURACY, DIVISIONS = 50, 1e-3, 16
 """Maximum number of steps of Fisher scoring in one alternation, relative change at which they end, and most
-halvings of a step."""
+divisions of a step."""
 LEAST_VARIANCE = 1e-16
 """Variance of torques that is stored in place of zero [N² m², N²]."""
 AT_REST = (0.02, 0.05, 0.1)
@@ -317,29 +317,28 @@ def _settled(rows: Residuals, theta: Tensor, share: Tensor, free: Tensor) -> Ten
     """Return the variances θ after scoring until they no longer change.
 
     Rows that hardly show a variance have almost no information on it where it is small, so that a step can be
-    too long by far. Long steps are halved until the density rises.
+    too long by far. Long steps are divided by four until the density rises.
     """
     nq, count = rows.external.shape[-1], rows.slow.shape[-1]
     joints = (torch.arange(count) < nq).repeat(2).to(theta.device)
     for _ in range(STEPS):
         step = torch.where(free, _scored(rows, theta, share, free) - theta, 0.0)
-        size = torch.where(joints, theta[joints].max(), theta).clamp(min=LEAST_VARIANCE)
-        change = float((step.abs() / size).max())
         if bool((step.abs() > 0.5 * theta).any()):
             step = _shortened(rows, theta, step)
+        size = torch.where(joints, theta[joints].max(), theta).clamp(min=LEAST_VARIANCE)
         theta = theta + step
-        if change < ACCURACY:
+        if float((step.abs() / size).max()) < ACCURACY:
             break
     return theta
 
 
 def _shortened(rows: Residuals, theta: Tensor, step: Tensor) -> Tensor:
-    """Return the step, halved until it does not lower the density, or none."""
+    """Return the step, divided until it does not lower the density, or none."""
     before = rows.log_density(*theta.chunk(2))
-    for _ in range(HALVINGS):
+    for _ in range(DIVISIONS):
         if rows.log_density(*(theta + step).chunk(2)) >= before:
             return step
-        step = 0.5 * step
+        step = 0.25 * step
     return torch.zeros_like(step)
 
 
