@@ -2,47 +2,42 @@
 
 from __future__ import annotations
 
-import math
-
 import pytest
 import torch
 from torch import Tensor
 
+from forcegp.forces.priors.contact import SlidingFrictionPrior
 from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.forces.search import FAR, LIMITS, box_around, doubts_at_bounds, initial_hyperparameters
 from forcegp.gp.features import Block
-from forcegp.gp.kernels import SquaredExponential
 
 N, ROWS = 50, 6
 
 
-def sizes_of(W: Tensor, target: Tensor, sizes: list[float]) -> list[float]:
-    """Initial sizes of forces for rows with negligible noise."""
-    prior = JointForcePrior(SquaredExponential(shared=True))
-    block = Block(({"q": torch.randn(len(W), 3, dtype=torch.float64)},), (1e6 * W,), 1e6 * target)
-    found = initial_hyperparameters([prior], [block], [torch.tensor(sizes, dtype=torch.float64)])
-    return found[f"{prior.name}.log_std"].exp().tolist()
+def block_of(W: Tensor, target: Tensor, inputs: str, width: int) -> Block:
+    features = {inputs: torch.randn(len(W), width, dtype=torch.float64)}
+    return Block((features,), (W,), target)
 
 
-def test_forces_start_at_their_least_squares() -> None:
+def test_forces_along_one_direction_start_as_if_alone() -> None:
+    torch.manual_seed(0)
+    direction = torch.randn(N, ROWS, dtype=torch.float64)
+    speed = 0.5 * torch.rand(N, 1, dtype=torch.float64)
+    W = torch.stack([speed * direction, direction], dim=-1)
+    blocks = [block_of(W, 3.0 * speed * direction, "speed", 1)]
+    found = initial_hyperparameters([SlidingFrictionPrior("table")], blocks)["contact_table.log_std"].exp()
+    size = direction.square().sum(1).sqrt()
+    dry = ((3.0 * speed[:, 0] * size).square().mean() / size.square().mean()).sqrt()
+    assert found.tolist() == pytest.approx([3.0, float(dry)], rel=1e-9)
+
+
+def test_other_forces_start_at_their_least_squares() -> None:
     torch.manual_seed(0)
     W, force = (torch.randn(N, *shape, dtype=torch.float64) for shape in ((ROWS, 3), (3,)))
-    found = sizes_of(W, (W @ force[..., None])[..., 0], [1.0, 1.0, 1.0])
-    assert found == pytest.approx(force.square().mean(0).sqrt().tolist(), rel=1e-9)
-
-
-def test_a_force_that_no_row_shows_starts_at_its_typical_size_times_that_of_the_others() -> None:
-    force = torch.linspace(-2.0, 5.0, N, dtype=torch.float64)
-    W = torch.tensor([1.0, 0.0], dtype=torch.float64).expand(N, 1, 2)
-    size = float(force.square().mean().sqrt())
-    assert sizes_of(W, force[:, None], [2.0, 14.0]) == pytest.approx([size, 7.0 * size], rel=1e-2)
-
-
-def test_forces_that_show_in_their_sum_only_share_it_by_their_typical_sizes() -> None:
-    force = torch.linspace(-2.0, 5.0, N, dtype=torch.float64)
-    W = torch.ones(N, 1, 2, dtype=torch.float64)
-    size = float(force.square().mean().sqrt()) / math.hypot(3.0, 4.0)
-    assert sizes_of(W, force[:, None], [3.0, 4.0]) == pytest.approx([3.0 * size, 4.0 * size], rel=1e-2)
+    blocks = [block_of(W, (W @ force[..., None])[..., 0], "q", 3)]
+    prior = JointForcePrior(SlidingFrictionPrior("table").kernel)
+    found = initial_hyperparameters([prior], blocks)[f"{prior.name}.log_std"].exp()
+    assert found.tolist() == pytest.approx(force.square().mean(0).sqrt().tolist(), rel=1e-9)
 
 
 def test_learning_stays_around_its_start_and_says_where_it_ended_at_a_bound() -> None:

@@ -36,3 +36,13 @@ def test_no_other_variance_has_a_larger_density(seed: int, start: float) -> None
     for k, factor in itertools.product(range(4), (0.5, 2.0)):
         other = torch.where(torch.arange(4) == k, factor * found.clamp(min=1e-6), found)
         assert rows.log_density(*other.chunk(2)) < density + 0.1
+
+
+def test_padding_changes_no_density() -> None:
+    """Measurements with fewer values per sample are scored beside others."""
+    rows, theta = rows_of(0), torch.tensor([1.0, 2.0, 3.0, 4.0], dtype=torch.float64)
+    padded = rows.padded(5)
+    assert padded.r.shape[-1] == 5
+    assert padded.log_density(*theta.chunk(2)) == pytest.approx(rows.log_density(*theta.chunk(2)), rel=1e-12)
+    for one, other in zip(padded.read(*theta.chunk(2)), rows.read(*theta.chunk(2)), strict=True):
+        torch.testing.assert_close(one, other)

@@ -211,10 +211,9 @@ def calibrated_noise(problem: Problem, hyperparameters: Mapping[str, Tensor]) ->
     rounding = torch.from_numpy(resolution(tau.cpu().numpy())).to(tau) / math.sqrt(12.0)
     least, unknown = problem.hidden_torque(), UNSHOWN * load
     hidden = least > 0.0
-    sensed = ~hidden if problem.external_std is None else ~hidden & (problem.external_std == 0.0)
-    if bool(sensed.any()):
+    if not bool(hidden.all()):
         # A hidden joint has the sensors of the others, so its relative noise is at most a few times theirs.
-        relative = (hyperparameters[TORQUE_NOISE].exp() / load)[sensed].square().mean().sqrt()
+        relative = (hyperparameters[TORQUE_NOISE].exp() / load)[~hidden].square().mean().sqrt()
         share = (ALIKE * relative / UNSHOWN).clamp(max=1.0)
         least, unknown = share * least, share * unknown
     learned = hyperparameters[TORQUE_NOISE].exp().maximum(least).maximum(rounding)

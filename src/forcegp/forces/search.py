@@ -66,10 +66,8 @@ FRICTION_SAMPLES = 200
 """Maximum number of evenly spaced samples used to select the initial Coulomb friction."""
 COEFFICIENTS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
 """Friction coefficients to try."""
-STEPS, SETTLED = 100, 1e-3
-"""Maximum number of steps to the common factor of forces, and change of its logarithm at which they end."""
-SMALLEST_LOAD = 1e-3
-"""Smallest typical load of a joint, relative to the largest."""
+PARALLEL = 1e-9
+"""Two directions are considered parallel if one minus their mean cosine is below this value."""
 
 
 def initial(problem: Problem, learn_noise: bool, learn_torque_noise: bool = False) -> Tensors:
@@ -84,7 +82,8 @@ def initial(problem: Problem, learn_noise: bool, learn_torque_noise: bool = Fals
     if problem.has_coulomb:
         start = _with_friction(few, noise)
     else:
-        start = initial_hyperparameters(problem.priors, few.fixed_rows.blocks, typical_sizes(few))
+        beyond_noise = problem.external_std is not None
+        start = initial_hyperparameters(problem.priors, few.fixed_rows.blocks, beyond_noise)
     start |= noise
     if learn_noise:
         stds = problem.training.noise_std
@@ -105,7 +104,6 @@ def _with_friction(problem: Problem, noise: Tensors) -> Tensors:
     few = without_inducing(few) if is_finite(problem.priors) else few
     like = problem.system.robot.mass
     friction = initial_coulomb(problem.priors, like)
-    sizes = typical_sizes(few)
     limits = below_jamming(problem.system, problem.training.measurements, problem.priors, limits_of(friction))
 
     def start_at(x: float) -> tuple[Tensors, WhitenedRows]:
@@ -114,7 +112,7 @@ def _with_friction(problem: Problem, noise: Tensors) -> Tensors:
             for key, value in friction.items()
         }
         rows = few.rows({**trial, **noise})
-        start = initial_hyperparameters(few.priors, rows.blocks, sizes)
+        start = initial_hyperparameters(few.priors, rows.blocks, few.external_std is not None)
         return start | trial, rows
 
     def value(x: float) -> float:
@@ -127,31 +125,13 @@ def _with_friction(problem: Problem, noise: Tensors) -> Tensors:
     return start_at(float(optimum.x))[0]
 
 
-@torch.no_grad()
-def typical_sizes(problem: Problem) -> list[Tensor]:
-    """Return the size `(components,)` of each prior at which it loads the joints like the known torques.
-
-    With the typical load L_j of the joints and the operator E, s_k = 1/√(mean Σ_j (E_jk/L_j)²), that is L_k
-    for a force on each joint.
-    """
-    load = problem.typical_load()
-    load = load.clamp(min=SMALLEST_LOAD * float(load.max()))
-    states = [m.at(problem.system) for m in problem.training.measurements]
-    sizes = []
-    for prior in problem.priors:
-        E = torch.cat([prior.operator(problem.system, at) for at in states])
-        effect = (E / load[:, None]).square().sum(1).mean(0)
-        sizes.append(effect.clamp(min=1e-300).rsqrt().clamp(max=1e4))
-    return sizes
-
-
 def initial_hyperparameters(
-    priors: Sequence[ForcePrior], blocks: Sequence[Block], sizes: Sequence[Tensor] | None = None
+    priors: Sequence[ForcePrior], blocks: Sequence[Block], beyond_noise: bool = False
 ) -> dict[str, Tensor]:
     """Return the initial log-hyperparameters, keyed by `<prior>.<name>`.
 
     Args:
-        sizes: typical size `(components,)` of each force, up to a factor; 1 by default.
+        beyond_noise: whether to subtract the contribution of noise, for example if unknown forces are given.
 
     Raises:
         ModelError: contacts hold all joints in every sample, so no measurement depends on a force.
@@ -167,41 +147,45 @@ def initial_hyperparameters(
     # Some priors share the hyperparameters of another prior.
     for p, prior in [(p, prior) for p, prior in enumerate(priors) if prior.prefix == prior.name]:
         widths = {name: x.shape[-1] for name, x in blocks[0].features[p].items()}
-        size = torch.ones_like(blocks[0].operators[p][0, 0]) if sizes is None else sizes[p]
-        scale = _force_scale(p, blocks, size)
+        scale = _force_scale(p, blocks, prior.commensurate, beyond_noise)
         initial = prior.stated(prior.kernel.initial(len(scale), widths, scale.log().cpu().double()))
         params |= {f"{prior.name}.{name}": value.to(scale.device) for name, value in initial.items()}
     return params
 
 
-def _force_scale(p: int, blocks: Sequence[Block], size: Tensor) -> Tensor:
-    """Return the root mean square `(components,)` of force p, of which the rows may show only a part.
+def _force_scale(p: int, blocks: Sequence[Block], commensurate: bool, beyond_noise: bool) -> Tensor:
+    """Return the root mean square `(components,)` of the least-squares force of prior p.
 
-    The rows of a sample are r = W f + e, e ~ N(0, I). For f ~ N(0, c² diag s²) with typical sizes s, the
-    evidence of the common factor c is stationary if
-
-        c² = mean E[f_k² | r]/s_k²,   E[f fᵀ | r] = m mᵀ + V,   m = V Wᵀ r,   V = (Wᵀ W + diag (c s)⁻²)⁻¹.
-
-    The result is √(mean E[f_k² | r]), which is the stated c s_k in directions that no row shows.
+    The rows determine only the sum of components with the same direction, which the minimum-norm solution
+    divides evenly. Components with different units, such as viscous and dry friction, are fitted separately.
     """
-    samples, factor = sum(len(block.target) for block in blocks), 1.0
-    for _ in range(STEPS):
-        parts = (_expected_square(block.operators[p], block.target, factor * size) for block in blocks)
-        square = torch.stack(list(parts)).sum(0) / samples
-        before, factor = factor, float((square / size.square()).mean().sqrt())
-        if abs(math.log(factor / before)) < SETTLED:
-            break
-    return square.sqrt().clamp(1e-3, 1e4)
+    operators = [block.operators[p] for block in blocks]
+    each = torch.arange(operators[0].shape[-1], device=operators[0].device)
+    first = each if commensurate else _first_parallel(operators)
+    groups, alone = first.unique(), (first[:, None] == first).sum(0) == 1
+    total = torch.zeros_like(blocks[0].operators[p][0, 0])
+    weight = torch.zeros_like(total)
+    for block in blocks:
+        W = block.operators[p]
+        inverse, square = torch.linalg.pinv(W[..., groups], rtol=1e-6), torch.zeros_like(W[:, 0])
+        square[:, groups] = (inverse @ block.target[..., None])[..., 0] ** 2
+        if beyond_noise:
+            square[:, groups] -= inverse.square().sum(-1)
+        size = torch.where(alone, 1.0, W.square().sum(1))
+        total, weight = total + (square * size)[:, first].sum(0), weight + size.sum(0)
+    return (total.clamp(min=0.0) / weight.clamp(min=1e-300)).sqrt().clamp(1e-3, 1e4)
 
 
-def _expected_square(W: Tensor, r: Tensor, s: Tensor) -> Tensor:
-    """Return Σ_n E[f_k² | r_n] `(components,)` for r = W f + e with f ~ N(0, diag s²) and e ~ N(0, I)."""
-    # B = W diag s, f = s (Bᵀ C⁻¹ r), Var f = s² (1 − diag Bᵀ C⁻¹ B) with C = B Bᵀ + I
-    B = W * s
-    C = B @ B.mT + torch.eye(W.shape[1], dtype=W.dtype, device=W.device)
-    solved = torch.linalg.solve(C, torch.cat([B, r[..., None]], dim=-1))
-    mean = (B.mT @ solved[..., -1:])[..., 0]
-    return s.square() * (mean.square() + 1.0 - (B * solved[..., :-1]).sum(1)).sum(0)
+def _first_parallel(operators: Sequence[Tensor]) -> Tensor:
+    """Return, for each component, the first one with the same direction at all samples, `(components,)`."""
+    along = most = torch.zeros_like(operators[0][0].mT @ operators[0][0])
+    for W in operators:
+        size = W.square().sum(1).sqrt()
+        along = along + (W.mT @ W).abs().sum(0)
+        most = most + (size[:, :, None] * size[:, None, :]).sum(0)
+    # |w_k·w_l| ≤ |w_k||w_l|: if the sums are equal, so are the two sides at every sample.
+    parallel = ((along >= (1.0 - PARALLEL) * most) & (most > 0.0)).fill_diagonal_(True)
+    return parallel.to(torch.uint8).argmax(0)
 
 
 def limits_of(params: Parameters) -> dict[str, tuple[float, float]]:

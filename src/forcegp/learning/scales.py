@@ -61,8 +61,9 @@ FEWEST_AT_REST = 10.0
 contact below which the unknown force of a contact that slides does."""
 LEAST_SHARE = 0.2
 """Smallest share of the samples that remains after the determined directions are subtracted."""
-MOTIONS = ("qdd", "joint_force")
-"""Quantities that show torque noise: accelerations, and joint forces computed with a force sensor."""
+MOTIONS = ("qdd", "joint_force", "contact_force", "multiplier")
+"""Quantities that show torque noise: accelerations, joint forces computed with a force sensor, and forces of
+contacts. Without the latter, ±2σ of the force on a leg holds 27 % instead of 79 % (sensor of one axis)."""
 
 
 @dataclass(frozen=True)
@@ -179,6 +180,11 @@ class Residuals(NamedTuple):
         """Whether each contact is closed `(n, c)`."""
         return (self.B != 0.0).any(-2).to(self.r) @ self.owners[:, self.external.shape[-1] :] > 0.0
 
+    def padded(self, d: int) -> Residuals:
+        """Return the rows with zeros up to d values per sample."""
+        pad, more = torch.nn.functional.pad, d - self.r.shape[-1]
+        return self._replace(r=pad(self.r, (0, more)), B=pad(self.B, (0, 0, 0, more)))
+
     def variances(self, torque: Tensor, stick: Tensor) -> Tensor:
         """Return S `(n, nq + 3 c)` for variances σ² and σ_s² `(nq + c,)`."""
         known = torch.nn.functional.pad(self.external, (0, len(torque) - self.external.shape[-1]))
@@ -272,7 +278,9 @@ def _with_noise(
     """Return the hyperparameters with updated torque noise and static friction, and the exponent κ."""
     motions = [i for i, m in enumerate(problem.training.measurements) if m.quantity in MOTIONS]
     each = [residuals(problem, values, evidence.weights, i) for i in motions]
-    whole = Residuals(*(torch.cat(part) for part in zip(*each, strict=True)))
+    widest = max(rows.r.shape[-1] for rows in each)
+    parts = zip(*(rows.padded(widest) for rows in each), strict=True)
+    whole = Residuals(*map(torch.cat, parts))
     nq, tips = whole.external.shape[-1], [tip_keys(name) for name in learned_tips(problem.system, values)]
     keys, theta = variance_keys(problem, values), torch.cat(variances(problem, values))
     gamma = determined_by_joint(problem, groups, evidence)

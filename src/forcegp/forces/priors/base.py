@@ -42,6 +42,8 @@ class ForcePrior(ABC):
     """Whether the prior includes Coulomb friction proportional to the multiplier."""
     vectors: tuple[str, ...] = ()
     """Vector inputs, which have a common scale so that results do not depend on the axes."""
+    commensurate: bool = True
+    """Whether all components of f have the same physical unit."""
     sticks: bool = False
     """Whether the force includes dry joint friction, for which `States.slip` is needed."""
     remembers: bool = False

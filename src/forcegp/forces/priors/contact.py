@@ -189,6 +189,8 @@ class SlidingFrictionPrior(SurfaceForcePrior):
     torsion_smoothing: float = 0.1
     coupled: bool = False
 
+    commensurate = False
+
     def __post_init__(self) -> None:
         super().__post_init__()
         check_inputs(f"{self.name}.terms", self.terms, TERMS)

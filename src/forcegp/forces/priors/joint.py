@@ -171,15 +171,9 @@ class JointFrictionPrior(JointTerm):
     def stated(self, initial: dict[str, Tensor]) -> dict[str, Tensor]:
         if type(self.kernel) is not Linear or self.kernel.shared or not self.kernel.ard:
             return initial
-        slopes, offset = initial["log_slope_std"].clone(), initial["log_bias_std"]
+        slopes = initial["log_slope_std"].clone()
         slopes[:, 2:] += math.log(SHAPE)
-        # The variances of all columns add up to that of the force.
-        before, after = (
-            torch.logsumexp(2.0 * torch.cat([x, last[:, None]], dim=-1), -1)
-            for x, last in ((initial["log_slope_std"], initial["log_slope_std"][:, 0]), (slopes, offset))
-        )
-        rest = 0.5 * (before - after)
-        return {**initial, "log_slope_std": slopes + rest[:, None], "log_bias_std": offset + rest}
+        return {**initial, "log_slope_std": slopes}
 
     def columns(self, x: JointState) -> dict[str, Array]:
         dry = {f"coulomb_{i}": x.direction(speed) for i, speed in enumerate(self.speeds)}
