@@ -63,7 +63,9 @@ LEAST_SHARE = 0.2
 """Smallest share of the samples that remains after the determined directions are subtracted."""
 MOTIONS = ("qdd", "joint_force", "contact_force", "multiplier")
 """Quantities that show torque noise: accelerations, joint forces computed with a force sensor, and forces of
-contacts. Without the latter, ±2σ of the force on a leg holds 27 % instead of 79 % (sensor of one axis)."""
+contacts. Without the latter, errors of the force on a leg, learned with a sensor of one axis, are 1.01 and
+0.89 instead of 0.38 and 0.68 N on one half of a log, and 0.20 and 0.32 instead of 0.22 and 0.55 N on the
+other."""
 
 
 @dataclass(frozen=True)
