@@ -250,6 +250,16 @@ def test_two_results_have_two_places(tmp_path: Path) -> None:
     refused([*words, str(tmp_path / "." / "part.parquet")], "by another result")
 
 
+@pytest.mark.parametrize(
+    ("name", "out"),
+    [("fit", "model"), ("fit", "model.safetensors"), ("excite", "motion.csv"), ("export", "arm.urdf")],
+)
+def test_a_result_is_not_in_its_own_place(name: str, out: str, tmp_path: Path) -> None:
+    """With and without the suffix that is appended."""
+    values = {"out": tmp_path / out, "to": "urdf", "samples": 2}
+    check_kept(outputs_of(COMMANDS[name], values), [])
+
+
 def test_results_beside_the_inputs_are_allowed(tmp_path: Path) -> None:
     """A fit runs again with the same paths; a sweep writes only the folders of its fits."""
     values = {"data": [tmp_path / "data.parquet"], "scene": "ur5_free", "out": tmp_path / "ur5_free"}

@@ -149,7 +149,7 @@ Places = Callable[[Path, Mapping[str, Any]], Iterable[Path]]
 def _model(out: Path, _: Mapping[str, Any]) -> list[Path]:
     from forcegp.storage.model_file import model_path
 
-    return [out, model_path(out)]
+    return list(dict.fromkeys([out, model_path(out)]))
 
 
 def _robot_files(out: Path, values: Mapping[str, Any]) -> list[Path]:
