@@ -26,7 +26,7 @@ def export(
             "--out", "-o", writable=True, help="Folder for the code and its test, or path of the robot file."
         ),
     ],
-    to: Annotated[str, Option("--to", help="Format: c, casadi, torch, urdf or mjcf.")] = "c",
+    to: Annotated[str, Option("--to", help="Format: c, casadi, urdf or mjcf.")] = "c",
     name: Annotated[str, Option(help="For C: name of the files and prefix of the functions.")] = "controller",
     functions: Annotated[
         int | None,
