@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import atexit
 import os
 import signal
 import sys
@@ -29,6 +30,8 @@ def end_when_interrupted() -> None:
     os.set_blocking(signals, False)
     signal.set_wakeup_fd(signals, warn_on_full_buffer=False)
     signal.signal(signal.SIGINT, _interrupt)
+    # While the interpreter shuts down, it has no handlers, and the exit code is known.
+    atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
 
     def watch() -> None:
         while os.read(wake, 1) != bytes([signal.SIGINT]) or signal.getsignal(signal.SIGINT) is not _interrupt:

@@ -118,6 +118,27 @@ except KeyboardInterrupt:
 """
 
 
+AT_THE_END = """
+import os, signal, sys
+from forcegp.interrupt import end_when_interrupted
+
+class Last:
+    def __del__(self, kill=os.kill, process=os.getpid(), number=signal.SIGINT):
+        kill(process, number)
+
+signal.signal(signal.SIGINT, signal.default_int_handler)
+end_when_interrupted()
+sys.last = Last()  # is deleted while the interpreter shuts down
+sys.exit(3)
+"""
+
+
+@pytest.mark.skipif(os.name != "posix", reason="signals")
+def test_an_interrupt_during_the_shutdown_leaves_the_exit_code() -> None:
+    done = subprocess.run([sys.executable, "-c", AT_THE_END], capture_output=True, text=True, check=False)
+    assert (done.returncode, done.stderr) == (3, "")
+
+
 @pytest.mark.skipif(os.name != "posix", reason="signals")
 def test_an_interrupt_with_another_handler_does_not_end_the_program() -> None:
     arguments = [sys.executable, "-c", REPLACED]
