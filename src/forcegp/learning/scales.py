@@ -355,10 +355,14 @@ def _shortened(rows: Residuals, theta: Tensor, step: Tensor) -> Tensor:
 def _scored(rows: Residuals, theta: Tensor, share: Tensor, free: Tensor) -> Tensor:
     """Return the variances θ after a step of Fisher scoring, zero for those that are not free."""
     a, D = rows.read(*theta.chunk(2))
-    c, R = torch.cat([torch.ones_like(rows.slow), rows.slow], dim=-1), rows.owners
+    c, k, R = torch.cat([torch.ones_like(rows.slow), rows.slow], dim=-1), rows.slow, rows.owners
     square, expected = a.square() @ R, D.diagonal(dim1=-2, dim2=-1) @ R
     g = 0.5 * (c * (square.repeat(1, 2) / share - expected.repeat(1, 2))).sum(0)
-    F = 0.5 * torch.einsum("ni,nij,nj->ij", c, (R.mT @ D.square() @ R).repeat(1, 2, 2), c)
+    # Σ c_i D_ij² c_j in blocks of c = (1, k)
+    D2 = R.mT @ D.square() @ R
+    slowed = D2 * k[:, None]
+    F_11, F_1k, F_kk = D2.sum(0), slowed.sum(0), (k[..., None] * slowed).sum(0)
+    F = 0.5 * torch.cat([torch.cat([F_11, F_1k], 1), torch.cat([F_1k.mT, F_kk], 1)])
     # in units of 1/√F_ii, with a small ridge for variances that no row shows
     unit = F.diagonal().clamp(min=1e-300).rsqrt()
     F = (F * unit[:, None] * unit + 1e-9 * torch.eye(len(F)).to(F))[free][:, free]
