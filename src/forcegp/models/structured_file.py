@@ -263,11 +263,11 @@ def _training(settings: StructuredSettings, spec: Specification, tensors: Mappin
         parts.append(part)
     scales = tuple(
         Standardization(
-            _below(tensors, f"scale.{prior.name}.mean."),
-            _below(tensors, f"scale.{prior.name}.std."),
+            {name: tensors[f"scale.{prior.name}.mean.{name}"] for name in names},
+            {name: tensors[f"scale.{prior.name}.std.{name}"] for name in names},
             constant,
         )
-        for prior, constant in zip(spec.priors, settings.constant, strict=True)
+        for prior, names, constant in zip(spec.priors, _inputs(spec), settings.constant, strict=True)
     )
     weights = tuple(part["weight"] for part in parts) if parts and "weight" in parts[0] else None
     slopes = tuple(part.get("slope") for part in parts) if any("slope" in part for part in parts) else None
@@ -312,17 +312,22 @@ def _restored(
     return spec, problem, hyper, posterior, result, system, _below(tensors, "noise_std.")
 
 
-def _in_order(problem: Problem, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return the tensors with the inputs of each kernel in the order that its prior defines.
+def _inputs(spec: Specification) -> list[list[str]]:
+    """Return the names of the inputs of each prior in the order that it defines.
 
-    A kernel on all inputs depends on their order, which files do not preserve.
+    Columns and kernels on all inputs depend on this order, which files do not preserve.
     """
-    system = problem.system
+    system = spec.system
     rest = torch.zeros(1, system.robot.nq, dtype=system.robot.dtype, device=system.robot.device)
     closed = torch.ones(1, len(system.contacts), dtype=torch.bool, device=rest.device)
     at = states(system, rest, rest, rest, closed)
-    features = [prior.features(system, at) for prior in problem.priors]
-    named = [f"{p}.inducing.{name}" for p, inputs in enumerate(features) for name in inputs]
+    return [list(prior.features(system, at)) for prior in spec.priors]
+
+
+def _in_order(problem: Problem, tensors: Mapping[str, Tensor]) -> dict[str, Tensor]:
+    """Return the tensors with the inputs of each kernel in the order of the scales."""
+    inputs = enumerate(scale.std for scale in problem.training.scales)
+    named = [f"{p}.inducing.{name}" for p, names in inputs for name in names]
     return {name: tensors[name] for name in (*named, *tensors) if name in tensors}
 
 
