@@ -282,7 +282,8 @@ def test_mimic_joint_is_refused_unless_locked(tmp_path: Path) -> None:
         forcegp.load_robot(path, locked_joints={"jj": 0.0})
     with pytest.raises(RobotFileError, match="'j' cannot be locked"):
         forcegp.load_robot(path, locked_joints={"j": float("nan")})
-    robot = forcegp.load_robot(path, locked_joints={"j": 0.7})
+    with pytest.warns(RobotFileWarning, match="'j' is locked at 0.7, and in the file follows 'i'"):
+        robot = forcegp.load_robot(path, locked_joints={"j": 0.7})
     rotation, position = kinematics.frame_pose(robot, torch.zeros(1, dtype=robot.dtype), "b")
     np.testing.assert_allclose(rotation, Rotation.from_rotvec([0, 0, 0.7]).as_matrix(), atol=1e-15)
     np.testing.assert_allclose(position, [0, 0, 1])

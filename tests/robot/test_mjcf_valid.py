@@ -293,6 +293,21 @@ def test_gravity_is_that_of_the_file_unless_stated(tmp_path: Path, option: str, 
         assert forcegp.load_scene(scene).robot().gravity.tolist() == gravity
 
 
+@pytest.mark.parametrize(("flag", "text"), [("damper", "damping"), ("frictionloss", "frictionloss")])
+def test_forces_that_a_flag_switches_off_are_zero(tmp_path: Path, flag: str, text: str) -> None:
+    joint = '<joint name="a" axis="0 1 0" damping="2" frictionloss="0.5"/>'
+    path = write(
+        tmp_path,
+        f'<option><flag {flag}="disable"/></option><actuator><motor joint="a" damping="3"/></actuator>',
+        f'<body name="one">{joint}{INERTIAL}</body>',
+    )
+    with pytest.warns(RobotFileWarning, match=f"{text} is switched off by a flag"):
+        robot = forcegp.load_robot(path)
+    off = text == "damping"
+    assert (robot.damping.item(), robot.friction.item()) == ((0.0, 0.5) if off else (5.0, 0.0))
+    assert_equal(robot, path)
+
+
 def test_a_body_without_inertia_is_named_with_its_joint(tmp_path: Path) -> None:
     """MuJoCo rejects a body without mass; the library rejects mass on the axis of a joint."""
     nothing = '<inertial pos="0 0 0" mass="0" diaginertia="0 0 0"/>'

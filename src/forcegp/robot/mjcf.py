@@ -51,6 +51,7 @@ def read_mjcf(root: Element, path: Path) -> Tree:
     document, remarks = reduce_mjcf(root, path)
     with _warnings_of_mujoco(str(path), remarks):
         model = _compile(document, path)
+        remarks += [f"{path}: {text} off by a flag" for text in _switched_off(model)]
     names = _names("body", [model.body(i).name for i in range(model.nbody)])
     joint_names = _names("joint", [model.joint(i).name for i in range(model.njnt)])
     coupled = _couplings(model, joint_names, path)
@@ -80,6 +81,19 @@ def read_mjcf(root: Element, path: Path) -> Tree:
         gravity=(0.0, 0.0, 0.0) if weightless else tuple(model.opt.gravity.tolist()),
         reference=_Compiled(model, joint_names),
     )
+
+
+def _switched_off(model: Any) -> Iterator[str]:
+    """Remove the forces that flags of a file switch off, and yield what they are."""
+    bits, flags = mujoco.mjtDisableBit, model.opt.disableflags
+    damper = int(bits.mjDSBL_DAMPER) if hasattr(bits, "mjDSBL_DAMPER") else int(bits.mjDSBL_PASSIVE)  # pyright: ignore[reportAttributeAccessIssue]
+    for bit, force in ((damper, "damping"), (int(bits.mjDSBL_FRICTIONLOSS), "frictionloss")):
+        if flags & bit:
+            for owner in ("dof", "tendon", "actuator"):
+                for name in (f"{owner}_{force}", f"{owner}_{force}poly"):
+                    if hasattr(model, name):
+                        getattr(model, name)[:] = 0.0
+            yield f"{force} is switched"
 
 
 def _names(kind: str, names: list[str]) -> list[str]:

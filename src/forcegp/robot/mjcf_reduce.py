@@ -26,6 +26,8 @@ _OF_PLUGINS = (
     "damping",
 )  # fmt: skip
 """Attributes that an actuator of a plugin shares with other actuators."""
+_FLAGS = "gravity", "damper", "frictionloss", "passive"
+"""Flags that switch off forces of the robot; the last one is of older versions of MuJoCo."""
 _LOOKS = ("user", "material")
 _EQUALITIES = ("joint", "tendon", "connect", "weld")
 _WORDS = (
@@ -50,7 +52,7 @@ def reduce_mjcf(root: Element, path: Path) -> tuple[Element, list[str]]:
         elif section.tag == "option":
             option = SubElement(document, "option", _only(section, ("gravity",)))
             for flag in section.iter("flag"):
-                SubElement(option, "flag", _only(flag, ("gravity",)))
+                SubElement(option, "flag", _only(flag, _FLAGS))
             fluid = ", ".join(name for name in ("density", "viscosity", "wind") if section.get(name))
             remarks += [f"{where}: the forces of {fluid} are ignored"] if fluid else []
         elif section.tag == "worldbody":
