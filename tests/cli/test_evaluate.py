@@ -61,6 +61,18 @@ def test_an_impossible_acceleration_is_left_out_and_named(
     assert found["noisy_rmse"] == pytest.approx(rest["noisy_rmse"]) and rest["left_out"] == []
 
 
+@pytest.mark.parametrize("name", ["q", "qd", "tau"])
+@pytest.mark.parametrize("size", [1e6, -1e8, 1e18])
+def test_any_impossible_value_is_left_out_and_named(
+    name: str, size: float, arm: tuple[Path, forcegp.Dataset], tmp_path: Path
+) -> None:
+    model, log = arm
+    values = getattr(log, name).clone()
+    values[37, 1] = size
+    found = evaluated(model, log.replace(**{name: values}), tmp_path)
+    assert found["left_out"] == [37] and any("Row 37: left out" in text for text in found["doubts"])
+
+
 @pytest.mark.parametrize("rows", [1, 2, 3, 9])
 @pytest.mark.parametrize("size", [None, 1e18])
 def test_few_rows_are_scored_and_compared_with_nothing(

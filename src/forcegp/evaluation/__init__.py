@@ -84,7 +84,7 @@ class Evaluation:
             that has learned the controller.
         motion: open-loop motion if the model predicts forces and the data are in time order.
         payload: change of the payload since the training, if one is found in free motion.
-        left_out: rows of the data that are not evaluated, since their accelerations are impossible.
+        left_out: rows of the data that are not evaluated, since a value in them is impossible.
     """
 
     kind: str
@@ -170,7 +170,7 @@ class Evaluation:
             )
         if self.left_out:
             rows = describe(numbered(np.array(self.left_out))).capitalize()
-            found.append(f"{rows}: left out, since an acceleration is impossible.")
+            found.append(f"{rows}: left out, since a value is impossible.")
         changed = self._responding(self.response, LEAST_RESPONSE, 1.0 / LEAST_RESPONSE)
         doubtful = changed.keys() & self._beyond_mean(SUPPORTED).keys() - weak.keys()
         if other := {joint: x for joint, x in changed.items() if joint in doubtful}:
@@ -240,7 +240,7 @@ def evaluate(
             predictors. The default is the system of the model before learning.
         progress: a function called with the number of states predicted so far and the total number.
 
-    Rows with impossible accelerations are left out, and named in `left_out`. Fewer than ten rows are compared
+    Rows with impossible values are left out, and named in `left_out`. Fewer than ten rows are compared
     with no trivial predictor.
 
     Raises:
@@ -250,7 +250,7 @@ def evaluate(
     if len(data) == 0:
         raise DataError("there is nothing to evaluate on", expected="at least one sample", got="none")
     data.check_robot(model.specified.robot)
-    impossible = outliers(data.qdd)
+    impossible = _impossible(data)
     if bool(impossible.any()):
         scored = evaluate(
             model, data[~impossible], train=train, compare=compare, system=system, progress=progress
@@ -261,6 +261,11 @@ def evaluate(
     except torch.linalg.LinAlgError as cause:  # pyright: ignore[reportPrivateImportUsage]
         text, hint = "a linear system of the evaluation is singular", "look for outliers with forcegp check"
         raise NumericalError(text, got=str(cause)[:200], hint=hint) from cause
+
+
+def _impossible(data: Dataset) -> Tensor:
+    """Return a mask `(n,)` of rows with an impossible position, velocity, acceleration or torque."""
+    return outliers(torch.cat([data.q, data.qd, data.qdd, data.tau], dim=-1))
 
 
 def _evaluated(
@@ -346,7 +351,7 @@ def _trivial(
     system: ConstrainedSystem, data: Dataset, train: Dataset | None
 ) -> dict[str, tuple[Tensor, Tensor, Tensor]]:
     """Return errors, torque errors and standard deviations `(n, nq)` on data not used for training."""
-    train = None if train is None else train[~outliers(train.qdd)]
+    train = None if train is None else train[~_impossible(train)]
     half = len(data) // 2
     parts = [(train, data)] if train is not None else [(data[half:], data[:half]), (data[:half], data[half:])]
     errors: dict[str, list[tuple[Tensor, Tensor, Tensor]]] = {}

@@ -19,17 +19,18 @@ FEWEST = 10
 
 
 POSSIBLE, APART, COMMON = 1e3, 100.0, 0.99
-"""An acceleration that no arm exceeds [rad/s², m/s²], and a multiple of the quantile `COMMON` of all rows."""
+"""A position, velocity, acceleration or torque that few arms exceed (SI units), and a multiple of the
+quantile `COMMON` of all rows."""
 
 
-def outliers(qdd: Tensor) -> Tensor:
-    """Return a mask `(n,)` of rows with an impossible acceleration among accelerations `(n, nq)`.
+def outliers(values: Tensor) -> Tensor:
+    """Return a mask `(n,)` of rows with an impossible entry among values `(n, d)` of a log.
 
-    It exceeds both `POSSIBLE` and `APART` times the quantile of |q̈| of all other rows.
+    It exceeds both `POSSIBLE` and `APART` times the quantile of the magnitudes in all other rows.
     """
-    found = torch.zeros(len(qdd), dtype=torch.bool, device=qdd.device)
+    found = torch.zeros(len(values), dtype=torch.bool, device=values.device)
     while int((~found).sum()) > 1:
-        size = qdd[~found].abs()
+        size = values[~found].abs()
         k = min(math.ceil(COMMON * len(size)), len(size) - 1)
         new = (size > (APART * size.kthvalue(k, dim=0).values).clamp(min=POSSIBLE)).any(-1)
         if not bool(new.any()):
