@@ -372,6 +372,7 @@ def test_wrapped_angles_are_unwrapped_and_the_velocity_keeps_its_sign(tmp_path: 
     [
         ("target_moment_{}", "a command ('target')"),
         ("tau{}_cmd", "a command ('cmd')"),
+        ("u{}", "a command ('u')"),
         ("tau_J_d_{}", "a command ('d')"),
         ("tauref{}", "a command ('ref')"),
         ("SollMoment{}", "a command ('soll')"),
