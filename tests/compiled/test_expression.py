@@ -96,7 +96,7 @@ def test_tangents_are_derivatives() -> None:
     x, y, z = (graph.input("q", i) for i in range(3))
     inner = (x * y - z).tanh()
     whole = (inner * x + (-y).exp() / (z * z + 1.0).sqrt() - x.step() * y) / (2.0 - y) - -z
-    whole = whole + (x * 3.0).sin() * (y * z).cos()
+    whole = whole + (x * 3.0).sin() * (y * z).cos() + abs(x - y) * (1.0 + x * x).log()
     one = graph.constant(1.0)
     seeds = {entry.position: {i: one} for i, entry in enumerate((x, y, z))}
     (rates,) = graph.tangents([whole], seeds)

@@ -12,8 +12,10 @@ from torch import Tensor
 import forcegp
 from forcegp.forces.priors.memory import DISTANCES, BristlePrior, bristles
 from forcegp.forces.term import Array, JointState, JointTerm, exp
+from forcegp.forces.term import log as logarithm
 from forcegp.gp.kernels import Columns, Kernel
 from forcegp.models.calibrated import calibrated
+from forcegp.models.structured_fit import StructuredFit
 from forcegp.rollout import RolloutOptions
 
 DRY, DRAG, BUMP = 0.4, 0.3, 0.25
@@ -31,6 +33,17 @@ class Drag(JointTerm):
     def columns(self, x: JointState) -> dict[str, Array]:
         square = x.qd * x.qd
         return {"dry": x.direction(), "square": square * x.direction(0.1), "bump": x.qd * exp(-square)}
+
+
+@dataclass(frozen=True)
+class Creep(JointTerm):
+    """Friction that grows with the logarithm of the speed."""
+
+    kernel: Kernel = field(default_factory=Columns)
+    name: str = "creep"
+
+    def columns(self, x: JointState) -> dict[str, Array]:
+        return {"creep": x.direction() * logarithm(1.0 + abs(x.qd) / 0.1), "drag": x.qd * abs(x.qd)}
 
 
 def force(qd: Tensor) -> Tensor:
@@ -65,6 +78,23 @@ def test_the_law_is_learned_with_bars(fit) -> None:
     assert float(error.square().mean().sqrt()) < 0.03
     assert float((error.abs() <= 2.0 * found.std + 1e-3).double().mean()) > 0.85
     torch.testing.assert_close(fit.torque_std, torch.full_like(fit.torque_std, 0.05), rtol=0.1, atol=0.0)
+
+
+def test_a_saved_law_keeps_its_parameters(fit, tmp_path: Path) -> None:
+    """Files do not keep the order of the columns, so one load may be right by chance."""
+    fit.save(tmp_path / "model")
+    for _ in range(10):
+        again = forcegp.load_model(tmp_path / "model")
+        assert isinstance(again, StructuredFit) and again.parameters() == fit.parameters()
+
+
+def test_laws_may_use_magnitudes_and_logarithms() -> None:
+    """In C with Jacobians by automatic differentiation, and in PyTorch."""
+    (system, data), (_, test) = log(0, 400), log(2, 20)
+    fit = forcegp.StructuredGP(system, "analytical", [Creep()]).fit(data)
+    one, two = fit.predict(test.q, test.qd, test.tau), fit.compiled().predict(test.q, test.qd, test.tau)
+    torch.testing.assert_close(two.mean, one.mean, rtol=SAME, atol=SAME)
+    torch.testing.assert_close(two.covariance, one.covariance, rtol=1e-7, atol=SAME)
 
 
 def test_compiled_code_and_casadi_read_the_same_lines(fit, tmp_path: Path) -> None:

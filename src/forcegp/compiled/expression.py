@@ -14,7 +14,7 @@ import numpy as np
 
 Node = tuple[str, object, object]
 """Operation and operands: ("const", value, None), ("input", name, index), or (op, left, right) positions."""
-UNARY = ("exp", "tanh", "sqrt", "sin", "cos", "step")
+UNARY = ("exp", "log", "tanh", "sqrt", "sin", "cos", "step")
 """Functions of one operand. `step` is 1 for positive operands and 0 otherwise."""
 Tangents = dict[int, "Scalar"]
 """Derivatives of a scalar, keyed by direction. Missing derivatives are zero."""
@@ -81,7 +81,7 @@ class Graph:
         if j is None:
             factors = {"neg": lambda: self.constant(-1.0), "exp": lambda: value}
             factors |= {"tanh": lambda: 1.0 - value * value, "sqrt": lambda: 0.5 / value}
-            factors |= {"sin": lambda: a.cos(), "cos": lambda: -a.sin()}
+            factors |= {"sin": lambda: a.cos(), "cos": lambda: -a.sin(), "log": lambda: 1.0 / a}
             factor = factors[op]()
             return {d: t * factor for d, t in by_a.items()}
         b, by_b = Scalar(self, j), found[j]  # pyright: ignore
@@ -124,6 +124,13 @@ class Scalar:
     def exp(self) -> Scalar:
         """Return the exponential."""
         return self._function("exp")
+
+    def log(self) -> Scalar:
+        """Return the natural logarithm."""
+        return self._function("log")
+
+    def __abs__(self) -> Scalar:
+        return self * (2.0 * self.step() - 1.0)
 
     def tanh(self) -> Scalar:
         """Return the hyperbolic tangent."""

@@ -34,6 +34,11 @@ def exp(x: Array) -> Array:
     return x.exp() if isinstance(x, Tensor) else np.exp(x)
 
 
+def log(x: Array) -> Array:
+    """Return the natural logarithm of x."""
+    return x.log() if isinstance(x, Tensor) else np.log(x)
+
+
 def sqrt(x: Array) -> Array:
     """Return √x."""
     return x.sqrt() if isinstance(x, Tensor) else np.sqrt(x)
@@ -130,7 +135,10 @@ class JointTerm(PerJointPrior):
 
     @abstractmethod
     def columns(self, x: JointState) -> dict[str, Array]:
-        """Return the named columns φ_c(x_i), each of the shape of `x.qd`."""
+        """Return the named columns φ_c(x_i), each of the shape of `x.qd`.
+
+        They may use arithmetic, `abs`, and the functions of this module, which C and CasADi have too.
+        """
 
     def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
         history = None if at.history is None else at.history.unbind(-1)
