@@ -30,7 +30,7 @@ def end_when_interrupted() -> None:
     os.set_blocking(signals, False)
     signal.set_wakeup_fd(signals, warn_on_full_buffer=False)
     signal.signal(signal.SIGINT, _interrupt)
-    # While the interpreter shuts down, it has no handlers, and the exit code is known.
+    # Python removes its handlers at shutdown, and an interrupt would then replace the exit code.
     atexit.register(signal.signal, signal.SIGINT, signal.SIG_IGN)
 
     def watch() -> None:

@@ -218,19 +218,17 @@ class _Regression:
             gain: standard deviation `(nq,)` due to gains of torque sensors, which no log determines.
             delay: index of the delay, if it is an unknown.
         """
-        blocks, own = len(self.by_stretch.gram), torch.cat([torch.arange(len(gain)), delay])
+        n, blocks = len(gain), range(len(self.by_stretch.gram))
+        own = torch.cat([torch.arange(n), delay])
 
         def read(given: NormalEquations) -> tuple[Tensor, Tensor]:
             h, precision, _ = self.normal(given)
             V = torch.linalg.inv(precision[own][:, own])
-            return (V @ h[own])[: len(gain)], V.diagonal()[: len(gain)]
+            return (V @ h[own])[:n], V.diagonal()[:n]
 
-        (u, V), each = (
-            read(self.by_stretch.total()),
-            [read(self.by_stretch.without(g))[0] for g in range(blocks)],
-        )
-        between = (blocks - 1) * torch.stack(each).var(0, correction=0)
-        variance = V.maximum(between) + gain**2
+        u, V = read(self.by_stretch.total())
+        others = torch.stack([read(self.by_stretch.without(g))[0] for g in blocks])
+        variance = V.maximum((len(blocks) - 1) * others.var(0, correction=0)) + gain**2
         worth = 0.5 * u.square() / variance + 0.5 * variance.log()
         kept = (u > CLEAR * variance.sqrt()) & (worth > 0.0)
         return kept.nonzero()[:, 0], variance.sqrt()

@@ -36,9 +36,9 @@ NOISY = (1.0, 2.0, 4.0)
 MOVES = 0.1
 """Minimum fraction of samples in which a joint must move so that sticking can be detected."""
 RIDGE = 1e-4
-"""Ridge penalty on the scaled friction columns, relative to the number of samples, as friction of joints that
-hardly move is collinear. On held-out blocks of seven real logs, torque errors are 0.65 (Kinova), 0.77 (iiwa)
-and 0.98 to 1.01 times those with 1e-8; with 1e-3, they are 0.88 to 1.10 times those with 1e-4."""
+"""Ridge penalty on the scaled friction columns, relative to the number of samples. If a joint hardly moves,
+its columns are nearly collinear. On held-out blocks of seven training logs, torque errors are 0.65 (Kinova),
+0.77 (iiwa) and 0.98 to 1.01 times those with 1e-8. With 1e-3, they are 0.88 to 1.10 times as large."""
 SIGNIFICANT = 2.0
 """Number of standard errors over blocks above which a difference is significant."""
 APART = 0.05

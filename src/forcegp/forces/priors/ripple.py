@@ -82,7 +82,7 @@ def waves_of(q: Tensor, residual: Tensor) -> tuple[float, ...]:
     while len(waves) < MOST_WAVES and reach > 0.0:
         k, power = _periodogram(q, left, reach)
         known, width = torch.tensor([abs(wave) for wave in waves]).to(k), 2.0 * math.pi / reach
-        # A line is as wide as one over the angle. Others are side lobes, or the slope of a smooth function.
+        # Everything else is a side lobe of a line, or the slope of a smooth function.
         fresh = ((k[:, None] - known).abs() > width).all(-1) & _is_highest(power)
         fresh &= k >= FEWEST_PERIODS * width
         excess = torch.where(fresh, power / _level(power), 0.0)
@@ -90,7 +90,7 @@ def waves_of(q: Tensor, residual: Tensor) -> tuple[float, ...]:
         if float(excess[i]) < math.log(len(k) / OVERSAMPLING) + CERTAIN:
             break
         waves.append(_refined(q, left, float(k[i]), reach))
-        # The other waves move a wave, so each is refined again without them.
+        # A wave shifts the estimates of the others, so each is refined again without the others.
         for m, wave in enumerate(waves[:-1]):
             waves[m] = _refined(q, _without(q, residual, waves[:m] + waves[m + 1 :]), wave, reach)
         left = _without(q, residual, waves)
@@ -121,10 +121,10 @@ def _is_highest(power: Tensor) -> Tensor:
 
 
 def _level(power: Tensor) -> Tensor:
-    """Return the expected power at each wave number, which is ln 2 times below the median of its neighbours.
+    """Return the expected power at each wave number: the median of its neighbours over ln 2.
 
-    At small wave numbers, there are fewer neighbours: the level is steep there, and the median of a monotone
-    function over a symmetric interval is its value in the middle.
+    The level may be steep at small wave numbers. There, fewer neighbours are used, as many on either side,
+    since the median of a monotone function over a symmetric interval is its value in the middle.
     """
     half = OVERSAMPLING * NEIGHBOURS // 2
     padded = torch.cat([power, power[-half - 1 : -1].flip(0)])
