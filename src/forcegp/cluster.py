@@ -14,6 +14,9 @@ from forcegp.errors import optional_module
 if TYPE_CHECKING:
     from distributed import Client
 
+WORKER_ENVIRONMENT = dict.fromkeys(("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"), 1)
+"""Environment of new workers. By default, Dask also sets `MALLOC_TRIM_THRESHOLD_`. With it, glibc returns
+each large array to the system, and sums over samples take 2.5 times as long."""
 X = TypeVar("X")
 Y = TypeVar("Y")
 
@@ -35,6 +38,9 @@ def cluster(workers: int = 2, address: str | None = None) -> Iterator[Client]:
             yield client
         return
     with (
+        optional_module("dask.config", "A cluster", "sweep").set(
+            {"distributed.nanny.pre-spawn-environ": WORKER_ENVIRONMENT}
+        ),
         dask.LocalCluster(n_workers=workers, threads_per_worker=1, dashboard_address="127.0.0.1:0") as local,
         dask.Client(local) as client,
     ):

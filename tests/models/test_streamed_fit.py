@@ -137,6 +137,11 @@ def once_killed(folder: str, item: int) -> int:
     return item
 
 
+def test_workers_keep_their_memory(client: Any) -> None:
+    """With a threshold for returning memory, glibc returns every large array at once."""
+    assert set(client.run(os.environ.get, "MALLOC_TRIM_THRESHOLD_").values()) == {None}
+
+
 @pytest.mark.slow
 def test_the_tasks_of_a_killed_worker_are_repeated(tmp_path: Path) -> None:
     pytest.importorskip("distributed")
