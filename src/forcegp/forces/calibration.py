@@ -9,9 +9,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Mapping
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Iterator, Mapping
 
 import scipy
 import torch
@@ -41,7 +39,6 @@ from forcegp.forces.problem import (
 )
 from forcegp.forces.quantities import affine_map
 from forcegp.forces.unknowns import tip_factor
-from forcegp.gp.basis import LatentBasis
 
 STRETCHES = 8
 """Number of contiguous blocks into which a log with fewer than three segments is divided."""
@@ -245,12 +242,11 @@ def held_out_blocks(
     problem: Problem, hyperparameters: Mapping[str, Tensor]
 ) -> list[tuple[Tensor, Tensor, Tensor]]:
     """Return the residuals, variances and P of each block of the log (see `_held_out`)."""
-    rest, parts = Rest(problem, hyperparameters), []
-    for i in _motions(problem.training):
-        group = stretches(problem.training.measurements[i].segment)
-        for g in group.unique().tolist():
-            parts.append(_held_out(rest, i, (group == g).nonzero()[:, 0]))
-    return parts
+    return [
+        _held_out(problem, hyperparameters, posterior, i, own)
+        for i in _motions(problem.training)
+        for own, posterior in posteriors_of_others(problem, hyperparameters, i)
+    ]
 
 
 def held_out_squares(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> Tensor:
@@ -273,7 +269,6 @@ def growth(problem: Problem, hyperparameters: Mapping[str, Tensor], load: Tensor
         load: typical torque of each joint `(nq,)` [N m, N].
     """
     s2, square, known, slope = hyperparameters[TORQUE_NOISE].exp() ** 2, [], [], []
-    other = Rest(problem, hyperparameters)
     for i in _motions(problem.training):
         m = problem.training.measurements[i]
         for x in (m.qd, m.tau):
@@ -283,7 +278,9 @@ def growth(problem: Problem, hyperparameters: Mapping[str, Tensor], load: Tensor
                 continue
             rest = trained_region(m.qd[~top], m.tau[~top], load)
             own = top.nonzero()[:, 0]
-            residual, V, P = _held_out(other, i, own)
+            others = dataclasses.replace(problem, training=problem.training.without(i, own))
+            posterior = force_posterior(others, hyperparameters)
+            residual, V, P = _held_out(problem, hyperparameters, posterior, i, own)
             D = distance_beyond(rest, m.qd[own], m.tau[own])
             reached = (P.diagonal(dim1=-2, dim2=-1) > 0.5) & (D > 0.0)
             square.append(residual.square()[reached])
@@ -311,47 +308,54 @@ def stretches(segment: Tensor) -> Tensor:
     return torch.arange(n, device=segment.device) * STRETCHES // max(n, 1)
 
 
-@dataclass(frozen=True)
-class Rest:
-    """Forces conditioned on all samples of a problem but some."""
+def posteriors_of_others(
+    problem: Problem, hyperparameters: Mapping[str, Tensor], measurement: int
+) -> Iterator[tuple[Tensor, ForcePosterior]]:
+    """Yield the rows of each block of a measurement, and the forces conditioned on all other samples.
 
-    problem: Problem
-    hyperparameters: Mapping[str, Tensor]
+    The sums of the other blocks are added. Those of one block are not subtracted from those of the whole log,
+    since the rounding errors of the latter, relative to the prior, may exceed one.
+    """
+    training = problem.training
+    group = stretches(training.measurements[measurement].segment)
+    blocks = [(group == g).nonzero()[:, 0] for g in group.unique().tolist()]
+    if problem.inducing is None:
+        for rows in blocks:
+            others = dataclasses.replace(problem, training=training.without(measurement, rows))
+            yield rows, force_posterior(others, hyperparameters)
+        return
+    basis = basis_of(problem, hyperparameters)
 
-    @cached_property
-    def basis(self) -> LatentBasis:
-        """The basis functions of sparse inference."""
-        return basis_of(self.problem, self.hyperparameters)
+    def over(part: Training) -> Totals:
+        return total_over(problem, hyperparameters, basis, part.pieces(PIECE_SAMPLES))
 
-    @cached_property
-    def whole(self) -> Totals:
-        """Sums over all samples."""
-        return self._over(self.problem.training)
+    def only(rows: Tensor) -> Training:
+        index = range(len(training.measurements))
+        return training.of_rows([rows if i == measurement else rows[:0] for i in index])
 
-    def _over(self, training: Training) -> Totals:
-        pieces = training.pieces(PIECE_SAMPLES)
-        return total_over(self.problem, self.hyperparameters, self.basis, pieces)
-
-    def without(self, measurement: int, rows: Tensor) -> ForcePosterior:
-        """Return the forces conditioned on all samples but the given rows of one measurement."""
-        training = self.problem.training
-        if self.problem.inducing is None:
-            rest = dataclasses.replace(self.problem, training=training.without(measurement, rows))
-            return force_posterior(rest, self.hyperparameters)
-        none = rows[:0]
-        chosen = [rows if i == measurement else none for i in range(len(training.measurements))]
-        rest = dataclasses.replace(
-            self.whole, sums=self.whole.sums - self._over(training.of_rows(chosen)).sums
-        )
-        return posterior_of(self.problem, self.hyperparameters, self.basis, rest)
+    everything = torch.arange(len(group), device=group.device)
+    elsewhere = over(training.without(measurement, everything))
+    totals = [over(only(rows)) for rows in blocks]
+    for k, rows in enumerate(blocks):
+        total = sum((totals[j] for j in range(len(totals)) if j != k), start=elsewhere)
+        yield rows, posterior_of(problem, hyperparameters, basis, total)
 
 
-def _held_out(rest: Rest, i: int, own: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """Return held-out torque residuals `(n, nq)` of measurement i, their variance without noise, and P."""
-    problem, hyperparameters = rest.problem, rest.hyperparameters
+def _held_out(
+    problem: Problem,
+    hyperparameters: Mapping[str, Tensor],
+    posterior: ForcePosterior,
+    i: int,
+    own: Tensor,
+) -> tuple[Tensor, Tensor, Tensor]:
+    """Return torque residuals `(n, nq)` of rows of measurement i, their variance without noise, and P.
+
+    Args:
+        posterior: forces conditioned on other samples.
+        own: the rows.
+    """
     training, std = problem.training, problem.noise_at(hyperparameters, i)
     m, system = training.measurements[i][own], problem.system
-    posterior = rest.without(i, own)
     at = m.at(system)
     z, M = affine_map(system, at, m.quantity), at.eom.M
     if m.quantity == "joint_force":
