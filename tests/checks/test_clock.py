@@ -80,6 +80,21 @@ def test_a_unit_that_is_off_is_the_fault_of_the_clock(
     assert report.findings[0].evidence["seconds_per_unit"] == pytest.approx(1.0 / factor, rel=0.05)
 
 
+@pytest.mark.parametrize("derived", [(), ("qdd",)], ids=", ".join)
+def test_minutes_are_told_from_degrees_by_velocities(pendulum: Case, derived: tuple[str, ...]) -> None:
+    system, log = pendulum
+    report = check(system, _derived(log, *derived).replace(t=log.t / 60.0))
+    assert serious(report) - {"period-header"} == {"time-unit"}
+    assert report.findings[0].evidence["seconds_per_unit"] == pytest.approx(60.0, rel=0.01)
+
+
+@pytest.mark.parametrize("derived", [(), ("qdd",)], ids=", ".join)
+def test_positions_in_degrees_are_no_minutes(pendulum: Case, derived: tuple[str, ...]) -> None:
+    system, log = pendulum
+    kinds = serious(check(system, _derived(log, *derived).replace(q=np.degrees(log.q))))
+    assert "degrees" in kinds and "time-unit" not in kinds
+
+
 def _every_seventh(random: np.random.Generator, n: int) -> np.ndarray:
     return np.arange(n) % 7 != 6
 

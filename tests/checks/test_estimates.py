@@ -268,3 +268,13 @@ torque = {{ columns = {{ {shoulder} = "tau.{shoulder}", {elbow} = "tau.{elbow}" 
     assert data.header.derived == ("qd", "qdd")
     (finding,) = of_kind(check(PENDULUM, data), "import-doubt")
     assert finding.message == "a current: give the gear ratio" and finding.severity == "warning"
+
+
+@pytest.mark.parametrize("seed", [0, 2])
+def test_friction_of_joints_that_stick_is_no_other_fault(seed: int) -> None:
+    """Joints reverse where they accelerate most, and hold any load at rest."""
+    scene = load_scene("ur5_free")
+    config = replace(scene.simulation, duration=12.0, seed=seed)
+    report = check(scene.system(), log_of(simulate(scene.system(), config).data))
+    named = {kind for f in report.findings if f.severity != "note" for kind in f.kinds}
+    assert named == {"friction-undeclared", "joint-still"}

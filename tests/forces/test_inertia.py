@@ -25,6 +25,7 @@ from forcegp.forces.inverse_dynamics import (
     averaged,
     instrumental,
     is_harmless,
+    is_less,
     log_ratio,
     partners,
     products,
@@ -542,3 +543,11 @@ def test_the_file_is_kept_where_the_user_says_so(file: RobotModel) -> None:
     assert torch.equal(told["file"].system.robot.mass, light.mass)
     assert not bool(told["file"].system.robot.armature.any())
     assert "inertial" not in [prior.name for prior in told["file"].posterior.priors]
+
+
+def test_few_blocks_show_a_difference_by_chance_no_more_often_than_two_standard_errors() -> None:
+    generator = torch.Generator().manual_seed(0)
+    for blocks in (3, 8):
+        noise = torch.randn(20_000, blocks, generator=generator, dtype=torch.float64)
+        share = sum(is_less(each) for each in noise) / len(noise)
+        assert share == pytest.approx(0.02275, abs=0.004)  # Φ(−2)

@@ -133,6 +133,7 @@ def two_joints() -> tuple[forcegp.ConstrainedSystem, dict[str, np.ndarray]]:
         ("deg_shoulder deg_elbow", "mNm_shoulder mNm_elbow", 1e3, "mNm"),
         ("arm 1 deg|wrist deg", "tau_wide tau_narrow", 1.0, "Nm"),
         ("ang_a[deg] ang_b[deg]", "current_a[mA] current_b[mA]", 1e3, "mA"),
+        ("Istwinkel1[deg] Istwinkel2[deg]", "IstDrehmoment1[Nm] IstDrehmoment2[Nm]", 1.0, "Nm"),
     ],
 )
 def test_names_with_quantities_and_units(

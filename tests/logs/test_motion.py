@@ -79,6 +79,14 @@ def test_a_wrong_unit_of_time_is_found_before_the_log_is_used(tmp_path: Path, fa
         imported(tmp_path, Motion(m.t * factor, m.q, m.qd, m.tau))
 
 
+@pytest.mark.parametrize("factor", [1.0 / 3.6, 0.0864, 60.0])
+def test_velocities_that_no_unit_explains_are_reported(tmp_path: Path, factor: float) -> None:
+    m = motion()
+    report = imported(tmp_path, Motion(m.t, m.q, m.qd * factor, m.tau))
+    assert "velocity" in kinds(report)
+    assert f"q̇ is {factor:.3g} times the derivative of q" in str(report)
+
+
 @pytest.mark.parametrize("factor", [1e-6, 1e-3, 1e6])
 def test_a_wrong_unit_of_time_is_found_without_velocities(tmp_path: Path, factor: float) -> None:
     m = motion()

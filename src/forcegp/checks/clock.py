@@ -22,9 +22,11 @@ from forcegp.rows import describe, intervals
 
 ALIKE = 0.02
 """Tolerance within which all joints have the same slope, which indicates an incorrect clock rate."""
-UNITS = (1e-9, 1e-6, 1e-3, 1e3, 3600.0, 86400.0, 1e6, 1e9)
+UNITS = (1e-9, 1e-6, 1e-3, 60.0, 1e3, 3600.0, 86400.0, 1e6, 1e9)
 """Units that a clock may have instead of seconds, or by which it was divided or multiplied [s]."""
 UNIT_TOLERANCE = 0.1
+DEGREES = (DEGREE, 1.0 / DEGREE)
+"""Factors of a position or velocity in degrees, which are not the clock's."""
 NEAR_WHOLE = 0.05
 """Relative distance from an integer within which the rate of a clock may be that of rows left out evenly."""
 PERIODS, TYPICAL = (2e-5, 1.0), 4e-3
@@ -187,8 +189,8 @@ def check_clock_unit(system: ConstrainedSystem, log: Log) -> Outcome:
         return [], log
     factor = float(np.median(first.low[first.moving]))
     if log.derived or "qdd" in log.header.derived:
-        near = any(abs(factor / unit - 1.0) <= UNIT_TOLERANCE for unit in UNITS)
-        return _clock_finding(log, factor) if near or _one_factor(first, factor) else ([], log)
+        found = _unit(factor) is not None or _one_factor(first, factor)
+        return _clock_finding(log, factor) if found else ([], log)
     second = match(log, "qd", "qdd")
     if second is None or not (both := first.moving & second.moving).any():
         return [], log
@@ -208,9 +210,16 @@ def _implausible_period(log: Log) -> Outcome:
     return found, recomputed(log.replace(t=unit * log.t))
 
 
+def _unit(factor: float) -> float | None:
+    """Return the unit of time that explains a factor, or `None`. Minutes are 60, and degrees 57.3."""
+    if factor <= 0.0:
+        return None
+    unit = min((*UNITS, *DEGREES), key=lambda unit: abs(np.log(factor / unit)))
+    return unit if unit in UNITS and abs(factor / unit - 1.0) <= UNIT_TOLERANCE else None
+
+
 def _clock_finding(log: Log, factor: float) -> Outcome:
-    unit = next((unit for unit in UNITS if abs(factor / unit - 1.0) <= UNIT_TOLERANCE), None)
-    if unit is not None:
+    if (unit := _unit(factor)) is not None:
         kind, scale = "time-unit", unit
         text = f"time advances by {log.dt:.4g} per row, and by the motion {factor * log.dt:.4g} s"
     else:
@@ -230,7 +239,7 @@ def _clock_finding(log: Log, factor: float) -> Outcome:
 
 def _one_factor(level: Match, factor: float) -> bool:
     """Return whether several joints share a slope that is wrong and that degrees do not explain."""
-    degrees = any(abs(np.log(abs(factor) * unit)) <= UNIT_TOLERANCE for unit in (DEGREE, 1.0 / DEGREE))
+    degrees = any(abs(np.log(abs(factor) * unit)) <= UNIT_TOLERANCE for unit in DEGREES)
     if factor <= 0.0 or abs(factor - 1.0) <= TOLERANCE or degrees or level.moving.sum() < 2:
         return False
     related = np.abs(level.correlation[level.moving]) >= EXCHANGED

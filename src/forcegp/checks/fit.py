@@ -7,7 +7,7 @@ normal or tangential, and the hypothesis explains the rest of r.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 import torch
@@ -94,6 +94,11 @@ class TorqueProblem:
     nuisance: Array
     size: Array
     scale: Array
+
+    def at(self, rows: Array) -> TorqueProblem:
+        """Return the problem with the torques of each joint only in the rows of a mask (n, nq)."""
+        J, nuisance = self.J * rows[:, None, :], self.nuisance * rows[..., None]
+        return replace(self, r=self.r * rows, J=J, nuisance=nuisance)
 
     def without_contact(self, x: Array) -> Array:
         """Return P x/scale for columns x of shape (n, nq, p), without contact forces."""

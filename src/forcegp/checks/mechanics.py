@@ -290,10 +290,18 @@ def _weightless(explanation: Explanation, off: list[int]) -> Finding | None:
 
 
 def _unexplained(explanation: Explanation) -> list[Finding]:
+    """Find torques of which most is unexplained: of the whole arm, or of single joints."""
+    log, size = explanation.log, explanation.problem.size
     error = np.median(explanation.fit.error, axis=0) * explanation.problem.scale
-    share = float(np.sqrt((error**2).sum() / (explanation.problem.size**2).sum()))
+    share = float(np.sqrt((error**2).sum() / (size**2).sum()))
     text = f"robot file, friction and offsets leave {100 * share:.0f} % of the torque unexplained"
-    return [explanation.log.finding("torque-unexplained", text, share=share)] if share > UNEXPLAINED else []
+    if share > UNEXPLAINED:
+        return [log.finding("torque-unexplained", text, share=share)]
+    each = error / size
+    wrong = (each > UNEXPLAINED) & (size > FLOOR * size.max())
+    parts = ", ".join(f"{log.joint_names[j]} {100 * each[j]:.0f} %" for j in np.flatnonzero(wrong))
+    text = f"robot file, friction and offsets leave most of some torques unexplained: {parts}"
+    return log.on_joints("joint-unexplained", wrong, text)
 
 
 def _disturbances(explanation: Explanation) -> tuple[list[Finding], np.ndarray]:

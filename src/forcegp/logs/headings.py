@@ -69,11 +69,11 @@ def tokens(name: str) -> list[str]:
 
 @cache
 def _parts(word: str) -> tuple[str, ...]:
-    """Return a quantity and a command or model written as one word, such as `qdes`, as two words."""
+    """Return a quantity and its kind written as one word, such as `qdes` or `istwinkel`, as two words."""
     pairs = ((word[:k], word[k:]) for k in range(1, 0 if word in _KNOWN else len(word)))
     for start, end in pairs:
         for quantity, kind in ((start, end), (end, start)):
-            if quantity in _NAMED - {"w"} and len(kind) > 2 and kind in UNMEASURED:
+            if quantity in _NAMED - {"w"} and len(kind) > 2 and kind in UNMEASURED.union(MEASURED):
                 return start, end
     return (word,)
 
