@@ -41,7 +41,8 @@ from forcegp.forces.quantities import affine_map
 from forcegp.forces.unknowns import tip_factor
 
 STRETCHES = 8
-"""Number of contiguous blocks into which a log with fewer than three segments is divided."""
+"""Number of contiguous blocks into which a log with fewer segments is divided. Three segments are too few to
+show anything: with three, four and a half standard errors are as rare as two known ones."""
 MOST_STRETCHES = 16
 """Maximum number of blocks, each of which requires a posterior; a block may consist of several segments."""
 FEWEST = 50
@@ -300,9 +301,9 @@ def growth(problem: Problem, hyperparameters: Mapping[str, Tensor], load: Tensor
 
 
 def stretches(segment: Tensor) -> Tensor:
-    """Return the block index of each sample. Blocks are segments, or eighths of a log with few segments."""
+    """Return the block index of each sample. Blocks are segments, or eighths of a log with fewer segments."""
     _, own = segment.unique(return_inverse=True)
-    if int(own.max()) + 1 >= 3:
+    if int(own.max()) + 1 >= STRETCHES:
         return own % MOST_STRETCHES
     n = len(segment)
     return torch.arange(n, device=segment.device) * STRETCHES // max(n, 1)
