@@ -229,14 +229,17 @@ def _while_moving(model: Explanation, hypothesis: Hypothesis) -> bool:
     """Return whether a hypothesis explains the torques of moving joints, if joints move in most rows.
 
     At rest dry friction has any value. Joints reverse where they accelerate most, so this resembles masses.
+    Once parameters of the robot are free, they bend to the shape of friction, which is then free as well.
     """
     log, rows = model.log, model.rows
+    shapes = hypotheses.shape_columns(model.system, log, rows)[..., : None if len(model.prior) else 0]
     moving = np.abs(log.qd[rows]) > AT_REST * model.system.robot.friction_velocity.numpy()
     moving |= moving.mean() <= 0.5
 
     def at(changed: Log) -> Explanation:
         columns = model.columns * moving[..., None]
-        return replace(model, problem=model.on(changed).at(moving), columns=columns)
+        wider = replace(model, problem=model.on(changed)).with_nuisance(shapes)
+        return replace(wider, problem=wider.problem.at(moving), columns=columns)
 
     null = at(log)
     if hypothesis.columns is None:
