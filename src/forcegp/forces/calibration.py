@@ -40,9 +40,10 @@ from forcegp.forces.problem import (
 from forcegp.forces.quantities import affine_map
 from forcegp.forces.unknowns import tip_factor
 
-STRETCHES = 8
-"""Number of contiguous blocks into which a log with fewer segments is divided. Three segments are too few to
-show anything: with three, four and a half standard errors are as rare as two known ones."""
+STRETCHES, RECORDINGS = 8, 5
+"""Number of contiguous blocks into which a log with fewer segments than the second number is divided. Three
+segments show little: for them, four and a half standard errors are as rare as two known ones, and for five
+less than three. Eighths that cut the seven segments of a real iiwa hide the drive of its last joint."""
 MOST_STRETCHES = 16
 """Maximum number of blocks, each of which requires a posterior; a block may consist of several segments."""
 FEWEST = 50
@@ -303,7 +304,7 @@ def growth(problem: Problem, hyperparameters: Mapping[str, Tensor], load: Tensor
 def stretches(segment: Tensor) -> Tensor:
     """Return the block index of each sample. Blocks are segments, or eighths of a log with fewer segments."""
     _, own = segment.unique(return_inverse=True)
-    if int(own.max()) + 1 >= STRETCHES:
+    if int(own.max()) + 1 >= RECORDINGS:
         return own % MOST_STRETCHES
     n = len(segment)
     return torch.arange(n, device=segment.device) * STRETCHES // max(n, 1)
