@@ -112,13 +112,13 @@ class JointTerm(PerJointPrior):
         >>> from dataclasses import dataclass, field
         >>> from forcegp.gp.kernels import Columns
         >>> @dataclass(frozen=True)
-        ... class Drag(JointTerm):
+        ... class AirDrag(JointTerm):
         ...     kernel: Columns = field(default_factory=Columns)
-        ...     name: str = "drag"
+        ...     name: str = "air_drag"
         ...
         ...     def columns(self, x):
         ...         return {"quadratic": x.qd * x.qd * x.direction(0.1)}
-        >>> JointTerm.laws["drag"] is Drag
+        >>> JointTerm.laws["air_drag"] is AirDrag
         True
     """
 
