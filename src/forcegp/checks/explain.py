@@ -33,10 +33,10 @@ MATERIAL, MATERIAL_EACH = 0.15, 0.05
 """Minimum material drop in Σ_j log error: in total (14 % at one joint), and per affected joint."""
 
 DISCRETE = ("torque-sign", "joint-sign", "torque-order", "joint-order")
-"""Hypotheses that friction does not resemble."""
+"""Hypotheses that are not mistaken for friction."""
 AT_REST = 0.5
-"""Speed below which a joint may stick, relative to the speed at which dry friction has risen. With factors of
-.2, .5 and 1, masses of a UR5 whose joints stick are right in each of two logs; without, wrong in both."""
+"""Speed below which a joint may stick, relative to the speed at which dry friction has risen. With .2, .5
+and 1, no wrong masses are reported in two logs of a UR5 with correct masses. Without it, they are in both."""
 
 Tried = tuple[Hypothesis, TorqueFit]
 
@@ -228,8 +228,8 @@ def _delays(model: Explanation) -> Iterator[Hypothesis]:
 def _while_moving(model: Explanation, hypothesis: Hypothesis) -> bool:
     """Return whether a hypothesis explains the torques of moving joints, if joints move in most rows.
 
-    At rest dry friction has any value. Joints reverse where they accelerate most, so this resembles masses.
-    Once parameters of the robot are free, they bend to the shape of friction, which is then free as well.
+    At rest, dry friction may have any value, and joints reverse where they accelerate most, so an error of
+    friction resembles one of the masses. If parameters of the robot are fitted, so is the shape of friction.
     """
     log, rows = model.log, model.rows
     shapes = hypotheses.shape_columns(model.system, log, rows)[..., : None if len(model.prior) else 0]

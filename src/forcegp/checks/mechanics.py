@@ -290,7 +290,7 @@ def _weightless(explanation: Explanation, off: list[int]) -> Finding | None:
 
 
 def _unexplained(explanation: Explanation) -> list[Finding]:
-    """Find torques of which most is unexplained: of the whole arm, or of single joints."""
+    """Report an arm, or single joints, if most of the torque is unexplained."""
     log, size = explanation.log, explanation.problem.size
     error = np.median(explanation.fit.error, axis=0) * explanation.problem.scale
     share = float(np.sqrt((error**2).sum() / (size**2).sum()))
@@ -300,7 +300,7 @@ def _unexplained(explanation: Explanation) -> list[Finding]:
     each = error / size
     wrong = (each > UNEXPLAINED) & (size > FLOOR * size.max())
     parts = ", ".join(f"{log.joint_names[j]} {100 * each[j]:.0f} %" for j in np.flatnonzero(wrong))
-    text = f"robot file, friction and offsets leave most of some torques unexplained: {parts}"
+    text = f"robot file, friction and offsets leave most of the torque of some joints unexplained: {parts}"
     return log.on_joints("joint-unexplained", wrong, text)
 
 

@@ -41,9 +41,9 @@ RIDGE = 1e-4
 its columns are nearly collinear. On held-out blocks of seven training logs, torque errors are 0.65 (Kinova),
 0.77 (iiwa) and 0.98 to 1.01 times those with 1e-8. With 1e-3, they are 0.88 to 1.10 times as large."""
 SIGNIFICANT = 2.0
-"""Number of standard errors above which a difference is significant. Errors over few blocks are themselves
-uncertain: with eight, 2.43 of them are as rare as two known ones (Student). Without this, the right file of
-one of 30 simulated contact logs was replaced (2.15 standard errors), and forces were 7 times as wrong."""
+"""Number of standard errors above which a difference is significant. If they are estimated from few blocks,
+Student's t distribution applies: for eight blocks, the threshold is 2.43. With 2.0, the correct robot file
+was replaced for one of 30 simulated contact logs, and force errors were 7 times as large."""
 APART = 0.05
 """Time between a sample and its partner [s], unless the acceleration filter spans a longer time."""
 REACH = 3.0

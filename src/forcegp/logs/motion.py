@@ -22,7 +22,8 @@ STEPS, SLOW_STEP = (1e-5, 10.0), 0.5
 MOST_SPEED, MOST_RATIO = 300.0, 300.0
 """Joint speed [rad/s], and ratio of velocity to dq/dt (or its inverse), that only wrong units explain."""
 DOUBTED = 1.5
-"""Ratio of velocity to dq/dt (or its inverse) that is remarked. With a third of the rows lost, it is .7."""
+"""Ratio of velocity to dq/dt (or its inverse) above which import reports it. If a third of the rows was
+lost, the ratio is 0.7."""
 PARTS, CORRELATED = 100, 0.9
 """Fraction of the log over which displacements are compared; least correlation of such displacements."""
 NEIGHBOURS, CLEAR = 11, 8.0

@@ -175,7 +175,7 @@ def lock_joints(tree: Tree, locked: Mapping[str, float]) -> Tree:
         if name in locked and follows.leader and follows.leader not in held:
             text = f"is locked at {held[name]:g}, and in the file follows {follows.leader!r}"
             remarks.append(f"{tree.label}: joint {name!r} {text}")
-        elif name in locked and (follows.leader in held or not follows.leader):
+        elif name in locked:
             q = follows.position(held.get(follows.leader, 0.0))
             if abs(held[name] - q) > ROUNDING * max(1.0, abs(q)):
                 remarks.append(
