@@ -280,7 +280,10 @@ def mass_matrices(arm: Arm, fit: StructuredFit, q: Tensor) -> dict:
             inverse = latent_precision(posterior, one_row(posterior, fit.problem), p, robot)
             std = (C @ torch.linalg.solve(inverse, C.mT)).diagonal().sqrt().numpy()
             tolerance, unit = arm.wrong.gain / 3.0**0.5, C / prior.scale(robot)
-            per_gain = (unit @ unit.new_tensor(prior.per_gain)).norm(dim=-1).numpy()
+            # Without identified links, no gain changed them.
+            per_gain = (
+                (unit @ unit.new_tensor(prior.per_gain)).norm(dim=-1).numpy() if prior.per_gain else 0.0
+            )
             for key, gains in zip(KINDS, (per_gain, exact, 0.0), strict=True):
                 sigma = np.hypot(std, tolerance * gains)
                 result[f"sigmas{key}"] = ((found - exact) / sigma).tolist()
@@ -345,7 +348,7 @@ def pooled(result: Mapping[str, dict]) -> dict:
     off = {key: np.abs(np.concatenate([m[key] for m in each]) - 1.0) for key in ("file", "fit")}
     pool: dict = {
         "logs": len(each),
-        "identified": sum("sigmas" in m for m in each),
+        "identified": sum(m["fit"] != m["file"] for m in each),
         "untouched": sum(m["fit"] == m["file"] for m in each),
         **{f"median_{key}": float(np.median(x)) for key, x in off.items()},
     }

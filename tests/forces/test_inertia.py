@@ -122,20 +122,20 @@ def test_friction_with_memory_is_not_taken_for_inertia(file: RobotModel, seed: i
     truth = file.replace(mass=1.3 * file.mass, com=0.9 * file.com)
     data = log(truth, seed=seed, memory=0.05)
     result = found(file, data)
-    assert result.per_gain is not None and inertia_error(result.robot, truth, data) < 0.03
+    assert result.errors and result.errors.per_gain and inertia_error(result.robot, truth, data) < 0.03
 
 
 @pytest.mark.parametrize("seed", range(4))
 def test_a_right_file_is_kept(file: RobotModel, seed: int) -> None:
     result = found(file, log(file, seed=seed))
-    assert result.robot is file and result.per_gain is None and not result.doubts
+    assert result.robot is file and result.errors and not result.errors.per_gain and not result.doubts
 
 
 def test_inertia_of_drives_that_the_file_lacks_is_found(file: RobotModel) -> None:
     """Not taken for inertia of the links, which would load the other joint too."""
     armature = torch.tensor([0.3, 0.1], dtype=torch.float64)
     result = found(file, log(file.replace(armature=armature)))
-    assert result.per_gain is None and "the drives have inertia" in result.doubts[0]
+    assert result.errors and not result.errors.per_gain and "the drives have inertia" in result.doubts[0]
     torch.testing.assert_close(result.robot.armature, armature, rtol=0.1, atol=0.0)
 
 
@@ -152,8 +152,9 @@ def test_the_effect_of_a_gain_is_that_of_identifying_again_with_scaled_torques(
         robot = found(file, data.replace(tau=data.tau * (1.0 + gain * only))).robot
         return dynamics.mass_matrix(robot, data.q).diagonal(dim1=-2, dim2=-1).mean(0)
 
-    per_gain = found(file, data).per_gain
-    assert per_gain is not None
+    errors = found(file, data).errors
+    assert errors is not None
+    per_gain = torch.tensor(errors.per_gain, dtype=torch.float64)
     effect = torch.cat([unit_inertia(file, data.q), torch.eye(2).double()], dim=-1) @ per_gain[:, joint]
     expected, size = (diagonal(0.01) - diagonal(-0.01)) / 0.02, diagonal(0.0)
     torch.testing.assert_close(effect / size, expected / size, rtol=0.01, atol=0.003)
@@ -179,7 +180,7 @@ def test_links_that_the_file_describes_wrongly_are_identified(file: RobotModel) 
     truth = file.replace(mass=1.3 * file.mass, com=0.9 * file.com)
     data = log(truth)
     result = found(file, data)
-    assert result.per_gain is not None and "identified inertia replaces" in result.doubts[0]
+    assert result.errors and result.errors.per_gain and "identified inertia replaces" in result.doubts[0]
     assert inertia_error(result.robot, truth, data) < 0.25 * inertia_error(file, truth, data)
     system = forcegp.ConstrainedSystem(file)
     model = forcegp.StructuredGP(system, "analytical")
@@ -202,7 +203,7 @@ def test_a_late_torque_is_not_taken_for_inertia(file: RobotModel, late: float) -
     M, exact = (dynamics.mass_matrix(each, data.q).diagonal(dim1=-2, dim2=-1).mean(0)
                 for each in (result.robot, truth))  # fmt: skip
     torch.testing.assert_close(M, exact, rtol=0.01, atol=0.0)
-    assert result.delay == pytest.approx(-late, abs=1e-3)
+    assert result.errors and result.errors.delay == pytest.approx(-late, abs=1e-3)
 
 
 @pytest.mark.slow
@@ -285,7 +286,7 @@ def test_links_and_drives_are_identified_together(file: RobotModel) -> None:
     truth = file.replace(mass=1.3 * file.mass, com=0.9 * file.com, armature=armature)
     data = log(truth)
     result = found(file, data)
-    assert result.per_gain is not None and "the drives have inertia" in result.doubts[1]
+    assert result.errors and result.errors.per_gain and "the drives have inertia" in result.doubts[1]
     assert inertia_error(result.robot, truth, data) < 0.15 * inertia_error(file, truth, data)
 
 
@@ -332,7 +333,7 @@ def test_noise_of_accelerations_does_not_make_inertia_smaller(file: RobotModel, 
     truth = file.replace(mass=1.3 * file.mass, com=0.9 * file.com)
     data = log(truth, 6400, 2.0, acceleration_noise=noise)
     result = found(file, data)
-    assert result.per_gain is not None
+    assert result.errors and result.errors.per_gain
     own, exact = (dynamics.mass_matrix(each, data.q).diagonal(dim1=-2, dim2=-1).mean(0)
                   for each in (result.robot, truth))  # fmt: skip
     torch.testing.assert_close(own, exact, rtol=0.04, atol=0.0)

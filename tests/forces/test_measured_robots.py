@@ -80,7 +80,7 @@ def test_a_joint_that_moved_one_way_has_friction_the_other_way_too(file: forcegp
 def test_defaults_of_a_measured_log_learn_friction_and_noise(file: forcegp.RobotModel) -> None:
     train, test = log(file, 800, 0), log(file, 400, 7)
     fit = forcegp.StructuredGP(forcegp.ConstrainedSystem(file), "analytical").fit(train)
-    assert [prior.name for prior in fit.force_priors] == ["joint_friction", "bristles"]
+    assert [prior.name for prior in fit.force_priors] == ["joint_friction", "bristles", "inertial"]
     assert fit.torque_std is not None
     torch.testing.assert_close(fit.torque_std, NOISE, rtol=0.2, atol=0.0)
     error = torque_error(fit, test).square().mean(0).sqrt()

@@ -124,6 +124,17 @@ def test_short_intervals_take_the_state_around_them() -> None:
     np.testing.assert_array_equal(closed, (t > 0.3) & (t < 0.7))
 
 
+def test_a_contact_that_flickers_is_not_inverted() -> None:
+    """Neighbouring intervals are all too short: closed and open rows changed places."""
+    t = 0.01 * np.arange(60)
+    signals = Signals(("a",), t, np.arange(60), np.zeros(60, np.int64), {})
+    closed = np.zeros(60, dtype=np.bool_)
+    closed[10:50] = True
+    closed[[20, 22, 23, 25, 27]] = False
+    contact._merge_short(closed, signals, 0.05)
+    assert closed[10:50].all() and not closed[:10].any() and not closed[50:].any()
+
+
 def test_what_is_not_said_of_a_contact_is_an_error(
     pressed: tuple[forcegp.ConstrainedSystem, Signals, np.ndarray],
 ) -> None:

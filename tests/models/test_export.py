@@ -87,6 +87,15 @@ def contained_inertia() -> StructuredFit:
     return dataclasses.replace(fit, posterior=dataclasses.replace(fit.posterior, process=process))
 
 
+def uncertain_inertia() -> StructuredFit:
+    """The same, where predictions follow the robot file and the errors of its inertia widen their bars."""
+    fit, value = fitted("free_inertial"), torch.zeros(77, dtype=torch.float64)
+    process = dataclasses.replace(fit.posterior.process, pinned={1: value})
+    posterior = dataclasses.replace(fit.posterior, process=process)
+    problem = dataclasses.replace(fit.problem, pinned={fit.force_priors[1].name: value})
+    return dataclasses.replace(fit, posterior=posterior, problem=problem)
+
+
 def one_contact() -> StructuredFit:
     """Friction of the joints and, coupled with the multiplier, of a contact."""
     system = forcegp.ConstrainedSystem(two_contacts().robot, two_contacts().contacts[:1], forcegp.Baumgarte())
@@ -167,6 +176,7 @@ CASES: dict[str, Callable[[], StructuredFit]] = {
         free_friction,
         free_inertial,
         contained_inertia,
+        uncertain_inertia,
         one_contact,
         sparse,
         exact,

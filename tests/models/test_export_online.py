@@ -68,7 +68,15 @@ def updated(name: str) -> tuple[CompiledFit, StructuredFit]:
     return compiled(name).update(*state, active=active), fit
 
 
-CASES = ["free_friction", "free_inertial", "one_contact", "sparse", "zero_mean", "rounded_tip"]
+CASES = [
+    "free_friction",
+    "free_inertial",
+    "uncertain_inertia",
+    "one_contact",
+    "sparse",
+    "zero_mean",
+    "rounded_tip",
+]
 
 
 @pytest.mark.parametrize("name", slow_except(CASES, "free_inertial", "one_contact", "zero_mean"))

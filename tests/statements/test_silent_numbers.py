@@ -126,7 +126,6 @@ def test_rows_that_are_lost_and_renumbered_are_named(
     assert text in named.get(kind, "") if kind else not named, (name, named)
 
 
-@pytest.mark.xfail(strict=True, reason="one torque stuck for 4 s in the tested part: ±2σ holds 51 % to 75 %")
 def test_bars_hold_while_a_torque_is_stuck() -> None:
     train, test, truth = parts()
     assert holds(train, stuck(test), truth)

@@ -109,7 +109,7 @@ def rigid_robot(robot: RobotModel, rows: Rows) -> Inertia:
     def accelerations(other: RobotModel, delta: Tensor) -> Tensor:
         return acceleration_errors(rows, single.by_stretch, C, delta, mass_matrix(other, rows.q))
 
-    every, file = found.by_stretch.total(), estimated(delay)
+    every, file, left = found.by_stretch.total(), estimated(delay), prior.around(robot).with_drives(size)
     driving = torch.cat([kept, delay])
     nothing, drives, delta = (found.estimate(every, kept, n) for kept in (delay, driving, everything))
     driven = estimated(driving)
@@ -119,15 +119,17 @@ def rigid_robot(robot: RobotModel, rows: Rows) -> Inertia:
         better = _is_better(compared(lambda _: delta), known)
         if better and is_harmless(accelerations(consistent, delta), before):
             told = _told(robot, consistent.armature - robot.armature, size * std)
-            return Inertia(consistent, change, LATE * float(delta[-1]), (IDENTIFIED, *told))
+            per_gain = tuple(map(tuple, change.tolist()))
+            left = dataclasses.replace(left, per_gain=per_gain, delay=LATE * float(delta[-1]))
+            return Inertia(consistent, left, (IDENTIFIED, *told))
     while len(kept):
         with_drives = robot.replace(armature=robot.armature + size * drives[:n])
         harm = log_ratio(accelerations(with_drives, drives), before).mean(0)
         if float(harm.max()) <= TOLERATED:
-            return Inertia(with_drives, doubts=_told(robot, size * drives[:n], size * std))
+            return Inertia(with_drives, left, _told(robot, size * drives[:n], size * std))
         kept = kept[kept != kept[harm[kept].argmax()]]
         drives = found.estimate(every, torch.cat([kept, delay]), n)
-    return Inertia(robot)
+    return Inertia(robot, left)
 
 
 def _consistent(
@@ -307,15 +309,13 @@ class Inertia:
 
     Attributes:
         robot: robot from the robot file, with the identified inertia.
-        per_gain: if inertial parameters of links were identified and thus remain uncertain, the change of
-            these parameters and of the drives per relative error of each torque sensor's gain `(11 nq, nq)`.
-        delay: time by which the logged torque precedes the motion if links were identified, otherwise 0 [s].
+        errors: prior on the remaining errors of links and drives, or `None` if they are not considered. Their
+            mean is zero, so that predictions follow the robot, and they widen all error bars.
         doubts: warnings for the user.
     """
 
     robot: RobotModel
-    per_gain: Tensor | None = None
-    delay: float = 0.0
+    errors: InertialPrior | None = None
     doubts: tuple[str, ...] = ()
 
 

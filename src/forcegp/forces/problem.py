@@ -116,7 +116,19 @@ class Problem:
             scales = tuple(known[prior.name] for prior in priors)
         training = dataclasses.replace(self.training, scales=(*self.training.scales, *scales))
         more = dataclasses.replace(self, priors=(*self.priors, *priors), training=training, inducing=None)
-        return more if self.inducing is None else without_inducing(more)
+        if self.inducing is None:
+            return more
+        empty = without_inducing(more).inducing or ()
+        return dataclasses.replace(more, inducing=(*self.inducing, *empty[len(self.priors) :]))
+
+    def without_pinned(self) -> Problem:
+        """Return the problem without the forces that the robot includes."""
+        return dataclasses.replace(self.without_priors(self.pinned), pinned={})
+
+    def with_pinned(self, source: Problem) -> Problem:
+        """Return the problem with the forces that the robot of a larger problem includes at its end."""
+        priors = [prior for prior in source.priors if prior.name in source.pinned]
+        return dataclasses.replace(self.with_priors(priors, source), pinned=source.pinned)
 
     def system_at(self, tensors: Mapping[str, Tensor]) -> ConstrainedSystem:
         """Return the system with the robot evaluated at the analytical parameters in the tensors."""

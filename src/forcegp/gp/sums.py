@@ -156,27 +156,49 @@ def accumulate(basis: LatentBasis, blocks: Iterable[Block], chunk: int = CHUNK_S
 
 
 def _add(basis: LatentBasis, block: Block, into: Sums) -> None:
-    """Add a block in place. Only the upper triangle of G is updated."""
+    """Add a block in place. Only the upper triangle of G is updated.
+
+    The rows Φ of components with one column, such as constants, are computed for all of them together.
+    """
     V, prior, missed = basis.evaluate(block.features)
-    # S = WᵀW `(k, k, n)` and c = Wᵀy `(n, k)` of each sample
-    W = torch.cat(block.operators, dim=-1)
-    S, c = (W.mT @ W).permute(1, 2, 0).contiguous(), (W.mT @ block.target[..., None])[..., 0]
-    weighted = torch.empty_like(V)
-    active = [k for k, at in enumerate(basis.columns) if at.stop > at.start and bool(S[k, k].any())]
-    for position, k in enumerate(active):
-        # G_kl += Σ_i V_k S_kl V_lᵀ, v_k += Σ_i V_k c_k
-        of_k = basis.columns[k]
-        for l in active[position:]:
-            torch.mul(V[:, basis.columns[l]], S[k, l, :, None], out=weighted[:, basis.columns[l]])
-        for run in _runs([basis.columns[l] for l in active[position:]]):
-            into.G[of_k, run].addmm_(V[:, of_k].mT, weighted[:, run])
-        into.v[of_k] += V[:, of_k].mT @ c[:, k]
+    W, y = torch.cat(block.operators, dim=-1), block.target
+    # S_kk of S = WᵀW `(n, k)`
+    S_kk = W.square().sum(1)
+    sizes = [at.stop - at.start if bool(S_kk[:, k].any()) else 0 for k, at in enumerate(basis.columns)]
+    wide, narrow = ([k for k, n in enumerate(sizes) if fits(n)] for fits in ((1).__lt__, (1).__eq__))
+    _add_wide(basis, V, W[..., wide], wide, y, into)
+    if narrow:
+        at = torch.tensor([basis.columns[k].start for k in narrow], device=V.device)
+        # Φ = W V, G_NN += ΦᵀΦ, v_N += Φᵀy, and G_kN += Σ_i V_kᵀ (W_kᵀ Φ) for all other components k
+        Phi = W[..., narrow] * V[:, None, at]
+        rows = Phi.flatten(0, 1)
+        into.G[at[:, None], at] += rows.mT @ rows
+        into.v[at] += rows.mT @ y.flatten()
+        across = W[..., wide].mT @ Phi
+        for position, k in enumerate(wide):
+            own = torch.arange(basis.columns[k].start, basis.columns[k].stop, device=V.device)
+            both, later = V[:, own].mT @ across[:, position], at > own[0]
+            into.G[own[:, None], at[later]] += both[:, later]
+            into.G[at[~later][:, None], own] += both[:, ~later].mT
     # tr W k Wᵀ = Σ_k S_kk k_k(x, x), and of what is missed, k − |V|²
-    S_kk = torch.diagonal(S, dim1=0, dim2=1)
     into.prior.add_(_by_process(basis, S_kk, prior))
     into.missed.add_(_by_process(basis, S_kk, missed))
-    into.yy.add_((block.target**2).sum())
+    into.yy.add_((y**2).sum())
     into.rows.add_(block.rows)
+
+
+def _add_wide(basis: LatentBasis, V: Tensor, W: Tensor, wide: list[int], y: Tensor, into: Sums) -> None:
+    """Add the components with several columns, whose rows W V would need too much memory."""
+    # S = WᵀW `(k, k, n)` and c = Wᵀy `(n, k)` of each sample
+    S, c = (W.mT @ W).permute(1, 2, 0).contiguous(), (W.mT @ y[..., None])[..., 0]
+    weighted, columns = torch.empty_like(V), [basis.columns[k] for k in wide]
+    for k, of_k in enumerate(columns):
+        # G_kl += Σ_i V_k S_kl V_lᵀ, v_k += Σ_i V_k c_k
+        for l, of_l in enumerate(columns[k:], k):
+            torch.mul(V[:, of_l], S[k, l, :, None], out=weighted[:, of_l])
+        for run in _runs(columns[k:]):
+            into.G[of_k, run].addmm_(V[:, of_k].mT, weighted[:, run])
+        into.v[of_k] += V[:, of_k].mT @ c[:, k]
 
 
 def _by_process(basis: LatentBasis, S_kk: Tensor, variance: Tensor) -> Tensor:

@@ -1,7 +1,8 @@
 """A fit of columns to a log, as the list of its steps.
 
 1. Samples at rest only bound friction, and impacts violate the equations of motion; the others are used.
-2. Inertia is identified with instruments, if held-out parts of the log confirm it (`forces/inertia.py`).
+2. Inertia is identified with instruments, if held-out parts of the log confirm it (`forces/inertia.py`). Its
+   remaining errors are unknowns of zero mean.
 3. Scales of all columns, torque noise and static friction follow from the evidence (`scales.py`), and the
    Coulomb friction of contacts, which is not linear in its parameters, from a search given these scales.
 4. Torque noise is raised to the level observed on held-out blocks of the log (`forces/calibration.py`).
@@ -154,7 +155,7 @@ def regression(
     values = {**found.values, **memory_noise(found)}
     objective = -found.evidence.log_evidence
     return Regression(
-        found.problem,
+        found.problem.without_pinned().with_pinned(part),
         values,
         found.problem.training.samples,
         found.rounds,
@@ -227,15 +228,16 @@ def with_remainder(
     """
     later = [prior for prior in whole.priors if prior.remainder]
     names = {prior.name for prior in later}
-    problem = laws.problem.with_priors(later, whole)
+    given = laws.problem.without_pinned()
+    problem = given.with_priors(later, whole)
     values = {**laws.values, **start}
     problem = with_inducing(problem, values, SUPPORT)
     found = learned_scales(problem, values, lambda name: name in names and learns(name), noisy, False)
     found = dataclasses.replace(found, idle=laws.idle)
     if not prunes or not all(map(learns, names)):
         return found
-    after, before = (held_out_squares(each.problem, each.values) for each in (found, laws))
-    kept = _are_smaller(after - before)
+    changes = held_out_squares(found.problem, found.values) - held_out_squares(given, laws.values)
+    kept = _are_smaller(changes)
     if not any(kept):
         return laws
     return without_components(

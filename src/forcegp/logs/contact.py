@@ -325,12 +325,21 @@ def hysteresis(values: Array, high: float, low: float, segment: NDArray[np.int64
 
 
 def _merge_short(closed: NDArray[np.bool_], signals: Signals, shortest: float) -> int:
-    """Merge intervals shorter than `shortest` [s] with their neighbours, and return how many were merged."""
+    """Merge intervals shorter than `shortest` [s] with their neighbours, and return how many were merged.
+
+    The shortest interval is merged first, and of equal ones that with the longest neighbours.
+    """
     count = 0
     for trajectory in signals.runs():
         t, state = signals.t[trajectory], closed[trajectory]
-        for rows in runs(state)[1:-1]:
-            if t[rows.stop - 1] - t[rows.start] < shortest:
-                state[rows] = ~state[rows]
-                count += 1
+        bounds = np.concatenate([[0], np.flatnonzero(np.diff(state)) + 1, [len(state)]])
+        while len(bounds) > 3:
+            length = t[bounds[1:] - 1] - t[bounds[:-1]]
+            own, around = length[1:-1], length[:-2] + length[2:]
+            i = int(np.lexsort((-around, own))[0])
+            if own[i] >= shortest:
+                break
+            bounds, count = np.delete(bounds, [i + 1, i + 2]), count + 1
+        for start, stop in zip(bounds[:-1], bounds[1:], strict=True):
+            state[start:stop] = state[start]
     return count

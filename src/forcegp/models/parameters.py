@@ -36,7 +36,8 @@ class LearnedParameter:
 
     Attributes:
         name: name of the prior, the parameter, and the joint, if any.
-        value, std: posterior mean and standard deviation; zero mean if the robot includes the parameter.
+        value, std: value used for predictions, which is zero if the robot includes the parameter, and root mean
+            square deviation of the posterior from it.
         unit: SI unit.
         determined: whether the data reduce the standard deviation to less than half that of the prior.
     """
@@ -53,16 +54,17 @@ def learned_parameters(
     posterior: ForcePosterior, hyperparameters: Mapping[str, Tensor], robot: RobotModel
 ) -> tuple[LearnedParameter, ...]:
     """Return the parameters of all terms with finitely many columns (see `StructuredFit.parameters`)."""
-    latent = posterior.means
-    if not isinstance(latent, SparsePosterior):
+    latent, means = posterior.latent, posterior.means
+    if not isinstance(latent, SparsePosterior) or not isinstance(means, SparsePosterior):
         return ()
     inverse = torch.linalg.solve_triangular(latent.L, torch.eye(len(latent.L)).to(latent.L), upper=False)
-    deviation, found = inverse.square().sum(0).sqrt(), []
+    apart = latent.weights - means.weights
+    deviation, found = (inverse.square().sum(0) + apart.square()).sqrt(), []
     for p, part in enumerate(latent.basis.parts):
         if part.split.rest is None:
             own = latent.basis.of_process(p)
             shape = part.components, -1
-            rows = latent.weights[own].view(shape), deviation[own].view(shape)
+            rows = means.weights[own].view(shape), deviation[own].view(shape)
             found += _of_prior(posterior, hyperparameters, robot, p, *rows)
     return tuple(found)
 

@@ -27,7 +27,7 @@ from forcegp.data import Dataset
 from forcegp.data.fields import common_stick_speeds
 from forcegp.errors import check_name
 from forcegp.forces.calibration import calibrated_noise, residual_times
-from forcegp.forces.inertia import VOLUME_STATES, Inertia, drive_scale, inertia_of, with_updated_robot
+from forcegp.forces.inertia import Inertia, inertia_of, with_updated_robot
 from forcegp.forces.inverse_dynamics import LEAST, without_delay
 from forcegp.forces.measurements import (
     Observation,
@@ -227,8 +227,8 @@ def problem_for(
         part_of: total number of samples to condition on, if the data are only part of these samples.
 
     Returns:
-        The model, the problem, and warnings about the samples and the robot. If a first fit identifies the
-        robot, the model has a prior on the remaining inertia errors.
+        The model, the problem, and warnings about the samples and the robot. If a first fit considers the
+        inertia, the model has a prior on its remaining errors.
     """
     training, doubts = training_for(spec, before, data, chosen)
     robot, pinned = spec.system.robot, dict[str, Tensor]()
@@ -237,25 +237,11 @@ def problem_for(
     elif before is None and chosen is None:
         found = spec.inertia_of(training)
         robot, doubts = found.robot, (*doubts, *found.doubts)
-        if found.per_gain is not None:
-            spec, pinned = identified(spec, training, found)
+        if found.errors is not None:
+            spec = dataclasses.replace(spec, priors=(*spec.priors, found.errors))
+            pinned = {found.errors.name: robot.mass.new_zeros(found.errors.outputs(robot))}
             training, _ = training_for(spec, before, data, chosen)
     return spec, spec.problem(dataclasses.replace(training, part_of=part_of), robot, pinned), doubts
-
-
-def identified(
-    spec: Specification, training: Training, inertia: Inertia
-) -> tuple[Specification, dict[str, Tensor]]:
-    """Return the model for the robot with identified inertia and with inertia errors of zero mean."""
-    robot = spec.system.robot
-    q = torch.cat([m.q for m in training.evenly(VOLUME_STATES).measurements])
-    size = drive_scale(robot, q)
-    assert inertia.per_gain is not None
-    per_gain = tuple(map(tuple, inertia.per_gain.tolist()))
-    errors = InertialPrior().around(robot).with_drives(size)
-    errors = dataclasses.replace(errors, per_gain=per_gain, delay=inertia.delay)
-    pinned = {errors.name: robot.mass.new_zeros(errors.outputs(robot))}
-    return dataclasses.replace(spec, priors=(*spec.priors, errors)), pinned
 
 
 def training_for(

@@ -170,7 +170,7 @@ class CompiledFit(Predictor):
         if not self.model.online:
             raise ModelError(
                 "this fit cannot learn online in C",
-                expected="sparse inference with all basis functions, no state noise, and no learned inertia",
+                expected="sparse inference with all functions, no state noise, learned inertia or delay",
                 hint="call the `update` method of the fit",
             )
         parts = self.model.parts()

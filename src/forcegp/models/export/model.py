@@ -143,8 +143,15 @@ class ExportedModel:
 
     @property
     def online(self) -> bool:
-        """Whether the model can learn online, which requires basis functions with their full covariance."""
-        return self.sign > 0 and not self.posterior.process.pinned and self.sampling is not None
+        """Whether the model can learn online, which requires basis functions with their full covariance.
+
+        Forces that the robot includes must be zero and come last, and the torque must not be delayed.
+        """
+        process, priors = self.posterior.process, self.posterior.priors
+        last = set(range(len(priors) - len(process.pinned), len(priors)))
+        known = set(process.pinned) == last and not any(bool(x.any()) for x in process.pinned.values())
+        timely = not any(prior.delay for prior in priors)
+        return self.sign > 0 and known and timely and self.sampling is not None
 
     def check(self) -> None:
         """Check that all parts of the model have a C form.

@@ -6,10 +6,17 @@
  *   c' = (c - Y g) / gamma,  Y' = Y + (c - Y g / (gamma + 1)) g^T / gamma.
  * Finally, X X^T = noise + Phi A^-1 Phi^T and Y X^T = A^-1 Phi^T, so w' = w + Y X^-1 (y - Phi w). */
 
-/* weights of k(x, Z) and phi(x), computed from those of the whitened functions */
+/* weights of k(x, Z) and phi(x), computed from those of the whitened functions. The last ones, of forces that the robot
+ * includes, are zero: with K = (K_oo, 0; K_po, K_pp), the others then are w_o - K_po^T K_pp^-T w_p */
 static int fold(forcegp_learned *s) {
+  double given[RANK];
+  memcpy(given, s->weights, sizeof given);
+  for (int j = RANK - 1; j >= INCLUDED; --j) {
+    const double *c = s->root + (long)j * (j + 1) / 2, z = given[j] / c[j];
+    for (int i = 0; i <= j; ++i) given[i] -= z * c[i];
+  }
   for (int k = 0; k < COMPONENTS; ++k) {
-    const double *w = s->weights + FUNCTION[k];
+    const double *w = given + FUNCTION[k];
     const int m = POINTS[k], features = FOLDED[k + 1] - FOLDED[k] - m, kept = FUNCTION[k + 1] - FUNCTION[k] - features;
     for (int i = 0; i < m; ++i) s->folded[FOLDED[k] + i] = dot(WHITENINGS[k] + (long)i * kept, w, kept);
     memcpy(s->folded + FOLDED[k] + m, w + kept, sizeof(double) * features);

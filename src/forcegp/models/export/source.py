@@ -286,7 +286,9 @@ class Writer:
         self.array(self.starts, "FIRST_COMPONENT", "int")
         self.array(variance, "LEARNED_TORQUE_VARIANCE")
         group = "CONTACTS * 3 > NQ ? CONTACTS * 3 : NQ"
-        self.lines.append(f"enum {{ PRIOR_COUNT = {len(parts)}, GROUP = {group} }};")
+        basis, pinned = latent.basis, self.model.posterior.process.pinned
+        included = basis.of_process(min(pinned)).start if pinned else basis.size
+        self.lines.append(f"enum {{ PRIOR_COUNT = {len(parts)}, GROUP = {group}, INCLUDED = {included} }};")
         self.lines.append(f"static const double REST_SPEED = {REST_SPEED if moving else -1.0!r};")
         self.lines.append(f"static const double TEMPERING = {power**0.5!r};")
 
