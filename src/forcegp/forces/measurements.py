@@ -26,6 +26,9 @@ from forcegp.forces.quantities import QUANTITIES, States, states
 from forcegp.gp.features import Standardization
 from forcegp.robust import MAD_TO_STD
 
+KEPT = 4000
+"""Maximum number of samples whose equations of motion are kept."""
+
 
 @dataclass(frozen=True)
 class Measurement:
@@ -71,10 +74,19 @@ class Measurement:
         return (*self.states, self.values)
 
     def at(self, system: ConstrainedSystem) -> States:
-        """Return the states with their equations of motion and, if available, the measured accelerations."""
+        """Return the states with their equations of motion and, if available, the measured accelerations.
+
+        Those of at most `KEPT` samples are kept for the next call, since learning needs them many times.
+        """
+        kept = self.__dict__.get("_kept")
+        if kept is not None and kept[0] is system:
+            return kept[1]
         time = torch.stack([self.t, self.segment.to(self.t)], dim=-1)
         at = states(system, *self.states, qdd=self.values if self.quantity == "qdd" else None, time=time)
-        return at if self.history is None else dataclasses.replace(at, history=self.history)
+        at = at if self.history is None else dataclasses.replace(at, history=self.history)
+        if len(self.q) <= KEPT:
+            object.__setattr__(self, "_kept", (system, at))
+        return at
 
     @property
     def digests(self) -> Tensor:

@@ -302,7 +302,7 @@ def typical(std: Tensor) -> Tensor:
     return std if std.ndim == 1 else std.square().mean(0).sqrt()
 
 
-PIECE_SAMPLES = 8192
+PIECE_SAMPLES = 2048
 """Number of samples whose equations of motion are kept in memory at a time."""
 
 

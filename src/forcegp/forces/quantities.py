@@ -15,7 +15,7 @@ The mechanics are differentiated in closed form, and the force field is differen
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from typing import NamedTuple
 
 import torch
@@ -24,6 +24,7 @@ from torch.linalg import vecdot
 
 from forcegp.constraints import ConstrainedSystem, Equations
 from forcegp.errors import ModelError, ShapeError, UnknownNameError
+from forcegp.robot.model import RobotModel
 
 
 @dataclass(frozen=True)
@@ -38,6 +39,7 @@ class States:
         slip: `(n, nq)` sliding direction of each joint, which replaces tanh(q̇/v₀) in dry friction.
         time: `(n, 2)` time [s] and trajectory number, for states in a training log.
         history: `(n, nq, 2 k)` states of bristles for states along a log (`forces/priors/memory.py`).
+        kept: operators that were computed at these states, with their robots and priors, keyed by prior.
     """
 
     q: Tensor
@@ -49,6 +51,7 @@ class States:
     slip: Tensor | None = None
     time: Tensor | None = None
     history: Tensor | None = None
+    kept: dict[str, tuple[RobotModel, object, Tensor]] = field(init=False, repr=False, default_factory=dict)
 
 
 def states(

@@ -259,18 +259,26 @@ class SparsePosterior:
             blocks.append(filled.unflatten(0, part.used.shape))
         return blocks
 
-    def _latent(self, features: Sequence[Features]) -> tuple[Tensor, Tensor, Tensor]:
-        """Return T `(n, components, size)`, where T Tᵀ is the covariance represented by the basis, and the
-        residual and prior variances k(x, x) of the approximated part of all components, each `(n,
-        components)`. Squares of exact features do not cancel."""
-        T, missed, prior = [], [], []
-        for part, inverse, x in zip(self.basis.parts, self._inverse_factor, features, strict=True):
-            # T = Vᵀ L⁻ᵀ, so that T Tᵀ = Vᵀ A⁻¹ V
+    def _root(self, block: Block) -> tuple[Tensor, Tensor, Tensor]:
+        """Return R `(n, d, size)`, where R Rᵀ is the covariance represented by the basis.
+
+        Also return the residual and prior variances k(x, x) of the approximated part of all components, each
+        `(n, components)`. Squares of exact features do not cancel.
+        """
+        root: Tensor | float = 0.0
+        missed, prior = [], []
+        parts = zip(self.basis.parts, self._inverse_factor, block.features, block.operators, strict=True)
+        for part, inverse, x, W in parts:
+            # R = W Vᵀ L⁻ᵀ, so that R Rᵀ = W Vᵀ A⁻¹ V Wᵀ
             V, explained = part.values(x)
-            T.append(V @ inverse)
+            one = V.shape[-1] == 1
+            root = root + (
+                (W * V[..., 0].mT[:, None]) @ inverse[:, 0] if one else W @ (V @ inverse).transpose(0, 1)
+            )
             prior.append(part.rest_variance(x))
             missed.append(part.missed(prior[-1], explained))
-        return torch.cat(T).transpose(0, 1), torch.cat(missed).mT, torch.cat(prior).mT
+        assert isinstance(root, Tensor)
+        return root, torch.cat(missed).mT, torch.cat(prior).mT
 
     def covariance(self, block: Block) -> Tensor:
         """Return the posterior covariance `(n, d, d)` of the rows of each sample, excluding noise.
@@ -285,9 +293,8 @@ class SparsePosterior:
         parts = [block.target.new_zeros(0, d, d)]
         for chunk in chunked([block], CHUNK_PREDICTIONS):
             W = torch.cat(chunk.operators, dim=-1)
-            T, missed, prior = self._latent(chunk.features)
-            # Σ* = W (T Tᵀ + diag(k − |V|²)) Wᵀ (eq. 24)
-            root = W @ T
+            root, missed, prior = self._root(chunk)
+            # Σ* = R Rᵀ + W diag(k − |V|²) Wᵀ (eq. 24)
             posterior = root @ root.mT + (W * missed[:, None]) @ W.mT
             parts.append(require_resolved_variance(posterior, (W.square() @ prior[..., None])[..., 0]))
         covariance = torch.cat(parts)

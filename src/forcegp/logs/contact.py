@@ -14,7 +14,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from itertools import combinations
+from itertools import combinations, pairwise
 
 import numpy as np
 import torch
@@ -340,6 +340,6 @@ def _merge_short(closed: NDArray[np.bool_], signals: Signals, shortest: float) -
             if own[i] >= shortest:
                 break
             bounds, count = np.delete(bounds, [i + 1, i + 2]), count + 1
-        for start, stop in zip(bounds[:-1], bounds[1:], strict=True):
+        for start, stop in pairwise(bounds):
             state[start:stop] = state[start]
     return count

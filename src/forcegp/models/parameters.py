@@ -36,8 +36,8 @@ class LearnedParameter:
 
     Attributes:
         name: name of the prior, the parameter, and the joint, if any.
-        value, std: value used for predictions, which is zero if the robot includes the parameter, and root mean
-            square deviation of the posterior from it.
+        value, std: value used for predictions, which is zero if the robot includes the parameter, and root
+            mean square deviation of the posterior from it.
         unit: SI unit.
         determined: whether the data reduce the standard deviation to less than half that of the prior.
     """

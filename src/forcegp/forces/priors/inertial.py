@@ -86,12 +86,17 @@ class InertialPrior(ConstantForcePrior):
         return PER_LINK * robot.nq + len(self.drives)
 
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
+        robot, kept = system.robot, at.kept.get(self.name)
+        if kept is not None and kept[0] is robot and kept[1] is self:
+            return kept[2]
         # Without a measured acceleration, that of the analytical model is used.
         qdd = at.eom.acceleration(at.eom.Q_K + at.tau) if at.qdd is None else at.qdd
-        columns = regressor(system.robot, at.q, at.qd, qdd)
+        columns = regressor(robot, at.q, at.qd, qdd)
         if self.drives:
             columns = torch.cat([columns, torch.diag_embed(qdd)], dim=-1)
-        return -columns * self.scale(system.robot)
+        columns = -columns * self.scale(robot)
+        at.kept[self.name] = robot, self, columns
+        return columns
 
     def scale(self, robot: RobotModel) -> Tensor:
         """Return the standard deviations S without learned scales: `(10 nq,)`, or `(11 nq,)` with drives."""
