@@ -289,9 +289,14 @@ def memory_noise(found: Scales) -> Tensors:
 
 
 def worth_of(found: Scales) -> dict[str, float]:
-    """Return the log evidence of each prior and joint over its absence [nats]; 0 for those dropped."""
+    """Return the log evidence of each prior and joint over its absence [nats]; 0 for those dropped.
+
+    Forces that the robot includes are not judged.
+    """
     result, joints, priors = {}, found.problem.system.robot.joint_names, found.problem.priors
     for (p, k), family in families_of(found.groups).items():
+        if priors[p].name in found.problem.pinned:
+            continue
         several = found.values[found.groups[family[0]].key].shape[0] > 1
         part = f" of {joints[k]}" if priors[p].per_joint else f" {k + 1}" if several else ""
         name = f"{priors[p].name}{part}"

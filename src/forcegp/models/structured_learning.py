@@ -45,7 +45,7 @@ from forcegp.forces.noise_learning import left_out, weighted, with_learned_slope
 from forcegp.forces.posterior import REGION
 from forcegp.forces.priors.base import ANALYTICAL, COULOMB, NOISE, ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior
-from forcegp.forces.priors.joint import AnalyticalMean, JointFrictionPrior
+from forcegp.forces.priors.joint import AnalyticalMean, ConstantForcePrior, JointFrictionPrior
 from forcegp.forces.priors.memory import LONGEST_STEP, PAST, BristlePrior
 from forcegp.forces.priors.residual import ResidualPrior
 from forcegp.forces.problem import Problem, is_finite, is_sparse, with_inducing, without_inducing
@@ -188,8 +188,9 @@ def _unchecked_masses(training: Training) -> tuple[str, ...]:
 
 
 def constant_inputs(problem: Problem) -> tuple[str, ...]:
-    """Return the inputs that are constant in the training data, for each prior."""
+    """Return the inputs that are constant in the training data, for each prior that has inputs."""
     pairs = zip(problem.priors, problem.training.scales, strict=True)
+    pairs = (pair for pair in pairs if not isinstance(pair[0], ConstantForcePrior))
     return tuple(f"{prior.name}.{name}" for prior, scale in pairs for name in scale.constant)
 
 
