@@ -63,6 +63,10 @@ class Measurement:
         if self.t is None:
             object.__setattr__(self, "t", torch.zeros_like(self.q[:, 0]))
 
+    def __getstate__(self) -> dict[str, object]:
+        """Return the fields without the equations of motion that are kept, which other processes compute."""
+        return {name: value for name, value in self.__dict__.items() if name != "_kept"}
+
     @property
     def states(self) -> tuple[Tensor, Tensor, Tensor, Tensor]:
         """Return q, q̇, τ and the flags of closed contacts."""

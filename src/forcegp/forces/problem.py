@@ -126,7 +126,7 @@ class Problem:
         return dataclasses.replace(self.without_priors(self.pinned), pinned={})
 
     def with_pinned(self, source: Problem) -> Problem:
-        """Return the problem with the forces that the robot of a larger problem includes at its end."""
+        """Append the forces that the robot of another problem includes."""
         priors = [prior for prior in source.priors if prior.name in source.pinned]
         return dataclasses.replace(self.with_priors(priors, source), pinned=source.pinned)
 
