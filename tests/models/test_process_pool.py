@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import multiprocessing
 import os
+import pickle
 import sys
 from collections.abc import Iterator
 from concurrent.futures import ProcessPoolExecutor
@@ -66,3 +68,12 @@ def test_a_fit_of_python_code_says_so_before_it_is_sent(pool: ProcessPoolExecuto
     fit = forcegp.StructuredGP(table_system(), "zero", force_priors=[hill], noise=0.1).fit(DATA, learn=[])
     with pytest.raises(ModelError, match="contains Python code"):
         pool.submit(predicted, fit, "qdd").result(timeout=120)
+
+
+def test_equations_that_a_measurement_keeps_are_not_sent() -> None:
+    """They are many times as large as the samples."""
+    fit = forcegp.StructuredGP(table_system(), noise=0.1).fit(DATA, learn=[])
+    (m,) = fit.training.measurements
+    plain = len(pickle.dumps(dataclasses.replace(m)))
+    assert m.at(fit.system) is m.at(fit.system)
+    assert len(pickle.dumps(m)) == plain
