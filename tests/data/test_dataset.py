@@ -105,6 +105,10 @@ def test_rows_in_any_order_make_a_data_set_of_points() -> None:
         assert not points.header.ordered
     order = torch.arange(len(log) - 1, -1, -1)
     fields = {name: getattr(log, name)[order] for name in ("t", "q", "qd", "tau", "qdd", "segment")}
+    again = log[[7, 0, 3]].in_time_order()
+    assert again.header.ordered and torch.equal(again.t, log.t[[0, 3, 7]])
+    twice = log[[7, 0, 7]].in_time_order()
+    assert not twice.header.ordered and torch.equal(twice.t, log.t[[0, 7, 7]])
     with pytest.raises(DataError, match=r"'t' does not increase(.|\n)*data\[rows\](.|\n)*ordered=False"):
         Dataset(**fields, joint_names=log.joint_names)
     points = Dataset(**fields, joint_names=log.joint_names, header=DataHeader(ordered=False))

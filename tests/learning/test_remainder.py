@@ -9,6 +9,7 @@ import torch
 from torch import Tensor
 
 import forcegp
+from forcegp.forces.measurements import observations_of
 from forcegp.forces.priors.memory import Past, bristles
 from forcegp.forces.priors.sets import friction_priors
 from forcegp.gp.sums import Sums, without_feedback
@@ -100,6 +101,24 @@ def test_without_such_a_force_there_is_no_residual() -> None:
     system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
     fit = forcegp.StructuredGP(system).fit(logged(0.0)[0])
     assert "residual" not in [prior.name for prior in fit.force_priors]
+
+
+def test_the_order_of_rows_has_no_effect_on_a_fit() -> None:
+    # Without order, held-out blocks contain neighbours of the samples, and noise is kept as a force.
+    data, _ = logged(0.0)
+    system = forcegp.ConstrainedSystem(forcegp.load_robot("double_pendulum"))
+    shuffled = data[torch.randperm(len(data), generator=torch.Generator().manual_seed(0))]
+    assert not shuffled.header.ordered
+    one, two = (forcegp.StructuredGP(system).fit(each).predict_log(data) for each in (data, shuffled))
+    assert torch.equal(one.mean, two.mean) and torch.equal(one.std, two.std)
+
+
+def test_noise_of_each_row_moves_with_its_row() -> None:
+    data, _ = logged(0.0)
+    order = torch.randperm(len(data), generator=torch.Generator().manual_seed(0))
+    noise = 1.0 + data.q.square()
+    (sorted_,) = observations_of([forcegp.Observation(data[order], noise_std=noise[order])])
+    assert torch.equal(sorted_.data.t, data.t) and torch.equal(torch.as_tensor(sorted_.noise_std), noise)
 
 
 @pytest.mark.parametrize("cut", [1, 137, 400])

@@ -116,6 +116,19 @@ class Dataset(Fields):
         header = self.header.model_copy(update={"ordered": ordered})
         return self._map(lambda value: value[index], header=header)
 
+    def in_time_order(self) -> Dataset:
+        """Return the same rows sorted by segment and time.
+
+        `header.ordered` is then true, unless two rows of a segment have the same time.
+        """
+        if self.header.ordered:
+            return self
+        data = self[fields.in_time(self.t, self.segment)]
+        same = data.segment[1:] == data.segment[:-1]
+        if bool((same & (data.t.diff() <= 0.0)).any()):
+            return data
+        return data.replace(header=data.header.model_copy(update={"ordered": True}))
+
     @property
     def nq(self) -> int:
         """Number of joints."""

@@ -251,6 +251,12 @@ def check_time(data: Fields) -> None:
         raise DataError(text, hint="sort the log by 'segment' and 't'")
 
 
+def in_time(t: Tensor, segment: Tensor) -> Tensor:
+    """Return the indices `(n,)` that sort rows by segment, then by time."""
+    order = torch.argsort(t, stable=True)
+    return order[torch.argsort(segment[order], stable=True)]
+
+
 def row_indices(rows: object, n: int, device: torch.device) -> Tensor:
     """Return the row numbers `(k,)` of a slice, mask or list. Negative numbers count from the end."""
     if isinstance(rows, slice):

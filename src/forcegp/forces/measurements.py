@@ -18,7 +18,7 @@ from torch import Tensor
 from forcegp import dynamics
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset, farthest_points, standardized
-from forcegp.data.fields import check_robot, contact_table
+from forcegp.data.fields import check_robot, contact_table, in_time
 from forcegp.errors import DataError, ModelError, UnknownNameError
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.memory import DISTANCES, LONGEST_STEP, PAST, bristles
@@ -333,7 +333,10 @@ class Observation:
 
 
 def observations_of(data: Dataset | Sequence[Observation]) -> Sequence[Observation]:
-    """Return the given measurements, or measurements of accelerations if a data set is given.
+    """Return the given measurements in time order, or those of the accelerations of a data set.
+
+    Held-out blocks, instruments and friction with memory follow from neighbours in time. The order of rows
+    therefore has no effect on a fit.
 
     Raises:
         ModelError: there are no measurements, or the argument has the wrong type.
@@ -349,7 +352,16 @@ def observations_of(data: Dataset | Sequence[Observation]) -> Sequence[Observati
         raise ModelError(
             "there are no samples to learn from", expected="at least one observation", got="none"
         )
-    return observations
+    return [_in_time_order(o) for o in observations]
+
+
+def _in_time_order(observation: Observation) -> Observation:
+    data, noise = observation.data, observation.noise_std
+    if data.header.ordered:
+        return observation
+    if isinstance(noise, Tensor) and noise.ndim == 2 and len(noise) == len(data):
+        noise = noise[in_time(data.t, data.segment)]
+    return dataclasses.replace(observation, data=data.in_time_order(), noise_std=noise)
 
 
 def states_noise(observations: Sequence[Observation]) -> bool:

@@ -30,7 +30,6 @@ from torch import Tensor
 from forcegp.forces.calibration import autocorrelation_time
 from forcegp.forces.noise import TORQUE_NOISE
 from forcegp.forces.posterior import STICK_NOISE, STICK_SPEED, hidden_variance
-from forcegp.forces.priors.memory import in_time
 from forcegp.forces.problem import Problem, Tensors, basis_of, remainder
 from forcegp.forces.quantities import affine_map
 from forcegp.forces.unknowns import AXES, learned_tips, share_at_rest, tip_keys, tip_operator
@@ -382,13 +381,12 @@ def exponent(
     logs = []
     for i, rows in zip(motions, each, strict=True):
         m = problem.training.measurements[i]
-        order = in_time(m.t, m.segment)
         a, D = rows.read(torque, stick)
         S, joints = rows.variances(torque, stick), slice(0, rows.external.shape[-1])
         # Bᵀ C⁻² B = D − D S D, since C⁻¹ = 1 − C⁻¹ B S Bᵀ
         white = S * (D.diagonal(dim1=-2, dim2=-1) - (D.square() * S[:, None]).sum(-1))
-        signal = (S.sqrt() * a)[order, joints]
-        logs.append(autocorrelation_time(signal, m.segment[order], white.mean(0)[joints]).log())
+        signal = (S.sqrt() * a)[:, joints]
+        logs.append(autocorrelation_time(signal, m.segment, white.mean(0)[joints]).log())
     return min(1.0, math.exp(-float(torch.stack(logs).mean())))
 
 

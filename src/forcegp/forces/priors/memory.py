@@ -17,6 +17,7 @@ from dataclasses import dataclass, field, replace
 import torch
 from torch import Tensor
 
+from forcegp.data.fields import in_time
 from forcegp.forces.term import SPEEDS, Array, JointState, JointTerm, constants
 from forcegp.gp.kernels import Columns, Kernel
 
@@ -82,12 +83,6 @@ class BristlePrior(JointTerm):
             fits.append(torch.linalg.solve(gram, known.mT @ z[..., k, None]))
         e = torch.cat(fits, dim=-1)
         return replace(self, expected=tuple(tuple(map(tuple, joint)) for joint in e.tolist()))
-
-
-def in_time(t: Tensor, segment: Tensor) -> Tensor:
-    """Return the indices that sort the samples by segment, then by time."""
-    order = torch.argsort(t, stable=True)
-    return order[torch.argsort(segment[order], stable=True)]
 
 
 @dataclass(frozen=True)
