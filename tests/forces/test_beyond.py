@@ -49,12 +49,6 @@ def test_distance_from_the_trained_region() -> None:
     expected = torch.tensor([[0.0, 0.0], [math.hypot(speed, load), 0.0], [0.0, 0.2 / STICKING]]).double()
     torch.testing.assert_close(found, expected, rtol=2e-3, atol=0.0)
     assert not distance_beyond({}, at, torque).any()
-    # Without any effect of the first torque on accelerations: 10 ± 2/√3 instead of 10 ± 1.96.
-    hidden = trained_region(qd, tau, torch.tensor([20.0, 1.0]).double(), torch.tensor([True, False]))
-    assert float(distance_beyond(hidden, at[:1], torque[:1] + 4.0)[0, 0]) == pytest.approx(
-        5.0 * math.sqrt(3.0) / 2.0 - 1.0, rel=1e-3
-    )
-    torch.testing.assert_close(distance_beyond(hidden, at[2:], torque[2:])[:, 1], expected[2:, 1])
 
 
 def swing(robot: forcegp.RobotModel, n: int, speed: float, drag: float, seed: int) -> forcegp.Dataset:
@@ -170,17 +164,63 @@ def coverage(fit: StructuredFit, data: forcegp.Dataset, force: Tensor) -> float:
     return float(((found.mean[:, 0] - force).abs() <= 2.0 * found.std[:, 0]).double().mean())
 
 
+GANTRY = """<robot name="gantry">
+  <link name="root"/>
+  <joint name="x" type="prismatic"><parent link="root"/><child link="cart"/><axis xyz="1 0 0"/>
+    <limit effort="100" lower="-1" upper="1" velocity="10"/></joint>
+  <link name="cart"><inertial><mass value="3"/>
+    <inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+  <joint name="z" type="prismatic"><parent link="cart"/><child link="tool"/><axis xyz="0 0 1"/>
+    <limit effort="100" lower="-1" upper="1" velocity="10"/></joint>
+  <link name="tool"><inertial><mass value="1"/>
+    <inertia ixx="0.01" iyy="0.01" izz="0.01" ixy="0" ixz="0" iyz="0"/></inertial></link>
+</robot>
+"""
+
+
+@pytest.mark.parametrize(("free", "widest"), [(0, 6.0), (100, 6.0), (1000, 1.0)])
+def test_friction_that_contact_hides_has_its_stated_size(tmp_path: Path, free: int, widest: float) -> None:
+    """The table holds any force of the vertical axis, whose friction only samples in free motion show."""
+    path, slope = tmp_path / "gantry.urdf", -math.tan(0.2)
+    path.write_text(GANTRY, encoding="utf-8")
+    table = forcegp.Plane(normal=(math.sin(0.2), 0.0, math.cos(0.2)), offset=0.0)
+    contact = forcegp.SurfaceContact("table", frame="tool", point=(0.0, 0.0, 0.0), surface=table)
+    system = forcegp.ConstrainedSystem(forcegp.load_robot(path), [contact])
+    n, generator = 2000, torch.Generator().manual_seed(0)
+    t = 0.005 * torch.arange(n, dtype=torch.float64)
+    rates, sizes = torch.tensor([1.3, 3.1]).double(), torch.tensor([0.3, 0.1]).double()
+    waves = [sizes * rates**k * torch.sin(rates * t[:, None] + k * math.pi / 2) for k in range(3)]
+    q, qd, qdd = (torch.stack([x.sum(-1), slope * x.sum(-1)], -1) for x in waves)
+    closed = torch.arange(n) >= free
+    for k, x in enumerate((q, qd, qdd)):
+        lift = 0.05 * 5.0**k * torch.sin(5.0 * t + k * math.pi / 2) + (0.06 if k == 0 else 0.0)
+        x[:, 1] += torch.where(closed, 0.0, lift)
+    force = torch.where(closed, 30.0 + 5.0 * torch.sin(2.0 * t), 0.0)
+    friction = torch.tensor([2.0, 3.0]) * torch.tanh(qd / 0.01) + torch.tensor([3.0, 5.0]) * qd
+    tau = dynamics.inverse_dynamics(system.robot, q, qd, qdd) + friction
+    tau = tau - system.equations(q, qd, closed[:, None]).A[:, 0] * force[:, None]
+    noise = 0.05 * torch.randn(2, n, 2, generator=generator, dtype=torch.float64)
+    names, contacts = system.robot.joint_names, {"table": closed}
+    data = forcegp.Dataset(t, q, qd, tau + noise[0], qdd + noise[1], names, contact=contacts)
+    fit = forcegp.StructuredGP(system).fit(data)
+    at = data[closed]
+    found = fit.predict(at.q, at.qd, at.tau, "multiplier", noise=True)
+    error = (found.mean[:, 0] - force[closed]).abs()
+    assert float((error <= 2.0 * found.std[:, 0]).double().mean()) > 0.9
+    assert float(found.std.median()) < widest
+
+
 @pytest.mark.slow
 @pytest.mark.xfail(
     strict=True,
-    reason="the stated friction of a slider without a motor is too small: 1.9 N at σ 0.8 N, ±2σ holds 5 %",
+    reason="friction of the slider and of the knee are told apart by the shape of their columns, which is not "
+    "that of the true friction: 2.6 N at σ 0.2 N, ±2σ holds less than 1 %",
 )
 def test_a_joint_that_contact_hides_is_not_trusted(tmp_path: Path) -> None:
     """All that the knee does wrong acts along the normal, where no acceleration shows it."""
     system = leg(tmp_path)
     train, force = squats(system, 400, 0.1, 3.0)
     fit = forcegp.StructuredGP(system, "analytical").fit(train)
-    assert bool(fit.problem.hidden_torque()[2] > DRY) and not bool(fit.problem.hidden_torque()[1])
     assert coverage(fit, train, force) > 0.9
     test, force = squats(system, 200, 0.3, 9.0)
     assert coverage(fit, test, force) > 0.8

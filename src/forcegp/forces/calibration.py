@@ -61,8 +61,6 @@ REGIME = 0.25
 """Fraction of the samples in the fast regime and in the heavily loaded regime."""
 PRIOR_SAMPLES = 4.0
 """Weight of the prior in `growth`, as an equivalent number of independent samples."""
-ALIKE = 2.0
-"""Largest ratio of the relative torque noise of a joint that contact hides to that of the other joints."""
 WINDOW, WINDOWS = 10.0, 20
 """Window length in `correlation_times`, in autocorrelation times, and minimum number of windows."""
 
@@ -207,18 +205,10 @@ def calibrated_noise(problem: Problem, hyperparameters: Mapping[str, Tensor]) ->
     qd, tau = (torch.cat([getattr(m, name) for m in training.measurements]) for name in ("qd", "tau"))
     # Rounding to steps h has the variance h²/12.
     rounding = torch.from_numpy(resolution(tau.cpu().numpy())).to(tau) / math.sqrt(12.0)
-    least, unknown = problem.hidden_torque(), UNSHOWN * load
-    hidden = least > 0.0
-    if not bool(hidden.all()):
-        # A hidden joint has the sensors of the others, so its relative noise is at most a few times theirs.
-        relative = (hyperparameters[TORQUE_NOISE].exp() / load)[~hidden].square().mean().sqrt()
-        share = (ALIKE * relative / UNSHOWN).clamp(max=1.0)
-        least, unknown = share * least, share * unknown
-    learned = hyperparameters[TORQUE_NOISE].exp().maximum(least).maximum(rounding)
+    learned = hyperparameters[TORQUE_NOISE].exp().maximum(rounding)
     noise = {TORQUE_NOISE: held_out_torque_std(problem, hyperparameters, learned).log()}
     grows = growth(problem, {**hyperparameters, **noise}, load)
-    grows = torch.where(hidden, grows.maximum(unknown), grows)
-    region = trained_region(qd, tau, load, hidden, problem.power * len(qd))
+    region = trained_region(qd, tau, load, problem.power * len(qd))
     return {**noise, **region, GROWTH: grows}
 
 

@@ -189,7 +189,7 @@ def stick_variance(tensors: Mapping[str, Tensor], at: States) -> Tensor:
 
 
 def trained_region(
-    qd: Tensor, tau: Tensor, load: Tensor, hidden: Tensor | None = None, independent: float = math.inf
+    qd: Tensor, tau: Tensor, load: Tensor, independent: float = math.inf
 ) -> dict[str, Tensor]:
     """Return the region of the training samples `(n, nq)` as entries named `LOW`, `HIGH` and `SPREAD`.
 
@@ -197,8 +197,6 @@ def trained_region(
         qd, tau: velocities and torques of the samples in motion.
         load: typical torque of each joint `(nq,)`. A fraction of it is the lower bound on the standard
             deviation of the torque.
-        hidden: `(nq,)` bool, joints whose torques do not affect accelerations. Their torque region extends
-            one standard deviation on either side of the mean.
         independent: number of independent samples, one of which lies beyond each limit.
     """
     x = torch.stack([qd, tau], dim=1)
@@ -206,9 +204,6 @@ def trained_region(
     low, high = x.quantile(torch.tensor([share, 1.0 - share]).to(x), dim=0)
     least = torch.stack([torch.full_like(load, STICKING), RELATIVE * load])
     spread = x.std(0, correction=0).maximum(least)
-    if hidden is not None:
-        mean, std = tau.mean(0), spread[1]
-        low[1], high[1] = torch.where(hidden, mean - std, low[1]), torch.where(hidden, mean + std, high[1])
     return {LOW: low, HIGH: high, SPREAD: spread}
 
 

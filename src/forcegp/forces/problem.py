@@ -35,10 +35,8 @@ from forcegp.gp.sums import Sums, accumulate, without_feedback
 Tensors = dict[str, Tensor]
 OWN = tuple(name + "." for name in RESERVED)
 """Prefixes of learned parameters other than the hyperparameters of the priors."""
-SHOWN = 10.0
-"""Number of independent samples, with accelerations sensitive to a torque, needed to learn torque noise."""
 UNSHOWN = 0.1
-"""Uncertainty of a joint's torque and friction, relative to the load, if no measurement is sensitive to them.
+"""Stated size of a joint's friction, relative to its load, in directions that no measurement shows.
 It is also the growth per training standard deviation outside the trained region; 0.08 for a real iiwa 14."""
 REGION_STATES = 10_000
 """Maximum number of training states used to compute the trained region."""
@@ -236,38 +234,6 @@ class Problem:
             if m.quantity == "joint_force":
                 squares.append((m.values - mean) ** 2)
         return (torch.cat(squares).sum(0) / max(sum(map(len, squares)) - 1, 1)).sqrt()
-
-    @torch.no_grad()
-    def hidden_torque(self) -> Tensor:
-        """Return the standard deviation `(nq,)` of torques that hardly affect accelerations, 0 for others.
-
-        In contact, a force along the constraint does not change the accelerations. For a joint that acts
-        along the constraint, P_ii is near zero, and its noise and friction cannot be distinguished from those
-        of other joints. The estimate is the acceleration residual that given unknown forces e do not explain
-        at such samples, s² = Σ (r_i² − Σ_k H_ik² Var e_k) / Σ H_ii², and at least `UNSHOWN` times the load.
-        It applies if P_ii is less than one half at most samples and greater at fewer than `SHOWN` independent
-        samples, unless forces were also measured.
-        """
-        if set(self.training.quantities) != {"qdd"}:
-            return torch.zeros_like(self.system.robot.mass)
-        squares, responses, shown = [], [], []
-        for m in self.training.measurements:
-            at = m.at(self.system)
-            residual = m.values - at.eom.acceleration(self.mean(self.system, at))
-            H, P = (X.diagonal(dim1=-2, dim2=-1) for X in (at.eom.H, at.eom.P))
-            stated = 0.0 if self.external_std is None else at.eom.H**2 @ self.external_std**2
-            squares.append(residual**2 - stated)
-            responses.append(H**2)
-            shown.append((P > 0.5).to(P))
-        r2, H2, visible = (torch.cat(x) for x in (squares, responses, shown))
-        unseen = 1.0 - visible
-        most = (unseen * r2).sum(0) / (unseen * H2).sum(0).clamp(min=1e-300)
-        hidden = (visible.mean(0) < 0.5) & (self.power * visible.sum(0) < SHOWN)
-        turns = self.system.robot.revolute > 0.0
-        load, least = self.typical_load(), torch.zeros_like(most)
-        for alike in (hidden & turns, hidden & ~turns):
-            least[alike] = UNSHOWN * load[alike].square().mean().sqrt()
-        return torch.where(hidden, most.clamp(min=0.0).sqrt().maximum(least), 0.0)
 
     @torch.no_grad()
     def typical_load(self) -> Tensor:

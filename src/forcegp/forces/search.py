@@ -24,6 +24,7 @@ from forcegp.forces.priors.base import ANALYTICAL, ForcePrior
 from forcegp.forces.priors.contact import below_jamming, initial_coulomb
 from forcegp.forces.problem import (
     OWN,
+    UNSHOWN,
     Problem,
     Tensors,
     is_finite,
@@ -75,15 +76,16 @@ def initial(problem: Problem, learn_noise: bool, learn_torque_noise: bool = Fals
     few = problem
     if problem.training.samples > START_SAMPLES:
         few = dataclasses.replace(problem, training=problem.training.evenly(START_SAMPLES))
-    noise = {}
+    noise, unseen = {}, None
     if learn_torque_noise:
+        unseen = UNSHOWN * few.typical_load()
         closed = (m.at(few.system) for m in few.training.measurements)
         noise = initial_torque_noise(few.torque_residual()) | stated_tips(few.system, closed)
     if problem.has_coulomb:
-        start = _with_friction(few, noise)
+        start = _with_friction(few, noise, unseen)
     else:
         beyond_noise = problem.external_std is not None
-        start = initial_hyperparameters(problem.priors, few.fixed_rows.blocks, beyond_noise)
+        start = initial_hyperparameters(problem.priors, few.fixed_rows.blocks, beyond_noise, unseen)
     start |= noise
     if learn_noise:
         stds = problem.training.noise_std
@@ -95,7 +97,7 @@ def initial(problem: Problem, learn_noise: bool, learn_torque_noise: bool = Fals
 
 
 @torch.no_grad()
-def _with_friction(problem: Problem, noise: Tensors) -> Tensors:
+def _with_friction(problem: Problem, noise: Tensors, unseen: Tensor | None) -> Tensors:
     """Return the most likely Coulomb friction coefficient, and hyperparameters of the remaining forces.
 
     From a poor coefficient, learning may reach a local optimum in which friction depends on the state.
@@ -112,7 +114,7 @@ def _with_friction(problem: Problem, noise: Tensors) -> Tensors:
             for key, value in friction.items()
         }
         rows = few.rows({**trial, **noise})
-        start = initial_hyperparameters(few.priors, rows.blocks, few.external_std is not None)
+        start = initial_hyperparameters(few.priors, rows.blocks, few.external_std is not None, unseen)
         return start | trial, rows
 
     def value(x: float) -> float:
@@ -126,12 +128,16 @@ def _with_friction(problem: Problem, noise: Tensors) -> Tensors:
 
 
 def initial_hyperparameters(
-    priors: Sequence[ForcePrior], blocks: Sequence[Block], beyond_noise: bool = False
+    priors: Sequence[ForcePrior],
+    blocks: Sequence[Block],
+    beyond_noise: bool = False,
+    unseen: Tensor | None = None,
 ) -> dict[str, Tensor]:
     """Return the initial log-hyperparameters, keyed by `<prior>.<name>`.
 
     Args:
         beyond_noise: whether to subtract the contribution of noise, for example if unknown forces are given.
+        unseen: standard deviation of joint forces `(nq,)` in directions that no measurement shows.
 
     Raises:
         ModelError: contacts hold all joints in every sample, so no measurement depends on a force.
@@ -147,14 +153,20 @@ def initial_hyperparameters(
     # Some priors share the hyperparameters of another prior.
     for p, prior in [(p, prior) for p, prior in enumerate(priors) if prior.prefix == prior.name]:
         widths = {name: x.shape[-1] for name, x in blocks[0].features[p].items()}
-        scale = _force_scale(p, blocks, prior.commensurate, beyond_noise)
+        stated = unseen if prior.per_joint else None
+        scale = _force_scale(p, blocks, prior.commensurate, beyond_noise, stated)
         initial = prior.stated(prior.kernel.initial(len(scale), widths, scale.log().cpu().double()))
         params |= {f"{prior.name}.{name}": value.to(scale.device) for name, value in initial.items()}
     return params
 
 
-def _force_scale(p: int, blocks: Sequence[Block], commensurate: bool, beyond_noise: bool) -> Tensor:
+def _force_scale(
+    p: int, blocks: Sequence[Block], commensurate: bool, beyond_noise: bool, unseen: Tensor | None = None
+) -> Tensor:
     """Return the root mean square `(components,)` of the least-squares force of prior p.
+
+    The least-squares force W⁺y has no part in the directions 1 − W⁺W that the rows do not show, as those of
+    joints that act along a contact. There, a given standard deviation counts.
 
     The rows determine only the sum of components with the same direction, which the minimum-norm solution
     divides evenly. Components with different units, such as viscous and dry friction, are fitted separately.
@@ -171,6 +183,9 @@ def _force_scale(p: int, blocks: Sequence[Block], commensurate: bool, beyond_noi
         square[:, groups] = (inverse @ block.target[..., None])[..., 0] ** 2
         if beyond_noise:
             square[:, groups] -= inverse.square().sum(-1)
+        if unseen is not None:
+            hidden = 1.0 - (inverse @ W[..., groups]).diagonal(dim1=-2, dim2=-1)
+            square[:, groups] += hidden.clamp(min=0.0) * unseen[groups] ** 2
         size = torch.where(alone, 1.0, W.square().sum(1))
         total, weight = total + (square * size)[:, first].sum(0), weight + size.sum(0)
     return (total.clamp(min=0.0) / weight.clamp(min=1e-300)).sqrt().clamp(1e-3, 1e4)

@@ -68,8 +68,6 @@ FEWEST_MOVING = 20
 """Number of samples in motion below which samples at rest are also kept."""
 FIRST_POWER = 0.25
 """Exponent of the tempered likelihood before the correlation of the residuals is known."""
-UNSEEN_TIME = 1e-6
-"""Correlation time of torque noise that was not observed [s]."""
 ROUNDS = 3
 """Maximum number of times that hyperparameters are relearned after updates based on the residuals."""
 
@@ -382,10 +380,6 @@ def _regressed(
     if NOISE in free:
         values |= calibrated_noise(part, values)
     part = _at_the_rate_of_the_log(part, values, neighbours or problem.training)
-    if part.correlation is not None and NOISE in free:
-        # Noise that contact hides widens multipliers, but it was not observed and shakes no trajectory.
-        unseen = part.hidden_torque() > 0.0
-        part = dataclasses.replace(part, correlation=torch.where(unseen, UNSEEN_TIME, part.correlation))
     training = dataclasses.replace(problem.training, scales=part.training.scales)
     whole, warnings = dataclasses.replace(part, training=training), ()
     if spec.options.inference == "exact":
