@@ -28,7 +28,6 @@ from forcegp.forces.posterior import (
 )
 from forcegp.forces.problem import (
     PIECE_SAMPLES,
-    UNSHOWN,
     Problem,
     Totals,
     basis_of,

@@ -188,9 +188,7 @@ def stick_variance(tensors: Mapping[str, Tensor], at: States) -> Tensor:
     return std**2 * torch.exp(-((at.qd / speed) ** 2))
 
 
-def trained_region(
-    qd: Tensor, tau: Tensor, load: Tensor, independent: float = math.inf
-) -> dict[str, Tensor]:
+def trained_region(qd: Tensor, tau: Tensor, load: Tensor, independent: float = math.inf) -> dict[str, Tensor]:
     """Return the region of the training samples `(n, nq)` as entries named `LOW`, `HIGH` and `SPREAD`.
 
     Args:

@@ -35,9 +35,6 @@ from forcegp.gp.sums import Sums, accumulate, without_feedback
 Tensors = dict[str, Tensor]
 OWN = tuple(name + "." for name in RESERVED)
 """Prefixes of learned parameters other than the hyperparameters of the priors."""
-UNSHOWN = 0.1
-"""Stated size of a joint's friction, relative to its load, in directions that no measurement shows.
-It is also the growth per training standard deviation outside the trained region; 0.08 for a real iiwa 14."""
 REGION_STATES = 10_000
 """Maximum number of training states used to compute the trained region."""
 

@@ -24,7 +24,6 @@ from forcegp.forces.priors.base import ANALYTICAL, ForcePrior
 from forcegp.forces.priors.contact import below_jamming, initial_coulomb
 from forcegp.forces.problem import (
     OWN,
-    UNSHOWN,
     Problem,
     Tensors,
     is_finite,
@@ -67,6 +66,9 @@ FRICTION_SAMPLES = 200
 """Maximum number of evenly spaced samples used to select the initial Coulomb friction."""
 COEFFICIENTS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
 """Friction coefficients to try."""
+UNSHOWN = 0.1
+"""Stated size of the friction of a joint in directions that no measurement shows, relative to its load.
+Over all joints of a real iiwa 14, it is .08."""
 PARALLEL = 1e-9
 """Two directions are considered parallel if one minus their mean cosine is below this value."""
 
