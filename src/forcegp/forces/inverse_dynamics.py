@@ -16,7 +16,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import scipy.stats
+import scipy.special
 import torch
 from torch import Tensor
 
@@ -460,5 +460,5 @@ def is_harmless(after: Tensor, before: Tensor) -> bool:
 def is_less(difference: Tensor) -> bool:
     """Return whether the mean of differences `(groups,)` is significantly below zero (Student's t test)."""
     n = len(difference)
-    least = float(scipy.stats.t.isf(scipy.stats.norm.sf(SIGNIFICANT), n - 1))
+    least = float(scipy.special.stdtrit(n - 1, scipy.special.ndtr(SIGNIFICANT)))
     return float(difference.mean()) < -least * float(difference.std()) / math.sqrt(n)

@@ -105,12 +105,14 @@ def _with_friction(problem: Problem, noise: Tensors, unseen: Tensor | None) -> T
     From a poor coefficient, learning may reach a local optimum in which friction depends on the state.
     """
     few = dataclasses.replace(problem, training=problem.training.evenly(FRICTION_SAMPLES), inducing=None)
-    few = without_inducing(few) if is_finite(problem.priors) else few
+    # A force that no law names is learned from what the laws leave.
+    laws = few.without_priors([prior.name for prior in problem.priors if prior.remainder])
+    laws = without_inducing(laws) if is_finite(laws.priors) else laws
     like = problem.system.robot.mass
     friction = initial_coulomb(problem.priors, like)
     limits = below_jamming(problem.system, problem.training.measurements, problem.priors, limits_of(friction))
 
-    def start_at(x: float) -> tuple[Tensors, WhitenedRows]:
+    def start_at(x: float, few: Problem = laws) -> tuple[Tensors, WhitenedRows]:
         trial = {
             key: like.new_tensor(min(x, limits[key][1])) if key.endswith("log_coefficient") else value
             for key, value in friction.items()
@@ -121,12 +123,12 @@ def _with_friction(problem: Problem, noise: Tensors, unseen: Tensor | None) -> T
 
     def value(x: float) -> float:
         start, rows = start_at(x)
-        return float(few.negative_log_likelihood(kernel_parameters({**start, **noise}), rows))
+        return float(laws.negative_log_likelihood(kernel_parameters({**start, **noise}), rows))
 
     best = min(range(1, len(COEFFICIENTS) - 1), key=lambda k: value(math.log(COEFFICIENTS[k])))
     around = (math.log(COEFFICIENTS[best - 1]), math.log(COEFFICIENTS[best + 1]))
     optimum = scipy.optimize.minimize_scalar(value, bounds=around, method="bounded", options={"xatol": 1e-3})
-    return start_at(float(optimum.x))[0]
+    return start_at(float(optimum.x), few)[0]
 
 
 def initial_hyperparameters(

@@ -16,7 +16,7 @@ import math
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 
-import scipy.stats
+import scipy.special
 import torch
 from torch import Tensor
 
@@ -250,7 +250,7 @@ def _are_smaller(changes: Tensor) -> list[bool]:
     blocks, joints = changes.shape
     if blocks < 2:
         return [False] * joints
-    most = scipy.stats.t.ppf(CHANCE / joints, blocks - 1)
+    most = scipy.special.stdtrit(blocks - 1, CHANCE / joints)
     return (changes.mean(0) < most * changes.std(0) / math.sqrt(blocks)).tolist()
 
 

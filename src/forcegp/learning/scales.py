@@ -133,14 +133,15 @@ def _moved(found: Scales, evidence: Evidence) -> Scales:
 
 def _alternated(found: Scales, noisy: bool) -> Scales:
     """Alternate between scales and noise until neither changes."""
-    for _ in range(ROUNDS):
+    for number in range(ROUNDS):
         _, sums = _sums(found.problem, found.values)
         found = _moved(found, fixed_point(sums, found.groups, found.stated, found.kept))
         found = replace(found, rounds=found.rounds + 1, converged=not noisy)
         if not noisy:
             break
         before = _noise(found.values)
-        values, power = _with_noise(found.problem, found.values, found.groups, found.evidence)
+        speeds = AT_REST if number == 0 else ()
+        values, power = _with_noise(found.problem, found.values, found.groups, found.evidence, speeds)
         found = replace(found, problem=replace(found.problem, power=power), values=values)
         size = before.maximum(_noise(values))
         change = (_noise(values) - before).abs()
@@ -273,9 +274,13 @@ def variances(problem: Problem, values: Tensors) -> tuple[Tensor, Tensor]:
 
 
 def _with_noise(
-    problem: Problem, values: Tensors, groups: list[Group], evidence: Evidence
+    problem: Problem, values: Tensors, groups: list[Group], evidence: Evidence, speeds: Sequence[float]
 ) -> tuple[Tensors, float]:
-    """Return the hyperparameters with updated torque noise and static friction, and the exponent κ."""
+    """Return the hyperparameters with updated torque noise and static friction, and the exponent κ.
+
+    Args:
+        speeds: speeds v_s to try; the present ones if there are none.
+    """
     motions = [i for i, m in enumerate(problem.training.measurements) if m.quantity in MOTIONS]
     each = [residuals(problem, values, evidence.weights, i) for i in motions]
     widest = max(rows.r.shape[-1] for rows in each)
@@ -288,12 +293,12 @@ def _with_noise(
     share = torch.nn.functional.pad(share, (0, len(tips)), value=1.0).repeat(2)
     # k = e^{−(v/v_s)²} for other speeds v_s, first of the joints and then of the contacts
     rows, speed, theta = _at_likeliest_speed(
-        whole, slice(0, nq), values[STICK_SPEED], theta, share, problem.power
+        whole, slice(0, nq), values[STICK_SPEED], theta, share, problem.power, speeds
     )
     changed = {STICK_SPEED: torch.full_like(values[STICK_NOISE], speed)}
     if tips:
         now = torch.stack([values[tip.speed] for tip in tips])
-        _, speed, theta = _at_likeliest_speed(rows, slice(nq, None), now, theta, share, problem.power)
+        _, speed, theta = _at_likeliest_speed(rows, slice(nq, None), now, theta, share, problem.power, speeds)
         changed |= {tip.speed: torch.full_like(x, speed) for tip, x in zip(tips, now, strict=True)}
     torque, stick = theta.clamp(min=LEAST_VARIANCE).chunk(2)
     for (joints, *contacts), x in zip(keys, (0.5 * torque.log(), 0.5 * stick.log()), strict=True):
@@ -302,16 +307,23 @@ def _with_noise(
 
 
 def _at_likeliest_speed(
-    whole: Residuals, own: slice, now: Tensor, theta: Tensor, share: Tensor, power: float
+    whole: Residuals,
+    own: slice,
+    now: Tensor,
+    theta: Tensor,
+    share: Tensor,
+    power: float,
+    speeds: Sequence[float],
 ) -> tuple[Residuals, float, Tensor]:
     """Return the rows, log v_s and the variances θ for the likeliest speed of some joints or contacts.
 
     Args:
         own: the columns of these joints or contacts in `slow`.
-        now: current log v_s of each.
+        now: current log v_s of each, which all share.
+        speeds: speeds v_s to try; the current one if there are none.
     """
     tried, joints = [], torch.ones(whole.external.shape[-1], dtype=torch.bool)
-    for speed in map(math.log, AT_REST):
+    for speed in map(math.log, speeds) if speeds else [float(now[0])]:
         slow = whole.slow.clone()
         slow[:, own] = slow[:, own] ** (2.0 * (now - speed)).exp()
         rows = whole._replace(slow=slow)
