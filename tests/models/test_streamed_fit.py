@@ -74,6 +74,21 @@ def test_inducing_points(files: StreamedDataset) -> None:
     assert any("more inducing points would help" in warning for warning in fit.result.warnings)
 
 
+@pytest.mark.parametrize("streamed", [False, True])
+def test_samples_with_an_impossible_value_are_excluded_and_counted(
+    files: StreamedDataset, tmp_path: Path, streamed: bool
+) -> None:
+    qdd = data.qdd.clone()
+    qdd[33, 1] = 1e6
+    friction, found = forcegp.StructuredGP(two_contacts(), "analytical", [JointFrictionPrior()]), []
+    for log in (data.replace(qdd=qdd), data[torch.arange(len(data)) != 33]):
+        log[log.t < data.t[70]].write(tmp_path / "a.parquet")
+        found.append(friction.fit(files if streamed else log, options=SHORT))
+    warnings = [" ".join(fit.result.warnings) for fit in found]
+    assert "1 samples were excluded as outliers" in warnings[0] and "outliers" not in warnings[1]
+    assert_same(*found, 1e-6)
+
+
 @pytest.mark.slow
 def test_a_measured_robot(files: StreamedDataset) -> None:
     """Samples in motion, torque noise, and forces that the robot contains."""

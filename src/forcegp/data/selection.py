@@ -1,4 +1,4 @@
-"""Preparation of a log for learning: selection of points, held-out blocks, impacts, and noise.
+"""Preparation of a log for learning: selection of points, held-out blocks, outliers, impacts, and noise.
 
 Farthest-point sampling selects a few points that cover the inputs of a log (section 5.3 of the paper). If
 training points come from the same parts of the log as the test rows, as in the paper, the test error measures
@@ -7,6 +7,7 @@ interpolation. Held-out blocks measure how well unseen motion is predicted.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass
 from itertools import pairwise
@@ -221,6 +222,31 @@ def _stretches(data: Dataset, stretch: float) -> list[tuple[int, int]]:
         blocks += [(first + a, first + b) for a, b in pairwise(cuts) if b > a]
         first += rows
     return blocks
+
+
+POSSIBLE, APART, COMMON = 1e3, 100.0, 0.99
+"""A position, velocity, acceleration or torque that few arms exceed (SI units), and a multiple of the
+quantile `COMMON` of all rows."""
+
+
+def outliers(*columns: Tensor) -> Tensor:
+    """Return a mask `(n,)` of rows of a log with an impossible position, velocity, acceleration or torque.
+
+    It exceeds both `POSSIBLE` and `APART` times the quantile of the magnitudes in all other rows.
+
+    Args:
+        columns: values `(n, d)` each.
+    """
+    values = torch.cat(columns, dim=-1)
+    found = torch.zeros(len(values), dtype=torch.bool, device=values.device)
+    while int((~found).sum()) > 1:
+        size = values[~found].abs()
+        k = min(math.ceil(COMMON * len(size)), len(size) - 1)
+        new = (size > (APART * size.kthvalue(k, dim=0).values).clamp(min=POSSIBLE)).any(-1)
+        if not bool(new.any()):
+            break
+        found[~found] = new
+    return found
 
 
 IMPACT = "impact"

@@ -13,6 +13,7 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
+from forcegp.data.selection import outliers
 from forcegp.errors import DataError, NumericalError
 from forcegp.evaluation.judgement import (
     Motion,
@@ -41,7 +42,6 @@ from forcegp.evaluation.scores import (
     Verdict,
     moving_joints,
     nlpd,
-    outliers,
     sentence,
     verdicts,
 )
@@ -250,7 +250,7 @@ def evaluate(
     if len(data) == 0:
         raise DataError("there is nothing to evaluate on", expected="at least one sample", got="none")
     data.check_robot(model.specified.robot)
-    impossible = _impossible(data)
+    impossible = outliers(data.q, data.qd, data.qdd, data.tau)
     if bool(impossible.any()):
         scored = evaluate(
             model, data[~impossible], train=train, compare=compare, system=system, progress=progress
@@ -261,11 +261,6 @@ def evaluate(
     except torch.linalg.LinAlgError as cause:  # pyright: ignore[reportPrivateImportUsage]
         text, hint = "a linear system of the evaluation is singular", "look for outliers with forcegp check"
         raise NumericalError(text, got=str(cause)[:200], hint=hint) from cause
-
-
-def _impossible(data: Dataset) -> Tensor:
-    """Return a mask `(n,)` of rows with an impossible position, velocity, acceleration or torque."""
-    return outliers(torch.cat([data.q, data.qd, data.qdd, data.tau], dim=-1))
 
 
 def _evaluated(
@@ -351,7 +346,7 @@ def _trivial(
     system: ConstrainedSystem, data: Dataset, train: Dataset | None
 ) -> dict[str, tuple[Tensor, Tensor, Tensor]]:
     """Return errors, torque errors and standard deviations `(n, nq)` on data not used for training."""
-    train = None if train is None else train[~_impossible(train)]
+    train = None if train is None else train[~outliers(train.q, train.qd, train.qdd, train.tau)]
     half = len(data) // 2
     parts = [(train, data)] if train is not None else [(data[half:], data[:half]), (data[:half], data[half:])]
     errors: dict[str, list[tuple[Tensor, Tensor, Tensor]]] = {}

@@ -18,27 +18,6 @@ FEWEST = 10
 """Minimum number of samples required to compute an error in motion or at rest."""
 
 
-POSSIBLE, APART, COMMON = 1e3, 100.0, 0.99
-"""A position, velocity, acceleration or torque that few arms exceed (SI units), and a multiple of the
-quantile `COMMON` of all rows."""
-
-
-def outliers(values: Tensor) -> Tensor:
-    """Return a mask `(n,)` of rows with an impossible entry among values `(n, d)` of a log.
-
-    It exceeds both `POSSIBLE` and `APART` times the quantile of the magnitudes in all other rows.
-    """
-    found = torch.zeros(len(values), dtype=torch.bool, device=values.device)
-    while int((~found).sum()) > 1:
-        size = values[~found].abs()
-        k = min(math.ceil(COMMON * len(size)), len(size) - 1)
-        new = (size > (APART * size.kthvalue(k, dim=0).values).clamp(min=POSSIBLE)).any(-1)
-        if not bool(new.any()):
-            break
-        found[~found] = new
-    return found
-
-
 @dataclass(frozen=True)
 class Errors:
     """Differences between predicted and reference accelerations [rad/s², m/s²].

@@ -19,6 +19,7 @@ from forcegp import dynamics
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset, farthest_points, standardized
 from forcegp.data.fields import check_robot, contact_table, in_time
+from forcegp.data.selection import outliers
 from forcegp.errors import DataError, ModelError, UnknownNameError
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.memory import DISTANCES, LONGEST_STEP, PAST, bristles
@@ -223,6 +224,20 @@ def _spread(m: Measurement, count: int) -> Tensor:
     return farthest_points(x, min(count, len(x.unique(dim=0))))
 
 
+def without_outliers(observations: Sequence[Observation]) -> tuple[list[Observation], int]:
+    """Remove samples with an impossible value; return the others and the number of samples removed."""
+    bad = [outliers(o.data.q, o.data.qd, o.data.tau, o.data.qdd) for o in observations]
+    pairs = zip(observations, bad, strict=True)
+    kept = [o.rows((~out).nonzero()[:, 0]) if bool(out.any()) else o for o, out in pairs]
+    return kept, sum(int(out.sum()) for out in bad)
+
+
+def excluded(dropped: int) -> tuple[str, ...]:
+    """Return a warning about a number of outliers, if there are any."""
+    text = f"{dropped} samples were excluded as outliers: a value in them is impossible (see `forcegp check`)"
+    return (text,) if dropped else ()
+
+
 FAR = 6.0
 """Number of robust standard deviations of A q̈ − b above which a sample is not in persistent contact."""
 
@@ -331,6 +346,13 @@ class Observation:
     quantity: str = "qdd"
     noise_std: NoiseStd | None = None
 
+    def rows(self, index: Tensor) -> Observation:
+        """Return the samples with the given indices, with the noise of each if it is known."""
+        noise = self.noise_std
+        if isinstance(noise, Tensor) and noise.ndim == 2 and len(noise) == len(self.data):
+            noise = noise[index]
+        return dataclasses.replace(self, data=self.data[index], noise_std=noise)
+
 
 def observations_of(data: Dataset | Sequence[Observation]) -> Sequence[Observation]:
     """Return the given measurements in time order, or those of the accelerations of a data set.
@@ -352,16 +374,12 @@ def observations_of(data: Dataset | Sequence[Observation]) -> Sequence[Observati
         raise ModelError(
             "there are no samples to learn from", expected="at least one observation", got="none"
         )
-    return [_in_time_order(o) for o in observations]
+    return [o if o.data.header.ordered else _in_time_order(o) for o in observations]
 
 
 def _in_time_order(observation: Observation) -> Observation:
-    data, noise = observation.data, observation.noise_std
-    if data.header.ordered:
-        return observation
-    if isinstance(noise, Tensor) and noise.ndim == 2 and len(noise) == len(data):
-        noise = noise[in_time(data.t, data.segment)]
-    return dataclasses.replace(observation, data=data.in_time_order(), noise_std=noise)
+    found = observation.rows(in_time(observation.data.t, observation.data.segment))
+    return dataclasses.replace(found, data=found.data.in_time_order())
 
 
 def states_noise(observations: Sequence[Observation]) -> bool:

@@ -18,7 +18,7 @@ from torch import nn
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset, StreamedDataset
 from forcegp.errors import ModelError
-from forcegp.forces.measurements import NoiseStd, Observation, observations_of
+from forcegp.forces.measurements import NoiseStd, Observation, excluded, observations_of
 from forcegp.forces.noise import Noise, state_std_of
 from forcegp.forces.priors.base import ForcePrior, check_priors
 from forcegp.forces.priors.joint import AnalyticalMean, JointFrictionPrior, mean_of
@@ -200,7 +200,7 @@ class StructuredGP(Model[StructuredFit]):
         if sample.log is not None and lesson.problem.inducing is not None:
             whole = Pass(spec, sample.log, sample, client, progress)
             forces = whole.forces(*lesson.problem.with_coulomb_errors(values))
-        warnings = (*doubts, *lesson.warnings)
+        warnings = (*excluded(sample.outliers), *doubts, *lesson.warnings)
         fit = conditioned(spec, lesson.problem, values, lesson.learned, warnings, lesson.learned_on, forces)
         if progress is not None:
             progress(fit.result.evaluations, fit.result.evaluations, fit.result.objective)

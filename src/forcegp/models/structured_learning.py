@@ -32,6 +32,7 @@ from forcegp.forces.inverse_dynamics import LEAST, without_delay
 from forcegp.forces.measurements import (
     Observation,
     Training,
+    excluded,
     observations_of,
     period_of,
     require_measured,
@@ -39,6 +40,7 @@ from forcegp.forces.measurements import (
     training_of,
     unmeasured_forces,
     without_impacts,
+    without_outliers,
 )
 from forcegp.forces.noise import TORQUE_NOISE, Noise, external_std, state_std_of
 from forcegp.forces.noise_learning import left_out, weighted, with_learned_slopes
@@ -260,12 +262,18 @@ def training_for(
         scales = zip(spec.priors, before.training.scales, strict=True)
         kept = {prior.name: scale for prior, scale in scales if prior.name not in learned}
     noise_std, standardize = spec.noise.acceleration, spec.options.standardize
-    training = training_of(data, spec.system, spec.priors, noise_std, kept, standardize)
+    observations, dropped = observations_of(data), 0
+    if spec.noise.learns_torque:
+        observations, dropped = without_outliers(observations)
+    training = training_of(observations, spec.system, spec.priors, noise_std, kept, standardize)
     if any(prior.delay for prior in spec.priors):
         training = without_delay(training, spec.priors)
     if spec.automatic:
         require_measured(training, spec.system)
-    return in_motion(spec.system, training, fewest) if spec.noise.learns_torque else (training, ())
+    if not spec.noise.learns_torque:
+        return training, ()
+    moving, doubts = in_motion(spec.system, training, fewest)
+    return moving, (*excluded(dropped), *doubts)
 
 
 def check_learned(spec: Specification, learn: Iterable[str]) -> None:

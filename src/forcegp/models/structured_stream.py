@@ -20,6 +20,7 @@ from torch import Tensor
 
 from forcegp.cluster import on_cluster, worker_count
 from forcegp.data import Dataset
+from forcegp.data.selection import outliers
 from forcegp.data.stream import Keep, StreamedDataset, spaced_sample
 from forcegp.errors import ModelError
 from forcegp.forces.calibration import MOST_RESIDUALS, STRETCHES
@@ -51,7 +52,8 @@ class Sample:
         count: total number of samples to condition on, or 0 if `data` contains all of them.
         log: the streamed log, if any.
         stretches: a few contiguous runs of samples, for estimating the correlation time of residuals.
-        moving: whether samples at rest are ignored.
+        moving: whether samples at rest and outliers are ignored.
+        outliers: number of outliers in a streamed log.
     """
 
     data: Dataset | Sequence[Observation]
@@ -59,6 +61,7 @@ class Sample:
     log: StreamedDataset | None = None
     stretches: Dataset | None = None
     moving: bool = False
+    outliers: int = 0
 
     def neighbours(self, spec: Specification, training: Training) -> Training | None:
         """Return the contiguous runs of samples as training data.
@@ -85,30 +88,48 @@ def sample_of(spec: Specification, data: StreamedDataset) -> Sample:
         ModelError: exact inference is requested for a streamed log.
     """
     moving = spec.automatic or spec.noise.learns_torque
-    rows, stretches, count = _rows_of(data, moving_rows if moving else None)
+    dropped: list[int] = []
+    rows, stretches, count = _rows_of(data, moving_rows if moving else None, dropped)
     if moving and count < FEWEST_MOVING:
         moving = False
-        rows, stretches, count = _rows_of(data, None)
+        rows, stretches, count = _rows_of(data, None, dropped)
     _check_inference(spec, count, len(rows))
-    return Sample(rows, count, data, stretches, moving)
+    return Sample(rows, count, data, stretches, moving, sum(dropped) if moving else 0)
 
 
-def _rows_of(log: StreamedDataset, keep: Keep | None) -> tuple[Dataset, Dataset, int]:
-    """Return evenly spaced rows to keep, contiguous runs of rows to keep, and the number of all such rows."""
+def _rows_of(log: StreamedDataset, keep: Keep | None, dropped: list[int]) -> tuple[Dataset, Dataset, int]:
+    """Return evenly spaced rows to keep, contiguous runs of rows to keep, and the number of all such rows.
+
+    Args:
+        dropped: receives the number of outliers of each piece.
+    """
     stretches: list[Dataset] = []
-    rows, count = spaced_sample(_with_stretches(log, stretches, keep), SAMPLE_ROWS, keep)
+    rows, count = spaced_sample(_with_stretches(log, stretches, keep, dropped), SAMPLE_ROWS, keep)
     return rows, Dataset.concatenate(stretches), count
 
 
-def _with_stretches(stream: StreamedDataset, parts: list[Dataset], keep: Keep | None) -> Iterator[Dataset]:
+def _with_stretches(
+    stream: StreamedDataset, parts: list[Dataset], keep: Keep | None, dropped: list[int]
+) -> Iterator[Dataset]:
     """Yield the pieces of a log, and append the first rows of some pieces to `parts`."""
     last, length = stream.piece_count - 1, MOST_RESIDUALS // STRETCHES
-    pieces = followed(stream.pieces()) if stream.header.ordered else stream.pieces()
+    pieces = stream.pieces() if keep is None else possible(stream.pieces(), dropped)
+    pieces = followed(pieces) if stream.header.ordered else pieces
     wanted = {round(last * i / (STRETCHES - 1)) for i in range(STRETCHES)}
     for number, piece in enumerate(pieces):
         if number in wanted:
             parts.append((piece if keep is None else piece[keep(piece)])[:length])
         yield piece
+
+
+def possible(pieces: Iterable[Dataset], dropped: list[int] | None = None) -> Iterator[Dataset]:
+    """Yield the pieces of a log without outliers, and append the number of outliers of each piece."""
+    for piece in pieces:
+        bad = outliers(piece.q, piece.qd, piece.qdd, piece.tau)
+        count = int(bad.sum())
+        if dropped is not None:
+            dropped.append(count)
+        yield piece[~bad] if count else piece
 
 
 def followed(pieces: Iterable[Dataset]) -> Iterator[Dataset]:
@@ -226,7 +247,7 @@ class Part:
         hyperparameters: the hyperparameters.
         basis: the basis functions of all workers.
         scales: input scales, keyed by prior.
-        moving: whether samples at rest are ignored.
+        moving: whether samples at rest and outliers are ignored.
     """
 
     spec: Specification
@@ -239,8 +260,9 @@ class Part:
     def pieces(self, log: StreamedDataset, r: int = 0, k: int = 1) -> Iterator[Dataset]:
         """Yield piece r of every k, with the states of bristles if a prior depends on the past."""
         if any(prior.remembers for prior in self.problem.priors):
-            return islice(followed(log.pieces()), r, None, k)
-        return log.pieces((r, k))
+            whole = possible(log.pieces()) if self.moving else log.pieces()
+            return islice(followed(whole), r, None, k)
+        return possible(log.pieces((r, k))) if self.moving else log.pieces((r, k))
 
     @torch.no_grad()
     def piece(self, piece: Dataset) -> Totals:
