@@ -325,12 +325,18 @@ def inertia_of(
 ) -> Inertia:
     """Identify the inertia of a real robot from samples in free motion.
 
+    With fewer than `LEAST` such samples, links and drives stay at the robot file. In either case, their
+    remaining errors are unknown.
+
     Args:
         system: robot and contacts of the robot file.
         friction: prior that defines the features of joint friction.
         mean: prior mean of Q, including the motor torque.
-        training: samples in motion, at least `LEAST` of them in free motion.
+        training: samples in motion.
     """
+    if training.free_motions < LEAST:
+        size = drive_scale(system.robot, torch.cat([m.q for m in training.measurements]))
+        return Inertia(system.robot, InertialPrior().around(system.robot).with_drives(size))
     rows = free_rows(system, friction, mean, training).with_memory()
     return rigid_robot(system.robot, with_ripple(system.robot, rows))
 

@@ -17,7 +17,7 @@ from __future__ import annotations
 import dataclasses
 import time
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import torch
 from torch import Tensor, nn
@@ -145,9 +145,8 @@ class Specification:
         )
         if friction is None or not asks or any(isinstance(prior, InertialPrior) for prior in self.priors):
             return Inertia(self.system.robot)
-        if training.free_motions < LEAST:
-            return Inertia(self.system.robot, doubts=_unchecked_masses(training))
-        return inertia_of(self.system, friction, self.mean, training)
+        found = inertia_of(self.system, friction, self.mean, training)
+        return found if training.free_motions >= LEAST else replace(found, doubts=_unchecked_masses(training))
 
     def problem(
         self, training: Training, robot: RobotModel | None = None, pinned: Mapping[str, Tensor] | None = None
