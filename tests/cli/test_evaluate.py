@@ -14,7 +14,7 @@ from typer.testing import CliRunner
 import forcegp
 from forcegp.cli import app
 from forcegp.data import RobotMismatchWarning
-from forcegp.evaluation.scores import outliers
+from forcegp.data.selection import outliers
 from logs import random_log
 
 

@@ -4,7 +4,8 @@ Inputs are standardized, so typical samples are correlated if the length-scale i
 number of inputs. A log-normal prior around this initial value has a width of four e-folds above and one
 below. It keeps the length-scales of irrelevant inputs from drifting to infinity, and penalises length-scales
 so short that a force could fit the noise. The initial standard deviation of a force is the root mean square
-of the force that best explains the training residuals in the least-squares sense.
+of the force that best explains the training residuals in the least-squares sense. For joint forces of a model
+with torque noise, a share of the load is added, as another unknown force may hide them.
 """
 
 from __future__ import annotations
@@ -66,9 +67,9 @@ FRICTION_SAMPLES = 200
 """Maximum number of evenly spaced samples used to select the initial Coulomb friction."""
 COEFFICIENTS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
 """Friction coefficients to try."""
-UNSHOWN = 0.1
-"""Stated size of the friction of a joint in directions that no measurement shows, relative to its load.
-Over all joints of a real iiwa 14, it is .08."""
+LEAST_FORCE = 0.1
+"""Least stated size of the friction of a joint, relative to its load; .08 over all joints of a real iiwa 14.
+Least squares finds none if a contact or another unknown force hides it: 0.0005 N m at the hip of a leg."""
 PARALLEL = 1e-9
 """Two directions are considered parallel if one minus their mean cosine is below this value."""
 
@@ -78,16 +79,16 @@ def initial(problem: Problem, learn_noise: bool, learn_torque_noise: bool = Fals
     few = problem
     if problem.training.samples > START_SAMPLES:
         few = dataclasses.replace(problem, training=problem.training.evenly(START_SAMPLES))
-    noise, unseen = {}, None
+    noise, least = {}, None
     if learn_torque_noise:
-        unseen = UNSHOWN * few.typical_load()
+        least = LEAST_FORCE * few.typical_load()
         closed = (m.at(few.system) for m in few.training.measurements)
         noise = initial_torque_noise(few.torque_residual()) | stated_tips(few.system, closed)
     if problem.has_coulomb:
-        start = _with_friction(few, noise, unseen)
+        start = _with_friction(few, noise, least)
     else:
         beyond_noise = problem.external_std is not None
-        start = initial_hyperparameters(problem.priors, few.fixed_rows.blocks, beyond_noise, unseen)
+        start = initial_hyperparameters(problem.priors, few.fixed_rows.blocks, beyond_noise, least)
     start |= noise
     if learn_noise:
         stds = problem.training.noise_std
@@ -99,7 +100,7 @@ def initial(problem: Problem, learn_noise: bool, learn_torque_noise: bool = Fals
 
 
 @torch.no_grad()
-def _with_friction(problem: Problem, noise: Tensors, unseen: Tensor | None) -> Tensors:
+def _with_friction(problem: Problem, noise: Tensors, least: Tensor | None) -> Tensors:
     """Return the most likely Coulomb friction coefficient, and hyperparameters of the remaining forces.
 
     From a poor coefficient, learning may reach a local optimum in which friction depends on the state.
@@ -118,7 +119,7 @@ def _with_friction(problem: Problem, noise: Tensors, unseen: Tensor | None) -> T
             for key, value in friction.items()
         }
         rows = few.rows({**trial, **noise})
-        start = initial_hyperparameters(few.priors, rows.blocks, few.external_std is not None, unseen)
+        start = initial_hyperparameters(few.priors, rows.blocks, few.external_std is not None, least)
         return start | trial, rows
 
     def value(x: float) -> float:
@@ -135,13 +136,13 @@ def initial_hyperparameters(
     priors: Sequence[ForcePrior],
     blocks: Sequence[Block],
     beyond_noise: bool = False,
-    unseen: Tensor | None = None,
+    least: Tensor | None = None,
 ) -> dict[str, Tensor]:
     """Return the initial log-hyperparameters, keyed by `<prior>.<name>`.
 
     Args:
         beyond_noise: whether to subtract the contribution of noise, for example if unknown forces are given.
-        unseen: standard deviation of joint forces `(nq,)` in directions that no measurement shows.
+        least: standard deviation `(nq,)` of joint forces that least squares attributes to other forces.
 
     Raises:
         ModelError: contacts hold all joints in every sample, so no measurement depends on a force.
@@ -157,20 +158,15 @@ def initial_hyperparameters(
     # Some priors share the hyperparameters of another prior.
     for p, prior in [(p, prior) for p, prior in enumerate(priors) if prior.prefix == prior.name]:
         widths = {name: x.shape[-1] for name, x in blocks[0].features[p].items()}
-        stated = unseen if prior.per_joint else None
-        scale = _force_scale(p, blocks, prior.commensurate, beyond_noise, stated)
+        scale = _force_scale(p, blocks, prior.commensurate, beyond_noise)
+        scale = scale.hypot(least) if least is not None and prior.per_joint else scale
         initial = prior.stated(prior.kernel.initial(len(scale), widths, scale.log().cpu().double()))
         params |= {f"{prior.name}.{name}": value.to(scale.device) for name, value in initial.items()}
     return params
 
 
-def _force_scale(
-    p: int, blocks: Sequence[Block], commensurate: bool, beyond_noise: bool, unseen: Tensor | None = None
-) -> Tensor:
+def _force_scale(p: int, blocks: Sequence[Block], commensurate: bool, beyond_noise: bool) -> Tensor:
     """Return the root mean square `(components,)` of the least-squares force of prior p.
-
-    The least-squares force W⁺y has no part in the directions 1 − W⁺W that the rows do not show, as those of
-    joints that act along a contact. There, a given standard deviation counts.
 
     The rows determine only the sum of components with the same direction, which the minimum-norm solution
     divides evenly. Components with different units, such as viscous and dry friction, are fitted separately.
@@ -187,9 +183,6 @@ def _force_scale(
         square[:, groups] = (inverse @ block.target[..., None])[..., 0] ** 2
         if beyond_noise:
             square[:, groups] -= inverse.square().sum(-1)
-        if unseen is not None:
-            hidden = 1.0 - (inverse @ W[..., groups]).diagonal(dim1=-2, dim2=-1)
-            square[:, groups] += hidden.clamp(min=0.0) * unseen[groups] ** 2
         size = torch.where(alone, 1.0, W.square().sum(1))
         total, weight = total + (square * size)[:, first].sum(0), weight + size.sum(0)
     return (total.clamp(min=0.0) / weight.clamp(min=1e-300)).sqrt().clamp(1e-3, 1e4)
