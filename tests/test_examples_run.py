@@ -115,7 +115,6 @@ def test_mpc_with_learned_friction(tmp_path: Path) -> None:
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(strict=True, reason="the force leaves its bounds in 20 % of the steps with the regression")
 def test_mpc_holds_a_force(tmp_path: Path) -> None:
     for package in ("mujoco", "casadi"):
         pytest.importorskip(package)

@@ -4,8 +4,7 @@ Inputs are standardized, so typical samples are correlated if the length-scale i
 number of inputs. A log-normal prior around this initial value has a width of four e-folds above and one
 below. It keeps the length-scales of irrelevant inputs from drifting to infinity, and penalises length-scales
 so short that a force could fit the noise. The initial standard deviation of a force is the root mean square
-of the force that best explains the training residuals in the least-squares sense. For joint forces of a model
-with torque noise, a share of the load is added, as another unknown force may hide them.
+of the force that best explains the training residuals in the least-squares sense.
 """
 
 from __future__ import annotations
@@ -67,28 +66,34 @@ FRICTION_SAMPLES = 200
 """Maximum number of evenly spaced samples used to select the initial Coulomb friction."""
 COEFFICIENTS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
 """Friction coefficients to try."""
-LEAST_FORCE = 0.1
-"""Least stated size of the friction of a joint, relative to its load; .08 over all joints of a real iiwa 14.
-Least squares finds none if a contact or another unknown force hides it: 0.0005 N m at the hip of a leg."""
+UNSHOWN = 0.1
+"""Stated size of the friction of a joint in directions that no measurement shows, relative to its load.
+Over all joints of a real iiwa 14, it is .08."""
 PARALLEL = 1e-9
 """Two directions are considered parallel if one minus their mean cosine is below this value."""
 
 
-def initial(problem: Problem, learn_noise: bool, learn_torque_noise: bool = False) -> Tensors:
-    """Return the default initial values of all learnable parameters of a problem."""
+def initial(
+    problem: Problem, learn_noise: bool, learn_torque_noise: bool = False, automatic: bool = False
+) -> Tensors:
+    """Return the default initial values of all learnable parameters of a problem.
+
+    Args:
+        automatic: whether the priors were chosen automatically. Friction that no measurement shows then has
+            the size `UNSHOWN`. Of given priors, it has that of least squares.
+    """
     few = problem
     if problem.training.samples > START_SAMPLES:
         few = dataclasses.replace(problem, training=problem.training.evenly(START_SAMPLES))
-    noise, least = {}, None
+    noise, unseen = {}, UNSHOWN * few.typical_load() if automatic else None
     if learn_torque_noise:
-        least = LEAST_FORCE * few.typical_load()
         closed = (m.at(few.system) for m in few.training.measurements)
         noise = initial_torque_noise(few.torque_residual()) | stated_tips(few.system, closed)
     if problem.has_coulomb:
-        start = _with_friction(few, noise, least)
+        start = _with_friction(few, noise, unseen)
     else:
         beyond_noise = problem.external_std is not None
-        start = initial_hyperparameters(problem.priors, few.fixed_rows.blocks, beyond_noise, least)
+        start = initial_hyperparameters(problem.priors, few.fixed_rows.blocks, beyond_noise, unseen)
     start |= noise
     if learn_noise:
         stds = problem.training.noise_std
@@ -100,7 +105,7 @@ def initial(problem: Problem, learn_noise: bool, learn_torque_noise: bool = Fals
 
 
 @torch.no_grad()
-def _with_friction(problem: Problem, noise: Tensors, least: Tensor | None) -> Tensors:
+def _with_friction(problem: Problem, noise: Tensors, unseen: Tensor | None) -> Tensors:
     """Return the most likely Coulomb friction coefficient, and hyperparameters of the remaining forces.
 
     From a poor coefficient, learning may reach a local optimum in which friction depends on the state.
@@ -119,7 +124,7 @@ def _with_friction(problem: Problem, noise: Tensors, least: Tensor | None) -> Te
             for key, value in friction.items()
         }
         rows = few.rows({**trial, **noise})
-        start = initial_hyperparameters(few.priors, rows.blocks, few.external_std is not None, least)
+        start = initial_hyperparameters(few.priors, rows.blocks, few.external_std is not None, unseen)
         return start | trial, rows
 
     def value(x: float) -> float:
@@ -136,13 +141,13 @@ def initial_hyperparameters(
     priors: Sequence[ForcePrior],
     blocks: Sequence[Block],
     beyond_noise: bool = False,
-    least: Tensor | None = None,
+    unseen: Tensor | None = None,
 ) -> dict[str, Tensor]:
     """Return the initial log-hyperparameters, keyed by `<prior>.<name>`.
 
     Args:
         beyond_noise: whether to subtract the contribution of noise, for example if unknown forces are given.
-        least: standard deviation `(nq,)` of joint forces that least squares attributes to other forces.
+        unseen: standard deviation of joint forces `(nq,)` in directions that no measurement shows.
 
     Raises:
         ModelError: contacts hold all joints in every sample, so no measurement depends on a force.
@@ -158,15 +163,20 @@ def initial_hyperparameters(
     # Some priors share the hyperparameters of another prior.
     for p, prior in [(p, prior) for p, prior in enumerate(priors) if prior.prefix == prior.name]:
         widths = {name: x.shape[-1] for name, x in blocks[0].features[p].items()}
-        scale = _force_scale(p, blocks, prior.commensurate, beyond_noise)
-        scale = scale.hypot(least) if least is not None and prior.per_joint else scale
+        stated = unseen if prior.per_joint else None
+        scale = _force_scale(p, blocks, prior.commensurate, beyond_noise, stated)
         initial = prior.stated(prior.kernel.initial(len(scale), widths, scale.log().cpu().double()))
         params |= {f"{prior.name}.{name}": value.to(scale.device) for name, value in initial.items()}
     return params
 
 
-def _force_scale(p: int, blocks: Sequence[Block], commensurate: bool, beyond_noise: bool) -> Tensor:
+def _force_scale(
+    p: int, blocks: Sequence[Block], commensurate: bool, beyond_noise: bool, unseen: Tensor | None = None
+) -> Tensor:
     """Return the root mean square `(components,)` of the least-squares force of prior p.
+
+    The least-squares force W⁺y has no part in the directions 1 − W⁺W that the rows do not show, as those of
+    joints that act along a contact. There, a given standard deviation counts.
 
     The rows determine only the sum of components with the same direction, which the minimum-norm solution
     divides evenly. Components with different units, such as viscous and dry friction, are fitted separately.
@@ -183,6 +193,9 @@ def _force_scale(p: int, blocks: Sequence[Block], commensurate: bool, beyond_noi
         square[:, groups] = (inverse @ block.target[..., None])[..., 0] ** 2
         if beyond_noise:
             square[:, groups] -= inverse.square().sum(-1)
+        if unseen is not None:
+            hidden = 1.0 - (inverse @ W[..., groups]).diagonal(dim1=-2, dim2=-1)
+            square[:, groups] += hidden.clamp(min=0.0) * unseen[groups] ** 2
         size = torch.where(alone, 1.0, W.square().sum(1))
         total, weight = total + (square * size)[:, first].sum(0), weight + size.sum(0)
     return (total.clamp(min=0.0) / weight.clamp(min=1e-300)).sqrt().clamp(1e-3, 1e4)

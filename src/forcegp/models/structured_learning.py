@@ -298,7 +298,7 @@ def search_of(
     The scale of a force that the robot includes is not learned.
     """
     options = options or (OPTIONS if spec.analytical_parameters is None else WITH_PARAMETERS)
-    start = initial(problem, spec.noise.learn, spec.noise.learns_torque)
+    start = initial(problem, spec.noise.learn, spec.noise.learns_torque, spec.automatic)
     known = {} if chosen is None else known
     current = {key: known.get(key, value) for key, value in start.items()}
     if chosen is not None and NOISE not in chosen:
