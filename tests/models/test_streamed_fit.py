@@ -85,7 +85,7 @@ def test_samples_with_an_impossible_value_are_excluded_and_counted(
         log[log.t < data.t[70]].write(tmp_path / "a.parquet")
         found.append(friction.fit(files if streamed else log, options=SHORT))
     warnings = [" ".join(fit.result.warnings) for fit in found]
-    assert "1 samples were excluded as outliers" in warnings[0] and "outliers" not in warnings[1]
+    assert "excluded 1 outlier:" in warnings[0] and "outlier" not in warnings[1]
     assert_same(*found, 1e-6)
 
 

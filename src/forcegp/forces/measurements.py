@@ -234,8 +234,8 @@ def without_outliers(observations: Sequence[Observation]) -> tuple[list[Observat
 
 def excluded(dropped: int) -> tuple[str, ...]:
     """Return a warning about a number of outliers, if there are any."""
-    text = f"{dropped} samples were excluded as outliers: a value in them is impossible (see `forcegp check`)"
-    return (text,) if dropped else ()
+    text = f"excluded {dropped} outlier{'s' * (dropped > 1)}: samples with an impossible value"
+    return (f"{text} (`forcegp check` names other spikes)",) if dropped else ()
 
 
 FAR = 6.0

@@ -67,8 +67,8 @@ FRICTION_SAMPLES = 200
 COEFFICIENTS = (0.01, 0.02, 0.05, 0.1, 0.2, 0.4, 0.8, 1.6)
 """Friction coefficients to try."""
 UNSHOWN = 0.1
-"""Stated size of the friction of a joint in directions that no measurement shows, relative to its load.
-Over all joints of a real iiwa 14, it is .08."""
+"""Stated size of a joint's friction, relative to its load, in directions on which no measurement depends. The
+unexplained torque of a real iiwa 14 is .08 of the load, over all joints."""
 PARALLEL = 1e-9
 """Two directions are considered parallel if one minus their mean cosine is below this value."""
 
@@ -175,8 +175,8 @@ def _force_scale(
 ) -> Tensor:
     """Return the root mean square `(components,)` of the least-squares force of prior p.
 
-    The least-squares force W⁺y has no part in the directions 1 − W⁺W that the rows do not show, as those of
-    joints that act along a contact. There, a given standard deviation counts.
+    The rows do not depend on the directions 1 − W⁺W, such as those of joints that act along a contact. The
+    least-squares force W⁺y is zero there, so the given standard deviation `unseen` is used instead.
 
     The rows determine only the sum of components with the same direction, which the minimum-norm solution
     divides evenly. Components with different units, such as viscous and dry friction, are fitted separately.
