@@ -12,7 +12,7 @@ from torch import Tensor
 import forcegp
 from forcegp.forces.noise import TORQUE_NOISE
 from forcegp.forces.posterior import STICK_NOISE
-from forcegp.learning.scales import Residuals, _scored
+from forcegp.learning.scales import AT_REST, FEWEST, Residuals, Stated, _at_likeliest_speed, _scored
 
 JOINTS, ROWS = 3, 6000
 STD, STICK = torch.tensor([0.5, 0.1, 0.0]).double(), torch.tensor([0.0, 0.4, 0.0]).double()
@@ -41,6 +41,20 @@ def test_scoring_finds_variances_and_zeros() -> None:
     torque, stick = theta.sqrt().chunk(2)
     torch.testing.assert_close(torque, STD, rtol=SAMPLED, atol=0.01)
     torch.testing.assert_close(stick, STICK, rtol=SAMPLED, atol=0.03)
+
+
+def test_variances_of_few_independent_samples_are_the_stated_ones() -> None:
+    """Whatever was learned before the correlation of the samples was known."""
+    stated, learned = torch.full((6,), 4.0).double(), torch.full((6,), 0.01).double()
+    now, first = (torch.full((JOINTS,), math.log(x), dtype=torch.float64) for x in (0.1, 0.02))
+
+    def found(power: float) -> tuple[float, Tensor]:
+        known = Stated(stated, power, torch.ones_like(stated))
+        return _at_likeliest_speed(rows(), slice(0, JOINTS), now, first, learned, known, AT_REST)[1:]
+
+    speed, theta = found(0.5 * FEWEST / ROWS)
+    assert math.isclose(math.exp(speed), 0.02) and torch.equal(theta, stated)
+    torch.testing.assert_close(found(1.0)[1][:JOINTS].sqrt(), STD, rtol=SAMPLED, atol=0.03)
 
 
 def test_scoring_is_stationary_where_the_likelihood_is() -> None:

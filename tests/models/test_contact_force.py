@@ -12,7 +12,15 @@ from torch import Tensor
 import forcegp
 from forcegp.errors import ModelError, UnknownNameError
 from forcegp.forces.quantities import states
-from forcegp.forces.unknowns import share_at_rest, tip_factor, tip_keys, tip_operator, tip_variance
+from forcegp.forces.unknowns import (
+    REACH,
+    share_at_rest,
+    stated_tips,
+    tip_factor,
+    tip_keys,
+    tip_operator,
+    tip_variance,
+)
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.scene import load_scene
 from forcegp.simulate import simulate
@@ -133,6 +141,22 @@ def test_the_covariance_of_the_unknown_force() -> None:
     torch.testing.assert_close(N @ N.mT, expected)
     assert not bool(tip_operator(system, at, "table")[3].any())
     assert bool((share_at_rest({}, at, "table") < share_at_rest(values, at, "table")).all())
+
+
+def test_rest_is_told_by_the_speed_along_the_normal() -> None:
+    """A closed contact has no normal speed, so that its apparent one is an error of velocities."""
+    system, wrong = load_scene("ur5_wiping").system(), 0.05
+    log = judged("sticks")[0]
+    closed = torch.ones(len(log), 1, dtype=torch.bool)
+    point = system.equations(log.q, log.qd).contact_points["table"]
+    up = torch.linalg.pinv(point.jacobian) @ point.unit_normal[..., None]
+    noise = torch.randn(len(log), generator=torch.Generator().manual_seed(0), dtype=torch.float64)
+    speeds = []
+    for size in (0.0, wrong):
+        at = states(system, log.q, log.qd + size * noise[:, None] * up[..., 0], log.tau, closed)
+        speeds.append(float(stated_tips(system, [at])[tip_keys("table").speed].exp()))
+    assert speeds[0] == pytest.approx(0.02)
+    assert speeds[1] == pytest.approx(REACH * wrong, rel=0.15)
 
 
 def test_contacts_that_cannot_be_read() -> None:

@@ -6,8 +6,9 @@ explain is therefore drawn anew in each row, at the tip as at a joint:
 
     u ~ N(0, (σ² + s² k) (1 − n nᵀ)),  k = e^{−(v/v_s)²}
 
-for the tangential speed v of the contact point. It acts on the joints through J_Eᵀ. Rest is found by speed.
-A large s is the same as projecting the direction out.
+for the tangential speed v of the contact point. It acts on the joints through J_Eᵀ. Rest is found by speed,
+and the speed of a point at rest is not zero if velocities are wrong. A closed contact has no normal speed, so
+the normal speed of its point shows by how much. A large s is the same as projecting the direction out.
 """
 
 from __future__ import annotations
@@ -23,6 +24,7 @@ from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.forces.posterior import RELATIVE, STICKING
 from forcegp.forces.priors.base import NOISE
 from forcegp.forces.quantities import States
+from forcegp.robust import MAD_TO_STD
 
 DETERMINED = 1e-6
 """Smallest part 1 − R_ii of a multiplier that the motion determines, up to rounding."""
@@ -31,6 +33,10 @@ AXES = 3
 LARGEST_COEFFICIENT = 1.0
 """Stated ratio of s to the typical normal force: friction at rest is at most μ λ, with μ ≤ 1 for most dry
 materials. It holds if fewer than ten independent samples are at rest (`learning/scales.py`)."""
+REACH = 3.0
+"""Ratio of v_s to the standard deviation of the normal speed of a closed contact. A real leg has an apparent
+normal speed of .03 to .04 m/s. Its fore-aft errors are 1.55 times those of the equations of motion with 1,
+1.11 with 2, 1.00 with 3, and .96 with 5. Simulated contacts have no normal speed."""
 
 
 class TipKeys(NamedTuple):
@@ -92,20 +98,27 @@ def stated_tips(system: ConstrainedSystem, states: Iterable[States]) -> dict[str
     """Return initial values for each contact, from normal forces at states under the robot file and τ.
 
     Contacts that share a load have λ_i/√(1 − R_ii) with the projector R onto Aᵀμ = 0, so that the variance of
-    their common tangential force is that of one contact.
+    their common tangential force is that of one contact. v_s is at least `REACH` times the standard deviation
+    of the speed along the normal.
     """
-    found, loads = {}, list[tuple[Tensor, Tensor]]()
+    found, loads, normal = {}, list[tuple[Tensor, Tensor]](), dict[str, list[Tensor]]()
     for at in states:
         own = 1.0 - at.eom.hidden.diagonal(dim1=-2, dim2=-1)
         force = at.eom.multiplier(at.eom.Q_K + at.tau).clamp(min=0.0)
         loads.append(
             (at.active, torch.where(own > DETERMINED, force / own.clamp(min=DETERMINED).sqrt(), 0.0))
         )
+        for name, closed in zip(system.contact_names, at.active.unbind(-1), strict=True):
+            if (point := at.eom.contact_points.get(name)) is not None:
+                speed = torch.linalg.vecdot(point.unit_normal, point.velocity)[closed]
+                normal.setdefault(name, []).append(speed)
     for name in free_tips(system):
         index, row = system.contact_names.index(name), system.rows[name].start
         load = torch.cat([force[active[:, index], row] for active, force in loads])
         if len(load) and bool((load > 0.0).any()):
             s = LARGEST_COEFFICIENT * float(load.square().mean().sqrt())
-            values = (system.robot.mass.new_tensor(math.log(x)) for x in (RELATIVE * s, s, STICKING))
+            speed = REACH * MAD_TO_STD * float(torch.cat(normal[name]).abs().median())
+            stated = RELATIVE * s, s, max(STICKING, speed)
+            values = (system.robot.mass.new_tensor(math.log(x)) for x in stated)
             found |= dict(zip(tip_keys(name), values, strict=True))
     return found

@@ -37,6 +37,7 @@ from forcegp.learning.scales import (
     MOTIONS,
     Scales,
     learned_scales,
+    noise_of,
     residuals,
     variances,
     without_components,
@@ -191,8 +192,7 @@ def _alternating(
         if settled and degrees_of_freedom is None:
             break
         # The scales start from the stated ones again.
-        noise = {key: value for key, value in values.items() if key.startswith(NOISE + ".")}
-        found = learned_scales(part, {**start, **noise, **searched}, learns, noisy, prunes)
+        found = learned_scales(part, {**start, **searched}, learns, noisy, prunes, noise_of(values))
     return found
 
 
@@ -232,7 +232,8 @@ def with_remainder(
     problem = given.with_priors(later, whole)
     values = {**laws.values, **start}
     problem = with_inducing(problem, values, SUPPORT)
-    found = learned_scales(problem, values, lambda name: name in names and learns(name), noisy, False)
+    stated, own = {**values, **laws.stated_noise}, lambda name: name in names and learns(name)
+    found = learned_scales(problem, stated, own, noisy, False, noise_of(values))
     found = dataclasses.replace(found, idle=laws.idle)
     if not prunes or not all(map(learns, names)):
         return found

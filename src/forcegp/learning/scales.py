@@ -13,7 +13,7 @@
    in the directions that closed contacts leave free, where the three components of a contact force have one
    variance, over which its squares are summed. A variance that the data do not show is zero.
 3. Residuals are correlated in time. If τ is their autocorrelation time, n samples contain as much information
-   as κ n independent ones, κ = 1/τ.
+   as κ n independent ones, κ = 1/τ. A variance with too few of them has its stated value.
 """
 
 from __future__ import annotations
@@ -30,6 +30,7 @@ from torch import Tensor
 from forcegp.forces.calibration import autocorrelation_time
 from forcegp.forces.noise import TORQUE_NOISE
 from forcegp.forces.posterior import STICK_NOISE, STICK_SPEED, hidden_variance
+from forcegp.forces.priors.base import NOISE
 from forcegp.forces.problem import Problem, Tensors, basis_of, remainder
 from forcegp.forces.quantities import affine_map
 from forcegp.forces.unknowns import AXES, learned_tips, share_at_rest, tip_keys, tip_operator
@@ -55,9 +56,9 @@ LEAST_VARIANCE = 1e-16
 AT_REST = (0.02, 0.05, 0.1)
 """Speeds v_s below which a joint or contact is nearly at rest, of which the likeliest is taken [rad/s, m/s]:
 the resolution of common encoders, and speeds at which joints reverse within a sampling period."""
-FEWEST_AT_REST = 10.0
-"""Number of independent samples at rest below which static friction keeps its stated value, and of samples in
-contact below which the unknown force of a contact that slides does."""
+FEWEST = 10.0
+"""Number of independent samples below which a variance has its stated value. Of static friction, samples at
+rest count, and of the unknown force of a contact that slides, samples in contact."""
 LEAST_SHARE = 0.2
 """Smallest share of the samples that remains after the determined directions are subtracted."""
 MOTIONS = ("qdd", "joint_force", "contact_force", "multiplier")
@@ -75,6 +76,7 @@ class Scales:
         values: the hyperparameters.
         groups, evidence: the groups of columns, and their evidence.
         stated: logarithm of the stated scale of each group over its scale in `values` `(g,)`.
+        stated_noise: stated hyperparameters of the noise.
         kept: mask `(g,)` of the groups that are learned and were not dropped.
         idle: prior and component of the families that were dropped.
         rounds: number of alternations.
@@ -86,6 +88,7 @@ class Scales:
     groups: list[Group]
     evidence: Evidence
     stated: Tensor
+    stated_noise: Tensors
     kept: Tensor
     idle: tuple[tuple[int, int], ...] = ()
     rounds: int = 0
@@ -94,22 +97,29 @@ class Scales:
 
 @torch.no_grad()
 def learned_scales(
-    problem: Problem, start: Mapping[str, Tensor], learns: Callable[[str], bool], noisy: bool, prunes: bool
+    problem: Problem,
+    start: Mapping[str, Tensor],
+    learns: Callable[[str], bool],
+    noisy: bool,
+    prunes: bool,
+    begin: Mapping[str, Tensor] | None = None,
 ) -> Scales:
     """Return the scales of all columns and the torque noise of a problem.
 
     Args:
         problem: the problem; all priors have finitely many columns or inducing points.
-        start: initial hyperparameters, whose scales are the stated ones.
+        start: initial hyperparameters, whose scales and noise are the stated ones.
         learns: function that returns whether the scales with a given prefix are learned.
         noisy: whether torque noise is learned.
         prunes: whether to drop columns that the evidence does not carry.
+        begin: initial hyperparameters that are not at their stated values.
     """
-    groups, sums = _sums(problem, dict(start))
+    values = {**start, **(begin or {})}
+    groups, sums = _sums(problem, values)
     kept = torch.tensor([learns(group.key.split(".")[0]) for group in groups])
     none = fixed_point(sums, groups, sums.v.new_zeros(len(groups)), torch.zeros_like(kept))
-    begin = Scales(problem, dict(start), groups, none, torch.zeros_like(none.log_scales), kept)
-    found = _alternated(begin, noisy)
+    stated = torch.zeros_like(none.log_scales)
+    found = _alternated(Scales(problem, values, groups, none, stated, noise_of(start), kept), noisy)
     if not prunes:
         return found
     families = {key: f for key, f in families_of(groups).items() if bool(kept[f].all())}
@@ -117,6 +127,11 @@ def learned_scales(
     evidence, left = without_idle(sums, groups, found.stated, kept, list(families.values()))
     idle = tuple(key for key, family in families.items() if not bool(left[family].any()))
     return _alternated(_moved(replace(found, kept=left, idle=idle), evidence), noisy)
+
+
+def noise_of(values: Mapping[str, Tensor]) -> Tensors:
+    """Return the hyperparameters of the noise."""
+    return {key: value for key, value in values.items() if key.startswith(NOISE + ".")}
 
 
 def _sums(problem: Problem, values: Tensors) -> tuple[list[Group], Sums]:
@@ -141,7 +156,7 @@ def _alternated(found: Scales, noisy: bool) -> Scales:
             break
         before = _noise(found.values)
         speeds = AT_REST if number == 0 else ()
-        values, power = _with_noise(found.problem, found.values, found.groups, found.evidence, speeds)
+        values, power = _with_noise(found, speeds)
         found = replace(found, problem=replace(found.problem, power=power), values=values)
         size = before.maximum(_noise(values))
         change = (_noise(values) - before).abs()
@@ -273,62 +288,79 @@ def variances(problem: Problem, values: Tensors) -> tuple[Tensor, Tensor]:
     return slides, rests
 
 
-def _with_noise(
-    problem: Problem, values: Tensors, groups: list[Group], evidence: Evidence, speeds: Sequence[float]
-) -> tuple[Tensors, float]:
+def _with_noise(found: Scales, speeds: Sequence[float]) -> tuple[Tensors, float]:
     """Return the hyperparameters with updated torque noise and static friction, and the exponent κ.
 
     Args:
-        speeds: speeds v_s to try; the present ones if there are none.
+        speeds: speeds v_s to try, if they are above the stated one; the present ones if there are none.
     """
+    problem, values = found.problem, found.values
     motions = [i for i, m in enumerate(problem.training.measurements) if m.quantity in MOTIONS]
-    each = [residuals(problem, values, evidence.weights, i) for i in motions]
+    each = [residuals(problem, values, found.evidence.weights, i) for i in motions]
+    power = exponent(problem, motions, each, *variances(problem, values))
+    problem = replace(problem, power=power)
     widest = max(rows.r.shape[-1] for rows in each)
     parts = zip(*(rows.padded(widest) for rows in each), strict=True)
     whole = Residuals(*map(torch.cat, parts))
     nq, tips = whole.external.shape[-1], [tip_keys(name) for name in learned_tips(problem.system, values)]
     keys, theta = variance_keys(problem, values), torch.cat(variances(problem, values))
-    gamma = determined_by_joint(problem, groups, evidence)
-    share = (1.0 - gamma / (problem.power * len(whole.r))).clamp(min=LEAST_SHARE)
+    gamma = determined_by_joint(problem, found.groups, found.evidence)
+    share = (1.0 - gamma / (power * len(whole.r))).clamp(min=LEAST_SHARE)
     share = torch.nn.functional.pad(share, (0, len(tips)), value=1.0).repeat(2)
+    stated = Stated(torch.cat(variances(problem, found.stated_noise)), power, share)
     # k = e^{−(v/v_s)²} for other speeds v_s, first of the joints and then of the contacts
+    first = found.stated_noise[STICK_SPEED]
     rows, speed, theta = _at_likeliest_speed(
-        whole, slice(0, nq), values[STICK_SPEED], theta, share, problem.power, speeds
+        whole, slice(0, nq), values[STICK_SPEED], first, theta, stated, speeds
     )
     changed = {STICK_SPEED: torch.full_like(values[STICK_NOISE], speed)}
     if tips:
-        now = torch.stack([values[tip.speed] for tip in tips])
-        _, speed, theta = _at_likeliest_speed(rows, slice(nq, None), now, theta, share, problem.power, speeds)
+        now, first = (torch.stack([x[tip.speed] for tip in tips]) for x in (values, found.stated_noise))
+        _, speed, theta = _at_likeliest_speed(rows, slice(nq, None), now, first, theta, stated, speeds)
         changed |= {tip.speed: torch.full_like(x, speed) for tip, x in zip(tips, now, strict=True)}
     torque, stick = theta.clamp(min=LEAST_VARIANCE).chunk(2)
     for (joints, *contacts), x in zip(keys, (0.5 * torque.log(), 0.5 * stick.log()), strict=True):
         changed |= {joints: x[:nq], **dict(zip(contacts, x[nq:].unbind(), strict=True))}
-    return {**values, **changed}, exponent(problem, motions, each, torque, stick)
+    return {**values, **changed}, power
+
+
+class Stated(NamedTuple):
+    """Stated variances θ, κ, and the share of the samples that determines each θ."""
+
+    theta: Tensor
+    power: float
+    share: Tensor
 
 
 def _at_likeliest_speed(
     whole: Residuals,
     own: slice,
     now: Tensor,
+    first: Tensor,
     theta: Tensor,
-    share: Tensor,
-    power: float,
+    stated: Stated,
     speeds: Sequence[float],
 ) -> tuple[Residuals, float, Tensor]:
     """Return the rows, log v_s and the variances θ for the likeliest speed of some joints or contacts.
 
     Args:
         own: the columns of these joints or contacts in `slow`.
-        now: current log v_s of each, which all share.
-        speeds: speeds v_s to try; the current one if there are none.
+        now, first: current and stated log v_s of each, which all share.
+        speeds: speeds v_s to try, if they are above the stated one and enough samples are below them; the
+            current one if there are none.
     """
-    tried, joints = [], torch.ones(whole.external.shape[-1], dtype=torch.bool)
-    for speed in map(math.log, speeds) if speeds else [float(now[0])]:
+    least, tried = float(first.max()), []
+    for speed in [least, *map(math.log, speeds)] if speeds else [float(now[0])]:
         slow = whole.slow.clone()
         slow[:, own] = slow[:, own] ** (2.0 * (now - speed)).exp()
         rows = whole._replace(slow=slow)
-        enough = power * torch.cat([rows.closed.sum(0), slow.sum(0)]) >= FEWEST_AT_REST
-        found = _settled(rows, theta, share, torch.cat([joints.to(enough.device), enough]))
+        counts = torch.full_like(slow[0], len(slow)), slow.sum(0)
+        counts[0][whole.external.shape[-1] :] = rows.closed.sum(0)
+        few = stated.power * float(counts[1][own].max()) < FEWEST
+        if tried and (speed <= least or few):
+            continue
+        free = stated.power * torch.cat(counts) >= FEWEST
+        found = _settled(rows, torch.where(free, theta, stated.theta), stated.share, free)
         tried.append((rows.log_density(*found.chunk(2)), rows, speed, found))
     return max(tried, key=lambda each: each[0])[1:]
 
@@ -341,7 +373,7 @@ def _settled(rows: Residuals, theta: Tensor, share: Tensor, free: Tensor) -> Ten
     """
     nq, count = rows.external.shape[-1], rows.slow.shape[-1]
     joints = (torch.arange(count) < nq).repeat(2).to(theta.device)
-    for _ in range(STEPS):
+    for _ in range(STEPS if bool(free.any()) else 0):
         step = torch.where(free, _scored(rows, theta, share, free) - theta, 0.0)
         if bool((step.abs() > 0.5 * theta).any()):
             step = _shortened(rows, theta, step)
