@@ -30,8 +30,8 @@ from forcegp.data import split_by_stretches
 from forcegp.forces.priors.sets import PAPER, default_priors
 from forcegp.forces.problem import Problem, kernel_parameters
 from forcegp.forces.quantities import states
-from forcegp.forces.search import initial
 from forcegp.gp.likelihood import negative_log_likelihood
+from forcegp.learning.search import initial
 from forcegp.models.structured_learning import training_for
 from forcegp.simulate import simulate
 

@@ -469,7 +469,7 @@ def hop(logs: Path) -> dict[str, object]:
 
 def torque_shares(logs: Path) -> dict[str, object]:
     """Root mean square over the load of all joints of M q̈ − Q, for each joint of the iiwa 14 and for all: by
-    how much torques of a robot file without friction are wrong, `UNSHOWN` of `forcegp.forces.search`."""
+    how much torques of a robot file without friction are wrong, `UNSHOWN` of `forcegp.learning.search`."""
     (case,) = iiwa14(logs)
     data = evenly(moving(case.train), 4000)
     eom = case.system.equations(data.q, data.qd)

@@ -34,9 +34,9 @@ from torch import Tensor
 import forcegp
 from forcegp.errors import optional_module
 from forcegp.evaluation.least_squares import identify_rigid
-from forcegp.forces.inertia import latent_precision, one_row
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.identification import regressor
+from forcegp.learning.inertia import latent_precision, one_row
 from forcegp.logs import parse_mapping
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.robot.model import RobotModel

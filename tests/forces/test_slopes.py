@@ -10,11 +10,11 @@ import torch
 from torch import Tensor
 
 import forcegp
-from forcegp.forces import noise_learning
 from forcegp.forces.measurements import Measurement, Training
 from forcegp.forces.noise import learned_slopes, state_jacobian
 from forcegp.forces.priors.sets import default_priors
 from forcegp.forces.quantities import States, states
+from forcegp.learning import noise_learning
 from forcegp.models import structured_learning
 from forcegp.models.structured_fit import StructuredFit
 from forces.cases import draw, mixed_contacts, two_contacts

@@ -10,7 +10,7 @@ import torch
 
 import forcegp
 from forcegp import LearningOptions
-from forcegp.forces.search import Search
+from forcegp.learning.search import Search
 from forcegp.models.independent_gp import IndependentGP
 from forces.cases import draw, logged, two_contacts
 from forces.textbook import Textbook, squared_exponential

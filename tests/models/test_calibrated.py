@@ -15,12 +15,12 @@ from forcegp.cli.app import app
 from forcegp.control.information import Unknowns
 from forcegp.dynamics import damping_force, inverse_dynamics, mass_matrix
 from forcegp.errors import ModelError, ParameterError, UnknownNameError, optional_module
-from forcegp.forces.inertia import latent_precision, one_row
 from forcegp.forces.posterior import ForceSamples
 from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
 from forcegp.forces.priors.joint import JointFrictionPrior
 from forcegp.forces.quantities import states_at
 from forcegp.identification import regressor
+from forcegp.learning.inertia import latent_precision, one_row
 from forcegp.models.calibrated import (
     _Reader,
     calibrated,
@@ -35,7 +35,7 @@ from forcegp.rollout import RolloutOptions
 from forcegp.simulate.excite import Limits, excite, random_states
 from forcegp.simulate.passive import PassiveForces
 from forcegp.simulate.urdf import write_urdf
-from forces.test_inertia import log, unit_inertia
+from learning.test_inertia import log, unit_inertia
 
 mujoco = optional_module("mujoco", "These tests")
 DAMPING, DRY = (0.3, 0.1), (1.0, 0.4)

@@ -22,10 +22,10 @@ from forcegp.forces.priors.contact import ContactForcePrior, SlidingFrictionPrio
 from forcegp.forces.priors.joint import JointForcePrior, JointFrictionPrior
 from forcegp.forces.priors.sets import default_priors
 from forcegp.forces.quantities import QUANTITIES, states
-from forcegp.forces.search import negative_log_prior
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.kernels import Linear, Matern52, SquaredExponential
 from forcegp.gp.optimise import LearningOptions
+from forcegp.learning.search import negative_log_prior
 from forcegp.models.prediction import CHUNK
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.models.structured_gp import StructuredGP

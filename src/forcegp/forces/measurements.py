@@ -156,6 +156,11 @@ class Training:
         return tuple(m.quantity for m in self.measurements)
 
     @property
+    def motions(self) -> list[int]:
+        """Indices of measured accelerations, and of joint forces computed with a force sensor."""
+        return [i for i, quantity in enumerate(self.quantities) if quantity in ("qdd", "joint_force")]
+
+    @property
     def free_motions(self) -> int:
         """Return the largest number of accelerations in free motion in any one measurement."""
         free = [int((~m.active.any(-1)).sum()) for m in self.measurements if m.quantity == "qdd"]

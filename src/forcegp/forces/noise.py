@@ -4,7 +4,7 @@ State noise is propagated to first order. At a measured state x + δ with δ ~ N
 + δ) ≈ z(x) + G δ with G = ∂z/∂(q, q̇), so the rows of a sample have additional noise with covariance G Σ_x Gᵀ
 (McHutchon and Rasmussen, *Gaussian process training with input noise*, 2011). G is first computed from the
 equations of motion of the robot file under the measured torque. Once forces have been learned, it is computed
-from q̈ = L b + H F̄ with their posterior mean F̄ (`forces/noise_learning.py`).
+from q̈ = L b + H F̄ with their posterior mean F̄ (`learning/noise_learning.py`).
 """
 
 from __future__ import annotations

@@ -1,12 +1,14 @@
 """A fit of columns to a log, as the list of its steps.
 
 1. Samples at rest only bound friction, and impacts violate the equations of motion; the others are used.
-2. Inertia is identified with instruments, if held-out parts of the log confirm it (`forces/inertia.py`). Its
+2. Inertia is identified with instruments, if held-out parts of the log confirm it (`inertia.py`). Its
    remaining errors are unknowns of zero mean.
-3. Scales of all columns, torque noise and static friction follow from the evidence (`scales.py`), and the
-   Coulomb friction of contacts, which is not linear in its parameters, from a search given these scales.
-4. Torque noise is raised to the level observed on held-out blocks of the log (`forces/calibration.py`).
-5. The posterior is conditioned on all samples (`models/structured_fit.py`).
+3. Scales of all columns (`evidence.py`), torque noise and static friction (`scales.py`) follow from the
+   evidence, and the Coulomb friction of contacts, which is not linear in its parameters, from a search given
+   these scales.
+4. Torque noise is raised to the level observed on held-out blocks of the log (`held_out.py`).
+5. The correlation of residuals in time determines how many samples are independent (`correlation.py`).
+6. The posterior is conditioned on all samples (`models/structured_fit.py`).
 """
 
 from __future__ import annotations
@@ -20,19 +22,18 @@ import scipy.special
 import torch
 from torch import Tensor
 
-from forcegp.forces.calibration import held_out_squares
 from forcegp.forces.measurements import Training, scaled
 from forcegp.forces.noise import TORQUE_NOISE, white_noise_std
-from forcegp.forces.noise_learning import weighted
 from forcegp.forces.posterior import MEMORY
 from forcegp.forces.priors.base import COULOMB, NOISE, ForcePrior
 from forcegp.forces.priors.memory import BristlePrior
 from forcegp.forces.priors.ripple import RipplePrior, ripple_of
 from forcegp.forces.problem import Problem, Tensors, basis_of, noise_key, with_inducing, without_inducing
-from forcegp.forces.search import Search, initial
 from forcegp.gp.kernels import Columns, Constant, Kernel, Linear, SquaredExponential
 from forcegp.gp.optimise import FitProgress, LearningOptions
 from forcegp.learning.evidence import families_of, worth
+from forcegp.learning.held_out import held_out_squares
+from forcegp.learning.noise_learning import weighted
 from forcegp.learning.scales import (
     MOTIONS,
     Scales,
@@ -42,6 +43,7 @@ from forcegp.learning.scales import (
     variances,
     without_components,
 )
+from forcegp.learning.search import Search, initial
 
 SAMPLES = 4000
 """Maximum number of evenly spaced samples from which scales and noise are learned. Ten parameters of a joint

@@ -27,7 +27,6 @@ import scipy.optimize
 import torch
 from torch import Tensor
 
-from forcegp.forces.calibration import autocorrelation_time
 from forcegp.forces.noise import TORQUE_NOISE
 from forcegp.forces.posterior import STICK_NOISE, STICK_SPEED, hidden_variance
 from forcegp.forces.priors.base import NOISE
@@ -35,6 +34,7 @@ from forcegp.forces.problem import Problem, Tensors, basis_of, remainder
 from forcegp.forces.quantities import affine_map
 from forcegp.forces.unknowns import AXES, learned_tips, share_at_rest, tip_keys, tip_operator
 from forcegp.gp.sums import Sums, accumulate, without_feedback
+from forcegp.learning.correlation import autocorrelation_time
 from forcegp.learning.evidence import (
     SMALLEST,
     Evidence,

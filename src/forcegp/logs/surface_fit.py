@@ -17,7 +17,7 @@ from forcegp import kinematics
 from forcegp.constraints import ConstrainedSystem, Plane, Sphere, SurfaceContact
 from forcegp.data import Dataset
 from forcegp.errors import DataError
-from forcegp.forces.calibration import autocorrelation_time
+from forcegp.learning.correlation import autocorrelation_time
 from forcegp.logs.table import Array
 from forcegp.robust import robust_std
 

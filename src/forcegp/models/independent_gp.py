@@ -24,11 +24,11 @@ from forcegp.forces.noise import Noise
 from forcegp.forces.priors.joint import JointForcePrior
 from forcegp.forces.problem import require_double
 from forcegp.forces.quantities import FlatStates
-from forcegp.forces.search import box_around, doubts_at_bounds, initial_hyperparameters, negative_log_prior
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.features import Block, Standardization
 from forcegp.gp.likelihood import negative_log_likelihood
 from forcegp.gp.optimise import Learned, LearningOptions, minimise, reported
+from forcegp.learning.search import box_around, doubts_at_bounds, initial_hyperparameters, negative_log_prior
 from forcegp.models.base import AccelerationFit, FitProgress, Model
 from forcegp.models.fit_result import FitResult
 from forcegp.resources import announce_memory

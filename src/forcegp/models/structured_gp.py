@@ -61,7 +61,7 @@ class StructuredGP(Model[StructuredFit]):
         inducing_points: maximum number of inducing points per prior. Fewer points are used if they suffice.
             The result of the fit indicates whether more points would help.
         inertia: `"file"` keeps the inertia of the robot. `"auto"` identifies the inertia of links and drives
-            that the log determines (`forces/inertia.py`). It requires a
+            that the log determines (`learning/inertia.py`). It requires a
             `JointFrictionPrior` and a mean that includes the motor torque. `None` means `"auto"` for
             automatically selected priors, and `"file"` otherwise.
         standardize: whether to standardize kernel inputs, which the paper does not do.

@@ -5,7 +5,7 @@
 2. If all unknowns are columns, their scales and the variances of rows follow from the evidence
    (`learning/fit.py`). Other hyperparameters are searched on part of a long log, or on all of a short log.
 3. If residuals are correlated in time, the likelihood is tempered. For kernels, residuals also determine
-   slopes and weights (`forces/noise_learning.py`), and hyperparameters are then learned again.
+   slopes and weights (`learning/noise_learning.py`), and hyperparameters are then learned again.
 4. Inertial parameters move to their posterior mean in one physically consistent Gauss–Newton step.
 5. Torque noise is increased to the level observed on held-out blocks of the training log. Its growth beyond
    the trained speeds and torques is learned from held-out regimes.
@@ -26,9 +26,6 @@ from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
 from forcegp.data.fields import common_stick_speeds
 from forcegp.errors import check_name
-from forcegp.forces.calibration import calibrated_noise, residual_times
-from forcegp.forces.inertia import Inertia, inertia_of, with_updated_robot
-from forcegp.forces.inverse_dynamics import LEAST, without_delay
 from forcegp.forces.measurements import (
     Observation,
     Training,
@@ -43,7 +40,6 @@ from forcegp.forces.measurements import (
     without_outliers,
 )
 from forcegp.forces.noise import TORQUE_NOISE, Noise, external_std, state_std_of
-from forcegp.forces.noise_learning import left_out, weighted, with_learned_slopes
 from forcegp.forces.posterior import REGION
 from forcegp.forces.priors.base import ANALYTICAL, COULOMB, NOISE, ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior
@@ -51,10 +47,15 @@ from forcegp.forces.priors.joint import AnalyticalMean, ConstantForcePrior, Join
 from forcegp.forces.priors.memory import LONGEST_STEP, PAST, BristlePrior
 from forcegp.forces.priors.residual import ResidualPrior
 from forcegp.forces.problem import Problem, is_finite, is_sparse, with_inducing, without_inducing
-from forcegp.forces.search import Search, initial
 from forcegp.gp.exact import require_exact_fits
 from forcegp.gp.optimise import FitProgress, Learned, LearningOptions, Progress, reported
+from forcegp.learning.correlation import residual_times
 from forcegp.learning.fit import are_columns, regression, with_acceleration_noise, with_expectations
+from forcegp.learning.held_out import calibrated_noise
+from forcegp.learning.inertia import Inertia, inertia_of, with_updated_robot
+from forcegp.learning.inverse_dynamics import LEAST, without_delay
+from forcegp.learning.noise_learning import left_out, weighted, with_learned_slopes
+from forcegp.learning.search import Search, initial
 from forcegp.robot.model import RobotModel
 from forcegp.storage.options import StructuredOptions
 

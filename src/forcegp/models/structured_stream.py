@@ -23,8 +23,6 @@ from forcegp.data import Dataset
 from forcegp.data.selection import outliers
 from forcegp.data.stream import Keep, StreamedDataset, spaced_sample
 from forcegp.errors import ModelError
-from forcegp.forces.calibration import MOST_RESIDUALS, STRETCHES
-from forcegp.forces.inverse_dynamics import without_delay
 from forcegp.forces.measurements import Observation, Training, period_of, training_of
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import ForcePrior
@@ -32,6 +30,8 @@ from forcegp.forces.priors.memory import LONGEST_STEP, PAST, Past, bristles
 from forcegp.forces.problem import PIECE_SAMPLES, Problem, Totals, basis_of, posterior_of, total_over
 from forcegp.gp.basis import LatentBasis
 from forcegp.gp.features import Standardization
+from forcegp.learning.correlation import MOST_RESIDUALS, RUNS
+from forcegp.learning.inverse_dynamics import without_delay
 from forcegp.models.base import FitProgress
 from forcegp.models.structured_learning import FEWEST_MOVING, REST_SPEED, Specification
 from forcegp.resources import one_thread
@@ -112,10 +112,10 @@ def _with_stretches(
     stream: StreamedDataset, parts: list[Dataset], keep: Keep | None, dropped: list[int]
 ) -> Iterator[Dataset]:
     """Yield the pieces of a log, and append the first rows of some pieces to `parts`."""
-    last, length = stream.piece_count - 1, MOST_RESIDUALS // STRETCHES
+    last, length = stream.piece_count - 1, MOST_RESIDUALS // RUNS
     pieces = stream.pieces() if keep is None else possible(stream.pieces(), dropped)
     pieces = followed(pieces) if stream.header.ordered else pieces
-    wanted = {round(last * i / (STRETCHES - 1)) for i in range(STRETCHES)}
+    wanted = {round(last * i / (RUNS - 1)) for i in range(RUNS)}
     for number, piece in enumerate(pieces):
         if number in wanted:
             parts.append((piece if keep is None else piece[keep(piece)])[:length])

@@ -351,7 +351,7 @@ class CoulombErrorPrior(ConstantForcePrior):
     """A prior on the error of learned friction, Q_z = λ̂ ∂(μ u)/∂(log μ, log ε) δ with δ ~ N(0, 1).
 
     λ̂ is the multiplier under the analytical forces and the learned friction. The unit standard deviation of
-    δ is about the width of the weak priors on log μ and log ε (`forces/search.py`).
+    δ is about the width of the weak priors on log μ and log ε (`learning/search.py`).
 
     Attributes:
         contact: name of the contact with uncertain friction.

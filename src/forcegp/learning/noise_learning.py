@@ -37,8 +37,8 @@ from forcegp.forces.noise import learned_slopes
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.problem import Problem, force_posterior
 from forcegp.forces.quantities import affine_map
-from forcegp.forces.search import Search
 from forcegp.gp.optimise import Learned, Progress
+from forcegp.learning.search import Search
 
 STEPS = 5
 """Number of weight updates for given hyperparameters; each requires a posterior."""

@@ -22,11 +22,11 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.data import Dataset
-from forcegp.forces.calibration import stretches
 from forcegp.forces.measurements import Measurement, Training
 from forcegp.forces.priors import memory
 from forcegp.forces.priors.base import ForceMean, ForcePrior
 from forcegp.forces.priors.joint import JointFrictionPrior
+from forcegp.learning.held_out import stretches
 
 LEAST, MOST = 200, 4000
 """Minimum number of samples required in free motion, and maximum number of (evenly spaced) samples used."""

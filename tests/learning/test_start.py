@@ -8,8 +8,8 @@ from torch import Tensor
 
 from forcegp.forces.priors.contact import SlidingFrictionPrior
 from forcegp.forces.priors.joint import JointForcePrior
-from forcegp.forces.search import FAR, LIMITS, box_around, doubts_at_bounds, initial_hyperparameters
 from forcegp.gp.features import Block
+from forcegp.learning.search import FAR, LIMITS, box_around, doubts_at_bounds, initial_hyperparameters
 
 N, ROWS = 50, 6
 

@@ -29,8 +29,19 @@ from torch import Tensor
 
 from forcegp.constraints import ConstrainedSystem
 from forcegp.dynamics import mass_matrix
-from forcegp.forces.calibration import autocorrelation_time
-from forcegp.forces.inverse_dynamics import (
+from forcegp.forces.measurements import Training
+from forcegp.forces.noise import TORQUE_NOISE
+from forcegp.forces.posterior import ForcePosterior
+from forcegp.forces.priors.base import ForceMean
+from forcegp.forces.priors.inertial import InertialPrior
+from forcegp.forces.priors.joint import JointFrictionPrior
+from forcegp.forces.priors.ripple import ripple_of
+from forcegp.forces.problem import Problem, force_posterior, typical
+from forcegp.forces.term import JointState
+from forcegp.gp.features import Block
+from forcegp.identification import MASS_SHARE, regressor
+from forcegp.learning.correlation import autocorrelation_time
+from forcegp.learning.inverse_dynamics import (
     LATE,
     LEAST,
     RIDGE,
@@ -48,17 +59,6 @@ from forcegp.forces.inverse_dynamics import (
     log_ratio,
     products,
 )
-from forcegp.forces.measurements import Training
-from forcegp.forces.noise import TORQUE_NOISE
-from forcegp.forces.posterior import ForcePosterior
-from forcegp.forces.priors.base import ForceMean
-from forcegp.forces.priors.inertial import InertialPrior
-from forcegp.forces.priors.joint import JointFrictionPrior
-from forcegp.forces.priors.ripple import ripple_of
-from forcegp.forces.problem import Problem, force_posterior, typical
-from forcegp.forces.term import JointState
-from forcegp.gp.features import Block
-from forcegp.identification import MASS_SHARE, regressor
 from forcegp.robot.model import RobotModel
 
 PASSES = 3

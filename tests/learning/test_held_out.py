@@ -7,8 +7,8 @@ import math
 import torch
 
 import forcegp
-from forcegp.forces.calibration import unit_scales
 from forcegp.forces.noise import TORQUE_NOISE
+from forcegp.learning.held_out import unit_scales
 
 SAMPLES = 4000
 TRUE = torch.tensor([0.5, 0.2, 0.05], dtype=torch.float64)

@@ -16,10 +16,16 @@ import forcegp
 from forcegp import dynamics
 from forcegp.data import DataHeader
 from forcegp.errors import ConvergenceWarning, UnknownNameError
-from forcegp.forces import inverse_dynamics
-from forcegp.forces.calibration import correlation_times
-from forcegp.forces.inertia import Inertia, inertia_of, latent_precision, one_row
-from forcegp.forces.inverse_dynamics import (
+from forcegp.forces.measurements import Observation, training_of
+from forcegp.forces.priors import inertial
+from forcegp.forces.priors.inertial import DIVERGENCE, InertialPrior
+from forcegp.forces.priors.joint import AnalyticalMean, JointFrictionPrior
+from forcegp.forces.quantities import states
+from forcegp.identification import regressor
+from forcegp.learning import inverse_dynamics
+from forcegp.learning.correlation import correlation_times
+from forcegp.learning.inertia import Inertia, inertia_of, latent_precision, one_row
+from forcegp.learning.inverse_dynamics import (
     APART,
     Rows,
     averaged,
@@ -32,12 +38,6 @@ from forcegp.forces.inverse_dynamics import (
     sliding,
     sums,
 )
-from forcegp.forces.measurements import Observation, training_of
-from forcegp.forces.priors import inertial
-from forcegp.forces.priors.inertial import DIVERGENCE, InertialPrior
-from forcegp.forces.priors.joint import AnalyticalMean, JointFrictionPrior
-from forcegp.forces.quantities import states
-from forcegp.identification import regressor
 from forcegp.models.calibrated import calibrated
 from forcegp.robot.inertia import inertial_parameters, pseudo_inertia, pseudo_inertia_of
 from forcegp.robot.model import RobotModel

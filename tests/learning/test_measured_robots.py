@@ -11,10 +11,10 @@ from torch import Tensor
 
 import forcegp
 from forcegp import dynamics
-from forcegp.forces.calibration import autocorrelation_time, correlation_times
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import JointFrictionPrior
 from forcegp.identification import regressor
+from forcegp.learning.correlation import autocorrelation_time, correlation_times
 
 NOISE = torch.tensor([0.2, 0.05], dtype=torch.float64)
 """Standard deviation of the measured torque [N m]."""
