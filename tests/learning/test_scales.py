@@ -12,7 +12,16 @@ from torch import Tensor
 import forcegp
 from forcegp.forces.noise import TORQUE_NOISE
 from forcegp.forces.posterior import STICK_NOISE
-from forcegp.learning.scales import AT_REST, FEWEST, Residuals, Stated, _at_likeliest_speed, _scored
+from forcegp.forces.unknowns import AXES
+from forcegp.learning.scales import (
+    AT_REST,
+    FEWEST,
+    Residuals,
+    Stated,
+    _at_likeliest_speed,
+    _independent,
+    _scored,
+)
 
 JOINTS, ROWS = 3, 6000
 STD, STICK = torch.tensor([0.5, 0.1, 0.0]).double(), torch.tensor([0.0, 0.4, 0.0]).double()
@@ -43,17 +52,37 @@ def test_scoring_finds_variances_and_zeros() -> None:
     torch.testing.assert_close(stick, STICK, rtol=SAMPLED, atol=0.03)
 
 
+def with_contact(data: Residuals, closed: int) -> Residuals:
+    """The rows with a contact that is closed in the first ones, always at rest."""
+    B = torch.zeros(ROWS, JOINTS, AXES, dtype=torch.float64)
+    B[:closed] = 1.0
+    rests = (B != 0.0).any(-2).any(-1).double()
+    return data._replace(B=torch.cat([data.B, B], -1), slow=torch.cat([data.slow, rests[:, None]], -1))
+
+
+def test_independent_samples() -> None:
+    """All samples of a joint at rest count, and κ of those of a contact, which is at rest once."""
+    data, power = with_contact(rows(), 300), 0.01
+    moves, rests = _independent(data, power)
+    torch.testing.assert_close(moves, torch.tensor([*JOINTS * [power * ROWS], 300 * power]).double())
+    torch.testing.assert_close(rests[:JOINTS], data.slow[:, :JOINTS].sum(0))
+    assert math.isclose(float(rests[JOINTS]), 300 * power)
+
+
 def test_variances_of_few_independent_samples_are_the_stated_ones() -> None:
     """Whatever was learned before the correlation of the samples was known."""
-    stated, learned = torch.full((6,), 4.0).double(), torch.full((6,), 0.01).double()
-    now, first = (torch.full((JOINTS,), math.log(x), dtype=torch.float64) for x in (0.1, 0.02))
+    data, contact = with_contact(rows(), 300), slice(JOINTS, None)
+    stated, learned = torch.full((8,), 4.0).double(), torch.full((8,), 0.01).double()
+    now, first = (torch.full((1,), math.log(x), dtype=torch.float64) for x in (0.1, 0.02))
 
     def found(power: float) -> tuple[float, Tensor]:
         known = Stated(stated, power, torch.ones_like(stated))
-        return _at_likeliest_speed(rows(), slice(0, JOINTS), now, first, learned, known, AT_REST)[1:]
+        return _at_likeliest_speed(data, contact, now, first, learned, known, AT_REST)[1:]
 
-    speed, theta = found(0.5 * FEWEST / ROWS)
-    assert math.isclose(math.exp(speed), 0.02) and torch.equal(theta, stated)
+    few = found(0.5 * FEWEST / ROWS)
+    assert math.isclose(math.exp(few[0]), 0.02)
+    is_stated = few[1] == stated
+    assert is_stated.tolist() == [*(JOINTS + 1) * [True], *JOINTS * [False], True]
     torch.testing.assert_close(found(1.0)[1][:JOINTS].sqrt(), STD, rtol=SAMPLED, atol=0.03)
 
 
