@@ -5,7 +5,8 @@
 The log is a sum of sines with joint friction, ripple, a force on (q, q̇) that no law names, torque noise of
 0.3 N m and acceleration noise of 0.05 rad/s². With `--rows 20000`, it is a log of 100 s.
 It is written to the folder once. Printed: duration from the files to the fit, passes over the log, and peak
-memory above that before the fit.
+memory above that before the fit. With `--workers 2`, the fit is repeated with a Dask cluster of workers with
+one thread each that have started, and durations and results are compared.
 """
 
 from __future__ import annotations
@@ -16,13 +17,16 @@ import resource
 import time
 import warnings
 from collections.abc import Iterator
+from importlib import import_module
 from pathlib import Path
 
 import torch
 
 import forcegp
+from forcegp.cluster import cluster
 from forcegp.data import StreamedDataset
 from forcegp.files import write_text
+from forcegp.models.structured_fit import StructuredFit
 
 FILES, PERIOD, CHUNK = 10, 0.005, 20_000
 TEETH = (30.0, 41.0, 57.0, 66.0, 72.0, 85.0, 99.0)
@@ -63,6 +67,19 @@ class CountedLog(StreamedDataset):
         return super().pieces(share)
 
 
+def shared(
+    model: forcegp.StructuredGP, files: tuple[Path, ...], fit: StructuredFit, workers: int
+) -> dict[str, float]:
+    """Duration of the same fit with workers, and the largest relative difference of its parameters."""
+    with cluster(workers) as client:
+        client.run(import_module, "forcegp.models.structured_fit")
+        begin = time.perf_counter()
+        other = model.fit(StreamedDataset(files), client=client)
+        seconds = time.perf_counter() - begin
+    pairs = zip(fit.parameters(), other.parameters(), strict=True)
+    return {"seconds": seconds, "difference": max(abs(a.value - b.value) / a.std for a, b in pairs)}
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(
         description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter
@@ -70,6 +87,7 @@ def main() -> None:
     parser.add_argument("--folder", type=Path, required=True, help="where the log is kept")
     parser.add_argument("--rows", type=int, default=1_000_000)
     parser.add_argument("--threads", type=int, default=2)
+    parser.add_argument("--workers", type=int, help="repeat the fit with this many workers")
     parser.add_argument("--json", type=Path, help="write the results there")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")
@@ -78,7 +96,8 @@ def main() -> None:
     system = forcegp.ConstrainedSystem(forcegp.load_robot("kuka_iiwa"))
     before, begin = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss, time.perf_counter()
     processed = time.process_time()
-    fit = forcegp.StructuredGP(system, mean="analytical").fit(CountedLog(files))
+    model = forcegp.StructuredGP(system, mean="analytical")
+    fit = model.fit(CountedLog(files))
     result = {
         "seconds": time.perf_counter() - begin,
         "process_seconds": time.process_time() - processed,
@@ -89,6 +108,9 @@ def main() -> None:
     }
     times = f"{result['seconds']:.1f} s ({result['process_seconds']:.1f} s of the processor)"
     print(f"{times}, {result['passes']} passes, {result['mebibytes']:.0f} MiB")
+    if arguments.workers:
+        result["workers"] = shared(model, files, fit, arguments.workers)
+        print(f"{result['workers']['seconds'] / result['seconds']:.2f} × with workers", result["workers"])
     if arguments.json:
         write_text(arguments.json, json.dumps(result, indent=1))
 

@@ -90,7 +90,7 @@ def rigid_robot(robot: RobotModel, rows: Rows) -> Inertia:
     delay = found.clear_delay()
     everything = torch.cat([torch.arange(C.shape[-1] - 1), delay])
     gain = GAIN * M.diagonal(dim1=-2, dim2=-1).mean(0) / size
-    kept, std = found.carried_drives(gain, delay)
+    kept = found.carried_drives(gain, delay)
 
     def errors(estimate: Estimate) -> Tensor:
         """Return held-out errors of single samples. Averages would hide sharp friction."""
@@ -118,15 +118,14 @@ def rigid_robot(robot: RobotModel, rows: Rows) -> Inertia:
         consistent, delta, change = _consistent(robot, prior, found, size, delay)
         better = _is_better(compared(lambda _: delta), known)
         if better and is_harmless(accelerations(consistent, delta), before):
-            told = _told(robot, consistent.armature - robot.armature, size * std)
             per_gain = tuple(map(tuple, change.tolist()))
             left = dataclasses.replace(left, per_gain=per_gain, delay=LATE * float(delta[-1]))
-            return Inertia(consistent, left, (IDENTIFIED, *told))
+            return Inertia(consistent, left, (IDENTIFIED,))
     while len(kept):
         with_drives = robot.replace(armature=robot.armature + size * drives[:n])
         harm = log_ratio(accelerations(with_drives, drives), before).mean(0)
         if float(harm.max()) <= TOLERATED:
-            return Inertia(with_drives, left, _told(robot, size * drives[:n], size * std))
+            return Inertia(with_drives, left)
         kept = kept[kept != kept[harm[kept].argmax()]]
         drives = found.estimate(every, torch.cat([kept, delay]), n)
     return Inertia(robot, left)
@@ -209,8 +208,8 @@ class _Regression:
         clear = abs(mean) > CLEAR * math.sqrt(max(1.0, scatter) / total)
         return torch.full((int(clear),), last)
 
-    def carried_drives(self, gain: Tensor, delay: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the drives that the evidence carries, and the standard deviations of all drives `(nq,)`.
+    def carried_drives(self, gain: Tensor, delay: Tensor) -> Tensor:
+        """Return the indices of the drives that the evidence carries.
 
         With all links at the file, a drive u ~ N(û, V) with prior N(0, 1) is worth ½ û²/V + ½ log V nats. It
         must also be significant, since this is little for a drive that the log hardly determines. V is at
@@ -233,7 +232,7 @@ class _Regression:
         variance = V.maximum((len(blocks) - 1) * others.var(0, correction=0)) + gain**2
         worth = 0.5 * u.square() / variance + 0.5 * variance.log()
         kept = (u > CLEAR * variance.sqrt()) & (worth > 0.0)
-        return kept.nonzero()[:, 0], variance.sqrt()
+        return kept.nonzero()[:, 0]
 
     def estimate(self, given: NormalEquations, kept: Tensor, n: int, known: Tensor | None = None) -> Tensor:
         """Return the most probable values of the unknowns `kept`, with nonnegative drives (the first n)."""
@@ -369,14 +368,6 @@ def drive_scale(robot: RobotModel, q: Tensor) -> Tensor:
         if bool(alike.any()):
             scale[alike] = M[alike].clamp(min=GEARED * float(M[alike].max()))
     return scale
-
-
-def _told(robot: RobotModel, armature: Tensor, std: Tensor) -> tuple[str, ...]:
-    """Return a message about drives with identified inertia `(nq,)` and its deviations, if there are any."""
-    columns = robot.joint_names, armature.tolist(), std.tolist()
-    named = [f"{name} {a:.2g} ± {2.0 * s:.1g}" for name, a, s in zip(*columns, strict=True) if a > 0.0]
-    lacks = "the drives have inertia that the robot file lacks [kg m², kg for sliding joints; ± 2σ]"
-    return (f"{lacks}: {', '.join(named)}",) if named else ()
 
 
 @torch.no_grad()

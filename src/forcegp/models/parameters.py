@@ -7,7 +7,8 @@ N(A⁻¹v, A⁻¹).
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+import math
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -47,6 +48,18 @@ class LearnedParameter:
     std: float
     unit: str
     determined: bool
+
+
+def clear_drives(
+    parameters: Iterable[LearnedParameter], file: RobotModel, robot: RobotModel
+) -> tuple[str, ...]:
+    """Return a message about drives of a robot whose inertia the file lacks beyond ±2σ, if there are any."""
+    std = {each.name.split(".", 1)[-1]: each.std for each in parameters}
+    added = zip(robot.joint_names, (robot.armature - file.armature).tolist(), strict=True)
+    bars = ((name, a, 2.0 * std.get(f"drive of {name}", math.inf)) for name, a in added)
+    clear = [f"{name} {a:.2g} ± {bar:.1g}" for name, a, bar in bars if a > bar]
+    lacks = "the drives have inertia that the robot file lacks [kg m², kg for sliding joints; ± 2σ]"
+    return (f"{lacks}: {', '.join(clear)}",) if clear else ()
 
 
 @torch.no_grad()

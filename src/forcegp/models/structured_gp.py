@@ -28,6 +28,7 @@ from forcegp.gp.inducing import LIMIT
 from forcegp.gp.optimise import LearningOptions
 from forcegp.learning.fit import SAMPLES, are_columns
 from forcegp.models.base import FitProgress, Model
+from forcegp.models.parameters import clear_drives
 from forcegp.models.structured_fit import KIND, StructuredFit, conditioned
 from forcegp.models.structured_learning import Specification, check_learned, learned, problem_for, search_of
 from forcegp.models.structured_stream import Pass, Sample, sample_of
@@ -204,7 +205,8 @@ class StructuredGP(Model[StructuredFit]):
         fit = conditioned(spec, lesson.problem, values, lesson.learned, warnings, lesson.learned_on, forces)
         if progress is not None:
             progress(fit.result.evaluations, fit.result.evaluations, fit.result.objective)
-        warnings = (*fit.result.warnings, *self._without_effect(fit))
+        drives = clear_drives(fit.parameters(), self.system.robot, fit.system.robot)
+        warnings = (*fit.result.warnings, *drives, *self._without_effect(fit))
         result = dataclasses.replace(fit.result, worth=dict(lesson.worth), warnings=warnings)
         return dataclasses.replace(fit, result=result)
 
