@@ -18,7 +18,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterable, Mapping, Sequence
+from collections.abc import Collection, Iterable, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 
@@ -84,11 +84,12 @@ class ForceProcess:
         """Add Coulomb friction at the contacts to the affine map of a quantity."""
         return coupled(system, at, z, self.coulomb)
 
-    def rows(self, system: ConstrainedSystem, at: States, z: AffineMap) -> Block:
+    def rows(self, system: ConstrainedSystem, at: States, z: AffineMap, zero: Collection[int] = ()) -> Block:
         """Express a quantity as rows that act on the latent forces.
 
         Args:
             z: the quantity, including Coulomb friction at the contacts.
+            zero: indices of priors whose operators are not needed, which are zero instead.
 
         Returns:
             Kernel inputs and operators B(x) E(x) of each prior, with the target o(x) + B(x) m(x).
@@ -103,7 +104,7 @@ class ForceProcess:
             B = by_target.get(prior.target, z.B_Q)
             if B is not None and z.B_F is not None and isinstance(prior, JointTerm):
                 B = B + z.B_F
-            if B is None:
+            if B is None or p in zero:
                 operators.append(z.o.new_zeros(*z.o.shape, prior.outputs(system.robot)))
             else:
                 operators.append(B if prior.per_joint else B @ prior.operator(system, at))
@@ -145,6 +146,11 @@ class ForcePosterior:
             means = means.knowing(p, {"one": value.new_zeros(1, 1)}, value)
         return means
 
+    @cached_property
+    def without_mean(self) -> frozenset[int]:
+        """Indices of priors whose forces have zero mean, such as those on the errors of links."""
+        return frozenset(p for p, value in self.process.pinned.items() if not bool(value.any()))
+
     def __call__(self, system: ConstrainedSystem, at: States) -> Tensor:
         """Return the posterior mean `(n, nq)` of Q̄ = Σ E f + m, which is the force field for rollouts."""
         force = self.unknown_force(system, at, range(len(self.priors))) + self.process.mean(system, at)
@@ -154,7 +160,7 @@ class ForcePosterior:
         """Return the posterior mean `(n, nq)` of Σ E f over the given priors, excluding Coulomb friction."""
         # Σ_p E_p μ_p
         force: Tensor | float = 0.0
-        for p in (p for p in priors if self.means.measured[p]):
+        for p in (p for p in priors if self.means.measured[p] and p not in self.without_mean):
             mean = self.means.latent_mean(p, self.process.features(p, system, at))
             force = force + (self.priors[p].operator(system, at) @ mean[..., None])[..., 0]
         return force
@@ -176,7 +182,7 @@ class ForcePosterior:
 
     def read_mean(self, system: ConstrainedSystem, at: States, z: AffineMap) -> Tensor:
         """Return the posterior mean o + B (m + Σ E μ) `(n, d)` of a quantity at the given states."""
-        rows = self.rows(system, at, z)
+        rows = self.process.rows(system, at, self.process.coupled(system, at, z), self.without_mean)
         return rows.target + self.means.mean(rows)
 
 
