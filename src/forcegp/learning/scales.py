@@ -348,18 +348,15 @@ def _at_likeliest_speed(
     Args:
         own: the columns of these joints or contacts in `slow`.
         now, first: current and stated log v_s of each, which all share.
-        speeds: speeds v_s to try, if they are above the stated one and enough samples are below them; the
-            current one if there are none.
+        speeds: speeds v_s to try, if they are above the stated one; the current one if there are none.
     """
     least, tried = float(first.max()), []
-    for speed in [least, *map(math.log, speeds)] if speeds else [float(now[0])]:
+    above = (speed for speed in map(math.log, speeds) if speed > least)
+    for speed in [least, *above] if speeds else [float(now[0])]:
         slow = whole.slow.clone()
         slow[:, own] = slow[:, own] ** (2.0 * (now - speed)).exp()
         rows = whole._replace(slow=slow)
-        shown = _independent(rows, stated.power)
-        if tried and (speed <= least or float(shown[1][own].max()) < FEWEST):
-            continue
-        free = torch.cat(shown) >= FEWEST
+        free = torch.cat(_independent(rows, stated.power)) >= FEWEST
         found = _settled(rows, torch.where(free, theta, stated.theta), stated.share, free)
         tried.append((rows.log_density(*found.chunk(2)), rows, speed, found))
     return max(tried, key=lambda each: each[0])[1:]
