@@ -13,7 +13,7 @@
    in the directions that closed contacts leave free, where the three components of a contact force have one
    variance, over which its squares are summed. A variance that the data do not show is zero.
 3. Residuals are correlated in time. If τ is their autocorrelation time, n samples contain as much information
-   as κ n independent ones, κ = 1/τ. A variance with too few of them has its stated value.
+   as κ n independent ones, κ = 1/τ. A variance with too few samples has its stated value.
 """
 
 from __future__ import annotations
@@ -57,10 +57,10 @@ AT_REST = (0.02, 0.05, 0.1)
 """Speeds v_s below which a joint or contact is nearly at rest, of which the likeliest is taken [rad/s, m/s]:
 the resolution of common encoders, and speeds at which joints reverse within a sampling period."""
 FEWEST = 10.0
-"""Number of independent samples below which a variance has its stated value. Of static friction, samples at
-rest count, and of the unknown force of a contact that slides, samples in contact. If κ applied to samples of
-a joint at rest, errors on held-out blocks of the training logs of a UR10 and a UR3 would be 2 % larger, and
-of four other arms equal."""
+"""Number of samples below which a variance has its stated value. Of static friction, samples at rest count,
+and of the unknown force of a contact that slides, samples in contact. Those of contacts count κ times. If κ
+applied to joints too, errors on held-out blocks of the training logs of a UR10 and a UR3 would be 2 % larger,
+and friction would not be learned from 40 samples."""
 LEAST_SHARE = 0.2
 """Smallest share of the samples that remains after the determined directions are subtracted."""
 MOTIONS = ("qdd", "joint_force", "contact_force", "multiplier")
@@ -81,6 +81,7 @@ class Scales:
         stated_noise: stated hyperparameters of the noise.
         kept: mask `(g,)` of the groups that are learned and were not dropped.
         idle: prior and component of the families that were dropped.
+        least_power: smallest κ of the residuals of learned forces.
         rounds: number of alternations.
         converged: whether they ended by themselves.
     """
@@ -93,6 +94,7 @@ class Scales:
     stated_noise: Tensors
     kept: Tensor
     idle: tuple[tuple[int, int], ...] = ()
+    least_power: float = 1.0
     rounds: int = 0
     converged: bool = False
 
@@ -159,7 +161,9 @@ def _alternated(found: Scales, noisy: bool) -> Scales:
         before = _noise(found.values)
         speeds = AT_REST if number == 0 else ()
         values, power = _with_noise(found, speeds)
-        found = replace(found, problem=replace(found.problem, power=power), values=values)
+        # Before the first round, residuals contain the forces to be learned.
+        least = min(power, found.least_power) if number else found.least_power
+        found = replace(found, problem=replace(found.problem, power=power), values=values, least_power=least)
         size = before.maximum(_noise(values))
         change = (_noise(values) - before).abs()
         if bool((change <= SETTLED * size + NEGLIGIBLE * size.amax()).all()):
@@ -309,7 +313,7 @@ def _with_noise(found: Scales, speeds: Sequence[float]) -> tuple[Tensors, float]
     gamma = determined_by_joint(problem, found.groups, found.evidence)
     share = (1.0 - gamma / (power * len(whole.r))).clamp(min=LEAST_SHARE)
     share = torch.nn.functional.pad(share, (0, len(tips)), value=1.0).repeat(2)
-    stated = Stated(torch.cat(variances(problem, found.stated_noise)), power, share)
+    stated = Stated(torch.cat(variances(problem, found.stated_noise)), min(power, found.least_power), share)
     # k = e^{−(v/v_s)²} for other speeds v_s, first of the joints and then of the contacts
     first = found.stated_noise[STICK_SPEED]
     rows, speed, theta = _at_likeliest_speed(
@@ -327,7 +331,7 @@ def _with_noise(found: Scales, speeds: Sequence[float]) -> tuple[Tensors, float]
 
 
 class Stated(NamedTuple):
-    """Stated variances θ, κ, and the share of the samples that determines each θ."""
+    """Stated variances θ, the smallest κ, and the share of the samples that determines each θ."""
 
     theta: Tensor
     power: float
@@ -363,15 +367,15 @@ def _at_likeliest_speed(
 
 
 def _independent(rows: Residuals, power: float) -> tuple[Tensor, Tensor]:
-    """Return the numbers of independent samples `(nq + c,)` in motion or contact, and of those at rest.
+    """Return the numbers of samples `(nq + c,)` in motion or contact, and of those at rest.
 
-    Samples at rest of a joint belong to many reversals, and those of a contact to one.
+    Those of a contact count κ times, since its force and the torque noise of joints explain the same motion.
     """
     joints = torch.arange(rows.slow.shape[-1]).to(rows.r.device) < rows.external.shape[-1]
     rests = rows.slow.sum(0)
     moves = torch.full_like(rests, len(rows.r))
     moves[~joints] = rows.closed.sum(0).to(moves)
-    return power * moves, torch.where(joints, rests, power * rests)
+    return torch.where(joints, moves, power * moves), torch.where(joints, rests, power * rests)
 
 
 def _settled(rows: Residuals, theta: Tensor, share: Tensor, free: Tensor) -> Tensor:
