@@ -360,9 +360,12 @@ def _at_likeliest_speed(
         slow = whole.slow.clone()
         slow[:, own] = slow[:, own] ** (2.0 * (now - speed)).exp()
         rows = whole._replace(slow=slow)
-        free = torch.cat(_independent(rows, stated.power)) >= FEWEST
+        moves, rests = _independent(rows, stated.power)
+        free = torch.cat([moves, rests]) >= FEWEST
         found = _settled(rows, torch.where(free, theta, stated.theta), stated.share, free)
         tried.append((rows.log_density(*found.chunk(2)), rows, speed, found))
+        if own.start and float(rests[own].max()) < FEWEST:
+            break  # Slow sliding does not show the force of a contact at rest.
     return max(tried, key=lambda each: each[0])[1:]
 
 
