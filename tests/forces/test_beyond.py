@@ -211,11 +211,6 @@ def test_friction_that_contact_hides_has_its_stated_size(tmp_path: Path, free: i
 
 
 @pytest.mark.slow
-@pytest.mark.xfail(
-    strict=True,
-    reason="friction of the slider and of the knee are told apart by the shape of their columns, which is "
-    "not that of the true friction: 2.6 N at σ 0.2 N, ±2σ holds 1 %",
-)
 def test_a_joint_that_contact_hides_is_not_trusted(tmp_path: Path) -> None:
     """All that the knee does wrong acts along the normal, where no acceleration shows it."""
     system = leg(tmp_path)

@@ -161,7 +161,6 @@ def _alternated(found: Scales, noisy: bool) -> Scales:
         before = _noise(found.values)
         speeds = AT_REST if number == 0 else ()
         values, power = _with_noise(found, speeds)
-        # Before the first round, residuals contain the forces to be learned.
         least = min(power, found.least_power) if number else found.least_power
         found = replace(found, problem=replace(found.problem, power=power), values=values, least_power=least)
         size = before.maximum(_noise(values))
@@ -313,7 +312,9 @@ def _with_noise(found: Scales, speeds: Sequence[float]) -> tuple[Tensors, float]
     gamma = determined_by_joint(problem, found.groups, found.evidence)
     share = (1.0 - gamma / (power * len(whole.r))).clamp(min=LEAST_SHARE)
     share = torch.nn.functional.pad(share, (0, len(tips)), value=1.0).repeat(2)
-    stated = Stated(torch.cat(variances(problem, found.stated_noise)), min(power, found.least_power), share)
+    # In the first round, residuals contain the forces to be learned, and κ of the caller holds too.
+    least = min(power, found.least_power, found.problem.power if speeds else 1.0)
+    stated = Stated(torch.cat(variances(problem, found.stated_noise)), least, share)
     # k = e^{−(v/v_s)²} for other speeds v_s, first of the joints and then of the contacts
     first = found.stated_noise[STICK_SPEED]
     rows, speed, theta = _at_likeliest_speed(
@@ -360,12 +361,9 @@ def _at_likeliest_speed(
         slow = whole.slow.clone()
         slow[:, own] = slow[:, own] ** (2.0 * (now - speed)).exp()
         rows = whole._replace(slow=slow)
-        moves, rests = _independent(rows, stated.power)
-        free = torch.cat([moves, rests]) >= FEWEST
+        free = torch.cat(_independent(rows, stated.power)) >= FEWEST
         found = _settled(rows, torch.where(free, theta, stated.theta), stated.share, free)
         tried.append((rows.log_density(*found.chunk(2)), rows, speed, found))
-        if own.start and float(rests[own].max()) < FEWEST:
-            break  # Slow sliding does not show the force of a contact at rest.
     return max(tried, key=lambda each: each[0])[1:]
 
 
