@@ -161,6 +161,7 @@ def _alternated(found: Scales, noisy: bool) -> Scales:
         before = _noise(found.values)
         speeds = AT_REST if number == 0 else ()
         values, power = _with_noise(found, speeds)
+        # The residuals of the first round still contain the forces to be learned.
         least = min(power, found.least_power) if number else found.least_power
         found = replace(found, problem=replace(found.problem, power=power), values=values, least_power=least)
         size = before.maximum(_noise(values))
@@ -312,8 +313,7 @@ def _with_noise(found: Scales, speeds: Sequence[float]) -> tuple[Tensors, float]
     gamma = determined_by_joint(problem, found.groups, found.evidence)
     share = (1.0 - gamma / (power * len(whole.r))).clamp(min=LEAST_SHARE)
     share = torch.nn.functional.pad(share, (0, len(tips)), value=1.0).repeat(2)
-    # In the first round, residuals contain the forces to be learned, and κ of the caller holds too.
-    least = min(power, found.least_power, found.problem.power if speeds else 1.0)
+    least = min(power, found.least_power)
     stated = Stated(torch.cat(variances(problem, found.stated_noise)), least, share)
     # k = e^{−(v/v_s)²} for other speeds v_s, first of the joints and then of the contacts
     first = found.stated_noise[STICK_SPEED]

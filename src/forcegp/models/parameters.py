@@ -8,7 +8,7 @@ N(A⁻¹v, A⁻¹).
 from __future__ import annotations
 
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
 
 import torch
@@ -51,13 +51,21 @@ class LearnedParameter:
 
 
 def clear_drives(
-    parameters: Iterable[LearnedParameter], file: RobotModel, robot: RobotModel
+    parameters: Callable[[], Iterable[LearnedParameter]], file: RobotModel, robot: RobotModel
 ) -> tuple[str, ...]:
-    """Return a message about drives of a robot whose inertia the file lacks beyond ±2σ, if there are any."""
-    std = {each.name.split(".", 1)[-1]: each.std for each in parameters}
-    added = zip(robot.joint_names, (robot.armature - file.armature).tolist(), strict=True)
-    bars = ((name, a, 2.0 * std.get(f"drive of {name}", math.inf)) for name, a in added)
-    clear = [f"{name} {a:.2g} ± {bar:.1g}" for name, a, bar in bars if a > bar]
+    """Return a warning about drives with inertia that the file lacks, if ±2σ excludes zero.
+
+    Args:
+        parameters: function that returns the learned parameters, which is called if there are such drives.
+        file, robot: the robot of the file, and the identified robot.
+    """
+    added = (robot.armature - file.armature).tolist()
+    if max(added) <= 0.0:
+        return ()
+    std = {each.name.split(".", 1)[-1]: each.std for each in parameters()}
+    bars = (2.0 * std.get(f"drive of {name}", math.inf) for name in robot.joint_names)
+    named = zip(robot.joint_names, added, bars, strict=True)
+    clear = [f"{name} {a:.2g} ± {bar:.1g}" for name, a, bar in named if a > bar]
     lacks = "the drives have inertia that the robot file lacks [kg m², kg for sliding joints; ± 2σ]"
     return (f"{lacks}: {', '.join(clear)}",) if clear else ()
 

@@ -205,7 +205,7 @@ class StructuredGP(Model[StructuredFit]):
         fit = conditioned(spec, lesson.problem, values, lesson.learned, warnings, lesson.learned_on, forces)
         if progress is not None:
             progress(fit.result.evaluations, fit.result.evaluations, fit.result.objective)
-        drives = clear_drives(fit.parameters(), self.system.robot, fit.system.robot)
+        drives = clear_drives(fit.parameters, self.system.robot, fit.system.robot)
         warnings = (*fit.result.warnings, *drives, *self._without_effect(fit))
         result = dataclasses.replace(fit.result, worth=dict(lesson.worth), warnings=warnings)
         return dataclasses.replace(fit, result=result)
