@@ -291,8 +291,8 @@ def test_drives_are_named_with_the_bars_of_the_posterior(file: RobotModel) -> No
     (text,) = (each for each in fit.result.warnings if "the drives have inertia" in each)
     stated = dict(zip(file.joint_names, re.findall(r"([\d.]+) ± ([\d.e-]+)", text), strict=True))
     for name, true in zip(file.joint_names, armature.tolist(), strict=True):
-        value, bar = map(float, stated[name])
-        assert abs(value - true) <= 2.0 * bar, text
+        value, two_sigma = map(float, stated[name])
+        assert abs(value - true) <= 2.0 * two_sigma, text
     wide = [dataclasses.replace(each, std=1e3 * each.std) for each in fit.parameters()]
     assert clear_drives(lambda: wide, file, fit.system.robot) == ()
 
