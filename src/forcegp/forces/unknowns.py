@@ -7,8 +7,8 @@ explain is therefore drawn anew in each row, at the tip as at a joint:
     u ~ N(0, (σ² + s² k) (1 − n nᵀ)),  k = e^{−(v/v_s)²}
 
 for the tangential speed v of the contact point. It acts on the joints through J_Eᵀ. A large s is the same as
-projecting the direction out. Rest is found by speed. Errors of the velocities give a point at rest an apparent
-speed, whose size follows from the normal speed of closed contacts, which is zero in truth.
+projecting the direction out. Rest is found by speed. Errors of the velocities give a point at rest a speed,
+whose size follows from the normal speed of closed contacts, which is zero in truth.
 """
 
 from __future__ import annotations

@@ -298,13 +298,12 @@ def _with_noise(found: Scales, speeds: Sequence[float]) -> tuple[Tensors, float]
     """Return the hyperparameters with updated torque noise and static friction, and the exponent κ.
 
     Args:
-        speeds: speeds v_s to try, if they are above the stated one; the present ones if there are none.
+        speeds: speeds v_s to try, for contacts above the stated one; the present ones if there are none.
     """
     problem, values = found.problem, found.values
     motions = [i for i, m in enumerate(problem.training.measurements) if m.quantity in MOTIONS]
     each = [residuals(problem, values, found.evidence.weights, i) for i in motions]
     power = exponent(problem, motions, each, *variances(problem, values))
-    problem = replace(problem, power=power)
     widest = max(rows.r.shape[-1] for rows in each)
     parts = zip(*(rows.padded(widest) for rows in each), strict=True)
     whole = Residuals(*map(torch.cat, parts))
@@ -313,17 +312,17 @@ def _with_noise(found: Scales, speeds: Sequence[float]) -> tuple[Tensors, float]
     gamma = determined_by_joint(problem, found.groups, found.evidence)
     share = (1.0 - gamma / (power * len(whole.r))).clamp(min=LEAST_SHARE)
     share = torch.nn.functional.pad(share, (0, len(tips)), value=1.0).repeat(2)
-    least = min(power, found.least_power)
-    stated = Stated(torch.cat(variances(problem, found.stated_noise)), least, share)
+    stated = Stated(torch.cat(variances(problem, found.stated_noise)), min(power, found.least_power), share)
     # k = e^{−(v/v_s)²} for other speeds v_s, first of the joints and then of the contacts
-    first = found.stated_noise[STICK_SPEED]
     rows, speed, theta = _at_likeliest_speed(
-        whole, slice(0, nq), values[STICK_SPEED], first, theta, stated, speeds
+        whole, slice(0, nq), values[STICK_SPEED], speeds or None, theta, stated
     )
     changed = {STICK_SPEED: torch.full_like(values[STICK_NOISE], speed)}
     if tips:
         now, first = (torch.stack([x[tip.speed] for tip in tips]) for x in (values, found.stated_noise))
-        _, speed, theta = _at_likeliest_speed(rows, slice(nq, None), now, first, theta, stated, speeds)
+        least = math.exp(float(first.max()))
+        above = (least, *(speed for speed in speeds if speed > least)) if speeds else None
+        _, speed, theta = _at_likeliest_speed(rows, slice(nq, None), now, above, theta, stated)
         changed |= {tip.speed: torch.full_like(x, speed) for tip, x in zip(tips, now, strict=True)}
     torque, stick = theta.clamp(min=LEAST_VARIANCE).chunk(2)
     for (joints, *contacts), x in zip(keys, (0.5 * torque.log(), 0.5 * stick.log()), strict=True):
@@ -340,24 +339,17 @@ class Stated(NamedTuple):
 
 
 def _at_likeliest_speed(
-    whole: Residuals,
-    own: slice,
-    now: Tensor,
-    first: Tensor,
-    theta: Tensor,
-    stated: Stated,
-    speeds: Sequence[float],
+    whole: Residuals, own: slice, now: Tensor, speeds: Sequence[float] | None, theta: Tensor, stated: Stated
 ) -> tuple[Residuals, float, Tensor]:
     """Return the rows, log v_s and the variances θ for the likeliest speed of some joints or contacts.
 
     Args:
         own: the columns of these joints or contacts in `slow`.
-        now, first: current and stated log v_s of each, which all share.
-        speeds: speeds v_s to try, if they are above the stated one; the current one if there are none.
+        now: current log v_s of each, which all share.
+        speeds: speeds v_s to try, or `None` for the current one.
     """
-    least, tried = float(first.max()), []
-    above = (speed for speed in map(math.log, speeds) if speed > least)
-    for speed in [least, *above] if speeds else [float(now[0])]:
+    tried = []
+    for speed in [float(now[0])] if speeds is None else map(math.log, speeds):
         slow = whole.slow.clone()
         slow[:, own] = slow[:, own] ** (2.0 * (now - speed)).exp()
         rows = whole._replace(slow=slow)
