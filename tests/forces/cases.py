@@ -120,7 +120,7 @@ def sampled_forces(samples: ForceSamples, system: ConstrainedSystem, at: States)
     Q_z = torch.zeros_like(Q)
     for p, prior in enumerate(process.priors):
         features = process.features(p, system, at)
-        latent = samples.functions.latent(p, features) + samples.posterior.shift(p, features)
+        latent = samples.functions.latent(p, features)
         force = (prior.operator(system, at) @ latent[..., None])[..., 0]
         Q, Q_z = (Q, Q_z + force) if prior.target == "contact" else (Q + force, Q_z)
     # Q_z ← Q̄ − Q, with Coulomb friction in Q̄

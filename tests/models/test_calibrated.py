@@ -15,9 +15,10 @@ from forcegp.cli.app import app
 from forcegp.control.information import Unknowns
 from forcegp.dynamics import damping_force, inverse_dynamics, mass_matrix
 from forcegp.errors import ModelError, ParameterError, UnknownNameError, optional_module
-from forcegp.forces.posterior import ForceSamples
+from forcegp.forces.posterior import ForceSamples, draw_samples
 from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
 from forcegp.forces.priors.joint import JointFrictionPrior
+from forcegp.forces.problem import force_posterior
 from forcegp.forces.quantities import states_at
 from forcegp.identification import regressor
 from forcegp.learning.inertia import latent_precision, one_row
@@ -178,7 +179,7 @@ def test_a_payload_is_part_of_the_robot() -> None:
     )
     fit = model.fit(log_of(heavy, 800, 5))
     one = {"one": torch.zeros(1, 1, dtype=torch.float64)}
-    latent = fit.posterior.means.latent_mean(1, fit.posterior.process.scales[1].apply(one))[0]
+    latent = fit.posterior.latent.latent_mean(1, fit.posterior.process.scales[1].apply(one))[0]
     found = calibrated(fit)
     assert float(latent[0]) > 0.2
     assert float(found.robot.mass[-1] - robot.mass[-1]) == pytest.approx(float(latent[0]), abs=0.01)
@@ -399,12 +400,15 @@ def test_each_sampled_robot_explains_another_motion_nearly_as_well(identified: S
 def test_samples_are_spread_by_the_difference_between_identification_and_posterior(
     fit: StructuredFit, identified: StructuredFit
 ) -> None:
-    """Functions drawn from the posterior have its mean δ; the identified robot has δ = 0, so b = −E δ."""
+    """Functions drawn from the joint posterior have its mean δ; the identified robot has δ = 0: b = −E δ."""
     reader = _Reader.of(identified, 0)
     b, (_, C, _, prior) = reader._disagreement()[0], inertia_of(identified)
-    drawn = identified.force_samples(4000, torch.Generator().manual_seed(5))
-    assert isinstance(drawn, ForceSamples)
-    p = identified.force_priors.index(prior)
+    p, generator = identified.force_priors.index(prior), torch.Generator().manual_seed(5)
+    priors = tuple(
+        dataclasses.replace(x, is_error=False) if x is prior else x for x in identified.force_priors
+    )
+    joint_problem = dataclasses.replace(identified.problem, priors=priors)
+    drawn = draw_samples(force_posterior(joint_problem, identified.hyperparameters), 4000, generator)
     one = {name: x[:1] for name, x in reader._features(p).items()}
     delta = drawn.functions.latent(p, one)[:, 0]
     count = C.shape[-1]

@@ -79,21 +79,13 @@ def free_inertial() -> StructuredFit:
     return model.fit(free_log(robot, 60), learn=[])
 
 
-def contained_inertia() -> StructuredFit:
-    """The same, where the robot contains the errors of its inertia."""
-    fit = fitted("free_inertial")
-    value = 0.1 * torch.randn(77, dtype=torch.float64, generator=torch.Generator().manual_seed(2))
-    process = dataclasses.replace(fit.posterior.process, pinned={1: value})
-    return dataclasses.replace(fit, posterior=dataclasses.replace(fit.posterior, process=process))
-
-
 def uncertain_inertia() -> StructuredFit:
     """The same, where predictions follow the robot file and the errors of its inertia widen their bars."""
-    fit, value = fitted("free_inertial"), torch.zeros(77, dtype=torch.float64)
-    process = dataclasses.replace(fit.posterior.process, pinned={1: value})
-    posterior = dataclasses.replace(fit.posterior, process=process)
-    problem = dataclasses.replace(fit.problem, pinned={fit.force_priors[1].name: value})
-    return dataclasses.replace(fit, posterior=posterior, problem=problem)
+    robot = forcegp.load_robot("kuka_iiwa")
+    errors = InertialPrior(is_error=True).with_drives(torch.full((7,), 0.05))
+    priors = [JointFrictionPrior(), errors]
+    model = forcegp.StructuredGP(forcegp.ConstrainedSystem(robot), "analytical", priors, noise=0.1)
+    return model.fit(free_log(robot, 60), learn=[])
 
 
 def one_contact() -> StructuredFit:
@@ -175,7 +167,6 @@ CASES: dict[str, Callable[[], StructuredFit]] = {
     for f in (
         free_friction,
         free_inertial,
-        contained_inertia,
         uncertain_inertia,
         one_contact,
         sparse,
@@ -249,7 +240,7 @@ def test_the_models_are_what_they_are_meant_to_be() -> None:
     assert fitted("free_friction").torque_std is not None
     assert fitted("one_contact").posterior.process.coulomb
     state, _ = states(fitted("free_inertial"))
-    means = [fitted(name).predict(*state).mean for name in ("free_inertial", "contained_inertia")]
+    means = [fitted(name).predict(*state).mean for name in ("free_inertial", "uncertain_inertia")]
     assert float((means[0] - means[1]).abs().max()) > 0.1
 
 

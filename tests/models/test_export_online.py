@@ -204,9 +204,6 @@ def test_a_robot_at_rest_teaches_nothing() -> None:
 
 @pytest.mark.slow
 def test_what_cannot_learn_is_refused() -> None:
-    state, active, _ = samples(fitted("contained_inertia"))
-    with pytest.raises(ModelError, match="cannot learn online in C"):
-        compiled("contained_inertia").update(*state, active=active)
     fast = compiled("sparse")
     state, active, _ = samples(fitted("sparse"))
     with pytest.raises(ModelError, match="cannot learn online in C"):

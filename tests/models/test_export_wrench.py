@@ -48,7 +48,7 @@ def rounding(fit: StructuredFit, data: forcegp.Dataset, frame: forcegp.WrenchFra
     return max(SAME, 4.0 * max(differences(*pair)))
 
 
-CASES = ["free_friction", "free_inertial", "contained_inertia", "one_contact", "sparse", "exact", "zero_mean"]
+CASES = ["free_friction", "free_inertial", "uncertain_inertia", "one_contact", "sparse", "exact", "zero_mean"]
 
 
 @pytest.mark.parametrize("frame", [TOOL, pytest.param(ELBOW, marks=pytest.mark.slow)], ids=["world", "local"])

@@ -18,9 +18,8 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
-from functools import cached_property
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
 
 import torch
 from torch import Tensor
@@ -34,7 +33,7 @@ from forcegp.forces.quantities import OPEN, AffineMap, States, affine_map, hidde
 from forcegp.forces.term import JointTerm
 from forcegp.gp.draws import FunctionSamples
 from forcegp.gp.exact import ExactPosterior
-from forcegp.gp.features import Block, Features, Standardization
+from forcegp.gp.features import Block, Standardization
 from forcegp.gp.sparse import SparsePosterior
 
 STICK_NOISE, STICK_SPEED = f"{NOISE}.stick.log_noise_std", f"{NOISE}.stick.log_speed"
@@ -66,15 +65,12 @@ class ForceProcess:
         priors, scales: force priors, and the standardization of their inputs.
         mean: prior mean of Q.
         coulomb: contact friction proportional to the multiplier.
-        pinned: values `(components,)` of constant latent forces that the robot already includes, keyed by
-            prior index. The prior mean of such a force is minus its value, and the posterior mean is zero.
     """
 
     priors: tuple[ForcePrior, ...]
     scales: tuple[Standardization, ...]
     mean: ForceMean
     coulomb: tuple[CoulombFriction, ...] = ()
-    pinned: Mapping[int, Tensor] = field(default_factory=dict)
 
     def features(self, p: int, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
         """Return the standardized kernel inputs of prior p at given states."""
@@ -84,12 +80,12 @@ class ForceProcess:
         """Add Coulomb friction at the contacts to the affine map of a quantity."""
         return coupled(system, at, z, self.coulomb)
 
-    def rows(self, system: ConstrainedSystem, at: States, z: AffineMap, zero: Collection[int] = ()) -> Block:
+    def rows(self, system: ConstrainedSystem, at: States, z: AffineMap, errors: bool = True) -> Block:
         """Express a quantity as rows that act on the latent forces.
 
         Args:
             z: the quantity, including Coulomb friction at the contacts.
-            zero: indices of priors whose operators are not needed, which are zero instead.
+            errors: whether the operators of errors are needed, which are zero otherwise.
 
         Returns:
             Kernel inputs and operators B(x) E(x) of each prior, with the target o(x) + B(x) m(x).
@@ -104,7 +100,7 @@ class ForceProcess:
             B = by_target.get(prior.target, z.B_Q)
             if B is not None and z.B_F is not None and isinstance(prior, JointTerm):
                 B = B + z.B_F
-            if B is None or p in zero:
+            if B is None or (prior.is_error and not errors):
                 operators.append(z.o.new_zeros(*z.o.shape, prior.outputs(system.robot)))
             else:
                 operators.append(B if prior.per_joint else B @ prior.operator(system, at))
@@ -132,25 +128,6 @@ class ForcePosterior:
         """The force priors."""
         return self.process.priors
 
-    def shift(self, p: int, features: Features) -> Tensor | float:
-        """Return the shift that makes the mean of samples of latent force p equal to the predicted mean."""
-        if not self.process.pinned:
-            return 0.0
-        return self.means.latent_mean(p, features) - self.latent.latent_mean(p, features)
-
-    @cached_property
-    def means(self) -> LatentPosterior:
-        """Processes used to compute means, conditioned on the forces that the robot already includes."""
-        means = self.latent
-        for p, value in self.process.pinned.items():
-            means = means.knowing(p, {"one": value.new_zeros(1, 1)}, value)
-        return means
-
-    @cached_property
-    def without_mean(self) -> frozenset[int]:
-        """Indices of priors whose forces have zero mean, such as those on the errors of links."""
-        return frozenset(p for p, value in self.process.pinned.items() if not bool(value.any()))
-
     def __call__(self, system: ConstrainedSystem, at: States) -> Tensor:
         """Return the posterior mean `(n, nq)` of Q̄ = Σ E f + m, which is the force field for rollouts."""
         force = self.unknown_force(system, at, range(len(self.priors))) + self.process.mean(system, at)
@@ -160,8 +137,8 @@ class ForcePosterior:
         """Return the posterior mean `(n, nq)` of Σ E f over the given priors, excluding Coulomb friction."""
         # Σ_p E_p μ_p
         force: Tensor | float = 0.0
-        for p in (p for p in priors if self.means.measured[p] and p not in self.without_mean):
-            mean = self.means.latent_mean(p, self.process.features(p, system, at))
+        for p in (p for p in priors if self.latent.measured[p] and not self.priors[p].is_error):
+            mean = self.latent.latent_mean(p, self.process.features(p, system, at))
             force = force + (self.priors[p].operator(system, at) @ mean[..., None])[..., 0]
         return force
 
@@ -178,12 +155,12 @@ class ForcePosterior:
         """Return the posterior mean `(n, d)` and covariance `(n, d, d)` of a quantity, excluding noise."""
         # o + B (m + Σ E μ), and W Cov(f) Wᵀ (eqs. 23 to 25)
         rows = self.rows(system, at, z)
-        return rows.target + self.means.mean(rows), self.latent.covariance(rows)
+        return rows.target + self.latent.mean(rows), self.latent.covariance(rows)
 
     def read_mean(self, system: ConstrainedSystem, at: States, z: AffineMap) -> Tensor:
         """Return the posterior mean o + B (m + Σ E μ) `(n, d)` of a quantity at the given states."""
-        rows = self.process.rows(system, at, self.process.coupled(system, at, z), self.without_mean)
-        return rows.target + self.means.mean(rows)
+        rows = self.process.rows(system, at, self.process.coupled(system, at, z), errors=False)
+        return rows.target + self.latent.mean(rows)
 
 
 def stick_variance(tensors: Mapping[str, Tensor], at: States) -> Tensor:
@@ -300,8 +277,7 @@ class ForceSamples:
             for chunk in chunks:
                 own = {n: x[chunk.start * runs : chunk.stop * runs] for n, x in features.items()}
                 parts.append(self.functions.by_runs(p, own, chunk, runs))
-            force = torch.cat(parts) + self.posterior.shift(p, features)
-            unknown = unknown + (prior.operator(system, at) @ force[..., None])[..., 0]
+            unknown = unknown + (prior.operator(system, at) @ torch.cat(parts)[..., None])[..., 0]
         return unknown
 
 

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable, Collection, Iterable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property
 from typing import Any
 
@@ -68,9 +68,6 @@ class Problem:
         torque_std: standard deviation `(nq,)` of the white noise of the motor torque, unless it is learned.
         power: exponent κ of the likelihood, which is below 1 if samples are correlated.
         correlation: correlation time `(nq,)` of the noise of each torque [s]; `None` if unknown.
-        pinned: values `(components,)` of latent forces that the robot already includes, keyed by prior. Their
-            prior mean is minus this value, their posterior mean is 0, and other forces are conditioned on
-            them.
         inducing: inducing inputs of each prior, for sparse inference; `None` for exact inference.
         state_std: standard deviation of the noise of q and q̇, `(2 nq,)`, or `None` if there is none.
         external_std: standard deviation of unknown forces on the joints `(nq,)`, or `None` if there are none.
@@ -85,7 +82,6 @@ class Problem:
     power: float = 1.0
     correlation: Tensor | None = None
     inducing: tuple[Features, ...] | None = None
-    pinned: Mapping[str, Tensor] = field(default_factory=dict)
     state_std: Tensor | None = None
     external_std: Tensor | None = None
 
@@ -116,14 +112,14 @@ class Problem:
         empty = without_inducing(more).inducing or ()
         return dataclasses.replace(more, inducing=(*self.inducing, *empty[len(self.priors) :]))
 
-    def without_pinned(self) -> Problem:
-        """Return the problem without the forces that the robot includes."""
-        return dataclasses.replace(self.without_priors(self.pinned), pinned={})
+    @property
+    def errors(self) -> tuple[ForcePrior, ...]:
+        """Priors on errors of what the robot includes. They come after all other priors."""
+        return tuple(prior for prior in self.priors if prior.is_error)
 
-    def with_pinned(self, source: Problem) -> Problem:
-        """Append the forces that the robot of another problem includes."""
-        priors = [prior for prior in source.priors if prior.name in source.pinned]
-        return dataclasses.replace(self.with_priors(priors, source), pinned=source.pinned)
+    def without_errors(self) -> Problem:
+        """Return the problem without errors of what the robot includes."""
+        return self.without_priors([prior.name for prior in self.errors])
 
     def system_at(self, tensors: Mapping[str, Tensor]) -> ConstrainedSystem:
         """Return the system with the robot evaluated at the analytical parameters in the tensors."""
@@ -157,13 +153,17 @@ class Problem:
         friction = self.coulomb(tensors)
         priors = tuple(CoulombErrorPrior(f.contact, friction) for f in friction)
         one = self.system.robot.mass.new_zeros(1, 1)
-        scales = (Standardization.none({"one": one}),) * len(priors)
-        inducing = None if self.inducing is None else (*self.inducing, *({"one": one[:0]} for _ in priors))
+        more, scale = len(priors), Standardization.none({"one": one})
+        known = len(self.priors) - len(self.errors)
+
+        def among(items: tuple[Any, ...], added: Any) -> tuple[Any, ...]:
+            return (*items[:known], *more * (added,), *items[known:])
+
         return dataclasses.replace(
             self,
-            priors=(*self.priors, *priors),
-            training=dataclasses.replace(self.training, scales=(*self.training.scales, *scales)),
-            inducing=inducing,
+            priors=(*self.priors[:known], *priors, *self.priors[known:]),
+            training=dataclasses.replace(self.training, scales=among(self.training.scales, scale)),
+            inducing=None if self.inducing is None else among(self.inducing, {"one": one[:0]}),
         ), {**tensors, **{f"{prior.name}.log_scale": one[0] for prior in priors}}
 
     def force_noise(self, tensors: Mapping[str, Tensor]) -> ForceNoise | None:
@@ -185,9 +185,7 @@ class Problem:
 
     def process_at(self, tensors: Mapping[str, Tensor]) -> ForceProcess:
         """Return the prior on the forces, with learned operators and Coulomb friction."""
-        names = [prior.name for prior in self.priors]
-        pinned = {names.index(name): value for name, value in self.pinned.items()}
-        return ForceProcess(self.priors, self.training.scales, self.mean, self.coulomb(tensors), pinned)
+        return ForceProcess(self.priors, self.training.scales, self.mean, self.coulomb(tensors))
 
     def sample_noise(
         self, tensors: Mapping[str, Tensor], system: ConstrainedSystem, measurement: int
@@ -346,7 +344,8 @@ def posterior_of(
         NumericalError: the sums are not finite, or the noise is negligible compared with the prior variance.
     """
     # A = I + Σ V S Vᵀ, w ~ N(A⁻¹v, A⁻¹)
-    latent = SparsePosterior.of(basis, without_feedback(total.sums, remainder(problem.priors, basis), True))
+    sums = without_feedback(total.sums, remainder(problem.priors, basis), True)
+    latent = SparsePosterior.of(basis, sums, len(problem.errors))
     latent.require_resolved()
     return ForcePosterior(problem.process_at(hyperparameters), latent)
 
@@ -434,7 +433,7 @@ def forces_and_constant(
     params, rows = kernel_parameters(hyperparameters), problem.rows(hyperparameters)
     require_exact_fits(rows.blocks, learning=False)
     # f | y ~ N(k Wᵀ Σ⁻¹ y, k − k Wᵀ Σ⁻¹ W k), Σ = W k Wᵀ + I (eqs. 22 to 24)
-    latent = ExactPosterior.of(problem.priors, params, rows.blocks)
+    latent = ExactPosterior.of(problem.priors, params, rows.blocks, len(problem.errors))
     return ForcePosterior(problem.process_at(hyperparameters), latent), rows.constant
 
 

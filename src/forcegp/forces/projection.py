@@ -169,13 +169,10 @@ def whiten(
     # z = B_Q Q + B_z Q_z + o (eqs. 19 and 20)
     at, std = measurement.at(system), noise.std.expand_as(measurement.values)
     z = process.coupled(system, at, affine_map(system, at, measurement.quantity))
-    # W = B E and E[z] = o + B m, with the prior means of latent forces (eqs. 12 and 15)
+    # W = B E and E[z] = o + B m (eqs. 12 and 15)
     rows = process.rows(system, at, z)
-    expected = rows.target
-    for p, value in process.pinned.items():
-        expected = expected - rows.operators[p] @ value
     # (W, y − E[z], N)/σ
-    parts = [*rows.operators, (measurement.values - expected)[..., None], *noise.factors(at, z)]
+    parts = [*rows.operators, (measurement.values - rows.target)[..., None], *noise.factors(at, z)]
     widths = tuple(W.shape[-1] for W in rows.operators)
     everything = _Rows(rows.features, widths, torch.cat(parts, dim=-1) / std[..., None])
     # State noise also affects the directions fixed by the constraint, so these are not projected out.

@@ -6,7 +6,7 @@ Memory use grows with the square of the number of rows. Fits that exceed the ava
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import torch
@@ -45,16 +45,20 @@ class ExactPosterior:
         processes: the kernels and the prefixes of their hyperparameters.
         params: log-hyperparameters.
         blocks: the rows.
-        alpha: (K + I)⁻¹ y `(rows,)`.
+        alpha: (K + I)⁻¹ y `(rows,)`, where the covariance K of the rows excludes errors.
+        errors: number of processes, the last ones, whose mean is zero, so that they only widen error bars.
     """
 
     processes: tuple[Process, ...]
     params: Parameters
     blocks: list[Block]
     alpha: Tensor
+    errors: int = 0
 
     @classmethod
-    def of(cls, processes: Sequence[Process], params: Parameters, blocks: list[Block]) -> ExactPosterior:
+    def of(
+        cls, processes: Sequence[Process], params: Parameters, blocks: list[Block], errors: int = 0
+    ) -> ExactPosterior:
         """Condition on rows.
 
         Raises:
@@ -64,7 +68,8 @@ class ExactPosterior:
         if len(fitted.L):
             # K_ii + 1 is the squared norm of a row of the factor.
             require_resolved_noise(torch.linalg.vecdot(fitted.L, fitted.L).max())
-        result = cls(tuple(processes), params, blocks, fitted.alpha)
+        alpha = _without_errors(processes, params, blocks, errors) if errors else fitted.alpha
+        result = cls(tuple(processes), params, blocks, alpha, errors)
         result.__dict__["conditioned"] = fitted
         return result
 
@@ -97,23 +102,13 @@ class ExactPosterior:
         cross = cross_gram(self.processes, self.params, self.blocks, new)
         # Σ = [[L Lᵀ, C], [Cᵀ, K_new + I]], α = Σ⁻¹ y
         L, jitter = bordered(old.L, cross, gram(self.processes, self.params, new))
-        alpha = torch.cholesky_solve(target_of(together)[:, None], L)[:, 0]
-        result = ExactPosterior(self.processes, self.params, together, alpha)
-        result.__dict__["conditioned"] = Conditioned(L, alpha, max(old.jitter, jitter))
+        joint = torch.cholesky_solve(target_of(together)[:, None], L)[:, 0]
+        alpha = joint
+        if self.errors:
+            alpha = _without_errors(self.processes, self.params, together, self.errors)
+        result = replace(self, blocks=together, alpha=alpha)
+        result.__dict__["conditioned"] = Conditioned(L, joint, max(old.jitter, jitter))
         return result
-
-    def knowing(self, p: int, features: Features, value: Tensor) -> ExactPosterior:
-        """Condition on the value `(components,)` of a constant process p; its mean becomes zero."""
-        # y ← y − W_p f_p, with W_p ← 0
-        blocks = [
-            Block(
-                block.features,
-                tuple(torch.zeros_like(W) if q == p else W for q, W in enumerate(block.operators)),
-                block.target - block.operators[p] @ value,
-            )
-            for block in self.blocks
-        ]
-        return ExactPosterior.of(self.processes, self.params, blocks)
 
     @cached_property
     def measured(self) -> tuple[bool, ...]:
@@ -131,9 +126,10 @@ class ExactPosterior:
         return [sub(self.params, process.prefix) for process in self.processes]
 
     @cached_property
-    def _weights(self) -> list[list[Tensor]]:
+    def weights(self) -> list[list[Tensor]]:
         """Weights `(components, n, 1)` for each process and block; products with k(x, X) sum to the mean."""
-        return self.weights_of(self.alpha[:, None])
+        weights, first = self.weights_of(self.alpha[:, None]), len(self.processes) - self.errors
+        return [*weights[:first], *([torch.zeros_like(w) for w in each] for each in weights[first:])]
 
     def weights_of(self, rows: Tensor) -> list[list[Tensor]]:
         """Apply Wᵀ to vectors `(rows, s)`, yielding `(components, n, s)` for each process and block."""
@@ -154,13 +150,18 @@ class ExactPosterior:
             for p, process in enumerate(self.processes)
         ]
 
-    def latent_mean(self, p: int, features: Features) -> Tensor:
-        """Return the posterior mean of process p at standardized features, `(n, components)`."""
+    def latent_mean(self, p: int, features: Features, joint: bool = False) -> Tensor:
+        """Return the posterior mean of process p at standardized features, `(n, components)`.
+
+        Args:
+            joint: whether errors are not zero, but have their posterior mean.
+        """
         if not self.measured[p]:
             x, components = next(iter(features.values())), self.blocks[0].operators[p].shape[-1]
             return x.new_zeros(len(x), components)
         # μ(x) = k(x, X) Wᵀα (eqs. 11 and 23)
-        pairs = zip(self.kernels_to_data[p], self._weights[p], strict=True)
+        weights = self.weights_of(self.conditioned.alpha[:, None]) if joint else self.weights
+        pairs = zip(self.kernels_to_data[p], weights[p], strict=True)
         parts = [(kernel(features) @ w)[..., 0] for kernel, w in pairs]
         return sum(parts[1:], start=parts[0]).mT
 
@@ -222,16 +223,25 @@ class ExactPosterior:
         terms, at_rows = draw_priors(
             self.processes, self.params, self.blocks, self.measured, count, generator, features
         )
-        # ε ~ N(0, I), β = Wᵀ Σ⁻¹ (y − W f(X) − ε)
+        # ε ~ N(0, I), β = Wᵀ (α − Σ⁻¹ (W f(X) + ε)), with α = Σ⁻¹ y unless there are errors
         like = self.alpha
         noise = torch.randn(len(like), count, dtype=torch.float64, generator=generator).to(like)
-        residual = target_of(self.blocks)[:, None] - at_rows - noise
-        weights = self.weights_of(torch.cholesky_solve(residual, self.conditioned.L))
+        weights = self.weights_of(-torch.cholesky_solve(at_rows + noise, self.conditioned.L))
         # f(x) = φ(x)ᵀ w + k(x, X) β
         for p, process in enumerate(self.processes):
-            for block, w in zip(self.blocks, weights[p], strict=True) if self.measured[p] else ():
-                terms[p] += kernel_terms(process.kernel, self._process_params[p], block.features[p], w)
+            parts = zip(self.blocks, weights[p], self.weights[p], strict=True)
+            for block, w, mean in parts if self.measured[p] else ():
+                terms[p] += kernel_terms(process.kernel, self._process_params[p], block.features[p], mean + w)
         return FunctionSamples.of(terms)
+
+
+def _without_errors(
+    processes: Sequence[Process], params: Parameters, blocks: Sequence[Block], errors: int
+) -> Tensor:
+    """Return (K + I)⁻¹ y with the covariance K of all processes but the last ones, which are errors."""
+    n = len(processes) - errors
+    known = [replace(b, features=b.features[:n], operators=b.operators[:n]) for b in blocks]
+    return condition(processes[:n], params, known).alpha
 
 
 def exact_bytes(blocks: Sequence[Block], learning: bool = True) -> int:

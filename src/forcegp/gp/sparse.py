@@ -4,6 +4,9 @@ With A = I + Σ V_i S_i V_iᵀ and v = Σ V_i W_iᵀ y_i, the latent mean is V_*
 k_** − V_*ᵀV_* + V_*ᵀA⁻¹V_* (Titsias 2009; Hensman et al. 2013). The cost of a prediction does not depend on
 the number of samples.
 
+The last processes may be errors of zero mean, which only widen error bars. Given that they are zero, the mean
+of the other weights o is A_oo⁻¹ v_o. The leading block of the factor of A is the factor of A_oo.
+
 The weights of some basis functions may drift, so that some components change while others do not. A drifting
 weight is an Ornstein–Uhlenbeck process whose stationary distribution is the prior: w′ = ρ w + √(1 − ρ²) ξ
 with ξ ~ N(0, I). In information form (A = I + G, v), with drifting weights p and other weights o,
@@ -114,16 +117,21 @@ class SparsePosterior:
         moments: sums over the samples other than G, which is recovered from the factor.
         L: lower Cholesky factor of A = I + G.
         jitter: jitter added to the diagonal, usually 0.0.
+        errors: number of processes, the last ones, whose mean is zero.
     """
 
     basis: LatentBasis
     moments: Moments
     L: Tensor
     jitter: float = 0.0
+    errors: int = 0
 
     @classmethod
-    def of(cls, basis: LatentBasis, sums: Sums) -> SparsePosterior:
+    def of(cls, basis: LatentBasis, sums: Sums, errors: int = 0) -> SparsePosterior:
         """Factorise A = I + G.
+
+        Args:
+            errors: number of processes, the last ones, whose mean is zero.
 
         Raises:
             NumericalError: A is not positive definite, for example after removing samples that were not
@@ -132,7 +140,7 @@ class SparsePosterior:
         # A = I + G = L Lᵀ
         A = sums.G + torch.eye(len(sums.G), dtype=sums.G.dtype, device=sums.G.device)
         L, jitter = cholesky(A)
-        result = cls(basis, Moments(*sums.tensors[:-1]), L, jitter)
+        result = cls(basis, Moments(*sums.tensors[:-1]), L, jitter, errors)
         result.__dict__["sums"] = sums
         return result
 
@@ -146,7 +154,11 @@ class SparsePosterior:
 
     @classmethod
     def of_tensors(
-        cls, processes: Sequence[Process], params: Parameters, tensors: Mapping[str, Tensor]
+        cls,
+        processes: Sequence[Process],
+        params: Parameters,
+        tensors: Mapping[str, Tensor],
+        errors: int = 0,
     ) -> SparsePosterior:
         """Restore a posterior from `tensors`.
 
@@ -167,7 +179,7 @@ class SparsePosterior:
                 got=f"{len(moments.v)} of {len(moments.prior)}",
             )
         # Files are row-major; the factor is column-major, as LAPACK returns it.
-        return cls(basis, moments, L.mT.contiguous().mT, jitter)
+        return cls(basis, moments, L.mT.contiguous().mT, jitter, errors)
 
     @cached_property
     def sums(self) -> Sums:
@@ -175,9 +187,23 @@ class SparsePosterior:
         eye = torch.eye(len(self.L), dtype=self.L.dtype, device=self.L.device)
         return Sums(**vars(self.moments), G=self.L @ self.L.mT - (1.0 + self.jitter) * eye)
 
+    @property
+    def leading(self) -> int:
+        """Number of weights of the processes that are not errors."""
+        first = len(self.basis.parts) - self.errors
+        return self.basis.of_process(first).start if self.errors else len(self.L)
+
     @cached_property
     def weights(self) -> Tensor:
-        """Posterior mean A⁻¹v of the weights of the basis functions `(size,)`."""
+        """Mean of the weights of the basis functions, given that errors are zero, `(size,)`."""
+        # A_oo⁻¹ v_o, 0
+        k = self.leading
+        mean = torch.cholesky_solve(self.moments.v[:k, None], self.L[:k, :k])[:, 0]
+        return torch.cat([mean, torch.zeros_like(self.moments.v[k:])])
+
+    @cached_property
+    def joint_weights(self) -> Tensor:
+        """Posterior mean A⁻¹v of the weights of the basis functions, including errors, `(size,)`."""
         return torch.cholesky_solve(self.moments.v[:, None], self.L)[:, 0]
 
     @property
@@ -185,7 +211,7 @@ class SparsePosterior:
         """Collapsed lower bound on the exact log-likelihood log p(y) (Titsias 2009)."""
         # F = −½ [Σ y² − vᵀA⁻¹v + log|A| + rows log 2π + Σ tr W(k − VᵀV)Wᵀ], log|A| = 2 Σ log L_ii
         moments = self.moments
-        fit = moments.yy - moments.v @ self.weights
+        fit = moments.yy - moments.v @ self.joint_weights
         log_determinant = 2.0 * self.L.diagonal().abs().log().sum()
         constant = moments.rows * math.log(2.0 * math.pi)
         return -float(0.5 * (fit + log_determinant + constant + moments.missed.sum()))
@@ -193,7 +219,7 @@ class SparsePosterior:
     @property
     def residual(self) -> float:
         """Mean square residual of the rows in units of the noise."""
-        # |y − Φ w|² = yᵀy − vᵀw − wᵀw with (I + ΦᵀΦ) w = v
+        # |y − Φ w|² = yᵀy − vᵀw − wᵀw with (I + ΦᵀΦ) w = v, in the rows where w is not zero
         w, rows = self.weights, self.moments.rows.clamp(min=1.0)
         return max(0.0, float((self.moments.yy - self.moments.v @ w - w @ w) / rows))
 
@@ -208,13 +234,22 @@ class SparsePosterior:
     @cached_property
     def folded(self) -> list[tuple[Tensor, Tensor]]:
         """Posterior mean of each process, as weights of k(x, Z) and of its exact features."""
-        basis, weights = self.basis, self.weights[:, None]
-        return [part.fold(weights[basis.of_process(p)]) for p, part in enumerate(basis.parts)]
+        return self.folded_by(self.weights)
 
-    def latent_mean(self, p: int, features: Features) -> Tensor:
-        """Return the posterior mean of process p, `(n, components)`."""
+    def folded_by(self, weights: Tensor) -> list[tuple[Tensor, Tensor]]:
+        """Return weights `(size,)` of the basis functions as weights of k(x, Z) and of exact features."""
+        columns = (weights[self.basis.of_process(p), None] for p in range(len(self.basis.parts)))
+        return [part.fold(w) for part, w in zip(self.basis.parts, columns, strict=True)]
+
+    def latent_mean(self, p: int, features: Features, joint: bool = False) -> Tensor:
+        """Return the posterior mean of process p, `(n, components)`.
+
+        Args:
+            joint: whether errors are not zero, but have their posterior mean.
+        """
         # μ(x) = V(x)ᵀ A⁻¹v = k(x, Z) (R m) + φ(x)ᵀ m (eq. 23)
-        part, (on_kernel, on_features) = self.basis.parts[p], self.folded[p]
+        folded = self.folded_by(self.joint_weights) if joint else self.folded
+        part, (on_kernel, on_features) = self.basis.parts[p], folded[p]
         x = next(iter(features.values()))
         mean = x.new_zeros(part.components, len(x), 1)
         if part.to_inducing is not None:
@@ -226,22 +261,6 @@ class SparsePosterior:
     def mean(self, block: Block) -> Tensor:
         """Return the posterior mean Σ W f of the rows of each sample of a block, `(n, d)`."""
         return rows_mean(self.latent_mean, block)
-
-    def knowing(self, p: int, features: Features, value: Tensor) -> SparsePosterior:
-        """Condition on the value `(components,)` of a constant process p with finitely many features.
-
-        The mean of process p becomes zero, since the value is now part of the prior mean.
-        """
-        part, own = self.basis.parts[p], self.basis.of_process(p)
-        eye = torch.eye(part.components, dtype=value.dtype, device=value.device)
-        # f_p = Φ w_p
-        Phi = part.rows(eye[None], part.values(features)[0])
-        weights = torch.linalg.lstsq(Phi, value[:, None]).solution[:, 0]
-        # v_o ← v_o − G_op w_p, with the rows of w_p removed; A = I + G = L Lᵀ
-        G = self.L @ self.L.mT - torch.eye(len(self.L), dtype=self.L.dtype, device=self.L.device)
-        v = self.moments.v - G[:, own] @ weights
-        G[own], G[:, own], v[own] = 0.0, 0.0, 0.0
-        return SparsePosterior.of(self.basis, Sums(**vars(replace(self.moments, v=v)), G=G))
 
     @cached_property
     def _inverse_factor(self) -> list[Tensor]:
@@ -326,7 +345,7 @@ class SparsePosterior:
             generator: source of randomness, on the CPU.
             features: number of random features per component.
         """
-        # w = m + L⁻ᵀ ξ ~ N(A⁻¹v, A⁻¹)
+        # w = m + L⁻ᵀ ξ ~ N(m, A⁻¹)
         m = self.weights[:, None]
         normal = torch.randn(len(m), count, dtype=torch.float64, generator=generator).to(m)
         weights = m + torch.linalg.solve_triangular(self.L.mT, normal, upper=True)
@@ -340,10 +359,10 @@ class SparsePosterior:
         """
         rows = sum(block.rows for block in blocks)
         if rows > UPDATE_FRACTION * self.basis.size or self.L.device.type != "cpu":
-            return SparsePosterior.of(self.basis, self.sums + accumulate(self.basis, blocks))
+            return self._with(self.sums + accumulate(self.basis, blocks))
         # A′ = A + ΦᵀΦ
         moments, Phi = add_rows(self.basis, self.moments, blocks)
-        return SparsePosterior(self.basis, moments, extended(self.L, Phi), self.jitter)
+        return replace(self, moments=moments, L=extended(self.L, Phi))
 
     def forgetting(self, factor: float) -> SparsePosterior:
         """Multiply the weight of all previous samples by `factor`; 0 restores the prior.
@@ -351,7 +370,7 @@ class SparsePosterior:
         Raises:
             ModelError: the factor is not between 0 and 1.
         """
-        return SparsePosterior.of(self.basis, self.sums.scaled(factor))
+        return self._with(self.sums.scaled(factor))
 
     def drifting(self, factor: float, processes: Sequence[int]) -> SparsePosterior:
         """Let the weights of the given processes drift towards their prior. Other weights do not change.
@@ -361,7 +380,7 @@ class SparsePosterior:
         """
         columns = torch.arange(self.basis.size, device=self.L.device)
         weights = torch.cat([columns[self.basis.of_process(p)] for p in processes])
-        return SparsePosterior.of(self.basis, drifted(self.sums, weights, factor))
+        return self._with(drifted(self.sums, weights, factor))
 
     def without(self, blocks: Sequence[Block]) -> SparsePosterior:
         """Remove samples that the posterior was conditioned on.
@@ -370,4 +389,7 @@ class SparsePosterior:
             ModelError: there are more rows than the posterior was conditioned on.
             NumericalError: the posterior was not conditioned on these samples.
         """
-        return SparsePosterior.of(self.basis, self.sums - accumulate(self.basis, blocks))
+        return self._with(self.sums - accumulate(self.basis, blocks))
+
+    def _with(self, sums: Sums) -> SparsePosterior:
+        return SparsePosterior.of(self.basis, sums, self.errors)

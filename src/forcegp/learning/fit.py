@@ -158,7 +158,7 @@ def regression(
     values = {**found.values, **memory_noise(found)}
     objective = -found.evidence.log_evidence
     return Regression(
-        found.problem.without_pinned().with_pinned(part),
+        found.problem.without_errors().with_priors(part.errors, part),
         values,
         found.problem.training.samples,
         found.rounds,
@@ -230,7 +230,7 @@ def with_remainder(
     """
     later = [prior for prior in whole.priors if prior.remainder]
     names = {prior.name for prior in later}
-    given = laws.problem.without_pinned()
+    given = laws.problem.without_errors()
     problem = given.with_priors(later, whole)
     values = {**laws.values, **start}
     problem = with_inducing(problem, values, SUPPORT)
@@ -294,11 +294,11 @@ def memory_noise(found: Scales) -> Tensors:
 def worth_of(found: Scales) -> dict[str, float]:
     """Return the log evidence of each prior and joint over its absence [nats]; 0 for those dropped.
 
-    Forces that the robot includes are not judged.
+    Errors of what the robot includes are not judged.
     """
     result, joints, priors = {}, found.problem.system.robot.joint_names, found.problem.priors
     for (p, k), family in families_of(found.groups).items():
-        if priors[p].name in found.problem.pinned:
+        if priors[p].is_error:
             continue
         several = found.values[found.groups[family[0]].key].shape[0] > 1
         part = f" of {joints[k]}" if priors[p].per_joint else f" {k + 1}" if several else ""

@@ -109,7 +109,7 @@ def rigid_robot(robot: RobotModel, rows: Rows) -> Inertia:
     def accelerations(other: RobotModel, delta: Tensor) -> Tensor:
         return acceleration_errors(rows, single.by_stretch, C, delta, mass_matrix(other, rows.q))
 
-    every, file, left = found.by_stretch.total(), estimated(delay), prior.around(robot).with_drives(size)
+    every, file, left = found.by_stretch.total(), estimated(delay), _errors(robot, size)
     driving = torch.cat([kept, delay])
     nothing, drives, delta = (found.estimate(every, kept, n) for kept in (delay, driving, everything))
     driven = estimated(driving)
@@ -161,6 +161,11 @@ def _consistent(
     change[free] = torch.linalg.solve(precision[free][:, free], per_gain[free])
     change = torch.cat([prior.scale(robot)[:, None] * change[links], size[:, None] * change[:n]])
     return moved.replace(armature=robot.armature + size * unknowns[:n]), unknowns, change
+
+
+def _errors(robot: RobotModel, size: Tensor) -> InertialPrior:
+    """Return the prior on what remains unknown of links and of drives of the given size."""
+    return InertialPrior(is_error=True).around(robot).with_drives(size)
 
 
 def with_delay(rows: Rows, columns: Tensor) -> Tensor:
@@ -335,7 +340,7 @@ def inertia_of(
     """
     if training.free_motions < LEAST:
         size = drive_scale(system.robot, torch.cat([m.q for m in training.measurements]))
-        return Inertia(system.robot, InertialPrior().around(system.robot).with_drives(size))
+        return Inertia(system.robot, _errors(system.robot, size))
     rows = free_rows(system, friction, mean, training).with_memory()
     return rigid_robot(system.robot, with_ripple(system.robot, rows))
 
@@ -374,21 +379,18 @@ def drive_scale(robot: RobotModel, q: Tensor) -> Tensor:
 def with_updated_robot(problem: Problem, values: Mapping[str, Tensor]) -> Problem:
     """Return the problem with the inertial parameters at their posterior mean (one Gauss–Newton step)."""
     for p, prior in enumerate(problem.priors):
-        moves = prior.name not in problem.pinned and problem.parameters is None
+        moves = not prior.is_error and problem.parameters is None
         if isinstance(prior, InertialPrior) and moves and not prior.drives:
             posterior = force_posterior(problem, values)
             features = one_row(posterior, problem)
             mean = posterior.latent.latent_mean(p, features[p])[0]
             precision = latent_precision(posterior, features, p, problem.system.robot)
             volume = _log_volume(problem, values)
-            robot, moved = prior.updated(problem.system.robot, mean, precision, volume)
+            robot, _ = prior.updated(problem.system.robot, mean, precision, volume)
             # The prior keeps the scale of the parameters in the file, not of the updated ones.
-            return dataclasses.replace(
-                problem,
-                system=problem.system.with_robot(robot),
-                priors=tuple(prior.around(problem.system.robot) if q is prior else q for q in problem.priors),
-                pinned={prior.name: moved},
-            )
+            left = dataclasses.replace(prior.around(problem.system.robot), is_error=True)
+            moved = problem.without_priors([prior.name]).with_priors([left], problem)
+            return dataclasses.replace(moved, system=problem.system.with_robot(robot))
     return problem
 
 

@@ -36,6 +36,7 @@ from forcegp.forces.priors.joint import AnalyticalMean
 from forcegp.forces.quantities import States, states_at
 from forcegp.forces.term import JointTerm
 from forcegp.identification import regressor
+from forcegp.models.parameters import is_identified
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.robot.inertia import from_pseudo_inertia, inertial_parameters, pseudo_inertia, pseudo_inertia_of
 from forcegp.robot.model import RobotModel
@@ -376,17 +377,14 @@ class _Reader:
         """Return b `(1, d)`, the identified inertia minus its posterior mean.
 
         Instruments identify inertia without bias by noisy accelerations, but from part of the samples; the
-        posterior contains all samples, but regards accelerations in the regressor as exact. A robot at its
-        posterior mean, which contains nonzero pinned forces, has b = 0.
+        posterior contains all samples, but regards accelerations in the regressor as exact.
         """
-        posterior = self.fit.posterior
-        identified = float(not any(bool(value.any()) for value in posterior.process.pinned.values()))
         b = [self._kept().flatten()]
         for kind in (InertialPrior, PayloadPrior):
             for p in [p for p, prior in enumerate(self.fit.force_priors) if isinstance(prior, kind)][:1]:
                 one = {name: x[:1] for name, x in self._features(p).items()}
-                b.append((posterior.means.latent_mean(p, one) - posterior.latent.latent_mean(p, one))[0])
-        return identified * torch.cat(b)[None]
+                b.append(-self._from_mean(p, one)[0])
+        return torch.cat(b)[None]
 
     def _consistent(self, values: Tensor, first: int, samples: Tensor) -> Tensor:
         """Return the values `(n, d)` with the most probable physically consistent links and drives.
@@ -446,10 +444,16 @@ class _Reader:
         """Return the friction at the identified inertia minus the friction at the joint posterior mean."""
         fit, at, force = self.fit, self.at, torch.zeros_like(self.at.q)
         for p, prior in enumerate(fit.force_priors):
-            if isinstance(prior, JointTerm) and fit.posterior.process.pinned:
-                latent = fit.posterior.shift(p, fit.posterior.process.features(p, fit.system, at))
-                force = force + torch.einsum("nij,nj->ni", prior.operator(fit.system, at), latent)
+            if isinstance(prior, JointTerm):
+                latent = self._from_mean(p, self._features(p))
+                force = force - torch.einsum("nij,nj->ni", prior.operator(fit.system, at), latent)
         return self._over_poses(force)
+
+    def _from_mean(self, p: int, features: dict[str, Tensor]) -> Tensor:
+        """Return the joint posterior mean of latent force p minus its mean given the identified inertia."""
+        latent = self.fit.posterior.latent
+        apart = latent.latent_mean(p, features, joint=True) - latent.latent_mean(p, features)
+        return apart * float(is_identified(self.fit.force_priors))
 
     def _curves(self, drawn: ForceSamples) -> Tensor:
         """Return the friction Q_D `(1 + samples, k, nq)` of the posterior mean and samples, over poses."""
@@ -459,10 +463,9 @@ class _Reader:
         curves = self._over_poses(known).expand(drawn.count, -1, -1)
         for p in priors:
             features, E = self._features(p), fit.force_priors[p].operator(fit.system, at)
-            shift = fit.posterior.shift(p, features) + torch.zeros_like(E[:, 0])
             for rows in torch.arange(len(E)).split(len(self.speeds)):
                 latent = drawn.functions.latent(p, {name: x[rows] for name, x in features.items()})
-                curves = curves + torch.einsum("nij,snj->sni", E[rows], latent + shift[rows]) / POSES
+                curves = curves + torch.einsum("nij,snj->sni", E[rows], latent) / POSES
         mean = self._over_poses(known + fit.posterior.unknown_force(fit.system, at, priors))
         return torch.cat([mean[None], curves])
 
@@ -474,9 +477,8 @@ class _Reader:
         for p, prior in enumerate(self.fit.force_priors):
             if isinstance(prior, kind):
                 one = {name: x[:1] for name, x in self._features(p).items()}
-                mean = self.fit.posterior.means.latent_mean(p, one)
-                samples = drawn.functions.latent(p, one)[:, 0]
-                return torch.cat([mean, samples + self.fit.posterior.shift(p, one)])
+                mean = self.fit.posterior.latent.latent_mean(p, one)
+                return torch.cat([mean, drawn.functions.latent(p, one)[:, 0]])
         return self.speeds.new_zeros(1 + drawn.count, 0)
 
     def _gain_errors(self, draws: int, generator: torch.Generator) -> Tensor:

@@ -368,7 +368,7 @@ class Reading:
             pairs = zip(own, rows.operators, strict=True)
             chosen = tuple(W if mine is keep else torch.zeros_like(W) for mine, W in pairs)
             block = dataclasses.replace(rows, operators=chosen)
-            return posterior.means.mean(block), posterior.latent.covariance(block)
+            return posterior.latent.mean(block), posterior.latent.covariance(block)
 
         force = self.source.unknown(self.fit, at, part(True))
         mean, S = part(False)

@@ -8,13 +8,14 @@ N(A⁻¹v, A⁻¹).
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Iterable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from forcegp.forces.posterior import ForcePosterior
+from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
 from forcegp.forces.term import JointTerm
 from forcegp.gp.kernels import Constant, Linear, sub
@@ -70,22 +71,27 @@ def clear_drives(
     return (f"{lacks}: {', '.join(clear)}",) if clear else ()
 
 
+def is_identified(priors: Sequence[ForcePrior]) -> bool:
+    """Return whether instruments identified the inertia, which differs from its posterior mean then."""
+    return any(isinstance(prior, InertialPrior) and prior.is_error and bool(prior.drives) for prior in priors)
+
+
 @torch.no_grad()
 def learned_parameters(
     posterior: ForcePosterior, hyperparameters: Mapping[str, Tensor], robot: RobotModel
 ) -> tuple[LearnedParameter, ...]:
     """Return the parameters of all terms with finitely many columns (see `StructuredFit.parameters`)."""
-    latent, means = posterior.latent, posterior.means
-    if not isinstance(latent, SparsePosterior) or not isinstance(means, SparsePosterior):
+    latent = posterior.latent
+    if not isinstance(latent, SparsePosterior):
         return ()
     inverse = torch.linalg.solve_triangular(latent.L, torch.eye(len(latent.L)).to(latent.L), upper=False)
-    apart = latent.weights - means.weights
-    deviation, found = (inverse.square().sum(0) + apart.square()).sqrt(), []
+    apart = latent.joint_weights - latent.weights if is_identified(posterior.priors) else 0.0
+    deviation, found = (inverse.square().sum(0) + apart**2).sqrt(), []
     for p, part in enumerate(latent.basis.parts):
         if part.split.rest is None:
             own = latent.basis.of_process(p)
             shape = part.components, -1
-            rows = means.weights[own].view(shape), deviation[own].view(shape)
+            rows = latent.weights[own].view(shape), deviation[own].view(shape)
             found += _of_prior(posterior, hyperparameters, robot, p, *rows)
     return tuple(found)
 

@@ -135,7 +135,6 @@ def pack(
     """
     own = spec.analytical_parameters if isinstance(spec.analytical_parameters, AnalyticalParameters) else None
     tensors = {f"hyper.{key}": value for key, value in _kept(hyperparameters, own).items()}
-    tensors |= {f"pinned.{name}": value for name, value in problem.pinned.items()}
     if problem.torque_std is not None:
         tensors["torque_std"] = problem.torque_std
     if problem.correlation is not None:
@@ -304,7 +303,6 @@ def _restored(
         system=spec.system if spec.analytical_parameters is not None else system,
         power=settings.power,
         correlation=correlation,
-        pinned=_below(tensors, "pinned."),
         torque_std=tensors.get("torque_std"),
     )
     posterior = _posterior(*problem.with_coulomb_errors(hyper), tensors)
@@ -336,11 +334,11 @@ def _posterior(problem: Problem, hyper: dict[str, Tensor], tensors: Mapping[str,
     params, process = kernel_parameters(hyper), problem.process_at(hyper)
     if "alpha" not in tensors:
         kept = _in_order(problem, _below(tensors, "sparse."))
-        latent = SparsePosterior.of_tensors(problem.priors, params, kept)
+        latent = SparsePosterior.of_tensors(problem.priors, params, kept, len(problem.errors))
         return ForcePosterior(process, latent)
     blocks, alpha = problem.rows(hyper).blocks, tensors["alpha"]
     rows = sum(block.rows for block in blocks)
     if alpha.shape != (rows,):
         raise ValueError(f"weights of shape {tuple(alpha.shape)} for {rows} rows")
-    latent = ExactPosterior(problem.priors, params, blocks, alpha)
+    latent = ExactPosterior(problem.priors, params, blocks, alpha, len(problem.errors))
     return ForcePosterior(process, latent)

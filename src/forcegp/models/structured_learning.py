@@ -149,14 +149,11 @@ class Specification:
         found = inertia_of(self.system, friction, self.mean, training)
         return found if training.free_motions >= LEAST else replace(found, doubts=_unchecked_masses(training))
 
-    def problem(
-        self, training: Training, robot: RobotModel | None = None, pinned: Mapping[str, Tensor] | None = None
-    ) -> Problem:
+    def problem(self, training: Training, robot: RobotModel | None = None) -> Problem:
         """Return the learning problem for training data.
 
         Args:
             robot: the robot used for learning, if it differs from that of the file.
-            pinned: the values of the forces that this robot includes, keyed by prior.
         """
         system = self.system if robot in (None, self.system.robot) else self.system.with_robot(robot)
         noise, robot, std = self.noise, self.system.robot, None
@@ -169,7 +166,6 @@ class Specification:
             training,
             self.analytical_parameters,
             std,
-            pinned=pinned or {},
             state_std=state_std_of(noise.state, robot),
             external_std=external_std(noise.external, robot),
         )
@@ -232,17 +228,16 @@ def problem_for(
         inertia, the model has a prior on its remaining errors.
     """
     training, doubts = training_for(spec, before, data, chosen)
-    robot, pinned = spec.system.robot, dict[str, Tensor]()
-    if before is not None and not any(bool(value.any()) for value in before.pinned.values()):
-        robot, pinned = before.system.robot, before.pinned
+    robot = spec.system.robot
+    if before is not None and any(prior.is_error for prior in spec.priors):
+        robot = before.system.robot
     elif before is None and chosen is None:
         found = spec.inertia_of(training)
         robot, doubts = found.robot, (*doubts, *found.doubts)
         if found.errors is not None:
             spec = dataclasses.replace(spec, priors=(*spec.priors, found.errors))
-            pinned = {found.errors.name: robot.mass.new_zeros(found.errors.outputs(robot))}
             training, _ = training_for(spec, before, data, chosen)
-    return spec, spec.problem(dataclasses.replace(training, part_of=part_of), robot, pinned), doubts
+    return spec, spec.problem(dataclasses.replace(training, part_of=part_of), robot), doubts
 
 
 def training_for(
@@ -296,7 +291,7 @@ def search_of(
 ) -> Search:
     """Return the search for the learned parts of a problem, with initial values and fixed values.
 
-    The scale of a force that the robot includes is not learned.
+    The scale of an error of what the robot includes is not learned.
     """
     options = options or (OPTIONS if spec.analytical_parameters is None else WITH_PARAMETERS)
     start = initial(problem, spec.noise.learn, spec.noise.learns_torque, spec.automatic)
@@ -305,9 +300,11 @@ def search_of(
     if chosen is not None and NOISE not in chosen:
         current |= {key: value for key, value in known.items() if key.startswith(REGION)}
 
+    errors = {prior.name for prior in problem.errors}
+
     def is_held(name: str) -> bool:
-        # If the robot includes a force, the scale of that force cannot be learned from the residuals.
-        return name in problem.pinned or (chosen is not None and name not in chosen)
+        # If the robot includes a force, the scale of its error cannot be learned from the residuals.
+        return name in errors or (chosen is not None and name not in chosen)
 
     held = {key: value for key, value in current.items() if is_held(key.split(".")[0])}
     return Search({key: value for key, value in start.items() if key not in held}, held, options)

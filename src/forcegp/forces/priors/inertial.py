@@ -51,6 +51,7 @@ class InertialPrior(ConstantForcePrior):
         per_gain: change of the identified parameters of links, then drives, per relative error of the gain of
             each torque sensor, `11 nq` rows of `nq`; empty if the robot was not identified from torques.
         delay: time by which logged torques precede the motion, identified with the robot [s].
+        is_error: whether the robot has the most probable parameters, so that their errors have zero mean.
 
     Example:
         >>> import torch, forcegp
@@ -69,6 +70,7 @@ class InertialPrior(ConstantForcePrior):
     drives: tuple[float, ...] = ()
     per_gain: tuple[tuple[float, ...], ...] = ()
     delay: float = 0.0
+    is_error: bool = False
 
     def around(self, robot: RobotModel) -> InertialPrior:
         """Return the prior with its scales S fixed to those of the given robot."""

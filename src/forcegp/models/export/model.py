@@ -145,13 +145,10 @@ class ExportedModel:
     def online(self) -> bool:
         """Whether the model can learn online, which requires basis functions with their full covariance.
 
-        Forces that the robot includes must be zero and come last, and the torque must not be delayed.
+        The torque must not be delayed.
         """
-        process, priors = self.posterior.process, self.posterior.priors
-        last = set(range(len(priors) - len(process.pinned), len(priors)))
-        known = set(process.pinned) == last and not any(bool(x.any()) for x in process.pinned.values())
-        timely = not any(prior.delay for prior in priors)
-        return self.sign > 0 and known and timely and self.sampling is not None
+        timely = not any(prior.delay for prior in self.posterior.priors)
+        return self.sign > 0 and timely and self.sampling is not None
 
     def check(self) -> None:
         """Check that all parts of the model have a C form.
@@ -217,8 +214,7 @@ class ExportedModel:
         return self._of_rows(self.posterior.latent)
 
     def _of_basis(self, latent: SparsePosterior) -> list[Functions]:
-        means, basis, parts = self.posterior.means, latent.basis, []
-        assert isinstance(means, SparsePosterior)
+        basis, parts = latent.basis, []
         if self.functions is None:
             eye = torch.eye(len(latent.L), dtype=latent.L.dtype)
             # C = L⁻ᵀ, upper triangular
@@ -232,7 +228,7 @@ class ExportedModel:
             C = vectors[:, kept] * (1.0 - 1.0 / values[kept]).clamp(min=0.0).sqrt()
         for p, (part, components) in enumerate(zip(basis.parts, basis.components, strict=True)):
             columns = basis.columns[components]
-            on_kernel, on_features = means.folded[p]
+            on_kernel, on_features = latent.folded[p]
             weights = torch.cat([on_kernel, on_features], dim=1)[..., 0]
             first = tuple(rows.start if self.functions is None else 0 for rows in columns)
             roots = [C[rows, start:] for rows, start in zip(columns, first, strict=True)]
@@ -247,8 +243,7 @@ class ExportedModel:
         return parts
 
     def _of_rows(self, latent: ExactPosterior) -> list[Functions]:
-        means, L, parts = self.posterior.means, latent.conditioned.L, []
-        assert isinstance(means, ExactPosterior)
+        L, weights, parts = latent.conditioned.L, latent.weights, []
         if self.functions is None:
             rows = torch.linalg.solve_triangular(L, torch.eye(len(L), dtype=L.dtype), upper=False).mT
         elif not self.functions:
@@ -256,7 +251,6 @@ class ExportedModel:
         else:
             values, vectors = torch.linalg.eigh(L @ L.mT)
             rows = vectors[:, -self.functions :] * values[-self.functions :].rsqrt()
-        weights = means.weights_of(means.alpha[:, None])
         for p, roots in enumerate(latent.weights_of(rows)):
             prior = self.posterior.priors[p]
             cut = split(prior.kernel, sub(latent.params, latent.processes[p].prefix))

@@ -12,7 +12,6 @@ from forcegp.errors import MissingDependencyError, ModelError, NumericalError
 from forcegp.forces.posterior import ForceSamples
 from forcegp.forces.quantities import ForceField
 from forcegp.gp.features import FeatureMap
-from forcegp.gp.sparse import SparsePosterior
 from forcegp.models.export.library import KINDS, MESSAGES
 from forcegp.models.export.model import ExportedModel, Functions
 from forcegp.models.export.source import NO_FRICTION, c_source
@@ -43,16 +42,11 @@ class CompiledMotion:
 
     def _functions(self, model: ExportedModel, samples: ForceSamples) -> tuple[Tensor, ctypes.Array[Waves]]:
         """Return the weights of all function samples, one row each, and the waves for the basis residual."""
-        posterior, parts = samples.posterior, model.parts()
+        parts = model.parts()
         assert samples.functions.folded is not None
         rows, waves = [], (Waves * len(parts))()
         for p, (part, drawn) in enumerate(zip(parts, samples.functions.folded, strict=True)):
             weights = torch.cat([drawn.on_kernel, drawn.on_features], dim=1)
-            if posterior.process.pinned:
-                assert isinstance(posterior.latent, SparsePosterior)
-                # Samples of the latent posterior are shifted to the mean given the forces in the robot.
-                mean = torch.cat(posterior.latent.folded[p], 1)[..., 0]
-                weights = weights + (part.weights - mean)[..., None]
             rows.append(weights.flatten(0, 1).mT)
             if drawn.missed is not None:
                 waves[p] = self._missed(part, *drawn.missed)

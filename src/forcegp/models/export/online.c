@@ -6,12 +6,12 @@
  *   c' = (c - Y g) / gamma,  Y' = Y + (c - Y g / (gamma + 1)) g^T / gamma.
  * Finally, X X^T = noise + Phi A^-1 Phi^T and Y X^T = A^-1 Phi^T, so w' = w + Y X^-1 (y - Phi w). */
 
-/* weights of k(x, Z) and phi(x), computed from those of the whitened functions. The last ones, of forces that the robot
- * includes, are zero: with K = (K_oo, 0; K_po, K_pp), the others then are w_o - K_po^T K_pp^-T w_p */
+/* weights of k(x, Z) and phi(x), computed from those of the whitened functions. The last ones, errors of what the
+ * robot includes, are zero: with K = (K_oo, 0; K_po, K_pp), the others then are w_o - K_po^T K_pp^-T w_p */
 static int fold(forcegp_learned *s) {
   double given[RANK];
   memcpy(given, s->weights, sizeof given);
-  for (int j = RANK - 1; j >= INCLUDED; --j) {
+  for (int j = RANK - 1; j >= LEADING; --j) {
     const double *c = s->root + (long)j * (j + 1) / 2, z = given[j] / c[j];
     for (int i = 0; i <= j; ++i) given[i] -= z * c[i];
   }

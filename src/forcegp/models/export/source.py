@@ -280,15 +280,15 @@ class Writer:
         variance, power, moving = self.model.sampling
         parts, latent = self.parts, self.model.posterior.latent
         assert isinstance(latent, SparsePosterior)
-        self.array(latent.weights, "WEIGHTS")
+        self.array(latent.joint_weights, "WEIGHTS")
         self.array(accumulate((len(C) for part in parts for C in part.roots), initial=0), "FUNCTION", "int")
         self.array([part.size for part in parts for _ in range(part.components)], "POINTS", "int")
         self.array(self.starts, "FIRST_COMPONENT", "int")
         self.array(variance, "LEARNED_TORQUE_VARIANCE")
         group = "CONTACTS * 3 > NQ ? CONTACTS * 3 : NQ"
-        basis, pinned = latent.basis, self.model.posterior.process.pinned
-        included = basis.of_process(min(pinned)).start if pinned else basis.size
-        self.lines.append(f"enum {{ PRIOR_COUNT = {len(parts)}, GROUP = {group}, INCLUDED = {included} }};")
+        self.lines.append(
+            f"enum {{ PRIOR_COUNT = {len(parts)}, GROUP = {group}, LEADING = {latent.leading} }};"
+        )
         self.lines.append(f"static const double REST_SPEED = {REST_SPEED if moving else -1.0!r};")
         self.lines.append(f"static const double TEMPERING = {power**0.5!r};")
 
