@@ -7,8 +7,7 @@
 3. If residuals are correlated in time, the likelihood is tempered. For kernels, residuals also determine
    slopes and weights (`learning/noise_learning.py`), and hyperparameters are then learned again.
 4. Inertial parameters move to their posterior mean in one physically consistent Gauss–Newton step.
-5. Torque noise is increased to the level observed on held-out blocks of the training log. Its growth beyond
-   the trained speeds and torques is learned from held-out regimes.
+5. Torque noise is increased to the level observed on held-out blocks of the training log.
 6. The posterior is conditioned on all samples.
 """
 
@@ -40,7 +39,6 @@ from forcegp.forces.measurements import (
     without_outliers,
 )
 from forcegp.forces.noise import TORQUE_NOISE, Noise, external_std, state_std_of
-from forcegp.forces.posterior import REGION
 from forcegp.forces.priors.base import ANALYTICAL, COULOMB, NOISE, ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import AnalyticalMean, ConstantForcePrior, JointFrictionPrior
@@ -297,8 +295,6 @@ def search_of(
     start = initial(problem, spec.noise.learn, spec.noise.learns_torque, spec.automatic)
     known = {} if chosen is None else known
     current = {key: known.get(key, value) for key, value in start.items()}
-    if chosen is not None and NOISE not in chosen:
-        current |= {key: value for key, value in known.items() if key.startswith(REGION)}
 
     errors = {prior.name for prior in problem.errors}
 
