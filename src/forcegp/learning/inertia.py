@@ -44,7 +44,6 @@ from forcegp.learning.correlation import autocorrelation_time
 from forcegp.learning.inverse_dynamics import (
     LATE,
     LEAST,
-    RIDGE,
     TOLERATED,
     Estimate,
     NormalEquations,
@@ -58,6 +57,7 @@ from forcegp.learning.inverse_dynamics import (
     is_less,
     log_ratio,
     products,
+    ridged,
 )
 from forcegp.robot.model import RobotModel
 
@@ -349,10 +349,9 @@ def with_ripple(robot: RobotModel, rows: Rows) -> Rows:
     """Add the features of ripple to Φ. Without them, ripple of 2 % of the torque moves M by up to 8 %."""
     eye = torch.eye(robot.nq).to(rows.q)
     X = [regressor(robot, rows.q, rows.qd, rows.qdd), rows.qdd[..., None] * eye, rows.friction]
-    X, r = torch.cat(X, dim=-1).transpose(0, 1), rows.residual.T[..., None]
+    X = torch.cat(X, dim=-1).transpose(0, 1)
     X = X / X.square().mean(1, keepdim=True).sqrt().clamp(min=1e-300)
-    gram = X.mT @ X + RIDGE * X.shape[1] * torch.eye(X.shape[-1]).to(X)
-    left = (r - X @ torch.linalg.solve(gram, X.mT @ r))[..., 0].T
+    left = rows.residual - (X @ ridged(X, rows.residual.T)[..., None])[..., 0].T
     n = rows.leading
     ripple = ripple_of(rows.q[:n], left[:n])
     if ripple is None:

@@ -304,8 +304,7 @@ def sliding(speed: Tensor, slowest: float, Phi: Tensor, residual: Tensor) -> Ten
     slides, ratio = torch.ones_like(speed, dtype=torch.bool), torch.full_like(speed[0], SCATTER)
     for bound in (slowest * factor for factor in NOISY):
         moving = speed >= bound
-        weighted = moving[..., None] * Phi
-        w = torch.linalg.lstsq(weighted.transpose(0, 1), (moving * residual).mT[..., None]).solution[..., 0]
+        w = ridged((moving[..., None] * Phi).transpose(0, 1), (moving * residual).mT)
         square = (residual - (Phi * w).sum(-1)).square()
         parts = (~moving).double(), moving.double()
         at_rest, in_motion = ((part * square).sum(0) / part.sum(0).clamp(min=1) for part in parts)
@@ -314,6 +313,15 @@ def sliding(speed: Tensor, slowest: float, Phi: Tensor, residual: Tensor) -> Ten
         slides = torch.where(sticks, moving, slides)
         ratio = torch.where(sticks, scatter, ratio)
     return slides
+
+
+def ridged(X: Tensor, r: Tensor) -> Tensor:
+    """Return the weights `(..., f)` of scaled columns X `(..., n, f)` that explain r `(..., n)`, with `RIDGE`.
+
+    Columns that are nearly collinear, or zero up to rounding, would make the result depend on rounding.
+    """
+    gram = X.mT @ X + RIDGE * X.shape[-2] * torch.eye(X.shape[-1]).to(X)
+    return torch.linalg.solve(gram, X.mT @ r[..., None])[..., 0]
 
 
 def averaged(rows: Rows, columns: Tensor, inertial: Tensor, width: float) -> tuple[Rows, Tensor]:
