@@ -316,7 +316,7 @@ def sliding(speed: Tensor, slowest: float, Phi: Tensor, residual: Tensor) -> Ten
 
 
 def ridged(X: Tensor, r: Tensor) -> Tensor:
-    """Return the weights `(..., f)` of scaled columns X `(..., n, f)` that explain r `(..., n)`, with `RIDGE`.
+    """Return the weights `(..., f)` of scaled columns X `(..., n, f)` in r `(..., n)`, with ridge penalty.
 
     Columns that are nearly collinear, or zero up to rounding, would make the result depend on rounding.
     """
