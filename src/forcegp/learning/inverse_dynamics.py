@@ -302,10 +302,11 @@ def sliding(speed: Tensor, slowest: float, Phi: Tensor, residual: Tensor) -> Ten
         residual: `(n, nq)` torque that the robot file does not explain.
     """
     slides, ratio = torch.ones_like(speed, dtype=torch.bool), torch.full_like(speed[0], SCATTER)
+    # From moving joints alone, friction at low speed would be extrapolated, as its columns saturate.
+    w = ridged(Phi.transpose(0, 1), residual.mT)
+    square = (residual - (Phi * w).sum(-1)).square()
     for bound in (slowest * factor for factor in NOISY):
         moving = speed >= bound
-        w = ridged((moving[..., None] * Phi).transpose(0, 1), (moving * residual).mT)
-        square = (residual - (Phi * w).sum(-1)).square()
         parts = (~moving).double(), moving.double()
         at_rest, in_motion = ((part * square).sum(0) / part.sum(0).clamp(min=1) for part in parts)
         scatter = at_rest / in_motion.clamp(min=LEAST_SQUARE)
