@@ -44,11 +44,11 @@ from forcegp.forces.priors.joint import JointForcePrior, JointFrictionPrior
 from forcegp.forces.priors.sets import friction_priors
 from forcegp.gp.kernels import Matern32
 from forcegp.gp.sparse import SparsePosterior
+from forcegp.learning.specification import REST_SPEED
 from forcegp.models.export.casadi_function import casadi_function
 from forcegp.models.export.library import CompiledFit
 from forcegp.models.prediction import Predictor
 from forcegp.models.structured_fit import StructuredFit
-from forcegp.models.structured_learning import REST_SPEED
 from forcegp.rollout import RolloutOptions, forward
 from forcegp.simulate import SimulationConfig, simulate
 

@@ -32,7 +32,7 @@ from forcegp.forces.problem import Problem, kernel_parameters
 from forcegp.forces.quantities import states
 from forcegp.gp.likelihood import negative_log_likelihood
 from forcegp.learning.search import initial
-from forcegp.models.structured_learning import training_for
+from forcegp.learning.specification import training_for
 from forcegp.simulate import simulate
 
 REPEATS = 3

@@ -19,8 +19,8 @@ from forcegp.files import Header, Record
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.sets import contact_priors, default_priors
 from forcegp.gp.optimise import LearningOptions, minimise
+from forcegp.learning.specification import WITH_PARAMETERS
 from forcegp.models.structured_gp import StructuredGP
-from forcegp.models.structured_learning import WITH_PARAMETERS
 from forcegp.robot.model import RobotModel
 from reproduction.stages import write_data
 from reproduction.statements import Statement

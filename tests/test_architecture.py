@@ -39,7 +39,7 @@ LAYERS = (
     ("compiled", "derivatives", "identification"),
     ("constraints",),
     ("data",),
-    ("gp",),
+    ("gp", "options"),
     ("forces",),
     ("learning",),
     ("storage",),

@@ -14,8 +14,8 @@ from forcegp.forces.measurements import Measurement, Training
 from forcegp.forces.noise import learned_slopes, state_jacobian
 from forcegp.forces.priors.sets import default_priors
 from forcegp.forces.quantities import States, states
+from forcegp.learning import fit as steps
 from forcegp.learning import noise_learning
-from forcegp.models import structured_learning
 from forcegp.models.structured_fit import StructuredFit
 from forces.cases import draw, mixed_contacts, two_contacts
 
@@ -101,7 +101,7 @@ def error_of(model: StructuredFit, seed: int) -> float:
 def test_learned_slopes_are_better(mean: str, monkeypatch: pytest.MonkeyPatch) -> None:
     learned = [fitted(seed, mean) for seed in SEEDS]
     assert all(model.training.slopes is not None for model in learned)
-    monkeypatch.setattr(structured_learning, "ROUNDS", 0)
+    monkeypatch.setattr(steps, "ROUNDS", 0)
     of_file = [fitted(seed, mean) for seed in SEEDS]
     assert all(model.training.slopes is None for model in of_file)
     one, two = (sum(map(error_of, models, SEEDS)) for models in (learned, of_file))

@@ -20,6 +20,7 @@ from forcegp.forces.priors.joint import AnalyticalMean, JointForcePrior, JointFr
 from forcegp.forces.priors.memory import BristlePrior
 from forcegp.gp import kernels
 from forcegp.gp.kernels import Linear, Matern52, SquaredExponential, Sum
+from forcegp.learning.specification import WITH_PARAMETERS
 from forcegp.models.analytical import ADAM, AnalyticalModel, Window
 from forcegp.models.configured import Configured, configured, keys_of
 from forcegp.models.independent_gp import IndependentGP
@@ -27,7 +28,6 @@ from forcegp.models.minibatch import BatchOptions
 from forcegp.models.neural import SHALLOW, NeuralNetwork
 from forcegp.models.structured_file import classes
 from forcegp.models.structured_gp import StructuredGP
-from forcegp.models.structured_learning import WITH_PARAMETERS
 from forcegp.scene import load_model_table, load_scene
 from forcegp.scene.sections import LearningSection, ModelSection, NoiseSection
 from logs import random_log

@@ -12,8 +12,8 @@ from forcegp.forces.priors.joint import AnalyticalMean
 from forcegp.models.independent_gp import IndependentGP, IndependentSettings
 from forcegp.models.structured_file import StructuredSettings
 from forcegp.models.structured_gp import StructuredGP
+from forcegp.options import KernelOptions, StructuredOptions
 from forcegp.scene.sections import ModelSection
-from forcegp.storage.options import KernelOptions, StructuredOptions
 from random_data import table_system
 
 SYSTEM = table_system()

@@ -20,7 +20,7 @@ from forcegp.errors import ModelError
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import JointFrictionPrior
 from forcegp.gp.sparse import SparsePosterior
-from forcegp.models import structured_stream
+from forcegp.learning import streamed
 from forcegp.models.structured_fit import StructuredFit
 from forces.cases import draw, friction_and_residual, logged, mixed_contacts, two_contacts
 
@@ -102,7 +102,7 @@ def test_a_measured_robot(files: StreamedDataset) -> None:
 def test_a_part_of_a_long_log_is_learned_from(
     files: StreamedDataset, monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    monkeypatch.setattr(structured_stream, "SAMPLE_ROWS", 20)
+    monkeypatch.setattr(streamed, "SAMPLE_ROWS", 20)
     fit = model().fit(files, learn=[])
     assert fit.training.samples == 25 and fit.result.samples == 100
     assert isinstance(fit.posterior.latent, SparsePosterior)
@@ -111,7 +111,7 @@ def test_a_part_of_a_long_log_is_learned_from(
 
 def test_exact_inference_needs_the_whole_log(files: StreamedDataset, monkeypatch: pytest.MonkeyPatch) -> None:
     assert model("exact").fit(files, learn=[]).result.inference == "exact"
-    monkeypatch.setattr(structured_stream, "SAMPLE_ROWS", 20)
+    monkeypatch.setattr(streamed, "SAMPLE_ROWS", 20)
     with pytest.raises(ModelError, match=r"exact inference on a log of 100 samples[\s\S]*sparse"):
         model("exact").fit(files, learn=[])
 

@@ -1,11 +1,12 @@
-"""A fit of columns to a log, as the list of its steps.
+"""A fit as the list of its steps.
 
-1. Samples at rest only bound friction, and impacts violate the equations of motion; the others are used.
+1. Samples at rest only bound friction, and impacts violate the equations of motion. All others are used
+   (`specification.py`).
 2. Inertia is identified with instruments, if held-out parts of the log confirm it (`inertia.py`). Its
-   remaining errors are unknowns of zero mean.
-3. Scales of all columns (`evidence.py`), torque noise and static friction (`scales.py`) follow from the
-   evidence, and the Coulomb friction of contacts, which is not linear in its parameters, from a search given
-   these scales.
+   remaining errors have zero mean and widen error bars.
+3. Scales of columns and variances of rows follow from the evidence (`regression.py`). Kernels with other
+   hyperparameters are searched on part of the log (`search.py`), and again if residuals change the weights
+   of samples or the slopes that propagate state noise (`noise_learning.py`).
 4. Torque noise is raised to the level observed on held-out blocks of the log (`held_out.py`).
 5. The correlation of residuals in time determines how many samples are independent (`correlation.py`).
 6. The posterior is conditioned on all samples (`models/structured_fit.py`).
@@ -14,319 +15,205 @@
 from __future__ import annotations
 
 import dataclasses
-import math
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass
+import time
+from collections.abc import Mapping
+from dataclasses import dataclass, field
 
-import scipy.special
-import torch
 from torch import Tensor
 
-from forcegp.forces.measurements import Training, scaled
-from forcegp.forces.noise import TORQUE_NOISE, white_noise_std
-from forcegp.forces.posterior import MEMORY
-from forcegp.forces.priors.base import COULOMB, NOISE, ForcePrior
-from forcegp.forces.priors.memory import BristlePrior
-from forcegp.forces.priors.ripple import RipplePrior, ripple_of
-from forcegp.forces.problem import Problem, Tensors, basis_of, noise_key, with_inducing, without_inducing
-from forcegp.gp.kernels import Columns, Constant, Kernel, Linear, SquaredExponential
-from forcegp.gp.optimise import FitProgress, LearningOptions
-from forcegp.learning.evidence import families_of, worth
-from forcegp.learning.held_out import held_out_squares
-from forcegp.learning.noise_learning import weighted
-from forcegp.learning.scales import (
-    MOTIONS,
-    Scales,
-    learned_scales,
-    noise_of,
-    residuals,
-    variances,
-    without_components,
-)
-from forcegp.learning.search import Search, initial
+from forcegp.forces.measurements import Training
+from forcegp.forces.noise import TORQUE_NOISE
+from forcegp.forces.priors.base import NOISE
+from forcegp.forces.problem import Problem, is_finite, is_sparse, with_inducing, without_inducing
+from forcegp.gp.exact import require_exact_fits
+from forcegp.gp.optimise import FitProgress, Learned, reported
+from forcegp.learning.correlation import residual_times
+from forcegp.learning.held_out import calibrated_noise
+from forcegp.learning.inertia import with_updated_robot
+from forcegp.learning.noise_learning import left_out, weighted, with_learned_slopes
+from forcegp.learning.regression import are_columns, regression, with_acceleration_noise, with_expectations
+from forcegp.learning.search import Search
+from forcegp.learning.specification import Specification
 
-SAMPLES = 4000
-"""Maximum number of evenly spaced samples from which scales and noise are learned. Ten parameters of a joint
-need hundreds of independent samples, and residuals are correlated over about 20."""
-FIRST_POWER = 0.1
-"""Exponent of the likelihood before the correlation of the residuals is known."""
-FRICTION_SAMPLES = 400
-"""Maximum number of samples for the search for Coulomb friction, which whitens all rows at each step."""
-CHANCE = 0.02
-"""Probability of keeping a residual force of any joint that does not exist, that of two standard errors."""
-SUPPORT = 64
-"""Maximum number of support points of a residual force."""
-PASSES = 3
-"""Maximum number of searches for Coulomb friction, each followed by new scales."""
-SETTLED = 0.01
-"""Change of the logarithm of a friction coefficient at which the passes end."""
-QUICK = LearningOptions(tolerance=1e-6, max_evaluations=60)
-LEAST_ACCELERATION_NOISE = 1e-3
-"""Smallest noise of accelerations, relative to their standard deviation. Filters remove white noise, and the
-rest counts as torque noise."""
-
-
-def is_column(kernel: Kernel) -> bool:
-    """Return whether the only hyperparameters of a kernel are scales of columns."""
-    plain = type(kernel) is Linear and kernel.ard and not kernel.shared and kernel.offset is None
-    return (
-        plain
-        or isinstance(kernel, Columns | Constant)
-        or (type(kernel) is SquaredExponential and kernel.shared)
-    )
-
-
-def are_columns(priors: tuple[ForcePrior, ...]) -> bool:
-    """Return whether all priors consist of columns."""
-    return all(is_column(prior.kernel) for prior in priors)
+LEARN_SAMPLES = 800
+"""Number of samples for learning hyperparameters if all priors have finitely many features."""
+LEARN_SAMPLES_INDUCING = 400
+"""Number of samples for learning hyperparameters by exact inference if the log needs sparse inference."""
+FIRST_POWER = 0.25
+"""Exponent of the tempered likelihood before the correlation of the residuals is known."""
+ROUNDS = 3
+"""Maximum number of times that hyperparameters are relearned after updates based on the residuals."""
 
 
 @dataclass(frozen=True)
-class Regression:
-    """Learned columns, ready for conditioning on all samples.
+class Lesson:
+    """Result of learning, and the problem on which the posterior is conditioned.
 
     Attributes:
-        problem: the problem with the likelihood exponent κ of the samples learned from.
-        values: the hyperparameters.
-        samples: number of samples learned from.
-        rounds: number of alternations between scales and noise.
-        converged: whether they ended by themselves.
-        objective: negative log evidence of the rows, up to a constant.
-        worth: log evidence of each prior for each joint over its absence [nats], keyed by prior and joint.
+        problem: the problem with all samples, the updated robot, and the noise.
+        hyperparameters: the learned and fixed hyperparameters.
+        learned: the result of the optimisation.
+        learned_on: number of samples used for learning.
+        warnings: warnings about the result.
+        worth: log evidence of each group of columns over its absence [nats].
     """
 
     problem: Problem
-    values: Tensors
-    samples: int
-    rounds: int
-    converged: bool
-    objective: float
-    worth: Mapping[str, float]
+    hyperparameters: dict[str, Tensor]
+    learned: Learned | None = None
+    learned_on: int | None = None
+    warnings: tuple[str, ...] = ()
+    worth: Mapping[str, float] = field(default_factory=dict)
 
 
-def with_expectations(problem: Problem, standardize: bool = True) -> Problem:
-    """Return the problem whose bristles know their mean at a velocity, from its training data."""
-    changed = {}
-    for prior in problem.priors:
-        for m in problem.training.measurements:
-            if isinstance(prior, BristlePrior) and not prior.expected and m.history is not None:
-                changed[prior.name] = prior.expecting(m.qd, m.history)
-                break
-    if not changed:
-        return problem
-    priors = tuple(changed.get(prior.name, prior) for prior in problem.priors)
-    kept = {p.name: s for p, s in zip(priors, problem.training.scales, strict=True) if p.name not in changed}
-    training = scaled(problem.training, problem.system, priors, kept, standardize)
-    return dataclasses.replace(problem, priors=priors, training=training)
-
-
-@torch.no_grad()
-def regression(
+def learned(
+    spec: Specification,
     problem: Problem,
-    start: Tensors,
-    learns: Callable[[str], bool],
-    prunes: bool = False,
-    degrees_of_freedom: float | None = None,
-    progress: FitProgress | None = None,
-) -> Regression:
-    """Learn the scales of columns, torque noise and Coulomb friction of a problem.
-
-    Args:
-        problem: the problem with all samples in memory.
-        start: initial hyperparameters, with those that are not learned at their values.
-        learns: function that returns whether the part with a given name is learned.
-        prunes: whether to drop columns that the evidence does not carry.
-        degrees_of_freedom: degrees of freedom of Student t noise, or `None` for Gaussian noise.
-        progress: function called after each pass with its number, the total number, and NaN.
-    """
-    part = dataclasses.replace(problem, training=problem.training.evenly(SAMPLES), power=FIRST_POWER)
-    noisy = learns(NOISE) and TORQUE_NOISE in start
-    later = [prior.name for prior in part.priors if prior.remainder]
-    own = {key: value for key, value in start.items() if key.split(".")[0] in later}
-    rest = {key: value for key, value in start.items() if key not in own}
-    named = without_inducing(part.without_priors(later))
-
-    def of_laws(named: Problem, start: Tensors) -> Scales:
-        return _alternating(named, start, learns, noisy, prunes, degrees_of_freedom, progress)
-
-    found = of_laws(named, rest)
-    if prunes and noisy and (ripple := ripple_in(found)) is not None:
-        named = named.with_priors([ripple])
-        found = of_laws(named, {**initial(named, False), **rest})
-    if later:
-        found = with_remainder(part, found, own, learns, noisy, prunes)
-    values = {**found.values, **memory_noise(found)}
-    objective = -found.evidence.log_evidence
-    return Regression(
-        found.problem.without_errors().with_priors(part.errors, part),
-        values,
-        found.problem.training.samples,
-        found.rounds,
-        found.converged,
-        objective,
-        worth_of(found),
-    )
-
-
-def _alternating(
-    part: Problem,
-    start: Tensors,
-    learns: Callable[[str], bool],
-    noisy: bool,
-    prunes: bool,
-    degrees_of_freedom: float | None,
+    search: Search,
     progress: FitProgress | None,
-) -> Scales:
-    """Return scales and noise of laws, alternating with a search for Coulomb friction."""
-    friction = [key for key in start if key.startswith(COULOMB + ".") and learns(COULOMB)]
-    passes = PASSES if friction or degrees_of_freedom is not None else 1
-    found = learned_scales(part, dict(start), learns, noisy, prunes)
-    for number in range(1, passes + 1):
-        part, values = found.problem, found.values
-        if progress is not None:
-            progress(number, passes, math.nan)
-        if number == passes:
-            break
-        if degrees_of_freedom is not None:
-            part = weighted(part, values, degrees_of_freedom)
-        searched = _coulomb(part, values, friction) if friction else {}
-        settled = all(float((searched[key] - values[key]).abs().max()) < SETTLED for key in friction)
-        if settled and degrees_of_freedom is None:
-            break
-        # The scales start from the stated ones again.
-        found = learned_scales(part, {**start, **searched}, learns, noisy, prunes, noise_of(values))
-    return found
-
-
-def ripple_in(found: Scales) -> RipplePrior | None:
-    """Return the ripple in the residual torques, or `None` if there is none or it is known."""
-    problem, parts = found.problem, []
-    if any(isinstance(prior, RipplePrior) for prior in problem.priors):
-        return None
-    for i, m in enumerate(problem.training.measurements):
-        if m.quantity in MOTIONS:
-            rows = residuals(problem, found.values, found.evidence.weights, i)
-            parts.append((m.q, rows.torque(*variances(problem, found.values))))
-    return ripple_of(*map(torch.cat, zip(*parts, strict=True))) if parts else None
-
-
-def with_remainder(
-    whole: Problem,
-    laws: Scales,
-    start: Tensors,
-    learns: Callable[[str], bool],
-    noisy: bool,
-    prunes: bool,
-) -> Scales:
-    """Return the columns with those of a residual force, learned from what all laws leave.
-
-    Errors of laws are correlated along a motion, so that a function of the state describes them on this
-    motion only. If `prunes`, the force of a joint is kept if it reduces the errors on held-out blocks.
+    begin: Mapping[str, Tensor] | None,
+    neighbours: Training | None,
+) -> Lesson:
+    """Learn the free parameters of a search from a problem, and prepare the problem for conditioning.
 
     Args:
-        whole: the problem with the residual force.
-        laws: the result without it.
-        start: initial hyperparameters of the residual force.
+        begin: initial values that differ from those of the search.
+        neighbours: samples at the sampling rate of the log, if the problem contains only part of the log.
     """
-    later = [prior for prior in whole.priors if prior.remainder]
-    names = {prior.name for prior in later}
-    given = laws.problem.without_errors()
-    problem = given.with_priors(later, whole)
-    values = {**laws.values, **start}
-    problem = with_inducing(problem, values, SUPPORT)
-    stated, own = {**values, **laws.stated_noise}, lambda name: name in names and learns(name)
-    found = learned_scales(problem, stated, own, noisy, False, noise_of(values))
-    found = dataclasses.replace(found, idle=laws.idle)
-    if not prunes or not all(map(learns, names)):
-        return found
-    changes = held_out_squares(found.problem, found.values) - held_out_squares(given, laws.values)
-    kept = _are_smaller(changes)
-    if not any(kept):
-        return laws
-    return without_components(
-        found, [p for p, prior in enumerate(problem.priors) if prior.remainder], kept, noisy
-    )
+    if not search.start:
+        return Lesson(prepared(spec, problem, search.held), search.held)
+    # 3. Scales of columns and variances of rows, or hyperparameters of kernels
+    columns = is_regression(spec, problem)
+    found = (_of_columns if columns else _of_kernels)(spec, problem, search, progress, begin)
+    part, values = found.problem, dict(found.hyperparameters)
+    if spec.noise.learns_torque:
+        # Given priors on links move the robot.
+        part = with_updated_robot(part, values)
+        # 4. Torque noise of held-out blocks
+        if TORQUE_NOISE in search.start:
+            values |= calibrated_noise(part, values)
+        # 5. Correlation of the residuals
+        part = _at_the_rate_of_the_log(part, values, neighbours or problem.training)
+    training = dataclasses.replace(problem.training, scales=part.training.scales, slopes=part.training.slopes)
+    keeps = columns and spec.options.inference != "exact"
+    whole = dataclasses.replace(part, training=training, inducing=part.inducing if keeps else None)
+    whole = prepared(spec, whole, values)
+    warnings = (*found.warnings, *_little_weight(spec, whole))
+    return dataclasses.replace(found, problem=whole, hyperparameters=values, warnings=warnings)
 
 
-def _are_smaller(changes: Tensor) -> list[bool]:
-    """Return for each joint whether changes `(blocks, nq)` are below zero, by a t-test over the blocks."""
-    blocks, joints = changes.shape
-    if blocks < 2:
-        return [False] * joints
-    most = scipy.special.stdtrit(blocks - 1, CHANCE / joints)
-    return (changes.mean(0) < most * changes.std(0) / math.sqrt(blocks)).tolist()
+def is_regression(spec: Specification, problem: Problem) -> bool:
+    """Return whether all unknowns are columns or variances of rows, so that no search is needed."""
+    plain = spec.analytical_parameters is None and problem.state_std is None
+    return plain and spec.noise.learns_torque and are_columns(problem.priors)
 
 
-def _coulomb(problem: Problem, values: Mapping[str, Tensor], keys: list[str]) -> Tensors:
-    """Return the Coulomb friction of contacts that is most probable for given scales and noise."""
-    few = dataclasses.replace(problem, training=problem.training.evenly(FRICTION_SAMPLES))
-    few = dataclasses.replace(
-        few, power=min(1.0, problem.power * problem.training.samples / few.training.samples)
-    )
-    begin = {key: values[key] for key in keys}
-    held = {key: value for key, value in values.items() if key not in begin}
-    with torch.enable_grad():
-        return dict(Search(begin, held, QUICK).solve(few, begin=begin).tensors)
+def _of_columns(
+    spec: Specification,
+    problem: Problem,
+    search: Search,
+    progress: FitProgress | None,
+    begin: Mapping[str, Tensor] | None,
+) -> Lesson:
+    """Learn columns and variances of rows from the evidence."""
+    began, free = time.perf_counter(), {key.split(".")[0] for key in search.start}
+    start = {**search.start, **search.held, **(begin or {})}
+    if spec.noise.learn and NOISE in free:
+        problem, noise = with_acceleration_noise(problem)
+        start |= noise
+    problem = with_expectations(problem, spec.options.standardize)
+    degrees = spec.noise.degrees_of_freedom
+    found = regression(problem, start, free.__contains__, spec.automatic, degrees, progress)
+    values, seconds = dict(found.values), time.perf_counter() - began
+    message = "the evidence is stationary" if found.converged else "stopped at the limit of alternations"
+    outcome = Learned(values, found.objective, found.converged, found.rounds, seconds, message)
+    return Lesson(found.problem, values, outcome, found.samples, worth=found.worth)
 
 
-def memory_noise(found: Scales) -> Tensors:
-    """Return the standard deviation `(nq,)` of the force of bristles at a state without past, if any.
+def _of_kernels(
+    spec: Specification,
+    problem: Problem,
+    search: Search,
+    progress: FitProgress | None,
+    begin: Mapping[str, Tensor] | None,
+) -> Lesson:
+    """Search for hyperparameters of kernels on part of the samples.
 
-    With columns φ of a joint and weights w ~ N(ŵ, V), the variance is Σ (ŵ ŵᵀ + V) E[φ φᵀ] over the log.
+    The residuals determine the exponent of the tempered likelihood, the slopes that propagate state noise,
+    and the sample weights. Whenever these change, hyperparameters are relearned, at most `ROUNDS` times.
     """
-    problem, basis, variance = found.problem, basis_of(found.problem, found.values), {}
-    process = problem.process_at(found.values)
-    for p, prior in enumerate(problem.priors):
-        past = [m for m in problem.training.measurements if m.history is not None]
-        if prior.remembers and past:
-            x = [process.features(p, problem.system, m.at(problem.system)) for m in past]
-            phi = torch.cat([basis.parts[p].values(each)[0] for each in x], dim=1)
-            square = phi.mT @ phi / phi.shape[1]
-            own = basis.of_process(p)
-            w = found.evidence.weights[own].view(len(phi), -1)
-            V = found.evidence.variance[own, own].view(*w.shape, *w.shape)
-            V = torch.stack([V[j, :, j] for j in range(len(w))])
-            each = ((w[:, :, None] * w[:, None] + V) * square).sum((1, 2))
-            variance[MEMORY] = variance.get(MEMORY, 0.0) + each
-    return {key: 0.5 * value.clamp(min=1e-24).log() for key, value in variance.items()}
+    part, report = subset(spec, problem), reported(progress, search.options.max_evaluations)
+    if part.inducing is None:
+        require_exact_fits(part.fixed_rows.blocks)
+    correlated = spec.noise.learns_torque and TORQUE_NOISE in search.start
+    if correlated:
+        part = dataclasses.replace(part, power=FIRST_POWER)
+    found, learned_on = search.solve(part, report, begin), part.training.samples
+    sloped = part.state_std is not None
+    sloped &= not is_sparse(spec.options.inference, part.priors, problem.training.all_samples)
+    warnings: list[str] = []
+    for number in range(ROUNDS):
+        before = part
+        if sloped:
+            part, found, doubts = with_learned_slopes(part, search, found, report)
+            warnings += doubts
+        rest, values = part, search.values(found)
+        if correlated and number == 0:
+            part = dataclasses.replace(part, power=residual_times(part, values, part.training)[0])
+        if spec.noise.degrees_of_freedom is not None:
+            part = weighted(part, values, spec.noise.degrees_of_freedom)
+        if part is not rest:
+            found = search.solve(part, report, found.tensors)
+        if part is before:
+            break
+    return Lesson(part, search.values(found), found, learned_on, tuple(dict.fromkeys(warnings)))
 
 
-def worth_of(found: Scales) -> dict[str, float]:
-    """Return the log evidence of each prior and joint over its absence [nats]; 0 for those dropped.
+def _little_weight(spec: Specification, whole: Problem) -> tuple[str, ...]:
+    """Return a warning about samples that heavy-tailed noise gives little weight."""
+    if spec.noise.degrees_of_freedom is None or not (count := left_out(whole)):
+        return ()
+    samples = whole.training.samples
+    return (f"{count} of {samples} samples are far outside the noise and have little weight",)
 
-    Errors of what the robot includes are not judged.
+
+def subset(spec: Specification, problem: Problem) -> Problem:
+    """Return the problem restricted to the samples from which hyperparameters are learned."""
+    training = problem.training
+    if not is_sparse(spec.options.inference, problem.priors, training.all_samples):
+        return problem
+    finite = is_finite(problem.priors)
+    most = LEARN_SAMPLES if finite else LEARN_SAMPLES_INDUCING
+    if training.samples > most:
+        # Neighbours in time determine the correlation of residuals; otherwise distant samples are better.
+        training = training.evenly(most) if spec.noise.learns_torque else training.thinned(most)
+    problem = dataclasses.replace(problem, training=training)
+    return without_inducing(problem) if finite else problem
+
+
+def _at_the_rate_of_the_log(part: Problem, values: Mapping[str, Tensor], training: Training) -> Problem:
+    """Return the problem with the correlation of its residuals at the sampling rate of the log.
+
+    Neighbouring samples are closer in time in the whole log than in the part used for learning. For a
+    streamed log, the correlation is estimated from a few contiguous runs of samples.
     """
-    result, joints, priors = {}, found.problem.system.robot.joint_names, found.problem.priors
-    for (p, k), family in families_of(found.groups).items():
-        if priors[p].is_error:
-            continue
-        several = found.values[found.groups[family[0]].key].shape[0] > 1
-        part = f" of {joints[k]}" if priors[p].per_joint else f" {k + 1}" if several else ""
-        name = f"{priors[p].name}{part}"
-        columns = torch.cat([found.groups[g].columns for g in family])
-        result[name] = 0.0 if (p, k) in found.idle else worth(found.evidence, columns)
-    return result
+    power, correlation = residual_times(part, values, training)
+    if part.training.measurements is training.measurements:
+        power = part.power
+    share = training.samples / training.all_samples
+    return dataclasses.replace(part, power=power * share, correlation=correlation)
 
 
-def acceleration_noise(training: Training) -> tuple[Tensor, ...]:
-    """Return the white noise `(d,)` of each measurement whose noise is not stated."""
-    stds = []
-    for m, std in zip(training.measurements, training.noise_std, strict=True):
-        if m.quantity != "qdd":
-            stds.append(std)
-            continue
-        least = LEAST_ACCELERATION_NOISE * m.values.std(0).clamp(min=1e-9)
-        whole = m.segment[4:] == m.segment[:-4]
-        if training.period and bool(whole.any()):
-            least = least.maximum(white_noise_std(m.values, whole))
-        stds.append(least)
-    return tuple(stds)
-
-
-def with_acceleration_noise(problem: Problem) -> tuple[Problem, Tensors]:
-    """Return the problem with the white noise of its accelerations, and this noise as hyperparameters."""
-    noise = acceleration_noise(problem.training)
-    training = dataclasses.replace(problem.training, noise_std=noise)
-    return dataclasses.replace(problem, training=training), {
-        noise_key(i): s.log() for i, s in enumerate(noise)
-    }
+def prepared(spec: Specification, problem: Problem, values: Mapping[str, Tensor]) -> Problem:
+    """Return the problem with its inference method and, for heavy-tailed noise, its sample weights."""
+    pointed = problem.inducing is not None and any(prior.remainder for prior in problem.priors)
+    if pointed or is_sparse(spec.options.inference, problem.priors, problem.training.all_samples):
+        # Sums over samples use the slopes of the model in the robot file.
+        problem = dataclasses.replace(problem, training=dataclasses.replace(problem.training, slopes=None))
+        if is_finite(problem.priors):
+            problem = without_inducing(problem)
+        elif not pointed:
+            problem = with_inducing(problem, values, spec.options.inducing_points)
+    if spec.noise.degrees_of_freedom is None:
+        return problem
+    return weighted(problem, values, spec.noise.degrees_of_freedom)

@@ -1,6 +1,6 @@
 """Noise that depends on the learned forces: slopes that propagate state noise, and sample weights.
 
-Updates of both alternate with updates of the hyperparameters (`solve` in `models/structured_learning.py`).
+Updates of both alternate with updates of the hyperparameters (`fit.py`).
 
 **Slopes.** The first fit propagates state noise through the equations of motion of the robot file
 (`noise.py`), which do not include the unknown forces. For example, a spring of 100 N m/rad converts noise of

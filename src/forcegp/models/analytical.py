@@ -25,9 +25,9 @@ from forcegp.models.base import FitProgress, FittedModel, Model
 from forcegp.models.fit_result import FitResult
 from forcegp.models.minibatch import BatchOptions, train
 from forcegp.models.prediction import Answer, Query
+from forcegp.options import Window
 from forcegp.robot.parameters import AnalyticalParameters
 from forcegp.storage.model_file import ModelHeader
-from forcegp.storage.options import Window
 from forcegp.storage.system import take, take_robot
 
 KIND = "analytical"

@@ -16,6 +16,7 @@ from forcegp.forces.noise import Noise
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.joint import AnalyticalMean
 from forcegp.gp.optimise import LearningOptions
+from forcegp.learning.specification import WITH_PARAMETERS
 from forcegp.models.analytical import ADAM, AnalyticalModel
 from forcegp.models.base import FitProgress, FittedModel, Model
 from forcegp.models.minibatch import BatchOptions
@@ -24,7 +25,6 @@ from forcegp.models.registry import MODELS, create
 from forcegp.models.sensed import with_sensor
 from forcegp.models.structured_file import classes
 from forcegp.models.structured_gp import StructuredGP
-from forcegp.models.structured_learning import WITH_PARAMETERS
 from forcegp.robot.parameters import AnalyticalParameters
 from forcegp.scene import ModelTable
 from forcegp.scene.sections import NoiseSection

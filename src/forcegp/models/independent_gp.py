@@ -31,9 +31,9 @@ from forcegp.gp.optimise import Learned, LearningOptions, minimise, reported
 from forcegp.learning.search import box_around, doubts_at_bounds, initial_hyperparameters, negative_log_prior
 from forcegp.models.base import AccelerationFit, FitProgress, Model
 from forcegp.models.fit_result import FitResult
+from forcegp.options import KernelOptions
 from forcegp.resources import announce_memory
 from forcegp.storage.model_file import ModelHeader
-from forcegp.storage.options import KernelOptions
 from forcegp.storage.system import take
 
 KIND = "independent_gp"

@@ -35,12 +35,12 @@ from forcegp.gp import kernels
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.features import Standardization
 from forcegp.gp.sparse import SparsePosterior
+from forcegp.learning.specification import Specification, constant_inputs
 from forcegp.models.fit_result import FitResult
-from forcegp.models.structured_learning import Specification, constant_inputs
+from forcegp.options import StructuredOptions
 from forcegp.robot.parameters import AnalyticalParameters
 from forcegp.storage.descriptions import decode, encode
 from forcegp.storage.model_file import ModelHeader
-from forcegp.storage.options import StructuredOptions
 from forcegp.storage.system import take_robot
 
 Stated = NonNegativeFloat | tuple[NonNegativeFloat, ...]

@@ -45,6 +45,8 @@ from forcegp.forces.unknowns import tip_factor
 from forcegp.gp.exact import ExactPosterior
 from forcegp.gp.optimise import Learned
 from forcegp.gp.sparse import SparsePosterior
+from forcegp.learning.fit import prepared
+from forcegp.learning.specification import Specification, constant_inputs, training_for
 from forcegp.models.base import FittedModel
 from forcegp.models.export.folder import Export, write_export
 from forcegp.models.export.library import CompiledFit
@@ -56,7 +58,6 @@ from forcegp.models.parameter_std import parameter_std
 from forcegp.models.parameters import LearnedParameter, learned_parameters
 from forcegp.models.prediction import Answer, Prediction, Query, in_pieces
 from forcegp.models.structured_file import pack, unpack
-from forcegp.models.structured_learning import Specification, constant_inputs, prepared, training_for
 from forcegp.rollout.inputs import Disturbance
 from forcegp.storage.model_file import ModelHeader
 

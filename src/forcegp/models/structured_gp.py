@@ -1,7 +1,7 @@
 """Gaussian-process priors on forces, mapped to accelerations and multipliers by known mechanics.
 
 The acceleration has the prior q̈ ~ GP(L b + H m_Q, H k_Q Hᵀ) (eq. 15). Priors on all other quantities are
-similar (eqs. 19 to 25). `fit` learns the hyperparameters (`structured_learning.solve`) and conditions on the
+similar (eqs. 19 to 25). `fit` learns the hyperparameters (`learning/fit.py`) and conditions on the
 data (`structured_fit.conditioned`). `gram` in `gp/likelihood.py` computes the covariance in eq. 10.
 """
 
@@ -26,14 +26,15 @@ from forcegp.forces.priors.sets import default_priors, friction_priors
 from forcegp.forces.problem import require_double
 from forcegp.gp.inducing import LIMIT
 from forcegp.gp.optimise import LearningOptions
-from forcegp.learning.fit import SAMPLES, are_columns
+from forcegp.learning.fit import learned
+from forcegp.learning.regression import SAMPLES, are_columns
+from forcegp.learning.specification import Specification, check_learned, problem_for, search_of
+from forcegp.learning.streamed import Pass, Sample, sample_of
 from forcegp.models.base import FitProgress, Model
 from forcegp.models.parameters import clear_drives
 from forcegp.models.structured_fit import KIND, StructuredFit, conditioned
-from forcegp.models.structured_learning import Specification, check_learned, learned, problem_for, search_of
-from forcegp.models.structured_stream import Pass, Sample, sample_of
+from forcegp.options import StructuredOptions
 from forcegp.resources import one_thread
-from forcegp.storage.options import StructuredOptions
 
 if TYPE_CHECKING:
     from distributed import Client

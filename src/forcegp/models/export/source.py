@@ -34,10 +34,10 @@ from forcegp.gp.basis import KernelPart
 from forcegp.gp.draws import MISSED_FEATURES
 from forcegp.gp.features import SMALLEST_FRACTION, stacked
 from forcegp.gp.sparse import SparsePosterior
+from forcegp.learning.specification import REST_SPEED
 from forcegp.models.export.mean import ARGUMENTS, DIFFERENTIATED, LearnedMotion
 from forcegp.models.export.model import ExportedModel, Functions, row_of
 from forcegp.models.prediction import NEGATIVE, ROUNDING
-from forcegp.models.structured_learning import REST_SPEED
 from forcegp.rollout import law
 
 NO_FRICTION = 10

@@ -30,10 +30,10 @@ from forcegp.forces.priors.memory import LONGEST_STEP, PAST, Past, bristles
 from forcegp.forces.problem import PIECE_SAMPLES, Problem, Totals, basis_of, posterior_of, total_over
 from forcegp.gp.basis import LatentBasis
 from forcegp.gp.features import Standardization
+from forcegp.gp.optimise import FitProgress
 from forcegp.learning.correlation import MOST_RESIDUALS, RUNS
 from forcegp.learning.inverse_dynamics import without_delay
-from forcegp.models.base import FitProgress
-from forcegp.models.structured_learning import FEWEST_MOVING, REST_SPEED, Specification
+from forcegp.learning.specification import FEWEST_MOVING, REST_SPEED, Specification
 from forcegp.resources import one_thread
 
 if TYPE_CHECKING:

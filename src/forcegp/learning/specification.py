@@ -1,20 +1,8 @@
-"""Parts of a structured Gaussian process, and the steps of learning.
-
-1. Samples at rest only provide a bound on friction, and impacts violate the equations of motion. If torque
-   noise is learned, only samples in motion and without impacts are used.
-2. If all unknowns are columns, their scales and the variances of rows follow from the evidence
-   (`learning/fit.py`). Other hyperparameters are searched on part of a long log, or on all of a short log.
-3. If residuals are correlated in time, the likelihood is tempered. For kernels, residuals also determine
-   slopes and weights (`learning/noise_learning.py`), and hyperparameters are then learned again.
-4. Inertial parameters move to their posterior mean in one physically consistent Gauss–Newton step.
-5. Torque noise is increased to the level observed on held-out blocks of the training log.
-6. The posterior is conditioned on all samples.
-"""
+"""Parts of a structured Gaussian process, and the samples and the robot that it learns from."""
 
 from __future__ import annotations
 
 import dataclasses
-import time
 from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 
@@ -38,39 +26,26 @@ from forcegp.forces.measurements import (
     without_impacts,
     without_outliers,
 )
-from forcegp.forces.noise import TORQUE_NOISE, Noise, external_std, state_std_of
+from forcegp.forces.noise import Noise, external_std, state_std_of
 from forcegp.forces.priors.base import ANALYTICAL, COULOMB, NOISE, ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import AnalyticalMean, ConstantForcePrior, JointFrictionPrior
 from forcegp.forces.priors.memory import LONGEST_STEP, PAST, BristlePrior
 from forcegp.forces.priors.residual import ResidualPrior
-from forcegp.forces.problem import Problem, is_finite, is_sparse, with_inducing, without_inducing
-from forcegp.gp.exact import require_exact_fits
-from forcegp.gp.optimise import FitProgress, Learned, LearningOptions, Progress, reported
-from forcegp.learning.correlation import residual_times
-from forcegp.learning.fit import are_columns, regression, with_acceleration_noise, with_expectations
-from forcegp.learning.held_out import calibrated_noise
-from forcegp.learning.inertia import Inertia, inertia_of, with_updated_robot
+from forcegp.forces.problem import Problem
+from forcegp.gp.optimise import LearningOptions
+from forcegp.learning.inertia import Inertia, inertia_of
 from forcegp.learning.inverse_dynamics import LEAST, without_delay
-from forcegp.learning.noise_learning import left_out, weighted, with_learned_slopes
 from forcegp.learning.search import Search, initial
+from forcegp.options import StructuredOptions
 from forcegp.robot.model import RobotModel
-from forcegp.storage.options import StructuredOptions
 
 OPTIONS, WITH_PARAMETERS = LearningOptions(), LearningOptions(tolerance=1e-9)
 """Default options, and options for learning θ_A, for which L-BFGS may stall for a step or two."""
-LEARN_SAMPLES = 800
-"""Number of samples for learning hyperparameters if all priors have finitely many features."""
-LEARN_SAMPLES_INDUCING = 400
-"""Number of samples for learning hyperparameters by exact inference if the log needs sparse inference."""
 REST_SPEED = 0.01
 """Largest joint speed at which a sample counts as being at rest [rad/s, m/s]."""
 FEWEST_MOVING = 20
 """Number of samples in motion below which samples at rest are also kept."""
-FIRST_POWER = 0.25
-"""Exponent of the tempered likelihood before the correlation of the residuals is known."""
-ROUNDS = 3
-"""Maximum number of times that hyperparameters are relearned after updates based on the residuals."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -188,27 +163,6 @@ def constant_inputs(problem: Problem) -> tuple[str, ...]:
     return tuple(f"{prior.name}.{name}" for prior, scale in pairs for name in scale.constant)
 
 
-@dataclass(frozen=True)
-class Lesson:
-    """Result of learning, and the problem on which the posterior is conditioned.
-
-    Attributes:
-        problem: the problem with all samples, the updated robot, and the noise.
-        hyperparameters: the learned and fixed hyperparameters.
-        learned: the result of the optimisation.
-        learned_on: number of samples used for learning.
-        warnings: warnings about the result.
-        worth: log evidence of each group of columns over its absence [nats].
-    """
-
-    problem: Problem
-    hyperparameters: dict[str, Tensor]
-    learned: Learned | None = None
-    learned_on: int | None = None
-    warnings: tuple[str, ...] = ()
-    worth: Mapping[str, float] = field(default_factory=dict)
-
-
 def problem_for(
     spec: Specification,
     before: Problem | None,
@@ -280,6 +234,21 @@ def check_learned(spec: Specification, learn: Iterable[str]) -> None:
         check_name("force prior to learn", name, names)
 
 
+def in_motion(
+    system: ConstrainedSystem, training: Training, fewest: int = FEWEST_MOVING
+) -> tuple[Training, tuple[str, ...]]:
+    """Return the samples in motion and without impacts, and warnings about them."""
+    moving = training.moving(REST_SPEED)
+    if moving.samples < fewest:
+        text = "samples are in motion: friction cannot be separated from noise at rest"
+        return training, (f"only {moving.samples} {text}",)
+    moving, impacts = without_impacts(moving, system)
+    if not impacts:
+        return moving, ()
+    text = "samples in contact were excluded as impacts: they accelerate away from the surface or into it"
+    return moving, (f"{impacts} {text}",)
+
+
 def search_of(
     spec: Specification,
     problem: Problem,
@@ -304,177 +273,3 @@ def search_of(
 
     held = {key: value for key, value in current.items() if is_held(key.split(".")[0])}
     return Search({key: value for key, value in start.items() if key not in held}, held, options)
-
-
-def in_motion(
-    system: ConstrainedSystem, training: Training, fewest: int = FEWEST_MOVING
-) -> tuple[Training, tuple[str, ...]]:
-    """Return the samples in motion and without impacts, and warnings about them."""
-    moving = training.moving(REST_SPEED)
-    if moving.samples < fewest:
-        text = "samples are in motion: friction cannot be separated from noise at rest"
-        return training, (f"only {moving.samples} {text}",)
-    moving, impacts = without_impacts(moving, system)
-    if not impacts:
-        return moving, ()
-    text = "samples in contact were excluded as impacts: they accelerate away from the surface or into it"
-    return moving, (f"{impacts} {text}",)
-
-
-def subset(spec: Specification, problem: Problem) -> Problem:
-    """Return the problem restricted to the samples from which hyperparameters are learned."""
-    training = problem.training
-    if not is_sparse(spec.options.inference, problem.priors, training.all_samples):
-        return problem
-    finite = is_finite(problem.priors)
-    most = LEARN_SAMPLES if finite else LEARN_SAMPLES_INDUCING
-    if training.samples > most:
-        # Neighbours in time determine the correlation of residuals; otherwise distant samples are better.
-        training = training.evenly(most) if spec.noise.learns_torque else training.thinned(most)
-    problem = dataclasses.replace(problem, training=training)
-    return without_inducing(problem) if finite else problem
-
-
-def learned(
-    spec: Specification,
-    problem: Problem,
-    search: Search,
-    progress: FitProgress | None,
-    begin: Mapping[str, Tensor] | None,
-    neighbours: Training | None,
-) -> Lesson:
-    """Learn the free parameters of a search, from the evidence of columns or by an optimiser."""
-    if not search.start:
-        return Lesson(prepared(spec, problem, search.held), search.held)
-    if is_regression(spec, problem):
-        return _regressed(spec, problem, search, progress, begin, neighbours)
-    report = reported(progress, search.options.max_evaluations)
-    return solve(spec, problem, search, report, begin, neighbours)
-
-
-def is_regression(spec: Specification, problem: Problem) -> bool:
-    """Return whether all unknowns are columns or variances of rows, so that no search is needed."""
-    plain = spec.analytical_parameters is None and problem.state_std is None
-    return plain and spec.noise.learns_torque and are_columns(problem.priors)
-
-
-def _regressed(
-    spec: Specification,
-    problem: Problem,
-    search: Search,
-    progress: FitProgress | None,
-    begin: Mapping[str, Tensor] | None,
-    neighbours: Training | None,
-) -> Lesson:
-    """Learn columns and noise from the evidence (`learning/fit.py`)."""
-    began, free = time.perf_counter(), {key.split(".")[0] for key in search.start}
-    start = {**search.start, **search.held, **(begin or {})}
-    if spec.noise.learn and NOISE in free:
-        problem, noise = with_acceleration_noise(problem)
-        start |= noise
-    problem = with_expectations(problem, spec.options.standardize)
-    degrees = spec.noise.degrees_of_freedom
-    found = regression(problem, start, free.__contains__, spec.automatic, degrees, progress)
-    part, values = found.problem, dict(found.values)
-    if any(isinstance(prior, InertialPrior) for prior in part.priors):
-        part = with_updated_robot(part, values)
-    if NOISE in free:
-        values |= calibrated_noise(part, values)
-    part = _at_the_rate_of_the_log(part, values, neighbours or problem.training)
-    training = dataclasses.replace(problem.training, scales=part.training.scales)
-    whole, warnings = dataclasses.replace(part, training=training), ()
-    if spec.options.inference == "exact":
-        whole = dataclasses.replace(whole, inducing=None)
-    whole = prepared(spec, whole, values)
-    if degrees is not None and (count := left_out(whole)):
-        text = f"{count} of {whole.training.samples} samples are far outside the noise and have little weight"
-        warnings = (text,)
-    seconds = time.perf_counter() - began
-    message = "the evidence is stationary" if found.converged else "stopped at the limit of alternations"
-    learned = Learned(values, found.objective, found.converged, found.rounds, seconds, message)
-    return Lesson(whole, values, learned, found.samples, warnings, found.worth)
-
-
-def solve(
-    spec: Specification,
-    problem: Problem,
-    search: Search,
-    progress: Progress | None = None,
-    begin: Mapping[str, Tensor] | None = None,
-    neighbours: Training | None = None,
-) -> Lesson:
-    """Learn the free parameters of a search, and prepare the problem for conditioning.
-
-    The residuals determine the exponent of the tempered likelihood, the slopes that propagate state noise,
-    and the sample weights. Whenever these change, hyperparameters are relearned, at most `ROUNDS` times.
-
-    Args:
-        neighbours: samples at the sampling rate of the log, if the problem contains only part of the log.
-    """
-    part = subset(spec, problem)
-    if part.inducing is None:
-        require_exact_fits(part.fixed_rows.blocks)
-    calibrated = spec.noise.learns_torque and TORQUE_NOISE in search.start
-    correlated = calibrated
-    if correlated:
-        part = dataclasses.replace(part, power=FIRST_POWER)
-    learned, learned_on = search.solve(part, progress, begin), part.training.samples
-    sloped = part.state_std is not None
-    sloped &= not is_sparse(spec.options.inference, part.priors, problem.training.all_samples)
-    warnings: list[str] = []
-    for number in range(ROUNDS):
-        before = part
-        if sloped:
-            part, learned, doubts = with_learned_slopes(part, search, learned, progress)
-            warnings += doubts
-        rest, values = part, search.values(learned)
-        if correlated and number == 0:
-            part = dataclasses.replace(part, power=residual_times(part, values, part.training)[0])
-        if spec.noise.degrees_of_freedom is not None:
-            part = weighted(part, values, spec.noise.degrees_of_freedom)
-        if part is not rest:
-            learned = search.solve(part, progress, learned.tensors)
-        if part is before:
-            break
-    values = search.values(learned)
-    if calibrated and any(isinstance(prior, InertialPrior) for prior in part.priors):
-        part = with_updated_robot(part, values)
-    if calibrated:
-        values |= calibrated_noise(part, values)
-    if correlated:
-        part = _at_the_rate_of_the_log(part, values, neighbours or problem.training)
-    training = dataclasses.replace(problem.training, slopes=part.training.slopes)
-    whole = dataclasses.replace(part, training=training, inducing=None)
-    whole = prepared(spec, whole, values)
-    if spec.noise.degrees_of_freedom is not None and (count := left_out(whole)):
-        samples = whole.training.samples
-        warnings.append(f"{count} of {samples} samples are far outside the noise and have little weight")
-    return Lesson(whole, values, learned, learned_on, tuple(dict.fromkeys(warnings)))
-
-
-def _at_the_rate_of_the_log(part: Problem, values: Mapping[str, Tensor], training: Training) -> Problem:
-    """Return the problem with the correlation of its residuals at the sampling rate of the log.
-
-    Neighbouring samples are closer in time in the whole log than in the part used for learning. For a
-    streamed log, the correlation is estimated from a few contiguous runs of samples.
-    """
-    power, correlation = residual_times(part, values, training)
-    if part.training.measurements is training.measurements:
-        power = part.power
-    share = training.samples / training.all_samples
-    return dataclasses.replace(part, power=power * share, correlation=correlation)
-
-
-def prepared(spec: Specification, problem: Problem, values: Mapping[str, Tensor]) -> Problem:
-    """Return the problem with its inference method and, for heavy-tailed noise, its sample weights."""
-    pointed = problem.inducing is not None and any(prior.remainder for prior in problem.priors)
-    if pointed or is_sparse(spec.options.inference, problem.priors, problem.training.all_samples):
-        # Sums over samples use the slopes of the model in the robot file.
-        problem = dataclasses.replace(problem, training=dataclasses.replace(problem.training, slopes=None))
-        if is_finite(problem.priors):
-            problem = without_inducing(problem)
-        elif not pointed:
-            problem = with_inducing(problem, values, spec.options.inducing_points)
-    if spec.noise.degrees_of_freedom is None:
-        return problem
-    return weighted(problem, values, spec.noise.degrees_of_freedom)
