@@ -36,7 +36,7 @@ from forcegp.learning.inverse_dynamics import (
     log_ratio,
     partners,
     products,
-    sliding,
+    rest_weight,
     sums,
 )
 from forcegp.models.calibrated import calibrated
@@ -384,10 +384,10 @@ def test_averaged_equations_are_sums_of_neighbours_within_a_stretch() -> None:
     C, Phi, r = (torch.randn(2 * n, nq, k, generator=random, dtype=torch.float64) for k in (p, 4, 1))
     r, inertial = r[..., 0], torch.randn(2 * n, nq, generator=random, dtype=torch.float64)
     i, group = torch.arange(n), (torch.arange(n) // 60).repeat(2)
-    slides = torch.ones_like(r, dtype=torch.bool)
-    slides[30, 0] = False
+    weight = torch.ones_like(r)
+    weight[30, 0] = 0.3
     rows = Rows(
-        r, r, r, r, Phi, slides, group, group, torch.cat([i + n, i]), Phi[..., :0], r, 0.0 * r, 0.01, 0.03**2
+        r, r, r, r, Phi, weight, group, group, torch.cat([i + n, i]), Phi[..., :0], r, 0.0 * r, 0.01, 0.03**2
     )
     mean, columns = averaged(rows, C, inertial, 0.04)
     assert mean.step == 0.02 and len(columns) == 2 * len(range(15, n - 15, 2))
@@ -401,8 +401,9 @@ def test_averaged_equations_are_sums_of_neighbours_within_a_stretch() -> None:
     torch.testing.assert_close(mean.residual[row], expected)
     torch.testing.assert_close(mean.friction[row], torch.einsum("k,kjf->jf", wide / wide.sum(), Phi[at]))
     inside = torch.tensor([15 <= c % 60 < 45 for c in range(15, n - 15, 2)]).repeat(2)
-    assert bool((mean.slides[:, 1] == inside).all()), "no average reaches across stretches"
-    assert not bool(mean.slides[: len(inside) // 2, 0][:15].any()), "nor over a joint that sticks"
+    assert bool((mean.weight[:, 1] == inside).all()), "no average reaches across stretches"
+    near = mean.weight[: len(inside) // 2, 0][:15]
+    assert set(near.tolist()) == {0.3}, "a joint that sticks makes the whole average uncertain"
 
 
 @pytest.mark.parametrize("factor", [1e-3, 1e-6])
@@ -459,7 +460,7 @@ def test_sums_give_the_dense_least_squares(monkeypatch: pytest.MonkeyPatch) -> N
     Phi = torch.randn(n, nq, f, generator=random, dtype=torch.float64)
     r, tau = torch.randn(2, n, nq, generator=random, dtype=torch.float64)
     group = torch.arange(n) * 3 // n
-    moves = torch.ones_like(r, dtype=torch.bool)
+    moves = torch.ones_like(r)
     by_stretch = sums(Rows(r, r, r, r, Phi, moves, group, group, torch.arange(n), Phi[..., :0], tau, r), C)
     every, rest = by_stretch.total(), by_stretch.without(1)
     for given, own in ((every, group >= 0), (rest, group != 1)):
@@ -490,8 +491,8 @@ def test_instruments_give_the_textbook_estimate(monkeypatch: pytest.MonkeyPatch)
     r = torch.randn(n, nq, generator=random, dtype=torch.float64)
     partner = torch.cat([torch.arange(n // 2) + n // 2, torch.arange(n // 2)])
     group = torch.arange(n // 2).repeat(2) * 3 // (n // 2)
-    moves = torch.ones_like(r, dtype=torch.bool)
-    rows = Rows(r, r, r, r, Phi, moves, group, group, partner, Phi[..., :0], r, r)
+    weight = 0.2 + 0.8 * torch.rand(n, nq, generator=random, dtype=torch.float64)
+    rows = Rows(r, r, r, r, Phi, weight, group, group, partner, Phi[..., :0], r, r)
     every = instrumental(rows, C).total()
     delta = torch.linalg.solve(*every.quadratic(NOISE)[:2])
     X, Z = (torch.zeros(n, nq, p + nq * f, dtype=torch.float64) for _ in range(2))
@@ -499,14 +500,16 @@ def test_instruments_give_the_textbook_estimate(monkeypatch: pytest.MonkeyPatch)
     for j in range(nq):
         X[:, j, p + j * f : p + (j + 1) * f] = Z[:, j, p + j * f : p + (j + 1) * f] = Phi[:, j]
     # Friction belongs to one joint, so its equations do not depend on the weights.
-    weighted = (Z / NOISE[:, None] ** 2).flatten(0, 1)
+    pair = weight * weight[partner]
+    weighted = (Z * pair[..., None] / NOISE[:, None] ** 2).flatten(0, 1)
     dense = torch.linalg.solve(weighted.mT @ X.flatten(0, 1), weighted.mT @ r.flatten())
     torch.testing.assert_close(
         torch.cat([delta, every.friction(delta).flatten()]), dense, rtol=ROUNDING, atol=ROUNDING
     )
     left = r - X @ dense
     found = products(rows, C).total().error(delta, every.friction(delta))
-    torch.testing.assert_close(found, (left * left[partner]).mean(0), rtol=1e-7, atol=1e-10)
+    expected = (pair * left * left[partner]).sum(0) / pair.sum(0)
+    torch.testing.assert_close(found, expected, rtol=1e-7, atol=1e-10)
 
 
 def test_a_joint_at_rest_is_found_behind_the_noise_of_its_velocity() -> None:
@@ -518,9 +521,9 @@ def test_a_joint_at_rest_is_found_behind_the_noise_of_its_velocity() -> None:
     qd = true + 0.04 * torch.randn(n, 2, generator=random, dtype=torch.float64)
     friction = torch.where(true == 0.0, 2.0 * torch.rand(n, 2, generator=random).double() - 1.0, true.sign())
     Phi = torch.stack([torch.tanh(qd / 0.02), qd, torch.ones_like(qd)], dim=-1)
-    slides = sliding(qd.abs(), 0.02, Phi, friction + 0.1 * torch.randn(n, 2, generator=random).double())
-    assert float(slides[: n // 3, 0].double().mean()) < 0.1
-    assert bool((slides[n // 3 :].double().mean(0) > 0.9).all()), "but for rows as slow as the noise"
+    weight = rest_weight(qd.abs(), 0.02, Phi, friction + 0.1 * torch.randn(n, 2, generator=random).double())
+    assert float(weight[: n // 3, 0].mean()) < 0.5
+    assert bool((weight[n // 3 :].mean(0) > 0.9).all()), "but for rows as slow as the noise"
 
 
 def test_harm_is_what_the_joints_suffer_on_average() -> None:

@@ -263,7 +263,7 @@ def _over_widths(rows: Rows, inertial: Tensor, M: Tensor) -> Iterator[_Regressio
     accelerating, n = (M @ rows.qdd[..., None])[..., 0], M.shape[-1]
     for width in WIDTHS if rows.step else WIDTHS[:1]:
         used, columns = averaged(rows, inertial, accelerating, width) if rows.step else (rows, inertial)
-        if width and (int(used.slides.sum(0).min()) < LEAST or int(used.group.max()) < int(rows.group.max())):
+        if width and (int(used.weight.sum(0).min()) < LEAST or int(used.group.max()) < int(rows.group.max())):
             break
         columns = with_delay(used, columns)
         by_stretch, kept = instrumental(used, columns), torch.arange(columns.shape[-1])
@@ -271,8 +271,8 @@ def _over_widths(rows: Rows, inertial: Tensor, M: Tensor) -> Iterator[_Regressio
         found = _Regression(by_stretch, M.new_ones(n), 1.0)
         for _ in range(PASSES):
             left = used.residual - columns @ mean - (used.friction * every.friction(mean)).sum(-1)
-            left = used.slides * left
-            noise = (left.square().sum(0) / used.slides.sum(0).clamp(min=1)).sqrt().clamp(min=1e-300)
+            left = used.weight * left
+            noise = (left.square().sum(0) / used.weight.square().sum(0).clamp(min=1)).sqrt().clamp(min=1e-300)
             found = _Regression(by_stretch, noise, _power(used, left / noise))
             mean = found.estimate(every, kept, n)
         yield found
