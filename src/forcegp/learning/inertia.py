@@ -216,19 +216,20 @@ class _Regression:
     def carried_drives(self, gain: Tensor, delay: Tensor) -> Tensor:
         """Return the indices of the drives that the evidence carries.
 
-        With all links at the file, a drive u ~ N(û, V) with prior N(0, 1) is worth ½ û²/V + ½ log V nats. It
-        must also be significant, since this is little for a drive that the log hardly determines. V is at
-        least the variance of a jackknife over blocks, between which errors of links and friction vary.
+        A drive u ~ N(û, V) with prior N(0, 1) is worth ½ û²/V + ½ log V nats. It must also be significant,
+        since this is little for a drive that the log hardly determines. V includes the uncertainty of links:
+        with links at the file, wipes of a UR5 without drives yield drives of five standard deviations. V is
+        at least the variance of a jackknife over blocks, between which errors of friction vary.
 
         Args:
             gain: standard deviation `(nq,)` due to gains of torque sensors, which no log determines.
             delay: index of the delay, if it is an unknown.
         """
         n, blocks = len(gain), range(len(self.by_stretch.gram))
-        own = torch.cat([torch.arange(n), delay])
 
         def read(given: NormalEquations) -> tuple[Tensor, Tensor]:
             h, precision, _ = self.normal(given)
+            own = torch.cat([torch.arange(len(h) - 1), delay])
             V = torch.linalg.inv(precision[own][:, own])
             return (V @ h[own])[:n], V.diagonal()[:n]
 
