@@ -28,6 +28,7 @@ import forcegp
 from forcegp.errors import optional_module
 from forcegp.evaluation.least_squares import identify_rigid
 from forcegp.forces.external_wrench import WrenchFrame, momentum_force
+from forcegp.forces.posterior import GROWTH
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import JointFrictionPrior
 from forcegp.logs import parse_mapping
@@ -142,6 +143,7 @@ def observer(fit, data: forcegp.Dataset, folder: Path) -> Path:
     """The compiled program."""
     fit.export(folder / "controller")
     lists = {"CORRELATION": fit.problem.correlation, "VELOCITY_NOISE": velocity_noise(data)}
+    lists["GROWTH"] = fit.hyperparameters[GROWTH]
     lines = [f"static const double PRIOR = {PRIOR}, LASTS = {LASTS};"]
     for name, x in lists.items():
         lines.append(f"static const double {name}[] = {{{', '.join(map(repr, x.tolist()))}}};")

@@ -100,16 +100,18 @@ static void correct(filter *f, const double *qd) {
  * model expects, which a force on the tool changes; S is read where there is none, so that they count by weight */
 static int look(filter *f, const state *s, double *beyond) {
   static const unsigned char open[CONTROLLER_CONTACTS] = {0};
-  double M[NQ][NQ], J[K][NQ], S[NQ][NQ], force[NQ], column[NQ], tau[NQ], far[NQ];
+  double M[NQ][NQ], J[K][NQ], S[NQ][NQ], force[NQ], column[NQ], tau[NQ], far[NQ], farther[NQ];
   int error;
   memset(f->F, 0, sizeof f->F), memset(f->drift, 0, sizeof f->drift);
   for (int i = 0; i < NQ; ++i) f->F[i][i] = 1.0;
   error = controller_equations(s->q, s->qd, &M[0][0], &J[0][0]);
   if (error) return error;
-  error = controller_predict(s->q, s->qd, s->tau, open, CONTROLLER_JOINT_FORCE, 1, force, NULL, far);
+  error = controller_predict(s->q, s->qd, s->tau, open, CONTROLLER_JOINT_FORCE, 1, force, NULL, farther);
   for (int i = 0; i < NQ; ++i) tau[i] = s->tau[i] - force[i];
-  error = error ? error : controller_predict(s->q, s->qd, tau, open, CONTROLLER_JOINT_FORCE, 1, column, &S[0][0], NULL);
+  error = error ? error : controller_predict(s->q, s->qd, tau, open, CONTROLLER_JOINT_FORCE, 1, column, &S[0][0], far);
   if (error) return error;
+  for (int i = 0; i < NQ; ++i) /* the torque itself is farther from those of the training */
+    S[i][i] += GROWTH[i] * GROWTH[i] * fmax(farther[i] * farther[i] - far[i] * far[i], 0.0);
   factor(M), factor(S);
   for (int j = NQ; j < N; ++j) {
     for (int i = 0; i < NQ; ++i) column[i] = j < ETA ? J[j - W][i] : i < j - ETA ? 0.0 : S[i][j - ETA];
@@ -119,7 +121,7 @@ static int look(filter *f, const state *s, double *beyond) {
   solve(M, force);
   memcpy(f->drift, force, sizeof force);
   *beyond = 0.0;
-  for (int i = 0; i < NQ; ++i) *beyond = fmax(*beyond, far[i]);
+  for (int i = 0; i < NQ; ++i) *beyond = fmax(*beyond, farther[i]);
   return 0;
 }
 

@@ -1,4 +1,4 @@
-"""States beyond the trained region, and joints that contact hides."""
+"""Error bars beyond the trained region: distance, growth, joints that contact hides."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 import forcegp
 from forcegp import dynamics, kinematics
 from forcegp.cli.common import warn_beyond
-from forcegp.forces.posterior import STICKING, distance_beyond, trained_region
+from forcegp.forces.posterior import GROWTH, STICKING, distance_beyond, trained_region
 from forcegp.models.structured_fit import StructuredFit
 
 LEG = """<robot name="leg">
@@ -51,8 +51,8 @@ def test_distance_from_the_trained_region() -> None:
     assert not distance_beyond({}, at, torque).any()
 
 
-def swing(robot: forcegp.RobotModel, n: int, speed: float, seed: int) -> forcegp.Dataset:
-    """A double pendulum with friction."""
+def swing(robot: forcegp.RobotModel, n: int, speed: float, drag: float, seed: int) -> forcegp.Dataset:
+    """A double pendulum with friction, and drag −drag |q̇| q̇ that no default prior has."""
     generator = torch.Generator().manual_seed(seed)
     t = 0.01 * torch.arange(n, dtype=torch.float64)
     w = 1.0 + 3.0 * torch.rand(3, 2, generator=generator, dtype=torch.float64)
@@ -62,7 +62,7 @@ def swing(robot: forcegp.RobotModel, n: int, speed: float, seed: int) -> forcegp
     qd, qdd = (size * torch.sin(angle)).sum(1), (size * w * torch.cos(angle)).sum(1)
     q = 0.01 * qd.cumsum(0)
     noise = 0.05 * torch.randn(n, 2, generator=generator, dtype=torch.float64)
-    friction = 0.3 * torch.tanh(qd / 0.02) + 0.2 * qd
+    friction = 0.3 * torch.tanh(qd / 0.02) + 0.2 * qd + drag * qd.abs() * qd
     tau = dynamics.inverse_dynamics(robot, q, qd, qdd) + friction + noise
     return forcegp.Dataset(t=t, q=q, qd=qd, qdd=qdd, tau=tau, joint_names=robot.joint_names)
 
@@ -73,26 +73,43 @@ def pendulum() -> forcegp.RobotModel:
     return robot.replace(damping=torch.zeros_like(robot.damping), friction=torch.zeros_like(robot.friction))
 
 
-def test_states_beyond_the_training_are_named(
+def fitted(robot: forcegp.RobotModel, drag: float) -> StructuredFit:
+    model = forcegp.StructuredGP(forcegp.ConstrainedSystem(robot), "analytical", noise=0.01)
+    return model.fit(swing(robot, 600, 0.5, drag, 0))
+
+
+def test_faster_motion_is_less_certain(
     pendulum: forcegp.RobotModel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    model = forcegp.StructuredGP(forcegp.ConstrainedSystem(pendulum), "analytical", noise=0.01)
-    inside, test = swing(pendulum, 600, 0.5, 0), swing(pendulum, 400, 2.0, 1)
-    fit = model.fit(inside)
-    found = fit.predict(test.q, test.qd, test.tau, "total_force", noise=True)
+    dragged = fitted(pendulum, 3.0)
+    test = swing(pendulum, 400, 2.0, 3.0, 1)
+    found = dragged.predict(test.q, test.qd, test.tau, "total_force", noise=True)
+    M = dynamics.mass_matrix(dragged.system.robot, test.q)
+    error = ((M @ test.qdd[..., None])[..., 0] - found.mean).abs()
+    assert float((error <= 2.0 * found.std).double().mean()) > 0.8
+
     assert found.beyond is not None and float(found.beyond.max()) > 3.0
     (warning,) = found.warnings
     assert "of 400 states lie beyond the trained speeds and torques" in warning and "train on" in warning
-    warn_beyond(fit, test)
+    warn_beyond(dragged, test)
     assert " ".join(capsys.readouterr().err.split()) == f"warning: {warning}"
-    assert not fit.predict(inside.q, inside.qd, inside.tau, covariance=False).warnings
+    inside = swing(pendulum, 600, 0.5, 3.0, 0)
+    assert not dragged.predict(inside.q, inside.qd, inside.tau, covariance=False).warnings
 
-    fit.save(tmp_path / "model")
+    dragged.save(tmp_path / "model")
     again = forcegp.load_model(tmp_path / "model").predict(
         test.q, test.qd, test.tau, "total_force", noise=True
     )
     assert torch.equal(again.beyond, found.beyond) and again.warnings == found.warnings
     torch.testing.assert_close(again.std, found.std, rtol=1e-9, atol=0.0)
+
+
+def test_the_region_stays_where_noise_is_not_learned_again(pendulum: forcegp.RobotModel) -> None:
+    model = forcegp.StructuredGP(forcegp.ConstrainedSystem(pendulum), "analytical", noise=0.01)
+    data = swing(pendulum, 200, 0.5, 0.0, 0)
+    first = model.fit(data)
+    second = model.fit(data, learn=["joint_friction"], after=first)
+    assert torch.equal(first.hyperparameters[GROWTH], second.hyperparameters[GROWTH])
 
 
 def leg(folder: Path) -> forcegp.ConstrainedSystem:

@@ -29,7 +29,7 @@ from forcegp.errors import (
     ShapeError,
     UnknownNameError,
 )
-from forcegp.forces.posterior import hidden_variance
+from forcegp.forces.posterior import unknown_variance
 from forcegp.forces.priors.contact import ContactForcePrior, NormalForcePrior, SlidingFrictionPrior
 from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
 from forcegp.forces.priors.joint import JointForcePrior, JointFrictionPrior
@@ -357,7 +357,7 @@ def test_friction_of_the_joints() -> None:
     rows = fit.posterior.rows(fit.system, at, QUANTITIES["joint_force"](fit.system, at))
     only = tuple(W if p == 0 else torch.zeros_like(W) for p, W in enumerate(rows.operators))
     spread = fit.posterior.latent.covariance(type(rows)(rows.features, only, rows.target))
-    spread = spread + torch.diag_embed(hidden_variance(fit.hyperparameters, at, None))
+    spread = spread + torch.diag_embed(unknown_variance(fit.hyperparameters, at, None))
     torch.testing.assert_close(ours.covariance, spread, rtol=1e-9, atol=1e-12)
     same = fit.predict(*state, "joint_friction")
     torch.testing.assert_close(same.mean, ours.mean, rtol=1e-10, atol=1e-12)

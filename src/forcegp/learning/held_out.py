@@ -17,7 +17,7 @@ from torch import Tensor
 from forcegp.data.fields import resolution
 from forcegp.forces.measurements import Training
 from forcegp.forces.noise import TORQUE_NOISE
-from forcegp.forces.posterior import ForcePosterior, hidden_variance
+from forcegp.forces.posterior import GROWTH, RELATIVE, ForcePosterior, hidden_variance, trained_region
 from forcegp.forces.problem import (
     PIECE_SAMPLES,
     Problem,
@@ -43,12 +43,15 @@ SWEEPS, SETTLED = 20, 1e-3
 
 
 def calibrated_noise(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return torque noise calibrated on held-out samples."""
-    tau = torch.cat([m.tau for m in problem.training.measurements])
+    """Return torque noise calibrated on held-out samples, and the trained region with its growth rate."""
+    load, training = problem.typical_load(), problem.training
+    qd, tau = (torch.cat([getattr(m, name) for m in training.measurements]) for name in ("qd", "tau"))
     # Rounding to steps h has the variance h²/12.
     rounding = torch.from_numpy(resolution(tau.cpu().numpy())).to(tau) / math.sqrt(12.0)
     learned = hyperparameters[TORQUE_NOISE].exp().maximum(rounding)
-    return {TORQUE_NOISE: held_out_torque_std(problem, hyperparameters, learned).log()}
+    noise = {TORQUE_NOISE: held_out_torque_std(problem, hyperparameters, learned).log()}
+    region = trained_region(qd, tau, load, problem.power * len(qd))
+    return {**noise, **region, GROWTH: RELATIVE * load}
 
 
 def held_out_torque_std(problem: Problem, hyperparameters: Mapping[str, Tensor], least: Tensor) -> Tensor:

@@ -27,6 +27,7 @@ from forcegp.forces.measurements import (
     without_outliers,
 )
 from forcegp.forces.noise import Noise, external_std, state_std_of
+from forcegp.forces.posterior import REGION
 from forcegp.forces.priors.base import ANALYTICAL, COULOMB, NOISE, ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import AnalyticalMean, ConstantForcePrior, JointFrictionPrior
@@ -264,6 +265,8 @@ def search_of(
     start = initial(problem, spec.noise.learn, spec.noise.learns_torque, spec.automatic)
     known = {} if chosen is None else known
     current = {key: known.get(key, value) for key, value in start.items()}
+    if chosen is not None and NOISE not in chosen:
+        current |= {key: value for key, value in known.items() if key.startswith(REGION)}
 
     errors = {prior.name for prior in problem.errors}
 

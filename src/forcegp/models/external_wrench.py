@@ -28,7 +28,7 @@ from forcegp.forces.external_wrench import (
     over_levers,
 )
 from forcegp.forces.noise import external_std, white_noise_std
-from forcegp.forces.posterior import ForcePosterior, hidden_variance
+from forcegp.forces.posterior import ForcePosterior, unknown_variance
 from forcegp.forces.priors.memory import bristles
 from forcegp.forces.problem import Problem
 from forcegp.forces.quantities import AffineMap, States, affine_map, states_at
@@ -338,7 +338,7 @@ class Reading:
         at, _ = states_at(system, data.q, data.qd, data.tau, active)
         at = dataclasses.replace(at, qdd=qdd, history=None if self.history is None else self.history[rows])
         mean, S, force, A = self._learned(at)
-        unknown = hidden_variance(fit.hyperparameters, at, fit.problem.external_std)
+        unknown = unknown_variance(fit.hyperparameters, at, fit.problem.external_std)
         stated = data.extras.get("tau_std")
         for std in (self.external, stated, fit.torque_std):
             unknown = unknown if std is None else unknown + std**2

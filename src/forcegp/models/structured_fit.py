@@ -20,12 +20,13 @@ from forcegp.forces.external_wrench import WrenchFrame
 from forcegp.forces.measurements import Observation, Training
 from forcegp.forces.noise import TORQUE_NOISE, learned_slopes
 from forcegp.forces.posterior import (
+    GROWTH,
     LOW,
     ForcePosterior,
     distance_beyond,
     doubts_of,
     draw_samples,
-    hidden_variance,
+    unknown_variance,
 )
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior
@@ -139,7 +140,7 @@ class StructuredFit(FittedModel):
         z = self.posterior.process.coupled(system, at, z)
         of_all = z if z.B_F is None else z._replace(B_Q=z.B_Q + z.B_F)
         spread = spread + _carried(
-            of_all, hidden_variance(self.hyperparameters, at, self.problem.external_std)
+            of_all, unknown_variance(self.hyperparameters, at, self.problem.external_std)
         )
         tips = tip_factor(self.hyperparameters, system, at)
         if tips is not None:
@@ -358,8 +359,9 @@ class StructuredFit(FittedModel):
 
     @property
     def _region(self) -> Mapping[str, Tensor]:
-        """Return the region of the training data, which a model file contains without these data."""
-        return self.problem.region if self.training.samples else self.hyperparameters
+        """Return the trained region, which is that of the calibrated noise or else of the training data."""
+        calibrated = GROWTH in self.hyperparameters or not self.training.samples
+        return self.hyperparameters if calibrated else self.problem.region
 
     def force_field(self) -> ForceField:
         """Return the posterior mean of Q̄ = Q + Q_z as a force field."""

@@ -604,11 +604,11 @@ static int evaluate(const forcegp_learned *learned, const double *q, const doubl
   return 0;
 }
 
-/* variance of forces other than the learned ones: of sticking joints, and torque noise */
-static void unknown_forces(const double *qd, int noise, double *unknown) {
+/* variance of forces other than the learned ones: of sticking joints, beyond the trained region, and torque noise */
+static void unknown_forces(const double *qd, const double *far, int noise, double *unknown) {
   for (int i = 0; i < NQ; ++i) {
-    const double slow = qd[i] / STICK_SPEED[i];
-    unknown[i] = STICK_VARIANCE[i] * exp(-slow * slow) + EXTERNAL_VARIANCE[i];
+    const double slow = qd[i] / STICK_SPEED[i], grown = GROWTH[i] * far[i];
+    unknown[i] = STICK_VARIANCE[i] * exp(-slow * slow) + EXTERNAL_VARIANCE[i] + grown * grown;
     if (noise) unknown[i] += TORQUE_VARIANCE[i];
   }
 }
@@ -697,7 +697,7 @@ static int posterior(const forcegp_learned *learned, const double *q, const doub
   read_mean(&z, &s->f, s->prior_mean, size, mean);
   if (!all_finite(mean, size)) return FORCEGP_OVERFLOW;
   if (!covariance) return 0;
-  unknown_forces(qd, noise, unknown);
+  unknown_forces(qd, s->far, noise, unknown);
   resolved = read_covariance(&z, &s->e, &s->f, unknown, size, covariance);
   if (noise)
     for (int bit = 0, row = 0; bit < QUANTITIES; ++bit)

@@ -21,7 +21,7 @@ from forcegp.compiled.source import c_function
 from forcegp.constraints import SurfaceContact
 from forcegp.constraints.gauss import rank_tolerance
 from forcegp.forces.external_wrench import MULTIPLIER_STD
-from forcegp.forces.posterior import HIGH, LOW, MEMORY, SPREAD, STICK_NOISE, STICK_SPEED
+from forcegp.forces.posterior import GROWTH, HIGH, LOW, MEMORY, SPREAD, STICK_NOISE, STICK_SPEED
 from forcegp.forces.priors import contact
 from forcegp.forces.priors.base import CONSTRAINT, CONTACT, JOINT
 from forcegp.forces.priors.inertial import PER_PAYLOAD, InertialPrior, PayloadPrior
@@ -255,6 +255,7 @@ class Writer:
         zero, far = torch.zeros(nq, dtype=torch.float64), torch.full((2, nq), 1e300, dtype=torch.float64)
         for key, name, default in ((LOW, "LOW", -far), (HIGH, "HIGH", far), (SPREAD, "SPREAD", far)):
             self.array(values.get(key, default), name)
+        self.array(values.get(GROWTH, zero), "GROWTH")
         sticks = STICK_NOISE in values
         self.array((2.0 * values[STICK_NOISE]).exp() if sticks else zero, "STICK_VARIANCE")
         self.array(values[STICK_SPEED].exp() if sticks else zero + 1.0, "STICK_SPEED")

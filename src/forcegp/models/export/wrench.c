@@ -65,7 +65,7 @@ static int estimate(const forcegp_learned *learned, const double *q, const doubl
   maps(&s.e, s.gain, FORCEGP_TOTAL_FORCE, &z);
   read_mean(&z, &s.f, s.prior_mean, NQ, force);
   if (!read_covariance(&z, &s.e, &s.f, zero, NQ, S)) return FORCEGP_UNRESOLVED;
-  unknown_forces(qd, 1, unknown);
+  unknown_forces(qd, s.far, 1, unknown);
   for (int i = 0; i < NQ; ++i) {
     r[i] = dot(s.e.M[i], qdd, NQ) - force[i], S[i * NQ + i] += unknown[i];
     for (int k = 0; k < NQ; ++k) {
