@@ -1,4 +1,4 @@
-"""Error bars beyond the trained region: distance, growth, joints that contact hides."""
+"""Error bars beyond the trained region: distance, growth learned from regimes, joints that contact hides."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from torch import Tensor
 import forcegp
 from forcegp import dynamics, kinematics
 from forcegp.cli.common import warn_beyond
-from forcegp.forces.posterior import GROWTH, STICKING, distance_beyond, trained_region
+from forcegp.forces.posterior import GROWTH, RELATIVE, STICKING, distance_beyond, trained_region
 from forcegp.models.structured_fit import StructuredFit
 
 LEG = """<robot name="leg">
@@ -78,10 +78,13 @@ def fitted(robot: forcegp.RobotModel, drag: float) -> StructuredFit:
     return model.fit(swing(robot, 600, 0.5, drag, 0))
 
 
-def test_faster_motion_is_less_certain(
+def test_growth_is_learned_from_regimes(
     pendulum: forcegp.RobotModel, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    dragged = fitted(pendulum, 3.0)
+    """Where fast motion was worse predicted than noise allows, faster motion is less certain."""
+    dragged, exact = fitted(pendulum, 3.0), fitted(pendulum, 0.0)
+    growth = [fit.hyperparameters[GROWTH] / fit.problem.typical_load() for fit in (dragged, exact)]
+    assert bool((growth[0] > 1.5 * growth[1]).all()) and bool((growth[1] < 0.5 * RELATIVE).all())
     test = swing(pendulum, 400, 2.0, 3.0, 1)
     found = dragged.predict(test.q, test.qd, test.tau, "total_force", noise=True)
     M = dynamics.mass_matrix(dragged.system.robot, test.q)

@@ -1,4 +1,4 @@
-"""Torque noise from held-out blocks of the log.
+"""Torque noise and its growth beyond the trained region, from held-out blocks of the log.
 
 The variance on new motions is estimated from blocks of the training log that the posterior was not
 conditioned on.
@@ -17,7 +17,14 @@ from torch import Tensor
 from forcegp.data.fields import resolution
 from forcegp.forces.measurements import Training
 from forcegp.forces.noise import TORQUE_NOISE
-from forcegp.forces.posterior import GROWTH, RELATIVE, ForcePosterior, hidden_variance, trained_region
+from forcegp.forces.posterior import (
+    GROWTH,
+    RELATIVE,
+    ForcePosterior,
+    distance_beyond,
+    hidden_variance,
+    trained_region,
+)
 from forcegp.forces.problem import (
     PIECE_SAMPLES,
     Problem,
@@ -40,18 +47,23 @@ FEWEST = 50
 """Minimum number of samples required for calibration."""
 SWEEPS, SETTLED = 20, 1e-3
 """Maximum number of sweeps over the joints, and relative change in the noise at convergence."""
+REGIME = 0.25
+"""Fraction of the samples in the fast regime and in the heavily loaded regime."""
+PRIOR_SAMPLES = 4.0
+"""Weight of the prior in `growth`, as an equivalent number of independent samples."""
 
 
 def calibrated_noise(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> dict[str, Tensor]:
-    """Return torque noise calibrated on held-out samples, and the trained region with its growth rate."""
+    """Return torque noise calibrated on held-out samples, the trained region, and error growth outside it."""
     load, training = problem.typical_load(), problem.training
     qd, tau = (torch.cat([getattr(m, name) for m in training.measurements]) for name in ("qd", "tau"))
     # Rounding to steps h has the variance h²/12.
     rounding = torch.from_numpy(resolution(tau.cpu().numpy())).to(tau) / math.sqrt(12.0)
     learned = hyperparameters[TORQUE_NOISE].exp().maximum(rounding)
     noise = {TORQUE_NOISE: held_out_torque_std(problem, hyperparameters, learned).log()}
+    grows = growth(problem, {**hyperparameters, **noise}, load)
     region = trained_region(qd, tau, load, problem.power * len(qd))
-    return {**noise, **region, GROWTH: RELATIVE * load}
+    return {**noise, **region, GROWTH: grows}
 
 
 def held_out_torque_std(problem: Problem, hyperparameters: Mapping[str, Tensor], least: Tensor) -> Tensor:
@@ -86,6 +98,50 @@ def held_out_squares(problem: Problem, hyperparameters: Mapping[str, Tensor]) ->
     """Return the mean squared torque error of each joint on each block of the log `(blocks, nq)`."""
     parts = held_out_blocks(problem, hyperparameters)
     return torch.stack([residual.square().mean(0) for residual, _, _ in parts])
+
+
+def growth(problem: Problem, hyperparameters: Mapping[str, Tensor], load: Tensor) -> Tensor:
+    """Return the growth rate g `(nq,)` of torque standard deviations outside the trained region.
+
+    The fastest quarter and the most heavily loaded quarter of the training samples are predicted from the
+    rest; D is their distance from the region of the rest. The rate is g = c · load with a common c for all
+    joints. c is the posterior mode under r_i ~ N(0, V_i + Σ_k P_ik² (s_k² + g_k² D_k²)), tempered like the
+    likelihood, and a scaled inverse-χ² prior, which dominates if the log has only one regime.
+
+    Args:
+        problem: the learned problem, including its likelihood exponent.
+        hyperparameters: hyperparameters, including the predicted torque noise.
+        load: typical torque of each joint `(nq,)` [N m, N].
+    """
+    s2, square, known, slope = hyperparameters[TORQUE_NOISE].exp() ** 2, [], [], []
+    for i in problem.training.motions:
+        m = problem.training.measurements[i]
+        for x in (m.qd, m.tau):
+            intensity = ((x - x.mean(0)) / x.std(0).clamp(min=1e-12)).abs().amax(-1)
+            top = intensity > intensity.quantile(1.0 - REGIME)
+            if min(int(top.sum()), int((~top).sum())) < FEWEST:
+                continue
+            rest = trained_region(m.qd[~top], m.tau[~top], load)
+            own = top.nonzero()[:, 0]
+            others = dataclasses.replace(problem, training=problem.training.without(i, own))
+            posterior = force_posterior(others, hyperparameters)
+            residual, V, P = _held_out(problem, hyperparameters, posterior, i, own)
+            D = distance_beyond(rest, m.qd[own], m.tau[own])
+            reached = (P.diagonal(dim1=-2, dim2=-1) > 0.5) & (D > 0.0)
+            square.append(residual.square()[reached])
+            known.append((V + P.square() @ s2)[reached])
+            slope.append((P.square() @ (load * D).square()[..., None])[..., 0][reached])
+    r2, V, a = (torch.cat(x) if x else load[:0] for x in (square, known, slope))
+
+    def objective(log_c2: float) -> float:
+        c2 = math.exp(log_c2)
+        v = V + c2 * a
+        misfit = 0.5 * problem.power * float((v.log() + r2 / v).sum())
+        return misfit + 0.5 * PRIOR_SAMPLES * (log_c2 + RELATIVE**2 / c2)
+
+    bounds = (2.0 * math.log(1e-2 * RELATIVE), 2.0 * math.log(1e2 * RELATIVE))
+    found = scipy.optimize.minimize_scalar(objective, bounds=bounds, method="bounded")
+    return math.exp(0.5 * float(found.x)) * load
 
 
 def stretches(segment: Tensor) -> Tensor:
