@@ -355,8 +355,8 @@ class Losses:
 def oracle(halves: list[tuple[Losses, Losses]], learned_from: str) -> dict[str, object]:
     """The subset of terms of each joint, learned in one half, that is best in the other.
 
-    It has the least largest ratio of errors to `BOUNDS`, and from the slider the least geometric mean of the
-    axes, geometric means over both ways, so the test halves choose it.
+    Ratios of errors are geometric means over both ways. The best subset minimises the largest ratio to
+    `BOUNDS`, or, learned from the slider, the geometric mean of both axes. The test halves choose it.
     """
     names = [f"{joint} {name}" for joint in ("hip", "knee") for name in (*TERMS, "inertia")]
     subsets = [[i for i in range(len(names)) if m >> i & 1] for m in range(1, 2 ** len(names))]
