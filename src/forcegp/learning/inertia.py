@@ -175,8 +175,8 @@ def with_delay(rows: Rows, columns: Tensor) -> Tensor:
 
 @dataclass(frozen=True)
 class _Regression:
-    """A regression with instrumental variables, that of the faster half of each joint's samples, the residual
-    noise `(nq,)` and the likelihood exponent κ."""
+    """A regression with instrumental variables on all samples and on the faster half of each joint's samples,
+    with its residual noise `(nq,)` and its likelihood exponent κ."""
 
     by_stretch: NormalEquations
     faster: NormalEquations
@@ -218,8 +218,8 @@ class _Regression:
     def carried_drives(self, gain: Tensor, delay: Tensor) -> Tensor:
         """Return the indices of the drives that the evidence carries.
 
-        With links at the file, the drive is significant. With links unknown, it is u ~ N(û, V) with prior
-        N(0, 1) and worth ½ û²/V + ½ log V nats, and this evidence is not clearly against it.
+        A drive must be significant with links at the file. With links unknown, a drive u ~ N(û, V) with prior
+        N(0, 1) is worth ½ û²/V + ½ log V nats, and this evidence must not be clearly against it.
 
         Args:
             gain: standard deviation `(nq,)` due to gains of torque sensors, which no log determines.
@@ -235,8 +235,8 @@ class _Regression:
         """Return the estimates `(n,)` of the drives and their variances, given the unknowns to consider.
 
         Variances are at least those of a jackknife over blocks of time, between which friction varies, and
-        the squared change if only the faster half of each joint's samples is used. A joint that creeps, as
-        with the soft friction of a simulator, resists acceleration like a drive.
+        the squared change of the estimate if only the faster half of each joint's samples is used. A joint
+        that creeps, as with the soft friction of a simulator, resists acceleration like a drive.
         """
 
         def read(given: NormalEquations) -> tuple[Tensor, Tensor]:
