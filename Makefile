@@ -65,11 +65,12 @@ audit: $(READY)  ## known vulnerabilities of the installed packages, where the a
 ends:            ## tests with the lowest versions allowed, or with RESOLUTION=highest the newest
 	sh .ci/ends $(PYTHON) $(RESOLUTION)
 
-attack: $(READY) ## 20,000 inputs per reader, faults at every step, 50 kills per command (hours)
+attack: $(READY) ## 20,000 inputs per reader, faults at every step, 50 kills per command, types of every call (hours)
 	@$(BIN)/python -m pip install --quiet "atheris>=3; python_version >= '3.11'" || echo "[attack] without atheris"
 	PYTHONPATH=src $(BIN)/python fuzz/attack.py --inputs 20000 --engine mutate
 	PYTHONPATH=src $(BIN)/python fuzz/attack.py --inputs 20000
 	FORCEGP_ATTACK=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest tests/faults tests/robot/test_fuzz.py
+	FORCEGP_CHECKED=1 OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal -m "not slow"
 	@echo "[attack] no findings"
 
 clean:           ## remove what the targets made

@@ -1,13 +1,15 @@
-"""Shapes and types of every call are checked while the tests run, and each test process uses one thread."""
+"""With `FORCEGP_CHECKED=1` shapes and types of every call are checked; each test process uses one thread."""
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator
 
 from jaxtyping import config, install_import_hook
 
 # The hook sees modules that are imported after it, so it comes before any test imports the library.
-install_import_hook("forcegp", "typechecker.check")
+if os.environ.get("FORCEGP_CHECKED") == "1":
+    install_import_hook("forcegp", "typechecker.check")
 
 import pytest  # noqa: E402
 import torch  # noqa: E402
