@@ -37,9 +37,11 @@ test-slow: $(READY)  ## the slow tests, which continuous integration runs too
 	OMP_NUM_THREADS=1 $(BIN)/python -m pytest -n 2 --dist worksteal -m slow
 	@echo "[test-slow] all passed"
 
-lint: $(READY)   ## ruff, check and format
+lint: $(READY)   ## ruff, order of imports, texts
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
+	PYTHONPATH=. $(BIN)/lint-imports --no-cache --no-logo
+	$(BIN)/python .ci/texts.py
 
 package: $(READY)  ## build the wheel and try it in an environment of its own
 	sh .ci/wheel $(BIN)/python

@@ -11,8 +11,8 @@ from jaxtyping import config, install_import_hook
 if os.environ.get("FORCEGP_CHECKED") == "1":
     install_import_hook("forcegp", "typechecker.check")
 
-import pytest  # noqa: E402
-import torch  # noqa: E402
+import pytest
+import torch
 
 torch.set_num_threads(1)
 

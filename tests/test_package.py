@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import ast
+import inspect
 import re
 import subprocess
 import sys
@@ -16,7 +17,7 @@ import forcegp
 def test_every_public_name_is_there_and_declared_for_type_checkers() -> None:
     assert set(forcegp.__all__) == set(dir(forcegp))
     for name in forcegp.__all__:
-        assert getattr(forcegp, name) is not None
+        assert inspect.getdoc(getattr(forcegp, name)), f"forcegp.{name} has no docstring"
     tree = ast.parse(Path(str(forcegp.__file__)).with_suffix(".pyi").read_text())
     declared = [alias for node in tree.body if isinstance(node, ast.ImportFrom) for alias in node.names]
     # Without `as`, a name in a stub is not exported.

@@ -260,7 +260,7 @@ def _bend(motion: _Motion, screw: tuple, rate: tuple) -> tuple[np.ndarray, np.nd
 
 
 def _columns(
-    motion: _Motion, screw: tuple, rate: tuple, spin, momentum, composite: _Inertia
+    motion: _Motion, screw: tuple, rate: tuple, spin: np.ndarray, momentum: np.ndarray, composite: _Inertia
 ) -> tuple[tuple, tuple]:
     """Return 2B Ṡ + I S̈ and 2B S + 2 I Ṡ for one joint and its subtree."""
     bent, turned = _momentum(*composite, *_bend(motion, screw, rate)), _momentum(*composite, *rate)

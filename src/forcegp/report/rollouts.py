@@ -31,6 +31,7 @@ from forcegp.report.page import (
     series,
 )
 from forcegp.rollout.comparison import HORIZONS, LEVEL, Comparison
+from forcegp.rollout.trajectory import Rollout
 
 
 class Band(Record):
@@ -173,7 +174,7 @@ def _model_path(
     )
 
 
-def _bands(rolled, values: Tensor, n: int) -> list[Band]:
+def _bands(rolled: Rollout, values: Tensor, n: int) -> list[Band]:
     """Return a band for each component of samples `(S, T, d)`, over the first n times or up to divergence."""
     band = rolled.bands(values[:, :n], LEVEL)
     last = _sound(band.lower)
