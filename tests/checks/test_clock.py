@@ -32,6 +32,8 @@ def _bursts(count: int) -> Callable[[np.ndarray], np.ndarray]:
     return lambda k: DT * count * (k // count) + 2e-5 * (k % count)
 
 
+DERIVED: list[tuple[str, ...]] = [(), ("qdd",), ("qd", "qdd")]
+"""Columns that an import computed."""
 CLOCKS = {
     "bursts of 10": _bursts(10),
     "bursts of 2": _bursts(2),
@@ -40,8 +42,7 @@ CLOCKS = {
 }
 
 
-@pytest.mark.parametrize("clock", CLOCKS.values(), ids=CLOCKS)
-@pytest.mark.parametrize("derived", [(), ("qdd",), ("qd", "qdd")], ids=", ".join)
+@pytest.mark.parametrize(("clock", "derived"), zip(CLOCKS.values(), [*DERIVED, ()], strict=True), ids=CLOCKS)
 def test_a_clock_that_jumps_or_comes_in_bursts_alone_is_to_blame(
     pendulum: Case, clock: Callable[[np.ndarray], np.ndarray], derived: tuple[str, ...]
 ) -> None:
@@ -68,8 +69,9 @@ def test_gaps_in_time_that_the_motion_confirms_are_gaps(pendulum: Case) -> None:
     assert "time-gap" in kinds and not kinds & {"time-bursts", "rows-lost"}
 
 
-@pytest.mark.parametrize("factor", [1e-9, 1e-6, 1e-3, 1e3, 1e6, 1e9])
-@pytest.mark.parametrize("derived", [(), ("qdd",), ("qd", "qdd")], ids=", ".join)
+@pytest.mark.parametrize(
+    ("factor", "derived"), zip([1e-9, 1e-6, 1e-3, 1e3, 1e6, 1e9], [*DERIVED, *DERIVED], strict=True), ids=str
+)
 def test_a_unit_that_is_off_is_the_fault_of_the_clock(
     pendulum: Case, factor: float, derived: tuple[str, ...]
 ) -> None:
@@ -107,8 +109,9 @@ def _one_per_cent(random: np.random.Generator, n: int) -> np.ndarray:
     return random.random(n) > 0.01
 
 
-@pytest.mark.parametrize("lose", [_every_seventh, _thirty_per_cent, _one_per_cent])
-@pytest.mark.parametrize("derived", [(), ("qdd",), ("qd", "qdd")], ids=", ".join)
+@pytest.mark.parametrize(
+    ("lose", "derived"), zip([_every_seventh, _thirty_per_cent, _one_per_cent], DERIVED, strict=True)
+)
 def test_rows_that_are_lost_and_renumbered_are_found(
     pendulum: Case, lose: Callable[[np.random.Generator, int], np.ndarray], derived: tuple[str, ...]
 ) -> None:
@@ -130,8 +133,9 @@ def test_clean_logs_have_a_clean_clock(pendulum: Case) -> None:
     assert not kinds & {"time-bursts", "rows-lost", "time-unit"}
 
 
-@pytest.mark.parametrize("rows", [1, 5, 30, 400, 800])
-@pytest.mark.parametrize("rate", [1e3, 1e4])
+@pytest.mark.parametrize(
+    ("rows", "rate"), [(1, 1e3), (5, 1e4), (30, 1e3), (400, 1e4), (800, 1e3), (800, 1e4)]
+)
 @pytest.mark.parametrize("derived", [(), ("qd", "qdd")], ids=", ".join)
 def test_short_logs_are_checked_or_too_short(rows: int, rate: float, derived: tuple[str, ...]) -> None:
     robot = forcegp.load_robot("double_pendulum")

@@ -48,7 +48,7 @@ def evaluated(model: Path, log: forcegp.Dataset, folder: Path) -> dict[str, Any]
     return json.loads(done.stdout)
 
 
-@pytest.mark.parametrize("size", [1e4, -1e6, 1e12, 1e18])
+@pytest.mark.parametrize("size", [1e4, -1e18])
 def test_an_impossible_acceleration_is_left_out_and_named(
     size: float, arm: tuple[Path, forcegp.Dataset], tmp_path: Path
 ) -> None:
@@ -61,8 +61,7 @@ def test_an_impossible_acceleration_is_left_out_and_named(
     assert found["noisy_rmse"] == pytest.approx(rest["noisy_rmse"]) and rest["left_out"] == []
 
 
-@pytest.mark.parametrize("name", ["q", "qd", "tau"])
-@pytest.mark.parametrize("size", [1e6, -1e8, 1e18])
+@pytest.mark.parametrize(("name", "size"), [("q", 1e6), ("qd", -1e8), ("tau", 1e18), ("tau", -1e6)])
 def test_any_impossible_value_is_left_out_and_named(
     name: str, size: float, arm: tuple[Path, forcegp.Dataset], tmp_path: Path
 ) -> None:
@@ -73,7 +72,7 @@ def test_any_impossible_value_is_left_out_and_named(
     assert found["left_out"] == [37] and any("Row 37: left out" in text for text in found["doubts"])
 
 
-@pytest.mark.parametrize("rows", [1, 2, 3, 9])
+@pytest.mark.parametrize("rows", [1, 2, 9])
 @pytest.mark.parametrize("size", [None, 1e18])
 def test_few_rows_are_scored_and_compared_with_nothing(
     rows: int, size: float | None, arm: tuple[Path, forcegp.Dataset], tmp_path: Path

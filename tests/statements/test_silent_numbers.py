@@ -88,7 +88,7 @@ def test_bars_hold_or_the_fit_refuses_wrong_torques(fault: Fault) -> None:
     assert holds(fault(train), fault(test), truth)
 
 
-@pytest.mark.parametrize("factor", [0.5, 0.8, 0.9, 1.0, 1.1, 1.3])
+@pytest.mark.parametrize("factor", [0.5, 0.9, 1.0, 1.3])
 def test_check_names_the_gain_of_all_torques(factor: float) -> None:
     """`check` states the correction 1/factor, although an offset of one joint explains part of it."""
     data = log()[0]
