@@ -47,7 +47,7 @@ package: $(READY)  ## build the wheel and try it in an environment of its own
 	sh .ci/wheel $(BIN)/python
 
 docs: $(READY)   ## the documentation site; runs the code of every page
-	OMP_NUM_THREADS=1 $(BIN)/python -m sphinx --fail-on-warning --keep-going --quiet docs $(OUT)/docs
+	OMP_NUM_THREADS=1 $(BIN)/python -m sphinx --jobs 2 --fail-on-warning --keep-going --quiet docs $(OUT)/docs
 	@echo "[docs] open $(OUT)/docs/index.html"
 
 types: $(READY)  ## pyright

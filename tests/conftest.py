@@ -23,3 +23,8 @@ def unchecked() -> Iterator[None]:
     config.update("jaxtyping_disable", True)
     yield
     config.update("jaxtyping_disable", False)
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Begin with whole scripts, of which one takes minutes, so that no process waits for it at the end."""
+    items.sort(key=lambda item: not item.nodeid.startswith("tests/test_examples_run.py"))
