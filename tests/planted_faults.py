@@ -277,6 +277,11 @@ def _without_gravity(system: ConstrainedSystem, log: Log) -> tuple[ConstrainedSy
     return system, log.replace(tau=log.tau + gravity), None
 
 
+def _without_model(system: ConstrainedSystem, log: Log) -> tuple[ConstrainedSystem, Log, Rows]:
+    states = (torch.from_numpy(x) for x in (log.q, log.qd, log.qdd))
+    return system, log.replace(tau=log.tau - dynamics.inverse_dynamics(system.robot, *states).numpy()), None
+
+
 def _still(system: ConstrainedSystem, log: Log) -> tuple[ConstrainedSystem, Log, Rows]:
     """A joint that is held, with the torque that the rest of the motion then needs."""
     columns = {name: getattr(log, name).copy() for name in ("q", "qd", "qdd")}
@@ -451,6 +456,7 @@ FAULTS = (
         amount=0.06,
     ),
     Fault("torque less gravity", "torque-without-gravity", _without_gravity),
+    Fault("torque less the model", "torque-without-model", _without_model),
     Fault("torques exchanged", "torque-order", _change(tau=lambda g: g.tau[:, _swap(g, 1, 3)]), joint=1),
     Fault("no torque", "torque-zero", _change(tau=lambda g: 0.0 * g.tau)),
     Fault(

@@ -67,9 +67,13 @@ class Explanation:
         return cross_validate(self.problem, self.columns, self.prior)
 
     def on(self, log: Log, rows: np.ndarray | None = None) -> TorqueProblem:
-        """Return the torque problem for a modified log, with the same joint weights."""
+        """Return the torque problem for a modified log, with the same weights and sizes of the torques.
+
+        With other sizes, a correction that makes torques larger would make their errors smaller.
+        """
         rows = self.rows if rows is None else rows
-        return hypotheses.problem_of(self.system, log, rows, self.problem.scale)
+        problem = hypotheses.problem_of(self.system, log, rows, self.problem.scale)
+        return replace(problem, size=self.problem.size)
 
     def weighed(self) -> Explanation:
         """Return the explanation with the joints weighted by their residual noise."""
@@ -189,7 +193,7 @@ def _fits(model: Explanation) -> Iterator[Tried]:
     else:
         few = model.rows[::SCREENING]
         null = cross_validate(model.on(log, few)).score.mean()
-        for hypothesis in (*hypotheses.discrete(log), *_delays(model)):
+        for hypothesis in (*hypotheses.discrete(system, log), *_delays(model)):
             changed = hypothesis.change(log)
             if cross_validate(model.on(changed, few)).score.mean() < null:
                 yield hypothesis, cross_validate(model.on(changed))

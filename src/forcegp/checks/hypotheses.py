@@ -17,6 +17,8 @@ from forcegp.checks.fit import TorqueFit, TorqueProblem, labelled_contacts, resi
 from forcegp.checks.log import Array, Log, displacement, force_unit
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.identification import MASS_SHARE, MOMENT_ARM, regressor
+from forcegp.logs.compensated import subtracted
+from forcegp.logs.mapping import Compensated
 from forcegp.robot.model import RobotModel
 
 LAGS = (1, 2, 3, 4, 6, 8, 11, 15, 20)
@@ -116,9 +118,17 @@ def delayed(log: Log, shift: int, joints: tuple[int, ...] = ()) -> Log:
     return log.replace(tau=tau).mask(lost)
 
 
-def discrete(log: Log) -> Iterator[Hypothesis]:
-    """Yield hypotheses without parameters: wrong signs and swapped joints."""
+def restored(log: Log, robot: RobotModel, compensated: Compensated) -> Log:
+    """Return the log with the torque that a driver has subtracted."""
+    return log.replace(tau=log.tau + subtracted(robot, compensated, log.q, log.qd, log.qdd))
+
+
+def discrete(system: ConstrainedSystem, log: Log) -> Iterator[Hypothesis]:
+    """Yield hypotheses without parameters: wrong signs, swapped joints, and torques less those of a model."""
     every, tau, motion = tuple(range(log.nq)), ("tau",), ("q", "qd", "qdd")
+    for what in ("gravity", "model") if system.robot.gravity.any() else ("model",):
+        change = partial(restored, robot=system.robot, compensated=what)
+        yield Hypothesis(f"torque-without-{what}", 0, change, joints=every)
     if log.nq > 1:
         yield Hypothesis("torque-sign", 0, partial(Log.changed, names=tau, flip=every), joints=every)
     for j in every:
@@ -245,6 +255,8 @@ DISCRETE = {
     "joint-sign": "{} fits the robot file when it turns the other way",
     "torque-order": "the torques of {} fit when exchanged",
     "joint-order": "{} fit the robot file when exchanged",
+    "torque-without-gravity": "the torque of {} contains no gravity: the driver subtracts it",
+    "torque-without-model": "the torque of {} contains no inverse dynamics: the driver subtracts a model",
 }
 
 
@@ -366,7 +378,7 @@ def _gravity(system: ConstrainedSystem, log: Log, change: Array) -> Finding:
     vector = ", ".join(f"{value:.3g}" for value in fitted)
     pulls = bool(system.robot.gravity.any())
     if pulls and size < WEIGHTLESS:
-        text = "the torque contains no gravity: gravity compensation was subtracted"
+        text = DISCRETE["torque-without-gravity"].format("all joints")
         return log.finding("torque-without-gravity", text, log.joint_names, **evidence)
     tilted = pulls and angle <= TILT
     text = f"the torque fits with gravity ({vector}) m/s², {angle:.3g}° from the scene's"

@@ -270,22 +270,17 @@ def _offsets(explanation: Explanation) -> list[Finding]:
 
 def _weightless(explanation: Explanation, off: list[int]) -> Finding | None:
     """Return the finding that adding the gravity torque explains as much as the offsets of these joints."""
-    robot, log, nq = explanation.system.robot, explanation.log, explanation.log.nq
-    gravity = np.concatenate(
-        [
-            dynamics.gravity_force(robot, log.tensors(part, "q")[0]).detach().numpy()
-            for part in np.array_split(np.arange(len(log)), max(1, len(log) // 8192))
-        ]
-    )
+    log, nq = explanation.log, explanation.log.nq
+    whole = hypotheses.restored(log, explanation.system.robot, "gravity")
     offset = -explanation.fit.nuisance[2 * nq :][off]
-    usual = gravity[explanation.rows][:, off].mean(axis=0)
-    added = replace(explanation, problem=explanation.on(log.replace(tau=log.tau - gravity)))
+    usual = (log.tau - whole.tau)[explanation.rows][:, off].mean(axis=0)
+    added = replace(explanation, problem=explanation.on(whole))
     fit = added.without([2 * nq + j for j in off]).fit
     if (np.abs(offset - usual) > UNEXPLAINED * np.abs(offset)).any() or any(
         _worse(explanation, fit, j) for j in off
     ):
         return None
-    text = "the torque contains no gravity: gravity compensation was subtracted"
+    text = hypotheses.DISCRETE["torque-without-gravity"].format("all joints")
     return log.finding("torque-without-gravity", text, log.joint_names)
 
 

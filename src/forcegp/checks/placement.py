@@ -81,7 +81,7 @@ def _never_closed(
     system: ConstrainedSystem, contact: SurfaceContact, log: Log, rows: np.ndarray
 ) -> Outcome | None:
     """Return the single correction that brings a tip that is never in contact to the surface, if any."""
-    signs = ((h, h.change(log)) for h in discrete(log) if h.name == "joint-sign")
+    signs = ((h, h.change(log)) for h in discrete(system, log) if h.name == "joint-sign")
     tried = []
     for h, other in (*signs, *_offsets(system, contact, log, rows, LEVEL)):
         share = float((np.abs(tip_path(system, contact, other, rows).c) <= TOUCHING).mean())
@@ -123,7 +123,7 @@ def _explanation(
     system: ConstrainedSystem, contact: SurfaceContact, log: Log, rows: np.ndarray, most: float
 ) -> Outcome | None:
     """Return the correction of the angles that places the tip on the surface, if any."""
-    angles = ((h, h.change(log)) for h in discrete(log) if h.name in ("joint-sign", "joint-order"))
+    angles = ((h, h.change(log)) for h in discrete(system, log) if h.name in ("joint-sign", "joint-order"))
     for candidates in (angles, _offsets(system, contact, log, rows)):
         near = [(h, other) for h, other in candidates if _off(system, contact, other, rows) <= most]
         if near:

@@ -19,6 +19,7 @@ from forcegp.data.clipped import clipped
 from forcegp.errors import DataError
 from forcegp.guards import foreign
 from forcegp.logs.clock import even_clock, usual_step
+from forcegp.logs.compensated import restore
 from forcegp.logs.contact import Evidence, detect, per_contact
 from forcegp.logs.from_contact import derive_joints, stick_speeds
 from forcegp.logs.gather import gather
@@ -123,6 +124,7 @@ def import_log(
             evidence = _contacts(signals, system, log_mapping, report, displaced)
             std = add_derivatives(signals, log_mapping.sections.derivatives, report)
             std = _treat_clipped(signals, std, log_mapping, report)
+            restore(signals, system.robot, log_mapping, report)
             data = _dataset(signals, std, log_mapping, system, report, derived)
     except DataError as error:
         raise error if str(path) in error.message else DataError.at(str(path), error) from None
@@ -147,6 +149,7 @@ def _contacts(
     copies = {name: value.copy() for name, value in signals.vectors.items()}
     trial = replace(signals, vectors=copies, contact={}, row=np.arange(len(signals)))
     add_derivatives(trial, mapping.sections.derivatives, ImportReport(report.source))
+    restore(trial, system.robot, mapping, ImportReport(report.source))
     kept = np.zeros(len(signals), dtype=bool)
     kept[trial.row] = True
     signals.keep(kept)

@@ -6,7 +6,7 @@ logged torque with the inverse dynamics of the robot in the scene. Uncertain ent
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from functools import cache
 from pathlib import Path
@@ -15,7 +15,6 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from forcegp import dynamics
 from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.data.derivative import cross_validated_window
 from forcegp.data.fields import MOST_RADIANS
@@ -23,10 +22,19 @@ from forcegp.errors import DataError
 from forcegp.guards import foreign
 from forcegp.logs import units
 from forcegp.logs.clock import even_clock
+from forcegp.logs.compensated import restore, subtracted
 from forcegp.logs.contact import force_levels, multiplier
 from forcegp.logs.gather import gather
 from forcegp.logs.headings import find_families, find_time, find_wrench, tokens
-from forcegp.logs.mapping import ROWS, ContactStateSection, Draft, Family, parse_mapping, quoted
+from forcegp.logs.mapping import (
+    ROWS,
+    Compensated,
+    ContactStateSection,
+    Draft,
+    Family,
+    parse_mapping,
+    quoted,
+)
 from forcegp.logs.motion import TURNS, wrapped
 from forcegp.logs.readers import read
 from forcegp.logs.smoothing import add_derivatives
@@ -39,6 +47,15 @@ TRIED_ROWS = 3000
 """Maximum number of rows on which the inverse dynamics are evaluated."""
 BEYOND_LIMIT = 3.0
 """Multiple of a joint limit that angles in radians do not reach."""
+SLOW = 0.02
+"""Speed at which dry friction saturates [rad/s, m/s]."""
+DETERMINED = 10.0
+"""Standard errors, of independent samples, from which a torque follows the inverse dynamics."""
+LACKING = 0.3
+"""Share of gravity below which torques are taken for compensated. Six real logs have 0.55 to 2.1, as their
+masses differ from the robot file's; a simulated arm has 1.05, and −0.003 if its driver subtracts gravity."""
+UNRELATED = 0.1
+"""Mean squared correlation up to which torques do not follow the inverse dynamics."""
 LEAST_DEGREES = 3.2
 """If no position exceeds this value, the unit is not degrees, since the arm would hardly move [°]."""
 CLEARER, NEAR = 1.5, 1.3
@@ -166,6 +183,7 @@ def _signals(path: str | Path, draft: Draft, system: ConstrainedSystem, without:
     even_clock(signals, None, report)
     settings = mapping.sections.derivatives.model_copy(update={"source": "position"})
     add_derivatives(signals, settings, report)
+    restore(signals, system.robot, mapping, report)
     return signals
 
 
@@ -234,8 +252,14 @@ def _torque(draft: Draft, trial: Signals, system: ConstrainedSystem) -> None:
         family.unit = family.unit if family.declared else "A"
         text = "a current: give the gear ratio and the torque constant [N m/A]; DrivePrior learns its error"
         draft.say("torque", text, doubt=True)
-    if clear.sum() < 0.5 * (len(clear) - len(family.unmeasured)):
-        return draft.say("torque", "few torques follow the inverse dynamics: sign unknown", doubt=True)
+    measured = len(clear) - len(family.unmeasured)
+    if (share := gravity_share(trial, system)) < LACKING:
+        lighter, follows = torque_slopes(trial, system, "gravity")
+        if (np.abs(follows) > 0.5).sum() >= min(clear.sum(), 0.5 * measured):
+            slopes, clear, family.compensated = lighter, np.abs(follows) > 0.5, "gravity"
+            draft.say("torque", f"it contains {share:.2f} of gravity: taken for compensated", doubt=True)
+    if clear.sum() < 0.5 * measured:
+        return _remainder(draft, trial, correlation)
     family.sign = _signs(slopes, clear, trial.joint_names)
     if isinstance(family.sign, dict):
         draft.say("torque", "the sign differs between joints; are the joints in the right order?", doubt=True)
@@ -249,28 +273,76 @@ def _torque(draft: Draft, trial: Signals, system: ConstrainedSystem) -> None:
         draft.say("torque", f"{size:.3g} times the inverse dynamics: a current, or motor side?", doubt=True)
 
 
-def torque_slopes(trial: Signals, system: ConstrainedSystem) -> tuple[Array, Array]:
+def _remainder(draft: Draft, trial: Signals, correlation: Array) -> None:
+    """Propose `compensated = "model"` for torques that friction explains, and their sign: drives push."""
+    family, qd, tau = draft.families["torque"], trial.vectors["qd"], trial.vectors["tau"]
+    work, explained = np.zeros(qd.shape[1]), np.zeros(qd.shape[1])
+    for i in range(qd.shape[1]):
+        columns = np.column_stack([np.ones(len(qd)), qd[:, i], np.tanh(qd[:, i] / SLOW)])
+        weights = np.linalg.lstsq(columns, tau[:, i], rcond=None)[0]
+        friction = columns[:, 1:] @ weights[1:]
+        work[i] = float((friction * qd[:, i]).sum())
+        spread = float(np.var(tau[:, i]))
+        explained[i] = 1.0 - float(np.var(tau[:, i] - columns @ weights)) / spread if spread > 0.0 else 0.0
+    few = (explained > 0.5).sum() < 0.5 * (len(work) - len(family.unmeasured))
+    if few or (correlation**2).mean() > UNRELATED:
+        return draft.say("torque", "few torques follow the inverse dynamics: sign unknown", doubt=True)
+    family.sign = _signs(work, explained > 0.5, trial.joint_names)
+    family.compensated = "model"
+    draft.say("torque", "friction explains it: taken for what the driver's model leaves", doubt=True)
+
+
+def torque_slopes(
+    trial: Signals, system: ConstrainedSystem, compensated: Compensated | None = None
+) -> tuple[Array, Array]:
     """Return the slope (nq,) of the logged torque over inverse dynamics, and the partial correlation (nq,).
+
+    If the torque is `compensated`, inverse dynamics lack what the driver subtracts.
 
     For each joint, τ_log = k τ_rigid + v q̇ + f sign(q̇) + Aᵀλ + const is fitted by least squares, with a
     constant λ for each contact. The partial correlation is that of τ_log and τ_rigid given the other terms.
     """
-    nq = system.robot.nq
+    names = ("model",) if compensated is None else ("model", compensated)
+    slopes, correlation = np.zeros(system.robot.nq), np.zeros(system.robot.nq)
+    for i, (tau, *rigid) in enumerate(_beside_friction(trial, system, names)):
+        x = rigid[0] if compensated is None else rigid[0] - rigid[1]
+        if (power := float(x @ x)) > 0.0 and (own := float(tau @ tau)) > 0.0:
+            slopes[i], correlation[i] = x @ tau / power, x @ tau / np.sqrt(power * own)
+    return slopes, correlation
+
+
+def gravity_share(trial: Signals, system: ConstrainedSystem) -> float:
+    """Return the share of the gravity torque that the logged torques contain beside the other rigid torques.
+
+    For each joint, τ_log = k (τ_rigid + (h − 1) τ_gravity) + friction is fitted, and h averaged over the
+    joints with their precisions. Without any determined k, h is 1.
+    """
+    shares, weights = [], []
+    for tau, rigid, gravity in _beside_friction(trial, system, ("model", "gravity")):
+        X = np.column_stack([rigid - gravity, gravity])
+        if np.linalg.matrix_rank(X) < 2:
+            continue
+        inverse = np.linalg.inv(X.T @ X)
+        k, kh = inverse @ (X.T @ tau)
+        variance = float(np.var(tau - X @ [k, kh])) * np.diag(inverse)
+        if abs(k) > DETERMINED * np.sqrt(variance[0]):
+            shares.append(kh / k)
+            weights.append(k**2 / max(float(variance[1]), 1e-300))
+    return float(np.average(shares, weights=weights)) if shares else 1.0
+
+
+def _beside_friction(
+    trial: Signals, system: ConstrainedSystem, names: Sequence[Compensated]
+) -> Iterator[tuple[Array, ...]]:
+    """Yield for each joint the torque and the named rigid torques less their fits by friction and contact."""
     rows = np.linspace(0, len(trial) - 1, min(TRIED_ROWS, len(trial))).astype(int)
     q, qd, qdd, tau = (np.ascontiguousarray(trial.vectors[name][rows]) for name in ("q", "qd", "qdd", "tau"))
-    state = [torch.from_numpy(x) for x in (q, qd, qdd)]
-    rigid = dynamics.inverse_dynamics(system.robot, *state).numpy()
-    A = system.equations(state[0], state[1]).A.numpy()
-    slopes, correlation = np.zeros(nq), np.zeros(nq)
-    for i in range(nq):
+    torques = [tau, *(subtracted(system.robot, name, q, qd, qdd) for name in names)]
+    A = system.equations(torch.from_numpy(q), torch.from_numpy(qd)).A.numpy()
+    for i in range(system.robot.nq):
         others = np.column_stack([np.ones(len(rows)), qd[:, i], np.sign(qd[:, i]), A[:, :, i]])
-        both = np.column_stack([rigid[:, i], tau[:, i]])
-        remainder = both - others @ np.linalg.lstsq(others, both, rcond=None)[0]
-        power = (remainder**2).sum(axis=0)
-        if power.min() > 0.0:
-            product = float(remainder[:, 0] @ remainder[:, 1])
-            slopes[i], correlation[i] = product / power[0], product / float(np.sqrt(power[0] * power[1]))
-    return slopes, correlation
+        each = np.column_stack([torque[:, i] for torque in torques])
+        yield tuple((each - others @ np.linalg.lstsq(others, each, rcond=None)[0]).T)
 
 
 def propose_contacts(

@@ -49,6 +49,7 @@ class Family:
     by_joint: dict[str, str] = field(default_factory=dict)
     unwrap: bool = False
     unmeasured: list[str] = field(default_factory=list)
+    compensated: Compensated | None = None
 
     def table(self) -> dict[str, Any]:
         """Return the table for this family in the mapping file."""
@@ -56,6 +57,7 @@ class Family:
         sign = None if self.sign == 1.0 else self.sign
         current = CURRENT if self.unit in ("A", "mA") else {}
         more = {"unwrap": self.unwrap or None, "unmeasured": self.unmeasured or None}
+        more |= {"compensated": self.compensated}
         return {**columns, "stream": self.stream or None, "unit": self.unit, "sign": sign, **more, **current}
 
 
@@ -148,6 +150,9 @@ PerJoint = float | dict[str, float]
 """One number for all joints, or one number for each joint name."""
 
 
+Compensated = Literal["gravity", "model"]
+"""What a driver subtracts from the torque: −Q_G, or M q̈ − Q_C − Q_G."""
+
 TimeUnit = Literal["s", "ms", "us", "ns", "min", "h", "d"]
 """Units of time; a day has 86,400 s."""
 
@@ -193,11 +198,13 @@ class QuantitySection(Section):
 
 class TorqueSection(QuantitySection):
     """`[torque]`: a torque, or a current and the torque constant of the motor [N m/A]. Joints with neither
-    are listed in `unmeasured`. Rows with `clipped` torques are kept, given large noise, or dropped."""
+    are listed in `unmeasured`. Rows with `clipped` torques are kept, given large noise, or dropped. If the
+    driver has subtracted the gravity torque or the inverse dynamics, `compensated` says which."""
 
     torque_constant: PerJoint | None = None
     unmeasured: tuple[str, ...] = ()
     clipped: Literal["noise", "drop", "keep"] = "noise"
+    compensated: Compensated | None = None
 
 
 class PositionSection(QuantitySection):
