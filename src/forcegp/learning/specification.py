@@ -31,7 +31,7 @@ from forcegp.forces.posterior import REGION
 from forcegp.forces.priors.base import ANALYTICAL, COULOMB, NOISE, ForcePrior
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import AnalyticalMean, ConstantForcePrior, JointFrictionPrior
-from forcegp.forces.priors.memory import LONGEST_STEP, PAST, BristlePrior
+from forcegp.forces.priors.memory import DISTANCES, LONGEST_STEP, PAST, BristlePrior
 from forcegp.forces.priors.residual import ResidualPrior
 from forcegp.forces.problem import Problem
 from forcegp.gp.optimise import LearningOptions
@@ -45,6 +45,8 @@ OPTIONS, WITH_PARAMETERS = LearningOptions(), LearningOptions(tolerance=1e-9)
 """Default options, and options for learning θ_A, for which L-BFGS may stall for a step or two."""
 REST_SPEED = 0.01
 """Largest joint speed at which a sample counts as being at rest [rad/s, m/s]."""
+SAMPLED, OUTERMOST = 20_000, 0.005
+"""Largest number of samples that determine the range of motion of a joint, and their share beyond it."""
 FEWEST_MOVING = 20
 """Number of samples in motion below which samples at rest are also kept."""
 
@@ -210,9 +212,11 @@ def training_for(
         scales = zip(spec.priors, before.training.scales, strict=True)
         kept = {prior.name: scale for prior, scale in scales if prior.name not in learned}
     noise_std, standardize = spec.noise.acceleration, spec.options.standardize
-    observations, dropped = observations_of(data), 0
+    observations, dropped, still = observations_of(data), 0, [False] * spec.system.robot.nq
     if spec.noise.learns_torque:
         observations, dropped = without_outliers(observations)
+        still = still_joints(observations)
+        observations = [replace(o, data=at_rest(o.data, still)) for o in observations]
     training = training_of(observations, spec.system, spec.priors, noise_std, kept, standardize)
     if any(prior.delay for prior in spec.priors):
         training = without_delay(training, spec.priors)
@@ -221,7 +225,28 @@ def training_for(
     if not spec.noise.learns_torque:
         return training, ()
     moving, doubts = in_motion(spec.system, training, fewest)
+    names = spec.system.robot.joint_names
+    unmoved = [name for name, rests in zip(names, still, strict=True) if rests]
+    if unmoved:
+        doubts = (*doubts, f"friction is not determined for joints that do not move: {', '.join(unmoved)}")
     return moving, (*excluded(dropped), *doubts)
+
+
+def still_joints(observations: Iterable[Observation]) -> list[bool]:
+    """Return for each joint whether it stays within the least distance over which friction builds up."""
+    q = torch.cat([o.data.q for o in observations])
+    q = q[:: max(1, len(q) // SAMPLED)]
+    low, high = q.quantile(torch.tensor([OUTERMOST, 1.0 - OUTERMOST]).to(q), dim=0)
+    return (high - low < DISTANCES[0]).tolist()
+
+
+def at_rest(data: Dataset, still: Sequence[bool]) -> Dataset:
+    """Return the data with zero velocities of the given joints, where measured ones are noise.
+
+    As a function of such velocities, the torque that static friction holds would be friction, and its
+    independence of noise would be the absence of friction.
+    """
+    return data.replace(qd=data.qd.masked_fill(data.qd.new_tensor(still).bool(), 0.0)) if any(still) else data
 
 
 def check_learned(spec: Specification, learn: Iterable[str]) -> None:
