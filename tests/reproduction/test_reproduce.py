@@ -101,13 +101,11 @@ def test_the_paper_s_own_models_make_a_page(tmp_path: Path) -> None:
     assert model.hyperparameters["joint.log_lengthscale"].numel() == 147
 
 
-def test_two_processes_make_the_same_page(tmp_path: Path) -> None:
-    sizes = dataclasses.replace(TEN_SECONDS, sizes=(20,), main=20, identification_evaluations=5)
+def test_two_processes_make_the_same_page(made: Reproduction, tmp_path: Path) -> None:
     said: list[str] = []
-    alone = run(sizes, tmp_path / "alone", seed=3)
-    both = run(sizes, tmp_path / "both", seed=3, processes=2, say=lambda line, *_: said.append(line))
-    assert both.reused == 0 and both.stages == alone.stages == len(set(said))
-    for one, two in zip(alone.results.scores, both.results.scores, strict=True):
+    both = run(TEN_SECONDS, tmp_path, seed=3, processes=2, say=lambda line, *_: said.append(line))
+    assert both.reused == 0 and both.stages == made.stages == len(set(said))
+    for one, two in zip(made.results.scores, both.results.scores, strict=True):
         assert (one.model, one.split, one.points) == (two.model, two.split, two.points)
         assert two.noisy_mae == pytest.approx(one.noisy_mae, rel=1e-9)
 
