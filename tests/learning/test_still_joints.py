@@ -59,6 +59,16 @@ def test_friction_of_a_still_joint_stays_at_its_prior(speed_noise: float) -> Non
     assert any("do not move" in doubt and name in doubt for doubt in fit.result.warnings)
 
 
+def test_samples_of_a_still_joint_are_forgotten_as_they_were_learned() -> None:
+    system = forcegp.ConstrainedSystem(forcegp.load_robot("ur5"))
+    data = log(1e-3)
+    fit = forcegp.StructuredGP(system, "analytical").fit(data[:600])
+    back = fit.update(data[600:700]).forget(data[600:700])
+    rows = data[700:710]
+    ours, theirs = (one.predict(rows.q, rows.qd, rows.tau) for one in (fit, back))
+    torch.testing.assert_close(ours.mean, theirs.mean, rtol=1e-6, atol=1e-6)
+
+
 def test_still_joints_are_those_within_the_least_distance() -> None:
     data = log(1e-3)
     assert still_joints(observations_of(data)) == [j == STILL for j in range(6)]

@@ -34,6 +34,7 @@ from forcegp.forces.priors.joint import AnalyticalMean, ConstantForcePrior, Join
 from forcegp.forces.priors.memory import DISTANCES, LONGEST_STEP, PAST, BristlePrior
 from forcegp.forces.priors.residual import ResidualPrior
 from forcegp.forces.problem import Problem
+from forcegp.gp.features import Standardization
 from forcegp.gp.optimise import LearningOptions
 from forcegp.learning.inertia import Inertia, inertia_of
 from forcegp.learning.inverse_dynamics import LEAST, without_delay
@@ -215,7 +216,7 @@ def training_for(
     observations, dropped, still = observations_of(data), 0, [False] * spec.system.robot.nq
     if spec.noise.learns_torque:
         observations, dropped = without_outliers(observations)
-        still = still_joints(observations)
+        still = still_of(spec, kept) if learned is not None else still_joints(observations)
         observations = [replace(o, data=at_rest(o.data, still)) for o in observations]
     training = training_of(observations, spec.system, spec.priors, noise_std, kept, standardize)
     if any(prior.delay for prior in spec.priors):
@@ -227,26 +228,35 @@ def training_for(
     moving, doubts = in_motion(spec.system, training, fewest)
     names = spec.system.robot.joint_names
     unmoved = [name for name, rests in zip(names, still, strict=True) if rests]
-    if unmoved:
+    if unmoved and learned is None:
         doubts = (*doubts, f"friction is not determined for joints that do not move: {', '.join(unmoved)}")
     return moving, (*excluded(dropped), *doubts)
 
 
 def still_joints(observations: Iterable[Observation]) -> list[bool]:
-    """Return for each joint whether it stays within the least distance over which friction builds up."""
-    q = torch.cat([o.data.q for o in observations])
-    q = q[:: max(1, len(q) // SAMPLED)]
-    low, high = q.quantile(torch.tensor([OUTERMOST, 1.0 - OUTERMOST]).to(q), dim=0)
-    return (high - low < DISTANCES[0]).tolist()
+    """Return for each joint whether it rests within the least distance over which friction builds up."""
+    q, qd = (torch.cat([getattr(o.data, name) for o in observations]) for name in ("q", "qd"))
+    ends = q[:: max(1, len(q) // SAMPLED)].quantile(torch.tensor([OUTERMOST, 1.0 - OUTERMOST]).to(q), dim=0)
+    return ((qd.abs().amax(0) < REST_SPEED) & (ends.diff(dim=0)[0] < DISTANCES[0])).tolist()
+
+
+def still_of(spec: Specification, scales: Mapping[str, Standardization]) -> list[bool]:
+    """Return for each joint whether it rested in all samples behind the scales of friction."""
+    names = [prior.name for prior in spec.priors if isinstance(prior, JointFrictionPrior)]
+    still = {column for name in names if name in scales for column in scales[name].constant}
+    return [f"velocity[{j}]" in still for j in range(spec.system.robot.nq)]
 
 
 def at_rest(data: Dataset, still: Sequence[bool]) -> Dataset:
-    """Return the data with zero velocities of the given joints, where measured ones are noise.
+    """Return the data without velocities below that of rest of the given joints, where they are noise.
 
     As a function of such velocities, the torque that static friction holds would be friction, and its
     independence of noise would be the absence of friction.
     """
-    return data.replace(qd=data.qd.masked_fill(data.qd.new_tensor(still).bool(), 0.0)) if any(still) else data
+    if not any(still):
+        return data
+    noise = data.qd.new_tensor(still).bool() & (data.qd.abs() < REST_SPEED)
+    return data.replace(qd=data.qd.masked_fill(noise, 0.0))
 
 
 def check_learned(spec: Specification, learn: Iterable[str]) -> None:

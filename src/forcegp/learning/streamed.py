@@ -23,7 +23,7 @@ from forcegp.data import Dataset
 from forcegp.data.selection import outliers
 from forcegp.data.stream import Keep, StreamedDataset, spaced_sample
 from forcegp.errors import ModelError
-from forcegp.forces.measurements import Observation, Training, observations_of, period_of, training_of
+from forcegp.forces.measurements import Observation, Training, period_of, training_of
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import ForcePrior
 from forcegp.forces.priors.memory import LONGEST_STEP, PAST, Past, bristles
@@ -33,7 +33,7 @@ from forcegp.gp.features import Standardization
 from forcegp.gp.optimise import FitProgress
 from forcegp.learning.correlation import MOST_RESIDUALS, RUNS
 from forcegp.learning.inverse_dynamics import without_delay
-from forcegp.learning.specification import FEWEST_MOVING, REST_SPEED, Specification, at_rest, still_joints
+from forcegp.learning.specification import FEWEST_MOVING, REST_SPEED, Specification, at_rest, still_of
 from forcegp.resources import one_thread
 
 if TYPE_CHECKING:
@@ -224,8 +224,7 @@ class Pass:
         basis, kept = basis_of(problem, hyperparameters), kept_scales(problem.priors, problem.training)
         rows = [torch.arange(0)] * len(problem.training.measurements)
         bare = dataclasses.replace(problem, training=problem.training.of_rows(rows))
-        still = still_joints(observations_of(self.sample.data)) if self.sample.moving else ()
-        part = Part(self.spec, bare, dict(hyperparameters), basis, kept, self.sample.moving, tuple(still))
+        part = Part(self.spec, bare, dict(hyperparameters), basis, kept, self.sample.moving)
         if self.client is None:
             totals = _in_threads(part.piece, part.pieces(self.log), torch.get_num_threads())
         else:
@@ -249,7 +248,6 @@ class Part:
         basis: the basis functions of all workers.
         scales: input scales, keyed by prior.
         moving: whether samples at rest and outliers are ignored.
-        still: for each joint, whether it never moves.
     """
 
     spec: Specification
@@ -258,7 +256,6 @@ class Part:
     basis: LatentBasis
     scales: dict[str, Standardization]
     moving: bool
-    still: tuple[bool, ...]
 
     def pieces(self, log: StreamedDataset, r: int = 0, k: int = 1) -> Iterator[Dataset]:
         """Yield piece r of every k, with the states of bristles if a prior depends on the past."""
@@ -267,7 +264,10 @@ class Part:
         return self._usable(log.pieces((r, k)))
 
     def _usable(self, pieces: Iterator[Dataset]) -> Iterator[Dataset]:
-        return (at_rest(piece, self.still) for piece in possible(pieces)) if self.moving else pieces
+        if not self.moving:
+            return pieces
+        still = still_of(self.spec, self.scales)
+        return (at_rest(piece, still) for piece in possible(pieces))
 
     @torch.no_grad()
     def piece(self, piece: Dataset) -> Totals:
