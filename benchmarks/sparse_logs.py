@@ -56,7 +56,7 @@ def accuracy(folder: Path, name: str, seed: int) -> dict:
     began, used = time.perf_counter(), time.process_time()
     fit = model.fit(train)
     seconds, processor = time.perf_counter() - began, time.process_time() - used
-    found = evaluate(model, test, compare=False)
+    found = evaluate(fit, test, compare=False)
     return {
         "model": name,
         "seed": seed,
