@@ -265,6 +265,9 @@ def plausible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit)
     if hypothesis.name == "encoder-offset":
         least = max(SMALL_ANGLE, SIGNIFICANT * fit.spread[0])
         return bool(least < abs(fit.theta[0]) <= LARGEST_ANGLE)
+    if hypothesis.name == "torque-without-model":
+        # Garbage in accelerations explains nothing either: what is left must be friction, joint by joint.
+        return bool(np.median(fit.shares, axis=0).max() < EXPLAINED)
     if hypothesis.name == "gains":
         joints = list(hypothesis.joints)
         # A gain that only makes the torque larger than its error explains nothing.
