@@ -278,8 +278,9 @@ def _without_gravity(system: ConstrainedSystem, log: Log) -> tuple[ConstrainedSy
 
 
 def _without_model(system: ConstrainedSystem, log: Log) -> tuple[ConstrainedSystem, Log, Rows]:
-    states = (torch.from_numpy(x) for x in (log.q, log.qd, log.qdd))
-    return system, log.replace(tau=log.tau - dynamics.inverse_dynamics(system.robot, *states).numpy()), None
+    """What free motion then needs is the friction of the joints."""
+    friction = -dynamics.damping_force(system.robot, torch.from_numpy(log.qd)).numpy()
+    return system, log.replace(tau=friction), None
 
 
 def _still(system: ConstrainedSystem, log: Log) -> tuple[ConstrainedSystem, Log, Rows]:
@@ -456,7 +457,7 @@ FAULTS = (
         amount=0.06,
     ),
     Fault("torque less gravity", "torque-without-gravity", _without_gravity),
-    Fault("torque less the model", "torque-without-model", _without_model),
+    Fault("torque less the model", "torque-without-model", _without_model, contact=False),
     Fault("torques exchanged", "torque-order", _change(tau=lambda g: g.tau[:, _swap(g, 1, 3)]), joint=1),
     Fault("no torque", "torque-zero", _change(tau=lambda g: 0.0 * g.tau)),
     Fault(
