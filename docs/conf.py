@@ -59,7 +59,7 @@ def _code_key() -> str:
 
 nb_execution_mode = os.environ.get("FORCEGP_DOCS_EXECUTE", "cache")
 nb_execution_cache_path = str(HERE.parent / "out" / "executed" / _code_key())
-get_cache(nb_execution_cache_path).list_cache_records()  # two processes that read pages find its tables
+get_cache(nb_execution_cache_path).list_cache_records()  # creates its tables before two processes do
 nb_execution_in_temp = True
 nb_execution_timeout = 600  # of one cell; a busy machine is slow
 nb_execution_raise_on_error = True

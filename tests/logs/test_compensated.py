@@ -102,7 +102,7 @@ def test_a_proposed_mapping_says_what_is_subtracted(
     draft = guess.guess_mapping(path, forcegp.ConstrainedSystem(robot))
     torque = parse_mapping(draft.toml().encode(), "proposed mapping").sections.torque
     assert torque.compensated == how and torque.sign == sign
-    assert how is None or any("taken for" in doubt for doubt in draft.doubts)
+    assert how is None or any("seems to subtract" in doubt for doubt in draft.doubts)
     data = import_log(path, robot, parse_mapping(draft.toml().encode(), "proposed mapping")).data
     kinds = {finding.kind for finding in forcegp.check(forcegp.ConstrainedSystem(robot), data).findings}
     assert not {kind for kind in kinds if kind.startswith(("torque-without", "torque-sign"))}

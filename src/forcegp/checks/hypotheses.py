@@ -266,7 +266,7 @@ def plausible(system: ConstrainedSystem, hypothesis: Hypothesis, fit: TorqueFit)
         least = max(SMALL_ANGLE, SIGNIFICANT * fit.spread[0])
         return bool(least < abs(fit.theta[0]) <= LARGEST_ANGLE)
     if hypothesis.name == "torque-without-model":
-        # Garbage in accelerations explains nothing either: what is left must be friction, joint by joint.
+        # Wrong accelerations would fit better without a model too, so friction must explain each joint.
         return bool(np.median(fit.shares, axis=0).max() < EXPLAINED)
     if hypothesis.name == "gains":
         joints = list(hypothesis.joints)

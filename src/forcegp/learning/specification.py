@@ -248,10 +248,10 @@ def still_of(spec: Specification, scales: Mapping[str, Standardization]) -> list
 
 
 def at_rest(data: Dataset, still: Sequence[bool]) -> Dataset:
-    """Return the data without velocities below that of rest of the given joints, where they are noise.
+    """Return the data with zero velocities of the given joints below the speed of rest, as these are noise.
 
-    As a function of such velocities, the torque that static friction holds would be friction, and its
-    independence of noise would be the absence of friction.
+    Otherwise a fit would explain the static torque of a joint by the noise of its velocity, or conclude from
+    torques that do not depend on this noise that the joint has no friction.
     """
     if not any(still):
         return data

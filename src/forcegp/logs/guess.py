@@ -19,6 +19,7 @@ from forcegp.constraints import ConstrainedSystem, SurfaceContact
 from forcegp.data.derivative import cross_validated_window
 from forcegp.data.fields import MOST_RADIANS
 from forcegp.errors import DataError
+from forcegp.forces.term import SHARPEST
 from forcegp.guards import foreign
 from forcegp.logs import units
 from forcegp.logs.clock import even_clock
@@ -47,12 +48,10 @@ TRIED_ROWS = 3000
 """Maximum number of rows on which the inverse dynamics are evaluated."""
 BEYOND_LIMIT = 3.0
 """Multiple of a joint limit that angles in radians do not reach."""
-SLOW = 0.02
-"""Speed at which dry friction saturates [rad/s, m/s]."""
 DETERMINED = 10.0
 """Standard errors, of independent samples, from which a torque follows the inverse dynamics."""
 LACKING = 0.3
-"""Share of gravity below which torques are taken for compensated. Six real logs have 0.55 to 2.1, as their
+"""Share of gravity below which torques are taken for compensated. Seven real logs have 0.55 to 2.1, as their
 masses differ from the robot file's; a simulated arm has 1.05, and −0.003 if its driver subtracts gravity."""
 UNRELATED = 0.1
 """Mean squared correlation up to which torques do not follow the inverse dynamics."""
@@ -257,7 +256,9 @@ def _torque(draft: Draft, trial: Signals, system: ConstrainedSystem) -> None:
         lighter, follows = torque_slopes(trial, system, "gravity")
         if (np.abs(follows) > 0.5).sum() >= min(clear.sum(), 0.5 * measured):
             slopes, clear, family.compensated = lighter, np.abs(follows) > 0.5, "gravity"
-            draft.say("torque", f"it contains {share:.2f} of gravity: taken for compensated", doubt=True)
+            draft.say(
+                "torque", f"{share:.0%} of gravity is in it: the driver seems to subtract it", doubt=True
+            )
     if clear.sum() < 0.5 * measured:
         return _remainder(draft, trial, correlation)
     family.sign = _signs(slopes, clear, trial.joint_names)
@@ -278,7 +279,7 @@ def _remainder(draft: Draft, trial: Signals, correlation: Array) -> None:
     family, qd, tau = draft.families["torque"], trial.vectors["qd"], trial.vectors["tau"]
     work, explained = np.zeros(qd.shape[1]), np.zeros(qd.shape[1])
     for i in range(qd.shape[1]):
-        columns = np.column_stack([np.ones(len(qd)), qd[:, i], np.tanh(qd[:, i] / SLOW)])
+        columns = np.column_stack([np.ones(len(qd)), qd[:, i], np.tanh(qd[:, i] / SHARPEST)])
         weights = np.linalg.lstsq(columns, tau[:, i], rcond=None)[0]
         friction = columns[:, 1:] @ weights[1:]
         work[i] = float((friction * qd[:, i]).sum())
@@ -289,7 +290,7 @@ def _remainder(draft: Draft, trial: Signals, correlation: Array) -> None:
         return draft.say("torque", "few torques follow the inverse dynamics: sign unknown", doubt=True)
     family.sign = _signs(work, explained > 0.5, trial.joint_names)
     family.compensated = "model"
-    draft.say("torque", "friction explains it: taken for what the driver's model leaves", doubt=True)
+    draft.say("torque", "friction explains it: the driver seems to subtract a model", doubt=True)
 
 
 def torque_slopes(
