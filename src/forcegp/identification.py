@@ -16,10 +16,10 @@ from jaxtyping import Float
 from scipy.linalg import qr, solve_triangular
 from torch import Tensor
 
-from forcegp.batchlast import apply, batch_first, batch_last, dot, product
-from forcegp.dynamics import LinkInertia, accelerations, link_force
+from forcegp.batchlast import apply, batch_first, batch_last, cross, dot
+from forcegp.dynamics import accelerations
 from forcegp.errors import DataError
-from forcegp.kinematics import LinkPoses, common_states, link_motion, link_poses
+from forcegp.kinematics import common_states, link_motion, link_poses
 from forcegp.robot.inertia import inertial_parameters
 from forcegp.robot.model import RobotModel
 from forcegp.types import JointVector
@@ -55,27 +55,25 @@ def regressor(robot: RobotModel, q: JointVector, qd: JointVector, qdd: JointVect
     q, qd, qdd = common_states(robot, q=q, qd=qd, qdd=qdd)
     poses = link_poses(robot, q)
     motion = link_motion(robot, poses, qd)
-    alpha, acceleration = accelerations(robot, poses, motion, batch_last(qdd, 1))
-    columns = []
-    for unit in torch.eye(len(PARAMETER_NAMES), dtype=robot.dtype, device=robot.device):
-        torque, force = link_force(_links_of(poses, unit), motion, alpha, acceleration)
-        # s_jᵀ [n_i; f_i] of joint j and link i
-        turning = dot(poses.angular.unsqueeze(2), torque.unsqueeze(1))
-        columns.append(turning + dot(poses.linear.unsqueeze(2), force.unsqueeze(1)))
-    Y = torch.stack(columns, dim=2) * robot.ancestors.mT[..., None, None]
+    alpha, spatial = accelerations(robot, poses, motion, batch_last(qdd, 1))
+    # p̈ − g of the origin p of each link
+    speed = motion.velocity + cross(motion.omega, poses.p)
+    lifted = spatial + cross(alpha, poses.p) + cross(motion.omega, speed)
+    # link i and its ancestor j, with the motion [s; v] of link i for q̇_j = 1, in the axes of link i
+    i, j = robot.ancestors.nonzero().unbind(-1)
+    s, p = poses.angular[:, j], poses.p[:, i]
+    still = poses.R[:, :, i].transpose(0, 1)
+    s, v = apply(still, s), apply(still, poses.linear[:, j] + cross(s, p))
+    w, alpha, a = (apply(still, x[:, i]) for x in (motion.omega, alpha, lifted))
+    # f = m a + α × h + ω × (ω × h) and n = h × a + I α + ω × (I ω), with h = m c: vᵀf + sᵀn for unit π_k
+    u = cross(s, w)
+    moment = cross(v, alpha) + cross(cross(v, w), w) + cross(a, s)
+    E = [[s[k] * alpha[l] + u[k] * w[l] for l in range(3)] for k in range(3)]
+    pairs = ((k, l) for k in range(3) for l in range(k, 3))
+    inertia = (E[k][k] if k == l else E[k][l] + E[l][k] for k, l in pairs)
+    parts = torch.stack([dot(v, a), *moment, *inertia], dim=1)
+    Y = parts.new_zeros(robot.nq, robot.nq, *parts.shape[1:]).index_put((j, i), parts)
     return batch_first(Y.flatten(1, 2), poses.batch)
-
-
-def _links_of(poses: LinkPoses, parameters: Tensor) -> LinkInertia:
-    """Return the inertias of all links about the base origin; all links have the same π `(10,)`."""
-    rows = torch.tensor([[4, 5, 6], [5, 7, 8], [6, 8, 9]], device=parameters.device)
-    R, p, mass = poses.R, poses.p, parameters[0].expand(poses.p.shape[1], 1)
-    # I_o = R I Rᵀ + (2 p·h + m p·p) 1 − p hᵀ − h pᵀ − m p pᵀ with h = R m c
-    h, moved = apply(R, parameters[1:4, None, None]), mass * p
-    eye = torch.eye(3, dtype=p.dtype, device=p.device)[..., None, None]
-    inertia = product(product(R, parameters[rows][..., None, None]), R.transpose(0, 1))
-    inertia = inertia + eye * dot(p, 2.0 * h + moved) - p[:, None] * (h + moved) - h[:, None] * p
-    return LinkInertia(mass, h + moved, inertia)
 
 
 def parameter_vector(robot: RobotModel) -> Float[Tensor, " p"]:

@@ -18,7 +18,7 @@ import torch
 from torch import Tensor
 
 from forcegp.gp.factor import Spectrum
-from forcegp.gp.features import Block, FeatureMap, Features, points
+from forcegp.gp.features import Block, FeatureMap, Features, points, rows_mean
 from forcegp.gp.kernels import Constant, Kernel, Linear, Parameters, Process, Product, Sum, sides, sub
 
 EXACT: tuple[type[Kernel], ...] = (Linear, Constant)
@@ -187,6 +187,16 @@ class ProcessBasis:
         on_kernel = self.roots @ filled[:, :width] if self.spectra else filled[:, :0]
         return on_kernel, filled[:, width:]
 
+    def mean(self, features: Features, folded: tuple[Tensor, Tensor]) -> Tensor:
+        """Return V(x)ᵀ w `(n, components)` for weights that `fold` has converted."""
+        on_kernel, on_features = folded
+        mean = on_kernel.new_zeros(self.components, points(features), 1)
+        if self.to_inducing is not None:
+            mean = self.to_inducing(features) @ on_kernel
+        if self.finite is not None:
+            mean = mean + self.finite.basis(features) @ on_features
+        return mean[..., 0].mT
+
     def missed(self, variance: Tensor, explained: Tensor) -> Tensor:
         """Return the residual variance k(x, x) − |V(x)|² ≥ 0 of the approximated part, `(components, n)`.
 
@@ -280,6 +290,11 @@ class LatentBasis:
         """Return the positions of the basis functions of process p."""
         slices = self.columns[self.components[p]]
         return slice(slices[0].start, slices[-1].stop)
+
+    def mean(self, block: Block, weights: Tensor) -> Tensor:
+        """Return Φ w `(n, r)` for weights w `(size,)`, without Φ."""
+        each = [part.fold(weights[self.of_process(p), None]) for p, part in enumerate(self.parts)]
+        return rows_mean(lambda p, features: self.parts[p].mean(features, each[p]), block)
 
     def rows(self, block: Block) -> Tensor:
         """Express the rows of a block in terms of the basis functions, Φ `(n r, size)`."""

@@ -249,14 +249,7 @@ class SparsePosterior:
         """
         # μ(x) = V(x)ᵀ A⁻¹v = k(x, Z) (R m) + φ(x)ᵀ m (eq. 23)
         folded = self.folded_by(self.joint_weights) if joint else self.folded
-        part, (on_kernel, on_features) = self.basis.parts[p], folded[p]
-        x = next(iter(features.values()))
-        mean = x.new_zeros(part.components, len(x), 1)
-        if part.to_inducing is not None:
-            mean = part.to_inducing(features) @ on_kernel
-        if part.finite is not None:
-            mean = mean + part.finite.basis(features) @ on_features
-        return mean[..., 0].mT
+        return self.basis.parts[p].mean(features, folded[p])
 
     def mean(self, block: Block) -> Tensor:
         """Return the posterior mean Σ W f of the rows of each sample of a block, `(n, d)`."""

@@ -35,7 +35,7 @@ from forcegp.forces.problem import (
     total_over,
     typical,
 )
-from forcegp.forces.quantities import affine_map
+from forcegp.forces.quantities import States, affine_map
 from forcegp.forces.unknowns import tip_factor
 
 STRETCHES, RECORDINGS = 8, 5
@@ -96,8 +96,23 @@ def held_out_blocks(
 
 def held_out_squares(problem: Problem, hyperparameters: Mapping[str, Tensor]) -> Tensor:
     """Return the mean squared torque error of each joint on each block of the log `(blocks, nq)`."""
-    parts = held_out_blocks(problem, hyperparameters)
-    return torch.stack([residual.square().mean(0) for residual, _, _ in parts])
+    squares = []
+    for i in problem.training.motions:
+        for own, posterior in posteriors_of_others(problem, hyperparameters, i):
+            m = problem.training.measurements[i][own]
+            at = m.at(problem.system)
+            z = affine_map(problem.system, at, m.quantity)
+            residual = _torque_error(problem, i, own, at, posterior.read_mean(problem.system, at, z))
+            squares.append(residual.square().mean(0))
+    return torch.stack(squares)
+
+
+def _torque_error(problem: Problem, i: int, own: Tensor, at: States, mean: Tensor) -> Tensor:
+    """Return the torque errors `(n, nq)` of rows of measurement i, M times those of accelerations."""
+    m, weights = problem.training.measurements[i], problem.training.weights
+    error = m.values[own] - mean
+    error = error if m.quantity == "joint_force" else (at.eom.M @ error[..., None])[..., 0]
+    return error if weights is None else weights[i][own].sqrt()[:, None] * error
 
 
 def growth(problem: Problem, hyperparameters: Mapping[str, Tensor], load: Tensor) -> Tensor:
@@ -207,9 +222,7 @@ def _held_out(
         M = torch.eye(M.shape[-1], dtype=M.dtype, device=M.device).expand_as(M)
     P = M @ z.B_Q
     mean, covariance = posterior.read(system, at, z)
-    residual = (M @ (m.values - mean)[..., None])[..., 0]
-    if training.weights is not None:
-        residual = training.weights[i][own].sqrt()[:, None] * residual
+    residual = _torque_error(problem, i, own, at, mean)
     spread = (M @ covariance @ M.mT).diagonal(dim1=-2, dim2=-1)
     stick = (P**2 @ hidden_variance(hyperparameters, at, problem.external_std)[..., None])[..., 0]
     tips = tip_factor(hyperparameters, system, at)

@@ -144,8 +144,9 @@ def regression(
 
     found = of_laws(named, rest)
     if prunes and noisy and (ripple := ripple_in(found)) is not None:
+        others = [prior.name for prior in named.priors]
         named = named.with_priors([ripple])
-        found = of_laws(named, {**initial(named, False), **rest})
+        found = of_laws(named, {**initial(named.without_priors(others), False), **rest})
     if later:
         found = with_remainder(part, found, own, learns, noisy, prunes)
     values = {**found.values, **memory_noise(found)}

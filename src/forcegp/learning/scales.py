@@ -258,10 +258,8 @@ def residuals(problem: Problem, values: Mapping[str, Tensor], weights: Tensor, i
     at, process, basis = m.at(system), problem.process_at(values), basis_of(problem, values)
     z = process.coupled(system, at, affine_map(system, at, m.quantity))
     rows = process.rows(system, at, z)
-    parts = zip(basis.parts, rows.operators, rows.features, strict=True)
-    Phi = torch.cat([part.rows(W, part.values(x)[0]) for part, W, x in parts], dim=-1)
     std, weight = std.expand_as(m.values), problem.training.weights
-    r = (m.values - rows.target - (Phi @ weights).view_as(rows.target)) / std
+    r = (m.values - rows.target - basis.mean(rows, weights)) / std
     tips = learned_tips(system, values)
     operators = (z.B_z @ tip_operator(system, at, name) for name in tips)
     B = torch.cat([z.B_Q, *operators], dim=-1) / std[..., None]
