@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import re
 import tempfile
 from dataclasses import dataclass
 from importlib.util import find_spec
@@ -145,24 +146,31 @@ def kinova(logs: Path) -> list[Case]:
 
 STAUBLI = """
 time = { column = "t" }
-joints = { joint_1 = "0", joint_2 = "1", joint_3 = "2", joint_4 = "3" }
+joints = { joint_1 = "0", joint_2 = "1", joint_3 = "2", joint_4 = "3"{wrist} }
 [position]
 column = "q[{joint}]"
 unit = "rad"
 side = "motor"
-gear_ratio = { joint_1 = 32.0, joint_2 = 32.0, joint_3 = 45.0, joint_4 = -48.0 }
-offset = { joint_1 = 0.0, joint_2 = 50.26548245743669, joint_3 = -70.68583470577035, joint_4 = 0.0 }
+gear_ratio = { joint_1 = 32.0, joint_2 = 32.0, joint_3 = 45.0, joint_4 = -48.0{ratios} }
+offset = { joint_1 = 0.0, joint_2 = 50.26548245743669, joint_3 = -70.68583470577035, joint_4 = 0.0{zeros} }
 [torque]
 column = "tau[{joint}]"
 unit = "Nm"
 side = "motor"
-gear_ratio = { joint_1 = 32.0, joint_2 = 32.0, joint_3 = 45.0, joint_4 = -48.0 }
+gear_ratio = { joint_1 = 32.0, joint_2 = 32.0, joint_3 = 45.0, joint_4 = -48.0{ratios} }
 [derivatives]
 window = 151
 """
 """Motor side at 5 kHz; offsets are those of q₂ − π/2 and q₃ + π/2. The filter spans 30 ms."""
+WRIST = {
+    "wrist": ', joint_5 = "4", joint_6 = "5"',
+    "ratios": ", joint_5 = 45.0, joint_6 = 32.0",
+    "zeros": ", joint_5 = 0.0, joint_6 = 0.0",
+}
 STAUBLI_STEP = 2e-4
 """Sampling time [s]; the files hold no clock."""
+WRIST_SECONDS = 6.0
+"""The part of the log with all six joints that trains [s]; the rest tests."""
 
 
 def staubli(logs: Path) -> list[Case]:
@@ -171,13 +179,35 @@ def staubli(logs: Path) -> list[Case]:
     robot = forcegp.load_robot(
         existing(folder / "tx40_mdh_modified.urdf"), locked_joints={"joint_5": 0.0, "joint_6": 0.0}
     )
+    return halved("staubli", robot, _staubli_log(folder, robot, dict.fromkeys(WRIST, "")))
+
+
+def staubli_wrist(logs: Path) -> list[Case]:
+    """All six joints: the last drive moves by q₆ + q₅. Its link, which has no inertia, gets 1e-4 kg m²."""
+    folder = existing(logs / "staubli_tx40")
+    head, link = existing(folder / "tx40_mdh_modified.urdf").read_text().split('<link name="link_6">')
+    for axis in ("ixx", "iyy", "izz"):
+        link = re.sub(rf'{axis}="[0.]+"', f'{axis}="1e-4"', link, count=1)
+    with tempfile.TemporaryDirectory() as made:
+        path = Path(made) / "tx40.urdf"
+        path.write_text(f'{head}<link name="link_6">{link}')
+        robot = forcegp.load_robot(path, coupling={"joint_6": {"joint_5": 1.0}})
+    data = _staubli_log(folder, robot, WRIST)
+    early, system = data.t - data.t[0] < WRIST_SECONDS, forcegp.ConstrainedSystem(robot)
+    return [Case("staubli, coupled wrist", system, data[early], {"last part": data[~early]})]
+
+
+def _staubli_log(folder: Path, robot: forcegp.RobotModel, parts: dict[str, str]) -> forcegp.Dataset:
+    """The log of the motors, with parts of the mapping."""
+    toml = STAUBLI
+    for name, part in parts.items():
+        toml = toml.replace(f"{{{name}}}", part)
     names = "pos_read_data", "curr_data"
     q, tau = (np.loadtxt(folder / f"{name}.csv", delimiter=",", skiprows=1) for name in names)
     with tempfile.TemporaryDirectory() as made:
         path = Path(made) / "log.npz"
         np.savez(path, t=STAUBLI_STEP * np.arange(len(q)), q=q, tau=tau)
-        data = forcegp.read_log(path, robot, parse_mapping(STAUBLI.encode(), "staubli"))
-    return halved("staubli", robot, data)
+        return forcegp.read_log(path, robot, parse_mapping(toml.encode(), "staubli"))
 
 
 CASES = {
@@ -187,6 +217,7 @@ CASES = {
     "ur10": ur10,
     "kinova": kinova,
     "staubli": staubli,
+    "staubli_wrist": staubli_wrist,
 }
 
 

@@ -53,7 +53,7 @@ def mass_matrix_of(robot: RobotModel, poses: LinkPoses, links: LinkInertia) -> T
     angular, linear = momentum(whole, S, L)
     M = dot(torch.cat([S, L]).unsqueeze(2), torch.cat([angular, linear]).unsqueeze(1))
     strictly = torch.tril(E, -1)
-    upper = torch.addcmul(torch.diag(robot.armature)[..., None], M, E.mT[..., None])
+    upper = torch.addcmul(robot.drive_inertia[..., None], M, E.mT[..., None])
     return torch.addcmul(upper, M.transpose(0, 1), strictly[..., None])
 
 
@@ -162,7 +162,8 @@ def damping_force(robot: RobotModel, qd: JointVector, slip: JointVector | None =
     """Return the viscous, Coulomb and Stribeck friction of the joints, `(*batch, nq)` [N m, N].
 
     Q_D = −d q̇ − (f_c + f_s e^{−(q̇/v_s)²}) tanh(q̇/v_0), where tanh smooths friction near zero speed. If the
-    sliding direction `slip` `(*batch, nq)` is given, it replaces tanh(q̇/v_0). Source: Armstrong-Hélouvry et
+    sliding direction `slip` `(*batch, nq)` is given, it replaces tanh(q̇/v_0). With coupled drives, q̇ are the
+    speeds of the drives. Source: Armstrong-Hélouvry et
     al., *A survey of models, analysis tools and compensation methods for the control of machines with
     friction* (1994).
 
@@ -170,8 +171,10 @@ def damping_force(robot: RobotModel, qd: JointVector, slip: JointVector | None =
         ShapeError: qd has the wrong shape for the robot.
     """
     robot.check_state(qd=qd)
-    dry = robot.friction + robot.stribeck * torch.exp(-((qd / robot.stribeck_velocity) ** 2))
-    return -robot.damping * qd - dry * (torch.tanh(qd / robot.friction_velocity) if slip is None else slip)
+    v = robot.drive_motion(qd)
+    dry = robot.friction + robot.stribeck * torch.exp(-((v / robot.stribeck_velocity) ** 2))
+    along = torch.tanh(v / robot.friction_velocity) if slip is None else slip
+    return robot.joint_torque(-robot.damping * v - dry * along)
 
 
 def inverse_dynamics(robot: RobotModel, q: JointVector, qd: JointVector, qdd: JointVector) -> JointVector:
@@ -192,7 +195,7 @@ def inverse_dynamics(robot: RobotModel, q: JointVector, qd: JointVector, qdd: Jo
     poses = link_poses(robot, q)
     motion, a = link_motion(robot, poses, qd), batch_last(qdd, 1)
     wrench = link_force(link_inertia(robot, poses), motion, *accelerations(robot, poses, motion, a))
-    return batch_first(_joint_force(robot, poses, *wrench) + robot.armature[:, None] * a, poses.batch)
+    return batch_first(_joint_force(robot, poses, *wrench) + robot.drive_inertia @ a, poses.batch)
 
 
 def forward_dynamics(robot: RobotModel, q: JointVector, qd: JointVector, force: JointVector) -> JointVector:

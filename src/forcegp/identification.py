@@ -210,9 +210,10 @@ def identify(
     q, qd, qdd, tau = (x.detach().to("cpu", torch.float64) for x in (q, qd, qdd, tau))
     W = regressor(robot, q, qd, qdd)[..., list(base.columns)]
     if friction:
-        columns = torch.diag_embed(qd), torch.diag_embed(torch.tanh(qd / robot.friction_velocity))
-        W = torch.cat([W, *columns], dim=-1)
-    W, y = W.detach().numpy(), (tau - robot.armature * qdd).detach().numpy()
+        v = robot.drive_motion(qd)
+        columns = (torch.diag_embed(x) for x in (v, torch.tanh(v / robot.friction_velocity)))
+        W = torch.cat([W, *(robot.joint_torque(x).mT for x in columns)], dim=-1)
+    W, y = W.detach().numpy(), (tau - qdd @ robot.drive_inertia).detach().numpy()
     n, nq, unknowns = W.shape
     if n * nq <= unknowns or n < 2:
         text = "too few samples to identify the robot"

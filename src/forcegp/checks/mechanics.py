@@ -50,6 +50,8 @@ def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
     """Check the torques for wrong signs, order, gains and delays, and the robot file for wrong parameters."""
     if len(log.rows(LEAST_ROWS)) < LEAST_ROWS:
         raise NotJudgedError(f"fewer than {LEAST_ROWS} usable rows")
+    if system.robot.coupling is not None:
+        raise NotJudgedError("torques of coupled drives are not compared with friction of joints")
     passive = _without_torque(log)
     if any(finding.severity == "error" for finding in passive):
         return passive, log

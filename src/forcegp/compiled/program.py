@@ -41,7 +41,7 @@ class Links:
     def __init__(self, robot: RobotModel) -> None:
         self.graph = graph = Graph()
         self.parents = robot.parents
-        self.gravity, self.armature = graph.constants(numbers(robot.gravity)), numbers(robot.armature)
+        self.gravity, self.drives = graph.constants(numbers(robot.gravity)), numbers(robot.drive_inertia)
         self.mass = numbers(robot.mass)
         self.R, self.p, self.z, self.l, self.c, self.I = [], [], [], [], [], []
         base = graph.constants(numbers(robot.base_rotation)), graph.constants(np.zeros(3))
@@ -141,7 +141,8 @@ def _mass_matrix(links: Links) -> np.ndarray:
         angular, linear = _momentum(*composite, links.z[j], links.l[j])
         for i in links.ancestors(j):
             M[i, j] = M[j, i] = links.z[i] @ angular + links.l[i] @ linear
-        M[j, j] = M[j, j] + links.armature[j]
+    for i, j in np.argwhere(links.drives):
+        M[i, j] = M[i, j] + links.drives[i, j]
     return M
 
 
@@ -188,7 +189,8 @@ def _joint_force(links: Links, qd: list | None, qdd: list | None, gravity: bool)
     torques, forces = _link_forces(links, _motion(links, qd, qdd, gravity))
     result = [z @ t + l @ f for z, l, t, f in zip(links.z, links.l, torques, forces, strict=True)]
     if qdd is not None:
-        result = [r + a * m for r, a, m in zip(result, qdd, links.armature, strict=True)]
+        for i, j in np.argwhere(links.drives):
+            result[i] = result[i] + qdd[j] * links.drives[i, j]
     return np.array(result, dtype=object)
 
 

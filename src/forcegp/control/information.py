@@ -94,6 +94,7 @@ class Unknowns:
         Raises:
             ParameterError: the region is empty.
         """
+        robot.check_own_drives("the plan of a motion")
         if not len(region[0]):
             raise ParameterError("the region has no states", expected="one state or more", got="none")
         torque = rigid_torque(robot, *region).square().mean(0).sqrt()
@@ -187,7 +188,7 @@ class Unknowns:
 def rigid_torque(robot: RobotModel, q: Tensor, qd: Tensor, qdd: Tensor, Y: Tensor | None = None) -> Tensor:
     """Return the torque that a motion requires, Y π + armature q̈ − Q_D, `(n, nq)` [N m, N]."""
     Y = regressor(robot, q, qd, qdd) if Y is None else Y
-    return Y @ parameter_vector(robot) + robot.armature * qdd - damping_force(robot, qd)
+    return Y @ parameter_vector(robot) + qdd @ robot.drive_inertia - damping_force(robot, qd)
 
 
 def a_optimal(G: Tensor, unknowns: Unknowns) -> Tensor:

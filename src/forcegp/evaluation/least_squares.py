@@ -80,9 +80,10 @@ def identify_rigid(system: ConstrainedSystem, train: Dataset) -> LeastSquares:
 
 
 def _friction_columns(robot: RobotModel, qd: Tensor) -> Tensor:
-    """Return (diag q̇, diag tanh(q̇/v₀), 1), `(n, nq, 3 nq)`."""
-    dry = torch.tanh(qd / robot.friction_velocity)
-    return torch.cat([torch.diag_embed(x) for x in (qd, dry, torch.ones_like(qd))], dim=-1)
+    """Return Cᵀ (diag v, diag tanh(v/v₀), 1) `(n, nq, 3 nq)` for the speeds v = C q̇ of the drives."""
+    v = robot.drive_motion(qd)
+    columns = (v, torch.tanh(v / robot.friction_velocity), torch.ones_like(v))
+    return torch.cat([robot.joint_torque(torch.diag_embed(x)).mT for x in columns], dim=-1)
 
 
 def _prior_std(robot: RobotModel, train: Dataset) -> Tensor:

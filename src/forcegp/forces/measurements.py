@@ -532,7 +532,9 @@ def training_of(
     pairs = [measurement_of(o, system, noise_std) for o in observations]
     measurements = (m for m, _ in pairs)
     if any(prior.remembers for prior in priors):
-        measurements = (with_history(m, o.data) for (m, _), o in zip(pairs, observations, strict=True))
+        measurements = (
+            with_history(m, o.data, system) for (m, _), o in zip(pairs, observations, strict=True)
+        )
     training = Training(
         measurements=tuple(measurements),
         noise_std=tuple(std for _, std in pairs),
@@ -544,7 +546,7 @@ def training_of(
     return scaled(training, system, priors, kept, standardize)
 
 
-def with_history(m: Measurement, data: Dataset) -> Measurement:
+def with_history(m: Measurement, data: Dataset, system: ConstrainedSystem) -> Measurement:
     """Return the measurement with the states of bristles along its log, if they can be followed."""
     known = [data.extras[f"{PAST}{k}"] for k in range(2 * len(DISTANCES)) if f"{PAST}{k}" in data.extras]
     if known:
@@ -552,7 +554,7 @@ def with_history(m: Measurement, data: Dataset) -> Measurement:
     period = period_of(data)
     if not 0.0 < period <= LONGEST_STEP:
         return m
-    return dataclasses.replace(m, history=bristles(m.t, m.qd, m.segment))
+    return dataclasses.replace(m, history=bristles(m.t, system.robot.drive_motion(m.qd), m.segment))
 
 
 def scaled(

@@ -105,7 +105,7 @@ class ForceProcess:
             if B is None or (prior.is_error and not errors):
                 operators.append(z.o.new_zeros(*z.o.shape, prior.outputs(system.robot)))
             else:
-                operators.append(B if prior.per_joint else B @ prior.operator(system, at))
+                operators.append(prior.applied(B, system, at))
         return Block(tuple(features), tuple(operators), target)
 
 

@@ -66,7 +66,7 @@ def constants(like: Array, values: object) -> Array:
 
 @dataclass(frozen=True)
 class JointState:
-    """The state of each joint, from which a term computes its columns.
+    """The state of each joint, from which a term computes its columns; with coupled drives, of each drive.
 
     Attributes:
         q, qd: positions and velocities [rad, rad/s; m, m/s].
@@ -87,9 +87,14 @@ class JointState:
 
 
 class PerJointPrior(ForcePrior):
-    """A prior on one force per joint with E = I; subclasses may have a different operator."""
+    """A prior on one force per joint with E = I; subclasses may have a different operator.
+
+    Forces of drives have E = Cᵀ, which is the identity unless drives are coupled.
+    """
 
     per_joint = True
+    of_drives = False
+    """Whether the forces act between the drives and their gears."""
 
     def __init_subclass__(cls, **options: Any) -> None:
         super().__init_subclass__(**options)
@@ -99,7 +104,15 @@ class PerJointPrior(ForcePrior):
         return robot.nq
 
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
-        return torch.eye(at.q.shape[-1], dtype=at.q.dtype, device=at.q.device).expand(len(at.q), -1, -1)
+        E = torch.eye(at.q.shape[-1], dtype=at.q.dtype, device=at.q.device)
+        E = system.robot.joint_torque(E).mT if self.of_drives else E
+        return E.expand(len(at.q), -1, -1)
+
+    def applied(self, B: Tensor, system: ConstrainedSystem, at: States) -> Tensor:
+        if not self.per_joint:
+            return super().applied(B, system, at)
+        # B Cᵀ
+        return system.robot.drive_motion(B) if self.of_drives else B
 
 
 class JointTerm(PerJointPrior):
@@ -123,6 +136,7 @@ class JointTerm(PerJointPrior):
     """
 
     target = JOINT
+    of_drives = True
     centred = False
     sticks = True
     laws: ClassVar[dict[str, type[JointTerm]]] = {}
@@ -141,6 +155,8 @@ class JointTerm(PerJointPrior):
         """
 
     def features(self, system: ConstrainedSystem, at: States) -> dict[str, Tensor]:
+        robot = system.robot
         history = None if at.history is None else at.history.unbind(-1)
-        x = JointState(at.q, at.qd, at.eom.Q_G.abs(), at.slip, history)
+        q, qd, load = robot.drive_motion(at.q), robot.drive_motion(at.qd), robot.drive_torque(at.eom.Q_G)
+        x = JointState(q, qd, load.abs(), at.slip, history)
         return {name: column[..., None] for name, column in self.columns(x).items()}

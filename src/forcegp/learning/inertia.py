@@ -80,8 +80,8 @@ def rigid_robot(robot: RobotModel, rows: Rows) -> Inertia:
         rows: samples in free motion.
     """
     prior, n = InertialPrior(), robot.nq
-    M, size = mass_matrix(robot, rows.q), drive_scale(robot, rows.q)
-    links = regressor(robot, rows.q, rows.qd, rows.qdd) * prior.scale(robot)
+    M, size = inertia_at(robot, rows.q), drive_scale(robot, rows.q)
+    links = links_at(robot, rows) * prior.scale(robot)
     inertial = torch.cat([size * torch.diag_embed(rows.qdd), links], dim=-1)
     C = with_delay(rows, inertial)
     regressions, judged = tuple(_over_widths(rows, inertial, M)), products(rows, C)
@@ -107,7 +107,7 @@ def rigid_robot(robot: RobotModel, rows: Rows) -> Inertia:
         return compared(lambda rest: found.estimate(rest, kept, n))
 
     def accelerations(other: RobotModel, delta: Tensor) -> Tensor:
-        return acceleration_errors(rows, single.by_stretch, C, delta, mass_matrix(other, rows.q))
+        return acceleration_errors(rows, single.by_stretch, C, delta, inertia_at(other, rows.q))
 
     every, file, left = found.by_stretch.total(), estimated(delay), _errors(robot, size)
     driving = torch.cat([kept, delay])
@@ -366,16 +366,28 @@ def inertia_of(
 def with_ripple(robot: RobotModel, rows: Rows) -> Rows:
     """Add the features of ripple to Φ. Without them, ripple of 2 % of the torque moves M by up to 8 %."""
     eye = torch.eye(robot.nq).to(rows.q)
-    X = [regressor(robot, rows.q, rows.qd, rows.qdd), rows.qdd[..., None] * eye, rows.friction]
+    X = [links_at(robot, rows), rows.qdd[..., None] * eye, rows.friction]
     X = torch.cat(X, dim=-1).transpose(0, 1)
     X = X / X.square().mean(1, keepdim=True).sqrt().clamp(min=1e-300)
     left = rows.residual - (X @ ridged(X, rows.residual.T)[..., None])[..., 0].T
     n = rows.leading
-    ripple = ripple_of(rows.q[:n], left[:n])
+    turned = robot.drive_motion(rows.q)
+    ripple = ripple_of(turned[:n], left[:n])
     if ripple is None:
         return rows
-    waves = torch.stack([*ripple.columns(JointState(rows.q, rows.qd, rows.qd)).values()], dim=-1)
+    waves = torch.stack([*ripple.columns(JointState(turned, rows.qd, rows.qd)).values()], dim=-1)
     return dataclasses.replace(rows, friction=torch.cat([rows.friction, waves], dim=-1))
+
+
+def inertia_at(robot: RobotModel, q: Tensor) -> Tensor:
+    """Return the inertia `(n, nq, nq)` in the coordinates of the drives, C⁻ᵀ M C⁻¹."""
+    return robot.drive_torque(robot.drive_torque(mass_matrix(robot, q)).mT)
+
+
+def links_at(robot: RobotModel, rows: Rows) -> Tensor:
+    """Return the torques C⁻ᵀ Y `(n, nq, 10 nq)` of the drives per inertial parameter of the links."""
+    qd, qdd = robot.joint_motion(rows.qd), robot.joint_motion(rows.qdd)
+    return robot.drive_torque(regressor(robot, rows.q, qd, qdd).mT).mT
 
 
 def drive_scale(robot: RobotModel, q: Tensor) -> Tensor:
@@ -384,7 +396,7 @@ def drive_scale(robot: RobotModel, q: Tensor) -> Tensor:
     It is the mean inertia of the joint in the robot file, and at least `GEARED` of the largest among joints
     of the same type. A geared drive of a wrist exceeds its links by far (12 to 2500 times on a UR10e).
     """
-    M = mass_matrix(robot, q).diagonal(dim1=-2, dim2=-1).mean(0)
+    M = inertia_at(robot, q).diagonal(dim1=-2, dim2=-1).mean(0)
     scale = M.clone()
     for alike in (robot.revolute > 0.0, robot.revolute == 0.0):
         if bool(alike.any()):

@@ -61,7 +61,7 @@ COHERENT = 0.9
 
 @dataclass(frozen=True)
 class Rows:
-    """Samples in free motion.
+    """Samples in free motion. If drives are coupled, all but q are those of the drives, not of the joints.
 
     Attributes:
         q, qd, qdd: `(n, nq)` positions, velocities and accelerations.
@@ -181,7 +181,8 @@ def free_rows(
     motions = (m for m in training.measurements if m.quantity == "qdd")
     free = ((m, (~m.active.any(-1)).nonzero()[:, 0]) for m in motions)
     m = next(m[rows] for m, rows in free if len(rows) >= LEAST)
-    later, memory, rate = partners(m, training.filter_span), bristles(m), torque_rate(m)
+    later, rate = partners(m, training.filter_span), system.robot.drive_torque(torque_rate(m))
+    memory = bristles(dataclasses.replace(m, qd=system.robot.drive_motion(m.qd)))
     first = (later >= 0).nonzero()[:, 0]
     paired = len(first) >= LEAST
     if not paired:
@@ -280,12 +281,13 @@ def _rows(
     group: Tensor,
     partner: Tensor,
 ) -> Rows:
-    at = m.at(system)
+    at, robot = m.at(system), system.robot
     Phi = torch.cat([*prior.features(system, at).values(), torch.ones_like(at.q)[..., None]], dim=-1)
     Phi, memory = (x / x.square().mean(0).sqrt().clamp(min=1e-12) for x in (Phi, memory))
-    residual = mean(system, at) - (at.eom.M @ m.values[..., None])[..., 0]
-    weight = rest_weight(m.qd.abs(), min(prior.speeds), Phi, residual)
-    return Rows(m.q, m.qd, m.values, residual, Phi, weight, group, m.segment, partner, memory, m.tau, rate)
+    residual = robot.drive_torque(mean(system, at) - (at.eom.M @ m.values[..., None])[..., 0])
+    qd, qdd, tau = robot.drive_motion(m.qd), robot.drive_motion(m.values), robot.drive_torque(m.tau)
+    weight = rest_weight(qd.abs(), min(prior.speeds), Phi, residual)
+    return Rows(m.q, qd, qdd, residual, Phi, weight, group, m.segment, partner, memory, tau, rate)
 
 
 def rest_weight(speed: Tensor, slowest: float, Phi: Tensor, residual: Tensor) -> Tensor:

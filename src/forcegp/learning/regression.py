@@ -103,7 +103,8 @@ def with_expectations(problem: Problem, standardize: bool = True) -> Problem:
     for prior in problem.priors:
         for m in problem.training.measurements:
             if isinstance(prior, BristlePrior) and not prior.expected and m.history is not None:
-                changed[prior.name] = prior.expecting(m.qd, m.history)
+                turning = problem.system.robot.drive_motion(m.qd)
+                changed[prior.name] = prior.expecting(turning, m.history)
                 break
     if not changed:
         return problem
@@ -200,7 +201,8 @@ def ripple_in(found: Scales) -> RipplePrior | None:
     for i, m in enumerate(problem.training.measurements):
         if m.quantity in MOTIONS:
             rows = residuals(problem, found.values, found.evidence.weights, i)
-            parts.append((m.q, rows.torque(*variances(problem, found.values))))
+            torque, robot = rows.torque(*variances(problem, found.values)), problem.system.robot
+            parts.append((robot.drive_motion(m.q), robot.drive_torque(torque)))
     return ripple_of(*map(torch.cat, zip(*parts, strict=True))) if parts else None
 
 

@@ -35,6 +35,7 @@ from forcegp.learning.correlation import MOST_RESIDUALS, RUNS
 from forcegp.learning.inverse_dynamics import without_delay
 from forcegp.learning.specification import FEWEST_MOVING, REST_SPEED, Specification, at_rest, still_of
 from forcegp.resources import one_thread
+from forcegp.robot.model import RobotModel
 
 if TYPE_CHECKING:
     from distributed import Client
@@ -89,32 +90,39 @@ def sample_of(spec: Specification, data: StreamedDataset) -> Sample:
     """
     moving = spec.automatic or spec.noise.learns_torque
     dropped: list[int] = []
-    rows, stretches, count = _rows_of(data, moving_rows if moving else None, dropped)
+    robot = spec.system.robot
+    rows, stretches, count = _rows_of(data, robot, moving_rows if moving else None, dropped)
     if moving and count < FEWEST_MOVING:
         moving = False
-        rows, stretches, count = _rows_of(data, None, dropped)
+        rows, stretches, count = _rows_of(data, robot, None, dropped)
     _check_inference(spec, count, len(rows))
     return Sample(rows, count, data, stretches, moving, sum(dropped) if moving else 0)
 
 
-def _rows_of(log: StreamedDataset, keep: Keep | None, dropped: list[int]) -> tuple[Dataset, Dataset, int]:
+def _rows_of(
+    log: StreamedDataset, robot: RobotModel, keep: Keep | None, dropped: list[int]
+) -> tuple[Dataset, Dataset, int]:
     """Return evenly spaced rows to keep, contiguous runs of rows to keep, and the number of all such rows.
 
     Args:
         dropped: receives the number of outliers of each piece.
     """
     stretches: list[Dataset] = []
-    rows, count = spaced_sample(_with_stretches(log, stretches, keep, dropped), SAMPLE_ROWS, keep)
+    rows, count = spaced_sample(_with_stretches(log, robot, stretches, keep, dropped), SAMPLE_ROWS, keep)
     return rows, Dataset.concatenate(stretches), count
 
 
 def _with_stretches(
-    stream: StreamedDataset, parts: list[Dataset], keep: Keep | None, dropped: list[int]
+    stream: StreamedDataset,
+    robot: RobotModel,
+    parts: list[Dataset],
+    keep: Keep | None,
+    dropped: list[int],
 ) -> Iterator[Dataset]:
     """Yield the pieces of a log, and append the first rows of some pieces to `parts`."""
     last, length = stream.piece_count - 1, MOST_RESIDUALS // RUNS
     pieces = stream.pieces() if keep is None else possible(stream.pieces(), dropped)
-    pieces = followed(pieces) if stream.header.ordered else pieces
+    pieces = followed(pieces, robot) if stream.header.ordered else pieces
     wanted = {round(last * i / (RUNS - 1)) for i in range(RUNS)}
     for number, piece in enumerate(pieces):
         if number in wanted:
@@ -132,15 +140,16 @@ def possible(pieces: Iterable[Dataset], dropped: list[int] | None = None) -> Ite
         yield piece[~bad] if count else piece
 
 
-def followed(pieces: Iterable[Dataset]) -> Iterator[Dataset]:
+def followed(pieces: Iterable[Dataset], robot: RobotModel) -> Iterator[Dataset]:
     """Yield the pieces of a log with the states of bristles, which continue from piece to piece."""
     past = None
     for piece in pieces:
         if len(piece) > 1 and not 0.0 < period_of(piece) <= LONGEST_STEP:
             yield piece
             continue
-        history = bristles(piece.t, piece.qd, piece.segment, past)
-        past = Past(piece.t[-1:], piece.qd[-1:], piece.segment[-1:], history[-1:])
+        speed = robot.drive_motion(piece.qd)
+        history = bristles(piece.t, speed, piece.segment, past)
+        past = Past(piece.t[-1:], speed[-1:], piece.segment[-1:], history[-1:])
         states = {f"{PAST}{k}": x for k, x in enumerate(history.unbind(-1))}
         yield piece.replace(extras={**piece.extras, **states})
 
@@ -260,7 +269,7 @@ class Part:
     def pieces(self, log: StreamedDataset, r: int = 0, k: int = 1) -> Iterator[Dataset]:
         """Yield piece r of every k, with the states of bristles if a prior depends on the past."""
         if any(prior.remembers for prior in self.problem.priors):
-            return islice(followed(self._usable(log.pieces())), r, None, k)
+            return islice(followed(self._usable(log.pieces()), self.spec.system.robot), r, None, k)
         return self._usable(log.pieces((r, k)))
 
     def _usable(self, pieces: Iterator[Dataset]) -> Iterator[Dataset]:

@@ -113,7 +113,7 @@ def import_log(
         report.find("doubt", doubt)
     try:
         with foreign(str(path), "a log that can be imported"):
-            signals = gather(path, log_mapping, system.robot.joint_names, report, progress)
+            signals = gather(path, log_mapping, system.robot, report, progress)
             announce_memory(8 * NUMBERS * system.robot.nq * len(signals), f"importing {len(signals):,} rows")
             check_clock(signals, system.robot.revolute.numpy() > 0.0, report)
             find_jumps(signals, report)

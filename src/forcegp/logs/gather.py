@@ -3,7 +3,8 @@
 A reading r is converted to y = s k (r − o), with one set of numbers per joint. Here, o is the reading at zero
 in the unit of the column, s = ±1 is the sign, and k is the unit, multiplied by the torque constant K_t for a
 current. With a gear of ratio N, a motor turns N times as fast as its joint, and the joint torque is N times
-the motor torque: q = q_m / N, τ = N τ_m.
+the motor torque: q = q_m / N, τ = N τ_m. If drives are coupled, these are the drives' own coordinates p = C q
+and torques τ_p, and q = C⁻¹ p, τ = Cᵀ τ_p.
 """
 
 from __future__ import annotations
@@ -12,6 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
+import torch
 
 from forcegp.errors import DataError
 from forcegp.logs import units
@@ -21,6 +23,7 @@ from forcegp.logs.mapping import SYMBOLS, Mapping
 from forcegp.logs.motion import TURNS, find_wrapped
 from forcegp.logs.readers import read
 from forcegp.logs.table import Array, ImportReport, LogTable, Progress, Signals, Stream
+from forcegp.robot import RobotModel
 from forcegp.rows import describe, numbered
 
 CLOSED, STICKS = "contact ", "sticks "
@@ -30,13 +33,13 @@ CLOSED, STICKS = "contact ", "sticks "
 def gather(
     path: str | Path,
     mapping: Mapping,
-    joints: Sequence[str],
+    robot: RobotModel,
     report: ImportReport,
     progress: Progress | None = None,
     rows: int | None = None,
 ) -> Signals:
     """Read the mapped columns of a log onto a common clock, with at most `rows` rows if possible."""
-    sections = mapping.sections
+    sections, joints = mapping.sections, robot.joint_names
     needed = {*sections.time.columns, sections.time.segment or sections.time.columns[0]}
     for name in SYMBOLS:
         if mapping.quantity(name) is not None:
@@ -49,7 +52,7 @@ def gather(
     for remark in table.remarks:
         report.find("reader", remark)
     _find_names(table, mapping, joints, report)
-    return _Gathering(table, mapping, tuple(joints), report).run()
+    return _Gathering(table, mapping, robot, report).run()
 
 
 def _find_names(table: LogTable, mapping: Mapping, joints: Sequence[str], report: ImportReport) -> None:
@@ -79,10 +82,9 @@ def _find_names(table: LogTable, mapping: Mapping, joints: Sequence[str], report
 class _Gathering:
     """Extraction of the mapped columns from a table."""
 
-    def __init__(
-        self, table: LogTable, mapping: Mapping, joints: tuple[str, ...], report: ImportReport
-    ) -> None:
-        self.table, self.mapping, self.joints, self.report = table, mapping, joints, report
+    def __init__(self, table: LogTable, mapping: Mapping, robot: RobotModel, report: ImportReport) -> None:
+        self.table, self.mapping, self.robot, self.report = table, mapping, robot, report
+        self.joints = joints = robot.joint_names
         self.time, position = mapping.sections.time, mapping.columns_of("position", joints)
         self.origin: list[float] = []
         self.reference = table.stream_of(position[0], mapping.sections.position.stream)
@@ -134,7 +136,24 @@ class _Gathering:
             own *= scale[self.joints.index(joint)]
             if isinstance(stream.columns, dict) and len(stream.columns) > 1:
                 del stream.columns[column]  # hold only one copy in memory
-        return stream, result
+        return stream, self._of_joints(name, result) if section.side == "motor" else result
+
+    def _of_joints(self, name: str, values: Array) -> Array:
+        """Convert a vector of drives (n, nq) to one of joints, which differ if drives are coupled."""
+        robot, measured = self.robot, self.mapping.measured(name, self.joints)
+        if robot.coupling is None:
+            return values
+        mixed = robot.coupling != torch.eye(robot.nq).to(robot.coupling)
+        involved = (mixed.any(0) | mixed.any(1)).tolist()
+        lacking = [j for j, own in zip(self.joints, involved, strict=True) if own and j not in measured]
+        if lacking:
+            raise self.mapping.error(
+                (name,),
+                f"joint {lacking[0]!r} has a coupled drive, but no column",
+                expected=f"a column for each of {', '.join(j for j, x in zip(self.joints, involved) if x)}",
+            )
+        convert = robot.joint_torque if name == "torque" else robot.joint_motion
+        return convert(torch.from_numpy(values).to(robot.coupling)).numpy()
 
     def _scale(self, name: str) -> Array:
         """Return the factors s k (nq,) that convert a joint vector to SI units on the joint side."""

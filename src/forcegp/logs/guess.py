@@ -178,7 +178,7 @@ def _signals(path: str | Path, draft: Draft, system: ConstrainedSystem, without:
     further = {name: table for name, table in draft.further.items() if not name.startswith("contact")}
     toml = replace(draft, time=draft.time | {"missing": "drop"}, families=families, further=further).toml()
     mapping, report = parse_mapping(toml.encode(), "proposed mapping"), ImportReport(str(path))
-    signals = gather(path, mapping, system.robot.joint_names, report, rows=ROWS)
+    signals = gather(path, mapping, system.robot, report, rows=ROWS)
     even_clock(signals, None, report)
     settings = mapping.sections.derivatives.model_copy(update={"source": "position"})
     add_derivatives(signals, settings, report)

@@ -326,6 +326,7 @@ class _Reader:
                 hint='fit StructuredGP(system, "analytical")',
             )
         robot, values = fit.system.robot, fit.hyperparameters
+        robot.check_own_drives("a robot file")
         if fastest is None:
             fastest = torch.full_like(robot.mass, UNTRAINED)
             if LOW in values:

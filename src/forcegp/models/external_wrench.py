@@ -328,7 +328,7 @@ class Reading:
         """Prepare a log. Friction with memory follows from the velocities of a log in time order."""
         history, remembers = None, any(prior.remembers for prior in fit.posterior.priors)
         if remembers and data.header.ordered:
-            history = bristles(data.t, data.qd, data.segment)
+            history = bristles(data.t, fit.system.robot.drive_motion(data.qd), data.segment)
         return cls(fit, data, source, history, external_std(external, fit.system.robot))
 
     def forces(self, rows: Tensor, qdd: Tensor) -> JointForces:

@@ -193,7 +193,7 @@ class StructuredFit(FittedModel):
             raise DataError("friction with memory needs a log in time order", got="points in another order")
         active, history = data.active(self.system.contact_names), None
         if any(prior.remembers for prior in self.force_priors):
-            history = bristles(data.t, data.qd, data.segment)
+            history = bristles(data.t, self.system.robot.drive_motion(data.qd), data.segment)
         flat = flat_states(self.system, data.q, data.qd, data.tau, active)._replace(history=history)
         with torch.no_grad():
             return self._answered(flat, Query(quantity, None, covariance, noise))

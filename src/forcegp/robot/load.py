@@ -17,11 +17,13 @@ import torch
 
 from forcegp.errors import (
     InertiaError,
+    ParameterError,
     RobotFileError,
     RobotFileWarning,
     ShapeError,
     UnknownNameError,
     UnsupportedRobotError,
+    check_name,
 )
 from forcegp.robot.model import BASE, RobotModel
 from forcegp.robot.safety import parse_xml, read_bytes
@@ -291,6 +293,7 @@ def load_robot(
     base_rpy: Sequence[float | int] = (0.0, 0.0, 0.0),
     gravity: Sequence[float | int] | None = None,
     locked_joints: Mapping[str, float] | None = None,
+    coupling: Mapping[str, Mapping[str, float]] | Sequence[Sequence[float]] | None = None,
     dtype: torch.dtype = torch.float64,
     device: torch.device | str = "cpu",
 ) -> RobotModel:
@@ -306,6 +309,9 @@ def load_robot(
         gravity: gravitational acceleration in the world [m/s²]. The default is that of an MJCF file, and
             (0, 0, −9.81) for other files.
         locked_joints: positions [rad, m] of joints to treat as fixed, such as those of a gripper.
+        coupling: drives that also move with other joints. With `{"joint_6": {"joint_5": 1.0}}`, the drive of
+            joint_6, behind its gear, moves by q₆ + q₅. Alternatively, the whole matrix C, whose rows are the
+            drives: they move by C q, and torques τ on them act on the joints as Cᵀ τ.
         dtype: floating-point type of all constants.
         device: device of all constants.
 
@@ -318,12 +324,14 @@ def load_robot(
         (7, 'lbr_iiwa_joint_1')
 
     Raises:
-        UnknownNameError: the bundled robot or a joint to lock does not exist.
+        UnknownNameError: the bundled robot, or a joint to lock or to couple, does not exist.
+        ParameterError: the coupling is singular or not finite.
         RobotFileError: the file cannot be read or is invalid. The message names the link or joint.
         UnsupportedRobotError: a joint is a floating, planar, ball or mimic joint. The hint is to lock it.
         MissingDependencyError: the file is MJCF and MuJoCo is not installed.
         InertiaError: the inertia of a link is not physical.
-        ShapeError: base_position, base_rpy or gravity is not a vector of three finite numbers.
+        ShapeError: base_position, base_rpy or gravity is not a vector of three finite numbers, or the matrix
+            of the coupling has the wrong shape.
     """
     turn = scipy.spatial.transform.Rotation.from_euler("xyz", _vector(base_rpy, "base_rpy"))
     world = {"base_rotation": turn.as_matrix(), "base_position": _vector(base_position, "base_position")}
@@ -336,7 +344,40 @@ def load_robot(
             listed = ", ".join(f"{x:g}" for x in tree.gravity)
             text = f"{tree.label}: the gravity of the file is used, ({listed}) m/s²"
             tree = replace(tree, remarks=(*tree.remarks, text))
-    return robot_of(tree, world).to(device, dtype)
+    robot = robot_of(tree, world)
+    return robot.replace(coupling=coupling_of(coupling, robot.joint_names)).to(device, dtype)
+
+
+def coupling_of(
+    coupling: Mapping[str, Mapping[str, float]] | Sequence[Sequence[float]] | None, joints: Sequence[str]
+) -> torch.Tensor | None:
+    """Return the matrix C `(nq, nq)` of coupled drives, or `None` if each joint has its own drive.
+
+    Raises:
+        UnknownNameError, ShapeError, ParameterError: see `load_robot`.
+    """
+    if coupling is None or not len(coupling):
+        return None
+    C = np.eye(len(joints))
+    if isinstance(coupling, Mapping):
+        for drive, others in coupling.items():
+            for joint, factor in others.items():
+                for name in (drive, joint):
+                    check_name("joint of the coupling", name, joints)
+                C[joints.index(drive), joints.index(joint)] = factor
+    else:
+        rows = [len(row) for row in coupling]
+        if rows != [len(joints)] * len(joints):
+            expected = f"{len(joints)} rows of {len(joints)} numbers, for {', '.join(joints)}"
+            raise ShapeError("the coupling of the drives has the wrong shape", expected=expected, got=rows)
+        C = np.array(coupling, dtype=np.float64)
+    if not np.isfinite(C).all() or not np.linalg.cond(C) < 1.0 / SINGULAR:
+        raise ParameterError(
+            "the coupling of the drives is singular",
+            expected="a matrix C, with drives that move by C q, from whose motion that of all joints follows",
+            got=C.tolist(),
+        )
+    return torch.from_numpy(C)
 
 
 def robot_path(source: str | Path) -> Path:

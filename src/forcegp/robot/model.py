@@ -17,7 +17,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from forcegp.errors import ParameterError, ShapeError, check_name
+from forcegp.errors import ParameterError, ShapeError, UnsupportedRobotError, check_name
 from forcegp.notebook import html_table
 
 JointType = Literal["revolute", "prismatic"]
@@ -54,6 +54,8 @@ class RobotModel:
         base_rotation, base_position: pose of the base in the world, `(3, 3)`, `(3,)` [m].
         gravity: gravitational acceleration in the world, `(3,)` [m/s²].
         remarks: notes on questionable properties of the file, one sentence each.
+        coupling: matrix C `(nq, nq)` for drives that move with several joints, at the speeds C q̇; `None` if
+            each joint has its own drive. Damping, friction and armature are those of the drives.
     """
 
     name: str
@@ -84,6 +86,7 @@ class RobotModel:
     base_position: Tensor
     gravity: Tensor
     remarks: tuple[str, ...] = ()
+    coupling: Tensor | None = None
 
     def __repr__(self) -> str:
         """Return a one-line summary without the values of the tensors."""
@@ -159,6 +162,34 @@ class RobotModel:
         """All constants that are tensors, keyed by name."""
         values = ((field.name, getattr(self, field.name)) for field in dataclasses.fields(self))
         return {name: value for name, value in values if isinstance(value, Tensor)}
+
+    @property
+    def drive_inertia(self) -> Tensor:
+        """Inertia Cᵀ diag(a) C `(nq, nq)` of all drives [kg m², kg]."""
+        inertia = torch.diag(self.armature)
+        return inertia if self.coupling is None else self.coupling.mT @ inertia @ self.coupling
+
+    def drive_motion(self, x: Tensor) -> Tensor:
+        """Convert positions, velocities or accelerations `(..., nq)` of joints to those of drives, C x."""
+        return x if self.coupling is None else x @ self.coupling.mT
+
+    def joint_motion(self, x: Tensor) -> Tensor:
+        """Convert positions, velocities or accelerations `(..., nq)` of drives to those of joints, C⁻¹ x."""
+        return x if self.coupling is None else x @ torch.linalg.inv(self.coupling).mT
+
+    def joint_torque(self, tau: Tensor) -> Tensor:
+        """Convert torques `(..., nq)` of drives to those of joints, Cᵀ τ, as τᵀ C q̇ is their power."""
+        return tau if self.coupling is None else tau @ self.coupling
+
+    def drive_torque(self, tau: Tensor) -> Tensor:
+        """Convert torques `(..., nq)` of joints to those of drives, C⁻ᵀ τ."""
+        return tau if self.coupling is None else tau @ torch.linalg.inv(self.coupling)
+
+    def check_own_drives(self, what: str) -> None:
+        """Raise `UnsupportedRobotError` if drives are coupled, which `what` does not support."""
+        if self.coupling is not None:
+            text = f"{what} does not support the coupled drives of robot {self.name!r}"
+            raise UnsupportedRobotError(text, expected="one drive for each joint", got=self.coupling.tolist())
 
     def frame_index(self, frame: str) -> int:
         """Return the index of a named frame; raise an `UnknownNameError` that suggests the closest name."""

@@ -253,7 +253,10 @@ class Law(ABC):
         """Return q̈ `(n, nq)` and λ `(n, m)` at states. λ is NaN if the law does not model forces."""
 
     def dry_friction(self, system: ConstrainedSystem) -> Callable[[States], DryFriction] | None:
-        """Return a function that separates dry joint friction from the force, or `None` if there is none."""
+        """Return a function that separates dry joint friction from the force, or `None` if there is none.
+
+        Coupled drives do not stick: their dry friction remains a smooth function of their speed.
+        """
         return None
 
     @property
@@ -280,6 +283,8 @@ class ForceLaw(Law):
         known = posterior_of(self.force)
         mean, priors = (self.force, ()) if known is None else (known.process.mean, known.priors)
         robot = system.robot
+        if robot.coupling is not None:
+            return None
         in_mean = isinstance(mean, AnalyticalMean) and "friction" in mean.terms
         declared = in_mean and bool(((robot.friction != 0.0) | (robot.stribeck != 0.0)).any())
         if not declared and not any(prior.sticks for prior in priors):

@@ -103,6 +103,7 @@ class RobotSection(Section):
     base_rpy: Point = (0.0, 0.0, 0.0)
     gravity: Point | None = None
     locked_joints: dict[str, float] = Field(default_factory=dict)
+    coupling: dict[str, dict[str, float]] | tuple[tuple[float, ...], ...] | None = None
 
 
 class ContactSection(ContactFields, strict=True):

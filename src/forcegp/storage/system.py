@@ -137,6 +137,7 @@ SHAPES: dict[str, tuple[str | int, ...]] = {
     "base_rotation": (3, 3),
     "base_position": (3,),
     "gravity": (3,),
+    "coupling": ("nq", "nq"),
 }
 """Shapes of the robot tensors that do not consist of one number per joint."""
 MAY_BE_INFINITE = ("lower", "upper", "velocity_limit", "effort_limit")
@@ -196,7 +197,8 @@ def _robot(record: RobotRecord, tensors: Mapping[str, Tensor], source: str) -> R
     dtype = axis.dtype if axis is not None and axis.is_floating_point() else torch.float64
     arrays = {}
     for field in dataclasses.fields(RobotModel):
-        if field.name not in type(record).model_fields:
+        absent = field.default is None and PREFIX + field.name not in tensors
+        if field.name not in type(record).model_fields and not absent:
             shape = tuple(sizes.get(str(n), n) for n in SHAPES.get(field.name, ("nq",)))
             finite = field.name not in MAY_BE_INFINITE
             arrays[field.name] = take(tensors, PREFIX + field.name, shape, dtype, source, finite=finite)

@@ -78,6 +78,10 @@ class ForcePrior(ABC):
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
         """Return E(x) `(n, nq, outputs)`."""
 
+    def applied(self, B: Tensor, system: ConstrainedSystem, at: States) -> Tensor:
+        """Return B E(x) for a map B `(n, d, nq)` of joint forces."""
+        return B @ self.operator(system, at)
+
     def stated(self, initial: dict[str, Tensor]) -> dict[str, Tensor]:
         """Return initial log-hyperparameters of the kernel, changed by what is known of the force."""
         return initial

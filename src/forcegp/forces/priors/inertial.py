@@ -95,7 +95,9 @@ class InertialPrior(ConstantForcePrior):
         qdd = at.eom.acceleration(at.eom.Q_K + at.tau) if at.qdd is None else at.qdd
         columns = regressor(robot, at.q, at.qd, qdd)
         if self.drives:
-            columns = torch.cat([columns, torch.diag_embed(qdd)], dim=-1)
+            # Cᵀ diag(C q̈)
+            drives = robot.joint_torque(torch.diag_embed(robot.drive_motion(qdd))).mT
+            columns = torch.cat([columns, drives], dim=-1)
         columns = -columns * self.scale(robot)
         at.kept[self.name] = robot, self, columns
         return columns

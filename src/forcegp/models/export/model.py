@@ -167,6 +167,7 @@ class ExportedModel:
                 )
         if self.system.robot.device.type != "cpu":
             raise ModelError("a fit on a GPU cannot be exported", hint="save it, and load it on the CPU")
+        self.system.robot.check_own_drives("an exported program")
         for each in self.system.contacts:
             if not isinstance(each, SurfaceContact) or each.stick_speed is not None:
                 raise _no_c("contact", each.name, each, "a SurfaceContact that always slides")
