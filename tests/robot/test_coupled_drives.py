@@ -22,8 +22,8 @@ mujoco = pytest.importorskip("mujoco")
 ARM = """<mujoco><option timestep="0.001" integrator="implicitfast"/><worldbody>
 <body pos="0 0 .5"><joint name="a" axis="0 1 0"/><inertial pos="0 0 .2" mass="1.5" diaginertia=".02 .02 .01"/>
 <body pos="0 0 .4"><joint name="b" axis="0 1 0"/><inertial pos="0 0 .1" mass=".8" diaginertia=".01 .01 .004"/>
-<body pos="0 0 .2"><joint name="c" axis="0 0 1"/><inertial pos=".03 0 .05" mass=".4" diaginertia=".003 .003 .002"/>
-</body></body></body></worldbody>{tendon}</mujoco>"""
+<body pos="0 0 .2"><joint name="c" axis="0 0 1"/>
+<inertial pos=".03 0 .05" mass=".4" diaginertia=".003 .003 .002"/></body></body></worldbody>{tendon}</mujoco>"""
 INERTIA, VISCOUS, DRY = 0.03, 0.2, 0.4
 TENDON = f"""<tendon><fixed armature="{INERTIA}" damping="{VISCOUS}" frictionloss="{{dry}}">
 <joint joint="b" coef="1"/><joint joint="c" coef="1"/></fixed></tendon>"""
@@ -196,9 +196,9 @@ def test_motor_side_columns_become_those_of_joints(tmp_path: Path, robot: forceg
     rows = [int((data.t - t).abs().argmin()) for t in found.t]
     assert torch.allclose(found.q, data.q[rows], atol=1e-3)
     assert torch.allclose(found.tau, data.tau[rows], atol=1e-9)
+    head, torque = toml.split("[torque]")
+    lacking = f'{head}[torque]{torque.replace("b = 20.0, ", "")}\n    unmeasured = ["b"]'
     with pytest.raises(MappingError, match="'b' has a coupled drive, but no column"):
-        head, torque = toml.split("[torque]")
-        lacking = f'{head}[torque]{torque.replace("b = 20.0, ", "")}\n    unmeasured = ["b"]'
         forcegp.read_log(tmp_path / "log.npz", robot, parse_mapping(lacking.encode(), "motors"))
 
 

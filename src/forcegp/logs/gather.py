@@ -144,13 +144,13 @@ class _Gathering:
         if robot.coupling is None:
             return values
         mixed = robot.coupling != torch.eye(robot.nq).to(robot.coupling)
-        involved = (mixed.any(0) | mixed.any(1)).tolist()
-        lacking = [j for j, own in zip(self.joints, involved, strict=True) if own and j not in measured]
+        involved = [self.joints[i] for i in (mixed.any(0) | mixed.any(1)).nonzero()[:, 0].tolist()]
+        lacking = [joint for joint in involved if joint not in measured]
         if lacking:
             raise self.mapping.error(
                 (name,),
                 f"joint {lacking[0]!r} has a coupled drive, but no column",
-                expected=f"a column for each of {', '.join(j for j, x in zip(self.joints, involved) if x)}",
+                expected=f"a column for each of {', '.join(involved)}",
             )
         convert = robot.joint_torque if name == "torque" else robot.joint_motion
         return convert(torch.from_numpy(values).to(robot.coupling)).numpy()
