@@ -23,7 +23,8 @@ ARM = """<mujoco><option timestep="0.001" integrator="implicitfast"/><worldbody>
 <body pos="0 0 .5"><joint name="a" axis="0 1 0"/><inertial pos="0 0 .2" mass="1.5" diaginertia=".02 .02 .01"/>
 <body pos="0 0 .4"><joint name="b" axis="0 1 0"/><inertial pos="0 0 .1" mass=".8" diaginertia=".01 .01 .004"/>
 <body pos="0 0 .2"><joint name="c" axis="0 0 1"/>
-<inertial pos=".03 0 .05" mass=".4" diaginertia=".003 .003 .002"/></body></body></worldbody>{tendon}</mujoco>"""
+<inertial pos=".03 0 .05" mass=".4" diaginertia=".003 .003 .002"/>
+</body></body></body></worldbody>{tendon}</mujoco>"""
 INERTIA, VISCOUS, DRY = 0.03, 0.2, 0.4
 TENDON = f"""<tendon><fixed armature="{INERTIA}" damping="{VISCOUS}" frictionloss="{{dry}}">
 <joint joint="b" coef="1"/><joint joint="c" coef="1"/></fixed></tendon>"""
