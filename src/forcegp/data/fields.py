@@ -37,6 +37,10 @@ class DataHeader(Header):
         imported: kind and message of each finding of the import, including warnings about the mapping.
         unmeasured_torques: names of joints without a measured motor torque. Their torque column is 0.
         stick_speeds: speed below which a contact sticks [m/s], keyed by contact. Other contacts always slide.
+        torque_scale_std: relative standard deviation of the scale of each torque, if torques are not measured
+            but follow from commands or currents with nominal constants.
+        servo_stiffness, servo_damping: nominal k_p and k_d of each servo [N m/rad, N m s/rad], if torques
+            follow from the commanded positions `extras["command"]`.
         joint_names, contact_names: names in column order, empty if not logged.
     """
 
@@ -56,6 +60,9 @@ class DataHeader(Header):
     imported: tuple[tuple[str, str], ...] = ()
     unmeasured_torques: tuple[str, ...] = ()
     stick_speeds: dict[str, PositiveFloat] = Field(default_factory=dict)
+    torque_scale_std: PositiveFloat | None = None
+    servo_stiffness: tuple[PositiveFloat, ...] = ()
+    servo_damping: tuple[NonNegativeFloat, ...] = ()
     joint_names: tuple[str, ...] = ()
     contact_names: tuple[str, ...] = ()
 

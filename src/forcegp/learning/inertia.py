@@ -84,9 +84,8 @@ def rigid_robot(robot: RobotModel, rows: Rows) -> Inertia:
     links = links_at(robot, rows) * prior.scale(robot)
     inertial = torch.cat([size * torch.diag_embed(rows.qdd), links], dim=-1)
     C = with_delay(rows, inertial)
-    regressions, judged = tuple(_over_widths(rows, inertial, M)), products(rows, C)
-    single = regressions[0]
-    found = max(regressions, key=lambda each: float(torch.logdet(each.normal()[1])))
+    (single, *_), found = _regressions(rows, inertial, M)
+    judged = products(rows, C)
     delay = found.clear_delay()
     everything = torch.cat([torch.arange(C.shape[-1] - 1), delay])
     gain = GAIN * M.diagonal(dim1=-2, dim2=-1).mean(0) / size
@@ -129,6 +128,38 @@ def rigid_robot(robot: RobotModel, rows: Rows) -> Inertia:
         kept = kept[kept != kept[harm[kept].argmax()]]
         drives = found.estimate(every, torch.cat([kept, delay]), n)
     return Inertia(robot, left)
+
+
+def servo_robot(robot: RobotModel, rows: Rows, scale_std: float) -> Inertia:
+    """Return the robot with the drives of servos, whose torques have an unknown scale 1 + s.
+
+    Only ratios of torques to inertia and friction are determined, so that links, which stay those of the
+    file, fix the scale. Where they hardly resist the motion, s keeps its stated standard deviation, torques
+    are the nominal ones, and the inertia of the drive is relative to them.
+
+    Args:
+        robot: robot from the robot file.
+        rows: samples in free motion.
+        scale_std: stated standard deviation of s.
+    """
+    n = robot.nq
+    M, size = inertia_at(robot, rows.q), LOOSE * drive_scale(robot, rows.q)
+    columns = torch.cat([size * torch.diag_embed(rows.qdd), -scale_std * torch.diag_embed(rows.tau)], dim=-1)
+    _, found = _regressions(rows, columns, M)
+    drives, scales = torch.arange(n), torch.arange(n, 2 * n)
+    known = found.read(2 * n, torch.cat([drives, scales]))[1][n:].sqrt() < DETERMINED
+    unknowns = torch.cat([drives, scales[known]])
+    best, std = found.estimate(found.by_stretch.total(), unknowns, n), found.read(n, unknowns)[1].sqrt()
+    links = InertialPrior(mass=EXACT, length=EXACT, inertia=EXACT, is_error=True).around(robot)
+    errors = links.with_drives(size * std.clamp(max=1.0))
+    undetermined = tuple((~known).nonzero()[:, 0].tolist())
+    return Inertia(robot.replace(armature=robot.armature + size * best[:n]), errors, (), undetermined)
+
+
+def _regressions(rows: Rows, inertial: Tensor, M: Tensor) -> tuple[tuple[_Regression, ...], _Regression]:
+    """Return the regressions over all widths, and the one with the narrowest posterior."""
+    each = tuple(_over_widths(rows, inertial, M))
+    return each, max(each, key=lambda one: float(torch.logdet(one.normal()[1])))
 
 
 def _consistent(
@@ -226,28 +257,28 @@ class _Regression:
             delay: index of the delay, if it is an unknown.
         """
         n, last = len(gain), self.by_stretch.unknowns - 1
-        (u, V), (v, W) = (self._drives(n, torch.cat([torch.arange(stop), delay])) for stop in (n, last))
+        (u, V), (v, W) = (self.read(n, torch.cat([torch.arange(stop), delay])) for stop in (n, last))
         clear = u > CLEAR * (V + gain**2).sqrt()
         worth = 0.5 * v.square() / W + 0.5 * W.log()
         return (clear & (v > 0.0) & (worth > -AGAINST)).nonzero()[:, 0]
 
-    def _drives(self, n: int, unknowns: Tensor) -> tuple[Tensor, Tensor]:
-        """Return the estimates `(n,)` of the drives and their variances, given the unknowns to consider.
+    def read(self, n: int, unknowns: Tensor) -> tuple[Tensor, Tensor]:
+        """Return the estimates `(n,)` of the first n unknowns to consider, and their variances.
 
         Variances are at least those of a jackknife over blocks of time, between which friction varies, and
         the squared change of the estimate if only the faster half of each joint's samples is used. A joint
         that creeps, as with the soft friction of a simulator, resists acceleration like a drive.
         """
 
-        def read(given: NormalEquations) -> tuple[Tensor, Tensor]:
+        def at(given: NormalEquations) -> tuple[Tensor, Tensor]:
             h, precision, _ = self.normal(given)
             V = torch.linalg.inv(precision[unknowns][:, unknowns])
             return (V @ h[unknowns])[:n], V.diagonal()[:n]
 
         blocks = range(len(self.by_stretch.gram))
-        u, V = read(self.by_stretch.total())
-        others = torch.stack([read(self.by_stretch.without(g))[0] for g in blocks])
-        change = (read(self.faster.total())[0] - u).square()
+        u, V = at(self.by_stretch.total())
+        others = torch.stack([at(self.by_stretch.without(g))[0] for g in blocks])
+        change = (at(self.faster.total())[0] - u).square()
         return u, V.maximum((len(blocks) - 1) * others.var(0, correction=0)).maximum(change)
 
     def estimate(self, given: NormalEquations, kept: Tensor, n: int, known: Tensor | None = None) -> Tensor:
@@ -310,6 +341,11 @@ five real arms are 1.36 times as large in the geometric mean, and torque errors 
 VOLUME_STATES = 100
 """Number of states over which log |M| or the noise volume is averaged."""
 IDENTIFIED = "identified inertia replaces that of the robot file, since it predicts held-out torques better"
+DETERMINED, LOOSE, EXACT = 0.5, 10.0, 1e-6
+"""Of torques with unknown scale: standard deviation of the scale, over the stated one, below which it is
+determined; factor on the prior deviation of drives, which would shrink together with the torques; relative
+error of the links that fix the scale. With 1 in place of 10, the scale of five of thirteen servos in MuJoCo
+is pulled towards zero."""
 GAIN = 0.02
 """Relative standard deviation of the gain of a torque sensor, up to 2 % in data sheets of strain gauges."""
 CLEAR = 3.0
@@ -334,16 +370,22 @@ class Inertia:
         errors: prior on the remaining errors of links and drives, or `None` if they are not considered. Their
             mean is zero, so that predictions follow the robot, and they widen all error bars.
         doubts: warnings for the user.
+        unscaled: joints for which the log does not determine the scale of the torque.
     """
 
     robot: RobotModel
     errors: InertialPrior | None = None
     doubts: tuple[str, ...] = ()
+    unscaled: tuple[int, ...] = ()
 
 
 @torch.no_grad()
 def inertia_of(
-    system: ConstrainedSystem, friction: JointFrictionPrior, mean: ForceMean, training: Training
+    system: ConstrainedSystem,
+    friction: JointFrictionPrior,
+    mean: ForceMean,
+    training: Training,
+    scale_std: float | None = None,
 ) -> Inertia:
     """Identify the inertia of a real robot from samples in free motion.
 
@@ -355,12 +397,16 @@ def inertia_of(
         friction: prior that defines the features of joint friction.
         mean: prior mean of Q, including the motor torque.
         training: samples in motion.
+        scale_std: standard deviation of the relative scale of torques that are not measured.
     """
     if training.free_motions < LEAST:
         size = drive_scale(system.robot, torch.cat([m.q for m in training.measurements]))
         return Inertia(system.robot, _errors(system.robot, size))
     rows = free_rows(system, friction, mean, training).with_memory()
-    return rigid_robot(system.robot, with_ripple(system.robot, rows))
+    rows = with_ripple(system.robot, rows)
+    return (
+        rigid_robot(system.robot, rows) if scale_std is None else servo_robot(system.robot, rows, scale_std)
+    )
 
 
 def with_ripple(robot: RobotModel, rows: Rows) -> Rows:

@@ -29,6 +29,7 @@ from forcegp.forces.measurements import (
 from forcegp.forces.noise import Noise, external_std, state_std_of
 from forcegp.forces.posterior import REGION
 from forcegp.forces.priors.base import ANALYTICAL, COULOMB, NOISE, ForcePrior
+from forcegp.forces.priors.constants import DrivePrior
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import AnalyticalMean, ConstantForcePrior, JointFrictionPrior
 from forcegp.forces.priors.memory import DISTANCES, LONGEST_STEP, PAST, BristlePrior
@@ -102,11 +103,22 @@ class Specification:
         )
         known = any(prior.remembers for prior in self.priors)
         priors = (*self.priors, BristlePrior()) if past and not known else self.priors
+        scale = max(o.data.header.torque_scale_std or 0.0 for o in observations)
+        if scale and not any(isinstance(prior, DrivePrior) for prior in priors):
+            priors = (*priors, DrivePrior(std=scale))
         if self.options.inference != "exact" and not any(prior.remainder for prior in priors):
             priors = (*priors, ResidualPrior())
         options = self.options.model_copy(update={"inertia": self.options.inertia or "auto"})
         noise = self.noise.for_priors(priors)
         return dataclasses.replace(self, priors=priors, noise=noise, options=options)
+
+    def without_scales(self, joints: tuple[int, ...]) -> Specification:
+        """Return the specification in which torques of some joints have their nominal scale."""
+        priors = (
+            dataclasses.replace(prior, unscaled=joints) if isinstance(prior, DrivePrior) else prior
+            for prior in self.priors
+        )
+        return dataclasses.replace(self, priors=tuple(priors))
 
     def with_priors_of(self, problem: Problem) -> Specification:
         """Return the specification with the priors of a problem, without those that were dropped."""
@@ -123,7 +135,8 @@ class Specification:
         )
         if friction is None or not asks or any(isinstance(prior, InertialPrior) for prior in self.priors):
             return Inertia(self.system.robot)
-        found = inertia_of(self.system, friction, self.mean, training)
+        scale = next((prior.std for prior in self.priors if isinstance(prior, DrivePrior)), None)
+        found = inertia_of(self.system, friction, self.mean, training, scale)
         return found if training.free_motions >= LEAST else replace(found, doubts=_unchecked_masses(training))
 
     def problem(self, training: Training, robot: RobotModel | None = None) -> Problem:
@@ -190,6 +203,8 @@ def problem_for(
     elif before is None and chosen is None:
         found = spec.inertia_of(training)
         robot, doubts = found.robot, (*doubts, *found.doubts)
+        if found.unscaled:
+            spec = spec.without_scales(found.unscaled)
         if found.errors is not None:
             spec = dataclasses.replace(spec, priors=(*spec.priors, found.errors))
             training, _ = training_for(spec, before, data, chosen)
@@ -303,10 +318,11 @@ def search_of(
     if chosen is not None and NOISE not in chosen:
         current |= {key: value for key, value in known.items() if key.startswith(REGION)}
 
-    errors = {prior.name for prior in problem.errors}
+    errors = {prior.name for prior in problem.priors if prior.is_error or prior.is_stated}
 
     def is_held(name: str) -> bool:
-        # If the robot includes a force, the scale of its error cannot be learned from the residuals.
+        # If the robot includes a force, the scale of its error cannot be learned from the residuals. That of
+        # a drive constant would follow from a drive that the robot lacks.
         return name in errors or (chosen is not None and name not in chosen)
 
     held = {key: value for key, value in current.items() if is_held(key.split(".")[0])}

@@ -25,6 +25,7 @@ from forcegp.logs.from_contact import derive_joints, stick_speeds
 from forcegp.logs.gather import gather
 from forcegp.logs.mapping import Mapping, default_mapping, load_mapping, parse_mapping
 from forcegp.logs.motion import check_clock, find_jumps
+from forcegp.logs.servo import damp, servo_fields, spring_torque
 from forcegp.logs.smoothing import add_derivatives, impact_mask
 from forcegp.logs.table import Array, ImportFinding, ImportReport, Signals
 from forcegp.resources import announce_memory
@@ -120,10 +121,11 @@ def import_log(
             derived = tuple(name for name in ("qd", "qdd") if name not in signals.vectors)
             even_clock(signals, log_mapping.sections.time.period, report)
             derive_joints(signals, system, log_mapping, report)
+            spring_torque(signals, system.robot, log_mapping, report)
             _find_clipped(signals, log_mapping)
             evidence = _contacts(signals, system, log_mapping, report, displaced)
             std = add_derivatives(signals, log_mapping.sections.derivatives, report)
-            std = _treat_clipped(signals, std, log_mapping, report)
+            std = damp(signals, _treat_clipped(signals, std, log_mapping, report), log_mapping, report)
             restore(signals, system.robot, log_mapping, report)
             data = _dataset(signals, std, log_mapping, system, report, derived)
     except DataError as error:
@@ -162,7 +164,7 @@ def _contacts(
 def _find_clipped(signals: Signals, mapping: Mapping) -> None:
     """Mark clipped torques in the vector `clipped`, before a filter smooths their plateaus."""
     speed = np.gradient(signals.vectors["q"], axis=0) if len(signals) > 1 else signals.vectors["q"]
-    if mapping.sections.torque.clipped != "keep":
+    if mapping.torque.clipped != "keep":
         usable = np.ones(len(signals), dtype=bool)
         signals.vectors["clipped"] = clipped(signals.vectors["tau"], speed, usable).astype(np.float64)
 
@@ -176,7 +178,7 @@ def _treat_clipped(
     """
     if "clipped" not in signals.vectors or not (mask := signals.vectors.pop("clipped")).any():
         return std
-    settings, how = mapping.sections.derivatives, mapping.sections.torque.clipped
+    settings, how = mapping.sections.derivatives, mapping.torque.clipped
     window = settings.window if std is not None and settings.filter_torque else 1
     size = np.abs(signals.vectors["tau"]) * mask
     for rows in signals.runs():
@@ -210,6 +212,9 @@ def _dataset(
     extras = {} if std is None else {"qdd_std": _tensor(std)}
     if "tau_std" in signals.vectors:
         extras["tau_std"] = _tensor(signals.vectors.pop("tau_std"))
+    if "command" in signals.vectors:
+        extras["command"] = _tensor(signals.vectors.pop("command"))
+    servo = mapping.sections.servo
     vectors = {name: _tensor(signals.vectors.pop(name)) for name in ("q", "qd", "qdd", "tau")}
     of_contacts = {key: {name: _tensor(x) for name, x in of.items()} for key, of in of_contacts.items()}
     header = DataHeader(
@@ -222,8 +227,9 @@ def _dataset(
         provenance=tuple(report.steps),
         derived=derived,
         imported=tuple((found.kind, found.message) for found in report.findings),
-        unmeasured_torques=mapping.sections.torque.unmeasured,
+        unmeasured_torques=mapping.torque.unmeasured,
         stick_speeds=sticking,
+        **({} if servo is None else servo_fields(mapping, robot.joint_names)),
         joint_names=robot.joint_names,
         contact_names=tuple(signals.contact),
     )

@@ -49,7 +49,7 @@ def subtracted(
 
 def restore(signals: Signals, robot: RobotModel, mapping: Mapping, report: ImportReport) -> None:
     """Add the torque that the driver has subtracted to those of all measured joints."""
-    torque = mapping.sections.torque
+    torque = mapping.torque
     if torque.compensated is None:
         return
     q, qd, qdd = (signals.vectors[name] for name in ("q", "qd", "qdd"))

@@ -19,7 +19,7 @@ from forcegp.errors import DataError
 from forcegp.logs import units
 from forcegp.logs.clock import drop_repeated, find_held, join_stream, split_trajectories
 from forcegp.logs.headings import doubtful, named_like, tokens
-from forcegp.logs.mapping import SYMBOLS, Mapping
+from forcegp.logs.mapping import LOGGED, SYMBOLS, Mapping
 from forcegp.logs.motion import TURNS, find_wrapped
 from forcegp.logs.readers import read
 from forcegp.logs.table import Array, ImportReport, LogTable, Progress, Signals, Stream
@@ -41,7 +41,7 @@ def gather(
     """Read the mapped columns of a log onto a common clock, with at most `rows` rows if possible."""
     sections, joints = mapping.sections, robot.joint_names
     needed = {*sections.time.columns, sections.time.segment or sections.time.columns[0]}
-    for name in SYMBOLS:
+    for name in LOGGED:
         if mapping.quantity(name) is not None:
             needed |= set(mapping.columns_of(name, joints))
     if sections.wrench is not None:
@@ -66,6 +66,8 @@ def _find_names(table: LogTable, mapping: Mapping, joints: Sequence[str], report
             if (reason := doubtful(name)) is not None:
                 report.find("named", named_like(name, reason, quantity))
     torque = mapping.sections.torque
+    if torque is None:
+        return
     column = next(iter(mapping.columns_of("torque", joints)), "")
     if torque.unit in units.CURRENT:
         measured = mapping.measured("torque", joints)
@@ -91,8 +93,8 @@ class _Gathering:
 
     def run(self) -> Signals:
         """Return the quantities, interpolating those of other streams onto the reference stream."""
-        quantities = [name for name in SYMBOLS if self._is_logged(name)]
-        vectors = {SYMBOLS[name]: self._vector(name) for name in quantities}
+        quantities = [name for name in LOGGED if self._is_logged(name)]
+        vectors = {LOGGED[name]: self._vector(name) for name in quantities}
         if self.mapping.sections.wrench is not None:
             vectors["wrench"] = self._wrench()
         vectors |= self._flags()
@@ -112,7 +114,7 @@ class _Gathering:
             return False
         columns = self.mapping.columns_of(name, self.joints)
         absent = [column for column in columns if column not in self.table.names]
-        if name in ("position", "torque") or not absent:
+        if name in ("position", "torque", "servo") or not absent:
             return True
         self.report.find("computed", f"the log has no column {absent[0]!r}: the {name} is computed")
         return False
@@ -166,7 +168,7 @@ class _Gathering:
         scale = numbers("sign") * units.QUANTITY[name][section.unit]
         if section.side == "motor":
             scale *= numbers("gear_ratio") ** (1.0 if name == "torque" else -1.0)
-        if name == "torque" and self.mapping.sections.torque.torque_constant is not None:
+        if name == "torque" and self.mapping.torque.torque_constant is not None:
             scale *= numbers("torque_constant")
         result = np.ones(len(self.joints))
         result[[self.joints.index(joint) for joint in joints]] = scale

@@ -140,6 +140,8 @@ def _value(value: object) -> str:
 
 SYMBOLS = {"position": "q", "velocity": "qd", "acceleration": "qdd", "torque": "tau"}
 """Names of the mapped quantities in a data set."""
+LOGGED = {**SYMBOLS, "servo": "command"}
+"""Names of the vectors that are read from a log."""
 ROS_NAMES = {"position": "position", "velocity": "velocity", "torque": "effort"}
 """Names of the mapped quantities in ROS joint states."""
 KNOWN_NAMES = {"t": "a data set", "header": "ROS joint states"}
@@ -205,6 +207,18 @@ class TorqueSection(QuantitySection):
     unmeasured: tuple[str, ...] = ()
     clipped: Literal["noise", "drop", "keep"] = "noise"
     compensated: Compensated | None = None
+
+
+class ServoSection(QuantitySection):
+    """`[servo]`: commanded positions in place of torques, and the nominal stiffness and damping of each servo
+    [N m/rad, N m s/rad], with the relative standard deviation of the stiffness. Rows in which a torque
+    exceeds `limit` [N m] are dropped. The `delay` of commands [s] is found from the motion unless given."""
+
+    stiffness: PerJoint
+    damping: PerJoint = 0.0
+    limit: PerJoint | None = None
+    delay: Annotated[float, Field(ge=0.0)] | Literal["auto"] = "auto"
+    stiffness_std: float = Field(default=0.3, ge=0.0)
 
 
 class PositionSection(QuantitySection):
@@ -273,7 +287,8 @@ class MappingSections(Section):
     position: PositionSection
     velocity: QuantitySection | None = None
     acceleration: QuantitySection | None = None
-    torque: TorqueSection
+    torque: TorqueSection | None = None
+    servo: ServoSection | None = None
     wrench: WrenchSection | None = None
     contact: dict[str, ContactStateSection] = Field(default_factory=dict)
     derivatives: DerivativesSection = DerivativesSection()
@@ -292,8 +307,13 @@ class Mapping:
     doubts: tuple[str, ...] = ()
 
     def quantity(self, name: str) -> QuantitySection | None:
-        """Return the table of a joint vector: `position`, `velocity`, `acceleration` or `torque`."""
+        """Return the table of a joint vector, whose names are those in `LOGGED`."""
         return getattr(self.sections, name)
+
+    @property
+    def torque(self) -> TorqueSection:
+        """The table of the torque, with defaults for the log of servos."""
+        return self.sections.torque or TorqueSection(unit="Nm", clipped="keep")
 
     def measured(self, name: str, joints: Sequence[str]) -> list[str]:
         """Return the joints for which a quantity is logged. Joints with an `unmeasured` torque, or with
@@ -382,11 +402,20 @@ def parse_mapping(content: bytes, source: str) -> Mapping:
 def _check(mapping: Mapping) -> None:
     """Check the units, and the keys that depend on each other."""
     sections = mapping.sections
-    for name in SYMBOLS:
+    for name in LOGGED:
         if (section := mapping.quantity(name)) is not None:
             _check_quantity(mapping, name, section)
-    if (sections.torque.unit in units.CURRENT) != (sections.torque.torque_constant is not None):
-        text, got = "a current needs a torque constant, and nothing else has one", repr(sections.torque.unit)
+    if (sections.torque is None) == (sections.servo is None):
+        raise mapping.error(
+            (),
+            "torques or commands of servos are needed, and not both",
+            expected="[torque], or [servo] with the nominal stiffness of each servo",
+            hint="of a log without torque, only ratios of stiffness, friction and drive inertia follow where "
+            "links and gravity are small: a nominal stiffness fixes their scale",
+        )
+    torque = mapping.torque
+    if (torque.unit in units.CURRENT) != (torque.torque_constant is not None):
+        text, got = "a current needs a torque constant, and nothing else has one", repr(torque.unit)
         expected = 'unit = "A" with torque_constant = … [N m/A], or a unit of torque without it'
         raise mapping.error(("torque", "unit"), text, expected, got)
     for name, contact in sections.contact.items():
@@ -428,6 +457,9 @@ def _check_quantity(mapping: Mapping, name: str, section: QuantitySection) -> No
         "sign": ("1 or -1", lambda n: abs(n) == 1.0),
         "gear_ratio": ("a number that is not 0", lambda n: n != 0.0),
         "torque_constant": ("> 0", lambda n: n > 0.0),
+        "stiffness": ("> 0 [N m/rad]", lambda n: n > 0.0),
+        "damping": (">= 0 [N m s/rad]", lambda n: n >= 0.0),
+        "limit": ("> 0 [N m]", lambda n: n > 0.0),
     }
     for key, (what, right) in valid.items():
         value = getattr(section, key, None)

@@ -14,7 +14,11 @@ _UNITS: dict[str, dict[str, float]] = VOCABULARY["units"]
 TIME, VELOCITY, TORQUE, CURRENT, FORCE = (
     _UNITS[name] for name in ("time", "velocity", "torque", "current", "force")
 )
-QUANTITY: Mapping[str, Mapping[str, float]] = {**_UNITS, "torque": {**TORQUE, **CURRENT}}
+QUANTITY: Mapping[str, Mapping[str, float]] = {
+    **_UNITS,
+    "torque": {**TORQUE, **CURRENT},
+    "servo": _UNITS["position"],
+}
 """Factors that convert the units of each mapped quantity to SI units. Currents are converted to amperes."""
 SI = {name: next(iter(_UNITS[name])) for name in ("position", "velocity", "acceleration", "torque")}
 """Default unit of each joint vector for revolute joints."""

@@ -16,6 +16,7 @@ from torch import Tensor
 
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import ForcePrior
+from forcegp.forces.priors.constants import DrivePrior
 from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
 from forcegp.forces.term import JointTerm
 from forcegp.gp.kernels import Constant, Linear, sub
@@ -120,6 +121,10 @@ def _of_prior(
                 if name not in UNITS and not name.startswith(WITHOUT_UNIT):
                     units = f"{units} per unit of {name}"
                 yield _parameter(f"{prior.name}.{name} of {joint}", w[j, c], std[j, c], unit[j, c], units)
+    if isinstance(prior, DrivePrior) and isinstance(prior.kernel, Constant):
+        for k, joint in enumerate(robot.joint_names):
+            unit = prior.std * prior.kernel.std(params).expand(robot.nq)[k]
+            yield _parameter(f"{prior.name}.scale of {joint}", w[k, 0], std[k, 0], unit, "")
     if isinstance(prior, PayloadPrior | InertialPrior) and isinstance(prior.kernel, Constant):
         links = robot.nq * len(PARAMETER_NAMES)
         sizes = prior.units(w) if isinstance(prior, PayloadPrior) else prior.scale(robot)

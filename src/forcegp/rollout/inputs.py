@@ -138,7 +138,8 @@ class Inputs(ABC):
 
 
 Torque = Tensor | Dataset | Inputs | Callable[[Tensor, Tensor, Tensor], Tensor]
-"""An array `(samples, nq)` or `(*batch, samples, nq)`, a log, `Inputs`, or a function of (t, q, q̇)."""
+"""An array `(samples, nq)` or `(*batch, samples, nq)`, a log, whose torques or commanded positions are used,
+`Inputs`, or a function of (t, q, q̇)."""
 
 
 @dataclass(frozen=True)
@@ -168,6 +169,37 @@ class Sampled(Inputs):
         if len(self.values) == 1:
             return self.values[0, index]
         return self.values[torch.arange(len(index), device=index.device), index]
+
+
+@dataclass(frozen=True)
+class Commands(Inputs):
+    """Servos that follow commanded positions, τ = k_p (q_c(t) − q) − k_d q̇.
+
+    Args:
+        positions: commands q_c, interpolated linearly.
+        stiffness, damping: k_p and k_d `(nq,)` [N m/rad, N m s/rad].
+    """
+
+    positions: Sampled
+    stiffness: Tensor
+    damping: Tensor
+
+    @classmethod
+    def of(cls, log: Dataset) -> Commands:
+        """Return the commands of the log of servos.
+
+        Raises:
+            DataError: the log lacks commands, or is not a single trajectory with a constant sampling period.
+        """
+        if "command" not in log.extras:
+            raise DataError("the log of servos has no commands", expected="the column 'command'")
+        positions = Sampled(log.extras["command"][None], sampling_period(log), linear=True)
+        gains = (log.q.new_tensor(x) for x in (log.header.servo_stiffness, log.header.servo_damping))
+        return cls(positions, *gains)
+
+    def torque(self, t: Tensor, end: Tensor, at: Reached) -> Tensor:
+        ahead = self.positions.torque(t, end, at) - at.q
+        return self.stiffness * ahead - self.damping * at.qd
 
 
 @dataclass(frozen=True)
@@ -253,6 +285,8 @@ def inputs_of(
         raise UnknownNameError("interpolation", interpolation, INTERPOLATIONS)
     if isinstance(tau, Inputs):
         return tau
+    if isinstance(tau, Dataset) and tau.header.servo_stiffness:
+        return Commands.of(tau)
     if isinstance(tau, Dataset):
         return Sampled(tau.tau[None], sampling_period(tau), interpolation == "linear")
     if not isinstance(tau, Tensor):

@@ -58,6 +58,8 @@ class ForcePrior(ABC):
     """Whether the force is learned from what all other forces leave, and does not change them."""
     is_error: bool = False
     """Whether the robot includes the force, so that its mean is zero and its error only widens error bars."""
+    is_stated: bool = False
+    """Whether the scale of the force is stated, and not learned."""
     delay: float = 0.0
     """Time by which logged torques precede the motion, if it was identified with the force [s]."""
 

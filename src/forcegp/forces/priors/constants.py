@@ -27,6 +27,8 @@ class DrivePrior(ConstantForcePrior):
 
     Args:
         std: relative standard deviation s of the drive constants.
+        unscaled: indices of joints whose constant a log does not determine: it stays nominal in predictions,
+            and uncertain by s.
         kernel: covariance of δ.
         name: prefix of the hyperparameters.
 
@@ -39,10 +41,13 @@ class DrivePrior(ConstantForcePrior):
         ModelError: the standard deviation is not positive.
     """
 
+    is_stated = True
+
     std: float = 0.2
     kernel: Kernel = field(default_factory=Constant)
     name: str = "drives"
     target: str = JOINT
+    unscaled: tuple[int, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.std > 0.0:
@@ -55,8 +60,13 @@ class DrivePrior(ConstantForcePrior):
     def outputs(self, robot: RobotModel) -> int:
         return robot.nq
 
+    def stated(self, initial: dict[str, Tensor]) -> dict[str, Tensor]:
+        return {name: torch.zeros_like(value) for name, value in initial.items()}
+
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
-        return self.std * torch.diag_embed(at.tau)
+        known = at.tau.new_ones(at.tau.shape[-1])
+        known[list(self.unscaled)] = 0.0
+        return self.std * torch.diag_embed(at.tau * known)
 
 
 @dataclass(frozen=True)

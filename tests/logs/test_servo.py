@@ -1,0 +1,222 @@
+"""Logs of servos without torques, of an arm that MuJoCo moves."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+import forcegp
+from forcegp.errors import DataError, MappingError
+from forcegp.logs import import_log
+from forcegp.logs.mapping import parse_mapping
+
+mujoco = pytest.importorskip("mujoco")
+
+ARM = """<mujoco><option timestep="0.001" integrator="implicitfast"/><worldbody>
+<body pos="0 0 .5"><joint name="a" axis="0 1 0"/><inertial pos="0 0 .2" mass="1.5" diaginertia=".02 .02 .01"/>
+<body pos="0 0 .4"><joint name="b" axis="0 1 0"/>
+<inertial pos="0 0 .15" mass=".8" diaginertia=".01 .01 .002"/>
+<body pos="0 0 .2"><joint name="c" axis="0 0 1"/>
+<inertial pos="0 0 .05" mass=".2" diaginertia="1e-4 1e-4 1e-4"/>
+</body></body></body></worldbody></mujoco>"""
+STIFFNESS, DAMPING = np.array([150.0, 60.0, 20.0]), np.array([9.0, 3.0, 0.8])
+ARMATURE, FRICTION, VISCOUS = (
+    np.array([0.08, 0.04, 0.02]),
+    np.array([1.2, 0.6, 0.2]),
+    np.array([0.8, 0.4, 0.1]),
+)
+WRONG = np.array([1.3, 1.0 / 1.3, 1.3])
+"""Nominal stiffness and damping over the true ones. No link shows the scale of the last servo."""
+DELAY = 0.012
+
+
+@dataclass(frozen=True)
+class Raw:
+    """A log as it comes: time, positions and commands."""
+
+    t: np.ndarray
+    q: np.ndarray
+    command: np.ndarray
+
+    def write(self, path: Path) -> Path:
+        """Write the columns."""
+        np.savez(path, t=self.t, q=self.q, c=self.command)
+        return path
+
+
+def engine(armature: Any = 0.0, friction: Any = 0.0, viscous: Any = 0.0) -> Any:
+    """MuJoCo's model of the arm."""
+    model = mujoco.MjModel.from_xml_string(ARM)
+    model.dof_armature[:], model.dof_frictionloss[:], model.dof_damping[:] = armature, friction, viscous
+    return model
+
+
+def commanded(seed: int, t: float) -> np.ndarray:
+    """Commands at a time, which begin at zero."""
+    random = np.random.default_rng(seed)
+    size, w, phase = (
+        random.uniform(0.1, 0.3, (5, 3)),
+        random.uniform(0.6, 6.0, (5, 3)),
+        random.uniform(0, 6, (5, 3)),
+    )
+    return (size * (np.sin(w * t + phase) - np.sin(phase))).sum(0)
+
+
+def logged(seed: int, seconds: float, every: int = 4) -> Raw:
+    """Positions of the true arm with noise, and commands, every few milliseconds."""
+    model = engine(ARMATURE, FRICTION, VISCOUS)
+    data, rows, random = mujoco.MjData(model), [], np.random.default_rng(seed)
+    for k in range(round(1000 * seconds)):
+        t = 1e-3 * k
+        if k % every == 0:
+            rows.append([np.full(3, t), data.qpos + 1e-5 * random.standard_normal(3), commanded(seed, t)])
+        late = commanded(seed, max(0.0, t - DELAY))
+        data.qfrc_applied[:] = STIFFNESS * (late - data.qpos) - DAMPING * data.qvel
+        mujoco.mj_step(model, data)
+    t, q, command = np.array(rows).transpose(1, 0, 2)
+    return Raw(t[:, 0], q, command)
+
+
+def mapping(more: str = "", servo: bool = True, window: int = 21) -> Any:
+    """The mapping with nominal gains."""
+    stiffness, damping = (
+        ", ".join(f"{j} = {x}" for j, x in zip("abc", nominal, strict=True))
+        for nominal in (WRONG * STIFFNESS, WRONG * DAMPING)
+    )
+    toml = f"""time = {{ column = "t" }}
+    joints = {{ a = "0", b = "1", c = "2" }}
+    position = {{ column = "q[{{joint}}]", unit = "rad" }}
+    derivatives = {{ window = {window} }}
+    """
+    if servo:
+        toml += f"""[servo]
+        column = "c[{{joint}}]"
+        unit = "rad"
+        stiffness = {{ {stiffness} }}
+        damping = {{ {damping} }}
+        {more}"""
+    return parse_mapping(toml.encode(), "servo")
+
+
+@pytest.fixture(scope="module")
+def robot(tmp_path_factory: pytest.TempPathFactory) -> forcegp.RobotModel:
+    """The arm of the robot file, without drives and friction."""
+    path = tmp_path_factory.mktemp("arm") / "arm.xml"
+    path.write_text(ARM)
+    return forcegp.load_robot(path)
+
+
+@pytest.fixture(scope="module")
+def raw(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """Twenty seconds at 250 Hz."""
+    return logged(0, 20.0).write(tmp_path_factory.mktemp("servo") / "log.npz")
+
+
+def test_torques_follow_from_commands_that_are_late(robot: forcegp.RobotModel, raw: Path) -> None:
+    """The delay is found within 2 ms; the header and the commands describe the servos."""
+    found = import_log(raw, robot, mapping())
+    data, (step,) = found.data, [step for step in found.report.steps if "commands" in step]
+    assert abs(float(step.split("commands ")[1].split(" ms")[0]) - 1e3 * DELAY) < 2.0
+    assert data.header.torque_scale_std == 0.3
+    assert data.header.servo_stiffness == pytest.approx(WRONG * STIFFNESS)
+    given = import_log(raw, robot, mapping("delay = 0.012", window=5)).data
+    late = np.array([commanded(0, float(t) - DELAY) for t in given.t])
+    assert np.abs(given.extras["command"].numpy() - late).max() < 1e-4
+    spring = WRONG * STIFFNESS * (late - given.q.numpy()) - WRONG * DAMPING * given.qd.numpy()
+    inner = slice(10, -10)
+    assert np.abs(spring - given.tau.numpy())[inner].max() < 0.05 * np.abs(spring).max()
+
+
+def test_gains_are_learned_where_links_fix_their_scale(robot: forcegp.RobotModel, raw: Path) -> None:
+    """Error bars hold, and the scale of the last servo, which moves hardly any link, stays as stated."""
+    fit = forcegp.StructuredGP(forcegp.ConstrainedSystem(robot)).fit(forcegp.read_log(raw, robot, mapping()))
+    own = {p.name: p for p in fit.parameters()}
+    for joint, wrong in zip("ab", WRONG, strict=False):
+        scale = own[f"drives.scale of {joint}"]
+        assert scale.determined
+        assert abs(scale.value - (1.0 / wrong - 1.0)) < 3.0 * scale.std + 0.01
+        assert scale.std < 0.15
+    last = own["drives.scale of c"]
+    assert (last.value, last.std, last.determined) == (0.0, pytest.approx(0.3), False)
+    # Relative to the nominal torque of this servo
+    assert float(fit.system.robot.armature[2]) == pytest.approx(WRONG[2] * ARMATURE[2], rel=0.15)
+
+
+def test_playback_of_commands_follows_the_true_arm(
+    robot: forcegp.RobotModel, raw: Path, tmp_path: Path
+) -> None:
+    """Two seconds of other commands: a quarter of the error of the file with nominal gains, in MuJoCo."""
+    fit = forcegp.StructuredGP(forcegp.ConstrainedSystem(robot)).fit(forcegp.read_log(raw, robot, mapping()))
+    test = logged(1, 5.0).write(tmp_path / "test.npz")
+    log = forcegp.read_log(test, robot, mapping())
+    log = log[250:751]
+    path = fit.rollout(log.q[0], log.qd[0], log, duration=2.0)
+    rows = ((log.t - log.t[0]) / (path.t[1] - path.t[0])).round().long()
+    ours = (path.q.view(-1, 3)[rows] - log.q).square().mean().sqrt()
+    model, errors = engine(armature=1e-3), []
+    data = mujoco.MjData(model)
+    data.qpos[:], data.qvel[:] = log.q[0], log.qd[0]
+    start, k_p, k_d = float(log.t[0]), WRONG * STIFFNESS, WRONG * DAMPING
+    model.dof_damping[:] = k_d  # implicit, as explicit damping of light joints is unstable
+    for k in range(2000):
+        if k % 4 == 0:
+            errors.append(data.qpos - log.q[k // 4].numpy())
+        data.qfrc_applied[:] = k_p * (commanded(1, start + 1e-3 * k) - data.qpos)
+        mujoco.mj_step(model, data)
+    file = np.sqrt(np.square(errors).mean())
+    assert ours < 0.005
+    assert ours < 0.25 * file
+
+
+def test_rows_in_which_a_servo_saturates_are_dropped(robot: forcegp.RobotModel, raw: Path) -> None:
+    """With a limit of 8 N m for the first servo, and one that is always exceeded."""
+    found = import_log(raw, robot, mapping("limit = { a = 8.0, b = 1e3, c = 1e3 }"))
+    (finding,) = [f for f in found.report.findings if f.kind == "clipped"]
+    assert "servo of a saturates" in finding.message
+    assert found.data.tau[:, 0].abs().max() < 8.0
+    with pytest.raises(DataError, match="saturates in every row"):
+        import_log(raw, robot, mapping("limit = 1e-9"))
+
+
+def test_invalid_servos_are_named(robot: forcegp.RobotModel, raw: Path) -> None:
+    """Neither torques nor commands, a stiffness below zero, and a log without time for its delay."""
+    with pytest.raises(MappingError, match="torques or commands of servos are needed"):
+        mapping(servo=False)
+    with pytest.raises(MappingError, match="not a valid limit"):
+        mapping("limit = -1.0")
+    with pytest.raises(MappingError, match="stiffness"):
+        parse_mapping(
+            b'time = { column = "t" }\nposition = { column = "q", unit = "rad" }\n'
+            b'servo = { column = "c", unit = "rad" }',
+            "servo",
+        )
+    with pytest.raises(DataError, match="shorter than the delay"):
+        import_log(raw, robot, mapping("delay = 100.0"))
+
+
+def test_a_known_stiffness_has_no_unknown_scale(robot: forcegp.RobotModel, raw: Path) -> None:
+    """`stiffness_std = 0` makes torques known, as measured ones."""
+    data = forcegp.read_log(raw, robot, mapping("stiffness_std = 0.0"))
+    assert data.header.torque_scale_std is None
+    fit = forcegp.StructuredGP(forcegp.ConstrainedSystem(robot)).fit(data)
+    assert not [p for p in fit.parameters() if p.name.startswith("drives")]
+
+
+def test_a_saved_data_set_and_model_keep_the_servos(
+    robot: forcegp.RobotModel, raw: Path, tmp_path: Path
+) -> None:
+    """Commands and gains survive a file, and a loaded model predicts the same torque scale."""
+    data = forcegp.read_log(raw, robot, mapping())
+    data.write(tmp_path / "log.parquet")
+    again = forcegp.Dataset.read(tmp_path / "log.parquet")
+    assert torch.equal(again.extras["command"], data.extras["command"])
+    assert again.header.servo_damping == data.header.servo_damping
+    fit = forcegp.StructuredGP(forcegp.ConstrainedSystem(robot)).fit(again[::5])
+    fit.save(tmp_path / "model.safetensors")
+    loaded, at = forcegp.load_model(tmp_path / "model.safetensors"), (data.q[:3], data.qd[:3], data.tau[:3])
+    assert torch.equal(loaded.predict(*at).mean, fit.predict(*at).mean)
