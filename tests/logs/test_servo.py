@@ -141,6 +141,9 @@ def test_gains_are_learned_where_links_fix_their_scale(robot: forcegp.RobotModel
         assert scale.determined
         assert abs(scale.value - (1.0 / wrong - 1.0)) < 3.0 * scale.std + 0.01
         assert scale.std < 0.15
+    (said,) = [doubt for doubt in fit.result.warnings if "nominal" in doubt]
+    assert said.startswith("torques over the nominal ones")
+    assert said.endswith("links hardly resist: c")
     last = own["drives.scale of c"]
     assert (last.value, last.std, last.determined) == (0.0, pytest.approx(0.3), False)
     # Relative to the nominal torque of this servo
@@ -197,6 +200,13 @@ def test_invalid_servos_are_named(robot: forcegp.RobotModel, raw: Path) -> None:
         )
     with pytest.raises(DataError, match="shorter than the delay"):
         import_log(raw, robot, mapping("delay = 100.0"))
+
+
+def test_check_does_not_judge_torques_of_nominal_gains(robot: forcegp.RobotModel, raw: Path) -> None:
+    """Their errors are learned by a fit, and are no fault of the log."""
+    report = forcegp.check(forcegp.ConstrainedSystem(robot), forcegp.read_log(raw, robot, mapping()))
+    assert "nominal gains" in report.skipped["dynamics"]
+    assert not [f for f in report.findings if f.severity == "error"]
 
 
 def test_a_known_stiffness_has_no_unknown_scale(robot: forcegp.RobotModel, raw: Path) -> None:

@@ -72,6 +72,20 @@ def clear_drives(
     return (f"{lacks}: {', '.join(clear)}",) if clear else ()
 
 
+def torque_scales(parameters: Sequence[LearnedParameter]) -> tuple[str, ...]:
+    """Return a sentence about torques over the nominal ones, if their scale is an unknown."""
+    mark = ".scale of "
+    found = [(each.name.split(mark)[1], each) for each in parameters if mark in each.name]
+    if not found:
+        return ()
+    known = [f"{joint} {1.0 + p.value:.3g} ± {2.0 * p.std:.1g}" for joint, p in found if p.determined]
+    rest = [joint for joint, p in found if not p.determined]
+    sentence = f"torques over the nominal ones [± 2σ]: {', '.join(known) or 'none is determined'}"
+    if known and rest:
+        sentence += f"; not determined, since links hardly resist: {', '.join(rest)}"
+    return (sentence,)
+
+
 def is_identified(priors: Sequence[ForcePrior]) -> bool:
     """Return whether instruments identified the inertia, which differs from its posterior mean then."""
     return any(isinstance(prior, InertialPrior) and prior.is_error and bool(prior.drives) for prior in priors)
