@@ -33,6 +33,7 @@ from forcegp.forces.measurements import Training
 from forcegp.forces.noise import TORQUE_NOISE
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import ForceMean
+from forcegp.forces.priors.constants import UNDETERMINED
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import JointFrictionPrior
 from forcegp.forces.priors.ripple import ripple_of
@@ -147,13 +148,13 @@ def servo_robot(robot: RobotModel, rows: Rows, scale_std: float) -> Inertia:
     columns = torch.cat([size * torch.diag_embed(rows.qdd), -scale_std * torch.diag_embed(rows.tau)], dim=-1)
     _, found = _regressions(rows, columns, M)
     drives, scales = torch.arange(n), torch.arange(n, 2 * n)
-    known = found.read(2 * n, torch.cat([drives, scales]))[1][n:].sqrt() < DETERMINED
-    unknowns = torch.cat([drives, scales[known]])
+    spread = found.read(2 * n, torch.cat([drives, scales]))[1][n:].sqrt()
+    unknowns = torch.cat([drives, scales[spread < UNDETERMINED]])
     best, std = found.estimate(found.by_stretch.total(), unknowns, n), found.read(n, unknowns)[1].sqrt()
     links = InertialPrior(mass=EXACT, length=EXACT, inertia=EXACT, is_error=True).around(robot)
     errors = links.with_drives(size * std.clamp(max=1.0))
-    undetermined = tuple((~known).nonzero()[:, 0].tolist())
-    return Inertia(robot.replace(armature=robot.armature + size * best[:n]), errors, (), undetermined)
+    spread = tuple(spread.clamp(max=1.0).tolist())
+    return Inertia(robot.replace(armature=robot.armature + size * best[:n]), errors, (), spread)
 
 
 def _regressions(rows: Rows, inertial: Tensor, M: Tensor) -> tuple[tuple[_Regression, ...], _Regression]:
@@ -341,11 +342,10 @@ five real arms are 1.36 times as large in the geometric mean, and torque errors 
 VOLUME_STATES = 100
 """Number of states over which log |M| or the noise volume is averaged."""
 IDENTIFIED = "identified inertia replaces that of the robot file, since it predicts held-out torques better"
-DETERMINED, LOOSE, EXACT = 0.5, 10.0, 1e-6
-"""Of torques with unknown scale: standard deviation of the scale, over the stated one, below which it is
-determined; factor on the prior deviation of drives, which would shrink together with the torques; relative
-error of the links that fix the scale. With 1 in place of 10, the scale of five of thirteen servos in MuJoCo
-is pulled towards zero."""
+LOOSE, EXACT = 10.0, 1e-6
+"""Of torques with unknown scale: factor on the prior deviation of drives, which would shrink together with
+the torques, and relative error of the links that fix the scale. With 1 in place of 10, the scale of two of
+six servos of an SO-101 in MuJoCo is pulled towards zero."""
 GAIN = 0.02
 """Relative standard deviation of the gain of a torque sensor, up to 2 % in data sheets of strain gauges."""
 CLEAR = 3.0
@@ -370,13 +370,14 @@ class Inertia:
         errors: prior on the remaining errors of links and drives, or `None` if they are not considered. Their
             mean is zero, so that predictions follow the robot, and they widen all error bars.
         doubts: warnings for the user.
-        unscaled: joints for which the log does not determine the scale of the torque.
+        spread: standard deviation of the scale of each torque over blocks of the log, relative to the stated
+            one, if it is unknown.
     """
 
     robot: RobotModel
     errors: InertialPrior | None = None
     doubts: tuple[str, ...] = ()
-    unscaled: tuple[int, ...] = ()
+    spread: tuple[float, ...] = ()
 
 
 @torch.no_grad()

@@ -112,10 +112,10 @@ class Specification:
         noise = self.noise.for_priors(priors)
         return dataclasses.replace(self, priors=priors, noise=noise, options=options)
 
-    def without_scales(self, joints: tuple[int, ...]) -> Specification:
-        """Return the specification in which torques of some joints have their nominal scale."""
+    def with_spread(self, spread: tuple[float, ...]) -> Specification:
+        """Return the specification with the standard deviations of the scales of torques over the log."""
         priors = (
-            dataclasses.replace(prior, unscaled=joints) if isinstance(prior, DrivePrior) else prior
+            dataclasses.replace(prior, spread=spread) if isinstance(prior, DrivePrior) else prior
             for prior in self.priors
         )
         return dataclasses.replace(self, priors=tuple(priors))
@@ -203,8 +203,8 @@ def problem_for(
     elif before is None and chosen is None:
         found = spec.inertia_of(training)
         robot, doubts = found.robot, (*doubts, *found.doubts)
-        if found.unscaled:
-            spec = spec.without_scales(found.unscaled)
+        if found.spread:
+            spec = spec.with_spread(found.spread)
         if found.errors is not None:
             spec = dataclasses.replace(spec, priors=(*spec.priors, found.errors))
             training, _ = training_for(spec, before, data, chosen)

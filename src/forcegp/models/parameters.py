@@ -138,7 +138,8 @@ def _of_prior(
     if isinstance(prior, DrivePrior) and isinstance(prior.kernel, Constant):
         for k, joint in enumerate(robot.joint_names):
             unit = prior.std * prior.kernel.std(params).expand(robot.nq)[k]
-            yield _parameter(f"{prior.name}.scale of {joint}", w[k, 0], std[k, 0], unit, "")
+            deviation = std[k, 0].clamp(min=prior.spread[k]) if prior.spread else std[k, 0]
+            yield _parameter(f"{prior.name}.scale of {joint}", w[k, 0], deviation, unit, "")
     if isinstance(prior, PayloadPrior | InertialPrior) and isinstance(prior.kernel, Constant):
         links = robot.nq * len(PARAMETER_NAMES)
         sizes = prior.units(w) if isinstance(prior, PayloadPrior) else prior.scale(robot)

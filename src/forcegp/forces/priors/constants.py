@@ -15,6 +15,9 @@ from forcegp.forces.quantities import States
 from forcegp.gp.kernels import Constant, Kernel
 from forcegp.robot.model import RobotModel
 
+UNDETERMINED = 0.5
+"""Standard deviation, over the stated one, above which a log does not determine a drive constant."""
+
 
 @dataclass(frozen=True)
 class DrivePrior(ConstantForcePrior):
@@ -27,8 +30,8 @@ class DrivePrior(ConstantForcePrior):
 
     Args:
         std: relative standard deviation s of the drive constants.
-        unscaled: indices of joints whose constant a log does not determine: it stays nominal in predictions,
-            and uncertain by s.
+        spread: standard deviation of each δ_i over blocks of the log, if it was identified together with the
+            inertia. Constants with at least `UNDETERMINED` stay nominal in predictions, and uncertain by s.
         kernel: covariance of δ.
         name: prefix of the hyperparameters.
 
@@ -47,7 +50,7 @@ class DrivePrior(ConstantForcePrior):
     kernel: Kernel = field(default_factory=Constant)
     name: str = "drives"
     target: str = JOINT
-    unscaled: tuple[int, ...] = ()
+    spread: tuple[float, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.std > 0.0:
@@ -65,7 +68,8 @@ class DrivePrior(ConstantForcePrior):
 
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
         known = at.tau.new_ones(at.tau.shape[-1])
-        known[list(self.unscaled)] = 0.0
+        if self.spread:
+            known = (at.tau.new_tensor(self.spread) < UNDETERMINED).to(known)
         return self.std * torch.diag_embed(at.tau * known)
 
 
