@@ -3,7 +3,7 @@
     python benchmarks/servo.py --json servo.json          # iiwa 14 and SO-101, 50 and 500 Hz, three seeds
 
 Stiffness and damping in the mapping are wrong by 30 %, up or down. The true arm has drives, damping, friction
-loss and commands that are late by 10 ms; positions have 1e-5 rad of noise. Ratios are errors of joint angles
+loss and commands that are late by 10 ms. Ratios are errors of joint angles
 over two seconds of other commands in open loop, over those of the robot file with the nominal gains in
 MuJoCo. Scales count as determined if the fit says so.
 """
@@ -33,8 +33,8 @@ mujoco = optional_module("mujoco", "This benchmark")
 ROBOTS = ("iiwa14", "so101")
 WINDOWS = {500: 41, 50: 7}
 """Rows of the filter at each rate [Hz]."""
-WRONG, DELAY, NOISE, SECONDS, LENGTH, PLAYED = 1.3, 0.01, 1e-5, 30.0, 2.0, 3
-"""Factor on gains, delay [s], noise [rad], lengths of the log and an open loop [s], number of open loops."""
+WRONG, DELAY, SECONDS, LENGTH, PLAYED = 1.3, 0.01, 30.0, 2.0, 3
+"""Factor on gains, delay [s], lengths of the log and an open loop [s], number of open loops."""
 STATES = 200
 """States over which inertia and load are averaged."""
 
@@ -108,14 +108,16 @@ class Arm:
         """
         return parse_mapping(toml.encode(), "servo")
 
-    def log(self, random: np.random.Generator, seconds: float, rate: int) -> tuple[forcegp.Dataset, Any]:
+    def log(
+        self, random: np.random.Generator, seconds: float, rate: int, noise: float
+    ) -> tuple[forcegp.Dataset, Any]:
         """The import of the log of the true arm, and its commands."""
         model, command, rows = self.engine(true=True), self.commands(random), []
         data, every = mujoco.MjData(model), round(1000 / rate)
         data.qpos[:] = command(0.0)
         for k in range(round(1000 * seconds)):
             if k % every == 0:
-                q = data.qpos + NOISE * random.standard_normal(self.robot.nq)
+                q = data.qpos + noise * random.standard_normal(self.robot.nq)
                 rows.append([np.full_like(q, 1e-3 * k), q, command(1e-3 * k)])
             data.ctrl[:] = self.stiffness * (command(max(0.0, 1e-3 * k - DELAY)) - data.qpos)
             mujoco.mj_step(model, data)
@@ -139,12 +141,12 @@ class Arm:
         return float(np.square(errors).mean())
 
 
-def compared(name: str, rate: int, seed: int) -> dict[str, Any]:
+def compared(name: str, rate: int, seed: int, noise: float) -> dict[str, Any]:
     """Open loops, gains and drives of one arm."""
     random = np.random.default_rng(seed)
     arm = Arm.of(name, random)
-    train, _ = arm.log(random, SECONDS, rate)
-    test, command = arm.log(random, LENGTH * PLAYED + 1.0, rate)
+    train, _ = arm.log(random, SECONDS, rate, noise)
+    test, command = arm.log(random, LENGTH * PLAYED + 1.0, rate, noise)
     begin = time.perf_counter()
     fit = forcegp.StructuredGP(forcegp.ConstrainedSystem(arm.robot)).fit(train)
     seconds, rows = time.perf_counter() - begin, round(LENGTH * rate)
@@ -178,6 +180,7 @@ def main() -> None:
     parser.add_argument("--robot", choices=ROBOTS, action="append")
     parser.add_argument("--rate", type=int, choices=tuple(WINDOWS), action="append")
     parser.add_argument("--seeds", type=int, default=3)
+    parser.add_argument("--noise", type=float, default=1e-5, help="standard deviation of positions [rad]")
     parser.add_argument("--json", type=Path, help="write the results there")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")
@@ -185,7 +188,7 @@ def main() -> None:
     for name in arguments.robot or ROBOTS:
         for rate in arguments.rate or WINDOWS:
             for seed in range(arguments.seeds):
-                one = compared(name, rate, seed)
+                one = compared(name, rate, seed, arguments.noise)
                 results.append(one)
                 ratio = one["open_loop_rad"] / one["file_rad"]
                 shown = f"{sum(one['determined'])} of {len(one['determined'])} scales determined"

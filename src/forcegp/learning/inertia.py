@@ -153,8 +153,8 @@ def servo_robot(robot: RobotModel, rows: Rows, scale_std: float) -> Inertia:
     best, std = found.estimate(found.by_stretch.total(), unknowns, n), found.read(n, unknowns)[1].sqrt()
     links = InertialPrior(mass=EXACT, length=EXACT, inertia=EXACT, is_error=True).around(robot)
     errors = links.with_drives(size * std.clamp(max=1.0))
-    spread = tuple(spread.clamp(max=1.0).tolist())
-    return Inertia(robot.replace(armature=robot.armature + size * best[:n]), errors, (), spread)
+    armature = robot.armature + size * best[:n]
+    return Inertia(robot.replace(armature=armature), errors, (), tuple(spread.clamp(max=1.0).tolist()))
 
 
 def _regressions(rows: Rows, inertial: Tensor, M: Tensor) -> tuple[tuple[_Regression, ...], _Regression]:
@@ -402,7 +402,8 @@ def inertia_of(
     """
     if training.free_motions < LEAST:
         size = drive_scale(system.robot, torch.cat([m.q for m in training.measurements]))
-        return Inertia(system.robot, _errors(system.robot, size))
+        spread = () if scale_std is None else (1.0,) * system.robot.nq
+        return Inertia(system.robot, _errors(system.robot, size), (), spread)
     rows = free_rows(system, friction, mean, training).with_memory()
     rows = with_ripple(system.robot, rows)
     return (
