@@ -26,8 +26,8 @@ LONGEST, STEP, ROWS = 0.1, 0.002, 20_000
 EARLIER = (0.02, 0.07)
 """Times by which commands precede the motion that they are instruments for [s]."""
 RISE, RANK, FEWEST = 0.01, 1e-9, 50
-"""Speed over which dry friction rises in this search [rad/s, m/s], relative singular value of columns that are
-dependent, and fewest rows of a joint."""
+"""Speed over which dry friction rises in this search [rad/s, m/s], relative singular value of dependent
+columns, and fewest rows of a joint."""
 MOVING = 0.7
 """Share of the RMS speed above which a joint moves: near reversals, filters blur dry friction. In MuJoCo, with
 an SO-101 and an iiwa 14 at 50 and 500 Hz, delays of 10 ms are found as 9.6 to 11.0 ms with position noise of
@@ -183,7 +183,7 @@ def _delay(signals: Signals, robot: RobotModel, mapping: Mapping) -> float:
 def _orthogonal(Z: Array) -> Array:
     """Return an orthonormal basis of the columns of Z."""
     U, S, _ = np.linalg.svd(Z / np.sqrt(np.square(Z).mean(axis=0) + 1e-300), full_matrices=False)
-    return U[:, S > RANK * S[0]]
+    return U[:, RANK * S[0] < S]
 
 
 def _unexplained(e: Array, X: Array, Q: Array) -> float:
