@@ -29,10 +29,10 @@ RISE, RANK, FEWEST = 0.01, 1e-9, 50
 """Speed over which dry friction rises in this search [rad/s, m/s], relative singular value of dependent
 columns, and fewest rows of a joint."""
 MOVING = 0.7
-"""Share of the RMS speed above which a joint moves: near reversals, filters blur dry friction. In MuJoCo, with
-an SO-101 and an iiwa 14 at 50 and 500 Hz, delays of 10 ms are found as 9.6 to 11.0 ms with position noise of
-0.01 to 0.4 mrad; of all rows, as 10.6 to 11.9. By least squares without instruments, noise of 0.4 mrad yields
-26 ms."""
+"""Share of the RMS speed above which a joint moves: near reversals, filters blur dry friction. In MuJoCo,
+with an SO-101 and an iiwa 14 at 50 and 500 Hz, delays of 10 ms are found as 9.6 to 11.0 ms with noise of
+0.01 to 0.4 mrad of positions; of all rows, as 10.6 to 11.9. By least squares without instruments, noise of
+0.4 mrad yields 26 ms."""
 AT_LIMIT = 0.999
 """Share of the torque limit above which a servo saturates."""
 
