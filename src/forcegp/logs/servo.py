@@ -38,9 +38,9 @@ AT_LIMIT = 0.999
 
 
 def spring_torque(signals: Signals, robot: RobotModel, mapping: Mapping, report: ImportReport) -> None:
-    """Replace the vector `command` by the torque k_p (q_c(t − s) − q), and add the command itself, late by s.
+    """Compute the torques k_p (q_c(t − s) − q), and shift the vector `command` by the delay s.
 
-    Rows whose command was given before the log are dropped.
+    Rows whose command was given before the log begins are dropped.
 
     Raises:
         DataError: no row is left.
@@ -107,8 +107,8 @@ def servo_fields(mapping: Mapping, joints: tuple[str, ...]) -> dict[str, Any]:
 def _shifted(signals: Signals, x: Array, delay: float) -> Array:
     """Return vectors x (n, k) at times `delay` earlier, NaN before the first one of a trajectory.
 
-    Linear interpolation of a log at 50 Hz is off by as much as a stiff servo, so that delays are multiples of
-    the sampling period.
+    At 50 Hz, errors of linear interpolation are as large as those of a stiff servo, and the search would find
+    multiples of the sampling period.
     """
     late = np.full_like(x, np.nan)
     for rows in signals.runs():
@@ -145,7 +145,7 @@ def _delay(signals: Signals, robot: RobotModel, mapping: Mapping) -> float:
     minimised, where P projects on Z (two-stage least squares).
 
     Raises:
-        DataError: the log is too short.
+        DataError: the log is too short, no joint moves, or the delay is longer than `LONGEST`.
     """
     moved, asked = (_motion(signals, robot, mapping, name) for name in ("q", "command"))
     # Without rows at which the filter or the commands begin or end
@@ -168,6 +168,11 @@ def _delay(signals: Signals, robot: RobotModel, mapping: Mapping) -> float:
     speed = np.abs(moved.qd[rows])
     fast = speed > MOVING * np.sqrt(np.square(speed).mean(axis=0))
     joints = [(j, own, _orthogonal(Z[own, j])) for j, own in enumerate(fast.T) if own.sum() > FEWEST]
+    if not joints:
+        text, hint = "the delay of the commands cannot be found", "state it, as in delay = 0.01 under [servo]"
+        raise DataError(
+            text, expected=f"more than {FEWEST} rows in which a joint moves", got="none", hint=hint
+        )
 
     def left(delay: float) -> float:
         """Return the sum over the joints."""
@@ -176,6 +181,13 @@ def _delay(signals: Signals, robot: RobotModel, mapping: Mapping) -> float:
 
     tried = np.arange(0.0, LONGEST, STEP)
     best = tried[int(np.argmin([left(s) for s in tried]))]
+    if best > LONGEST - 1.5 * STEP:
+        raise DataError(
+            "the delay of the commands cannot be found",
+            expected=f"at most {LONGEST:g} s",
+            got="commands that explain the motion better the later they are",
+            hint="check the columns of the commands, or state the delay, as in delay = 0.15 under [servo]",
+        )
     bounds = (max(0.0, best - 2.0 * STEP), best + 2.0 * STEP)
     return float(scipy.optimize.minimize_scalar(left, bounds=bounds, method="bounded").x)
 
