@@ -210,18 +210,16 @@ def test_check_does_not_judge_torques_of_nominal_gains(robot: forcegp.RobotModel
 
 
 def test_a_delay_that_cannot_be_found_is_no_number(robot: forcegp.RobotModel, tmp_path: Path) -> None:
-    """Later than the longest delay that is tried, an arm that rests, and a short log."""
+    """Later than the longest delay that is tried, an arm that rests, a short log, and commands in steps."""
     raw = logged(2, 6.0)
     late = Raw(raw.t[40:], raw.q[40:], np.roll(raw.command, -40, axis=0)[40:])
     rests = Raw(raw.t, np.zeros_like(raw.q), raw.command)
     short = Raw(raw.t[:30], raw.q[:30], raw.command[:30])
-    for name, each, text in (
-        ("late", late, "cannot be found"),
-        ("rests", rests, "cannot be found"),
-        ("short", short, "too short"),
-    ):
-        with pytest.raises(DataError, match=text):
-            import_log(each.write(tmp_path / f"{name}.npz"), robot, mapping())
+    steps = Raw(raw.t, raw.q, raw.command[np.arange(len(raw.t)) // 5 * 5])
+    unfound = {"late": late, "rests": rests, "short": short, "held over several rows": steps}
+    for text, each in unfound.items():
+        with pytest.raises(DataError, match="too short" if text == "short" else "cannot be found"):
+            import_log(each.write(tmp_path / f"{text}.npz"), robot, mapping())
 
 
 def test_a_known_stiffness_has_no_unknown_scale(robot: forcegp.RobotModel, raw: Path) -> None:

@@ -33,6 +33,10 @@ MOVING = 0.7
 with an SO-101 and an iiwa 14 at 50 and 500 Hz, delays of 10 ms are found as 9.6 to 11.0 ms with noise of
 0.01 to 0.4 mrad of positions; of all rows, as 10.6 to 11.9. By least squares without instruments, noise of
 0.4 mrad yields 26 ms."""
+HOLD, HELD = 0.2, 0.1
+"""Time within which the next change of a command belongs to the same motion [s], and share of changes after
+which the command is held. In MuJoCo, steps of 20 and 32 ms in logs at 250 Hz yield 84 ms and more for a delay
+of 12 ms; logs at the rate of the steps yield 21 and 25 ms, which contain half a step."""
 AT_LIMIT = 0.999
 """Share of the torque limit above which a servo saturates."""
 
@@ -145,8 +149,16 @@ def _delay(signals: Signals, robot: RobotModel, mapping: Mapping) -> float:
     minimised, where P projects on Z (two-stage least squares).
 
     Raises:
-        DataError: the log is too short, no joint moves, or the delay is longer than `LONGEST`.
+        DataError: the log is too short, no joint moves, commands are held over several rows, or the delay is
+            longer than `LONGEST`.
     """
+    if _is_held(signals):
+        raise DataError(
+            "the delay of the commands cannot be found, since commands are held over several rows",
+            expected="commands that change in every row in which the arm is told to move",
+            got="commands that move in steps",
+            hint="state it, as in delay = 0.01 under [servo], or log at the rate of the commands",
+        )
     moved, asked = (_motion(signals, robot, mapping, name) for name in ("q", "command"))
     # Without rows at which the filter or the commands begin or end
     usable = np.asarray(np.isfinite(_shifted(moved.signals, asked.q, LONGEST)).all(axis=1))
@@ -190,6 +202,14 @@ def _delay(signals: Signals, robot: RobotModel, mapping: Mapping) -> float:
         )
     bounds = (max(0.0, best - 2.0 * STEP), best + 2.0 * STEP)
     return float(scipy.optimize.minimize_scalar(left, bounds=bounds, method="bounded").x)
+
+
+def _is_held(signals: Signals) -> bool:
+    """Return whether commands move in steps of several rows."""
+    changes = np.flatnonzero((np.diff(signals.vectors["command"], axis=0) != 0.0).any(axis=1))
+    apart = np.diff(signals.t[changes])
+    steps = (np.diff(changes) > 1) & (apart < HOLD)
+    return bool(len(steps)) and float(steps.mean()) > HELD
 
 
 def _orthogonal(Z: Array) -> Array:
