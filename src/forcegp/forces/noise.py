@@ -189,7 +189,7 @@ def state_jacobian(
     if m.quantity not in ("qdd", "multiplier"):
         return None
     if force is None:
-        at = system.linearize(m.q, m.qd, m.tau, m.active)
+        at = system.linearize(m.q, m.qd, system.robot.true_torque(m.tau), m.active)
     else:
         at = linearize_field(force, system, m.q, m.qd, m.tau, m.active)
     pair = (at.dq, at.dqd) if m.quantity == "qdd" else (at.multiplier_dq, at.multiplier_dqd)

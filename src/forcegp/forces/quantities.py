@@ -63,7 +63,8 @@ def states(
     qdd: Tensor | None = None,
     time: Tensor | None = None,
 ) -> States:
-    """Evaluate the equations of motion at a batch of states."""
+    """Evaluate the equations of motion at a batch of states with nominal torques."""
+    tau = system.robot.true_torque(tau)
     return States(q, qd, tau, active, system.equations(q, qd, active), qdd, time=time)
 
 

@@ -33,7 +33,6 @@ from forcegp.forces.measurements import Training
 from forcegp.forces.noise import TORQUE_NOISE
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors.base import ForceMean
-from forcegp.forces.priors.constants import UNDETERMINED
 from forcegp.forces.priors.inertial import InertialPrior
 from forcegp.forces.priors.joint import JointFrictionPrior
 from forcegp.forces.priors.ripple import ripple_of
@@ -60,6 +59,7 @@ from forcegp.learning.inverse_dynamics import (
     products,
     ridged,
 )
+from forcegp.robot.inertia import inertial_parameters
 from forcegp.robot.model import RobotModel
 
 PASSES = 3
@@ -131,35 +131,52 @@ def rigid_robot(robot: RobotModel, rows: Rows) -> Inertia:
     return Inertia(robot, left)
 
 
-def servo_robot(robot: RobotModel, rows: Rows, scale_std: float) -> Inertia:
-    """Return the robot with the drives of servos, whose torques have an unknown scale 1 + s.
+def rescaled_robot(robot: RobotModel, rows: Rows, std: float) -> Inertia:
+    """Return the robot with the inertia and the scales 1 + s of torques that a log determines.
 
-    Only ratios of torques to inertia and friction are determined, so that links, which stay those of the
-    file, fix the scale. Where they hardly resist the motion, s keeps its stated standard deviation, torques
-    are the nominal ones, and the inertia of the drive is relative to them.
+    Nominal torques are wrong by an unknown factor for each drive. Only ratios of torques to inertia and
+    friction are determined, so that the links of the file fix the scales, and the links may then change.
 
     Args:
         robot: robot from the robot file.
-        rows: samples in free motion.
-        scale_std: stated standard deviation of s.
+        rows: samples in free motion with nominal torques.
+        std: stated standard deviation of s.
+    """
+    found, known = Inertia(robot), rows
+    for _ in range(ROUNDS):
+        scale, spread = torque_scale(robot, known, std)
+        found = rigid_robot(robot, rows.scaled(scale))
+        if IDENTIFIED not in found.doubts:
+            break
+        # Y π for the changed links
+        before, after = (inertial_parameters(x.mass, x.com, x.inertia) for x in (robot, found.robot))
+        change = (links_at(robot, rows) @ (after - before).flatten()[:, None])[..., 0]
+        known = dataclasses.replace(rows, residual=rows.residual - change)
+    robot = found.robot.replace(torque_scale=scale)
+    return dataclasses.replace(found, robot=robot, spread=tuple(spread.tolist()))
+
+
+def torque_scale(robot: RobotModel, rows: Rows, std: float) -> tuple[Tensor, Tensor]:
+    """Return the scales 1 + s `(nq,)` of torques for known links and unknown drives, and σ(s).
+
+    Where links hardly resist the motion, the torques are the nominal ones, and the inertia of the drive is
+    relative to them.
     """
     n = robot.nq
     M, size = inertia_at(robot, rows.q), LOOSE * drive_scale(robot, rows.q)
-    columns = torch.cat([size * torch.diag_embed(rows.qdd), -scale_std * torch.diag_embed(rows.tau)], dim=-1)
-    _, found = _regressions(rows, columns, M)
+    _, found = _regressions(rows, size * torch.diag_embed(rows.qdd), M, std)
     drives, scales = torch.arange(n), torch.arange(n, 2 * n)
     spread = found.read(2 * n, torch.cat([drives, scales]))[1][n:].sqrt()
     unknowns = torch.cat([drives, scales[spread < UNDETERMINED]])
-    best, std = found.estimate(found.by_stretch.total(), unknowns, n), found.read(n, unknowns)[1].sqrt()
-    links = InertialPrior(mass=EXACT, length=EXACT, inertia=EXACT, is_error=True).around(robot)
-    errors = links.with_drives(size * std.clamp(max=1.0))
-    armature = robot.armature + size * best[:n]
-    return Inertia(robot.replace(armature=armature), errors, (), tuple(spread.clamp(max=1.0).tolist()))
+    u = found.estimate(found.by_stretch.total(), unknowns, n)
+    return 1.0 + std * u[n : 2 * n], std * spread.clamp(max=1.0)
 
 
-def _regressions(rows: Rows, inertial: Tensor, M: Tensor) -> tuple[tuple[_Regression, ...], _Regression]:
+def _regressions(
+    rows: Rows, inertial: Tensor, M: Tensor, scale_std: float | None = None
+) -> tuple[tuple[_Regression, ...], _Regression]:
     """Return the regressions over all widths, and the one with the narrowest posterior."""
-    each = tuple(_over_widths(rows, inertial, M))
+    each = tuple(_over_widths(rows, inertial, M, scale_std))
     return each, max(each, key=lambda one: float(torch.logdet(one.normal()[1])))
 
 
@@ -301,13 +318,23 @@ def _marginal(precision: Tensor, kept: Tensor, others: Tensor) -> Tensor:
     return precision[kept][:, kept] - across @ torch.linalg.solve(precision[others][:, others], across.mT)
 
 
-def _over_widths(rows: Rows, inertial: Tensor, M: Tensor) -> Iterator[_Regression]:
-    """Yield, for each averaging width, a regression on equations averaged over time."""
+def _over_widths(
+    rows: Rows, inertial: Tensor, M: Tensor, scale_std: float | None = None
+) -> Iterator[_Regression]:
+    """Yield, for each averaging width, a regression on equations averaged over time.
+
+    Args:
+        inertial: columns of the inertia.
+        M: inertia of the robot file.
+        scale_std: standard deviation of the relative scale of each torque, if it is an unknown.
+    """
     accelerating, n = (M @ rows.qdd[..., None])[..., 0], M.shape[-1]
     for width in WIDTHS if rows.step else WIDTHS[:1]:
         used, columns = averaged(rows, inertial, accelerating, width) if rows.step else (rows, inertial)
         if width and (int(used.weight.sum(0).min()) < LEAST or int(used.group.max()) < int(rows.group.max())):
             break
+        if scale_std is not None:
+            columns = torch.cat([columns, -scale_std * torch.diag_embed(used.tau)], dim=-1)
         columns = with_delay(used, columns)
         speed = used.qd.abs()
         fast = dataclasses.replace(used, weight=used.weight * (speed >= speed.median(0).values))
@@ -342,10 +369,13 @@ five real arms are 1.36 times as large in the geometric mean, and torque errors 
 VOLUME_STATES = 100
 """Number of states over which log |M| or the noise volume is averaged."""
 IDENTIFIED = "identified inertia replaces that of the robot file, since it predicts held-out torques better"
-LOOSE, EXACT = 10.0, 1e-6
-"""Of torques with unknown scale: factor on the prior deviation of drives, which would shrink together with
-the torques, and relative error of the links that fix the scale. With 1 in place of 10, the scale of two of
-six servos of an SO-101 in MuJoCo is pulled towards zero."""
+LOOSE = 10.0
+"""Factor on the prior deviation of drives that would shrink together with torques of unknown scale. With 1,
+the scale of two of six servos of an SO-101 in MuJoCo is pulled towards zero."""
+UNDETERMINED = 0.5
+"""Standard deviation of a scale, over the stated one, from which on the torque is the nominal one."""
+ROUNDS = 3
+"""Maximum number of estimates of the scales, each with the links of the previous one."""
 GAIN = 0.02
 """Relative standard deviation of the gain of a torque sensor, up to 2 % in data sheets of strain gauges."""
 CLEAR = 3.0
@@ -370,8 +400,7 @@ class Inertia:
         errors: prior on the remaining errors of links and drives, or `None` if they are not considered. Their
             mean is zero, so that predictions follow the robot, and they widen all error bars.
         doubts: warnings for the user.
-        spread: standard deviation of the scale of each torque over blocks of the log, relative to the stated
-            one, if it is unknown.
+        spread: standard deviation of the scale of each torque over blocks of the log, if it is unknown.
     """
 
     robot: RobotModel
@@ -402,13 +431,13 @@ def inertia_of(
     """
     if training.free_motions < LEAST:
         size = drive_scale(system.robot, torch.cat([m.q for m in training.measurements]))
-        spread = () if scale_std is None else (1.0,) * system.robot.nq
+        spread = () if scale_std is None else (scale_std,) * system.robot.nq
         return Inertia(system.robot, _errors(system.robot, size), (), spread)
     rows = free_rows(system, friction, mean, training).with_memory()
     rows = with_ripple(system.robot, rows)
-    return (
-        rigid_robot(system.robot, rows) if scale_std is None else servo_robot(system.robot, rows, scale_std)
-    )
+    if scale_std is None:
+        return rigid_robot(system.robot, rows)
+    return rescaled_robot(system.robot, rows, scale_std)
 
 
 def with_ripple(robot: RobotModel, rows: Rows) -> Rows:

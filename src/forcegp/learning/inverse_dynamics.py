@@ -93,6 +93,11 @@ class Rows:
     step: float = 0.0
     filter_variance: float = 0.0
 
+    def scaled(self, scale: Tensor) -> Rows:
+        """Return the samples with torques times `scale` `(nq,)`."""
+        residual = self.residual + (scale - 1.0) * self.tau
+        return dataclasses.replace(self, residual=residual, tau=scale * self.tau, rate=scale * self.rate)
+
     def with_memory(self) -> Rows:
         """Add the features of friction with memory to Φ."""
         return dataclasses.replace(self, friction=torch.cat([self.friction, self.memory], dim=-1))

@@ -114,11 +114,10 @@ class Specification:
 
     def with_spread(self, spread: tuple[float, ...]) -> Specification:
         """Return the specification with the standard deviations of the scales of torques over the log."""
-        priors = (
-            dataclasses.replace(prior, spread=spread) if isinstance(prior, DrivePrior) else prior
-            for prior in self.priors
-        )
-        return dataclasses.replace(self, priors=tuple(priors))
+        own = [prior for prior in self.priors if isinstance(prior, DrivePrior)]
+        others = [prior for prior in self.priors if not isinstance(prior, DrivePrior)]
+        errors = (dataclasses.replace(prior, spread=spread, is_error=True) for prior in own)
+        return dataclasses.replace(self, priors=(*others, *errors))
 
     def with_priors_of(self, problem: Problem) -> Specification:
         """Return the specification with the priors of a problem, without those that were dropped."""

@@ -138,11 +138,19 @@ def _of_prior(
     if isinstance(prior, DrivePrior) and isinstance(prior.kernel, Constant):
         for k, joint in enumerate(robot.joint_names):
             unit = prior.std * prior.kernel.std(params).expand(robot.nq)[k]
-            deviation = std[k, 0].clamp(min=prior.spread[k]) if prior.spread else std[k, 0]
-            yield _parameter(f"{prior.name}.scale of {joint}", w[k, 0], deviation, unit, "")
+            mean, deviation = w[k, 0], std[k, 0]
+            if prior.is_error and robot.torque_scale is not None:
+                mean = (robot.torque_scale[k] - 1.0) / unit
+                deviation = deviation.clamp(min=prior.spread[k] / float(unit))
+            yield _parameter(f"{prior.name}.scale of {joint}", mean, deviation, unit, "")
     if isinstance(prior, PayloadPrior | InertialPrior) and isinstance(prior.kernel, Constant):
         links = robot.nq * len(PARAMETER_NAMES)
         sizes = prior.units(w) if isinstance(prior, PayloadPrior) else prior.scale(robot)
+        spread = next((p.spread for p in posterior.priors if isinstance(p, DrivePrior)), ())
+        if isinstance(prior, InertialPrior) and prior.per_gain and spread:
+            # What instruments find depends on the scales of the torques, with the errors of these.
+            of_scales = (std.new_tensor(prior.per_gain) * std.new_tensor(spread)).norm(dim=-1)
+            std = torch.maximum(std, (of_scales / (sizes * prior.kernel.std(params)))[:, None])
         for k, unit in enumerate(sizes * prior.kernel.std(params)):
             link, index = divmod(k, len(PARAMETER_NAMES))
             name, units = PARAMETER_NAMES[index], INERTIAL[index]

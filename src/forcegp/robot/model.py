@@ -56,6 +56,7 @@ class RobotModel:
         remarks: notes on questionable properties of the file, one sentence each.
         coupling: matrix C `(nq, nq)` for drives that move with several joints, at the speeds C q̇; `None` if
             each joint has its own drive. Damping, friction and armature are those of the drives.
+        torque_scale: torque of each drive over its nominal one, `(nq,)`; `None` if torques are measured.
     """
 
     name: str
@@ -87,6 +88,7 @@ class RobotModel:
     gravity: Tensor
     remarks: tuple[str, ...] = ()
     coupling: Tensor | None = None
+    torque_scale: Tensor | None = None
 
     def __repr__(self) -> str:
         """Return a one-line summary without the values of the tensors."""
@@ -184,6 +186,11 @@ class RobotModel:
     def drive_torque(self, tau: Tensor) -> Tensor:
         """Convert torques `(..., nq)` of joints to those of drives, C⁻ᵀ τ."""
         return tau if self.coupling is None else tau @ torch.linalg.inv(self.coupling)
+
+    def true_torque(self, tau: Tensor) -> Tensor:
+        """Convert nominal torques `(..., nq)` of joints to those that act on them."""
+        scale = self.torque_scale
+        return tau if scale is None else self.joint_torque(scale * self.drive_torque(tau))
 
     def check_own_drives(self, what: str) -> None:
         """Raise `UnsupportedRobotError` if drives are coupled, which `what` does not support."""

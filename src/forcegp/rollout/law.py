@@ -419,7 +419,11 @@ class RolloutProblem:
             with contextlib.suppress(NumericalError):  # more is tried below
                 qdd, multiplier, c, cd, held = self.compiled(state.q, state.qd, tau, state.active, h, sticks)
                 return Instant(tau, qdd, multiplier, c, cd, held if sticks else None)
-        at = States(state.q, state.qd, tau, state.active, at.eom)
+        acting = self.system.robot.true_torque(tau)
+        return self._reached(States(state.q, state.qd, acting, state.active, at.eom), h)._replace(tau=tau)
+
+    def _reached(self, at: States, h: Tensor) -> Instant:
+        """Return the motion at states, in which contacts with friction may stick over a step h `(n, 1)`."""
         now, rough = self._instant(at, h), self.rough
         if not rough or not bool((sticks := sticking_contacts(self.system, at, rough)).any()):
             return now

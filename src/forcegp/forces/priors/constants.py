@@ -15,10 +15,6 @@ from forcegp.forces.quantities import States
 from forcegp.gp.kernels import Constant, Kernel
 from forcegp.robot.model import RobotModel
 
-UNDETERMINED = 0.5
-"""Standard deviation, over the stated one, above which a log does not determine a drive constant."""
-
-
 @dataclass(frozen=True)
 class DrivePrior(ConstantForcePrior):
     """A prior on relative errors s δ_i of drive constants (torque constant times gear ratio).
@@ -31,7 +27,8 @@ class DrivePrior(ConstantForcePrior):
     Args:
         std: relative standard deviation s of the drive constants.
         spread: standard deviation of each δ_i over blocks of the log, if it was identified together with the
-            inertia. Constants with at least `UNDETERMINED` stay nominal in predictions, and uncertain by s.
+            inertia.
+        is_error: whether the robot has the most probable scales, so that their errors have zero mean.
         kernel: covariance of δ.
         name: prefix of the hyperparameters.
 
@@ -51,6 +48,7 @@ class DrivePrior(ConstantForcePrior):
     name: str = "drives"
     target: str = JOINT
     spread: tuple[float, ...] = ()
+    is_error: bool = False
 
     def __post_init__(self) -> None:
         if not self.std > 0.0:
@@ -67,10 +65,11 @@ class DrivePrior(ConstantForcePrior):
         return {name: torch.zeros_like(value) for name, value in initial.items()}
 
     def operator(self, system: ConstrainedSystem, at: States) -> Tensor:
-        known = at.tau.new_ones(at.tau.shape[-1])
-        if self.spread:
-            known = (at.tau.new_tensor(self.spread) < UNDETERMINED).to(known)
-        return self.std * torch.diag_embed(at.tau * known)
+        robot, tau = system.robot, at.tau
+        if self.is_error and at.qdd is not None:
+            # Noise of τ would favour δ = −1 / s, which leaves nothing of it.
+            tau = (at.eom.M @ at.qdd[..., None])[..., 0] - at.eom.Q_K
+        return self.std * robot.joint_torque(torch.diag_embed(robot.drive_torque(tau))).mT
 
 
 @dataclass(frozen=True)

@@ -36,6 +36,7 @@ from forcegp.constraints.gauss import FACING_DOWN
 from forcegp.forces.external_wrench import ROWS, WrenchFrame
 from forcegp.forces.priors import contact
 from forcegp.forces.priors.base import ForcePrior
+from forcegp.forces.priors.constants import DrivePrior
 from forcegp.forces.priors.inertial import MASS_AND_MOMENT, InertialPrior, PayloadPrior
 from forcegp.forces.priors.joint import TERMS, JointForcePrior
 from forcegp.forces.term import JointState, JointTerm
@@ -101,6 +102,8 @@ class Mean:
         self.links = Links(self.robot)
         self.graph, n = self.links.graph, self.robot.nq
         self.q, self.qd, self.tau = (np.array(self.links.vector(x), dtype=object) for x in ARGUMENTS[:3])
+        if self.robot.torque_scale is not None:
+            self.tau = self.tau * np.array(self.robot.torque_scale.tolist())
         self.M, self.Q_C, self.Q_G = _forces(self.links)
         self.Q_D = self._damping(None)
         on = [x for x in model.system.contacts if isinstance(x, SurfaceContact)]
@@ -404,6 +407,8 @@ class LearnedMotion(Mean):
                 errors = f * np.array(prior.scale(self.robot).tolist())
                 links, drives = errors[: PARAMETERS * n].reshape(n, PARAMETERS), errors[PARAMETERS * n :]
                 Q = Q - self._inertial_force(links, drives)
+            elif isinstance(prior, DrivePrior):
+                Q = Q + prior.std * (self.tau * f)
             elif isinstance(prior, PayloadPrior):
                 links, units = self.zeros(n, PARAMETERS), prior.units(self.robot.mass).tolist()
                 links[prior.link(self.robot), :MASS_AND_MOMENT] = f * np.array(units)

@@ -26,6 +26,7 @@ from forcegp.forces.external_wrench import WrenchFrame
 from forcegp.forces.posterior import ForcePosterior
 from forcegp.forces.priors import contact, joint
 from forcegp.forces.priors.base import ForcePrior
+from forcegp.forces.priors.constants import DrivePrior
 from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
 from forcegp.forces.priors.residual import ResidualPrior
 from forcegp.forces.term import JointTerm
@@ -45,7 +46,7 @@ from forcegp.gp.kernels import (
 )
 from forcegp.gp.sparse import SparsePosterior
 
-PRIORS = (joint.JointForcePrior, ResidualPrior, InertialPrior, PayloadPrior)
+PRIORS = (joint.JointForcePrior, ResidualPrior, InertialPrior, PayloadPrior, DrivePrior)
 PRIORS += (contact.NormalForcePrior, contact.SlidingFrictionPrior, contact.ContactForcePrior)
 PRIORS += (contact.CoulombErrorPrior,)
 KERNELS = (Linear, Columns, Constant, SquaredExponential, Matern32, Matern52)
