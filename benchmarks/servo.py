@@ -212,7 +212,8 @@ def main() -> None:
     within = np.mean([e <= 2.0 * s for e, s in known])
     print(f"{len(known)} scales: ±2σ holds {within:.2f}, median error {np.median([e for e, _ in known]):.3f}")
     errors, std, true = (
-        np.concatenate([one[key] for one in results]) for key in ("armature_errors", "armature_std", "armature")
+        np.concatenate([one[key] for one in results])
+        for key in ("armature_errors", "armature_std", "armature")
     )
     held, size = np.mean(np.abs(errors) <= 2.0 * std), np.median(np.abs(errors) / true)
     print(f"{len(errors)} armatures: ±2σ holds {held:.2f}, median error {100 * size:.0f} %")

@@ -36,6 +36,7 @@ IMPORTED = {
     "gap": "time-gap",
     "jitter": "time-jitter",
     "lost": "time-gap",
+    "modelled": "torque-noiseless",
 }
 """Kinds of findings made during import that are reported as a finding other than `import-found`."""
 Check = Callable[[ConstrainedSystem, Log], Outcome]

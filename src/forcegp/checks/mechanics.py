@@ -50,7 +50,7 @@ def check_dynamics(system: ConstrainedSystem, log: Log) -> Outcome:
     """Check the torques for wrong signs, order, gains and delays, and the robot file for wrong parameters."""
     if len(log.rows(LEAST_ROWS)) < LEAST_ROWS:
         raise NotJudgedError(f"fewer than {LEAST_ROWS} usable rows")
-    if log.header.torque_scale_std is not None:
+    if log.header.servo_stiffness:
         raise NotJudgedError("torques follow from nominal gains, whose errors a fit learns")
     if system.robot.coupling is not None:
         raise NotJudgedError("torques of coupled drives are not compared with friction of joints")

@@ -23,7 +23,8 @@ from forcegp.logs.compensated import restore
 from forcegp.logs.contact import Evidence, detect, per_contact
 from forcegp.logs.from_contact import derive_joints, stick_speeds
 from forcegp.logs.gather import gather
-from forcegp.logs.mapping import Mapping, default_mapping, load_mapping, parse_mapping
+from forcegp.logs.mapping import Mapping, default_mapping, load_mapping, parse_mapping, scale_std
+from forcegp.logs.modelled import find_modelled, without_noise
 from forcegp.logs.motion import check_clock, find_jumps
 from forcegp.logs.servo import damp, servo_fields, spring_torque
 from forcegp.logs.smoothing import add_derivatives, impact_mask
@@ -121,12 +122,15 @@ def import_log(
             derived = tuple(name for name in ("qd", "qdd") if name not in signals.vectors)
             even_clock(signals, log_mapping.sections.time.period, report)
             derive_joints(signals, system, log_mapping, report)
+            smooth = without_noise(signals, log_mapping) if "tau" in signals.vectors else None
             spring_torque(signals, system.robot, log_mapping, report)
             _find_clipped(signals, log_mapping)
             evidence = _contacts(signals, system, log_mapping, report, displaced)
             std = add_derivatives(signals, log_mapping.sections.derivatives, report)
             std = damp(signals, _treat_clipped(signals, std, log_mapping, report), log_mapping, report)
             restore(signals, system.robot, log_mapping, report)
+            if smooth is not None:
+                find_modelled(signals, smooth, system.robot, report)
             data = _dataset(signals, std, log_mapping, system, report, derived)
     except DataError as error:
         raise error if str(path) in error.message else DataError.at(str(path), error) from None
@@ -229,6 +233,7 @@ def _dataset(
         imported=tuple((found.kind, found.message) for found in report.findings),
         unmeasured_torques=mapping.torque.unmeasured,
         stick_speeds=sticking,
+        torque_scale_std=scale_std(mapping),
         **({} if servo is None else servo_fields(mapping, robot.joint_names)),
         joint_names=robot.joint_names,
         contact_names=tuple(signals.contact),

@@ -249,7 +249,7 @@ def _torque(draft: Draft, trial: Signals, system: ConstrainedSystem) -> None:
     named = {"current", "currents"}.intersection(tokens(family.pattern))
     if current := family.unit in units.CURRENT or (bool(named) and not family.declared):
         family.unit = family.unit if family.declared else "A"
-        text = "a current: give the gear ratio and the torque constant [N m/A]; DrivePrior learns its error"
+        text = "a current: give the gear ratio and the torque constant [N m/A]; a fit learns its error"
         draft.say("torque", text, doubt=True)
     measured = len(clear) - len(family.unmeasured)
     if (share := gravity_share(trial, system)) < LACKING:

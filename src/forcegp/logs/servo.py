@@ -102,7 +102,6 @@ def servo_fields(mapping: Mapping, joints: tuple[str, ...]) -> dict[str, Any]:
     section = mapping.sections.servo
     assert section is not None
     return {
-        "torque_scale_std": section.stiffness_std or None,
         "servo_stiffness": tuple(mapping.per_joint("servo", "stiffness", joints).tolist()),
         "servo_damping": tuple(mapping.per_joint("servo", "damping", joints).tolist()),
     }

@@ -16,7 +16,7 @@ spread by N(0, ¼ b bᵀ) in addition: mean and covariance of an estimate that i
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -31,12 +31,13 @@ from forcegp.destination import check_destination, check_kept
 from forcegp.errors import ModelError, ParameterError
 from forcegp.files import write_json
 from forcegp.forces.posterior import HIGH, LOW, ForceSamples
+from forcegp.forces.priors.constants import DrivePrior
 from forcegp.forces.priors.inertial import InertialPrior, PayloadPrior
 from forcegp.forces.priors.joint import AnalyticalMean
 from forcegp.forces.quantities import States, states_at
 from forcegp.forces.term import JointTerm
 from forcegp.identification import regressor
-from forcegp.models.parameters import is_identified
+from forcegp.models.parameters import SCALE, is_identified
 from forcegp.models.structured_fit import StructuredFit
 from forcegp.robot.inertia import from_pseudo_inertia, inertial_parameters, pseudo_inertia, pseudo_inertia_of
 from forcegp.robot.model import RobotModel
@@ -148,7 +149,10 @@ def calibrated(
     file = fit.specified.robot
     robot, (curve, left, offset) = mean
     curves = torch.stack([found for _, (found, _, _) in samples])
-    parameters = _parameters(file, robot, [each for each, _ in samples], reader.scale)
+    # Scales remain those that instruments found, and undetermined ones nominal.
+    robot = robot.replace(torque_scale=fit.system.robot.torque_scale)
+    robots = [each for each, _ in samples]
+    parameters = (*_parameters(file, robot, robots, reader.scale), *_torque_scales(fit, robot))
     return Calibration(robot, parameters, reader.speeds, curve, curves.std(0), left, offset)
 
 
@@ -361,7 +365,7 @@ class _Reader:
         curves = self._curves(drawn)
         inertia = self._constants(drawn, InertialPrior)
         inertia[1:] += self._gain_errors(drawn.count, generator)
-        parts = [curves.flatten(1), inertia, self._constants(drawn, PayloadPrior)]
+        parts = [curves.flatten(1), inertia, *(self._constants(drawn, x) for x in (PayloadPrior, DrivePrior))]
         sizes, values = [part.shape[-1] for part in parts], torch.cat(parts, dim=-1)
         offset, kept, b = self._offsets(curves), self._offsets(self._kept()[None]), self._disagreement()
         gain = _offset_gain(offset, offset[0] - kept[0], values)
@@ -372,7 +376,7 @@ class _Reader:
         along = torch.cat([random.new_zeros(1, 1), random]).to(b)
         spread = free[: 1 + draws] + 0.5 * (along - 1.0) * b
         rows = (row.split(sizes) for row in self._consistent(spread, sizes[0], free[1:]))
-        return [self._robot(curve.view_as(self.speeds), delta, load) for curve, delta, load in rows]
+        return [self._robot(curve.view_as(self.speeds), *others) for curve, *others in rows]
 
     def _disagreement(self) -> Tensor:
         """Return b `(1, d)`, the identified inertia minus its posterior mean.
@@ -381,7 +385,7 @@ class _Reader:
         posterior contains all samples, but regards accelerations in the regressor as exact.
         """
         b = [self._kept().flatten()]
-        for kind in (InertialPrior, PayloadPrior):
+        for kind in (InertialPrior, PayloadPrior, DrivePrior):
             for p in [p for p, prior in enumerate(self.fit.force_priors) if isinstance(prior, kind)][:1]:
                 one = {name: x[:1] for name, x in self._features(p).items()}
                 b.append(-self._from_mean(p, one)[0])
@@ -501,9 +505,14 @@ class _Reader:
     def _features(self, p: int) -> dict[str, Tensor]:
         return self.fit.posterior.process.features(p, self.fit.system, self.at)
 
-    def _robot(self, curve: Tensor, delta: Tensor, load: Tensor) -> tuple[RobotModel, Curve]:
-        """Return the robot for a friction curve, deviations δ of inertial parameters, and a payload."""
+    def _robot(self, curve: Tensor, delta: Tensor, load: Tensor, scale: Tensor) -> tuple[RobotModel, Curve]:
+        """Return the robot for a friction curve, deviations δ of inertial parameters, a payload, and errors
+        of the scales of torques."""
         robot = self.fit.system.robot
+        drives = next((p for p in self.fit.force_priors if isinstance(p, DrivePrior)), None)
+        if drives is not None:
+            known = torch.ones_like(scale) if robot.torque_scale is None else robot.torque_scale
+            robot = robot.replace(torque_scale=known * (1.0 + drives.std * scale))
         damping, friction, left, offset = _projected(self.speeds, curve)
         robot = robot.replace(damping=damping, friction=friction, stribeck=0.0 * friction)
         if self.scale is not None:
@@ -582,6 +591,15 @@ def _figures(robot: RobotModel) -> Tensor:
     friction = torch.stack([robot.damping, robot.friction], dim=-1)
     links = inertial_parameters(robot.mass, robot.com, robot.inertia)
     return torch.cat([friction, links, robot.armature[:, None]], dim=-1)
+
+
+def _torque_scales(fit: StructuredFit, robot: RobotModel) -> Iterator[Parameter]:
+    """Yield the scales of the torques, if they are unknown."""
+    for p in fit.parameters() if robot.torque_scale is not None else ():
+        if SCALE in p.name:
+            joint = p.name.split(SCALE)[1]
+            value = float(robot.torque_scale[robot.joint_names.index(joint)])
+            yield Parameter(joint, "torque_scale", 1.0, value, p.std, p.determined)
 
 
 def _parameters(

@@ -26,6 +26,8 @@ from forcegp.robot.model import RobotModel
 
 DETERMINED = 0.5
 """Standard deviation relative to that of the prior, below which a parameter is determined by the data."""
+SCALE = ".scale of "
+"""Text between the name of a prior and that of a joint whose torque has a scale."""
 UNITS = {"velocity": ("N m s/rad", "N s/m"), "load": ("1", "1")}
 """Units of weights of columns with a unit, for revolute and for sliding joints."""
 WITHOUT_UNIT = ("coulomb_", "z_", "sin_", "cos_", "offset")
@@ -74,8 +76,7 @@ def clear_drives(
 
 def torque_scales(parameters: Sequence[LearnedParameter]) -> tuple[str, ...]:
     """Return a sentence about torques over the nominal ones, if their scale is an unknown."""
-    mark = ".scale of "
-    found = [(each.name.split(mark)[1], each) for each in parameters if mark in each.name]
+    found = [(each.name.split(SCALE)[1], each) for each in parameters if SCALE in each.name]
     if not found:
         return ()
     known = [f"{joint} {1.0 + p.value:.3g} ± {2.0 * p.std:.1g}" for joint, p in found if p.determined]

@@ -50,7 +50,7 @@ def read_mjcf(root: Element, path: Path) -> Tree:
     """
     document, remarks = reduce_mjcf(root, path)
     with _warnings_of_mujoco(str(path), remarks):
-        model = _compile(document, path)
+        model, gains = _compile(document, path)
         remarks += [f"{path}: {text} off by a flag" for text in _switched_off(model)]
     names = _names("body", [model.body(i).name for i in range(model.nbody)])
     joint_names = _names("joint", [model.joint(i).name for i in range(model.njnt)])
@@ -77,7 +77,7 @@ def read_mjcf(root: Element, path: Path) -> Tree:
         joints=tuple(joints),
         sites=sites,
         remarks=(*remarks, *_tendon_forces(model, path)),
-        drives=tuple(_drives(model, joint_names)),
+        drives=tuple(_drives(model, joint_names, gains)),
         gravity=(0.0, 0.0, 0.0) if weightless else tuple(model.opt.gravity.tolist()),
         reference=_Compiled(model, joint_names),
     )
@@ -177,14 +177,16 @@ def _warnings_of_mujoco(label: str, remarks: list[str]) -> Iterator[None]:
             mujoco.set_mju_user_warning(before)
 
 
-def _compile(document: Element, path: Path) -> Any:
-    """Return MuJoCo's model of the document without meshes; raise typed errors with the compiler's text."""
+def _compile(document: Element, path: Path) -> tuple[Any, list[dict[str, float]]]:
+    """Return MuJoCo's model of the document without meshes, and the gains of its actuators.
+
+    Raise typed errors with the compiler's text."""
     spec = None
     try:
         spec = mujoco.MjSpec.from_string(tostring(document, encoding="unicode"))
         _drop_meshes(spec, path)
-        _reduce_constraints(spec, path)
-        return spec.compile()
+        gains = _reduce_constraints(spec, path)
+        return spec.compile(), gains
     except (ValueError, RuntimeError, mujoco.FatalError) as error:
         if isinstance(error, UnsupportedRobotError):
             raise
@@ -234,10 +236,11 @@ def _has_mass(geom: Any, body: Any, compiler: Any) -> bool:
     return geom.density != 0.0 if np.isnan(geom.mass) else geom.mass != 0.0
 
 
-def _reduce_constraints(spec: Any, path: Path) -> None:
+def _reduce_constraints(spec: Any, path: Path) -> list[dict[str, float]]:
     """Delete inactive equalities, refuse those that do not couple joints, and make motors of all actuators.
 
-    The gain of a motor is that of an actuator whose control is a force, and 0 otherwise.
+    The gain of a motor is that of an actuator whose control is a force, and 0 otherwise. Return the gear of
+    each actuator and, of a servo, its stiffness `kp` and its damping `kv`, if it is not relative.
     """
     for equality in list(spec.equalities):
         if not equality.active:
@@ -246,12 +249,17 @@ def _reduce_constraints(spec: Any, path: Path) -> None:
             kind = equality.type.name.removeprefix("mjEQ_").lower()
             raise unsupported_equality(path, kind, equality.name1)
     plain = mujoco.mjtGain.mjGAIN_FIXED, mujoco.mjtBias.mjBIAS_NONE, mujoco.mjtDyn.mjDYN_NONE
+    gains = []
     for actuator in spec.actuators:
+        gain, bias = actuator.gainprm, actuator.biasprm
+        servo = {"kp": gain[0] if bias[1] else 0.0, "kv": max(0.0, -bias[2])}
+        gains.append({name: float(value) for name, value in {"gear": actuator.gear[0], **servo}.items()})
         of_force = (actuator.gaintype, actuator.biastype, actuator.dyntype) == plain
         gain = actuator.gainprm[0] if of_force else 0.0
         actuator.set_to_motor()
         actuator.gainprm[0], actuator.inheritrange, actuator.actdim = gain, 0.0, -1
         actuator.actlimited = mujoco.mjtLimited.mjLIMITED_FALSE
+    return gains
 
 
 def _couplings(model: Any, names: list[str], path: Path) -> dict[str, Coupling]:
@@ -270,7 +278,7 @@ def _couplings(model: Any, names: list[str], path: Path) -> dict[str, Coupling]:
     return coupled
 
 
-def _drives(model: Any, names: list[str]) -> Iterator[Drive]:
+def _drives(model: Any, names: list[str], gains: list[dict[str, float]]) -> Iterator[Drive]:
     """Yield the armature and damping of actuators and tendons, which act on the joints besides their own."""
     joint_types = int(mujoco.mjtTrn.mjTRN_JOINT), int(mujoco.mjtTrn.mjTRN_JOINTINPARENT)
     tendons: list[dict[str, float]] = []
@@ -302,6 +310,7 @@ def _drives(model: Any, names: list[str]) -> Iterator[Drive]:
             {joint: float(gear) * ratio for joint, ratio in ratios.items()},
             _parameter(model, "actuator_armature", a),
             _parameter(model, "actuator_damping", a),
+            gains=gains[a],
         )
 
 

@@ -64,6 +64,7 @@ class Drive:
         name: description of the element in the file, used in messages.
         ratios: speed of the drive per joint speed; empty if it depends on the configuration.
         armature, damping, friction: parameters of the drive. A joint has ratio² times the first two.
+        gains: of an actuator, its gear and, of a servo, its stiffness and damping `kp` and `kv`.
     """
 
     name: str
@@ -71,6 +72,7 @@ class Drive:
     armature: float = 0.0
     damping: float = 0.0
     friction: float = 0.0
+    gains: Mapping[str, float] = field(default_factory=dict)
 
 
 @dataclass(frozen=True)

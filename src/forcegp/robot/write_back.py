@@ -37,6 +37,10 @@ ORIENTATIONS = ("axisangle", "euler", "xyaxes", "zaxis")
 """Attributes for the orientation of an inertial frame in MJCF, apart from a quaternion."""
 
 
+FORCES = {"motor": ("gear",), "position": ("kp", "kv"), "velocity": ("kv",)}
+"""Attributes of actuators in MJCF that are proportional to their force."""
+
+
 class Change(NamedTuple):
     """A changed parameter of a link or joint, such as `mass` or `damping`, with its values in SI units."""
 
@@ -62,6 +66,8 @@ def write_robot(
     locked_joints: Mapping[str, float] | None = None,
 ) -> WrittenRobot:
     """Write the masses, inertias, damping, friction and armature of a robot into a copy of its file.
+
+    If torques have a scale, the motors and servos of an MJCF file are scaled by it.
 
     Args:
         robot: the robot with the parameters to write. It must have the links and joints of the file.
@@ -101,8 +107,10 @@ def write_robot(
     label, is_urdf = str(path), document.root.tag == "robot"
     writer = _Urdf(document, label) if is_urdf else _Mjcf(document, label, content)
     changes = [*_joint_changes(writer, tree, robot, file), *_link_changes(writer, tree, robot, file)]
+    scaled, unscaled = _scale_changes(writer, robot)
+    changes += scaled
     written = document.written()
-    losses = _losses(robot, writer.figures)
+    losses = (*_losses(robot, writer.figures), *unscaled)
     _check(robot, robot_of(checked(lock_joints(read_tree(written, path), locked)), _world(robot)), writer)
     with atomic_file(out) as temporary:
         temporary.write_bytes(written)
@@ -136,6 +144,18 @@ def _joint_changes(writer: _Urdf | _Mjcf, tree: Tree, robot: RobotModel, file: R
         if values:
             writer.set_joint(joint, values)
     return changes
+
+
+def _scale_changes(writer: _Urdf | _Mjcf, robot: RobotModel) -> tuple[list[Change], tuple[str, ...]]:
+    """Scale the actuators by the scales of the torques. Return the changes, and a sentence on the others."""
+    scales = () if robot.torque_scale is None else robot.torque_scale.tolist()
+    changes, lacking = [], []
+    for joint, scale in zip(robot.joint_names, scales, strict=False):
+        found = writer.scale_actuators(joint, scale) if abs(scale - 1.0) > CHANGED else []
+        changes += found
+        lacking += [] if found or abs(scale - 1.0) <= CHANGED else [f"{joint} {scale:.4g}"]
+    text = f"no motor or servo in the file holds the scale of torques ({', '.join(lacking)})"
+    return changes, (text,) if lacking else ()
 
 
 def _link_changes(writer: _Urdf | _Mjcf, tree: Tree, robot: RobotModel, file: RobotModel) -> list[Change]:
@@ -276,6 +296,10 @@ class _Urdf:
         for name, text in values.items():
             self.document.set(dynamics, name, text)
 
+    def scale_actuators(self, joint: str, scale: float) -> list[Change]:
+        """URDF has no motors."""
+        return []
+
     def set_inertial(self, link: str, body: Inertial) -> None:
         element = self._named["link", link]
         inertial = element.find("inertial")
@@ -316,6 +340,9 @@ class _Mjcf:
         links = [link.name for link in content.links if link.frame][1:]
         self._bodies = _named(bodies, links)
         self._joints = _named(joints, [joint.name for joint in content.joints if joint.kind != "fixed"])
+        sections = [section for section in document.root.children if section.tag == "actuator"]
+        self._actuators = [e for section in sections for e in section.children]
+        self._drives = [drive for drive in content.drives if drive.gains]
 
     def _element(self, kind: str, name: str, among: Mapping[str, Span]) -> Span:
         if name not in among:
@@ -328,6 +355,25 @@ class _Mjcf:
         element = self._element("joint", joint, self._joints)
         for name, text in values.items():
             self.document.set(element, name, text)
+
+    def scale_actuators(self, joint: str, scale: float) -> list[Change]:
+        """Scale the motors and servos of a joint alone."""
+        if len(self._actuators) != len(self._drives):
+            raise RobotFileError(
+                f"{self.label}: actuators of joint {joint!r} may be in an included file",
+                expected=f"{len(self._drives)} actuators",
+                got=len(self._actuators),
+                hint="write to the included file, or expand the includes first",
+            )
+        changes = []
+        for element, drive in zip(self._actuators, self._drives, strict=True):
+            names = FORCES.get(element.tag, ())
+            if set(drive.ratios) == {joint}:
+                for name in (name for name in names if drive.gains[name]):
+                    value = drive.gains[name]
+                    self.document.set(element, name, _text(scale * value))
+                    changes.append(Change(element.attributes.get("name", joint), name, value, scale * value))
+        return changes
 
     def set_inertial(self, link: str, body: Inertial) -> None:
         element = self._element("body", link, self._bodies)

@@ -228,8 +228,12 @@ def take(
 
 def take_robot(tensors: Mapping[str, Tensor], prefix: str, like: RobotModel, source: str) -> RobotModel:
     """Return a robot built from tensors `<prefix><field>`, checked by `take`, with other fields copied."""
-    fields = {}
+    fields: dict[str, Tensor | None] = {}
+    optional = {field.name for field in dataclasses.fields(RobotModel) if field.default is None}
     for name, value in like.tensors.items():
+        if name in optional and prefix + name not in tensors:
+            fields[name] = None
+            continue
         shape, finite = tuple(value.shape), name not in MAY_BE_INFINITE
         fields[name] = take(tensors, prefix + name, shape, value.dtype, source, finite=finite)
     return like.replace(**fields)

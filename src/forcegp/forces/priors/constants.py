@@ -15,6 +15,7 @@ from forcegp.forces.quantities import States
 from forcegp.gp.kernels import Constant, Kernel
 from forcegp.robot.model import RobotModel
 
+
 @dataclass(frozen=True)
 class DrivePrior(ConstantForcePrior):
     """A prior on relative errors s δ_i of drive constants (torque constant times gear ratio).

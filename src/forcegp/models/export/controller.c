@@ -134,7 +134,7 @@ static int assemble(const double *restrict q, const double *restrict qd, const d
   memcpy(e->contact, next, sizeof(touching) * CONTACTS), next += sizeof(touching) / sizeof(double) * CONTACTS;
   memcpy(e->x, next, sizeof(double) * INPUTS), next += INPUTS;
   memcpy(e->phi, next, sizeof(double) * FEATURES);
-  for (int i = 0; i < NQ; ++i) Q[i] = e->Q_C[i] + e->Q_G[i] + e->Q_D[i] + tau[i];
+  for (int i = 0; i < NQ; ++i) Q[i] = e->Q_C[i] + e->Q_G[i] + e->Q_D[i] + TORQUE_SCALE[i] * tau[i];
   if (!inverse_factor(&e->M[0][0], NQ, G, K)) return 0;
   for (int i = 0; i < NQ; ++i)
     for (int j = 0; j <= i; ++j) {
@@ -406,7 +406,7 @@ static void friction_error(const equations *restrict e, const double *restrict t
   double u[NQ], Q[NQ], qdd[NQ], multiplier[SOME(ROWS)];
   against_sliding(at, smoothing, u);
   for (int j = 0; j < NQ; ++j)
-    Q[j] = e->Q_C[j] + e->Q_G[j] + e->Q_D[j] + tau[j] + dot(gain + j * ROWS, e->load, ROWS);
+    Q[j] = e->Q_C[j] + e->Q_G[j] + e->Q_D[j] + TORQUE_SCALE[j] * tau[j] + dot(gain + j * ROWS, e->load, ROWS);
   motion_under(e, Q, qdd, multiplier);
   for (int j = 0; j < NQ; ++j) {
     E[0][j] = e->closed[c] ? mu * multiplier[c] * u[j] : 0.0;
@@ -478,9 +478,19 @@ static void inertial(const double *restrict q, const double *restrict qd, const 
 }
 #endif
 
-/* E for inertia errors at the acceleration qdd or, with NULL, at the acceleration under the analytical forces */
-static void inertial_errors(const double *q, const double *qd, const equations *e, const double *qdd, latent *f) {
-  (void)q, (void)qd, (void)e, (void)qdd, (void)f;
+/* E for errors of inertia and of the scales of torques at the acceleration qdd or, with NULL, at the acceleration under
+ * the analytical forces and at the torques tau */
+static void inertial_errors(const double *q, const double *qd, const double *tau, const equations *e, const double *qdd,
+                            latent *f) {
+  (void)q, (void)qd, (void)tau, (void)e, (void)qdd, (void)f;
+#ifdef DRIVES
+  memset(f->E[DRIVES], 0, sizeof(double) * NQ * NQ);
+  for (int i = 0; i < NQ; ++i) {
+    const double known = e->Q_C[i] + e->Q_G[i] + e->Q_D[i];
+    const double torque = DRIVES_MEASURED && qdd ? dot(e->M[i], qdd, NQ) - known : TORQUE_SCALE[i] * tau[i];
+    f->E[DRIVES + i][i] = DRIVES_STD * torque;
+  }
+#endif
 #ifdef PAYLOAD
   inertial(q, qd, PAYLOAD_MEASURED && qdd ? qdd : e->qdd, PAYLOAD, PAYLOAD_COLUMN, 4, PAYLOAD_UNITS, f);
 #endif
@@ -556,7 +566,8 @@ static int read_covariance(const affine *restrict z, const equations *restrict e
 /* m, the prior mean of Q */
 static void expected_force(const equations *restrict e, const double *restrict tau, double *restrict m) {
   for (int i = 0; i < NQ; ++i)
-    m[i] = MEAN_TERMS[0] * e->Q_C[i] + MEAN_TERMS[1] * e->Q_G[i] + MEAN_TERMS[2] * e->Q_D[i] + MEAN_TERMS[3] * tau[i];
+    m[i] = MEAN_TERMS[0] * e->Q_C[i] + MEAN_TERMS[1] * e->Q_G[i] + MEAN_TERMS[2] * e->Q_D[i] +
+           MEAN_TERMS[3] * TORQUE_SCALE[i] * tau[i];
 }
 
 /* distance by which speed and torque exceed the training data, in standard deviations of these data */
@@ -600,7 +611,7 @@ static int evaluate(const forcegp_learned *learned, const double *q, const doubl
   if (learned) s->f.folded = learned->folded;
 #endif
   if ((status = latent_forces(q, qd, tau, &s->e, s->gain, spread, &s->f)) != 0) return status;
-  inertial_errors(q, qd, &s->e, qdd, &s->f);
+  inertial_errors(q, qd, tau, &s->e, qdd, &s->f);
   return 0;
 }
 
@@ -691,7 +702,7 @@ static int posterior(const forcegp_learned *learned, const double *q, const doub
   if (INERTIA_LEARNED && covariance) { /* at the predicted acceleration */
     maps(&s->e, s->gain, FORCEGP_QDD, &z);
     read_mean(&z, &s->f, s->prior_mean, NQ, qdd);
-    inertial_errors(q, qd, &s->e, qdd, &s->f);
+    inertial_errors(q, qd, tau, &s->e, qdd, &s->f);
   }
   size = maps(&s->e, s->gain, quantities, &z);
   read_mean(&z, &s->f, s->prior_mean, size, mean);

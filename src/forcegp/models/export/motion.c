@@ -124,7 +124,7 @@ static int motion(const double *folded, const waves *w, long sample, const doubl
   f.learned = NULL, f.functions = NULL, f.folded = folded ? folded + sample * FOLDED[COMPONENTS] : NULL;
   if ((status = latent_forces(q, qd, tau, &e, gain, 0, &f)) != 0) return status;
   add_waves(w, &e, sample, 0, &f);
-  inertial_errors(q, qd, &e, NULL, &f);
+  inertial_errors(q, qd, tau, &e, NULL, &f);
   expected_force(&e, tau, force);
   for (int r = 0; r < ROWS; ++r) c[r] = e.contact[r].c, cd[r] = dot(e.contact[r].A, qd, NQ);
   size = maps(&e, gain, FORCEGP_QDD | FORCEGP_MULTIPLIER, &z);

@@ -92,7 +92,7 @@ int forcegp_update(forcegp_learned *s, const double *q, const double *qd, const 
   if (fastest <= REST_SPEED) return FORCEGP_AT_REST;
   f.learned = s, f.folded = s->folded, f.functions = V;
   if ((status = latent_forces(q, qd, tau, &e, gain, 1, &f)) != 0) return status;
-  inertial_errors(q, qd, &e, quantity == FORCEGP_QDD ? measured : NULL, &f);
+  inertial_errors(q, qd, tau, &e, quantity == FORCEGP_QDD ? measured : NULL, &f);
   /* rows (W V^T, y - E[y]) / sigma with W = B E, of noise (1 + N N^T) / kappa with N = B_Q Sigma_tau^1/2 / sigma */
   size = maps(&e, gain, quantity, &z);
   operators(&z, &f, size, W);

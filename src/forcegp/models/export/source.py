@@ -24,6 +24,7 @@ from forcegp.forces.external_wrench import MULTIPLIER_STD
 from forcegp.forces.posterior import GROWTH, HIGH, LOW, MEMORY, SPREAD, STICK_NOISE, STICK_SPEED
 from forcegp.forces.priors import contact
 from forcegp.forces.priors.base import CONSTRAINT, CONTACT, JOINT
+from forcegp.forces.priors.constants import DrivePrior
 from forcegp.forces.priors.inertial import PER_PAYLOAD, InertialPrior, PayloadPrior
 from forcegp.forces.priors.joint import TERMS
 from forcegp.forces.quantities import PREDICTED, ROUNDED
@@ -233,7 +234,12 @@ class Writer:
         self.array([float(isinstance(prior, JointTerm)) for prior in owners], "IS_FRICTION", "int")
         terms = process.mean.terms  # pyright: ignore[reportFunctionMemberAccess]
         self.array([float(term in terms) for term in TERMS], "MEAN_TERMS")
+        scale = robot.torque_scale
+        self.array(torch.ones_like(robot.mass) if scale is None else scale, "TORQUE_SCALE")
         for part, start in zip(self.parts, self.starts, strict=False):
+            if isinstance(part.prior, DrivePrior):
+                self.lines += [f"#define DRIVES {start}", f"#define DRIVES_STD {part.prior.std!r}"]
+                self.lines.append(f"#define DRIVES_MEASURED {int(part.prior.is_error)}")
             if isinstance(part.prior, InertialPrior):
                 self.lines.append(f"#define INERTIAL {start}")
                 self.lines.append(f"#define INERTIAL_COLUMNS {part.components}")
@@ -368,7 +374,7 @@ class Writer:
     def _operator(self, part: Functions, start: int) -> list[str]:
         """Return the code for E(x), which maps f to generalized forces (inertial errors: `controller.c`)."""
         prior, E = part.prior, f"f->E + {start}"
-        if isinstance(prior, InertialPrior | PayloadPrior):
+        if isinstance(prior, InertialPrior | PayloadPrior | DrivePrior):
             return []
         if isinstance(prior, contact.NormalForcePrior):
             return [f"  along_constraint(e, {E});"]
