@@ -159,17 +159,19 @@ def rescaled_robot(robot: RobotModel, rows: Rows, std: float) -> Inertia:
 def torque_scale(robot: RobotModel, rows: Rows, std: float) -> tuple[Tensor, Tensor]:
     """Return the scales 1 + s `(nq,)` of torques for known links and unknown drives, and σ(s).
 
-    Where links hardly resist the motion, the torques are the nominal ones, and the inertia of the drive is
-    relative to them.
+    With the known torque u of the links, τ = g (u + d q̈) + Φ w is linear in g = 1/(1 + s) and in g d. With
+    the equivalent (1 + s) τ = u + d q̈ + Φ w, noise of τ would favour s = −1, where nothing of it is left.
+    Where links hardly resist the motion, torques are the nominal ones, and d is relative to them.
     """
     n = robot.nq
-    M, size = inertia_at(robot, rows.q), LOOSE * drive_scale(robot, rows.q)
+    M, size = inertia_at(robot, rows.q), drive_scale(robot, rows.q)
     _, found = _regressions(rows, size * torch.diag_embed(rows.qdd), M, std)
-    drives, scales = torch.arange(n), torch.arange(n, 2 * n)
-    spread = found.read(2 * n, torch.cat([drives, scales]))[1][n:].sqrt()
-    unknowns = torch.cat([drives, scales[spread < UNDETERMINED]])
-    u = found.estimate(found.by_stretch.total(), unknowns, n)
-    return 1.0 + std * u[n : 2 * n], std * spread.clamp(max=1.0)
+    drives, gains = torch.arange(n), torch.arange(n, 2 * n)
+    spread = found.read(2 * n, torch.cat([drives, gains]))[1][n:].sqrt()
+    unknowns = torch.cat([drives, gains[spread < UNDETERMINED]])
+    g = 1.0 + std * found.estimate(found.by_stretch.total(), unknowns, n)[n : 2 * n]
+    g = g.clamp(min=LEAST_GAIN)
+    return 1.0 / g, std * (spread / g**2).clamp(max=1.0)
 
 
 def _regressions(
@@ -334,7 +336,8 @@ def _over_widths(
         if width and (int(used.weight.sum(0).min()) < LEAST or int(used.group.max()) < int(rows.group.max())):
             break
         if scale_std is not None:
-            columns = torch.cat([columns, -scale_std * torch.diag_embed(used.tau)], dim=-1)
+            file = torch.diag_embed(used.tau - used.residual)
+            columns = torch.cat([columns, scale_std * file], dim=-1)
         columns = with_delay(used, columns)
         speed = used.qd.abs()
         fast = dataclasses.replace(used, weight=used.weight * (speed >= speed.median(0).values))
@@ -369,11 +372,10 @@ five real arms are 1.36 times as large in the geometric mean, and torque errors 
 VOLUME_STATES = 100
 """Number of states over which log |M| or the noise volume is averaged."""
 IDENTIFIED = "identified inertia replaces that of the robot file, since it predicts held-out torques better"
-LOOSE = 10.0
-"""Factor on the prior deviation of drives that would shrink together with torques of unknown scale. With 1,
-the scale of two of six servos of an SO-101 in MuJoCo is pulled towards zero."""
 UNDETERMINED = 0.5
 """Standard deviation of a scale, over the stated one, from which on the torque is the nominal one."""
+LEAST_GAIN = 0.1
+"""Smallest g = 1/(1 + s)."""
 ROUNDS = 3
 """Maximum number of estimates of the scales, each with the links of the previous one."""
 GAIN = 0.02

@@ -79,8 +79,8 @@ def torque_scales(parameters: Sequence[LearnedParameter]) -> tuple[str, ...]:
     found = [(each.name.split(SCALE)[1], each) for each in parameters if SCALE in each.name]
     if not found:
         return ()
-    known = [f"{joint} {1.0 + p.value:.3g} ± {2.0 * p.std:.1g}" for joint, p in found if p.determined]
-    rest = [joint for joint, p in found if not p.determined]
+    known = [f"{joint} {1.0 + p.value:.3g} ± {2.0 * p.std:.1g}" for joint, p in found if p.value]
+    rest = [joint for joint, p in found if not p.value]
     sentence = f"torques over the nominal ones [± 2σ]: {', '.join(known) or 'none is determined'}"
     if known and rest:
         sentence += f"; not determined, since links hardly resist: {', '.join(rest)}"
