@@ -22,7 +22,7 @@ from typing import Any
 import numpy as np
 import torch
 from real_cases import example_robot
-from sysid_peer import specification
+from sysid_peer import identified_servos, specification
 
 import forcegp
 from forcegp.errors import optional_module
@@ -131,36 +131,46 @@ class Arm:
             np.savez(path, t=t[:, 0], q=q, c=c)
             return forcegp.read_log(path, self.robot, self.mapping(rate)), command
 
-    def file_error(self, log: forcegp.Dataset, command: Any, rate: int) -> float:
-        """Mean square error of angles in MuJoCo with the robot file and nominal gains, without delay."""
-        model, errors = self.engine(true=False), []
+    def file_error(self, log: forcegp.Dataset, command: Any, rate: int, peer: Any = None) -> float:
+        """Mean square error of angles in MuJoCo with the robot file and nominal gains, without delay; or of
+        the model that `mujoco.sysid` identified, with the true delay."""
+        model, errors = peer or self.engine(true=False), []
         data, every = mujoco.MjData(model), round(1000 / rate)
         data.qpos[:], data.qvel[:] = log.q[0].numpy(), log.qd[0].numpy()
         for k in range(round(1000 * LENGTH)):
             if k % every == 0:
                 errors.append(data.qpos - log.q[k // every].numpy())
             now = float(log.t[0]) + 1e-3 * k
-            data.ctrl[:] = self.wrong * self.stiffness * (command(now) - data.qpos)
+            if peer is not None:
+                data.ctrl[:] = command(now - DELAY)
+            else:
+                data.ctrl[:] = self.wrong * self.stiffness * (command(now) - data.qpos)
             mujoco.mj_step(model, data)
         return float(np.square(errors).mean())
 
 
-def compared(name: str, rate: int, seed: int, noise: float) -> dict[str, Any]:
+def compared(name: str, rate: int, seed: int, noise: float, with_peer: bool) -> dict[str, Any]:
     """Open loops, gains and drives of one arm."""
     random = np.random.default_rng(seed)
     arm = Arm.of(name, random)
-    train, _ = arm.log(random, SECONDS, rate, noise)
+    train, trained = arm.log(random, SECONDS, rate, noise)
     test, command = arm.log(random, LENGTH * PLAYED + 1.0, rate, noise)
     begin = time.perf_counter()
     fit = forcegp.StructuredGP(forcegp.ConstrainedSystem(arm.robot)).fit(train)
     seconds, rows = time.perf_counter() - begin, round(LENGTH * rate)
-    ours, file = [], []
+    begin, peer = time.perf_counter(), None
+    if with_peer:
+        nominal = arm.wrong * arm.stiffness, arm.wrong * arm.damping
+        peer = identified_servos(arm.robot, train, *nominal, lambda t: trained(max(0.0, t - DELAY)))
+    peer_seconds = time.perf_counter() - begin
+    ours, file, peers = [], [], []
     for k in range(PLAYED):
         part = test[k * rows : (k + 1) * rows + 1]
         path = fit.rollout(part.q[0], part.qd[0], part, duration=LENGTH)
         at = ((part.t - part.t[0]) / (path.t[1] - path.t[0])).round().long().clamp(max=len(path.t) - 1)
         ours.append(float((path.q.reshape(len(path.t), -1)[at] - part.q).square().mean()))
         file.append(arm.file_error(part, command, rate))
+        peers.append(arm.file_error(part, command, rate, peer) if with_peer else np.nan)
     own = {p.name: p for p in fit.parameters()}
     scales = [own[f"drives.scale of {joint}"] for joint in arm.robot.joint_names]
     (step,) = (step for step in train.header.provenance if "commands" in step)
@@ -169,6 +179,8 @@ def compared(name: str, rate: int, seed: int, noise: float) -> dict[str, Any]:
         "delay_ms": step.split("commands ")[1].split(" ms")[0],
         "open_loop_rad": float(np.sqrt(np.mean(ours))),
         "file_rad": float(np.sqrt(np.mean(file))),
+        "peer_rad": float(np.sqrt(np.mean(peers))),
+        "peer_seconds": peer_seconds,
         "determined": [p.determined for p in scales],
         "errors": [float(p.value - (1.0 / x - 1.0)) for p, x in zip(scales, arm.wrong, strict=True)],
         "std": [p.std for p in scales],
@@ -188,6 +200,7 @@ def main() -> None:
     parser.add_argument("--rate", type=int, choices=tuple(WINDOWS), action="append")
     parser.add_argument("--seeds", type=int, default=3)
     parser.add_argument("--noise", type=float, default=1e-5, help="standard deviation of positions [rad]")
+    parser.add_argument("--peer", action="store_true", help="identify by mujoco.sysid too (minutes)")
     parser.add_argument("--json", type=Path, help="write the results there")
     arguments = parser.parse_args()
     warnings.simplefilter("ignore")
@@ -195,11 +208,14 @@ def main() -> None:
     for name in arguments.robot or ROBOTS:
         for rate in arguments.rate or WINDOWS:
             for seed in range(arguments.seeds):
-                one = compared(name, rate, seed, arguments.noise)
+                one = compared(name, rate, seed, arguments.noise, arguments.peer)
                 results.append(one)
                 ratio = one["open_loop_rad"] / one["file_rad"]
                 shown = f"{sum(one['determined'])} of {len(one['determined'])} scales determined"
                 open_loop = f"{one['open_loop_rad']:.4f} rad, {ratio:.3f} × the file"
+                if arguments.peer:
+                    beside = one["open_loop_rad"] / one["peer_rad"]
+                    open_loop += f", {beside:.3f} × mujoco.sysid ({one['peer_seconds']:.0f} s)"
                 print(
                     f"{one['case']}: {open_loop}; delay {one['delay_ms']} ms; {shown}; {one['seconds']:.1f} s"
                 )
